@@ -1,4 +1,4 @@
-"""Errors of a fitted body against the true one: arrays in, numbers out, metres."""
+"""Errors of a fitted body against the true body, metres."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def visible_vertex_error(
     true_vertices: np.ndarray,
     visible: np.ndarray,
 ) -> np.ndarray:
-    """The same (...) over the vertices that cameras truly see (..., V) bool; NaN where none is."""
+    """PVE (...) over the vertices in the mask ``visible`` (..., V); NaN where the mask is empty."""
     error = np.linalg.norm(vertices - true_vertices, axis=-1)
     count = visible.sum(-1)
     mean = (error * visible).sum(-1) / np.maximum(count, 1)
@@ -34,17 +34,17 @@ def visible_vertex_error(
 
 
 def joint_error(joints: np.ndarray, true_joints: np.ndarray) -> np.ndarray:
-    """MPJPE (...): mean distance of the 22 body joints of (..., 55, 3), nothing aligned."""
+    """MPJPE (...): mean distance of the 22 body joints of (..., 55, 3), without alignment."""
     return joint_errors(joints, true_joints).mean(-1)
 
 
 def joint_errors(joints: np.ndarray, true_joints: np.ndarray) -> np.ndarray:
-    """Distance (..., 22) of each of these joints."""
+    """Distance (..., 22) of each body joint of (..., 55, 3) from the true joint."""
     return np.linalg.norm(joints - true_joints, axis=-1)[..., BODY_JOINTS]
 
 
 def landmarks(vertices: np.ndarray, keypoints: KeypointMap) -> np.ndarray:
-    """Face landmarks (..., 68, 3) on the skin of (..., V, 3): 51 inner ones, then the jaw line."""
+    """Face landmarks (..., 68, 3) of vertices (..., V, 3): 51 inner landmarks, then the jaw line."""
     ids, weights = (
         np.concatenate([of[FACE], of[CONTOUR]]) for of in (keypoints.ids, keypoints.weights)
     )
@@ -54,8 +54,8 @@ def landmarks(vertices: np.ndarray, keypoints: KeypointMap) -> np.ndarray:
 def landmark_error(found: np.ndarray, true: np.ndarray, *, align: bool = False) -> np.ndarray:
     """Mean distance (...) of corresponding points (..., N, 3).
 
-    ``align`` first moves and turns the found ones as a whole onto the true ones (Kabsch 1976): what
-    is left is the face's form and expression, without the place and turn of the head.
+    ``align`` first applies the rigid transform that best maps the found onto the true points
+    (Kabsch 1976). The remaining error is that of shape and expression, without the head's pose.
     """
     if align:
         middle = true.mean(-2, keepdims=True)
@@ -76,10 +76,12 @@ def hand_error(
     *,
     align_wrists: bool = False,
 ) -> np.ndarray:
-    """Mean distance (..., 2) over each hand's 15 joints and 5 tips, left then right.
+    """Mean distance (..., 2) over the 15 joints and 5 fingertips of the left and the right hand.
 
-    ``joints`` (..., 55, 3), ``tips`` (..., 10, 3) thumb to little finger, left then right.
-    ``align_wrists`` first moves (not turns) the fitted hand's wrist onto the true one.
+    Args:
+        joints, true_joints: (..., 55, 3).
+        tips, true_tips: (..., 10, 3) thumb to little finger, left hand first.
+        align_wrists: first translate the fitted hand so that its wrist is at the true wrist.
     """
     errors = []
     for side, wrist in enumerate(WRISTS):
@@ -98,10 +100,13 @@ def corresponding_vertices(
     face: np.ndarray,
     weights: np.ndarray,
 ) -> np.ndarray:
-    """The true surface's points (..., V, 3) that correspond to a fitted mesh's vertices.
+    """Points (..., V, 3) of the true surface that correspond to the vertices of the fitted mesh.
 
-    ``true_vertices`` (..., Vt, 3), ``true_faces`` (Ft, 3); ``face`` (V,) and barycentric
-    ``weights`` (V, 3) say which point of the true mesh each vertex is, in rest pose.
+    Args:
+        true_vertices: (..., Vt, 3).
+        true_faces: (Ft, 3).
+        face: (V,) face of the true mesh that corresponds to each fitted vertex in rest pose.
+        weights: (V, 3) barycentric weights within that face.
     """
     corners = true_faces[face]
     return sum(
@@ -116,10 +121,12 @@ def normalised_joint_error(
     sigma: np.ndarray,
     which: slice = BODY_JOINTS,
 ) -> np.ndarray:
-    """Distance of some joints (..., 22) over the stated deviation: median 1 if calibrated.
+    """Distance of joints from the truth over the stated deviation; its median is 1 if calibrated.
 
-    ``sigma`` (..., 55) is the standard deviation of each coordinate, metres. ``which`` of the 55
-    joints; the body's where nothing is said.
+    Args:
+        joints, true_joints: (..., 55, 3).
+        sigma: (..., 55) stated standard deviation of each coordinate, metres.
+        which: the joints that are evaluated.
     """
     error = np.linalg.norm(joints - true_joints, axis=-1)[..., which]
     return error / (MEDIAN_CHI_3 * np.maximum(sigma[..., which], 1e-9))

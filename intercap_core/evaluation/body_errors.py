@@ -31,8 +31,8 @@ from intercap_core.geometry.rigid.surface_samples import sample_surface
 from intercap_core.geometry.rigid.surface_tree import SurfaceTree
 from intercap_core.schemas import SCENE, TRUTH
 
-EVERY = 5  # one frame in so many is compared with its points: neighbours are redundant
-SURFACE_SAMPLES = 4000  # of the body, spread over its area
+EVERY = 5  # every fifth frame is compared with its points: neighbours are redundant
+SURFACE_SAMPLES = 4000  # area samples of the body
 CLOUD_POINTS = 3000  # at most, evenly thinned
 CLOUD_KEYS = (
     "cloud_to_mesh", "mesh_to_cloud_visible", "cloud_to_mesh_floor", "mesh_to_cloud_visible_floor",
@@ -40,8 +40,10 @@ CLOUD_KEYS = (
 
 
 class BodyClouds:
-    """The person's points of one recording, as stage ``body_fit`` is given them: its masks, all
-    views that have depth, refined extrinsics."""
+    """The person's measured points of one recording, as stage ``body_fit`` reads them.
+
+    They use the person masks, all views with depth and the refined extrinsics.
+    """
 
     def __init__(
         self,
@@ -67,7 +69,7 @@ class BodyClouds:
         person: Path,
         model: BodyModel,
     ) -> Iterator[BodyClouds]:
-        """Open for a ``with`` block; raises UserError as reading artefacts does."""
+        """Context manager; raises UserError where an artefact cannot be read."""
         with Frames.open(frames) as images, artefacts.read(scene, SCENE) as found:
             rig = Rig.from_artefact(found)
             images = images.showing(found["image_of"])
@@ -76,9 +78,10 @@ class BodyClouds:
     def measure(self, t: int, vertices: np.ndarray, truth: Truth) -> dict[str, float]:
         """Mean distances of frame ``t`` by CLOUD_KEYS, metres; NaN where no point was measured.
 
-        ``vertices`` (V, 3) fitted. Of points to the mesh; of samples of the mesh to the points,
-        those that some depth image in which the person was segmented truly shows. The floors are
-        the same of the true body, which no fit of a body without clothes can go far below.
+        - ``cloud_to_mesh``: from the points to the fitted mesh, vertices (V, 3).
+        - ``mesh_to_cloud_visible``: from samples of the mesh to the points. Only samples that a
+          depth image with a person mask truly shows.
+        - ``..._floor``: the same for the true body, a lower bound for a body without clothing.
         """
         assert truth.vertices is not None
         true = truth.vertices[t].astype(np.float64)
@@ -98,7 +101,7 @@ class BodyClouds:
         return found
 
     def _seen(self, t: int, true: np.ndarray, truth: Truth) -> np.ndarray:
-        """Which samples of the true body (N,) are truly seen by depth that has a mask."""
+        """Mask (N,) of the true body's samples that a depth image with a person mask shows."""
         assert truth.visible is not None
         there = self._images.depth_available[t]
         cameras = [c for i, c in enumerate(self._rig) if there[i] and self._masks[t][i]]
@@ -109,7 +112,7 @@ class BodyClouds:
         sight = Sight(occluders)
         points = self._samples.of(true, self._faces)
         normals = face_normals(true, self._faces)[self._samples.faces]
-        # occlusion by furniture is known from the truth of the whole rig
+        # the visibility in the truth includes occlusion by furniture
         anyhow = self._samples.of(truth.visible[t].astype(np.float32), self._faces) > 0.5
         return anyhow & sight.seen(points, normals, cameras)
 
@@ -119,43 +122,34 @@ BODY_JOINT_NAMES = JOINT_NAMES[body.BODY_JOINTS]
 
 @dataclass(frozen=True, eq=False)
 class BodyErrors:
-    """T frames of one body, metres; what is not known is NaN.
-
-    ``pve``, ``visible`` (T,): mean error of all vertices, and of those that cameras truly see.
-    ``joints`` (T, 22) by joint; ``hands``, ``hands_wrist`` (T, 2) of joints and tips, the second
-    with the wrist aligned; ``touching`` (T, 2) hands that truly touch the object. ``face``,
-    ``face_aligned`` (T,) of 68 landmarks. ``acceleration`` (T,) metres a frame^2 at 30 fps.
-    ``normalised`` (T, 22), ``normalised_hands`` (T, 30) errors over the stated deviation.
-    ``flagged`` (T,) the stage does not trust it. ``clouds``: (N,) each, of every few frames.
-    ``views`` cameras that have images; ``truth`` the file that it was held to.
-    """
+    """Errors of one body over T frames, metres; NaN = unknown."""
 
     sequence: str
     interaction: str
-    truth: Path
-    views: int
-    pve: np.ndarray
-    visible: np.ndarray
-    joints: np.ndarray
-    hands: np.ndarray
-    hands_wrist: np.ndarray
-    touching: np.ndarray
-    face: np.ndarray
-    face_aligned: np.ndarray
-    acceleration: np.ndarray
-    normalised: np.ndarray
-    normalised_hands: np.ndarray
-    flagged: np.ndarray
-    clouds: dict[str, np.ndarray] = field(default_factory=dict)
+    truth: Path  # the file with the truth
+    views: int  # number of cameras with images
+    pve: np.ndarray  # (T,) mean error of all vertices
+    visible: np.ndarray  # (T,) mean error of the vertices that a camera truly sees
+    joints: np.ndarray  # (T, 22) error of each body joint
+    hands: np.ndarray  # (T, 2) mean error of joints and tips of the left and right hand
+    hands_wrist: np.ndarray  # (T, 2) the same with the wrist aligned
+    touching: np.ndarray  # (T, 2) whether the hand truly touches the object
+    face: np.ndarray  # (T,) mean error of 68 landmarks
+    face_aligned: np.ndarray  # (T,) the same after rigid alignment
+    acceleration: np.ndarray  # (T,) error, metres per frame^2 at 30 fps
+    normalised: np.ndarray  # (T, 22) joint errors over their stated deviation
+    normalised_hands: np.ndarray  # (T, 30) finger joint errors over their stated deviation
+    flagged: np.ndarray  # (T,) the stage marked the frame as unreliable
+    clouds: dict[str, np.ndarray] = field(default_factory=dict)  # (N,) by CLOUD_KEYS, every EVERY
 
     @property
     def bad(self) -> np.ndarray:
-        """Frames (T,) whose body is truly off: a vertex error above 40 mm."""
+        """Mask (T,) of frames with a vertex error above 40 mm."""
         return self.pve > BAD_BODY_M
 
     @property
     def worst(self) -> int:
-        """The frame with the largest error, of the joints where that of vertices is not known."""
+        """The frame with the largest vertex error, or joint error where the former is unknown."""
         known = np.isfinite(self.pve).any()
         return int(np.nanargmax(self.pve if known else self.joints.mean(1)))
 
@@ -171,7 +165,7 @@ def measure(
 ) -> BodyErrors:
     """Compare the artefact of stage ``body_fit`` with the truth of its recording.
 
-    Raises UserError where an artefact is broken, or the truth is of another recording.
+    Raises UserError where an artefact cannot be read or the truth is of another recording.
     """
     track = read_body(body_fit, "body_fit", body_models, gender)
     with artefacts.read(scene, SCENE) as found:
@@ -209,7 +203,7 @@ def _surface(
     truth: Truth,
     clouds: BodyClouds,
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Errors of skin and face (T,), and distances to the measured points of every few frames."""
+    """Errors of skin and face (T,), and distances to the measured points in every fifth frame."""
     total = len(track.joints)
     found = {key: np.full(total, np.nan) for key in ("pve", "visible", "face", "face_aligned")}
     measured: list[dict[str, float]] = []
@@ -231,10 +225,10 @@ def _surface(
 
 
 def figures(recordings: Sequence[BodyErrors]) -> Figures:
-    """What is reported of several recordings, millimetres: means over their frames.
+    """Figures over several recordings, millimetres: means over all their frames.
 
-    Hands in grasp are over the frames in which that hand truly touches the object. Flags are held
-    to the frames that are truly bad; recall and precision are left out where they have no meaning.
+    ``hand_grasp`` figures are over the frames in which the hand truly touches the object. Recall
+    and precision of the flags are omitted where they are undefined.
     """
     if not recordings:
         return {}
@@ -276,7 +270,7 @@ def figures(recordings: Sequence[BodyErrors]) -> Figures:
 
 
 def flag_figures(recordings: Sequence[BodyErrors]) -> Figures:
-    """How many frames are flagged, how many are truly bad, and how well the two agree."""
+    """Shares of flagged and bad frames, and recall and precision of the flags."""
     bad, flagged = (np.concatenate([getattr(r, n) for r in recordings]) for n in ("bad", "flagged"))
     found = {
         "flagged_share": float(flagged.mean()),

@@ -1,4 +1,4 @@
-"""Two versions of a dataset side by side: what changed, by sequence and frame."""
+"""Compare two versions of a dataset: changes by sequence and frame."""
 
 from __future__ import annotations
 
@@ -20,28 +20,27 @@ from intercap_core.evaluation.summary import SequenceSummary
 from intercap_core.evaluation.verdict.figures import stated_errors
 from intercap_core.schemas import JOINT
 
-TOUCHING = 0.5  # a stated probability of contact from which a region counts as touching
-MOVED_MM = 1.0  # a frame has changed where body or object moved by this much
-TURNED_DEG = 0.5  # or the object turned by this much
+TOUCHING = 0.5  # probability of contact from which a region counts as touching
+# A frame counts as changed if body or object moved, or the object turned, by more than this.
+MOVED_MM = 1.0
+TURNED_DEG = 0.5
 NAME, FRAME = "sequence", "frame"
 SAME, CHANGED, ADDED, REMOVED, UNLIKE = "same", "changed", "added", "removed", "not comparable"
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """``sequences`` has a row for each that either version has, the most changed first; ``frames``
-    a row for each changed frame; ``figures`` of both datasets whole, "figure", "old" and "new", as
-    summary.json has them, empty where either has none. Millimetres and degrees."""
+    """Differences between two versions, millimetres and degrees."""
 
-    sequences: pd.DataFrame
-    frames: pd.DataFrame
-    figures: pd.DataFrame
+    sequences: pd.DataFrame  # one row per sequence of either version, most changed first
+    frames: pd.DataFrame  # one row per changed frame
+    figures: pd.DataFrame  # "figure", "old", "new" of summary.json; empty if a version lacks it
 
 
 def compare(old: Path, new: Path) -> Comparison:
     """Compare two results folders, sequence by sequence.
 
-    A sequence is one with a joint artefact. Raises UserError where a folder has none.
+    Folders with a joint artefact are sequences. Raises UserError where a version has none.
     """
     before, after = (_sequences(folder) for folder in (old, new))
     rows: list[dict[str, object]] = []
@@ -82,7 +81,7 @@ def compare(old: Path, new: Path) -> Comparison:
 
 
 def _figures(old: Path, new: Path) -> pd.DataFrame:
-    """Figures that both summaries have, by name."""
+    """Figures that the summary.json of both versions has."""
     both = []
     for folder in (old, new):
         try:
@@ -105,11 +104,11 @@ def _numbers(values: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, 
 
 def _sequences(folder: Path) -> dict[str, Path]:
     if not folder.is_dir():
-        raise UserError(f"{folder}: there is no such folder; name a results folder")
+        raise UserError(f"{folder}: no such folder; expected a results folder, results/<dataset>")
     found = {path.parent.name: path.parent for path in sorted(folder.glob("*/joint.h5"))}
     if not found:
         raise UserError(
-            f"{folder}: holds no sequence with a joint.h5; name a results folder, "
+            f"{folder}: has no sequence with a joint.h5; expected a results folder, "
             "results/<dataset>, of a project that was run"
         )
     return found
@@ -157,7 +156,7 @@ def _frames(name: str, before: Artefact, after: Artefact) -> pd.DataFrame:
     if joints.shape != joints_after.shape:
         raise UserError(
             f"sequence {name}: {len(joints)} frames before and {len(joints_after)} after; frames "
-            "cannot be set against each other"
+            "cannot be compared"
         )
     apart = 1e3 * np.linalg.norm(joints_after - joints, axis=2)
     fingers = np.hstack([apart[:, hand] for hand in FINGER_JOINTS])
@@ -169,7 +168,7 @@ def _frames(name: str, before: Artefact, after: Artefact) -> pd.DataFrame:
     regions = np.array(before.text("region_names"))
     old, new = _touching(before), _touching(after)
     if "made_by" in before.attributes or "made_by" in after.attributes:
-        new = old  # of another program's results contact is not stated, which is no change
+        new = old  # imported results state no contact, which is not a change
     return pd.DataFrame(
         {
             NAME: name,
@@ -195,7 +194,7 @@ def _named(regions: np.ndarray, which: np.ndarray) -> Sequence[str]:
 
 
 def _measured(folder: Path, when: str) -> dict[str, object]:
-    """Flagged frames and stated errors, where there is a summary that can be read."""
+    """Number of flagged frames, and stated errors; empty where the summary cannot be read."""
     try:
         found = SequenceSummary.read(folder / "summary.h5").metrics
     except UserError:

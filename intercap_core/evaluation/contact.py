@@ -17,7 +17,7 @@ SWEEP_M = (0.002, 0.003, 0.0045, 0.006, 0.008, 0.010, 0.015, 0.020, 0.030)
 
 
 def vertex_contact(signed_distance: np.ndarray, threshold_m: float = CONTACT_M) -> np.ndarray:
-    """Which vertices touch, of any shape."""
+    """Mask of the vertices in contact, of the shape of ``signed_distance`` (metres)."""
     return signed_distance <= threshold_m
 
 
@@ -26,35 +26,41 @@ def region_contact(
     regions: Mapping[str, np.ndarray],
     names: Sequence[str],
 ) -> np.ndarray:
-    """Whether some vertex of each region touches: (..., V) bool to (..., R) in ``names``' order."""
+    """Mask (..., R) of the regions in which at least one vertex is in contact.
+
+    Args:
+        vertex: (..., V) mask of vertices in contact.
+        regions: vertex indices by region name.
+        names: the R regions, in the order of the result.
+    """
     return np.stack([vertex[..., regions[name]].any(-1) for name in names], -1)
 
 
 def confusion(found: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """True and false positives, false and true negatives (..., 4) over the last axis."""
+    """Counts (..., 4) over the last axis: true positives, false positives, false and true negatives."""
     counts = (found & true, found & ~true, ~found & true, ~found & ~true)
     return np.stack([c.sum(-1) for c in counts], -1)
 
 
 def f1(counts: np.ndarray) -> float:
-    """F1 of summed counts (4,) as :func:`confusion` orders them; NaN with nothing to find."""
+    """F1 of summed counts (4,) in the order of :func:`confusion`; NaN without any positive."""
     hits, false_alarms, misses = (float(c) for c in np.asarray(counts)[:3])
     total = 2 * hits + false_alarms + misses
     return 2 * hits / total if total else float("nan")
 
 
 def recall(found: np.ndarray, true: np.ndarray) -> float:
-    """Share of the true ones (T,) that were found; NaN where there are none."""
+    """Share of the true elements (N,) that were found; NaN where none is true."""
     return float(found[true].mean()) if true.any() else float("nan")
 
 
 def precision(found: np.ndarray, true: np.ndarray) -> float:
-    """Share of the found ones (T,) that are true; NaN where none was found."""
+    """Share of the found elements (N,) that are true; NaN where none was found."""
     return recall(true, found)
 
 
 class Depths(NamedTuple):
-    """Mean, median and deepest of one frame's penetrating points, metres; 0 with none."""
+    """Depths of the penetrating points of one frame, metres; 0 where no point penetrates."""
 
     mean: float
     median: float
@@ -62,7 +68,7 @@ class Depths(NamedTuple):
 
 
 def depths(signed_distance: np.ndarray) -> Depths:
-    """Depths to the surface over the points (N,) that are inside (negative distance)."""
+    """Depths below the surface of the points (N,) inside it, whose signed distance is negative."""
     inside = -signed_distance[signed_distance < 0]
     if len(inside) == 0:
         return Depths(0.0, 0.0, 0.0)
@@ -70,9 +76,14 @@ def depths(signed_distance: np.ndarray) -> Depths:
 
 
 def ground_penetration(vertices: np.ndarray, point: np.ndarray, normal: np.ndarray) -> float:
-    """Depth of the deepest vertex (V, 3) below a floor, metres; 0 above it, NaN without floor.
+    """Depth of the deepest vertex below the floor, metres.
 
-    ``point`` (3,) lies on the floor, ``normal`` (3,) is its unit normal, up.
+    0 where all vertices are above the floor, NaN where the floor is not known.
+
+    Args:
+        vertices: (V, 3) metres.
+        point: (3,) a point of the floor.
+        normal: (3,) unit normal of the floor, pointing up.
     """
     if not (np.isfinite(point).all() and np.isfinite(normal).all()):
         return float("nan")
@@ -80,9 +91,14 @@ def ground_penetration(vertices: np.ndarray, point: np.ndarray, normal: np.ndarr
 
 
 def penetration_summary(per_frame_m: np.ndarray, contact_frame: np.ndarray) -> dict[str, float]:
-    """The paper's figures over contact frames, millimetres and shares; NaN with no contact.
+    """The paper's penetration figures over contact frames; NaN where no frame has contact.
 
-    ``per_frame_m`` (T,) one depth a frame, ``contact_frame`` (T,) bool.
+    Returns mean, median and 98th percentile in millimetres, and the shares of frames whose depth is
+    at most 5, 7, 10 and 20 mm.
+
+    Args:
+        per_frame_m: (T,) one depth per frame, metres.
+        contact_frame: (T,) mask of the frames with contact.
     """
     depth = 1e3 * np.asarray(per_frame_m, np.float64)[contact_frame]
     if len(depth) == 0:

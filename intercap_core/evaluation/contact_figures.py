@@ -15,19 +15,25 @@ from intercap_core.evaluation import contact, motion
 from intercap_core.evaluation.figures import Figures, SequenceMetrics, object_figures, pooled
 from intercap_core.schemas import METRIC_REGIONS
 
-NEAR_MISS_M = 0.03  # what comes nearer than this and does not touch is a near miss
-# Edges of the bins of a reliability table: the first and the last hold what is as good as sure.
+NEAR_MISS_M = 0.03  # a region closer than this without contact is a near miss
+# Bin edges of the reliability table; the first and the last bin hold the certain statements.
 RELIABILITY_BINS = (0.0, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 1.0)
 
 
 def detected_figures(
     probability: np.ndarray, true: np.ndarray, distance: np.ndarray, names: Sequence[str]
 ) -> dict[str, float]:
-    """How well ``probability`` (N, R) over a half agrees with ``true`` (N, R) contact.
+    """Agreement of stated contact (probability above 0.5) with true contact.
 
-    Over all frames and regions; the least F1 of the regions ``names`` (R,) that truly touch;
-    precision among what truly is nearer than a near miss by ``distance`` (N, R), metres; the Brier
-    score, the mean squared error of the probability; and its calibration error.
+    Returns precision, recall and F1 over all frames and regions; precision among regions nearer
+    than :data:`NEAR_MISS_M`; F1 of each region with true contact and their minimum; the Brier score
+    (mean squared error of the probability); the calibration error.
+
+    Args:
+        probability: (N, R) stated by the joint stage.
+        true: (N, R) true contact.
+        distance: (N, R) true distance of each region from the object, metres.
+        names: the R regions.
     """
     found = probability > 0.5
     counts = contact.confusion(found.T, true.T)
@@ -51,16 +57,15 @@ def detected_figures(
 
 @dataclass(frozen=True)
 class Reliability:
-    """Of each bin of probabilities that holds any: their ``count``, the mean ``stated`` one, and
-    the share that is ``true``, all (B,)."""
+    """Reliability table over the B probability bins that are not empty."""
 
-    count: np.ndarray
-    stated: np.ndarray
-    true: np.ndarray
+    count: np.ndarray  # (B,) number of statements
+    stated: np.ndarray  # (B,) mean stated probability
+    true: np.ndarray  # (B,) share of true contact
 
 
 def reliability(probability: np.ndarray, true: np.ndarray) -> Reliability:
-    """The reliability table of probabilities of any shape, ``true`` of the same."""
+    """Reliability table of probabilities; ``true`` has the same shape."""
     p, y = probability.ravel().astype(np.float64), true.ravel()
     of = np.clip(np.digitize(p, RELIABILITY_BINS) - 1, 0, len(RELIABILITY_BINS) - 2)
     count = np.bincount(of, minlength=len(RELIABILITY_BINS) - 1)
@@ -70,9 +75,9 @@ def reliability(probability: np.ndarray, true: np.ndarray) -> Reliability:
 
 
 def calibration_error(probability: np.ndarray, true: np.ndarray) -> float:
-    """Mean |stated - true| of the bins in which something is open: not surely free or touching.
+    """Expected calibration error, mean |stated - true|, over the bins of uncertain statements.
 
-    Nearly all regions are far from the object; with them the figure would always be near zero.
+    Regions that are certainly free are excluded: they are nearly all regions and would hide errors.
     """
     open_ = (probability >= RELIABILITY_BINS[1]) & (probability < RELIABILITY_BINS[-2])
     if not open_.any():
@@ -85,16 +90,16 @@ def _share(part: float, whole: float) -> float:
     return part / whole if whole else float("nan")
 
 
-# An object is worse than before beyond this share and these amounts, millimetres and degrees.
+# An error counts as worse if it grows by more than this share and by more than these amounts.
 WORSE_SHARE, WORSE_MM, WORSE_DEG = 0.05, 0.2, 0.1
 
 
 def hold_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figures:
-    """After ``stage``, which has a body: how what truly touches slips, how what truly stands moves.
+    """Slip of touching skin, motion of planted feet and joint errors after ``stage``.
 
-    ``slip_mm_s`` is the mean over objects of the means over their frames. Joints' errors are RMS,
-    the part that is constant over a sequence apart from the part that varies. What no sequence has
-    is left out.
+    ``slip_mm_s`` is the mean over objects of the means over their frames. Joint errors are RMS and
+    split into the part that is constant over a sequence and the part that varies. Figures that no
+    sequence has are omitted.
     """
     key = f"truth/{stage}/"
     have = [s for s in sequences if f"{key}fingertips" in s.values]
@@ -118,7 +123,7 @@ def hold_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figures:
 
 
 def slip_by_object(sequences: Sequence[SequenceMetrics], stage: str) -> dict[str, float]:
-    """Mean slip of each object that is truly touched, mm/s."""
+    """Mean slip over the frames with true contact, by object, mm/s."""
     found = {}
     for name in sorted({s.object_ for s in sequences}):
         slip = pooled([s for s in sequences if s.object_ == name], f"truth/{stage}/slip")
@@ -128,7 +133,7 @@ def slip_by_object(sequences: Sequence[SequenceMetrics], stage: str) -> dict[str
 
 
 def stated_contact_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
-    """How well the joint stage's own contact agrees with the true one."""
+    """Agreement of the contact that the joint stage states with true contact."""
     found = _stated_and_true(sequences)
     if found is None:
         return {}
@@ -137,7 +142,7 @@ def stated_contact_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
 
 
 def contact_reliability(sequences: Sequence[SequenceMetrics]) -> Reliability | None:
-    """How often what is stated as contact with some probability is contact; None without truth."""
+    """Reliability table of the joint stage's contact probabilities; None without truth."""
     found = _stated_and_true(sequences)
     return None if found is None else reliability(*found[:2])
 
@@ -152,11 +157,11 @@ def _stated_and_true(
     distance = pooled(have, "truth/region_distance")
     if probability is None or true is None or distance is None:
         return None
-    return probability[:, : len(METRIC_REGIONS)], true, distance  # the others have no true contact
+    return probability[:, : len(METRIC_REGIONS)], true, distance  # the other regions have no truth
 
 
 def worse_objects(sequences: Sequence[SequenceMetrics]) -> list[str]:
-    """Objects whose median or p95 of place or turn is worse after ``joint`` than as tracked."""
+    """Objects whose median or 95th percentile pose error is larger after ``joint`` than tracked."""
     limits = {
         "object_translation_mm": WORSE_MM,
         "object_translation_p95_mm": WORSE_MM,
@@ -177,7 +182,7 @@ def worse_objects(sequences: Sequence[SequenceMetrics]) -> list[str]:
 
 
 def _joint_figures(sequences: Sequence[SequenceMetrics], key: str) -> Figures:
-    """RMS errors of body joints, of their mean over each sequence and of what varies about it."""
+    """RMS of the mean joint errors of each sequence, and RMS of the deviation from these means."""
     constant, varying, frames = 0.0, 0.0, 0
     for s in sequences:
         offset = s.values[f"{key}joint_offset"].astype(np.float64)
@@ -192,7 +197,7 @@ def _joint_figures(sequences: Sequence[SequenceMetrics], key: str) -> Figures:
 
 
 def _lift_lags(s: SequenceMetrics, stage: str) -> list[float]:
-    """Frames by which each foot leaves late each time that it truly stops to stand."""
+    """Delay in frames of each true lift of a foot (negative: early)."""
     fitted, true = s.values[f"truth/{stage}/foot_centre"], s.values["truth/foot_centre"]
     standing = s.values["truth/standing"]
     return [

@@ -28,36 +28,34 @@ from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.schemas import FRAMES, PERSON, SCENE, TRUTH
 
-WORSE_M = 0.001  # by more than this a camera ends worse than it was given
+WORSE_M = 0.001  # a camera counts as worse if its error grew by more than this
 
 
 @dataclass(frozen=True, eq=False)
 class FieldScene:
-    """Of one recording's cameras (N,) but the master, those that have images.
+    """Errors of one recording's scene artefact; N cameras with images, without the master.
 
-    ``apart_s`` true time by which a camera's images are older than its sets say; ``late_s`` the
-    error of the stated one, the median over images, ``sigma_s`` its stated deviation;
-    ``set_aside``: the scene says that it cannot tell. ``before`` and ``after`` of the extrinsics
-    and their ``stated`` deviation, metres, RMS displacement over a 2 m cube. ``floor_m`` by how
-    much the floor is off under the true feet, in the mean, and ``tilt_deg`` its tilt; NaN without
-    a floor.
+    Displacements are RMS over the points of a 2 m cube at the rig's centre.
     """
 
     sequence: str
     fps: float
-    apart_s: np.ndarray
-    late_s: np.ndarray
-    sigma_s: np.ndarray
-    set_aside: np.ndarray
-    before: np.ndarray
-    after: np.ndarray
-    stated: np.ndarray
-    floor_m: float
-    tilt_deg: float
+    apart_s: np.ndarray  # (N,) true delay of the images relative to their frame sets
+    late_s: np.ndarray  # (N,) error of the estimated delay, median over images
+    sigma_s: np.ndarray  # (N,) stated standard deviation of the delay
+    set_aside: np.ndarray  # (N,) the scene excluded the camera as its delay is undetermined
+    before: np.ndarray  # (N,) displacement by the given extrinsics, metres
+    after: np.ndarray  # (N,) displacement by the refined extrinsics, metres
+    stated: np.ndarray  # (N,) stated standard deviation of the displacement, metres
+    floor_m: float  # mean height error of the floor under the true feet; NaN without a floor
+    tilt_deg: float  # angle between estimated and true floor normal; NaN without a floor
 
 
 def measure(frames: Path, scene: Path, truth: Path) -> FieldScene:
-    """Compare one scene with its truth; raises UserError where an artefact cannot be read."""
+    """Compare a scene artefact with its truth.
+
+    Raises UserError where an artefact cannot be read.
+    """
     with (
         artefacts.read(frames, FRAMES) as recorded,
         artefacts.read(scene, SCENE) as found,
@@ -111,9 +109,13 @@ def measure(frames: Path, scene: Path, truth: Path) -> FieldScene:
 def floor_error(
     point: np.ndarray, normal: np.ndarray, true: Floor, feet: np.ndarray
 ) -> tuple[float, float]:
-    """How far a floor through ``point`` (3,) with ``normal`` (3,) is from the ``true`` one, in the
-    mean over the places of the true floor under ``feet`` (N, 3), metres, and the angle between
-    them, degrees. NaN without a floor."""
+    """Mean distance of a floor from the true floor, metres, and the angle between them, degrees.
+
+    The mean is over the projections of ``feet`` (N, 3) onto the true floor. NaN without a floor.
+
+    Args:
+        point, normal: (3,) the estimated floor.
+    """
     if not np.isfinite(normal).all():
         return float("nan"), float("nan")
     under = feet - true.height(feet)[:, None] * true.normal
@@ -122,14 +124,17 @@ def floor_error(
 
 
 def stated_displacement(master_from_camera: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """RMS displacement (C,) over the points of a 2 m cube at the rig's centre, metres, that the
-    covariance (C, 7, C, 7) of rotation about the camera's centre, translation and depth bias
-    states."""
+    """Stated RMS displacement (C,) of the points of a 2 m cube at the rig's centre, metres.
+
+    ``covariance`` (C, 7, C, 7) is of rotation about the camera's centre, translation, depth bias.
+    """
     arms = rig_centre(master_from_camera) - master_from_camera[:, :3, 3]
     result = np.empty(len(arms))
     for c, arm in enumerate(arms):
         own = covariance[c, :6, c, :6]
-        across = np.cross(np.eye(3), arm)  # row i: the shift of the arm by a turn about axis i
+        across = np.cross(
+            np.eye(3), arm
+        )  # row i: displacement of the arm by a rotation about axis i
         by_pose = np.concatenate([across.T, np.eye(3)], axis=1)
         at_centre = np.trace(by_pose @ own @ by_pose.T)
         turn = np.trace(own[:3, :3])
@@ -138,10 +143,10 @@ def stated_displacement(master_from_camera: np.ndarray, covariance: np.ndarray) 
 
 
 def start_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
-    """Of recordings whose cameras started apart; milliseconds.
+    """Figures of recordings whose cameras started at different times; milliseconds.
 
-    A camera is solved where its images show the right set: the error is below half a set's time.
-    One that is not, and that the scene does not set aside, is ``offset_wrong``.
+    A camera is solved if its error is below half a frame period. ``offset_wrong`` counts the
+    cameras that are neither solved nor excluded by the scene.
     """
     if not scenes:
         return {}
@@ -171,7 +176,7 @@ def start_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
 
 
 def floor_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
-    """Of rooms whose measured surface is mostly floor; millimetres."""
+    """Figures of recordings in rooms whose measured surface is mostly floor; millimetres."""
     if not scenes:
         return {}
     before, after, stated = (
@@ -190,7 +195,7 @@ def floor_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
 
 
 def beam_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
-    """Of people whose feet leave the floor: the floor under them, millimetres and degrees."""
+    """Floor errors of recordings in which feet leave the floor, millimetres and degrees."""
     if not scenes:
         return {}
     height = np.array([s.floor_m for s in scenes])
@@ -202,7 +207,9 @@ def beam_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
     return found
 
 
-APART_M = 0.3  # in the median over limbs, beside the ray: another person; people pass at 0.8 m
+# A detection whose median distance from the subject's true limbs is larger is another person;
+# people in the studio pass each other at 0.8 m.
+APART_M = 0.3
 _LIMBS = [
     f"{side}_{part}"
     for side in ("left", "right")
@@ -214,11 +221,11 @@ _OTHER_SIDE = np.r_[len(_LIMBS) // 2 : len(_LIMBS), : len(_LIMBS) // 2]
 
 
 def measure_subject_share(person: Path, scene: Path, truth: Path) -> float:
-    """The share of the images with a chosen person in which it is the subject; NaN without any.
+    """Share of the images with a chosen person that show the subject; NaN without such images.
 
-    The chosen keypoints are compared with the true joints as the true cameras see them, sides
-    exchanged where that is nearer: a detector that exchanges them still shows the subject.
-    Raises UserError where an artefact cannot be read or they are of different recordings.
+    The chosen keypoints are compared with the true joints in the true cameras, with left and right
+    exchanged where that fits better: a detection with exchanged sides is still the subject.
+    Raises UserError where an artefact cannot be read or the truth is of another recording.
     """
     with (
         artefacts.read(person, PERSON) as chosen,
@@ -240,8 +247,12 @@ def measure_subject_share(person: Path, scene: Path, truth: Path) -> float:
 
 
 def _apart(keypoints: np.ndarray, camera: Camera, joints: np.ndarray) -> float:
-    """Median distance, metres beside the ray, of keypoints (K, 3) x, y, confidence from joints
-    (K, 3) in the camera's frame; infinite where nothing is seen."""
+    """Median distance of joints from the keypoints' rays, metres; infinite without keypoints.
+
+    Args:
+        keypoints: (K, 3) x, y, confidence.
+        joints: (K, 3) camera frame.
+    """
     rays, seen = camera.colour.unproject(keypoints[:, :2]), keypoints[:, 2] > 0
     if not seen.any():
         return np.inf

@@ -1,4 +1,4 @@
-"""From the metrics of sequences to the figures that are reported, in millimetres and degrees."""
+"""Figures that are reported over several sequences, from their metrics; millimetres and degrees."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SUMMARY_TRUTH = (
 SUMMARY_PENETRATION = (
     "mean_mm", "median_mm", "p98_mm", "share_le_5mm", "share_le_7mm", "share_le_20mm",
 )  # fmt: skip
-BAD_BODY_M = 0.040  # a body frame beyond this PVE should have been flagged
+BAD_BODY_M = 0.040  # a frame with a larger vertex error should have been flagged
 _PER_VERTEX = PER_VERTEX_METRICS | {"object_sample_points", "object_sample_contact"}
 
 Figures = dict[str, float]
@@ -32,26 +32,25 @@ Figures = dict[str, float]
 
 @dataclass(frozen=True, eq=False)
 class SequenceMetrics:
-    """One sequence's metrics artefact without its distances by vertex; ``made_by`` names another
-    program that made what is measured, "" = this one."""
+    """One sequence's metrics artefact without its distances by vertex."""
 
     name: str
     subject: str
     object_: str
     fps: float
     has_truth: bool
-    values: dict[str, np.ndarray] = field(repr=False)
-    made_by: str = ""
+    values: dict[str, np.ndarray] = field(repr=False)  # by dataset of the metrics artefact
+    made_by: str = ""  # program that made an imported result; "" = this one
 
     @classmethod
     def read(cls, path: Path) -> SequenceMetrics:
-        """Raises UserError as :func:`artefacts.read` does."""
+        """Read a metrics artefact; raises UserError where it cannot be read."""
         with artefacts.read(path, METRICS) as artefact:
             return cls.of(artefact)
 
     @classmethod
     def of(cls, artefact: Artefact) -> SequenceMetrics:
-        """From an open metrics artefact, or the summary of one."""
+        """Read from an open metrics or summary artefact."""
         told = artefact.attributes
         values = {
             key: artefact[key]
@@ -69,19 +68,18 @@ class SequenceMetrics:
 
     @property
     def has_object(self) -> bool:
-        """Whether there are figures of an object: not of a person alone, nor where none was
-        found."""
+        """Whether the metrics have an object: one was recorded and found."""
         return "contact_frame" in self.values
 
 
 def pooled(sequences: Sequence[SequenceMetrics], key: str) -> np.ndarray | None:
-    """The frames of all sequences that have dataset ``key``, end to end; None if none has."""
+    """Dataset ``key`` of all sequences that have it, concatenated over frames; None if none has."""
     found = [s.values[key] for s in sequences if key in s.values]
     return np.concatenate(found) if found else None
 
 
 def penetration_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
-    """Over contact frames: each frame's mean depth, as the paper's figure."""
+    """The paper's penetration figures, from each contact frame's mean depth."""
     depth, touching = pooled(sequences, "penetration_mean"), pooled(sequences, "contact_frame")
     if depth is None or touching is None:
         return {}
@@ -89,7 +87,7 @@ def penetration_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
 
 
 def cloud_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
-    """Means over all frames with a cloud."""
+    """Mean distances between meshes and measured points over all frames with a cloud."""
     keys = {
         "body_mm": "body_to_cloud",
         "object_mm": "object_to_cloud",
@@ -100,7 +98,7 @@ def cloud_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
 
 
 def floor_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
-    """What :func:`cloud_figures` gives with the true poses put in; empty without truth."""
+    """The figures of :func:`cloud_figures` for the true poses; empty without truth."""
     keys = {
         "body_mm": "truth/body_floor",
         "object_mm": "truth/object_floor",
@@ -114,9 +112,10 @@ def floor_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
 def truth_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figures:
     """Errors after ``stage`` over all frames of the sequences with truth.
 
-    What the stage does not estimate is left out. Object errors are medians (and p95) over frames
-    that two or more views truly see. Accelerations are millimetres a frame^2 at 30 fps;
-    ``acceleration_error`` is the body's, the object's where the stage has no body.
+    Quantities that the stage does not estimate are omitted. Object errors are medians and 95th
+    percentiles over the frames in which two or more cameras truly see the object. Accelerations are
+    in millimetres per frame^2 at 30 fps. ``acceleration_error`` is the body's, or the object's
+    where the stage has no body.
     """
     known = [s for s in sequences if s.has_truth]
 
@@ -142,7 +141,7 @@ def truth_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figures:
 
 
 def flag_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
-    """Recall and precision of the flags on frames that are truly bad after ``joint``."""
+    """Recall and precision of the flags for the frames that are truly bad after ``joint``."""
     flagged, bad = [], []
     for s in sequences:
         if not s.has_truth:
@@ -165,10 +164,10 @@ def flag_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
 
 
 def extrinsics_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
-    """True displacement of the cameras that have images, mean and worst: as given, after the scene,
-    after the joint fit.
+    """Mean and worst true displacement of the cameras, millimetres.
 
-    The master is left out: poses are relative to it.
+    Evaluated for the given poses (``before``), after the scene stage (``after``) and after the
+    joint fit (``joint``). Cameras without images and the master are excluded.
     """
     figures: Figures = {}
     for when in ("before", "after", "joint"):
@@ -210,7 +209,7 @@ def _over(
 
 
 def _hand_in_grasp(sequences: Sequence[SequenceMetrics], stage: str) -> float:
-    """Hand error over the frames in which that hand truly touches the object."""
+    """Hand error over the frames in which the hand truly touches the object, millimetres."""
     handling = [s for s in sequences if "truth/contact_region" in s.values]
     errors = pooled(handling, f"truth/{stage}/hand_mpjpe")
     touching = pooled(handling, "truth/contact_region")
@@ -240,7 +239,7 @@ def _object_errors(s: SequenceMetrics, stage: str) -> ObjectErrors:
 
 
 def object_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figures:
-    """The figures of :func:`object_errors.figures` by the names of this module's tables."""
+    """The figures of :func:`object_errors.figures`, renamed as in this module's tables."""
     have = [s for s in sequences if f"truth/{stage}/object_translation" in s.values]
     found = object_errors.figures([_object_errors(s, stage) for s in have])
     names = {
@@ -272,7 +271,7 @@ def _contact_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figure
 
 
 def summary(dataset: str, sequences: Sequence[SequenceMetrics]) -> dict[str, Any]:
-    """The content of summary.json; a figure that cannot be known is None."""
+    """The content of summary.json; unknown figures are None."""
     truth = {}
     if any(s.has_truth for s in sequences):
         for stage in ESTIMATES:
@@ -292,7 +291,7 @@ def summary(dataset: str, sequences: Sequence[SequenceMetrics]) -> dict[str, Any
 
 
 def _rounded(value: Any) -> Any:
-    """Six significant digits; NaN is null in JSON."""
+    """Round to six significant digits; NaN becomes None (null in JSON)."""
     if isinstance(value, dict):
         return {key: _rounded(entry) for key, entry in value.items()}
     if isinstance(value, float):

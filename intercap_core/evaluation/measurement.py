@@ -1,4 +1,4 @@
-"""Every distance of one fitted body and object, frame by frame."""
+"""All distances of one fitted body and object, frame by frame, for the metrics artefact."""
 
 from __future__ import annotations
 
@@ -29,17 +29,18 @@ from intercap_core.schemas import CONTACT_REGIONS
 
 log = logging.getLogger(__name__)
 
-BODY_SAMPLES = 4000  # points of the body compared with the cloud, area-sampled
-VISIBILITY_SAMPLES = 2000  # the same of the object
-SAMPLE_SPACING_M = 0.006  # of the object's contact points, so that a fingertip's touch shows
+# Area samples of the surfaces that are compared with the clouds
+BODY_SAMPLES = 4000
+VISIBILITY_SAMPLES = 2000  # of the object
+SAMPLE_SPACING_M = 0.006  # of the object's contact samples; resolves the touch of a fingertip
 MAX_OBJECT_SAMPLES = 20000
-CLOUD_POINTS = 3000  # points of the person that are compared with the body's surface
+CLOUD_POINTS = 3000  # at most, of the person, compared with the body's surface
 
 Values = dict[str, Any]
 
 
 class HandledObject:
-    """The object's ``mesh`` and ``track`` with the points of it that are compared."""
+    """An object's ``mesh`` and ``track`` with its contact points and visibility samples."""
 
     def __init__(self, mesh: ObjectMesh, track: ObjectTrack) -> None:
         self.mesh, self.track = mesh, track
@@ -58,14 +59,14 @@ class HandledObject:
         self.sample_normals = mesh.face_normals[self.samples.faces]
 
     def posed(self, t: int, points: np.ndarray) -> np.ndarray:
-        """Points (N, 3) of the object where they are in frame ``t``."""
+        """Points (N, 3) of the object, object frame, in the master frame at frame ``t``."""
         return points @ self.track.rotation[t].T + self.track.translation[t]
 
 
 class Measurement:
-    """Distances of one body and, where there is one, the object that it handles, frame by frame.
+    """Distances of one body and the object that it handles, frame by frame.
 
-    Without ``handled`` there is nothing about an object and no contact in the values.
+    Without ``handled`` the values have no dataset of an object or of contact.
     """
 
     def __init__(
@@ -89,7 +90,10 @@ class Measurement:
     def over_frames(self, floor: tuple[np.ndarray, np.ndarray], truth: Truth | None) -> Values:
         """Values by dataset of the metrics artefact.
 
-        With truth also ``true_distance`` (T, V), the true body's distances to the true object.
+        With truth, also ``true_distance`` (T, V): distances of the true body to the true object.
+
+        Args:
+            floor: point (3,) and unit normal (3,) of the floor.
         """
         rows: list[Values] = []
         handled = self.handled
@@ -144,12 +148,14 @@ class Measurement:
         surface: BodySurface,
         floor: tuple[np.ndarray, np.ndarray],
     ) -> tuple[Values, np.ndarray]:
-        """Distances between body and object in frame ``t``, and the object's points (N,) that the
-        body touches."""
+        """Distances between body and object in frame ``t``.
+
+        Also returns the mask (N,) of the object's contact points that the body touches.
+        """
         object_vertices = handled.posed(t, handled.mesh.vertices)
         points = handled.posed(t, handled.points)
         to_body = surface.signed_distance(object_vertices)
-        # of a point outside nothing but its contact is told
+        # Outside the body only contact is evaluated, so distances need no larger reach.
         point_distance = surface.signed_distance(points, reach=1.01 * self.threshold)
         track = handled.track
         to_object = handled.surface.signed_distance(
@@ -177,8 +183,10 @@ class Measurement:
         seen_body: np.ndarray | None,
         seen_object: np.ndarray | None,
     ) -> tuple[Values, tuple[MeasuredCloud, MeasuredCloud]]:
-        """Distances to frame ``t``'s clouds; the samples that cameras see are found where not
-        given."""
+        """Distances to the clouds of frame ``t``, and the clouds of person and object.
+
+        ``seen_body`` and ``seen_object`` are masks of the visible samples; None = computed here.
+        """
         handled = self.handled
         near = [vertices[::10]]
         if handled is not None:
@@ -220,7 +228,7 @@ class Measurement:
     def _true_body(
         self, t: int, truth: Truth, person: MeasuredCloud, seen_body: np.ndarray | None
     ) -> Values:
-        """The same measures with the true body put in."""
+        """Cloud distances of the true body: the floor of the fitted body's distances."""
         if truth.vertices is None:
             return {}
         vertices = truth.vertices[t].astype(np.float64)
@@ -239,7 +247,7 @@ class Measurement:
         object_: MeasuredCloud,
         seen_object: np.ndarray | None,
     ) -> Values:
-        """The same measures with the true object put in, and true contact."""
+        """Cloud distances of the true object, and true contact."""
         rotation, translation = truth.rotation[t], truth.translation[t]
         object_vertices = truth.object_vertices @ rotation.T + translation
         row: Values = {"truth/object_floor": vertex_to_cloud(object_vertices, object_)}

@@ -14,9 +14,10 @@ import numpy as np
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 
 REFERENCE_FPS = 30.0
-REST_SPEED = 0.02  # m/s: the true object rests below this ...
-REST_TURN = np.radians(5.0)  # ... and below this, rad/s
-ONSET_M = 0.010  # the object has started to move when it is this far from where it rested
+# Speeds below which the true object rests
+REST_SPEED = 0.02  # m/s
+REST_TURN = np.radians(5.0)  # rad/s
+ONSET_M = 0.010  # the object has started to move at this distance from its resting place
 MIN_REST_S = 0.2
 
 
@@ -34,19 +35,23 @@ def second_difference(positions: np.ndarray, fps: float) -> np.ndarray:
 
 
 def acceleration(positions: np.ndarray, fps: float) -> np.ndarray:
-    """Mean length (T,) of the second differences of points (T, N, 3), metres a frame^2."""
+    """Mean length (T,) of the second differences of points (T, N, 3), metres per frame^2."""
     return np.linalg.norm(second_difference(positions, fps), axis=-1).mean(-1)
 
 
 def acceleration_error(positions: np.ndarray, true: np.ndarray, fps: float) -> np.ndarray:
-    """Mean length (T,) of the difference of second differences of (T, N, 3), as above."""
+    """Mean length (T,) of the error of the second differences of (T, N, 3), metres per frame^2."""
     return acceleration(np.asarray(positions, np.float64) - true, fps)
 
 
 def moving(rotation: np.ndarray, centre: np.ndarray, fps: float) -> np.ndarray:
-    """Frames (T,) in which a true object moves, from (T, 3, 3) and (T, 3).
+    """Mask (T,) of the frames in which the true object moves.
 
     A frame moves when the step before or after it is faster than 20 mm/s or 5 degrees/s.
+
+    Args:
+        rotation: (T, 3, 3) true rotations.
+        centre: (T, 3) true centre of mass, metres.
     """
     result = np.zeros(len(centre), bool)
     speed = np.linalg.norm(np.diff(centre, axis=0), axis=-1) * fps
@@ -59,19 +64,20 @@ def moving(rotation: np.ndarray, centre: np.ndarray, fps: float) -> np.ndarray:
 
 
 def resting_steps(is_moving: np.ndarray) -> np.ndarray:
-    """Steps (T-1,) between frames (T,) over which the true object rests."""
+    """Mask (T-1,) of the steps between frames (T,) during which the true object rests."""
     return ~is_moving[1:] & ~is_moving[:-1]
 
 
 def steps(centre: np.ndarray, true_centre: np.ndarray) -> np.ndarray:
-    """Length (T-1,) of the track's steps beyond the true ones, metres; both (T, 3)."""
+    """Length (T-1,) of the difference between the track's and the true steps, metres; both (T, 3)."""
     return np.linalg.norm(np.diff(centre - true_centre, axis=0), axis=-1)
 
 
 def turns(rotation: np.ndarray, true_rotation: np.ndarray, symmetry: SymmetryGroup) -> np.ndarray:
-    """Angle (T-1,) of the track's turns beyond the true ones, degrees; both (T, 3, 3).
+    """Angle (T-1,) between the track's and the true frame-to-frame rotations, degrees.
 
-    Each rotation is taken as the equivalent one that is nearest to the rotation before it.
+    Both rotations are (T, 3, 3). Each tracked rotation is replaced by the equivalent rotation of
+    the symmetry group that is nearest to the rotation before it.
     """
     nearest = symmetry.nearest_equivalent(rotation[1:], rotation[:-1])
     turned = nearest @ np.swapaxes(rotation[:-1], -1, -2)
@@ -85,11 +91,11 @@ def motion_onset_lags(
     is_moving: np.ndarray,
     fps: float,
 ) -> list[float]:
-    """Frames by which the track is late each time the object starts to move (negative: early).
+    """Delay of the track, in frames, each time the object starts to move (negative: early).
 
-    For each rest of at least 0.2 s that ends in motion: the frame at which the track is 10 mm from
-    its own mean position during that rest, minus the same for the truth. A track that does not
-    start before the true motion is over counts the motion's length.
+    Evaluated for each rest of at least 0.2 s that ends in motion: the frame at which the track is
+    10 mm from its own mean position during that rest, minus the same frame of the truth. If the
+    track does not start before the true motion ends, the delay is the duration of the motion.
     """
     lags: list[float] = []
     start = 0
@@ -103,21 +109,22 @@ def motion_onset_lags(
             over = end
             while over < total and is_moving[over]:
                 over += 1
-            found, true = (_leaves(path[start:over], end - start) for path in (centre, true_centre))
+            found, true = (_onset(path[start:over], end - start) for path in (centre, true_centre))
             if true is not None:
                 lags.append(float((over - start if found is None else found) - true))
         start = end
     return lags
 
 
-def _leaves(path: np.ndarray, rest: int) -> int | None:
+def _onset(path: np.ndarray, rest: int) -> int | None:
     """First frame at which a path (N, 3) is ``ONSET_M`` from the mean of its first ``rest``."""
     away = np.linalg.norm(path - path[:rest].mean(0), axis=-1) > ONSET_M
-    away[: max(1, rest // 2)] = False  # jitter at the start of the rest is no motion
+    away[: max(1, rest // 2)] = False  # jitter at the start of the rest is not motion
     return int(np.argmax(away)) if away.any() else None
 
 
-# Between the two moments that a velocity is taken from: noise from frame to frame is no slip.
+# Time between the two positions from which a slip velocity is computed, seconds: long enough that
+# noise between consecutive frames does not count as slip.
 SLIP_S = 0.2
 
 
@@ -128,12 +135,16 @@ def slip_speed(
     normals_at: Callable[[np.ndarray], np.ndarray],
     fps: float,
 ) -> np.ndarray:
-    """Speed (T,) at which fitted skin slides over the fitted object, beyond the true one, m/s.
+    """Speed (T,) at which fitted skin slides over the fitted object beyond the true slip, m/s.
 
-    Of skin vertices in the object's own frame, fitted ``local`` and ``true_local`` (T, V, 3), over
-    those ``touching`` (T, V) truly both in the frame and :data:`SLIP_S` later: the mean norm of the
-    difference of both velocities along the surface, of which ``normals_at`` gives the unit normals
-    (N, 3) nearest to true points (N, 3). NaN where no vertex touches at both ends.
+    The mean over touching vertices of the tangential difference between fitted and true velocity in
+    the object's frame. NaN where no vertex touches both in the frame and :data:`SLIP_S` later.
+
+    Args:
+        local: (T, V, 3) fitted skin vertices in the fitted object's frame, metres.
+        true_local: (T, V, 3) the same vertices of the true body in the true object's frame.
+        touching: (T, V) mask of vertices in true contact.
+        normals_at: returns the unit normals (N, 3) of the true surface nearest to points (N, 3).
     """
     total = len(local)
     found = np.full(total, np.nan)
@@ -153,34 +164,37 @@ def slip_speed(
     return found
 
 
-# Of a sole vertex that carries weight: height above the floor, and speed, of the truth.
+# A true sole vertex carries weight below this height above the floor and below this speed.
 SUPPORT_HEIGHT_M, SUPPORT_SPEED_M_S = 0.015, 0.05
-STANDING_SHARE = 0.1  # of a sole's vertices that rest so: toes or a heel alone are a stand too
+STANDING_SHARE = 0.1  # of a sole's vertices that must carry weight; toes or a heel alone suffice
 
 
 @dataclass(frozen=True)
 class Floor:
-    """The plane normal . x + offset = 0: ``normal`` (3,) unit and up, ``offset`` metres."""
+    """The plane normal . x + offset = 0."""
 
-    normal: np.ndarray
-    offset: float
+    normal: np.ndarray  # (3,) unit, pointing up
+    offset: float  # metres
 
     def height(self, points: np.ndarray) -> np.ndarray:
-        """Of points (..., 3) above the floor, metres."""
+        """Height (...) of points (..., 3) above the floor, metres."""
         return points @ self.normal + self.offset
 
     def along(self, vectors: np.ndarray) -> np.ndarray:
-        """The part of vectors (..., 3) that lies in the floor."""
+        """Component of vectors (..., 3) parallel to the floor."""
         return vectors - (vectors @ self.normal)[..., None] * self.normal
 
 
 def support(
     true_sole: np.ndarray, floor: Floor, fps: float, level: np.ndarray | None = None
 ) -> np.ndarray:
-    """Vertices of a true sole (T, S, 3) that carry weight from a frame to the next: (T - 1, S).
+    """Mask (T - 1, S) of the sole vertices that carry weight from one frame to the next.
 
-    ``level`` (T,) is how high above the floor what is under it lies, metres, None = it is the
-    floor. No vertices of a foot that does not stand.
+    All False for the frames in which the foot does not stand.
+
+    Args:
+        true_sole: (T, S, 3) vertices of a true sole, metres.
+        level: (T,) height above the floor of the surface under the sole, metres; None = the floor.
     """
     above = floor.height(true_sole) if level is None else floor.height(true_sole) - level[:, None]
     low = above < SUPPORT_HEIGHT_M
@@ -192,29 +206,28 @@ def support(
 
 @dataclass(frozen=True)
 class FootErrors:
-    """Of one foot, metres and m/s, NaN where there is nothing to measure. Of what carries it
-    ``speed`` (T - 1,) along the floor and ``height`` (T - 1,), the mean distance from the true
-    height; ``swing`` (T - 1,), the mean distance of all of the sole from the true one where it does
-    not stand."""
+    """Errors of one foot between consecutive frames; NaN where they are not defined."""
 
-    speed: np.ndarray
-    height: np.ndarray
-    swing: np.ndarray
+    speed: np.ndarray  # (T - 1,) speed along the floor of the vertices that carry weight, m/s
+    height: np.ndarray  # (T - 1,) mean height error of the vertices that carry weight, metres
+    swing: np.ndarray  # (T - 1,) mean distance of the sole from the true sole while it swings
 
 
 def foot_errors(
     sole: np.ndarray, true_sole: np.ndarray, carrying: np.ndarray, floor: Floor, fps: float
 ) -> FootErrors:
-    """Errors of a fitted sole (T, S, 3), ``carrying`` (T - 1, S) as of :func:`support`."""
+    """Errors of a fitted sole (T, S, 3); ``carrying`` (T - 1, S) is the result of :func:`support`."""
     speed = np.linalg.norm(floor.along(np.diff(sole, axis=0)), axis=-1) * fps
     away = (sole - true_sole)[1:]
     swing = np.linalg.norm(away, axis=-1).mean(1)
     swing[carrying.any(1)] = np.nan
-    return FootErrors(_mean(speed, carrying), _mean(np.abs(away @ floor.normal), carrying), swing)
+    return FootErrors(
+        _masked_mean(speed, carrying), _masked_mean(np.abs(away @ floor.normal), carrying), swing
+    )
 
 
-def _mean(values: np.ndarray, counted: np.ndarray) -> np.ndarray:
-    """Means (T,) of the values (T, S) that are ``counted``; NaN where none is."""
-    number = counted.sum(1)
-    total = np.where(counted, values, 0.0).sum(1)
+def _masked_mean(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Means (T,) of the values (T, S) within ``mask``; NaN where the mask is empty."""
+    number = mask.sum(1)
+    total = np.where(mask, values, 0.0).sum(1)
     return np.where(number > 0, total / np.maximum(number, 1), np.nan)

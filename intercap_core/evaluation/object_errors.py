@@ -16,9 +16,9 @@ from intercap_core.evaluation.truth import match_times
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.schemas import OBJECT_TRACK, SCENE, TRUTH
 
-SURFACE_POINTS = 500  # vertices at most that ADD-S and MSSD are taken over
-ADD_S_SHARE = 0.1  # of the diameter: the usual bound of ADD-S
-# Bounds of MSSD over the diameter whose recalls are averaged (BOP challenge 2019)
+SURFACE_POINTS = 500  # maximal number of vertices for ADD-S and MSSD
+ADD_S_SHARE = 0.1  # of the diameter: the usual threshold of ADD-S
+# Thresholds of MSSD over the diameter whose recalls are averaged (BOP challenge 2019)
 MSSD_SHARES = np.arange(1, 11) * 0.05
 VIEW_BINS = ((0, 1), (2, 2), (3, 3), (4, 4), (5, 5), (6, 99))
 
@@ -27,42 +27,35 @@ Figures = dict[str, float]
 
 @dataclass(frozen=True, eq=False)
 class ObjectErrors:
-    """T frames of one object, metres and degrees; what is not known is NaN.
-
-    ``translation`` and ``rotation`` (T,) errors; ``turn`` (T,) degrees turned since the frame
-    before beyond what is true; ``centre``, ``true_centre`` (T, 3); ``views`` (T,) that truly see
-    the object; ``moves`` (T,) it truly moves; ``flagged`` (T,) the stage does not trust it.
-    ``add_s`` and ``mssd`` (T,) over the diameter; ``normalised`` and ``normalised_turn`` (T,)
-    errors over the stated deviation, None where none is stated.
-    """
+    """Errors of one object over T frames; NaN = unknown."""
 
     sequence: str
     object_: str
     fps: float
-    translation: np.ndarray
-    rotation: np.ndarray
-    turn: np.ndarray
-    centre: np.ndarray
-    true_centre: np.ndarray
-    views: np.ndarray
-    moves: np.ndarray
-    flagged: np.ndarray
-    add_s: np.ndarray | None = None
-    mssd: np.ndarray | None = None
-    normalised: np.ndarray | None = None
-    normalised_turn: np.ndarray | None = None
+    translation: np.ndarray  # (T,) error of the centre of mass, metres
+    rotation: np.ndarray  # (T,) error, degrees
+    turn: np.ndarray  # (T,) error of the rotation since the frame before, degrees
+    centre: np.ndarray  # (T, 3) centre of mass, metres
+    true_centre: np.ndarray  # (T, 3)
+    views: np.ndarray  # (T,) number of cameras that truly see the object
+    moves: np.ndarray  # (T,) whether the object truly moves
+    flagged: np.ndarray  # (T,) the stage marked the frame as unreliable
+    add_s: np.ndarray | None = None  # (T,) over the diameter
+    mssd: np.ndarray | None = None  # (T,) over the diameter
+    normalised: np.ndarray | None = None  # (T,) translation error over its stated deviation
+    normalised_turn: np.ndarray | None = None  # (T,) rotation error over its stated deviation
 
     @property
     def lost(self) -> np.ndarray:
-        """Frames (T,) in which the pose is truly lost."""
+        """Mask (T,) of the frames in which the pose is truly lost."""
         return object_pose.lost(self.translation, self.rotation)
 
 
 def measure(scene: Path, object_track: Path, truth: Path, mesh: ObjectMesh) -> ObjectErrors:
     """Compare the artefact of stage ``object_track`` with the truth of its recording.
 
-    Of an object that was found in no frame the errors are infinite. Raises UserError where an
-    artefact is broken, or the truth is of another recording.
+    Errors are infinite where the object was found in no frame. Raises UserError where an artefact
+    cannot be read or the truth is of another recording.
     """
     track = read_object(object_track, "object_track")
     with artefacts.read(object_track, OBJECT_TRACK) as found:
@@ -130,9 +123,9 @@ def add_s(
     true_rotation: np.ndarray,
     true_translation: np.ndarray,
 ) -> np.ndarray:
-    """ADD-S (T,): mean distance of the true surface points from the nearest of the found ones.
+    """ADD-S (T,): mean distance of the true surface points from the nearest estimated point.
 
-    ``points`` (N, 3) of the object under poses (T, 3, 3), (T, 3). Hinterstoisser et al., ACCV 2012.
+    ``points`` (N, 3) are placed by poses (T, 3, 3), (T, 3). Hinterstoisser et al., ACCV 2012.
     """
     found = points @ np.swapaxes(rotation, 1, 2) + translation[:, None]
     true = points @ np.swapaxes(true_rotation, 1, 2) + true_translation[:, None]
@@ -147,9 +140,9 @@ def mssd(
     true_translation: np.ndarray,
     mesh: ObjectMesh,
 ) -> np.ndarray:
-    """MSSD (T,): the largest distance of corresponding points, the least over the symmetry group.
+    """MSSD (T,): maximal distance of corresponding points, minimised over the symmetry group.
 
-    Hodan et al., BOP challenge 2020. Of a sphere it is the distance of its centres.
+    Hodan et al., BOP challenge 2020. For a sphere it is the distance of the centres.
     """
     if mesh.symmetry.sphere:
         return np.linalg.norm(translation - true_translation, axis=1)
@@ -163,10 +156,10 @@ def mssd(
 
 
 def figures(recordings: Sequence[ObjectErrors]) -> Figures:
-    """What is reported of several recordings, millimetres and degrees.
+    """Figures over several recordings, millimetres and degrees.
 
-    Errors are over frames that two or more views truly see; lost frames over all frames;
-    ``recovered_share`` of the times that the track was lost and the recording went on.
+    Errors are over the frames in which two or more cameras truly see the object, lost frames over
+    all frames. ``recovered_share`` is the share of lost runs that ended before the recording did.
     """
     if not recordings:
         return {}
@@ -187,7 +180,9 @@ def figures(recordings: Sequence[ObjectErrors]) -> Figures:
         values = scale * np.concatenate(errors)[seen]
         if len(values):
             found[f"{key}_median_{unit}"] = float(np.median(values))
-            with np.errstate(invalid="ignore"):  # infinite errors of what was found nowhere
+            with np.errstate(
+                invalid="ignore"
+            ):  # errors are infinite where the object was never found
                 found[f"{key}_p95_{unit}"] = float(np.percentile(values, 95))
     add, worst = _pooled([r.add_s for r in recordings]), _pooled([r.mssd for r in recordings])
     if len(add):
@@ -211,7 +206,7 @@ def figures(recordings: Sequence[ObjectErrors]) -> Figures:
 
 
 def by_views(recordings: Sequence[ObjectErrors]) -> dict[str, Figures]:
-    """The main figures by how many views truly see the object: "0-1", "2", ... "6+"."""
+    """The main figures by the number of cameras that truly see the object: "0-1", "2", ... "6+"."""
     views, lost = (np.concatenate([getattr(r, k) for r in recordings]) for k in ("views", "lost"))
     shift, turn = (
         np.concatenate([getattr(r, k) for r in recordings]) for k in ("translation", "rotation")
@@ -235,14 +230,14 @@ def _pooled(parts: Sequence[np.ndarray | None]) -> np.ndarray:
 
 
 def _lost_runs_end(lost: np.ndarray) -> list[bool]:
-    """For each run of lost frames (T,) that the recording goes on after: True, else False."""
+    """For each run of lost frames (T,), whether it ends before the recording does."""
     padded = np.concatenate([[False], lost, [False]]).astype(np.int8)
     ends = np.flatnonzero(np.diff(padded) < 0)
     return [bool(end < len(lost)) for end in ends]
 
 
 def _jitter_and_lag(recordings: Sequence[ObjectErrors]) -> Figures:
-    """Jitter over all frames of rest, and by how much the track errs at the start of motion."""
+    """Jitter over all frames at rest, and delay of the track at the onset of motion."""
     found: Figures = {}
     steps, turns, lags = [np.zeros(0)], [np.zeros(0)], []
     for r in recordings:

@@ -1,4 +1,4 @@
-"""Errors of an object's pose against the true one: arrays in, numbers out."""
+"""Errors of an object's pose against the true pose."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ LOST_TRANSLATION_M = 0.050
 LOST_ROTATION_DEG = 20.0
 FOUND_TRANSLATION_M = 0.020
 FOUND_ROTATION_DEG = 10.0
-UNKNOWN_TURN_DEG = 30.0  # a deviation beyond this states that a turn is not known
+UNKNOWN_TURN_DEG = 30.0  # an axis with a larger stated deviation is not determined
 
 
 def posed_point(rotation: np.ndarray, translation: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """A point (3,) of the object under poses (..., 3, 3), (..., 3): (..., 3)."""
+    """Position (..., 3) of the object's point (3,) under poses (..., 3, 3), (..., 3)."""
     return rotation @ point + translation
 
 
 def centre_error(centre: np.ndarray, true_centre: np.ndarray) -> np.ndarray:
-    """Distance (...) of the object's centre of mass (..., 3) from where it truly is, metres.
+    """Distance (...) of the object's centre of mass (..., 3) from the true one, metres.
 
     Symmetries leave the centre of mass in place, so no element of the group makes it smaller.
     """
@@ -39,8 +39,10 @@ def rotation_error_deg(
 
 
 def lost(translation_error_m: np.ndarray, rotation_error_degrees: np.ndarray) -> np.ndarray:
-    """Which poses are truly lost (...): off by more than 50 mm or 20 degrees, infinite where the
-    object is there and was not found."""
+    """Mask (...) of lost poses: errors above 50 mm or 20 degrees.
+
+    Errors are infinite where the object exists and no stage found it.
+    """
     return (translation_error_m > LOST_TRANSLATION_M) | (rotation_error_degrees > LOST_ROTATION_DEG)
 
 
@@ -49,9 +51,9 @@ def first_seen_found(
     rotation_error_degrees: np.ndarray,
     views: np.ndarray,
 ) -> bool | None:
-    """Whether the first frame that truly has a view is within 20 mm and 10 degrees.
+    """Whether the first frame in which a camera truly sees the object is within 20 mm and 10 degrees.
 
-    All (T,); None where no frame has a view.
+    All arguments are (T,). None where no camera sees the object.
     """
     seen = np.flatnonzero(views > 0)
     if len(seen) == 0:
@@ -68,9 +70,9 @@ def normalised_translation_error(
     true_translation: np.ndarray,
     covariance: np.ndarray,
 ) -> np.ndarray:
-    """Mahalanobis length (T,) of the translation's error over its median: 1 if calibrated.
+    """Mahalanobis length (T,) of the translation error over its median; 1 if calibrated.
 
-    ``covariance`` (T, 6, 6) of (rotation vector, translation); NaN where it says nothing.
+    ``covariance`` (T, 6, 6) of (rotation vector, translation). NaN where it is not positive definite.
     """
     block = covariance[:, 3:, 3:]
     error = translation - true_translation
@@ -88,10 +90,9 @@ def normalised_rotation_error(
     covariance: np.ndarray,
     symmetry: SymmetryGroup,
 ) -> np.ndarray:
-    """As :func:`normalised_translation_error` of the turn (T,) between poses (T, 3, 3).
+    """Mahalanobis length (T,) of the rotation error over its median; 1 if calibrated.
 
-    Axes with a stated deviation above ``UNKNOWN_TURN_DEG`` say nothing and are left out; NaN
-    where all are.
+    Axes with a stated deviation above ``UNKNOWN_TURN_DEG`` are excluded. NaN where all are.
     """
     truly = symmetry.nearest_equivalent(true_rotation, rotation)
     error = rotation_log(rotation @ np.swapaxes(truly, 1, 2))

@@ -14,40 +14,40 @@ from intercap_core.geometry.rigid.surface_tree import ShapedSurface, SurfaceTree
 
 
 class MeasuredCloud:
-    """Measured points (N, 3), metres, ready for nearest-point queries."""
+    """Measured points (N, 3), metres, indexed for nearest-point queries."""
 
     def __init__(self, points: np.ndarray) -> None:
         self.points = np.asarray(points, np.float32)
         self._tree = PointGrid(self.points) if len(self.points) else None
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Distance (M,) of mesh points (M, 3) to the closest measured point; NaN without any."""
+        """Distance (M,) of mesh points (M, 3) to the nearest measured point; NaN for an empty cloud."""
         if self._tree is None:
             return np.full(len(points), np.nan)
         return self._tree.distance(points)
 
 
 def vertex_to_cloud(vertices: np.ndarray, cloud: MeasuredCloud) -> float:
-    """The paper's figure: mean over every vertex (V, 3), occluded ones too, metres."""
+    """Mean distance of all vertices (V, 3), occluded ones included, metres: the paper's figure."""
     return float(cloud.distance(vertices).mean())
 
 
 def visible_to_cloud(points: np.ndarray, visible: np.ndarray, cloud: MeasuredCloud) -> float:
-    """Mean over the area samples (N, 3) that cameras can see (N,) bool; NaN with none."""
+    """Mean distance of the area samples (N, 3) in the mask ``visible`` (N,); NaN if it is empty."""
     if not visible.any():
         return float("nan")
     return float(cloud.distance(points[visible]).mean())
 
 
-REACH_M = 0.10  # distances are capped here: no reported figure needs larger ones
-DEEPEST_M = 0.25  # and depths of what is inside here
-_LIFT_M = 0.002  # a sight ray starts this far off the surface, to clear its own triangle
+REACH_M = 0.10  # distances outside are capped here: no reported figure needs larger distances
+DEEPEST_M = 0.25  # depths inside are capped here
+_LIFT_M = 0.002  # a visibility ray starts this far off the surface, clear of its own triangle
 
 
 class PosedObject:
-    """A rigid mesh (V, 3), (F, 3) in its own frame; its search trees are built once.
+    """A rigid mesh (V, 3), (F, 3) in its own frame, with search trees that are built once.
 
-    ``watertight``: rays tell what is inside; else the mesh winds around it.
+    ``watertight``: ray parity decides which points are inside; otherwise the winding number does.
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, *, watertight: bool = True) -> None:
@@ -58,7 +58,7 @@ class PosedObject:
         self._solid = _Solid(self._tree.shaped(vertices), field)
 
     def placed(self, rotation: np.ndarray, translation: np.ndarray) -> ShapedSurface:
-        """The surface under master_from_object."""
+        """The surface under the pose master_from_object."""
         return self._tree.shaped(self._vertices @ rotation.T + translation)
 
     def signed_distance(
@@ -69,34 +69,31 @@ class PosedObject:
         *,
         reach: float = REACH_M,
     ) -> np.ndarray:
-        """Distance (N,) of master-frame points (N, 3) to the object under master_from_object.
+        """Signed distance (N,) of points (N, 3), master frame, to the object; negative inside.
 
-        Negative inside; at most ``reach``, at least -``DEEPEST_M``.
+        Values are clipped to [-``DEEPEST_M``, ``reach``].
         """
         return self._solid.signed_distance((points - translation) @ rotation, reach)
 
 
 class BodySurface:
-    """A body in one pose, vertices (V, 3), with the ``tree`` of its faces (F, 3).
-
-    ``surface``: its tree, posed.
-    """
+    """The surface of a body in one pose, vertices (V, 3), with the search ``tree`` of its faces."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, tree: SurfaceTree) -> None:
         self.surface = tree.shaped(vertices)
         self._solid = _Solid(self.surface, None if tree.closed else DistanceField(vertices, faces))
 
     def signed_distance(self, points: np.ndarray, *, reach: float = REACH_M) -> np.ndarray:
-        """Signed distance (N,) of points (N, 3), as of :class:`PosedObject`."""
+        """Signed distance (N,) of points (N, 3), clipped as in :class:`PosedObject`."""
         return self._solid.signed_distance(points, reach)
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Distance (N,) of points (N, 3) on either side, at most ``DEEPEST_M``."""
+        """Unsigned distance (N,) of points (N, 3), at most ``DEEPEST_M``."""
         return self.surface.distance(points, DEEPEST_M)
 
 
 class _Solid:
-    """How far from a ``surface``, and what is inside: by the ``field`` where that is not closed."""
+    """Signed distance to a ``surface``; the ``field`` decides the sign where it is not closed."""
 
     def __init__(self, surface: ShapedSurface, field: DistanceField | None = None) -> None:
         self._surface, self._field = surface, field
@@ -116,7 +113,7 @@ class _Solid:
 
 
 class Sight:
-    """Visibility to the rig's cameras, in one frame, of surfaces that occlude each other."""
+    """Visibility of surface points to the cameras in one frame, with surfaces as occluders."""
 
     def __init__(self, surfaces: Sequence[ShapedSurface]) -> None:
         self._surfaces = surfaces
@@ -127,9 +124,12 @@ class Sight:
         normals: np.ndarray,
         cameras: Sequence[Camera],
     ) -> np.ndarray:
-        """Whether some depth camera (colour where it has none) sees each surface point (N,).
+        """Mask (N,) of the surface points that at least one camera sees.
 
-        ``points`` and outward ``normals`` (N, 3) are in the master frame, like the surfaces.
+        The depth lens decides; the colour lens where a camera has no depth.
+
+        Args:
+            points, normals: (N, 3) surface points and outward normals, master frame.
         """
         seen = np.zeros(len(points), bool)
         for camera in cameras:
@@ -153,7 +153,7 @@ class Sight:
 
 
 def face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Outward unit normals (F, 3)."""
+    """Outward unit normals (F, 3) of the faces."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a)
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-18)

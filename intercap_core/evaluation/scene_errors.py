@@ -20,7 +20,7 @@ CUBE_SIDE_M = 2.0
 def rig_centre(master_from_camera: np.ndarray) -> np.ndarray:
     """The point (3,) nearest to all optical axes of cameras (C, 4, 4), least squares.
 
-    A little ridge towards the mean camera position keeps parallel axes solvable.
+    A small ridge towards the mean camera position regularises parallel axes.
     """
     position = master_from_camera[:, :3, 3]
     axis = master_from_camera[:, :3, 2]
@@ -37,8 +37,8 @@ def displacement(
 ) -> np.ndarray:
     """RMS displacement (C,) of the points of a 2 m cube at the rig's true centre, metres.
 
-    Both rigs (C, 4, 4) are first expressed in their own ``master`` camera. The mean over the cube
-    of |A x + b|^2 is exact: |A centre + b|^2 + side^2 / 12 |A|^2.
+    Both rigs (C, 4, 4) are first expressed in the frame of their ``master`` camera. The mean of
+    |A x + b|^2 over the cube has the closed form |A centre + b|^2 + side^2 / 12 |A|^2.
     """
     estimated = invert(master_from_camera[master]) @ master_from_camera
     true = invert(true_master_from_camera[master]) @ true_master_from_camera
@@ -49,67 +49,62 @@ def displacement(
     return np.sqrt((at_centre**2).sum(1) + spread)
 
 
-CAPTURE_RADIUS_M = 1.5  # around the rig's centre, on the floor
-_RINGS, _SPOKES = 40, 90  # of the places on the floor where heights are compared
-MEDIAN_CHI_1 = 0.6745  # median of |x| where x is normal with deviation 1
-_WORSE_M = 1e-6  # rounding is no change for the worse
+CAPTURE_RADIUS_M = 1.5  # of the capture area on the floor around the rig's centre
+_RINGS, _SPOKES = 40, 90  # grid of the floor points at which heights are compared
+MEDIAN_CHI_1 = 0.6745  # median of |x| for a standard normal x
+_WORSE_M = 1e-6  # changes below this are rounding
 
 
 @dataclass(frozen=True)
 class Slip:
-    """Images ``first`` to ``last`` (sets) of a camera that all show ``frames`` sets before."""
+    """A run of images of one camera that all lag by the same number of frame sets."""
 
     camera: int
-    first: int
-    last: int
-    frames: int
+    first: int  # first frame set
+    last: int  # last frame set
+    frames: int  # lag in frame sets
 
 
 @dataclass(frozen=True)
 class SlipCounts:
-    """True slips that were detected or missed, and false detections, by event.
+    """Detection of slips, counted by event and by image."""
 
-    ``images_wrong`` of all ``images`` are given a slip that is not the true one.
-    """
-
-    found: int
-    missed: int
-    false: int
-    images_wrong: int
-    images: int
+    found: int  # true slips that were detected
+    missed: int  # true slips that were not detected
+    false: int  # detections without a true slip
+    images_wrong: int  # images whose slip is not the true one
+    images: int  # all images
 
 
 @dataclass(frozen=True, eq=False)
 class CaptureErrors:
-    """One capture's errors, metres, seconds, degrees; NaN = unknown or not estimated.
+    """Errors of one capture's scene artefact; NaN = unknown or not estimated.
 
-    ``before`` and ``after`` (C-1,) of the extrinsics, ``offset`` (C-1,), master left out;
-    ``offset_normalised`` (C-1,) over the stated deviation; ``depth_bias`` (C,). Cameras without an
-    image, or without depth, are left out.
+    Cameras without an image, or without depth, are excluded.
     """
 
     sequence: str
     room: str
-    before: np.ndarray
-    after: np.ndarray
-    offset: np.ndarray
-    offset_normalised: np.ndarray
+    before: np.ndarray  # (C-1,) displacement by the given extrinsics, metres, without the master
+    after: np.ndarray  # (C-1,) displacement by the refined extrinsics, metres
+    offset: np.ndarray  # (C-1,) time offsets relative to the master, seconds
+    offset_normalised: np.ndarray  # (C-1,) ``offset`` over its stated standard deviation
     slips: SlipCounts
-    ground_m: float
-    ground_deg: float
-    depth_bias: np.ndarray
+    ground_m: float  # mean height error of the floor over the capture area
+    ground_deg: float  # angle between the normals
+    depth_bias: np.ndarray  # (C,) metres
 
 
 def offset_errors(offset: np.ndarray, true_offset: np.ndarray, master: int) -> np.ndarray:
-    """Errors (C-1,) of time offsets (C,) relative to the master's, the master left out, seconds."""
+    """Errors (C-1,) of the offsets (C,) relative to the master, without the master, seconds."""
     error = (offset - offset[master]) - (true_offset - true_offset[master])
     return np.delete(error, master)
 
 
 def slip_events(slip: np.ndarray, available: np.ndarray) -> list[Slip]:
-    """Runs of equal slips, not zero, over each camera's images; both (T, C).
+    """Runs of equal nonzero slips of each camera; both arguments are (T, C).
 
-    Sets without an image of the camera neither belong to a run nor end it.
+    Frame sets without an image of the camera neither belong to a run nor end it.
     """
     events = []
     for camera in range(slip.shape[1]):
@@ -125,10 +120,10 @@ def slip_events(slip: np.ndarray, available: np.ndarray) -> list[Slip]:
 
 
 def compare_slips(slip: np.ndarray, true_slip: np.ndarray, available: np.ndarray) -> SlipCounts:
-    """Compare slips (T, C) by event, on the sets in which the camera has an image (T, C).
+    """Compare slips (T, C) by event, within the mask ``available`` (T, C) of the images.
 
-    A true event is found where a detected one of the same camera and the same number of frames
-    overlaps it; a detected event that overlaps no such true one is a false detection.
+    Two events match if they are of the same camera, have the same lag and overlap in time. A true
+    event without a match is missed, a detected event without a match is false.
     """
     true, found = slip_events(true_slip, available), slip_events(slip, available)
     answered = sum(any(_meet(t, f) for f in found) for t in true)
@@ -150,10 +145,12 @@ def ground_error(
 ) -> tuple[float, float]:
     """Mean height error over the capture area, metres, and the angle between normals, degrees.
 
-    The found floor goes through ``point`` (3,) with ``normal`` (3,), the true one is
-    ``true_normal`` . x + ``true_offset`` = 0, both normals unit and up. The capture area is the
-    disc of ``CAPTURE_RADIUS_M`` on the true floor around the foot of ``centre`` (3,). NaN without
-    a floor.
+    NaN where no floor was found. Both normals are unit vectors that point up.
+
+    Args:
+        point, normal: (3,) the estimated floor.
+        true_normal, true_offset: the true floor, true_normal . x + true_offset = 0.
+        centre: (3,) the capture area is the disc of ``CAPTURE_RADIUS_M`` below this point.
     """
     if not np.isfinite([*point, *normal]).all():
         return float("nan"), float("nan")
@@ -161,7 +158,7 @@ def ground_error(
     across = np.cross(true_normal, np.eye(3)[np.argmin(np.abs(true_normal))])
     across /= np.linalg.norm(across)
     along = np.cross(true_normal, across)
-    # Rings of equal area, so that all places count the same
+    # Rings of equal area: all points have the same weight
     radius = CAPTURE_RADIUS_M * np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS)
     angle = 2 * np.pi * np.arange(_SPOKES) / _SPOKES
     u, v = (np.outer(radius, f(angle)).ravel()[:, None] for f in (np.cos, np.sin))
@@ -172,9 +169,9 @@ def ground_error(
 
 
 def measure(frames: Path, scene: Path, truth: Path) -> CaptureErrors:
-    """Compare one capture's scene with its truth.
+    """Compare the scene artefact of one capture with its truth.
 
-    Raises UserError where an artefact is missing or broken, or the truth is of another recording.
+    Raises UserError where an artefact cannot be read or the truth is of another recording.
     """
     with (
         artefacts.read(frames, FRAMES) as recorded,
@@ -186,8 +183,8 @@ def measure(frames: Path, scene: Path, truth: Path) -> CaptureErrors:
         strangers = sorted(set(names) - set(true_names))
         if strangers:
             raise UserError(
-                f"{truth}: knows no camera {strangers[0]!r}, which {scene} has; it is the truth of "
-                "another recording"
+                f"{truth}: has no camera {strangers[0]!r}, which {scene} has; expected the truth of "
+                "the same recording"
             )
         order = [true_names.index(name) for name in names]
         available = recorded["colour_index"] >= 0
@@ -225,10 +222,10 @@ def measure(frames: Path, scene: Path, truth: Path) -> CaptureErrors:
 
 
 def figures(captures: Sequence[CaptureErrors]) -> dict[str, float]:
-    """What is reported of several captures, in millimetres, milliseconds and degrees.
+    """Figures over several captures, in millimetres, milliseconds and degrees.
 
-    Extrinsics of rooms with furniture, and apart those of bare floors (``floor_only``); shares of
-    captures that got better or worse are over both, by the mean over a capture's cameras.
+    Extrinsics are separate for furnished rooms and bare floors (``floor_only``). The shares of
+    improved and worse captures are over both, by the mean over each capture's cameras.
     """
     if not captures:
         return {}
@@ -278,7 +275,7 @@ def figures(captures: Sequence[CaptureErrors]) -> dict[str, float]:
 
 
 def _true_bias(truth: artefacts.Artefact) -> np.ndarray:
-    """(C,), NaN where the truth does not state it."""
+    """Depth biases (C,), NaN where the truth does not state them."""
     if "depth_bias" in truth:
         return truth["depth_bias"]
     return np.full(len(truth["time_offset"]), np.nan)

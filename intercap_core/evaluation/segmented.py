@@ -1,4 +1,4 @@
-"""Depth points of one frame that the segmentation gives to the person or the object."""
+"""Depth points of one frame that the segmentation assigns to the person or the object."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from intercap_core.geometry.camera.masks import Runs
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.schemas import OBJECT_TRACK, PERSON
 
-# Only depth pixels within this distance of the projected meshes are used: larger errors of a fit
-# need no exact figure.
+# Only depth pixels within this distance of the meshes are used: larger errors of a fit need no
+# exact figure.
 MARGIN_M = 0.25
 
 
 @dataclass(frozen=True, eq=False)
 class ViewMasks:
-    """Masks of one colour image: the person's and that of the object's kept candidate."""
+    """Masks of one colour image; None where it has none."""
 
     person: Runs | None
-    object_: Runs | None
+    object_: Runs | None  # the candidate that the object's track kept
 
 
 def segmented_points(
@@ -36,11 +36,14 @@ def segmented_points(
     near: np.ndarray,
     bias_m: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points of the person and of the object (N, 3) float32, master frame, metres.
+    """Points of the person and of the object, each (N, 3) float32, master frame, metres.
 
-    ``depth`` (H, W) uint16 mm; ``near`` (M, 3) points of the meshes, master frame, around which
-    depth pixels are looked at; ``bias_m`` is subtracted from the depth. A point belongs to the
-    mask that covers the colour pixel showing it.
+    A point belongs to the mask that covers its pixel in the colour image.
+
+    Args:
+        depth: (H, W) uint16 depth image, millimetres.
+        near: (M, 3) mesh points, master frame; only depth pixels around them are used.
+        bias_m: subtracted from the depth along the ray.
     """
     found = [np.empty((0, 3), np.float32), np.empty((0, 3), np.float32)]
     space = _Space.around(camera, near)
@@ -56,18 +59,19 @@ def segmented_points(
 
 @dataclass(frozen=True)
 class _Space:
-    """A box of a depth image from ``low`` to before ``high`` (column, row), and a range of depths,
-    millimetres."""
+    """A window of a depth image and a range of depths."""
 
-    low: tuple[int, int]
-    high: tuple[int, int]
-    nearest: float
-    farthest: float
+    low: tuple[int, int]  # first column and row
+    high: tuple[int, int]  # column and row after the last
+    nearest: float  # millimetres
+    farthest: float  # millimetres
 
     @classmethod
     def around(cls, camera: Camera, near: np.ndarray) -> _Space | None:
-        """That of points (M, 3), master frame, with ``MARGIN_M``; None where the camera sees none
-        of them."""
+        """Space around points (M, 3), master frame, with ``MARGIN_M``.
+
+        None where the camera sees none of the points.
+        """
         lens = camera.depth
         if lens is None:
             return None
@@ -88,8 +92,10 @@ class _Space:
     def points(
         self, depth: np.ndarray, camera: Camera, index: np.ndarray, bias_m: float
     ) -> np.ndarray:
-        """Points (N, 3) float32, master frame, of those flat pixels (M,) of the image (H, W) mm
-        that are in it."""
+        """Points (N, 3) float32, master frame, of the pixels within the space.
+
+        ``index`` (M,) are flat indices of ``depth`` (H, W), millimetres.
+        """
         assert camera.depth is not None
         return segmented_kernel.placed(
             depth,
@@ -105,7 +111,7 @@ class _Space:
 
 
 def read_person_masks(person: Path) -> list[list[bytes]]:
-    """Masks (T, C) of the person artefact, COCO RLE, empty = none."""
+    """Person masks (T, C) as COCO RLE bytes; empty where an image has none."""
     with artefacts.read(person, PERSON) as people:
         masks = artefacts.unpack_ragged(people["mask_offsets"], people["mask_rle"])
         sets, cameras = people["person"].shape
@@ -113,12 +119,14 @@ def read_person_masks(person: Path) -> list[list[bytes]]:
 
 
 class SegmentedClouds:
-    """Person's and object's points of every frame, over all views.
+    """Points of person and object in every frame, over all views.
 
-    ``frames`` are read by the moment that their images show (:meth:`Frames.showing`);
-    ``person_masks`` (T, C) of COCO RLE bytes, empty = none; ``candidate_masks`` the same of the
-    candidate that the object's track kept, None where it does not matter; ``depth_bias`` (C,) of
-    the scene.
+    Args:
+        frames: images by the moment that they show (:meth:`Frames.showing`).
+        person_masks: (T, C) COCO RLE bytes, empty = no mask.
+        candidate_masks: (T, C) masks of the candidates that the object's track kept; None if the
+            object's points are not needed.
+        depth_bias: (C,) depth bias of each camera, metres.
     """
 
     def __init__(
@@ -164,8 +172,10 @@ def read_clouds(
     person: Path,
     object_track: Path,
 ) -> SegmentedClouds:
-    """Those of a sequence, from the artefacts of its detections, person and object track;
-    ``images`` and ``image_of`` (T, C) by the moment that they show."""
+    """Segmented clouds of a sequence, from the artefacts of its stages.
+
+    ``images`` and ``image_of`` (T, C) are ordered by the moment that the images show.
+    """
     found = Detections.load(detections).showing(image_of).with_candidates_of(person)
     with artefacts.read(object_track, OBJECT_TRACK) as track:
         kept = track["candidate"]

@@ -1,4 +1,4 @@
-"""What of a depth image lies around a body, compiled: :mod:`.segmented`'s box, and its points."""
+"""Compiled loops of :mod:`.segmented`: extent of points in an image, and unprojection."""
 
 from __future__ import annotations
 
@@ -13,9 +13,15 @@ _MILLIMETRE = np.float32(1e-3)
 
 @numba.njit(cache=True, nogil=True)
 def extent(points, pose, lens):
-    """Least and largest (2,3) column, row and depth (metres) of points (M,3), which a camera with
-    the ``pose`` (4,4) camera_from_points and a ``lens`` of thirteen parameters covers; the least is
-    infinite where it covers none. All float64."""
+    """Minimum and maximum (2,3) of column, row and depth (metres) of the points in the image.
+
+    The minimum is infinite where no point is in the image. All arrays are float64.
+
+    Args:
+        points: (M,3).
+        pose: (4,4) camera_from_points.
+        lens: (13,) lens parameters.
+    """
     found = np.empty((2, 3))
     found[0], found[1] = np.inf, -np.inf
     limit = lens[12]
@@ -36,11 +42,16 @@ def extent(points, pose, lens):
 
 @numba.njit(cache=True, nogil=True)
 def placed(depth, index, rays, low, high, nearest, farthest, pose, bias):
-    """Points (N,3) float32 of flat pixels ``index`` (M,) of a depth image (H,W) uint16 mm.
+    """Points (N,3) float32 of the pixels within a window and a range of depths.
 
-    Of those that are from ``low`` to before ``high`` (column, row), deeper than ``nearest`` and
-    less deep than ``farthest``, mm, and whose ray, of ``rays`` (H,W,2), is known. ``bias`` metres
-    are taken off the depth along the ray; ``pose`` (4,4) float32 is that of the points' frame.
+    Args:
+        depth: (H,W) uint16, millimetres.
+        index: (M,) flat pixel indices.
+        rays: (H,W,2) ray directions; pixels without a finite ray are skipped.
+        low, high: first column and row, and column and row after the last.
+        nearest, farthest: range of depths, exclusive, millimetres.
+        pose: (4,4) float32, points_from_camera.
+        bias: metres, subtracted from the depth along the ray.
     """
     width = depth.shape[1]
     points = np.empty((len(index), 3), np.float32)

@@ -1,4 +1,4 @@
-"""Errors of each stage's body and object against the truth, by dataset of the metrics artefact."""
+"""Errors of the body and object of each stage against truth, by dataset of the metrics artefact."""
 
 from __future__ import annotations
 
@@ -23,22 +23,21 @@ _FEET = ("left_foot", "right_foot")  # regions of the soles
 
 @dataclass(frozen=True, eq=False)
 class _ObjectSurfaces:
-    """The tracked object's ``mesh`` and ``surface``, and the ``true_surface``."""
+    """Surfaces of the tracked and of the true object."""
 
-    mesh: ObjectMesh
-    surface: PosedObject
+    mesh: ObjectMesh  # tracked
+    surface: PosedObject  # tracked
     true_surface: DistanceField
 
     def true_normals(self, points: np.ndarray) -> np.ndarray:
-        """Normals (N, 3) of the true surface nearest to points (N, 3), its frame."""
+        """Normals (N, 3) of the true surface nearest to points (N, 3), both in its frame."""
         return self.true_surface.closest(points).normals
 
 
 class StageErrors:
-    """Errors of each stage by dataset name; what a stage does not estimate is left out.
+    """Errors of each stage by dataset name; quantities that a stage does not estimate are omitted.
 
-    ``mesh`` is the tracked object's; without one, or where there truly is none, the errors are the
-    body's alone.
+    Without ``mesh`` (of the tracked object), or without a true object, only the body is evaluated.
     """
 
     def __init__(
@@ -60,8 +59,8 @@ class StageErrors:
                 PosedObject(mesh.vertices, mesh.faces, watertight=mesh.watertight),
                 DistanceField(truth.object_vertices, truth.object_faces),
             )
-        self._touched = np.zeros(0, int)  # vertices that truly touch in some frame
-        self._true_local = np.zeros((0, 0, 3))  # of them, in the true object's frame
+        self._touched = np.zeros(0, int)  # vertices in true contact in at least one frame
+        self._true_local = np.zeros((0, 0, 3))  # (T, N, 3) of these vertices, true object's frame
         if truth.vertices is not None and true_distance is not None:
             touching = contact.vertex_contact(true_distance)
             self._touched = np.flatnonzero(touching.any(0))
@@ -70,6 +69,7 @@ class StageErrors:
             )
 
     def of_object(self, stage: str, track: ObjectTrack) -> Values:
+        """Errors of the object's pose after ``stage``."""
         if self._object is None:
             return {}
         errors = truths.object_errors(self._truth, track, self._object.mesh, self._fps)
@@ -82,9 +82,11 @@ class StageErrors:
         track: ObjectTrack,
         distance: np.ndarray | None = None,
     ) -> Values:
-        """Contact of ``body_fit`` is that with the tracked object: what the joint stage gets.
+        """Errors of the body after ``stage``, and of its contact with the object.
 
-        ``distance`` (T, V) of the body's vertices to the object where it is known already.
+        Args:
+            track: the object's poses; for ``body_fit`` those of ``object_track``.
+            distance: (T, V) distances of the body's vertices to the object if already known.
         """
         errors = truths.body_errors(self._truth, body_track, self._fps)
         if self._truth.vertices is not None:
@@ -94,7 +96,7 @@ class StageErrors:
     def _vertices(
         self, body_track: BodyTrack, track: ObjectTrack, known: np.ndarray | None
     ) -> Values:
-        """Errors of skin, contact, hold and stand, frame by frame."""
+        """Errors of skin, contact, slip and planted feet."""
         pve, counts, touching, held, soles = [], [], [], [], []
         assert self._truth.vertices is not None
         regions = body_track.model.regions
@@ -104,7 +106,7 @@ class StageErrors:
             pve.append(body.vertex_error(vertices, self._truth.vertices[t]))
             if self._object is None or self._true_distance is None:
                 continue
-            distance = np.full(len(vertices), np.inf)  # of an object that was not found
+            distance = np.full(len(vertices), np.inf)  # the object was not found
             if known is not None:
                 distance = known[t]
             elif track.known:
@@ -131,12 +133,12 @@ class StageErrors:
         }
 
     def _slip(self, held: np.ndarray, track: ObjectTrack) -> Values:
-        """Of the skin vertices (T, N, 3) that truly touch at some time, on the tracked object."""
+        """Slip on the tracked object of the skin vertices (T, N, 3) that are ever in true contact."""
         assert self._true_distance is not None and self._object is not None
         if not track.known:
             return {"slip": np.full(len(held), np.nan)}
         pose, true = (Pose(of.rotation, of.translation).matrix for of in (track, self._truth))
-        symmetry = self._object.mesh.symmetry  # a spin that nothing shows is no slip
+        symmetry = self._object.mesh.symmetry  # a rotation about a symmetry axis is no slip
         pose = np.array(
             [symmetry.nearest_equivalent_pose(a, b) for a, b in zip(pose, true, strict=True)]
         )
@@ -151,7 +153,7 @@ class StageErrors:
         return {"slip": speed}
 
     def _feet(self, soles: Sequence[np.ndarray], regions: Mapping[str, np.ndarray]) -> Values:
-        """Of both soles' vertices (T, S, 3)."""
+        """Errors of both feet, whose sole vertices are (T, S, 3)."""
         assert self._truth.vertices is not None
         found = []
         for sole, true, carrying in zip(soles, *self._true_soles(regions), strict=True):
@@ -166,7 +168,7 @@ class StageErrors:
     def _true_soles(
         self, regions: Mapping[str, np.ndarray]
     ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Vertices (T, S, 3) of both true soles, and which of them carry weight (T - 1, S)."""
+        """Vertices (T, S, 3) of both true soles, and masks (T - 1, S) of those that carry weight."""
         truth = self._truth
         assert truth.vertices is not None
         soles = [truth.vertices[:, regions[foot]].astype(np.float64) for foot in _FEET]
@@ -177,7 +179,7 @@ class StageErrors:
         return soles, carrying
 
     def about_truth(self, regions: Mapping[str, np.ndarray]) -> Values:
-        """What is true, of a body whose parts have these vertices."""
+        """Datasets of the truth itself; ``regions`` are the body's vertex indices by region."""
         truth = self._truth
         if self._object is None:
             return self._true_skin(regions)
@@ -210,10 +212,10 @@ class StageErrors:
 
 
 def _local(points: np.ndarray, rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    """Points (T, N, 3) in the frame of an object (T, 3, 3), (T, 3)."""
+    """Points (T, N, 3) in the frame of an object with poses (T, 3, 3), (T, 3)."""
     return (points - translation[:, None]) @ rotation
 
 
 def _since_before(feet: Sequence[np.ndarray]) -> np.ndarray:
-    """Values (T - 1,) of both feet, from each frame to the next, as (T, 2): NaN in the first."""
+    """Values (T - 1,) of both feet between consecutive frames as (T, 2), NaN in the first frame."""
     return np.concatenate([np.full((1, 2), np.nan), np.stack(feet, 1)])

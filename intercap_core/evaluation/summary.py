@@ -23,32 +23,26 @@ _RIG = "rig/"
 
 @dataclass(frozen=True)
 class FittedBody:
-    """Which body file a sequence was fitted with, and how many numbers of it."""
+    """The body model file with which a sequence was fitted."""
 
     gender: str
-    digest: str
-    num_betas: int
-    num_expression: int
+    digest: str  # of the file
+    num_betas: int  # shape coefficients that were fitted
+    num_expression: int  # expression coefficients that were fitted
 
 
 @dataclass(frozen=True, eq=False)
 class SequenceSummary:
-    """One sequence's summary artefact.
-
-    ``intent`` is "" where the table does not say; ``rig`` holds the datasets ``rig/...`` of
-    :data:`SUMMARY` by name; ``body_contact`` (V,) counts frames, None without an object;
-    ``surface`` (N, 3) and ``surface_contact`` (N,) are of the object in its own frame.
-    ``made_by``: schema version and digest of settings by stage.
-    """
+    """One sequence's summary artefact; contact is None without an object."""
 
     metrics: SequenceMetrics
-    intent: str
+    intent: str  # of the table of sequences; "" if not given
     body: FittedBody
-    rig: Mapping[str, np.ndarray] = field(repr=False)
-    body_contact: np.ndarray | None = field(repr=False)
-    surface: np.ndarray | None = field(repr=False)
-    surface_contact: np.ndarray | None = field(repr=False)
-    made_by: Mapping[str, tuple[int, str]]
+    rig: Mapping[str, np.ndarray] = field(repr=False)  # datasets ``rig/...`` of SUMMARY by name
+    body_contact: np.ndarray | None = field(repr=False)  # (V,) number of frames in contact
+    surface: np.ndarray | None = field(repr=False)  # (N, 3) object samples, object frame
+    surface_contact: np.ndarray | None = field(repr=False)  # (N,) number of frames in contact
+    made_by: Mapping[str, tuple[int, str]]  # schema version and settings digest by stage
 
     @property
     def name(self) -> str:
@@ -57,7 +51,7 @@ class SequenceSummary:
 
     @property
     def residuals(self) -> list[tuple[str, float, float]]:
-        """Name, before and after of each pair of cameras, metres."""
+        """Residuals of each pair of cameras: name, before and after refinement, metres."""
         names = self.rig["camera_names"]
         return [
             (f"{names[i]}–{names[j]}", float(before), float(after))
@@ -71,7 +65,7 @@ class SequenceSummary:
 
     @classmethod
     def read(cls, path: Path) -> SequenceSummary:
-        """Raises UserError as :func:`artefacts.read` does."""
+        """Read a summary artefact; raises UserError where it cannot be read."""
         with artefacts.read(path, SUMMARY) as artefact:
 
             def optional(key: str) -> np.ndarray | None:
@@ -109,10 +103,10 @@ class SequenceSummary:
 
 
 def write(output: Path, paths: Mapping[str, Path], *, intent: str) -> None:
-    """Write the summary of one sequence from its artefacts by stage.
+    """Write the summary of one sequence.
 
-    ``paths`` names every stage that a sequence's result rests on, scene, joint and metrics among
-    them. Raises UserError where one is missing or broken.
+    ``paths`` holds the artefacts of all stages on which the result depends, by stage; scene, joint
+    and metrics are required. Raises UserError where an artefact cannot be read.
     """
     with (
         artefacts.read(paths["metrics"], METRICS) as metrics,
@@ -173,30 +167,29 @@ def _rig(scene: Artefact) -> dict[str, np.ndarray | list[str]]:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceHeat:
-    """Share of ``frames`` in which each of ``points`` (N, 3), rest pose, is in contact (N,)."""
+    """Contact likelihood on the surface of one object."""
 
-    points: np.ndarray
-    likelihood: np.ndarray
-    frames: int
+    points: np.ndarray  # (N, 3) samples, object frame
+    likelihood: np.ndarray  # (N,) share of the frames in which a sample is in contact
+    frames: int  # number of frames
 
 
 @dataclass(frozen=True, eq=False)
 class Heatmaps:
-    """``body`` (V,) share of ``body_frames`` in contact; one map an object by name. ``left_out``:
-    sequences that do not count in a map, by name, and why."""
+    """Contact likelihood on the body and on each object."""
 
-    body: np.ndarray
-    body_frames: int
-    objects: dict[str, SurfaceHeat]
-    left_out: dict[str, list[str]] = field(default_factory=dict)
+    body: np.ndarray  # (V,) share of the frames in which a vertex is in contact
+    body_frames: int  # number of frames
+    objects: dict[str, SurfaceHeat]  # by name of the object
+    left_out: dict[str, list[str]] = field(default_factory=dict)  # reasons by excluded sequence
 
 
 def collect_heatmaps(summaries: Sequence[SequenceSummary]) -> Heatmaps:
-    """Add up the sequences' counts at 4.5 mm.
+    """Add up the sequences' contact counts at 4.5 mm.
 
-    Sequences without an object count in none of the maps. A map lies on one surface: bodies of
-    another vertex count than the first one's, and objects that were measured with another mesh
-    than the first one of their name, are left out and told.
+    Sequences without an object are skipped. All sequences of a map must share one surface: the
+    first sequence defines it. Bodies with another number of vertices and objects measured with
+    another mesh are excluded and listed in ``left_out``.
     """
     body = np.zeros(0)
     body_frames = 0
@@ -216,15 +209,16 @@ def collect_heatmaps(summaries: Sequence[SequenceSummary]) -> Heatmaps:
             body_frames += count
         else:
             left_out.setdefault(summary.name, []).append(
-                f"its body has {len(contact)} vertices where the sequences before have "
-                f"{len(body)}: not in the body's heatmap"
+                f"its body has {len(contact)} vertices, those of the sequences before {len(body)}: "
+                "not in the body's heatmap"
             )
         if name not in counts:
             counts[name], points[name], frames[name] = np.zeros(len(found)), here, 0
         if not np.array_equal(points[name], here):
             left_out.setdefault(summary.name, []).append(
-                f"object {name!r} was measured with another mesh than in the sequences before: not "
-                "in its heatmap; re-run stage 'metrics' of those that have the older mesh"
+                f"object {name!r} was measured with another mesh than in the sequences before: "
+                "excluded from its heatmap; re-run stage 'metrics' of the sequences with the older "
+                "mesh"
             )
             continue
         counts[name] += found

@@ -1,4 +1,4 @@
-"""The fitted bodies and objects of a sequence, as the artefacts hold them."""
+"""Fitted bodies and object poses of a sequence, read from the artefacts."""
 
 from __future__ import annotations
 
@@ -27,15 +27,14 @@ _TIPS = [
 
 @dataclass(frozen=True, eq=False)
 class BodyTrack:
-    """T bodies. ``sigma`` (T, 55) stated deviation of the joints or None, ``joints`` (T, 55, 3);
-    ``flagged`` (T,): the stage itself does not trust the frame."""
+    """The T fitted bodies of a sequence, master frame, metres."""
 
     model: BodyModel
     parameters: BodyParameters
-    joints: np.ndarray
-    tips: np.ndarray
-    flagged: np.ndarray
-    sigma: np.ndarray | None = None
+    joints: np.ndarray  # (T, 55, 3)
+    tips: np.ndarray  # (T, 10, 3) fingertips, thumb to little finger, left hand first
+    flagged: np.ndarray  # (T,) the stage marked the frame as unreliable
+    sigma: np.ndarray | None = None  # (T, 55) stated standard deviation of the joints
 
     def frame(self, t: int) -> np.ndarray:
         """Posed vertices (V, 3) float32 of one frame."""
@@ -43,7 +42,7 @@ class BodyTrack:
             return self.model.forward(self.parameters.frames(slice(t, t + 1))).vertices[0].numpy()
 
     def vertices(self) -> Iterator[np.ndarray]:
-        """Posed vertices (V, 3) float32 of one frame after another."""
+        """Iterate over the frames' posed vertices (V, 3) float32."""
         for start in range(0, len(self.joints), _CHUNK):
             chunk = self.parameters.frames(slice(start, start + _CHUNK))
             with torch.no_grad():
@@ -52,22 +51,24 @@ class BodyTrack:
 
 @dataclass(frozen=True, eq=False)
 class ObjectTrack:
-    """T poses master_from_object, all NaN where there is no object; ``flagged`` (T,): the stage
-    itself does not trust the frame; ``covariance`` (T, 6, 6) or None."""
+    """T poses master_from_object; all NaN where the recording has no object."""
 
-    rotation: np.ndarray
-    translation: np.ndarray
-    flagged: np.ndarray
-    covariance: np.ndarray | None = None
+    rotation: np.ndarray  # (T, 3, 3)
+    translation: np.ndarray  # (T, 3) metres
+    flagged: np.ndarray  # (T,) the stage marked the frame as unreliable
+    covariance: np.ndarray | None = None  # (T, 6, 6) of rotation vector and translation
 
     @property
     def known(self) -> bool:
-        """Whether there is an object in any frame."""
+        """Whether any frame has a pose."""
         return bool(np.isfinite(self.translation).any())
 
 
 def read_body(path: Path, stage: str, body_models: BodyModels, gender: str) -> BodyTrack:
-    """Bodies of the ``"body_fit"`` or ``"joint"`` artefact; raises UserError as reading does."""
+    """Bodies of the artefact of stage ``"body_fit"`` or ``"joint"``.
+
+    Raises UserError where the artefact cannot be read.
+    """
     with artefacts.read(path, BODY_FIT if stage == "body_fit" else JOINT) as artefact:
         parameters = read_parameters(artefact)
         first = stage == "body_fit"
@@ -83,7 +84,10 @@ def read_body(path: Path, stage: str, body_models: BodyModels, gender: str) -> B
 
 
 def read_object(path: Path, stage: str) -> ObjectTrack:
-    """Poses of the ``"object_track"`` or ``"joint"`` artefact; raises UserError as reading does."""
+    """Poses of the artefact of stage ``"object_track"`` or ``"joint"``.
+
+    Raises UserError where the artefact cannot be read.
+    """
     with artefacts.read(path, OBJECT_TRACK if stage == "object_track" else JOINT) as artefact:
         first = stage == "object_track"
         flags = ("lost", "ambiguous") if first else ("flagged",)

@@ -19,9 +19,11 @@ from intercap_core.schemas import METRIC_REGIONS, TRUTH
 
 
 def match_times(path: Path, true_times: np.ndarray, times: np.ndarray, fps: float) -> np.ndarray:
-    """The set (T,) of the truth ``path`` nearest to each recorded one; times in seconds, rising.
+    """Index (T,) of the true frame set nearest in time to each recorded set.
 
-    Raises UserError where the truth has no set within half a frame of a recorded one.
+    Both times are in seconds and increasing; ``path`` names the truth in the error message.
+
+    Raises UserError where the truth has no set within half a frame of a recorded set.
     """
     after = np.clip(np.searchsorted(true_times, times), 0, len(true_times) - 1)
     before = np.maximum(after - 1, 0)
@@ -30,9 +32,9 @@ def match_times(path: Path, true_times: np.ndarray, times: np.ndarray, fps: floa
     apart = np.abs(true_times[nearest] - times)
     if apart.max(initial=0) > 0.5 / fps:
         raise UserError(
-            f"{path}: holds {len(true_times)} frames and the recording {len(times)}; that of "
-            f"{times[np.argmax(apart)]:.3f} s is {apart.max():.3f} s from the nearest; make the "
-            "truth of this recording again or leave it out"
+            f"{path}: holds {len(true_times)} frames, the recording {len(times)}; the recorded frame at "
+            f"{times[np.argmax(apart)]:.3f} s is {apart.max():.3f} s from the nearest true frame; "
+            "make the truth of this recording again or remove it from the table"
         )
     return nearest
 
@@ -41,42 +43,36 @@ def match_times(path: Path, true_times: np.ndarray, times: np.ndarray, fps: floa
 class Truth:
     """True body and object in the recording's T frame sets, master frame, metres.
 
-    ``vertices`` (T, V, 3) of the true skin that correspond to the fitted mesh's, or None where the
-    fitted body has another topology than the one the truth was matched to; ``visible`` (T, V) of
-    them; ``joints`` (T, 55, 3), ``tips`` (T, 10, 3); ``object_vertices`` (Vo, 3), ``object_faces``
-    (Fo, 3) and ``object_visible`` (T, Vo) of the true object's own mesh; ``rotation`` (T, 3, 3),
-    ``translation`` (T, 3), of a person alone NaN, and the mesh empty; ``contact_region`` (T, 12) in
-    the order of METRIC_REGIONS; the ``floor`` that bare soles are on, and how high above it what is
-    under the left and the right sole lies, ``support_height`` (T, 2); ``master_from_colour``
-    (C, 4, 4) and ``camera_names``.
+    Without an object the object's mesh is empty and its pose NaN. ``vertices`` and ``visible`` are
+    None where the fitted body's topology is not the one to which the truth was matched.
     """
 
-    vertices: np.ndarray | None
-    visible: np.ndarray | None
-    joints: np.ndarray
-    tips: np.ndarray
-    object_vertices: np.ndarray
-    object_faces: np.ndarray
-    object_visible: np.ndarray
-    rotation: np.ndarray
-    translation: np.ndarray
-    object_views: np.ndarray
-    contact_region: np.ndarray
-    floor: Floor
-    support_height: np.ndarray
-    camera_names: tuple[str, ...]
-    master_from_colour: np.ndarray
+    vertices: np.ndarray | None  # (T, V, 3) points of the true skin at the fitted mesh's vertices
+    visible: np.ndarray | None  # (T, V) whether a camera truly sees them
+    joints: np.ndarray  # (T, 55, 3)
+    tips: np.ndarray  # (T, 10, 3) fingertips, thumb to little finger, left hand first
+    object_vertices: np.ndarray  # (Vo, 3) of the true object's mesh, object frame
+    object_faces: np.ndarray  # (Fo, 3)
+    object_visible: np.ndarray  # (T, Vo) whether a camera truly sees each object vertex
+    rotation: np.ndarray  # (T, 3, 3) master_from_object
+    translation: np.ndarray  # (T, 3) master_from_object
+    object_views: np.ndarray  # (T,) number of cameras that truly see the object
+    contact_region: np.ndarray  # (T, 12) true contact, in the order of METRIC_REGIONS
+    floor: Floor  # the plane on which bare soles stand
+    support_height: np.ndarray  # (T, 2) height of the surface under the left and the right sole
+    camera_names: tuple[str, ...]  # C names
+    master_from_colour: np.ndarray  # (C, 4, 4) true camera poses
 
     @property
     def has_object(self) -> bool:
-        """Whether there truly is an object."""
+        """Whether the recording has an object."""
         return len(self.object_faces) > 0
 
     @classmethod
     def load(cls, path: Path, times: np.ndarray, fps: float, num_vertices: int) -> Truth:
         """Read the truth at the frame sets' ``times`` (T,), seconds.
 
-        Raises UserError where the file is broken or does not cover those moments.
+        Raises UserError where the file is damaged or does not cover these times.
         """
         with artefacts.read(path, TRUTH) as file:
             at = match_times(path, file["times"], times, fps)
@@ -90,7 +86,7 @@ class Truth:
                 seen = file["body_visible"][at].astype(np.float32)[..., None]
                 visible = body.corresponding_vertices(seen, faces, face, weights)[..., 0] > 0.5
             names = file.text("region_names")
-            # bare feet in shoes stand as high as the soles are thick
+            # The body model's bare soles are above the ground by the thickness of the shoes' soles.
             soles = float(file.attributes.get("sole_m", 0.0))
             offset = float(file.attributes["ground_offset"]) - soles
             columns = [names.index(name) for name in METRIC_REGIONS]
@@ -118,9 +114,11 @@ class Truth:
         samples: SurfaceSamples,
         mesh: ObjectMesh,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """True object points nearest to the tracked mesh's samples, and which cameras truly see.
+        """True object vertices nearest to the tracked mesh's samples, and their visibility.
 
-        Returns the points (N, 3), object frame, and (T, N) bool.
+        Returns:
+            points: (N, 3) object frame.
+            visible: (T, N) whether a camera truly sees each point.
         """
         points = samples.of(mesh.vertices, mesh.faces)
         nearest = cKDTree(self.object_vertices).query(points)[1]
@@ -133,8 +131,7 @@ def _support_height(file: artefacts.Artefact, at: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class _TrueObject:
-    """The object's part of the file at T moments: an empty mesh without poses where there is
-    none."""
+    """The object's datasets at T frame sets; see the fields of :class:`Truth`."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -166,7 +163,7 @@ class _TrueObject:
 
 
 def body_errors(truth: Truth, track: BodyTrack, fps: float) -> dict[str, np.ndarray]:
-    """Errors of T fitted bodies' joints by key of the metrics artefact."""
+    """Joint errors of T fitted bodies, by dataset of the metrics artefact."""
     joints, tips = track.joints, track.tips
     true = truth.joints
     hands = np.r_[body.FINGER_JOINTS[0], body.FINGER_JOINTS[1]]
@@ -195,9 +192,9 @@ def object_errors(
     mesh: ObjectMesh,
     fps: float,
 ) -> dict[str, np.ndarray]:
-    """Errors of T object poses by key of the metrics artefact."""
+    """Errors of T object poses, by dataset of the metrics artefact."""
     if not track.known:
-        return _missed(len(truth.rotation))
+        return _errors_of_missed_object(len(truth.rotation))
     centre = mesh.centre_of_mass
     fitted = object_pose.posed_point(track.rotation, track.translation, centre)
     true = object_pose.posed_point(truth.rotation, truth.translation, centre)
@@ -220,8 +217,8 @@ def object_errors(
     return result
 
 
-def _missed(frames: int) -> dict[str, np.ndarray]:
-    """Errors of an object that is there and that was found in no frame: beyond any bound."""
+def _errors_of_missed_object(frames: int) -> dict[str, np.ndarray]:
+    """Errors of an object that the stage found in no frame: infinite."""
     unknown = np.full(frames, np.nan)
     return {
         "object_translation": np.full(frames, np.inf),
@@ -234,7 +231,10 @@ def _missed(frames: int) -> dict[str, np.ndarray]:
 
 
 def contact_counts(distance: np.ndarray, true_distance: np.ndarray) -> np.ndarray:
-    """Counts (W, 4) of one frame's body vertices by threshold, from signed distances (V,)."""
+    """Confusion counts (W, 4) of a frame's body vertices for each threshold of the sweep.
+
+    Both arguments are signed distances (V,) to the object, metres.
+    """
     return np.stack(
         [
             contact.confusion(

@@ -162,7 +162,7 @@ def test_truth_at_other_times_is_refused_whatever_its_length(
     shutil.copy(capture.paths["truth"], wrong.paths["truth"])
     with h5py.File(wrong.paths["truth"], "r+") as file:
         file["times"][...] *= 1.5
-    with pytest.raises(UserError, match=r"truth\.h5: holds 5 frames and the recording 5"):
+    with pytest.raises(UserError, match=r"truth\.h5: holds 5 frames, the recording 5"):
         _run(wrong, tmp_path / "metrics.h5", truth=True)
 
 

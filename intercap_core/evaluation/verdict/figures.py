@@ -15,13 +15,12 @@ from intercap_core.evaluation.figures import Figures, SequenceMetrics
 
 @dataclass(frozen=True)
 class ImageMeasure:
-    """A measure of how well an image agrees: the dataset's name within verdict/, what it is, the
-    unit that it is told in, and how many of them the dataset's unit has."""
+    """A measure of the agreement between a result and an image."""
 
-    key: str
-    of: str
-    unit: str
-    scale: float
+    key: str  # dataset within verdict/ of the metrics artefact
+    of: str  # description
+    unit: str  # unit in which it is reported
+    scale: float  # factor from the dataset's unit to ``unit``
 
 
 IMAGE_MEASURES = (
@@ -34,18 +33,16 @@ IMAGE_MEASURES = (
 
 @dataclass(frozen=True)
 class HeldOutCamera:
-    """Medians over the frames that the ``camera`` judges, in the order of ``IMAGE_MEASURES``: errors of the
-    result (``held_in``) and of a fit without the camera (``held_out``); ``shift_mm`` by part, how
-    far it is elsewhere without the camera (root mean square over frames). NaN = not known."""
+    """Medians over the frames for which a camera was held out; NaN where unknown."""
 
     camera: str
-    held_in: tuple[float, ...]
-    held_out: tuple[float, ...]
-    shift_mm: dict[str, float]
+    held_in: tuple[float, ...]  # errors of the result, in the order of IMAGE_MEASURES
+    held_out: tuple[float, ...]  # errors of the fit without the camera, same order
+    shift_mm: dict[str, float]  # RMS displacement of each part without the camera
 
 
 def held_out_cameras(sequence: SequenceMetrics) -> Sequence[HeldOutCamera]:
-    """Of every camera that was held out; empty where none was."""
+    """The figures of every camera that was held out; empty where none was."""
     values = sequence.values
     if "verdict/held_camera" not in values:
         return ()
@@ -78,9 +75,9 @@ def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")
 
 
-BAD_MM = 20.0  # a part of a sequence whose error is larger should not go unnoticed
-WITHIN = 1.5  # a stated error within this factor of the true one tells it
-# the figure against truth of each judged part
+BAD_MM = 20.0  # a part with a larger mean error over a sequence should have a large stated error
+WITHIN = 1.5  # factor within which a stated error counts as correct
+# the figure against truth of each part
 TRUE = {
     "body": "body_pve_mm",
     "hands": "hand_mpjpe_mm",
@@ -90,30 +87,26 @@ TRUE = {
 
 @dataclass(frozen=True)
 class StatedError:
-    """Of a sequence's ``part``: the ``stated`` error, millimetres, within ``factor`` of which four
-    of five true errors are, and the ``true`` one over the frames of which it is stated; NaN where
-    it is not known. ``silent``: why nothing is stated. ``repeated``: by how much the part is
-    elsewhere where only the frames beside it are seen, odd from even and even from odd, in the mean
-    over the same frames, millimetres; NaN where nothing was held out."""
+    """Stated and true error of one part of a sequence, means over the frames with a statement."""
 
     sequence: str
     part: str
-    stated: float
-    factor: float
-    true: float
-    silent: str = ""
-    repeated: float = float("nan")
+    stated: float  # millimetres; NaN where no error is stated
+    factor: float  # 80 % of the true errors are within this factor of ``stated``
+    true: float  # millimetres; NaN without truth
+    silent: str = ""  # reason why no error is stated
+    repeated: float = float("nan")  # mm, displacement if every other frame's images are not used
 
 
 def stated_errors(sequence: SequenceMetrics) -> Sequence[StatedError]:
-    """Of every judged part; empty where no verdict was asked for."""
-    if sequence not in _known:
-        _known[sequence] = _stated(sequence)
-    return _known[sequence]
+    """Stated errors of every part; empty where the metrics have no verdict."""
+    if sequence not in _stated_cache:
+        _stated_cache[sequence] = _stated(sequence)
+    return _stated_cache[sequence]
 
 
-# Tables, figures and pages each ask for them, and those with truth take a while.
-_known: WeakKeyDictionary[SequenceMetrics, tuple[StatedError, ...]] = WeakKeyDictionary()
+# Tables, figures and pages each need the stated errors; those with truth take long to compute.
+_stated_cache: WeakKeyDictionary[SequenceMetrics, tuple[StatedError, ...]] = WeakKeyDictionary()
 
 
 def _stated(sequence: SequenceMetrics) -> tuple[StatedError, ...]:
@@ -135,8 +128,10 @@ def _stated(sequence: SequenceMetrics) -> tuple[StatedError, ...]:
 
 
 def _true(sequence: SequenceMetrics, part: str, stated: np.ndarray) -> float:
-    """The true error of a part, millimetres, over the frames (T,) of which an error is stated, all
-    where it is stated of none; NaN without truth."""
+    """True error of a part, millimetres; NaN without truth.
+
+    Mean over the frames in the mask ``stated`` (T,), over all frames if the mask is empty.
+    """
     if not sequence.has_truth:
         return float("nan")
     judged = sequence
@@ -151,8 +146,10 @@ def _true(sequence: SequenceMetrics, part: str, stated: np.ndarray) -> float:
 
 
 def _repeated(sequence: SequenceMetrics, place: int) -> float:
-    """The mean of ``verdict/repeated`` of the part at ``place``, millimetres, over the frames of
-    which an error is stated, all where it is stated of none; NaN where it was not measured."""
+    """Mean of ``verdict/repeated`` of the part at index ``place``, millimetres; NaN if unknown.
+
+    Mean over the frames with a stated error, over all frames if there is none.
+    """
     if "verdict/repeated" not in sequence.values:
         return float("nan")
     moved = sequence.values["verdict/repeated"][place]
@@ -162,7 +159,7 @@ def _repeated(sequence: SequenceMetrics, place: int) -> float:
 
 
 def mean_stated(sequences: Sequence[SequenceMetrics]) -> dict[str, float]:
-    """Mean stated error of each part, millimetres, over the sequences of which one is stated."""
+    """Mean stated error of each part, millimetres, over the sequences that state one."""
     found: dict[str, list[float]] = {}
     for error in (e for s in sequences for e in stated_errors(s)):
         if np.isfinite(error.stated):
@@ -171,11 +168,12 @@ def mean_stated(sequences: Sequence[SequenceMetrics]) -> dict[str, float]:
 
 
 def verdict_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
-    """How stated errors tell the true ones, over sequences with truth; empty without.
+    """Agreement of stated and true errors over the sequences with truth; empty without truth.
 
-    ``rank_correlation`` (Spearman) over sequences, by part and their mean; ``within_factor_share``
-    of all parts of all sequences, ``bad_sequence_recall``: of those above BAD_MM the share that is
-    stated to be above it. Where nothing is stated, nothing is counted but ``silent_share``.
+    - ``silent_share``: share of parts without a stated error; these count in no other figure.
+    - ``rank_correlation``: Spearman's, over sequences, of each part and their mean.
+    - ``within_factor_share``: share of parts whose stated error is within WITHIN of the true error.
+    - ``bad_sequence_recall``: share of the parts above BAD_MM whose stated error is above it too.
     """
     found = [e for s in sequences for e in stated_errors(s) if np.isfinite(e.true)]
     said = [e for e in found if np.isfinite(e.stated)]

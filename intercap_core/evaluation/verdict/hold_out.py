@@ -40,7 +40,7 @@ HELD_S = 0.2
 
 
 class JudgedPart(StrEnum):
-    """What is judged."""
+    """A part of a result whose error is stated."""
 
     BODY = "body"
     HANDS = "hands"
@@ -48,7 +48,7 @@ class JudgedPart(StrEnum):
 
 
 class Refits:
-    """Refits around one ``state``, at which the ``assembly``'s terms were refreshed."""
+    """Refits around one ``state``; the terms of ``assembly`` must have been refreshed at it."""
 
     def __init__(self, assembly: Assembly, state: State) -> None:
         self.state = state
@@ -66,7 +66,7 @@ class Refits:
         self._descent = self._step(every)
 
     def with_views(self, used: np.ndarray) -> State:
-        """The state that the views ``used`` (T, C) alone lead to."""
+        """The state fitted to the images in the mask ``used`` (T, C)."""
         return self.state.moved(limited(self._step(used) - self._descent))
 
     def _step(self, used: np.ndarray) -> np.ndarray:
@@ -74,7 +74,7 @@ class Refits:
         for columns, term in self._seen:
             equations.add_blocks(term.name, columns, *term.of_views(used, self.state))
         step = equations.step(np.full(len(self.state), MIN_DAMPING))
-        if step is None:  # nothing holds some parameter: no step tells anything
+        if step is None:  # some parameter is not determined
             return np.full(self._rest.gradient.shape, np.nan)
         return step
 
@@ -84,49 +84,37 @@ JOINTS = {JudgedPart.BODY: slice(0, 22), JudgedPart.HANDS: slice(25, 55)}
 
 @dataclass(frozen=True, eq=False)
 class ViewErrors:
-    """How far the image of each camera is from a state, (T, C); NaN = it shows nothing of it.
+    """Errors of a state in each image, (T, C); NaN where the image does not show the part."""
 
-    ``keypoint_px`` median over the body's keypoints; ``person_m`` median distance of the person's
-    points from the skin beyond clothes; ``overlap`` IoU of the object's mask and render;
-    ``object_depth_m`` median error of its depth.
-    """
-
-    keypoint_px: np.ndarray
-    person_m: np.ndarray
-    overlap: np.ndarray
-    object_depth_m: np.ndarray
+    keypoint_px: np.ndarray  # median reprojection error of the body's keypoints
+    person_m: np.ndarray  # median distance of the person's points from the skin, less clothing
+    overlap: np.ndarray  # intersection over union of the object's mask and its render
+    object_depth_m: np.ndarray  # median depth error of the object
 
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """The judgement.
+    """Result of a held-out evaluation of T frames; V cameras were held out in turn."""
 
-    ``cameras`` (V,) that were held out, one after another; ``held`` (T,) the one that judges a
-    frame, whose own errors are those of ``without``: of states that it has no part in. ``within``:
-    of the result itself. ``keypoint_m`` (T,): the held camera's error of keypoints at the person's
-    distance, metres. ``shift`` (V, T) metres by which each part moves without a camera,
-    ``repeated`` (T,) by how much it is elsewhere where only the neighbouring frames are seen.
-    """
-
-    cameras: np.ndarray
-    held: np.ndarray
-    within: ViewErrors
-    without: ViewErrors
-    keypoint_m: np.ndarray
-    shift: dict[JudgedPart, np.ndarray]
-    repeated: dict[JudgedPart, np.ndarray]
+    cameras: np.ndarray  # (V,) indices of the cameras that were held out
+    camera_index: np.ndarray  # (T,) camera held out for this frame
+    all_cameras: ViewErrors  # errors of the result itself, in all cameras
+    held_out: ViewErrors  # errors in the held-out camera of a fit that did not use it
+    keypoint_m: np.ndarray  # (T,) keypoint error in the held-out camera at the person's distance
+    shift: dict[JudgedPart, np.ndarray]  # (V, T) displacement of a part without a camera, metres
+    repeated: dict[JudgedPart, np.ndarray]  # (T,) displacement if this frame's images are not used
 
 
 def hold_out(inputs: JointInputs, settings: JointSettings, result: JointResult) -> HeldOut | None:
-    """Refit ``result`` without each camera and from every other frame, and judge it by the rest.
+    """Refit ``result`` without each camera and from every other frame; compare with what was left out.
 
-    None where fewer than two cameras show the person: without one of them nothing is left.
+    None where fewer than two cameras show the person.
     """
     assembly = assemble(inputs, settings)
     state = result.state
-    _hold_fixed(assembly, result)
+    _fix_to_result(assembly, result)
     assembly.problem.refresh(state)
-    within = _within(assembly)
+    within = _errors_within(assembly)
     seen = np.isfinite(within.keypoint_px).any(axis=0)
     cameras = np.flatnonzero(seen)
     if len(cameras) < 2:
@@ -145,18 +133,18 @@ def hold_out(inputs: JointInputs, settings: JointSettings, result: JointResult) 
         half.append(refits.with_views(used))
     block = np.arange(len(state)) // max(1, round(inputs.fps * HELD_S))
     turn = block % len(cameras)
-    mixed = _taken(without, turn)
+    mixed = _select_states(without, turn)
     held = cameras[turn]
-    judged = _judged(assembly, mixed, held)
+    judged = _errors_in_held_out(assembly, mixed, held)
     points = _points(inputs, state)
     moved = [_points(inputs, other) for other in without]
-    halves = _points(inputs, _taken(half, np.arange(len(state)) % 2))
+    halves = _points(inputs, _select_states(half, np.arange(len(state)) % 2))
     return HeldOut(
         cameras,
         held,
         within,
         judged,
-        _at_person(judged.keypoint_px, result, points[JudgedPart.BODY]),
+        _pixels_to_metres(judged.keypoint_px, result, points[JudgedPart.BODY]),
         {
             part: np.stack([_rms(other[part] - at) for other in moved])
             for part, at in points.items()
@@ -165,8 +153,8 @@ def hold_out(inputs: JointInputs, settings: JointSettings, result: JointResult) 
     )
 
 
-def _hold_fixed(assembly: Assembly, result: JointResult) -> None:
-    """Cameras, time offsets and contact as the result has them."""
+def _fix_to_result(assembly: Assembly, result: JointResult) -> None:
+    """Set cameras, time offsets and contact to those of the result."""
     if assembly.contact is not None:
         assembly.contact.take_contact(result.probability, result.annotated)
     assembly.body.take_cameras(result.cameras, result.time_offset)
@@ -175,16 +163,16 @@ def _hold_fixed(assembly: Assembly, result: JointResult) -> None:
         assembly.object_.take_cameras(result.cameras)
 
 
-def _within(assembly: Assembly) -> ViewErrors:
-    """Of all cameras, at the state at which body and object were refreshed last."""
+def _errors_within(assembly: Assembly) -> ViewErrors:
+    """Errors in all cameras, at the state at which the terms were refreshed last."""
     images = assembly.object_
     return _view_errors(
         assembly.body, images.reports() if isinstance(images, ObjectImagesData) else ()
     )
 
 
-def _judged(assembly: Assembly, state: State, held: np.ndarray) -> ViewErrors:
-    """Those of the camera that judges each frame, ``held`` (T,), alone, at ``state``."""
+def _errors_in_held_out(assembly: Assembly, state: State, held: np.ndarray) -> ViewErrors:
+    """Errors of ``state`` in the camera ``held`` (T,) of each frame; NaN in the other cameras."""
     images = assembly.object_
     assembly.body.compare(state, held)
     found = _view_errors(
@@ -195,7 +183,7 @@ def _judged(assembly: Assembly, state: State, held: np.ndarray) -> ViewErrors:
 
 
 def _view_errors(body: BodyData, reports: Iterable[tuple[int, int, ViewReport]]) -> ViewErrors:
-    """Of the body as it was compared last, and the object's ``reports`` by frame and camera."""
+    """Errors of the body at its last comparison and of the object's (frame, camera, report)."""
     keypoint = body.residuals().keypoint_px
     overlap, depth = np.full((2, *keypoint.shape), np.nan)
     for t, camera, report in reports:
@@ -204,9 +192,11 @@ def _view_errors(body: BodyData, reports: Iterable[tuple[int, int, ViewReport]])
     return ViewErrors(keypoint, body.person_by_view(), overlap, depth)
 
 
-def _at_person(pixels: np.ndarray, result: JointResult, joints: np.ndarray) -> np.ndarray:
-    """Errors (T,), metres, of those in ``pixels`` (T, C), one camera a frame, at the middle of the
-    body's ``joints`` (T, J, 3)."""
+def _pixels_to_metres(pixels: np.ndarray, result: JointResult, joints: np.ndarray) -> np.ndarray:
+    """Errors (T,) in metres at the mean depth of the body's ``joints`` (T, J, 3).
+
+    ``pixels`` (T, C) has one finite value per frame.
+    """
     rig = result.cameras.rig
     pose = rig.colour_from_master
     depth = joints.mean(axis=1) @ pose[:, 2, :3].T + pose[:, 2, 3]
@@ -214,19 +204,18 @@ def _at_person(pixels: np.ndarray, result: JointResult, joints: np.ndarray) -> n
     return np.where(np.isfinite(size).any(axis=1), np.nansum(size, axis=1), np.nan)
 
 
-def _taken(states: list[State], which: np.ndarray) -> State:
-    """Each frame of the state of this number (T,)."""
-    frames, one = np.arange(len(which)), states[0]
+def _select_states(states: list[State], which: np.ndarray) -> State:
+    """State whose frame t is that of ``states[which[t]]``; shapes are those of the first state."""
+    frames, first = np.arange(len(which)), states[0]
     body, rotation, translation = (
         np.stack([getattr(state, name) for state in states])[which, frames]
         for name in ("body", "rotation", "translation")
     )
-    return State(body, one.betas, one.expression, rotation, translation)
+    return State(body, first.betas, first.expression, rotation, translation)
 
 
 def _points(inputs: JointInputs, state: State) -> dict[JudgedPart, np.ndarray]:
-    """What is compared of each part (T, K, 3): joints and, where there is one, the object's centre
-    of mass."""
+    """Points (T, K, 3) by which each part is compared: joints, or the object's centre of mass."""
     with torch.no_grad():
         posed = inputs.model(state.parameters(inputs.model), vertex_ids=np.array([0]))
     joints = posed.joints.double().cpu().numpy()

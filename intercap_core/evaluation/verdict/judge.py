@@ -1,4 +1,4 @@
-"""The verdict on one sequence: what was held out, and the error that is stated of each part."""
+"""The verdict on one sequence: held-out evaluation and stated error of each part."""
 
 from __future__ import annotations
 
@@ -30,13 +30,12 @@ Values = dict[str, np.ndarray | list[str]]
 
 @dataclass(frozen=True, eq=False)
 class SequenceVerdict:
-    """Of T frames and C cameras: what was held out, None where nothing could be, and what is stated
-    of each part: not of an object where there is none."""
+    """Held-out evaluation and stated errors of a sequence."""
 
-    cameras: tuple[str, ...]
-    frames: int
-    held: HeldOut | None
-    stated: dict[JudgedPart, ErrorEstimate]
+    cameras: tuple[str, ...]  # names of the C cameras
+    frames: int  # T
+    held: HeldOut | None  # None where fewer than two cameras show the person
+    stated: dict[JudgedPart, ErrorEstimate]  # without the object where the recording has none
 
     @classmethod
     def reach(
@@ -55,7 +54,7 @@ class SequenceVerdict:
         body_settings: BodyFitSettings,
         track_settings: ObjectTrackSettings,
     ) -> SequenceVerdict:
-        """Judge joint.h5 by what the stages before it had; no truth is read.
+        """Evaluate the joint artefact with the inputs of the joint stage; no truth is read.
 
         Raises UserError where an artefact or the mesh cannot be used.
         """
@@ -91,7 +90,7 @@ class SequenceVerdict:
         }
         for part, said in stated.items():
             if said.silent:
-                log.warning("no error is stated of the %s: %s", part, said.silent)
+                log.warning("%s: no stated error: %s", part, said.silent)
             else:
                 low, high = 1e3 * said.error / said.factor, 1e3 * said.error * said.factor
                 log.info(
@@ -100,7 +99,7 @@ class SequenceVerdict:
         return cls(names, len(result.state), held, stated)
 
     def values(self) -> Values:
-        """As the metrics artefact holds them, without their prefix."""
+        """Datasets of the metrics artefact by name, without the prefix ``verdict/``."""
         parts = list(self.stated)
         said = [self.stated[part] for part in parts]
         values: Values = {
@@ -121,18 +120,18 @@ class SequenceVerdict:
         for place, part in enumerate(parts):
             shift[place, held.cameras] = held.shift[part]
         values |= {
-            "held_camera": held.held,
+            "held_camera": held.camera_index,
             "shift": shift,
             "repeated": np.stack([held.repeated[part] for part in parts]),
         }
-        for name, within in vars(held.within).items():
+        for name, within in vars(held.all_cameras).items():
             values[name] = within
-            values[f"{name}_held_out"] = getattr(held.without, name)
+            values[f"{name}_held_out"] = getattr(held.held_out, name)
         return values
 
 
 def _sigma(fits: SequentialFits, part: JudgedPart) -> np.ndarray:
-    """What the sequential fits state of a part (T,), metres."""
+    """Standard deviation (T,) of a part that the sequential fits state, metres."""
     if part == JudgedPart.OBJECT:
         return fits.object_sigma
     return np.sqrt((fits.joint_sigma[:, JOINTS[part]] ** 2).mean(axis=1))
@@ -141,8 +140,10 @@ def _sigma(fits: SequentialFits, part: JudgedPart) -> np.ndarray:
 def _moved(
     inputs: JointInputs, result: JointResult, body_fit: Path, joint: Path
 ) -> dict[JudgedPart, np.ndarray]:
-    """By how much the joint fit is elsewhere than the sequential ones (T,), metres, RMS over a
-    part's joints; of the object at its centre of mass."""
+    """Displacement (T,) of each part from the sequential fits to the joint fit, metres.
+
+    RMS over the joints of a part; at the centre of mass of the object.
+    """
     with artefacts.read(body_fit, BODY_FIT) as before, artefacts.read(joint, JOINT) as after:
         apart = ((after["joints"] - before["joints"]).astype(float) ** 2).sum(axis=2)
     found = {part: np.sqrt(apart[:, at].mean(axis=1)) for part, at in JOINTS.items()}
@@ -156,7 +157,7 @@ def _moved(
 
 
 def _known(fits: SequentialFits, result: JointResult, part: JudgedPart) -> np.ndarray:
-    """Frames (T,) in which the part was measured, and is where it was measured."""
+    """Mask (T,) of the frames in which the part was measured and the joint fit agrees."""
     flags = fits.flags
     if part == JudgedPart.OBJECT:
         return ~(flags.lost | flags.carried) & ~result.contradicted

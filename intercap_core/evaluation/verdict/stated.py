@@ -23,22 +23,21 @@ import numpy as np
 
 from intercap_core.evaluation.verdict.hold_out import HeldOut, JudgedPart
 
-# Of fewer frames of a sequence, as a share, no error is stated: the rest would be a guess.
+# No error is stated where fewer than this share of the frames was measured.
 MIN_JUDGED_SHARE = 0.5
 
 
 class Factors(NamedTuple):
-    """Of the stated error: ``rest``, metres, the factors ``of`` the features, and the ``spread``:
-    four of five true errors are within this factor of the stated one."""
+    """Parameters of the stated error of one part."""
 
-    rest: float
-    of: tuple[float, float, float, float]
-    spread: float
+    rest: float  # error that no held-out camera shows, metres
+    of: tuple[float, float, float, float]  # factors a, b, c, d of the FEATURES
+    spread: float  # 80 % of the true errors are within this factor of the stated error
 
 
-# Fitted by `python -m bench.verdict` to the studio's truth: 41 recordings seen by two to six
-# cameras, with and without depth, at usual and twice the noise, with other builds, people alone and
-# a beam. The spreads are those of kinds of recordings that were left out of the fit.
+# Fitted to the virtual studio by `python -m bench.verdict`: 41 recordings with two to six cameras,
+# with and without depth, at noise scales 1 and 2, with other body builds, people without an object
+# and a balance beam. The spreads are cross-validated: each kind of recording was left out once.
 FACTORS = {
     JudgedPart.BODY: Factors(0.0041, (1.55, 0.07, 0.69, 1.08), 1.28),
     JudgedPart.HANDS: Factors(0.0, (0.97, 0.15, 0.81, 1.40), 1.25),
@@ -51,28 +50,31 @@ FEATURES = ("shift", "keypoint", "sigma", "moved")
 
 @dataclass(frozen=True, eq=False)
 class ErrorEstimate:
-    """What is said of one part: its mean ``error``, metres; four of five are within ``factor`` of
-    it, either way. ``by_frame`` (T,), NaN where nothing is said. ``features``: what it was made of,
-    metres. ``silent``: why nothing is said, "" = it is said."""
+    """The stated error of one part."""
 
-    error: float
-    factor: float
-    by_frame: np.ndarray
-    features: dict[str, float]
-    silent: str = ""
+    error: float  # mean over the frames, metres; NaN where no error is stated
+    factor: float  # 80 % of the true errors are within this factor of ``error``
+    by_frame: np.ndarray  # (T,) metres; NaN in frames without a statement
+    features: dict[str, float]  # mean of each of FEATURES, metres
+    silent: str = ""  # reason why no error is stated; "" if one is stated
 
 
 def estimate_error(
     held: HeldOut | None, part: JudgedPart, sigma: np.ndarray, moved: np.ndarray, known: np.ndarray
 ) -> ErrorEstimate:
-    """The error of ``part``, from what the fits state (``sigma`` (T,), metres) and how far the
-    joint one ``moved`` it (T,), metres, over the frames that are ``known`` (T,) bool: elsewhere a
-    pose is filled in, which no camera speaks of."""
+    """Estimate the error of ``part``.
+
+    Args:
+        held: the held-out evaluation; None where there is none.
+        sigma: (T,) standard deviation that the sequential fits state, metres.
+        moved: (T,) displacement from the sequential fits to the joint fit, metres.
+        known: (T,) mask of the frames in which the part was measured, not filled in.
+    """
     nothing = np.full(len(known), np.nan)
     empty = dict.fromkeys(FEATURES, float("nan"))
     factors = FACTORS[part]
     if held is None:
-        reason = "fewer than two cameras show the person: without one of them nothing is left"
+        reason = "fewer than two cameras show the person, so none can be held out"
         return ErrorEstimate(float("nan"), factors.spread, nothing, empty, reason)
     count = len(held.cameras)
     shift = np.sqrt((count - 1) / count * (held.shift[part] ** 2).sum(axis=0))

@@ -65,7 +65,9 @@ def held(capture: fitted.Capture) -> HeldOut:
 
 def test_every_camera_is_held_out_in_turn(held: HeldOut) -> None:
     np.testing.assert_array_equal(held.cameras, [0, 1, 2])
-    np.testing.assert_array_equal(held.held, [0, 0, 0, 1, 1, 1])  # 0.2 s at 15 frames a second
+    np.testing.assert_array_equal(
+        held.camera_index, [0, 0, 0, 1, 1, 1]
+    )  # 0.2 s at 15 frames a second
     for part in JudgedPart:
         assert held.shift[part].shape == (3, 6)
         assert np.isfinite(held.shift[part]).all()
@@ -73,18 +75,18 @@ def test_every_camera_is_held_out_in_turn(held: HeldOut) -> None:
 
 
 def test_only_the_held_camera_judges_a_frame(held: HeldOut) -> None:
-    for name, without in vars(held.without).items():
+    for name, without in vars(held.held_out).items():
         judged = np.isfinite(without)
-        assert not judged[np.arange(3) != held.held[:, None]].any(), name
-    assert np.isfinite(held.without.keypoint_px).sum() == 6
+        assert not judged[np.arange(3) != held.camera_index[:, None]].any(), name
+    assert np.isfinite(held.held_out.keypoint_px).sum() == 6
 
 
 def test_the_result_is_compared_as_it_stands(held: HeldOut) -> None:
     # the result stands 10 mm below the true keypoints, 2.4 m from cameras of 230 px
     expected = fitted.BODY_OFFSET_M * 230 / 2.4
-    assert np.median(held.within.keypoint_px) == pytest.approx(expected, rel=0.1)
-    assert held.within.overlap[1:].min() > 0.9  # the first frame's object is lost
-    assert np.isnan(held.within.overlap[0]).all()
+    assert np.median(held.all_cameras.keypoint_px) == pytest.approx(expected, rel=0.1)
+    assert held.all_cameras.overlap[1:].min() > 0.9  # the first frame's object is lost
+    assert np.isnan(held.all_cameras.overlap[0]).all()
 
 
 def _lying(capture: fitted.Capture, folder: Path, camera: int, pixels: float) -> Path:
@@ -103,8 +105,8 @@ def test_a_camera_that_lies_is_told(capture: fitted.Capture, held: HeldOut, tmp_
     before, after = (np.mean(h.shift[JudgedPart.BODY], axis=1) for h in (held, lie))
     # of what the lie is worth at the person's distance
     assert ((after - before) > 0.05 * 3.0 * 2.4 / 230).all()
-    mine = lie.held == 1
-    seen = lie.without.keypoint_px[mine, 1], lie.within.keypoint_px[mine, 1]
+    mine = lie.camera_index == 1
+    seen = lie.held_out.keypoint_px[mine, 1], lie.all_cameras.keypoint_px[mine, 1]
     assert np.median(seen[0]) > np.median(seen[1])  # a fit without it does not follow the lie
 
 

@@ -1,4 +1,4 @@
-"""What is held, what stands, and contact as it is stated, worked out by hand."""
+"""Slip, planted feet and stated contact, worked out by hand."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from intercap_core.evaluation.contact_figures import (
+    calibration_error,
     detected_figures,
     hold_figures,
+    reliability,
     slip_by_object,
     stated_contact_figures,
     worse_objects,
@@ -187,3 +189,17 @@ def test_an_object_is_worse_beyond_a_share_and_an_amount() -> None:
         tracked("d", "car", 0.0040, 0.0030),
     ]
     assert worse_objects(some) == ["cup"]
+
+
+def test_reliability_by_hand() -> None:
+    probability = np.array([[0.0, 0.01, 0.4, 0.4], [0.4, 0.45, 0.99, 1.0]])
+    true = np.array([[0, 0, 1, 0], [0, 0, 1, 1]], bool)
+    found = reliability(probability, true)
+    np.testing.assert_array_equal(found.count, [2, 4, 2])
+    np.testing.assert_allclose(found.stated, [0.005, 0.4125, 0.995])
+    np.testing.assert_allclose(found.true, [0.0, 0.25, 1.0])
+    np.testing.assert_allclose(calibration_error(probability, true), 0.4125 - 0.25)
+
+
+def test_nothing_open_has_no_calibration_error() -> None:
+    assert np.isnan(calibration_error(np.array([0.0, 1.0]), np.array([False, True])))

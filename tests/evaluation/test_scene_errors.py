@@ -66,7 +66,7 @@ def test_times_are_matched_to_the_nearest_whatever_their_number() -> None:
     path, true = Path("truth.h5"), np.arange(4) / 10
     assert match_times(path, true, np.array([0.0, 0.11, 0.29]), 10).tolist() == [0, 1, 3]
     assert match_times(path, true[:1], np.array([0.01]), 10).tolist() == [0]
-    with pytest.raises(UserError, match=r"0\.400 s is 0\.100 s from the nearest"):
+    with pytest.raises(UserError, match=r"0\.400 s is 0\.100 s from the nearest true frame"):
         match_times(path, true, np.arange(1, 5) / 10, 10)
 
 
