@@ -372,7 +372,9 @@ FASTER = Recipe(learning_rate_m=4e-3, learning_rate_rad=8e-3)
 
 
 def draw_convergence(clip: ObjectClip, output: Path) -> None:
-    """Fit ``CONVERGENCE_FRAMES`` frames from 3 cm and 10 degrees off the truth, in seeded directions.
+    """Plot the error of fits that start 3 cm and 10 degrees off the truth over time.
+
+    ``CONVERGENCE_FRAMES`` frames are fitted, with seeded directions of the offset.
 
     Medians over the frames against the median time from the fit's begin, everything included that
     is done for one frame. Ours are fits that were stopped after as many steps. Raises UserError

@@ -3,8 +3,8 @@
     python -m bench.verdict METRICS [METRICS ...]
 
 METRICS are metrics.h5 of sequences with truth, best of many kinds of rigs and noise: stated errors
-can be trusted as far as those reach. Prints the factors for `intercap_core/evaluation/verdict/stated.py`,
-and how well errors are told of recordings of a kind (the folder above a sequence's) that was left
+can be trusted as far as those reach. Prints the factors for
+`intercap_core/evaluation/verdict/stated.py`, and how well errors are told of recordings of a kind (the folder above a sequence's) that was left
 out of the fit: the spread that is stated is of these.
 """
 
@@ -86,7 +86,7 @@ def fit(samples: Samples) -> Factors:
 
 
 def left_out(samples: Samples) -> np.ndarray:
-    """ErrorEstimate errors (N,), each from factors that were fitted to recordings of other kinds."""
+    """Stated errors (N,), each from factors that were fitted to recordings of other kinds."""
     stated = np.empty(len(samples.true))
     for kind in np.unique(samples.kind):
         own = samples.kind == kind
@@ -123,7 +123,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             table.add_row(str(part), str(len(off)), str(kinds), *(f"{cell:.2f}" for cell in cells))
         of = ", ".join(f"{value:.2f}" for value in factors.of)
         print(
-            f"    JudgedPart.{part.name}: Factors({factors.rest:.4f}, ({of}), {factors.spread:.2f}),"
+            f"    JudgedPart.{part.name}: "
+            f"Factors({factors.rest:.4f}, ({of}), {factors.spread:.2f}),"
         )
     console.print(table)
     return 0

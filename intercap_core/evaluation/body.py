@@ -44,7 +44,7 @@ def joint_errors(joints: np.ndarray, true_joints: np.ndarray) -> np.ndarray:
 
 
 def landmarks(vertices: np.ndarray, keypoints: KeypointMap) -> np.ndarray:
-    """Face landmarks (..., 68, 3) of vertices (..., V, 3): 51 inner landmarks, then the jaw line."""
+    """Face landmarks (..., 68, 3) of vertices (..., V, 3): 51 inner ones, then the jaw line."""
     ids, weights = (
         np.concatenate([of[FACE], of[CONTOUR]]) for of in (keypoints.ids, keypoints.weights)
     )

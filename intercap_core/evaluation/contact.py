@@ -37,7 +37,10 @@ def region_contact(
 
 
 def confusion(found: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """Counts (..., 4) over the last axis: true positives, false positives, false and true negatives."""
+    """Confusion counts (..., 4) over the last axis.
+
+    The order is true positives, false positives, false negatives, true negatives.
+    """
     counts = (found & true, found & ~true, ~found & true, ~found & ~true)
     return np.stack([c.sum(-1) for c in counts], -1)
 

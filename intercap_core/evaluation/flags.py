@@ -10,13 +10,16 @@ from intercap_core.body.joints import JOINT_INDEX
 
 
 def merge_reasons(sources: Sequence[tuple[np.ndarray, str]]) -> list[str]:
-    """T texts that join the reasons of each frame, "" = reliable, from pairs of mask (T,) and reason."""
+    """Join the reasons of each frame to T texts, "" = reliable.
+
+    ``sources`` are pairs of a mask (T,) and its reason.
+    """
     frames = len(sources[0][0])
     return ["; ".join(reason for mask, reason in sources if mask[t]) for t in range(frames)]
 
 
 def ranges(reasons: Sequence[str]) -> list[tuple[int, int, str]]:
-    """Runs of frames with the same reason as (first, last, reason); reliable frames are left out."""
+    """Runs of frames with the same reason as (first, last, reason), without reliable frames."""
     runs: list[tuple[int, int, str]] = []
     for frame, reason in enumerate(reasons):
         if not reason:

@@ -69,7 +69,7 @@ def resting_steps(is_moving: np.ndarray) -> np.ndarray:
 
 
 def steps(centre: np.ndarray, true_centre: np.ndarray) -> np.ndarray:
-    """Length (T-1,) of the difference between the track's and the true steps, metres; both (T, 3)."""
+    """Length (T-1,) of the track's steps minus the true steps, metres; both (T, 3)."""
     return np.linalg.norm(np.diff(centre - true_centre, axis=0), axis=-1)
 
 
@@ -216,7 +216,7 @@ class FootErrors:
 def foot_errors(
     sole: np.ndarray, true_sole: np.ndarray, carrying: np.ndarray, floor: Floor, fps: float
 ) -> FootErrors:
-    """Errors of a fitted sole (T, S, 3); ``carrying`` (T - 1, S) is the result of :func:`support`."""
+    """Errors of a fitted sole (T, S, 3); ``carrying`` (T - 1, S) is from :func:`support`."""
     speed = np.linalg.norm(floor.along(np.diff(sole, axis=0)), axis=-1) * fps
     away = (sole - true_sole)[1:]
     swing = np.linalg.norm(away, axis=-1).mean(1)

@@ -51,7 +51,7 @@ def first_seen_found(
     rotation_error_degrees: np.ndarray,
     views: np.ndarray,
 ) -> bool | None:
-    """Whether the first frame in which a camera truly sees the object is within 20 mm and 10 degrees.
+    """Whether the error is below 20 mm and 10 degrees in the first frame that shows the object.
 
     All arguments are (T,). None where no camera sees the object.
     """
@@ -72,7 +72,8 @@ def normalised_translation_error(
 ) -> np.ndarray:
     """Mahalanobis length (T,) of the translation error over its median; 1 if calibrated.
 
-    ``covariance`` (T, 6, 6) of (rotation vector, translation). NaN where it is not positive definite.
+    ``covariance`` (T, 6, 6) is of rotation vector and translation. The result is NaN where it is
+    not positive definite.
     """
     block = covariance[:, 3:, 3:]
     error = translation - true_translation

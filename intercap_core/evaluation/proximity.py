@@ -21,7 +21,7 @@ class MeasuredCloud:
         self._tree = PointGrid(self.points) if len(self.points) else None
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Distance (M,) of mesh points (M, 3) to the nearest measured point; NaN for an empty cloud."""
+        """Distance (M,) of points (M, 3) to the nearest measured point; NaN for an empty cloud."""
         if self._tree is None:
             return np.full(len(points), np.nan)
         return self._tree.distance(points)

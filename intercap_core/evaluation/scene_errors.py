@@ -183,8 +183,8 @@ def measure(frames: Path, scene: Path, truth: Path) -> CaptureErrors:
         strangers = sorted(set(names) - set(true_names))
         if strangers:
             raise UserError(
-                f"{truth}: has no camera {strangers[0]!r}, which {scene} has; expected the truth of "
-                "the same recording"
+                f"{truth}: has no camera {strangers[0]!r}, which {scene} has; expected "
+                "the truth of the same recording"
             )
         order = [true_names.index(name) for name in names]
         available = recorded["colour_index"] >= 0

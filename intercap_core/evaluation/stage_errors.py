@@ -133,7 +133,7 @@ class StageErrors:
         }
 
     def _slip(self, held: np.ndarray, track: ObjectTrack) -> Values:
-        """Slip on the tracked object of the skin vertices (T, N, 3) that are ever in true contact."""
+        """Slip of the skin vertices (T, N, 3) that are ever in true contact."""
         assert self._true_distance is not None and self._object is not None
         if not track.known:
             return {"slip": np.full(len(held), np.nan)}
@@ -168,7 +168,7 @@ class StageErrors:
     def _true_soles(
         self, regions: Mapping[str, np.ndarray]
     ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Vertices (T, S, 3) of both true soles, and masks (T - 1, S) of those that carry weight."""
+        """Vertices (T, S, 3) of both true soles, and masks (T - 1, S) of their support."""
         truth = self._truth
         assert truth.vertices is not None
         soles = [truth.vertices[:, regions[foot]].astype(np.float64) for foot in _FEET]

@@ -32,8 +32,8 @@ def match_times(path: Path, true_times: np.ndarray, times: np.ndarray, fps: floa
     apart = np.abs(true_times[nearest] - times)
     if apart.max(initial=0) > 0.5 / fps:
         raise UserError(
-            f"{path}: holds {len(true_times)} frames, the recording {len(times)}; the recorded frame at "
-            f"{times[np.argmax(apart)]:.3f} s is {apart.max():.3f} s from the nearest true frame; "
+            f"{path}: holds {len(true_times)} frames, the recording {len(times)}; the recorded "
+            f"frame at {times[np.argmax(apart)]:.3f} s is {apart.max():.3f} s from the nearest true frame; "
             "make the truth of this recording again or remove it from the table"
         )
     return nearest

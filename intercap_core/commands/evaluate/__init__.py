@@ -1,6 +1,10 @@
-"""Virtual recordings held to their truth: `intercap evaluate`.
+"""`intercap evaluate`: virtual recordings compared with their truth.
 
-``evaluate`` runs the parts, ``part`` is what they have in common (stage, measure, figures, tables),
-``captures``, ``objects``, ``bodies`` and ``sequences`` are the four of them. ``workflows`` brings
-their artefacts up to date, ``budget`` holds minutes, ``reference`` compares with recorded figures.
+- ``run``: the command; runs the workflows, measures, prints and writes the figures.
+- ``part``: the type of a part of the evaluation, and caching of measured errors.
+- ``sequences``, ``captures``, ``objects``, ``bodies``, ``field_scenes``, ``field``: the six parts.
+- ``workflows``: brings the artefacts of all projects up to date.
+- ``budget``: expected and measured minutes of each part.
+- ``seeds``: the same recordings with new random seeds.
+- ``reference``: the regression gate of the quick evaluation.
 """

@@ -1,4 +1,4 @@
-"""The body's part of `intercap evaluate`: recordings taken to the body's fit and held to truth."""
+"""Part ``bodies`` of `intercap evaluate`: body fits compared with truth."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from intercap_core.project import Project
 
 Bodies = Measured[BodyErrors]
 AREA = "body"
-OTHER_AREAS = ("object",)  # whose recordings are measured here too
+OTHER_AREAS = ("object",)  # datasets whose recordings are measured here too
 _WIDTH = 190
 _COLUMNS = {
     "PVE": ("pve_mm", 1), "p95": ("pve_p95_mm", 1), "seen": ("pve_visible_mm", 1),
@@ -55,27 +55,27 @@ def measure(project: Project, sequence: str) -> BodyErrors:
 
 
 def _start(evaluation: Bodies) -> str:
-    """What stands before the keys of a project's figures."""
+    """Prefix of the keys of a project's figures."""
     return variant(evaluation.dataset, AREA, *OTHER_AREAS)
 
 
 def rig_of(config: Config) -> str:
-    """What a project's settings leave of its rig, and how the shape is fitted, in words."""
+    """Description of the cameras and depth that the settings select, and of the shape's fit."""
     cameras = config.frames.cameras
     words = [f"{len(cameras)} views" if len(cameras) > 1 else "1 view" if cameras else "all views"]
     if not config.frames.depth:
         words.append("no depth")
     if config.body_fit.shape == "per_frame":
-        words.append("a shape a frame")
+        words.append("one shape per frame")
     return ", ".join(words)
 
 
 def flat(evaluations: Sequence[Bodies]) -> dict[str, float]:
     """Keys ``body.pve_mm``, ``body.cup_drink.pve_mm``, ``body.noise2_pve_mm``.
 
-    The quality of the flags without a variant's name is over all projects together: a project
-    without bad frames says nothing of how well they are found. ``body.compared_...`` are those of
-    the project that has no variant's name over the recordings that variants take anew.
+    Recall and precision of the flags without a variant's prefix are over all projects, because a
+    single project may have no bad frames. ``body.compared_...`` are figures of the project without
+    a variant, over the recordings that variants also evaluate.
     """
     found: dict[str, float] = {}
     for evaluation in evaluations:
@@ -108,19 +108,19 @@ def _keys(group: str, start: str, figures: Mapping[str, float]) -> dict[str, flo
 
 
 def _reference(evaluations: Sequence[Bodies]) -> Bodies | None:
-    """The project that is no variant."""
+    """The project that is not a variant; None if there is none."""
     return next((e for e in evaluations if not _start(e)), None)
 
 
 def _apart(evaluations: Sequence[Bodies]) -> list[Bodies]:
-    """Projects with recordings of their own, rather than those of another one taken otherwise."""
+    """Projects with their own recordings, that is not the reference's with fewer views or data."""
     reference = _reference(evaluations)
     known = {e.truth for e in reference.errors} if reference else set()
     return [e for e in evaluations if e is reference or not {x.truth for x in e.errors} <= known]
 
 
 def _compared(evaluations: Sequence[Bodies]) -> list[BodyErrors]:
-    """The reference's errors in the recordings that variants took anew."""
+    """The reference's errors in the recordings that variants evaluate with less data."""
     reference = _reference(evaluations)
     others = [e for e in evaluations if e not in _apart(evaluations)]
     if reference is None or not others:
@@ -130,8 +130,7 @@ def _compared(evaluations: Sequence[Bodies]) -> list[BodyErrors]:
 
 
 def print_bodies(evaluations: Sequence[Bodies]) -> None:
-    """By interaction for each project of its own recordings, by rig for those taken otherwise, by
-    joint, and each recording's worst frame."""
+    """Print tables by interaction, by rig, by joint, and of each recording's worst frame."""
     console = console_of(_WIDTH)
     apart = _apart(evaluations)
     for found in apart:
@@ -188,7 +187,7 @@ def _add_row(
 
 
 def _print_joints(console: Console, evaluations: Sequence[Bodies]) -> None:
-    """Mean, 95th percentile and honesty of each joint; a group of columns for each project."""
+    """Print mean, 95th percentile and normalised error of each joint, for each project."""
     table = Table("joint", box=None, title="body joints: mean and p95, mm; median normalised error")
     columns = [body_errors.by_joint(found.errors) for found in evaluations]
     for found in evaluations:

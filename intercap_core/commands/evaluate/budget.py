@@ -1,4 +1,4 @@
-"""Minutes: what each part of the evaluation may take, is expected to take, and took."""
+"""Budgeted, expected and measured minutes of each part of the evaluation."""
 
 from __future__ import annotations
 
@@ -13,32 +13,30 @@ from intercap_core.commands.evaluate.part import Figures, Targets
 from intercap_core.project import Project
 from intercap_core.stage_list import STAGES
 
-# Minutes on two cores that a part may add to `make evaluate`: of the recordings that it makes and
-# of the stages that no earlier part computes. What is added later states its own here; the whole
-# stays under 75 without it and under 120 with all. Of the objects' 34 minutes 11 are for detections
-# that are drawn anew.
+# Minutes on two cores that a part may add to `make evaluate`, for its recordings and the stages
+# that no earlier part computes. The sum must stay below 120. Of the objects' 34 minutes 11 are for
+# recordings with redrawn detections.
 BUDGET_MINUTES = {
     "sequences": 23, "captures": 13, "objects": 34, "bodies": 12, "field_scenes": 15, "field": 22,
 }  # fmt: skip
 BUDGET_CORES = 2
 STUDIO = "studio"
-# CPU seconds a frame of six 720P views on one core of an Intel Xeon at 2.5 GHz, and of a process
-# start (imports, compiled code from the cache). Measured while other work ran; the quick set took
-# twice as long.
+# CPU seconds per frame of six 720P views on one core of an Intel Xeon at 2.5 GHz, and per process
+# start (imports, compiled code from the cache). Measured on a shared machine.
 SECONDS_PER_FRAME = {
     STUDIO: 0.75, "frames": 0.03, "detections": 0.01, "scene": 0.28, "person": 0.26,
     "object_track": 0.40, "body_fit": 0.17, "joint": 0.30, "metrics": 0.26,
 }  # fmt: skip
 SECONDS_PER_START = 2.5
-STUDIO_1080P = 1.35  # times what it takes at 720P
+STUDIO_1080P = 1.35  # factor of the studio's time at 1080P over 720P
 VIEWS = 6
-FRAMES = 45  # where the settings do not say
+FRAMES = 45  # if the settings state no number
 
 Jobs = list[tuple[Project, str, str]]  # project, sequence, stage or STUDIO
 
 
-def stages_to(last: str) -> list[str]:
-    """The stages up to ``last`` that it depends on, in order."""
+def upstream_stages(last: str) -> list[str]:
+    """Stage ``last`` and the stages on which it depends, in the order of the workflow."""
     wanted, pending = set(), [last]
     while pending:
         stage = pending.pop()
@@ -49,7 +47,7 @@ def stages_to(last: str) -> list[str]:
 
 
 def expected_seconds(project: Project, stage: str, frames: int) -> float:
-    """CPU seconds of one job: a recording's stage, or ``STUDIO``, on a machine as above."""
+    """Expected CPU seconds of one job: a stage of a recording, or ``STUDIO``."""
     studio = project.config.studio
     made = VIEWS if studio is None else studio.cameras
     views = made if stage == STUDIO else len(project.config.frames.cameras) or made
@@ -59,8 +57,8 @@ def expected_seconds(project: Project, stage: str, frames: int) -> float:
     return SECONDS_PER_START + SECONDS_PER_FRAME.get(stage, 0.3) * share * frames
 
 
-def frames_of(projects: Sequence[Project]) -> dict[Path, int]:
-    """Frames of every recording that a studio of these projects makes, by its folder."""
+def recording_frames(projects: Sequence[Project]) -> dict[Path, int]:
+    """Number of frames of each recording that the projects' studios render, by its folder."""
     return {
         (project.results / "recordings" / name).resolve(): entry.frames
         for project in projects
@@ -69,9 +67,9 @@ def frames_of(projects: Sequence[Project]) -> dict[Path, int]:
     }
 
 
-def jobs_of(project: Project, stages: Sequence[str]) -> Jobs:
-    """Every job that the given last stages of a project need, its recordings included."""
-    wanted = [stage for stage in STAGES if any(stage in stages_to(s) for s in stages)]
+def list_jobs(project: Project, stages: Sequence[str]) -> Jobs:
+    """All jobs that a project's target ``stages`` need, including the recordings."""
+    wanted = [stage for stage in STAGES if any(stage in upstream_stages(s) for s in stages)]
     found: Jobs = []
     for name in project.sequences:
         made = project.recordings_made(name) is not None
@@ -80,14 +78,13 @@ def jobs_of(project: Project, stages: Sequence[str]) -> Jobs:
 
 
 def jobs_by_part(parts: Mapping[str, Targets]) -> dict[str, Jobs]:
-    """The jobs that each part adds, by its name; ``parts``: the last stages of its projects. Shared
-    ones count in the first part that needs them."""
+    """Jobs that each part adds; shared jobs belong to the first part that needs them."""
     known: set[tuple[Path, str, str]] = set()
     found: dict[str, Jobs] = {}
     for part, targets in parts.items():
         found[part] = []
         for stage, project in targets:
-            for job in jobs_of(project, [stage]):
+            for job in list_jobs(project, [stage]):
                 key = (project.results.resolve(), job[1], job[2])
                 if key not in known:
                     known.add(key)
@@ -96,7 +93,7 @@ def jobs_by_part(parts: Mapping[str, Targets]) -> dict[str, Jobs]:
 
 
 def seconds_taken(job: tuple[Project, str, str]) -> float | None:
-    """Wall seconds that a job took when it was last run, from the workflow's benchmark file."""
+    """Wall seconds of a job's last run, from the workflow's benchmark file; None if unknown."""
     project, sequence, stage = job
     path = Path("benchmarks") / project.config.dataset / sequence / f"{stage}.tsv"
     try:
@@ -107,9 +104,9 @@ def seconds_taken(job: tuple[Project, str, str]) -> float | None:
 
 
 def minutes_of_parts(jobs: Mapping[str, Jobs], frames: Mapping[Path, int]) -> Figures:
-    """``<part>_minutes_budget``, ``_expected`` and ``_taken`` on two cores that are always busy.
+    """``<part>_minutes_budget``, ``_expected`` and ``_taken`` on two fully used cores.
 
-    What was taken is of every job's last run, whether in this evaluation or kept from before.
+    ``_taken`` sums every job's last run, whether in this evaluation or an earlier one.
     """
     found: Figures = {}
     per_minute = 60.0 * BUDGET_CORES
@@ -131,7 +128,7 @@ def minutes_of_parts(jobs: Mapping[str, Jobs], frames: Mapping[Path, int]) -> Fi
 
 
 def print_minutes(parts: Sequence[str], figures: Figures, minutes: float) -> None:
-    """A row a part, and how long this run took in all."""
+    """Print one row per part, and the duration of this run."""
     console = Console()
     heads = ("jobs", "budget", "expected", "taken")
     table = Table("part", *heads, box=None, title=f"minutes on {BUDGET_CORES} cores")

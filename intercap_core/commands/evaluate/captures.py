@@ -1,4 +1,4 @@
-"""The capture's part of `intercap evaluate`: recordings taken to the scene and held to truth."""
+"""Part ``captures`` of `intercap evaluate`: scene artefacts compared with truth."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def flat(evaluations: Sequence[Captures]) -> Figures:
 
 
 def print_captures(evaluations: Sequence[Captures]) -> None:
-    """One table with a row for each capture, one of the figures with a column for each project."""
+    """Print a table with a row per capture, and a table of figures with a column per project."""
     console = console_of(_WIDTH)
     heads = ("room", "poses mm", "after", "worst", "offset ms", "slips", "false", "floor mm",
              "deg")  # fmt: skip

@@ -1,8 +1,7 @@
-"""The field's part of `intercap evaluate` that ends with the metrics, of people alone with exports.
+"""Part ``field`` of `intercap evaluate`: metrics and held-out verdict under field conditions.
 
-No depth and other definitions of joints, other builds, boots, few cameras, people alone, a beam,
-somebody else in the room;
-what the verdict without truth tells of them.
+Recordings without depth, other definitions of joints, other body builds, boots, few cameras, people
+without an object (taken to the export), a balance beam, a second person in the room.
 """
 
 from __future__ import annotations
@@ -47,15 +46,13 @@ _WIDTH = 122
 
 @dataclass(frozen=True, eq=False)
 class FieldSequence:
-    """What stage ``metrics`` has measured; the relative errors (B,) of the limbs' lengths, and the
-    error of the person's height, metres; of all images with a chosen person the share in which it
-    is the subject; whether there is an export of a body and of no object."""
+    """Errors of one recording under field conditions."""
 
     metrics: SequenceMetrics
-    bones: np.ndarray
-    height_m: float
-    subject_right: float
-    exported_alone: bool
+    bones: np.ndarray  # (B,) relative errors of the lengths of the limbs' bones
+    height_m: float  # error of the person's height
+    subject_right: float  # share of the images with a chosen person that show the subject
+    exported_alone: bool  # whether the export has a body and no object
 
 
 FieldSequences = Measured[FieldSequence]
@@ -85,29 +82,29 @@ def measure(project: Project, sequence: str) -> FieldSequence:
 
 
 def exported_alone(folder: Path) -> bool:
-    """Whether ``folder`` is a whole export that moves a body and knows of no object."""
+    """Whether ``folder`` is a complete export with a body and without an object."""
     if not (folder / MARKER).is_file():
         return False
-    told = json.loads((folder / MARKER).read_text(encoding="utf-8"))
-    there = all((folder / name).is_file() for name in told["files"])
-    named = {Path(name).name for name in told["files"]}
-    return there and "body.npz" in named and "object.npz" not in named and not told["object"]
+    marker = json.loads((folder / MARKER).read_text(encoding="utf-8"))
+    complete = all((folder / name).is_file() for name in marker["files"])
+    names = {Path(name).name for name in marker["files"]}
+    return complete and "body.npz" in names and "object.npz" not in names and not marker["object"]
 
 
 def last_stage(project: Project) -> str | None:
-    """People alone are taken to the export; what else there is ends with the metrics."""
+    """The export for people without an object; None = the metrics."""
     return "export" if project.config.dataset == ALONE else None
 
 
 def seconds(project: Project, sequence: str) -> Figures:
-    """``verdict.seconds_per_frame`` of one recording, as `intercap bench` has it."""
+    """``verdict.seconds_per_frame`` of one recording, measured as by `intercap bench`."""
     with artefacts.read(project.artefact(sequence, "frames"), FRAMES) as recorded:
         frames = len(recorded["times"])
     return judgement(project.path, sequence, frames)
 
 
 def _lengths(joints: np.ndarray) -> np.ndarray:
-    """Median lengths (B,) of the limbs' bones over time, of joints (T, 55, 3)."""
+    """Median lengths (B,) over time of the limbs' bones, from joints (T, 55, 3)."""
     ends = [
         [JOINT_INDEX[f"{side}_{name}"] for name in bone]
         for side in ("left", "right")
@@ -155,7 +152,7 @@ def flat(evaluations: Sequence[FieldSequences]) -> Figures:
 
 
 def _of_bodies(some: Sequence[FieldSequence]) -> Figures:
-    """Skin, lengths of limbs and heights of some recordings' bodies."""
+    """Errors of skin, bone lengths and height of the recordings' bodies."""
     bones = np.abs(np.stack([e.bones for e in some])).mean(axis=1)  # by person
     return {
         "pve_mm": figures.truth_figures([e.metrics for e in some], "joint")["body_pve_mm"],
@@ -166,15 +163,14 @@ def _of_bodies(some: Sequence[FieldSequence]) -> Figures:
 
 
 def _of_a_person_alone(sequence: FieldSequence) -> bool:
-    """Whether there are figures and an export of the body, and none of an object that is not
-    there."""
+    """Whether metrics and export have a body and no object."""
     has = figures.truth_figures([sequence.metrics], "joint")
     measured = "body_pve_mm" in has and not any(name.startswith("object") for name in has)
     return measured and sequence.exported_alone
 
 
 def print_field(evaluations: Sequence[FieldSequences]) -> None:
-    """A row a recording: true and stated errors, limbs, height."""
+    """Print one row per recording: true and stated errors, bone lengths, height."""
     console = console_of(_WIDTH)
     heads = ("body mm", "stated", "hands mm", "stated", "object mm", "stated", "flagged %",
              "bones %", "height mm", "subject %")  # fmt: skip
@@ -185,8 +181,8 @@ def print_field(evaluations: Sequence[FieldSequences]) -> None:
             by_part = {error.part: error for error in stated_errors(e.metrics)}
             for part in TRUE:  # a person alone has no object
                 error = by_part.get(part)
-                told = error and [number(error.true, 1), number(error.stated, 1) or "silent"]
-                cells += told or ["", ""]
+                pair = error and [number(error.true, 1), number(error.stated, 1) or "silent"]
+                cells += pair or ["", ""]
             table.add_row(
                 f"{found.dataset}: {e.metrics.name}",
                 *cells,

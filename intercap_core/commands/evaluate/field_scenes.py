@@ -1,7 +1,7 @@
-"""The field's part of `intercap evaluate` that ends with the scene.
+"""Part ``field_scenes`` of `intercap evaluate`: scene artefacts under field conditions.
 
-Cameras that started apart or have unequal rates, rooms whose measured surface is mostly floor, a
-person on a beam.
+Cameras that start at different times or have different rates, rooms whose measured surface is
+mostly floor, a person on a balance beam.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from intercap_core.evaluation.field_errors import FieldScene
 from intercap_core.project import Project
 
 FieldScenes = Measured[FieldScene]
-# What datasets of each cause begin with
+# Prefixes of the datasets of each condition
 STARTS, RATES, FLOOR, BEAM = "field_starts", "field_rates", "field_floor", "field_beam"
 _WIDTH = 128
 
@@ -38,7 +38,7 @@ def measure(project: Project, sequence: str) -> FieldScene:
 
 
 def flat(evaluations: Sequence[FieldScenes]) -> Figures:
-    """Keys ``field.<measure>``; those of starts also by dataset, of unequal rates apart."""
+    """Keys ``field.<measure>``; ``rates_`` for different rates; starts also by dataset."""
     found = keyed("field.", field_errors.floor_figures(_of(evaluations, FLOOR)))
     found |= keyed("field.", field_errors.start_figures(_of(evaluations, STARTS)))
     found |= keyed("field.rates_", field_errors.start_figures(_of(evaluations, RATES)))
@@ -56,7 +56,7 @@ def _of(evaluations: Sequence[FieldScenes], cause: str) -> list[FieldScene]:
 
 
 def print_scenes(evaluations: Sequence[FieldScenes]) -> None:
-    """A row a recording."""
+    """Print one row per recording."""
     console = console_of(_WIDTH)
     heads = ("apart s", "off ms", "stated ms", "set aside", "poses mm", "after", "stated", "worse",
              "floor mm", "deg")  # fmt: skip

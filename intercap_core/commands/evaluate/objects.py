@@ -1,4 +1,4 @@
-"""The object's part of `intercap evaluate`: recordings tracked and held to truth."""
+"""Part ``objects`` of `intercap evaluate`: object tracks compared with truth."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from intercap_core.project import Project
 
 Objects = Measured[ObjectErrors]
 AREA = "object"
-# The recordings of one dataset and those in which the detectors err in another way.
+# The dataset ``object`` and its copies with redrawn detector errors
 REDRAWN = re.compile(rf"{AREA}(_redrawn\d+)?")
 _WIDTH = 120
 _COLUMNS = {
@@ -59,7 +59,7 @@ def by_object(errors: Sequence[ObjectErrors]) -> dict[str, list[ObjectErrors]]:
 def flat(evaluations: Sequence[Objects]) -> Figures:
     """Keys ``object.lost_share``, ``object.cup.lost_share``, ``object.views_2.lost_share``.
 
-    Those of a dataset called object_<variant> are ``object.<variant>_lost_share`` and so on.
+    Keys of a dataset object_<variant> are ``object.<variant>_lost_share`` and so on.
     """
     found: Figures = {}
     for tracked in evaluations:
@@ -79,8 +79,10 @@ def flat(evaluations: Sequence[Objects]) -> Figures:
 
 
 def lost_by_draw(evaluations: Sequence[Objects]) -> dict[str, list[float]]:
-    """Share of lost frames of each object that all draws of the detectors' errors have, one for
-    each draw; nothing where there is only one."""
+    """Share of lost frames of each object for each draw of the detector errors.
+
+    Only objects that all draws have; empty where there is only one draw.
+    """
     draws = [by_object(one.errors) for one in evaluations if REDRAWN.fullmatch(one.dataset)]
     if len(draws) < 2:
         return {}
@@ -91,7 +93,7 @@ def lost_by_draw(evaluations: Sequence[Objects]) -> dict[str, list[float]]:
 
 
 def print_objects(evaluations: Sequence[Objects]) -> None:
-    """For each project a row an object and one for all, then a row for each number of views."""
+    """Print for each project a table by object and a table by number of views."""
     console = console_of(_WIDTH)
     for found in evaluations:
         table = Table("object", *_COLUMNS, box=None)
@@ -112,7 +114,7 @@ def print_objects(evaluations: Sequence[Objects]) -> None:
         console.print(table)
     drawn = lost_by_draw(evaluations)
     if drawn:
-        table = Table("object", "lost, detections drawn anew", "spread", box=None)
+        table = Table("object", "lost, redrawn detections", "spread", box=None)
         for name, shares in drawn.items():
             each = "  ".join(number(share, 3) for share in shares)
             table.add_row(name, each, number(max(shares) - min(shares), 3))
@@ -120,7 +122,7 @@ def print_objects(evaluations: Sequence[Objects]) -> None:
 
 
 def has_object(project: Project, sequence: str) -> bool:
-    """Whether a recording is of a person with an object."""
+    """Whether the recording has an object."""
     return project.object_of(sequence) is not None
 
 

@@ -1,4 +1,4 @@
-"""What the parts of an evaluation have in common: recordings taken to a stage and measured."""
+"""Common code of the parts of an evaluation: measure recordings, cache errors, print tables."""
 
 from __future__ import annotations
 
@@ -25,10 +25,11 @@ from intercap_core.project import Project, load_project
 
 Errors = TypeVar("Errors")
 Figures = dict[str, float]
-Targets = Sequence[tuple[str, Project]]  # the last stage of each project
-Columns = Mapping[str, tuple[str, int]]  # of a table: heading to a figure's key and its digits
+Targets = Sequence[tuple[str, Project]]  # last stage and project
+Columns = Mapping[str, tuple[str, int]]  # heading of a column to a figure's key and digits
 
-SPREAD = "_spread"
+SPREAD = "_spread"  # suffix of the standard error of a figure
+# Figures without a standard error: counts, and keys that contain EXTREME
 COUNTS = (
     "frames", "captures", "slips_true", "slips_missed", "slips_false", "object_worse_count",
 )  # fmt: skip
@@ -37,49 +38,46 @@ EXTREME = "worst"
 
 @dataclass(frozen=True, eq=False)
 class Measured(Generic[Errors]):
-    """The errors of every recording of one project, and the recordings that did not get there.
-
-    ``rig`` says in words what the settings leave of the recordings, where that matters.
-    """
+    """Errors of the recordings of one project."""
 
     dataset: str
-    errors: Sequence[Errors]
-    missing: Sequence[str] = ()
-    rig: str = ""
+    errors: Sequence[Errors]  # one per recording that reached the stage
+    missing: Sequence[str] = ()  # names of the recordings that did not
+    rig: str = ""  # description of the cameras and data that the settings select
 
 
 @dataclass(frozen=True)
 class EvaluationPart(Generic[Errors]):
-    """One part of the evaluation.
+    """One part of the evaluation: how its recordings are computed, measured and reported."""
 
-    ``measure`` (project, sequence) compares the artefact of ``stage`` with the truth; it reads the
-    artefacts ``reads`` beside it, and ``code`` is the module (below ``intercap_core``) whose digest
-    stands for what it computes. ``kept`` is the dataclass of errors that are stored because
-    measuring takes long; None where they are read at once. ``flat`` gives the keys ``area.measure``
-    of all projects, ``print_tables`` prints them, ``rig`` describes a project's settings;
-    ``has`` (project, sequence) says whether a recording has what is measured. ``last`` (project) is
-    the stage to which a project's recordings are taken where that is beyond ``stage``, ``timed``
-    (project, sequence) measures how long something takes, once an evaluation.
-    """
-
+    # Name of the module in this package; its code digest is part of the key of cached errors.
     name: str
+    # The stage whose artefact is compared with the truth.
     stage: str
+    # Other stages whose artefacts are read.
     reads: tuple[str, ...]
+    # Measures the errors of (project, sequence).
     measure: Callable[[Project, str], Errors]
+    # Returns the figures of all projects, keys "area.measure".
     flat: Callable[[Sequence[Measured[Errors]]], Figures]
     print_tables: Callable[[Sequence[Measured[Errors]]], None]
+    # Describes the cameras and data that a project's settings select.
     rig: Callable[[Project], str] = lambda _: ""
+    # Dataclass of the errors if they are cached on disk; None = measured in every run.
     kept: type[Errors] | None = None
+    # Whether (project, sequence) has the measured quantity.
     has: Callable[[Project, str], bool] = lambda _project, _sequence: True
+    # Last stage of a project's workflow if it is later than ``stage``.
     last: Callable[[Project], str | None] = lambda _: None
+    # Measures durations of (project, sequence), once per evaluation.
     timed: Callable[[Project, str], Figures] | None = None
 
     def targets(self, projects: Sequence[Project]) -> Targets:
-        """Each project with the stage that its recordings are taken to."""
+        """The last stage of each project's workflow."""
         return [(self.last(project) or self.stage, project) for project in projects]
 
     def time_one(self, projects: Sequence[Project]) -> Figures:
-        """What ``timed`` says of the first recording that has come to the stage; empty without."""
+        """Figures of ``timed`` for the first recording with an artefact; empty if there is none."""
         there = (
             (project, name)
             for project in projects
@@ -90,9 +88,9 @@ class EvaluationPart(Generic[Errors]):
         return {} if self.timed is None or first is None else self.timed(*first)
 
     def measure_all(self, projects: Sequence[Project], *, workers: int) -> list[Measured[Errors]]:
-        """Measure every recording whose artefact is there, several at a time.
+        """Measure every recording that has an artefact of the stage, in parallel processes.
 
-        Raises UserError where no sequence of a project has come to the stage.
+        Raises UserError where no sequence of a project has one.
         """
         counted = [[n for n in project.sequences if self.has(project, n)] for project in projects]
         there = [
@@ -102,7 +100,8 @@ class EvaluationPart(Generic[Errors]):
         for project, names in zip(projects, there, strict=True):
             if not names:
                 raise UserError(
-                    f"{project.path}: no sequence has a {self.stage}; look into {project.logs}"
+                    f"{project.path}: no sequence has an artefact of stage {self.stage!r}; "
+                    f"see the logs in {project.logs}"
                 )
         module = import_module(f"intercap_core.commands.evaluate.{self.name}")
         jobs = [
@@ -110,9 +109,11 @@ class EvaluationPart(Generic[Errors]):
             for project, names in zip(projects, there, strict=True)
             for name in names
         ]
-        context = get_context("spawn")  # numerical libraries keep threads that a fork would lose
+        context = get_context("spawn")  # a fork would lose the threads of numerical libraries
         with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=context) as pool:
-            errors: Iterator[Any] = iter(list(pool.map(_measure_one, *zip(*jobs, strict=True))))
+            errors: Iterator[Any] = iter(
+                list(pool.map(_measure_recording, *zip(*jobs, strict=True)))
+            )
         return [
             Measured(
                 project.config.dataset,
@@ -124,31 +125,31 @@ class EvaluationPart(Generic[Errors]):
         ]
 
 
-def _measure_one(module: str, settings: Path, sequence: str) -> object:
+def _measure_recording(module: str, settings: Path, sequence: str) -> object:
     part: EvaluationPart[object] = import_module(module).PART
-    return measured_once(part, load_project(settings), sequence)
+    return measure_cached(part, load_project(settings), sequence)
 
 
-def measured_once(part: EvaluationPart[Errors], project: Project, sequence: str) -> Errors:
-    """Measure one recording, or take its errors from the last time that all inputs were the same.
+def measure_cached(part: EvaluationPart[Errors], project: Project, sequence: str) -> Errors:
+    """Errors of one recording, from the cache if all inputs are unchanged.
 
-    The errors lie beside the artefacts, named by the digest of what they were computed from: the
-    files, the project's tables and settings, and the code.
+    The cache file is next to the artefacts; its name holds the digest of the inputs: files, the
+    project's tables and settings, and code.
     """
     truth = project.sequences[sequence].truth
     assert truth is not None
     if not truth.is_file():
         raise UserError(
-            f"{truth}: the truth of {sequence!r} is missing, though its {part.stage} is there; "
-            f"remove {project.results / sequence} and start again: both are made anew"
+            f"{truth}: the truth of {sequence!r} is missing, but its {part.stage} artefact exists; "
+            f"remove {project.results / sequence} and start again: both will be recomputed"
         )
     if part.kept is None:
         return part.measure(project, sequence)
     state = hashlib.sha256(code_digest(f"commands.evaluate.{part.name}").encode())
     row = project.sequences[sequence]
     entry, subject = project.object_of(sequence), project.subjects[row.subject]
-    for told in (*filter(None, [entry]), subject, project.config.body_models):
-        state.update(told.model_dump_json().encode())
+    for setting in (*filter(None, [entry]), subject, project.config.body_models):
+        state.update(setting.model_dump_json().encode())
     files = [project.artefact(sequence, stage) for stage in (*part.reads, part.stage)]
     for path in (*files, truth, *([entry.mesh] if entry else [])):
         with open(path, "rb") as file:
@@ -163,12 +164,12 @@ def measured_once(part: EvaluationPart[Errors], project: Project, sequence: str)
         old.unlink()
     partial = path.with_suffix(f".{os.getpid()}")
     partial.write_bytes(pickle.dumps(_plain(errors)))
-    partial.replace(path)  # a killed run leaves no half-written file under the final name
+    partial.replace(path)  # a killed run leaves no partial file under the final name
     return errors
 
 
 def _plain(value: Any) -> Any:
-    """Dataclasses as dictionaries and paths as text, so that no pickle names a class."""
+    """Convert dataclasses to dictionaries and paths to text, so that the pickle names no class."""
     if is_dataclass(value):
         return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
     return str(value) if isinstance(value, Path) else value
@@ -189,17 +190,17 @@ def _dataclass_of(kind: Any, values: dict[str, Any]) -> Any:
 
 
 def require_truth(project: Project) -> None:
-    """Raises UserError where a sequence has no truth to be held to."""
+    """Raise UserError where a sequence has no truth."""
     for name, row in project.sequences.items():
         if row.truth is None:
             raise UserError(
-                f"{project.path}: sequence {name!r} has no truth to be evaluated against; leave "
-                "it out, or name its truth in the table"
+                f"{project.path}: sequence {name!r} has no truth to be evaluated against; remove "
+                "it, or add its truth to the table of sequences"
             )
 
 
 def variant(dataset: str, *areas: str) -> str:
-    """What stands before a measure's name: "noise2_" of object_noise2 in the area object."""
+    """Prefix of a measure's name: "noise2_" for the dataset object_noise2 in the area object."""
     for area in areas:
         if dataset == area or dataset.startswith(f"{area}_"):
             dataset = dataset.removeprefix(area)
@@ -209,7 +210,7 @@ def variant(dataset: str, *areas: str) -> str:
 
 
 def keyed(prefix: str, figures: Mapping[str, float]) -> Figures:
-    """The figures with this before each key."""
+    """The figures with ``prefix`` before each key."""
     return {f"{prefix}{key}": value for key, value in figures.items()}
 
 
@@ -218,9 +219,8 @@ def spread(
 ) -> Figures:
     """Standard error of each figure over the recordings, keys ``<figure>_spread``.
 
-    Every recording's figure is taken on its own; their sample deviation over the square root of
-    their number. Counts and extremes have none, nor has a figure that fewer than two recordings
-    have.
+    The sample standard deviation of the recordings' own figures over the square root of their
+    number. Counts, extremes and figures of fewer than two recordings have none.
     """
     alone = [figures([recording]) for recording in recordings]
     found: Figures = {}
@@ -239,7 +239,7 @@ def add_rows(
     spreads: Mapping[str, float] | None = None,
     cells: Sequence[str] = (),
 ) -> None:
-    """A row of ``figures``, after ``cells``; below it their spreads where any are given."""
+    """Add a row of ``cells`` and ``figures``, and a second row of ``spreads`` if given."""
     row = (number(figures.get(key), digits) for key, digits in columns.values())
     table.add_row(name, *cells, *row)
     if spreads:
@@ -248,12 +248,12 @@ def add_rows(
 
 
 def console_of(width: int) -> Console:
-    """A console for tables of this width: one that is cut when piped is of no use."""
+    """A console of at least this width, so that piped tables are not truncated."""
     console = Console()
     console.width = max(console.width, width)
     return console
 
 
 def number(value: float | None, digits: int) -> str:
-    """A cell of a table; empty where the figure is not known."""
+    """Text of a table's cell; empty for an unknown figure."""
     return "" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"

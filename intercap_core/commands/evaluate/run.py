@@ -1,4 +1,4 @@
-"""`intercap evaluate`: virtual recordings against truth, as tables and as flat JSON."""
+"""The command `intercap evaluate`: compare virtual recordings with truth."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from intercap_core.commands.evaluate.reference import (
     read_reference,
     update_reference,
 )
-from intercap_core.commands.evaluate.seeds import drawn_anew
+from intercap_core.commands.evaluate.seeds import redraw_settings
 from intercap_core.commands.evaluate.workflows import bring_up_to_date
 from intercap_core.errors import UserError
 from intercap_core.project import load_project
@@ -53,32 +53,29 @@ def evaluate(
     cores: int = 0,
     seed: int | None = None,
 ) -> int:
-    """Bring the evaluation's recordings up to date, print the tables and write ``output``.
+    """Bring the evaluation's recordings up to date, print the tables and write the figures.
 
-    ``settings``: for each part of ``PARTS`` the settings files of its recordings: ``sequences`` are
-    taken to the metrics, ``captures`` to the scene alone, ``objects`` to the object's track,
-    ``bodies`` to the body's fit, ``field_scenes`` and ``field``, recordings as outside a studio, to
-    the scene and to the metrics (people alone to the exports). ``output`` is flat JSON with keys
-    ``area.measure`` and, where a figure has one, ``area.measure_spread``: areas of annotated
-    recordings end in ``_annotated``, those of ``captures`` have their dataset's name, that of
-    ``objects`` is ``object``, that of ``bodies`` is ``body``, those of both parts of the field are
-    ``field`` and ``verdict``; ``time`` holds minutes. The figures are compared with those of
-    ``reference`` where one is given.
-    ``seed`` draws all recordings anew (:mod:`.seeds`). Returns 1 where a stage failed; recordings
-    that failed are left out of the figures and named. Raises UserError where a project's settings
-    are wrong, or none of its sequences has a result.
+    Returns 1 where a stage failed; recordings that failed are excluded from the figures and named.
+    Raises UserError where a project's settings are wrong or none of its sequences has a result.
+
+    Args:
+        settings: settings files of the recordings of each part in ``PARTS``.
+        output: flat JSON with keys ``area.measure``, and ``area.measure_spread`` for the standard
+            error of a figure. docs/evaluation.md describes the areas; ``time`` holds minutes.
+        cores: number of cores, 0 = all.
+        seed: draw everything random in the recordings from new seeds (:mod:`.seeds`).
     """
     begin = time.monotonic()
     if seed is not None:
-        settings = drawn_anew(settings, seed)
+        settings = redraw_settings(settings, seed)
     projects = {
         name: [load_project(path) for path in paths] for name, paths in settings.items() if paths
-    }  # faults are told before any work
+    }  # errors in settings are reported before any work
     wanted = {name: PARTS[name].targets(some) for name, some in projects.items()}
     for some in projects.values():
         for project in some:
             require_truth(project)
-    frames = budget.frames_of([project for some in projects.values() for project in some])
+    frames = budget.recording_frames([project for some in projects.values() for project in some])
     status = bring_up_to_date(wanted, frames, cores=cores)
     workers = cores or len(os.sched_getaffinity(0))
     found: Figures = {}

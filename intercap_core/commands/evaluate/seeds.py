@@ -1,7 +1,7 @@
-"""The same recordings with everything that is random drawn anew: figures that nothing was tuned on.
+"""The recordings of an evaluation with new random seeds, for figures on unseen data.
 
-Other people play the same scripts, with other motions, rooms and errors. Settings and tables are
-written below ``results/seed_<N>/settings``, what is computed beside them.
+Other people act in the same scripts, with other motions, rooms and errors. Settings and tables are
+written to ``results/seed_<N>/settings``, results to ``results/seed_<N>``.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from intercap_core.project import Project, load_project, read_yaml, tidy
 TABLES = ("sequences", "subjects")
 
 
-def drawn_anew(settings: Mapping[str, Sequence[Path]], seed: int) -> dict[str, list[Path]]:
-    """Settings files like those of each part, with all seeds drawn anew by ``seed``.
+def redraw_settings(settings: Mapping[str, Sequence[Path]], seed: int) -> dict[str, list[Path]]:
+    """Write copies of the settings files of each part with new seeds derived from ``seed``.
 
-    Raises UserError where one of the given files is wrong.
+    Raises UserError where a settings file is invalid.
     """
     return {
         part: [_written(load_project(path), seed) for path in paths]
@@ -61,7 +61,7 @@ def _written(project: Project, seed: int) -> Path:
 
 
 def _people(project: Project, seed: int) -> dict[str, str]:
-    """Who plays whose part: the subjects of the table in another order, each another one."""
+    """New subject for each subject of the table: a cyclic permutation without fixed points."""
     names = sorted(project.subjects)
     by = 1 + seed % max(len(names) - 1, 1)
     return {name: names[(i + by) % len(names)] for i, name in enumerate(names)}
@@ -75,8 +75,7 @@ def _rows(table: Path) -> list[dict[str, str]]:
 def _moved(
     row: dict[str, str], folder: Path, project: Project, root: Path, people: Mapping[str, str]
 ) -> dict[str, str]:
-    """A row of the table of sequences with other people, and what lies in the results where the new
-    results are."""
+    """A row of the table of sequences with the new subject and paths within the new results."""
     results = Path(os.path.abspath(project.config.results))
     moved = dict(row, subject=people[row["subject"]])
     for column, value in row.items():

@@ -1,4 +1,4 @@
-"""The part of `intercap evaluate` that is taken to the end: every stage held to truth."""
+"""Part ``sequences`` of `intercap evaluate`: all stages compared with truth."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from intercap_core.project import Project
 from intercap_core.stage_list import ESTIMATES
 
 PLAIN, ANNOTATED = "no annotations", "annotated"
-# Figures of the sequential fits that stand beside the joint stage's, and their names there.
+# Figures of the sequential fits that are repeated in the area ``joint``, and their names there
 SEQUENTIAL = {
     "body_pve_mm": "body_pve_sequential_mm",
     "hand_grasp_mpjpe_mm": "hand_grasp_sequential_mm",
@@ -36,13 +36,13 @@ SEQUENTIAL = {
     "foot_swing_mm": "foot_swing_sequential_mm",
     "acceleration_feet_mm": "acceleration_feet_sequential_mm",
 }
-# Other names under which the joint stage's goals are stated.
+# Second names of figures in the area ``joint``: area and name of the figure
 ALSO = {
     "object_translation_median_mm": ("joint", "object_translation_mm"),
     "contact_vertex_f1": ("joint", "contact_f1"),
     "penetration_mean_mm": ("penetration", "mean_mm"),
 }
-# Of each object, after which stage and how it is called there, beside the joint stage.
+# Columns of the table by object: sequential stage and figure that are compared with ``joint``
 BY_OBJECT = {
     "body mm": ("body_fit", "body_pve_mm"),
     "grasp mm": ("body_fit", "hand_grasp_mpjpe_mm"),
@@ -55,29 +55,29 @@ BY_OBJECT = {
     "p95 ": ("object_track", "object_rotation_p95_deg"),
     "contact F1": ("body_fit", "contact_f1"),
 }
-BY_OBJECT_WIDTH = 190  # columns of its table, also where a file takes it
+BY_OBJECT_WIDTH = 190  # characters
 Areas = dict[str, Figures]
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredSequence:
-    """The metrics of one sequence, and whether it is annotated."""
+    """The metrics of one sequence."""
 
     metrics: SequenceMetrics
-    annotated: bool
+    annotated: bool  # whether the sequence has annotations
 
 
 Sequences = Measured[MeasuredSequence]
 
 
 def measure(project: Project, sequence: str) -> MeasuredSequence:
-    """What stage ``metrics`` has measured."""
+    """Read the metrics of one recording."""
     made = project.annotation_made(sequence) or project.annotation_path(sequence).exists()
     return MeasuredSequence(SequenceMetrics.read(project.artefact(sequence, "metrics")), made)
 
 
 def groups(evaluations: Sequence[Sequences]) -> dict[str, list[SequenceMetrics]]:
-    """The sequences apart by whether they are annotated; empty groups are left out."""
+    """Sequences with and without annotations; empty groups are omitted."""
     every = [e for found in evaluations for e in found.errors]
     apart = {
         name: [e.metrics for e in every if e.annotated == annotated]
@@ -87,7 +87,7 @@ def groups(evaluations: Sequence[Sequences]) -> dict[str, list[SequenceMetrics]]
 
 
 def areas(sequences: Sequence[SequenceMetrics]) -> Areas:
-    """Every figure of a group of sequences by area: the stages, and what is not one stage's."""
+    """All figures of a group of sequences by area: the stages, and areas common to all stages."""
     known = [s for s in sequences if s.has_truth]
     found = {
         stage: figures.truth_figures(sequences, stage) | contact_figures.hold_figures(known, stage)
@@ -116,7 +116,7 @@ def areas(sequences: Sequence[SequenceMetrics]) -> Areas:
 
 
 def _beside_sequential(sequences: Sequence[SequenceMetrics], found: Areas) -> Figures:
-    """What the joint stage is held to: the sequential fits' figures, and objects that got worse."""
+    """Figures with which the joint stage is compared, and figures by object."""
     first = found["body_fit"]
     beside = {as_: first[name] for name, as_ in SEQUENTIAL.items() if name in first}
     if any(s.object_ for s in sequences):
@@ -146,7 +146,7 @@ def _by_object(sequences: Sequence[SequenceMetrics]) -> dict[str, list[SequenceM
 
 
 def with_spread(sequences: Sequence[SequenceMetrics]) -> Areas:
-    """The same, and to each figure its standard error over the sequences."""
+    """The figures of :func:`areas` and their standard errors over the sequences."""
     return {
         area: found | spread(lambda some, area=area: areas(some)[area], sequences)  # type: ignore[misc]
         for area, found in areas(sequences).items()
@@ -165,7 +165,7 @@ def flat(evaluations: Sequence[Sequences]) -> Figures:
 
 
 def print_sequences(evaluations: Sequence[Sequences]) -> None:
-    """One table for the three stages side by side, one for the rest; a column for each group."""
+    """Print a table of the three stages, one of the other areas, and one by object."""
     console = Console()
     found = {name: with_spread(some) for name, some in groups(evaluations).items()}
     counts = {name: len(some) for name, some in groups(evaluations).items()}

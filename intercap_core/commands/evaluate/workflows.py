@@ -1,8 +1,8 @@
-"""Many projects brought up to date at once: two workflows side by side keep every core busy.
+"""Bring the workflows of many projects up to date, two at a time.
 
-One workflow leaves cores idle while its last long job runs; another one fills them. The one whose
-results most others wait for starts first, then the longest. A project whose recordings another one
-makes waits for that one.
+One workflow leaves cores idle while its last long job runs; a second workflow uses them. A project
+that reads the recordings of another project starts after it. Among the projects that can start, the
+one with the longest expected work, including the work that waits for it, is first.
 """
 
 from __future__ import annotations
@@ -24,37 +24,37 @@ from rich.console import Console
 from rich.markup import escape
 
 from intercap_core.commands.check import check_bodies
-from intercap_core.commands.evaluate.budget import FRAMES, Jobs, expected_seconds, jobs_of
+from intercap_core.commands.evaluate.budget import FRAMES, Jobs, expected_seconds, list_jobs
 from intercap_core.commands.evaluate.part import Targets
 from intercap_core.commands.run import LAST_LINES, POLL_SECONDS, Watcher, snakemake_command
 from intercap_core.errors import UserError
 from intercap_core.project import Project
 
-SIDE_BY_SIDE = 2
-TELL_SECONDS = 60.0
+SIDE_BY_SIDE = 2  # workflows at a time
+TELL_SECONDS = 60.0  # interval of the progress report
 LOCK = Path(".snakemake") / "evaluation.lock"
 
 
 @dataclass(eq=False)
-class Order:
-    """One project's targets, the jobs they need at most, and the projects to wait for."""
+class ProjectRun:
+    """The workflow of one project, planned, running or ended."""
 
     project: Project
-    stages: list[str]
-    seconds: dict[str, list[float]]  # by rule, one a job
-    after: list[Order] = field(default_factory=list)
+    stages: list[str]  # target stages
+    seconds: dict[str, list[float]]  # expected CPU seconds of all jobs, by rule
+    after: list[ProjectRun] = field(default_factory=list)  # projects that must end before
     watcher: Watcher | None = None
     process: subprocess.Popen[bytes] | None = None
     transcript: IO[str] | None = None
-    status: int | None = None
+    status: int | None = None  # exit status; None until the workflow has ended
 
     @property
     def expected(self) -> float:
-        """Seconds of CPU if nothing is kept."""
+        """CPU seconds if no job is up to date."""
         return sum(map(sum, self.seconds.values()))
 
     def left(self) -> tuple[float, float]:
-        """Expected CPU seconds of the jobs that are still to do, and of those that were done."""
+        """Expected CPU seconds of the remaining jobs, and of the completed jobs."""
         planned = self._planned()
         if self.status is not None:
             counts = (planned or {}).items()
@@ -74,7 +74,7 @@ class Order:
         return todo, done
 
     def _planned(self) -> dict[str, int] | None:
-        """Jobs by rule that the workflow has found to do; None before it has."""
+        """Number of jobs by rule that the workflow has planned; None before planning."""
         if self.watcher is None or not self.watcher.transcript.is_file():
             return None
         text = self.watcher.transcript.read_text(encoding="utf-8", errors="replace")
@@ -93,44 +93,48 @@ def bring_up_to_date(
     *,
     cores: int = 0,
 ) -> int:
-    """Run the workflows of all projects to the stages that are ``wanted`` of them, by part.
+    """Run the workflows of all projects to the stages that the parts need.
 
-    What failed is named; returns 1 where anything did. A run that was killed goes on from the jobs
-    that were done: no lock of Snakemake's is left behind, one of the system's keeps two evaluations
-    in one folder apart. Raises UserError where another one runs.
+    Failed jobs are printed; returns 1 where any failed. A run that was killed continues:
+    Snakemake's lock is not used, and a system lock prevents two evaluations in one folder. Raises UserError
+    where another evaluation is running.
+
+    Args:
+        wanted: target stages and projects by part.
+        frames: number of frames by folder of the recording.
     """
-    orders = orders_of(wanted, frames)
-    for order in orders:
-        check_bodies(order.project)
+    runs = plan_runs(wanted, frames)
+    for run in runs:
+        check_bodies(run.project)
     console = Console(stderr=True)
     cores = cores or len(os.sched_getaffinity(0))
-    beside = min(SIDE_BY_SIDE, cores, len(orders))
+    beside = min(SIDE_BY_SIDE, cores, len(runs))
     LOCK.parent.mkdir(exist_ok=True)
     with open(LOCK, "w", encoding="utf-8") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             raise UserError(
-                "another evaluation, or a part of it, still runs in this folder"
+                "another evaluation is running in this folder; wait for it or end it"
             ) from None
-        told_to_end = signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+        previous_handler = signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
         try:
-            _run(orders, beside, cores, lock.fileno(), console)
+            _run(runs, beside, cores, lock.fileno(), console)
         except KeyboardInterrupt:
             raise SystemExit(130) from None
         finally:
-            running = [order.process for order in orders if order.process is not None]
+            running = [run.process for run in runs if run.process is not None]
             for process in running:
                 if process.poll() is None:
                     process.terminate()
             for process in running:
                 process.wait()
-            signal.signal(signal.SIGTERM, told_to_end)
-    return max((1 if order.status else 0 for order in orders), default=0)
+            signal.signal(signal.SIGTERM, previous_handler)
+    return max((1 if run.status else 0 for run in runs), default=0)
 
 
-def orders_of(wanted: Mapping[str, Targets], frames: Mapping[Path, int]) -> list[Order]:
-    """One order a project, whatever parts want it, in the order in which they are to start."""
+def plan_runs(wanted: Mapping[str, Targets], frames: Mapping[Path, int]) -> list[ProjectRun]:
+    """One run per project with the target stages of all parts, in the order of starting."""
     stages: dict[Path, list[str]] = {}
     projects: dict[Path, Project] = {}
     for targets in wanted.values():
@@ -138,31 +142,31 @@ def orders_of(wanted: Mapping[str, Targets], frames: Mapping[Path, int]) -> list
             key = project.path.resolve()
             projects[key] = project
             stages.setdefault(key, []).append(stage)
-    orders = [
-        Order(project, stages[key], _seconds(jobs_of(project, stages[key]), frames))
+    runs = [
+        ProjectRun(project, stages[key], _seconds(list_jobs(project, stages[key]), frames))
         for key, project in projects.items()
     ]
-    for order in orders:
+    for run in runs:
         read = {
             row.recordings.resolve()
-            for name, row in order.project.sequences.items()
-            if order.project.recordings_made(name) is None
+            for name, row in run.project.sequences.items()
+            if run.project.recordings_made(name) is None
         }
-        order.after = [
+        run.after = [
             other
-            for other in orders
-            if other is not order
+            for other in runs
+            if other is not run
             and any(
                 (made := other.project.recordings_made(name)) is not None and made.resolve() in read
                 for name in other.project.sequences
             )
         ]
 
-    def urgency(order: Order) -> float:
-        waiting = sum(other.expected for other in orders if order in other.after)
-        return order.expected + waiting
+    def urgency(run: ProjectRun) -> float:
+        waiting = sum(other.expected for other in runs if run in other.after)
+        return run.expected + waiting
 
-    return sorted(orders, key=urgency, reverse=True)
+    return sorted(runs, key=urgency, reverse=True)
 
 
 def _seconds(jobs: Jobs, frames: Mapping[Path, int]) -> dict[str, list[float]]:
@@ -173,73 +177,73 @@ def _seconds(jobs: Jobs, frames: Mapping[Path, int]) -> dict[str, list[float]]:
     return found
 
 
-def _run(orders: list[Order], beside: int, cores: int, lock: int, console: Console) -> None:
-    begin = told = time.monotonic()
-    while any(order.status is None for order in orders):
-        running = [o for o in orders if o.process is not None and o.status is None]
-        waiting = [o for o in orders if o.process is None and o.status is None]
+def _run(runs: list[ProjectRun], beside: int, cores: int, lock: int, console: Console) -> None:
+    begin = reported = time.monotonic()
+    while any(run.status is None for run in runs):
+        running = [o for o in runs if o.process is not None and o.status is None]
+        waiting = [o for o in runs if o.process is None and o.status is None]
         ready = [o for o in waiting if all(other.status is not None for other in o.after)]
-        for order in ready[: beside - len(running)]:
-            _start(order, -(-cores // beside), lock, console)
+        for run in ready[: beside - len(running)]:
+            _start(run, -(-cores // beside), lock, console)
         time.sleep(POLL_SECONDS)
-        for order in running:
-            assert order.process is not None and order.watcher is not None
-            order.watcher.tell()
-            if order.process.poll() is not None:
-                _end(order, console)
+        for run in running:
+            assert run.process is not None and run.watcher is not None
+            run.watcher.tell()
+            if run.process.poll() is not None:
+                _end(run, console)
         now = time.monotonic()
-        if now - told > TELL_SECONDS:
-            told = now
-            console.print(progress(orders, beside, now - begin), highlight=False, markup=False)
+        if now - reported > TELL_SECONDS:
+            reported = now
+            console.print(progress(runs, beside, now - begin), highlight=False, markup=False)
 
 
-def progress(orders: Sequence[Order], beside: int, elapsed: float) -> str:
-    """How many projects are done and how long the rest takes at most, at the pace until now.
+def progress(runs: Sequence[ProjectRun], beside: int, elapsed: float) -> str:
+    """Report of the completed projects and the remaining minutes at the present pace.
 
-    What a workflow keeps is known once it has started: before, all of its jobs count.
+    The minutes are an upper bound: all jobs of a workflow count until it has planned its jobs.
     """
-    left, done = (sum(values) for values in zip(*(o.left() for o in orders), strict=True))
+    left, done = (sum(values) for values in zip(*(o.left() for o in runs), strict=True))
     pace = elapsed * beside / done if done > 60 else 1.0
-    ended = sum(order.status is not None for order in orders)
+    ended = sum(run.status is not None for run in runs)
     return (
-        f"{ended} of {len(orders)} projects done after {elapsed / 60:.0f} minutes, at most "
+        f"{ended} of {len(runs)} projects done after {elapsed / 60:.0f} minutes, at most "
         f"{math.ceil(left * pace / beside / 60)} left"
     )
 
 
-def _start(order: Order, cores: int, lock: int, console: Console) -> None:
-    project = order.project
+def _start(run: ProjectRun, cores: int, lock: int, console: Console) -> None:
+    project = run.project
     targets = [
-        str(project.artefact(name, stage)) for stage in order.stages for name in project.sequences
+        str(project.artefact(name, stage)) for stage in run.stages for name in project.sequences
     ]
-    order.watcher = Watcher(project, console)
-    path = order.watcher.transcript
+    run.watcher = Watcher(project, console)
+    path = run.watcher.transcript
     path.parent.mkdir(parents=True, exist_ok=True)
     path.unlink(missing_ok=True)
-    order.transcript = open(path, "w", encoding="utf-8")  # noqa: SIM115 (closed in _end)
+    run.transcript = open(path, "w", encoding="utf-8")  # noqa: SIM115 (closed in _end)
     command = snakemake_command(project.path, cores=cores, arguments=[*targets, "--nolock"])
-    order.process = subprocess.Popen(
+    run.process = subprocess.Popen(
         command,
-        stdout=order.transcript,
+        stdout=run.transcript,
         stderr=subprocess.STDOUT,
         env={**os.environ, "NO_COLOR": "1"},
-        pass_fds=[lock],  # held as long as any of them lives
+        pass_fds=[lock],  # the lock lasts as long as any of the processes
     )
 
 
-def _end(order: Order, console: Console) -> None:
-    assert order.process is not None and order.watcher is not None and order.transcript is not None
-    order.transcript.close()
-    order.status = order.process.returncode
-    failures = order.watcher.failures() if order.status else {}
+def _end(run: ProjectRun, console: Console) -> None:
+    assert run.process is not None and run.watcher is not None and run.transcript is not None
+    run.transcript.close()
+    run.status = run.process.returncode
+    failures = run.watcher.failures() if run.status else {}
     for name, words in failures.items():
         console.print(
-            f"[red]{escape(order.project.config.dataset)}: {escape(name)}[/red] {escape(words)}",
+            f"[red]{escape(run.project.config.dataset)}: {escape(name)}[/red] {escape(words)}",
             highlight=False,
             soft_wrap=True,
         )
-    if order.status and not failures:
-        lines = order.watcher.transcript.read_text(encoding="utf-8").splitlines()
+    if run.status and not failures:
+        lines = run.watcher.transcript.read_text(encoding="utf-8").splitlines()
         console.print("\n".join(lines[-LAST_LINES:]), highlight=False, markup=False)
 
 

@@ -1,4 +1,4 @@
-"""Figures of the held-out verdict from the metrics artefact: stated errors, true errors, cameras."""
+"""Figures of the held-out verdict: stated and true errors, and errors by camera."""
 
 from __future__ import annotations
 

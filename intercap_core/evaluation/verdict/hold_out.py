@@ -106,7 +106,7 @@ class HeldOut:
 
 
 def hold_out(inputs: JointInputs, settings: JointSettings, result: JointResult) -> HeldOut | None:
-    """Refit ``result`` without each camera and from every other frame; compare with what was left out.
+    """Refit ``result`` without each camera and without every other frame, and compare.
 
     None where fewer than two cameras show the person.
     """

@@ -152,7 +152,7 @@ def test_bodies_with_less_are_fitted_to_recordings_that_others_make() -> None:
     for project in others:
         assert {row.recordings for row in project.sequences.values()} <= made
     assert [body_evaluation.rig_of(project.config) for project in others] == [
-        "all views, a shape a frame",
+        "all views, one shape per frame",
         "all views, no depth",
         "4 views",
         "4 views, no depth",

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from intercap_core.commands.evaluate.captures import PART
-from intercap_core.commands.evaluate.part import measured_once, spread
+from intercap_core.commands.evaluate.part import measure_cached, spread
 from intercap_core.config import Config, ObjectEntry, SubjectEntry
 from intercap_core.errors import UserError
 from intercap_core.evaluation.scene_errors import CaptureErrors, SlipCounts
@@ -40,17 +40,17 @@ def test_errors_are_kept_by_content(tmp_path: Path) -> None:
 
     part = replace(PART, measure=measure)
     for _ in range(2):
-        found = measured_once(part, project, "one")
+        found = measure_cached(part, project, "one")
         assert found.sequence == "one" and found.slips == errors.slips
         np.testing.assert_array_equal(found.after, values)
     assert calls == ["one"]
     files[1].write_text("another scene")
-    measured_once(part, project, "one")
+    measure_cached(part, project, "one")
     assert calls == ["one", "one"]
     assert len(list((files[1].parent / "evaluation").iterdir())) == 1  # the older errors are gone
     (tmp_path / "truth.h5").unlink()  # a recording that was interrupted, whose results remain
     with pytest.raises(UserError, match=r"truth.h5: the truth of 'one' is missing.*remove .*one"):
-        measured_once(part, project, "one")
+        measure_cached(part, project, "one")
 
 
 def test_the_spread_is_the_standard_error_over_recordings() -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from intercap_core.commands.evaluate.seeds import drawn_anew
+from intercap_core.commands.evaluate.seeds import redraw_settings
 from intercap_core.project import Project, load_project
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -22,7 +22,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def drawn(here: Path, name: str, seed: int) -> Project:
     path = Path("config") / "object" / name
-    return load_project(drawn_anew({"objects": [path]}, seed)["objects"][0])
+    return load_project(redraw_settings({"objects": [path]}, seed)["objects"][0])
 
 
 def test_seeds_and_people_are_others_and_the_scripts_the_same(here: Path) -> None:

@@ -17,7 +17,7 @@ from intercap_core.cli import (
 from intercap_core.commands.evaluate import budget
 from intercap_core.commands.evaluate.part import Targets
 from intercap_core.commands.evaluate.run import PARTS
-from intercap_core.commands.evaluate.workflows import Order, orders_of, progress
+from intercap_core.commands.evaluate.workflows import ProjectRun, plan_runs, progress
 from intercap_core.project import load_project
 
 SETTINGS = {
@@ -39,16 +39,18 @@ def wanted() -> dict[str, Targets]:
 
 
 def _frames(wanted: dict[str, Targets]) -> dict[Path, int]:
-    return budget.frames_of([project for targets in wanted.values() for _, project in targets])
+    return budget.recording_frames(
+        [project for targets in wanted.values() for _, project in targets]
+    )
 
 
 def test_projects_wait_for_those_that_make_their_recordings(
     wanted: dict[str, Targets],
 ) -> None:
-    orders = orders_of(wanted, _frames(wanted))
-    by_name = {order.project.config.dataset: order for order in orders}
-    assert len(orders) == len(by_name) == 1 + 3 + 7 + 7 + 5 + 7
-    assert orders[0] is by_name["object"]  # what most wait for comes first
+    runs = plan_runs(wanted, _frames(wanted))
+    by_name = {run.project.config.dataset: run for run in runs}
+    assert len(runs) == len(by_name) == 1 + 3 + 7 + 7 + 5 + 7
+    assert runs[0] is by_name["object"]  # what most wait for comes first
     stages = [PARTS[part].stage for part in ("sequences", "objects", "bodies")]
     assert by_name["object"].stages == stages
     for name in ("object_no_detector", "body_two_view"):
@@ -57,11 +59,11 @@ def test_projects_wait_for_those_that_make_their_recordings(
 
 
 def test_people_alone_are_taken_to_the_export_and_nobody_else(wanted: dict[str, Targets]) -> None:
-    orders = orders_of(wanted, _frames(wanted))
-    to_export = [order for order in orders if "export" in order.stages]
-    assert [order.project.config.dataset for order in to_export] == ["field_alone"]
+    runs = plan_runs(wanted, _frames(wanted))
+    to_export = [run for run in runs if "export" in run.stages]
+    assert [run.project.config.dataset for run in to_export] == ["field_alone"]
     assert to_export[0].stages == ["export"]
-    jobs = [(name, stage) for _, name, stage in budget.jobs_of(to_export[0].project, ["export"])]
+    jobs = [(name, stage) for _, name, stage in budget.list_jobs(to_export[0].project, ["export"])]
     for name in to_export[0].project.sequences:
         own = [stage for of, stage in jobs if of == name]
         assert own[0] == "studio" and own[-2:] == ["metrics", "export"] and len(own) == 10
@@ -95,8 +97,8 @@ def test_each_part_is_expected_to_keep_to_its_budget(
 
 def test_what_is_left_shrinks_as_jobs_are_done(tmp_path: Path) -> None:
     project = load_project(Path("config/test/config.yaml"))
-    order = Order(project, ["scene"], {"frames": [10.0, 30.0], "scene": [60.0, 60.0]})
-    assert order.left() == (160.0, 0.0)
+    run = ProjectRun(project, ["scene"], {"frames": [10.0, 30.0], "scene": [60.0, 60.0]})
+    assert run.left() == (160.0, 0.0)
 
     class Watcher:
         transcript = tmp_path / "snakemake.log"
@@ -104,11 +106,11 @@ def test_what_is_left_shrinks_as_jobs_are_done(tmp_path: Path) -> None:
         def jobs(self) -> dict[str, object]:
             return {"a: frames": type("State", (), {"state": "finished"})}
 
-    order.watcher = Watcher()  # type: ignore[assignment]
-    order.watcher.transcript.write_text(
+    run.watcher = Watcher()  # type: ignore[assignment]
+    run.watcher.transcript.write_text(
         "Job stats:\njob  count\n---\nframes  1\nscene  2\ntotal  3\n"
     )
-    assert order.left() == (120.0, 20.0)
-    assert progress([order], 2, 0.0) == "0 of 1 projects done after 0 minutes, at most 1 left"
-    order.status = 0
-    assert order.left() == (0.0, 140.0)
+    assert run.left() == (120.0, 20.0)
+    assert progress([run], 2, 0.0) == "0 of 1 projects done after 0 minutes, at most 1 left"
+    run.status = 0
+    assert run.left() == (0.0, 140.0)
