@@ -1,11 +1,12 @@
-"""Fit what the verdict states of a result without truth to the true errors of virtual recordings.
+"""Fit the factors of the stated error (held-out verdict) to the true errors of recordings.
 
     python -m bench.verdict METRICS [METRICS ...]
 
-METRICS are metrics.h5 of sequences with truth, best of many kinds of rigs and noise: stated errors
-can be trusted as far as those reach. Prints the factors for
-`intercap_core/evaluation/verdict/stated.py`, and how well errors are told of recordings of a kind (the folder above a sequence's) that was left
-out of the fit: the spread that is stated is of these.
+METRICS are metrics.h5 of sequences with truth. They should cover many kinds of rigs and noise: the
+fit is valid for the kinds of recordings that it has seen. The kind is the name of the folder above
+that of the sequence. Prints the factors for `intercap_core/evaluation/verdict/stated.py` and the
+cross-validated errors: each kind is predicted by factors fitted to the other kinds. The stated
+spread is that of the cross-validated errors.
 """
 
 from __future__ import annotations

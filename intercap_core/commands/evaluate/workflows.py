@@ -96,8 +96,8 @@ def bring_up_to_date(
     """Run the workflows of all projects to the stages that the parts need.
 
     Failed jobs are printed; returns 1 where any failed. A run that was killed continues:
-    Snakemake's lock is not used, and a system lock prevents two evaluations in one folder. Raises UserError
-    where another evaluation is running.
+    Snakemake's lock is not used, and a system lock prevents two evaluations in one folder.
+    Raises UserError where another evaluation is running.
 
     Args:
         wanted: target stages and projects by part.
