@@ -20,6 +20,7 @@ from intercap_core.joint.terms.stick_residual import local_points
 from intercap_core.output.site.closeups import SIDES, closeup, holds, read_handling
 from intercap_core.project import Project
 from intercap_core.schemas import SCENE
+from intercap_core.sequence_inputs import SequencePaths
 
 Paths = Mapping[str, Mapping[str, Mapping[str, Path]]]  # by variant, sequence and stage
 # Variants of the ablation that the pictures show
@@ -52,13 +53,10 @@ def _grasps(project: Project, paths: Paths, output: Path) -> Path | None:
         return None
     sheets = []
     for name, by_stage in paths[EVERYTHING].items():
-        row = project.sequences[name]
         handling = read_handling(
-            by_stage,
-            entry=project.objects[row.object],
-            body_models=project.config.body_models,
-            gender=project.subjects[row.subject].gender,
-            truth=row.truth,
+            SequencePaths(**by_stage),
+            project.models(name),
+            truth=project.sequences[name].truth,
             joints={
                 "no contact/stick": paths[WITHOUT_CONTACT][name]["joint"],
                 "joint": by_stage["joint"],

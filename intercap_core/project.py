@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,6 +26,7 @@ from intercap_core.inputs.files import MAX_TABLE_BYTES, Unreadable, read_text
 from intercap_core.inputs.quotes import printable, quoted
 from intercap_core.inputs.yaml_files import read_yaml
 from intercap_core.schemas import FRAMES
+from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 
 M = TypeVar("M", bound=BaseModel)
 NAMES_TOLD = 40  # of a table, in a message
@@ -50,6 +51,17 @@ class Project:
     def logs(self) -> Path:
         """Folder of this dataset's logs."""
         return Path("logs") / self.config.dataset
+
+    def paths(self, sequence: str) -> SequencePaths:
+        """Paths of the sequence's artefacts, from frames to metrics."""
+        return SequencePaths(
+            **{stage.name: self.artefact(sequence, stage.name) for stage in fields(SequencePaths)}
+        )
+
+    def models(self, sequence: str) -> SequenceModels:
+        """The object, subject and body files of the sequence."""
+        subject = self.subjects[self.sequences[sequence].subject]
+        return SequenceModels(self.object_of(sequence), subject, self.config.body_models)
 
     def object_of(self, sequence: str) -> ObjectEntry | None:
         """The sequence's object; None where its row names none: a person alone."""

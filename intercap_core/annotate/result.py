@@ -23,6 +23,7 @@ from intercap_core.output.viewer.content import gather
 from intercap_core.output.viewer.package import payload, unpacked
 from intercap_core.pipeline.record import read_record
 from intercap_core.schemas import BODY_FIT, JOINT, METRICS, OBJECT_TRACK, PERSON, SCENE
+from intercap_core.sequence_inputs import SequencePaths
 
 DOUBTED = 1.5  # times the part's stated error: a frame that the verdict doubts
 _DRAWN = {
@@ -95,18 +96,15 @@ def describe(opened: Opened) -> dict[str, Any]:
 def viewer_payload(opened: Opened) -> str:
     """The 4D viewer's data; raises UserError where there is no body yet or it is not readable."""
     project = opened.project
-    row = project.sequences[opened.name]
 
     def made() -> str:
         drawn = _of_page(opened)
         if drawn:
             return payload(*_the_result_alone(*unpacked(drawn)))
-        content = gather(
-            opened.paths,
-            object_=project.object_of(opened.name),
-            body_models=project.config.body_models,
-            gender=project.subjects[row.subject].gender,
+        paths = SequencePaths(
+            **{stage: path for stage, path in opened.paths.items() if stage != "summary"}
         )
+        content = gather(paths, project.models(opened.name))
         return payload(*_the_result_alone(content.header, content.arrays))
 
     missing = [stage for stage in _VIEWER if not opened.there(stage)]

@@ -8,7 +8,6 @@ from pathlib import Path
 from intercap_core.errors import UserError
 from intercap_core.output.site.closeups import closeup, holds, read_handling
 from intercap_core.project import load_project
-from intercap_core.stage_list import SEQUENCE_STAGES
 
 
 def draw_closeups(
@@ -31,17 +30,11 @@ def draw_closeups(
         )
     written, empty = [], []
     for name in sequences or project.sequences:
-        row, entry = project.sequences[name], project.object_of(name)
-        if entry is None:
+        models = project.models(name)
+        if models.object_ is None:
             empty.append(name)
             continue
-        handling = read_handling(
-            {stage: project.artefact(name, stage) for stage in SEQUENCE_STAGES},
-            entry=entry,
-            body_models=project.config.body_models,
-            gender=project.subjects[row.subject].gender,
-            truth=row.truth,
-        )
+        handling = read_handling(project.paths(name), models, truth=project.sequences[name].truth)
         found = holds(handling.probability)
         if not found:
             empty.append(name)

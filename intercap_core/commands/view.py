@@ -8,9 +8,6 @@ from pathlib import Path
 from intercap_core.errors import UserError
 from intercap_core.output.viewer import page
 from intercap_core.project import Project
-from intercap_core.stage_list import SEQUENCE_STAGES
-
-_NEEDED = ("frames", "scene", "body_fit")
 
 
 def view(project: Project, sequence: str, output: Path | None = None, *, show: bool = True) -> Path:
@@ -19,12 +16,11 @@ def view(project: Project, sequence: str, output: Path | None = None, *, show: b
     Returns the page, in the folder ``output`` or ``view`` beside the sequence's artefacts. Raises
     UserError where the sequence has no body yet or an artefact is broken.
     """
-    row = project.sequences[sequence]
-    paths = {stage: project.artefact(sequence, stage) for stage in SEQUENCE_STAGES}
-    for stage in _NEEDED:
-        if not paths[stage].is_file():
+    paths = project.paths(sequence)
+    for needed in (paths.frames, paths.scene, paths.body_fit):
+        if not needed.is_file():
             raise UserError(
-                f"{paths[stage]}: there is no such file, so there is nothing to look at yet; run "
+                f"{needed}: there is no such file, so there is nothing to look at yet; run "
                 f"`intercap run {project.path} -- --until body_fit` first"
             )
     folder = output or project.results / sequence / "view"
@@ -34,10 +30,8 @@ def view(project: Project, sequence: str, output: Path | None = None, *, show: b
     page.write_script(
         folder / page.SCRIPT,
         paths,
-        object_=project.object_of(sequence),
-        body_models=project.config.body_models,
-        gender=project.subjects[row.subject].gender,
-        truth=row.truth,
+        project.models(sequence),
+        truth=project.sequences[sequence].truth,
     )
     written = folder / "index.html"
     written.write_text(page.standalone(sequence), encoding="utf-8")

@@ -30,6 +30,7 @@ from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.rigid.surface_samples import sample_surface
 from intercap_core.geometry.rigid.surface_tree import SurfaceTree
 from intercap_core.schemas import SCENE, TRUTH
+from intercap_core.sequence_inputs import SequencePaths
 
 EVERY = 5  # every fifth frame is compared with its points: neighbours are redundant
 SURFACE_SAMPLES = 4000  # area samples of the body
@@ -155,10 +156,7 @@ class BodyErrors:
 
 
 def measure(
-    frames: Path,
-    scene: Path,
-    person: Path,
-    body_fit: Path,
+    paths: SequencePaths,
     truth: Path,
     body_models: BodyModels,
     gender: str,
@@ -167,8 +165,8 @@ def measure(
 
     Raises UserError where an artefact cannot be read or the truth is of another recording.
     """
-    track = read_body(body_fit, "body_fit", body_models, gender)
-    with artefacts.read(scene, SCENE) as found:
+    track = read_body(paths.body_fit, "body_fit", body_models, gender)
+    with artefacts.read(paths.scene, SCENE) as found:
         sequence, fps = str(found.attributes["sequence"]), float(found.attributes["fps"])
         known = Truth.load(truth, found["times"], fps, track.model.num_vertices)
         views = int(found["present"].sum())
@@ -176,7 +174,7 @@ def measure(
         interaction = str(told.attributes["interaction"])
     found_errors = body_errors(known, track, fps)
     assert track.sigma is not None
-    with BodyClouds.open(frames, scene, person, track.model) as points:
+    with BodyClouds.open(paths.frames, paths.scene, paths.person, track.model) as points:
         surface, clouds = _surface(track, known, points)
     return BodyErrors(
         sequence=sequence,

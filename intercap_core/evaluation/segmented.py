@@ -15,6 +15,7 @@ from intercap_core.geometry.camera.mask_pixels import mask_pixels, mask_window
 from intercap_core.geometry.camera.masks import Runs
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.schemas import OBJECT_TRACK, PERSON
+from intercap_core.sequence_inputs import SequencePaths
 
 # Only depth pixels within this distance of the meshes are used: larger errors of a fit need no
 # exact figure.
@@ -168,20 +169,21 @@ def read_clouds(
     rig: Rig,
     depth_bias: np.ndarray,
     image_of: np.ndarray,
-    detections: Path,
-    person: Path,
-    object_track: Path,
+    paths: SequencePaths,
 ) -> SegmentedClouds:
-    """Segmented clouds of a sequence, from the artefacts of its stages.
+    """Segmented clouds of a sequence, from its detections, person and object track.
 
-    ``images`` and ``image_of`` (T, C) are ordered by the moment that the images show.
+    Args:
+        images: colour and depth, ordered by the moment that they show.
+        depth_bias: (C,) metres.
+        image_of: (T, C) index of the image that shows each frame.
     """
-    found = Detections.load(detections).showing(image_of).with_candidates_of(person)
-    with artefacts.read(object_track, OBJECT_TRACK) as track:
+    found = Detections.load(paths.detections).showing(image_of).with_candidates_of(paths.person)
+    with artefacts.read(paths.object_track, OBJECT_TRACK) as track:
         kept = track["candidate"]
     total, cameras = kept.shape
     candidates = [
         [found.candidates(t, c)[kept[t, c]].rle if kept[t, c] >= 0 else b"" for c in range(cameras)]
         for t in range(total)
     ]
-    return SegmentedClouds(images, rig, read_person_masks(person), candidates, depth_bias)
+    return SegmentedClouds(images, rig, read_person_masks(paths.person), candidates, depth_bias)

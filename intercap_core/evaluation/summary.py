@@ -17,6 +17,7 @@ from intercap_core.evaluation.contact import CONTACT_M, vertex_contact
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.scene_errors import displacement
 from intercap_core.schemas import JOINT, METRICS, PER_VERTEX_METRICS, SCENE, SUMMARY
+from intercap_core.sequence_inputs import SequencePaths
 
 _RIG = "rig/"
 
@@ -102,15 +103,11 @@ class SequenceSummary:
             )
 
 
-def write(output: Path, paths: Mapping[str, Path], *, intent: str) -> None:
-    """Write the summary of one sequence.
-
-    ``paths`` holds the artefacts of all stages on which the result depends, by stage; scene, joint
-    and metrics are required. Raises UserError where an artefact cannot be read.
-    """
+def write(output: Path, paths: SequencePaths, *, intent: str) -> None:
+    """Write the summary of one sequence; raises UserError if an artefact is missing or broken."""
     with (
-        artefacts.read(paths["metrics"], METRICS) as metrics,
-        artefacts.read(paths["joint"], JOINT) as joint,
+        artefacts.read(paths.metrics, METRICS) as metrics,
+        artefacts.read(paths.joint, JOINT) as joint,
     ):
         told = {
             **{name: metrics.attributes[name] for name in METRICS.attributes},
@@ -127,11 +124,11 @@ def write(output: Path, paths: Mapping[str, Path], *, intent: str) -> None:
             if "body_to_object" in metrics:
                 touching = vertex_contact(metrics["body_to_object"], CONTACT_M)
                 writer.put("body_contact_frames", touching.sum(0).astype(np.int32))
-            with artefacts.read(paths["scene"], SCENE) as scene:
+            with artefacts.read(paths.scene, SCENE) as scene:
                 for key, values in _rig(scene).items():
                     writer.put(f"{_RIG}{key}", values)
             stages, versions, settings = [], [], []
-            for stage, path in paths.items():
+            for stage, path in paths.by_stage().items():
                 schema = getattr(schemas, stage.upper())
                 with artefacts.read(path, schema) as source:
                     stages.append(stage)

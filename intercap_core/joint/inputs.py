@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -16,13 +15,7 @@ from intercap_core.artefacts import Artefact
 from intercap_core.body.artefact import load_model, load_pose_prior
 from intercap_core.body.lemo import FEWEST_FRAMES, FRAMES_PER_SECOND, MotionEncoder
 from intercap_core.body.model import BodyModel
-from intercap_core.config import (
-    BodyFitSettings,
-    BodyModels,
-    JointSettings,
-    ObjectEntry,
-    ObjectTrackSettings,
-)
+from intercap_core.config import JointSettings, ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import Detections
 from intercap_core.formats.recordings.frames import Frames
@@ -42,6 +35,7 @@ from intercap_core.joint.terms.learned_motion import LearnedMotion
 from intercap_core.joint.time_offsets import OffsetPrior
 from intercap_core.object_track.recording import ObjectRecording
 from intercap_core.schemas import BODY_FIT, OBJECT_TRACK, SCENE
+from intercap_core.sequence_inputs import FitSettings, SequenceModels, SequencePaths
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,31 +67,22 @@ class JointInputs:
 
 @contextmanager
 def open_inputs(
-    *,
-    frames: Path,
-    scene: Path,
-    detections: Path,
-    person: Path,
-    object_track: Path,
-    body_fit: Path,
-    object_: ObjectEntry | None,
-    body_models: BodyModels,
-    settings: JointSettings,
-    body_settings: BodyFitSettings,
-    track_settings: ObjectTrackSettings,
+    paths: SequencePaths,
+    models: SequenceModels,
+    fit_settings: FitSettings,
     device: str = "cpu",
 ) -> Iterator[JointInputs]:
-    """Open for a ``with`` block, in which images are read.
+    """Open the inputs of the joint fit for a ``with`` block, in which images are read.
 
-    ``body_settings`` say what the body fit had fitted, ``track_settings`` how the tracker compares
-    images; ``object_`` is None for a person alone. An object whose track is lost in all frames is
-    taken as none. Raises UserError where an artefact or the mesh cannot be used.
+    An object whose track is lost in all frames is treated as absent. Raises UserError if an
+    artefact or the mesh cannot be used.
     """
+    settings, object_, body_models = fit_settings.joint, models.object_, models.body_models
     mesh = _mesh(object_, settings)
     with (
-        artefacts.read(body_fit, BODY_FIT) as body,
-        artefacts.read(object_track, OBJECT_TRACK) as track,
-        artefacts.read(scene, SCENE) as source,
+        artefacts.read(paths.body_fit, BODY_FIT) as body,
+        artefacts.read(paths.object_track, OBJECT_TRACK) as track,
+        artefacts.read(paths.scene, SCENE) as source,
     ):
         model = load_model(body_models, str(body.attributes["gender"]), body, device=device)
         encoder = _motion_encoder(settings, source, model)
@@ -105,13 +90,13 @@ def open_inputs(
         attributes = {name: body.attributes[name] for name in ("sequence", "gender", "body_model")}
         fps = float(source.attributes["fps"])
         body_data = BodyData.load(
-            frames=frames,
-            scene=scene,
-            person=person,
+            frames=paths.frames,
+            scene=paths.scene,
+            person=paths.person,
             body_fit=body,
             model=model,
             state=sequential.state,
-            settings=body_settings,
+            settings=fit_settings.body_fit,
             fps=fps,
             pose_prior=load_pose_prior(body_models, model),
         )
@@ -127,13 +112,17 @@ def open_inputs(
     threads = ThreadPool(torch.get_num_threads() if model.device.type == "cpu" else 1)
     # numpy divides its products among threads too; small ones gain nothing by that, and those of
     # two threads would wait for each other
-    with Frames.open(frames) as recording, threadpool_limits(1, user_api="blas"):
+    with Frames.open(paths.frames) as recording, threadpool_limits(1, user_api="blas"):
         images = None
         if settings.look_again and object_ is not None and mesh is not None:
             seen = ObjectRecording(
-                recording, Detections.load(detections), scene, person, mesh.diameter
+                recording,
+                Detections.load(paths.detections),
+                paths.scene,
+                paths.person,
+                mesh.diameter,
             )
-            images = ObjectImages(seen, mesh, track_settings, object_.labels, threads)
+            images = ObjectImages(seen, mesh, fit_settings.object_track, object_.labels, threads)
         yield JointInputs(
             geometry,
             sequential,

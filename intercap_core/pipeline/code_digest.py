@@ -17,7 +17,9 @@ from pathlib import Path
 
 PACKAGE = "intercap_core"
 ROOT = Path(__file__).resolve().parents[1]
-DECLARATIONS = frozenset({f"{PACKAGE}.{name}" for name in ("config", "schemas", "project")})
+DECLARATIONS = frozenset(
+    {f"{PACKAGE}.{name}" for name in ("config", "schemas", "project", "sequence_inputs")}
+)
 # Where compiled code lies, and what is said meanwhile, changes no result.
 NEUTRAL = frozenset(f"{PACKAGE}.{name}" for name in ("disk", "kernel_cache", "progress", "signals"))
 CONSTANTS = (".constants", "_constants")  # ends of modules that hold a room's numbers

@@ -18,6 +18,7 @@ from intercap_core.pipeline.code_cache import stage_code
 from intercap_core.pipeline.contents import Contents
 from intercap_core.pipeline.record import Record, libraries, plain, processor
 from intercap_core.project import Project
+from intercap_core.sequence_inputs import FitSettings
 
 # Columns of a sequence's row that a stage may read; reading another one is an error.
 COLUMNS: dict[str, tuple[str, ...]] = {
@@ -55,9 +56,8 @@ def arguments(
     config, row = project.config, project.sequences[sequence]
     known: dict[str, Any] = {
         "settings": getattr(config, stage, None),  # not every stage has any
-        "body_settings": config.body_fit,
-        "track_settings": config.object_track,
-        "joint_settings": config.joint,
+        "fit_settings": FitSettings(config.joint, config.body_fit, config.object_track),
+        "models": project.models(sequence),
         "sequence": row_of(stage, row),
         "object_": project.object_of(sequence),
         "subject": project.subjects[row.subject],
@@ -74,6 +74,11 @@ def arguments(
         "left_right": annotation.left_right,
     }
     return {name: known[name] for name in stage_code(stage).parameters if name in known}
+
+
+def takes_paths(stage: str) -> bool:
+    """Whether the stage gets its artefacts as :class:`SequencePaths`, not as single arguments."""
+    return "paths" in stage_code(stage).parameters
 
 
 def record(
@@ -95,6 +100,9 @@ def record(
     device = given.pop("device", "cpu")
     if given.get("results") is not None:
         given["results"] = intercap_file(given["results"])  # of a folder its newest
+    for name in ("models", "fit_settings"):
+        group = given.pop(name, None)
+        given |= vars(group) if group is not None else {}
     if "body_models" in given:
         given["body_models"] = _body_files(project.config, given["subject"].gender)
     return _record(

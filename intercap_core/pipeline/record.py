@@ -175,6 +175,9 @@ def _given(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
 
 _LABELS = {
     "settings": "settings",
+    "joint": "settings of joint",
+    "body_fit": "settings of body_fit",
+    "object_track": "settings of object_track",
     "object_": "object's entry",
     "subject": "subject's entry",
     "sequence": "row of the table",

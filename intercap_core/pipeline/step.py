@@ -22,6 +22,7 @@ from intercap_core.pipeline.needs import disk_told
 from intercap_core.pipeline.plan import DATASET, OF_ALL, dataset_record_of, failures, noted
 from intercap_core.pipeline.record import FILE, Record, add_record, read_record
 from intercap_core.project import Project
+from intercap_core.sequence_inputs import SequencePaths
 from intercap_core.stage_list import STAGES
 from intercap_core.stages import folders
 
@@ -115,7 +116,8 @@ def _make(
         check_device(project)
     module = importlib.import_module(f"intercap_core.stages.{stage}")
     passed = given.arguments(project, sequence, stage, annotation)
-    passed |= {name: inputs[name] for name in STAGES[stage].reads}
+    read = {name: inputs[name] for name in STAGES[stage].reads}
+    passed |= {"paths": SequencePaths(**read)} if given.takes_paths(stage) else read
     in_folder = STAGES[stage].writes_folder
     if in_folder:
         folders.check_replaceable(output, marker=module.MARKER, what=stage)

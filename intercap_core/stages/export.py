@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.config import BodyModels, ExportSettings, ObjectEntry, SubjectEntry
+from intercap_core.config import ExportSettings
 from intercap_core.errors import UserError
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.formats.recordings.frames import Frames
@@ -31,6 +31,7 @@ from intercap_core.output.export.touching import TouchingSurfaces
 from intercap_core.output.export.upright import z_up_frame
 from intercap_core.output.export.verdict import Verdict
 from intercap_core.schemas import JOINT, SCENE
+from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 from intercap_core.stages.folders import EXPORT_MARKER, check_replaceable, replaced
 
 log = logging.getLogger(__name__)
@@ -43,39 +44,32 @@ _NO_FRAME = "none: numbers of vertices and regions, distances in metres"
 
 def run(
     *,
-    frames: Path,
-    joint: Path,
-    scene: Path,
-    metrics: Path,
-    body_fit: Path,
-    object_track: Path,
-    object_: ObjectEntry | None,
-    subject: SubjectEntry,
-    body_models: BodyModels,
+    paths: SequencePaths,
+    models: SequenceModels,
     settings: ExportSettings,
     output: Path,
 ) -> None:
     """Write the chosen formats into the folder ``output``, replacing an earlier export there.
 
     The folder appears whole or not at all: it is filled under a temporary name beside its own, and
-    an earlier export goes only when the new one is complete. README.txt says what ``metrics``
-    state of the errors, and what is left out without an object (``object_`` is None, or it was
+    an earlier export goes only when the new one is complete. README.txt says what the
+    metrics state of the errors, and what is left out without an object (``object_`` is None, or it was
     found in no frame). Raises UserError where an artefact or the object's mesh is missing or
     broken, where the metrics are of another body, object or number of frames than the joint result,
     and where ``output`` holds anything but an export.
     """
-    output = Path(output)
+    object_, output = models.object_, Path(output)
     check_replaceable(output, marker=MARKER, what="export")
     mesh = None if object_ is None else ObjectMesh.load(object_)
-    with artefacts.read(scene, SCENE) as setting:
+    with artefacts.read(paths.scene, SCENE) as setting:
         given = Rig.from_artefact(setting)
         zup_from_master, upright = setting["zup_from_master"], z_up_frame(setting)
         image_of, times = setting["image_of"], setting["times"]
         fps = float(setting.attributes["fps"])
-    with artefacts.read(joint, JOINT) as fit:
+    with artefacts.read(paths.joint, JOINT) as fit:
         rig = given.moved(fit["master_from_colour"])
         exposures = Exposures(image_of, times, fit["time_offset"])
-    motion = read_motion(joint, fps, body_models, subject.gender, zup_from_master)
+    motion = read_motion(paths.joint, fps, models.body_models, models.gender, zup_from_master)
     if not motion.has_object:
         mesh = None
     z_up = settings.frame == "z-up"
@@ -85,7 +79,7 @@ def run(
     formats = [name for name in named if mesh is not None or not needs_object(name)]
     for name in set(named) - set(formats):
         log.info("sequence %s: there is no object, so %s is not exported", motion.sequence, name)
-    about = _about(joint, metrics, body_fit, object_track, motion, mesh)
+    about = _about(paths, motion, mesh)
     posed = set(formats) & (_OF_IMAGES | {"meshes"})
     bodies = body_vertices(motion) if posed else np.zeros((0, 0, 3))
     poses = list(object_poses(motion, rig, exposures))
@@ -122,7 +116,7 @@ def run(
         if set(formats) & _OF_BODIES:
             files = body_files.write(folder / "body", about.body)
         if settings.images and set(formats) & _OF_IMAGES:
-            _copy_images(folder, frames, rig, exposures, formats)
+            _copy_images(folder, paths.frames, rig, exposures, formats)
         if about.verdict.stated:
             _dump(folder / "verdict.json", {"sequence": motion.sequence, **about.verdict.whole()})
         text = readme(motion, viewed, mesh, named, about, files, kind=settings.mesh_format)
@@ -138,29 +132,22 @@ def run(
         _write_manifest(folder, motion, formats, about, coordinates, files)
 
 
-def _about(
-    joint: Path,
-    metrics: Path,
-    body_fit: Path,
-    object_track: Path,
-    motion: Motion,
-    mesh: ObjectMesh | None,
-) -> About:
+def _about(paths: SequencePaths, motion: Motion, mesh: ObjectMesh | None) -> About:
     """What goes with the numbers; of another program's result no deviation is known."""
-    measured = SequenceMetrics.read(metrics)
+    measured = SequenceMetrics.read(paths.metrics)
     if len(measured) != len(motion):
         raise UserError(
-            f"{metrics}: holds {len(measured)} frames, but the joint result of sequence "
+            f"{paths.metrics}: holds {len(measured)} frames, but the joint result of sequence "
             f"{motion.sequence!r} {len(motion)}: it was measured on another; re-run stage 'metrics'"
         )
     return About(
         motion.sequence,
         BodyFile.of(motion.model, motion.gender),
         [str(reason) for reason in measured.values["flag_reason"]],
-        None if mesh is None else contact.StatedContact.read(joint),
+        None if mesh is None else contact.StatedContact.read(paths.joint),
         Verdict.of(measured),
-        None if mesh is None else TouchingSurfaces.read(metrics, motion, mesh),
-        None if motion.made_by else Deviations.read(body_fit, object_track, motion),
+        None if mesh is None else TouchingSurfaces.read(paths.metrics, motion, mesh),
+        None if motion.made_by else Deviations.read(paths.body_fit, paths.object_track, motion),
         motion.made_by,
     )
 

@@ -16,16 +16,7 @@ import torch
 from intercap_core import artefacts
 from intercap_core.body.keypoints import LEFT_HAND, RIGHT_HAND
 from intercap_core.body.model import BodyModel
-from intercap_core.config import (
-    BodyFitSettings,
-    BodyModels,
-    ContactInterval,
-    JointSettings,
-    ObjectEntry,
-    ObjectTrackSettings,
-    SubjectEntry,
-    digest,
-)
+from intercap_core.config import ContactInterval, digest
 from intercap_core.joint.cameras import CameraFit
 from intercap_core.joint.constants import FEW_HAND_VIEWS
 from intercap_core.joint.fit import JointFit, fit
@@ -33,6 +24,7 @@ from intercap_core.joint.inputs import open_inputs
 from intercap_core.joint.released.artefact import import_joint
 from intercap_core.joint.state import State
 from intercap_core.schemas import CONTACT_REGIONS, JOINT, PERSON
+from intercap_core.sequence_inputs import FitSettings, SequenceModels, SequencePaths
 
 log = logging.getLogger(__name__)
 
@@ -51,58 +43,35 @@ _BODY_PARAMETERS = (
 
 def run(
     *,
-    frames: Path,
-    scene: Path,
-    detections: Path,
-    person: Path,
-    object_track: Path,
-    body_fit: Path,
+    paths: SequencePaths,
+    models: SequenceModels,
+    fit_settings: FitSettings,
     output: Path,
-    object_: ObjectEntry | None,
-    subject: SubjectEntry,
-    body_models: BodyModels,
-    settings: JointSettings,
-    body_settings: BodyFitSettings,
-    track_settings: ObjectTrackSettings,
     contact: Sequence[ContactInterval] | None = None,
     device: str = "cpu",
     results: Path | None = None,
 ) -> None:
-    """Write joint.h5 from the sequential fits, or of another program's ``results``.
+    """Write joint.h5: a fit that starts from the sequential fits, or imported results.
 
-    ``body_settings`` say what the body fit had fitted, ``track_settings`` how the tracker compares
-    images. ``contact`` are the annotated intervals, None where contact is to be detected from the
-    geometry. Where ``object_`` is None, or its track is lost in all frames, the body's terms are
-    minimised alone. Raises UserError where an artefact or the mesh cannot be used.
+    Without an object, or if its track is lost in all frames, only the body's terms are minimised.
+    Raises UserError if an artefact or the mesh cannot be used.
+
+    Args:
+        contact: annotated intervals; None to detect contact from the geometry.
+        results: result of another program, imported instead of a fit.
     """
+    settings = fit_settings.joint
     if results is not None:
         import_joint(
             results,
-            frames=frames,
-            scene=scene,
-            person=person,
-            output=output,
-            object_=object_,
-            subject=subject,
-            body_models=body_models,
-            betas=body_settings.betas,
+            paths,
+            models,
+            output,
+            betas=fit_settings.body_fit.betas,
             settings_digest=digest(settings),
         )
         return
-    with open_inputs(
-        frames=frames,
-        scene=scene,
-        detections=detections,
-        person=person,
-        object_track=object_track,
-        body_fit=body_fit,
-        object_=object_,
-        body_models=body_models,
-        settings=settings,
-        body_settings=body_settings,
-        track_settings=track_settings,
-        device=device,
-    ) as inputs:
+    with open_inputs(paths, models, fit_settings, device) as inputs:
         fitted = fit(inputs, settings, contact)
     for odd in fitted.contact.oddities:
         first, last = odd.frames.start, max(odd.frames.start, odd.frames.stop - 1)
@@ -117,8 +86,8 @@ def run(
         output,
         JOINT,
         settings_digest=digest(settings),
-        subject=subject.subject,
-        object=object_.name if object_ else "",
+        subject=models.subject.subject,
+        object=models.object_.name if models.object_ else "",
         iterations=fitted.steps,
         refused=fitted.refused,
         converged=fitted.converged,
@@ -127,7 +96,7 @@ def run(
     ) as writer:
         _put_body(writer, inputs.model, fitted.state)
         _put(writer, fitted)
-        undetermined = inputs.sequential.flags.hands | _hands_of_few_views(person)
+        undetermined = inputs.sequential.flags.hands | _hands_of_few_views(paths.person)
         writer.put("hand_undetermined", undetermined)
         _put_cameras(writer, inputs.cameras)
 

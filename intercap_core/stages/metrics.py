@@ -9,16 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.config import (
-    BodyFitSettings,
-    BodyModels,
-    JointSettings,
-    MetricsSettings,
-    ObjectEntry,
-    ObjectTrackSettings,
-    SubjectEntry,
-    digest,
-)
+from intercap_core.config import MetricsSettings, digest
 from intercap_core.evaluation import body, motion, object_pose
 from intercap_core.evaluation import truth as truths
 from intercap_core.evaluation.flags import exchanged, merge_reasons
@@ -40,6 +31,7 @@ from intercap_core.schemas import (
     PERSON,
     SCENE,
 )
+from intercap_core.sequence_inputs import FitSettings, SequenceModels, SequencePaths
 
 log = logging.getLogger(__name__)
 
@@ -48,45 +40,37 @@ _FOREIGN_TRUTH_M = 0.06  # clothing, noise and occlusion leave some 10 mm
 
 def run(
     *,
-    frames: Path,
-    scene: Path,
-    detections: Path,
-    person: Path,
-    object_track: Path,
-    body_fit: Path,
-    joint: Path,
-    output: Path,
-    object_: ObjectEntry | None,
-    subject: SubjectEntry,
-    body_models: BodyModels,
+    paths: SequencePaths,
+    models: SequenceModels,
+    fit_settings: FitSettings,
     settings: MetricsSettings,
-    joint_settings: JointSettings,
-    body_settings: BodyFitSettings,
-    track_settings: ObjectTrackSettings,
+    output: Path,
     truth: Path | None = None,
 ) -> None:
-    """Measure the joint result of one sequence, judge it by what was held out, and hold every stage
-    to ``truth`` where given.
+    """Measure the joint result of one sequence, state its error from held-out cameras, and compare
+    every stage with the truth if it is known.
 
-    The settings of other stages say how their fits were made, which the verdict repeats in part.
-    Where ``object_`` is None, or it was found in no frame, what would be of an object and of
-    contact is left out; of one that is truly there, the errors are infinite. Raises UserError where
-    an input artefact is missing, broken or does not fit the others.
+    Object and contact metrics are omitted if the sequence has no object or the object was found in
+    no frame. The errors of an object that is present but was not found are infinite. Raises
+    UserError if an input artefact is missing, broken or does not fit the others.
+
+    Args:
+        fit_settings: settings of the fits, which the held-out comparison repeats in part.
+        truth: truth file of a virtual recording.
     """
-    with artefacts.read(joint, JOINT) as fitted:
+    object_, body_models, gender = models.object_, models.body_models, models.gender
+    with artefacts.read(paths.joint, JOINT) as fitted:
         made_by = {k: v for k, v in fitted.attributes.items() if k in JOINT.optional_attributes}
     mesh = None if object_ is None else ObjectMesh.load(object_)
-    fitted_body = read_body(joint, "joint", body_models, subject.gender)
-    fitted_object = read_object(joint, "joint")
+    fitted_body = read_body(paths.joint, "joint", body_models, gender)
+    fitted_object = read_object(paths.joint, "joint")
     with contextlib.ExitStack() as stack:
-        images = stack.enter_context(Frames.open(frames))
-        setting = stack.enter_context(artefacts.read(scene, SCENE))
-        fitted = stack.enter_context(artefacts.read(joint, JOINT))
+        images = stack.enter_context(Frames.open(paths.frames))
+        setting = stack.enter_context(artefacts.read(paths.scene, SCENE))
+        fitted = stack.enter_context(artefacts.read(paths.joint, JOINT))
         images = images.showing(setting["image_of"])
         rig = Rig.from_artefact(setting).moved(fitted["master_from_colour"])
-        clouds = read_clouds(
-            images, rig, fitted["depth_bias"], setting["image_of"], detections, person, object_track
-        )
+        clouds = read_clouds(images, rig, fitted["depth_bias"], setting["image_of"], paths)
         known = None
         if truth is not None:
             vertices = fitted_body.model.num_vertices
@@ -105,12 +89,12 @@ def run(
         true_distance = values.pop("true_distance", None)
         _warn_of_foreign_truth(truth, values)
         values |= _motion(fitted_body, handled, images.fps)
-        values |= _stated(images, person, object_track, body_fit, joint)
+        values |= _stated(images, paths)
         if handled is not None:
             values["contact_probability"] = fitted["contact_probability"]
         if known is not None:
-            tracked = read_object(object_track, "object_track")
-            first_body = read_body(body_fit, "body_fit", body_models, subject.gender)
+            tracked = read_object(paths.object_track, "object_track")
+            first_body = read_body(paths.body_fit, "body_fit", body_models, gender)
             errors = StageErrors(known, true_distance, mesh, measured.threshold, images.fps)
             values |= errors.of_object("object_track", tracked)
             values |= errors.of_body("body_fit", first_body, tracked)
@@ -123,7 +107,7 @@ def run(
             )
         attributes = {
             "sequence": images.sequence,
-            "subject": subject.subject,
+            "subject": models.subject.subject,
             "object": object_.name if object_ else "",
             "fps": images.fps,
             "has_truth": known is not None,
@@ -133,20 +117,7 @@ def run(
     # Last, while the rig and the body are held: what they hold, tables of rays and the like, is not
     # made again. The verdict was fitted to errors of this program's results alone.
     if settings.hold_out and not made_by:
-        verdict = SequenceVerdict.reach(
-            frames=frames,
-            scene=scene,
-            detections=detections,
-            person=person,
-            object_track=object_track,
-            body_fit=body_fit,
-            joint=joint,
-            object_=object_,
-            body_models=body_models,
-            settings=joint_settings,
-            body_settings=body_settings,
-            track_settings=track_settings,
-        ).values()
+        verdict = SequenceVerdict.reach(paths, models, fit_settings).values()
     with artefacts.write(output, METRICS, settings_digest=digest(settings), **attributes) as writer:
         for key in sorted(values):
             writer.put(key, values[key])
@@ -164,20 +135,18 @@ def _motion(body_track: BodyTrack, handled: HandledObject | None, fps: float) ->
     return values
 
 
-def _stated(
-    images: Frames, person: Path, object_track: Path, body_fit: Path, joint: Path
-) -> Values:
+def _stated(images: Frames, paths: SequencePaths) -> Values:
     """Frames that some stage does not trust, with every reason."""
-    with artefacts.read(person, PERSON) as artefact:
+    with artefacts.read(paths.person, PERSON) as artefact:
         missing = artefact["missing"]
-    with artefacts.read(object_track, OBJECT_TRACK) as artefact:
+    with artefacts.read(paths.object_track, OBJECT_TRACK) as artefact:
         named = bool(artefact.attributes["object"])
         lost, ambiguous = artefact["lost"] & named, artefact["ambiguous"]
         carried = artefact["carried"] if "carried" in artefact else np.zeros_like(lost)
-    with artefacts.read(body_fit, BODY_FIT) as artefact:
+    with artefacts.read(paths.body_fit, BODY_FIT) as artefact:
         failed, bridged = artefact["failed"], artefact["bridged"]
         uncertain = artefact["uncertain"]
-    with artefacts.read(joint, JOINT) as artefact:
+    with artefacts.read(paths.joint, JOINT) as artefact:
         joint_flags, joint_reasons = artefact["flagged"], artefact.text("flag_reason")
         joints = artefact["joints"]
     unseen = np.asarray(~images.available.any(1))

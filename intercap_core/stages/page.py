@@ -4,7 +4,8 @@ trusted."""
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +14,10 @@ from intercap_core import artefacts, schemas
 from intercap_core.artefacts import Artefact
 from intercap_core.body.artefact import load_model, read_parameters
 from intercap_core.config import (
-    BodyModels,
     ContactInterval,
     ObjectEntry,
     PageSettings,
     SequenceEntry,
-    SubjectEntry,
 )
 from intercap_core.errors import UserError
 from intercap_core.evaluation.figures import SequenceMetrics
@@ -35,6 +34,7 @@ from intercap_core.output.site.sequence_page import SequenceContent, ViewerParts
 from intercap_core.output.site.track import TrackFacts, read_track
 from intercap_core.output.viewer import page as viewer
 from intercap_core.schemas import JOINT, OBJECT_TRACK, SCENE
+from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 from intercap_core.stages.folders import check_replaceable, replaced
 
 log = logging.getLogger(__name__)
@@ -45,40 +45,30 @@ _MAX_CLOSEUPS = 2  # holds drawn; `intercap closeups` draws all
 
 def run(
     *,
-    frames: Path,
-    detections: Path,
-    scene: Path,
-    person: Path,
-    object_track: Path,
-    body_fit: Path,
-    joint: Path,
-    metrics: Path,
+    paths: SequencePaths,
+    models: SequenceModels,
     sequence: SequenceEntry,
-    object_: ObjectEntry | None,
-    subject: SubjectEntry,
-    body_models: BodyModels,
     contact: Sequence[ContactInterval] | None,
     settings: PageSettings,
     output: Path,
     truth: Path | None,
 ) -> None:
-    """Write the page into the folder ``output``, replacing an earlier one there.
+    """Write the page into the folder ``output``, replacing an earlier page.
 
-    ``truth``, where known, is drawn beside close-ups of hands; ``contact`` is what the user
-    annotated. Raises UserError where an artefact or the object's mesh is missing or broken, and
-    where ``output`` holds anything but a page.
+    Raises UserError if an artefact or the object's mesh is missing or broken, or if ``output``
+    holds anything but a page.
+
+    Args:
+        contact: annotated intervals.
+        truth: truth file, drawn next to the close-ups of hands if it is known.
     """
-    paths = {
-        "frames": frames, "detections": detections, "scene": scene, "person": person,
-        "object_track": object_track, "body_fit": body_fit, "joint": joint, "metrics": metrics,
-    }  # fmt: skip
     output = Path(output)
     check_replaceable(output, marker=MARKER, what="page")
-    measured = SequenceMetrics.read(metrics)
-    found = object_ if measured.has_object else None
-    with artefacts.read(joint, JOINT) as fit, artefacts.read(scene, SCENE) as setting:
-        model = load_model(body_models, subject.gender, fit)
-        mesh = None if found is None else ObjectMesh.load(found)
+    measured = SequenceMetrics.read(paths.metrics)
+    shown = models if measured.has_object else replace(models, object_=None)
+    with artefacts.read(paths.joint, JOINT) as fit, artefacts.read(paths.scene, SCENE) as setting:
+        model = load_model(models.body_models, models.gender, fit)
+        mesh = None if shown.object_ is None else ObjectMesh.load(shown.object_)
         posed = Fit(model, read_parameters(fit), fit["rotation"], fit["translation"], mesh)
         rig, image_of = Rig.from_artefact(setting), setting["image_of"]
         master = rig.names.index(str(setting.attributes["master"]))
@@ -86,7 +76,7 @@ def run(
         rig = rig.moved(fit["master_from_colour"])
     note, drawn = "", []
     try:
-        drawn = _overlays(frames, measured, posed, rig, image_of, settings)
+        drawn = _overlays(paths.frames, measured, posed, rig, image_of, settings)
     except UserError as error:  # one image that does not decode must not cost the page
         note = str(error)
         log.warning("%s: no overlays: %s", measured.name, error)
@@ -97,10 +87,10 @@ def run(
         note=note,
         joint=said,
         energies=energies,
-        closeups=_closeups(paths, found, body_models, subject.gender, truth),
-        capture=read_capture(frames, scene),
-        track=None if object_ is None else _track(paths, object_),
-        body=read_fit(frames, scene, person, body_fit, body_models, subject.gender),
+        closeups=_closeups(paths, shown, truth),
+        capture=read_capture(paths.frames, paths.scene),
+        track=None if models.object_ is None else _track(paths, models.object_),
+        body=read_fit(paths, models),
         annotated=contact,
         made_by=_made_by(paths),
         body_file=model.path.name,
@@ -108,14 +98,7 @@ def run(
     )
     with replaced(output) as folder:
         (folder / MARKER).write_text(page(content), encoding="utf-8")
-        viewer.write_script(
-            folder / viewer.SCRIPT,
-            paths,
-            object_=found,
-            body_models=body_models,
-            gender=subject.gender,
-            truth=truth,
-        )
+        viewer.write_script(folder / viewer.SCRIPT, paths, shown, truth=truth)
 
 
 def _overlays(
@@ -178,40 +161,32 @@ def _energies(joint: Artefact) -> list[tuple[str, float, float]]:
     ]
 
 
-def _closeups(
-    paths: Mapping[str, Path],
-    entry: ObjectEntry | None,
-    body_models: BodyModels,
-    gender: str,
-    truth: Path | None,
-) -> list[CloseUp]:
+def _closeups(paths: SequencePaths, models: SequenceModels, truth: Path | None) -> list[CloseUp]:
     """The longest holds of a sequence; none without an object."""
-    if entry is None:
+    if models.object_ is None:
         return []
     known = truth if truth is not None and truth.is_file() else None
-    handling = read_handling(
-        paths, entry=entry, body_models=body_models, gender=gender, truth=known
-    )
+    handling = read_handling(paths, models, truth=known)
     return [closeup(handling, hold) for hold in holds(handling.probability)[:_MAX_CLOSEUPS]]
 
 
-def _track(paths: Mapping[str, Path], entry: ObjectEntry) -> TrackFacts:
-    with artefacts.read(paths["scene"], SCENE) as scene:
-        moments = Detections.load(paths["detections"]).showing(scene["image_of"])
-    found = moments.with_candidates_of(paths["person"])
-    with artefacts.read(paths["object_track"], OBJECT_TRACK) as track:
+def _track(paths: SequencePaths, entry: ObjectEntry) -> TrackFacts:
+    with artefacts.read(paths.scene, SCENE) as scene:
+        moments = Detections.load(paths.detections).showing(scene["image_of"])
+    found = moments.with_candidates_of(paths.person)
+    with artefacts.read(paths.object_track, OBJECT_TRACK) as track:
         candidate = track["candidate"]
 
     def kept(t: int, c: int) -> bytes:
         return found.candidates(t, c)[candidate[t, c]].rle if candidate[t, c] >= 0 else b""
 
     mesh = ObjectMesh.load(entry)
-    return read_track(paths["frames"], paths["scene"], paths["object_track"], mesh, kept)
+    return read_track(paths, mesh, kept)
 
 
-def _made_by(paths: Mapping[str, Path]) -> dict[str, str]:
+def _made_by(paths: SequencePaths) -> dict[str, str]:
     found = {}
-    for stage, path in paths.items():
+    for stage, path in paths.by_stage().items():
         schema = getattr(schemas, stage.upper())
         with artefacts.read(path, schema) as artefact:
             digest = artefact.attributes.get("settings_digest") or "-"

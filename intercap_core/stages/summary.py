@@ -1,4 +1,4 @@
-"""One sequence's share of the dataset's figures."""
+"""Stage summary: what one sequence adds to the figures of the dataset."""
 
 from __future__ import annotations
 
@@ -6,24 +6,9 @@ from pathlib import Path
 
 from intercap_core.config import SequenceEntry
 from intercap_core.evaluation import summary
+from intercap_core.sequence_inputs import SequencePaths
 
 
-def run(
-    *,
-    frames: Path,
-    detections: Path,
-    scene: Path,
-    person: Path,
-    object_track: Path,
-    body_fit: Path,
-    joint: Path,
-    metrics: Path,
-    sequence: SequenceEntry,
-    output: Path,
-) -> None:
-    """Write the summary artefact; raises UserError where an artefact is missing or broken."""
-    paths = {
-        "frames": frames, "detections": detections, "scene": scene, "person": person,
-        "object_track": object_track, "body_fit": body_fit, "joint": joint, "metrics": metrics,
-    }  # fmt: skip
+def run(*, paths: SequencePaths, sequence: SequenceEntry, output: Path) -> None:
+    """Write summary.h5; raises UserError if an artefact is missing or broken."""
     summary.write(output, paths, intent=sequence.intent or "")

@@ -27,8 +27,9 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
 
 
 def _measure(capture: fitted.Capture, **instead: Path) -> BodyErrors:
-    paths = capture.inputs("frames", "scene", "person", "body_fit", "truth") | instead
-    return body_errors.measure(**paths, body_models=fitted.BODY_MODELS, gender="neutral")
+    truth = instead.pop("truth", capture.paths["truth"])
+    paths = replace(capture.inputs("frames", "scene", "person", "body_fit"), **instead)
+    return body_errors.measure(paths, truth, fitted.BODY_MODELS, "neutral")
 
 
 @pytest.fixture(scope="module")

@@ -27,13 +27,11 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
 
 def _run(capture: fitted.Capture, output: Path, truth: bool) -> Path:
     metrics.run(
-        **capture.inputs(*STAGES),
+        paths=capture.inputs(*STAGES),
         output=output,
-        object_=capture.object_,
-        subject=fitted.SUBJECT,
-        body_models=fitted.BODY_MODELS,
+        models=capture.models,
         settings=MetricsSettings(),
-        **fitted.OTHER_SETTINGS,
+        fit_settings=fitted.FIT_SETTINGS,
         truth=capture.paths["truth"] if truth else None,
     )
     return output

@@ -28,13 +28,11 @@ def measured_capture(folder: Path, object_name: str = "cup") -> fitted.Capture:
     """A capture of a person with an object, up to metrics."""
     made = fitted.make_capture(folder, object_name=object_name)
     metrics.run(
-        **made.inputs(*STAGES["metrics"].reads),
+        paths=made.inputs(*STAGES["metrics"].reads),
         output=made.paths["metrics"],
-        object_=made.object_,
-        subject=fitted.SUBJECT,
-        body_models=fitted.BODY_MODELS,
+        models=made.models,
         settings=MetricsSettings(),
-        **fitted.OTHER_SETTINGS,
+        fit_settings=fitted.FIT_SETTINGS,
     )
     return made
 
@@ -42,10 +40,8 @@ def measured_capture(folder: Path, object_name: str = "cup") -> fitted.Capture:
 def run(capture: fitted.Capture, output: Path, **settings: Any) -> Path:
     """Export the capture into ``output``, which is returned."""
     export.run(
-        **capture.inputs(*STAGES["export"].reads),
-        object_=capture.object_,
-        subject=fitted.SUBJECT,
-        body_models=fitted.BODY_MODELS,
+        paths=capture.inputs(*STAGES["export"].reads),
+        models=capture.models,
         settings=ExportSettings(**settings),
         output=output,
     )

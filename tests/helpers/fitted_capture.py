@@ -50,6 +50,7 @@ from intercap_core.schemas import (
     SCENE,
     TRUTH,
 )
+from intercap_core.sequence_inputs import FitSettings, SequenceModels, SequencePaths
 from tests.helpers.bodies import open_body
 from tests.helpers.synthetic_capture import put_frame_sets
 
@@ -58,12 +59,7 @@ BODY_OFFSET_M = 0.010  # the fitted body stands this much beside the true one, d
 OBJECT_OFFSET_M = 0.004  # the tracked ball, down too; the joint result is half as far off
 SUBJECT = SubjectEntry(subject="p01", gender="neutral")
 BODY_MODELS = BodyModels()
-# of the stages whose fits the metrics judge
-OTHER_SETTINGS = {
-    "joint_settings": JointSettings(),
-    "body_settings": BodyFitSettings(),
-    "track_settings": ObjectTrackSettings(),
-}
+FIT_SETTINGS = FitSettings(JointSettings(), BodyFitSettings(), ObjectTrackSettings())
 
 
 @dataclass
@@ -81,8 +77,12 @@ class Capture:
     translation: np.ndarray
     extra: dict[str, Any] = field(default_factory=dict)
 
-    def inputs(self, *stages: str) -> dict[str, Path]:
-        return {stage: self.paths[stage] for stage in stages}
+    @property
+    def models(self) -> SequenceModels:
+        return SequenceModels(self.object_, SUBJECT, BODY_MODELS)
+
+    def inputs(self, *stages: str) -> SequencePaths:
+        return SequencePaths(**{stage: self.paths[stage] for stage in stages})
 
 
 def object_entry(name: str) -> ObjectEntry:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -41,13 +42,11 @@ def two_captures(folder: Path) -> dict[str, fitted.Capture]:
 def measure(capture: fitted.Capture, *, truth: bool = False) -> None:
     """The capture's metrics."""
     metrics.run(
-        **capture.inputs(*MEASURED),
+        paths=capture.inputs(*MEASURED),
         output=capture.paths["metrics"],
-        object_=capture.object_,
-        subject=fitted.SUBJECT,
-        body_models=fitted.BODY_MODELS,
+        models=capture.models,
         settings=MetricsSettings(),
-        **fitted.OTHER_SETTINGS,
+        fit_settings=fitted.FIT_SETTINGS,
         truth=capture.paths["truth"] if truth else None,
     )
 
@@ -61,7 +60,7 @@ def write_summaries(
     for name, capture in captures.items():
         paths[name] = out / f"{name}.h5"
         summary.run(
-            **capture.inputs(*STAGES["summary"].reads),
+            paths=capture.inputs(*STAGES["summary"].reads),
             sequence=row(name, (intents or {}).get(name)),
             output=paths[name],
         )
@@ -81,11 +80,9 @@ def write_site(
     for sequence, capture in captures.items():
         measured = SequenceMetrics.read(capture.paths["metrics"])
         page.run(
-            **capture.inputs(*STAGES["page"].reads),
+            paths=capture.inputs(*STAGES["page"].reads),
             sequence=row(sequence, (intents or {}).get(sequence)),
-            object_=capture.object_ if measured.object_ else None,
-            subject=fitted.SUBJECT,
-            body_models=fitted.BODY_MODELS,
+            models=replace(capture.models, object_=capture.object_ if measured.object_ else None),
             contact=None,
             settings=settings or PageSettings(),
             output=out / "site" / "sequences" / sequence,

@@ -24,6 +24,7 @@ from intercap_core.config import BodyModels, JointSettings, ObjectEntry, ObjectT
 from intercap_core.errors import UserError
 from intercap_core.geometry.rigid.contact_vertices import contact_list
 from intercap_core.schemas import CONTACT_REGIONS, JOINT, OBJECT_TRACK
+from intercap_core.sequence_inputs import FitSettings, SequenceModels, SequencePaths
 from intercap_core.stages import joint
 from tests.helpers.lemo_release import write_release
 from tests.stages.test_body_fit import SETTINGS, SUBJECT, Capture
@@ -79,17 +80,16 @@ class Held:
         """The joint stage's artefact, with other ``settings`` where they are given."""
         output = self.paths["scene"].parent / "joint.h5"
         joint.run(
-            **self.paths,
-            output=output,
-            object_=self.entry,
-            subject=SUBJECT,
-            body_models=BodyModels(),
-            detections=output.with_name("detections.h5"),  # not read: the ball is in no image
-            settings=JointSettings.model_validate(
-                {"look_again": False, "refine_cameras": False, **settings}
+            paths=SequencePaths(**self.paths),
+            models=SequenceModels(self.entry, SUBJECT, BodyModels()),
+            fit_settings=FitSettings(
+                JointSettings.model_validate(
+                    {"look_again": False, "refine_cameras": False, **settings}
+                ),
+                SETTINGS,
+                ObjectTrackSettings(),
             ),
-            body_settings=SETTINGS,
-            track_settings=ObjectTrackSettings(),
+            output=output,
         )
         with artefacts.read(output, JOINT) as found:
             read = {key: found[key] for key in found.keys("")}

@@ -56,13 +56,11 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
     path = fitted.write_project(folder, capture, "s01")
     made = load_project(path)
     metrics.run(
-        **capture.inputs(*STAGES["metrics"].reads),
+        paths=capture.inputs(*STAGES["metrics"].reads),
         output=made.artefact("s01", "metrics"),
-        object_=capture.object_,
-        subject=fitted.SUBJECT,
-        body_models=fitted.BODY_MODELS,
+        models=capture.models,
         settings=MetricsSettings(),
-        **fitted.OTHER_SETTINGS,
+        fit_settings=fitted.FIT_SETTINGS,
     )
     for stage in ("joint", "scene"):
         made.artefact("s01", stage).write_bytes(capture.paths[stage].read_bytes())

@@ -24,6 +24,7 @@ from intercap_core.errors import UserError
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.schemas import BODY_FIT, DETECTIONS, JOINT, METRICS, OBJECT_TRACK, PERSON
+from intercap_core.sequence_inputs import FitSettings, SequenceModels, SequencePaths
 from intercap_core.stage_list import STAGES
 from intercap_core.stages import (
     body_fit,
@@ -253,13 +254,11 @@ def test_object_in_sixteen_views(tmp_path):
 def test_the_later_stages_end_with_whatever_depth_there_is(tmp_path, reduction):
     capture = fitted.make_capture(tmp_path / "whole", total=SETS)
     paths = reduction.apply(capture.paths, tmp_path / "reduced")
-    common = {"object_": capture.object_, "body_models": fitted.BODY_MODELS}
-    common["subject"] = fitted.SUBJECT
     measured = tmp_path / "metrics.h5"
     metrics.run(
-        **paths,
-        **common,
-        **fitted.OTHER_SETTINGS,
+        paths=SequencePaths(**{stage: paths[stage] for stage in STAGES["metrics"].reads}),
+        models=capture.models,
+        fit_settings=fitted.FIT_SETTINGS,
         output=measured,
         settings=MetricsSettings(),
         truth=capture.paths["truth"],
@@ -269,15 +268,13 @@ def test_the_later_stages_end_with_whatever_depth_there_is(tmp_path, reduction):
         depth = 0 if reduction.depth == [] else 1 if reduction.images_until else SETS
         assert seen.sum() == depth
         assert (found["truth/joint/body_pve"] < 0.02).all()
+    inputs = SequencePaths(metrics=measured, **{s: paths[s] for s in STAGES["metrics"].reads})
     export.run(
-        frames=paths["frames"], joint=paths["joint"], scene=paths["scene"], metrics=measured,
-        body_fit=paths["body_fit"], object_track=paths["object_track"],
-        output=tmp_path / "export", settings=ExportSettings(), **common,
-    )  # fmt: skip
-    inputs = {"metrics": measured, **{s: paths[s] for s in STAGES["metrics"].reads}}
-    summary.run(**inputs, sequence=row("cap"), output=tmp_path / "summary.h5")
+        paths=inputs, models=capture.models, output=tmp_path / "export", settings=ExportSettings()
+    )
+    summary.run(paths=inputs, sequence=row("cap"), output=tmp_path / "summary.h5")
     page.run(
-        **inputs, **common, sequence=row("cap"), contact=None, truth=None,
+        paths=inputs, models=capture.models, sequence=row("cap"), contact=None, truth=None,
         settings=PageSettings(frames=1, cameras=1), output=tmp_path / "page",
     )  # fmt: skip
     first = merge({"cap": tmp_path / "summary.h5"}, {"cap": capture}, tmp_path)
@@ -293,11 +290,13 @@ def test_the_joint_fit_needs_no_depth(people, objects, tmp_path):
     ball = no_depth.apply(objects["football"].paths, tmp_path / "object")
     track = tracked(ball, tmp_path / "track.h5", "football")
     joint.run(
-        frames=paths["frames"], scene=paths["scene"], detections=paths["detections"],
-        person=paths["person"], object_track=track, body_fit=tmp_path / "body_fit.h5",
+        paths=SequencePaths(
+            frames=paths["frames"], scene=paths["scene"], detections=paths["detections"],
+            person=paths["person"], object_track=track, body_fit=tmp_path / "body_fit.h5",
+        ),
+        models=SequenceModels(catalogue()["football"], SUBJECT, BodyModels()),
+        fit_settings=FitSettings(JointSettings(), FAST, ObjectTrackSettings()),
         output=tmp_path / "joint.h5",
-        object_=catalogue()["football"], subject=SUBJECT, body_models=BodyModels(),
-        settings=JointSettings(), body_settings=FAST, track_settings=ObjectTrackSettings(),
     )  # fmt: skip
     with artefacts.read(tmp_path / "joint.h5", JOINT) as found:
         assert np.isnan(found["cloud_residual"]).all()

@@ -44,10 +44,7 @@ def measure(project: Project, sequence: str) -> BodyErrors:
     truth = project.sequences[sequence].truth
     assert truth is not None
     return body_errors.measure(
-        project.artefact(sequence, "frames"),
-        project.artefact(sequence, "scene"),
-        project.artefact(sequence, "person"),
-        project.artefact(sequence, "body_fit"),
+        project.paths(sequence),
         truth,
         project.config.body_models,
         project.subjects[project.sequences[sequence].subject].gender,

@@ -9,19 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.config import (
-    BodyFitSettings,
-    BodyModels,
-    JointSettings,
-    ObjectEntry,
-    ObjectTrackSettings,
-)
 from intercap_core.evaluation.verdict.hold_out import JOINTS, HeldOut, JudgedPart, hold_out
 from intercap_core.evaluation.verdict.stated import FEATURES, ErrorEstimate, estimate_error
 from intercap_core.joint.inputs import JointInputs, open_inputs
 from intercap_core.joint.result import JointResult
 from intercap_core.joint.sequential import SequentialFits
 from intercap_core.schemas import BODY_FIT, JOINT, SCENE
+from intercap_core.sequence_inputs import FitSettings, SequenceModels, SequencePaths
 
 log = logging.getLogger(__name__)
 
@@ -40,48 +34,26 @@ class SequenceVerdict:
     @classmethod
     def reach(
         cls,
-        *,
-        frames: Path,
-        scene: Path,
-        detections: Path,
-        person: Path,
-        object_track: Path,
-        body_fit: Path,
-        joint: Path,
-        object_: ObjectEntry | None,
-        body_models: BodyModels,
-        settings: JointSettings,
-        body_settings: BodyFitSettings,
-        track_settings: ObjectTrackSettings,
+        paths: SequencePaths,
+        models: SequenceModels,
+        fit_settings: FitSettings,
     ) -> SequenceVerdict:
         """Evaluate the joint artefact with the inputs of the joint stage; no truth is read.
 
         Raises UserError where an artefact or the mesh cannot be used.
         """
-        with artefacts.read(scene, SCENE) as source:
-            result = JointResult.read(joint, source)
+        with artefacts.read(paths.scene, SCENE) as source:
+            result = JointResult.read(paths.joint, source)
             names = tuple(source.text("camera_names"))
-        with open_inputs(
-            frames=frames,
-            scene=scene,
-            detections=detections,
-            person=person,
-            object_track=object_track,
-            body_fit=body_fit,
-            object_=object_,
-            body_models=body_models,
-            settings=settings,
-            body_settings=body_settings,
-            track_settings=track_settings,
-        ) as inputs:
-            held = hold_out(inputs, settings, result)
+        with open_inputs(paths, models, fit_settings) as inputs:
+            held = hold_out(inputs, fit_settings.joint, result)
             sequential = inputs.sequential
             parts = [
                 part
                 for part in JudgedPart
                 if part != JudgedPart.OBJECT or inputs.geometry.has_object
             ]
-            moved = _moved(inputs, result, body_fit, joint)
+            moved = _moved(inputs, result, paths.body_fit, paths.joint)
         stated = {
             part: estimate_error(
                 held, part, _sigma(sequential, part), moved[part], _known(sequential, result, part)

@@ -13,7 +13,6 @@ from intercap_core.body.artefact import file_digest
 from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
-from intercap_core.config import BodyModels, ObjectEntry, SubjectEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.formats.released.results import Recording, Results
@@ -21,6 +20,7 @@ from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.joint.released.reader import read_results
 from intercap_core.schemas import CONTACT_REGIONS, JOINT, PERSON, SCENE
+from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 
 log = logging.getLogger(__name__)
 
@@ -33,14 +33,10 @@ _POSE = ("global_orient", "transl", "body_pose", "jaw_pose", "leye_pose", "reye_
 
 def import_joint(
     results: Path,
-    *,
-    frames: Path,
-    scene: Path,
-    person: Path,
+    paths: SequencePaths,
+    models: SequenceModels,
     output: Path,
-    object_: ObjectEntry | None,
-    subject: SubjectEntry,
-    body_models: BodyModels,
+    *,
     betas: int,
     settings_digest: str,
 ) -> None:
@@ -52,12 +48,13 @@ def import_joint(
     results are of another body and ours is fitted to it. Raises UserError where the results are of
     another number of frames, or of more numbers than the body file has.
     """
-    path = body_models.of(subject.gender) or OPEN_BODY
-    with artefacts.read(scene, SCENE) as setting:
+    object_, subject = models.object_, models.subject
+    path = models.body_models.of(subject.gender) or OPEN_BODY
+    with artefacts.read(paths.scene, SCENE) as setting:
         total, sequence = len(setting["times"]), str(setting.attributes["sequence"])
         rig = Rig.from_artefact(setting).moved(setting["master_from_colour_start"])
         offsets, offset_sigma = setting["time_offset"], setting["time_offset_sigma"]
-    with Frames.open(frames) as recorded:
+    with Frames.open(paths.frames) as recorded:
         times = recorded.first_set_s + recorded.time_s
     found = read_results(results, Recording(sequence, times, object_, path, betas))
     if len(found) != total:
@@ -116,7 +113,7 @@ def import_joint(
         for name in _POSE:
             writer.put(name, getattr(params, name).numpy())
         writer.put("joints", posed.joints.numpy())
-        writer.put("keypoint_residual", _residuals(person, rig, keypoints))
+        writer.put("keypoint_residual", _residuals(paths.person, rig, keypoints))
         writer.put("cloud_residual", np.full(total, np.nan, np.float32))
         writer.put("rotation", rotation)
         writer.put("translation", translation)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,6 @@ import torch
 from intercap_core import artefacts
 from intercap_core.body.artefact import load_model, read_parameters
 from intercap_core.body.joints import JOINT_NAMES
-from intercap_core.config import BodyModels
 from intercap_core.errors import UserError
 from intercap_core.evaluation.body import BODY_JOINTS, FINGER_JOINTS
 from intercap_core.formats.recordings.frames import Frames
@@ -27,6 +25,7 @@ from intercap_core.output.site.body_pictures import (
 from intercap_core.output.site.overlays import choose_frames
 from intercap_core.output.site.sheets import Sheet
 from intercap_core.schemas import BODY_FIT, PERSON, SCENE
+from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 
 GOOD_PX = 8.0  # a view agrees up to this median error, at 1080 rows
 _ROWS = 4  # moments of the sheet
@@ -64,27 +63,20 @@ class BodyFacts:
     note: str = ""
 
 
-def read_fit(
-    frames: Path,
-    scene: Path,
-    person: Path,
-    body_fit: Path,
-    body_models: BodyModels,
-    gender: str,
-) -> BodyFacts:
+def read_fit(paths: SequencePaths, models: SequenceModels) -> BodyFacts:
     """Read and draw one fit. What cannot be drawn is left out, with its reason in ``note``.
 
     Raises UserError as :func:`artefacts.read` does.
     """
-    with artefacts.read(scene, SCENE) as setting:
+    with artefacts.read(paths.scene, SCENE) as setting:
         rig, image_of = Rig.from_artefact(setting), setting["image_of"]
-    with artefacts.read(person, PERSON) as people:
+    with artefacts.read(paths.person, PERSON) as people:
         detected = people["keypoints"]
-    with artefacts.read(body_fit, BODY_FIT) as fit:
+    with artefacts.read(paths.body_fit, BODY_FIT) as fit:
         parameters = read_parameters(fit)
         worst = fit["joint_sigma"][:, BODY_JOINTS].max(1)
         shown = choose_frames(worst, _ROWS)
-        model = load_model(body_models, gender, fit)
+        model = load_model(models.body_models, models.gender, fit)
         with torch.no_grad():
             posed = model.forward(parameters.frames(torch.tensor(shown)))
             points = model.keypoints(posed).double().numpy()
@@ -92,7 +84,7 @@ def read_fit(
         bodies = {t: PosedBody(vertices[i], points[i]) for i, t in enumerate(shown)}
         sheet, note = None, ""
         try:
-            with Frames.open(frames) as images:
+            with Frames.open(paths.frames) as images:
                 faces = model.faces.numpy()
                 sheet = body_sheet(images.showing(image_of), rig, bodies, faces, detected)
         except UserError as error:  # one unreadable image must not prevent the report

@@ -16,7 +16,6 @@ import numpy as np
 from intercap_core import artefacts
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
-from intercap_core.config import BodyModels, ObjectEntry
 from intercap_core.evaluation import flags
 from intercap_core.evaluation.contact import CONTACT_M
 from intercap_core.evaluation.proximity import PosedObject
@@ -30,6 +29,7 @@ from intercap_core.geometry.rigid.shots import Drawable
 from intercap_core.output.site.overlays import BODY_COLOUR, OBJECT_COLOUR, encode_jpeg
 from intercap_core.output.site.shading import Painted, draw
 from intercap_core.schemas import JOINT, SCENE
+from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 
 SIDES = ("left", "right")
 TOUCHING_COLOUR = (0.86, 0.20, 0.26)
@@ -130,20 +130,20 @@ class CloseUp:
 
 
 def read_handling(
-    paths: Mapping[str, Path],
+    paths: SequencePaths,
+    models: SequenceModels,
     *,
-    entry: ObjectEntry,
-    body_models: BodyModels,
-    gender: str,
     truth: Path | None,
     joints: Mapping[str, Path] | None = None,
 ) -> Handling:
-    """Read what is drawn from a sequence's artefacts, ``paths`` by stage, and its ``truth``.
+    """Read what is drawn from the artefacts of a sequence with an object, and its ``truth``.
 
     ``joints`` are joint.h5 by the name of their column; by default the sequence's own is "joint",
     beside "sequential". Holds are those of the last one. Raises UserError as reading does.
     """
-    mesh = ObjectMesh.load(entry)
+    assert models.object_ is not None
+    mesh = ObjectMesh.load(models.object_)
+    body_models, gender = models.body_models, models.gender
 
     def column(name: str, body: tuple[Path, str], object_: tuple[Path, str]) -> Column:
         track, pose = read_body(*body, body_models, gender), read_object(*object_)
@@ -154,8 +154,8 @@ def read_handling(
 
     columns = []
     if joints is None:
-        joints = {"joint": paths["joint"]}
-        sequential = (paths["body_fit"], "body_fit"), (paths["object_track"], "object_track")
+        joints = {"joint": paths.joint}
+        sequential = (paths.body_fit, "body_fit"), (paths.object_track, "object_track")
         columns.append(column("sequential", *sequential))
     columns += [column(name, (path, "joint"), (path, "joint")) for name, path in joints.items()]
     last = list(joints.values())[-1]
@@ -164,7 +164,7 @@ def read_handling(
         regions = joint.text("region_names")
         hands = [regions.index(f"{side}_hand") for side in SIDES]
         probability = joint["contact_probability"][:, hands]
-    with artefacts.read(paths["scene"], SCENE) as scene:
+    with artefacts.read(paths.scene, SCENE) as scene:
         times, fps = scene["times"], float(scene.attributes["fps"])
         up = scene["zup_from_master"][2, :3].astype(float)
     known = False

@@ -21,6 +21,7 @@ from intercap_core.output.site.overlays import choose_frames
 from intercap_core.output.site.sheets import Sheet
 from intercap_core.output.site.track_pictures import CANDIDATE_COLOUR, TRACK_COLOUR, track_sheet
 from intercap_core.schemas import OBJECT_TRACK, SCENE
+from intercap_core.sequence_inputs import SequencePaths
 
 GOOD_OVERLAP = 0.7
 _ROWS = 5  # moments of the sheet
@@ -65,9 +66,7 @@ class TrackFacts:
 
 
 def read_track(
-    frames: Path,
-    scene: Path,
-    object_track: Path,
+    paths: SequencePaths,
     mesh: ObjectMesh,
     kept: Callable[[int, int], bytes],
 ) -> TrackFacts:
@@ -77,7 +76,7 @@ def read_track(
     frame, that is why. Raises UserError as
     :func:`artefacts.read` does.
     """
-    with artefacts.read(object_track, OBJECT_TRACK) as track:
+    with artefacts.read(paths.object_track, OBJECT_TRACK) as track:
         poses = np.array(
             [rigid(r, t) for r, t in zip(track["rotation"], track["translation"], strict=True)]
         )
@@ -85,7 +84,7 @@ def read_track(
         sheet, note = None, str(track.attributes["doubts"])
         seed = "nowhere: it was found in no frame"
         if source != NO_TRACK:
-            sheet, note = _sheet(frames, scene, mesh, poses, kept, track["overlap"])
+            sheet, note = _sheet(paths.frames, paths.scene, mesh, poses, kept, track["overlap"])
             found = "annotated" if source == "annotated" else "found by search"
             seed = f"frame {track.attributes['seed_frame']}, {found}"
         covariance = track["covariance"]

@@ -17,7 +17,7 @@ from intercap_core.artefacts import Artefact
 from intercap_core.body.artefact import load_model, read_parameters
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
-from intercap_core.config import BodyModels, ObjectEntry
+from intercap_core.config import BodyModels
 from intercap_core.errors import UserError
 from intercap_core.evaluation.contact import CONTACT_M
 from intercap_core.evaluation.segmented import SegmentedClouds, read_clouds
@@ -30,6 +30,7 @@ from intercap_core.output.export.upright import z_up_frame
 from intercap_core.output.viewer.package import quantised
 from intercap_core.output.viewer.skinning import skinned
 from intercap_core.schemas import BODY_FIT, JOINT, METRICS, OBJECT_TRACK, SCENE
+from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 
 MOMENTS = 40  # of clouds and images: every n-th frame, so that at most so many have them
 TRUE_MOMENTS = 60  # of the true body, which has no skeleton of its own to move it by
@@ -59,22 +60,16 @@ class _Body:
     translation: np.ndarray
 
 
-def gather(
-    paths: Mapping[str, Path],
-    *,
-    object_: ObjectEntry | None,
-    body_models: BodyModels,
-    gender: str,
-    truth: Path | None = None,
-) -> Content:
-    """What the viewer shows of a sequence.
+def gather(paths: SequencePaths, models: SequenceModels, *, truth: Path | None = None) -> Content:
+    """The data that the viewer shows of a sequence.
 
-    ``paths``: artefacts by stage; frames, scene and body_fit have to be there, of the others each
-    is shown that is. Raises UserError where one of these is missing or broken.
+    The artefacts of frames, scene and body_fit must exist; of the other stages, those that exist
+    are shown. Raises UserError if an artefact is missing or broken.
     """
-    there = {stage: path for stage, path in paths.items() if path.is_file()}
+    object_, body_models, gender = models.object_, models.body_models, models.gender
+    there = {stage: path for stage, path in paths.by_stage().items() if path.is_file()}
     content = Content()
-    with artefacts.read(paths["scene"], SCENE) as scene:
+    with artefacts.read(paths.scene, SCENE) as scene:
         zup, rig, image_of = scene["zup_from_master"], Rig.from_artefact(scene), scene["image_of"]
         bias = scene["depth_bias"]
         upright = z_up_frame(scene)
@@ -91,7 +86,7 @@ def gather(
             flags = joint.text("flag_reason")
             imported = "made_by" in joint.attributes
             _add_stated_contact(content, joint, model)
-    bodies["sequential"] = _sequential(paths["body_fit"], there, body_models, gender)
+    bodies["sequential"] = _sequential(paths.body_fit, there, body_models, gender)
     names = {**VERSIONS, "joint": IMPORTED} if imported else VERSIONS
     shown = next(iter(bodies.values()))
     total = shown.parameters.batch
@@ -110,7 +105,7 @@ def gather(
         _add_body(content, name, body, zup)
         if mesh is not None:
             _add_poses(content, name, body.rotation, body.translation, zup)
-    with Frames.open(paths["frames"]) as recorded:
+    with Frames.open(paths.frames) as recorded:
         images = recorded.showing(image_of)
         moments = np.unique(np.linspace(0, total - 1, min(total, MOMENTS)).round().astype(int))
         content.header |= {
@@ -127,8 +122,7 @@ def gather(
         _add_images(content, images, rig, moments)
         if {"detections", "person", "object_track"} <= there.keys():
             objects = None if mesh is None or not known.any() else mesh
-            sources = (there[stage] for stage in ("detections", "person", "object_track"))
-            clouds = read_clouds(images, rig, bias, image_of, *sources)
+            clouds = read_clouds(images, rig, bias, image_of, paths)
             _add_clouds(content, clouds, shown, objects, moments, zup)
         if truth is not None and truth.is_file():
             vertices_of = shown.model.num_vertices

@@ -5,9 +5,9 @@ from __future__ import annotations
 import html
 from pathlib import Path
 
-from intercap_core.config import BodyModels, ObjectEntry
 from intercap_core.output.viewer.content import gather
 from intercap_core.output.viewer.package import DATA, script
+from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 
 SCRIPT = "viewer.js"
 # The file beside the page is of the same origin where a server gives it, and of none on a disk;
@@ -35,15 +35,13 @@ def load() -> str:
 
 def write_script(
     output: Path,
-    paths: dict[str, Path],
+    paths: SequencePaths,
+    models: SequenceModels,
     *,
-    object_: ObjectEntry | None,
-    body_models: BodyModels,
-    gender: str,
     truth: Path | None = None,
 ) -> None:
     """Write the viewer with a sequence's data; see :func:`.content.gather` for the arguments."""
-    found = gather(paths, object_=object_, body_models=body_models, gender=gender, truth=truth)
+    found = gather(paths, models, truth=truth)
     output.write_text(script(found.header, found.arrays), encoding="utf-8")
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from intercap_core import artefacts
-from intercap_core.config import BodyFitSettings, JointSettings, ObjectTrackSettings
+from intercap_core.config import JointSettings
 from intercap_core.evaluation.verdict.hold_out import JOINTS, HeldOut, JudgedPart, hold_out
 from intercap_core.evaluation.verdict.judge import SequenceVerdict
 from intercap_core.joint.equations import NormalEquations
@@ -22,6 +22,7 @@ from intercap_core.joint.minimise import limited
 from intercap_core.joint.result import JointResult
 from intercap_core.joint.state import BODY, OBJECT, State
 from intercap_core.schemas import SCENE
+from intercap_core.sequence_inputs import SequencePaths
 from tests.helpers import fitted_capture as fitted
 
 STAGES = ("frames", "scene", "detections", "person", "object_track", "body_fit")
@@ -39,16 +40,12 @@ def _opened(
     paths = capture.paths | instead
     with artefacts.read(paths["scene"], SCENE) as scene:
         result = JointResult.read(paths["joint"], scene)
-    settings = JointSettings()
     with open_inputs(
-        **{stage: paths[stage] for stage in STAGES},
-        object_=capture.object_,
-        body_models=fitted.BODY_MODELS,
-        settings=settings,
-        body_settings=BodyFitSettings(),
-        track_settings=ObjectTrackSettings(),
+        SequencePaths(**{stage: paths[stage] for stage in STAGES}),
+        capture.models,
+        fitted.FIT_SETTINGS,
     ) as inputs:
-        yield inputs, settings, result
+        yield inputs, fitted.FIT_SETTINGS.joint, result
 
 
 def _held(capture: fitted.Capture, **instead: Path) -> HeldOut:
@@ -154,14 +151,7 @@ def test_one_camera_alone_judges_nothing(capture: fitted.Capture, tmp_path: Path
         values[:, 1:, :, 2] = 0  # no other camera sees a keypoint
         file["keypoints"][...] = values
     paths = {stage: capture.paths[stage] for stage in (*STAGES, "joint")} | {"person": path}
-    verdict = SequenceVerdict.reach(
-        **paths,
-        object_=capture.object_,
-        body_models=fitted.BODY_MODELS,
-        settings=JointSettings(),
-        body_settings=BodyFitSettings(),
-        track_settings=ObjectTrackSettings(),
-    )
+    verdict = SequenceVerdict.reach(SequencePaths(**paths), capture.models, fitted.FIT_SETTINGS)
     values = verdict.values()
     assert np.isnan(values["error"]).all()
     assert all("fewer than two cameras" in reason for reason in values["silent"])

@@ -105,14 +105,11 @@ def imported(
 def _import(capture: fitted.Capture, results: Path, folder: Path) -> fitted.Capture:
     paths = capture.paths | {"joint": folder / "joint.h5", "metrics": folder / "metrics.h5"}
     joint.run(
-        **capture.inputs(*MEASURED[:-1]),
+        paths=capture.inputs(*MEASURED[:-1]),
         output=paths["joint"],
         results=results,
-        object_=capture.object_,
-        subject=fitted.SUBJECT,
-        body_models=fitted.BODY_MODELS,
-        settings=fitted.OTHER_SETTINGS["joint_settings"],
-        **{k: v for k, v in fitted.OTHER_SETTINGS.items() if k != "joint_settings"},
+        models=capture.models,
+        fit_settings=fitted.FIT_SETTINGS,
     )
     return fitted.Capture(**{**capture.__dict__, "paths": paths})
 
@@ -179,13 +176,11 @@ def test_metrics_measure_them_and_pages_say_whose_they_are(
     capture: fitted.Capture, imported: fitted.Capture, tmp_path: Path
 ) -> None:
     metrics.run(
-        **imported.inputs(*MEASURED),
+        paths=imported.inputs(*MEASURED),
         output=imported.paths["metrics"],
-        object_=capture.object_,
-        subject=fitted.SUBJECT,
-        body_models=fitted.BODY_MODELS,
+        models=capture.models,
         settings=MetricsSettings(),
-        **fitted.OTHER_SETTINGS,
+        fit_settings=fitted.FIT_SETTINGS,
         truth=capture.paths["truth"],
     )
     found = SequenceMetrics.read(imported.paths["metrics"])

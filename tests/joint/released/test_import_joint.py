@@ -33,13 +33,11 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
 
 def _measure(capture: fitted.Capture) -> None:
     metrics.run(
-        **capture.inputs(*MEASURED),
+        paths=capture.inputs(*MEASURED),
         output=capture.paths["metrics"],
-        object_=capture.object_,
-        subject=fitted.SUBJECT,
-        body_models=fitted.BODY_MODELS,
+        models=capture.models,
         settings=MetricsSettings(),
-        **fitted.OTHER_SETTINGS,
+        fit_settings=fitted.FIT_SETTINGS,
         truth=capture.paths["truth"],
     )
 
@@ -48,10 +46,8 @@ def _measure(capture: fitted.Capture) -> None:
 def results(capture: fitted.Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("export") / "files"
     export.run(
-        **capture.inputs(*STAGES["export"].reads),
-        object_=capture.object_,
-        subject=fitted.SUBJECT,
-        body_models=fitted.BODY_MODELS,
+        paths=capture.inputs(*STAGES["export"].reads),
+        models=capture.models,
         settings=ExportSettings(formats=("intercap",)),
         output=folder,
     )
@@ -62,14 +58,11 @@ def _import(capture: fitted.Capture, results: Path, folder: Path) -> fitted.Capt
     """The capture with a joint artefact that is made of ``results``."""
     paths = capture.paths | {"joint": folder / "joint.h5", "metrics": folder / "metrics.h5"}
     joint.run(
-        **capture.inputs(*MEASURED[:-1]),
+        paths=capture.inputs(*MEASURED[:-1]),
         output=paths["joint"],
         results=results,
-        object_=capture.object_,
-        subject=fitted.SUBJECT,
-        body_models=fitted.BODY_MODELS,
-        settings=fitted.OTHER_SETTINGS["joint_settings"],
-        **{k: v for k, v in fitted.OTHER_SETTINGS.items() if k != "joint_settings"},
+        models=capture.models,
+        fit_settings=fitted.FIT_SETTINGS,
     )
     return fitted.Capture(**{**capture.__dict__, "paths": paths})
 

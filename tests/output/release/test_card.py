@@ -44,13 +44,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
             del file["flag_reason"]
             file["flag_reason"] = reasons
         metrics.run(
-            **capture.inputs(*STAGES),
+            paths=capture.inputs(*STAGES),
             output=capture.paths["metrics"],
-            object_=capture.object_,
-            subject=fitted.SUBJECT,
-            body_models=fitted.BODY_MODELS,
+            models=capture.models,
             settings=MetricsSettings(hold_out=False),
-            **fitted.OTHER_SETTINGS,
+            fit_settings=fitted.FIT_SETTINGS,
         )
         made[name] = capture
     out = tmp_path_factory.mktemp("dataset")

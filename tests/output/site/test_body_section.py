@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -33,8 +34,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
 
 
 def _facts(made: fitted.Capture, **instead: Path) -> body.BodyFacts:
-    paths = made.inputs("frames", "scene", "person", "body_fit") | instead
-    return body.read_fit(**paths, body_models=fitted.BODY_MODELS, gender="neutral")
+    paths = replace(made.inputs("frames", "scene", "person", "body_fit"), **instead)
+    return body.read_fit(paths, made.models)
 
 
 def test_states_of_fit_and_views_and_deviations_by_joint(made: fitted.Capture) -> None:

@@ -35,10 +35,8 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
 
 def read(capture: fitted.Capture, truth: Path | None) -> Handling:
     return closeups.read_handling(
-        capture.paths,
-        entry=capture.object_,
-        body_models=fitted.BODY_MODELS,
-        gender="neutral",
+        capture.inputs("scene", "body_fit", "object_track", "joint"),
+        capture.models,
         truth=truth,
     )
 

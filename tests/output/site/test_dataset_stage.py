@@ -193,9 +193,9 @@ def test_what_is_annotated_is_beside_what_is_stated(
 ) -> None:
     capture = captures["s01_o03"]
     page.run(
-        **capture.inputs(*STAGES["page"].reads),
-        sequence=row("s01_o03"), object_=capture.object_, subject=fitted.SUBJECT,
-        body_models=fitted.BODY_MODELS, settings=PageSettings(cameras=1, frames=1),
+        paths=capture.inputs(*STAGES["page"].reads),
+        sequence=row("s01_o03"), models=capture.models,
+        settings=PageSettings(cameras=1, frames=1),
         contact=[ContactInterval(part="right_hand", start=1, end=9)],
         output=tmp_path / "page", truth=None,
     )  # fmt: skip
@@ -211,9 +211,9 @@ def test_a_page_replaces_a_page_and_nothing_else(
     capture = captures["s01_o03"]
     with pytest.raises(UserError, match="nor an earlier page"):
         page.run(
-            **capture.inputs(*STAGES["page"].reads),
-            sequence=row("s01_o03"), object_=capture.object_, subject=fitted.SUBJECT,
-            body_models=fitted.BODY_MODELS, settings=PageSettings(), contact=None,
+            paths=capture.inputs(*STAGES["page"].reads),
+            sequence=row("s01_o03"), models=capture.models,
+            settings=PageSettings(), contact=None,
             output=tmp_path, truth=None,
         )  # fmt: skip
     assert (tmp_path / "notes.txt").read_text() == "mine"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -49,13 +50,11 @@ def captures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, fitted.Captu
         if name == MISSED:
             _miss(capture)
         metrics.run(
-            **capture.inputs(*STAGES),
+            paths=capture.inputs(*STAGES),
             output=capture.paths["metrics"],
-            object_=None if name == ALONE else capture.object_,
-            subject=fitted.SUBJECT,
-            body_models=fitted.BODY_MODELS,
+            models=replace(capture.models, object_=None) if name == ALONE else capture.models,
             settings=MetricsSettings(),
-            **fitted.OTHER_SETTINGS,
+            fit_settings=fitted.FIT_SETTINGS,
             truth=capture.paths["truth"],
         )
     return made

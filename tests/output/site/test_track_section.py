@@ -13,6 +13,7 @@ from intercap_core.geometry.camera.masks import encode
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.output.site import track
 from intercap_core.output.site.track_pictures import CANDIDATE_COLOUR, TRACK_COLOUR
+from intercap_core.sequence_inputs import SequencePaths
 from tests.helpers import fitted_capture as fitted
 
 SETS = 6
@@ -38,9 +39,11 @@ def _facts(made: fitted.Capture, frames: Path | None = None) -> track.TrackFacts
     whole = encode(np.ones((270, 480), bool))
     kept = [whole, b"", b""]
     return track.read_track(
-        frames or made.paths["frames"],
-        made.paths["scene"],
-        made.paths["object_track"],
+        SequencePaths(
+            frames=frames or made.paths["frames"],
+            scene=made.paths["scene"],
+            object_track=made.paths["object_track"],
+        ),
         ObjectMesh.load(made.object_),
         lambda t, c: kept[c],
     )

@@ -16,6 +16,7 @@ from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.output.viewer import page
 from intercap_core.output.viewer.content import gather
 from intercap_core.schemas import JOINT, SCENE
+from intercap_core.sequence_inputs import SequencePaths
 from tests.helpers import fitted_capture as fitted
 from tests.helpers.browser import PHONE, Visit, needs_chromium, visit
 
@@ -33,10 +34,8 @@ def _write(capture: fitted.Capture, folder: Path, name: str = NAME, **without: b
     paths = {stage: path for stage, path in capture.paths.items() if stage not in without}
     page.write_script(
         folder / page.SCRIPT,
-        paths,
-        object_=capture.object_,
-        body_models=fitted.BODY_MODELS,
-        gender=fitted.SUBJECT.gender,
+        SequencePaths(**{stage: path for stage, path in paths.items() if stage != "truth"}),
+        capture.models,
         truth=None if "truth" in without else capture.paths["truth"],
     )
     (folder / "index.html").write_text(page.standalone(name))
@@ -258,12 +257,11 @@ def test_a_page_without_its_file_says_so(shown: Path, tmp_path: Path) -> None:
 def test_any_artefact_from_the_body_fit_on_is_enough(
     capture: fitted.Capture, tmp_path: Path
 ) -> None:
-    some = {stage: capture.paths[stage] for stage in ("frames", "scene", "body_fit")}
-    found = gather(some, object_=capture.object_, body_models=fitted.BODY_MODELS, gender="neutral")
+    found = gather(capture.inputs("frames", "scene", "body_fit"), capture.models)
     assert list(found.header["versions"]) == ["sequential"] and found.header["object"] == ""
     assert "clouds/person" not in found.arrays and found.header["frames"] == FRAMES
     whole = gather(
-        capture.paths, object_=capture.object_, body_models=fitted.BODY_MODELS, gender="neutral",
+        capture.inputs(*(stage for stage in capture.paths if stage != "truth")), capture.models,
         truth=capture.paths["truth"],
     )  # fmt: skip
     assert list(whole.header["versions"]) == ["joint", "sequential", "truth"]
