@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import chi
 
 from intercap_core.evaluation.body import MEDIAN_CHI_3
 from intercap_core.geometry.rigid.pose import rotation_log
@@ -95,6 +94,8 @@ def normalised_rotation_error(
 
     Axes with a stated deviation above ``UNKNOWN_TURN_DEG`` are excluded. NaN where all are.
     """
+    from scipy.stats import chi  # takes a second to import, which most processes do not need
+
     truly = symmetry.nearest_equivalent(true_rotation, rotation)
     error = rotation_log(rotation @ np.swapaxes(truly, 1, 2))
     result = np.full(len(error), np.nan)

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from scipy.stats import spearmanr
 
 from intercap_core.evaluation import figures
 from intercap_core.evaluation.figures import Figures, SequenceMetrics
@@ -175,6 +174,8 @@ def verdict_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
     - ``within_factor_share``: share of parts whose stated error is within WITHIN of the true error.
     - ``bad_sequence_recall``: share of the parts above BAD_MM whose stated error is above it too.
     """
+    from scipy.stats import spearmanr  # takes a second to import, which most processes do not need
+
     found = [e for s in sequences for e in stated_errors(s) if np.isfinite(e.true)]
     said = [e for e in found if np.isfinite(e.stated)]
     if not said:
