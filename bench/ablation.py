@@ -1,14 +1,13 @@
-"""What each term of the joint fit is worth: the fit without it, or with another, held to truth.
+"""Errors of the joint fit without each of its terms, or with another variant of a term.
 
     python -m bench.ablation [SETTINGS] [--sequences NAME ...] [--variants NAME ...]
         [--output results/ablation.json] [--folder results/ablation]
 
-Only the stages `joint` and `metrics` are computed, once for each variant of the settings in
-``VARIANTS``, from the artefacts that a run of SETTINGS has left: by default those of `make
-evaluate-quick`, so run that first. What is there already, by its content, is taken as it is: a run
-that was ended goes on. Prints one table, writes its figures with keys ``<variant>.<measure>``, the
-table as Markdown and three pictures (grasps.jpg, acceleration.png, contact_path.png) into the
-folder. Nothing of the project is written over.
+Stages `joint` and `metrics` are computed for each variant in ``VARIANTS`` from the artefacts of a
+run of SETTINGS (default: those of `make evaluate-quick`, which must have run). Results that are up
+to date by their content are reused, so an interrupted run continues. Prints a table, writes its
+figures with keys ``<variant>.<measure>``, the table as Markdown and three pictures (grasps.jpg,
+acceleration.png, contact_path.png) into the folder. No file of the project is overwritten.
 """
 
 from __future__ import annotations
@@ -90,9 +89,10 @@ Paths = dict[str, dict[str, dict[str, Path]]]  # by variant, sequence and stage
 def ablate(
     settings: Path, sequences: Sequence[str], variants: Sequence[str], folder: Path
 ) -> tuple[Paths, dict[str, Figures]]:
-    """Compute all variants; their artefacts, and figures by variant with the sequential fits' last.
+    """Compute all variants; returns their artefacts, and figures by variant.
 
-    Raises UserError where a sequence or a variant is unknown, or has no truth or artefacts.
+    The last entry of the figures is that of the sequential fits. Raises UserError where a sequence
+    or variant is unknown, or has no truth or artefacts.
     """
     plain = load_project(settings)
     names = list(sequences or plain.sequences)
@@ -152,7 +152,7 @@ def _figures(paths: Mapping[str, Mapping[str, Path]], *, sequential: bool) -> Fi
 
 
 def rows(figures: Mapping[str, Figures]) -> list[list[str]]:
-    """The table's cells, one row a variant, "–" where a variant has no such figure."""
+    """Cells of the table, one row per variant, "–" where a figure is unknown."""
     keys = [m.name if m.joint == "joint" else f"{m.joint}_{m.name}" for m in MEASURES]
     return [
         [variant, *(_number(found[key]) if key in found else "–" for key in keys)]

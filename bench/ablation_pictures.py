@@ -1,4 +1,4 @@
-"""Three pictures of an ablation: grasps, acceleration of a vertex, path of a contact point."""
+"""Pictures of an ablation: grasps, acceleration of a vertex, path of a contact point."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _HEAD_PX, _INK = 24, (52, 44, 40)
 
 
 def draw_pictures(project: Project, paths: Paths, folder: Path) -> list[Path]:
-    """Draw what the computed variants allow into ``folder``; the pictures' paths.
+    """Draw the pictures that the computed variants allow into ``folder``; returns their paths.
 
     Raises UserError where matplotlib is not installed.
     """
@@ -48,7 +48,7 @@ def draw_pictures(project: Project, paths: Paths, folder: Path) -> list[Path]:
 
 
 def _grasps(project: Project, paths: Paths, output: Path) -> Path | None:
-    """The longest hold of every sequence with and without contact and stick, beside truth."""
+    """The longest grasp of every sequence with and without contact and stick terms, and the truth."""
     if not {EVERYTHING, WITHOUT_CONTACT} <= set(paths):
         return None
     sheets = []
@@ -77,7 +77,7 @@ def _grasps(project: Project, paths: Paths, output: Path) -> Path | None:
 
 @dataclass(frozen=True, eq=False)
 class _Track:
-    """Skin (T, V, 3) and the object's pose of one version, master frame, metres."""
+    """Skin (T, V, 3) and object poses of one variant, master frame, metres."""
 
     skin: np.ndarray
     rotation: np.ndarray
@@ -91,7 +91,7 @@ class _Track:
 
 @dataclass(frozen=True, eq=False)
 class _Known:
-    """One sequence: versions by name, truth among them, ``fps`` and the body's ``regions``."""
+    """One sequence: tracks by variant (and "truth"), ``fps`` and the body's ``regions``."""
 
     tracks: Mapping[str, _Track]
     truth: Truth
@@ -100,7 +100,7 @@ class _Known:
 
 
 def _read(project: Project, paths: Paths, sequence: str, versions: Mapping[str, str]) -> _Known:
-    """Versions by the variant that they show; "" is the sequential fits."""
+    """Read the variants of a sequence; "" stands for the sequential fits."""
     row, models = project.sequences[sequence], project.config.body_models
     gender = project.subjects[row.subject].gender
     tracks, model = {}, None

@@ -1,4 +1,4 @@
-"""Stages computed again with other inputs or settings, from the artefacts that a run has left."""
+"""Recompute stages with other inputs or settings, from the artefacts of a run."""
 
 from __future__ import annotations
 
@@ -15,8 +15,10 @@ from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
 
 
 def check_run(project: Project, sequences: Sequence[str], stages: Collection[str]) -> None:
-    """Raise UserError where a sequence is unknown or without truth, or where an artefact that one
-    of ``stages`` reads, and none of them writes, is not there."""
+    """Raise UserError where a sequence is unknown, has no truth, or lacks a required artefact.
+
+    Required are the artefacts that ``stages`` read and that none of them writes.
+    """
     settings = project.path
     unknown = [name for name in sequences if name not in project.sequences]
     if unknown:
@@ -36,14 +38,14 @@ def check_run(project: Project, sequences: Sequence[str], stages: Collection[str
 
 
 def artefacts_of(project: Project, sequence: str) -> dict[str, Path]:
-    """Where the sequence's artefacts are, by stage."""
+    """Paths of the sequence's artefacts by stage."""
     return {stage: project.artefact(sequence, stage) for stage in SEQUENCE_STAGES}
 
 
 def compute_once(
     stage: str, project: Project, sequence: str, paths: Mapping[str, Path], output: Path
 ) -> Path:
-    """``output``, computed from the artefacts ``paths`` unless it is there of the same content."""
+    """Compute ``output`` from the artefacts ``paths`` unless it is up to date by content."""
     key, content = output.with_suffix(".key"), _content(stage, project, sequence, paths)
     if not (output.exists() and key.exists() and key.read_text() == content):
         key.unlink(missing_ok=True)  # a run that is ended here leaves no key beside another content
@@ -54,7 +56,7 @@ def compute_once(
 
 
 def _content(stage: str, project: Project, sequence: str, paths: Mapping[str, Path]) -> str:
-    """Digest of all that a stage's artefact depends on."""
+    """Digest of all inputs of a stage's artefact."""
     state = hashlib.sha256(code_digest(f"stages.{stage}").encode())
     state.update(project.config.model_dump_json(exclude={"studio", "report", "export"}).encode())
     state.update(repr(project.annotation(sequence)).encode())

@@ -1,12 +1,13 @@
-"""Two recordings mended in a real Chromium, as a person would: what that takes and what it brings.
+"""Correct two recordings on the annotation page in Chromium, as a person would.
 
     python -m bench.annotate_driven [config/annotate/config.yaml] [--output results/evaluation.json]
 
-makes the recordings and their results where they are not there, takes away what an earlier call
-annotated, and then drives the page by keys, clicks and drags alone. In the first the object is
-placed in a few of the frames in which the track truly lost it; in the second the intervals of
-contact are mended. Each is saved and run from the page, and held to truth before and after. The
-truth is the eye of the person: where the object and the contact are to be seen, no more.
+Measures the effort and the effect of annotation. Missing recordings and results are computed,
+annotations of an earlier call are removed, and the page is operated by keys, clicks and drags only.
+In the first recording the object is placed in a few of the frames in which the track is lost; in
+the second the intervals of contact are corrected. Each is saved and run from the page, and compared
+with truth before and after. The truth stands for the person's eye: it is used to see the object and
+the contact, for nothing else.
 """
 
 from __future__ import annotations
@@ -93,7 +94,7 @@ class Eye:
 
 
 class Placing:
-    """The object is placed at frames of the page that a hand works on."""
+    """Places the object in frames of the page."""
 
     def __init__(self, hand: Hand, eye: Eye) -> None:
         self.hand, self.eye = hand, eye
@@ -102,7 +103,10 @@ class Placing:
         self.poses = {name: np.array(one["pose"]) for name, one in self.cameras.items()}
 
     def place(self, frame: int) -> float:
-        """Drag and turn it in two views, fit it, and look whether that is better; degrees off."""
+        """Drag and rotate the object in two views, fit it, and keep the better pose.
+
+        Returns degrees.
+        """
         hand = self.hand
         hand.go_to(frame)
         if hand.see("document.body.dataset.mode"):
@@ -130,7 +134,7 @@ class Placing:
         return after[1]
 
     def _enlarge(self, frame: int) -> None:
-        """The two views that see it and look along the most different directions."""
+        """Enlarge the two views of the object with the most different viewing directions."""
         seen = [name for name in self.cameras if self._inside(frame, name)]
         if len(seen) < 2:
             seen = list(self.cameras)
@@ -152,7 +156,7 @@ class Placing:
         return np.array(self.hand.see("window.annotate.pose.pose"))
 
     def _off(self, frame: int) -> tuple[float, float]:
-        """Metres and degrees between what is drawn and what is seen."""
+        """Metres and degrees between the displayed and the true pose."""
         pose, centre = self._shown(), self.eye.mesh.centre_of_mass
         true = self.eye.rotation[frame] @ centre + self.eye.translation[frame]
         away = float(np.linalg.norm(pose[:, :3] @ centre + pose[:, 3] - true))
@@ -160,7 +164,7 @@ class Placing:
         return away, float(turned)
 
     def _move(self, frame: int) -> None:
-        """Drags in one view and then the other, until it lies on the image in both."""
+        """Drag in both views in turn until the object is aligned in both."""
         centre = self.eye.mesh.centre_of_mass
         for _ in range(6):
             worst = 0.0
@@ -185,7 +189,7 @@ class Placing:
         return pose[:, :3].T @ (self.eye.centre(frame, camera) - pose[:, 3])
 
     def _turn(self, frame: int) -> None:
-        """Drags with Shift and with Alt, by how it is seen in the first view."""
+        """Drag with Shift and with Alt until the orientation is aligned in the first view."""
         view = self.hand.views({})[0]
         camera = self.poses[view["camera"]][:, :3]
         middle = (view["box"][0] + view["box"][2] / 2, view["box"][1] + view["box"][3] / 2)
@@ -203,20 +207,20 @@ class Placing:
 
 
 def _within(by: Point) -> Point:
-    """A drag no longer than the hand reaches, whole pixels."""
+    """A drag limited to the reach of a hand, in whole pixels."""
     scale = min(1.0, _REACH / max(1e-9, float(np.hypot(*by))))
     return round(by[0] * scale), round(by[1] * scale)
 
 
 def _start(box: list[float], at: Point, by: Point) -> Point:
-    """Where a drag begins: on the object where the view shows it, else in the view's middle."""
+    """Start of a drag: on the object where the view shows it, else in the view's centre."""
     x, y, wide, high = box
     inside = x + 4 < at[0] < x + wide - 4 and y + 4 < at[1] < y + high - 4
     return at if inside else (x + wide / 2 - by[0] / 4, y + high / 2 - by[1] / 4)
 
 
 def mend_object(project: Project, name: str, hand: Hand) -> dict[str, float]:
-    """Questions first, then what is seen to be lost; a run; again for what is still lost."""
+    """Answer the questions, then place the object in lost frames, run, and repeat."""
     errors = measure(project, name)
     before = float(errors.lost.mean())
     print(f"{name}: lost in {int(errors.lost.sum())} of {len(errors.lost)} frames")
@@ -251,7 +255,7 @@ def mend_object(project: Project, name: str, hand: Hand) -> dict[str, float]:
 
 
 def _answered(placing: Placing, errors: ObjectErrors) -> set[int]:
-    """Answer what is asked about the object; the frames in which it was placed."""
+    """Answer the questions about the object; returns the frames in which it was placed."""
     hand, found = placing.hand, set()
     for _ in range(12):
         hand.key("q")
@@ -276,7 +280,7 @@ def _answered(placing: Placing, errors: ObjectErrors) -> set[int]:
 
 
 def _to_place(lost: np.ndarray, posed: set[int], apart: int) -> list[int]:
-    """Those of the ``lost`` frames (T,) that no pose is nearer to than ``apart`` frames."""
+    """The ``lost`` frames (T,) without a pose within ``apart`` frames."""
     found: list[int] = []
     for frame in np.flatnonzero(lost).tolist():
         if all(abs(frame - other) >= apart for other in (*posed, *found)):
@@ -288,7 +292,7 @@ def _to_place(lost: np.ndarray, posed: set[int], apart: int) -> list[int]:
 
 
 def mend_contact(project: Project, name: str, hand: Hand) -> dict[str, float]:
-    """Intervals on the timeline are dragged, split, deleted and added until they are as seen."""
+    """Drag, split, delete and add intervals on the timeline until they match the truth."""
     before, meshes_before, true = contact_figures(project, name)
     print(f"{name}: contact F1 {before:.3f}, of the fitted meshes {meshes_before:.3f}")
     edits = 0
@@ -309,8 +313,10 @@ def mend_contact(project: Project, name: str, hand: Hand) -> dict[str, float]:
 
 
 def contact_figures(project: Project, name: str) -> tuple[float, float, dict[str, list[Interval]]]:
-    """F1 by body part and frame of stated contact and of the fitted meshes', and the true
-    intervals by part, each with the first frame and the one after the last."""
+    """F1 of stated contact and of the fitted meshes' contact, and the true intervals by part.
+
+    An interval is its first frame and the frame after its last.
+    """
     found = SequenceMetrics.read(project.artefact(name, "metrics"))
     true = found.values["truth/contact_region"]
     intervals = {
@@ -323,7 +329,7 @@ def contact_figures(project: Project, name: str) -> tuple[float, float, dict[str
 
 
 def _edited(hand: Hand, part: str, wanted: list[Interval]) -> bool:
-    """Do one thing about a part's intervals; True where they are all as wanted."""
+    """Apply one edit to a part's intervals; True where they all match."""
     shown = _bars(hand, part)
     for one in shown:
         if one in wanted:
@@ -351,7 +357,7 @@ def _edited(hand: Hand, part: str, wanted: list[Interval]) -> bool:
 
 
 def _bars(hand: Hand, part: str) -> list[Interval]:
-    """The part's intervals as the timeline has them."""
+    """The part's intervals on the timeline."""
     told = hand.see(
         "(part) => [...document.querySelectorAll(`[data-part='${part}'] .bar`)]"
         ".map((bar) => bar.dataset.interval)",
@@ -389,16 +395,16 @@ def _drag_end(hand: Hand, part: str, one: Interval, end: str, frames: int) -> No
 
 @contextmanager
 def opened(settings: Path, sequence: str, cores: int) -> Iterator[Hand]:
-    """The sequence's page in a browser, served by a process of its own."""
+    """The sequence's page in a browser, with a server process of its own."""
     with annotate_page.served_page(settings, sequence, cores) as found:
         found.page.wait_for_timeout(1000)
         yield Hand(found)
 
 
 def made_plain(project: Project, cores: int) -> None:
-    """Results of both recordings without any annotation.
+    """Compute the results of both recordings without annotations.
 
-    Raises UserError where annotations lie outside the results, as a user's own would.
+    Raises UserError where annotations are outside the results folder, as a user's would be.
     """
     wanted = []
     for name in (OBJECT, CONTACT):
@@ -418,7 +424,7 @@ def made_plain(project: Project, cores: int) -> None:
 
 
 def driven(settings: Path, cores: int) -> dict[str, float]:
-    """Figures of both sessions and of the page; those of a session that failed are left out."""
+    """Figures of both sessions and of the page; figures of a failed session are omitted."""
     from playwright.sync_api import Error
 
     project = load_project(settings)
@@ -443,7 +449,7 @@ def driven(settings: Path, cores: int) -> dict[str, float]:
 
 
 def main() -> None:
-    """Drive both, print the figures, and put them beside what is in the output."""
+    """Run both sessions, print the figures and add them to the output."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     settings = Path("config/annotate/config.yaml")
     parser.add_argument("settings", type=Path, nargs="?", default=settings)

@@ -1,5 +1,6 @@
-"""A person's hand and eye on the page of `intercap annotate`: keys, clicks and drags, counted and
-timed, and what is to be seen. Nothing here calls the page's own code to do the work.
+"""Operate the annotation page as a person: keys, clicks and drags, counted and timed.
+
+Nothing here calls the page's own functions to do the work.
 """
 
 from __future__ import annotations
@@ -48,15 +49,15 @@ class Hand:
 
     @property
     def seconds(self) -> float:
-        """In the browser, without the runs."""
+        """Seconds in the browser, without the runs."""
         return time.monotonic() - self.started - self.waited
 
     def see(self, expression: str, told: Any = None) -> Any:
-        """What the page shows, as a JavaScript expression."""
+        """Value of a JavaScript expression on the page."""
         return self.visit.page.evaluate(expression, told)
 
     def views(self, points: dict[str, list[np.ndarray]]) -> list[dict[str, Any]]:
-        """The large views, with where ``points`` of the room by camera are drawn in each."""
+        """The large views, with the image positions of ``points`` by camera."""
         told = {name: [p.tolist() for p in those] for name, those in points.items()}
         return list(self.see(_VIEWS, told))
 
@@ -74,7 +75,7 @@ class Hand:
         self._done()
 
     def choose(self, selector: str, value: str) -> None:
-        """An entry of a list."""
+        """Select an entry of a list."""
         self.visit.page.locator(selector).select_option(value)
         self._done()
 
@@ -91,7 +92,7 @@ class Hand:
         self._done()
 
     def go_to(self, frame: int) -> None:
-        """By the arrow keys, ten frames at a time where it is far."""
+        """Go to a frame by the arrow keys, in steps of ten where it is far."""
         away = frame - int(self.see("window.annotate.frame"))
         tens, ones = divmod(abs(away), 10)
         arrow = "ArrowRight" if away > 0 else "ArrowLeft"

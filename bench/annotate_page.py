@@ -1,16 +1,18 @@
-"""From a key to all views drawn: the page of `intercap annotate` in a real Chromium.
+"""Latency of the annotation page in Chromium, from a key to the drawn views.
 
     python -m bench.annotate_page [config/demo/config.yaml] [--sequence NAME] [--steps 30]
         [--output results/bench.json]
 
-The arrow key is pressed as a person does, with a pause between; a step ends when every view has
-drawn the new frame, the graphics process has ended its work on them and the browser has painted.
-Into the JSON go ``annotate.page_ms_per_step``, the median of steps on, their 95th percentile
-(``..._p95``), the median until the 3D viewer has followed (``..._3d``, two frames later at the
-least), ``annotate.page_ms_per_jump``, to the last frame, whose images nobody fetched ahead,
-``annotate.page_ms_to_open``, from the address to the 4D viewer, and
-``annotate.page_ms_per_edit``, for which the page stands still. Of a long sequence:
-config/evaluation/long.yaml, once it is computed.
+The arrow key is pressed with pauses, as by a person. A step ends when every view has drawn the new
+frame, the graphics process has finished and the browser has painted. Figures in the JSON:
+
+- ``annotate.page_ms_per_step``: median of a step; ``..._p95`` the 95th percentile; ``..._3d`` the
+  median until the 3D viewer has followed (at least two frames later).
+- ``annotate.page_ms_per_jump``: jump to the last frame, whose images are not prefetched.
+- ``annotate.page_ms_to_open``: from the address to the 4D viewer.
+- ``annotate.page_ms_per_edit``: time for which an edit blocks the page.
+
+Use config/evaluation/long.yaml, once computed, for a long sequence.
 """
 
 from __future__ import annotations
@@ -76,8 +78,10 @@ _EDITS = """
 
 
 def steps_ms(page: Page, steps: int, key: str = "ArrowRight") -> np.ndarray:
-    """Milliseconds (N, 2) of so many steps, one after the other, of a page that is watched (WATCH):
-    to all views, and to the 3D viewer."""
+    """Milliseconds (N, 2) of N consecutive steps on a watched page (WATCH).
+
+    The columns are the time to all views and to the 3D viewer.
+    """
     page.evaluate("window.stepMs.length = 0")
     for step in range(steps):
         page.keyboard.press(key)
@@ -89,7 +93,7 @@ def steps_ms(page: Page, steps: int, key: str = "ArrowRight") -> np.ndarray:
 
 @contextmanager
 def served_page(settings: Path, sequence: str, cores: int = 0) -> Iterator[Visit]:
-    """The sequence's page in a browser, ready, served by a process of its own.
+    """The sequence's page in a browser, ready, with a server process of its own.
 
     Raises UserError where the server does not start.
     """
@@ -112,7 +116,7 @@ def served_page(settings: Path, sequence: str, cores: int = 0) -> Iterator[Visit
 
 
 def measure(settings: Path, sequence: str, steps: int) -> dict[str, float]:
-    """Figures of one sequence, served by a process of its own."""
+    """Figures of one sequence, served by a separate process."""
     with served_page(settings, sequence) as page:
         page.page.wait_for_timeout(1500)
         page.page.evaluate(WATCH)
@@ -136,7 +140,7 @@ def measure(settings: Path, sequence: str, steps: int) -> dict[str, float]:
 
 
 def main() -> None:
-    """Measure, print, and put the figures beside what is in the output."""
+    """Measure, print, and add the figures to the output."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("settings", type=Path, nargs="?", default=Path("config/demo/config.yaml"))
     parser.add_argument("--sequence", default="cup_drink_s02")

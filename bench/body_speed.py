@@ -1,13 +1,17 @@
-"""The body's fit beside the paper's recipe: seconds a frame and errors, in one run.
+"""Compare the body's fit with the paper's recipe, and the body model with other packages.
 
     python -m bench.body_speed [config/bench/config.yaml] [--output results/bench.json]
 
-Wants the artefacts that ``intercap bench`` computes. Both read the same keypoints, clouds and
-cameras of the first sequence, decoded beforehand, start from the same triangulated joints and have
-as many threads. The recipe is measured as published, every frame through all its stages, and as
-quick as it can be made: later frames go on from the one before through the last stage alone, and
-end when they are as good as ours, or as good as they get, which the truth says. Adds its figures,
-keys ``body.<measure>``, to the output, those of the body model's forward among them.
+Needs the artefacts of ``intercap bench``. Both methods read the same keypoints, clouds and cameras
+of the first sequence, decoded in advance, start from the same triangulated joints and use the same
+number of threads. The recipe is measured as published, with all its stages in every frame, and in
+its fastest form: each frame continues from the frame before with the last stage only, and stops
+when the truth says that it is as accurate as ours or at its best. Adds figures with keys
+``body.<measure>`` to the output.
+
+The body model's forward pass is compared with `body-models` (Apache-2.0) and `smplfitter` (MIT) on
+one file, for all vertices of 32 bodies. The `smplx` package is licensed for non-commercial research
+only and is not measured.
 """
 
 from __future__ import annotations
@@ -45,18 +49,18 @@ from intercap_core.project import load_project
 
 THREADS = int(os.environ["OMP_NUM_THREADS"])
 FRAMES = 6
-RECIPE_FRAMES = 2  # of them by the whole recipe, which takes long
-AS_GOOD = 1.02  # times our error: reached
-NEAR_BEST = 1.05  # times a frame's smallest error: as good as it gets
-SPARSE = 10  # every so-many-th vertex while the recipe's path is looked at
+RECIPE_FRAMES = 2  # frames fitted by the whole recipe, which is slow
+AS_GOOD = 1.02  # factor of our error below which the recipe counts as equally accurate
+NEAR_BEST = 1.05  # factor of a frame's smallest error that counts as the best
+SPARSE = 10  # every tenth vertex is evaluated along the recipe's path
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One way to fit N frames: seconds a frame, and each frame's error (N,), mm over vertices."""
+    """Time and errors of one method on N frames."""
 
-    seconds: float
-    pve: np.ndarray
+    seconds: float  # per frame
+    pve: np.ndarray  # (N,) mean vertex error, millimetres
 
     @property
     def pve_mm(self) -> float:
@@ -64,7 +68,7 @@ class Run:
 
 
 def ours(clip: BodyClip) -> Run:
-    """What the stage does with all frames of the clip."""
+    """Fit all frames of the clip as the stage does."""
     begin = time.perf_counter()
     fit = Fitter(clip.model, clip.seen, clip.clouds, clip.settings).run()
     vectors = fit.vectors.cpu()
@@ -75,13 +79,13 @@ def ours(clip: BodyClip) -> Run:
 
 
 def one_by_one(clip: BodyClip) -> Run:
-    """The same, every frame on its own."""
+    """Fit every frame separately."""
     runs = [ours(clip.part(slice(t, t + 1))) for t in range(len(clip))]
     return Run(float(np.mean([r.seconds for r in runs])), np.concatenate([r.pve for r in runs]))
 
 
 def placed(clip: BodyClip) -> Tensor:
-    """Bodies (T, P) at rest, laid on the triangulated trunk: where our fit and the recipe start."""
+    """Initial bodies (T, P) of both methods: the rest pose aligned to the triangulated trunk."""
     model, rest = clip.model, clip.model.zeros()
     keypoints = model.keypoints_of(rest)[0].double().cpu().numpy()
     pelvis = model.forward(rest, vertex_ids=np.array([0])).joints[0, 0].double().cpu().numpy()
@@ -112,16 +116,16 @@ def paper(clip: BodyClip) -> tuple[list[FrameFit], list[FrameFit]]:
 
 
 def finished(clip: BodyClip, fits: list[FrameFit], first: int) -> Run:
-    """The fits of frames ``first``, ``first + 1``, ... at their end."""
+    """Errors and times at the end of the fits of frames ``first``, ``first + 1``, ..."""
     frames = np.arange(first, first + len(fits))
     seconds = float(np.mean([fit.seconds[-1] for fit in fits]))
     return Run(seconds, clip.errors(torch.stack([fit.end for fit in fits]), frames))
 
 
 def until(clip: BodyClip, fits: list[FrameFit], first: int, wanted: np.ndarray) -> tuple[Run, bool]:
-    """The fits where they first come to the errors ``wanted`` (N,), or near their smallest.
+    """Errors and times where the fits first reach ``wanted`` (N,), else near their smallest.
 
-    Also whether every frame came to ours.
+    The second value tells whether every frame reached its wanted error.
     """
     seconds, errors, reached = [], [], []
     for t, fit in enumerate(fits, first):
@@ -135,15 +139,17 @@ def until(clip: BodyClip, fits: list[FrameFit], first: int, wanted: np.ndarray) 
 
 
 def moment(pve: np.ndarray, wanted: float) -> tuple[int, bool]:
-    """Number of the first evaluation whose error (E,) is as good as wanted, or else nearly as small
-    as it gets; which."""
+    """Index of the first evaluation whose error (E,) reaches ``wanted``, else nearly its smallest.
+
+    The second value tells which of the two it is.
+    """
     if pve.min() <= AS_GOOD * wanted:
         return int(np.argmax(pve <= AS_GOOD * wanted)), True
     return int(np.argmax(pve <= NEAR_BEST * pve.min())), False
 
 
 def measure(settings: Path, output: Path, frames: int) -> None:
-    """Measure, print and add to the output; see the module's text."""
+    """Measure, print and add the figures to ``output``; see the module's docstring."""
     torch.set_num_threads(THREADS)
     forward = forward_times()
     project = load_project(settings)
@@ -157,7 +163,7 @@ def measure(settings: Path, output: Path, frames: int) -> None:
     all_at_once = ours(recording)
     together, alone = ours(clip), one_by_one(clip)
     whole, short = paper(clip)
-    again = ours(recording)  # before and after, should the machine have been disturbed
+    again = ours(recording)  # before and after, to average out other load
     fit = Run((all_at_once.seconds + again.seconds) / 2, all_at_once.pve[at])
     recipe, quick = finished(clip, whole, 0), finished(clip, short, 1)
     reached, is_as_good = until(clip, short, 1, fit.pve)
@@ -243,7 +249,7 @@ def forward_times() -> dict[str, float]:
     """Median milliseconds by name, forward and with the gradient of a sum over the vertices.
 
     All pose the open body with 10 + 10 shape directions and random pose blend shapes, as many as in
-    a licensed file. Raises ValueError where a peer's vertices are others than ours.
+    a licensed file. Raises ValueError where the vertices of a package differ from ours.
     """
     with tempfile.TemporaryDirectory() as folder:
         full, short = write_files(Path(folder))
@@ -268,7 +274,7 @@ def forward_times() -> dict[str, float]:
 
 
 def write_files(folder: Path) -> tuple[Path, Path]:
-    """The open body with pose blend shapes, with 400 shape directions and with 20."""
+    """Write the open body with pose blend shapes, with 400 and with 20 shape directions."""
     with np.load(OPEN_BODY) as file:
         arrays = {name: file[name] for name in file.files}
     shape, expression = np.split(arrays["shapedirs"].astype(np.float32), 2, axis=2)

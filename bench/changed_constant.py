@@ -1,4 +1,4 @@
-"""Find a constant of the package by name, and run Python as if another value stood in its file."""
+"""Find a constant of the package by name, and import the package with another value of it."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ class Constant:
 
     @property
     def label(self) -> str:
-        """The shortest name that tells it apart: ``room.NAME``, or ``room.module:NAME``."""
+        """The shortest unambiguous name: ``package.NAME`` or ``package.module:NAME``."""
         _, room, *rest = self.module.split(".")
         return f"{room}.{self.name}" if rest == ["constants"] else f"{room}.{rest[-1]}:{self.name}"
 
 
 def find_constant(text: str, *, root: Path = ROOT) -> Constant:
-    """The constant that ``room.NAME``, ``room.module:NAME`` or a full dotted module names.
+    """The constant named ``package.NAME``, ``package.module:NAME`` or by its full dotted name.
 
-    ``room.NAME`` is looked for in the room's ``constants`` first, then in its other files, there
-    also as ``_NAME``. Raises UserError, with names that are like it, where there is none, and with
-    the candidates where there are several.
+    ``package.NAME`` is searched in the package's module ``constants`` first, then in its other
+    files, there also as ``_NAME``. Raises UserError with similar names where there is none, and
+    with the candidates where there are several.
     """
     module, _, name = text.rpartition(":") if ":" in text else text.rpartition(".")
     parts = module.removeprefix(f"{PACKAGE}.").split(".")
@@ -84,7 +84,7 @@ def _module(path: Path, root: Path) -> str:
 
 @cache
 def _constants(path: Path) -> dict[str, str]:
-    """Upper-case names that the file binds at its top level, with their expressions."""
+    """Upper-case names bound at the top level of the file, with their expressions."""
     found = {}
     for statement in ast.parse(path.read_text(encoding="utf-8")).body:
         for target, value in _bindings(statement):
@@ -113,11 +113,11 @@ def _bindings(statement: ast.stmt) -> list[tuple[str, ast.expr]]:
 
 
 def scaled(name: str, value: Any, factor: float, around: float = 0.0) -> Any:
-    """``value`` times ``factor``, or its distance from ``around`` so many times as large.
+    """``value`` times ``factor``, or with its distance from ``around`` times ``factor``.
 
-    An integer stays one, at least 1. A number between 0 and 1 whose name ends in no unit is a share
-    or a probability: it stays in that range. Of tuples, lists and dictionaries every number is
-    scaled. Raises UserError for what is no number.
+    Integers stay integers of at least 1. A number between 0 and 1 whose name has no unit is a share
+    or a probability and stays in that range. In tuples, lists and dictionaries every number is
+    scaled. Raises UserError for values that are not numbers.
     """
     if isinstance(value, dict):
         return {key: scaled(name, entry, factor, around) for key, entry in value.items()}
@@ -137,9 +137,9 @@ def scaled(name: str, value: Any, factor: float, around: float = 0.0) -> Any:
 def import_changed(constant: Constant, change: Callable[[Any], Any]) -> tuple[Any, Any]:
     """Import the constant's module with another value; returns the value before and after.
 
-    To be called before anything else of the package is imported: other modules, default arguments,
-    kernels and what the module itself derives from the constant then take the changed value.
-    Raises UserError where the module is imported already.
+    Must be called before any other module of the package is imported, so that other modules,
+    default arguments, kernels and derived constants use the changed value. Raises UserError where
+    the module is already imported.
     """
     if constant.module in sys.modules:
         raise UserError(f"{constant.module} is imported already; change it in a fresh process")
@@ -168,7 +168,7 @@ def import_changed(constant: Constant, change: Callable[[Any], Any]) -> tuple[An
 
 
 def _wrap(statement: ast.stmt, value: ast.expr) -> None:
-    """Put ``_changed(...)`` around ``value`` where it stands in ``statement``."""
+    """Put ``_changed(...)`` around ``value`` at its position in ``statement``."""
 
     class Wrap(ast.NodeTransformer):
         def visit(self, node: ast.AST) -> ast.AST:
@@ -180,10 +180,9 @@ def _wrap(statement: ast.stmt, value: ast.expr) -> None:
 
 
 def in_kernels(constant: Constant, *, root: Path = ROOT) -> bool:
-    """Whether a file with compiled kernels takes the constant, or what is derived from it.
+    """Whether a file with compiled kernels uses the constant or a value derived from it.
 
-    Numba's cache knows nothing of the globals of a kernel, so such a value wants a cache of its
-    own.
+    Numba's cache ignores the globals of a kernel, so a changed value needs a separate cache.
     """
     own = root.joinpath(*constant.module.split(".")[1:]).with_suffix(".py")
     derived = {constant.name}

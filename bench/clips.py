@@ -55,34 +55,30 @@ from intercap_core.object_track.view import View
 from intercap_core.project import Project
 from intercap_core.schemas import BODY_FIT, FRAMES, JOINT, OBJECT_TRACK, SCENE
 
-# Of an annotated pose: turn (rad) and shift (m), as large as the evaluation's annotations are wrong
+# Error of an annotated pose, rotation (rad) and translation (m), as in the evaluation's annotations
 ANNOTATION_ERROR = np.concatenate([np.radians(5) * np.ones(3), 0.010 * np.ones(3)]) / np.sqrt(3)
 SEEN_VIEWS = 2  # frames that fewer truly see are not counted, as in the evaluation
 
 
 @dataclass(frozen=True, eq=False)
 class ObjectClip:
-    """T consecutive frame sets with C views each.
+    """T consecutive frame sets with C views each, as the object's tracker reads them."""
 
-    ``whole`` is the object's mesh, ``mesh`` the one that is tracked; ``true_rotation`` (T, 3, 3),
-    ``true_translation`` (T, 3) and ``true_views`` (T,) are of the recording's truth.
-    """
-
-    whole: ObjectMesh
-    mesh: ObjectMesh
-    views: list[list[View]]
-    times: np.ndarray
-    up: np.ndarray | None
-    joints: np.ndarray
-    labels: tuple[str, ...]
+    whole: ObjectMesh  # the object's mesh
+    mesh: ObjectMesh  # the simplified mesh that is tracked
+    views: list[list[View]]  # T lists of C
+    times: np.ndarray  # (T,) seconds
+    up: np.ndarray | None  # (3,) normal of the floor; None if unknown
+    joints: np.ndarray  # (T, 135, 3) triangulated keypoints
+    labels: tuple[str, ...]  # detector labels of the object
     settings: ObjectTrackSettings
-    true_rotation: np.ndarray
-    true_translation: np.ndarray
-    true_views: np.ndarray
+    true_rotation: np.ndarray  # (T, 3, 3) master_from_object
+    true_translation: np.ndarray  # (T, 3)
+    true_views: np.ndarray  # (T,) number of cameras that truly see the object
 
     @classmethod
     def load(cls, project: Project, sequence: str, count: int) -> ObjectClip:
-        """The first ``count`` frame sets from the first that shows the object well.
+        """``count`` frame sets from the first in which two cameras truly see the object.
 
         Raises UserError where the sequence has no truth or an artefact is missing.
         """
@@ -122,7 +118,7 @@ class ObjectClip:
 
     @property
     def annotated(self) -> np.ndarray:
-        """The first frame's pose (4, 4) as a person might set it: off by 10 mm and 5 degrees."""
+        """The first frame's pose (4, 4) with the error of an annotation: 10 mm and 5 degrees."""
         pose = rigid(self.true_rotation[0], self.true_translation[0])
         return moved(pose, ANNOTATION_ERROR)
 
@@ -145,7 +141,7 @@ class ObjectClip:
         )
 
     def observer(self) -> Observer:
-        """What the tracker asks of the images, for one pass of it."""
+        """The observer of one pass of the tracker over the images."""
         return Observer(
             self.mesh,
             self.views.__getitem__,
@@ -161,7 +157,7 @@ class ObjectClip:
         return [[[k.label for k in view.candidates] for view in views] for views in self.views]
 
     def errors(self, poses: np.ndarray, frames: np.ndarray | int) -> tuple[np.ndarray, np.ndarray]:
-        """Errors of poses (..., 4, 4) in the given frame or frames: millimetres, degrees (...)."""
+        """Errors (...) of poses (..., 4, 4) in the given frames, millimetres and degrees."""
         centre = self.whole.centre_of_mass
         rotation = np.broadcast_to(self.true_rotation[frames], (*poses.shape[:-2], 3, 3))
         apart = object_pose.centre_error(
@@ -173,7 +169,7 @@ class ObjectClip:
 
     @cached_property
     def seen(self) -> np.ndarray:
-        """Frames (T,) bool that count: enough views truly see the object."""
+        """Mask (T,) of the frames that are evaluated: two cameras truly see the object."""
         return self.true_views >= SEEN_VIEWS
 
 
@@ -186,17 +182,13 @@ _CHUNK = 32  # bodies posed at once
 
 @dataclass(frozen=True, eq=False)
 class BodyClip:
-    """T consecutive frame sets.
-
-    ``seen`` and ``clouds`` (T entries) are what the fit reads; ``true_vertices`` (T, V, 3) the
-    points of the true skin that correspond to the model's vertices, metres, master frame.
-    """
+    """T consecutive frame sets, as the body's fit reads them."""
 
     model: BodyModel
     seen: Observations
-    clouds: list[PersonCloud | None]
+    clouds: list[PersonCloud | None]  # T entries
     settings: BodyFitSettings
-    true_vertices: np.ndarray
+    true_vertices: np.ndarray  # (T, V, 3) true skin at the model's vertices, metres, master frame
 
     @classmethod
     def load(cls, project: Project, sequence: str) -> BodyClip:
@@ -227,7 +219,7 @@ class BodyClip:
         return len(self.clouds)
 
     def part(self, frames: slice) -> BodyClip:
-        """Some of the frames as a clip of their own."""
+        """A clip of some of the frames."""
         numbers, cameras = range(len(self))[frames], len(self.seen.rig)
         seen = replace(
             self.seen,
@@ -246,7 +238,7 @@ class BodyClip:
         )
 
     def on(self, device: torch.device) -> BodyClip:
-        """The same with model and clouds on another device."""
+        """The clip with model and clouds on another device."""
         model = BodyModel.load(self.model.path, device=device)
         clouds = [
             cloud and replace(cloud, **{name: getattr(cloud, name).to(device) for name in _TENSORS})
@@ -255,7 +247,7 @@ class BodyClip:
         return replace(self, model=model, clouds=clouds)
 
     def errors(self, vectors: Tensor, frames: np.ndarray, *, step: int = 1) -> np.ndarray:
-        """PVE (N,) in millimetres of bodies (N, P) in ``frames`` (N,), of every step-th vertex."""
+        """PVE (N,) of bodies (N, P) in ``frames`` (N,) over every step-th vertex, millimetres."""
         ids = np.arange(0, self.model.num_vertices, step)
         found = []
         for start in range(0, len(vectors), _CHUNK):
@@ -269,7 +261,7 @@ class BodyClip:
         return np.concatenate(found)
 
 
-SURE = 0.5  # probability over which a region touches
+SURE = 0.5  # probability above which a region is in contact
 _SETTLED = ("keypoint_offsets", "covering", "keypoint_sigma", "covering_noise", "keypoint_doubt")
 _POSE = (
     "global_orient", "body_pose", "jaw_pose", "leye_pose", "reye_pose", "left_hand_pose",
@@ -279,29 +271,24 @@ _POSE = (
 
 @dataclass(frozen=True, eq=False)
 class BodyEvidence:
-    """E_B: ``fitter`` takes correspondences of ``problem``, whose terms are plain torch and whose
-    constants are those that the body's fit has settled."""
+    """E_B in plain torch, with the noise constants that the body's fit has estimated."""
 
-    fitter: Fitter
+    fitter: Fitter  # computes the correspondences of ``problem``
     problem: BodyProblem
 
 
 @dataclass(frozen=True, eq=False)
 class JointClip:
-    """T frame sets with C views each; ``start`` is the state of the sequential fits.
-
-    ``tracked`` is the object's mesh with fewer faces, ``views`` what E_O compares it with;
-    ``touching`` (T, R) the regions that touch at the start by the stage's own detection.
-    """
+    """T frame sets with C views each, as the joint stage reads them."""
 
     geometry: Geometry
-    start: State
+    start: State  # state of the sequential fits
     body: BodyEvidence
-    tracked: ObjectMesh
-    views: list[list[View]]
-    labels: tuple[str, ...]
+    tracked: ObjectMesh  # simplified mesh of the object
+    views: list[list[View]]  # T lists of C, evidence of E_O
+    labels: tuple[str, ...]  # detector labels of the object
     object_settings: ObjectTrackSettings
-    touching: np.ndarray
+    touching: np.ndarray  # (T, R) regions in contact at the start, by the stage's detection
     floor: Ground | None
     fps: float
     settings: JointSettings
@@ -366,7 +353,7 @@ class JointClip:
         return len(self.start)
 
     def errors(self, state: State) -> JointErrors:
-        """How far ``state`` is from the truth."""
+        """Errors of ``state`` against the truth."""
         model, true = self.geometry.model, self.truth
         assert true.vertices is not None
         with torch.no_grad():
@@ -384,15 +371,14 @@ class JointClip:
 
 @dataclass(frozen=True)
 class JointErrors:
-    """Millimetres: ``pve`` the mean over frames and skin vertices; ``object_`` the mean over the
-    frames that enough views see, at the centre of mass."""
+    """Errors of body and object, millimetres."""
 
-    pve: float
-    object_: float
+    pve: float  # mean over frames and vertices
+    object_: float  # mean error of the centre of mass over the frames with enough views
 
     @property
     def mean(self) -> float:
-        """Mean of the two: what a state is judged by."""
+        """Mean of both errors, by which states are compared."""
         return (self.pve + self.object_) / 2
 
 
@@ -407,7 +393,7 @@ def read_state(joint: Path) -> State:
 
 
 def _touching_regions(geometry: Geometry, sequential: SequentialFits, fps: float) -> np.ndarray:
-    """(T, R) regions that touch where the sequential fits end, as the stage detects them."""
+    """Mask (T, R) of the regions in contact in the sequential fits, by the stage's detection."""
     state = sequential.state
     posed, at_patch = geometry.at(state), geometry.skin.patch
     motion = region_motion(

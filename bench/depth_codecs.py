@@ -1,9 +1,9 @@
-"""Size and speed of lossless codecs for depth images, one image a chunk, fletcher32 on.
+"""Size and speed of lossless codecs for depth images, one image per chunk, with fletcher32.
 
     python bench/depth_codecs.py RECORDING.mkv [--repeat 40]
 
-Prints a Markdown table: bytes of the image over bytes in the file, and the median time to write
-and to read one image through HDF5, one thread. Every codec's output is compared with its input.
+Prints a Markdown table: compression ratio, and the median time to write and to read one image
+through HDF5 on one thread. The output of every codec is compared with its input.
 """
 
 from __future__ import annotations

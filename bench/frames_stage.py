@@ -1,9 +1,9 @@
-"""Speed and memory of the frames stage on recordings as large as real ones.
+"""Speed and memory of the frames stage on recordings of realistic size.
 
     python bench/frames_stage.py RECORDING.mkv [--cameras 6] [--sets 100]
 
-Repeats the images of one real recording over ``--cameras`` recordings of ``--sets`` images each,
-runs the stage on them, and prints milliseconds a frame set and peak memory.
+Repeats the images of one real recording as ``--cameras`` recordings of ``--sets`` images each, runs
+the stage and prints milliseconds per frame set and peak memory.
 """
 
 from __future__ import annotations

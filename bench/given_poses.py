@@ -1,10 +1,10 @@
-"""What poses that somebody gives are worth: an object's track with none, one and more of them.
+"""Errors of an object's track without, with one and with more annotated poses.
 
     intercap run config/object/two_cameras_2.yaml -- --until object_track
     python -m bench.given_poses
 
-tracks the object again from the stored artefacts, with poses from truth that are off by a
-centimetre and five degrees in frames in which the stored track is truly lost.
+The object is tracked again from the stored artefacts. The annotated poses are true poses with an
+error of one centimetre and five degrees, in frames in which the stored track is lost.
 """
 
 from __future__ import annotations
@@ -60,8 +60,10 @@ def main() -> None:
 def compare(
     project: Project, names: Sequence[str] | None, counts: Sequence[int], seed: int, output: Path
 ) -> None:
-    """Print the errors of each sequence's track without poses and with so many (``counts``), and
-    put them into the JSON ``output``; without ``names``, of all whose track is truly lost."""
+    """Print the errors of the tracks with each number of poses in ``counts``; add them to ``output``.
+
+    Without ``names``, all sequences whose track is lost in some frame are evaluated.
+    """
     table = Table("sequence", "poses", *_COLUMNS, box=None)
     table.title = "errors over all frames, and there: in those that are lost without poses"
     for name in names or _lost_sequences(project):
@@ -85,7 +87,7 @@ def _lost_sequences(project: Project) -> list[str]:
 
 
 def spread_over(lost: np.ndarray, count: int) -> list[int]:
-    """``count`` frames spread evenly over the ``lost`` ones (T,)."""
+    """Indices of ``count`` frames, evenly spaced over the ``lost`` frames (T,)."""
     frames = np.flatnonzero(lost)
     if count > len(frames):
         raise UserError(f"{count} poses were asked for, and {len(frames)} frames are lost")
@@ -95,8 +97,10 @@ def spread_over(lost: np.ndarray, count: int) -> list[int]:
 def poses_from_truth(
     project: Project, name: str, frames: Sequence[int], seed: int
 ) -> list[ObjectPose]:
-    """The true poses of ``frames``, each off by :data:`OFF_M` and :data:`OFF_DEGREES` in its own
-    direction."""
+    """True poses of ``frames`` with errors of :data:`OFF_M` and :data:`OFF_DEGREES`.
+
+    Every error has its own direction.
+    """
     truth, entry = project.sequences[name].truth, project.object_of(name)
     assert truth is not None and entry is not None
     centre = ObjectMesh.load(entry).centre_of_mass
@@ -127,7 +131,7 @@ def poses_from_truth(
 def tracked(
     project: Project, name: str, poses: Sequence[ObjectPose]
 ) -> tuple[ObjectErrors, np.ndarray, np.ndarray]:
-    """The errors of a track with these poses, and its frames (T,) that are carried and lost."""
+    """Errors of the track with these poses, and its masks (T,) of bridged and lost frames."""
     passed = given.arguments(project, name, "object_track", project.annotation(name))
     inputs = {stage: project.artefact(name, stage) for stage in STAGES["object_track"].reads}
     truth, entry = project.sequences[name].truth, project.object_of(name)
@@ -143,7 +147,7 @@ def tracked(
 
 
 def figures(errors: ObjectErrors, there: np.ndarray) -> dict[str, float]:
-    """Shares of frames, millimetres and degrees: of all frames, and of those (T,) ``there``."""
+    """Shares, millimetres and degrees over all frames and over the frames in the mask ``there`` (T,)."""
     all_ = object_errors.figures([errors])
     found = {key: all_[key] for key in ("lost_share", "lost_unnoticed_share")}
     for prefix, frames in (("", np.ones_like(there)), ("there_", there)):

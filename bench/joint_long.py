@@ -1,10 +1,9 @@
-"""The joint stage on long sequences: its peak memory, in a process of its own.
+"""Extend recordings to long sequences, and measure the joint stage's peak memory on them.
 
-A recording is played forward and backward until it is as long as wanted, so that motion goes on
-without a jump: every dataset of the stage's inputs that has an axis of frames is extended and
-written by the artefacts' writer. Images are not stored again, frames point to those that are there.
-Where it is played backward the cameras expose as much too early as they expose late otherwise:
-enough to measure memory with, not to measure errors with, and no truth goes with it.
+A recording is repeated forward and backward, so that motion is continuous: every dataset with a
+frame axis in the stage's inputs is extended. Images are not copied; the new frames refer to the
+existing images. In backward frames the sign of the cameras' time offsets is wrong, so the result
+is suited to measure time and memory, not errors; it has no truth.
 """
 
 from __future__ import annotations
@@ -26,8 +25,8 @@ from intercap_core.project import Project, load_project
 from intercap_core.stage_list import STAGES
 
 MEGABYTE = 1 << 10  # in kilobytes
-# What is stored end to end, of all cameras or in a camera's group: offsets with an entry an image,
-# and what they point into.
+# Ragged datasets: offsets with one entry per image (of all cameras, or within a camera's group),
+# and the datasets that they index.
 _PER_IMAGE = {
     "mask_offsets": ("mask_rle",),
     "beside_offsets": ("beside_rle",),
@@ -39,12 +38,12 @@ _PER_SET = {
     "people_offsets": ("people",),
     "candidate_offsets": ("candidate_labels", "candidate_scores", "candidate_boxes", "rle"),
 }
-# of parts that have a length each
+# Datasets whose elements have their own offsets
 _OFFSETS_WITHIN = {"candidate_rle": "candidate_rle_offsets", "rle": "rle_offsets"}
 
 
 def there_and_back(frames: int, count: int) -> np.ndarray:
-    """Numbers (count,) of ``frames`` frames, played forward and backward, none twice in a row."""
+    """Indices (count,) of ``frames`` frames, forward and backward, none twice in a row."""
     turn = np.r_[np.arange(frames), np.arange(frames - 2, 0, -1)]
     return np.resize(turn, count)
 
@@ -72,7 +71,7 @@ def lengthen(source: Path, stage: str, output: Path, count: int) -> None:
 
 
 def _parts(key: str) -> list[tuple[str, ...]]:
-    """What the offsets ``key`` point into, each with the offsets within it where it has such."""
+    """Datasets that the offsets ``key`` index, each with its own offsets if it has any."""
     group, _, name = key.rpartition("/")
     names = (_PER_SET if group else _PER_IMAGE).get(name, ())
     within = [(part, *filter(None, [_OFFSETS_WITHIN.get(part)])) for part in names]
@@ -101,7 +100,7 @@ def _extended(read: Artefact, schema: artefacts.Schema, key: str, order: np.ndar
 
 
 def _nearest_sets(image_of: np.ndarray, order: np.ndarray) -> np.ndarray:
-    """Sets (N, C) that show each moment: of those with the set's images, the nearest in time."""
+    """Sets (N, C) whose images show each moment; of several copies, the nearest in time."""
     wanted = image_of[order]
     found = np.full_like(wanted, -1)
     for number in np.unique(wanted[wanted >= 0]):
@@ -112,7 +111,7 @@ def _nearest_sets(image_of: np.ndarray, order: np.ndarray) -> np.ndarray:
 
 
 def _put_ragged(read: Artefact, writer: Writer, key: str, order: np.ndarray, frames: int) -> None:
-    """Write offsets that have an entry for each image, in the order of (T, C), and their parts."""
+    """Write offsets with one entry per image (T, C), and the datasets that they index."""
     offsets = read[key]
     views = (len(offsets) - 1) // frames
     image = (order[:, None] * views + np.arange(views)).ravel()
@@ -130,13 +129,13 @@ def _put_ragged(read: Artefact, writer: Writer, key: str, order: np.ndarray, fra
 
 
 def _runs(starts: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """start, start + 1, ... of every run, end to end."""
+    """Concatenated indices start, start + 1, ... of every run."""
     ends = np.cumsum(lengths)
     return np.repeat(starts - (ends - lengths), lengths) + np.arange(lengths.sum())
 
 
 def peak_memory_mb(settings: Path, project: Project, sequence: str, count: int) -> float:
-    """Peak resident memory of the joint stage on ``count`` frames, in a process that does no more.
+    """Peak resident memory of the joint stage on ``count`` frames, in a separate process.
 
     Raises UserError where the stage fails.
     """
@@ -154,14 +153,14 @@ def peak_memory_mb(settings: Path, project: Project, sequence: str, count: int) 
 
 
 def peak_mb() -> float:
-    """Of this process since it was started. Not that of getrusage, which knows the parent's."""
+    """Peak resident memory of this process, megabytes; getrusage would include the parent's."""
     lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
     (peak,) = (line.split()[1] for line in lines if line.startswith("VmHWM:"))
     return int(peak) / MEGABYTE
 
 
 def _main(arguments: Sequence[str] | None = None) -> None:
-    """Run the stage on a folder's inputs and print its peak memory, megabytes."""
+    """Run the stage on the inputs in a folder and print its peak memory in megabytes."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("settings", type=Path)
     parser.add_argument("sequence")

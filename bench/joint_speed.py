@@ -1,13 +1,13 @@
-"""The joint stage beside the paper's recipe: seconds a frame, memory and errors, in one run.
+"""Compare the joint stage with the paper's recipe: seconds per frame, memory and errors.
 
     python -m bench.joint_speed [config/bench/config.yaml] [--output results/bench.json]
 
-Wants the artefacts that ``intercap bench`` computes. Both refine the whole first sequence from the
-same sequential fits, keypoints, clouds, crops, cameras and threads. Ours is timed as the stage is,
-files read and written, without the start of its process; the recipe from inputs in memory, by its
-own steps (``--steps``) and until the truth says that it is as good as ours, or else at its best.
-Then the stage's peak memory on the same recording played to 300 and 1,000 frames. Adds its figures,
-keys ``joint.<measure>``, to the output, those of ``intercap bench`` among them.
+Needs the artefacts of ``intercap bench``. Both methods refine the whole first sequence from the
+same sequential fits, keypoints, clouds, crops and cameras, with the same number of threads. The
+stage is timed with reading and writing of files, without the start of its process. The recipe
+starts from inputs in memory and is timed over ``--steps`` steps, and until the truth says that it
+is as accurate as ours or at its best. The stage's peak memory is measured on the recording extended
+to 300 and 1,000 frames. Adds figures with keys ``joint.<measure>`` to the output.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from intercap_core.stage_list import STAGES
 
 THREADS = int(os.environ["OMP_NUM_THREADS"])
 LONG = (300, 1000)  # frames
-AS_GOOD = 1.02  # times our error: reached
+AS_GOOD = 1.02  # factor of our error below which a state counts as equally accurate
 
 
 def ours(project: Project, sequence: str) -> tuple[float, State]:
-    """Seconds of the whole stage, and what it ends with."""
+    """Run the whole stage; returns its seconds and its result."""
     inputs = {name: project.artefact(sequence, name) for name in STAGES["joint"].reads}
     with tempfile.TemporaryDirectory(dir=project.results) as folder:
         output = Path(folder) / "joint.h5"
@@ -50,9 +50,9 @@ def ours(project: Project, sequence: str) -> tuple[float, State]:
 
 
 def moment(errors: np.ndarray, wanted: float) -> tuple[int, bool]:
-    """Number of the first state whose error (R,) is as good as wanted, else of the best; which.
+    """Index of the first state whose error (R,) reaches ``wanted``, else of the best state.
 
-    The first of them, where both start, is nobody's result and does not count.
+    The second value tells which of the two it is. State 0 is the common start and is excluded.
     """
     own = errors[1:]
     near = own <= AS_GOOD * wanted
@@ -60,7 +60,7 @@ def moment(errors: np.ndarray, wanted: float) -> tuple[int, bool]:
 
 
 def measure(settings: Path, output: Path, steps: int) -> None:
-    """Measure, print and add to the output; see the module's text."""
+    """Measure, print and add the figures to ``output``; see the module's docstring."""
     torch.set_num_threads(THREADS)
     project = load_project(settings)
     sequence = next(iter(project.sequences))
@@ -71,7 +71,7 @@ def measure(settings: Path, output: Path, steps: int) -> None:
 
     first, state = ours(project, sequence)
     recipe = refine(energy, len(clip), steps)
-    again, _ = ours(project, sequence)  # before and after, should the machine have been disturbed
+    again, _ = ours(project, sequence)  # before and after, to average out other load
     seconds = (first + again) / 2
     found = [clip.errors(one) for one in recipe.states]
     start, end, reached = clip.errors(clip.start), found[-1], clip.errors(state)

@@ -1,13 +1,13 @@
-"""The object's tracker beside the paper's recipe: milliseconds a frame and errors, in one run.
+"""Compare the object's tracker with the paper's recipe: milliseconds per frame and errors.
 
     python -m bench.object_speed [config/bench/config.yaml] [--output results/bench.json]
 
-Wants the artefacts that ``intercap bench`` computes of the first sequence, on which shorter
-schedules of the baseline are tried too. Then our whole track and the recipe on a recording of each
-object, those of config/object, made where they are not there; ``--frames`` of each. Both get the
-same frames, decoded and reduced beforehand, the same first pose (the true one, off by 10 mm and 5
-degrees) and as many threads. Adds its figures, keys ``object.<measure>``, to the output and draws
-``object_convergence.png`` beside the artefacts.
+Needs the artefacts of ``intercap bench``. On its first sequence shorter schedules of the baseline
+are measured too. Then tracker and recipe are compared on ``--frames`` frames of one recording of
+each object (config/object; recordings that do not exist are made). Both get the same frames,
+decoded and reduced in advance, the same first pose (the true pose with an error of 10 mm and 5
+degrees) and the same number of threads. Adds figures with keys ``object.<measure>`` to the output
+and draws ``object_convergence.png`` next to the artefacts.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ from intercap_core.project import load_project
 
 THREADS = int(os.environ["OMP_NUM_THREADS"])
 FRAMES = 20
-RECORDINGS = Path("config/object/config.yaml")  # one of each object, those of the evaluation
-REPEATS = 3  # of what takes seconds; medians
-# Adam steps a frame (the first frame gets 400 / 150 times as many) and learning rate, metres; twice
-# as many radians. Two for each number, from a wider choice on recordings that are not measured.
+RECORDINGS = Path("config/object/config.yaml")  # one recording of each object
+REPEATS = 3  # of measurements, whose median is reported
+# Adam steps a frame (400 / 150 times as many in the first) and learning rate in metres, twice that
+# in radians. Chosen on recordings that are not measured here.
 SCHEDULES = (
     (5, 4e-3),
     (5, 8e-3),
@@ -60,28 +60,25 @@ SCHEDULES = (
     (40, 4e-3),
     (75, 2e-3),
 )
-AS_GOOD = 1.02  # times our errors: reached
-NEAR_BEST = 1.05  # times the best median that any schedule comes to: its best
-SOFT_STEPS = 5  # of the plain torch rasteriser, which takes long
+AS_GOOD = 1.02  # factor of our errors below which a schedule counts as equally accurate
+NEAR_BEST = 1.05  # factor of the best median of all schedules that counts as the best
+SOFT_STEPS = 5  # with the plain torch rasteriser, which is slow
 
 
 @dataclass(frozen=True)
 class Run:
-    """One way to track the clip: milliseconds a frame, errors (median, p95) and frames lost.
+    """Time and errors of one method on a clip."""
 
-    ``errors`` (2, n): millimetres and degrees of the n frames that count; ``frames`` all frames.
-    """
-
-    ms: float
-    translation_mm: tuple[float, float]
-    rotation_deg: tuple[float, float]
-    lost: float
-    errors: np.ndarray = field(default_factory=lambda: np.zeros((2, 0)), compare=False)
-    frames: int = 0
+    ms: float  # per frame
+    translation_mm: tuple[float, float]  # median and 95th percentile
+    rotation_deg: tuple[float, float]  # median and 95th percentile
+    lost: float  # share of the evaluated frames
+    errors: np.ndarray = field(default_factory=lambda: np.zeros((2, 0)), compare=False)  # mm, deg
+    frames: int = 0  # all frames
 
     @classmethod
     def of(cls, clip: ObjectClip, poses: np.ndarray, seconds: float) -> Run:
-        """From poses (T, 4, 4) and the seconds they took in all."""
+        """From poses (T, 4, 4) and the total seconds."""
         millimetres, degrees = clip.errors(poses, np.arange(len(clip)))
         return cls.of_errors(
             np.stack([millimetres[clip.seen], degrees[clip.seen]]), len(clip), seconds
@@ -89,7 +86,7 @@ class Run:
 
     @classmethod
     def of_errors(cls, errors: np.ndarray, frames: int, seconds: float) -> Run:
-        """From errors (2, n), the number of frames that were tracked, and the seconds in all."""
+        """From errors (2, n), the number of tracked frames and the total seconds."""
         millimetres, degrees = errors
         lost = (millimetres > 1e3 * LOST_TRANSLATION_M) | (degrees > LOST_ROTATION_DEG)
         return cls(
@@ -103,7 +100,7 @@ class Run:
 
     @classmethod
     def pooled(cls, runs: Sequence[Run]) -> Run:
-        """Several recordings together: every frame counts the same."""
+        """Pool several recordings; every frame has the same weight."""
         seconds = sum(1e-3 * run.ms * run.frames for run in runs)
         errors = np.concatenate([run.errors for run in runs], axis=1)
         return cls.of_errors(errors, sum(run.frames for run in runs), seconds)
@@ -119,19 +116,19 @@ class Run:
         }
 
     def as_good_as(self, other: Run) -> bool:
-        """Whether no median or p95 is worse by more than a little and no more frames are lost."""
+        """Whether no median or p95 is worse by more than 2 % and no more frames are lost."""
         mine, its = ((*r.translation_mm, *r.rotation_deg) for r in (self, other))
         near = all(a <= AS_GOOD * b for a, b in zip(mine, its, strict=True))
         return near and self.lost <= other.lost
 
 
 def _given(start: np.ndarray) -> GivenPose:
-    """The first frame's pose as an annotation has it, with the deviations of one."""
+    """The first frame's pose as an annotation, with an annotation's standard deviations."""
     return GivenPose(0, start, 0.01, np.radians(5.0))
 
 
 def whole_track(clip: ObjectClip, start: np.ndarray | None, repeats: int = REPEATS) -> Run:
-    """All that the stage does: hypotheses, decision, exposure times, flags; no start: a search."""
+    """Run the whole stage; without ``start`` it searches the first pose."""
     seconds, poses = [], np.zeros(0)
     for _ in range(repeats if start is not None else 1):
         tracker = clip.tracker()
@@ -143,7 +140,7 @@ def whole_track(clip: ObjectClip, start: np.ndarray | None, repeats: int = REPEA
 
 
 def one_pass(clip: ObjectClip, start: np.ndarray) -> Run:
-    """Each frame fitted once and in order, as the paper goes: the fit alone."""
+    """Fit each frame once in order, as the paper does, without the stage's other steps."""
     seconds, poses = [], np.zeros(0)
     for _ in range(REPEATS):
         observer = clip.observer()
@@ -159,7 +156,7 @@ def one_pass(clip: ObjectClip, start: np.ndarray) -> Run:
 
 
 def paper(clip: ObjectClip, start: np.ndarray, recipe: Recipe) -> Run:
-    """The baseline, one frame after another, each from where the tracker's pass would start."""
+    """Run the baseline; each frame starts at the pose that the tracker would extrapolate."""
     begin, before, now = time.perf_counter(), start, start
     poses: list[np.ndarray] = []
     for views in clip.views:
@@ -186,7 +183,7 @@ def adam(
 
 
 def schedules(clip: ObjectClip, start: np.ndarray) -> list[tuple[int, Run]]:
-    """The baseline with fewer steps: their number a frame, fewest first, and what came of it."""
+    """Run the baseline with each schedule; returns (steps per frame, result), fewest first."""
     found = []
     for steps, rate in SCHEDULES:
         first = steps * Recipe.first_steps // Recipe.steps
@@ -196,7 +193,10 @@ def schedules(clip: ObjectClip, start: np.ndarray) -> list[tuple[int, Run]]:
 
 
 def until(ours: Run, found: list[tuple[int, Run]]) -> tuple[int, Run, bool]:
-    """The fewest steps that are as good as ours, or else as good as this baseline gets; which."""
+    """The shortest schedule as accurate as ours, else the shortest near the baseline's best.
+
+    The last value tells whether it is as accurate as ours.
+    """
     for steps, run in found:
         if run.as_good_as(ours):
             return steps, run, True
@@ -207,13 +207,13 @@ def until(ours: Run, found: list[tuple[int, Run]]) -> tuple[int, Run, bool]:
 
 
 def milliseconds_a_step(clip: ObjectClip, start: np.ndarray, recipe: Recipe, steps: int) -> float:
-    """Median over the steps of one frame."""
+    """Median duration of an Adam step in one frame."""
     fit = adam(clip, clip.views[0], start, recipe, steps)
     return 1e3 * float(np.median(np.diff(fit.seconds)[1:]))
 
 
 def measure(settings: Path, output: Path, frames: int) -> None:
-    """Measure, print and add to the output; see the module's text."""
+    """Measure, print and add the figures to ``output``; see the module's docstring."""
     torch.set_num_threads(THREADS)
     project = load_project(settings)
     sequence = next(iter(project.sequences))
@@ -227,7 +227,7 @@ def measure(settings: Path, output: Path, frames: int) -> None:
     found = schedules(clip, start)
     recipe = paper(clip, start, Recipe())
     found.append((Recipe.steps, recipe))
-    again = whole_track(clip, start)  # before and after, should the machine have been disturbed
+    again = whole_track(clip, start)  # before and after, to average out other load
     ours = replace(ours, ms=(ours.ms + again.ms) / 2)
     search = len(clip) * (whole_track(clip, None).ms - ours.ms)
     steps, reached, is_as_good = until(ours, found)
@@ -269,11 +269,10 @@ def measure(settings: Path, output: Path, frames: int) -> None:
 
 
 def compare_recordings(settings: Path, frames: int) -> dict[str, tuple[Run, Run]]:
-    """By object: our whole track and the paper's recipe, on a recording of each.
+    """Our whole track and the paper's recipe on one recording of each object, by object.
 
-    Both get the same frames, crops, first pose and threads. The recordings are made, and taken to
-    the stages before ``object_track``, where they are not there yet. Objects that fewer than two
-    views see in the first ``frames`` frames are left out.
+    Missing recordings and artefacts are computed. Objects that fewer than two cameras see in the
+    clip are skipped.
     """
     project = load_project(settings)
     targets = [str(project.artefact(name, "person")) for name in project.sequences]
@@ -306,7 +305,7 @@ def compared_figures(found: Mapping[str, tuple[Run, Run]]) -> dict[str, float]:
 
 
 def print_compared(found: Mapping[str, tuple[Run, Run]]) -> None:
-    """A row an object and one of all frames together; ours, then the recipe."""
+    """Print one row per object and one of all frames; ours, then the recipe."""
     ours, recipe = (Run.pooled([pair[i] for pair in found.values()]) for i in (0, 1))
     heads = ("mm (p95)", "degrees (p95)", "lost", "ms")
     table = Table("object", *heads, *(f"recipe: {head}" for head in heads), box=None)

@@ -1,28 +1,27 @@
-"""How far truth that is put in takes the joint fit, and what a mesh with holes costs it.
+"""Errors of the joint fit with parts of the truth as input, and with a mesh that has holes.
 
     python -m bench.oracle [SETTINGS] [--sequences NAME ...] [--variants NAME ...]
         [--cores N] [--output results/oracle.json] [--folder results/oracle]
 
-From the artefacts that a run of SETTINGS has left (by default those of `make evaluate-quick`, so
-run that first) `object_track`, `joint` and `metrics` are computed once for each variant:
+Stages `object_track`, `joint` and `metrics` are computed for each variant from the artefacts of a
+run of SETTINGS (default: those of `make evaluate-quick`, which must have run):
 
-    as it is                 what the stages are given
-    true cameras             the studio's poses, held; depth biases settle as before
-    true depth               and the studio's depth biases, held
-    true mesh                and the mesh that the studio drew: the object's floor
-    starts at the truth      the same three, but the cameras are free to move as far as the scene's
-                             covariance lets them: where the images themselves, with their noise,
-                             leave cameras that are right. The cameras' floor
+    as it is                 the inputs of the run
+    true cameras             true camera poses, fixed; depth biases are estimated
+    true depth               true camera poses and depth biases, fixed
+    true mesh                also the studio's mesh: the lower bound of the object's error
+    starts at the truth      the same inputs, but the cameras may move as far as the scene's
+                             covariance allows: the lower bound of the cameras' error, which is
+                             due to the noise of the images
     open mesh                the given mesh with a tenth of its faces missing, in one patch and
-                             scattered, for the tracker as well
+                             scattered, also for the tracker
 
-The body's fit that joint starts from, the masks and the time offsets stay as they are. All is
-measured with the scene and the mesh that the run has. What is there already, by its content, is
-taken as it is: a run that was ended goes on. Prints tables by object and puts its figures into the
-JSON of ``--output`` beside what is there: keys ``oracle.<variant>.<measure>``,
-``oracle.<object>.<variant>.<measure>``, and the joint stage's ``joint.extrinsics_floor_mm``,
-``joint.object_..._floor_...`` and ``joint.open_mesh_ratio``. Nothing of the project is written
-over.
+The body's fit from which joint starts, the masks and the time offsets are unchanged, and the
+metrics use the scene and the mesh of the run. Results that are up to date by their content are
+reused, so an interrupted run continues. Prints tables by object and adds figures to the JSON of
+``--output`` with keys ``oracle.<variant>.<measure>``, ``oracle.<object>.<variant>.<measure>``,
+``joint.extrinsics_floor_mm``, ``joint.object_..._floor_...`` and ``joint.open_mesh_ratio``. No file
+of the project is overwritten.
 """
 
 from __future__ import annotations
@@ -118,9 +117,9 @@ def consult(
     variants: Sequence[str] = tuple(VARIANTS),
     cores: int = 1,
 ) -> Found:
-    """Compute the variants, ``cores`` sequences at a time; what `metrics` says of them.
+    """Compute the variants, ``cores`` sequences at a time; returns their metrics.
 
-    Raises UserError where a sequence or a variant is unknown, or has no truth or artefacts.
+    Raises UserError where a sequence or variant is unknown, or has no truth or artefacts.
     """
     project = load_project(settings)
     names = list(sequences or project.sequences)
@@ -147,7 +146,7 @@ def consult(
 def _consult_one(
     settings: Path, sequence: str, folder: Path, variants: Sequence[str]
 ) -> dict[str, Path]:
-    """The metrics of one sequence by variant."""
+    """Metrics of one sequence by variant."""
     project = load_project(settings)
     tracks: dict[tuple[bool, bool, str], Path] = {}
     found = {}
@@ -199,7 +198,7 @@ def by_variant(found: Found) -> dict[str, Figures]:
 
 
 def by_object(found: Found) -> dict[str, dict[str, Figures]]:
-    """The same of each object's sequences."""
+    """The figures ``MEASURES`` of each variant by object."""
     names = sorted({s.object_ for some in found.values() for s in some.values()})
     return {
         name: {
@@ -226,8 +225,10 @@ def _measured(sequences: Sequence[SequenceMetrics]) -> Figures:
 
 
 def joint_figures(found: Found) -> Figures:
-    """The floors, and what the open mesh costs: the error with it over the one with the closed
-    mesh, each the mean of the sequences' own figures, and the worst sequence's ratio."""
+    """Lower bounds of the joint stage's errors, and error ratios of the open to the closed mesh.
+
+    The ratio is of the means of the sequences' own figures; the worst sequence's ratio is added.
+    """
     over_all = by_variant(found)
     floors = {key: over_all.get(TRUE_MESH, {}).get(measure) for key, measure in FLOORS.items()}
     floors["extrinsics_floor_mm"] = over_all.get(FREE, {}).get("extrinsics_mm")

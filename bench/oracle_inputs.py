@@ -1,4 +1,4 @@
-"""What an oracle puts into a fit: the studio's cameras, depth biases and mesh; and an open mesh."""
+"""Inputs of :mod:`bench.oracle`: true cameras, depth biases and mesh, and a mesh with holes."""
 
 from __future__ import annotations
 
@@ -26,13 +26,12 @@ CLUMP_FACES = 6
 
 
 def write_true_scene(scene: Path, truth: Path, output: Path, *, biases: bool, held: bool) -> Path:
-    """``scene`` with the true camera poses, and the true depth biases where ``biases``.
+    """Write ``scene`` with the true camera poses, and the true depth biases where ``biases``.
 
-    Poses are relative to the scene's master, whose pose stays; cameras go by their names; what the
-    scene does not know, a camera without images or depth, stays unknown. ``held``: what is put in
-    is known for certain, so that its covariance is 0 (what is not put in keeps its own); else the
-    covariance stays as the scene states it. Raises UserError where the truth has no such camera or
-    states no depth bias.
+    Poses are relative to the scene's master, whose pose is unchanged. Cameras are matched by name;
+    values that the scene does not know (no images, no depth) stay unknown. With ``held`` the
+    covariance of the true values is 0; otherwise it stays as the scene states it. Raises UserError
+    where the truth lacks a camera or states no depth bias.
     """
     with artefacts.read(scene, SCENE) as found, artefacts.read(truth, TRUTH) as true:
         poses, bias = _true_cameras(found, true, biases)
@@ -91,7 +90,7 @@ def write_open_mesh(output: Path, entry: ObjectEntry, *, seed: int = 0) -> Objec
 
 
 def removed_faces(vertices: np.ndarray, faces: np.ndarray, seed: int) -> np.ndarray:
-    """Which faces (F,) bool of a mesh to remove: one patch and scattered clumps."""
+    """Mask (F,) of the faces to remove: one patch and scattered clumps."""
     rng = np.random.default_rng(seed)
     mesh = trimesh.Trimesh(vertices, faces, process=False, validate=False)
     beside: list[list[int]] = [[] for _ in faces]
@@ -109,7 +108,7 @@ def removed_faces(vertices: np.ndarray, faces: np.ndarray, seed: int) -> np.ndar
 
 
 def _remove_patch(removed: np.ndarray, beside: list[list[int]], first: int, count: int) -> None:
-    """Remove up to ``count`` faces around ``first``, the ones that fewest edges lead to before."""
+    """Remove up to ``count`` faces around ``first``, in the order of a breadth-first search."""
     waiting, seen = [first], {first}
     for face in waiting:
         if count <= 0:

@@ -1,8 +1,8 @@
-"""Replay a stage from stored artefacts with another value of one constant, in a fresh process.
+"""Replay a stage from stored artefacts with another value of one constant, in a new process.
 
     python -m bench.replay TASK OUTPUT
 
-is such a process: ``TASK`` is the JSON of a run, its outcome is written to ``OUTPUT``.
+runs in that process: ``TASK`` is the JSON of a run, and its outcome is written to ``OUTPUT``.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ OVERRIDES: dict[str, dict[str, Any]] = {"segmentation": {"person": {"segmentatio
 
 @dataclass(frozen=True)
 class Run:
-    """One replay. ``constant`` None: as the code is, of ``room``'s stages."""
+    """One replay of a package's stages; ``constant`` None = with the unchanged code."""
 
     room: str
     constant: Constant | None = None
@@ -50,7 +50,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a replay gave: the value it ran with as text, figures, or why it failed."""
+    """Result of a replay: the value as text, and figures or the reason of its failure."""
 
     value: str
     changed: str
@@ -62,7 +62,7 @@ class Outcome:
 def replay(settings: Path, sequences: Sequence[str], run: Run) -> Outcome:
     """Change the constant, replay its stages from stored artefacts, and measure.
 
-    To be called in a fresh process: :func:`import_changed` says why.
+    Must be called in a new process, see :func:`import_changed`.
     """
     value, changed = "", ""
     if run.constant is not None:
@@ -99,7 +99,7 @@ def replay(settings: Path, sequences: Sequence[str], run: Run) -> Outcome:
 
 
 def content_key(settings: Path, sequences: Sequence[str], run: Run) -> str:
-    """Digest of all that a replay depends on: code, settings, inputs, truth, and the change."""
+    """Digest of all inputs of a replay: code, settings, artefacts, truth and the change."""
     from intercap_core.pipeline.code_digest import code_digest
     from intercap_core.project import load_project
     from intercap_core.stage_list import STAGES as EVERY
@@ -127,8 +127,10 @@ _digests: dict[tuple[Path, int], bytes] = {}
 
 
 def file_digest(path: Path) -> bytes:
-    """SHA-256 of a file, read once in a process until it is written anew; raises UserError where
-    it is not there."""
+    """SHA-256 of a file, cached in the process until the file changes.
+
+    Raises UserError where the file is missing.
+    """
     if not path.is_file():
         raise UserError(f"{path}: not there; take the recordings to their metrics first")
     key = (path, path.stat().st_mtime_ns)
@@ -148,7 +150,7 @@ def run_from(plain: Mapping[str, Any]) -> Run:
 
 
 class Replays:
-    """Runs replays in processes of their own, and keeps what they give in a JSON file."""
+    """Run replays in separate processes and cache their outcomes in a JSON file."""
 
     def __init__(self, settings: Path, sequences: Sequence[str], known: Path, jobs: int) -> None:
         self._settings, self._sequences = settings, list(sequences)
@@ -157,7 +159,7 @@ class Replays:
         self._lock = threading.Lock()
 
     def of(self, runs: Sequence[Run]) -> list[Outcome]:
-        """The outcome of each run, those that are not known yet computed."""
+        """Outcome of each run; unknown outcomes are computed."""
         keys = [content_key(self._settings, self._sequences, run) for run in runs]
         with ThreadPoolExecutor(self._jobs) as pool:
             return list(pool.map(self._one, runs, keys))
@@ -206,7 +208,7 @@ def _text(value: Any) -> str:
 
 
 def main(task: str, output: str) -> None:
-    """Replay one run, and write what it gave."""
+    """Replay one run and write its outcome."""
     told = json.loads(task)
     outcome = replay(Path(told["settings"]), told["sequences"], run_from(told["run"]))
     Path(output).write_text(json.dumps(asdict(outcome)), encoding="utf-8")

@@ -1,9 +1,8 @@
-"""A dataset of 223 sequences: a start with nothing to do, a check, and which jobs an edit
-asks for.
+"""Times of a dataset of 223 sequences: a run with nothing to do, a check, the jobs of an edit.
 
-A small recording that is computed (`config/test`) is repeated under other names: recordings are
-links to the same files, artefacts copies with records of their own. Seconds are CPU seconds of a
-process and its children.
+A computed recording (`config/test`) is repeated under other names: recordings are links to the same
+files, artefacts are copies with their own records. Seconds are CPU seconds of a process and its
+children.
 """
 
 from __future__ import annotations
@@ -36,9 +35,9 @@ JOBS = re.compile(r"^total\s+(\d+)", re.MULTILINE)
 
 
 def measure(settings: Path, output: Path, count: int) -> None:
-    """Print ``scale.*`` and put them into the JSON ``output``.
+    """Print ``scale.*`` and add them to the JSON ``output``.
 
-    Raises UserError where no sequence of the project has been computed to the end.
+    Raises UserError where no sequence of the project is completely computed.
     """
     source = load_project(settings)
     computed = [n for n in source.sequences if source.artefact(n, "summary").is_file()]
@@ -66,8 +65,7 @@ def measure(settings: Path, output: Path, count: int) -> None:
 
 
 def _repeated(source: Project, name: str, here: Path, count: int) -> Project:
-    """A project in the folder ``here`` whose sequences are copies of one, and whose working folder
-    it is."""
+    """A project in the folder ``here`` whose sequences are copies of one sequence."""
     row, recordings = source.sequences[name], source.sequences[name].recordings.resolve()
     names = [f"seq_{number:03d}" for number in range(count)]
     rows = ["\t".join(("sequence", "subject", "object", "recordings", "calibration", "keypoints",
@@ -105,7 +103,7 @@ def _repeated(source: Project, name: str, here: Path, count: int) -> Project:
 
 
 def _copy(source: Project, before: Path, name: str, project: Project, other: str) -> None:
-    """Every output of a sequence under another name, with a record as if it had been made here."""
+    """Copy all outputs of a sequence under another name, with records of that name."""
     contents = Contents(project.results / other / NAME)
     annotation = project.annotation(other)
     identities: dict[str, str] = {}
@@ -130,7 +128,7 @@ def _copy(source: Project, before: Path, name: str, project: Project, other: str
 
 
 def _cpu_seconds(here: Path, *arguments: str) -> float:
-    """CPU seconds of one command on the project, its children included."""
+    """CPU seconds of a command on the project, including its children."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     verb, *rest = arguments
     done = subprocess.run(

@@ -1,8 +1,8 @@
-"""The site of a large dataset: what merging 223 sequences of 300 frames costs, and one page.
+"""Cost of the site of a large dataset: merging 223 sequences of 300 frames, and one page.
 
-Sequences of the demo (run `make demo` first) are played forward and backward to 300 frames, and
-their summaries repeated under other names, subjects and objects' shares of the table. Each figure
-is of a process of its own: seconds of the clock, and its peak memory.
+Sequences of the demo (`make demo` must have run) are extended to 300 frames, and their summaries
+are repeated under other names, subjects and objects. Every figure is measured in a separate
+process: wall seconds and peak memory.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ LOAD_TIMEOUT_S = 120.0
 
 
 def measure(settings: Path, output: Path, count: int) -> None:
-    """Print ``dataset.*`` and put them into the JSON ``output``.
+    """Print ``dataset.*`` and add them to the JSON ``output``.
 
-    Raises UserError where no sequence of the project has been computed to the end.
+    Raises UserError where no sequence of the project is completely computed.
     """
     from bench.command import add_figures
 
@@ -69,10 +69,9 @@ def measure(settings: Path, output: Path, count: int) -> None:
 
 
 def load_seconds(folder: Path) -> float | None:
-    """Seconds until a page's viewer stands, in a real browser without a GPU; None without Chromium.
+    """Seconds until a page's viewer is ready in a browser without a GPU; None without Chromium.
 
-    A copy of the page calls a server on this machine when it is ready; pages as they are written
-    may call nobody.
+    A copy of the page notifies a local server when it is ready; released pages make no requests.
     """
     program = shutil.which("chromium") or shutil.which("chromium-browser")
     if program is None:
@@ -142,7 +141,7 @@ def _repeat(project: Project, summaries: list[Path], folder: Path, count: int) -
 
 
 def _timed(what: str, settings: Path, sequence: str, folder: Path) -> dict[str, float]:
-    """Seconds and peak memory of one piece of work, in a process that does no more."""
+    """Seconds and peak memory of a function in a separate process."""
     command = [
         sys.executable, "-m", "bench.scale_report", str(settings),
         "--one", what, "--sequence", sequence, "--folder", str(folder),

@@ -1,12 +1,12 @@
-"""What a stage computes with half and with double the value of one of its constants.
+"""Errors of a stage with half and with double the value of one of its constants.
 
     python -m bench.sensitivity [SETTINGS] [--constants object_track.JUMP_COST ...]
         [--sequences ...] [--output docs/sensitivity.md]
 
-Each constant's stage is replayed from the project's stored artefacts into a folder that is thrown
-away, each value in a process of its own; nothing of the project is written over. The figures are
-errors against the truth of virtual recordings. What is known already is kept by its content in
-``results/sensitivity.json``: a run that was stopped goes on where it was.
+The stage is replayed from the project's stored artefacts into a temporary folder, each value in a
+separate process; no file of the project is overwritten. The figures are errors against the truth of
+virtual recordings. Results are cached by content in ``results/sensitivity.json``, so an interrupted
+run continues.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ class _Row:
 
     @property
     def worst(self) -> float:
-        """The largest change of a figure, as a share; infinite where a stage failed."""
+        """The largest relative change of a figure; infinite where a stage failed."""
         if self.half.failure or self.double.failure:
             return float("inf")
         every = (changes(self.usual, self.half), changes(self.usual, self.double))
@@ -134,7 +134,7 @@ class _Row:
 
 
 def changes(usual: Outcome, other: Outcome) -> dict[str, tuple[float, float, float]]:
-    """Figures, flags apart, that differ by 2 % and more: before, after, and the change's share."""
+    """Figures, without flags, that differ by 2 % or more: before, after, relative change."""
     found = {}
     for name, before in usual.figures.items():
         after = other.figures.get(name, float("nan"))
@@ -145,7 +145,7 @@ def changes(usual: Outcome, other: Outcome) -> dict[str, tuple[float, float, flo
 
 
 def markdown(usual: Mapping[str, Outcome], rows: Sequence[_Row]) -> str:
-    """The table of unchanged figures, and that of the constants, the most sensitive first."""
+    """Table of the unchanged figures, and table of the constants, most sensitive first."""
     lines = ["| room | figures as the code is | flagged | s |", "|---|---|---|---|"]
     for room, outcome in usual.items():
         told = ", ".join(
@@ -196,7 +196,7 @@ def _number(value: float) -> str:
 
 
 def page(settings: Path, sequences: Sequence[str], tables: str) -> str:
-    """The tables with what a reader has to know of them."""
+    """The tables with an introduction for readers."""
     words = INTRODUCTION.format(
         sequences=" and ".join(sequences), settings=settings, percent=f"{100 * CHANGED:g}"
     )
@@ -227,7 +227,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _probe_of(name: str) -> Probe:
-    """The listed probe of that name, or a plain one."""
+    """The listed probe of that name, or a default probe."""
     return next((p for p in RISKIEST if p.name == name), Probe(name))
 
 

@@ -1,4 +1,4 @@
-"""What one stage's artefact is worth, in a few figures: its errors against truth, and its flags."""
+"""Figures of one stage's artefact: errors against truth, and flags."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ OBJECT_FIGURES = {
 
 @dataclass(frozen=True)
 class Written:
-    """Artefacts of one sequence: ``artefacts`` by stage, those replayed among them."""
+    """Artefacts of one sequence by stage, including replayed artefacts."""
 
     project: Project
     sequence: str
@@ -65,7 +65,7 @@ class Written:
         return self.project.subjects[self.project.sequences[self.sequence].subject].gender
 
     def true(self, num_vertices: int = 0) -> Truth:
-        """The truth at the moments of the sequence's frame sets."""
+        """The truth at the times of the sequence's frame sets."""
         with artefacts.read(self.artefacts["scene"], SCENE) as scene:
             times, fps = scene["times"], float(scene.attributes["fps"])
         return Truth.load(self.truth, times, fps, num_vertices)
@@ -74,13 +74,13 @@ class Written:
 def figures_of(stage: str, written: Sequence[Written]) -> Figures:
     """Figures of a stage's artefacts over several sequences; ``flagged`` counts frames.
 
-    Raises KeyError for a stage that has none.
+    Raises KeyError for a stage without figures.
     """
     return _OF_STAGE[stage](written)
 
 
 def _scene(written: Sequence[Written]) -> Figures:
-    """Flags are pairs of cameras that the stage calls weak, and cameras with a note."""
+    """Figures of the scene; flags are weak camera pairs and cameras with a note."""
     errors = [
         scene_errors.measure(w.artefacts["frames"], w.artefacts["scene"], w.truth) for w in written
     ]
@@ -194,19 +194,19 @@ STAGES_WITH_FIGURES = tuple(_OF_STAGE)
 
 
 def keypoint_errors(points: np.ndarray, true_joints: np.ndarray) -> np.ndarray:
-    """Distance (T, K) of ``JOINT_KEYPOINTS`` of (T, 135, 3) from the joints of (T, 55, 3).
+    """Distance (T, K) of ``JOINT_KEYPOINTS`` of (T, 135, 3) from the joints (T, 55, 3).
 
-    NaN where the keypoint is not known. It contains what detector and body model mean differently
-    by one name, 10 to 20 mm.
+    NaN for unknown keypoints. Includes the 10 to 20 mm by which detector and body model define a
+    joint differently.
     """
     true = true_joints[:, [JOINT_INDEX[KEYPOINT_NAMES[k]] for k in JOINT_KEYPOINTS]]
     return np.linalg.norm(points[:, list(JOINT_KEYPOINTS)] - true, axis=-1)
 
 
 def sides_right(points: np.ndarray, true_joints: np.ndarray) -> np.ndarray:
-    """Which of ``SIDED`` (T, S) are nearer to the joint of their own side than to the other's.
+    """Mask (T, S) of the ``SIDED`` keypoints nearer to the joint of their own side.
 
-    ``points`` (T, 135, 3) and ``true_joints`` (T, 55, 3); true where the keypoint is not known.
+    ``points`` is (T, 135, 3), ``true_joints`` (T, 55, 3). True for unknown keypoints.
     """
     own, other = (
         np.linalg.norm(

@@ -1,9 +1,10 @@
-"""Seconds and peak memory of every stage at two lengths: what the jobs' requests are made of.
+"""Seconds and peak memory of every stage at several sequence lengths.
 
-The project's first sequence, computed to the end, is played forward and backward until it is as
-long as wanted, as for the joint stage's memory (``bench.joint_long``); each stage then runs in a
-process of its own. `python -m bench.stage_resources config/bench/config.yaml --frames 45 300`
-prints a row for each stage and length; ``intercap_core.pipeline.requests`` holds what follows.
+    python -m bench.stage_resources config/bench/config.yaml --frames 45 300
+
+The first sequence of the project, which must be computed, is extended to each length
+(``bench.joint_long``). Each stage runs in a separate process and prints one row. The resource
+requests in ``intercap_core.pipeline.requests`` are derived from the result.
 """
 
 from __future__ import annotations

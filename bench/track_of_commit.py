@@ -1,12 +1,12 @@
-"""The object's tracker of another commit on the artefacts that are there, beside today's track.
+"""Compare the object's tracker of another commit with the present one, on the same artefacts.
 
     python -m bench.track_of_commit COMMIT SETTINGS [SETTINGS ...]
 
-Tracks every recording of the settings, such as config/object/noise_2.yaml or those below
-results/seed_<N>/settings, with the code of the commit, checked out for a while beside this one: the
-same frames, detections and person, the same truth, and that commit's own measures; so does today's.
-Settings that the commit does not know cannot be read by it. Prints a row of
-both for each, and adds them to ``--output`` with keys ``before.<dataset>.<measure>`` and
+Every recording of the settings (such as config/object/noise_2.yaml or those in
+results/seed_<N>/settings) is tracked with the code of the commit, checked out temporarily next to
+this one, and with the present code: the same frames, detections, person and truth, each with its
+own code's metrics. Settings that the commit does not know cannot be read. Prints one row of each,
+and adds figures to ``--output`` with keys ``before.<dataset>.<measure>`` and
 ``now.<dataset>.<measure>``.
 """
 
@@ -32,7 +32,7 @@ COLUMNS = {
 
 
 def errors_of(settings: Path, sequence: str, folder: Path) -> Any:
-    """Errors of one recording's track, made in ``folder`` by the code that is imported."""
+    """Errors of one recording's track, computed in ``folder`` by the imported code."""
     from intercap_core.evaluation import object_errors
     from intercap_core.geometry.rigid.mesh import ObjectMesh
     from intercap_core.project import load_project
@@ -55,7 +55,7 @@ def errors_of(settings: Path, sequence: str, folder: Path) -> Any:
 
 
 def measured(settings: list[Path], folder: Path, workers: int) -> dict[str, Any]:
-    """Figures by dataset, as ``intercap evaluate`` has them; see :func:`errors_of`."""
+    """Figures by dataset, as in ``intercap evaluate``; see :func:`errors_of`."""
     from intercap_core.evaluation.object_errors import figures
     from intercap_core.project import load_project
 
@@ -69,7 +69,7 @@ def measured(settings: list[Path], folder: Path, workers: int) -> dict[str, Any]
 
 
 def before(commit: str, settings: list[Path], workers: int) -> dict[str, Any]:
-    """:func:`measured` by the code of ``commit``, tracks made anew."""
+    """:func:`measured` with the code of ``commit``."""
     with tempfile.TemporaryDirectory() as folder:
         tree = Path(folder) / "tree"
         subprocess.run(["git", "worktree", "add", "--detach", str(tree), commit], check=True)
