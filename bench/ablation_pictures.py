@@ -48,7 +48,7 @@ def draw_pictures(project: Project, paths: Paths, folder: Path) -> list[Path]:
 
 
 def _grasps(project: Project, paths: Paths, output: Path) -> Path | None:
-    """The longest grasp of every sequence with and without contact and stick terms, and the truth."""
+    """The longest grasp of every sequence, with and without contact and stick, and the truth."""
     if not {EVERYTHING, WITHOUT_CONTACT} <= set(paths):
         return None
     sheets = []

@@ -1,4 +1,4 @@
-"""The paper's body fit as it is published, for comparison: equation 2 by staged L-BFGS.
+"""The paper's body fit, as a baseline: equation 2 minimised by L-BFGS in stages.
 
 One frame after another, each from the one before. The stages, their weights, the robust functions
 and the solver are those of SMPLify-X and PROX-D, on which the paper builds; derivatives are
@@ -47,15 +47,14 @@ _BODY, _JAW, _EYES = slice(3, 66), slice(66, 69), slice(69, 75)
 
 @dataclass(frozen=True)
 class Stage:
-    """Weights of one stage, applied squared: of priors, of keypoints of hands and face (those of
-    the body count 1), and of the cloud to the mesh (not squared; back it is 1)."""
+    """Weights of one stage; all but ``scan_to_mesh`` are applied squared."""
 
     pose: float
     shape: float
     jaw: float
-    hands: float
-    face: float
-    scan_to_mesh: float
+    hands: float  # keypoints of the hands; those of the body have weight 1
+    face: float  # keypoints of the face
+    scan_to_mesh: float  # from the cloud to the mesh; the other direction has weight 1
 
 
 STAGES = (
@@ -69,23 +68,24 @@ STAGES = (
 
 @dataclass(frozen=True, eq=False)
 class FrameFit:
-    """Each evaluation of one frame: bodies (E, P), energy (E,), number of the stage (E,), and
-    seconds (E,) since the frame began."""
+    """All E evaluations of the energy in the fit of one frame."""
 
-    vectors: Tensor
-    energy: np.ndarray
-    stage: np.ndarray
-    seconds: np.ndarray
+    vectors: Tensor  # (E, P) bodies
+    energy: np.ndarray  # (E,)
+    stage: np.ndarray  # (E,) index of the stage
+    seconds: np.ndarray  # (E,) since the start of the frame
 
     @property
     def end(self) -> Tensor:
-        """The body (P,) that the last stage comes to."""
+        """The body (P,) at the end of the last stage."""
         return self.vectors[self.best[-1]]
 
     @property
     def best(self) -> np.ndarray:
-        """For each evaluation the number (E,) of the stage's best so far, which the line search
-        may have left again."""
+        """Index (E,) of the stage's best evaluation up to each evaluation.
+
+        The line search may have left it again.
+        """
         kept = np.zeros(len(self.energy), int)
         for e in range(1, len(kept)):
             before = kept[e - 1]
@@ -140,8 +140,11 @@ def fit_by_lbfgs(
 
 
 class Free:
-    """What L-BFGS sees (66 + 3 + 24 + 3 + S,): turn and pose of the body, jaw, coefficients of both
-    hands over their deviation, translation, shape and expression. The eyes stay."""
+    """Conversion between parameter vectors and the free parameters (66 + 3 + 24 + 3 + S,).
+
+    Free are global orientation and body pose, jaw, normalised coefficients of both hands,
+    translation, shape and expression. The eyes are fixed.
+    """
 
     def __init__(self, model: BodyModel) -> None:
         self._mean = model.hand_mean
@@ -165,7 +168,7 @@ class Free:
 
 
 class _ViewCloud(NamedTuple):
-    """points (M, 3) of one view and their search tree."""
+    """Points (M, 3) of one view and their search tree."""
 
     points: Tensor
     tree: cKDTree
@@ -201,7 +204,7 @@ class Energy:
         self._trust = tensor(np.zeros(NUM_KEYPOINTS))
 
     def enter(self, stage: Stage, vector: Tensor) -> None:
-        """Take the stage's weights, and each view's visible vertices at a body (1, P)."""
+        """Set the stage's weights, and each view's visible vertices at a body (1, P)."""
         self._stage = stage
         self._trust = torch.zeros_like(self._trust)
         self._trust[BODY] = 1
@@ -234,7 +237,7 @@ class Energy:
         return (weight * geman_mcclure((apart**2).sum(-1), KEYPOINT_SCALE_PX).rho).sum()
 
     def _depth(self, vertices: Tensor) -> Tensor:
-        """E_D both ways: vertices (V, 3), each view's cloud against what it sees of them."""
+        """E_D in both directions, between each view's cloud and its visible vertices of (V, 3)."""
         there = back = vertices.new_zeros(())
         for cloud, visible in zip(self._clouds, self._visible, strict=True):
             if cloud is None or not len(visible):

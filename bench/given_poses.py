@@ -60,7 +60,7 @@ def main() -> None:
 def compare(
     project: Project, names: Sequence[str] | None, counts: Sequence[int], seed: int, output: Path
 ) -> None:
-    """Print the errors of the tracks with each number of poses in ``counts``; add them to ``output``.
+    """Print the errors of the tracks with each number of poses and add them to ``output``.
 
     Without ``names``, all sequences whose track is lost in some frame are evaluated.
     """
@@ -147,7 +147,7 @@ def tracked(
 
 
 def figures(errors: ObjectErrors, there: np.ndarray) -> dict[str, float]:
-    """Shares, millimetres and degrees over all frames and over the frames in the mask ``there`` (T,)."""
+    """Shares, millimetres and degrees over all frames and over the mask ``there`` (T,)."""
     all_ = object_errors.figures([errors])
     found = {key: all_[key] for key in ("lost_share", "lost_unnoticed_share")}
     for prefix, frames in (("", np.ones_like(there)), ("there_", there)):

@@ -1,12 +1,16 @@
-"""The paper's object tracking as it is published, for comparison: equation 1 by Adam.
+"""The paper's object tracking, as a baseline: equation 1 minimised by Adam.
 
-Every view keeps the candidate that overlaps the expected pose's rendering most, then 400 (first
-frame) or 150 (others) Adam steps on the soft silhouette and depth of all views in one batch. Steps,
-learning rate and crops are those of the authors' public code, which goes on from the last pose with
-Adam's moments instead of expecting one; that loses small objects in a fast hand. Their weights were
-"set empirically" and the depth term is missing there; with equation 1's plain squares a few mask
-pixels that show the wall behind drive the pose away, so depth is robust here, by the Geman-McClure
-function that the code imports.
+Every view keeps the candidate with the largest overlap with the rendering of the expected pose.
+Then 400 (first frame) or 150 (other frames) Adam steps follow, on the soft silhouette and depth of
+all views in one batch. Steps, learning rate and crops are those of the authors' public code.
+
+Differences from that code:
+
+- It continues from the last pose with Adam's moments; here each frame starts from an extrapolated
+  pose, because the former loses small objects in a fast hand.
+- It has no depth term, and the paper's weights were "set empirically". With equation 1's squares, a
+  few mask pixels that show the wall behind drive the pose away, so depth is robust here, by the
+  Geman-McClure function that the code imports.
 """
 
 from __future__ import annotations
@@ -28,34 +32,31 @@ from intercap_core.geometry.rigid.shots import Rendering
 from intercap_core.object_track.reduced_mask import ReducedMask
 from intercap_core.object_track.view import View
 
-MARGIN_PX = 12  # of a tile around mask and prediction: how far a pose may stray
-COVERED = 0.5  # depth counts where the object is drawn at all
-LIKELY_LABEL_BONUS = 0.05  # of overlap
+MARGIN_PX = 12  # of a tile around mask and prediction
+COVERED = 0.5  # depth is compared where the rendered coverage is larger
+LIKELY_LABEL_BONUS = 0.05  # added to the overlap
 MIN_PIXELS = 20  # of a mask, as in the public code
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """Steps and weights. ``depth_weight`` lambda_depth over lambda_segm, per m^2.
-
-    ``depth_scale_m``: None for equation 1's squares, else Geman-McClure's scale.
-    """
+    """Steps and weights of the baseline."""
 
     first_steps: int = 400
     steps: int = 150
     learning_rate_m: float = 1e-3
     learning_rate_rad: float = 1e-3
-    depth_weight: float = 1e4
-    depth_scale_m: float | None = 0.05
+    depth_weight: float = 1e4  # lambda_depth over lambda_segm, per m^2
+    depth_scale_m: float | None = 0.05  # of Geman-McClure; None for equation 1's squares
     rasteriser: Literal["overdraw", "soft"] = "overdraw"
 
 
 @dataclass(frozen=True, eq=False)
 class FrameFit:
-    """Poses (steps + 1, 4, 4) from the start on, and seconds (steps + 1,) since the frame began."""
+    """Path of the fit of one frame; the first entry is the start."""
 
-    poses: np.ndarray
-    seconds: np.ndarray
+    poses: np.ndarray  # (steps + 1, 4, 4)
+    seconds: np.ndarray  # (steps + 1,) since the start of the frame
 
 
 def fit_by_adam(
@@ -68,10 +69,9 @@ def fit_by_adam(
     min_overlap: float,
     labels: tuple[str, ...],
 ) -> FrameFit:
-    """``steps`` Adam steps from ``pose`` (4, 4) master_from_object; none where nothing is seen.
+    """Take ``steps`` Adam steps from ``pose`` (4, 4) master_from_object; none if no view sees it.
 
-    The turn is a rotation vector about the object's origin from the frame's start, so that it
-    stays far from the vector's singular half turn.
+    The rotation vector is relative to the frame's start, far from its singularity at 180 degrees.
     """
     begin = time.perf_counter()
     crops = Crops.cut(mesh, views, pose, min_overlap, labels)
@@ -102,16 +102,12 @@ def fit_by_adam(
 
 @dataclass(frozen=True, eq=False)
 class Crops:
-    """What V views show of the object: mask pixels (P,) of all, on tiles, and their depth.
+    """Mask pixels of the object in V views, on tiles, and their depth."""
 
-    ``depth`` (P,) float32 metres along the colour camera's axis, 0 where unmeasured; ``lens``
-    (V, 13) with the tile's corner as origin; ``camera_from_master`` (V, 4, 4).
-    """
-
-    pixels: Pixels
-    depth: np.ndarray
-    lens: np.ndarray
-    camera_from_master: np.ndarray
+    pixels: Pixels  # the P mask pixels of all views
+    depth: np.ndarray  # (P,) float32 metres along the colour camera's axis, 0 = unmeasured
+    lens: np.ndarray  # (V, 13) with the tile's corner as origin
+    camera_from_master: np.ndarray  # (V, 4, 4)
 
     @classmethod
     def cut(
@@ -122,7 +118,7 @@ class Crops:
         min_overlap: float,
         labels: tuple[str, ...],
     ) -> Crops | None:
-        """Choose the candidates at ``pose``; None where no view has one."""
+        """Crop the views to the candidates chosen at ``pose``; None where no view has a candidate."""
         found: list[tuple[Any, ...]] = []
         for view in views:
             lens, camera = view.geometry.lens, view.geometry.camera
@@ -153,9 +149,9 @@ class Crops:
 def choose(
     view: View, drawn: Rendering, min_overlap: float, labels: tuple[str, ...]
 ) -> ReducedMask | None:
-    """The candidate of largest IoU with the last pose's rendering: render, compare and preserve.
+    """The candidate with the largest IoU with the rendering ``drawn``; None below the threshold.
 
-    What the person hides does not count, and a likely label breaks ties, as in the tracker.
+    Pixels hidden by the person are ignored, and a likely label breaks ties, as in the tracker.
     """
     best, best_rank = None, 0.0
     window = (drawn.x0, drawn.y0, *drawn.mask.shape)
@@ -176,7 +172,7 @@ def registered_depth(
 ) -> np.ndarray:
     """Depth (h, w) float32 of a window of the reduced colour image, 0 where unmeasured.
 
-    Measured around the object at ``pose``; of several points of one pixel the nearest.
+    Only depth around the object at ``pose`` is used; of several points in a pixel the nearest.
     """
     geometry = view.geometry
     camera, lens = geometry.camera, geometry.depth_lens
