@@ -118,7 +118,7 @@ class Crops:
         min_overlap: float,
         labels: tuple[str, ...],
     ) -> Crops | None:
-        """Crop the views to the candidates chosen at ``pose``; None where no view has a candidate."""
+        """Crop the views to the candidates chosen at ``pose``; None where no view has one."""
         found: list[tuple[Any, ...]] = []
         for view in views:
             lens, camera = view.geometry.lens, view.geometry.camera

@@ -92,7 +92,7 @@ def test_a_constant_that_is_imported_already_is_refused() -> None:
 
     assert contact.CONTACT_M == 0.0045
     with pytest.raises(UserError, match="fresh process"):
-        import_changed(find_constant("metrics.CONTACT_M"), lambda value: value)
+        import_changed(find_constant("evaluation.contact:CONTACT_M"), lambda value: value)
 
 
 def test_kernels_that_take_it_are_noticed(package: Path) -> None:
