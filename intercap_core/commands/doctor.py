@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from intercap_core.errors import UserError
-from intercap_core.pipeline.claim import living_owner
+from intercap_core.pipeline.lease import lease_holder
 from intercap_core.pipeline.needs import needs
 from intercap_core.pipeline.record import libraries, processor
 from intercap_core.project import Project
@@ -125,7 +125,7 @@ def _file_system(results: Path) -> Finding:
 
 
 def _locks(project: Project) -> Finding:
-    owner = living_owner(project.results / "run")
+    owner = lease_holder(project.results / "run")
     if owner is not None:
         return Finding("locks", NOTE, f"a run is going on: {owner}")
     if any(Path(".snakemake/locks").glob("*")):

@@ -6,6 +6,7 @@ import contextlib
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -23,8 +24,8 @@ from intercap_core.commands.check import check_bodies
 from intercap_core.commands.closing import print_remarks
 from intercap_core.disk import free_bytes
 from intercap_core.errors import UserError
-from intercap_core.pipeline.claim import Claim, path_of, try_claim
 from intercap_core.pipeline.job import last_words, read_state
+from intercap_core.pipeline.lease import Lease, lease_path, try_acquire
 from intercap_core.pipeline.plan import Plan
 from intercap_core.project import Project, load_project
 from intercap_core.signals import ToldToEnd
@@ -69,36 +70,57 @@ def run_workflow(
     if DRY_RUN & set(arguments):
         command = snakemake_command(settings, cores=cores, profile=profile, arguments=arguments)
         return subprocess.call(command)
-    with _alone(project, settings, console):
+    with _exclusive(project, settings, console):
         return _run(project, settings, cores, profile, arguments, console)
 
 
 @contextmanager
-def _alone(project: Project, settings: Path, console: Console) -> Iterator[None]:
-    """Hold the project's results against another run, and clear what a killed one left locked.
+def _exclusive(project: Project, settings: Path, console: Console) -> Iterator[None]:
+    """Prevent a second run of the same results, and remove Snakemake's lock of a killed run.
 
-    Raises UserError where a run is going on, naming it.
+    Raises UserError that names the other run if there is one.
     """
-    held = try_claim(path_of(project.results / "run"))
-    if not isinstance(held, Claim):
-        raise UserError(
-            f"{project.results}: another run is going on ({held}); wait for its end, or end it"
-        )
+    lease = _acquire_run_lease(project, console)
     try:
-        if held.left_by is not None and not held.left_by.is_near():
-            console.print(f"the run by {held.left_by} gave no sign for a minute: taken for dead")
-        elif held.left_by is not None:
-            going_on = _snakemake_here()
-            if going_on:
+        killed = lease.expired_owner
+        if killed is not None and killed.host == socket.gethostname():
+            snakemake = _snakemake_here()
+            if snakemake:
                 raise UserError(
-                    f"{project.results}: the run by {held.left_by} was killed, but its jobs go on "
-                    f"(process {going_on} is their Snakemake); wait for its end, or end it"
+                    f"{project.results}: the run by {killed} was killed, but its jobs go on "
+                    f"(process {snakemake} is their Snakemake); wait for its end, or end it"
                 )
-            console.print(f"the run by {held.left_by} was killed: going on where it stopped")
+            console.print(f"the run by {killed} was killed: going on where it stopped")
             subprocess.run(snakemake_command(settings, arguments=["--unlock"]), capture_output=True)
+        elif killed is not None:
+            console.print(f"the lease of the run by {killed} has expired: it is taken over")
         yield
     finally:
-        held.release()
+        lease.release()
+
+
+def _acquire_run_lease(project: Project, console: Console) -> Lease:
+    """The lease of the run; waits until a lease without a heartbeat expires.
+
+    Raises UserError as soon as another run gives a heartbeat.
+    """
+    path = lease_path(project.results / "run")
+    first_beat = None
+    while True:
+        lease = try_acquire(path)
+        if isinstance(lease, Lease):
+            return lease
+        with contextlib.suppress(FileNotFoundError):
+            beat = path.stat().st_mtime_ns
+            if first_beat is None:
+                first_beat = beat
+                console.print(f"waiting for a heartbeat of the run by {lease}", highlight=False)
+            elif beat != first_beat:
+                raise UserError(
+                    f"{project.results}: another run is going on ({lease}); wait for its end, or "
+                    "end it"
+                )
+        time.sleep(POLL_SECONDS)
 
 
 def _snakemake_here() -> int | None:

@@ -11,9 +11,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from intercap_core.pipeline.claim import living_owner
 from intercap_core.pipeline.intact import damage_of
 from intercap_core.pipeline.job import read_state
+from intercap_core.pipeline.lease import lease_holder
 from intercap_core.pipeline.plan import Kind, Plan, State
 from intercap_core.pipeline.record import read_record
 from intercap_core.progress import Progress
@@ -70,7 +70,7 @@ def _of_sequence(project: Project, plan: Plan, name: str) -> dict[str, StageStat
     found: dict[str, StageStatus] = {}
     for stage, state in states.items():
         output = plan.output(name, stage)
-        owner = living_owner(output)
+        owner = lease_holder(output)
         if owner is not None:
             found[stage] = StageStatus(RUNNING, (str(owner),))
         elif state.kind is Kind.done:

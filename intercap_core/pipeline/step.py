@@ -14,10 +14,10 @@ from intercap_core import artefacts, schemas
 from intercap_core.config import Annotation
 from intercap_core.errors import UserError
 from intercap_core.pipeline import given, outcome
-from intercap_core.pipeline.claim import Claim, claim
 from intercap_core.pipeline.contents import NAME as CONTENTS_NAME
 from intercap_core.pipeline.contents import Contents
 from intercap_core.pipeline.intact import forget, note
+from intercap_core.pipeline.lease import Lease, acquire
 from intercap_core.pipeline.needs import disk_told
 from intercap_core.pipeline.plan import DATASET, OF_ALL, dataset_record_of, failures, noted
 from intercap_core.pipeline.record import FILE, Record, add_record, read_record
@@ -53,14 +53,14 @@ def run_step(
     _give_back_memory()
     made = False
     while not made:
-        with disk_told(project, output, stage), claim(output) as held:
+        with disk_told(project, output, stage), acquire(output) as lease:
             made_from = _made_from(stage, project, sequence, annotation, inputs)
             if keep and _is_made(output, made_from):
                 log.info("sequence %s, %s: was made meanwhile, and is kept", sequence, stage)
                 made = True
             else:
                 _check_inputs(stage, sequence, inputs)
-                made = _make(stage, project, sequence, annotation, inputs, output, made_from, held)
+                made = _make(stage, project, sequence, annotation, inputs, output, made_from, lease)
         if not made:  # this process stood still for a while
             log.info("sequence %s, %s: another process took it over", sequence, stage)
             keep = True
@@ -108,7 +108,7 @@ def _make(
     inputs: Mapping[str, Path],
     output: Path,
     made_from: Record,
-    held: Claim,
+    lease: Lease,
 ) -> bool:
     """Run the stage, and put its output in its place together with its record; False where another
     process took that place over meanwhile, and nothing was put there."""
@@ -125,7 +125,7 @@ def _make(
     try:
         module.run(output=part, **passed)
         add_record(part, made_from)
-        if not held.still_held():
+        if not lease.is_held():
             return False
         if in_folder:
             folders.put(part, output)
@@ -189,7 +189,7 @@ def run_studio(project: Project, sequence: str) -> Path:
         )
     from intercap_core.studio.capture import make_capture
 
-    with disk_told(project, folder), claim(folder):
+    with disk_told(project, folder), acquire(folder):
         contents = Contents(project.results / sequence / CONTENTS_NAME)
         made_from = given.studio_record(project, sequence, contents)
         (folder / FILE).unlink(missing_ok=True)
@@ -221,7 +221,7 @@ def run_dataset(project: Project) -> Path:
         {name: record.identity for name, record in records.items() if record is not None},
         failed,
     )
-    with disk_told(project, folder / DATASET), claim(folder / DATASET):
+    with disk_told(project, folder / DATASET), acquire(folder / DATASET):
         (dataset_record_of(project) / FILE).unlink(missing_ok=True)
         for name in OF_ALL:
             forget(folder / name)

@@ -211,4 +211,4 @@ def test_a_damaged_artefact_is_named_and_a_run_makes_it_again(lab: Flow, damage:
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
     assert {stage: lab.artefact(ONE, stage).read_bytes() for stage in whole} == whole
-    assert not list(lab.results.rglob(".*.part")) and not list(lab.results.rglob(".*.claim"))
+    assert not list(lab.results.rglob(".*.part")) and not list(lab.results.rglob(".*.lease"))
