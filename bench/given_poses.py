@@ -29,7 +29,7 @@ from intercap_core.evaluation import object_errors
 from intercap_core.evaluation.object_errors import ObjectErrors
 from intercap_core.evaluation.truth import match_times
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.pipeline import given
+from intercap_core.pipeline import stage_inputs
 from intercap_core.project import Project, load_project
 from intercap_core.schemas import OBJECT_TRACK, SCENE, TRUTH
 from intercap_core.stage_list import STAGES
@@ -132,7 +132,7 @@ def tracked(
     project: Project, name: str, poses: Sequence[ObjectPose]
 ) -> tuple[ObjectErrors, np.ndarray, np.ndarray]:
     """Errors of the track with these poses, and its masks (T,) of bridged and lost frames."""
-    passed = given.arguments(project, name, "object_track", project.annotation(name))
+    passed = stage_inputs.arguments(project, name, "object_track", project.annotation(name))
     inputs = {stage: project.artefact(name, stage) for stage in STAGES["object_track"].reads}
     truth, entry = project.sequences[name].truth, project.object_of(name)
     assert truth is not None and entry is not None

@@ -21,10 +21,9 @@ import yaml
 
 from bench.command import add_figures, from_command_line
 from intercap_core.errors import UserError
-from intercap_core.pipeline import given
-from intercap_core.pipeline.contents import NAME, Contents
-from intercap_core.pipeline.intact import note
-from intercap_core.pipeline.record import add_record
+from intercap_core.pipeline.checksums import INPUTS_FILE, InputChecksums, remember_output
+from intercap_core.pipeline.provenance import write_manifest
+from intercap_core.pipeline.stage_inputs import stage_manifest
 from intercap_core.pipeline.step import run_dataset
 from intercap_core.project import Project, load_project
 from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
@@ -104,7 +103,7 @@ def _repeated(source: Project, name: str, here: Path, count: int) -> Project:
 
 def _copy(source: Project, before: Path, name: str, project: Project, other: str) -> None:
     """Copy all outputs of a sequence under another name, with records of that name."""
-    contents = Contents(project.results / other / NAME)
+    checksums = InputChecksums(project.results / other / INPUTS_FILE)
     annotation = project.annotation(other)
     identities: dict[str, str] = {}
     for stage, declared in STAGES.items():
@@ -116,15 +115,15 @@ def _copy(source: Project, before: Path, name: str, project: Project, other: str
                 file.attrs["sequence"] = other
         else:
             shutil.copytree(made, path, copy_function=os.link)
-        record = given.record(
+        manifest = stage_manifest(
             project, other, stage, annotation,
-            artefacts={read: identities[read] for read in declared.reads}, contents=contents,
+            artefacts={read: identities[read] for read in declared.reads}, checksums=checksums,
         )  # fmt: skip
-        identities[stage] = record.identity
-        add_record(path, record)
+        identities[stage] = manifest.fingerprint
+        write_manifest(path, manifest)
         if stage in SEQUENCE_STAGES:
-            note(path)
-    contents.keep()
+            remember_output(path)
+    checksums.save()
 
 
 def _cpu_seconds(here: Path, *arguments: str) -> float:

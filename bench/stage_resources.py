@@ -4,7 +4,7 @@
 
 The first sequence of the project, which must be computed, is extended to each length
 (``bench.joint_long``). Each stage runs in a separate process and prints one row. The resource
-requests in ``intercap_core.pipeline.requests`` are derived from the result.
+needs of the stages (``Stage.resources`` in ``intercap_core.stage_list``) are derived from it.
 """
 
 from __future__ import annotations

@@ -26,7 +26,9 @@ import numpy as np
 from intercap_core.disk import PartFile
 from intercap_core.errors import UserError
 
-MADE_FROM = "made_from"  # attribute: what the artefact was made from, as pipeline.record writes it
+MADE_FROM = (
+    "made_from"  # attribute: what the artefact was made from, as pipeline.provenance writes it
+)
 PART = ".part"  # how the name of what is being written ends
 _LIBVER = ("v110", "v110")  # headers with checksums, attributes of any size
 CHUNK_BYTES = 1 << 20  # HDF5's default chunk cache holds one such chunk with room to spare

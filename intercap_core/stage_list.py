@@ -1,109 +1,192 @@
-"""The stages of one sequence, in the order data flows: the one list of them.
+"""The stages of one sequence, in the order in which data flows through them.
 
-The command line, the step that runs a stage, the rules and the report derive theirs from it. A
-stage's ``run`` lives in ``intercap_core/stages/<name>.py``, what it calls in the room of that name.
+This list holds every fact that the rest of the program knows about a stage: the command line, the
+run decision, the rules of the workflow, the resources of jobs and the report read it. A new stage
+needs an entry here, a module ``stages/<name>.py`` with a function ``run``, a schema, a section of
+settings and a rule.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True)
-class Stage:
-    """``reads`` names the stages whose artefacts it opens. ``on_device``: runs where the setting
-    ``device`` says. ``estimates``: it estimates poses, which the metrics hold to the truth.
-    ``writes_folder``: of other tools' files instead of an artefact.
+class Extent:
+    """Size of a sequence."""
+
+    frames: int
+    """Synchronised frame sets."""
+    cameras: int
+    """Cameras."""
+
+    @property
+    def images(self) -> int:
+        """Colour images of all cameras."""
+        return self.frames * self.cameras
+
+
+@dataclass(frozen=True)
+class JobResources:
+    """Peak memory and time of a job, linear in frames and images.
+
+    Measured with ``python -m bench.stage_resources`` on 45 and 300 frames of six 1080p cameras and
+    45 frames of three.
     """
 
-    name: str
-    purpose: str
-    reads: tuple[str, ...]
-    on_device: bool = False
-    estimates: bool = False
-    writes_folder: bool = False
+    mb: float
+    """Peak memory independent of the recording, megabytes."""
+    mb_per_frame: float = 0.0
+    """Additional megabytes per frame set."""
+    mb_per_image: float = 0.0
+    """Additional megabytes per image."""
+    seconds: float = 10.0
+    """Time independent of the recording."""
+    seconds_per_image: float = 0.0
+    """Additional seconds per image."""
 
+    def memory_mb(self, extent: Extent) -> float:
+        """Peak memory for a sequence, megabytes."""
+        return self.mb + self.mb_per_frame * extent.frames + self.mb_per_image * extent.images
+
+    def time_s(self, extent: Extent) -> float:
+        """Seconds for a sequence."""
+        return self.seconds + self.seconds_per_image * extent.images
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """Declaration of one stage."""
+
+    name: str
+    """Name of the module, the schema, the section of settings and the artefact."""
+    purpose: str
+    """Sentence for the command line."""
+    reads: tuple[str, ...]
+    """Stages whose artefacts it opens."""
+    resources: JobResources
+    """Memory and time of its job."""
+    output_bytes: int
+    """Size of its output for 300 frame sets of six 1080p cameras, as in the demo."""
+    columns: tuple[str, ...] = ()
+    """Columns of the sequence's row that it reads; others are hidden from it."""
+    layout_columns: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """Further columns by the layout of the recording."""
+    on_device: bool = False
+    """True if it runs on the device that the setting ``device`` names."""
+    estimates: bool = False
+    """True if it estimates poses, which the metrics compare with the truth."""
+    writes_folder: bool = False
+    """True if it writes a folder of other tools' files instead of an artefact."""
+
+
+_FITS = ("frames", "scene", "detections", "person", "object_track", "body_fit")
+_ALL = ("frames", "detections", "scene", "person", "object_track", "body_fit", "joint", "metrics")
 
 STAGES: dict[str, Stage] = {
     stage.name: stage
     for stage in (
-        Stage("frames", "Recordings to synchronised frame sets.", ()),
         Stage(
-            "detections",
-            "Keypoints and segmentation candidates, from files or models.",
-            ("frames",),
+            name="frames",
+            purpose="Recordings to synchronised frame sets.",
+            reads=(),
+            columns=(
+                "layout", "recordings", "calibration", "calibration_scale", "calibration_up",
+                "calibration_floor",
+            ),
+            resources=JobResources(160, seconds=5, seconds_per_image=0.01),
+            output_bytes=750_000_000,
         ),
         Stage(
-            "scene",
-            "Refined extrinsics, ground plane and background.",
-            ("frames", "detections"),
+            name="detections",
+            purpose="Keypoints and segmentation candidates, from files or models.",
+            reads=("frames",),
+            columns=(
+                "layout", "recordings", "calibration", "calibration_scale", "keypoints",
+                "candidates",
+            ),
+            layout_columns={"behave": ("object",)},  # BEHAVE names its files after the object
+            resources=JobResources(140, mb_per_image=0.03, seconds=5, seconds_per_image=0.01),
+            output_bytes=5_000_000,
         ),
         Stage(
-            "person",
-            "The subject over views, and the triangulated keypoints.",
-            ("frames", "detections", "scene"),
+            name="scene",
+            purpose="Refined extrinsics, ground plane and background.",
+            reads=("frames", "detections"),
+            resources=JobResources(400, mb_per_image=0.09, seconds_per_image=0.03),
+            output_bytes=2_000_000,
         ),
         Stage(
-            "object_track",
-            "The object's pose in every frame.",
-            ("frames", "scene", "detections", "person"),
+            name="person",
+            purpose="The subject over views, and the triangulated keypoints.",
+            reads=("frames", "detections", "scene"),
+            resources=JobResources(420, mb_per_image=0.05, seconds_per_image=0.02),
+            output_bytes=7_000_000,
+        ),
+        Stage(
+            name="object_track",
+            purpose="The object's pose in every frame.",
+            reads=("frames", "scene", "detections", "person"),
+            resources=JobResources(420, mb_per_image=0.47, seconds_per_image=0.06),
+            output_bytes=200_000,
             estimates=True,
         ),
         Stage(
-            "body_fit",
-            "SMPL-X parameters in every frame.",
-            ("frames", "scene", "person"),
+            name="body_fit",
+            purpose="SMPL-X parameters in every frame.",
+            reads=("frames", "scene", "person"),
+            resources=JobResources(560, mb_per_image=0.4, seconds=15, seconds_per_image=0.06),
+            output_bytes=1_100_000,
             on_device=True,
             estimates=True,
         ),
         Stage(
-            "joint",
-            "Body and object together, over all frames, with contact.",
-            ("frames", "scene", "detections", "person", "object_track", "body_fit"),
+            name="joint",
+            purpose="Body and object together, over all frames, with contact.",
+            reads=_FITS,
+            resources=JobResources(800, mb_per_frame=3.7, seconds=20, seconds_per_image=0.06),
+            output_bytes=700_000,
             on_device=True,
             estimates=True,
         ),
         Stage(
-            "metrics",
-            "Distances, penetration, and errors against truth where it is known.",
-            ("frames", "scene", "detections", "person", "object_track", "body_fit", "joint"),
+            name="metrics",
+            purpose="Distances, penetration, and errors against truth where it is known.",
+            reads=(*_FITS, "joint"),
+            resources=JobResources(750, mb_per_image=0.9, seconds=15, seconds_per_image=0.06),
+            output_bytes=5_000_000,
         ),
         Stage(
-            "summary",
-            "What the sequence adds to the dataset's tables, heatmaps and charts.",
-            (
-                "frames",
-                "detections",
-                "scene",
-                "person",
-                "object_track",
-                "body_fit",
-                "joint",
-                "metrics",
-            ),
+            name="summary",
+            purpose="What the sequence adds to the dataset's tables, heatmaps and charts.",
+            reads=_ALL,
+            columns=("intent",),
+            resources=JobResources(370, mb_per_image=0.02),
+            output_bytes=2_500_000,
         ),
         Stage(
-            "page",
-            "The sequence's page of the site.",
-            (
-                "frames",
-                "detections",
-                "scene",
-                "person",
-                "object_track",
-                "body_fit",
-                "joint",
-                "metrics",
-            ),
+            name="page",
+            purpose="The sequence's page of the site.",
+            reads=_ALL,
+            columns=("intent",),
+            resources=JobResources(620, mb_per_image=0.3, seconds=20, seconds_per_image=0.03),
+            output_bytes=15_000_000,
             writes_folder=True,
         ),
         Stage(
-            "export",
-            "Files for other tools: InterCap, AMASS, BOP, COCO, glb, meshes.",
-            ("frames", "joint", "scene", "metrics", "body_fit", "object_track"),
+            name="export",
+            purpose="Files for other tools: InterCap, AMASS, BOP, COCO, glb, meshes.",
+            reads=("frames", "joint", "scene", "metrics", "body_fit", "object_track"),
+            resources=JobResources(600, mb_per_image=0.05, seconds=20, seconds_per_image=0.02),
+            output_bytes=60_000_000,
             writes_folder=True,
         ),
     )
-}
+}  # fmt: skip
 SEQUENCE_STAGES = tuple(name for name, stage in STAGES.items() if not stage.writes_folder)
+"""Stages that write an artefact."""
 ESTIMATES = tuple(name for name, stage in STAGES.items() if stage.estimates)
+"""Stages whose poses are compared with the truth."""
+LEAVES = tuple(name for name in STAGES if not any(name in stage.reads for stage in STAGES.values()))
+"""Stages whose output no other stage reads."""

@@ -22,10 +22,10 @@ from intercap_core.commands.run import ENDS_WITHIN_S
 from intercap_core.config import Annotation
 from intercap_core.errors import UserError
 from intercap_core.pipeline.job import last_words, read_state
-from intercap_core.pipeline.plan import Kind, Plan
+from intercap_core.pipeline.plan import OutputStatus, Plan
 from intercap_core.project import Project
+from intercap_core.stage_list import LEAVES
 
-LEAVES = ("summary", "page", "export")  # what nothing else of a sequence is made of
 _LAST_LINES = 12
 _PLANNING = threading.Lock()  # Python 3.11 fails where two threads parse source at a time
 _PATIENCE_S = 10.0  # beyond what `intercap run` takes at most to end in order
@@ -55,12 +55,12 @@ def touched(project: Project, sequence: str) -> list[dict[str, Any]]:
     with _PLANNING:
         plan = Plan(project)
         found = [
-            {"stage": stage, "state": str(state.kind), "reasons": list(state.reasons)}
+            {"stage": stage, "state": str(state.status), "reasons": list(state.reasons)}
             for stage, state in plan.states(sequence).items()
-            if state.kind is not Kind.done
+            if state.status is not OutputStatus.done
         ]
         if not isinstance(project, EditedProject):
-            plan.keep()
+            plan.save()
         return found
 
 

@@ -21,7 +21,7 @@ from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.output.viewer import page as page_of
 from intercap_core.output.viewer.content import gather
 from intercap_core.output.viewer.package import payload, unpacked
-from intercap_core.pipeline.record import read_record
+from intercap_core.pipeline.provenance import read_manifest
 from intercap_core.schemas import BODY_FIT, JOINT, METRICS, OBJECT_TRACK, PERSON, SCENE
 from intercap_core.sequence_inputs import SequencePaths
 
@@ -131,12 +131,12 @@ def _of_page(opened: Opened) -> str:
     Of a long sequence it saves a minute.
     """
     page = opened.project.artefact(opened.name, "page")
-    script, record = page / page_of.SCRIPT, read_record(page)
+    script, record = page / page_of.SCRIPT, read_manifest(page)
     if record is None or not script.is_file():
         return ""
     for stage, identity in record.artefacts.items():
-        own = read_record(opened.paths[stage]) if opened.there(stage) else None
-        if own is None or own.identity != identity:
+        own = read_manifest(opened.paths[stage]) if opened.there(stage) else None
+        if own is None or own.fingerprint != identity:
             return ""
     _, called, data = script.read_text(encoding="utf-8").rpartition(_CALL)
     return data.partition('"')[0] if called else ""

@@ -13,8 +13,8 @@ from rich.table import Table
 
 from intercap_core.errors import UserError
 from intercap_core.pipeline.lease import lease_holder
-from intercap_core.pipeline.needs import needs
-from intercap_core.pipeline.record import libraries, processor
+from intercap_core.pipeline.provenance import library_versions, processor
+from intercap_core.pipeline.resources import disk_usage
 from intercap_core.project import Project
 from intercap_core.versions import versions
 
@@ -38,7 +38,7 @@ def findings(project: Project | None) -> Iterator[Finding]:
     """Everything that is looked at; of a ``project`` its device, body files, disk and locks too."""
     for name, version in versions():
         yield Finding(name, GOOD, version)
-    deciding = ", ".join(f"{name} {version}" for name, version in libraries().items())
+    deciding = ", ".join(f"{name} {version}" for name, version in library_versions().items())
     yield Finding("decide numbers", GOOD, f"{deciding}; {processor()}, {os.cpu_count()} cores")
     yield _gpu(project)
     if project is not None:
@@ -88,13 +88,13 @@ def _bodies(project: Project) -> Finding:
 
 def _disk(project: Project) -> Iterator[Finding]:
     """What is there, what the sequences that are missing will need, and what may be dropped."""
-    found = needs(project)
+    found = disk_usage(project)
     words = (
-        f"{found.there / 1e9:.1f} GB of results are there, {found.missing / 1e9:.1f} GB more are "
+        f"{found.present / 1e9:.1f} GB of results are there, {found.missing / 1e9:.1f} GB more are "
         f"expected{found.basis}, {found.free / 1e9:.1f} GB are free"
     )
     yield Finding("disk", BAD if found.free < _SPARE * found.missing else GOOD, words)
-    share = 100 * found.usual["frames"] / max(sum(found.usual.values()), 1)
+    share = 100 * found.per_output["frames"] / max(sum(found.per_output.values()), 1)
     yield Finding(
         "what may go", NOTE,
         f"frames.h5 ({share:.0f} % of a sequence) when a dataset is done: the next run makes it "

@@ -146,7 +146,7 @@ def _run(
 ) -> int:
     plan = Plan(project)
     done = not arguments and plan.all_done()
-    plan.keep()
+    plan.save()
     if done:
         count = len(project.sequences)
         console.print(f"nothing to do: all {count} sequences are done", highlight=False)

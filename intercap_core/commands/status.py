@@ -11,11 +11,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from intercap_core.pipeline.intact import damage_of
+from intercap_core.pipeline.checksums import find_damage
 from intercap_core.pipeline.job import read_state
 from intercap_core.pipeline.lease import lease_holder
-from intercap_core.pipeline.plan import Kind, Plan, State
-from intercap_core.pipeline.record import read_record
+from intercap_core.pipeline.plan import OutputState, OutputStatus, Plan
+from intercap_core.pipeline.provenance import read_manifest
 from intercap_core.progress import Progress
 from intercap_core.project import Project
 from intercap_core.stage_list import STAGES
@@ -60,8 +60,10 @@ def status(project: Project) -> Status:
     plan = Plan(project)
     sequences = {name: _of_sequence(project, plan, name) for name in project.sequences}
     dataset = plan.dataset
-    plan.keep()
-    words = {Kind.done: DONE, Kind.missing: MISSING, Kind.stale: STALE}[dataset.kind]
+    plan.save()
+    words = {OutputStatus.done: DONE, OutputStatus.missing: MISSING, OutputStatus.stale: STALE}[
+        dataset.status
+    ]
     return Status(sequences, StageStatus(words, dataset.reasons))
 
 
@@ -73,7 +75,7 @@ def _of_sequence(project: Project, plan: Plan, name: str) -> dict[str, StageStat
         owner = lease_holder(output)
         if owner is not None:
             found[stage] = StageStatus(RUNNING, (str(owner),))
-        elif state.kind is Kind.done:
+        elif state.status is OutputStatus.done:
             found[stage] = StageStatus(DONE, (), state.made_on)
         else:
             found[stage] = _not_done(project, name, stage, state, found)
@@ -81,7 +83,7 @@ def _of_sequence(project: Project, plan: Plan, name: str) -> dict[str, StageStat
 
 
 def _not_done(
-    project: Project, name: str, stage: str, state: State, found: Mapping[str, StageStatus]
+    project: Project, name: str, stage: str, state: OutputState, found: Mapping[str, StageStatus]
 ) -> StageStatus:
     log = project.logs / name / f"{stage}.log"
     if log.is_file():
@@ -91,7 +93,7 @@ def _not_done(
     reads = STAGES[stage].reads if stage in STAGES else ()
     if any(found[other].state != DONE for other in reads if other in found):
         return StageStatus(WAITING)
-    return StageStatus(STALE if state.kind is Kind.stale else MISSING, state.reasons)
+    return StageStatus(STALE if state.status is OutputStatus.stale else MISSING, state.reasons)
 
 
 def print_status(project: Project, *, every: bool = False, as_json: bool = False) -> None:
@@ -191,8 +193,8 @@ def print_verification(project: Project) -> bool:
     damaged: list[str] = []
     progress = Progress(log, "verified", len(paths), "files")
     for path in paths:
-        found = damage_of(path)
-        if not found and read_record(path) is None:
+        found = find_damage(path)
+        if not found and read_manifest(path) is None:
             found = f"{path}: what it was made from is not recorded, or damaged"
         damaged += [found] if found else []
         progress.step()

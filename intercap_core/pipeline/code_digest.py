@@ -1,59 +1,143 @@
-"""Digests of the code that a stage uses, so that editing the core re-runs what it concerns.
+"""Digests of the code that each stage uses: a change of the core makes stale what it concerns.
 
-The modules that a stage reaches are found by walking imports transitively, those inside functions
-too. What counts is the syntax tree without docstrings and comments, and the data files that lie
-beside a reached module: rewording a docstring re-runs nothing. The declarations that every stage
-shares (settings, schemas, project) are followed name by name: a new setting of one stage does not
-touch the others. So are the constants of a room, its modules ``constants`` and ``..._constants``.
+The modules that a stage reaches are found by following imports, including those inside functions.
+The digest covers their syntax trees without docstrings and comments, and the data files next to
+them: a reworded docstring makes nothing stale. Modules of declarations that all stages share
+(settings, schemas, project, constants) are followed name by name, so that a new setting of one
+stage does not make the others stale. The digests are cached in the user's cache folder under a
+checksum of the whole package, because walking the syntax trees takes seconds.
 """
 
 from __future__ import annotations
 
 import ast
+import contextlib
 import hashlib
+import json
+import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+
+from intercap_core.kernel_cache import cache_base
+from intercap_core.stage_list import STAGES
 
 PACKAGE = "intercap_core"
 ROOT = Path(__file__).resolve().parents[1]
 DECLARATIONS = frozenset(
     {f"{PACKAGE}.{name}" for name in ("config", "schemas", "project", "sequence_inputs")}
 )
-# Where compiled code lies, and what is said meanwhile, changes no result.
-NEUTRAL = frozenset(f"{PACKAGE}.{name}" for name in ("disk", "kernel_cache", "progress", "signals"))
-CONSTANTS = (".constants", "_constants")  # ends of modules that hold a room's numbers
+# Modules that change no result: caches, messages, and the list of stages, of which the manifest
+# holds what concerns a stage (the artefacts that it reads and its row).
+NEUTRAL = frozenset(
+    f"{PACKAGE}.{name}" for name in ("disk", "kernel_cache", "progress", "signals", "stage_list")
+)
+CONSTANTS = (".constants", "_constants")  # ends of names of modules that hold only constants
 DATA_FOLDERS = ("data", "templates")
 
 WHOLE = "*"  # stands for every name of a module
+
+MODULES = {
+    **{stage: f"stages.{stage}" for stage in STAGES},
+    "dataset": "stages.dataset",
+    "studio": "studio.capture",
+}
+_MAX_CACHED = 16  # digests of other versions of the code, the newest
+
+
+@dataclass(frozen=True)
+class StageCode:
+    """The code of one stage."""
+
+    digests: Mapping[str, str]
+    """Digest of the modules that it reaches, by package."""
+    parameters: tuple[str, ...]
+    """Names of the arguments of its ``run``; () for the dataset and the studio."""
+
+
+@cache
+def stage_code(name: str) -> StageCode:
+    """The code of a stage, of "dataset" or of "studio"."""
+    return _all_stage_code()[name]
+
+
+@cache
+def _all_stage_code() -> dict[str, StageCode]:
+    folder = cache_base() / "code"
+    path = folder / f"{_package_checksum()}.json"
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+        cached = json.loads(path.read_text(encoding="utf-8"))
+        return {name: StageCode(cached[name][0], tuple(cached[name][1])) for name in MODULES}
+    code = {
+        name: StageCode(code_digests(module), _run_parameters(module))
+        for name, module in MODULES.items()
+    }
+    with contextlib.suppress(OSError):  # without a writable cache, the next start computes again
+        folder.mkdir(parents=True, exist_ok=True)
+        part = path.with_name(f".{path.name}.{os.getpid()}.part")
+        part.write_text(json.dumps({n: [dict(c.digests), c.parameters] for n, c in code.items()}))
+        os.replace(part, path)
+        for old in sorted(folder.glob("*.json"), key=_date)[:-_MAX_CACHED]:
+            old.unlink(missing_ok=True)
+    return code
+
+
+def _date(path: Path) -> int:
+    return path.stat().st_mtime_ns
+
+
+def _run_parameters(module: str) -> tuple[str, ...]:
+    """Names of the keyword arguments of ``run``, without importing the module."""
+    for node in ast.parse(_path(f"{PACKAGE}.{module}", ROOT).read_bytes()).body:
+        if isinstance(node, ast.FunctionDef) and node.name == "run":
+            return tuple(argument.arg for argument in node.args.kwonlyargs)
+    return ()
+
+
+def _package_checksum() -> str:
+    """Checksum of the package's code, and of the size and date of its data files."""
+    state = hashlib.sha256()
+    for folder, folders, names in os.walk(ROOT):
+        folders[:] = sorted(name for name in folders if name != "__pycache__")
+        is_data = any(part in DATA_FOLDERS for part in Path(folder).relative_to(ROOT).parts)
+        for name in sorted(names):
+            path = Path(folder, name)
+            if is_data:
+                stat = path.stat()
+                state.update(f"{path} {stat.st_size} {stat.st_mtime_ns}\n".encode())
+            elif name.endswith(".py"):
+                text = path.read_bytes()
+                state.update(f"{PACKAGE} {path} {len(text)}\n".encode())
+                state.update(text)
+    return state.hexdigest()[:24]
 
 
 @dataclass(frozen=True)
 class _Statement:
     """A top-level statement of a module, without docstrings."""
 
-    content: bytes  # its syntax tree as text
-    defines: frozenset[str]  # names that it binds; empty where it acts in another way
-    uses: frozenset[str]  # names that it mentions, those inside text too
+    content: bytes  # syntax tree as text
+    defines: frozenset[str]  # names that it binds; empty for statements with other effects
+    uses: frozenset[str]  # names that it mentions, including those in strings
     imports: tuple[tuple[str, str], ...]  # (module, name) pairs, anywhere inside it
 
 
 def code_digest(module: str, *, root: Path = ROOT) -> str:
-    """One digest of all that :func:`code_digests` has by room; raises as it does."""
+    """One digest of all code and data that ``module`` reaches; raises as :func:`code_digests`."""
     found = code_digests(module, root=root)
     return hashlib.sha256("".join(f"{k} {v}\n" for k, v in found.items()).encode()).hexdigest()[:16]
 
 
 def code_digests(module: str, *, root: Path = ROOT) -> dict[str, str]:
-    """Digests of all code and data that ``module`` (e.g. "stages.joint") reaches, by room: the
-    package's folder or file that it lies in.
+    """Digests of all code and data that ``module`` (e.g. "stages.joint") reaches, by subpackage.
 
-    ``root`` is the package's folder. Raises FileNotFoundError where there is no such module.
+    ``root`` is the folder of the package. Raises FileNotFoundError if the module does not exist.
     """
     states: dict[str, hashlib._Hash] = {}
     reached = modules_reached(module, root=root)
     for name in sorted(reached):
-        state = states.setdefault(_room(name), hashlib.sha256())
+        state = states.setdefault(_subpackage(name), hashlib.sha256())
         state.update(name.encode())
         for statement in _used(name, reached[name], root):
             state.update(statement.content)
@@ -63,17 +147,17 @@ def code_digests(module: str, *, root: Path = ROOT) -> dict[str, str]:
             state = states.setdefault(relative.parts[0], hashlib.sha256())
             state.update(relative.as_posix().encode())
             state.update(_file_digest(path, path.stat().st_mtime_ns))
-    return {room: state.hexdigest()[:16] for room, state in sorted(states.items())}
+    return {name: state.hexdigest()[:16] for name, state in sorted(states.items())}
 
 
-def _room(module: str) -> str:
+def _subpackage(module: str) -> str:
     return [*module.split("."), PACKAGE][1]
 
 
 def modules_reached(module: str, *, root: Path = ROOT) -> dict[str, frozenset[str]]:
-    """Modules of the package that ``module`` imports, directly or not, with the names it uses.
+    """Modules of the package that ``module`` imports, directly or indirectly, with the names used.
 
-    The names are ``{"*"}`` for every module but the shared declarations.
+    The names are ``{"*"}`` for all modules except the shared declarations.
     """
     start = f"{PACKAGE}.{module}"
     if not _path(start, root).is_file():
@@ -96,7 +180,7 @@ def modules_reached(module: str, *, root: Path = ROOT) -> dict[str, frozenset[st
 
 
 def _used(module: str, names: frozenset[str], root: Path) -> list[_Statement]:
-    """The module's statements that take part when ``names`` are imported from it, in order."""
+    """Top-level statements that are needed to define ``names``, in order."""
     path = _path(module, root)
     statements = _statements(module, path, path.stat().st_mtime_ns, root)
     if WHOLE in names:
@@ -159,7 +243,7 @@ def _uses(statement: ast.stmt) -> set[str]:
         if isinstance(node, ast.Name):
             names.add(node.id)
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-            names.add(node.value)  # an annotation may be written as text
+            names.add(node.value)  # annotations may be strings
     return names
 
 

@@ -1,4 +1,4 @@
-"""Run one stage of one sequence of a project: settings, tables and annotation to its arguments."""
+"""Run one stage of one sequence of a project, the studio, or the stage of all sequences."""
 
 from __future__ import annotations
 
@@ -13,14 +13,17 @@ from pathlib import Path
 from intercap_core import artefacts, schemas
 from intercap_core.config import Annotation
 from intercap_core.errors import UserError
-from intercap_core.pipeline import given, outcome
-from intercap_core.pipeline.contents import NAME as CONTENTS_NAME
-from intercap_core.pipeline.contents import Contents
-from intercap_core.pipeline.intact import forget, note
+from intercap_core.pipeline import outcome, stage_inputs
+from intercap_core.pipeline.checksums import (
+    INPUTS_FILE,
+    InputChecksums,
+    forget_output,
+    remember_output,
+)
 from intercap_core.pipeline.lease import Lease, acquire
-from intercap_core.pipeline.needs import disk_told
-from intercap_core.pipeline.plan import DATASET, OF_ALL, dataset_record_of, failures, noted
-from intercap_core.pipeline.record import FILE, Record, add_record, read_record
+from intercap_core.pipeline.plan import DATASET, DATASET_OUTPUTS, checked_files, failures
+from intercap_core.pipeline.provenance import FILE, Manifest, read_manifest, write_manifest
+from intercap_core.pipeline.resources import explain_disk_errors
 from intercap_core.project import Project
 from intercap_core.sequence_inputs import SequencePaths
 from intercap_core.stage_list import STAGES
@@ -29,7 +32,7 @@ from intercap_core.stages import folders
 log = logging.getLogger(__name__)
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
-_GIVEN_BACK_BYTES = 4 << 20
+_RETURNED_BYTES = 4 << 20  # size from which on freed memory goes back to the system
 
 
 def run_step(
@@ -41,28 +44,30 @@ def run_step(
     output: Path,
     keep: bool = False,
 ) -> None:
-    """Call ``intercap_core.stages.<stage>.run`` with what its signature asks for.
+    """Run ``intercap_core.stages.<stage>.run`` and put its output in place with its manifest.
 
-    ``inputs`` are the artefacts by the name of the stage that wrote them; ``output`` is an artefact
-    or, for the export and the page, a folder. It is made by one process at a time: another one that
-    makes it is waited for. ``keep``: where the output is there by then and was made from the same,
-    it is kept, as is what another process made that took the output over. Raises UserError where an
-    input is missing, unreadable or of another sequence, and where the stage finds a fault in it.
+    One process at a time writes an output; others wait for its lease. Raises UserError if an input
+    is missing, unreadable or of another sequence, or if the stage finds a fault in it.
+
+    Args:
+        inputs: artefacts by the stage that wrote them.
+        output: an artefact, or a folder for the export and the page.
+        keep: leave an output that is up to date by the time the lease is acquired.
     """
     annotation = project.annotation(sequence, look_at_frames=stage != "frames")
-    _give_back_memory()
-    made = False
-    while not made:
-        with disk_told(project, output, stage), acquire(output) as lease:
-            made_from = _made_from(stage, project, sequence, annotation, inputs)
-            if keep and _is_made(output, made_from):
-                log.info("sequence %s, %s: was made meanwhile, and is kept", sequence, stage)
-                made = True
+    _return_freed_memory()
+    done = False
+    while not done:
+        with explain_disk_errors(project, output, stage), acquire(output) as lease:
+            manifest = _current_manifest(stage, project, sequence, annotation, inputs)
+            if keep and _is_up_to_date(output, manifest):
+                log.info("sequence %s, %s: another process has written it", sequence, stage)
+                done = True
             else:
                 _check_inputs(stage, sequence, inputs)
-                made = _make(stage, project, sequence, annotation, inputs, output, made_from, lease)
-        if not made:  # this process stood still for a while
-            log.info("sequence %s, %s: another process took it over", sequence, stage)
+                done = _make(stage, project, sequence, annotation, inputs, output, manifest, lease)
+        if not done:  # this process was suspended until its lease expired
+            log.info("sequence %s, %s: another process has taken it over", sequence, stage)
             keep = True
     if not STAGES[stage].writes_folder:
         for note in outcome.notes(stage, output):
@@ -70,34 +75,34 @@ def run_step(
     log.info("sequence %s, %s: %s", sequence, stage, outcome.line(stage, output, inputs))
 
 
-def _made_from(
+def _current_manifest(
     stage: str,
     project: Project,
     sequence: str,
     annotation: Annotation,
     inputs: Mapping[str, Path],
-) -> Record:
-    """The record of what the output will be made from."""
-    records = {name: read_record(inputs[name]) for name in STAGES[stage].reads}
-    contents = Contents(project.results / sequence / CONTENTS_NAME)
-    found = given.record(
+) -> Manifest:
+    """Manifest of the output that the stage writes now."""
+    manifests = {name: read_manifest(inputs[name]) for name in STAGES[stage].reads}
+    checksums = InputChecksums(project.results / sequence / INPUTS_FILE)
+    current = stage_inputs.stage_manifest(
         project,
         sequence,
         stage,
         annotation,
         artefacts={
-            name: "not recorded" if record is None else record.identity
-            for name, record in records.items()
+            name: "not recorded" if manifest is None else manifest.fingerprint
+            for name, manifest in manifests.items()
         },
-        contents=contents,
+        checksums=checksums,
     )
-    contents.keep()
-    return found
+    checksums.save()
+    return current
 
 
-def _is_made(output: Path, made_from: Record) -> bool:
-    before = read_record(output) if output.exists() else None
-    return before is not None and before.identity == made_from.identity
+def _is_up_to_date(output: Path, current: Manifest) -> bool:
+    before = read_manifest(output) if output.exists() else None
+    return before is not None and before.fingerprint == current.fingerprint
 
 
 def _make(
@@ -107,32 +112,32 @@ def _make(
     annotation: Annotation,
     inputs: Mapping[str, Path],
     output: Path,
-    made_from: Record,
+    manifest: Manifest,
     lease: Lease,
 ) -> bool:
-    """Run the stage, and put its output in its place together with its record; False where another
-    process took that place over meanwhile, and nothing was put there."""
+    """Run the stage and replace its output; False if the lease was lost meanwhile, in which case
+    the output is left alone."""
     if STAGES[stage].on_device:
         check_device(project)
     module = importlib.import_module(f"intercap_core.stages.{stage}")
-    passed = given.arguments(project, sequence, stage, annotation)
+    arguments = stage_inputs.arguments(project, sequence, stage, annotation)
     read = {name: inputs[name] for name in STAGES[stage].reads}
-    passed |= {"paths": SequencePaths(**read)} if given.takes_paths(stage) else read
+    arguments |= {"paths": SequencePaths(**read)} if stage_inputs.takes_paths(stage) else read
     in_folder = STAGES[stage].writes_folder
     if in_folder:
         folders.check_replaceable(output, marker=module.MARKER, what=stage)
     part = artefacts.part_of(output)
     try:
-        module.run(output=part, **passed)
-        add_record(part, made_from)
+        module.run(output=part, **arguments)
+        write_manifest(part, manifest)
         if not lease.is_held():
             return False
         if in_folder:
             folders.put(part, output)
         else:
-            forget(output)
+            forget_output(output)
             os.replace(part, output)
-            note(output)
+            remember_output(output)
         return True
     finally:
         if in_folder:
@@ -141,20 +146,20 @@ def _make(
             part.unlink(missing_ok=True)
 
 
-def _give_back_memory() -> None:
-    """Have glibc give arrays of 4 MB and more back to the system when they are freed.
+def _return_freed_memory() -> None:
+    """Make glibc return freed arrays of 4 MB and more to the system.
 
-    It keeps such memory for the process from the first time on that one is freed, up to 32 MB each:
-    a fifth of the joint stage's peak at 1,000 frames. Nothing to do for other C libraries.
+    By default it keeps up to 32 MB per array for the process, a fifth of the joint stage's peak at
+    1,000 frames. Without effect for other C libraries.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if os.name == "posix" else None
     if mallopt is not None:
-        mallopt(_M_MMAP_THRESHOLD, _GIVEN_BACK_BYTES)
-        mallopt(_M_TRIM_THRESHOLD, _GIVEN_BACK_BYTES)
+        mallopt(_M_MMAP_THRESHOLD, _RETURNED_BYTES)
+        mallopt(_M_TRIM_THRESHOLD, _RETURNED_BYTES)
 
 
 def check_device(project: Project) -> None:
-    """Raise UserError where the settings ask for a device that this machine does not have."""
+    """Raise UserError if the settings name a device that this machine does not have."""
     if project.config.device == "cpu":
         return
     import torch
@@ -169,18 +174,18 @@ def check_device(project: Project) -> None:
 def _check_inputs(stage: str, sequence: str, inputs: Mapping[str, Path]) -> None:
     for name in STAGES[stage].reads:
         with artefacts.read(inputs[name], getattr(schemas, name.upper())) as source:
-            found = source.attributes["sequence"]
-        if found != sequence:
+            actual = source.attributes["sequence"]
+        if actual != sequence:
             raise UserError(
-                f"{inputs[name]}: holds sequence {found!r}, expected {sequence!r}; delete it and "
+                f"{inputs[name]}: holds sequence {actual!r}, expected {sequence!r}; delete it and "
                 f"re-run stage {name!r} for sequence {sequence!r}"
             )
 
 
 def run_studio(project: Project, sequence: str) -> Path:
-    """Make one virtual recording; returns its folder.
+    """Write one virtual recording; returns its folder.
 
-    Raises UserError where the project's studio does not make this sequence.
+    Raises UserError if the project's studio does not make this sequence.
     """
     folder = project.recordings_made(sequence)
     if project.config.studio is None or folder is None:
@@ -189,9 +194,9 @@ def run_studio(project: Project, sequence: str) -> Path:
         )
     from intercap_core.studio.capture import make_capture
 
-    with disk_told(project, folder), acquire(folder):
-        contents = Contents(project.results / sequence / CONTENTS_NAME)
-        made_from = given.studio_record(project, sequence, contents)
+    with explain_disk_errors(project, folder), acquire(folder):
+        checksums = InputChecksums(project.results / sequence / INPUTS_FILE)
+        manifest = stage_inputs.studio_manifest(project, sequence, checksums)
         (folder / FILE).unlink(missing_ok=True)
         make_capture(
             project.config.studio.captures[sequence],
@@ -200,31 +205,37 @@ def run_studio(project: Project, sequence: str) -> Path:
             objects=project.object_of(sequence),
             output=folder,
         )
-        add_record(folder, made_from)
+        write_manifest(folder, manifest)
     return folder
 
 
 def run_dataset(project: Project) -> Path:
     """Merge the sequences' summaries; returns the path of the site's first page.
 
-    Sequences that the project excludes because they failed are named in it, and those whose
-    summary is missing or broken. Raises UserError where none is left.
+    The page names sequences that the project excludes because they failed, and those whose summary
+    is missing or broken. Raises UserError if no sequence is left.
     """
     from intercap_core.output.site.settings import changed
     from intercap_core.stages import dataset
 
     folder = project.results
     failed = failures(project)
-    records = {name: read_record(project.artefact(name, "summary")) for name in project.sequences}
-    made_from = given.dataset_record(
+    manifests = {
+        name: read_manifest(project.artefact(name, "summary")) for name in project.sequences
+    }
+    current = stage_inputs.dataset_manifest(
         project,
-        {name: record.identity for name, record in records.items() if record is not None},
+        {
+            name: manifest.fingerprint
+            for name, manifest in manifests.items()
+            if manifest is not None
+        },
         failed,
     )
-    with disk_told(project, folder / DATASET), acquire(folder / DATASET):
-        (dataset_record_of(project) / FILE).unlink(missing_ok=True)
-        for name in OF_ALL:
-            forget(folder / name)
+    with explain_disk_errors(project, folder / DATASET), acquire(folder / DATASET):
+        (folder / FILE).unlink(missing_ok=True)
+        for name in DATASET_OUTPUTS:
+            forget_output(folder / name)
         first = dataset.run(
             dataset=project.config.dataset,
             summaries={name: project.artefact(name, "summary") for name in project.sequences},
@@ -240,8 +251,8 @@ def run_dataset(project: Project) -> Path:
             failed=failed,
             changed=changed(project.config),
         )
-        add_record(dataset_record_of(project), made_from)
-        for file in noted(folder / name for name in OF_ALL):
-            note(file)
+        write_manifest(folder, current)
+        for file in checked_files(folder / name for name in DATASET_OUTPUTS):
+            remember_output(file)
     log.info("dataset %s: %s", project.config.dataset, outcome.dataset_line(folder))
     return first

@@ -16,7 +16,7 @@ import pytest
 
 from intercap_core.annotate import before, rerun
 from intercap_core.errors import UserError
-from intercap_core.pipeline.plan import Kind, Plan, mark_of
+from intercap_core.pipeline.plan import OutputStatus, Plan, mark_of
 from intercap_core.project import Project, load_project
 from intercap_core.stage_list import SEQUENCE_STAGES
 from tests.annotate.served import NAME, annotation, artefact, small_project
@@ -201,7 +201,9 @@ def test_a_sequence_without_results_has_nothing_beside_it(project: Project) -> N
 def test_what_is_out_of_date_is_marked_before_snakemake_lists_the_marks(project: Project) -> None:
     plan = Plan(project)
     plan.mark_all()
-    stale = [stage for stage, state in plan.states(NAME).items() if state.kind is Kind.stale]
+    stale = [
+        stage for stage, state in plan.states(NAME).items() if state.status is OutputStatus.stale
+    ]
     assert stale and all(mark_of(project, NAME, stage).is_file() for stage in stale)
 
 

@@ -23,27 +23,27 @@ AS_IF_MADE_NOW = """
 import sys
 from dataclasses import replace
 from pathlib import Path
-from intercap_core.pipeline import given
-from intercap_core.pipeline.contents import NAME, Contents
+from intercap_core.pipeline.checksums import INPUTS_FILE, InputChecksums
 from intercap_core.pipeline.plan import DATASET, Plan
-from intercap_core.pipeline.record import add_record, read_record
+from intercap_core.pipeline.provenance import read_manifest, write_manifest
+from intercap_core.pipeline.stage_inputs import dataset_manifest, stage_manifest
 from intercap_core.project import load_project
 from intercap_core.stage_list import STAGES
 project = load_project(Path(sys.argv[1]))
 made = {}
 for name in project.sequences:
-    contents, identities = Contents(project.results / name / NAME), {}
+    checksums, identities = InputChecksums(project.results / name / INPUTS_FILE), {}
     annotation = project.annotation(name)
     for stage, declared in STAGES.items():
         reads = {other: identities[other] for other in declared.reads}
-        record = given.record(
-            project, name, stage, annotation, artefacts=reads, contents=contents
+        record = stage_manifest(
+            project, name, stage, annotation, artefacts=reads, checksums=checksums
         )
-        identities[stage] = record.identity
-        if read_record(project.artefact(name, stage)) != record:
-            add_record(project.artefact(name, stage), record)
+        identities[stage] = record.fingerprint
+        if read_manifest(project.artefact(name, stage)) != record:
+            write_manifest(project.artefact(name, stage), record)
     made[name] = identities["summary"]
-add_record(project.results, given.dataset_record(project, made, {}))
+write_manifest(project.results, dataset_manifest(project, made, {}))
 """
 ONE, OTHER = "suitcase_carry_s03", "cup_drink_s04"
 # Appended to a stage of a copy: the stage's imports and signature stay, so that its code digest and
@@ -58,7 +58,8 @@ def _replayed(real):
     def run(*, output, **given):
         artefacts = importlib.import_module("intercap_core.artefacts")
         schemas = importlib.import_module("intercap_core.schemas")
-        for name, path in given.items():
+        read = given["paths"].by_stage() if "paths" in given else given
+        for name, path in read.items():
             if isinstance(path, Path) and hasattr(schemas, name.upper()):
                 with artefacts.read(path, getattr(schemas, name.upper())) as source:
                     for key in source.keys():

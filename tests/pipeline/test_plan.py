@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from intercap_core.pipeline import contents, given
-from intercap_core.pipeline.contents import Contents
-from intercap_core.pipeline.plan import Kind, Plan
+from intercap_core.pipeline import checksums, stage_inputs
+from intercap_core.pipeline.checksums import InputChecksums
+from intercap_core.pipeline.plan import OutputStatus, Plan
 from intercap_core.project import Project, load_project
 from intercap_core.stage_list import STAGES
 
@@ -41,10 +41,10 @@ def test_of_a_sequence_without_results_no_recording_is_read(
     def never(path: Path) -> str:
         raise AssertionError(f"{path} was read")
 
-    monkeypatch.setattr(contents, "_file_digest", never)
+    monkeypatch.setattr(checksums, "_file_digest", never)
     states = Plan(project).states("s01")
     assert set(states) == set(STAGES)
-    assert {state.kind for state in states.values()} == {Kind.missing}
+    assert {state.status for state in states.values()} == {OutputStatus.missing}
     assert not Plan(project).all_done() and Plan(project).mark("s01", "joint") == []
 
 
@@ -60,10 +60,10 @@ def test_a_broken_annotation_holds_all_stages_up_and_is_named(project: Project) 
 
 def test_what_lies_beside_a_mesh_is_part_of_what_is_recorded(project: Project) -> None:
     def files() -> dict[str, str]:
-        made_from = given.record(
+        made_from = stage_inputs.stage_manifest(
             project, "s01", "object_track", project.annotation("s01"),
             artefacts=dict.fromkeys(STAGES["object_track"].reads, "made"),
-            contents=Contents(Path("none")),
+            checksums=InputChecksums(Path("none")),
         )  # fmt: skip
         return dict(made_from.files["object_"])
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from intercap_core.pipeline.record import FILE
+from intercap_core.pipeline.provenance import FILE
 from tests.helpers.flow import ONE, Flow
 
 BEFORE_METRICS = (

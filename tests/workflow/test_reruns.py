@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 from intercap_core import artefacts
-from intercap_core.pipeline.record import Record, add_record
+from intercap_core.pipeline.provenance import Manifest, write_manifest
 from tests.helpers.flow import ONE, OTHER, Flow
 
 AFTER_METRICS = {"summary", "page", "export"}
@@ -227,10 +227,10 @@ def test_a_result_of_other_settings_that_is_put_back_is_seen(flow: Flow) -> None
     path = flow.artefact(ONE, "scene")
     whole = path.read_bytes()
     text = artefacts.made_from(path)
-    record = Record.from_text(text)
+    record = Manifest.from_text(text)
     assert record is not None
     settings = {**record.given["settings"], "voxel_mm": 0.5}
-    add_record(path, replace(record, given={**record.given, "settings": settings}))
+    write_manifest(path, replace(record, given={**record.given, "settings": settings}))
     assert (ONE, "scene") in flow.pending()
     said = flow.intercap("status", flow.settings).stdout
     assert f"scene out of date in {ONE}: settings: voxel_mm 0.5 → none" in said
@@ -241,9 +241,9 @@ def test_a_result_of_other_settings_that_is_put_back_is_seen(flow: Flow) -> None
 def test_another_processor_is_told_and_runs_nothing(flow: Flow) -> None:
     path = flow.artefact(ONE, "joint")
     whole = path.read_bytes()
-    record = Record.from_text(artefacts.made_from(path))
+    record = Manifest.from_text(artefacts.made_from(path))
     assert record is not None
-    add_record(path, replace(record, machine={"device": "cuda", "cpu": "another"}))
+    write_manifest(path, replace(record, machine={"device": "cuda", "cpu": "another"}))
     assert flow.pending() == set()
     said = flow.intercap("status", flow.settings).stdout
     assert "2 done of 2 sequences" in said

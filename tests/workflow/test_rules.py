@@ -7,14 +7,16 @@ import inspect
 import re
 import subprocess
 import sys
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
 from intercap_core.config import Annotation
-from intercap_core.pipeline import given
-from intercap_core.pipeline.contents import Contents
+from intercap_core.pipeline import stage_inputs
+from intercap_core.pipeline.checksums import InputChecksums
 from intercap_core.project import load_project
+from intercap_core.sequence_inputs import FitSettings, SequenceModels
 from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -25,8 +27,9 @@ RULES = dict(re.findall(r"^rule (\w+):\n(.*?)(?=^rule |\Z)", TEXT, re.DOTALL | r
 @pytest.mark.parametrize("stage", STAGES)
 def test_a_rule_s_inputs_are_what_its_stage_reads(stage: str) -> None:
     run = importlib.import_module(f"intercap_core.stages.{stage}").run
-    reads = set(inspect.signature(run).parameters) & set(SEQUENCE_STAGES)
-    assert set(STAGES[stage].reads) == reads
+    names = set(inspect.signature(run).parameters)
+    reads = set(STAGES[stage].reads)
+    assert "paths" in names or names & set(SEQUENCE_STAGES) == reads
     assert f'unpack(artefacts_read("{stage}"))' in RULES[stage] or not reads
 
 
@@ -34,12 +37,15 @@ def test_a_rule_s_inputs_are_what_its_stage_reads(stage: str) -> None:
 def test_all_that_a_stage_is_given_is_in_its_record(stage: str) -> None:
     """Every argument but artefacts and output is recorded, and the device as one of a machine."""
     run = importlib.import_module(f"intercap_core.stages.{stage}").run
-    names = set(inspect.signature(run).parameters) - set(SEQUENCE_STAGES) - {"output"}
+    names = set(inspect.signature(run).parameters) - set(SEQUENCE_STAGES) - {"output", "paths"}
+    for group, members in (("models", SequenceModels), ("fit_settings", FitSettings)):
+        if group in names:
+            names = names - {group} | {member.name for member in fields(members)}
     project = load_project(ROOT / "config/test/config.yaml")
     sequence = next(iter(project.sequences))
-    made_from = given.record(
+    made_from = stage_inputs.stage_manifest(
         project, sequence, stage, Annotation(),
-        artefacts=dict.fromkeys(STAGES[stage].reads, "made"), contents=Contents(ROOT / "none"),
+        artefacts=dict.fromkeys(STAGES[stage].reads, "made"), checksums=InputChecksums(ROOT / "none"),
     )  # fmt: skip
     assert set(made_from.given) == names - {"device"}
     assert set(made_from.artefacts) == set(STAGES[stage].reads)
@@ -48,8 +54,8 @@ def test_all_that_a_stage_is_given_is_in_its_record(stage: str) -> None:
 def test_a_stage_cannot_read_a_column_that_is_not_recorded() -> None:
     row = next(iter(load_project(ROOT / "config/test/config.yaml").sequences.values()))
     with pytest.raises(AttributeError):
-        _ = given.row_of("frames", row).intent
-    assert given.row_of("summary", row).sequence == row.sequence
+        _ = stage_inputs.restrict_row("frames", row).intent
+    assert stage_inputs.restrict_row("summary", row).sequence == row.sequence
 
 
 @pytest.mark.parametrize("rule", sorted(RULES))

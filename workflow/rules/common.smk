@@ -9,8 +9,7 @@ from intercap_core.formats.recordings.layouts import input_files
 from intercap_core.errors import UserError
 from intercap_core.formats.released.file_names import files_of
 from intercap_core.pipeline.plan import DATASET, STUDIO, Plan
-from intercap_core.pipeline.requests import (
-    Extent,
+from intercap_core.pipeline.resources import (
     extent_of,
     has_model,
     memory_mb,
@@ -19,7 +18,7 @@ from intercap_core.pipeline.requests import (
     recorded_mb,
 )
 from intercap_core.project import load_project
-from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
+from intercap_core.stage_list import SEQUENCE_STAGES, STAGES, Extent
 
 
 def _load():
@@ -43,7 +42,7 @@ if workflow.is_main_process:
         PLAN.mark_all()
     except (UserError, OSError) as error:
         raise WorkflowError(str(error)) from None
-    atexit.register(PLAN.keep)
+    atexit.register(PLAN.save)
 VIRTUAL = [name for name in SEQUENCES if PROJECT.recordings_made(name) is not None]
 NOTHING = "(?!)"  # a pattern that no text matches
 RESULTS = PROJECT.results.as_posix()
@@ -123,7 +122,7 @@ def out_of_date(stage):
 
 def identity_of(stage):
     """Param: what the output is to be made from, for whoever compares jobs of two runs."""
-    return lambda wildcards: PLAN.identity(getattr(wildcards, "sequence", ""), stage)
+    return lambda wildcards: PLAN.fingerprint(getattr(wildcards, "sequence", ""), stage)
 
 
 def artefacts_read(stage):

@@ -1,5 +1,8 @@
-"""What a stage is given, and what is recorded of it: one list for both, so that no stage depends on
-anything that its record does not have."""
+"""The arguments of each stage, and the manifest of its output.
+
+Both are derived from the signature of the stage's ``run``, so that a stage cannot depend on a
+setting, table entry or annotation that its manifest does not record.
+"""
 
 from __future__ import annotations
 
@@ -14,51 +17,38 @@ from intercap_core.formats.recordings.behave import find_intrinsics_folder
 from intercap_core.formats.recordings.layouts import input_files
 from intercap_core.formats.released.file_names import intercap_file
 from intercap_core.output.site.settings import changed
-from intercap_core.pipeline.code_cache import stage_code
-from intercap_core.pipeline.contents import Contents
-from intercap_core.pipeline.record import Record, libraries, plain, processor
+from intercap_core.pipeline.checksums import InputChecksums
+from intercap_core.pipeline.code_digest import stage_code
+from intercap_core.pipeline.provenance import Manifest, library_versions, processor, to_plain
 from intercap_core.project import Project
 from intercap_core.sequence_inputs import FitSettings
+from intercap_core.stage_list import STAGES
 
-# Columns of a sequence's row that a stage may read; reading another one is an error.
-COLUMNS: dict[str, tuple[str, ...]] = {
-    "frames": (
-        "layout", "recordings", "calibration", "calibration_scale", "calibration_up",
-        "calibration_floor",
-    ),
-    "detections": (
-        "layout", "recordings", "calibration", "calibration_scale", "keypoints", "candidates",
-    ),
-    "summary": ("intent",),
-    "page": ("intent",),
-}  # fmt: skip
-_OF_BEHAVE = ("object",)  # the stage detections finds BEHAVE's files by the object's name
 STUDIO = "studio"
 
 
-def row_of(stage: str, row: SequenceEntry) -> SequenceEntry:
-    """The row with its name and those columns alone that the stage may read; of others it has no
-    attribute."""
-    names = COLUMNS.get(stage, ())
-    if stage == "detections" and row.layout == "behave":
-        names += _OF_BEHAVE
-    kept = {name: getattr(row, name) for name in ("sequence", *names)}
-    narrow = SequenceEntry.model_construct({*kept}, **kept)
-    for name in narrow.__dict__.keys() - kept.keys():  # which have their defaults
-        del narrow.__dict__[name]
-    return narrow
+def restrict_row(stage: str, row: SequenceEntry) -> SequenceEntry:
+    """The row with its name and the columns that the stage declares; other columns are no
+    attributes of it."""
+    declared = STAGES[stage]
+    names = (*declared.columns, *declared.layout_columns.get(row.layout, ()))
+    values = {name: getattr(row, name) for name in ("sequence", *names)}
+    restricted = SequenceEntry.model_construct({*values}, **values)
+    for name in restricted.__dict__.keys() - values.keys():  # which have their defaults
+        del restricted.__dict__[name]
+    return restricted
 
 
 def arguments(
     project: Project, sequence: str, stage: str, annotation: Annotation
 ) -> dict[str, Any]:
-    """What ``stages.<stage>.run`` is called with, but for artefacts and the output."""
+    """Arguments of ``stages.<stage>.run`` except the artefacts and the output."""
     config, row = project.config, project.sequences[sequence]
     known: dict[str, Any] = {
-        "settings": getattr(config, stage, None),  # not every stage has any
+        "settings": getattr(config, stage, None),  # not every stage has settings
         "fit_settings": FitSettings(config.joint, config.body_fit, config.object_track),
         "models": project.models(sequence),
-        "sequence": row_of(stage, row),
+        "sequence": restrict_row(stage, row),
         "object_": project.object_of(sequence),
         "subject": project.subjects[row.subject],
         "body_models": config.body_models,
@@ -77,43 +67,42 @@ def arguments(
 
 
 def takes_paths(stage: str) -> bool:
-    """Whether the stage gets its artefacts as :class:`SequencePaths`, not as single arguments."""
+    """Whether the stage gets its artefacts as SequencePaths instead of single arguments."""
     return "paths" in stage_code(stage).parameters
 
 
-def record(
+def stage_manifest(
     project: Project,
     sequence: str,
     stage: str,
     annotation: Annotation,
     *,
     artefacts: Mapping[str, str],
-    contents: Contents,
-    before: Record | None = None,
-) -> Record:
-    """What the stage's output would be made from now.
+    checksums: InputChecksums,
+    before: Manifest | None = None,
+) -> Manifest:
+    """Manifest of the output that the stage would write now.
 
-    ``artefacts``: the identity of each artefact that it reads; ``before``: an earlier record, which
-    saves reading large files whose size tells that they are others.
+    Args:
+        artefacts: fingerprint of each artefact that the stage reads, by stage.
+        before: an earlier manifest; saves reading large files whose size has changed.
     """
     given = arguments(project, sequence, stage, annotation)
-    device = given.pop("device", "cpu")
+    machine = {"device": given.pop("device", "cpu"), "cpu": processor()}
     if given.get("results") is not None:
-        given["results"] = intercap_file(given["results"])  # of a folder its newest
+        given["results"] = intercap_file(given["results"])  # the newest file of a folder
     for name in ("models", "fit_settings"):
         group = given.pop(name, None)
         given |= vars(group) if group is not None else {}
     if "body_models" in given:
         given["body_models"] = _body_files(project.config, given["subject"].gender)
-    return _record(
-        stage, sequence, given, artefacts, contents, before, {"device": device, "cpu": processor()}
-    )
+    return _manifest(stage, sequence, given, artefacts, checksums, before, machine)
 
 
-def studio_record(project: Project, sequence: str, contents: Contents) -> Record:
-    """What a virtual recording would be made from now; what is already there of it is not read.
+def studio_manifest(project: Project, sequence: str, checksums: InputChecksums) -> Manifest:
+    """Manifest of the virtual recording that the studio would write now.
 
-    Raises KeyError where the studio does not make the sequence.
+    Raises KeyError if the studio does not make the sequence.
     """
     studio = project.config.studio
     if studio is None:
@@ -123,14 +112,18 @@ def studio_record(project: Project, sequence: str, contents: Contents) -> Record
         "capture": studio.captures[sequence],
         "object_": project.object_of(sequence),
     }
-    return _record(STUDIO, sequence, given, {}, contents, None, {"cpu": processor()})
+    return _manifest(STUDIO, sequence, given, {}, checksums, None, {"cpu": processor()})
 
 
-def dataset_record(
+def dataset_manifest(
     project: Project, summaries: Mapping[str, str], failed: Mapping[str, str]
-) -> Record:
-    """What tables, card and the site's first page would be made from now; ``summaries`` has the
-    identity of each sequence's summary."""
+) -> Manifest:
+    """Manifest of the outputs of all sequences: tables, card and the site's first page.
+
+    Args:
+        summaries: fingerprint of each sequence's summary.
+        failed: reason by excluded sequence.
+    """
     given = {
         "settings": project.config.card,
         "formats": project.config.export.formats,
@@ -143,53 +136,61 @@ def dataset_record(
         "changed": changed(project.config),
     }
     code = stage_code("dataset").digests
-    return Record("dataset", "", plain(given), {}, dict(summaries), code, libraries())
+    return Manifest("dataset", "", to_plain(given), {}, dict(summaries), code, library_versions())
 
 
-def _record(
+def _manifest(
     stage: str,
     sequence: str,
     given: Mapping[str, Any],
     artefacts: Mapping[str, str],
-    contents: Contents,
-    before: Record | None,
+    checksums: InputChecksums,
+    before: Manifest | None,
     machine: Mapping[str, str],
-) -> Record:
+) -> Manifest:
     values: dict[str, Any] = {}
     files: dict[str, dict[str, str]] = {}
     for name, value in given.items():
-        told, paths = _told(value)
-        values[name] = plain(told)
+        content, paths = _split_paths(value)
+        values[name] = to_plain(content)
         known = before.files.get(name, {}) if before is not None else {}
         if paths:
             files[name] = {
-                key: contents.digest(path, was=known.get(key)) for key, path in paths.items()
+                key: checksums.digest(path, was=known.get(key)) for key, path in paths.items()
             }
-    code = stage_code(stage).digests
-    return Record(stage, sequence, values, files, dict(artefacts), code, libraries(), dict(machine))
+    return Manifest(
+        stage=stage,
+        sequence=sequence,
+        given=values,
+        files=files,
+        artefacts=dict(artefacts),
+        code=stage_code(stage).digests,
+        libraries=library_versions(),
+        machine=dict(machine),
+    )
 
 
-def _told(value: Any) -> tuple[Any, dict[str, Path]]:
-    """A value without its paths, and the paths by names that tell nothing of where they lie."""
+def _split_paths(value: Any) -> tuple[Any, dict[str, Path]]:
+    """A value without its paths, and the paths by names that do not depend on their folder."""
     if isinstance(value, Path):
         return None, {value.name: value}
     if isinstance(value, SequenceEntry):
-        return _row_told(value)
+        return _split_row(value)
     if isinstance(value, BaseModel):
         named = {name: entry for name, entry in value if isinstance(entry, Path)}
         paths = {
             f"{name}/{path.name}": path
             for name, entry in named.items()
-            for path in (entry, *_beside(entry))
+            for path in (entry, *_companion_files(entry))
         }
         return value.model_dump(mode="json", exclude=set(named)), paths
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return [_told(entry)[0] for entry in value], {}
+        return [_split_paths(entry)[0] for entry in value], {}
     return value, {}
 
 
-def _row_told(row: SequenceEntry) -> tuple[dict[str, Any], dict[str, Path]]:
-    """A row's columns; its recordings by the files that the layout has."""
+def _split_row(row: SequenceEntry) -> tuple[dict[str, Any], dict[str, Path]]:
+    """Columns of a row, and its files; recordings by the files of their layout."""
     values, paths = {}, {}
     for name in sorted(row.model_fields_set):
         value = getattr(row, name)
@@ -207,14 +208,14 @@ def _row_told(row: SequenceEntry) -> tuple[dict[str, Any], dict[str, Path]]:
     return values, paths
 
 
-def _beside(path: Path) -> list[Path]:
-    """Files that are read with another one: a mesh's materials and texture, a body's maps."""
+def _companion_files(path: Path) -> list[Path]:
+    """Files read together with another: materials and texture of a mesh, maps of a body."""
     names = (f"{path.stem}.mtl", f"{path.stem}.png", f"{path.stem}.jpg", f"{path.stem}_maps.json")
-    return [one for name in names if (one := path.with_name(name)).is_file()]
+    return [file for name in names if (file := path.with_name(name)).is_file()]
 
 
 def _body_files(config: Config, gender: str) -> BodyModels:
-    """The body file that somebody of this gender is fitted with, and the pose prior."""
+    """The body file for a gender, and the pose prior."""
     models = config.body_models
     return BodyModels(
         neutral=models.of(gender), vposer=models.vposer, vposer_version=models.vposer_version

@@ -11,11 +11,15 @@ import pytest
 
 from intercap_core import artefacts
 from intercap_core.artefacts import Field, Schema
-from intercap_core.pipeline.contents import Contents
-from intercap_core.pipeline.record import Record, add_record, libraries, read_record
+from intercap_core.pipeline.provenance import (
+    Manifest,
+    library_versions,
+    read_manifest,
+    write_manifest,
+)
 
 SCHEMA = Schema("x", 1, "x", {"a": Field(("T",), "float64", "numbers")}, {"gender": "of whom"})
-MADE = Record(
+MADE = Manifest(
     "joint", "s01", {"settings": {"weight": 1.0, "steps": 30}, "contact": None},
     {"object_": {"mesh/cup.ply": "ab:12"}}, {"frames": "f", "scene": "s"},
     {"energy": "e", "joint": "j"}, {"numpy": "2.1"}, {"cpu": "one", "device": "cpu"},
@@ -30,37 +34,37 @@ def _artefact(path: Path) -> Path:
 
 def test_a_record_comes_back_and_changes_nothing_else(tmp_path: Path) -> None:
     path = _artefact(tmp_path / "x.h5")
-    assert read_record(path) is None
-    add_record(path, MADE)
-    assert read_record(path) == MADE
+    assert read_manifest(path) is None
+    write_manifest(path, MADE)
+    assert read_manifest(path) == MADE
     with artefacts.read(path, SCHEMA) as artefact:
         assert "made_from" not in artefact.attributes and artefact["a"].tolist() == [0, 1, 2]
-    add_record(path, replace(MADE, stage="other"))  # in place of the first
-    found = read_record(path)
+    write_manifest(path, replace(MADE, stage="other"))  # in place of the first
+    found = read_manifest(path)
     assert found is not None and found.stage == "other"
     folder = tmp_path / "page"
     folder.mkdir()
-    add_record(folder, MADE)
-    assert read_record(folder) == MADE
+    write_manifest(folder, MADE)
+    assert read_manifest(folder) == MADE
 
 
 def test_a_long_record_fits(tmp_path: Path) -> None:
     path = _artefact(tmp_path / "x.h5")
     long = replace(MADE, code={f"room{i}": "0123456789abcdef" for i in range(5000)})
-    add_record(path, long)
-    assert read_record(path) == long
+    write_manifest(path, long)
+    assert read_manifest(path) == long
 
 
 def test_equal_inputs_give_equal_bytes(tmp_path: Path) -> None:
     one, two = (_artefact(tmp_path / name) for name in ("one.h5", "two.h5"))
     for path in (one, two):
-        add_record(path, MADE)
+        write_manifest(path, MADE)
     assert one.read_bytes() == two.read_bytes()
 
 
 def test_the_machine_is_told_and_decides_nothing() -> None:
     other = replace(MADE, machine={"cpu": "two", "device": "cuda"})
-    assert other.identity == MADE.identity and other.to_text() != MADE.to_text()
+    assert other.fingerprint == MADE.fingerprint and other.to_text() != MADE.to_text()
     assert other.differences(MADE) == []
 
 
@@ -82,7 +86,7 @@ def test_the_machine_is_told_and_decides_nothing() -> None:
 )  # fmt: skip
 def test_what_differs_is_named(changed: dict, words: str) -> None:
     now = replace(MADE, **changed)
-    assert now.identity != MADE.identity
+    assert now.fingerprint != MADE.fingerprint
     assert now.differences(MADE) == [words]
 
 
@@ -90,7 +94,7 @@ def test_every_changed_letter_of_an_artefact_is_found_or_harmless(tmp_path: Path
     """Attributes, records and values: no flipped bit gives another content without a word."""
     path = _artefact(tmp_path / "x.h5")
     long = replace(MADE, code={f"room{i}": "0123456789abcdef" for i in range(200)})
-    add_record(path, long)
+    write_manifest(path, long)
     whole = path.read_bytes()
     found = {"refused": 0, "same": 0}
     rng = np.random.default_rng(0)
@@ -106,7 +110,7 @@ def test_every_changed_letter_of_an_artefact_is_found_or_harmless(tmp_path: Path
             found["refused"] += 1
             continue
         assert content == ("male", [0, 1, 2]) and units == "1", place
-        assert read_record(path) in (None, long), place
+        assert read_manifest(path) in (None, long), place
         found["same"] += 1
     assert found["refused"] > 500
 
@@ -115,13 +119,13 @@ def test_a_damaged_record_is_none(tmp_path: Path) -> None:
     """Of long attributes HDF5 has no checksum."""
     path = _artefact(tmp_path / "x.h5")
     long = replace(MADE, code={f"room{i}": "0123456789abcdef" for i in range(5000)})
-    add_record(path, long)
+    write_manifest(path, long)
     whole = path.read_bytes()
     place = whole.index(b"0123456789abcdef", len(whole) // 2)
     path.write_bytes(whole[:place] + b"1" + whole[place + 1 :])
-    assert read_record(path) is None
+    assert read_manifest(path) is None
     path.write_bytes(whole)
-    assert read_record(path) == long
+    assert read_manifest(path) == long
 
 
 def test_texts_lie_in_no_heap(tmp_path: Path) -> None:
@@ -133,48 +137,5 @@ def test_texts_lie_in_no_heap(tmp_path: Path) -> None:
 
 
 def test_libraries_that_decide_numbers_are_named() -> None:
-    assert {"numpy", "numba", "torch"} <= set(libraries())
-    assert "+" not in "".join(libraries().values())
-
-
-def test_contents_are_read_once_and_by_size_and_date(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    file, store = tmp_path / "k1.mkv", tmp_path / "s01" / ".inputs.json"
-    store.parent.mkdir()
-    file.write_bytes(b"images")
-    contents = Contents(store)
-    digest = contents.digest(file)
-    contents.keep()
-    reads: list[Path] = []
-    from intercap_core.pipeline import contents as module
-
-    take = module._file_digest
-    monkeypatch.setattr(module, "_file_digest", lambda path: reads.append(path) or take(path))
-    again = Contents(store)
-    assert again.digest(file) == digest and reads == []
-    file.touch()
-    assert again.digest(file) == digest and reads == [file]  # the same content
-    again.keep()
-    assert Contents(store).digest(file) == digest and len(reads) == 1
-    file.write_bytes(b"others")
-    assert again.digest(file) != digest
-    assert again.digest(tmp_path / "none") == "missing"
-    monkeypatch.setattr(module, "LARGE", 3)
-    file.write_bytes(b"longer than before")
-    count = len(reads)
-    assert again.digest(file, was=digest) == "changed" and len(reads) == count
-
-
-def test_a_folder_is_what_is_in_it(tmp_path: Path) -> None:
-    folder = tmp_path / "k1"
-    (folder / "colour").mkdir(parents=True)
-    (folder / "colour" / "00001.jpg").write_bytes(b"one")
-    contents = Contents(tmp_path / ".inputs.json")
-    first = contents.digest(folder)
-    (folder / "colour" / "00002.jpg").write_bytes(b"two")
-    second = contents.digest(folder)
-    (folder / "colour" / "00002.jpg").unlink()
-    assert first != second and contents.digest(folder) == first
-    (folder / "colour" / "00001.jpg").write_bytes(b"uno")  # in place
-    assert contents.digest(folder) != first
+    assert {"numpy", "numba", "torch"} <= set(library_versions())
+    assert "+" not in "".join(library_versions().values())

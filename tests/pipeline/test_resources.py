@@ -12,10 +12,9 @@ import pytest
 
 from intercap_core.config import FramesSettings
 from intercap_core.errors import UserError
-from intercap_core.pipeline.requests import (
+from intercap_core.pipeline.resources import (
     CUDA_MB,
-    NEEDS,
-    Extent,
+    JOBS,
     extent_of,
     memory_mb,
     minutes,
@@ -23,7 +22,7 @@ from intercap_core.pipeline.requests import (
     recorded_mb,
 )
 from intercap_core.project import Project, load_project
-from intercap_core.stage_list import STAGES
+from intercap_core.stage_list import STAGES, Extent
 from intercap_core.stages import frames
 from tests.conftest import PROJECT_ROOT
 from tests.helpers.plain_capture import CAMERAS, plain_entry, write_rig
@@ -76,7 +75,7 @@ def test_what_a_user_raises_still_grows() -> None:
 
 def test_stages_on_a_gpu_are_those_of_the_settings() -> None:
     def found(**settings: object) -> set[str]:
-        return {stage for stage in NEEDS if on_gpu(project(**settings), stage)}
+        return {stage for stage in JOBS if on_gpu(project(**settings), stage)}
 
     assert found() == set()
     assert found(device="cuda") == {"body_fit", "joint"}

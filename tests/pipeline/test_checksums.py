@@ -14,7 +14,14 @@ import numpy as np
 import pytest
 
 from intercap_core import artefacts, schemas
-from intercap_core.pipeline.intact import damage_of, forget, is_as_left, note
+from intercap_core.pipeline import checksums
+from intercap_core.pipeline.checksums import (
+    InputChecksums,
+    find_damage,
+    forget_output,
+    is_unchanged,
+    remember_output,
+)
 
 WRITES = """
 import resource, sys
@@ -89,21 +96,21 @@ def summary(tmp_path: Path) -> Path:
 
 
 def test_a_result_is_known_again_until_it_changes(summary: Path) -> None:
-    assert not is_as_left(summary) and damage_of(summary) == ""
-    note(summary)
-    assert is_as_left(summary)
+    assert not is_unchanged(summary) and find_damage(summary) == ""
+    remember_output(summary)
+    assert is_unchanged(summary)
     os.utime(summary, (1.0, 1.0))
-    assert not is_as_left(summary) and damage_of(summary) == ""
+    assert not is_unchanged(summary) and find_damage(summary) == ""
     with summary.open("ab") as file:  # which no checksum lies over
         file.write(b"more")
-    assert "is not as it was written" in damage_of(summary)
-    note(summary)
-    assert is_as_left(summary)
+    assert "is not as it was written" in find_damage(summary)
+    remember_output(summary)
+    assert is_unchanged(summary)
     (summary.with_name(f".{summary.name}.left")).write_text("[1, ")
-    assert not is_as_left(summary) and damage_of(summary) == ""
-    note(summary)
-    forget(summary)
-    assert not is_as_left(summary)
+    assert not is_unchanged(summary) and find_damage(summary) == ""
+    remember_output(summary)
+    forget_output(summary)
+    assert not is_unchanged(summary)
 
 
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.8])
@@ -113,9 +120,9 @@ def test_a_flipped_bit_and_a_cut_are_found(summary: Path, share: float) -> None:
     flipped = bytearray(whole)
     flipped[where + 3] ^= 0x10
     summary.write_bytes(flipped)
-    assert "delete" in damage_of(summary) and str(summary) in damage_of(summary)
+    assert "delete" in find_damage(summary) and str(summary) in find_damage(summary)
     summary.write_bytes(whole[: int(share * len(whole))])
-    assert "delete" in damage_of(summary)
+    assert "delete" in find_damage(summary)
 
 
 def test_a_changed_file_of_an_export_is_named(tmp_path: Path) -> None:
@@ -124,9 +131,9 @@ def test_a_changed_file_of_an_export_is_named(tmp_path: Path) -> None:
     (folder / "res.pkl").write_bytes(b"numbers")
     digest = "2bcd5ff1ab4c3bb3ff8a3ab8c86a0c4e37cbb2f4ea8b9f2f6d9f5e3c4b2a1d0e"
     (folder / "export.json").write_text(json.dumps({"files": {"res.pkl": digest}}))
-    assert "res.pkl: is not as it was written" in damage_of(folder)
+    assert "res.pkl: is not as it was written" in find_damage(folder)
     (folder / "export.json").write_text(json.dumps({"files": {}}))
-    assert damage_of(folder) == ""
+    assert find_damage(folder) == ""
 
 
 def test_wherever_the_disk_ends_nothing_is_left_and_no_process_crashes(tmp_path: Path) -> None:
@@ -158,10 +165,51 @@ def test_a_signal_in_the_midst_of_a_write_ends_the_process_in_order(tmp_path: Pa
 
 
 def test_another_result_that_is_put_back_is_no_damage(summary: Path) -> None:
-    note(summary)
+    remember_output(summary)
     artefacts.put_made_from(summary, "other settings")
-    assert not is_as_left(summary) and damage_of(summary) == ""
-    note(summary)
+    assert not is_unchanged(summary) and find_damage(summary) == ""
+    remember_output(summary)
     artefacts.put_made_from(summary, "settings of another one")
     summary.write_bytes(summary.read_bytes()[:-2000])
-    assert "delete" in damage_of(summary)
+    assert "delete" in find_damage(summary)
+
+
+def test_inputs_are_read_once_and_by_size_and_date(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, store = tmp_path / "k1.mkv", tmp_path / "s01" / ".inputs.json"
+    store.parent.mkdir()
+    file.write_bytes(b"images")
+    inputs = InputChecksums(store)
+    digest = inputs.digest(file)
+    inputs.save()
+    reads: list[Path] = []
+    take = checksums._file_digest
+    monkeypatch.setattr(checksums, "_file_digest", lambda path: reads.append(path) or take(path))
+    again = InputChecksums(store)
+    assert again.digest(file) == digest and reads == []
+    file.touch()
+    assert again.digest(file) == digest and reads == [file]  # the same content
+    again.save()
+    assert InputChecksums(store).digest(file) == digest and len(reads) == 1
+    file.write_bytes(b"others")
+    assert again.digest(file) != digest
+    assert again.digest(tmp_path / "none") == "missing"
+    monkeypatch.setattr(checksums, "_LARGE_BYTES", 3)
+    file.write_bytes(b"longer than before")
+    count = len(reads)
+    assert again.digest(file, was=digest) == "changed" and len(reads) == count
+
+
+def test_digest_of_a_folder_follows_its_files(tmp_path: Path) -> None:
+    folder = tmp_path / "k1"
+    (folder / "colour").mkdir(parents=True)
+    (folder / "colour" / "00001.jpg").write_bytes(b"one")
+    inputs = InputChecksums(tmp_path / ".inputs.json")
+    first = inputs.digest(folder)
+    (folder / "colour" / "00002.jpg").write_bytes(b"two")
+    second = inputs.digest(folder)
+    (folder / "colour" / "00002.jpg").unlink()
+    assert first != second and inputs.digest(folder) == first
+    (folder / "colour" / "00001.jpg").write_bytes(b"uno")  # in place
+    assert inputs.digest(folder) != first
