@@ -1,6 +1,6 @@
-"""One job of the workflow: its threads, its log, and how its faults are told.
+"""One job of the workflow: its threads, its log, and the report of its errors.
 
-Imports nothing heavy, so that the thread counts are set before any library reads them.
+Imports no numerical library, so that the numbers of threads are set before any library reads them.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ THREAD_VARIABLES = (
     "NUMBA_NUM_THREADS",
     "OPENCV_FOR_THREADS_NUM",
 )
-# Last line of a job's log; `intercap run` shows these.
+# Beginning of the last line of a log, and of its warnings. `intercap run` reads them.
 FINISHED = "finished in"
 FAILED = "failed:"
 WARNED = "warning:"
-UNEXPECTED = "unexpected"  # what a failure begins with that is no fault of the input
-ENDED = f"{UNEXPECTED} end"  # from outside
+UNEXPECTED = "unexpected"  # begins the reason of a failure that the input did not cause
+ENDED = f"{UNEXPECTED} end"  # by a signal
 
 
 def set_threads(threads: int) -> None:
-    """Let the numerical libraries use ``threads`` threads; only before they are imported."""
+    """Let the numerical libraries use ``threads`` threads; call it before they are imported."""
     for variable in THREAD_VARIABLES:
         os.environ[variable] = str(threads)
 
@@ -42,9 +42,9 @@ def set_threads(threads: int) -> None:
 def job(name: str, log: Path, *, threads: int = 1) -> Iterator[None]:
     """Run the block as one job that writes to ``log``.
 
-    A fault of the input or of the disk is told in one line, in the log and on standard error; any
-    other error leaves its traceback in the log. Both end the process with status 1, as does a log
-    that cannot be written. A process that is told to end says so too.
+    A fault of the input or the disk is reported in one line, in the log and on standard error. The
+    log of any other error has its traceback. Both end the process with status 1; a signal ends it
+    with the status that shells use.
     """
     set_threads(threads)
     log = Path(log)
@@ -52,9 +52,9 @@ def job(name: str, log: Path, *, threads: int = 1) -> Iterator[None]:
         log.parent.mkdir(parents=True, exist_ok=True)
         handler = logging.FileHandler(log, mode="w", encoding="utf-8")
     except OSError as error:
-        _tell(f"{name} failed: {disk.told(error, log)}")
+        _print_error(f"{name} failed: {disk.told(error, log)}")
         raise SystemExit(1) from None
-    handler.setFormatter(_Marked("%(asctime)s %(message)s", datefmt="%H:%M:%S"))
+    handler.setFormatter(_LogFormatter("%(asctime)s %(message)s", datefmt="%H:%M:%S"))
     logger = logging.getLogger("intercap_core")
     logger.setLevel(logging.INFO)
     logger.addHandler(handler)
@@ -66,25 +66,25 @@ def job(name: str, log: Path, *, threads: int = 1) -> Iterator[None]:
         logger.info("%s %.1f s", FINISHED, time.monotonic() - start)
     except UserError as error:
         logger.error("%s %s", FAILED, error)
-        _tell(f"{name} failed: {error}")
+        _print_error(f"{name} failed: {error}")
         raise SystemExit(1) from None
     except ToldToEnd as end:
         logger.error("%s %s, %s", FAILED, ENDED, end)
-        _tell(f"{name} failed: {ENDED}, {end}; what was half-written is removed, run again")
+        _print_error(f"{name} failed: {ENDED}, {end}; what was half-written is removed, run again")
         raise SystemExit(end.status) from None
     except Exception as error:
         logger.exception("unexpected error")
-        told = f"{UNEXPECTED} {type(error).__name__}: {str(error).strip() or 'no message'}"
-        logger.error("%s %s", FAILED, told.splitlines()[0])
-        _tell(f"{name} failed: {told}; the traceback is in {log}")
+        text = f"{UNEXPECTED} {type(error).__name__}: {str(error).strip() or 'no message'}"
+        logger.error("%s %s", FAILED, text.splitlines()[0])
+        _print_error(f"{name} failed: {text}; the traceback is in {log}")
         raise SystemExit(1) from None
     finally:
         logger.removeHandler(handler)
         handler.close()
 
 
-class _Marked(logging.Formatter):
-    """Warnings say that they are: :func:`warnings_of` finds them again."""
+class _LogFormatter(logging.Formatter):
+    """Marks warnings, so that :func:`warnings_of` finds them."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:
         if record.levelno == logging.WARNING:
@@ -93,35 +93,35 @@ class _Marked(logging.Formatter):
 
 
 def warnings_of(log: Path) -> list[str]:
-    """The warnings in a job's log, each once, in their order; none where there is no log."""
+    """The distinct warnings in a job's log, in order; [] if there is no log."""
     if not log.is_file():
         return []
     lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
-    said = (line.partition(" ")[2] for line in lines)
-    warned = (text.removeprefix(WARNED).strip() for text in said if text.startswith(WARNED))
+    messages = (line.partition(" ")[2] for line in lines)  # without the time of day
+    warned = (text.removeprefix(WARNED).strip() for text in messages if text.startswith(WARNED))
     return list(dict.fromkeys(warned))
 
 
 def last_words(log: Path) -> str:
-    """The last line of a log without its time of day; empty where there is none."""
+    """The last line of a log without its time of day; "" if the log is empty."""
     lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
     return lines[-1].partition(" ")[2] if lines else ""
 
 
-def _tell(line: str) -> None:
-    """Write to standard error, on a line of its own.
+def _print_error(line: str) -> None:
+    """Write a line to standard error.
 
-    Snakemake and other jobs write there too, and Snakemake ends its messages by a second write:
-    one write that begins with a newline is never glued to such a message.
+    Snakemake ends its messages by a second write. One write that begins with a newline is never
+    appended to such a message.
     """
     sys.stderr.write(f"\n{line}\n")
     sys.stderr.flush()
 
 
 def last_failure(folder: Path) -> str | None:
-    """Why a job that logged into ``folder`` failed, the newest first; None where none did.
+    """Reason of the newest failed job that logged into ``folder``; None if no job failed.
 
-    A job that ended without a word, as one that was killed, has failed as well.
+    A log without an end, as a killed job leaves it, counts as a failure.
     """
     logs = sorted(folder.glob("*.log"), key=lambda path: path.stat().st_mtime_ns, reverse=True)
     states = [read_state(log) for log in logs]
@@ -132,7 +132,8 @@ def last_failure(folder: Path) -> str | None:
 
 
 def read_state(log: Path) -> tuple[str, str]:
-    """Whether the job that wrote ``log`` runs, finished or failed; and how long, or why."""
+    """State of the job that writes ``log`` ("running", "finished" or "failed"), and its duration
+    or the reason."""
     last = last_words(log)
     for state, mark in (("finished", FINISHED), ("failed", FAILED)):
         if last.startswith(mark):

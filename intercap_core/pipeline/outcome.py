@@ -1,8 +1,4 @@
-"""What a stage has come to, in one line that a person understands, and what it could not do well.
-
-Both are read back from what was written, so that what is said of kept results and of new ones is
-the same.
-"""
+"""The result of a stage in one line, and its degradations, read from what the stage wrote."""
 
 from __future__ import annotations
 
@@ -22,14 +18,15 @@ _CHOSEN_BY = {
     "handling": ", the subject handles the object",
     "middle": ", the subject is seen most",
 }
-_SURE = 0.5  # contact that is likelier than not
-_NAMED = 5  # sequences that a line names, of those that are left out
+_CONTACT_PROBABILITY = 0.5
+_MAX_NAMED = 5  # left-out sequences named in a line
 
 
 def line(stage: str, path: Path, inputs: Mapping[str, Path] | None = None) -> str:
-    """One line on what ``stage`` wrote, an artefact or a folder, from its ``inputs`` by stage.
+    """One line about the output ``path`` of a stage; raises UserError if it cannot be read.
 
-    Raises UserError where an artefact cannot be read.
+    Args:
+        inputs: artefacts that the stage read, by stage.
     """
     if stage in _FOLDER_LINES:
         return _FOLDER_LINES[stage](path, inputs or {})
@@ -38,22 +35,22 @@ def line(stage: str, path: Path, inputs: Mapping[str, Path] | None = None) -> st
 
 
 def dataset_line(results: Path) -> str:
-    """One line on what was merged of a dataset's sequences, from the card in its ``results``."""
+    """One line about the outputs of all sequences, from the card in the folder ``results``."""
     card = json.loads((results / "card.json").read_text(encoding="utf-8"))
     counts, failed = card["counts"], [entry["sequence"] for entry in card["failed"]]
     merged = int(counts["sequences"])
     words = f"{merged} of {merged + len(failed)} sequences merged, {counts['frames']:,} frames"
     if failed:
-        named = ", ".join(failed[:_NAMED])
-        more = len(failed) - _NAMED
+        named = ", ".join(failed[:_MAX_NAMED])
+        more = len(failed) - _MAX_NAMED
         words += f"; left out: {named}" + (f" and {more} more" if more > 0 else "")
     return words
 
 
 def notes(stage: str, path: Path) -> list[str]:
-    """What of the artefact is degraded, in words, each once; raises UserError as :func:`line`.
+    """Distinct degradations that an artefact states; raises UserError as :func:`line`.
 
-    A summary repeats what the metrics say: of it there is nothing.
+    [] for a summary, which repeats the metrics.
     """
     if stage == "summary":
         return []
@@ -73,7 +70,7 @@ def notes(stage: str, path: Path) -> list[str]:
         if stage == "scene" and not artefact.attributes["ground_found"]:
             found.append("no floor was found")
         if stage == "joint" and not artefact.attributes["converged"]:
-            found.append("the joint fit ended before it settled")
+            found.append("the joint fit reached its iteration limit before it converged")
         if "verdict/silent" in artefact:
             parts = zip(
                 artefact.text("verdict/part_names"), artefact.text("verdict/silent"), strict=True
@@ -83,8 +80,8 @@ def notes(stage: str, path: Path) -> list[str]:
 
 
 def flagged_frames(metrics: Path) -> tuple[int, int, list[tuple[str, int]]]:
-    """Of a metrics artefact: frames that are flagged, all frames, and the reasons with the number
-    of frames of each, the most frequent first."""
+    """Number of flagged frames and of all frames in a metrics artefact, and the reasons with their
+    number of frames, most frequent first."""
     with artefacts.read(metrics, schemas.METRICS) as artefact:
         flagged, reasons = artefact["flagged"], artefact.text("flag_reason")
     counts: dict[str, int] = {}
@@ -165,13 +162,13 @@ def _body_fit(a: Artefact) -> str:
 def _joint(a: Artefact) -> str:
     if "made_by" in a.attributes:
         return f"made by {a.attributes['made_by']}; {_share(~a['flagged'])} frames are not flagged"
-    settled = "settled" if a.attributes["converged"] else "ended before it settled"
-    touching = int((a["contact_probability"] > _SURE).any(axis=1).sum())
+    end = "converged" if a.attributes["converged"] else "iteration limit reached"
+    touching = int((a["contact_probability"] > _CONTACT_PROBABILITY).any(axis=1).sum())
     contact = f"contact in {touching} of {len(a['flagged'])} frames"
     if np.isnan(a["contact_probability"]).all():
         contact = "the body alone, without an object"
     return (
-        f"{a.attributes['iterations']} steps, {a.attributes['refused']} refused, {settled}; "
+        f"{a.attributes['iterations']} steps, {a.attributes['refused']} refused, {end}; "
         f"{contact}, "
         f"{int(a['flagged'].sum())} not trusted"
     )
@@ -188,8 +185,8 @@ def _metrics(a: Artefact) -> str:
             for part, e, factor in stated
             if np.isfinite(e)
         ]
-    said = f"stated errors: {', '.join(parts)}; " if parts else ""
-    return f"{said}{_share(a['flagged'])} frames flagged"
+    errors = f"stated errors: {', '.join(parts)}; " if parts else ""
+    return f"{errors}{_share(a['flagged'])} frames flagged"
 
 
 def _summary(summary: Artefact) -> str:
@@ -210,10 +207,10 @@ def _page(folder: Path, inputs: Mapping[str, Path]) -> str:
 
 
 def _export(folder: Path, _: Mapping[str, Path]) -> str:
-    told = json.loads((folder / "export.json").read_text(encoding="utf-8"))
+    manifest = json.loads((folder / "export.json").read_text(encoding="utf-8"))
     files = sum(path.is_file() for path in folder.rglob("*"))
     return (
-        f"{', '.join(told['formats']) or 'no format'}: {told['frames']} frames in {files} files, "
+        f"{', '.join(manifest['formats']) or 'no format'}: {manifest['frames']} frames in {files} files, "
         f"{_megabytes(folder)}"
     )
 
