@@ -1,5 +1,7 @@
-"""Disks that are full, over a quota or not writable: found in errors, told in words, and kept from
-HDF5, which ends the process when it cannot write what it holds."""
+"""Disks that are full, over a quota or not writable: recognised in errors, and hidden from HDF5.
+
+HDF5 ends the process when it cannot write its buffers.
+"""
 
 from __future__ import annotations
 
@@ -18,12 +20,11 @@ NOT_WRITABLE = frozenset({errno.EROFS, errno.EACCES, errno.EPERM})
 
 
 class PartFile(io.FileIO):
-    """A file for h5py to write to, which takes every write.
+    """A file for h5py that accepts every write.
 
-    HDF5 has no way to give up a file whose last writes fail: the process crashes when it ends
-    (h5py's thread 914). So what a full disk does not take is kept in memory, and :meth:`check`
-    raises the error: call it while writing, and after HDF5 has closed the file. So it is with a
-    signal that would raise in the midst of a write.
+    HDF5 cannot abandon a file whose last writes fail: the process crashes at its end (h5py issue
+    914). Bytes that a full disk rejects are therefore kept in memory, and :meth:`check` raises the
+    error. Call it while writing, and after HDF5 has closed the file. Signals are deferred likewise.
     """
 
     def __init__(self, path: Path, mode: str) -> None:
@@ -33,14 +34,13 @@ class PartFile(io.FileIO):
         self._at = 0
 
     def check(self) -> None:
-        """Raise the OSError of the first write that failed, which names the file, or what the
-        process was told by a signal while it wrote."""
+        """Raise the OSError of the first failed write, or the signal that came during a write."""
         raise_pending()
         if self._error is not None:
             raise OSError(self._error.errno, self._error.strerror, str(self.name))
 
     def write(self, data: Any) -> int:
-        """Write all of ``data``, here or to memory."""
+        """Write all of ``data``, to the disk or to memory."""
         view = memoryview(data).cast("B")
         done = 0
         while done < len(view) and self._error is None:
@@ -54,7 +54,7 @@ class PartFile(io.FileIO):
         return len(view)
 
     def readinto(self, buffer: Any) -> int:
-        """Read what was written, to the disk or to memory."""
+        """Read from the disk and from memory."""
         view = memoryview(buffer).cast("B")
         start, read = self._at, super().readinto(view) or 0
         for offset, data in self._kept:
@@ -66,14 +66,14 @@ class PartFile(io.FileIO):
         return read
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Go to a place, also behind what the disk took."""
+        """Set the position, which may lie behind the end of the file on the disk."""
         self._at = super().seek(offset, whence)
         if whence == os.SEEK_END:
             self._at = max([self._at, *(at + len(data) for at, data in self._kept)])
         return self._at
 
     def truncate(self, size: int | None = None) -> int:
-        """Set the length, unless the disk is full: the file is of no use then."""
+        """Set the length; without effect after a failed write, as the file is useless then."""
         size = self._at if size is None else size
         if self._error is None:
             try:
@@ -87,7 +87,7 @@ unbroken(PartFile.write, PartFile.readinto, PartFile.seek, PartFile.truncate)
 
 
 def fault_in(error: BaseException) -> OSError | None:
-    """What the system said of a disk, where that is why ``error`` was raised; else None."""
+    """The error of the disk that caused ``error``; None if there is none."""
     for one in _chain(error):
         if isinstance(one, OSError) and one.errno in FULL | NOT_WRITABLE:
             return one
@@ -95,9 +95,11 @@ def fault_in(error: BaseException) -> OSError | None:
 
 
 def told(fault: OSError, place: Path | None = None, needed: str = "") -> str:
-    """One sentence: where, what the system said, what is needed, what to do.
+    """A message with the path, the system's reason, the space needed and what to do.
 
-    ``place``: what was being written, where ``fault`` does not name it; ``needed``: how much.
+    Args:
+        place: path that was being written, if ``fault`` does not name it.
+        needed: words about the space needed.
     """
     named = Path(str(fault.filename)) if fault.filename else place
     where = f"{place or named}: " if place or named else ""
@@ -126,7 +128,7 @@ def _is_beside(named: Path | None, place: Path) -> bool:
 
 
 def free_bytes(place: Path) -> int:
-    """What the disk of a path takes, which need not be there yet."""
+    """Free space on the disk of a path, which need not exist yet."""
     there = next(one for one in (place, *place.resolve().parents) if one.exists())
     return shutil.disk_usage(there).free
 

@@ -1,7 +1,4 @@
-"""How far a long loop is, in lines of the log: for whoever has no terminal, and for `intercap run`.
-
-Changes no result, so that stages need not run again where this file changes.
-"""
+"""Progress of long loops as lines of the log, which `intercap run` shows."""
 
 from __future__ import annotations
 
@@ -9,14 +6,18 @@ import logging
 import time
 from collections.abc import Callable
 
-EVERY_S = 15.0  # between two lines: a hundred lines of a stage of half an hour
+EVERY_S = 15.0  # interval of the lines
 
 
 class Progress:
-    """Counts the steps of a loop and says now and then how many are done, and how fast.
+    """Counts the steps of a loop and logs count, rate and remaining time.
 
-    ``doing`` and ``things`` are the words before and after the numbers: "tracked 20 of 90 frames,
-    4.1 a second, 17 s to go". ``of`` is their number, None where nobody knows it.
+    A line reads "tracked 20 of 90 frames, 4.1 a second, 17 s to go".
+
+    Args:
+        doing: word before the numbers, such as "tracked".
+        of: number of all steps; None if unknown.
+        things: word after the numbers, such as "frames".
     """
 
     def __init__(
@@ -30,15 +31,15 @@ class Progress:
     ) -> None:
         self._log, self._doing, self._of, self._things = log, doing, of, things
         self._clock = clock
-        self._start = self._told = clock()
+        self._start = self._logged = clock()
         self._count = 0
 
     def step(self, count: int = 1) -> None:
-        """Count ``count`` more as done; says a line where one is due, and at the last."""
+        """Count ``count`` more steps; logs a line every ``EVERY_S`` seconds and at the last step."""
         self._count += count
         now = self._clock()
-        if now - self._told >= EVERY_S or self._count == self._of:
-            self._told = now
+        if now - self._logged >= EVERY_S or self._count == self._of:
+            self._logged = now
             self._log.info("%s", self._line(now - self._start))
 
     def _line(self, elapsed: float) -> str:

@@ -1,4 +1,4 @@
-"""A process that is told to end does so in order: what is half-written goes, one sentence stays."""
+"""Orderly end of a process after Ctrl-C, SIGTERM or SIGHUP."""
 
 from __future__ import annotations
 
@@ -15,8 +15,11 @@ _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class ToldToEnd(BaseException):
-    """Raised where a signal reaches the process: no handler of errors takes it for one, and typer,
-    which has an answer of its own to KeyboardInterrupt, lets it through."""
+    """Raised when a signal asks the process to end.
+
+    Not an Exception, so that no error handler catches it, and not a KeyboardInterrupt, which typer
+    handles itself.
+    """
 
     def __init__(self, number: int) -> None:
         self.number = number
@@ -24,18 +27,17 @@ class ToldToEnd(BaseException):
 
     @property
     def status(self) -> int:
-        """What a shell expects as the exit status."""
+        """Exit status by the convention of shells."""
         return 128 + self.number
 
 
 def unbroken(*functions: Callable[..., Any]) -> None:
-    """From these functions, which other languages call, no signal raises: it waits for
-    :func:`raise_pending`."""
+    """Defer signals inside these functions, which C code calls, until :func:`raise_pending`."""
     _UNBROKEN.update(function.__code__ for function in functions)
 
 
 def raise_pending() -> None:
-    """Raise :class:`ToldToEnd` where a signal came in the midst of what may not be broken."""
+    """Raise :class:`ToldToEnd` if a signal was deferred."""
     if _pending:
         raise ToldToEnd(_pending.pop())
 
@@ -50,9 +52,10 @@ def _is_within(frame: FrameType | None) -> bool:
 
 @contextmanager
 def told_to_end() -> Iterator[None]:
-    """Raise :class:`ToldToEnd` in the block at the first Ctrl-C, SIGTERM or hang-up; later ones are
-    ignored, so that none breaks into the clearing up. Signals that are ignored stay so (``nohup``),
-    and nothing is done outside a process's main thread.
+    """Raise :class:`ToldToEnd` in the block at the first SIGINT, SIGTERM or SIGHUP.
+
+    Later signals are ignored, so that they do not interrupt the clean-up. Signals that were ignored
+    before (``nohup``) stay ignored. Without effect outside the main thread.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -1,4 +1,4 @@
-"""The joint result as files that other people's tools load."""
+"""Stage export: the joint result in the file formats of other tools."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ from intercap_core.stages.folders import EXPORT_MARKER, check_replaceable, repla
 log = logging.getLogger(__name__)
 
 MARKER = EXPORT_MARKER
-_OF_IMAGES = {"bop", "coco"}  # formats that say what is in each image
-_OF_BODIES = {"intercap", "amass"}  # formats of parameters, which say nothing without the mesh
+_IMAGE_FORMATS = {"bop", "coco"}  # formats that annotate images
+_BODY_FORMATS = {"intercap", "amass"}  # formats of parameters, which need the body model
 _NO_FRAME = "none: numbers of vertices and regions, distances in metres"
 
 
@@ -49,14 +49,12 @@ def run(
     settings: ExportSettings,
     output: Path,
 ) -> None:
-    """Write the chosen formats into the folder ``output``, replacing an earlier export there.
+    """Write the formats of the settings into the folder ``output``, replacing an earlier export.
 
-    The folder appears whole or not at all: it is filled under a temporary name beside its own, and
-    an earlier export goes only when the new one is complete. README.txt says what the
-    metrics state of the errors, and what is left out without an object (``object_`` is None, or it was
-    found in no frame). Raises UserError where an artefact or the object's mesh is missing or
-    broken, where the metrics are of another body, object or number of frames than the joint result,
-    and where ``output`` holds anything but an export.
+    The folder is filled under a temporary name and put in place when it is complete. README.txt
+    states the errors from the metrics, and what is omitted because no object was found. Raises
+    UserError if an artefact or the object's mesh is missing or broken, if the metrics do not belong
+    to the joint result, or if ``output`` holds anything but an export.
     """
     object_, output = models.object_, Path(output)
     check_replaceable(output, marker=MARKER, what="export")
@@ -80,7 +78,7 @@ def run(
     for name in set(named) - set(formats):
         log.info("sequence %s: there is no object, so %s is not exported", motion.sequence, name)
     about = _about(paths, motion, mesh)
-    posed = set(formats) & (_OF_IMAGES | {"meshes"})
+    posed = set(formats) & (_IMAGE_FORMATS | {"meshes"})
     bodies = body_vertices(motion) if posed else np.zeros((0, 0, 3))
     poses = list(object_poses(motion, rig, exposures))
     with replaced(output) as folder:
@@ -113,9 +111,9 @@ def run(
                 (folder / "glb").mkdir()
                 glb.write(folder / "glb" / f"{motion.sequence}.glb", viewed, mesh, about, z_up=z_up)
         files: Sequence[Written] = ()
-        if set(formats) & _OF_BODIES:
+        if set(formats) & _BODY_FORMATS:
             files = body_files.write(folder / "body", about.body)
-        if settings.images and set(formats) & _OF_IMAGES:
+        if settings.images and set(formats) & _IMAGE_FORMATS:
             _copy_images(folder, paths.frames, rig, exposures, formats)
         if about.verdict.stated:
             _dump(folder / "verdict.json", {"sequence": motion.sequence, **about.verdict.whole()})
@@ -133,7 +131,7 @@ def run(
 
 
 def _about(paths: SequencePaths, motion: Motion, mesh: ObjectMesh | None) -> About:
-    """What goes with the numbers; of another program's result no deviation is known."""
+    """Errors, flags and contact that accompany each format; no deviations for imported results."""
     measured = SequenceMetrics.read(paths.metrics)
     if len(measured) != len(motion):
         raise UserError(
@@ -155,7 +153,7 @@ def _about(paths: SequencePaths, motion: Motion, mesh: ObjectMesh | None) -> Abo
 def _copy_images(
     folder: Path, frames: Path, rig: Rig, exposures: Exposures, formats: Sequence[str]
 ) -> None:
-    """Copy the recorded colour images that show a frame to where the formats look for them."""
+    """Copy the recorded colour images that show a frame to the folders of the image formats."""
     with Frames.open(frames) as recorded:
         for c, camera in enumerate(rig):
             for image in sorted({int(i) for i in exposures.image_of[:, c] if i >= 0}):

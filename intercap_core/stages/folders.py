@@ -1,4 +1,4 @@
-"""Folders that a stage writes: they appear whole or not at all."""
+"""Output folders of a stage, which appear complete or not at all."""
 
 from __future__ import annotations
 
@@ -10,12 +10,16 @@ from pathlib import Path
 from intercap_core.artefacts import PART, part_of
 from intercap_core.errors import UserError
 
-EXPORT_MARKER = "export.json"  # of an export, and the digests of its files
+EXPORT_MARKER = "export.json"  # names the files of an export and their checksums
 
 
 def check_replaceable(output: Path, *, marker: str, what: str) -> None:
-    """Raise UserError where ``output`` holds anything but an earlier ``what``, which has a file
-    ``marker``."""
+    """Raise UserError if ``output`` holds anything but an earlier output of the same kind.
+
+    Args:
+        marker: name of a file that each such output has.
+        what: name of the kind, for the message.
+    """
     if output.is_dir():
         if any(output.iterdir()) and not (output / marker).is_file():
             raise UserError(
@@ -28,10 +32,10 @@ def check_replaceable(output: Path, *, marker: str, what: str) -> None:
 
 @contextlib.contextmanager
 def replaced(output: Path) -> Iterator[Path]:
-    """An empty folder that takes the place of ``output`` when the block ends without an error.
+    """An empty folder that replaces ``output`` when the block ends without an error.
 
-    It is filled under a temporary name beside its own, and what was there goes only when the new
-    one is complete. An ``output`` that has such a name is filled itself.
+    It has a temporary name next to ``output``. An ``output`` that is such a temporary folder itself
+    is filled directly.
     """
     output = output.resolve()
     part = output if output.suffix == PART else part_of(output)
@@ -47,7 +51,7 @@ def replaced(output: Path) -> Iterator[Path]:
 
 
 def put(part: Path, output: Path) -> None:
-    """Put a complete folder in the place of ``output``, which goes, or stays where this fails."""
+    """Replace ``output`` by a complete folder; restores ``output`` if that fails."""
     old = part.with_suffix(".old")
     try:
         if output.exists():

@@ -1,7 +1,6 @@
-"""Stage joint: body and object refined together over all frames (equation 6).
+"""Stage joint: body, object and contact refined together over all frames (equation 6).
 
-One shape, the poses of body and object in every frame, contact detected or annotated. Starts where
-the two sequential stages end. The energy's terms are listed in :mod:`intercap_core.joint.problem`.
+Starts from the two sequential fits. :mod:`intercap_core.joint.problem` lists the energy terms.
 """
 
 from __future__ import annotations
@@ -95,15 +94,14 @@ def run(
         **inputs.attributes,
     ) as writer:
         _put_body(writer, inputs.model, fitted.state)
-        _put(writer, fitted)
+        _put_fit(writer, fitted)
         undetermined = inputs.sequential.flags.hands | _hands_of_few_views(paths.person)
         writer.put("hand_undetermined", undetermined)
         _put_cameras(writer, inputs.cameras)
 
 
 def _hands_of_few_views(person: Path) -> np.ndarray:
-    """Left and right hands (T, 2) bool that few views see: most of their keypoints in two or
-    fewer."""
+    """Mask (T, 2) of left and right hands of which few views see the median keypoint."""
     with artefacts.read(person, PERSON) as artefact:
         views = artefact["joint_views"]
     few = [np.median(views[:, hand], axis=1) <= FEW_HAND_VIEWS for hand in (LEFT_HAND, RIGHT_HAND)]
@@ -127,8 +125,8 @@ def _put_body(writer: artefacts.Writer, model: BodyModel, state: State) -> None:
     writer.put("joints", joints.cpu().numpy())
 
 
-def _put(writer: artefacts.Writer, fitted: JointFit) -> None:
-    """Write all but the body, in the order of the file."""
+def _put_fit(writer: artefacts.Writer, fitted: JointFit) -> None:
+    """Write everything except the body and the cameras."""
     before, after = fitted.energy_before, fitted.energy_after
     names = sorted(before.keys() | after.keys())
     writer.put("keypoint_residual", fitted.residuals.keypoint_px)

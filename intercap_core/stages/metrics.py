@@ -1,4 +1,4 @@
-"""Distances between body, object and measurements, and errors where the truth is known."""
+"""Stage metrics: distances between body, object and measurements, and errors against the truth."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def run(
         true_distance = values.pop("true_distance", None)
         _warn_of_foreign_truth(truth, values)
         values |= _motion(fitted_body, handled, images.fps)
-        values |= _stated(images, paths)
+        values |= _flags(images, paths)
         if handled is not None:
             values["contact_probability"] = fitted["contact_probability"]
         if known is not None:
@@ -114,8 +114,8 @@ def run(
             **made_by,
         }
     verdict = {}
-    # Last, while the rig and the body are held: what they hold, tables of rays and the like, is not
-    # made again. The verdict was fitted to errors of this program's results alone.
+    # Rig and body are still referenced, so that their cached ray tables are used again. The error
+    # model of the verdict was fitted to results of this program only, not to imported ones.
     if settings.hold_out and not made_by:
         verdict = SequenceVerdict.reach(paths, models, fit_settings).values()
     with artefacts.write(output, METRICS, settings_digest=digest(settings), **attributes) as writer:
@@ -135,8 +135,8 @@ def _motion(body_track: BodyTrack, handled: HandledObject | None, fps: float) ->
     return values
 
 
-def _stated(images: Frames, paths: SequencePaths) -> Values:
-    """Frames that some stage does not trust, with every reason."""
+def _flags(images: Frames, paths: SequencePaths) -> Values:
+    """Frames that any stage flags, with all reasons."""
     with artefacts.read(paths.person, PERSON) as artefact:
         missing = artefact["missing"]
     with artefacts.read(paths.object_track, OBJECT_TRACK) as artefact:
@@ -150,7 +150,7 @@ def _stated(images: Frames, paths: SequencePaths) -> Values:
         joint_flags, joint_reasons = artefact["flagged"], artefact.text("flag_reason")
         joints = artefact["joints"]
     unseen = np.asarray(~images.available.any(1))
-    alone = ~joint_flags  # the joint stage repeats, in its words, what it was told of a frame
+    alone = ~joint_flags  # the reasons of the joint stage include those of the earlier stages
     reasons = merge_reasons(
         [
             (unseen, "no images"),
@@ -168,8 +168,8 @@ def _stated(images: Frames, paths: SequencePaths) -> Values:
         ]
     )
     for t in np.flatnonzero(joint_flags):
-        said = joint_reasons[t] or "joint fit not trusted"
-        reasons[t] = f"{reasons[t]}; {said}" if reasons[t] else said
+        reason = joint_reasons[t] or "joint fit not trusted"
+        reasons[t] = f"{reasons[t]}; {reason}" if reasons[t] else reason
     return {
         "flagged": np.array([bool(r) for r in reasons]),
         "flag_reason": reasons,
@@ -177,10 +177,13 @@ def _stated(images: Frames, paths: SequencePaths) -> Values:
 
 
 def _extrinsics_errors(
-    scene: artefacts.Artefact, settled: np.ndarray, truth: truths.Truth
+    scene: artefacts.Artefact, refined: np.ndarray, truth: truths.Truth
 ) -> Values:
-    """Errors of the cameras as given, as the scene has them, and as joint has ``settled`` them
-    (C, 4, 4)."""
+    """Errors of the camera poses as given, after ``scene`` and after ``joint``.
+
+    Args:
+        refined: (C, 4, 4) master-from-colour transforms of the joint fit.
+    """
     names = scene.text("camera_names")
     if not set(names) <= set(truth.camera_names):
         return {}
@@ -193,16 +196,16 @@ def _extrinsics_errors(
         for when, poses in (
             ("before", scene["master_from_colour_start"]),
             ("after", scene["master_from_colour"]),
-            ("joint", settled),
+            ("joint", refined),
         )
     }
 
 
 def _warn_of_foreign_truth(path: Path | None, values: Values) -> None:
-    """The true body and object lie in the clouds, or the truth is of another recording.
+    """Warn if the true body and object are far from the segmented points.
 
-    A warning, no error: clouds that are wrong from end to end look the same, and a capture that
-    went so badly must not drop out of the figures.
+    The truth is then probably of another recording. This is no error, because segmentations that
+    are wrong throughout look the same, and such a capture must stay in the figures.
     """
     keys = [f"truth/{name}_floor" for name in ("body", "object")]
     floor = [values[key] for key in keys if key in values]

@@ -1,5 +1,4 @@
-"""The sequence's page of the site: what was recorded, what was found, and how far it is to be
-trusted."""
+"""Stage page: the sequence's page of the site with its recording, fits, errors and viewer."""
 
 from __future__ import annotations
 
@@ -40,7 +39,7 @@ from intercap_core.stages.folders import check_replaceable, replaced
 log = logging.getLogger(__name__)
 
 MARKER = "index.html"
-_MAX_CLOSEUPS = 2  # holds drawn; `intercap closeups` draws all
+_MAX_CLOSEUPS = 2  # longest contacts drawn; `intercap closeups` draws all
 
 
 def run(
@@ -72,12 +71,12 @@ def run(
         posed = Fit(model, read_parameters(fit), fit["rotation"], fit["translation"], mesh)
         rig, image_of = Rig.from_artefact(setting), setting["image_of"]
         master = rig.names.index(str(setting.attributes["master"]))
-        said, energies = _of_joint(fit, rig, master), _energies(fit)
+        description, energies = _describe_joint(fit, rig, master), _energies(fit)
         rig = rig.moved(fit["master_from_colour"])
     note, drawn = "", []
     try:
         drawn = _overlays(paths.frames, measured, posed, rig, image_of, settings)
-    except UserError as error:  # one image that does not decode must not cost the page
+    except UserError as error:  # a page without overlays is better than none
         note = str(error)
         log.warning("%s: no overlays: %s", measured.name, error)
     content = SequenceContent(
@@ -85,7 +84,7 @@ def run(
         intent=sequence.intent or "",
         overlays=drawn,
         note=note,
-        joint=said,
+        joint=description,
         energies=energies,
         closeups=_closeups(paths, shown, truth),
         capture=read_capture(paths.frames, paths.scene),
@@ -116,15 +115,15 @@ def _overlays(
         return overlays(images.showing(image_of), rig, fit, cameras, chosen)
 
 
-def _of_joint(joint: Artefact, rig: Rig, master: int) -> str:
-    """How the joint fit went, and by how much it has moved the cameras of ``rig``, in words."""
+def _describe_joint(joint: Artefact, rig: Rig, master: int) -> str:
+    """Iterations of the joint fit, and by how much it has moved the cameras of ``rig``, in words."""
     if "made_by" in joint.attributes:
         return (
             f"Not fitted here: made by {joint.attributes['made_by']}, with the cameras as they "
             "were given. The sequential fits are this program's."
         )
     steps, refused = joint.attributes["iterations"], joint.attributes["refused"]
-    settled = "settled" if joint.attributes["converged"] else "ended before it settled"
+    end = "converged" if joint.attributes["converged"] else "iteration limit reached"
     corrected = ""
     if joint.attributes["cameras_corrected"]:
         posed = np.isfinite(rig.master_from_colour).all((1, 2))
@@ -149,7 +148,7 @@ def _of_joint(joint: Artefact, rig: Rig, master: int) -> str:
         for side, count in zip(("left", "right"), frames, strict=True)
         if count
     )
-    return f"Joint fit: {steps} steps taken, {refused} refused, {settled}{corrected}.{hands}"
+    return f"Joint fit: {steps} steps taken, {refused} refused, {end}{corrected}.{hands}"
 
 
 def _energies(joint: Artefact) -> list[tuple[str, float, float]]:
@@ -162,7 +161,7 @@ def _energies(joint: Artefact) -> list[tuple[str, float, float]]:
 
 
 def _closeups(paths: SequencePaths, models: SequenceModels, truth: Path | None) -> list[CloseUp]:
-    """The longest holds of a sequence; none without an object."""
+    """Close-ups of the longest hand contacts; [] without an object."""
     if models.object_ is None:
         return []
     known = truth if truth is not None and truth.is_file() else None
@@ -185,10 +184,10 @@ def _track(paths: SequencePaths, entry: ObjectEntry) -> TrackFacts:
 
 
 def _made_by(paths: SequencePaths) -> dict[str, str]:
-    found = {}
+    versions = {}
     for stage, path in paths.by_stage().items():
         schema = getattr(schemas, stage.upper())
         with artefacts.read(path, schema) as artefact:
             digest = artefact.attributes.get("settings_digest") or "-"
-            found[stage] = f"v{schema.version} {digest}"
-    return found
+            versions[stage] = f"v{schema.version} {digest}"
+    return versions
