@@ -35,7 +35,8 @@ class Progress:
         self._count = 0
 
     def step(self, count: int = 1) -> None:
-        """Count ``count`` more steps; logs a line every ``EVERY_S`` seconds and at the last step."""
+        """Count ``count`` more steps; logs a line every ``EVERY_S`` seconds and at the last
+        step."""
         self._count += count
         now = self._clock()
         if now - self._logged >= EVERY_S or self._count == self._of:

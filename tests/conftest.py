@@ -65,7 +65,8 @@ SMOKE = frozenset(
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
-    """Return a scheduler that keeps the tests of one file, or of a folder of TOGETHER, on one worker.
+    """Return a scheduler that keeps the tests of one file, or of a folder of TOGETHER, on one
+    worker.
 
     ``--dist loadgroup`` would need marks that xdist 3.8 does not pass on under pytest 9.2.
     """

@@ -33,8 +33,8 @@ def match_times(path: Path, true_times: np.ndarray, times: np.ndarray, fps: floa
     if apart.max(initial=0) > 0.5 / fps:
         raise UserError(
             f"{path}: holds {len(true_times)} frames, the recording {len(times)}; the recorded "
-            f"frame at {times[np.argmax(apart)]:.3f} s is {apart.max():.3f} s from the nearest true "
-            "frame; make the truth of this recording again or remove it from the table"
+            f"frame at {times[np.argmax(apart)]:.3f} s is {apart.max():.3f} s from the "
+            "nearest true frame; make the truth of this recording again or remove it from the table"
         )
     return nearest
 

@@ -71,4 +71,4 @@ differences from the paper are in ``docs/equations.md``.
 
 Terms take arrays and return residuals, weights and Jacobians, or add to normal equations. Their
 callers find correspondences and weigh terms against each other.
-"""
+"""  # noqa: E501

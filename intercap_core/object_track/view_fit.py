@@ -10,7 +10,8 @@ for each of n depth pixels and of m contour pixels (of the mask's contour or of 
 whichever has more), with ``trust`` of a mask from CONTOUR_TRUST_MIN to 1 by its overlap with the
 render (CONTOUR_TRUST_OVERLAP, CONTOUR_TRUST_RANGE). All are in
 :mod:`intercap_core.object_track.constants`; the residuals are in
-:mod:`intercap_core.object_track.object_depth` and :mod:`intercap_core.object_track.object_silhouette`.
+:mod:`intercap_core.object_track.object_depth` and
+:mod:`intercap_core.object_track.object_silhouette`.
 """
 
 from __future__ import annotations

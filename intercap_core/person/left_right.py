@@ -3,11 +3,13 @@
 A detector that mistakes a back for a front exchanges left and right in a whole view, often in
 several views at once; points triangulated from inconsistent views are wrong.
 
-:func:`make_views_agree` tries, for each limb, all 2^(C-1) assignments of sides to views and takes the one of
+:func:`make_views_agree` tries, for each limb, all 2^(C-1) assignments of sides to views and takes
+the one of
 least cost: truncated squared gaps between the rays of every pair of views, plus a cost for each
 exchanged view. Which of the two mirrored bodies is the true one remains open.
 
-:func:`find_mirrored` decides it for arms, legs and head of all sets together, by the Viterbi algorithm
+:func:`find_mirrored` decides it for arms, legs and head of all sets together, by the Viterbi
+algorithm
 over the eight ways of exchanging them. Unary costs: knees and ankles bend one way, the nose is in
 front of the ears and of the chest, shoulders and hips face the same way, detectors are mostly
 right. Pairwise costs: motion from set to set, and a change of sides. A hand belongs to the arm

@@ -210,7 +210,8 @@ def _export(folder: Path, _: Mapping[str, Path]) -> str:
     manifest = json.loads((folder / "export.json").read_text(encoding="utf-8"))
     files = sum(path.is_file() for path in folder.rglob("*"))
     return (
-        f"{', '.join(manifest['formats']) or 'no format'}: {manifest['frames']} frames in {files} files, "
+        f"{', '.join(manifest['formats']) or 'no format'}: {manifest['frames']} frames in "
+        f"{files} files, "
         f"{_megabytes(folder)}"
     )
 

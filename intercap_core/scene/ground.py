@@ -1,4 +1,5 @@
-"""The floor plane: fitted to depth, annotated, stated by the user, or derived from standing feet."""
+"""The floor plane: fitted to depth, annotated, stated by the user, or derived from standing
+feet."""
 
 from __future__ import annotations
 

@@ -71,17 +71,20 @@ def describe_stated_start(
     found = float(whole * starts.step_s - offset)
     if starts.denied[camera]:
         return (
-            f"{source} has it start {describe_start(late)}; the keypoints deny that and were followed: "
-            f"{describe_start(found)}"
+            f"{source} has it start {describe_start(late)}; the keypoints deny that and were "
+            f"followed: {describe_start(found)}"
         )
     if not offset_sigma < LITTLE_ADDED * stated.sigma[camera]:
         return (
-            f"its start rests on {source}: {describe_start(found)}, known to {offset_sigma:.3f} s; the "
-            "keypoints tell too little"
+            f"its start rests on {source}: {describe_start(found)}, known to {offset_sigma:.3f} s; "
+            "the keypoints tell too little"
         )
     if whole == 0:
         return ""
-    return f"it started {describe_start(found)}, and was brought into step: so say {source} and the keypoints"
+    return (
+        f"it started {describe_start(found)}, and was brought into step: so say {source} and the "
+        "keypoints"
+    )
 
 
 @dataclass(frozen=True, eq=False)

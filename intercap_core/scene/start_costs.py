@@ -165,7 +165,8 @@ class PairCosts:
 
 
 def _cost(rays: np.ndarray, rig: Rig, a: int, b: int, lag: int, fewest: float) -> np.ndarray:
-    """One lag's costs (T,) of :class:`PairCosts`: of each person whom camera a follows, and the one of
+    """One lag's costs (T,) of :class:`PairCosts`: of each person whom camera a follows, and the
+    one of
     camera b who agrees best all along, how far the distances to each other's epipolar lines are
     from their medians over time; the mean over people by how much they move."""
     sets = len(rays)

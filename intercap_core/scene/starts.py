@@ -103,9 +103,9 @@ class StatedStarts:
         for c in np.flatnonzero(self.known).tolist():
             if abs(self.late[c]) > lasts - min(MIN_SHARED_S, lasts / 2):
                 raise UserError(
-                    f"{self.source[c]} has camera {names[c]} start {describe_start(self.late[c])}, and the "
-                    f"recording lasts {lasts:.1f} s: hardly any of it would be in common; state "
-                    "the starts in seconds, of one clock"
+                    f"{self.source[c]} has camera {names[c]} start {describe_start(self.late[c])}, "
+                    f"and the recording lasts {lasts:.1f} s: hardly any of it would be in common; "
+                    "state the starts in seconds, of one clock"
                 )
 
     def beside(self, other: StatedStarts) -> tuple[StatedStarts, list[str]]:

@@ -45,7 +45,8 @@ def test_all_that_a_stage_is_given_is_in_its_record(stage: str) -> None:
     sequence = next(iter(project.sequences))
     made_from = stage_inputs.stage_manifest(
         project, sequence, stage, Annotation(),
-        artefacts=dict.fromkeys(STAGES[stage].reads, "made"), checksums=InputChecksums(ROOT / "none"),
+        artefacts=dict.fromkeys(STAGES[stage].reads, "made"), checksums=InputChecksums(ROOT /
+        "none"),
     )  # fmt: skip
     assert set(made_from.given) == names - {"device"}
     assert set(made_from.artefacts) == set(STAGES[stage].reads)

@@ -3,8 +3,8 @@
 A file is a list of results or a data set (``images``, ``annotations``, ``categories``). A result
 says which image it belongs to (``image_id``, a number or a name, or ``file_name``) unless the file
 holds one image alone, its class by number or by name, a score, and a segmentation in any form that
-:func:`intercap_core.formats.detections.instance.to_rle` knows. Keys are those of detectron2, torchvision
-users, ultralytics, Segment Anything and Grounded SAM.
+:func:`intercap_core.formats.detections.instance.to_rle` knows. Keys are those of detectron2,
+torchvision users, ultralytics, Segment Anything and Grounded SAM.
 """
 
 from __future__ import annotations

@@ -1,8 +1,10 @@
 """What every layout of recordings gives: the cameras, their poses, their images one at a time.
 
-A layout is one class, :class:`RecordingLayout`, made for one sequence; it opens one :class:`CameraRecording`
+A layout is one class, :class:`RecordingLayout`, made for one sequence; it opens one
+:class:`CameraRecording`
 for each camera. The frames stage knows nothing else of where images come from. To add a layout:
-derive from both, name it in ``config.LayoutName`` and in :mod:`intercap_core.formats.recordings.layouts`.
+derive from both, name it in ``config.LayoutName`` and in
+:mod:`intercap_core.formats.recordings.layouts`.
 """
 
 from __future__ import annotations

@@ -171,7 +171,8 @@ def choose_epoch(
 ) -> int:
     """Return the stretch that overlaps the others' times; the longest where none does.
 
-    ``stretch`` (N,) is what :func:`split_into_epochs` says of ``times_us`` (N,); ``reference_us`` (M,) are
+    ``stretch`` (N,) is what :func:`split_into_epochs` says of ``times_us`` (N,); ``reference_us``
+    (M,) are
     increasing times of the others. A reset takes a clock out of step with them, so that of several
     stretches among their times the earlier is right: the first one with at least half as many
     images near a reference time as any other.

@@ -1,5 +1,5 @@
-"""Which depth pixels show a mask, compiled: :mod:`intercap_core.geometry.camera.clouds`' look-up without
-what does not reach the mask.
+"""Which depth pixels show a mask, compiled: :mod:`intercap_core.geometry.camera.clouds`' look-up
+without what does not reach the mask.
 
 Single precision throughout, as there.
 """

@@ -7,8 +7,8 @@ w (rad) about the object's own origin, from the left, and a shift d (m) of that 
 
 so that ``exp`` and ``log`` are those of SO(3) x R^3 and not of the twists of SE(3): a turn does not
 carry the origin along a helix. That is the retraction whose derivatives the energy terms hold
-(:mod:`intercap_core.object_track.object_depth`). Composition ``@`` and ``inverse`` are those of rigid
-motions all the same.
+(:mod:`intercap_core.object_track.object_depth`). Composition ``@`` and ``inverse`` are those of
+rigid motions all the same.
 
 Everything takes any leading batch shape. Plain functions on arrays of transforms are in
 :mod:`intercap_core.geometry.camera.transforms`.

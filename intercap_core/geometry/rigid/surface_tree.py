@@ -1,6 +1,7 @@
 """Distances to a mesh that moves or bends, of many points and up to a reach.
 
-Where Embree's tree (:mod:`intercap_core.geometry.rigid.distance`) is made anew for every shape and searches
+Where Embree's tree (:mod:`intercap_core.geometry.rigid.distance`) is made anew for every shape and
+searches
 as far as it must, this one keeps its faces' order and gives up at the reach, at a third of the time
 where most points are out of it.
 """
@@ -54,8 +55,8 @@ class ShapedSurface:
         inside: at most ``reach``, at least -``deepest``.
 
         Inside is where a ray crosses the surface an odd number of times, as in
-        :mod:`intercap_core.geometry.rigid.distance`: what is inside two parts of a mesh that cuts itself
-        counts as outside. Points that are no numbers are at ``reach``.
+        :mod:`intercap_core.geometry.rigid.distance`: what is inside two parts of a mesh that cuts
+        itself counts as outside. Points that are no numbers are at ``reach``.
         """
         queries = np.ascontiguousarray(points, np.float32)
         return kernel.signed(

@@ -2,8 +2,8 @@
 
 Their body is SMPL-H's: another template and other shape directions than those of a file in SMPL-X's
 format, so that no parameter but its rotations means the same. What is imported is its surface, to
-which our body is fitted (:mod:`intercap_core.joint.released.surface_fit`), and how far the two are apart
-is told.
+which our body is fitted (:mod:`intercap_core.joint.released.surface_fit`), and how far the two are
+apart is told.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Contact: Q_t E_C of equation 6 (A.4), weighed by lambda_Q (setting ``contact_weight``).
 
-The residuals, and what differs from the paper, are in :mod:`intercap_core.joint.terms.contact_residual`. The
+The residuals, and what differs from the paper, are in
+:mod:`intercap_core.joint.terms.contact_residual`. The
 paper's binary Q_t is the probability that each region touches, annotated or detected; what somebody
 saw touching draws more while it stands apart. The setting ``contact_to`` says what skin is drawn
 to: any point of the object, or its annotated part.

@@ -1,6 +1,7 @@
 """Ground support: E_G (body, A.5) and E_G' (object, A.6) of equation 6.
 
-Weighed by lambda_G (setting ``ground_weight``); residuals in :mod:`intercap_core.joint.terms.ground_residual`.
+Weighed by lambda_G (setting ``ground_weight``); residuals in
+:mod:`intercap_core.joint.terms.ground_residual`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Object in body (beyond the paper): the other side of :mod:`.penetration`, of the same weight.
 
-Residuals in :mod:`intercap_core.joint.terms.object_in_body_residual`. Of hands alone: what they hold is thin
+Residuals in :mod:`intercap_core.joint.terms.object_in_body_residual`. Of hands alone: what they
+hold is thin
 enough to lie between their vertices. Who sits is in the seat by what clothes and flesh yield, over
 an area on which the vertices of :mod:`.penetration` are dense, and would be lifted off it. Left out
 where the skin's own vertex is inside the object, which that term pushes out: a depth counts once.

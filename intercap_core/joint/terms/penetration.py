@@ -1,8 +1,8 @@
 """Body in object: named in the text of equation 6 ("as done in PROX"), without a symbol there.
 
 Beyond the paper's formulas: its E_P is equation 5, the self-penetration. Weighed by the setting
-``penetration_weight``; residuals in :mod:`intercap_core.joint.terms.penetration_residual`. E_P_self itself is
-part of the body's data.
+``penetration_weight``; residuals in :mod:`intercap_core.joint.terms.penetration_residual`.
+E_P_self itself is part of the body's data.
 """
 
 from __future__ import annotations

@@ -2,7 +2,8 @@
 
     E = sum over steps t, vertices i of Q_i a_i rho(|q_i(t+1) - q_i(t)|^2) / 2 sigma^2
 
-q is the vertex in the object's frame (:mod:`intercap_core.joint.terms.stick_residual`), Q the probability that
+q is the vertex in the object's frame (:mod:`intercap_core.joint.terms.stick_residual`), Q the
+probability that
 its region touches in both frames and its patch takes part, a its share of its patch's area. sigma
 is that of a random walk: real grips creep. Robust, so that what truly slides, turns in the fingers
 or is taken anew does so; and left out where a vertex has come far over the object at the start of

@@ -3,7 +3,8 @@
 A person is an object with ``keypoints``: x, y, confidence of every point in one flat list or a list
 a point, or x, y alone beside ``keypoint_scores`` (mmpose). Feet, face and hands may be lists of
 their own (``foot_kpts``, ``face_kpts``, ``lefthand_kpts``, ``righthand_kpts``: COCO-WholeBody's
-results). How many points there are says which: :mod:`intercap_core.formats.detections.keypoint_layouts`.
+results). How many points there are says which:
+:mod:`intercap_core.formats.detections.keypoint_layouts`.
 
 A file is a list of people who name their image, a data set (``images``, ``annotations``), a list of
 frames (``frame_id``, ``instances``: mmpose of a video), either below ``instance_info`` (its demo),
