@@ -197,7 +197,7 @@ def test_two_views_count_only_where_the_rig_has_no_more():
     assert not set(seen.unit) & set(unseen.unit)
 
 
-UP, ACROSS, AHEAD = np.eye(3)[[2, 0, 1]]
+VERTICAL, ACROSS, AHEAD = np.eye(3)[[2, 0, 1]]
 
 
 def _normals(counts: dict[tuple[float, ...], int]) -> np.ndarray:
@@ -207,7 +207,7 @@ def _normals(counts: dict[tuple[float, ...], int]) -> np.ndarray:
 
 
 def test_a_floor_has_at_most_its_share_and_the_sum_stays() -> None:
-    normals = _normals({tuple(UP): 900, tuple(ACROSS): 60, tuple(AHEAD): 40})
+    normals = _normals({tuple(VERTICAL): 900, tuple(ACROSS): 60, tuple(AHEAD): 40})
     weight = np.random.default_rng(2).uniform(0.5, 1, 1000)
     found = balance_directions(weight, normals)
     assert found.sum() == pytest.approx(weight.sum())
@@ -217,7 +217,7 @@ def test_a_floor_has_at_most_its_share_and_the_sum_stays() -> None:
 
 
 def test_specks_gain_no_more_than_the_limit() -> None:
-    normals = _normals({tuple(UP): 995, tuple(ACROSS): 5})
+    normals = _normals({tuple(VERTICAL): 995, tuple(ACROSS): 5})
     found = balance_directions(np.ones(1000), normals)
     np.testing.assert_allclose(found[995:], MAX_DIRECTION_GAIN)
     assert found.sum() == pytest.approx(1000)
@@ -225,7 +225,9 @@ def test_specks_gain_no_more_than_the_limit() -> None:
 
 def test_what_is_balanced_or_of_one_direction_stays_to_the_byte() -> None:
     weight = np.random.default_rng(3).uniform(0, 1, 300)
-    mixed = _normals({tuple(UP): 100, tuple(ACROSS): 100, tuple(AHEAD): 100})
+    mixed = _normals({tuple(VERTICAL): 100, tuple(ACROSS): 100, tuple(AHEAD): 100})
     np.testing.assert_array_equal(balance_directions(weight, mixed), weight)
-    np.testing.assert_array_equal(balance_directions(weight, _normals({tuple(UP): 300})), weight)
+    np.testing.assert_array_equal(
+        balance_directions(weight, _normals({tuple(VERTICAL): 300})), weight
+    )
     np.testing.assert_array_equal(balance_directions(np.zeros(300), mixed), np.zeros(300))
