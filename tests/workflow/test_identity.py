@@ -28,6 +28,7 @@ def without_truth(recorded: Flow, tmp_path_factory: pytest.TempPathFactory) -> P
     results = tmp_path_factory.mktemp("without_truth")
     settings = recorded.folder / recorded.settings
     project = load_project(settings, {"results": str(results)})
+    project.artefact(ONE, "frames").parent.mkdir(parents=True)
     for stage in BEFORE_METRICS:
         inputs = {name: project.artefact(ONE, name) for name in STAGES[stage].reads}
         run_step(stage, project, ONE, inputs=inputs, output=project.artefact(ONE, stage))
