@@ -769,7 +769,7 @@ def main() -> None:
     except OSError as error:
         if error.errno not in disk.FULL | disk.NOT_WRITABLE:
             raise
-        print(f"error: {disk.told(error)}", file=sys.stderr)
+        print(f"error: {disk.describe_fault(error)}", file=sys.stderr)
         raise SystemExit(1) from None
 
 

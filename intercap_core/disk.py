@@ -94,7 +94,7 @@ def fault_in(error: BaseException) -> OSError | None:
     return None
 
 
-def told(fault: OSError, place: Path | None = None, needed: str = "") -> str:
+def describe_fault(fault: OSError, place: Path | None = None, needed: str = "") -> str:
     """A message with the path, the system's reason, the space needed and what to do.
 
     Args:
@@ -115,7 +115,7 @@ def told(fault: OSError, place: Path | None = None, needed: str = "") -> str:
             f"{f'; {needed}' if needed else ''}; free space there, or name another folder by the "
             f"setting results, {kept}"
         )
-    if elsewhere and place is not None and not _is_beside(named, place):
+    if elsewhere and place is not None and not _is_in_folder_of(named, place):
         return f"{where}needs what cannot be opened ({fault.strerror}{at}); make it readable"
     return (
         f"{where}cannot be written ({fault.strerror}{at}); make its folder writable, or name "
@@ -123,7 +123,7 @@ def told(fault: OSError, place: Path | None = None, needed: str = "") -> str:
     )
 
 
-def _is_beside(named: Path | None, place: Path) -> bool:
+def _is_in_folder_of(named: Path | None, place: Path) -> bool:
     return named is not None and named.is_relative_to(place if place.is_dir() else place.parent)
 
 

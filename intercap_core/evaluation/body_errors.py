@@ -170,8 +170,8 @@ def measure(
         sequence, fps = str(found.attributes["sequence"]), float(found.attributes["fps"])
         known = Truth.load(truth, found["times"], fps, track.model.num_vertices)
         views = int(found["present"].sum())
-    with artefacts.read(truth, TRUTH) as told:
-        interaction = str(told.attributes["interaction"])
+    with artefacts.read(truth, TRUTH) as true:
+        interaction = str(true.attributes["interaction"])
     found_errors = body_errors(known, track, fps)
     assert track.sigma is not None
     with BodyClouds.open(paths.frames, paths.scene, paths.person, track.model) as points:

@@ -52,7 +52,7 @@ def job(name: str, log: Path, *, threads: int = 1) -> Iterator[None]:
         log.parent.mkdir(parents=True, exist_ok=True)
         handler = logging.FileHandler(log, mode="w", encoding="utf-8")
     except OSError as error:
-        _print_error(f"{name} failed: {disk.told(error, log)}")
+        _print_error(f"{name} failed: {disk.describe_fault(error, log)}")
         raise SystemExit(1) from None
     handler.setFormatter(_LogFormatter("%(asctime)s %(message)s", datefmt="%H:%M:%S"))
     logger = logging.getLogger("intercap_core")

@@ -147,7 +147,7 @@ def try_acquire(path: Path) -> Lease | LeaseOwner:
             part.write_text(text, encoding="utf-8")
             os.replace(part, path)  # of two that take it over, the first notices in is_held
     except OSError as error:
-        raise UserError(disk.told(error, path.parent)) from None
+        raise UserError(disk.describe_fault(error, path.parent)) from None
     return Lease(path, owner, expired)
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from intercap_core import artefacts
-from intercap_core.disk import fault_in, free_bytes, told
+from intercap_core.disk import describe_fault, fault_in, free_bytes
 from intercap_core.errors import UserError
 from intercap_core.project import Project
 from intercap_core.schemas import FRAMES
@@ -171,7 +171,7 @@ def explain_disk_errors(project: Project, output: Path, stage: str = "") -> Iter
                 size = usage.per_output[stage] / 1e6
                 words = f"{stage} takes about {size:,.1f} MB here, {words}"
             words += usage.basis
-        raise UserError(told(fault, output, words)) from error
+        raise UserError(describe_fault(fault, output, words)) from error
 
 
 def _relative_size(project: Project) -> tuple[float, str]:

@@ -16,29 +16,31 @@ from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import PeopleOfImages
 
 PRIOR_OFFSET_S = 0.01  # synchronised devices expose within a third of a period of 1/30 s
-FEWEST_SETS_APART = 2  # fewer sets are a slip or an offset, not a late start; tuned
-MIN_SHARED_S = 1.0  # that two cameras must both have recorded, to tell when they started
-# Of what is stated of a start and what keypoints say, together: beyond, they are followed. With a
-# smaller number one honest statement in some thousand would be overruled, and told.
+FEWEST_SETS_APART = 2  # a smaller shift is a slip or an offset, not a late start; tuned
+MIN_SHARED_S = 1.0  # overlap of two recordings below which a start cannot be determined
+# Combined standard deviations beyond which keypoints overrule a stated start. A smaller bound would
+# overrule about one correct statement in a thousand.
 DENIED_SIGMAS = 4.0
-# Of starts by the sound: within, images whose times are in step are left so. Of five cameras in
-# step one exceeds it in one recording of 75.
+# Standard deviations within which starts by sound leave synchronised images alone. One of five
+# synchronised cameras exceeds it in one recording of 75.
 IN_STEP_SIGMAS = 3.0
 
 
 @dataclass(frozen=True, eq=False)
 class StatedStarts:
-    """By how much each camera's images are older than their sets say, beside the master's: ``late``
-    (C,) s and its standard deviation ``sigma`` (C,), NaN = not stated, as of the master itself;
-    ``source`` (C,) says by what, in words."""
+    """Stated start of each camera relative to the master."""
 
     late: np.ndarray
+    """(C,) seconds by which a camera's images are older than their sets' times; NaN = not stated,
+    also for the master."""
     sigma: np.ndarray
+    """(C,) standard deviation of ``late``, seconds; NaN = not stated."""
     source: tuple[str, ...]
+    """(C,) origin of each statement, for messages; "" = not stated."""
 
     @classmethod
     def nothing(cls, views: int) -> StatedStarts:
-        """Of ``views`` cameras nothing is stated."""
+        """No statement about any of ``views`` cameras."""
         return cls(np.full(views, np.nan), np.full(views, np.nan), ("",) * views)
 
     @classmethod
@@ -50,16 +52,22 @@ class StatedStarts:
         first_image_s: np.ndarray,
         source: str,
     ) -> StatedStarts:
-        """From when cameras took their first images: ``stated`` seconds of any clock and their
-        standard deviation by camera; nothing where the master's is not among them.
+        """Convert stated times of first images to starts relative to the master.
 
-        ``first_image_s`` (C,): the same by the recordings' own times, NaN = no image.
+        Returns no statement at all if the master's start is not stated.
+
+        Args:
+            stated: seconds of any common clock and their standard deviation, by camera.
+            names: camera names, in the order of the rig.
+            master: index of the master.
+            first_image_s: (C,) time of the first image by the recording's own clock; NaN = none.
+            source: origin of the statements, for messages.
         """
         result = cls.nothing(len(names))
         own = stated.get(names[master])
         if own is None or not np.isfinite(first_image_s[master]):
             return result
-        told = [""] * len(names)
+        sources = [""] * len(names)
         for c, name in enumerate(names):
             if c == master or name not in stated or not np.isfinite(first_image_s[c]):
                 continue
@@ -67,38 +75,44 @@ class StatedStarts:
             started = seconds - own[0]
             result.late[c] = first_image_s[c] - first_image_s[master] - started
             result.sigma[c] = np.hypot(sigma, own[1])
-            told[c] = source
-        return replace(result, source=tuple(told))
+            sources[c] = source
+        return replace(result, source=tuple(sources))
 
     @property
     def known(self) -> np.ndarray:
-        """(C,) bool: something is stated of the camera."""
+        """(C,) bool: cameras with a stated start."""
         return np.isfinite(self.late)
 
     def sets(self, step_s: float) -> np.ndarray:
-        """The nearest whole sets (C,); 0 where nothing is stated."""
+        """Nearest whole number of frame sets (C,); 0 = not stated. ``step_s``: seconds per set."""
         return np.rint(np.nan_to_num(self.late) / max(step_s, 1e-9)).astype(int)
 
     def bounds(self, step_s: float, reach: int) -> np.ndarray:
-        """How many sets (C,) from what is stated a camera may be without denying it; ``reach``
-        where nothing is."""
+        """Largest deviation from the stated start (C,), in frame sets, that does not contradict it.
+
+        ``step_s``: seconds per set. ``reach``: the bound for cameras without a statement.
+        """
         away = DENIED_SIGMAS * np.hypot(np.nan_to_num(self.sigma), step_s / 2) / step_s
         return np.where(self.known, np.minimum(away, reach), reach).astype(int)
 
     def says_apart(self, step_s: float) -> bool:
-        """Whether some camera surely started at another time than its images' times say."""
+        """Whether a camera started clearly later or earlier than its images' times imply."""
         least = FEWEST_SETS_APART * step_s + DENIED_SIGMAS * self.sigma
         return bool((np.abs(self.late) > least)[self.known].any())
 
     def unless_in_step(self) -> StatedStarts:
-        """These, or nothing where they all agree with that the images' own times are of one clock:
-        those are then the better ones."""
+        """These statements, or none if they all agree with the images' own times.
+
+        The images' times are more accurate if they come from one clock.
+        """
         apart = (np.abs(self.late) > IN_STEP_SIGMAS * self.sigma)[self.known].any()
         return self if apart else StatedStarts.nothing(len(self.late))
 
     def check_common(self, times: np.ndarray, names: Sequence[str]) -> None:
-        """Raise UserError where a camera would have recorded nothing at the same time as the
-        master, whose sets are at ``times`` (T,) s."""
+        """Raise UserError if a camera's recording would not overlap with the master's.
+
+        ``times``: (T,) seconds of the master's frame sets. ``names``: camera names.
+        """
         lasts = float(times[-1] - times[0]) if len(times) else 0.0
         for c in np.flatnonzero(self.known).tolist():
             if abs(self.late[c]) > lasts - min(MIN_SHARED_S, lasts / 2):
@@ -108,9 +122,11 @@ class StatedStarts:
                     "state the starts in seconds, of one clock"
                 )
 
-    def beside(self, other: StatedStarts) -> tuple[StatedStarts, list[str]]:
-        """These, and what ``other`` says of cameras of which they say nothing or the same; what
-        the two disagree about (C,), in words, "" = nothing."""
+    def combine(self, other: StatedStarts) -> tuple[StatedStarts, list[str]]:
+        """Combine two sources of starts; where they disagree, this one takes precedence.
+
+        Returns the combined starts, and a message (C,) for each disagreement, "" = none.
+        """
         late, sigma, source = self.late.copy(), self.sigma.copy(), list(self.source)
         odd = [""] * len(late)
         for c in np.flatnonzero(other.known):
@@ -131,14 +147,14 @@ class StatedStarts:
 
 
 def combine_estimates(one: tuple[float, float], other: tuple[float, float]) -> tuple[float, float]:
-    """The mean of two values by their standard deviations, and its own."""
+    """Inverse-variance weighted mean of two (value, standard deviation) pairs, as such a pair."""
     weights = one[1] ** -2.0, other[1] ** -2.0
     total = sum(weights)
     return (weights[0] * one[0] + weights[1] * other[0]) / total, total**-0.5
 
 
 def describe_start(late: float) -> str:
-    """When a camera started whose images are ``late`` s older than their times say."""
+    """Start of a camera in words. ``late``: seconds by which its images are older than stated."""
     if abs(late) < 0.0005:
         return "as its times say"
     return f"{abs(late):.3f} s {'earlier' if late > 0 else 'later'} than its times say"
@@ -146,19 +162,22 @@ def describe_start(late: float) -> str:
 
 @dataclass(frozen=True, eq=False)
 class StartTimes:
-    """By how much each camera's images are older than their sets say, all along: ``late`` (C,) s,
-    the master's 0, and the nearest whole number of ``sets`` (C,). ``apart``: the cameras were not
-    started together. ``in_doubt`` (C,): then this camera's time could not be told. ``sigma`` (C,) s
-    that ``late`` is off by where it rests on what was stated, else NaN; ``denied`` (C,): something
-    was stated, and the keypoints say otherwise."""
+    """Estimated start of each camera relative to the master, constant over the recording."""
 
     late: np.ndarray
+    """(C,) seconds by which a camera's images are older than their sets' times; 0 = master."""
     sets: np.ndarray
+    """(C,) nearest whole number of frame sets to ``late``."""
     in_doubt: np.ndarray
+    """(C,) bool: the cameras did not start together, and this one's start is undetermined."""
     apart: bool
+    """True if the cameras did not start together."""
     step_s: float
+    """Seconds per frame set."""
     sigma: np.ndarray
+    """(C,) standard deviation of ``late`` if it rests on a statement, else NaN."""
     denied: np.ndarray
+    """(C,) bool: the keypoints contradict the stated start."""
 
     @classmethod
     def as_stated(cls, stated: StatedStarts, step_s: float) -> StartTimes:

@@ -150,11 +150,14 @@ def background_surfaces(
 def moving_surfaces(
     frames: Frames, rig: Rig, image_of: np.ndarray, backgrounds: list[Background | None]
 ) -> list[dict[int, DepthSurface]]:
-    """The moving surfaces of up to :data:`MOVING_MOMENTS` sets, by camera index, depth frame.
+    """Return the moving surfaces of up to :data:`MOVING_MOMENTS` frame sets, by camera index.
 
-    ``rig`` has the lenses; ``image_of`` (T, C): the set whose image of a camera shows each set's
-    moment, -1 = none. Surfaces whose speed cannot be told, for want of a set before or after, are
-    left out.
+    Points are in the depth camera's frame. Surfaces without a neighbouring set on both sides are
+    omitted, because their speed is unknown.
+
+    Args:
+        rig: lenses of the cameras.
+        image_of: (T, C) set whose image of camera c shows moment t; -1 = none.
     """
     depth_image = _with_depth(frames, image_of)
     whole = np.zeros(depth_image.shape, bool)  # (T, C) with the sets before and after

@@ -146,7 +146,7 @@ def _stated_starts(
     except UserError as error:
         raise UserError(f"sequence {source.sequence}: {error}") from None
     by_sound = StatedStarts.of(heard, names, master, first, "the sound").unless_in_step()
-    return annotated.beside(by_sound)
+    return annotated.combine(by_sound)
 
 
 def _backgrounds(

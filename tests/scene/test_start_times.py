@@ -343,7 +343,7 @@ def test_two_sources_are_put_together_unless_they_disagree():
     other = StatedStarts(
         np.array([nan, 0.53, 0.9, 0.1]), np.array([nan, 0.01, 0.01, 0.01]), ("", *"bbb")
     )
-    both, odd = first.beside(other)
+    both, odd = first.combine(other)
     np.testing.assert_allclose(both.late, [nan, 0.524, 0.5, 0.1])
     np.testing.assert_allclose(both.sigma, [nan, 0.02 / 5**0.5, 0.02, 0.01])
     assert both.source == ("", "a and b", "a", "b")

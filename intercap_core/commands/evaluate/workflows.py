@@ -108,7 +108,7 @@ def bring_up_to_date(
         check_bodies(run.project)
     console = Console(stderr=True)
     cores = cores or len(os.sched_getaffinity(0))
-    beside = min(SIDE_BY_SIDE, cores, len(runs))
+    parallel = min(SIDE_BY_SIDE, cores, len(runs))
     LOCK.parent.mkdir(exist_ok=True)
     with open(LOCK, "w", encoding="utf-8") as lock:
         try:
@@ -119,7 +119,7 @@ def bring_up_to_date(
             ) from None
         previous_handler = signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
         try:
-            _run(runs, beside, cores, lock.fileno(), console)
+            _run(runs, parallel, cores, lock.fileno(), console)
         except KeyboardInterrupt:
             raise SystemExit(130) from None
         finally:
@@ -177,14 +177,14 @@ def _seconds(jobs: Jobs, frames: Mapping[Path, int]) -> dict[str, list[float]]:
     return found
 
 
-def _run(runs: list[ProjectRun], beside: int, cores: int, lock: int, console: Console) -> None:
+def _run(runs: list[ProjectRun], parallel: int, cores: int, lock: int, console: Console) -> None:
     begin = reported = time.monotonic()
     while any(run.status is None for run in runs):
         running = [o for o in runs if o.process is not None and o.status is None]
         waiting = [o for o in runs if o.process is None and o.status is None]
         ready = [o for o in waiting if all(other.status is not None for other in o.after)]
-        for run in ready[: beside - len(running)]:
-            _start(run, -(-cores // beside), lock, console)
+        for run in ready[: parallel - len(running)]:
+            _start(run, -(-cores // parallel), lock, console)
         time.sleep(POLL_SECONDS)
         for run in running:
             assert run.process is not None and run.watcher is not None
@@ -194,20 +194,20 @@ def _run(runs: list[ProjectRun], beside: int, cores: int, lock: int, console: Co
         now = time.monotonic()
         if now - reported > TELL_SECONDS:
             reported = now
-            console.print(progress(runs, beside, now - begin), highlight=False, markup=False)
+            console.print(progress(runs, parallel, now - begin), highlight=False, markup=False)
 
 
-def progress(runs: Sequence[ProjectRun], beside: int, elapsed: float) -> str:
+def progress(runs: Sequence[ProjectRun], parallel: int, elapsed: float) -> str:
     """Report of the completed projects and the remaining minutes at the present pace.
 
     The minutes are an upper bound: all jobs of a workflow count until it has planned its jobs.
     """
     left, done = (sum(values) for values in zip(*(o.left() for o in runs), strict=True))
-    pace = elapsed * beside / done if done > 60 else 1.0
+    pace = elapsed * parallel / done if done > 60 else 1.0
     ended = sum(run.status is not None for run in runs)
     return (
         f"{ended} of {len(runs)} projects done after {elapsed / 60:.0f} minutes, at most "
-        f"{math.ceil(left * pace / beside / 60)} left"
+        f"{math.ceil(left * pace / parallel / 60)} left"
     )
 
 

@@ -45,14 +45,14 @@ SOLE_RADII_M: dict[tuple[str, str], tuple[float, float, float]] = {
 }
 FINGER_RADII_M = (0.012, 0.010, 0.009)  # at the knuckle, middle, tip
 PALM_RADII_M = (0.024, 0.016)  # at the wrist, at the knuckles
-HAND_MARGIN_M = 0.012  # fingers are told within millimetres; tuned on the studio
+HAND_MARGIN_M = 0.012  # fingers are located within millimetres; tuned on the studio
 # A hand whose fingers nobody saw goes on from the wrist along the forearm: length, radius, margin.
 BLIND_HAND_LENGTH_M, BLIND_HAND_RADIUS_M, BLIND_HAND_MARGIN_M = 0.15, 0.045, 0.02
 MIN_FINGERS = 3  # whose roots must be known for the hand's own bones; tuned on the studio
 USUAL_TRUNK_M = 0.50  # neck to middle of the hips, of the people whose radii these are
 SMALLEST_BUILD, LARGEST_BUILD = 0.6, 1.25  # of that: children to the tallest
 MAX_HAND_SPEED_M_S = 8.0  # above what hands reach in everyday tasks (some 5 m/s)
-UNTOLD_OFFSET_S = 0.01  # a camera's time offset that could not be told is off by; as scenes spread
+UNKNOWN_OFFSET_S = 0.01  # deviation of an undetermined time offset: the spread over scenes
 MAX_KEYPOINT_GAP_S = 0.5  # a keypoint lost for less is where it lies between; tuned on the studio
 BONES_PER_GROUP = 5  # bones that are passed over together where a point is far from all of them
 FAR = 20.0  # margins: the distance that is given to whatever is farther than this
@@ -192,7 +192,7 @@ class MovingPerson:
             limited_velocity(self.joints, times, max_speed=MAX_HAND_SPEED_M_S)
         )
         self._late = scene["time_offset"]
-        self._late_sigma = np.nan_to_num(scene["time_offset_sigma"], nan=UNTOLD_OFFSET_S)
+        self._late_sigma = np.nan_to_num(scene["time_offset_sigma"], nan=UNKNOWN_OFFSET_S)
 
     def bones(self, t: int, c: int) -> np.ndarray:
         """Bones (B, 9) of :func:`build_bones` when camera c exposes the image of moment t."""
