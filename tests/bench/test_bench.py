@@ -1,10 +1,8 @@
-"""Every benchmark can be imported, and every one with a command line prints its help."""
+"""Every benchmark can be imported, and figures of one area replace no others."""
 
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from importlib import import_module
 from pathlib import Path
 
@@ -14,25 +12,11 @@ from bench.command import add_figures
 
 BENCH = Path(__file__).parents[2] / "bench"
 MODULES = sorted(path.stem for path in BENCH.glob("*.py"))
-COMMANDS = [
-    name
-    for name in MODULES
-    if "__main__" in (text := (BENCH / f"{name}.py").read_text(encoding="utf-8"))
-    and ("ArgumentParser" in text or "from_command_line(" in text)
-]
 
 
 @pytest.mark.parametrize("name", MODULES)
 def test_module_imports(name: str) -> None:
     import_module(f"bench.{name}")
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_command_prints_its_help(name: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", f"bench.{name}", "--help"], capture_output=True, text=True
-    )
-    assert done.returncode == 0 and "usage:" in done.stdout, done.stderr
 
 
 def test_figures_replace_those_of_their_area_alone(tmp_path: Path) -> None:
