@@ -21,8 +21,8 @@ BEFORE_METRICS = (
 )
 
 
-# In a process of its own, as a job: the number of threads decides the last bits of sums, and must be
-# set before any numerical library is imported.
+# Runs in a process of its own, as a job does: the number of threads decides the last bits of sums
+# and must be set before a numerical library is imported.
 COMPUTE = """
 import sys
 from pathlib import Path
