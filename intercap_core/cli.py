@@ -1,6 +1,6 @@
-"""The `intercap` command: check a project, run it, run one step of it, look at an artefact.
+"""The `intercap` command: check a project, run it, run one stage of it, inspect an artefact.
 
-Nothing heavy is imported before a command needs it, so that help answers at once.
+Commands import numerical libraries themselves, so that `--help` answers at once.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import typer
 
 from intercap_core import disk
 from intercap_core.errors import UserError
-from intercap_core.signals import ToldToEnd, told_to_end
+from intercap_core.signals import Terminated, raise_on_signals
 from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
 
 WHOLE, SINGLE, LOOK = "A whole dataset", "One step of one sequence", "Look and maintain"
@@ -34,19 +34,20 @@ app = typer.Typer(
         "virtual recordings and everything up to the report.\n\n"
         "[bold]Own recordings:[/bold] fill in config/config.yaml, config/sequences.tsv and "
         "config/subjects.tsv (config/README.md explains every entry), then\n\n"
-        "[cyan]intercap check[/cyan] says what is wrong with them, and\n\n"
-        "[cyan]intercap run[/cyan] computes what is missing or out of date.\n\n"
-        "[bold]A released data set:[/bold] [cyan]intercap tables intercap ~/InterCap --output "
-        "config/intercap[/cyan] writes these tables for it.\n\n"
-        "[bold]One step:[/bold] [cyan]intercap joint config/demo/config.yaml cup_drink_s02[/cyan] "
-        "runs one stage on artefacts that are there; "
-        "[cyan]intercap inspect results/demo/cup_drink_s02/joint.h5[/cyan] says what a file holds."
+        "[cyan]intercap check[/cyan] lists the problems in them, and\n\n"
+        "[cyan]intercap run[/cyan] computes everything that is missing or out of date.\n\n"
+        "[bold]A released dataset:[/bold] [cyan]intercap tables intercap ~/InterCap --output "
+        "config/intercap[/cyan] writes these tables for InterCap or BEHAVE.\n\n"
+        "[bold]One stage:[/bold] [cyan]intercap joint config/demo/config.yaml cup_drink_s02[/cyan] "
+        "runs one stage on existing artefacts; "
+        "[cyan]intercap inspect results/demo/cup_drink_s02/joint.h5[/cyan] prints the contents of "
+        "an artefact."
     ),
 )
 
 
 class ReleasedKind(StrEnum):
-    """What `intercap release` lists."""
+    """Kinds of files that `intercap release` lists."""
 
     card = "card"
     tables = "tables"
@@ -56,7 +57,7 @@ class ReleasedKind(StrEnum):
 
 
 class Part(StrEnum):
-    """What `intercap evaluate` can be held to."""
+    """Parts of the evaluation."""
 
     sequences = "sequences"
     captures = "captures"
@@ -66,7 +67,7 @@ class Part(StrEnum):
     field = "field"
 
 
-WIDEST_HOLE = 0.1  # of the object's length: a hole that a flat cover closes without a guess
+WIDEST_HOLE = 0.1  # default limit, as a share of the object's length
 DEFAULT_SETTINGS = Path("config/config.yaml")
 SEQUENCE_SETTINGS = [Path("config/evaluation/config.yaml"), Path("config/object/config.yaml")]
 CAPTURE_SETTINGS = [
@@ -112,10 +113,11 @@ Cores = Annotated[int, typer.Option(min=0, help="Processor cores to use; 0 = all
 
 @app.command(rich_help_panel=WHOLE)
 def check(settings: Settings = DEFAULT_SETTINGS) -> None:
-    """Check settings, tables, annotations and recordings, and say all that is wrong.
+    """Check settings, tables, annotations and recordings, and list every problem.
 
-    Each recording is opened: its size beside the calibration, its length beside the other cameras'
-    and what its head states, its images beside its detections. A fraction of a second a sequence.
+    Opens each recording and compares its image size with the calibration, its length with its
+    header and the other cameras, and its images with the detections. Takes a fraction of a second
+    per sequence.
 
     Example: intercap check config/demo/config.yaml
     """
@@ -143,7 +145,7 @@ def check(settings: Settings = DEFAULT_SETTINGS) -> None:
         typer.echo(f"problem: {fault}", err=True)
     if found.summaries:
         count = len(found.summaries)
-        typer.echo(f"the recordings of {count} sequences were looked into in {elapsed:.1f} s")
+        typer.echo(f"checked the recordings of {count} sequences in {elapsed:.1f} s")
     good = len(project.sequences) - len({fault.sequence for fault in faults} - {""})
     typer.echo(f"{settings}: {good} of {len(project.sequences)} sequences are ready to run")
     if faults:
@@ -153,14 +155,14 @@ def check(settings: Settings = DEFAULT_SETTINGS) -> None:
 @app.command(rich_help_panel=WHOLE)
 def tables(
     layout: Annotated[
-        str, typer.Argument(metavar="LAYOUT", help="Whose release it is: intercap or behave.")
+        str, typer.Argument(metavar="LAYOUT", help="Released dataset: intercap or behave.")
     ],
-    root: Annotated[Path, typer.Argument(help="The folder that it was unpacked to.")],
+    root: Annotated[Path, typer.Argument(help="Folder of the unpacked release.")],
     output: Annotated[
         Path, typer.Option(help="Folder for config.yaml and its tables, such as config/intercap.")
     ],
     dataset: Annotated[
-        str | None, typer.Option(help="Name of the dataset; else that of the layout.")
+        str | None, typer.Option(help="Name of the dataset; default: the layout's name.")
     ] = None,
     calibrations: Annotated[
         Path | None, typer.Option(help="intercap: folder of calibration_first, _second, _third.")
@@ -183,17 +185,17 @@ def tables(
     results: Annotated[
         Path | None,
         typer.Option(
-            help="Results to measure and show in place of our joint fit, a folder for each "
-            "sequence: InterCap's own Res/; of behave the data set's own folder, or that of its "
-            "parameters at 30 fps with meshes beside them."
+            help="Released results that replace the joint fit in metrics and pages, a folder for "
+            "each sequence. InterCap: its Res/ folder. BEHAVE: the dataset's folder, or the folder "
+            "of its 30 fps parameters with meshes."
         ),
     ] = None,
-    replace: Annotated[bool, typer.Option("--replace", help="Write over files there.")] = False,
+    replace: Annotated[bool, typer.Option("--replace", help="Overwrite existing files.")] = False,
 ) -> None:
-    """Write a project's settings, tables and annotations for a released data set.
+    """Write a project's settings, tables and annotations for a released dataset.
 
-    The release stays where it is and as it is. What it does not say, or says twice, is told and
-    stands as a remark in the tables: look through them before you run.
+    The release itself is not changed. Missing and contradictory entries are printed, and written
+    as remarks into the tables: read them before you run.
 
     Examples: intercap tables intercap ~/InterCap --output config/intercap;
     intercap tables intercap ~/InterCap --results ~/InterCap/Res --dataset theirs --output
@@ -211,7 +213,7 @@ def tables(
         typer.echo(f"note: {remark}", err=True)
     for path in done.written:
         typer.echo(path)
-    typer.echo(f"{done.sequences} sequences; now: intercap check {output / 'config.yaml'}")
+    typer.echo(f"{done.sequences} sequences; next: intercap check {output / 'config.yaml'}")
 
 
 @app.command(
@@ -224,13 +226,13 @@ def run(
     cores: Cores = 0,
     profile: Annotated[
         Path | None,
-        typer.Option(help="Folder that says where jobs run: profiles/slurm for a cluster."),
+        typer.Option(help="Snakemake workflow profile: profiles/slurm for a Slurm cluster."),
     ] = None,
 ) -> None:
-    """Compute everything that is missing or out of date, and show how it goes.
+    """Compute everything that is missing or out of date, and show the progress.
 
-    Wraps Snakemake: what else you write is handed to it. A sequence that fails leaves the others
-    running, and the report is made of those that succeed.
+    Wraps Snakemake, which gets all further arguments. If a sequence fails, the others go on, and
+    the report covers those that succeed.
 
     Examples: intercap run config/demo/config.yaml;
     intercap run config/demo/config.yaml --cores 2 -- --until joint;
@@ -245,15 +247,14 @@ def run(
 @app.command(rich_help_panel=WHOLE)
 def status(
     settings: Settings = DEFAULT_SETTINGS,
-    every: Annotated[
-        bool, typer.Option("--all", help="Print sequences that are done too.")
-    ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print everything for programs.")] = False,
+    every: Annotated[bool, typer.Option("--all", help="Include sequences that are done.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
 ) -> None:
-    """Say which sequences are done, out of date and why, failed and why, running, or waiting.
+    """Print which sequences are done, out of date, failed, running or waiting, with the reasons.
 
-    Each result carries what it was made from: settings, annotation, files, code, libraries. What
-    differs now is named; a run would make exactly that anew. Nothing is computed.
+    Compares the manifest of each result (settings, annotation, files, code, libraries) with the
+    present one and names the differences. `intercap run` computes exactly these results again.
+    Nothing is computed.
 
     Example: intercap status config/demo/config.yaml
     """
@@ -266,11 +267,12 @@ def status(
 @app.command(rich_help_panel=LOOK)
 def doctor(
     settings: Annotated[
-        Path | None, typer.Argument(metavar="SETTINGS", help="A project, to look at its needs too.")
+        Path | None, typer.Argument(metavar="SETTINGS", help="Also check this project's needs.")
     ] = None,
 ) -> None:
-    """Say what this machine has of what a run needs: versions, GPU, body files, disk, file system,
-    locks, scheduler, browser. Status 1 where something will not do.
+    """Check this machine: versions, GPU, body files, disk, file system, locks, scheduler, browser.
+
+    Exits with status 1 if a requirement is not met.
 
     Example: intercap doctor config/demo/config.yaml
     """
@@ -283,9 +285,9 @@ def doctor(
 
 @app.command(rich_help_panel=WHOLE)
 def verify(settings: Settings = DEFAULT_SETTINGS) -> None:
-    """Read every result to its end and say which are damaged; status 1 where one is.
+    """Read every result completely and list the damaged ones; exits with status 1 if there are any.
 
-    A damaged one is named with the way to make it again: delete it and run.
+    To make a damaged result again, delete it and run.
 
     Example: intercap verify config/demo/config.yaml
     """
@@ -298,8 +300,7 @@ def verify(settings: Settings = DEFAULT_SETTINGS) -> None:
 
 @app.command(rich_help_panel=WHOLE)
 def report(settings: Settings = DEFAULT_SETTINGS) -> None:
-    """Write the site of what is computed: a page for each sequence, and tables, heatmaps and the
-    overview of all.
+    """Write the site from the existing results: a page per sequence, tables, heatmaps, overview.
 
     Example: intercap report config/demo/config.yaml
     """
@@ -318,12 +319,12 @@ def compare(
         Path | None, typer.Option(help="Folder for the tables by sequence and by frame, CSV.")
     ] = None,
 ) -> None:
-    """Say what changed between two versions of a dataset, by sequence and frame.
+    """Print the differences between two versions of a dataset, by sequence and frame.
 
-    By how much body, hands and object moved after the joint fit, which frames touch or are flagged
-    that were not, what errors are stated, and the figures of both. Keep a copy of the results
-    before you fix an annotation, and compare afterwards; or compare what another program made of
-    the same recordings (column results of sequences.tsv) with ours.
+    Lists how far body, hands and object moved after the joint fit, which frames gained or lost
+    contact or a flag, the stated errors, and the figures of both versions. Copy the results before
+    you fix an annotation, and compare afterwards. You can also compare another program's results
+    for the same recordings (column results of sequences.tsv) with ours.
 
     Example: intercap compare results/demo_before results/demo --output changes
     """
@@ -338,20 +339,20 @@ def release(
     settings: Settings = DEFAULT_SETTINGS,
     only: Annotated[
         list[ReleasedKind] | None,
-        typer.Option(help="Kinds of files to list; may repeat. Without it, all."),
+        typer.Option(help="Kinds of files to list; may repeat. Default: all."),
     ] = None,
     check: Annotated[
         Path | None,
         typer.Option(
-            metavar="FOLDER", help="Compare this folder with the list in it; needs no settings."
+            metavar="FOLDER", help="Verify this folder against the list in it; needs no settings."
         ),
     ] = None,
 ) -> None:
-    """List the dataset's files with their digests, versions and settings, to give them away.
+    """List the dataset's files with checksums, versions and settings, for publication.
 
-    Writes release.json and release.sha256 beside the card (card.md, card.json, croissant.json),
-    whose texts the settings' section card holds. Who gets the files checks them by --check, or by
-    sha256sum -c release.sha256.
+    Writes release.json and release.sha256 next to the card (card.md, card.json, croissant.json);
+    the card's texts come from the settings' section `card`. Recipients verify the files with
+    --check or with sha256sum -c release.sha256.
 
     Examples: intercap release config/demo/config.yaml --only card --only tables --only export;
     intercap release --check results/demo
@@ -371,39 +372,43 @@ def release(
 def evaluate(
     settings: Annotated[
         list[Path],
-        typer.Argument(metavar="SETTINGS", help="Recordings taken to the end; one or more."),
+        typer.Argument(metavar="SETTINGS", help="Projects evaluated up to the metrics."),
     ] = SEQUENCE_SETTINGS,
     captures: Annotated[
         list[Path],
-        typer.Option(metavar="SETTINGS", help="Recordings taken to the scene alone; may repeat."),
+        typer.Option(metavar="SETTINGS", help="Projects evaluated up to the scene; may repeat."),
     ] = CAPTURE_SETTINGS,
     objects: Annotated[
         list[Path],
-        typer.Option(metavar="SETTINGS", help="Recordings taken to the object track; may repeat."),
+        typer.Option(
+            metavar="SETTINGS", help="Projects evaluated up to the object track; may repeat."
+        ),
     ] = OBJECT_SETTINGS,
     bodies: Annotated[
         list[Path],
-        typer.Option(metavar="SETTINGS", help="Recordings taken to the body's fit; may repeat."),
+        typer.Option(metavar="SETTINGS", help="Projects evaluated up to the body fit; may repeat."),
     ] = BODY_SETTINGS,
     field_scenes: Annotated[
         list[Path],
         typer.Option(
             metavar="SETTINGS",
-            help="Recordings as outside a studio, taken to the scene; may repeat.",
+            help="Projects with field conditions, evaluated up to the scene; may repeat.",
         ),
     ] = FIELD_SCENE_SETTINGS,
     field: Annotated[
         list[Path],
         typer.Option(
             metavar="SETTINGS",
-            help="Recordings as outside a studio, and usual ones, taken to the end; may repeat.",
+            help="Projects with and without field conditions, evaluated up to the metrics; may "
+            "repeat.",
         ),
     ] = FIELD_SETTINGS,
     only: Annotated[
         Part | None,
         typer.Option(
-            help="One part: to the end, the scene, the object's track, the body's fit; recordings "
-            "as outside a studio to the scene, to the end."
+            help="Evaluate one part only: sequences and field up to the metrics, captures and "
+            "field_scenes up to the scene, objects up to the object track, bodies up to the body "
+            "fit."
         ),
     ] = None,
     output: Annotated[Path, typer.Option(help="Flat JSON of all figures.")] = Path(
@@ -413,8 +418,8 @@ def evaluate(
         bool,
         typer.Option(
             "--quick",
-            help="Evaluate a fixed small set within ten minutes; exit with an error where a figure "
-            "is worse than bench/reference-quick.json by more than its spread.",
+            help="Evaluate six recordings in about five minutes; exit with an error if a figure is "
+            "worse than in bench/reference-quick.json by more than its spread.",
         ),
     ] = False,
     update_reference: Annotated[
@@ -428,12 +433,12 @@ def evaluate(
         int | None,
         typer.Option(
             min=1,
-            help="Draw people, motions, rooms and errors anew; results go to results/seed_<N>.",
+            help="Draw other people, motions, rooms and errors; results go to results/seed_<N>.",
         ),
     ] = None,
     cores: Cores = 0,
 ) -> None:
-    """Run the evaluation captures and print the tables against truth.
+    """Run the virtual evaluation recordings and print their errors against the truth.
 
     Examples: intercap evaluate; intercap evaluate --only bodies --output body.json;
     intercap evaluate --only objects --seed 7 --output results/seed_7/evaluation.json
@@ -469,7 +474,7 @@ def bench(
     ),
     cores: Cores = 0,
 ) -> None:
-    """Measure seconds a frame and peak memory, by stage and end to end, on one recording.
+    """Measure seconds per frame and peak memory on one recording, by stage and end to end.
 
     Example: intercap bench
     """
@@ -498,11 +503,9 @@ def _stage_command(stage: str, purpose: str) -> Callable[..., None]:
         settings: Settings,
         sequence: SequenceName,
         output: Annotated[
-            Path | None, typer.Option(help="Where to write; else the project's own place.")
+            Path | None, typer.Option(help="Output path; default: its path in the project.")
         ] = None,
-        threads: Annotated[
-            int, typer.Option(min=1, help="Threads of the numerical libraries.")
-        ] = 1,
+        threads: Annotated[int, typer.Option(min=1, help="Threads of numerical libraries.")] = 1,
     ) -> None:
         _prepare(threads)
         from intercap_core.pipeline.step import run_step
@@ -518,8 +521,8 @@ def _stage_command(stage: str, purpose: str) -> Callable[..., None]:
         typer.echo(written)
 
     command.__doc__ = (
-        f"{purpose}\n\nReads what the earlier stages wrote for this sequence; what can be set is "
-        f"`{stage}` in SETTINGS (config/README.md).\n\n"
+        f"{purpose}\n\nReads the artefacts of earlier stages of this sequence. Its settings are "
+        f"the section `{stage}` of SETTINGS (config/README.md).\n\n"
         f"Example: intercap {stage.replace('_', '-')} config/demo/config.yaml cup_drink_s02"
     )
     return command
@@ -536,7 +539,7 @@ def inspect(
     artefact: Annotated[Path, typer.Argument(help="An .h5 file that a stage wrote.")],
     verify: Annotated[bool, typer.Option(help="Read all data and check its checksums.")] = False,
 ) -> None:
-    """Say what an artefact holds: attributes, datasets with shapes and units, what is flagged.
+    """Print the contents of an artefact: attributes, datasets with shapes and units, flags.
 
     Example: intercap inspect results/demo/cup_drink_s02/joint.h5
     """
@@ -552,14 +555,14 @@ def close_mesh(
     widest_mm: Annotated[
         float | None,
         typer.Option(
-            min=0.0, help="Widest hole to close, mm; else a tenth of the object's length."
+            min=0.0, help="Widest hole to close, mm; default: a tenth of the object's length."
         ),
     ] = None,
 ) -> None:
-    """Close the small holes of an object's mesh by flat covers, and say what was closed.
+    """Close the small holes of an object's mesh with flat covers, and list them.
 
-    A hole that is wider is refused: what surface was there cannot be known. The input stays as it
-    is, vertices keep their numbers, textures become colours of vertices.
+    Wider holes are an error, because their surface is unknown. The input file is not changed,
+    vertices keep their indices, and textures become vertex colours.
 
     Example: intercap close-mesh scan.ply scan_closed.ply --widest-mm 30
     """
@@ -581,11 +584,11 @@ def keypoint_definition(
     settings: Settings,
     output: Annotated[Path, typer.Argument(metavar="OUT", help="The table to write, a .tsv.")],
 ) -> None:
-    """Learn where your keypoint detector's joints lie, from recordings with depth.
+    """Estimate where your keypoint detector's joints lie on the body, from recordings with depth.
 
-    OpenPose, COCO and MediaPipe mean points up to 3 cm apart by one name. Depth shows where they
-    lie on the body; the table, named in body_fit.keypoint_definition, tells it to recordings
-    without. Stage body_fit of at least three people with depth has to be done.
+    Joints of the same name lie up to 3 cm apart in OpenPose, COCO and MediaPipe. Name the written
+    table in body_fit.keypoint_definition to use the estimate for recordings without depth.
+    Requires the body_fit results of at least three people with depth.
 
     Example: intercap keypoint-definition lab/config.yaml lab/detector.tsv
     """
@@ -599,27 +602,29 @@ def keypoint_definition(
 def annotate(
     settings: Settings = DEFAULT_SETTINGS,
     sequence: Annotated[
-        str | None, typer.Argument(help="A sequence of the table; without, a list, worst first.")
+        str | None, typer.Argument(help="A sequence; without it, a list of all, worst first.")
     ] = None,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="0 = any that is free.")] = 0,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 = any free port.")] = 0,
     by: Annotated[
         str,
-        typer.Option(metavar="NAME", help="Who annotates: kept, with the time, beside answers."),
+        typer.Option(metavar="NAME", help="Name of the annotator, stored with answers and time."),
     ] = "",
     cores: Cores = 0,
     profile: Annotated[
         Path | None,
-        typer.Option(help="Where runs go, as of `intercap run`: the page then tells the command."),
+        typer.Option(
+            help="Workflow profile of the runs, as for `intercap run`; the page shows the command."
+        ),
     ] = None,
     show: Annotated[
-        bool, typer.Option("--open/--no-open", help="Open it in the default browser.")
+        bool, typer.Option("--open/--no-open", help="Open the page in the default browser.")
     ] = False,
 ) -> None:
-    """Mend annotations in the browser: see the result over the images, fix it, run what it touches.
+    """Correct annotations in the browser: view results over the images, edit, re-run stages.
 
-    Serves a page on this machine alone and prints its address. From another machine, open a
-    tunnel (ssh -L PORT:127.0.0.1:PORT HOST) and use the same address. docs/annotate.md teaches
-    it in five minutes.
+    Serves a page on the loopback address and prints its URL. From another machine, open a tunnel
+    (ssh -L PORT:127.0.0.1:PORT HOST) and use the same URL. docs/annotate.md is a five-minute
+    introduction.
 
     Examples: intercap annotate cup_drink_s02 (of config/config.yaml);
     intercap annotate config/demo/config.yaml;
@@ -629,8 +634,8 @@ def annotate(
     from intercap_core.annotate.serve import serve
 
     if sequence is None and not settings.exists() and settings.suffix == "":
-        settings, sequence = DEFAULT_SETTINGS, str(settings)  # a name alone is a sequence's
-    with suppress(ToldToEnd):  # which is how it ends
+        settings, sequence = DEFAULT_SETTINGS, str(settings)  # a single name is a sequence
+    with suppress(Terminated):  # Ctrl-C is the normal way to end the server
         serve(
             settings, sequence, port=port, by=by, cores=cores, profile=profile, show=show,
             say=lambda line: typer.echo(line),
@@ -642,17 +647,17 @@ def view(
     settings: Settings,
     sequence: SequenceName,
     output: Annotated[
-        Path | None, typer.Option(help="Folder for the page; else view beside its artefacts.")
+        Path | None, typer.Option(help="Folder for the page; default: view/ in its results.")
     ] = None,
     show: Annotated[
-        bool, typer.Option("--open/--no-open", help="Open it in the default browser.")
+        bool, typer.Option("--open/--no-open", help="Open the page in the default browser.")
     ] = True,
 ) -> None:
-    """Look at a sequence in 3D over time, in a browser: body, object, clouds, cameras, contact.
+    """View a sequence in 3D over time, in a browser: body, object, point clouds, cameras, contact.
 
-    Shows what is computed, from body_fit on; where the joint fit is there, the sequential fits are
-    beside it, and the truth where it is known. The page needs no network and no server. Every page
-    of the site has the same viewer.
+    Shows all fits that exist (sequential and joint) and the truth if it is known; needs at least
+    the result of body_fit. The page needs no network and no server. Every page of the site
+    contains the same viewer.
 
     Example: intercap view config/demo/config.yaml cup_drink_s02
     """
@@ -669,16 +674,17 @@ def view(
 def closeups(
     settings: Settings,
     sequences: Annotated[
-        list[str] | None, typer.Argument(help="Sequences of the project's table; else all.")
+        list[str] | None, typer.Argument(help="Sequences; default: all of the table.")
     ] = None,
     output: Annotated[
-        Path | None, typer.Option(help="Folder for the pictures; else closeups in the results.")
+        Path | None,
+        typer.Option(help="Folder for the pictures; default: closeups/ in the results."),
     ] = None,
 ) -> None:
-    """Draw hands that hold: the joint fit beside the sequential fits and, where known, truth.
+    """Render hands in contact: the joint fit, the sequential fits and, if known, the truth.
 
-    A picture for each run of frames in which the joint stage finds a hand in contact, drawn at its
-    middle from two sides; skin within 4.5 mm of the object is red. Needs no display and no GPU.
+    Writes one picture per interval of hand contact, at its middle frame and from two sides. Skin
+    within 4.5 mm of the object is red. Needs no display and no GPU.
 
     Examples: intercap closeups config/demo/config.yaml;
     intercap closeups config/demo/config.yaml cup_drink_s02 --output cup
@@ -690,15 +696,15 @@ def closeups(
     for path in written:
         typer.echo(path)
     if empty:
-        typer.echo(f"no hand is found in contact: {', '.join(empty)}", err=True)
+        typer.echo(f"no hand in contact: {', '.join(empty)}", err=True)
 
 
 @app.command(rich_help_panel=LOOK)
 def docs(
     root: Annotated[Path, typer.Argument(help="The project's root.")] = Path("."),
-    check_only: Annotated[bool, typer.Option("--check", help="Only say what is stale.")] = False,
+    check_only: Annotated[bool, typer.Option("--check", help="Only list stale files.")] = False,
 ) -> None:
-    """Write what is generated from the code: settings, schemas, pages on artefacts and rooms."""
+    """Write the files that are generated from code: settings, schemas, pages on artefacts."""
     from intercap_core.commands.docs import generate
 
     stale = generate(root, write=not check_only)
@@ -709,7 +715,7 @@ def docs(
 
 
 def _prepare(threads: int = 1) -> None:
-    """Threads before any numerical library is imported; progress to standard error."""
+    """Set the number of threads before numerical libraries are imported; log to standard error."""
     import logging
 
     from intercap_core.pipeline.job import set_threads
@@ -720,7 +726,10 @@ def _prepare(threads: int = 1) -> None:
 
 
 def _check_output(path: Path, *, replace_any: bool) -> None:
-    """Refuse what cannot be written, before hours of work; a file that is no artefact is kept."""
+    """Raise UserError if the output cannot be written, before any computation.
+
+    Unless ``replace_any``, an existing file is replaced only if it is an artefact.
+    """
     import tempfile
 
     if path.is_dir():
@@ -748,23 +757,23 @@ def _check_output(path: Path, *, replace_any: bool) -> None:
 
 def _known(sequences: dict, name: str) -> str:
     if name not in sequences:
-        raise UserError(
-            f"there is no sequence {name!r} in the table; it lists {', '.join(sequences)}"
-        )
+        raise UserError(f"sequence {name!r} is not in the table; it lists {', '.join(sequences)}")
     return name
 
 
 def main() -> None:
-    """Entry point: a fault of the input or of the disk is one line and exit status 1, and so is
-    being told to end, with the status that shells expect."""
+    """Entry point. Faults of input or disk are printed in one line and exit with status 1.
+
+    A signal exits with the status that shells expect, 128 plus its number.
+    """
     try:
-        with told_to_end():
+        with raise_on_signals():
             app()
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(1) from None
-    except ToldToEnd as end:
-        print(f"{end}: what was half-written is removed; run it again", file=sys.stderr)
+    except Terminated as end:
+        print(f"{end}: incomplete outputs are removed; run again to continue", file=sys.stderr)
         raise SystemExit(end.status) from None
     except OSError as error:
         if error.errno not in disk.FULL | disk.NOT_WRITABLE:

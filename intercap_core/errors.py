@@ -2,7 +2,7 @@
 
 
 class UserError(Exception):
-    """A fault of the input, told in one sentence that a user can act on.
+    """A fault of the input, described in one sentence that a user can act on.
 
     The message names the file, sequence, camera and frame where known, says what was found and
     what was expected, and ends with the next step. The command line and the workflow scripts

@@ -14,7 +14,7 @@ _pending: list[int] = []
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-class ToldToEnd(BaseException):
+class Terminated(BaseException):
     """Raised when a signal asks the process to end.
 
     Not an Exception, so that no error handler catches it, and not a KeyboardInterrupt, which typer
@@ -23,7 +23,7 @@ class ToldToEnd(BaseException):
 
     def __init__(self, number: int) -> None:
         self.number = number
-        super().__init__(f"told to end ({signal.Signals(number).name})")
+        super().__init__(f"terminated by {signal.Signals(number).name}")
 
     @property
     def status(self) -> int:
@@ -37,9 +37,9 @@ def unbroken(*functions: Callable[..., Any]) -> None:
 
 
 def raise_pending() -> None:
-    """Raise :class:`ToldToEnd` if a signal was deferred."""
+    """Raise :class:`Terminated` if a signal was deferred."""
     if _pending:
-        raise ToldToEnd(_pending.pop())
+        raise Terminated(_pending.pop())
 
 
 def _is_within(frame: FrameType | None) -> bool:
@@ -51,8 +51,8 @@ def _is_within(frame: FrameType | None) -> bool:
 
 
 @contextmanager
-def told_to_end() -> Iterator[None]:
-    """Raise :class:`ToldToEnd` in the block at the first SIGINT, SIGTERM or SIGHUP.
+def raise_on_signals() -> Iterator[None]:
+    """Raise :class:`Terminated` in the block at the first SIGINT, SIGTERM or SIGHUP.
 
     Later signals are ignored, so that they do not interrupt the clean-up. Signals that were ignored
     before (``nohup``) stay ignored. Without effect outside the main thread.
@@ -67,7 +67,7 @@ def told_to_end() -> Iterator[None]:
             return
         for other in before:
             signal.signal(other, signal.SIG_IGN)
-        raise ToldToEnd(number)
+        raise Terminated(number)
 
     before = {one: signal.getsignal(one) for one in _ENDING}
     before = {one: h for one, h in before.items() if h is not None and h is not signal.SIG_IGN}

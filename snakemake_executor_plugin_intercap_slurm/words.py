@@ -20,7 +20,7 @@ REASONS = re.compile(
 
 @dataclass(frozen=True)
 class Ending:
-    """One stage: ``state`` is "finished", "failed", "running" (it has ended without a word) or
+    """One stage: ``state`` is "finished", "failed", "running" (it has ended without a log entry) or
     "waiting" (it has not begun). ``words`` say why; of a finished one, why its job failed after it.
     """
 
@@ -37,7 +37,7 @@ class Ending:
         said = {
             "finished": f"finished; its job then ended: {self.words}" if self.words else "finished",
             "failed": f"failed: {self.words}",
-            "running": f"ended without a word: {self.words}",
+            "running": f"ended without a log entry: {self.words}",
             "waiting": f"did not begin: {self.words}",
         }
         return f"Slurm job {slurm_id}, {self.name}: {said[self.state]}"

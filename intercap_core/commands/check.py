@@ -1,4 +1,4 @@
-"""Faults of single sequences: what would fail in the first minutes of a run, found before it."""
+"""`intercap check`: find faults of settings, tables and recordings before a run does."""
 
 from __future__ import annotations
 
@@ -12,27 +12,29 @@ from intercap_core.errors import UserError
 from intercap_core.project import Project, tidy
 
 if TYPE_CHECKING:
-    from intercap_core.commands.check_recordings import Looked
+    from intercap_core.commands.check_recordings import RecordingFindings
     from intercap_core.formats.recordings.source import RecordingLayout
 
-LABELS_TOLD = 8  # labels that a note names
+MAX_LABELS = 8  # labels listed in a note
 
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong with one sequence, or with a file that belongs to none ("")."""
+    """A fault of one sequence or of the project."""
 
     sequence: str
+    """Name of the sequence; "" for a fault of the project."""
     message: str
+    """Text that names file, finding, expectation and next step."""
 
     def __str__(self) -> str:
         return f"sequence {self.sequence!r}: {self.message}" if self.sequence else self.message
 
 
 def check_bodies(project: Project) -> None:
-    """Open the body files and the priors of pose and motion that the settings name.
+    """Open the body files and the pose and motion priors that the settings name.
 
-    Raises UserError where one cannot be opened: every sequence would fail by it, hours later.
+    Raises UserError if one of them cannot be opened.
     """
     lemo = project.config.joint.lemo_files
     if lemo is not None:
@@ -43,7 +45,7 @@ def check_bodies(project: Project) -> None:
     genders = {project.subjects[row.subject].gender for row in project.sequences.values()}
     files = sorted({path for gender in genders if (path := models.of(gender)) is not None})
     if not files and models.vposer is None:
-        return  # without importing what opens them
+        return  # without importing torch
     from intercap_core.body.artefact import load_pose_prior
     from intercap_core.body.model import BodyModel
     from intercap_core.body.plausible import check_body
@@ -55,9 +57,9 @@ def check_bodies(project: Project) -> None:
 
 
 def check_detector(project: Project) -> list[Fault]:
-    """Open the models that the settings name; notes of objects that segmentation does not know.
+    """Open the detectors that the settings name; returns objects without a matching class.
 
-    Raises UserError where one cannot be run here.
+    Raises UserError if a model cannot run on this machine.
     """
     settings = project.config.detections
     if settings.keypoint_model is not None:
@@ -73,7 +75,7 @@ def check_detector(project: Project) -> list[Fault]:
         Fault(
             "",
             f"{settings.segmentation_model}: none of its {len(classes)} classes "
-            f"({_told(classes)}) is a label of object {name!r} "
+            f"({_list_labels(classes)}) is a label of object {name!r} "
             f"({', '.join(project.objects[name].labels)}); add the label to objects.yaml, or name "
             "the model's classes in detections.segmentation_labels",
         )
@@ -82,33 +84,35 @@ def check_detector(project: Project) -> list[Fault]:
     ]
 
 
-def _told(labels: list[str]) -> str:
-    more = f" and {len(labels) - LABELS_TOLD} more" if len(labels) > LABELS_TOLD else ""
-    return ", ".join(labels[:LABELS_TOLD]) + more
+def _list_labels(labels: list[str]) -> str:
+    more = f" and {len(labels) - MAX_LABELS} more" if len(labels) > MAX_LABELS else ""
+    return ", ".join(labels[:MAX_LABELS]) + more
 
 
 @dataclass
 class Findings:
-    """Faults of all sequences, what a run survives, and each good recording in one line."""
+    """Findings on all sequences."""
 
     faults: list[Fault] = field(default_factory=list)
+    """Faults that would end a run of the sequence."""
     notes: list[Fault] = field(default_factory=list)
+    """Probable mistakes that do not end a run."""
     summaries: list[Fault] = field(default_factory=list)
+    """One line per usable recording."""
 
 
 def faults_of_sequences(project: Project) -> list[Fault]:
-    """The faults alone of :func:`check_sequences`."""
+    """The faults that :func:`check_sequences` finds, without its notes."""
     return check_sequences(project).faults
 
 
 def check_sequences(project: Project) -> Findings:
-    """Check what every sequence needs: annotation, files, mesh, poses, a look at its recordings.
+    """Check annotation, files, mesh, camera poses and recordings of every sequence.
 
-    Recordings that the studio is to make are not missed, but it must be able to make them. Of
-    images a few are read.
+    Reads a few images per recording. For virtual recordings, checks that the studio can make them.
     """
     found = Findings()
-    meshes = {name: _look_at_mesh(project, name, found) for name in project.objects_named()}
+    meshes = {name: _check_mesh(project, name, found) for name in project.objects_named()}
     faults = found.faults
     faults += _annotations_without_sequence(project)
     for name, row in project.sequences.items():
@@ -126,16 +130,17 @@ def check_sequences(project: Project) -> Findings:
         if project.recordings_made(name) is not None:
             faults += [Fault(name, message) for message in _faults_of_capture(project, name)]
             continue
-        looked = _look_at_files(row, project.config.frames)
-        faults += [Fault(name, message) for message in looked.faults]
-        found.notes += [Fault(name, message) for message in looked.notes]
-        found.summaries += [Fault(name, looked.summary)] if looked.summary else []
+        recording = _check_files(row, project.config.frames)
+        faults += [Fault(name, message) for message in recording.faults]
+        found.notes += [Fault(name, message) for message in recording.notes]
+        found.summaries += [Fault(name, recording.summary)] if recording.summary else []
     return found
 
 
 def fault_of_cameras(project: Project, name: str, annotation: Annotation) -> str | None:
-    """Say which entry of the annotation is of no camera of the recordings, where those can be
-    looked at and no frames have been read of them; what else is wrong with them is told elsewhere.
+    """Error message about an annotation entry for a camera that the recordings lack.
+
+    None if there is no such entry, or if the recordings are virtual or cannot be opened.
     """
     from intercap_core.formats.recordings.layouts import open_layout
 
@@ -150,9 +155,9 @@ def fault_of_cameras(project: Project, name: str, annotation: Annotation) -> str
 
 
 def notes_of_sequences(project: Project) -> list[Fault]:
-    """Say what a run survives and hardly anybody means: cameras without recording or detections.
+    """Notes on cameras without recording or detections, which do not end a run.
 
-    Recordings that the studio makes are not looked at, nor are those that cannot be used at all.
+    Skips virtual recordings and those that cannot be used at all.
     """
     return [
         Fault(name, message)
@@ -179,18 +184,18 @@ def _notes_of_cameras(project: Project, row: SequenceEntry) -> list[str]:
     if absent and layout.names:
         notes.append(
             f"{row.recordings} records {', '.join(layout.names)}; {row.calibration} also has "
-            f"{', '.join(absent)}: add these recordings, or correct their names, if there are any"
+            f"{', '.join(absent)}: add their recordings or correct the file names if they exist"
         )
     recorded = [name for name in known if name in layout.names]
-    beside = row.layout == "behave"
+    in_recordings = row.layout == "behave"
     settings = project.config.detections
     segmented = settings.segmentation_model is not None
-    modelled = segmented or settings.keypoint_model is not None
-    nothing = row.keypoints is None and row.candidates is None and not beside and not modelled
-    if nothing and recorded:
+    has_model = segmented or settings.keypoint_model is not None
+    has_files = row.keypoints is not None or row.candidates is not None or in_recordings
+    if recorded and not has_files and not has_model:
         notes.append(
-            "its row names neither keypoints nor candidates, without which only the frames can be "
-            "computed; run the detectors and add the columns"
+            "its row names neither keypoints nor candidates, so only the frames can be computed; "
+            "run the detectors and add the columns"
         )
     if row.keypoints is not None and row.keypoints.is_dir():
         folder = row.keypoints
@@ -217,7 +222,7 @@ def _notes_of_keypoints(
     layout: RecordingLayout,
     cameras: list[str],
 ) -> list[str]:
-    """What a look at the first people of each camera shows: their form, place and confidence."""
+    """Notes on layout, position and confidence of the first people of each camera."""
     from intercap_core.formats.detections.keypoint_files import look_at_keypoints
 
     notes: list[str] = []
@@ -230,7 +235,7 @@ def _notes_of_keypoints(
 
 
 def _colour_size(layout: RecordingLayout, camera: str) -> tuple[int, int] | None:
-    """Width and height of a camera's images, None = told as a fault elsewhere."""
+    """Width and height of a camera's images; None if its recording cannot be opened."""
     try:
         with layout.open(camera) as recording:
             return recording.camera.colour.width, recording.camera.colour.height
@@ -244,7 +249,7 @@ def _notes_of_candidates(
     layout: RecordingLayout,
     cameras: list[str],
 ) -> list[str]:
-    """What a look at the first results of each camera shows: their form, size and labels."""
+    """Notes on format, size and labels of the first candidates of each camera."""
     from intercap_core.formats.detections.candidate_files import look_at_candidates
     from intercap_core.formats.detections.class_names import class_names
 
@@ -266,8 +271,8 @@ def _notes_of_candidates(
     if labels and expected and not labels & {*expected}:
         found = sorted(label or "no label" for label in labels)
         notes.append(
-            f"{row.candidates}: the first results are labelled {_told(found)}, none of which "
-            f"object {row.object!r} expects ({', '.join(expected)}); add its labels to "
+            f"{row.candidates}: the labels of the first results are {_list_labels(found)}; "
+            f"object {row.object!r} expects {', '.join(expected)}; add its labels to "
             "objects.yaml, or set detections.category_names"
         )
     return notes
@@ -284,33 +289,33 @@ def _annotations_without_sequence(project: Project) -> list[Fault]:
     ]
 
 
-def _look_at_mesh(project: Project, name: str, found: Findings) -> str | None:
-    """Why an object's mesh cannot be used; what is said of one that can is noted."""
+def _check_mesh(project: Project, name: str, found: Findings) -> str | None:
+    """Error message if an object's mesh cannot be used; warnings on a usable one become notes."""
     from intercap_core.geometry.rigid import mesh
 
-    said = _Kept()
-    mesh.log.addHandler(said)
+    warnings = _LogTexts()
+    mesh.log.addHandler(warnings)
     mesh.log.propagate = False
     try:
         mesh.ObjectMesh.load(project.objects[name])
     except UserError as error:
         return str(error)
     finally:
-        mesh.log.removeHandler(said)
+        mesh.log.removeHandler(warnings)
         mesh.log.propagate = True
-    found.notes += [Fault("", text) for text in said.texts]
+    found.notes += [Fault("", text) for text in warnings.texts]
     return None
 
 
-class _Kept(logging.Handler):
-    """Keeps what is logged."""
+class _LogTexts(logging.Handler):
+    """Collects the texts of log records."""
 
     def __init__(self) -> None:
         super().__init__()
         self.texts: list[str] = []
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Keep the record's words."""
+        """Append the record's text."""
         self.texts.append(record.getMessage())
 
 
@@ -326,25 +331,27 @@ def _faults_of_capture(project: Project, name: str) -> list[str]:
     return []
 
 
-def _look_at_files(row: SequenceEntry, settings: FramesSettings) -> Looked:
-    from intercap_core.commands.check_recordings import Looked
+def _check_files(row: SequenceEntry, settings: FramesSettings) -> RecordingFindings:
+    from intercap_core.commands.check_recordings import RecordingFindings
 
     faults = []
     for column in ("calibration", "keypoints", "candidates", "results", "truth"):
         path = getattr(row, column)
         if path is not None and not path.exists():
-            faults.append(f"column {column} says {path}, which is not there")
+            faults.append(f"column {column} names {path}, which does not exist")
     if row.truth is not None and row.truth.exists():
         faults += faults_of_truth(row.truth)
     if not row.recordings.is_dir():
-        return Looked(faults=[f"there is no folder {row.recordings} of recordings", *faults])
-    looked = _look_at_recordings(row, settings) if row.calibration.exists() else Looked()
-    looked.faults[:0] = faults
-    return looked
+        return RecordingFindings(
+            faults=[f"column recordings names {row.recordings}, which is no folder", *faults]
+        )
+    found = _check_recordings(row, settings) if row.calibration.exists() else RecordingFindings()
+    found.faults[:0] = faults
+    return found
 
 
 def faults_of_truth(path: Path) -> list[str]:
-    """Why a file that the table names as truth is none."""
+    """Error message if a file in the column truth is no truth file; [] otherwise."""
     from intercap_core import artefacts
     from intercap_core.schemas import TRUTH
 
@@ -352,20 +359,20 @@ def faults_of_truth(path: Path) -> list[str]:
         with artefacts.read(path, TRUTH):
             return []
     except UserError as error:
-        return [f"column truth says a file that holds none: {error}"]
+        return [f"column truth names a file without truth: {error}"]
 
 
-def _look_at_recordings(row: SequenceEntry, settings: FramesSettings) -> Looked:
-    from intercap_core.commands.check_recordings import Looked, look_at_recordings
+def _check_recordings(row: SequenceEntry, settings: FramesSettings) -> RecordingFindings:
+    from intercap_core.commands.check_recordings import RecordingFindings, check_recordings
     from intercap_core.formats.recordings.layouts import open_layout
 
     try:
         layout = open_layout(row)
     except UserError as error:
-        return Looked(faults=[str(error)])
+        return RecordingFindings(faults=[str(error)])
     if not layout.names:
-        return Looked(
-            faults=[f"{row.recordings} holds no camera's recording in the layout {row.layout}"]
+        return RecordingFindings(
+            faults=[f"{row.recordings} contains no recording in the layout {row.layout}"]
         )
     cameras = settings.cameras
     known = list(layout.extrinsics.master_from_colour)
@@ -381,6 +388,6 @@ def _look_at_recordings(row: SequenceEntry, settings: FramesSettings) -> Looked:
         if name not in known
     ]
     posed = [name for name in used if name in known]
-    looked = look_at_recordings(row, layout, posed, without_depth=not settings.depth)
-    looked.faults[:0] = faults
-    return looked
+    found = check_recordings(row, layout, posed, without_depth=not settings.depth)
+    found.faults[:0] = faults
+    return found

@@ -1,4 +1,4 @@
-"""Every recording of a sequence looked into, cheaply: what would be lost without a word later."""
+"""Check a sequence's recordings in a fraction of a second: sizes, lengths, numbers of images."""
 
 from __future__ import annotations
 
@@ -16,48 +16,58 @@ from intercap_core.formats.detections import candidate_files, keypoint_files
 from intercap_core.formats.recordings.containers import RecordingPreview
 from intercap_core.formats.recordings.source import RecordingLayout
 
-# Of what the others last, or of what a file or its rate states: below the first a recording is of
-# little use and a problem, below the second it is noted.
-SHORT, SHORTER = 0.5, 0.95
-SPARSE = 0.9  # of the images that a rate and a duration give; every recording loses a few
-PARTLY_DETECTED = 0.9  # of a camera's images
-COUNTED_BYTES = 64 << 20  # a larger file of detections is not read through: half a second each
+# Length of a recording as a share of the other cameras' or of the length that its header states.
+MIN_LENGTH_SHARE = 0.5  # a shorter one is a fault
+FULL_LENGTH_SHARE = 0.95  # a shorter one is noted
+MIN_IMAGE_SHARE = 0.9  # of the number that rate and duration give; recordings lose a few images
+MIN_DETECTED_SHARE = 0.9  # of a camera's images
+MAX_COUNTED_BYTES = 64 << 20  # larger detection files are not counted; this size takes 0.5 s
 _IMAGE_ID = re.compile(rb'"(?:image_id|file_name)"\s*:\s*("[^"]*"|[^,}\s]+)')
 
 
-class Seen(NamedTuple):
-    """One camera's recording that opened: its preview, and what the calibration expects."""
+class CameraRecording(NamedTuple):
+    """Recording of one camera."""
 
     source: Path
+    """File or folder."""
     size: tuple[int, int]
+    """Width and height that the calibration states."""
     fps: float
+    """Images a second that the recording states."""
     depth: bool
+    """Whether it has depth images that are used."""
     truncated: bool
+    """Whether its end is missing."""
     preview: RecordingPreview
+    """Size, number and duration of its images."""
 
 
 @dataclass
-class Looked:
-    """What a look at one sequence's recordings shows; ``summary`` in one line."""
+class RecordingFindings:
+    """Findings on the recordings of one sequence."""
 
     summary: str = ""
+    """All recordings in one line."""
     faults: list[str] = field(default_factory=list)
+    """Faults that cost a camera or most of its images."""
     notes: list[str] = field(default_factory=list)
+    """Smaller losses."""
 
 
-def look_at_recordings(
+def check_recordings(
     row: SequenceEntry, layout: RecordingLayout, cameras: Iterable[str], without_depth: bool = False
-) -> Looked:
-    """Open each of ``cameras``, which have a recording and a pose, and look at it.
+) -> RecordingFindings:
+    """Open the recordings of ``cameras``, all of which have a camera pose, and check them.
 
-    Faults cost a camera or most of it; notes are survived. ``without_depth``: no depth is used.
+    Args:
+        without_depth: the settings do not use depth.
     """
-    looked, seen = Looked(), {}
+    findings, recordings = RecordingFindings(), {}
     for name in cameras:
         try:
             with layout.open(name) as recording:
                 lens, depth = recording.camera.colour, recording.camera.depth
-                seen[name] = Seen(
+                recordings[name] = CameraRecording(
                     recording.source,
                     (lens.width, lens.height),
                     recording.fps,
@@ -66,74 +76,83 @@ def look_at_recordings(
                     recording.preview(),
                 )
         except UserError as error:
-            looked.faults.append(str(error))
+            findings.faults.append(str(error))
         except OSError as error:
-            looked.faults.append(
+            findings.faults.append(
                 f"{layout.sequence.recordings}: camera {name} cannot be read "
                 f"({error.strerror or error}); copy its recording again"
             )
-    usual = _usual(seen)
-    for name, one in seen.items():
-        _judge(looked, row, name, one, usual.get(name))
-        looked.notes += _notes_of_detections(row, name, one.preview.images)
-    looked.summary = _summary(row, seen)
-    return looked
+    expected = _expected_seconds(recordings)
+    for name, recording in recordings.items():
+        _check_recording(findings, row, name, recording, expected.get(name))
+        findings.notes += _check_detections(row, name, recording.preview.images)
+    findings.summary = _summary(row, recordings)
+    return findings
 
 
-def _usual(seen: dict[str, Seen]) -> dict[str, float]:
-    """How long the others of each camera last, seconds; the longest half, as most may be cut."""
-    lasting = {name: one.preview.seconds for name, one in seen.items()}
-    usual = {}
-    for name in lasting:
-        others = sorted(s for other, s in lasting.items() if other != name and s is not None)
+def _expected_seconds(recordings: dict[str, CameraRecording]) -> dict[str, float]:
+    """Duration of each camera's recording by the others: median of their longer half, seconds.
+
+    The longer half, because most recordings of a sequence may be cut off.
+    """
+    seconds = {name: recording.preview.seconds for name, recording in recordings.items()}
+    expected = {}
+    for name in seconds:
+        others = sorted(s for other, s in seconds.items() if other != name and s is not None)
         if others:
-            usual[name] = float(np.median(others[len(others) // 2 :]))
-    return usual
+            expected[name] = float(np.median(others[len(others) // 2 :]))
+    return expected
 
 
-def _judge(looked: Looked, row: SequenceEntry, name: str, one: Seen, usual: float | None) -> None:
-    source, found = one.source, one.preview
+def _check_recording(
+    findings: RecordingFindings,
+    row: SequenceEntry,
+    name: str,
+    recording: CameraRecording,
+    expected_s: float | None,
+) -> None:
+    source, found = recording.source, recording.preview
     if found.size is None:
-        looked.faults.append(
+        findings.faults.append(
             f"{source}: camera {name} has no image that can be read, expected "
-            f"{one.size[0]}x{one.size[1]}; copy or record it again"
+            f"{recording.size[0]}x{recording.size[1]}; copy or record it again"
         )
-    elif found.size != one.size:
-        looked.faults.append(
+    elif found.size != recording.size:
+        findings.faults.append(
             f"{source}: camera {name}'s images are {found.size[0]}x{found.size[1]}, "
-            f"{row.calibration} is for {one.size[0]}x{one.size[1]}: the camera would be left out; "
-            "give the calibration of this resolution"
+            f"{row.calibration} is for {recording.size[0]}x{recording.size[1]}, so the camera "
+            "would be left out; give the calibration of this resolution"
         )
-    looked.notes += [f"{source}: camera {name} {fault}; copy it again" for fault in found.faults]
+    findings.notes += [f"{source}: camera {name} {fault}; copy it again" for fault in found.faults]
     images = str(found.images) if found.counted else f"about {found.images or 'no'}"
-    if found.share < SHORTER or one.truncated:
-        there = f"about {found.share:.0%} of what its head states" if found.share < 1 else "no end"
+    if found.share < FULL_LENGTH_SHARE or recording.truncated:
+        there = f"about {found.share:.0%} of the stated length" if found.share < 1 else "no end"
         text = (
             f"{source}: camera {name}'s recording is cut off: it has {there} ({images} images); "
             "copy or record it again"
         )
-        (looked.faults if found.share < SHORT else looked.notes).append(text)
-    if found.seconds is not None and usual is not None and found.share >= SHORTER:
-        shorter = found.seconds + 1 / one.fps < SHORTER * usual
+        (findings.faults if found.share < MIN_LENGTH_SHARE else findings.notes).append(text)
+    if found.seconds is not None and expected_s is not None and found.share >= FULL_LENGTH_SHARE:
+        shorter = found.seconds + 1 / recording.fps < FULL_LENGTH_SHARE * expected_s
         if shorter:
             text = (
                 f"{source}: camera {name} lasts {found.seconds:.1f} s ({images} images), the "
-                f"other cameras {usual:.1f} s; copy it again, or leave it out (frames.cameras)"
+                f"other cameras {expected_s:.1f} s; copy it again, or leave it out (frames.cameras)"
             )
-            most = found.seconds < SHORT * usual
-            (looked.faults if most else looked.notes).append(text)
+            most = found.seconds < MIN_LENGTH_SHARE * expected_s
+            (findings.faults if most else findings.notes).append(text)
     if found.counted and found.seconds is not None and found.images is not None:
-        expected = round(found.seconds * one.fps) + 1
-        if found.images < SPARSE * expected:
-            looked.notes.append(
+        expected = round(found.seconds * recording.fps) + 1
+        if found.images < MIN_IMAGE_SHARE * expected:
+            findings.notes.append(
                 f"{source}: camera {name} has {found.images} images in {found.seconds:.1f} s, "
-                f"expected about {expected} at {one.fps:g} a second; add the missing ones, or "
-                "correct fps or the timestamps"
+                f"expected about {expected} at {recording.fps:g} a second; add the missing images "
+                "or correct fps or the timestamps"
             )
 
 
-def _notes_of_detections(row: SequenceEntry, name: str, images: int | None) -> list[str]:
-    """Where a camera's keypoints or candidates speak of other images than it has."""
+def _check_detections(row: SequenceEntry, name: str, images: int | None) -> list[str]:
+    """Notes on keypoints or candidates whose number of images differs from the recording's."""
     counted = {
         "keypoints": row.keypoints and _count(
             keypoint_files.camera_file(row.keypoints, name),
@@ -149,35 +168,41 @@ def _notes_of_detections(row: SequenceEntry, name: str, images: int | None) -> l
         if not images or not count:
             continue
         folder = getattr(row, kind)
-        if count < PARTLY_DETECTED * images:
+        if count < MIN_DETECTED_SHARE * images:
             notes.append(
-                f"{folder}: {kind} of camera {name} speak of {count} of its {images} images; run "
+                f"{folder}: {kind} of camera {name} cover {count} of its {images} images; run "
                 "the detector on all of them"
             )
-        elif count * PARTLY_DETECTED > images:
+        elif count * MIN_DETECTED_SHARE > images:
             notes.append(
-                f"{folder}: {kind} of camera {name} speak of {count} images, it has {images}; they "
-                "may be another recording's, or the recording is cut"
+                f"{folder}: {kind} of camera {name} cover {count} images, it has {images}; "
+                "they may belong to another recording, or the recording is cut off"
             )
     return notes
 
 
-def _count(whole: Path | None, files: list[Path]) -> int | None:
-    """How many images one camera's detections speak of; None = not known."""
-    if whole is None:
-        return len(files) or None
-    if whole.stat().st_size > COUNTED_BYTES:
+def _count(file: Path | None, image_files: list[Path]) -> int | None:
+    """Number of images that a camera's detections cover; None if unknown.
+
+    Args:
+        file: the file of all images, if there is one.
+        image_files: files of single images.
+    """
+    if file is None:
+        return len(image_files) or None
+    if file.stat().st_size > MAX_COUNTED_BYTES:
         return None
-    return len(set(_IMAGE_ID.findall(whole.read_bytes()))) or None
+    return len(set(_IMAGE_ID.findall(file.read_bytes()))) or None
 
 
-def _summary(row: SequenceEntry, seen: dict[str, Seen]) -> str:
-    if not seen:
+def _summary(row: SequenceEntry, recordings: dict[str, CameraRecording]) -> str:
+    if not recordings:
         return ""
-    sizes = sorted({size for one in seen.values() if (size := one.preview.size) is not None})
-    images = [one.preview.images for one in seen.values() if one.preview.images is not None]
-    seconds = [one.preview.seconds for one in seen.values() if one.preview.seconds is not None]
-    depth = sum(one.depth for one in seen.values())
+    previews = [recording.preview for recording in recordings.values()]
+    sizes = sorted({preview.size for preview in previews if preview.size is not None})
+    images = [preview.images for preview in previews if preview.images is not None]
+    seconds = [preview.seconds for preview in previews if preview.seconds is not None]
+    depth = sum(recording.depth for recording in recordings.values())
     detected = [
         f"{kind} of {count}"
         for kind, has in (
@@ -185,10 +210,10 @@ def _summary(row: SequenceEntry, seen: dict[str, Seen]) -> str:
             ("candidates", lambda name, f: candidate_files.has_candidates(f, name, row.layout)),
         )
         if (folder := getattr(row, kind)) is not None
-        and (count := sum(has(name, folder) for name in seen))
+        and (count := sum(has(name, folder) for name in recordings))
     ]
     parts = [
-        f"{len(seen)} cameras" if len(seen) > 1 else "1 camera",
+        f"{len(recordings)} cameras" if len(recordings) > 1 else "1 camera",
         ", ".join(f"{width}x{height}" for width, height in sizes),
         f"{_span(images, '{:d}')} images" if images else "",
         f"{_span(seconds, '{:.1f}')} s" if seconds else "",

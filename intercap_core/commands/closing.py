@@ -1,4 +1,4 @@
-"""What `intercap run` says at its end: what is degraded, what jobs warned of, worst first."""
+"""Remarks at the end of `intercap run`: degradations and warnings, worst sequence first."""
 
 from __future__ import annotations
 
@@ -14,33 +14,37 @@ from intercap_core.pipeline.job import warnings_of
 from intercap_core.project import Project
 from intercap_core.stage_list import STAGES
 
-REASONS_TOLD = 4  # of a sequence's flags, the most frequent ones
-SEQUENCES_TOLD = 20  # all are in the file
+MAX_REASONS = 4  # most frequent reasons of flagged frames that are printed per sequence
+MAX_SEQUENCES = 20  # printed sequences; the file has all
 FILE = "remarks.txt"  # in the folder of the logs
 
 
 @dataclass(frozen=True)
 class Remarks:
-    """On one sequence: how many of its ``frames`` are ``flagged``, and remarks by stage."""
+    """Remarks on one sequence."""
 
     sequence: str
+    """Name of the sequence."""
     flagged: int
+    """Number of flagged frames."""
     frames: int
+    """Number of frames; 0 without metrics."""
     texts: tuple[str, ...]
+    """Remarks, each beginning with its stage."""
 
     @property
     def share(self) -> float:
-        """Of frames that are flagged."""
+        """Share of flagged frames."""
         return self.flagged / self.frames if self.frames else 0.0
 
 
 def remarks(project: Project) -> list[Remarks]:
-    """Of all sequences that have any, those with the largest share of flagged frames first."""
+    """Remarks of all sequences that have any, largest share of flagged frames first."""
     found = []
     for name in project.sequences:
         flagged = frames = 0
         texts: list[str] = []
-        told_before: set[str] = set()
+        known: set[str] = set()
         for stage in STAGES:
             path = project.artefact(name, stage)
             if not path.exists():
@@ -48,16 +52,16 @@ def remarks(project: Project) -> list[Remarks]:
             try:
                 notes = [] if STAGES[stage].writes_folder else outcome.notes(stage, path)
                 warned = _not_noted(project.logs / name / f"{stage}.log", name, notes)
-                # a mesh with holes is warned of by every stage that opens it
-                new = [*notes, *(text for text in warned if text not in told_before)]
-                told_before.update(new)
+                # every stage that opens a mesh with holes gives the same warning
+                new = [*notes, *(text for text in warned if text not in known)]
+                known.update(new)
                 texts += [f"{stage}: {text}" for text in new]
                 if stage == "metrics":
                     flagged, frames, reasons = outcome.flagged_frames(path)
-                    told = [f"{text} ({count})" for text, count in reasons[:REASONS_TOLD]]
-                    if told:
-                        texts.insert(0, f"{flagged} of {frames} frames flagged: {'; '.join(told)}")
-            except UserError as error:  # an older version's; the workflow says what to do about it
+                    named = [f"{text} ({count})" for text, count in reasons[:MAX_REASONS]]
+                    if named:
+                        texts.insert(0, f"{flagged} of {frames} frames flagged: {'; '.join(named)}")
+            except UserError as error:  # an artefact of an older version; the text says what to do
                 texts.append(str(error))
         if texts:
             found.append(Remarks(name, flagged, frames, tuple(texts)))
@@ -65,12 +69,12 @@ def remarks(project: Project) -> list[Remarks]:
 
 
 def of_dataset(project: Project) -> list[str]:
-    """What the job that merged the sequences warned of, which has no sequence of its own."""
+    """Warnings of the job that merges the sequences."""
     return warnings_of(project.logs / "dataset.log")
 
 
 def _not_noted(log: Path, sequence: str, notes: list[str]) -> list[str]:
-    """What the stage's last job warned of and its artefact does not say."""
+    """Warnings of a stage's last job that its artefact does not contain as notes."""
     warned = (
         text.removeprefix(f"sequence {sequence}: ").removeprefix(f"{sequence}: ")
         for text in warnings_of(log)
@@ -79,10 +83,9 @@ def _not_noted(log: Path, sequence: str, notes: list[str]) -> list[str]:
 
 
 def print_remarks(project: Project, console: Console) -> None:
-    """Every remark once, under its sequence, with the folder of its logs.
+    """Print the remarks by sequence, with the folder of its logs; all of them go to a file.
 
-    The dataset's come first, then sequences, as many as a person reads; a file, which is named
-    last, has them all.
+    Remarks on the dataset come first, then those on up to ``MAX_SEQUENCES`` sequences.
     """
     of_all, found = of_dataset(project), remarks(project)
     blocks = [
@@ -98,14 +101,14 @@ def print_remarks(project: Project, console: Console) -> None:
     path.write_text(_text([*head, *blocks]) or "no remarks\n", encoding="utf-8")
     if not head:
         return
-    left = len(blocks) - SEQUENCES_TOLD
-    told = _text([*head, *blocks[:SEQUENCES_TOLD]])
+    left = len(blocks) - MAX_SEQUENCES
+    printed = _text([*head, *blocks[:MAX_SEQUENCES]])
     more = f"{left} more sequences, and all remarks" if left > 0 else "all remarks"
-    console.print(f"{told}{more}: {path}", highlight=False, markup=False, soft_wrap=True)
+    console.print(f"{printed}{more}: {path}", highlight=False, markup=False, soft_wrap=True)
 
 
 def _text(blocks: Sequence[Sequence[str]]) -> str:
-    """Each block's first line as it is, the others below it."""
+    """Blocks of lines; the lines after the first of a block are indented."""
     return "".join(
         f"{first}\n" + "".join(f"  {text}\n" for text in rest) for first, *rest in blocks
     )

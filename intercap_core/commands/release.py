@@ -1,4 +1,4 @@
-"""`intercap release`: the list of a dataset's files with their digests, and its check."""
+"""`intercap release`: list a dataset's files with their checksums, and verify a released folder."""
 
 from __future__ import annotations
 
@@ -24,10 +24,9 @@ _PRINTED = 20  # paths of each kind of difference
 
 
 def write_release(project: Project, kinds: Sequence[str]) -> Path:
-    """List the files of what is computed; returns the path of the list.
+    """List the files of all results; returns the path of the list.
 
-    Sequences whose results are of several versions or settings are told: what is given away had
-    better be of one. Raises UserError where nothing is computed.
+    Warns if results come from several versions or settings. Raises UserError without results.
     """
     reported = {
         name: project.artefact(name, "summary")
@@ -35,12 +34,12 @@ def write_release(project: Project, kinds: Sequence[str]) -> Path:
         if project.artefact(name, "summary").is_file()
     }
     for name in sorted(set(project.sequences) - set(reported)):
-        log.warning("sequence %s is not released: it has no result", name)
+        log.warning("sequence %s is not released: it has no results", name)
     summaries = [SequenceSummary.read(path) for path in reported.values()]
     made = _made(summaries)
     for stage, found in made.items():
         if len(found) > 1:
-            few = min(found, key=lambda one: len(one["sequences"]))
+            few = min(found, key=lambda version: len(version["sequences"]))
             log.warning(
                 "stage %s is of %d versions or settings: %s differ from the others; run the "
                 "project again before you release it",
@@ -69,7 +68,7 @@ def write_release(project: Project, kinds: Sequence[str]) -> Path:
         sequences=list(reported),
         threads=os.cpu_count() or 1,
     )
-    total = sum(one.bytes for one in entries)
+    total = sum(entry.bytes for entry in entries)
     path = project.results / manifest.MANIFEST
     log.info("%d files, %.1f MB", len(entries), total / 1e6)
     if not config.card.licence:
@@ -78,7 +77,7 @@ def write_release(project: Project, kinds: Sequence[str]) -> Path:
 
 
 def check_release(folder: Path) -> bool:
-    """Print how a folder differs from its list; True where nothing is missing or changed."""
+    """Print how a folder differs from its list; True if nothing is missing or changed."""
     count, found = manifest.check(folder, threads=os.cpu_count() or 1)
     for what, paths in (
         ("missing", found.missing),
@@ -95,7 +94,7 @@ def check_release(folder: Path) -> bool:
 
 
 def _made(summaries: Sequence[SequenceSummary]) -> dict[str, list[dict[str, Any]]]:
-    """By stage: each version and digest of settings, with the sequences that are of it."""
+    """By stage: each version and settings digest, with its sequences."""
     found: dict[str, dict[tuple[int, str], list[str]]] = {}
     for summary in summaries:
         for stage, made in summary.made_by.items():
@@ -110,7 +109,7 @@ def _made(summaries: Sequence[SequenceSummary]) -> dict[str, list[dict[str, Any]
 
 
 def _without_folders(values: Any) -> Any:
-    """Settings without where files lie on this machine: their names alone."""
+    """Settings with absolute paths replaced by file names."""
     if isinstance(values, dict):
         return {key: _without_folders(value) for key, value in values.items()}
     if isinstance(values, str) and values.startswith("/"):
@@ -119,7 +118,7 @@ def _without_folders(values: Any) -> Any:
 
 
 def _inputs(project: Project, names: Sequence[str]) -> dict[str, str]:
-    """SHA-256 of the tables, and of the sequences' annotations, by their names."""
+    """SHA-256 of the tables and of the sequences' annotations, by file name."""
     config, folder = project.config, project.path.parent
     found = {}
     for name in ("sequences", "subjects", "objects"):

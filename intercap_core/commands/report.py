@@ -1,4 +1,4 @@
-"""`intercap report`: the site of what is computed, without the workflow."""
+"""`intercap report`: write the site from the existing results, without Snakemake."""
 
 from __future__ import annotations
 
@@ -16,10 +16,9 @@ _OF_THE_SITE = ("summary", "page")
 
 
 def write_site(project: Project) -> Path:
-    """Write summaries and pages that are missing or were made of other results than are there, then
-    the site's first page, whose path is returned.
+    """Write missing and stale summaries and pages and the site's first page; returns its path.
 
-    A sequence that cannot be reported is told and left out. Raises UserError where none is left.
+    Sequences that cannot be reported are left out with a warning. Raises UserError if none is left.
     """
     for name in project.sequences:
         inputs = {stage: project.artefact(name, stage) for stage in SEQUENCE_STAGES}

@@ -1,4 +1,4 @@
-"""`intercap run`: Snakemake with a table of sequences and stages that a person can follow."""
+"""`intercap run`: run Snakemake and show its progress as a table of sequences and stages."""
 
 from __future__ import annotations
 
@@ -28,31 +28,34 @@ from intercap_core.pipeline.job import last_words, read_state
 from intercap_core.pipeline.lease import Lease, lease_path, try_acquire
 from intercap_core.pipeline.plan import Plan
 from intercap_core.project import Project, load_project
-from intercap_core.signals import ToldToEnd
+from intercap_core.signals import Terminated
 from intercap_core.stage_list import STAGES
 
 POLL_SECONDS = 0.5
-ROWS = 24  # of the table that is redrawn: what a terminal shows
+ROWS = 24  # rows of the table: a standard terminal's height
 ENDED = "finished"
-SAID_EVERY_S = 30.0  # between two lines of progress where no terminal redraws a table
+REPORT_EVERY_S = 30.0  # interval of progress lines if the output is no terminal
 COLUMNS = tuple(STAGES)
 DRY_RUN = {"-n", "--dry-run", "--dryrun"}
 LAST_LINES = 15
 FULL_BELOW_BYTES = 1_000_000
-ENDS_WITHIN_S = 90.0  # a job, and those that a cluster is told to cancel, for which it has 60
-SLURM_COMMANDS = {"sbatch", "scancel", "squeue", "sacct", "scontrol"}  # which end by themselves
-GO_ON = "Slurm's jobs go on"  # what the executor says where it could not cancel them
-STEPS = re.compile(r"(\d+) of (\d+) steps \(")  # how Snakemake says how far it is
+ENDS_WITHIN_S = 90.0  # time for jobs to end; the executor has 60 s to cancel a cluster's jobs
+SLURM_COMMANDS = {"sbatch", "scancel", "squeue", "sacct", "scontrol"}  # they end by themselves
+GO_ON = "Slurm's jobs go on"  # begins the executor's line if it could not cancel jobs
+STEPS = re.compile(r"(\d+) of (\d+) steps \(")  # Snakemake's progress line
 AGGREGATES = ("site/index.html", "summary.json")
 
 
 @dataclass(frozen=True)
 class JobState:
-    """What the log of one job of this run says: running, finished or failed, and in which words."""
+    """State of one job of this run, read from its log."""
 
     state: str
+    """"running", "finished" or "failed"."""
     words: str
+    """Duration of a finished job, or reason of a failure."""
     log: Path
+    """Path of the log."""
 
 
 def run_workflow(
@@ -60,9 +63,13 @@ def run_workflow(
 ) -> int:
     """Bring a project up to date; returns the exit status.
 
-    ``profile`` is Snakemake's, a folder that says where and how jobs run. Where sequences fail,
-    they are named with their reason and the report is made of the others. Raises UserError where
-    settings or tables are wrong.
+    If sequences fail, they are listed with the reason, and the report covers the others. Raises
+    UserError if settings or tables are wrong.
+
+    Args:
+        cores: number of cores; 0 for all, or for the profile's.
+        profile: folder of a Snakemake workflow profile.
+        arguments: further arguments of Snakemake.
     """
     project = load_project(settings)
     check_bodies(project)
@@ -117,14 +124,14 @@ def _acquire_run_lease(project: Project, console: Console) -> Lease:
                 console.print(f"waiting for a heartbeat of the run by {lease}", highlight=False)
             elif beat != first_beat:
                 raise UserError(
-                    f"{project.results}: another run is going on ({lease}); wait for its end, or "
+                    f"{project.results}: another run is active ({lease}); wait for its end, or "
                     "end it"
                 )
         time.sleep(POLL_SECONDS)
 
 
 def _snakemake_here() -> int | None:
-    """A Snakemake that works in this folder."""
+    """Process id of a Snakemake that runs in this folder; None if there is none."""
     import psutil
 
     for process in psutil.process_iter(["pid", "cmdline", "cwd"]):
@@ -156,17 +163,18 @@ def _run(
     watcher = Watcher(project, console)
     try:
         status = run_watched(command, watcher, console)
-        # below a job to run Snakemake looks at no marks (DAG.update_needrun): where the results
-        # between are as they were, what is out of date there is planned by another start alone
+        # Snakemake ignores the marks of jobs downstream of a job that it runs
+        # (DAG.update_needrun). If that job writes an unchanged output, stale outputs downstream
+        # need another start.
         while status == 0 and not arguments and not watcher.idle and not Plan(project).all_done():
             watcher = Watcher(project, console)
             status = run_watched(command, watcher, console)
-    except ToldToEnd as end:
+    except Terminated as end:
         _unlock(settings)
-        words = f"{end}: {watcher.steps()} jobs were done, and are kept; the same command goes on"
+        words = f"{end}: {watcher.steps()} jobs are done; run the same command to continue"
         console.print(words, highlight=False, soft_wrap=True)
-        said = watcher.transcript.read_text(encoding="utf-8", errors="replace").splitlines()
-        for line in dict.fromkeys(line for line in said if line.startswith(GO_ON)):
+        printed = watcher.transcript.read_text(encoding="utf-8", errors="replace").splitlines()
+        for line in dict.fromkeys(line for line in printed if line.startswith(GO_ON)):
             console.print(line, highlight=False, markup=False, soft_wrap=True)
         raise SystemExit(end.status) from None
     failures = watcher.failures()
@@ -195,16 +203,16 @@ def _run(
 
 
 def _unlock(settings: Path) -> None:
-    """Clear what Snakemake has left locked, which was ended by this run, where none goes on."""
+    """Remove the lock of a Snakemake that this run has ended, unless another one is running."""
     if any(Path(".snakemake/locks").glob("*")) and _snakemake_here() is None:
         subprocess.run(snakemake_command(settings, arguments=["--unlock"]), capture_output=True)
 
 
 def _full_disk(project: Project) -> str:
-    """Which disk that a run writes to is full, in words; "" = none."""
+    """Error message about a full disk among those that a run writes to; "" if none is full."""
     for place in (project.results, project.logs, Path.cwd()):
         if free_bytes(place) < FULL_BELOW_BYTES:
-            return f"the disk of {place} is full; free space, then run again: what is done is kept"
+            return f"the disk of {place} is full; free space, then run again to continue"
     return ""
 
 
@@ -222,9 +230,9 @@ def snakemake_command(
     profile: Path | None = None,
     arguments: Sequence[str] = (),
 ) -> list[str]:
-    """The command line that runs a project's workflow; ``cores`` 0 = all, or as a profile says."""
+    """Command line that runs a project's workflow; arguments as of :func:`run_workflow`."""
     if profile is not None and not profile.is_dir():
-        raise UserError(f"{profile}: there is no such profile; name a folder, as profiles/slurm")
+        raise UserError(f"{profile}: is no folder; name a profile such as profiles/slurm")
     return [
         *(sys.executable, "-m", "snakemake"),
         *("--snakefile", str(snakefile())),
@@ -236,24 +244,24 @@ def snakemake_command(
 
 
 def snakefile() -> Path:
-    """The workflow that comes with the package, or one in the working directory."""
+    """Path of the Snakefile of the package, or of one in the working directory."""
     for folder in (Path(__file__).resolve().parents[2], Path.cwd()):
         if (folder / "Snakefile").is_file():
             return folder / "Snakefile"
     raise UserError(
-        "there is no Snakefile here; run from the project's root, where Snakefile and workflow/ are"
+        "no Snakefile in this folder; run in the folder that contains Snakefile and workflow/"
     )
 
 
 class Watcher:
-    """Follows a run through the logs of its jobs."""
+    """Follows a run by reading the logs of its jobs."""
 
     def __init__(self, project: Project, console: Console) -> None:
         self._project = project
         self._console = console
-        self._start = time.time() - 1.0  # file systems keep whole seconds at worst
-        self._told: set[str] = set()
-        self._said = time.monotonic()
+        self._start = time.time() - 1.0  # some file systems store whole seconds
+        self._printed: set[str] = set()
+        self._printed_at = time.monotonic()
         self._logs = project.logs
         self.transcript = self._logs / "snakemake.log"
 
@@ -265,16 +273,16 @@ class Watcher:
                 if path == self.transcript or path.stat().st_mtime < self._start:
                     continue
                 state = JobState(*read_state(path), path)
-            except FileNotFoundError:  # the workflow removes an old log before it runs a job anew
+            except FileNotFoundError:  # Snakemake removes an old log before it starts a job
                 continue
             sequence = path.parent.name if path.parent != self._logs else ""
             found[f"{sequence}: {path.stem}" if sequence else path.stem] = state
         return found
 
     def failures(self) -> dict[str, str]:
-        """Jobs that did not finish, with the reason; only once the run has ended."""
+        """Reason by job that did not finish; valid after the run has ended."""
         why = _full_disk(self._project) or "killed, perhaps for its memory"
-        ended = f"ended without a word: {why}"
+        ended = f"ended without a log entry: {why}"
         return {
             name: job.words if job.state == "failed" else ended
             for name, job in self.jobs().items()
@@ -282,7 +290,7 @@ class Watcher:
         }
 
     def table(self) -> Group:
-        """One row a sequence at which something runs or failed, one column a stage, and counts."""
+        """Table of the sequences with running or failed jobs, by stage, and counts of all."""
         jobs = self.jobs()
         of_sequence: dict[str, list[str]] = {name: [] for name in self._project.sequences}
         for name, job in jobs.items():
@@ -296,8 +304,8 @@ class Watcher:
         )
         waiting = sum(not states for states in of_sequence.values())
         counts = (
-            f"{self.steps()} jobs done; of {len(of_sequence)} sequences {len(ended)} have ended, "
-            f"{waiting} wait or are kept"
+            f"{self.steps()} jobs done; of {len(of_sequence)} sequences {len(ended)} are finished, "
+            f"{waiting} are waiting or up to date"
         )
         table = Table("sequence", *COLUMNS, box=None, header_style="bold")
         for sequence in shown[:ROWS]:
@@ -305,7 +313,7 @@ class Watcher:
             first = f"{sequence} (recording)" if making and making.state == "running" else sequence
             cells = [self._cell(sequence, stage, jobs) for stage in COLUMNS]
             table.add_row(first, *cells)
-        more = f", and {len(shown) - ROWS} more at work or failed" if len(shown) > ROWS else ""
+        more = f", {len(shown) - ROWS} more running or failed" if len(shown) > ROWS else ""
         return Group(table, counts + more)
 
     def _cell(self, sequence: str, stage: str, jobs: dict[str, JobState]) -> str:
@@ -321,23 +329,23 @@ class Watcher:
             else "[red]failed[/red]"
         )
 
-    def tell(self) -> None:
-        """Print each job once, when it has ended, and now and then how far those are that run.
+    def print_changes(self) -> None:
+        """Print each job when it has ended, and a progress line every ``REPORT_EVERY_S``.
 
-        For terminals that cannot redraw.
+        For outputs that are no terminal.
         """
         jobs = self.jobs()
         for name, job in jobs.items():
-            if job.state != "running" and name not in self._told:
-                self._told.add(name)
+            if job.state != "running" and name not in self._printed:
+                self._printed.add(name)
                 words = f"{name}: {job.state} {job.words}"
                 self._console.print(words, highlight=False, markup=False, soft_wrap=True)
-        if time.monotonic() - self._said >= SAID_EVERY_S:
-            self._said = time.monotonic()
+        if time.monotonic() - self._printed_at >= REPORT_EVERY_S:
+            self._printed_at = time.monotonic()
             self._console.print(self.progress(), highlight=False, markup=False, soft_wrap=True)
 
     def progress(self) -> str:
-        """How many jobs are done of how many, and the last words of those that run."""
+        """Number of finished jobs, and the last log line of each running job."""
         running = [
             f"{name} ({last_words(job.log)})"
             for name, job in self.jobs().items()
@@ -347,21 +355,21 @@ class Watcher:
         return f"{self.steps()} jobs done; {len(running)} run: {words}"
 
     def steps(self) -> str:
-        """How many jobs are done of how many, as Snakemake has said."""
-        said = self.transcript.read_text(encoding="utf-8", errors="replace")
-        done, of = (STEPS.findall(said) or [("0", "?")])[-1]
+        """Numbers of finished jobs and of all jobs, by Snakemake's last progress line."""
+        printed = self.transcript.read_text(encoding="utf-8", errors="replace")
+        done, of = (STEPS.findall(printed) or [("0", "?")])[-1]
         return f"{done} of {of}"
 
     @property
     def idle(self) -> bool:
-        """Whether Snakemake has said of no job that it is done."""
+        """Whether Snakemake has reported no finished job."""
         return self.steps().startswith("0 of ")
 
 
 def run_watched(command: Sequence[str], watcher: Watcher, console: Console) -> int:
-    """Run Snakemake, its output to the watcher's transcript; returns the exit status.
+    """Run Snakemake with its output in the watcher's transcript; returns the exit status.
 
-    Where this process is told to end, so are Snakemake and its jobs, and they are waited for.
+    A signal to this process also ends Snakemake and its jobs before it is raised.
     """
     watcher.transcript.parent.mkdir(parents=True, exist_ok=True)
     environment = {**os.environ, "NO_COLOR": "1"}
@@ -375,21 +383,23 @@ def run_watched(command: Sequence[str], watcher: Watcher, console: Console) -> i
                     time.sleep(POLL_SECONDS)
                     refresh()
                 refresh()
-        except ToldToEnd as end:
-            _end(process, interrupted=end.number == signal.SIGINT and _in_foreground())
+        except Terminated as end:
+            _terminate(process, interrupted=end.number == signal.SIGINT and _in_foreground())
             raise
         finally:
             if process.poll() is None:
-                _end(process)
+                _terminate(process)
     return process.returncode
 
 
-def _end(process: subprocess.Popen[bytes], *, interrupted: bool = False) -> None:
-    """End Snakemake and the jobs on this machine, in order, and after a while whatever is left.
+def _terminate(process: subprocess.Popen[bytes], *, interrupted: bool = False) -> None:
+    """Terminate Snakemake and its jobs on this machine; kill those left after ``ENDS_WITHIN_S``.
 
-    Of SIGTERM Snakemake starts no more jobs, of SIGINT it cancels those of a cluster; those of this
-    machine it would wait for. ``interrupted`` by a terminal, it has got that, and a second one
-    would break off the cancelling.
+    On SIGTERM Snakemake starts no more jobs. On SIGINT it cancels the jobs of a cluster, but waits
+    for local jobs, which are therefore terminated here.
+
+    Args:
+        interrupted: the terminal has already sent SIGINT; a second one would stop the cancelling.
     """
     import psutil
 
@@ -404,9 +414,9 @@ def _end(process: subprocess.Popen[bytes], *, interrupted: bool = False) -> None
         try:
             process.wait(ENDS_WITHIN_S)
         except subprocess.TimeoutExpired:
-            for one in (snakemake, *snakemake.children(recursive=True)):
+            for left in (snakemake, *snakemake.children(recursive=True)):
                 with contextlib.suppress(psutil.NoSuchProcess):
-                    one.kill()
+                    left.kill()
     process.wait()
 
 
@@ -422,7 +432,7 @@ def _in_foreground() -> bool:
 @contextmanager
 def _display(watcher: Watcher, console: Console) -> Iterator[Callable[[], None]]:
     if not console.is_terminal:
-        yield watcher.tell
+        yield watcher.print_changes
         return
     with Live(watcher.table(), console=console, refresh_per_second=2) as live:
         yield lambda: live.update(watcher.table())

@@ -1,9 +1,10 @@
-"""`intercap status`: which sequences are done, out of date and why, failed, running, or waiting."""
+"""`intercap status`: which outputs are done, out of date, failed, running or waiting, and why."""
 
 from __future__ import annotations
 
 import json
 import logging
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -22,10 +23,10 @@ from intercap_core.stage_list import STAGES
 
 log = logging.getLogger(__name__)
 
-ROWS = 40  # sequences printed that are not done
-NAMES = 6  # sequences named beside a reason
+ROWS = 40  # printed sequences that are not done
+NAMES = 6  # sequences listed per reason
 DONE, RUNNING, FAILED, STALE, MISSING = "done", "running", "failed", "out of date", "missing"
-WAITING = "waits"  # what it is made of is not done
+WAITING = "waits"  # an artefact that the stage reads is not done
 _MARKS = {
     DONE: "[green]✓[/green]", RUNNING: "[yellow]▶[/yellow]", FAILED: "[red]✗[/red]",
     STALE: "[yellow]≠[/yellow]", MISSING: "·", WAITING: "[dim]…[/dim]",
@@ -34,29 +35,35 @@ _MARKS = {
 
 @dataclass(frozen=True)
 class StageStatus:
-    """State of one output in one of the words above, and the reasons or who makes it."""
+    """State of one output."""
 
     state: str
+    """One of the constants above."""
     words: tuple[str, ...] = ()
+    """Reasons of a stale or failed output, or the process that is making it."""
     made_on: str = ""
+    """Device and processor, if the output was made on others than this machine's."""
 
 
 @dataclass(frozen=True)
 class Status:
-    """By sequence and stage, and of what is made of all sequences."""
+    """State of a project."""
 
     sequences: Mapping[str, Mapping[str, StageStatus]]
+    """State by sequence and stage."""
     dataset: StageStatus
+    """State of the outputs of all sequences."""
 
     def of(self, sequence: str) -> str:
-        """The sequence's own state: the most telling of its stages'."""
+        """State of a sequence: the first of running, failed, stale, missing, waiting that a stage
+        has, otherwise done."""
         found = {stage.state for stage in self.sequences[sequence].values()}
         order = (RUNNING, FAILED, STALE, MISSING, WAITING)
         return next((state for state in order if state in found), DONE)
 
 
 def status(project: Project) -> Status:
-    """Look at every output, its record, its log and its claim; nothing is computed."""
+    """Determine the state of every output from its manifest, log and lease."""
     plan = Plan(project)
     sequences = {name: _of_sequence(project, plan, name) for name in project.sequences}
     dataset = plan.dataset
@@ -97,17 +104,21 @@ def _not_done(
 
 
 def print_status(project: Project, *, every: bool = False, as_json: bool = False) -> None:
-    """Print counts, a table of the sequences that are not done (``every``: of all) and the reasons;
-    ``as_json``: everything for programs."""
+    """Print counts, a table of the sequences that are not done, and the reasons.
+
+    Args:
+        every: include the sequences that are done.
+        as_json: print all states as JSON instead.
+    """
     found = status(project)
     if as_json:
-        print(json.dumps(_json(found), indent=1, ensure_ascii=False))
+        print(json.dumps(_to_json(found), indent=1, ensure_ascii=False))
         return
     console = Console()
     states = {name: found.of(name) for name in found.sequences}
     counts = {state: list(states.values()).count(state) for state in _MARKS}
-    told = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
-    console.print(f"{project.config.dataset}: {told} of {len(states)} sequences", highlight=False)
+    words = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
+    console.print(f"{project.config.dataset}: {words} of {len(states)} sequences", highlight=False)
     shown = [name for name in states if every or states[name] != DONE]
     if shown:
         console.print(_table(found, shown[:ROWS] if not every else shown))
@@ -122,10 +133,10 @@ def print_status(project: Project, *, every: bool = False, as_json: bool = False
         why = f": {'; '.join(found.dataset.words)}" if found.dataset.words else ""
         words = f"the site's first page, tables and card are {found.dataset.state}{why}"
         console.print(words, highlight=False, markup=False, soft_wrap=True)
-    for machine, count in _elsewhere(found).items():
+    for machine, count in _other_machines(found).items():
         console.print(
             f"{count} results were made on another machine or device ({machine}); they may differ "
-            "in the last digits, and are not made anew for it",
+            "in the last digits and are not computed again",
             highlight=False, markup=False, soft_wrap=True,
         )  # fmt: skip
 
@@ -142,47 +153,53 @@ def _table(found: Status, names: list[str]) -> Table:
 
 
 def _reasons(found: Status) -> list[str]:
-    """Each reason once, with the stage and the sequences that have it, the most frequent first."""
-    having: dict[tuple[str, str, str], list[str]] = {}
+    """Each reason with its stage and sequences, most frequent first."""
+    sequences: dict[tuple[str, str, str], list[str]] = {}
     for name, stages in found.sequences.items():
-        for stage, one in stages.items():
-            if one.state in (FAILED, STALE, RUNNING):
-                for words in one.words:
-                    having.setdefault((one.state, stage, words), []).append(name)
+        for stage, output in stages.items():
+            if output.state in (FAILED, STALE, RUNNING):
+                for words in output.words:
+                    sequences.setdefault((output.state, stage, words), []).append(name)
     lines = []
     order = (FAILED, STALE, RUNNING)
     for (state, stage, words), names in sorted(
-        having.items(), key=lambda item: (order.index(item[0][0]), -len(item[1]))
+        sequences.items(), key=lambda item: (order.index(item[0][0]), -len(item[1]))
     ):
         more = f" and {len(names) - NAMES} more" if len(names) > NAMES else ""
         lines.append(f"{stage} {state} in {', '.join(names[:NAMES])}{more}: {words}")
     return lines
 
 
-def _elsewhere(found: Status) -> dict[str, int]:
-    counts: dict[str, int] = {}
-    for stages in found.sequences.values():
-        for one in stages.values():
-            if one.made_on:
-                counts[one.made_on] = counts.get(one.made_on, 0) + 1
-    return counts
+def _other_machines(found: Status) -> Counter[str]:
+    """Number of outputs by the other machine that made them."""
+    return Counter(
+        output.made_on
+        for stages in found.sequences.values()
+        for output in stages.values()
+        if output.made_on
+    )
 
 
-def _json(found: Status) -> dict[str, object]:
-    def told(one: StageStatus) -> dict[str, object]:
-        return {"state": one.state, "reasons": list(one.words), "made_on": one.made_on}
+def _to_json(found: Status) -> dict[str, object]:
+    def entry(output: StageStatus) -> dict[str, object]:
+        return {
+            "state": output.state, "reasons": list(output.words), "made_on": output.made_on
+        }  # fmt: skip
 
     return {
         "sequences": {
-            name: {"state": found.of(name), "stages": {s: told(one) for s, one in stages.items()}}
+            name: {
+                "state": found.of(name),
+                "stages": {stage: entry(output) for stage, output in stages.items()},
+            }
             for name, stages in found.sequences.items()
         },
-        "dataset": told(found.dataset),
+        "dataset": entry(found.dataset),
     }
 
 
 def print_verification(project: Project) -> bool:
-    """Read all data of every artefact and record, name what is damaged; whether all is whole."""
+    """Read all data of every artefact and print the damaged ones; True if none is damaged."""
     paths = [
         project.artefact(name, stage)
         for name in project.sequences
@@ -195,7 +212,7 @@ def print_verification(project: Project) -> bool:
     for path in paths:
         found = find_damage(path)
         if not found and read_manifest(path) is None:
-            found = f"{path}: what it was made from is not recorded, or damaged"
+            found = f"{path}: has no manifest, or a damaged one; delete it and run again"
         damaged += [found] if found else []
         progress.step()
     for words in damaged:

@@ -1,4 +1,4 @@
-"""`intercap view`: a sequence in the browser, from any artefact from body_fit on."""
+"""`intercap view`: show a sequence in the browser; needs at least its body_fit artefact."""
 
 from __future__ import annotations
 
@@ -11,16 +11,19 @@ from intercap_core.project import Project
 
 
 def view(project: Project, sequence: str, output: Path | None = None, *, show: bool = True) -> Path:
-    """Write a page with the sequence's viewer and open it in the browser where ``show``.
+    """Write a page with the sequence's viewer; returns its path.
 
-    Returns the page, in the folder ``output`` or ``view`` beside the sequence's artefacts. Raises
-    UserError where the sequence has no body yet or an artefact is broken.
+    Raises UserError if the sequence has no body_fit artefact or an artefact is damaged.
+
+    Args:
+        output: folder of the page; default: ``view`` next to the sequence's artefacts.
+        show: open the page in the browser.
     """
     paths = project.paths(sequence)
     for needed in (paths.frames, paths.scene, paths.body_fit):
         if not needed.is_file():
             raise UserError(
-                f"{needed}: there is no such file, so there is nothing to look at yet; run "
+                f"{needed}: no such file, expected the artefact of an earlier stage; run "
                 f"`intercap run {project.path} -- --until body_fit` first"
             )
     folder = output or project.results / sequence / "view"

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from intercap_core import disk
 from intercap_core.errors import UserError
-from intercap_core.signals import ToldToEnd, told_to_end
+from intercap_core.signals import Terminated, raise_on_signals
 
 THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
@@ -61,14 +61,14 @@ def job(name: str, log: Path, *, threads: int = 1) -> Iterator[None]:
     start = time.monotonic()
     logger.info("%s started with %d thread(s)", name, threads)
     try:
-        with told_to_end():
+        with raise_on_signals():
             yield
         logger.info("%s %.1f s", FINISHED, time.monotonic() - start)
     except UserError as error:
         logger.error("%s %s", FAILED, error)
         _print_error(f"{name} failed: {error}")
         raise SystemExit(1) from None
-    except ToldToEnd as end:
+    except Terminated as end:
         logger.error("%s %s, %s", FAILED, ENDED, end)
         _print_error(f"{name} failed: {ENDED}, {end}; what was half-written is removed, run again")
         raise SystemExit(end.status) from None
@@ -128,7 +128,7 @@ def last_failure(folder: Path) -> str | None:
     failed = [words for state, words in states if state == "failed"]
     if failed:
         return failed[0]
-    return "ended without a word" if any(state == "running" for state, _ in states) else None
+    return "ended without a log entry" if any(state == "running" for state, _ in states) else None
 
 
 def read_state(log: Path) -> tuple[str, str]:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from intercap_core.commands.check_recordings import Looked, look_at_recordings
+from intercap_core.commands.check_recordings import RecordingFindings, check_recordings
 from intercap_core.config import SequenceEntry
 from intercap_core.formats.recordings.layouts import open_layout
 from tests.helpers.kinect_files import entry_of, record
@@ -41,9 +41,9 @@ def write_video(path: Path, count: int = COUNT, size: tuple[int, int] = SIZE) ->
         container.mux(stream.encode(None))
 
 
-def look(row: SequenceEntry) -> Looked:
+def look(row: SequenceEntry) -> RecordingFindings:
     layout = open_layout(row)
-    return look_at_recordings(row, layout, layout.names)
+    return check_recordings(row, layout, layout.names)
 
 
 def cut(path: Path, share: float = 0.1) -> None:
@@ -115,13 +115,13 @@ def few_candidates(folder: Path) -> None:
         (lambda folder: None, "", ""),
         (of_another_size, "left's images are 192x128, ", ""),
         (without(0.1, tail=True), "left lasts 0.3 s (4 images), the other cameras 3.9 s",
-         "speak of 40 images, it has 4"),
+         "cover 40 images, it has 4"),
         (without(0.8, tail=True), "", "left lasts 3.1 s (32 images), the other cameras 3.9 s"),
         (without(0.5, tail=False), "", "left has 20 images in 3.9 s, expected about 40 at 10 a"),
         (emptied, "", "left 1 of 40 colour files are empty (first: 00003.jpg)"),
         (all_cut, "left has no image that can be read, expected 96x64", "looked at are damaged"),
-        (few_keypoints, "", "keypoints of camera left speak of 4 of its 40 images; run the"),
-        (few_candidates, "", "candidates of camera left speak of 2 of its 40 images; run the"),
+        (few_keypoints, "", "keypoints of camera left cover 4 of its 40 images; run the"),
+        (few_candidates, "", "candidates of camera left cover 2 of its 40 images; run the"),
     ],
 )  # fmt: skip
 def test_folders_of_images(

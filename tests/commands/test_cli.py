@@ -93,7 +93,7 @@ def test_a_stage_reads_what_earlier_ones_wrote() -> None:
     ("arguments", "says"),
     [
         (("check", "nowhere.yaml"), "nowhere.yaml: there is no such file"),
-        (("joint", "config/demo/config.yaml", "nobody"), "there is no sequence 'nobody'"),
+        (("joint", "config/demo/config.yaml", "nobody"), "sequence 'nobody' is not in the table"),
         (("studio", "config/config.yaml", "s01_o01_seg1"), "its recordings are real"),
         ((*SCENE, "--output", "README.md"), "README.md: exists and is not an artefact"),
         ((*SCENE, "--output", "docs"), "docs: is a folder, expected a file"),
@@ -257,7 +257,7 @@ LARGE = [
          "1 of its first 1 results cannot be used (first: entry 0 (image 0): the mask has 7x7"),
         ([LARGE[0] | {"segmentation": [[1, 2]]}, LARGE[1] | {"category_name": "mug"}, *LARGE],
          "(first: entry 0 (image 0): a polygon"),
-        (LARGE, "the first results are labelled apple, none of which object 'cup' expects (mug)"),
+        (LARGE, "the labels of the first results are apple; object 'cup' expects mug"),
         ([LARGE[0] | {"category_name": "mug"}, *LARGE[1:]], ""),
         ([], ""),
     ],
@@ -434,7 +434,7 @@ def test_reasons_that_look_like_markup_are_shown_as_they_are(
     log = Path("logs/trial/good/scene.log")
     log.parent.mkdir(parents=True)
     log.write_text("12:00:00 failed: a[/b] has [3] points\n")
-    watcher.tell()
+    watcher.print_changes()
     assert words.getvalue() == "good: scene: failed a[/b] has [3] points\n"
 
 

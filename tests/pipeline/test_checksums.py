@@ -59,7 +59,7 @@ from pathlib import Path
 import numpy as np
 from intercap_core import artefacts, disk
 from intercap_core.artefacts import Field, Schema
-from intercap_core.signals import ToldToEnd, told_to_end
+from intercap_core.signals import Terminated, raise_on_signals
 schema = Schema("some", 1, "frames", {"rows": Field(("T", "5000"), "float64", "noise")})
 
 class Slow(disk.PartFile):
@@ -71,12 +71,12 @@ artefacts.PartFile = Slow
 disk.unbroken(Slow.write)
 values = np.random.default_rng(0).random((4, 5000))
 try:
-    with told_to_end(), artefacts.write(Path(sys.argv[1]), schema) as writer:
+    with raise_on_signals(), artefacts.write(Path(sys.argv[1]), schema) as writer:
         rows = writer.stream("rows", (5000,))
         print("begun", flush=True)
         while True:
             rows.append(values)
-except ToldToEnd as end:
+except Terminated as end:
     raise SystemExit(end.status)
 """
 

@@ -1,4 +1,4 @@
-"""Killed, told to end, or met with damaged results: the same command goes on to the same bytes."""
+"""Killed, terminated, or started on damaged results: the same command goes on to the same bytes."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_damage_below_a_result_that_comes_to_the_same_is_mended_by_one_command(
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_told_to_end_it_says_so_once_and_leaves_nothing(victim: Victim, number: int) -> None:
+def test_a_terminated_run_reports_once_and_leaves_no_parts(victim: Victim, number: int) -> None:
     victim.flow.artefact(ONE, "person").unlink()
     began = time.time() - 1.0
     run = victim.start()
@@ -77,7 +77,7 @@ def test_told_to_end_it_says_so_once_and_leaves_nothing(victim: Victim, number: 
     name = signal.Signals(number).name
     assert run.wait(ENDS_WITHIN_S) == 128 + number
     said = victim.flow.transcript.read_text()
-    assert f"told to end ({name}): " in said and "Traceback" not in said
+    assert f"terminated by {name}: " in said and "Traceback" not in said
     told = (victim.logs / ONE / "person.log").read_text()
     assert told.rstrip().splitlines()[-1].partition("failed: ")[2].startswith("unexpected end")
     assert victim.left_over() == [] and not victim.flow.artefact(ONE, "person").exists()
