@@ -1,8 +1,8 @@
-"""Settings, tables and annotations: pydantic models that say what each entry means.
+"""Settings, tables and annotations as pydantic models, which document and validate each entry.
 
-Everything that a user writes is read here and checked before any job starts. Relative paths in a
-settings file or a table are relative to the folder of that file. ``config/README.md`` and the
-JSON schemas in ``config/schemas/`` are generated from these models.
+All files that a user writes are validated before any job starts. Relative paths in a settings file
+or a table are relative to the folder of that file. ``config/README.md`` and the JSON schemas in
+``config/schemas/`` are generated from these models.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from intercap_core.schemas import CONTACT_REGIONS
 from intercap_core.stage_list import STAGES
 
 MAX_POSITION_M = 50.0  # a capture volume is some metres wide
-MIN_FLOOR_SPREAD_M = 0.02  # floor points this close to one line give no plane
-# Of a start that is read off a time code, or off the frame of a clap: of a frame of 1/25 s, which
-# is seen as a whole, an even error of 1/25/sqrt(12) = 12 ms, and as much of the clock that is read.
+MIN_FLOOR_SPREAD_M = 0.02  # points closer to one line do not determine a plane
+# A start that is read off a time code or a clap has the uniform error of one frame,
+# 1/25/sqrt(12) s = 12 ms, once in the image and once on the clock.
 START_SIGMA_S = 0.02
 
 
@@ -47,20 +47,20 @@ def _metres(value: float) -> float:
 
 
 def _as_text(name: Any) -> Any:
-    """Names that are numbers are written as such: YAML reads them so."""
+    """Convert names that YAML reads as integers to text."""
     return str(name) if isinstance(name, int) and not isinstance(name, bool) else name
 
 
 def _not_reserved(name: str) -> str:
     if name in RESERVED_SEQUENCES:
-        raise ValueError("this name is taken by a folder of the results; choose another one")
+        raise ValueError("this name is reserved for a folder of the results; choose another one")
     return name
 
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_-]*$", max_length=80)]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Positive = Annotated[float, Field(gt=0.0)]
-RESERVED_SEQUENCES = ("recordings", "site", "tables")  # folders beside those of the sequences
+RESERVED_SEQUENCES = ("recordings", "site", "tables")  # other folders of the results
 Vector3 = tuple[float, float, float]
 CameraName = Annotated[str, BeforeValidator(_as_text), Field(pattern=r"^[A-Za-z0-9_-]+$")]
 Seconds = Annotated[float, Field(strict=True)]
@@ -75,8 +75,7 @@ LayoutName = Literal["k4a", "intercap", "behave", "plain"]
 
 
 class Model(BaseModel):
-    """Base of every settings model: unknown keys are mistakes, numbers finite, values fixed, paths
-    such as a file system has."""
+    """Base of all settings models: no unknown keys, finite numbers, valid paths, immutable."""
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, use_attribute_docstrings=True, allow_inf_nan=False
@@ -98,103 +97,106 @@ class FramesSettings(Model):
     """Recordings to synchronised frame sets."""
 
     max_skew_ms: Positive = 8.0
-    """An image belongs to a set when its device time is within this many milliseconds of it."""
+    """Largest difference between the device time of an image and the time of its frame set, ms."""
     cameras: tuple[str, ...] = ()
-    """Cameras to use, by name; empty = all. The others count as not recorded."""
+    """Names of the cameras to use; empty = all. Other cameras are treated as not recorded."""
     depth: bool = True
-    """Use depth; without, the recordings count as those of cameras that have none."""
+    """Use depth images. If false, all cameras are treated as colour cameras without depth."""
 
 
 class DetectionsSettings(Model):
     """Keypoints and segmentation candidates, from files or from a model; see docs/detectors.md."""
 
     min_score: Fraction = 0.05
-    """Candidates below this detector score are left out."""
+    """Candidates below this detector score are ignored."""
     category_names: Literal["coco", "coco80"] | Path = "coco"
-    """Which class a number in a file of candidates means, where the file does not list its classes:
-    COCO's published ids from 1 to 90, its 80 classes from 0, or a file of class names."""
+    """Classes of the category numbers in candidate files that do not list their classes: coco =
+    COCO's published ids from 1 to 90; coco80 = its 80 classes from 0; or a file of class names."""
     segmentation_model: Path | None = None
-    """ONNX model for instance segmentation (Mask R-CNN, PointRend or YOLO-seg exports); it sees the
-    images of which no file of candidates says anything."""
+    """ONNX model for instance segmentation (Mask R-CNN, PointRend or YOLO-seg exports). It runs on
+    the images without an entry in the candidate files."""
     segmentation_labels: Path | None = None
-    """File of the model's class names; without one, the names in the model or COCO's."""
+    """File of the model's class names; default: the names in the model, otherwise COCO's."""
     segmentation_input: Literal["auto", "rgb", "bgr255", "bgr_mean"] = "auto"
-    """Pixel values that the model takes: RGB from 0 to 1, BGR from 0 to 255 (detectron2), BGR less
-    the mean of ImageNet (maskrcnn-benchmark); auto = by the kind of its outputs."""
+    """Pixel values of the model's input: rgb = RGB from 0 to 1; bgr255 = BGR from 0 to 255
+    (detectron2); bgr_mean = BGR minus ImageNet's mean (maskrcnn-benchmark); auto = inferred from
+    the model's outputs."""
     segmentation_device: Literal["cpu", "cuda"] = "cpu"
-    """Where the model runs; cuda needs the package onnxruntime-gpu."""
+    """Device of the segmentation model; cuda needs the package onnxruntime-gpu."""
     keypoint_model: Path | None = None
-    """ONNX model for people's keypoints (RTMPose, RTMW, DWPose, HRNet or ViTPose exports); it sees
-    the images of which no file of keypoints says anything."""
+    """ONNX model for human keypoints (RTMPose, RTMW, DWPose, HRNet or ViTPose exports). It runs on
+    the images without an entry in the keypoint files."""
     keypoint_device: Literal["cpu", "cuda"] = "cpu"
-    """Where the model of keypoints runs."""
+    """Device of the keypoint model."""
     keypoint_full_confidence: Positive = 1.0
-    """Confidence of a keypoint, as files or the model state it, that counts as 1; raw responses of
-    RTMW reach 5 and more."""
+    """Keypoint confidence in files or model outputs that is mapped to 1. Raw responses of RTMW
+    reach 5 and more."""
     keypoint_heatmap_grid: Literal["msra", "udp"] = "msra"
-    """How a model of heatmaps was trained. msra: a cell is so many pixels (mmpose's HRNet, with or
-    without DARK); udp: the last cell stands for the last pixel (ViTPose)."""
+    """Alignment of heatmap cells and pixels: msra = a cell covers a fixed number of pixels (HRNet
+    of mmpose, with or without DARK); udp = the last cell is the last pixel (ViTPose)."""
 
 
 class SceneSettings(Model):
     """Extrinsics, ground plane and background."""
 
     refine_extrinsics: bool = True
-    """Refine the camera poses from the static background; the start is kept where that does not
-    improve held-out points."""
+    """Refine the camera poses from the static background. The initial pose is kept if held-out
+    points do not improve."""
     floor_tolerance_mm: Positive = 15.0
-    """Background points this close to the plane count as floor."""
+    """Largest distance of a background point to the ground plane that counts as floor, mm."""
 
 
 class PersonSettings(Model):
     """The subject over views, and the triangulated keypoints."""
 
     min_confidence: Fraction = 0.3
-    """Keypoints below this confidence do not take part."""
+    """Keypoints below this confidence are ignored."""
     max_reprojection_px: Positive = 20.0
-    """A view disagrees with a triangulated point beyond this error (at 1080p)."""
+    """Largest reprojection error of an inlier view of a triangulated point, pixels at 1080p."""
     segmentation: Literal["both", "auto", "detector", "images"] = "both"
-    """Where candidates of the object, and masks of the person that no detector gave, come from:
-    both = a detector's, and in every image those of the images alone (what stands before the
-    background), which costs 0.15 s a six-view frame; auto = the images alone only where no
-    detector looked; or only one of the two."""
+    """Sources of object candidates and of person masks. detector = detector only; images =
+    foreground segmentation of the images only; auto = foreground segmentation for images without
+    detections; both = detector and foreground segmentation in every image, which costs 0.15 s per
+    frame of six views."""
 
 
 class ObjectTrackSettings(Model):
     """The object's pose in every frame (equation 1)."""
 
     min_overlap: Fraction = 0.3
-    """A view's candidate is kept when its IoU with the predicted silhouette is at least this."""
+    """Smallest IoU of a candidate with the predicted silhouette for the candidate to be used."""
     background_term: bool = True
-    """Also penalise render over known background, beside the paper's one-sided silhouette."""
+    """Add a penalty for rendered pixels over known background to the paper's one-sided silhouette
+    term."""
     lost_overlap: Fraction = 0.25
-    """The track counts as lost when the mean overlap over its views falls below this."""
+    """The track is lost if the mean overlap over its views is below this value."""
     render_on: Literal["cpu", "cuda", "auto"] = "cpu"
-    """Where the object is drawn: a GPU needs the extra gpu; auto takes one where it can be used."""
+    """Device that renders the object; cuda needs the extra `gpu`; auto = cuda if it is usable."""
 
 
 class BodyFitSettings(Model):
     """SMPL-X parameters in every frame (equation 2)."""
 
     hands: bool = True
-    """Fit finger poses; without, hands stay at their mean."""
+    """Fit finger poses; otherwise hands have their mean pose."""
     face: bool = True
     """Fit jaw and expression from the face keypoints."""
     shape: Literal["shared", "per_frame"] = "shared"
-    """One shape for the sequence, or a free shape in every frame as in the paper's first stage."""
+    """One body shape for the sequence, or a free shape in every frame as in the paper's first
+    stage."""
     betas: Annotated[int, Field(ge=1, le=300)] = 10
-    """Numbers of the shape. Most readers of SMPL-X take ten; the open body has thirty, with which
-    it lies some 4 % closer, a licensed file of full size 300."""
+    """Number of shape coefficients. Most readers of SMPL-X expect ten. The open body has 30, which
+    reduce its distance to the data by about 4 %; a licensed file has up to 300."""
     keypoint_definition: Path | None = None
-    """Where the detector's body points lie on the body: a table that ``intercap
-    keypoint-definition`` learns from recordings with depth; without it, within 10 mm of the body
-    model's."""
+    """Table of the detector's joint positions on the body, written by ``intercap
+    keypoint-definition``. Without it, the fit estimates offsets with a standard deviation of 10 mm
+    from the body model's joints."""
     points_per_frame: Annotated[int, Field(ge=200, le=20000)] = 1500
-    """Person points kept of each frame's fused cloud."""
+    """Number of person points sampled from each frame's fused point cloud."""
     cloud_weight: Annotated[float, Field(gt=0, le=1000)] = 1.0
-    """Weight of points and rims of masks against the keypoints (lambda_D)."""
+    """Weight of point cloud and mask outlines relative to the keypoints (lambda_D)."""
     self_penetration_weight: Annotated[float, Field(ge=0, le=1000)] = 1.0
-    """Weight of the body's parts not entering each other (lambda_P of equation 2)."""
+    """Weight of the body's self-penetration (lambda_P of equation 2)."""
 
 
 class JointSettings(Model):
@@ -203,39 +205,41 @@ class JointSettings(Model):
     contact_weight: Annotated[float, Field(ge=0)] = 1.0
     """Weight of contact (lambda_Q)."""
     contact_to: Literal["any", "annotated"] = "any"
-    """What touching skin is drawn to: any point of the object (the paper's appendix), or what the
-    object's ``contact_vertices`` span (its text). Contact is found on all of it with both."""
+    """Surface that pulls touching skin: any = the whole object (the paper's appendix); annotated =
+    the area of the object's ``contact_vertices`` (the paper's text). Contact is detected on the
+    whole object with both."""
     stick_weight: Annotated[float, Field(ge=0)] = 1.0
-    """Weight of held skin not sliding over the object (without a symbol in equation 6)."""
+    """Weight against sliding of skin in contact over the object (no symbol in equation 6)."""
     plant_weight: Annotated[float, Field(ge=0)] = 1.0
-    """Weight of standing feet not moving (without a symbol in equation 6)."""
+    """Weight against motion of standing feet (no symbol in equation 6)."""
     ground_weight: Annotated[float, Field(ge=0)] = 1.0
-    """Weight of not sinking into the floor (lambda_G)."""
+    """Weight against penetration of the floor (lambda_G)."""
     penetration_weight: Annotated[float, Field(ge=0)] = 1.0
-    """Weight of body and object not entering each other (without a symbol in equation 6)."""
+    """Weight against interpenetration of body and object (no symbol in equation 6)."""
     body_smoothness: Annotated[float, Field(ge=0)] = 1.0
     """Weight of the body's smooth motion (lambda_S)."""
     lemo: Path | None = None
-    """Folder of LEMO's release: the body's smooth motion is then that of its motion encoder, for
-    recordings at 30 frames a second. Without, small accelerations of the joints."""
+    """Folder of LEMO's release, whose motion encoder then measures the body's smoothness; needs
+    recordings at 30 frames a second. Without it, joint accelerations are penalised."""
     object_smoothness: Annotated[float, Field(ge=0)] = 1.0
-    """Weight of the object's small acceleration (lambda_A)."""
+    """Weight of the object's acceleration (lambda_A)."""
     drift_weight: Annotated[float, Field(ge=0)] = 1.0
-    """Weight of corrections of the sequential fits that last (without a symbol in equation 6)."""
+    """Weight of slowly varying corrections of the sequential fits (no symbol in equation 6)."""
     look_again: bool = True
-    """Compare the object with the images anew in each round; else its track stands for them."""
+    """Compare the object with the images in each round; otherwise use the object track's poses
+    and covariances as observations."""
     refine_cameras: bool = True
-    """Correct poses and depth bias of the cameras by what body and object show (beyond the paper);
-    needs ``look_again``. Switch off where given poses are to be kept."""
+    """Refine poses and depth biases of the cameras from body and object (beyond the paper); needs
+    ``look_again``. Set to false to keep given camera poses."""
     detect_contact: bool = True
-    """Find contact from the geometry where it is not annotated."""
+    """Detect contact from the geometry in sequences without contact annotation."""
     annotation_uncertainty_frames: Annotated[int, Field(ge=0, le=100)] = 5
-    """Frames by which annotators err at the ends of an interval of contact: within them what is
-    seen may move the ends."""
+    """Uncertainty of the ends of annotated contact intervals, frames. Within it, the observed
+    distance may move the ends."""
 
     @property
     def lemo_files(self) -> tuple[Path, Path] | None:
-        """Weights and statistics of LEMO's encoder of smooth motion, where its release has them."""
+        """Weights and statistics of LEMO's motion encoder; None without LEMO's release."""
         if self.lemo is None:
             return None
         statistics = "preprocess_stats_smooth_withHand_global_markers.npz"
@@ -245,11 +249,11 @@ class JointSettings(Model):
         )
 
     def check_object(self, entry: ObjectEntry) -> str:
-        """What these settings need and the object's entry lacks, "" = nothing."""
+        """Error message if the object's entry lacks something that these settings need, or ""."""
         if self.contact_to == "annotated" and entry.contact_vertices is None:
             return (
                 f"object {entry.name!r} has no contact_vertices, which joint.contact_to: annotated "
-                "needs; name its list there, or set joint.contact_to to any"
+                "needs; add contact_vertices to its entry, or set joint.contact_to to any"
             )
         return ""
 
@@ -258,24 +262,23 @@ class MetricsSettings(Model):
     """Distances, penetration and errors against truth."""
 
     contact_mm: Positive = 4.5
-    """A body vertex this close to the object's surface is in contact."""
+    """Largest distance of a body vertex in contact to the object's surface, mm."""
     hold_out: bool = True
-    """Judge the result without truth: fit body and object again without each camera, compare them
-    with what it shows, and state their errors."""
+    """Estimate the errors without truth: repeat the fits without each camera and compare them with
+    that camera's images."""
 
 
 class PageSettings(Model):
     """The page of each sequence."""
 
     cameras: Annotated[int, Field(ge=1, le=16)] = 6
-    """Cameras shown with the fit drawn over their images; those that see most of body and object
-    where there are more."""
+    """Number of cameras shown with overlays; those that see most of body and object."""
     frames: Annotated[int, Field(ge=1, le=50)] = 4
-    """Frames shown with the fit drawn over them, for each camera."""
+    """Number of frames shown with overlays, per camera."""
 
 
 class ExportSettings(Model):
-    """Files for other people's tools."""
+    """Files for other tools."""
 
     formats: tuple[Literal["intercap", "amass", "bop", "coco", "glb", "contact", "meshes"], ...] = (
         "intercap",
@@ -285,49 +288,47 @@ class ExportSettings(Model):
         "glb",
         "contact",
     )
-    """Which exports are written; contact = its probability by frame, the vertices that touch, and a
-    draft annotation; meshes = body and object of each frame as mesh files, half a megabyte each."""
+    """Exported formats. contact = contact probability by frame, vertices in contact, and a draft
+    annotation; meshes = body and object of each frame as mesh files of half a megabyte each."""
     frame: Literal["z-up", "camera"] = "z-up"
-    """Frame of amass, glb and meshes: gravity-aligned with the ground at z = 0, or the master
-    camera. The intercap, bop and coco layouts are in camera frames by definition."""
+    """Coordinate frame of amass, glb and meshes: z-up = gravity-aligned with the ground at z = 0;
+    camera = the master camera. The formats intercap, bop and coco use camera frames."""
     mesh_format: Literal["ply", "obj"] = "ply"
-    """What the meshes are; ply alone can say which vertices touch."""
+    """File format of the meshes; only ply marks the vertices in contact."""
     mesh_every: Annotated[int, Field(ge=1)] = 1
-    """Meshes of every so many frames, from the first on."""
+    """Step between exported mesh frames."""
     masks: bool = True
-    """Draw the object's masks and boxes for bop, with what the body hides."""
+    """Render object masks and boxes for bop, with and without occlusion by the body."""
     images: bool = False
-    """Copy the recorded colour images into bop and coco: as recorded, lenses not straightened."""
+    """Copy the recorded colour images, with lens distortion, into bop and coco."""
 
 
 class CardSettings(Model):
-    """What the dataset's card says to whom it is given."""
+    """Texts of the dataset's card."""
 
     title: str = ""
     """Title; empty = the dataset's name."""
     description: str = ""
-    """What was recorded, why and how; Markdown."""
+    """Description of the recordings and their purpose, in Markdown."""
     version: Annotated[str, Field(pattern=r"^\d+\.\d+\.\d+$")] = "1.0.0"
     """Version of the dataset."""
     published: date | None = None
-    """Day of this version."""
+    """Publication date of this version."""
     licence: str = ""
-    """Name of the licence, as CC-BY-4.0, or the address of its text; empty = not stated, which the
-    card says."""
+    """Name of the licence, such as CC-BY-4.0, or its URL; empty = the card says "not stated"."""
     creators: tuple[str, ...] = ()
-    """Who made the dataset."""
+    """Names of the dataset's creators."""
     url: str = ""
-    """Where the dataset is found."""
+    """URL of the dataset."""
     citation: str = ""
-    """How to cite it, e.g. BibTeX."""
+    """Citation, such as a BibTeX entry."""
     test_share: Annotated[float, Field(ge=0, le=0.9)] = 0.2
-    """Share of the frames that each split, by subject and by object, holds out for tests; 0 = no
-    splits."""
+    """Share of frames in the test set of each split (by subject and by object); 0 = no splits."""
     test_subjects: tuple[Name, ...] = ()
-    """Subjects that are held out; empty = chosen by share. Name them to keep a split when the
-    dataset grows."""
+    """Subjects of the test set; empty = chosen by share. Set it to keep the split when the dataset
+    grows."""
     test_objects: tuple[Name, ...] = ()
-    """Objects that are held out; likewise."""
+    """Objects of the test set; empty = chosen by share."""
 
 
 StudioFault = Literal[
@@ -348,55 +349,55 @@ class StudioCapture(Model):
     interaction: Name
     """Script to play, e.g. suitcase_carry, cup_drink, stool_sit."""
     subject: Name
-    """Studio subject that plays it (see subjects.tsv)."""
+    """Subject of the studio (see subjects.tsv)."""
     seed: int
-    """Seed of the motion and of every error."""
+    """Seed of the motion and of all errors."""
     redrawn_detections: Annotated[int, Field(ge=0)] = 0
-    """Other numbers give the same recording, of which detectors err in another way."""
+    """Seed of the detectors' errors; other values give the same recording with other errors."""
     frames: Annotated[int, Field(ge=2, le=3000)] = 45
     """Number of frame sets."""
     annotate: bool = False
-    """Also write an annotation file that errs by up to 10 mm, 5 degrees and 5 frames."""
+    """Also write an annotation file with errors of up to 10 mm, 5 degrees and 5 frames."""
     starts_apart: Annotated[float, Field(ge=0, le=1.5)] = 0.0
-    """The cameras are started apart by up to so many seconds, and their times do not tell."""
+    """Largest difference between the cameras' starts, seconds; their timestamps do not show it."""
     every: dict[Name, Annotated[int, Field(ge=2, le=12)]] = {}
-    """Cameras with fewer frames a second: {k2: 2} records every second frame set only."""
+    """Cameras with a lower frame rate: {k2: 2} records every second frame set only."""
     keypoint_bias: Annotated[float, Field(ge=0, le=3)] = 1.0
-    """Scale of what a detector means otherwise by the body's joints, 10 to 20 mm at 1."""
+    """Scale of the detector's joint offsets from the body's joints, which are 10 to 20 mm at 1."""
     room: Literal["random", "furnished", "sparse", "bare"] = "random"
-    """With walls and furniture, a floor with two low pieces, or only a floor; by chance one capture
-    in five is bare."""
+    """furnished = walls and furniture; sparse = a floor with two low pieces; bare = only a floor;
+    random = bare in one capture of five."""
     passer_by: Literal["nobody", "walks", "stands"] = "nobody"
-    """Another person in the room, who walks 0.8 to 1.6 m past the subject or stands there."""
+    """Second person, who walks past the subject or stands at a distance of 0.8 to 1.6 m."""
     shoes: Literal["plain", "heavy"] = "plain"
-    """Shoes as thin as skin, or heavy ones: soles of 22 mm, 10 to 15 mm round the feet."""
+    """plain = as thin as skin; heavy = soles of 22 mm, 10 to 15 mm around the feet."""
     look: Literal["random", "mesh", "plain", "printed"] = "random"
-    """Colours of the object: its mesh's, one for all, or printed in a way that no scan knows."""
+    """Colours of the object: those of its mesh, one plain colour, or a print unknown to the mesh."""
     layout: LayoutName = "k4a"
-    """How the recordings are laid out; the same as in the table of sequences."""
+    """Layout of the recordings, as in the table of sequences."""
     depth: bool = True
     """Whether the cameras record depth."""
     video: bool = False
-    """Plain recordings as one video a camera instead of a folder of images."""
+    """Write plain recordings as one video per camera instead of a folder of images."""
     sound: bool = False
-    """Whether videos carry sound: steps, a voice, reverberation, each device's noise and delay."""
+    """Whether videos have sound: steps, voice, reverberation, noise and delay of each device."""
     states_starts: Annotated[float, Field(ge=0, le=1)] | None = None
-    """Also write an annotation that says when cameras started, with this deviation, seconds."""
+    """Also write an annotation of the cameras' starts with this standard deviation, seconds."""
     faults: tuple[StudioFault, ...] = ()
-    """What is broken in this recording on top of the usual errors; see docs/studio.md."""
+    """Faults of this recording in addition to the usual errors; see docs/studio.md."""
 
 
 class StudioSettings(Model):
-    """Virtual recordings made before the rest runs; absent for real recordings."""
+    """Virtual recordings, made before all other stages; absent for real recordings."""
 
     captures: dict[Name, StudioCapture]
-    """One entry for each sequence that the studio makes."""
+    """Virtual recordings by sequence."""
     fps: Literal[5, 15, 30, 60] = 15
-    """Frame sets a second; 60 is for layout plain."""
+    """Frame sets per second; 60 only for layout plain."""
     noise: Annotated[float, Field(ge=0, le=4)] = 1.0
-    """Scale of every error; 1 is the headline."""
+    """Scale of all errors; evaluations use 1."""
     noise_family: Literal["a", "b"] = "a"
-    """Shapes of the error distributions."""
+    """Family of the error distributions."""
     colour_mode: Literal["720P", "1080P", "1440P", "1536P", "2160P", "3072P"] = "1080P"
     """Resolution of the colour cameras."""
     depth_mode: Literal["NFOV_UNBINNED", "NFOV_2X2BINNED", "WFOV_UNBINNED", "WFOV_2X2BINNED"] = (
@@ -404,9 +405,10 @@ class StudioSettings(Model):
     )
     """Field of view and resolution of the depth cameras."""
     cameras: Annotated[int, Field(ge=1, le=16)] = 6
-    """Kinects in the ring."""
+    """Number of Kinects in the ring."""
     slips: Literal["missing", "silent"] = "missing"
-    """Two cameras lose frames, or deliver old frames whose device times do not tell."""
+    """Fault of two cameras: missing = they lose frames; silent = they deliver old frames with new
+    timestamps."""
 
 
 class BodyModels(Model):
@@ -419,10 +421,10 @@ class BodyModels(Model):
     male: Path | None = None
     """SMPLX_MALE.npz."""
     vposer: Path | None = None
-    """VPoser's weights, the prior of the body's pose: TR00_E096.pt (version 1) or a V02_05 .ckpt;
-    without, the open prior is used."""
+    """VPoser's weights, the prior of the body's pose: TR00_E096.pt (version 1) or a V02_05 .ckpt
+    (version 2). Without them, the open prior is used."""
     vposer_version: Literal[1, 2] | None = None
-    """Version that the file must have; without, it is told from the weights."""
+    """Version that the file must have; default: inferred from the weights."""
 
     def of(self, gender: str) -> Path | None:
         """The body file for a gender: its own, else the neutral one, else None (the open body)."""
@@ -430,15 +432,15 @@ class BodyModels(Model):
 
 
 class ClusterSettings(Model):
-    """What jobs ask of a cluster's scheduler; decides no result."""
+    """Resources that jobs request from a cluster's scheduler; without effect on results."""
 
     memory_scale: dict[Name, Positive] = {}
-    """Times the memory that a stage's jobs ask for, by stage, "all" = the others; a job that was
-    killed for its memory still comes back with more."""
+    """Factor of the requested memory by stage; "all" = all other stages. A job that exceeded its
+    memory is submitted again with more."""
     time_scale: dict[Name, Positive] = {}
-    """Times the minutes, likewise."""
+    """Factor of the requested time by stage; "all" = all other stages."""
     gpu_partition: str = ""
-    """Partition for the stages that run on a GPU; empty = the one that the profile names."""
+    """Partition for stages that run on a GPU; empty = the profile's partition."""
 
     @field_validator("memory_scale", "time_scale")
     @classmethod
@@ -446,7 +448,7 @@ class ClusterSettings(Model):
         known = ("all", "studio", *STAGES, "dataset")
         unknown = sorted(set(scales) - set(known))
         if unknown:
-            raise ValueError(f"{unknown[0]!r} is no stage; expected any of {', '.join(known)}")
+            raise ValueError(f"{unknown[0]!r} is no stage; expected one of {', '.join(known)}")
         return scales
 
 
@@ -456,7 +458,7 @@ class Config(Model):
     dataset: Name
     """Name of the dataset; results go to results/<dataset>/."""
     exclude: tuple[Name, ...] = ()
-    """Sequences of the table to leave out of everything."""
+    """Sequences of the table to ignore."""
     sequences: Path = Path("sequences.tsv")
     """Table of recordings."""
     subjects: Path = Path("subjects.tsv")
@@ -466,9 +468,9 @@ class Config(Model):
     annotations: Path = Path("annotations")
     """Folder of <sequence>.yaml files, all optional."""
     results: Path = Path("results")
-    """Folder for everything that is computed, relative to where the workflow runs."""
+    """Folder of all results, relative to the folder in which the workflow runs."""
     device: Literal["cpu", "cuda"] = "cpu"
-    """Where the fits run."""
+    """Device of the fits."""
     body_models: BodyModels = BodyModels()
     """SMPL-X files; without one, the open body is used."""
     frames: FramesSettings = FramesSettings()
@@ -494,7 +496,7 @@ class Config(Model):
     card: CardSettings = CardSettings()
     """The dataset's card."""
     cluster: ClusterSettings = ClusterSettings()
-    """What jobs ask of a cluster's scheduler."""
+    """Resources that jobs request from a cluster's scheduler."""
     studio: StudioSettings | None = None
     """Virtual recordings to make; absent for real ones."""
 
@@ -510,45 +512,45 @@ class SequenceEntry(Model):
     subject: Name
     """Row of subjects.tsv."""
     object: Name | None = None
-    """Key of objects.yaml; empty = a person alone, and no object is looked for."""
+    """Key of objects.yaml; empty = a person without an object."""
     intent: Name | None = None
-    """What the person was asked to do with the object, e.g. use or pass; empty = not stated.
-    Statistics are given by it, nothing else depends on it."""
+    """Instruction to the person, such as use or pass; empty = not stated. Used to group
+    statistics."""
     recordings: Path
-    """Folder of the recordings, one file or folder for each camera."""
+    """Folder of the recordings, with one file or folder per camera."""
     layout: LayoutName = "k4a"
-    """How the recordings are laid out: Azure Kinect files, InterCap's or BEHAVE's release, or plain
-    images and videos; see docs/recordings.md."""
+    """Layout of the recordings: k4a = Azure Kinect files; intercap, behave = files of these
+    releases; plain = images and videos. See docs/recordings.md."""
     calibration: Path
-    """Where the cameras are: a file or folder in the form that docs/recordings.md names for the
-    layout, or as Pose2Sim, Anipose, EasyMocap, COLMAP or nerfstudio write it."""
+    """File or folder of the camera calibration: the layout's own format (docs/recordings.md), or a
+    file of Pose2Sim, Anipose, EasyMocap, COLMAP or nerfstudio."""
     calibration_scale: Positive | None = None
-    """Metres for one unit of the calibration, where its form does not fix the unit."""
+    """Metres per unit of the calibration, for formats without a fixed unit."""
     calibration_up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None
-    """The axis of the calibration's own world that points up; not stated = it is not relied on."""
+    """Axis of the calibration's world frame that points up; empty = unknown."""
     calibration_floor: Metres | None = None
-    """Metres from the origin of the calibration's world up to the floor, 0 where the floor goes
-    through it; only with calibration_up."""
+    """Height of the floor above the origin of the calibration's world frame, metres; only with
+    calibration_up."""
     keypoints: Path | None = None
-    """Folder of people's keypoints: <camera>/<image>_keypoints.json as OpenPose writes them, or
-    <camera>.json or <camera>/<image>.json in the manner of COCO-WholeBody; docs/detectors.md."""
+    """Folder of human keypoints: <camera>/<image>_keypoints.json (OpenPose), or <camera>.json or
+    <camera>/<image>.json (COCO-WholeBody); see docs/detectors.md."""
     candidates: Path | None = None
     """Folder of <camera>.json files: instance segmentation in COCO's result format."""
     results: Path | None = None
-    """Results that another program made of this sequence, measured and shown in place of the joint
-    fit: as the InterCap release has them (res.pkl, or its folder), or the sequence's folder of
-    BEHAVE with its registrations; in the master camera's frame. See docs/recordings.md."""
+    """Another program's results for this sequence, in the master camera's frame; they replace the
+    joint fit in metrics and pages. InterCap's res.pkl or its folder, or BEHAVE's sequence folder
+    with its registrations. See docs/recordings.md."""
     truth: Path | None = None
-    """Truth of a virtual recording; read by the metrics alone."""
+    """Truth file of a virtual recording; read by the metrics only."""
     annotation: Path | None = None
-    """This sequence's annotation file; without one, <sequence>.yaml in the folder of annotations,
-    where it is there."""
+    """Annotation file of this sequence; default: <sequence>.yaml in the folder of annotations, if
+    it exists."""
 
     @model_validator(mode="after")
     def _floor_needs_up(self) -> SequenceEntry:
         if self.calibration_floor is not None and self.calibration_up is None:
             raise ValueError(
-                "calibration_floor is stated without calibration_up, which it is along"
+                "calibration_floor is set without calibration_up, the axis of its measurement"
             )
         return self
 
@@ -559,29 +561,29 @@ class SubjectEntry(Model):
     subject: Name
     """Name of the person."""
     gender: Literal["female", "male", "neutral"]
-    """Which body file is used, or of the open body whose shapes are expected; neutral: of all."""
+    """Body file, or shape prior of the open body; neutral = prior of all people."""
     height: Annotated[float, Field(ge=0.5, le=2.6)] | None = None
-    """Barefoot, in metres, where it is known; believed to 2 cm."""
+    """Height without shoes, metres, with a standard deviation of 2 cm; empty = unknown."""
 
 
 class ContinuousSymmetry(Model):
-    """As in BOP's models_info."""
+    """Axis of rotational symmetry, as in BOP's models_info."""
 
     axis: Vector3
     """Unit axis in the mesh's frame."""
     offset: Position = (0.0, 0.0, 0.0)
-    """A point on the axis, metres."""
+    """Point on the axis, metres."""
 
 
 class Symmetry(Model):
-    """Motions that leave the object looking the same."""
+    """Transforms that do not change the object's appearance."""
 
     discrete: tuple[tuple[float, ...], ...] = ()
-    """4x4 transforms, row by row, metres; the identity is implied."""
+    """4x4 transforms in row-major order, metres; the identity is implied."""
     continuous: tuple[ContinuousSymmetry, ...] = ()
     """Axes of rotational symmetry."""
     sphere: bool = False
-    """Any rotation about the mesh's origin looks the same."""
+    """Invariance to all rotations about the mesh's origin."""
 
     @model_validator(mode="after")
     def _sixteen(self) -> Symmetry:
@@ -595,31 +597,31 @@ class ObjectEntry(Model):
     """One entry of objects.yaml."""
 
     name: Name
-    """The entry's key, repeated by the loader."""
+    """Key of the entry."""
     mesh: Path
     """Watertight mesh in metres (.ply or .obj)."""
     contact_vertices: Path | None = None
-    """Vertices that people are likely to touch: a JSON list (or one that also says on which mesh it
-    was chosen, see geometry/rigid/contact_vertices.py), or a pickle as InterCap released."""
+    """Vertices of likely contact: a JSON list of indices, a JSON object with the list and the
+    checksum of its mesh, or a pickle as in InterCap's release."""
     symmetry: Symmetry = Symmetry()
     """Symmetry group."""
     labels: tuple[str, ...] = ()
-    """Detector classes that this object may be given (COCO names); empty = any."""
+    """Detector classes of this object (COCO names); empty = any."""
 
 
 # --- annotations -----------------------------------------------------------------------------
 
 
 class ContactInterval(Model):
-    """One body part touching the object for a while."""
+    """Interval in which one body part touches the object."""
 
     part: ContactPart
-    """Contact region of the body; any = it is not known which, only that none touches outside of
-    these intervals."""
+    """Contact region of the body; any = the region is unknown, and no region is in contact outside
+    of the annotated intervals."""
     start: FrameNumber
     """First frame set in contact, from 0."""
     end: FrameNumber
-    """First frame set after the contact; start = no frame, which is told and ignored."""
+    """First frame set after the contact. An interval with end = start is ignored with a warning."""
 
     @model_validator(mode="after")
     def _forward(self) -> ContactInterval:
@@ -634,24 +636,24 @@ class ObjectPose(Model):
     frame: FrameNumber = 0
     """Frame set of the pose."""
     rotation_vector: Vector3
-    """Axis times angle of master_from_object, radians."""
+    """Rotation of master_from_object, axis times angle, radians."""
     translation: Position
-    """Of the mesh's origin, metres."""
+    """Translation of master_from_object (position of the mesh's origin), metres."""
     sigma_m: Annotated[float, Field(gt=0.0, le=1.0)] = 0.01
-    """Standard deviation of where the object's centre is, along each axis, metres."""
+    """Standard deviation of the object's centre along each axis, metres."""
     sigma_degrees: Annotated[float, Field(gt=0.0, le=90.0)] = 5.0
     """Standard deviation of the rotation about each axis, degrees."""
 
 
 class ExchangedSides(Model):
-    """Frames in which a detector took the subject's left for its right."""
+    """Frames in which a detector exchanged the subject's left and right."""
 
     start: FrameNumber
-    """First frame set of them, from 0."""
+    """First frame set of the interval, from 0."""
     end: FrameNumber
-    """First frame set after them."""
+    """First frame set after the interval."""
     camera: CameraName | None = None
-    """Name of the camera, as in the calibration; absent = in all cameras."""
+    """Name of the camera, as in the calibration; absent = all cameras."""
 
     @model_validator(mode="after")
     def _forward(self) -> ExchangedSides:
@@ -661,20 +663,23 @@ class ExchangedSides(Model):
 
 
 class SubjectPoint(Model):
-    """A point of one image that lies on the subject, where several people are in the room."""
+    """A pixel on the subject, for recordings of several people."""
 
     camera: str
     """Name of the camera, as in the calibration."""
     frame: FrameNumber = 0
     """Frame set of the image."""
     x: float
-    """Pixels from the left edge of the colour image as recorded."""
+    """Pixels from the left edge of the recorded colour image."""
     y: float
-    """Pixels from its upper edge."""
+    """Pixels from the upper edge of the recorded colour image."""
 
     def fault(self, sizes: Mapping[str, tuple[int, int]]) -> str | None:
-        """Say that no camera of the recording has the point; ``sizes`` are the cameras' widths and
-        heights, pixels."""
+        """Error message if the point is in no image, otherwise None.
+
+        Args:
+            sizes: width and height of each camera's images, pixels.
+        """
         if self.camera not in sizes:
             return _no_camera(self.camera, list(sizes))
         width, height = sizes[self.camera]
@@ -691,17 +696,17 @@ def _no_camera(name: str, names: Sequence[str]) -> str:
 
 
 def floor_spread(points: Sequence[Position] | np.ndarray) -> float:
-    """Root mean square distance of points, metres, from the line that fits them best."""
+    """Root mean square distance of points (N, 3) from their best-fitting line, metres."""
     at = np.array(points, np.float64)
     values = np.linalg.svd(at - at.mean(0), compute_uv=False)
     return float(values[1] / np.sqrt(len(at)))
 
 
 class StatedStart(Model):
-    """When one camera started, and how well that is known."""
+    """Start of one camera."""
 
     seconds: Seconds
-    """When its first image was taken, on the clock that all of them are stated on."""
+    """Time of its first image on a clock shared by all cameras, seconds."""
     sigma: StartSigma | None = None
     """Standard deviation, seconds; absent = starts_sigma."""
 
@@ -712,52 +717,53 @@ Start = Annotated[
 ]
 
 
-class Recorded(NamedTuple):
-    """What an annotation's entries are of: the number of ``frames``, each camera's image by name
-    as (width, height), and the name of the ``master``."""
+class RecordingExtent(NamedTuple):
+    """Extent of a recording, within which annotations must lie."""
 
     frames: int
+    """Number of frame sets."""
     sizes: dict[str, tuple[int, int]]
+    """Width and height of each camera's images, pixels."""
     master: str
+    """Name of the master camera."""
 
 
-STATED_EMPTY = ("contact",)  # sections of an annotation in which an empty list states something
+STATED_EMPTY = ("contact",)  # sections in which an empty list is not the same as no list
 
 
 class Annotation(Model):
     """annotations/<sequence>.yaml; every section is optional."""
 
     contact: tuple[ContactInterval, ...] | None = None
-    """Frames in which body parts touch the object; absent = find them, an empty list = nothing
-    touches in the whole sequence."""
+    """Intervals in which body parts touch the object; absent = detect contact; an empty list = no
+    contact in the whole sequence."""
     object_poses: tuple[ObjectPose, ...] = ()
-    """Where the object is in some frames; its track agrees with them, and is carried from them
-    where nothing is seen of it; empty = search."""
+    """Object poses in some frames. The track agrees with them within their deviations and is
+    extrapolated from them in frames that show nothing of the object; empty = search."""
     object_pose: ObjectPose | None = None
-    """The same where there is one frame alone, instead of ``object_poses``."""
+    """Short form of ``object_poses`` for a single frame."""
     floor: tuple[Position, ...] | None = None
-    """Three or more points of the floor, master camera frame, metres; absent = fit."""
+    """Three or more points of the floor in the master camera's frame, metres; absent = estimate."""
     subject: tuple[SubjectPoint, ...] = ()
-    """Who of several people is the subject; more than one point where it left and came back;
-    absent = who handles the object, or is seen most."""
+    """Points on the subject, for recordings of several people; several points if the subject
+    leaves and returns. Absent = the person who handles the object, otherwise the one seen most."""
     left_right: tuple[ExchangedSides, ...] = ()
-    """Where a detector exchanged the subject's left and right: they are exchanged back."""
+    """Intervals in which a detector exchanged left and right; the stage person exchanges them
+    back."""
     drop_frames: tuple[FrameNumber, ...] = ()
     """Frame sets to treat as not recorded."""
     starts: dict[CameraName, Start] | None = None
-    """When cameras took their first images, seconds on one clock, whatever its zero: by camera, or
-    with a deviation of its own. The master is among them; absent = by the motion and the sound."""
+    """Time of each camera's first image on one clock with any origin, seconds, optionally with a
+    standard deviation. Must include the master. Absent = estimated from motion and sound."""
     starts_sigma: StartSigma = START_SIGMA_S
-    """Standard deviation of each of the starts that has none of its own, seconds."""
+    """Standard deviation of starts without their own, seconds."""
 
     @model_validator(mode="after")
-    def _starts_beside_others(self) -> Annotation:
+    def _starts_of_several_cameras(self) -> Annotation:
         if self.starts is None and "starts_sigma" in self.model_fields_set:
-            raise ValueError("starts_sigma is stated without starts")
+            raise ValueError("starts_sigma is set without starts")
         if self.starts is not None and len(self.starts) < 2:
-            raise ValueError(
-                "starts names fewer than two cameras; a start is told beside another's"
-            )
+            raise ValueError("starts names fewer than two cameras; name the master and others")
         return self
 
     @model_validator(mode="after")
@@ -766,8 +772,8 @@ class Annotation(Model):
             raise ValueError(f"floor has {len(self.floor)} points, a plane needs 3 or more")
         if self.floor is not None and floor_spread(self.floor) < MIN_FLOOR_SPREAD_M:
             raise ValueError(
-                f"the floor points lie on one line within {MIN_FLOOR_SPREAD_M * 1000:.0f} mm; a "
-                "plane needs one beside it"
+                f"the floor points lie on one line within {MIN_FLOOR_SPREAD_M * 1000:.0f} mm; add "
+                "a point away from it"
             )
         return self
 
@@ -780,19 +786,19 @@ class Annotation(Model):
             other = first.setdefault(pose.frame, index)
             if other != index:
                 raise ValueError(
-                    f"object_poses[{other}] and object_poses[{index}] are both of frame "
+                    f"object_poses[{other}] and object_poses[{index}] both describe frame "
                     f"{pose.frame}; keep one"
                 )
         return self
 
     @property
     def poses(self) -> tuple[ObjectPose, ...]:
-        """The object's annotated poses, by frame."""
+        """The object's annotated poses, ordered by frame."""
         given = self.object_poses if self.object_pose is None else (self.object_pose,)
         return tuple(sorted(given, key=lambda pose: pose.frame))
 
     def check_object(self, name: str | None) -> str | None:
-        """Say which section speaks of an object where the sequence's ``name`` of one is None."""
+        """Error message if the sequence has no object (``name`` None) but an annotated one."""
         if name is None:
             for section in ("contact", "object_pose", "object_poses"):
                 if getattr(self, section):
@@ -801,12 +807,12 @@ class Annotation(Model):
 
     @property
     def names_cameras(self) -> bool:
-        """Whether an entry is of a camera by its name."""
-        return bool(self.subject or self.starts) or any(one.camera for one in self.left_right)
+        """Whether an entry names a camera."""
+        return bool(self.subject or self.starts) or any(sides.camera for sides in self.left_right)
 
     @property
     def stated_starts(self) -> dict[str, tuple[float, float]]:
-        """Seconds and their standard deviation by camera; empty where no start is stated."""
+        """Start and its standard deviation by camera, seconds; empty without annotated starts."""
         stated = {}
         for name, start in (self.starts or {}).items():
             if isinstance(start, StatedStart):
@@ -816,8 +822,7 @@ class Annotation(Model):
         return stated
 
     def check_cameras(self, names: Sequence[str], master: str) -> str | None:
-        """Say which entry is of none of the cameras ``names``, or that the ``master``'s start
-        lacks."""
+        """Error message if an entry names an unknown camera or ``starts`` lacks the master."""
         for index, point in enumerate(self.subject):
             if point.camera not in names:
                 return f"subject[{index}] {_no_camera(point.camera, names)}"
@@ -829,13 +834,13 @@ class Annotation(Model):
                 return f"starts {_no_camera(name, names)}"
         if self.starts and master not in self.starts:
             return (
-                f"starts lacks {master}, the master, beside which the others' are told (0 where "
-                "they are counted from it)"
+                f"starts lacks {master}, the master; add its start (0 if the others are relative "
+                "to it)"
             )
         return None
 
-    def check_recording(self, recorded: Recorded) -> str | None:
-        """Say which entry is not of what was recorded, or None."""
+    def check_recording(self, recorded: RecordingExtent) -> str | None:
+        """Error message if an entry lies outside of the recording, otherwise None."""
         problem = self.check_frames(recorded.frames)
         if problem:
             return problem
@@ -846,7 +851,7 @@ class Annotation(Model):
         return self.check_cameras(list(recorded.sizes), recorded.master)
 
     def check_frames(self, count: int) -> str | None:
-        """Say which entry lies past the recording's ``count`` frame sets, or None."""
+        """Error message if an entry lies beyond the recording's ``count`` frame sets, or None."""
         for index, interval in enumerate(self.contact or ()):
             if interval.end > count:
                 return f"contact[{index}].end is {interval.end}, the recording has {count} frames"
@@ -874,7 +879,7 @@ class Annotation(Model):
 
 
 def digest(value: BaseModel | Any) -> str:
-    """A short digest of settings or of any JSON-like value: equal content, equal digest."""
+    """Digest of settings or of a JSON-like value: 16 hexadecimal digits of SHA-256."""
     if isinstance(value, BaseModel):
         value = value.model_dump(mode="json")
     text = json.dumps(value, sort_keys=True, default=str)

@@ -16,7 +16,7 @@ from intercap_core.config import (
     Annotation,
     Config,
     ObjectEntry,
-    Recorded,
+    RecordingExtent,
     SequenceEntry,
     SubjectEntry,
 )
@@ -29,12 +29,12 @@ from intercap_core.schemas import FRAMES
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 
 M = TypeVar("M", bound=BaseModel)
-NAMES_TOLD = 40  # of a table, in a message
+MAX_NAMES = 40  # names of a table that a message lists
 
 
 @dataclass(frozen=True)
 class Project:
-    """What one settings file and its tables say."""
+    """Settings file with its tables."""
 
     config: Config
     path: Path
@@ -64,16 +64,16 @@ class Project:
         return SequenceModels(self.object_of(sequence), subject, self.config.body_models)
 
     def object_of(self, sequence: str) -> ObjectEntry | None:
-        """The sequence's object; None where its row names none: a person alone."""
+        """The sequence's object; None for a person without an object."""
         name = self.sequences[sequence].object
         return None if name is None else self.objects[name]
 
     def objects_named(self) -> list[str]:
-        """Names of the objects that sequences have, sorted."""
+        """Sorted names of the objects in the table of sequences."""
         return sorted({row.object for row in self.sequences.values() if row.object is not None})
 
     def annotation_path(self, sequence: str) -> Path:
-        """Where this sequence's annotation file is, or would be."""
+        """Path of the sequence's annotation file, which need not exist."""
         if self.annotation_made(sequence):
             return self.results / "recordings" / sequence / "annotation.yaml"
         named = self.sequences[sequence].annotation if sequence in self.sequences else None
@@ -82,29 +82,31 @@ class Project:
         return tidy(self.path.parent / self.config.annotations / f"{sequence}.yaml")
 
     def artefact(self, sequence: str, stage: str) -> Path:
-        """Where a stage of this sequence writes: a file, or the folder of the export or page."""
+        """Path of a stage's output: a file, or a folder for export and page."""
         if stage == "page":
             return self.site / "sequences" / sequence
         return self.results / sequence / ("export" if stage == "export" else f"{stage}.h5")
 
     @property
     def site(self) -> Path:
-        """Folder of the pages, which can be given away as it is."""
+        """Folder of the site, which is self-contained."""
         return self.results / "site"
 
     def annotation(self, sequence: str, *, look_at_frames: bool = True) -> Annotation:
-        """Load this sequence's annotation; empty where there is no file.
+        """Load the sequence's annotation; an empty one if there is no file.
 
-        Raises UserError naming file and field where the file is broken or the sequence's row names
-        one that is not there, or where an entry lies past the end of the recording (as soon as its
-        frames have been read, and unless ``look_at_frames`` is False).
+        Raises UserError that names file and field if the file is invalid, if the table names a
+        missing file, or if an entry lies outside of the recording.
+
+        Args:
+            look_at_frames: compare the entries with the frames artefact, if it exists.
         """
         path = self.annotation_path(sequence)
         if not path.exists():
             if path == self.sequences[sequence].annotation:
                 raise UserError(
-                    f"{path}: sequence {sequence!r} names this annotation, and there is no such "
-                    "file; correct the column or clear it"
+                    f"{path}: no such file, but sequence {sequence!r} names it in the column "
+                    "annotation; correct the column or clear it"
                 )
             return Annotation()
         annotation = _parse(Annotation, _or_empty(read_yaml(path)), str(path), "annotation")
@@ -116,21 +118,21 @@ class Project:
             )
         if not look_at_frames:
             return annotation
-        recorded = self.recorded(sequence)
-        problem = annotation.check_recording(recorded) if recorded else None
-        if recorded and problem:
-            counted = " (numbered from 0)" if annotation.check_frames(recorded.frames) else ""
+        extent = self.recording_extent(sequence)
+        problem = annotation.check_recording(extent) if extent else None
+        if extent and problem:
+            counted = " (numbered from 0)" if annotation.check_frames(extent.frames) else ""
             raise UserError(f"{path}: {problem}{counted}; correct the entry")
         return annotation
 
-    def recorded(self, sequence: str) -> Recorded | None:
-        """What the sequence's annotation may speak of; None before its frames have been read."""
+    def recording_extent(self, sequence: str) -> RecordingExtent | None:
+        """Extent of the recording by its frames artefact; None if there is none."""
         with (
             contextlib.suppress(artefacts.Unreadable),
             artefacts.read(self.artefact(sequence, "frames"), FRAMES) as source,
         ):
             sizes = [(int(width), int(height)) for width, height in source["colour_size"]]
-            return Recorded(
+            return RecordingExtent(
                 len(source["times"]),
                 dict(zip(source.text("camera_names"), sizes, strict=True)),
                 str(source.attributes["master"]),
@@ -138,7 +140,7 @@ class Project:
         return None
 
     def annotation_made(self, sequence: str) -> bool:
-        """Whether the studio writes this sequence's annotation, beside the recordings."""
+        """Whether the studio writes this sequence's annotation along with its recordings."""
         captures = self.config.studio.captures if self.config.studio else {}
         if sequence not in captures:
             return False
@@ -217,8 +219,8 @@ def load_project(path: Path, overrides: Mapping[str, Any] | None = None) -> Proj
 def _some(names: Iterable[str]) -> str:
     """Names in order, the first of many."""
     found = sorted(names)
-    more = f" and {len(found) - NAMES_TOLD} more" if len(found) > NAMES_TOLD else ""
-    return ", ".join(found[:NAMES_TOLD]) + more
+    more = f" and {len(found) - MAX_NAMES} more" if len(found) > MAX_NAMES else ""
+    return ", ".join(found[:MAX_NAMES]) + more
 
 
 def _merged(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
@@ -231,7 +233,7 @@ def _merged(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str
 
 
 def _check_files(project: Project) -> None:
-    """Meshes and body files are shared by sequences: what is missing stops the run."""
+    """Raise UserError if a mesh or body file is missing; sequences share these files."""
     for name in project.objects_named():
         entry = project.objects[name]
         for field in ("mesh", "contact_vertices"):
@@ -248,7 +250,7 @@ def _check_files(project: Project) -> None:
         if isinstance(file, Path) and not file.is_file():
             raise UserError(
                 f"{project.path}: body_models.{field} is {file}, and there is no such file; "
-                "correct the path, or remove the line to use what is open"
+                "correct the path, or remove the line to use the open model"
             )
     definition = project.config.body_fit.keypoint_definition
     if definition is not None and not definition.is_file():
@@ -324,14 +326,14 @@ def _check_studio(project: Project, rows: dict[str, SequenceEntry], table: Path)
 
 
 def tidy(path: Path) -> Path:
-    """The path without "..", relative to the working directory where it lies below that."""
+    """The path without "..", relative to the working directory if it lies below it."""
     absolute = Path(os.path.abspath(path))
     here = Path.cwd()
     return absolute.relative_to(here) if absolute.is_relative_to(here) else absolute
 
 
 def _or_empty(values: Any) -> Any:
-    """What a YAML file holds, where an empty file holds no entries."""
+    """Contents of a YAML file; an empty file has no entries."""
     return {} if values is None else values
 
 
@@ -349,8 +351,8 @@ def _parse(model: type[M], values: Any, where: str, what: str) -> M:
         found = first.get("input")
         shown = "" if isinstance(found, dict) else f", found {quoted(found)}"
         more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
-        told = printable(f"{what} {field}: {message}{shown}{more}")
-        raise UserError(f"{where}: {told}; correct it") from None
+        fault = printable(f"{what} {field}: {message}{shown}{more}")
+        raise UserError(f"{where}: {fault}; correct it") from None
 
 
 def _read_table(path: Path, model: type[M], key: str, settings: Path) -> list[M]:

@@ -245,7 +245,7 @@ def test_mistakes_stop_with_one_sentence(folder: Path, edit: Edit, says: list[st
         ("object_pose: {frame: 0, translation: [0, 0, 1]}\n", ["rotation_vector", "required"]),
         (
             f"object_poses: [{POSE % 1}, {POSE % 4}, {POSE % 1}]\n",
-            ["object_poses[0] and object_poses[2] are both of frame 1"],
+            ["object_poses[0] and object_poses[2] both describe frame 1"],
         ),
         (
             f"object_pose: {POSE % 1}\nobject_poses: [{POSE % 2}]\n",
@@ -280,7 +280,7 @@ def test_mistakes_stop_with_one_sentence(folder: Path, edit: Edit, says: list[st
         ("starts: {k1: 0, k2: {seconds: 1, sigma: 0}}\n", ["starts.k2", "sigma", "greater", "0"]),
         ("starts: {k1: 0, k2: 1}\nstarts_sigma: -1\n", ["starts_sigma", "greater", "-1"]),
         ("starts: {k1: 0, k2: 1}\nstarts_sigma: 20\n", ["starts_sigma", "10", "20"]),
-        ("starts_sigma: 0.1\n", ["starts_sigma is stated without starts"]),
+        ("starts_sigma: 0.1\n", ["starts_sigma is set without starts"]),
         ("flor: []\n", ["flor", "not permitted"]),
         ("contact: [\n", ["not valid YAML"]),
         ("- 1\n", ["expected names and values"]),
@@ -320,7 +320,7 @@ def test_a_row_can_name_its_annotation(folder: Path) -> None:
     rows = [f"{header}\tannotation", f"{first}\tannotations/other.yaml"]
     table.write_text("\n".join([*rows, *(f"{line}\t" for line in others)]) + "\n")
     (folder / "annotations" / "one.yaml").write_text("drop_frames: [1]\n")
-    with pytest.raises(UserError, match=r"other.yaml: sequence 'one' names this annotation"):
+    with pytest.raises(UserError, match=r"other.yaml: no such file, but sequence 'one' names it"):
         load_project(Path("config.yaml")).annotation("one")
     (folder / "annotations" / "other.yaml").write_text("drop_frames: [2]\n")
     project = load_project(Path("config.yaml"))

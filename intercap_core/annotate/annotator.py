@@ -268,7 +268,7 @@ class Annotator:
     def _faults(self, name: str, annotation: Annotation) -> list[dict[str, str]]:
         """What the recording says against an annotation."""
         told = [annotation.check_object(self.project.sequences[name].object)]
-        recorded = self.project.recorded(name)
+        recorded = self.project.recording_extent(name)
         told.append(
             annotation.check_recording(recorded)
             if recorded

@@ -110,5 +110,5 @@ def test_megabytes_of_recordings_are_those_of_videos(tmp_path: Path) -> None:
 
 
 def test_a_factor_of_no_stage_is_refused() -> None:
-    with pytest.raises(UserError, match="'jiont' is no stage; expected any of all, studio, frames"):
+    with pytest.raises(UserError, match="'jiont' is no stage; expected one of all, studio, frames"):
         project(cluster={"memory_scale": {"jiont": 2}})
