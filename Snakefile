@@ -5,18 +5,12 @@ min_version("9.20")
 
 include: "workflow/rules/common.smk"
 include: "workflow/rules/studio.smk"
-include: "workflow/rules/frames.smk"
-include: "workflow/rules/detections.smk"
-include: "workflow/rules/scene.smk"
-include: "workflow/rules/person.smk"
-include: "workflow/rules/object_track.smk"
-include: "workflow/rules/body_fit.smk"
-include: "workflow/rules/joint.smk"
-include: "workflow/rules/metrics.smk"
-include: "workflow/rules/summary.smk"
-include: "workflow/rules/page.smk"
-include: "workflow/rules/export.smk"
 include: "workflow/rules/dataset.smk"
+
+
+for _stage in STAGES:
+
+    include: f"workflow/rules/{_stage}.smk"
 
 
 rule all:

@@ -372,7 +372,7 @@ class StudioCapture(Model):
     shoes: Literal["plain", "heavy"] = "plain"
     """plain = as thin as skin; heavy = soles of 22 mm, 10 to 15 mm around the feet."""
     look: Literal["random", "mesh", "plain", "printed"] = "random"
-    """Colours of the object: those of its mesh, one plain colour, or a print unknown to the mesh."""
+    """Colours of the object: of its mesh, one plain colour, or a print unknown to the mesh."""
     layout: LayoutName = "k4a"
     """Layout of the recordings, as in the table of sequences."""
     depth: bool = True

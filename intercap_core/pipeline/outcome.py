@@ -31,7 +31,7 @@ def line(stage: str, path: Path, inputs: Mapping[str, Path] | None = None) -> st
     if stage in _FOLDER_LINES:
         return _FOLDER_LINES[stage](path, inputs or {})
     with artefacts.read(path, getattr(schemas, stage.upper())) as artefact:
-        return _LINES[stage](artefact)
+        return _LINES[stage](artefact) if stage in _LINES else f"{path.stat().st_size / 1e6:.1f} MB"
 
 
 def dataset_line(results: Path) -> str:
