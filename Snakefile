@@ -14,8 +14,10 @@ for _stage in STAGES:
 
 
 rule all:
-    """Artefacts, exports and pages of every sequence, and the site; each by name, so that one that
-    was removed is made again though what was made of it is there."""
+    """All outputs: artefacts, exports and pages of every sequence, and the site.
+
+    Each output is listed, so that a deleted one is made again even if later outputs exist.
+    """
     default_target: True
     input:
         rules.dataset.output,

@@ -22,7 +22,7 @@ from intercap_core.stage_list import SEQUENCE_STAGES, STAGES, Extent
 
 
 def _load():
-    """Check all settings and tables before any job; one sentence says what is wrong."""
+    """Load and validate settings and tables before any job starts."""
     given = workflow.config_settings.configfiles
     path = given[0] if given else Path("config/config.yaml")
     overrides = {key: value for key, value in config.items() if key != "project"}
@@ -44,7 +44,7 @@ if workflow.is_main_process:
         raise WorkflowError(str(error)) from None
     atexit.register(PLAN.save)
 VIRTUAL = [name for name in SEQUENCES if PROJECT.recordings_made(name) is not None]
-NOTHING = "(?!)"  # a pattern that no text matches
+NOTHING = "(?!)"  # pattern without a match
 RESULTS = PROJECT.results.as_posix()
 LOGS = PROJECT.logs.as_posix()
 BENCHMARKS = f"benchmarks/{SETTINGS.dataset}"
@@ -56,18 +56,18 @@ wildcard_constraints:
 
 
 def existing(*paths):
-    """The paths that are there: what is missing is the fault of one sequence, told by its job."""
+    """Existing paths among ``paths``. A missing file fails the job of its sequence only."""
     return [path for path in paths if path is not None and Path(path).exists()]
 
 
 def of_sequence(wildcards):
-    """The sequence's row, its object (None = a person alone) and its subject."""
+    """The sequence's row, its object (None for a person without an object) and its subject."""
     row = PROJECT.sequences[wildcards.sequence]
     return row, PROJECT.object_of(wildcards.sequence), PROJECT.subjects[row.subject]
 
 
 def made_by_studio(wildcards, name):
-    """What stands for the studio's files of this kind; None for a real recording."""
+    """Output of the rule studio that represents a column's files; None for a real recording."""
     if PROJECT.recordings_made(wildcards.sequence) is None:
         return None
     output = "truth" if name == "truth" else "manifest"
@@ -75,16 +75,16 @@ def made_by_studio(wildcards, name):
 
 
 def recorded(column):
-    """Input function: what the sequence's row says under ``column``, or the studio made for it.
+    """Input function: files of the sequence's row in ``column``, or the studio's output.
 
-    Their dates do not count, but those of what the studio makes anew.
+    Their dates are ignored, except those of a recording that the studio makes again.
     """
 
     def files(wildcards):
         made = made_by_studio(wildcards, column)
         if made is not None:
-            anew = PLAN.is_stale(wildcards.sequence, STUDIO)
-            return made if anew else ancient(made)
+            is_stale = PLAN.is_stale(wildcards.sequence, STUDIO)
+            return made if is_stale else ancient(made)
         row = PROJECT.sequences[wildcards.sequence]
         if column == "recordings":
             return ancient(input_files(row))
@@ -94,17 +94,16 @@ def recorded(column):
 
 
 def annotation_broken(sequence):
-    """Whether the sequence's annotation cannot be read; the studio's own is not there yet."""
+    """Whether the sequence's annotation is invalid; one that the studio writes is not checked."""
     return bool(PLAN.annotation_fault(sequence)) and not PROJECT.annotation_made(
         sequence
     )
 
 
 def annotation_input(wildcards):
-    """Input function: where the annotation is broken, the output of a job that fails and says why.
+    """Input function: for an invalid annotation, the output of a job that fails with the reason.
 
-    What was computed before stays, and no other sequence is touched. That an annotation has
-    changed is seen by what is recorded in the artefacts.
+    The sequence's existing outputs stay. Changes of a valid annotation are found by the manifests.
     """
     if not annotation_broken(wildcards.sequence):
         return []
@@ -112,24 +111,24 @@ def annotation_input(wildcards):
 
 
 def out_of_date(stage):
-    """Input function: a mark that is newer than the stage's output where that was made from other
-    settings, annotations, files, code or artefacts than it would be now.
+    """Input function: for a stale output, a mark that is newer than the output.
 
-    This alone makes a job run again: all other inputs are ``ancient``.
+    Only this mark makes Snakemake run a job again; all other inputs are ``ancient``. See
+    docs/reruns.md.
     """
     return lambda wildcards: PLAN.mark(getattr(wildcards, "sequence", ""), stage)
 
 
 def identity_of(stage):
-    """Param: what the output is to be made from, for whoever compares jobs of two runs."""
+    """Param: fingerprint that the output will get, shown in Snakemake's reports."""
     return lambda wildcards: PLAN.fingerprint(getattr(wildcards, "sequence", ""), stage)
 
 
 def artefacts_read(stage):
-    """Input function: the artefacts that a stage reads, by the stage that wrote each.
+    """Input function: the artefacts that a stage reads, by stage.
 
-    Where the stage's output is out of date, it runs when these are made anew; else what they come
-    to is as it was, and their dates do not count.
+    Their dates count only if the stage's output is stale. Otherwise they are remade with the same
+    content, if at all, and the output stays up to date.
     """
 
     def files(wildcards):
@@ -145,7 +144,7 @@ def artefacts_read(stage):
 
 
 def summaries(wildcards):
-    """Input function: every sequence's summary, which count by their dates as above."""
+    """Input function: the summaries of all sequences; dates count as in ``artefacts_read``."""
     paths = expand(f"{RESULTS}/{{sequence}}/summary.h5", sequence=SEQUENCES)
     return paths if PLAN.is_stale("", DATASET) else ancient(paths)
 
@@ -157,35 +156,34 @@ def object_files(wildcards):
 
 
 def body_file(wildcards):
-    """Input function: the licensed body file of the subject's gender, where one is set."""
+    """Input function: the licensed body file of the subject's gender, if one is set."""
     _, _, subject = of_sequence(wildcards)
     return existing(SETTINGS.body_models.of(subject.gender))
 
 
 def pose_prior_file(wildcards):
-    """Input function: the pose prior's weights, where the settings name them."""
+    """Input function: the pose prior's weights, if the settings name them."""
     return existing(SETTINGS.body_models.vposer)
 
 
 def keypoint_definition_file(wildcards):
-    """Input function: where the detector's points lie, where the settings name a table."""
+    """Input function: the table of the detector's joint positions, if the settings name one."""
     return existing(SETTINGS.body_fit.keypoint_definition)
 
 
 def motion_prior_files(wildcards):
-    """Input function: the motion prior's weights and statistics, where the settings name them."""
+    """Input function: the motion prior's weights and statistics, if the settings name them."""
     return existing(*(SETTINGS.joint.lemo_files or ()))
 
 
 def results_file(wildcards):
-    """Input function: what stands for another program's results, where the sequence's row names
-    them."""
+    """Input function: files of another program's results, if the sequence's row names them."""
     named = PROJECT.sequences[wildcards.sequence].results
     return [] if named is None else existing(*files_of(named))
 
 
 def length_of(wildcards):
-    """How many frame sets and cameras there are to compute; known exactly once frames are."""
+    """Extent of the sequence, from its frames artefact or estimated from its recordings."""
     if not hasattr(wildcards, "sequence"):
         return Extent(0, 0)
     frames = PROJECT.artefact(wildcards.sequence, "frames")
@@ -195,12 +193,12 @@ def length_of(wildcards):
 
 @functools.cache
 def length_since(sequence, changed):
-    """The length of a sequence whose frames artefact was written at ``changed``."""
+    """Extent of a sequence whose frames artefact has the date ``changed``."""
     return extent_of(PROJECT, sequence)
 
 
 def memory(stage):
-    """Resource: by frames and cameras, and more with every attempt after a job was killed."""
+    """Resource: megabytes by frames and cameras, growing with each attempt."""
 
     def megabytes(wildcards, attempt):
         return memory_mb(PROJECT, stage, length_of(wildcards), attempt)
@@ -209,7 +207,7 @@ def memory(stage):
 
 
 def duration(stage):
-    """Resource: minutes, likewise; of the recordings' reader by their bytes."""
+    """Resource: minutes by frames and cameras, and by file size for the stage frames."""
 
     def asked(wildcards, attempt):
         read = 0.0
@@ -221,7 +219,7 @@ def duration(stage):
 
 
 def gpu_of(stage):
-    """Resources: a GPU, and the partition that has some, where the settings have the stage use it."""
+    """Resources: a GPU and its partition, if the settings run the stage on a GPU."""
     if not on_gpu(PROJECT, stage):
         return {}
     partition = SETTINGS.cluster.gpu_partition
