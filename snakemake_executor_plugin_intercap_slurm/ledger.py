@@ -1,4 +1,4 @@
-"""Which Slurm job computes what: a small file a job, for the run that comes after a killed one."""
+"""Ledger of submitted Slurm jobs, so that a run can adopt the jobs of a killed one."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-MARKS = "out_of_date"  # folder of the marks of outputs that are to be made anew
-Stamp = tuple[int, int]  # time of change in nanoseconds, and size
+MARKS = "out_of_date"  # folder of the marks of stale outputs
+Stamp = tuple[int, int]  # modification time in nanoseconds, and size
 
 
 def run_name(prefix: str | None) -> str:
-    """Slurm's name for the jobs of this folder and user: the same for every run."""
+    """Slurm's job name for this folder and user, the same for every run."""
     place = f"{getpass.getuser()}:{Path.cwd().resolve()}"
     name = str(uuid.uuid5(uuid.NAMESPACE_URL, place))
     return f"{prefix}_{name}" if prefix else name
 
 
 def stamp(path: str | os.PathLike[str]) -> Stamp | None:
-    """Time and size of a file or folder; None where there is none."""
+    """Modification time and size of a file or folder; None if it does not exist."""
     try:
         found = os.stat(path)
     except OSError:
@@ -33,46 +33,49 @@ def stamp(path: str | os.PathLike[str]) -> Stamp | None:
 
 
 def members(job: Any) -> list[Any]:
-    """The jobs of a group in their order; a single job alone."""
+    """Jobs of a group in their order, or the single job."""
     return list(job) if job.is_group() else [job]
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A job by the files that it writes; ``digest`` tells whether it is still what is asked for.
-
-    ``logs`` are the stamps that its stages' logs had before it was submitted, by path.
-    """
+    """A submitted job."""
 
     outputs: tuple[str, ...]
+    """Files that it writes."""
     digest: str
+    """Digest of its rules, parameters and inputs; a job with another digest is outdated."""
     logs: dict[str, Stamp | None]
+    """Stamps of its stages' logs before the submission, by path."""
     slurm_id: str = ""
+    """Number of the Slurm job."""
     slurm_log: str = ""
+    """Path of Slurm's log."""
 
     @classmethod
     def of(cls, job: Any) -> Entry:
-        """Of a job that is about to be submitted."""
+        """Entry of a job before its submission."""
         parts = members(job)
         outputs = sorted({str(path) for part in parts for path in part.output})
-        asked = [
+        content = [
             [(part.rule.name, sorted(map(repr, part.params.items()))) for part in parts],
             sorted(
                 (str(path), stamp(path))
                 for path in job.input
-                # a mark is as old as the run that sets it; what it stands for is in the params
+                # each run rewrites its marks; the params contain the fingerprint behind a mark
                 if str(path) not in outputs and MARKS not in Path(path).parts
             ),
         ]
         logs = {str(path): stamp(path) for part in parts for path in part.log}
-        return cls(tuple(outputs), hashlib.sha256(repr(asked).encode()).hexdigest(), logs)
+        return cls(tuple(outputs), hashlib.sha256(repr(content).encode()).hexdigest(), logs)
 
     def submitted(self, slurm_id: str, slurm_log: str) -> Entry:
+        """The entry after the submission."""
         return replace(self, slurm_id=slurm_id, slurm_log=slurm_log)
 
 
 class Ledger:
-    """The entries of a folder's jobs, each in the file ``<number of the Slurm job>.json``."""
+    """Entries of a folder's jobs, each in the file ``<number of the Slurm job>.json``."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -87,7 +90,7 @@ class Ledger:
         self._file(slurm_id).unlink(missing_ok=True)
 
     def keep(self, live: Collection[str]) -> list[Entry]:
-        """The entries of jobs that live; those of the others are removed."""
+        """Remove the entries of jobs that are not in ``live``; returns the others."""
         kept = []
         for path in sorted(self._folder.glob("*.json")):
             if path.stem in live and (entry := _read(path)) is not None:
@@ -105,7 +108,7 @@ def by_outputs(entries: Iterable[Entry]) -> dict[tuple[str, ...], Entry]:
 
 
 def _read(path: Path) -> Entry | None:
-    """An entry; None where the file is damaged."""
+    """The entry in a file; None if the file is damaged."""
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
         logs = {name: tuple(value) if value else None for name, value in values["logs"].items()}

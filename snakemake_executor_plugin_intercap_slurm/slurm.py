@@ -1,4 +1,4 @@
-"""What is asked of Slurm beside submitting: which jobs it has, whether it answers."""
+"""Queries to Slurm: states of jobs, cancelling, whether the controller answers."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-ASKED_AGAIN_AFTER_S = 5.0
-CANCELLED_WITHIN_S = 120.0
-ANSWERS_WITHIN_S = 60.0
-HELD = "HELD"  # here: by Slurm itself, which could not launch the job, until somebody releases it
-LAUNCH_FAILED = {"launch failed requeued held", "jobholdmaxrequeue"}  # reasons for that
+PING_INTERVAL_S = 5.0
+CANCEL_TIMEOUT_S = 120.0
+COMMAND_TIMEOUT_S = 60.0
+HELD = "HELD"  # our name for a job that Slurm holds because it could not launch it
+LAUNCH_FAILED = {"launch failed requeued held", "jobholdmaxrequeue"}  # squeue's reasons for it
 # States of a job that has not ended.
 LIVE = {
     HELD,
@@ -23,8 +23,10 @@ LIVE = {
 
 
 def states(name: str) -> dict[str, str] | None:
-    """State of each job called ``name`` that the controller knows, by number; ended ones too for as
-    long as it keeps them (``MinJobAge``). None where it does not answer."""
+    """State by number of the jobs with the name ``name``; None if the controller does not answer.
+
+    Includes ended jobs as long as the controller keeps them (``MinJobAge``).
+    """
     done = _run(["squeue", "--noheader", "--states=all", "--name", name, "--format=%i|%T|%r"])
     if done is None or done.returncode:
         return None
@@ -37,9 +39,9 @@ def _is_held(state: str, reason: str) -> bool:
 
 
 def cancel(number: str, name: str) -> None:
-    """Cancel a job and wait until it has ended, so that it writes nothing any more."""
+    """Cancel a job and wait until it has ended and writes no more files."""
     _run(["scancel", number])
-    end = time.monotonic() + CANCELLED_WITHIN_S
+    end = time.monotonic() + CANCEL_TIMEOUT_S
     while time.monotonic() < end:
         known = states(name)
         if known is not None and known.get(number) not in LIVE:
@@ -48,20 +50,20 @@ def cancel(number: str, name: str) -> None:
 
 
 def wait_for_controller(logger: Any, ending: threading.Event) -> None:
-    """Return when the controller answers, or when nobody waits for it any more."""
-    told = False
+    """Return when the controller answers or ``ending`` is set."""
+    warned = False
     while not ending.is_set():
         done = _run(["scontrol", "ping"])
         if done is not None and " UP" in done.stdout:
             return
-        if not told:
+        if not warned:
             logger.warning("Slurm's controller does not answer; jobs are submitted when it does.")
-            told = True
-        ending.wait(ASKED_AGAIN_AFTER_S)
+            warned = True
+        ending.wait(PING_INTERVAL_S)
 
 
 def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str] | None:
     try:
-        return subprocess.run(command, capture_output=True, text=True, timeout=ANSWERS_WITHIN_S)
+        return subprocess.run(command, capture_output=True, text=True, timeout=COMMAND_TIMEOUT_S)
     except subprocess.TimeoutExpired:
         return None

@@ -235,7 +235,7 @@ def test_controller_killed(
         time.sleep(30.0)
         run.slurm.start_one("slurmctld")
         said = started.ends_well()
-    assert f"Slurm could not launch job '{number}', and holds it" in said
+    assert f"Slurm could not launch job '{number}' and holds it" in said
     assert run.slurm.jobs(ended=True)[number][0] == "CANCELLED"
     assert len(numbers(run, ONE) - before) == 2
     run.slurm.command("scontrol", "update", f"nodename={node}", "state=resume")
@@ -332,7 +332,7 @@ def test_submitter_killed(
         found = f"Slurm job {number} of an earlier run computes"
         run.slurm.wait_for(lambda: found in again.said, "the job is found", within=300)
         send(signal.SIGCONT, processes)
-        assert "it is waited for" in again.ends_well()
+        assert "waiting for it" in again.ends_well()
     assert len(numbers(run, ONE) - before) == 2
 
 

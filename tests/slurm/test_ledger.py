@@ -9,8 +9,8 @@ from types import SimpleNamespace
 
 import pytest
 
+from snakemake_executor_plugin_intercap_slurm.endings import endings
 from snakemake_executor_plugin_intercap_slurm.ledger import Entry, Ledger
-from snakemake_executor_plugin_intercap_slurm.words import endings
 
 
 @dataclass

@@ -71,7 +71,7 @@ def test_a_mistake_is_submitted_once_and_told(tiny: ClusterRun, slurm: LoopbackS
     assert started.process.wait(300) == 1
     assert len(slurm.submitted_for("rule_detections", NAME)) == 1, started.said
     assert f"{NAME}: detections: failed: sequence {NAME}: no detections for any" in started.said
-    assert "It is not tried again" in started.said
+    assert "It is not submitted again" in started.said
     assert written(tiny.flow.results) == kept
 
 

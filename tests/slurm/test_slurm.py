@@ -51,7 +51,7 @@ class Executor(plugin.Executor):
 
     def __init__(self) -> None:
         self.run_uuid, self.logger = "name", logging.getLogger(__name__)
-        self._looked_at: list[SubmittedJobInfo] = []
+        self._polled: list[SubmittedJobInfo] = []
         self._over: set[int] = set()
         self._missing_since: dict[str, float] = {}
         self._last_submission = 0.0
@@ -123,7 +123,7 @@ def test_ctrl_c_reaches_jobs_that_are_looked_at(
     monkeypatch.setattr(SlurmExecutor, "cancel_jobs", no_answer)
     active, looked_at, ended = (submitted(tmp_path, number) for number in "789")
     executor = Executor()
-    executor._looked_at = [active, looked_at, ended]
+    executor._polled = [active, looked_at, ended]
     executor._over = {id(ended)}
     executor.cancel_jobs([active])
     assert cancelled == ["7", "8"]

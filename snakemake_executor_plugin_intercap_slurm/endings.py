@@ -1,4 +1,4 @@
-"""How the stages of a failed job ended, by their logs."""
+"""How the stages of a failed job ended, according to their logs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from intercap_core.pipeline.job import ENDED, UNEXPECTED, read_state
 
 from .ledger import Entry, members, stamp
 
-# What Slurm's own log of a job says of an end that the job had no word in.
+# Reasons in Slurm's log of a job that Slurm itself ended.
 REASONS = re.compile(
     r"(exceeded \w*\s*memory limit|oom.?kill|DUE TO [A-Z ]+[A-Z]|CANCELLED)", re.IGNORECASE
 )
@@ -20,31 +20,33 @@ REASONS = re.compile(
 
 @dataclass(frozen=True)
 class Ending:
-    """One stage: ``state`` is "finished", "failed", "running" (it has ended without a log entry) or
-    "waiting" (it has not begun). ``words`` say why; of a finished one, why its job failed after it.
-    """
+    """End of one stage of a job."""
 
     name: str
+    """Sequence and stage."""
     state: str
+    """"finished", "failed", "running" (ended without a log entry) or "waiting" (did not begin)."""
     words: str
+    """Reason; for a finished stage, why its job failed afterwards, if it did."""
 
     @property
     def is_mistake(self) -> bool:
-        """Whether it was told in a sentence what is wrong with the input: that stays wrong."""
+        """Whether the stage reported a fault of its input, which a retry would meet again."""
         return self.state == "failed" and not self.words.startswith(UNEXPECTED)
 
     def line(self, slurm_id: str) -> str:
-        said = {
+        """Line for the log of the run."""
+        lines = {
             "finished": f"finished; its job then ended: {self.words}" if self.words else "finished",
             "failed": f"failed: {self.words}",
             "running": f"ended without a log entry: {self.words}",
             "waiting": f"did not begin: {self.words}",
         }
-        return f"Slurm job {slurm_id}, {self.name}: {said[self.state]}"
+        return f"Slurm job {slurm_id}, {self.name}: {lines[self.state]}"
 
 
 def endings(job: Any, entry: Entry, slurm_log: Path) -> list[Ending]:
-    """One for each stage of a job that failed, in their order."""
+    """End of each stage of a failed job, in their order."""
     found = []
     for part in members(job):
         log = Path(str(next(iter(part.log))))
@@ -67,9 +69,9 @@ def endings(job: Any, entry: Entry, slurm_log: Path) -> list[Ending]:
 
 
 def _slurms_reason(slurm_log: Path) -> str:
-    """Why Slurm ended a job, in its own words; otherwise what may have been."""
+    """Reason in Slurm's log for the end of a job; otherwise a list of likely reasons."""
     with contextlib.suppress(OSError):
-        said = REASONS.findall(slurm_log.read_text(encoding="utf-8", errors="replace"))
-        if said:
-            return said[0]
+        reasons = REASONS.findall(slurm_log.read_text(encoding="utf-8", errors="replace"))
+        if reasons:
+            return reasons[0]
     return "killed for its memory or time, cancelled, or its node went down"
