@@ -45,13 +45,14 @@ SLOW = (
 )
 
 
-# Folders and files of the second tier, `make test-all`: a browser, a Slurm of their own.
+# Folders and files of the second tier, `make test-all`.
 FULL = (
     "annotate/browser",
     "output/site/test_site_in_a_browser.py",
     "output/viewer/test_browser.py",
     "slurm/test_faults.py",
     "slurm/test_short.py",
+    "workflow/test_identity.py",
 )
 # One test of each that `make test` runs as well.
 SMOKE = frozenset(

@@ -1,4 +1,4 @@
-"""A copy of the project in a folder of its own, run by the real Snakemake."""
+"""A copy of the project in its own folder, run by the real Snakemake."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+import h5py
 from numba.core.caching import _CacheLocator
 
 from intercap_core.kernel_cache import use_kernel_cache
@@ -19,35 +20,42 @@ ROOT = Path(__file__).resolve().parents[2]
 EXECUTOR = "snakemake_executor_plugin_intercap_slurm"
 COPIED = ("Snakefile", "workflow", "profiles", "envs", "config", "intercap_core", EXECUTOR)
 KERNELS = shutil.ignore_patterns("*.nbi", "*.nbc")  # of a cache beside the source
-AS_IF_MADE_NOW = """
+# Rewrites the manifest of every output to what the output would be made from now.
+REWRITE_MANIFESTS = """
 import sys
 from dataclasses import replace
 from pathlib import Path
 from intercap_core.pipeline.checksums import INPUTS_FILE, InputChecksums
 from intercap_core.pipeline.plan import DATASET, Plan
 from intercap_core.pipeline.provenance import read_manifest, write_manifest
-from intercap_core.pipeline.stage_inputs import dataset_manifest, stage_manifest
+from intercap_core.pipeline.stage_inputs import (
+    dataset_manifest, stage_manifest, studio_manifest
+)
 from intercap_core.project import load_project
 from intercap_core.stage_list import STAGES
 project = load_project(Path(sys.argv[1]))
-made = {}
+summaries = {}
 for name in project.sequences:
-    checksums, identities = InputChecksums(project.results / name / INPUTS_FILE), {}
+    checksums, fingerprints = InputChecksums(project.results / name / INPUTS_FILE), {}
+    recordings = project.recordings_made(name)
+    if recordings is not None:
+        write_manifest(recordings, studio_manifest(project, name, checksums))
     annotation = project.annotation(name)
     for stage, declared in STAGES.items():
-        reads = {other: identities[other] for other in declared.reads}
-        record = stage_manifest(
+        reads = {other: fingerprints[other] for other in declared.reads}
+        manifest = stage_manifest(
             project, name, stage, annotation, artefacts=reads, checksums=checksums
         )
-        identities[stage] = record.fingerprint
-        if read_manifest(project.artefact(name, stage)) != record:
-            write_manifest(project.artefact(name, stage), record)
-    made[name] = identities["summary"]
-write_manifest(project.results, dataset_manifest(project, made, {}))
+        fingerprints[stage] = manifest.fingerprint
+        output = project.artefact(name, stage)
+        if output.exists() and read_manifest(output) != manifest:
+            write_manifest(output, manifest)
+    summaries[name] = fingerprints["summary"]
+write_manifest(project.results, dataset_manifest(project, summaries, {}))
 """
 ONE, OTHER = "suitcase_carry_s03", "cup_drink_s04"
-# Appended to a stage of a copy: the stage's imports and signature stay, so that its code digest and
-# its arguments are the real ones, and its result is that of a finished run.
+# Appended to a stage of a copy, which then returns the result of a finished run. Its imports
+# and signature stay, so that its code digest and arguments are the real ones.
 REPLAY = """
 
 def _replayed(real):
@@ -82,10 +90,10 @@ REPLAYED = (
 
 
 def share_kernels(package: Path, cache: Path) -> None:
-    """Let a copy of the package at ``package`` keep its kernels in ``cache``, beside the project's.
+    """Let a copy of the package at ``package`` use the project's compiled kernels in ``cache``.
 
-    Numba tells sources apart by their path. So for each folder of the copy there is a link to
-    where the project's own kernels of that folder lie; an edited copy has a cache of its own.
+    Numba identifies sources by path, so each folder of the copy gets a link to the project's
+    kernels of that folder. An edited copy has its own cache.
     """
     own = use_kernel_cache()
     assert own is not None
@@ -102,10 +110,12 @@ def share_kernels(package: Path, cache: Path) -> None:
 
 @dataclass(frozen=True)
 class Flow:
-    """The copy's folder and which settings are run."""
+    """A copy of the project."""
 
     folder: Path
+    """Root of the copy."""
     settings: str
+    """Settings file that is run, relative to the root."""
 
     @classmethod
     def copy(
@@ -122,6 +132,8 @@ class Flow:
             replay: results of a finished run. Every stage but ``frames`` reads its inputs and
                 copies its output from there, instead of computing it.
             pause_s: seconds that a replayed stage waits before it writes.
+
+        Leases of a copy that replays expire after a quarter of the usual time.
         """
         for name in COPIED:
             source = ROOT / name
@@ -134,12 +146,19 @@ class Flow:
             for stage in REPLAYED:
                 with (folder / "intercap_core" / "stages" / f"{stage}.py").open("a") as module:
                     module.write(text)
+            lease = folder / "intercap_core" / "pipeline" / "lease.py"
+            usual = lease.read_text()
+            short = usual.replace("BEAT_S = 5.0", "BEAT_S = 1.0").replace(
+                "EXPIRES_S = 30.0", "EXPIRES_S = 7.5"
+            )
+            assert short != usual
+            lease.write_text(short)
         share_kernels(folder / "intercap_core", folder / "kernels")
         return cls(folder, settings)
 
     @property
     def environment(self) -> dict[str, str]:
-        """What the folder's own package is run with."""
+        """Environment in which the copy's own package runs."""
         kernels = str(self.folder / "kernels")
         return {**os.environ, "PYTHONPATH": str(self.folder), "NUMBA_CACHE_DIR": kernels}
 
@@ -154,7 +173,7 @@ class Flow:
         return self.folder / Path(self.settings).parent / "annotations" / f"{sequence}.yaml"
 
     def ask(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        """What `run` does, by a process that has started already: see `warm_snakemake`."""
+        """As `run`, by a process in which Snakemake has started: see `warm_snakemake`."""
         given = ["--configfile", self.settings, "--cores", "2", *arguments]
         output, errors = (self.folder / f"asked.{name}" for name in ("out", "err"))
         server = _server(self)
@@ -165,7 +184,7 @@ class Flow:
         return subprocess.CompletedProcess(given, status, output.read_text(), errors.read_text())
 
     def run(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        """Run Snakemake in the folder, with the folder's own package."""
+        """Run Snakemake in the folder, with the copy's own package."""
         command = [
             *(sys.executable, "-m", "snakemake", "--configfile", self.settings),
             *("--cores", "2", *arguments),
@@ -180,11 +199,11 @@ class Flow:
 
     @property
     def transcript(self) -> Path:
-        """What `intercap run` said when the fixture ran it."""
+        """File for the output of `intercap run`."""
         return self.folder / "transcript.txt"
 
     def intercap(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        """Run the command line in the folder, with the folder's own package."""
+        """Run the command line in the folder, with the copy's own package."""
         return subprocess.run(
             [sys.executable, "-m", "intercap_core.cli", *arguments],
             cwd=self.folder,
@@ -193,19 +212,34 @@ class Flow:
             text=True,
         )
 
-    def as_if_made_now(self) -> None:
-        """Rewrite every output's record to what the output would be made from now."""
+    def duplicate(self, sequence: str, copy: str) -> None:
+        """Give a second sequence the recordings and results of a finished one.
+
+        The manifests are rewritten, so that all of its outputs are up to date.
+        """
+        for folder in (self.results / "recordings", self.results, self.results / "site/sequences"):
+            shutil.copytree(folder / sequence, folder / copy, ignore=shutil.ignore_patterns(".*"))
+        for path in (self.results / copy).glob("*.h5"):
+            with h5py.File(path, "r+") as file:
+                file.attrs["sequence"] = copy
+        page = self.results / "site" / "sequences" / copy / "index.html"
+        page.write_text(page.read_text().replace(sequence, copy))
+        self.rewrite_manifests()
+
+    def rewrite_manifests(self) -> None:
+        """Make all existing outputs up to date."""
         subprocess.run(
-            [sys.executable, "-c", AS_IF_MADE_NOW, self.settings],
+            [sys.executable, "-c", REWRITE_MANIFESTS, self.settings],
             cwd=self.folder, env=self.environment, check=True,
         )  # fmt: skip
 
-    def pending(self, *, anew: bool = False) -> set[tuple[str, str]]:
-        """(sequence, rule) of every job that a run would start now; "" for the whole dataset.
+    def pending(self, *, new_process: bool = False) -> set[tuple[str, str]]:
+        """(sequence, rule) of every job that a run would start; sequence "" for the dataset's.
 
-        ``anew`` starts Snakemake for it, as a user does.
+        Args:
+            new_process: start Snakemake, as a user does, instead of using the running one.
         """
-        done = self.run("--summary") if anew else self.ask("--summary")
+        done = self.run("--summary") if new_process else self.ask("--summary")
         assert done.returncode == 0, done.stderr
         header, *rows = [line.split("\t") for line in done.stdout.splitlines() if "\t" in line]
         entries = [dict(zip(header, row, strict=True)) for row in rows]
@@ -220,7 +254,7 @@ class Flow:
 
 @functools.cache
 def _server(flow: Flow) -> subprocess.Popen[str]:
-    """The process that answers for this folder; it ends with this one, when its input closes."""
+    """Snakemake process of this folder; it ends with this process, when its input closes."""
     return subprocess.Popen(
         [sys.executable, str(ROOT / "tests" / "helpers" / "warm_snakemake.py")],
         cwd=flow.folder,

@@ -1,4 +1,4 @@
-"""One real run of a tiny capture, shared by the tests of the workflow."""
+"""One real run of a tiny recording, shared by the tests of the workflow."""
 
 from __future__ import annotations
 
@@ -6,24 +6,39 @@ import shutil
 
 import pytest
 
-from tests.helpers.flow import OTHER, Flow
+from intercap_core.stage_list import STAGES
+from tests.helpers.flow import ONE, OTHER, Flow
+
+RUN_AGAIN = ("metrics", "summary", "page", "export")
 
 
 @pytest.fixture(scope="session")
 def flow(tmp_path_factory: pytest.TempPathFactory) -> Flow:
-    """A finished run of two virtual recordings. Tests put back what they edit."""
+    """A finished project of two virtual recordings. Tests undo their edits.
+
+    The first sequence is computed, the second one is a copy of it under another name.
+    """
     flow = Flow.copy(tmp_path_factory.mktemp("flow"))
-    done = flow.run()
+    _run(flow, *(f"results/test/{name}" for name in (
+        f"{ONE}/summary.h5", f"{ONE}/export", f"site/sequences/{ONE}"
+    )))  # fmt: skip
+    flow.duplicate(ONE, OTHER)
+    _run(flow)
+    return flow
+
+
+def _run(flow: Flow, *targets: str) -> None:
+    done = flow.run(*targets)
     logs = [path.read_text()[-600:] for path in sorted((flow.folder / "logs").rglob("*.log"))]
     assert done.returncode == 0, "\n".join([done.stderr[-3000:], *logs])
-    return flow
 
 
 @pytest.fixture(scope="session")
 def recorded(flow: Flow, tmp_path_factory: pytest.TempPathFactory) -> Flow:
-    """The same recordings without studio and truth, in another folder, run by `intercap run`.
+    """The same recordings without studio and truth in another folder, after `intercap run`.
 
-    The recordings of one of the two sequences cannot be read. The stages are replayed.
+    The recordings of one of the two sequences are unreadable. The last stages of the other one have
+    been run by replay; its earlier results are those of ``flow``.
     """
     other = Flow.copy(
         tmp_path_factory.mktemp("recorded"), settings="config/lab/config.yaml", replay=flow.results
@@ -41,5 +56,10 @@ def recorded(flow: Flow, tmp_path_factory: pytest.TempPathFactory) -> Flow:
     without_truth = [row.rpartition("\t")[0] for row in rows]
     text = "\n".join(without_truth).replace("results/test/recordings", "captures") + "\n"
     (settings / "sequences.tsv").write_text(text)
+    (other.results / ONE).mkdir(parents=True)
+    for stage in STAGES:
+        if stage not in RUN_AGAIN:
+            shutil.copy2(flow.artefact(ONE, stage), other.artefact(ONE, stage))
+    other.rewrite_manifests()
     other.transcript.write_text(other.intercap("run", other.settings, "--cores", "2").stderr)
     return other

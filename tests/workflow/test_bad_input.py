@@ -1,4 +1,4 @@
-"""Bad input: one clear sentence, nothing lost, the other sequences go on."""
+"""Invalid input: one error message, no lost results, and the other sequences continue."""
 
 from __future__ import annotations
 
@@ -43,18 +43,18 @@ def computed(flow: Flow, sequence: str) -> dict[str, bytes]:
 
 
 def test_an_unreadable_recording_fails_alone(recorded: Flow, flow: Flow) -> None:
-    told = recorded.transcript.read_text()
-    line = next(line for line in told.splitlines() if line.startswith(f"{OTHER}: frames"))
+    printed = recorded.transcript.read_text()
+    line = next(line for line in printed.splitlines() if line.startswith(f"{OTHER}: frames"))
     assert "no camera in captures/cup_drink_s04 can be used" in line
-    assert "Traceback" not in told
+    assert "Traceback" not in printed
     assert not (recorded.results / OTHER / "frames.h5").exists()
     assert all(recorded.artefact(ONE, stage).exists() for stage in STAGES)
 
 
 def test_the_report_is_made_of_the_others_and_says_so(recorded: Flow) -> None:
-    told = recorded.transcript.read_text()
-    assert f"the report leaves out {OTHER}" in told
-    assert str(recorded.results / "site" / "index.html") in told
+    printed = recorded.transcript.read_text()
+    assert f"the report leaves out {OTHER}" in printed
+    assert str(recorded.results / "site" / "index.html") in printed
     summary = json.loads((recorded.results / "summary.json").read_text())
     assert summary["sequences"] == 1
     page = (recorded.results / "site" / "index.html").read_text()
@@ -87,8 +87,6 @@ def without_calibration(*cameras: str) -> Break:
     ("damage", "camera", "present", "note"),
     [
         (cut_in_half, "k2", True, "cut off"),
-        (without_calibration("k3"), "k3", False, "calibration"),
-        (lambda folder: (folder / "k3.mkv").unlink(), "k3", False, "no recording of k3"),
         (lambda folder: (folder / "k1.mkv").unlink(), "k1", False, "no recording of k1"),
     ],
 )
@@ -109,9 +107,7 @@ def test_one_bad_camera_is_survived_and_flagged(
     ("damage", "says"),
     [
         (without_calibration("k1", "k2", "k3"), ["no camera in", "calibration"]),
-        (lambda folder: [p.unlink() for p in folder.glob("*.mkv")], ["no recording of k1"]),
         (lambda folder: (folder / "calibration.json").unlink(), ["calibration.json"]),
-        (lambda folder: (folder / "calibration.json").write_text("{"), ["calibration.json"]),
     ],
 )
 def test_recordings_that_cannot_be_used(
@@ -149,63 +145,42 @@ def test_a_wrong_table_stops_before_any_job(
     done = lab.run() if says == ["object 'mug'"] else lab.ask()
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
-    told = [line for line in done.stderr.splitlines() if f"config/lab/{file}" in line]
-    assert len(told) == 1
+    lines = [line for line in done.stderr.splitlines() if f"config/lab/{file}" in line]
+    assert len(lines) == 1
     for part in says:
-        assert part in told[0]
+        assert part in lines[0]
     assert "Job" not in done.stderr
     assert computed(lab, ONE) == before
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ("contact: [{part: seat, start: 4, end: 2}]\n", "contact.0: interval is reversed"),
-        ("contact: [{part: seat, start: 4, end: 99}]\n", "contact[0].end is 99, the recording has"),
-        ("floor: [[\n", "not valid YAML"),
-        ("starts: {k1: 0, k9: 0.4}\n", "starts names camera 'k9'; the recording has k1, k2, k3"),
-        ("starts: {k2: 0, k3: 0.4}\n", "starts lacks k1, the master"),
-    ],
-)
-def test_a_broken_annotation_keeps_what_was_computed(lab: Flow, text: str, says: str) -> None:
+def test_an_invalid_annotation_keeps_the_results(lab: Flow) -> None:
     path = lab.annotation(ONE)
     path.parent.mkdir(exist_ok=True)
-    path.write_text(text)
+    path.write_text("contact: [{part: seat, start: 4, end: 99}]\n")
     before = computed(lab, ONE)
     done = lab.run(str(lab.artefact(ONE, "metrics").relative_to(lab.folder)))
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
     line = next(line for line in done.stderr.splitlines() if line.startswith(f"{ONE}: annotation"))
     assert f"config/lab/annotations/{ONE}.yaml" in line
-    assert says in line
+    assert "contact[0].end is 99, the recording has" in line
     assert computed(lab, ONE) == before
     path.unlink()
     assert {pending for pending in lab.pending() if pending[0] == ONE} == set()
 
 
-def halve(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-
-
-def scribble(path: Path) -> None:
-    """Damage every byte but those that say where things are."""
-    data = bytearray(path.read_bytes())
-    for at in range(len(data) // 4, len(data), 97):
-        data[at] ^= 0x5A
-    path.write_bytes(bytes(data))
-
-
-@pytest.mark.parametrize("damage", [halve, scribble])
-def test_a_damaged_artefact_is_named_and_a_run_makes_it_again(lab: Flow, damage: Break) -> None:
+def test_a_run_replaces_a_damaged_artefact(lab: Flow) -> None:
     path = lab.artefact(ONE, "person")
     whole = {stage: lab.artefact(ONE, stage).read_bytes() for stage in STAGES}
-    damage(path)
-    for command in ("body-fit", "object-track"):  # both read it
-        told = lab.intercap(command, lab.settings, ONE)
-        assert told.returncode == 1 and "Traceback" not in told.stderr
-        assert "person.h5" in told.stderr and "re-run stage 'person'" in told.stderr
-    said = lab.intercap("status", lab.settings).stdout
-    assert f"person out of date in {ONE}: what it was made from is not recorded, or" in said
+    data = bytearray(path.read_bytes())
+    for at in range(len(data) // 4, len(data), 97):  # behind the HDF5 metadata
+        data[at] ^= 0x5A
+    path.write_bytes(bytes(data))
+    failed = lab.intercap("body-fit", lab.settings, ONE)
+    assert failed.returncode == 1 and "Traceback" not in failed.stderr
+    assert "person.h5" in failed.stderr and "re-run stage 'person'" in failed.stderr
+    status = lab.intercap("status", lab.settings).stdout
+    assert f"person out of date in {ONE}: what it was made from is not recorded, or" in status
     assert lab.intercap("verify", lab.settings).returncode == 1
     done = lab.run(str(lab.artefact(ONE, "metrics").relative_to(lab.folder)))
     assert done.returncode == 0, done.stderr

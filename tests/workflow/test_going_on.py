@@ -32,7 +32,7 @@ def victim(flow: Flow, tmp_path_factory: pytest.TempPathFactory) -> Victim:
 def _copied(results: Path, folder: Path) -> Victim:
     other = Victim(Flow.copy(folder, replay=results, pause_s=STAGE_S))
     shutil.copytree(results, other.flow.results)
-    other.flow.as_if_made_now()
+    other.flow.rewrite_manifests()
     return other
 
 

@@ -51,7 +51,7 @@ def replaced(path: Path, old: str, new: str) -> Iterator[None]:
 
 
 def test_running_again_does_nothing(flow: Flow) -> None:
-    assert flow.pending(anew=True) == set()
+    assert flow.pending(new_process=True) == set()
     assert flow.pending() == set()
     done = flow.run()
     assert done.returncode == 0
@@ -104,7 +104,7 @@ def test_editing_one_section_leaves_the_stages_of_the_others(flow: Flow) -> None
     """The run has contact and floor annotated; then one of the two is edited or both touched."""
     path = flow.annotation(OTHER)
     with edited(path, CONTACT + FLOOR):
-        flow.as_if_made_now()
+        flow.rewrite_manifests()
         path.write_text("# a comment, and the same content\n" + FLOOR + CONTACT)
         assert flow.pending() == set()
         path.write_text(FLOOR + CONTACT.replace("end: 4", "end: 5"))
@@ -112,7 +112,7 @@ def test_editing_one_section_leaves_the_stages_of_the_others(flow: Flow) -> None
         assert flow.pending() == contact | {DATASET}
         path.write_text(CONTACT + FLOOR.replace("2.0", "2.1"))
         assert flow.pending() == {(OTHER, stage) for stage in AFTER_SCENE} | {DATASET}
-    flow.as_if_made_now()  # back to no annotation
+    flow.rewrite_manifests()  # back to no annotation
     assert flow.pending() == set()
 
 
@@ -129,7 +129,7 @@ def test_editing_an_energy_term_re_runs_what_reaches_it(
 ) -> None:
     path = flow.folder / "intercap_core" / f"{term}.py"
     with edited(path, path.read_text() + "\nEDITED = 1\n"):
-        pending = {rule for _, rule in flow.pending(anew=term == "joint/terms/ground")}
+        pending = {rule for _, rule in flow.pending(new_process=term == "joint/terms/ground")}
     assert pending == stages | {"metrics", *AFTER_METRICS, "dataset"}
 
 
@@ -146,11 +146,11 @@ def test_an_import_inside_a_function_counts(flow: Flow) -> None:
             "    return hidden_term\n",
         ),
     ):
-        flow.as_if_made_now()
+        flow.rewrite_manifests()
         assert flow.pending() == set()
         term.write_text("WEIGHT = 2\n")
         pending = {rule for _, rule in flow.pending()}
-    flow.as_if_made_now()
+    flow.rewrite_manifests()
     assert pending == AFTER_SCENE - {"scene"} | {"dataset"}
 
 
@@ -180,11 +180,11 @@ def test_another_model_re_runs_the_detections(flow: Flow) -> None:
     expected = {(name, rule) for name in (ONE, OTHER) for rule in {"detections", *AFTER_SCENE}}
     with edited(model, "one"), edited(path, text):
         assert flow.pending() == expected | {DATASET}
-        flow.as_if_made_now()
+        flow.rewrite_manifests()
         assert flow.pending() == set()
         model.write_text("another")
         assert flow.pending() == expected | {DATASET}
-    flow.as_if_made_now()
+    flow.rewrite_manifests()
 
 
 def test_results_in_another_place_know_what_they_were_made_from(flow: Flow) -> None:
