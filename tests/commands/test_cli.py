@@ -1,13 +1,16 @@
-"""The command line: help at once, faults in one line, what a file holds."""
+"""The command line: quick help, faults in one line, contents of files."""
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
+import os
 import resource
 import subprocess
 import sys
 from pathlib import Path
+from unittest import mock
 
 import cv2
 import h5py
@@ -17,7 +20,7 @@ import trimesh
 import yaml
 from rich.console import Console
 
-from intercap_core import artefacts
+from intercap_core import artefacts, cli
 from intercap_core.commands.check import (
     check_detector,
     faults_of_sequences,
@@ -42,6 +45,25 @@ SCENE = ("scene", "config/demo/config.yaml", "cup_drink_s02")
 
 
 def intercap(*arguments: str, folder: Path = ROOT) -> subprocess.CompletedProcess[str]:
+    """Run the command line in this process."""
+    output, errors = io.StringIO(), io.StringIO()
+    with (
+        contextlib.chdir(folder),
+        contextlib.redirect_stdout(output),
+        contextlib.redirect_stderr(errors),
+        mock.patch.object(sys, "argv", ["intercap", *arguments]),
+        mock.patch.dict(os.environ, {"COLUMNS": "200"}),
+    ):
+        try:
+            cli.main()
+            status = 0
+        except SystemExit as end:
+            status = int(end.code or 0)
+    return subprocess.CompletedProcess(arguments, status, output.getvalue(), errors.getvalue())
+
+
+def start_intercap(*arguments: str, folder: Path = ROOT) -> subprocess.CompletedProcess[str]:
+    """Run the command line in a process of its own."""
     return subprocess.run(
         [sys.executable, "-m", "intercap_core.cli", *arguments],
         cwd=folder,
@@ -51,9 +73,9 @@ def intercap(*arguments: str, folder: Path = ROOT) -> subprocess.CompletedProces
     )
 
 
-def test_help_answers_at_once_and_teaches() -> None:
+def test_help_is_quick_and_has_examples() -> None:
     start = resource.getrusage(resource.RUSAGE_CHILDREN)
-    done = intercap("--help")
+    done = start_intercap("--help")
     end = resource.getrusage(resource.RUSAGE_CHILDREN)
     # Processor time, not wall time: whatever else the machine does
     assert end.ru_utime + end.ru_stime - start.ru_utime - start.ru_stime < 1.0
@@ -72,7 +94,7 @@ def test_every_command_has_an_example() -> None:
     assert not [name for name, text in texts.items() if "Example" not in text]
 
 
-def test_help_imports_nothing_heavy() -> None:
+def test_help_imports_no_numerical_library() -> None:
     code = (
         "import sys; import intercap_core.cli, intercap_core.pipeline.job; "
         "print([m for m in ('torch', 'open3d', 'cv2', 'numpy', 'h5py', 'scipy', 'matplotlib')"
@@ -84,7 +106,7 @@ def test_help_imports_nothing_heavy() -> None:
     assert done.stdout.strip() == "[]"
 
 
-def test_a_stage_reads_what_earlier_ones_wrote() -> None:
+def test_stages_read_only_earlier_stages() -> None:
     for place, stage in enumerate(STAGES.values()):
         assert set(stage.reads) <= set(list(STAGES)[:place]), stage.name
 
@@ -104,7 +126,7 @@ def test_a_stage_reads_what_earlier_ones_wrote() -> None:
         (("inspect", "nowhere.h5"), "nowhere.h5: there is no such file"),
     ],
 )
-def test_a_mistake_is_one_line_and_status_one(arguments: tuple[str, ...], says: str) -> None:
+def test_a_user_error_is_one_line_with_status_one(arguments: tuple[str, ...], says: str) -> None:
     done = intercap(*arguments)
     assert done.returncode == 1
     assert says in done.stderr
@@ -152,7 +174,7 @@ def small_project(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_check_names_every_fault_of_every_sequence(small_project: Path) -> None:
+def test_check_lists_all_faults_of_all_sequences(small_project: Path) -> None:
     done = intercap("check", "config.yaml", folder=small_project)
     assert done.returncode == 1
     assert "1 of 3 sequences are ready" in done.stdout
@@ -183,7 +205,7 @@ def test_check_names_every_fault_of_every_sequence(small_project: Path) -> None:
         ("annotations/good.yml", "", "problem: annotations/good.yml: no sequence has this"),
     ],
 )
-def test_ready_means_that_the_files_can_be_used(
+def test_check_opens_the_files(
     small_project: Path,
     monkeypatch: pytest.MonkeyPatch,
     file: str,
@@ -201,9 +223,7 @@ def test_ready_means_that_the_files_can_be_used(
     assert says in f"problem: {fault}"
 
 
-def test_cameras_that_no_recording_is_of(
-    small_project: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_check_names_unknown_cameras(small_project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(small_project)
     settings = {"exclude": ["bad", "empty"], "frames": {"cameras": ["k9"]}}
     (fault,) = faults_of_sequences(load_project(Path("config.yaml"), settings))
@@ -262,7 +282,7 @@ LARGE = [
         ([], ""),
     ],
 )  # fmt: skip
-def test_check_looks_at_the_first_candidates(
+def test_check_reads_the_first_candidates(
     small_project: Path, monkeypatch: pytest.MonkeyPatch, content: str | list, says: str
 ) -> None:
     monkeypatch.chdir(small_project)
@@ -296,7 +316,7 @@ FAR_OUT = [v for i in range(133) for v in (1300.0 + i, 20.0, 0.5)]
         ("k1/0_keypoints.json", {"people": []}, ""),
     ],
 )  # fmt: skip
-def test_check_looks_at_the_first_keypoints(
+def test_check_reads_the_first_keypoints(
     small_project: Path, monkeypatch: pytest.MonkeyPatch, name: str, content: object, says: str
 ) -> None:
     monkeypatch.chdir(small_project)
@@ -312,11 +332,11 @@ def test_check_looks_at_the_first_keypoints(
     assert not says or says in notes[0]
 
 
-def test_objects_that_the_model_does_not_know_are_noted(
+def test_check_notes_objects_unknown_to_the_model(
     small_project: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("onnxruntime")
-    tiny_onnx = pytest.importorskip("tiny_onnx", exc_type=ImportError)
+    tiny_onnx = pytest.importorskip("tests.helpers.tiny_onnx", exc_type=ImportError)
     monkeypatch.chdir(small_project)
     names = {"names": "{0: 'suitcase', 1: 'cup'}"}
     path = tiny_onnx.yolo(small_project / "model.onnx", (64, 64), names)
@@ -331,7 +351,7 @@ def test_objects_that_the_model_does_not_know_are_noted(
 
 
 @pytest.mark.parametrize("model", ["segmentation_model", "keypoint_model"])
-def test_a_model_that_cannot_be_run_stops_the_check(small_project: Path, model: str) -> None:
+def test_check_reports_an_invalid_model(small_project: Path, model: str) -> None:
     (small_project / "model.onnx").write_text("not a model")
     config = small_project / "config.yaml"
     config.write_text(config.read_text() + f"detections: {{{model}: model.onnx}}\n")
@@ -345,7 +365,7 @@ def test_a_model_that_cannot_be_run_stops_the_check(small_project: Path, model: 
 
 @pytest.mark.parametrize("model", ["neutral", "vposer"])
 @pytest.mark.parametrize("command", ["check", "run"])
-def test_a_body_file_that_cannot_be_used_stops_before_any_job(
+def test_an_invalid_body_file_stops_before_any_job(
     small_project: Path, command: str, model: str
 ) -> None:
     (small_project / "body.npz").write_text("not a body")
@@ -357,7 +377,7 @@ def test_a_body_file_that_cannot_be_used_stops_before_any_job(
     assert " file body.npz " in done.stderr
 
 
-def test_a_device_that_is_not_there(small_project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_device_is_an_error(small_project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(small_project)
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     check_device(load_project(Path("config.yaml")))
@@ -379,7 +399,7 @@ def detections(tmp_path: Path) -> Path:
     return path
 
 
-def test_inspect_says_what_a_file_holds(detections: Path) -> None:
+def test_inspect_prints_attributes_and_datasets(detections: Path) -> None:
     done = intercap("inspect", str(detections), "--verify")
     assert done.returncode == 0, done.stderr
     assert "sequence  one" in done.stdout
@@ -389,7 +409,7 @@ def test_inspect_says_what_a_file_holds(detections: Path) -> None:
     assert "checksum is right" in done.stdout
 
 
-def test_inspect_shows_what_looks_like_markup_and_what_is_not_declared(detections: Path) -> None:
+def test_inspect_escapes_markup_and_marks_undeclared_entries(detections: Path) -> None:
     with h5py.File(detections, "r+") as file:
         file.attrs["sequence"] = "[/one] [red]two"
         file["extra"] = np.ones(3)
@@ -413,7 +433,7 @@ def test_inspect_finds_damage(detections: Path) -> None:
     assert "re-run stage 'detections'" in done.stderr
 
 
-def test_a_stage_refuses_what_is_of_another_sequence(small_project: Path) -> None:
+def test_a_stage_rejects_inputs_of_another_sequence(small_project: Path) -> None:
     place = small_project / "results" / "trial" / "good"
     place.mkdir(parents=True)
     write_frames(place / "frames.h5", ring(1)[0], num_sets=1)
@@ -425,7 +445,7 @@ def test_a_stage_refuses_what_is_of_another_sequence(small_project: Path) -> Non
     )
 
 
-def test_reasons_that_look_like_markup_are_shown_as_they_are(
+def test_reasons_with_markup_are_printed_literally(
     small_project: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(small_project)
@@ -438,7 +458,7 @@ def test_reasons_that_look_like_markup_are_shown_as_they_are(
     assert words.getvalue() == "good: scene: failed a[/b] has [3] points\n"
 
 
-def test_a_log_that_is_removed_while_it_is_looked_at_is_no_job(
+def test_a_log_removed_while_it_is_read_is_ignored(
     small_project: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(small_project)
@@ -449,7 +469,7 @@ def test_a_log_that_is_removed_while_it_is_looked_at_is_no_job(
     assert watcher.jobs() == {}
 
 
-def test_real_recordings_below_the_results_are_never_made(small_project: Path) -> None:
+def test_the_studio_never_replaces_real_recordings(small_project: Path) -> None:
     place = small_project / "results" / "trial" / "recordings" / "good"
     place.parent.mkdir(parents=True)
     (small_project / "rec").rename(place)
@@ -459,13 +479,13 @@ def test_real_recordings_below_the_results_are_never_made(small_project: Path) -
         "good\ts01\tcup\tresults/trial/recordings/good"
         "\tresults/trial/recordings/good/calibration.json\n"
     )
-    done = intercap("run", "config.yaml", "--", "--dry-run", folder=small_project)
+    done = start_intercap("run", "config.yaml", "--", "--dry-run", folder=small_project)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "good: reading and synchronising" in done.stdout
     assert "virtual recording" not in done.stdout
 
 
-def test_a_run_without_a_terminal_says_how_far_it_is(
+def test_a_run_without_a_terminal_prints_progress(
     small_project: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(small_project)

@@ -15,7 +15,7 @@ import pytest
 from tests.helpers.plain_capture import detect, plain_entry, write_rig
 
 pytest.importorskip("onnxruntime")
-tiny_pose = pytest.importorskip("tiny_pose", exc_type=ImportError)
+tiny_pose = pytest.importorskip("tests.helpers.tiny_pose", exc_type=ImportError)
 
 from intercap_core import artefacts  # noqa: E402
 from intercap_core.body.keypoints import KEYPOINT_NAMES  # noqa: E402

@@ -13,7 +13,7 @@ import pytest
 from tests.helpers.plain_capture import detect, plain_entry, write_rig
 
 pytest.importorskip("onnxruntime")
-tiny_onnx = pytest.importorskip("tiny_onnx", exc_type=ImportError)
+tiny_onnx = pytest.importorskip("tests.helpers.tiny_onnx", exc_type=ImportError)
 
 from intercap_core import artefacts  # noqa: E402
 from intercap_core.config import (  # noqa: E402

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("onnxruntime")
-tiny_onnx = pytest.importorskip("tiny_onnx", exc_type=ImportError)
+tiny_onnx = pytest.importorskip("tests.helpers.tiny_onnx", exc_type=ImportError)
 
 from intercap_core.config import DetectionsSettings  # noqa: E402
 from intercap_core.errors import UserError  # noqa: E402
