@@ -16,7 +16,7 @@ from intercap_core.evaluation.contact import CONTACT_M
 from intercap_core.evaluation.proximity import PosedObject
 from intercap_core.evaluation.tracks import read_body, read_object
 from intercap_core.evaluation.truth import Truth
-from intercap_core.joint.terms.stick_residual import local_points
+from intercap_core.joint.terms.stick import local_points
 from intercap_core.output.site.closeups import SIDES, closeup, holds, read_handling
 from intercap_core.project import Project
 from intercap_core.schemas import SCENE

@@ -40,13 +40,12 @@ from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.twist import moved
-from intercap_core.joint.contact.detect import contact_probability
-from intercap_core.joint.contact.motion import region_motion
-from intercap_core.joint.contact.patches import contact_patches
+from intercap_core.joint.contact.detect import contact_probability, region_motion
+from intercap_core.joint.floor import Ground
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.sequential import SequentialFits
+from intercap_core.joint.skin import contact_patches
 from intercap_core.joint.state import State
-from intercap_core.joint.terms.ground import Ground
 from intercap_core.object_track.constants import TRACKING_FACES
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.recording import ObjectRecording

@@ -36,21 +36,19 @@ from intercap_core.body.joints import JOINT_INDEX, NUM_JOINTS
 from intercap_core.body.kinematics import rotation_from_axis_angle
 from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.solve.robust import geman_mcclure
-from intercap_core.joint.constants import (
-    ACCELERATION_OUTLIER,
-    BODY_ACCELERATION,
-    CONTACT_SIGMA,
-    FINGER_ACCELERATION,
-    GROUND_SIGMA,
-    MIN_STANDING_VERTICES,
-    OBJECT_ACCELERATION,
-    PENETRATION_SIGMA,
-    VERTICES_PER_MEASUREMENT,
-)
-from intercap_core.joint.energy_constants import PENETRATION_TOLERANCE
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.proximity import proximity
+from intercap_core.joint.skin import VERTICES_PER_MEASUREMENT
 from intercap_core.joint.state import BODY, OBJECT_SHIFT, OBJECT_TURN, State
+from intercap_core.joint.terms.contact import CONTACT_SIGMA
+from intercap_core.joint.terms.ground import GROUND_SIGMA, MIN_STANDING_VERTICES
+from intercap_core.joint.terms.motion import (
+    ACCELERATION_OUTLIER,
+    BODY_ACCELERATION,
+    FINGER_ACCELERATION,
+    OBJECT_ACCELERATION,
+)
+from intercap_core.joint.terms.penetration import PENETRATION_SIGMA, PENETRATION_TOLERANCE
 
 STEPS = 700  # of L-BFGS: 100 and 600
 ROUND = 10  # steps between two looks at the clouds

@@ -11,9 +11,10 @@ from intercap_core.geometry.solve.banded import BandedSystem
 from intercap_core.geometry.solve.thread_pool import ThreadPool
 from intercap_core.joint.state import ALL
 
+ACCELERATION = (1.0, -2.0, 1.0)  # of frames t-1, t, t+1
+RATE = (-1.0, 1.0)  # of frames t, t+1
 # Derivatives (F, K, R, m) of K of a term's N values, R numbers each, in the F frames of a slice.
 Rows = Callable[[slice, np.ndarray], np.ndarray]
-
 # Rows are made for so many frames at a time: few enough that they stay in the cache.
 _FRAMES_TOGETHER = 8
 # Values of less weight than this share of their term's largest change nothing: the tail of a

@@ -1,5 +1,6 @@
 """The joint fit: alternates between estimating contact and minimising the energy, until neither
-changes."""
+changes.
+"""
 
 from __future__ import annotations
 
@@ -12,17 +13,8 @@ import numpy as np
 from intercap_core.config import ContactInterval, JointSettings
 from intercap_core.geometry.solve.thread_pool import ThreadPool
 from intercap_core.joint.cameras import CameraFit
-from intercap_core.joint.constants import (
-    BODY_SHARE,
-    CAMERAS_CHANGED_M,
-    CONTACT_CONVERGED,
-    ERROR_LASTING_S,
-    FLAGGED_DEPTH,
-    OFFSET_CHANGED_S,
-    ROUND_STEPS,
-)
-from intercap_core.joint.contact_estimate import ContactEstimate, ContactEstimator
-from intercap_core.joint.floor import contradiction
+from intercap_core.joint.contact.estimate import ContactEstimate, ContactEstimator
+from intercap_core.joint.floor import Ground, contradiction
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.inputs import JointInputs
 from intercap_core.joint.minimise import limited, minimise
@@ -32,13 +24,32 @@ from intercap_core.joint.sequential import Flags
 from intercap_core.joint.state import State
 from intercap_core.joint.terms.body_data import BodyData, Residuals
 from intercap_core.joint.terms.contact import Contact
-from intercap_core.joint.terms.ground import Ground
-from intercap_core.joint.terms.no_object import NoObject
-from intercap_core.joint.terms.object_data import ObjectData
+from intercap_core.joint.terms.object_data import NoObject, ObjectData
 from intercap_core.joint.terms.object_images import ObjectImagesData
 from intercap_core.joint.time_offsets import OffsetPrior, TimeOffsets
 
+# Errors of masks and keypoints last about so long, seconds: what the frames of that time say of the
+# cameras is one observation. Tuned on the studio.
+ERROR_LASTING_S = 0.3
+# What the body says of the cameras beside that: a detector's errors follow view and pose, and
+# clothing is of unknown thickness. Tuned on the studio.
+BODY_SHARE = 0.05
+# Changes of offsets above this call for another round, seconds: 3 mm of that hand's motion.
+OFFSET_CHANGED_S = 0.001
+# Corrections of cameras below this are not worth another round, metres.
+CAMERAS_CHANGED_M = 0.0005
+# Most accepted steps of each round; contact is estimated anew between rounds, and the first moves
+# the most. Tuned on the studio.
+ROUND_STEPS = (6, 4, 3)
+# Largest change of a contact probability after which another round has nothing new to work with.
+# Tuned on the studio.
+CONTACT_CONVERGED = 0.1
+# A frame with skin deeper than this inside the object, or the other way round, is flagged, metres:
+# far beyond what skin yields, so one of the two poses is wrong. Tuned on the studio.
+FLAGGED_DEPTH = 0.03
+
 log = logging.getLogger(__name__)
+ObjectTerm = ObjectData | ObjectImagesData | NoObject  # what stands for E_O
 
 
 @dataclass(frozen=True)
@@ -58,9 +69,6 @@ class JointFit:
     converged: bool
     flag_reasons: list[str]
     cameras: bool
-
-
-ObjectTerm = ObjectData | ObjectImagesData | NoObject  # what stands for E_O
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,15 +6,34 @@ they would carry the body there. The sequential fits know nothing of it, so they
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from intercap_core.joint.constants import FLOOR_CONTRADICTED, REACHED_SHARE
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.sequential import SequentialFits
-from intercap_core.joint.terms.ground import Ground
 from intercap_core.schemas import CONTACT_REGIONS
 
+# Feet so far below the floor, or feet and object so far above it, contradict it, metres: several
+# times what sequential fits err there (at most 0.03). Tuned on the studio.
+FLOOR_CONTRADICTED = 0.10
+# Share of the frames in which feet or object should reach the floor: a jump ends, and so does a
+# walk with the object in the air. Tuned on the studio.
+REACHED_SHARE = 0.1
+
 _FEET = tuple(CONTACT_REGIONS.index(f"{side}_foot") for side in ("left", "right"))
+
+
+@dataclass(frozen=True)
+class Ground:
+    """A floor: ``point`` (3,) and upward unit ``normal`` (3,), master frame, metres."""
+
+    point: np.ndarray
+    normal: np.ndarray
+
+    def heights(self, points: np.ndarray) -> np.ndarray:
+        """Heights (..., N) of points (..., N, 3) above the floor, metres; negative below it."""
+        return (points - self.point) @ self.normal
 
 
 def contradiction(geometry: Geometry, sequential: SequentialFits, floor: Ground) -> str:
@@ -26,7 +45,7 @@ def contradiction(geometry: Geometry, sequential: SequentialFits, floor: Ground)
     """
     posed = geometry.at(sequential.state)
     feet = geometry.skin.patch[np.isin(geometry.patches.region, _FEET)]
-    lowest = _height(posed.skin[:, feet], floor).min(axis=1)
+    lowest = floor.heights(posed.skin[:, feet]).min(axis=1)
     known = ~sequential.flags.filled
     if not known.any():
         return ""
@@ -35,15 +54,10 @@ def contradiction(geometry: Geometry, sequential: SequentialFits, floor: Ground)
         return f"floor {-sunk:.2f} m above the feet, not used"
     reach = lowest
     if geometry.has_object:
-        objects = _height(posed.object_vertices, floor).min(axis=1)
+        objects = floor.heights(posed.object_vertices).min(axis=1)
         reach = np.where(sequential.flags.lost, lowest, np.minimum(lowest, objects))
     reach = reach[known]
     nearest = float(np.quantile(reach, REACHED_SHARE))
     if nearest > FLOOR_CONTRADICTED:
         return f"floor {nearest:.2f} m below feet and object, not used"
     return ""
-
-
-def _height(points: np.ndarray, floor: Ground) -> np.ndarray:
-    """Heights (T, N) of points (T, N, 3) above the floor, metres."""
-    return (points - floor.point) @ floor.normal

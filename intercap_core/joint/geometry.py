@@ -14,12 +14,15 @@ from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.surface_samples import sample_surface
 from intercap_core.geometry.solve.thread_pool import ThreadPool
-from intercap_core.joint import smoothness as smoothness
-from intercap_core.joint.constants import DEPTH_POINTS, OBJECT_ARM
-from intercap_core.joint.contact.patches import Patches
 from intercap_core.joint.proximity import Proximity, Surface, proximity
-from intercap_core.joint.skin import Skin
+from intercap_core.joint.skin import Patches, Skin
 from intercap_core.joint.state import BODY, State
+
+# Turns are as smooth as those of a thing of this radius, metres: hands turn what they hold with
+# 20 rad/s^2 where they move it with 6 m/s^2. Tuned on the studio.
+OBJECT_ARM = 0.3
+# Points of the object's surface that are held against the body for that.
+DEPTH_POINTS = 400
 
 _FRAMES_TOGETHER = 32  # frames whose derivatives are made at a time
 
@@ -62,7 +65,7 @@ class Geometry:
     @cached_property
     def moments(self) -> np.ndarray:
         """Points (6, 3) with the object's moments, its frame."""
-        return smoothness.moment_points(self.mesh.vertices, OBJECT_ARM)
+        return moment_points(self.mesh.vertices, OBJECT_ARM)
 
     def at(self, state: State) -> PosedGeometry:
         """The geometry at ``state``; the last state's is kept, since all terms ask for the same.
@@ -176,12 +179,40 @@ class PosedGeometry:
     def moments(self) -> tuple[np.ndarray, np.ndarray]:
         """Points (T, 6, 3) with the object's moments and their derivative (T, 6, 3, 6) by it."""
         state = self.state
-        return smoothness.points_by_object(
-            self._geometry.moments, state.rotation, state.translation
-        )
+        return points_by_object(self._geometry.moments, state.rotation, state.translation)
 
     @cached_property
     def object_vertices(self) -> np.ndarray:
         """(T, V, 3) the object's vertices."""
         turned = self._geometry.mesh.vertices @ self.state.rotation.transpose(0, 2, 1)
         return turned + self.state.translation[:, None]
+
+
+def moment_points(vertices: np.ndarray, least: float = 0.0) -> np.ndarray:
+    """Six points (6, 3) with the mean and covariance of ``vertices`` (V, 3).
+
+    Mean + and - sqrt(3 lambda_i) e_i along the principal axes: any sum of squares of an affine map
+    over the vertices is V / 6 times the same sum over these points. None is nearer to the mean than
+    ``least``, metres: a thin thing's own points would leave its spin free.
+    """
+    mean = vertices.mean(axis=0)
+    covariance = np.cov((vertices - mean).T, bias=True)
+    values, axes = np.linalg.eigh(covariance)
+    arms = (axes * np.maximum(np.sqrt(3 * np.maximum(values, 0.0)), least)).T
+    return np.concatenate([mean + arms, mean - arms])
+
+
+def points_by_object(
+    points: np.ndarray,
+    rotation: np.ndarray,
+    translation: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Object points (N, 3) moved to all frames (T, N, 3), and their derivative (T, N, 3, 6) by
+    (w, d) for the motion X' = exp(w)(X - t) + t + d."""
+    arm = np.einsum("tij,nj->tni", rotation, points)
+    jacobian = np.zeros((*arm.shape, 6))
+    jacobian[..., 0, 1], jacobian[..., 0, 2] = arm[..., 2], -arm[..., 1]
+    jacobian[..., 1, 0], jacobian[..., 1, 2] = -arm[..., 2], arm[..., 0]
+    jacobian[..., 2, 0], jacobian[..., 2, 1] = arm[..., 1], -arm[..., 0]
+    jacobian[..., [0, 1, 2], [3, 4, 5]] = 1.0
+    return arm + translation[:, None], jacobian

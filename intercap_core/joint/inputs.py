@@ -24,18 +24,21 @@ from intercap_core.geometry.rigid.distance import DistanceField, SurfacePart
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.solve.thread_pool import ThreadPool
 from intercap_core.joint.cameras import BIAS, CameraFit, Cameras
-from intercap_core.joint.constants import MAX_RATE_ERROR
-from intercap_core.joint.contact.patches import contact_patches
+from intercap_core.joint.floor import Ground
 from intercap_core.joint.geometry import Geometry
-from intercap_core.joint.object_images import ObjectImages
 from intercap_core.joint.sequential import SequentialFits
+from intercap_core.joint.skin import contact_patches
 from intercap_core.joint.terms.body_data import BodyData
-from intercap_core.joint.terms.ground import Ground
-from intercap_core.joint.terms.learned_motion import LearnedMotion
+from intercap_core.joint.terms.motion import LearnedMotion
+from intercap_core.joint.terms.object_images import ObjectImages
 from intercap_core.joint.time_offsets import OffsetPrior
 from intercap_core.object_track.recording import ObjectRecording
 from intercap_core.schemas import BODY_FIT, OBJECT_TRACK, SCENE
 from intercap_core.sequence_inputs import FitSettings, SequenceModels, SequencePaths
+
+# A recording whose rate differs by more than this share from that of a learned prior shows it other
+# motion: AMASS, on which LEMO's was trained, holds walks that differ by more among themselves.
+MAX_RATE_ERROR = 0.1
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,25 +8,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from intercap_core.joint.constants import (
-    DAMPING_DOWN,
-    DAMPING_UP,
-    HELD_DAMPING,
-    INITIAL_DAMPING,
-    MAX_STEP_SHIFT,
-    MAX_STEP_TURN,
-    MIN_DAMPING,
-    MIN_GAIN_SHARE,
-    NEGLIGIBLE_SHARE,
-)
 from intercap_core.joint.equations import NormalEquations
-from intercap_core.joint.state import (
-    BODY_SHIFT,
-    BODY_TURNS,
-    OBJECT_SHIFT,
-    OBJECT_TURN,
-    State,
-)
+from intercap_core.joint.state import BODY_SHIFT, BODY_TURNS, OBJECT_SHIFT, OBJECT_TURN, State
+
+# Damping of Levenberg-Marquardt, share of the diagonal. Tuned on the studio.
+INITIAL_DAMPING = 1e-3
+MIN_DAMPING = 1e-6
+# A frame that ends with more hardly moves any more. Tuned on the studio.
+HELD_DAMPING = 0.5
+DAMPING_UP, DAMPING_DOWN = 10.0, 5.0  # factors after a rejected and an accepted step
+# Largest change in one step, rad and metres: beyond it a linearisation of skinning is poor.
+# Tuned on the studio.
+MAX_STEP_TURN = 0.5
+MAX_STEP_SHIFT = 0.1
+# A step that gains less than this share of what the round has gained ends it. Tuned on the studio.
+MIN_GAIN_SHARE = 0.03
+# A refused step that would have gained less than this share of the energy, by its slope: the fit is
+# at a minimum. Tuned on the studio.
+NEGLIGIBLE_SHARE = 1e-3
 
 log = logging.getLogger(__name__)
 

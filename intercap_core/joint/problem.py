@@ -15,34 +15,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from intercap_core.config import JointSettings
 from intercap_core.geometry.solve.thread_pool import ThreadPool
 from intercap_core.joint.equations import NormalEquations
+from intercap_core.joint.floor import Ground
 from intercap_core.joint.geometry import Geometry
+from intercap_core.joint.sequential import Trust
 from intercap_core.joint.state import State
 from intercap_core.joint.terms.contact import Contact
 from intercap_core.joint.terms.drift import BodyDrift, ObjectDrift
-from intercap_core.joint.terms.ground import BodyGround, Ground, ObjectGround
+from intercap_core.joint.terms.ground import BodyGround, ObjectGround
 from intercap_core.joint.terms.motion import BodyMotion, ObjectMotion
-from intercap_core.joint.terms.object_in_body import ObjectInBody
-from intercap_core.joint.terms.penetration import Penetration
+from intercap_core.joint.terms.penetration import ObjectInBody, Penetration
 from intercap_core.joint.terms.plant import Plant
 from intercap_core.joint.terms.stick import Stick
 from intercap_core.joint.terms.term import Term
-
-
-@dataclass(frozen=True)
-class Trust:
-    """Frames in which the sequential fits are trusted.
-
-    ``body`` and ``object_`` (T,) flags, ``still`` (T-1,) the steps over which the object rests.
-    """
-
-    body: np.ndarray
-    object_: np.ndarray
-    still: np.ndarray
 
 
 def joint_terms(

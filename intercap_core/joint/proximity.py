@@ -16,7 +16,13 @@ from typing import Protocol
 import numpy as np
 
 from intercap_core.geometry.rigid.distance import Closest
-from intercap_core.joint.energy_constants import FAR_FROM_BOX, ON_SURFACE
+
+# Farther from the object's box than this, metres, the box stands for the surface: many times what
+# any term or contact asks about.
+FAR_FROM_BOX = 0.25
+# Nearer to the surface than this, metres, the direction to the closest point is noise: the face's
+# normal is used. Tuned on the studio.
+ON_SURFACE = 1e-4
 
 _FRAMES_TOGETHER = 32  # what is between the points and the result is kept of so many at a time
 

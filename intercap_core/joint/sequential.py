@@ -2,17 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import radians
 
 import numpy as np
 
 from intercap_core.artefacts import Artefact
 from intercap_core.body.parameters import TRANSL
-from intercap_core.joint.constants import UNTRACKED_SIGMA
-from intercap_core.joint.problem import Trust
+from intercap_core.geometry.camera.transforms import rigid
+from intercap_core.geometry.rigid.twist import moved, twists
 from intercap_core.joint.state import State
-from intercap_core.joint.terms.object_data import TrackedPoses
 
+# A tracked pose is never surer than this, rad and metres: the meshes differ from the things
+# themselves. Tuned on the studio.
+TRACK_FLOOR_TURN = radians(0.05)
+TRACK_FLOOR_SHIFT = 0.0005
+# What is added where different poses explain a frame equally well, rad and metres: it is nearly
+# always the rotation (on which side the handle is). Tuned on the studio.
+AMBIGUOUS_TURN = radians(10.0)
+AMBIGUOUS_SHIFT = 0.002
+BRIDGED_OBJECT_TURN = 0.5  # rad; tuned on the studio
+BRIDGED_OBJECT_SHIFT = 0.15  # metres; tuned on the studio
+# Standard deviation of the object's position where the track is lost, metres: contact detection
+# then learns nothing from the distance. Tuned on the studio.
+UNTRACKED_SIGMA = 0.5
+
+# Standard deviations (6,) of turn and shift, rad and metres.
+_FLOOR = np.repeat([TRACK_FLOOR_TURN, TRACK_FLOOR_SHIFT], 3)
+_BRIDGED = np.repeat([BRIDGED_OBJECT_TURN, BRIDGED_OBJECT_SHIFT], 3)
+_AMBIGUOUS = np.repeat([AMBIGUOUS_TURN, AMBIGUOUS_SHIFT], 3)
 # In the order of `BodyParameters`.
 _POSE = (
     "global_orient",
@@ -24,6 +42,93 @@ _POSE = (
     "right_hand_pose",
     "transl",
 )
+
+
+@dataclass(frozen=True)
+class TrackedPoses:
+    """``rotation`` (T, 3, 3), ``translation`` (T, 3) and ``information`` (T, 6, 6), the inverse
+    covariance of (turn on the left, shift).
+
+    ``twist`` (T, 6) is the motion in a second, ``share`` (T, C) each camera's part in the evidence
+    for a pose and ``time_offset`` (C,) what the tracker took the cameras' to be, seconds. Frames
+    (T,) that are ``seen`` and in which it is ``resting``, their ``times``, seconds; ``spread``
+    (T, 6) the variance of a pose, beside what the images of a frame leave open.
+    """
+
+    rotation: np.ndarray
+    translation: np.ndarray
+    information: np.ndarray
+    twist: np.ndarray
+    share: np.ndarray
+    time_offset: np.ndarray
+    seen: np.ndarray
+    resting: np.ndarray
+    times: np.ndarray
+    spread: np.ndarray
+
+    @classmethod
+    def from_track(
+        cls,
+        rotation: np.ndarray,
+        translation: np.ndarray,
+        covariance: np.ndarray,
+        lost: np.ndarray,
+        ambiguous: np.ndarray,
+        resting: np.ndarray,
+        *,
+        carried: np.ndarray,
+        visible: np.ndarray,
+        times: np.ndarray,
+        time_offset: np.ndarray,
+    ) -> TrackedPoses:
+        """Take over an object track whose lost frames are interpolated.
+
+        ``covariance`` (T, 6, 6) around these poses alone; ``lost``, ``ambiguous``, ``resting`` and
+        ``carried`` (T,), of which the images show nothing; ``visible`` (T, C) the views that show
+        the object; ``times`` (T,) and ``time_offset`` (C,) seconds.
+        """
+        tracked = ~lost & np.isfinite(covariance).all(axis=(1, 2))
+        total = np.where(tracked[:, None, None], covariance, 0.0)
+        other = (ambiguous & ~carried)[:, None]  # of what is carried, the covariance says it
+        floor = np.where(other, np.hypot(_FLOOR, _AMBIGUOUS), _FLOOR)
+        spread = np.where(tracked[:, None], floor, _BRIDGED) ** 2
+        total += np.eye(6) * spread[:, None, :]
+        twist = twists(rigid(rotation, translation), ~lost, times)
+        twist[resting] = 0
+        share = visible / np.maximum(visible.sum(axis=1, keepdims=True), 1)
+        return cls(
+            rotation,
+            translation,
+            np.linalg.inv(total),
+            twist,
+            share,
+            time_offset,
+            tracked & ~carried,
+            resting,
+            times,
+            spread,
+        )
+
+    def at(self, time_offset: np.ndarray) -> TrackedPoses:
+        """The poses if the cameras had these offsets (C,), seconds: earlier by the mean change of
+        the views that show the object."""
+        late = self.share @ (time_offset - self.time_offset)
+        poses = moved(rigid(self.rotation, self.translation), -late[:, None] * self.twist)
+        return replace(
+            self, rotation=poses[:, :3, :3], translation=poses[:, :3, 3], time_offset=time_offset
+        )
+
+
+@dataclass(frozen=True)
+class Trust:
+    """Frames in which the sequential fits are trusted.
+
+    ``body`` and ``object_`` (T,) flags, ``still`` (T-1,) the steps over which the object rests.
+    """
+
+    body: np.ndarray
+    object_: np.ndarray
+    still: np.ndarray
 
 
 @dataclass(frozen=True)

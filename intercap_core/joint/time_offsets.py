@@ -13,6 +13,8 @@ last over many frames: r and u are replaced by the innovations of a first-order 
 coefficient is that of the residuals themselves. The remaining residuals are weighted by their own
 scale and robustly (Geman-McClure), and solved for all cameras at once with a prior on their
 offsets; the master's is zero, since the frame sets' times are the master's.
+
+Residuals of keypoints and clouds by camera, as the estimate of time offsets takes them.
 """
 
 from __future__ import annotations
@@ -21,19 +23,38 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+from torch import Tensor
 
+from intercap_core.body.keypoints import BODY, FACE, LEFT_HAND, RIGHT_HAND
+from intercap_core.body_fit.evidence import Evidence
+from intercap_core.body_fit.problem import BodyProblem
+from intercap_core.geometry.camera import projection
 from intercap_core.geometry.solve.robust import SIGMA_PER_MAD, geman_mcclure_weight
-from intercap_core.joint.constants import (
-    INNOVATION_OUTLIER,
-    LOOSE_OFFSET_SIGMA_S,
-    MAX_CORRELATION,
-    MAX_STEP_RATIO,
-    MIN_INNOVATIONS,
-    MIN_PRIOR_SIGMA_S,
-    OFFSET_ITERATIONS,
-    POINT_SIGMA_M,
-    POINTS_PER_PART,
-)
+
+# Standard deviation of an offset that nothing is known of, seconds: beyond it the frame sets would
+# have been matched differently (a third of the time between frames at 30 fps).
+LOOSE_OFFSET_SIGMA_S = 0.010
+# The prior comes from the same keypoints: it is not taken as surer than this, seconds. Tuned on
+# the studio.
+MIN_PRIOR_SIGMA_S = 0.0005
+# A fitted point's own error, metres; loose, so that only disagreement between views counts. Tuned
+# on the studio.
+POINT_SIGMA_M = 0.03
+MAX_CORRELATION = 0.98  # of successive residuals; tuned on the studio
+# Standard deviations at which an innovation starts to count as an outlier. Tuned on the studio.
+INNOVATION_OUTLIER = 3.0
+# Points of one part of the body count as at most so many: their errors are correlated. Tuned on
+# the studio.
+POINTS_PER_PART = 4.0
+# Number of a camera's depth points on a sample with which the sample has half its full weight.
+# Tuned on the studio.
+HALF_WEIGHT_POINTS = 2.0
+# Rows farther apart than this share of the median time step are no neighbours: one frame missing
+# makes a step of 2.
+MAX_STEP_RATIO = 1.5
+MIN_INNOVATIONS = 50  # fewer seen points of successive frames give no estimate; tuned on the studio
+OFFSET_ITERATIONS = 4  # reweightings of the offsets' normal equations; tuned on the studio
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,3 +232,55 @@ def _correlation(residual: np.ndarray, both: np.ndarray) -> float:
     now, before = (np.clip(x, -limit, limit) for x in (now, before))
     power = np.sqrt((now**2).sum() * (before**2).sum())
     return float(np.clip((now * before).sum() / max(power, 1e-30), 0.0, MAX_CORRELATION))
+
+
+def keypoint_sightings(evidence: Evidence, problem: BodyProblem) -> Sightings:
+    """The problem's keypoints in every colour image, in units of their sigma."""
+    views = problem.views
+    if views is None:
+        raise ValueError("the problem has no views to compare with")
+    points = evidence.points(problem)
+    seen = points[:, None] if views.shift is None else points[:, None] + views.shift
+    rotation = views.colour_from_master[:, :3, :3]
+    in_camera = seen @ rotation.transpose(1, 2) + views.colour_from_master[:, None, :3, 3]
+    pixels, by_camera = projection.project_with_jacobian(in_camera, views.lenses[:, None])
+    by_point = by_camera @ rotation[:, None] / views.sigma[..., None, None]
+    velocity = by_point @ evidence.velocity(points)[:, None, :, :, None]
+    return Sightings(
+        _array((pixels - views.observed) / views.sigma[..., None]),
+        _array(velocity[..., 0]),
+        _array(by_point),
+        _array(views.confidence),
+        _part_of_keypoint(problem.keypoints.index.cpu().numpy()),
+    )
+
+
+def cloud_sightings(evidence: Evidence, problem: BodyProblem) -> Sightings | None:
+    """The person's points at every sample of the skin, along its normal; None without depth."""
+    found = evidence.by_view
+    if found is None:
+        return None
+    params = evidence.model.parameters(problem.base)
+    where = evidence.model.forward(params, vertex_ids=evidence.sample_ids).vertices
+    along = (evidence.velocity(where) * found.normal).sum(-1)
+    joint = evidence.model.skinning_weights.argmax(1)[evidence.sample_ids]
+    shape = (*found.distance.shape, 1)
+    return Sightings(
+        -_array(found.distance)[..., None],
+        np.broadcast_to(_array(along)[:, None, :, None], shape),
+        np.ones((*shape, 1)),
+        _array(found.points / (found.points + HALF_WEIGHT_POINTS)),
+        joint.cpu().numpy(),
+    )
+
+
+def _part_of_keypoint(index: np.ndarray) -> np.ndarray:
+    """Each body keypoint is a part of its own; all of a hand are one, and all of the face."""
+    starts = (LEFT_HAND.start, RIGHT_HAND.start, FACE.start)
+    hand_or_face = BODY.stop - 1 + np.searchsorted(starts, index, side="right")
+    return np.where(index < BODY.stop, index, hand_or_face)
+
+
+def _array(values: Tensor) -> np.ndarray:
+    with torch.no_grad():
+        return values.double().cpu().numpy()

@@ -17,7 +17,6 @@ from intercap_core.body.keypoints import LEFT_HAND, RIGHT_HAND
 from intercap_core.body.model import BodyModel
 from intercap_core.config import ContactInterval, digest
 from intercap_core.joint.cameras import CameraFit
-from intercap_core.joint.constants import FEW_HAND_VIEWS
 from intercap_core.joint.fit import JointFit, fit
 from intercap_core.joint.inputs import open_inputs
 from intercap_core.joint.released.artefact import import_joint
@@ -26,6 +25,10 @@ from intercap_core.schemas import CONTACT_REGIONS, JOINT, PERSON
 from intercap_core.sequence_inputs import FitSettings, SequenceModels, SequencePaths
 
 log = logging.getLogger(__name__)
+
+# A hand whose keypoints are mostly seen in so many views or fewer is undetermined: what hides it
+# from the others hides fingers from these.
+FEW_HAND_VIEWS = 2
 
 _BODY_PARAMETERS = (
     "expression",

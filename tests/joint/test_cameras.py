@@ -23,7 +23,7 @@ from intercap_core.joint.cameras import (
     Sights,
 )
 from intercap_core.joint.state import BODY, OBJECT
-from intercap_core.joint.terms.body_cameras import add_by_cameras
+from intercap_core.joint.terms.body_data import add_by_cameras
 from tests.helpers.bodies import open_body
 from tests.helpers.body_capture import ring, write_capture
 from tests.joint.test_sightings import moving_vectors

@@ -16,15 +16,18 @@ from intercap_core.body.model import BodyModel
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
-from intercap_core.joint.constants import BODY_ACCELERATION, PROBE_STEPS
-from intercap_core.joint.contact.patches import contact_patches
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.minimise import minimise
 from intercap_core.joint.problem import Problem
+from intercap_core.joint.skin import contact_patches
 from intercap_core.joint.state import ALL, BODY, BODY_SHIFT, State
-from intercap_core.joint.terms.learned_motion import LearnedMotion
-from intercap_core.joint.terms.motion import BodyMotion
+from intercap_core.joint.terms.motion import (
+    BODY_ACCELERATION,
+    PROBE_STEPS,
+    BodyMotion,
+    LearnedMotion,
+)
 from intercap_core.joint.terms.term import Term
 from tests.helpers.lemo_release import random_state, write_release
 

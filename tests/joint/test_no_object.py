@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.joint.contact.patches import contact_patches
-from intercap_core.joint.contact_estimate import ContactEstimate
+from intercap_core.joint.contact.estimate import ContactEstimate
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.geometry import Geometry
+from intercap_core.joint.skin import contact_patches
 from intercap_core.joint.state import ALL, BODY, OBJECT, State
-from intercap_core.joint.terms.no_object import NoObject
+from intercap_core.joint.terms.object_data import NoObject
 from intercap_core.schemas import CONTACT_REGIONS
 from tests.helpers.bodies import open_body
 

@@ -11,18 +11,17 @@ from intercap_core.geometry.rigid.distance import DistanceField, SurfacePart
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 from intercap_core.geometry.solve.thread_pool import ThreadPool
-from intercap_core.joint import smoothness as smoothness
-from intercap_core.joint.constants import ANNOTATED_CONTACT_WEIGHT
-from intercap_core.joint.contact.patches import contact_patches
-from intercap_core.joint.energy_constants import CONTACT_TOLERANCE
 from intercap_core.joint.equations import NormalEquations
+from intercap_core.joint.floor import Ground
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.minimise import minimise
-from intercap_core.joint.problem import Problem, Trust, joint_terms
+from intercap_core.joint.problem import Problem, joint_terms
+from intercap_core.joint.sequential import TrackedPoses, Trust
+from intercap_core.joint.skin import contact_patches
 from intercap_core.joint.state import ALL, BODY, State
-from intercap_core.joint.terms.contact import Contact
-from intercap_core.joint.terms.ground import Ground
-from intercap_core.joint.terms.object_data import ObjectData, TrackedPoses
+from intercap_core.joint.terms.contact import ANNOTATED_CONTACT_WEIGHT, CONTACT_TOLERANCE, Contact
+from intercap_core.joint.terms.drift import jitter
+from intercap_core.joint.terms.object_data import ObjectData
 from intercap_core.joint.terms.term import Term
 from intercap_core.schemas import CONTACT_REGIONS
 
@@ -418,8 +417,8 @@ def test_jitter_is_the_noise_of_a_smooth_motion():
     t = np.arange(200)[:, None, None] / 30
     smooth = np.concatenate([np.sin(t), np.cos(1.3 * t), t], axis=2)
     noisy = smooth + rng.normal(scale=0.003, size=smooth.shape)
-    assert smoothness.jitter(noisy, np.ones(200, bool)) == pytest.approx(0.003, rel=0.2)
-    assert smoothness.jitter(smooth, np.ones(200, bool)) < 1e-5
+    assert jitter(noisy, np.ones(200, bool)) == pytest.approx(0.003, rel=0.2)
+    assert jitter(smooth, np.ones(200, bool)) < 1e-5
 
 
 def test_without_its_weight_drift_is_gone_but_for_what_rests(model, box):

@@ -14,8 +14,12 @@ from intercap_core.body_fit.body_samples import COVERINGS
 from intercap_core.body_fit.observations import person_clouds, read_observations
 from intercap_core.body_fit.schedule import Fitter, Settled
 from intercap_core.config import BodyFitSettings
-from intercap_core.joint.sightings import cloud_sightings, keypoint_sightings
-from intercap_core.joint.time_offsets import OffsetPrior, estimate_offsets
+from intercap_core.joint.time_offsets import (
+    OffsetPrior,
+    cloud_sightings,
+    estimate_offsets,
+    keypoint_sightings,
+)
 from tests.helpers.bodies import open_body
 from tests.helpers.body_capture import master_from_room, ring, write_capture
 

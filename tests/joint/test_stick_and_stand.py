@@ -6,15 +6,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from intercap_core.joint.constants import STICK_VERTICES
-from intercap_core.joint.contact.standing import sole_parts, standing_probability
 from intercap_core.joint.equations import NormalEquations
+from intercap_core.joint.floor import Ground
 from intercap_core.joint.minimise import minimise
 from intercap_core.joint.state import State
-from intercap_core.joint.terms import stick_residual as stick
-from intercap_core.joint.terms.ground import Ground
 from intercap_core.joint.terms.object_data import ObjectData
-from intercap_core.joint.terms.stick import _representatives
+from intercap_core.joint.terms.plant import sole_parts, standing_probability
+from intercap_core.joint.terms.stick import (
+    STICK_VERTICES,
+    _representatives,
+    local_by_object,
+    local_points,
+)
 from intercap_core.schemas import CONTACT_REGIONS
 from tests.joint.test_problem import _Hold, _Scene, _state, _tracked, box  # noqa: F401
 
@@ -35,7 +38,7 @@ def slip(scene: _Scene, state: State) -> float:
     hand = geometry.skin.patch[geometry.patches.region == LEFT_HAND]
     near = hand[np.argsort(scene.distance(state)[0, hand])[:6]]
     points = geometry.at(state).skin[:, near]
-    local = stick.local_points(points, state.rotation, state.translation)
+    local = local_points(points, state.rotation, state.translation)
     return float(np.sqrt((np.diff(local, axis=0) ** 2).sum(2).mean()))
 
 
@@ -44,13 +47,13 @@ def test_points_in_the_object_s_frame_and_their_derivative() -> None:
     points = rng.normal(size=(2, 3, 3))
     rotation = Rotation.random(2, rng).as_matrix()
     translation = rng.normal(size=(2, 3))
-    local = stick.local_points(points, rotation, translation)
+    local = local_points(points, rotation, translation)
     back = local @ rotation.transpose(0, 2, 1) + translation[:, None]
     np.testing.assert_allclose(back, points)
-    found = stick.local_by_object(points, rotation, translation)
+    found = local_by_object(points, rotation, translation)
     for k, step in enumerate(1e-6 * np.eye(6)):
         turned = Rotation.from_rotvec(step[:3]).as_matrix() @ rotation
-        there = stick.local_points(points, turned, translation + step[3:])
+        there = local_points(points, turned, translation + step[3:])
         np.testing.assert_allclose((there - local) / 1e-6, found[..., k], atol=1e-5)
 
 

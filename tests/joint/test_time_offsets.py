@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from intercap_core.joint.constants import LOOSE_OFFSET_SIGMA_S
 from intercap_core.joint.time_offsets import (
+    LOOSE_OFFSET_SIGMA_S,
     OffsetPrior,
     Sightings,
     estimate_offsets,

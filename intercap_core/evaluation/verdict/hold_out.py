@@ -21,16 +21,14 @@ import numpy as np
 import torch
 
 from intercap_core.config import JointSettings
-from intercap_core.joint.constants import MIN_DAMPING
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.fit import Assembly, assemble
 from intercap_core.joint.inputs import JointInputs
-from intercap_core.joint.minimise import limited
+from intercap_core.joint.minimise import MIN_DAMPING, limited
 from intercap_core.joint.result import JointResult
 from intercap_core.joint.state import BODY, OBJECT, State
 from intercap_core.joint.terms.body_data import BodyData
-from intercap_core.joint.terms.no_object import NoObject
-from intercap_core.joint.terms.object_data import ObjectData
+from intercap_core.joint.terms.object_data import NoObject, ObjectData
 from intercap_core.joint.terms.object_images import ObjectImagesData
 from intercap_core.object_track.view_report import ViewReport
 

@@ -9,7 +9,12 @@ from itertools import groupby, pairwise
 import numpy as np
 
 from intercap_core.config import ANY_REGION, ContactInterval
-from intercap_core.joint.contact.constants import ANNOTATED_LOGIT, FAR_CONTACT
+
+# Log odds of an annotation away from its ends: above all that distance and slip can say against it.
+ANNOTATED_LOGIT = 12.0
+# An annotated contact this far from the object is a mistake of one or the other, metres: beyond
+# what the fits err by where they are not flagged. Tuned on the studio.
+FAR_CONTACT = 0.15
 
 
 @dataclass(frozen=True)

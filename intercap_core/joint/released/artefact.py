@@ -1,4 +1,7 @@
-"""Another program's results as the joint artefact, which metrics and all that follows read."""
+"""Whose release results are of.
+
+Another program's results as the joint artefact, which metrics and all that follows read.
+"""
 
 from __future__ import annotations
 
@@ -15,20 +18,45 @@ from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.frames import Frames
+from intercap_core.formats.released.file_names import (
+    BEHAVE_OBJECT,
+    BEHAVE_PERSON,
+    INTERCAP,
+    intercap_file,
+)
 from intercap_core.formats.released.results import Recording, Results
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply, invert
-from intercap_core.joint.released.reader import read_results
+from intercap_core.joint.released import behave as release_behave
+from intercap_core.joint.released import intercap as release_intercap
 from intercap_core.schemas import CONTACT_REGIONS, JOINT, PERSON, SCENE
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 
 log = logging.getLogger(__name__)
-
 _FULL_HAND = 45
 _SHAPE_VARIES_M = 0.001  # of the skin, from which on one shape for all frames is told
 _LEAST_CONFIDENCE = 0.3  # of keypoints whose residuals are reported
 _POSE = ("global_orient", "transl", "body_pose", "jaw_pose", "leye_pose", "reye_pose",
          "left_hand_pose", "right_hand_pose")  # fmt: skip
+
+
+def read_results(path: Path, recording: Recording) -> Results:
+    """Results of a sequence, whoever's they are.
+
+    A file, and a folder that holds one of InterCap's names, is InterCap's; a folder of frame
+    folders ``t<seconds>``, or with BEHAVE's parameters at 30 fps, is BEHAVE's. Raises UserError
+    where it is neither, and as the readers do.
+    """
+    file = intercap_file(Path(path))
+    if not file.is_dir():
+        return release_intercap.read_results(file)
+    at_30_fps = (BEHAVE_PERSON, BEHAVE_OBJECT)
+    if any((file / name).is_file() for name in at_30_fps) or any(file.glob("t[0-9]*/")):
+        return release_behave.read_results(file, recording)
+    raise UserError(
+        f"{file}: holds none of {', '.join(INTERCAP)} (InterCap's), no frame's folder t<seconds> "
+        f"and none of {' and '.join(at_30_fps)} (BEHAVE's); name the file or folder of results"
+    )
 
 
 def import_joint(

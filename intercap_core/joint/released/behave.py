@@ -21,7 +21,6 @@ from intercap_core.body.parameters import POSE_BLOCKS, TRANSL
 from intercap_core.config import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.behave import frame_folders
-from intercap_core.formats.released import constants
 from intercap_core.formats.released.behave_files import (
     Skin,
     object_fits,
@@ -37,8 +36,17 @@ from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh import read_mesh
 from intercap_core.joint.released.surface_fit import fit_surfaces
 
-log = logging.getLogger(__name__)
+# Names of BEHAVE's folders round times to milliseconds; images come 33 ms apart at the least.
+SAME_TIME_US = 5_000
+# Beyond these a frame is flagged: four times what it ends at otherwise (see SURFACE_SIGMA_M).
+FAR_MEAN_M = 0.010
+FAR_MOST_M = 0.030  # 95th percentile
+# 95th percentile of how far the released placement is from ours, beyond which the mesh is another
+# one than the poses belong to. Closed and simplified copies of a template are nearer.
+OTHER_MESH_M = 0.010
+CHECKED_FRAMES = 5
 
+log = logging.getLogger(__name__)
 _FAR = "the body is far from the mesh that it was fitted to"
 
 
@@ -77,14 +85,14 @@ def read_results(folder: Path, recording: Recording) -> Results:
         posed = np.isfinite(translation).all(1)
         reasons[known & ~posed] = "no pose of the object in the imported files"
         known &= posed
-    far = (distance[:, 0] > constants.FAR_MEAN_M) | (distance[:, 1] > constants.FAR_MOST_M)
+    far = (distance[:, 0] > FAR_MEAN_M) | (distance[:, 1] > FAR_MOST_M)
     reasons[known] = np.where(far[known], _FAR, "")
     mean, most = 1e3 * np.mean(fitted.distance, axis=0)
     log.info(
         "sequence %s: the body was fitted to %d meshes in %s, %.1f mm beside them in the mean, "
         "%.1f mm in the 95th percentile; %d frames are beyond %.0f or %.0f mm and flagged",
         recording.sequence, len(person.frames), folder, mean, most, int(far.sum()),
-        1e3 * constants.FAR_MEAN_M, 1e3 * constants.FAR_MOST_M,
+        1e3 * FAR_MEAN_M, 1e3 * FAR_MOST_M,
     )  # fmt: skip
     pose, start = {}, 0
     for name, size in POSE_BLOCKS:
@@ -136,7 +144,7 @@ def _at_times(times: np.ndarray, known: list[int]) -> dict[int, int]:
     left = np.maximum(right - 1, 0)
     nearer = np.abs(ordered[left] - wanted) < np.abs(ordered[right] - wanted)
     nearest = ordered[np.where(nearer, left, right)]
-    same = np.abs(nearest - wanted) <= constants.SAME_TIME_US
+    same = np.abs(nearest - wanted) <= SAME_TIME_US
     return {int(t): int(nearest[t]) for t in np.flatnonzero(same)}
 
 
@@ -253,15 +261,15 @@ def _check_placement(
         return
     own = read_mesh(Path(entry.mesh))
     surface = DistanceField(np.asarray(own.vertices), np.asarray(own.faces))
-    chosen = np.linspace(0, len(there) - 1, constants.CHECKED_FRAMES).round().astype(int)
+    chosen = np.linspace(0, len(there) - 1, CHECKED_FRAMES).round().astype(int)
     for t in {there[i] for i in chosen}:
         placed = np.asarray(read_mesh(meshes[t]).vertices, np.float64)
         away = surface.distance((placed - translation[t]) @ rotation[t])
         apart = float(np.percentile(away, 95))
-        if not apart <= constants.OTHER_MESH_M:
+        if not apart <= OTHER_MESH_M:
             raise UserError(
                 f"{entry.mesh}: does not lie on {meshes[t]}, whose vertices are {1e3 * apart:.0f} "
-                f"mm from it, expected at most {1e3 * constants.OTHER_MESH_M:.0f}; the poses "
+                f"mm from it, expected at most {1e3 * OTHER_MESH_M:.0f}; the poses "
                 f"belong to BEHAVE's template: name objects/{entry.name}/{entry.name}_f1000.ply "
                 "(or its like) as 'mesh' in objects.yaml"
             )

@@ -25,12 +25,32 @@ from intercap_core.body_fit import body_cloud
 from intercap_core.body_fit.body_constants import MATCH_COSINE
 from intercap_core.body_fit.body_samples import choose_samples
 from intercap_core.body_fit.body_surface import Surface
-from intercap_core.formats.released import constants
 from intercap_core.formats.released.behave_files import Skin
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.normals import vertex_normals
 from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations, minimise
 from intercap_core.geometry.solve.robust import geman_mcclure_weight
+
+# Frames, spread evenly, that settle the one shape: on a studio's person the skin is then within
+# 0.1 mm of what 48 frames give.
+SHAPE_FRAMES = 16
+FRAMES_TOGETHER = 32  # fitted at once once the shape is known: memory
+# Rounds of finding correspondences, each with one step of Gauss-Newton: in the first fingers keep
+# the pose that was found for the other body, until hands lie on hands; else a finger goes to its
+# neighbour, which is 20 mm beside it.
+HELD_ROUNDS, FREE_ROUNDS = 6, 6  # with the shape
+POSE_HELD_ROUNDS, POSE_FREE_ROUNDS = 4, 4  # once the shape is known
+# What two body models differ by where pose and shape agree: the studio's people on another mesh
+# end 1.4 to 2.7 mm beside the open body in the mean, 4 to 8 in the 95th percentile.
+SURFACE_SIGMA_M = 0.004
+REACH_M = 0.20  # the farthest correspondence; arms start that far beside
+# A correspondence as far as this counts a quarter (Geman and McClure): of the body, and of hands
+# whose fingers are free, where what is farther may be the next finger.
+FAR_M, HAND_FAR_M = 0.03, 0.008
+# rad, about the rotations that were found for the other body: rest poses and joints of the two
+# differ by some degrees. They decide what the surface does not: turns about a limb's own axis, and
+# fingers in a fist. From rotations 8 degrees off, joints end 3 mm beside the true ones in the mean.
+POSE_SIGMA, FINGER_SIGMA, HELD_SIGMA = 0.25, 0.08, 0.01
 
 _REST = slice(66, 75)  # jaw and eyes, which stay
 _ROOT, _FINGERS = slice(0, 3), slice(75, 165)  # the pelvis' turn, and the hands' joints
@@ -51,15 +71,15 @@ def fit_surfaces(model: BodyModel, skins: Sequence[Skin], rotations: np.ndarray)
     expected = surfaces.start(skins, torch.as_tensor(rotations, dtype=model.dtype))
     vectors = expected.clone()
     count = len(skins)
-    some = np.unique(np.linspace(0, count - 1, constants.SHAPE_FRAMES).round().astype(int))
+    some = np.unique(np.linspace(0, count - 1, SHAPE_FRAMES).round().astype(int))
     settled = surfaces.settle(
         [skins[i] for i in some], vectors[some], expected[some], with_shape=True
     )
     vectors[:, surfaces.shape] = settled[0, surfaces.shape]
     vectors[some] = settled
     distance = np.zeros((count, 2))
-    for first in range(0, count, constants.FRAMES_TOGETHER):
-        at = slice(first, first + constants.FRAMES_TOGETHER)
+    for first in range(0, count, FRAMES_TOGETHER):
+        at = slice(first, first + FRAMES_TOGETHER)
         vectors[at] = surfaces.settle(skins[at], vectors[at], expected[at], with_shape=False)
         distance[at] = surfaces.distance(skins[at], vectors[at])
     return Fitted(vectors, distance)
@@ -103,9 +123,9 @@ class _Surfaces:
         targets = [_Target.of(skin) for skin in skins]
         own, about = vectors[:, self.columns], expected[:, self.columns]
         shared = vectors[0, self.shape] if with_shape else None
-        held, free = constants.POSE_HELD_ROUNDS, constants.POSE_FREE_ROUNDS
+        held, free = POSE_HELD_ROUNDS, POSE_FREE_ROUNDS
         if with_shape:
-            held, free = constants.HELD_ROUNDS, constants.FREE_ROUNDS
+            held, free = HELD_ROUNDS, FREE_ROUNDS
         for fingers in [False] * held + [True] * free:
             rows = self._rows(targets, vectors, fingers)
             stiffness = self._stiffness(fingers).to(own)
@@ -134,18 +154,18 @@ class _Surfaces:
 
     def _stiffness(self, fingers: bool) -> Tensor:
         """(n,) 1/rad^2 of the pose about where it starts; none of the pelvis' turn and place."""
-        found = torch.full((len(self.columns),), constants.POSE_SIGMA**-2)
+        found = torch.full((len(self.columns),), POSE_SIGMA**-2)
         found[_ROOT] = 0.0
         found[(self.columns >= _FINGERS.start) & (self.columns < _FINGERS.stop)] = (
-            constants.FINGER_SIGMA if fingers else constants.HELD_SIGMA
+            FINGER_SIGMA if fingers else HELD_SIGMA
         ) ** -2
         found[self.columns >= TRANSL.start] = 0.0
         return found
 
     def _rows(self, targets: Sequence[_Target], vectors: Tensor, fingers: bool) -> _Rows:
-        far = torch.full((len(self.ids), 1), constants.FAR_M)
+        far = torch.full((len(self.ids), 1), FAR_M)
         if fingers:
-            far[self.hand] = constants.HAND_FAR_M
+            far[self.hand] = HAND_FAR_M
         parts = []
         with torch.no_grad():
             for at in _chunks(len(targets)):
@@ -165,20 +185,20 @@ class _Surfaces:
             for values in (closest.points, closest.normals)
         )
         apart = (samples - there).norm(dim=1)
-        agrees = ((facing * along).sum(1) > MATCH_COSINE) & (apart < constants.REACH_M)
+        agrees = ((facing * along).sum(1) > MATCH_COSINE) & (apart < REACH_M)
         matches = body_cloud.match_compiled(
-            target.points, target.normals, vertices, normals, self.skin, constants.REACH_M
+            target.points, target.normals, vertices, normals, self.skin, REACH_M
         )
         ones = torch.ones(len(target.points), dtype=samples.dtype)
         none = torch.zeros(len(samples), dtype=samples.dtype)
-        mean, count = body_cloud.gather(matches, ones, none, len(samples), huber=constants.FAR_M)
+        mean, count = body_cloud.gather(matches, ones, none, len(samples), huber=FAR_M)
         both = torch.stack([facing, along], 1)
         away = torch.stack([(facing * (samples - there)).sum(1), -mean], 1)
         valid = torch.stack([agrees, count > 0.5], 1)
         size = torch.stack([apart, mean.abs()], 1)
         trust = geman_mcclure_weight(size * size, far)
         target_along = (both * samples[:, None]).sum(2) - away
-        return _Rows(both, target_along, valid * trust / constants.SURFACE_SIGMA_M**2)
+        return _Rows(both, target_along, valid * trust / SURFACE_SIGMA_M**2)
 
 
 class _Target:
@@ -282,5 +302,5 @@ def _middle(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def _chunks(count: int) -> list[slice]:
-    step = constants.FRAMES_TOGETHER
+    step = FRAMES_TOGETHER
     return [slice(i, i + step) for i in range(0, count, step)]

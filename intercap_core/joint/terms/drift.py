@@ -14,17 +14,39 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from intercap_core.joint import smoothness as smoothness
-from intercap_core.joint.constants import (
-    BODY_DRIFT,
-    DRIFT_POINTS_PER_MEASUREMENT,
-    OBJECT_DRIFT,
-    RESTING_SIGMA,
-)
-from intercap_core.joint.equations import NormalEquations
+from intercap_core.geometry.solve.robust import SIGMA_PER_MAD
+from intercap_core.joint.equations import RATE, NormalEquations
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.state import BODY, OBJECT, State
 from intercap_core.joint.terms.term import Term
+
+# How fast they change: a random walk, metres in one second. Tuned on the studio.
+BODY_DRIFT = 0.010
+OBJECT_DRIFT = 0.004
+# Points of the body or the object whose corrections are one measurement: neighbouring points move
+# as one. Tuned on the studio.
+DRIFT_POINTS_PER_MEASUREMENT = 2.0
+# Distance that an object at rest moves between frames, metres: practically none. Tuned on the
+# studio.
+RESTING_SIGMA = 2e-5
+
+_FOURTH = (1.0, -4.0, 6.0, -4.0, 1.0)
+
+
+def jitter(points: np.ndarray, valid: np.ndarray) -> float:
+    """Standard deviation, in metres, of noise that is independent from frame to frame in points
+    (T, N, 3), from the median size of fourth differences: motion itself hardly has any. Only runs
+    of ``valid`` (T,) frames count; 0 where there is none of five."""
+    count = len(points) - len(_FOURTH) + 1
+    if count < 1:
+        return 0.0
+    whole = np.all([valid[k : k + count] for k in range(len(_FOURTH))], axis=0)
+    if not whole.any():
+        return 0.0
+    fourth = np.sum([f * points[k : k + count] for k, f in enumerate(_FOURTH)], axis=0)
+    return float(
+        SIGMA_PER_MAD * np.median(np.abs(fourth[whole])) / np.sqrt(np.square(_FOURTH).sum())
+    )
 
 
 class BodyDrift(Term):
@@ -99,7 +121,7 @@ class ObjectDrift(Term):
 
 def _sigma(points: np.ndarray, trusted: np.ndarray, drift: float, fps: float) -> float:
     """Standard deviation, in metres, of the change of corrections from frame to frame."""
-    noise = smoothness.jitter(points, trusted)
+    noise = jitter(points, trusted)
     return np.sqrt(drift**2 / fps + 2 * noise**2)
 
 
@@ -124,6 +146,6 @@ def _add_pairs(
         lambda at, some: jacobian[at, some],
         weight / DRIFT_POINTS_PER_MEASUREMENT,
         change,
-        stencil=smoothness.RATE,
+        stencil=RATE,
         stiff=stiff,
     )

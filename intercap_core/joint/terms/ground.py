@@ -1,4 +1,11 @@
-"""Ground support: E_G (body, A.5) and E_G' (object, A.6) of equation 6.
+"""Ground support E_G and E_G' of equation 6 (A.5, A.6): nothing sinks into the floor.
+
+    E_G = sum over vertices W of the body of || RL(n . (p - W)) ||^2
+    E_G' = sum over vertices W' of the object of || RL(n . (p - W')) ||^2
+
+with p a point of the floor, n its upward unit normal and RL the rectifier max(0, x).
+
+Ground support: E_G (body, A.5) and E_G' (object, A.6) of equation 6.
 
 Weighed by lambda_G (setting ``ground_weight``); residuals in
 :mod:`intercap_core.joint.terms.ground_residual`.
@@ -6,29 +13,29 @@ Weighed by lambda_G (setting ``ground_weight``); residuals in
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from intercap_core.joint.constants import (
-    GROUND_SIGMA,
-    MIN_STANDING_VERTICES,
-    VERTICES_PER_MEASUREMENT,
-)
 from intercap_core.joint.equations import NormalEquations
+from intercap_core.joint.floor import Ground
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.proximity import along_by_object
+from intercap_core.joint.skin import VERTICES_PER_MEASUREMENT
 from intercap_core.joint.state import BODY, OBJECT, State
-from intercap_core.joint.terms import ground_residual as ground
 from intercap_core.joint.terms.term import Term
 
+# Depth of a vertex below the floor, metres: the ground plane's own error. Tuned on the studio.
+GROUND_SIGMA = 0.005
+# Vertices of the object on which it stands at least: fewer would each count as a measurement of
+# their own when an edge just touches the floor. Tuned on the studio.
+MIN_STANDING_VERTICES = 4
 
-@dataclass(frozen=True)
-class Ground:
-    """A floor: ``point`` (3,) and upward unit ``normal`` (3,), master frame, metres."""
 
-    point: np.ndarray
-    normal: np.ndarray
+def depth_below(points: np.ndarray, floor: Ground) -> np.ndarray:
+    """Height (..., N) of points (..., N, 3) over the floor where negative, else 0; metres.
+
+    Its derivative by a point is the normal where the residual is negative and 0 elsewhere.
+    """
+    return np.minimum(floor.heights(points), 0.0)
 
 
 class BodyGround(Term):
@@ -43,7 +50,7 @@ class BodyGround(Term):
     def add(self, state: State, equations: NormalEquations) -> None:
         """Add E_G at ``state``."""
         posed = self._geometry.at(state)
-        height = ground.residuals(posed.skin, self._floor.point, self._floor.normal)
+        height = depth_below(posed.skin, self._floor)
         weight = np.where(height < 0, self._geometry.skin.share, 0.0) * self._scale
 
         def rows(frames: slice, index: np.ndarray) -> np.ndarray:
@@ -87,4 +94,4 @@ class ObjectGround(Term):
 
     def _height(self, state: State) -> np.ndarray:
         vertices = self._geometry.at(state).object_vertices
-        return ground.residuals(vertices, self._floor.point, self._floor.normal)
+        return depth_below(vertices, self._floor)

@@ -2,8 +2,12 @@
 
 import numpy as np
 
-from intercap_core.joint.contact.constants import FRAME_SIGMA
-from intercap_core.joint.contact.detect import RegionMotion, contact_probability, lasting_error
+from intercap_core.joint.contact.detect import (
+    FRAME_SIGMA,
+    RegionMotion,
+    contact_probability,
+    lasting_error,
+)
 
 FPS = 15.0
 

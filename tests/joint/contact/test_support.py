@@ -3,8 +3,12 @@
 import numpy as np
 import pytest
 
-from intercap_core.joint.contact.constants import STANDARD_GRAVITY, UNHELD_PROBABILITY
-from intercap_core.joint.contact.support import held, support_evidence
+from intercap_core.joint.contact.detect import (
+    STANDARD_GRAVITY,
+    UNHELD_PROBABILITY,
+    held,
+    support_evidence,
+)
 
 FPS = 30.0
 UP = np.array([0.0, -1.0, 0.0])

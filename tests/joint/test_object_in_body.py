@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from intercap_core.joint.energy_constants import DEEPEST_IN_BODY, WATCHED_OUTSIDE
-from intercap_core.joint.terms import object_in_body_residual as object_in_body
+from intercap_core.joint.terms.penetration import DEEPEST_IN_BODY, WATCHED_OUTSIDE, find_embedded
 
 RADIUS = 0.1
 
@@ -18,7 +17,7 @@ def test_depth_and_direction_in_a_ball() -> None:
     way /= np.linalg.norm(way, axis=1, keepdims=True)
     distance = rng.uniform(-0.03, 0.02, 300)
     points = way * (RADIUS + distance)[:, None]
-    held = object_in_body.embedded(points, np.asarray(ball.vertices), np.asarray(ball.faces))
+    held = find_embedded(points, np.asarray(ball.vertices), np.asarray(ball.faces))
     # facets of 6 mm lie up to 0.1 mm inside the ball
     sure = np.minimum(np.abs(distance + DEEPEST_IN_BODY), np.abs(distance - WATCHED_OUTSIDE)) > 2e-4
     near = (distance > -DEEPEST_IN_BODY) & (distance < WATCHED_OUTSIDE)

@@ -6,12 +6,13 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from intercap_core.geometry.rigid.distance import DistanceField, SurfacePart
-from intercap_core.joint import smoothness as smoothness
-from intercap_core.joint.energy_constants import PENETRATION_TOLERANCE
+from intercap_core.joint.floor import Ground
+from intercap_core.joint.geometry import moment_points, points_by_object
 from intercap_core.joint.proximity import along_by_object, proximity
-from intercap_core.joint.terms import contact_residual as contact
-from intercap_core.joint.terms import ground_residual as ground
-from intercap_core.joint.terms import penetration_residual as penetration
+from intercap_core.joint.terms.contact import evaluate_contact, spread_contact
+from intercap_core.joint.terms.ground import depth_below
+from intercap_core.joint.terms.motion import accelerations
+from intercap_core.joint.terms.penetration import PENETRATION_TOLERANCE, weigh_depths
 
 RNG = np.random.default_rng(3)
 
@@ -81,8 +82,8 @@ def test_distance_derivatives_match_finite_differences(annotated):
 
 def _contact(distance, patch_of, region_of_patch, probability):
     distance, patch_of = np.array(distance), np.array(patch_of)
-    spread = contact.shares(distance, patch_of, np.array(region_of_patch))
-    return contact.term(distance, patch_of, spread, np.array(probability))
+    spread = spread_contact(distance, patch_of, np.array(region_of_patch))
+    return evaluate_contact(distance, patch_of, spread, np.array(probability))
 
 
 def test_contact_weights_of_a_touching_patch_sum_to_its_probability():
@@ -106,28 +107,28 @@ def test_a_finger_off_the_handle_is_left_alone_while_the_palm_holds_it():
 def test_contact_weights_are_the_derivative_of_its_energy():
     distance = RNG.uniform(-0.005, 0.03, size=(3, 12))
     patch_of = np.repeat([0, 1, 2], 4)
-    spread = contact.shares(distance, patch_of, np.array([0, 0, 1]))
+    spread = spread_contact(distance, patch_of, np.array([0, 0, 1]))
     probability = RNG.uniform(size=(3, 3))
-    residual, weight, _ = contact.term(distance, patch_of, spread, probability)
+    residual, weight, _ = evaluate_contact(distance, patch_of, spread, probability)
     for t, n in ((0, 1), (1, 5), (2, 11)):
         step = np.zeros_like(distance)
         step[t, n] = 1e-7
-        up = contact.term(distance + step, patch_of, spread, probability)[2].sum()
-        down = contact.term(distance - step, patch_of, spread, probability)[2].sum()
+        up = evaluate_contact(distance + step, patch_of, spread, probability)[2].sum()
+        down = evaluate_contact(distance - step, patch_of, spread, probability)[2].sum()
         numeric = (up - down) / 2e-7
         assert (weight * residual)[t, n] == pytest.approx(numeric, rel=1e-4, abs=1e-10)
 
 
 def test_only_depth_beyond_the_tolerance_costs():
     distance = np.array([[0.01, -0.5 * PENETRATION_TOLERANCE, -0.006]])
-    residual, weight = penetration.weights(distance, np.full(3, 2.0))
+    residual, weight = weigh_depths(distance, np.full(3, 2.0))
     np.testing.assert_allclose(residual[0], [0, 0, -0.006 + PENETRATION_TOLERANCE])
     np.testing.assert_allclose(weight[0], [0, 0, 2])
 
 
 def test_ground_counts_what_is_below_alone():
     points = np.array([[[0, 0, 0.1], [0, 0, -0.02]]])
-    height = ground.residuals(points, np.zeros(3), np.array([0, 0, 1.0]))
+    height = depth_below(points, Ground(np.zeros(3), np.array([0, 0, 1.0])))
     np.testing.assert_allclose(height, [[0, -0.02]])
 
 
@@ -147,7 +148,7 @@ def test_what_moves_with_the_object_has_the_derivative_of_finite_differences():
 def test_six_points_carry_the_energy_of_all_vertices():
     vertices = RNG.normal(size=(200, 3)) * (0.1, 0.2, 0.4) + (0.3, 0.0, -0.1)
     matrix, shift = RNG.normal(size=(3, 3)), RNG.normal(size=3)
-    six = smoothness.moment_points(vertices)
+    six = moment_points(vertices)
     energy = np.square(vertices @ matrix.T + shift).sum() / len(vertices)
     assert np.square(six @ matrix.T + shift).sum() / 6 == pytest.approx(energy)
 
@@ -155,15 +156,15 @@ def test_six_points_carry_the_energy_of_all_vertices():
 def test_object_points_derivative_matches_finite_differences():
     rotation, translation = _poses(2)
     points = RNG.normal(size=(4, 3))
-    moved, jacobian = smoothness.points_by_object(points, rotation, translation)
+    moved, jacobian = points_by_object(points, rotation, translation)
     step = 1e-6
     for axis in range(6):
         twist = np.eye(6)[axis] * step
         turn = Rotation.from_rotvec(twist[:3]).as_matrix()
-        there, _ = smoothness.points_by_object(points, turn @ rotation, translation + twist[3:])
+        there, _ = points_by_object(points, turn @ rotation, translation + twist[3:])
         np.testing.assert_allclose((there - moved) / step, jacobian[..., axis], atol=1e-5)
 
 
 def test_constant_velocity_has_no_acceleration():
     points = np.arange(6)[:, None, None] * np.array([0.1, 0.2, 0.3])
-    np.testing.assert_allclose(smoothness.accelerations(points, 30.0), 0, atol=1e-10)
+    np.testing.assert_allclose(accelerations(points, 30.0), 0, atol=1e-10)

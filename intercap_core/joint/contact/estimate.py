@@ -9,14 +9,16 @@ import numpy as np
 
 from intercap_core.config import ContactInterval, JointSettings
 from intercap_core.joint.contact.annotated import Oddity, annotation_evidence, oddities
-from intercap_core.joint.contact.detect import RegionMotion, contact_probability
-from intercap_core.joint.contact.motion import region_motion
-from intercap_core.joint.contact.support import held
+from intercap_core.joint.contact.detect import (
+    RegionMotion,
+    contact_probability,
+    held,
+    region_motion,
+)
+from intercap_core.joint.floor import Ground
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.sequential import SequentialFits
 from intercap_core.joint.state import State
-from intercap_core.joint.terms import ground_residual as ground
-from intercap_core.joint.terms.ground import Ground
 from intercap_core.schemas import CONTACT_REGIONS
 
 
@@ -99,7 +101,7 @@ class ContactEstimator:
         if self._floor is None:
             return None
         vertices = self._geometry.at(state).object_vertices
-        height = ground.residuals(vertices, self._floor.point, self._floor.normal).min(axis=1)
+        height = np.minimum(self._floor.heights(vertices), 0.0).min(axis=1)
         centre = self._geometry.at(state).moments[0].mean(axis=1)
         off = held(centre, height, self._floor.normal, self._fps)
         return off & ~self._sequential.flags.lost
