@@ -7,7 +7,7 @@ The paper's E_P (equation 5) is part of E_B; body in object and object in body, 
 drift go beyond the paper. To read a term, open its file; to leave one out or add one, change
 :func:`joint_terms`. Every residual is divided by the standard deviation that its source leaves
 unexplained, so that a term's weight in the settings is 1 where it is as strong as its evidence. The
-table of all equations is in :mod:`intercap_core.joint.energy_table`.
+table of all equations is in docs/equations.md.
 """
 
 from __future__ import annotations
