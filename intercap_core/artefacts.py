@@ -1,11 +1,10 @@
-"""The one place that opens HDF5: declared schemas, atomic writes, reads that validate.
+"""Artefacts: HDF5 files with a declared schema, written atomically and validated when read.
 
-An artefact is what one stage computed for one sequence. It is written under a temporary name in
-its own folder, synced and renamed, so a file under its final name is whole; its ``complete`` mark
-is set last all the same. Every dataset carries a fletcher32 checksum, its units and its frame;
-attributes have texts of fixed length, which lie under the checksums of HDF5's own structures (texts
-of any length would lie in a heap that has none). Nothing in the file depends on when, where or by
-whom it was written, so the same input gives the same bytes.
+An artefact is the output of one stage for one sequence. It is written under a temporary name in
+its folder, synced and renamed; the attribute ``complete`` is set last. Every dataset has a
+fletcher32 checksum, units and a coordinate frame. Text attributes have a fixed length, so that they
+are covered by the checksums of HDF5's headers; the heap of variable-length texts has none. The same
+input gives the same bytes: no time, host or path is stored.
 """
 
 from __future__ import annotations
@@ -26,12 +25,10 @@ import numpy as np
 from intercap_core.disk import PartFile
 from intercap_core.errors import UserError
 
-MADE_FROM = (
-    "made_from"  # attribute: what the artefact was made from, as pipeline.provenance writes it
-)
-PART = ".part"  # how the name of what is being written ends
+MADE_FROM = "made_from"  # attribute with the manifest of pipeline.provenance
+PART = ".part"  # suffix of incomplete outputs
 _LIBVER = ("v110", "v110")  # headers with checksums, attributes of any size
-CHUNK_BYTES = 1 << 20  # HDF5's default chunk cache holds one such chunk with room to spare
+CHUNK_BYTES = 1 << 20  # fits into HDF5's default chunk cache
 
 
 class Unreadable(UserError):
@@ -40,37 +37,47 @@ class Unreadable(UserError):
 
 @dataclass(frozen=True)
 class Field:
-    """One dataset of a schema.
-
-    ``dims`` names each axis; the same name has the same length throughout one file, and a digit
-    string is a fixed length. ``dtype`` is a numpy name or ``"str"``. ``frame`` is the coordinate
-    frame of the values, or empty where they have none.
-    """
+    """Declaration of one dataset."""
 
     dims: tuple[str, ...]
+    """Name of each axis. Axes of one name have the same length in a file; digits are a length."""
     dtype: str
+    """Numpy type, or "str"."""
     doc: str
+    """Description for the generated documentation."""
     units: str = "1"
+    """Unit of the values."""
     frame: str = ""
+    """Coordinate frame of the values; "" if they have none."""
     optional: bool = False
-    codec: str = "gzip"  # "gzip", "depth" (blosc2, lossless) or "none" (already compressed)
+    """Whether a file may lack the dataset."""
+    codec: str = "gzip"
+    """"gzip", "depth" (Blosc2, lossless) or "none" (for compressed values)."""
 
 
 @dataclass(frozen=True)
 class Schema:
-    """What one stage's artefact holds. A key may contain ``{camera}``: one dataset a camera."""
+    """Declaration of a stage's artefact."""
 
     name: str
+    """Name of the schema, stored in the file."""
     version: int
+    """Version of its meaning; other versions are rejected."""
     stage: str
+    """Stage that writes it."""
     fields: Mapping[str, Field]
-    attributes: Mapping[str, str] = field(default_factory=dict)  # name -> what it says
-    optional_attributes: Mapping[str, str] = field(default_factory=dict)  # files may lack them
+    """Datasets by key; a key with ``{camera}`` declares one dataset per camera."""
+    attributes: Mapping[str, str] = field(default_factory=dict)
+    """Descriptions of the root attributes."""
+    optional_attributes: Mapping[str, str] = field(default_factory=dict)
+    """Descriptions of root attributes that a file may lack."""
     frame: str = "master colour camera: x right, y down, z forward"
+    """Default coordinate frame."""
     units: str = "metres, seconds, radians unless a dataset says otherwise"
+    """Default units."""
 
     def field_of(self, key: str) -> Field:
-        """Return the field that declares dataset ``key``; raises KeyError where none does."""
+        """Declaration of the dataset ``key``; raises KeyError if there is none."""
         if key in self.fields:
             return self.fields[key]
         for template, declared in self.fields.items():
@@ -91,14 +98,14 @@ def _filters(declared: Field, dtype: np.dtype) -> dict[str, Any]:
 
 
 def _chunks(shape: tuple[int, ...], itemsize: int) -> tuple[int, ...]:
-    """Rows of the first axis, as many as fit in ``CHUNK_BYTES``; the other axes whole."""
+    """Shape of a chunk: complete rows of the first axis, up to ``CHUNK_BYTES``."""
     row = itemsize * int(np.prod([max(1, n) for n in shape[1:]], dtype=np.int64))
     rows = max(1, min(max(1, shape[0]), CHUNK_BYTES // row))
     return (rows, *(max(1, n) for n in shape[1:]))
 
 
 class Writer:
-    """Fills one artefact. Obtained from :func:`write`; not made directly."""
+    """Writes the datasets of one artefact; obtained from :func:`write`."""
 
     def __init__(self, file: h5py.File, schema: Schema, raw: PartFile) -> None:
         self._file = file
@@ -124,10 +131,10 @@ class Writer:
         return declared
 
     def put(self, key: str, values: Any) -> None:
-        """Write one whole dataset; ``values`` is cast to the declared dtype.
+        """Write a dataset; ``values`` are cast to the declared type.
 
-        Raises ValueError where the shape contradicts the schema or another dataset's axis, and
-        KeyError where the schema declares no such dataset, and OSError where the disk is full.
+        Raises ValueError if the shape contradicts the schema or another dataset, KeyError if the
+        schema does not declare the dataset, and OSError if the disk is full.
         """
         declared = self._schema.field_of(key)
         if declared.dtype == "str":
@@ -147,7 +154,7 @@ class Writer:
         self._raw.check()
 
     def stream(self, key: str, row_shape: tuple[int, ...] = ()) -> RowStream:
-        """Open a dataset that grows by rows along its first axis; memory stays flat."""
+        """Open a dataset to which rows are appended along its first axis."""
         declared = self._check(key, (0, *row_shape), free_first=True)
         dataset = self._create(key, declared, (0, *row_shape), np.dtype(declared.dtype))
         return RowStream(dataset, self._raw)
@@ -157,7 +164,7 @@ class Writer:
     ) -> h5py.Dataset:
         chunks = _chunks(shape, dtype.itemsize)
         if declared.codec == "depth":
-            chunks = (1, *shape[1:])  # one image a chunk: frames are read one by one
+            chunks = (1, *shape[1:])  # one image per chunk, because frames are read one by one
         elif shape[0] == 0 and len(shape) == 1:
             chunks = (CHUNK_BYTES // dtype.itemsize,)
         dataset = self._file.create_dataset(
@@ -176,7 +183,7 @@ class Writer:
         return dataset
 
 
-# Axes that mean the same thing over the whole file, also inside a camera's group.
+# Axes with one length in the whole file, also inside a camera's group.
 _SHARED_DIMS = frozenset({"T", "T+1", "C"})
 
 
@@ -185,14 +192,14 @@ def _template(schema: Schema, declared: Field) -> str:
 
 
 class RowStream:
-    """Appends rows to a growing dataset, a chunk's worth at a time."""
+    """Appends rows to a dataset."""
 
     def __init__(self, dataset: h5py.Dataset, raw: PartFile) -> None:
         self._dataset = dataset
         self._raw = raw
 
     def append(self, rows: np.ndarray) -> None:
-        """Append ``rows`` of shape (n, *row_shape); raises OSError where the disk is full."""
+        """Append ``rows`` of shape (n, *row_shape); raises OSError if the disk is full."""
         start = self._dataset.shape[0]
         self._dataset.resize(start + len(rows), axis=0)
         self._dataset[start:] = rows
@@ -206,11 +213,15 @@ class RowStream:
 def write(
     path: Path, schema: Schema, *, settings_digest: str = "", **attributes: Any
 ) -> Iterator[Writer]:
-    """Write an artefact atomically: on any error nothing appears under ``path``.
+    """Write an artefact atomically: after an error, ``path`` is unchanged.
 
-    ``attributes`` are the schema's root attributes (str, int, float or bool); more can be set on
-    ``Writer.attributes`` until the block ends. Raises ValueError where the finished file lacks a
-    dataset or attribute that the schema requires, and OSError where the disk does not take it.
+    Raises ValueError if a required dataset or attribute is missing at the end of the block, and
+    OSError if the disk is full or not writable.
+
+    Args:
+        settings_digest: digest of the stage's settings, stored as an attribute.
+        attributes: root attributes (str, int, float or bool); more can be set in
+            ``Writer.attributes`` within the block.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -231,15 +242,14 @@ def write(
 
 
 def part_of(path: Path) -> Path:
-    """Where a file or folder is while it is being written: beside its place, named after who
-    writes it."""
+    """Path of an incomplete output: in the same folder, with host, job and process in its name."""
     job = os.environ.get("SLURM_JOB_ID")
     writer = f"{socket.gethostname()}.{f'job{job}.' if job else ''}{os.getpid()}"
     return path.with_name(f".{path.name}.{writer}{PART}")
 
 
 def put_made_from(path: Path, text: str) -> None:
-    """Set what a complete artefact was made from."""
+    """Store the manifest of a complete artefact."""
     with PartFile(path, "r+b") as raw:
         with h5py.File(raw, "r+", libver=_LIBVER) as file:
             _set(file, MADE_FROM, text)
@@ -248,8 +258,7 @@ def put_made_from(path: Path, text: str) -> None:
 
 
 def made_from(path: Path) -> str:
-    """What an artefact says that it was made from, "" where it does not; raises Unreadable where it
-    is none."""
+    """Text of an artefact's manifest, "" if it has none; raises Unreadable if it is no artefact."""
     try:
         with h5py.File(path, "r", locking="best-effort") as file:
             return _value(file.attrs.get(MADE_FROM, ""))
@@ -257,19 +266,19 @@ def made_from(path: Path) -> str:
         raise Unreadable(f"{path}: cannot be read; delete it and re-run its stage") from None
 
 
-def _set(thing: h5py.File | h5py.Dataset, name: str, value: Any) -> None:
-    """An attribute; texts as fixed numbers of bytes."""
+def _set(owner: h5py.File | h5py.Dataset, name: str, value: Any) -> None:
+    """Set an attribute; texts have a fixed length."""
     if isinstance(value, str):
         encoded = value.encode()
         value = np.array(encoded, dtype=f"S{max(1, len(encoded))}")
-    thing.attrs[name] = value
+    owner.attrs[name] = value
 
 
-def _value(found: Any) -> Any:
-    """An attribute's value as Python has it."""
-    if isinstance(found, bytes):
-        return found.decode()
-    return found.item() if isinstance(found, np.generic) else found
+def _value(stored: Any) -> Any:
+    """Value of an attribute as a Python object."""
+    if isinstance(stored, bytes):
+        return stored.decode()
+    return stored.item() if isinstance(stored, np.generic) else stored
 
 
 def _finish(file: h5py.File, writer: Writer, schema: Schema, settings_digest: str) -> None:
@@ -293,29 +302,26 @@ def _finish(file: h5py.File, writer: Writer, schema: Schema, settings_digest: st
 
 
 class Artefact:
-    """A validated artefact that is open for reading. Obtained from :func:`read`."""
+    """A validated artefact, open for reading; obtained from :func:`read`."""
 
     def __init__(
-        self, file: h5py.File, path: Path, schema: Schema, found: Mapping[str, h5py.Dataset]
+        self, file: h5py.File, path: Path, schema: Schema, datasets: Mapping[str, h5py.Dataset]
     ) -> None:
-        """``found``: datasets that are open already, by key; looking one up costs more than reading
-        a short one."""
         self._file = file
         self._schema = schema
-        self._found = dict(found)
+        self._datasets = dict(datasets)  # open ones; a lookup takes longer than a short read
         self.path = path
-        # the root attributes as Python values, but what the artefact was made from
         self.attributes = {k: _value(v) for k, v in file.attrs.items() if k != MADE_FROM}
 
     def __contains__(self, key: str) -> bool:
-        return key in self._found or key in self._file
+        return key in self._datasets or key in self._file
 
     def keys(self, prefix: str = "") -> list[str]:
-        """The sorted names of all datasets whose name starts with ``prefix``."""
+        """Sorted names of the datasets that begin with ``prefix``."""
         names: list[str] = []
 
         def is_dataset(name: str) -> bool:
-            return name in self._found or isinstance(self._file[name], h5py.Dataset)
+            return name in self._datasets or isinstance(self._file[name], h5py.Dataset)
 
         try:
             self._file.visit(names.append)
@@ -324,20 +330,20 @@ class Artefact:
             raise self._damaged("its list of datasets is damaged") from error
 
     def __getitem__(self, key: str) -> np.ndarray:
-        """Read one whole dataset; text comes back as an object array of ``str``."""
+        """Read a dataset; texts are returned as an object array of ``str``."""
         return self.rows(key, slice(None))
 
     def rows(self, key: str, selection: Any) -> np.ndarray:
-        """Read part of a dataset, e.g. one image: ``rows("cameras/k1/depth", 7)``."""
+        """Read a part of a dataset, such as one image: ``rows("cameras/k1/depth", 7)``."""
         if key not in self:
             raise Unreadable(
                 f"{self.path}: dataset {key!r} is missing; re-run stage "
                 f"'{self._schema.stage}' for this sequence"
             )
         try:
-            if key not in self._found:
-                self._found[key] = self._file[key]
-            values = self._found[key][selection]
+            if key not in self._datasets:
+                self._datasets[key] = self._file[key]
+            values = self._datasets[key][selection]
         except (OSError, RuntimeError) as error:
             raise self._damaged(
                 f"dataset {key!r} is damaged (its checksum does not match)"
@@ -368,12 +374,12 @@ class Artefact:
         )
 
     def text(self, key: str) -> list[str]:
-        """Read a dataset of text as a list."""
+        """Read a dataset of texts as a list."""
         return [str(v) for v in self[key]]
 
 
 def schema_name(path: Path) -> str:
-    """Which schema a file says it holds; raises Unreadable where it is no artefact."""
+    """Name of an artefact's schema; raises Unreadable if the file is no artefact."""
     path = Path(path)
     if path.is_dir():
         raise Unreadable(f"{path}: is a folder, expected an .h5 file; name one that a stage wrote")
@@ -392,10 +398,9 @@ def schema_name(path: Path) -> str:
 
 @contextlib.contextmanager
 def read(path: Path, schema: Schema) -> Iterator[Artefact]:
-    """Open an artefact for reading after checking that it is what ``schema`` declares.
+    """Validate an artefact against ``schema`` and open it for reading.
 
-    Raises :class:`Unreadable` with one sentence that names the file, what is wrong with it and
-    which stage to re-run.
+    Raises :class:`Unreadable`, which names the file, its fault and the stage to re-run.
     """
     path = Path(path)
     again = f"re-run stage '{schema.stage}' for this sequence"
@@ -418,7 +423,7 @@ def read(path: Path, schema: Schema) -> Iterator[Artefact]:
 
 
 def _validate(file: h5py.File, path: Path, schema: Schema, again: str) -> dict[str, h5py.Dataset]:
-    """The declared datasets that are there, by key."""
+    """Check the file against the schema; returns its declared datasets by key."""
     found = str(_value(file.attrs.get("schema", "none")))
     if found != schema.name:
         raise Unreadable(f"{path}: holds schema {found!r}, expected {schema.name!r}; {again}")

@@ -1,12 +1,11 @@
-"""Where compiled kernels are kept, so that no kernel is older than the code that it was made of.
+"""Cache of compiled kernels that is valid for the present code only.
 
-Numba keeps a compiled function by the content of its own file alone. A kernel that calls one of
-another file, or uses a constant of another file, would go on with the old one after an edit there.
-So the cache's folder is named after a digest of everything that a kernel can reach: the modules
-that use numba and all that they import, the versions of numba and llvmlite, and the processor (a
-home may be shared by machines that differ).
+Numba's cache compares a kernel's own file. After an edit of a function or constant in another file,
+it would return a kernel that was compiled from the old one. The folder of the cache is therefore
+named after a digest of everything that a kernel can reach: the modules that use numba, all modules
+that they import, the versions of numba and llvmlite, and the processor (machines may share a home).
 
-Imports nothing heavy, numba least of all: this runs whenever the package is imported.
+This module runs on every import of the package and imports no large library.
 """
 
 from __future__ import annotations
@@ -22,9 +21,9 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parent
 VARIABLE = "NUMBA_CACHE_DIR"
-UNUSED_DAYS = 28  # a folder that no process has used for so long is emptied,
-KEPT_FOLDERS = 4  # unless it is one of the last few in use
-FORGOTTEN_DAYS = 365  # by then no process that knew the folder runs any more
+UNUSED_DAYS = 28  # age from which the kernels of a folder are deleted
+KEPT_FOLDERS = 4  # most recently used folders, which are never emptied
+FORGOTTEN_DAYS = 365  # age from which the folder itself is deleted
 DAY_S = 86400.0
 
 _NAME = re.compile(r"intercap-[0-9a-f]{16}")
@@ -37,10 +36,10 @@ _WORD = re.compile(rb"\w+")
 
 
 def use_kernel_cache() -> Path | None:
-    """Let numba keep this package's kernels in the folder that belongs to the present code.
+    """Set numba's cache to the folder of the present code; returns it, None if none is writable.
 
-    The folder lies in ``NUMBA_CACHE_DIR`` where that is set, otherwise in the user's cache folder;
-    where neither can be written, in the folder for temporary files. None where none can.
+    The folder lies in ``NUMBA_CACHE_DIR`` if that is set, otherwise in the user's cache folder; if
+    neither is writable, in the folder for temporary files.
     """
     name = _folder_name()
     folder: Path | None
@@ -58,10 +57,11 @@ def use_kernel_cache() -> Path | None:
 
 
 def kernel_modules(package: Path = PACKAGE) -> dict[str, bytes]:
-    """Source of every module whose code or constants a kernel can reach, by the module's name.
+    """Source text by name of every module that a kernel can reach.
 
-    These are the modules that import numba and what they import, directly or not. The text is
-    searched instead of parsed, which takes a tenth of the time and finds rather too much.
+    These are the modules that import numba and all modules that they import, directly or
+    indirectly. The text is searched with regular expressions, which takes a tenth of the time of
+    parsing and may find too many modules, but not too few.
     """
     sources = {name.encode(): text for name, text in _sources(package).items()}
     waiting = [name for name, text in sources.items() if _USES_NUMBA.search(text)]
@@ -109,20 +109,20 @@ def _folder_name() -> str:
 
 
 def _version(library: str) -> bytes:
-    """What tells a library's version, without importing it."""
+    """Version of a library as bytes, without importing it."""
     spec = importlib.util.find_spec(library)
     if spec is None or not spec.submodule_search_locations:
         return b""
     path = Path(spec.submodule_search_locations[0]) / "_version.py"
     if path.is_file():
         return path.read_bytes()
-    from importlib import metadata  # takes longer than all the rest
+    from importlib import metadata  # a slow import
 
     return metadata.version(library).encode()
 
 
 def _processor() -> bytes:
-    """Kind and abilities of this machine's processor."""
+    """Model and instruction sets of this machine's processor."""
     words = [
         os.uname().machine if hasattr(os, "uname") else os.environ.get("PROCESSOR_ARCHITECTURE")
     ]
@@ -150,10 +150,7 @@ def _user() -> int:
 
 
 def cache_base() -> Path:
-    """The user's folder for what this package keeps from one start to the next.
-
-    Raises OSError where no such folder is known.
-    """
+    """The package's folder among the user's caches; raises OSError if no cache folder is known."""
     caches = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     if not os.path.isabs(caches):
         raise OSError(f"no folder for caches is known ({caches})")
@@ -163,13 +160,13 @@ def cache_base() -> Path:
 def _chosen_base() -> Path:
     given = os.environ.get(VARIABLE)
     if given:
-        # A process that this one was started by may have set it to a folder of its own code.
+        # The parent process may have set it to the folder of its own code.
         return Path(given).parent if _NAME.fullmatch(Path(given).name) else Path(given)
     return cache_base() / "kernels"
 
 
 def _prepared(folder: Path) -> Path:
-    """The folder, there and marked as used now; raises OSError where it cannot be written."""
+    """Create the folder and update its date; raises OSError if it is not writable."""
     try:
         folder.mkdir(parents=True)
         fresh = True
@@ -183,7 +180,7 @@ def _prepared(folder: Path) -> Path:
 
 
 def _assert_own(folder: Path) -> None:
-    """Raise OSError unless the folder is this user's to write: what lies in it will be run."""
+    """Raise OSError unless this user owns the folder, because its contents will be executed."""
     state = folder.lstat()
     if not stat.S_ISDIR(state.st_mode) or (hasattr(os, "getuid") and state.st_uid != _user()):
         raise PermissionError(f"{folder} is not a folder of this user")
@@ -202,17 +199,17 @@ def _temporary(name: str, error: OSError) -> Path | None:
         _assert_own(base)
         folder = _prepared(base / name)
     except OSError:
-        logger.warning("compiled kernels cannot be kept (%s)", error)
+        logger.warning("compiled kernels cannot be cached (%s)", error)
         return None
-    logger.warning("compiled kernels are kept in %s (%s)", folder, error)
+    logger.warning("compiled kernels are cached in %s (%s)", folder, error)
     return folder
 
 
 def remove_unused(base: Path, *, now_s: float | None = None) -> None:
-    """Empty the folders of other code that nobody has used for weeks, but for the last few.
+    """Delete the kernels of other code after ``UNUSED_DAYS``, except for recently used folders.
 
-    Files go and the folders stay for a year: a process that still uses one compiles again, and
-    finds a place to keep the result. What another process removes or owns is passed over.
+    The folders stay for a year, so that a process that still uses one can write to it. Files that
+    another process or user owns or deletes are skipped.
     """
     now_s = time.time() if now_s is None else now_s
     used: list[tuple[float, Path]] = []

@@ -1,4 +1,4 @@
-"""Results as points: vertices and joints of the body and vertices of the object, at any moment.
+"""Vertices and joints of the body and vertices of the object in any frame of a result.
 
     from intercap_core.posed import open_sequence
 
@@ -6,10 +6,10 @@
     moment = sequence.at(30)
     moment.body, moment.joints, moment.object_  # (V, 3), (55, 3), (Vo, 3) metres, z up
 
-    seen = open_sequence("config/demo/config.yaml", "cup_drink_s02", stage="body_fit", frame="k3")
-    seen.bodies(slice(0, 45, 5))  # (9, V, 3) and (9, 55, 3), as camera k3 has them
+    fitted = open_sequence("config/demo/config.yaml", "cup_drink_s02", stage="body_fit", frame="k3")
+    fitted.bodies(slice(0, 45, 5))  # (9, V, 3) and (9, 55, 3) in the frame of camera k3
 
-The shapes are the same after both stages that have a body.
+Shapes are the same for both stages.
 """
 
 from __future__ import annotations
@@ -33,50 +33,56 @@ from intercap_core.output.export.upright import z_up_frame
 from intercap_core.project import Project, load_project
 from intercap_core.schemas import BODY_FIT, JOINT, OBJECT_TRACK, SCENE
 
-Z_UP, MASTER = "z-up", "master"  # frames beside those of the cameras, by name
+Z_UP, MASTER = "z-up", "master"  # names of coordinate frames that are no camera's
 
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """Vertices ``body`` (V, 3), ``joints`` (55, 3) and vertices ``object_`` (Vo, 3), metres, (0, 3)
-    of a person alone; ``trusted``: nothing speaks against this frame."""
+    """One frame of a sequence."""
 
     body: np.ndarray
+    """(V, 3) vertices of the body, metres."""
     joints: np.ndarray
+    """(55, 3) joints of the body, metres."""
     object_: np.ndarray
+    """(Vo, 3) vertices of the object, metres; (0, 3) without an object."""
     trusted: bool
+    """True if the frame is not flagged."""
 
 
 @dataclass(frozen=True, eq=False)
 class PosedSequence:
-    """T frames in one coordinate frame, ``frame_from_master`` (4, 4).
-
-    ``faces`` (F, 3) of the body, ``mesh`` the object with its own faces, None where the sequence
-    names none; poses master_from_object ``rotation`` (T, 3, 3) and ``translation`` (T, 3), NaN of
-    an object that was found in no frame; ``times`` (T,) s, ``trusted`` (T,) bool. ``frame`` says in
-    words which frame it is; for z-up also what turned it upright.
-    """
+    """The T frames of a sequence in one coordinate frame."""
 
     model: BodyModel
+    """Body model of the subject."""
     parameters: BodyParameters
+    """Body parameters of all frames."""
     mesh: ObjectMesh | None
+    """Mesh of the object; None without an object."""
     rotation: np.ndarray
+    """(T, 3, 3) rotation of master_from_object; NaN if the object was not found."""
     translation: np.ndarray
+    """(T, 3) translation of master_from_object, metres; NaN if the object was not found."""
     frame_from_master: np.ndarray
+    """(4, 4) transform to the coordinate frame of the results."""
     times: np.ndarray
+    """(T,) times, seconds."""
     trusted: np.ndarray
+    """(T,) bool, False for flagged frames."""
     frame: str
+    """Description of the coordinate frame; for z-up with the source of the up direction."""
 
     def __len__(self) -> int:
         return len(self.rotation)
 
     @property
     def faces(self) -> np.ndarray:
-        """(F, 3) of the body's vertices."""
+        """(F, 3) vertex indices of the body's faces."""
         return self.model.faces.cpu().numpy()
 
     def at(self, frame: int) -> Moment:
-        """One frame; raises IndexError beyond the last."""
+        """The frame with this index; raises IndexError if there is none."""
         if not -len(self) <= frame < len(self):
             raise IndexError(f"frame {frame} of {len(self)}")
         one = [frame % len(self)]
@@ -84,15 +90,14 @@ class PosedSequence:
         return Moment(vertices[0], joints[0], self.objects(one)[0], bool(self.trusted[frame]))
 
     def bodies(self, frames: slice | Sequence[int] = slice(None)) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices (N, V, 3) and joints (N, 55, 3) of some frames, all by default."""
+        """Vertices (N, V, 3) and joints (N, 55, 3) of the chosen frames, metres."""
         vector = self.parameters.vector()[np.arange(len(self))[frames]]
         with torch.no_grad():
             posed = self.model.forward(self.model.parameters(vector))
         return self._placed(posed.vertices.numpy()), self._placed(posed.joints.numpy())
 
     def objects(self, frames: slice | Sequence[int] = slice(None)) -> np.ndarray:
-        """Vertices (N, Vo, 3) of the object in some frames, all by default; Vo = 0 of a person
-        alone."""
+        """Object vertices (N, Vo, 3) of the chosen frames, metres; Vo = 0 without an object."""
         at = np.arange(len(self))[frames]
         if self.mesh is None:
             return np.zeros((len(at), 0, 3))
@@ -110,12 +115,15 @@ def open_sequence(
     stage: Literal["joint", "body_fit"] = "joint",
     frame: str = Z_UP,
 ) -> PosedSequence:
-    """Bodies and objects of a sequence of a project, its ``settings`` being ``config.yaml``.
+    """Open the bodies and objects of one sequence.
 
-    ``stage``: the final result, or the sequential fits (body_fit with object_track). ``frame``:
-    ``z-up`` with the floor at z = 0, ``master`` (the master colour camera: x right, y down, z
-    forward) or another camera's name, as that stage has it. Raises UserError for a sequence or
-    camera that is not there, and for artefacts that are missing or broken.
+    Raises UserError for an unknown sequence or camera and for missing or damaged artefacts.
+
+    Args:
+        settings: the project or its config.yaml.
+        stage: joint = final result; body_fit = sequential fits (body_fit and object_track).
+        frame: ``z-up`` with the floor at z = 0, ``master`` (master colour camera: x right, y down,
+            z forward), or the name of another camera, with that stage's camera poses.
     """
     project = settings if isinstance(settings, Project) else load_project(Path(settings))
     if sequence not in project.sequences:

@@ -1,4 +1,4 @@
-"""`intercap bench`: seconds a frame and peak memory of one recording, by stage and end to end."""
+"""`intercap bench`: seconds per frame and peak memory of one recording, by stage and in total."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ MEASURED = SEQUENCE_STAGES[: SEQUENCE_STAGES.index("metrics") + 1]
 
 
 def measure(settings: Path, output: Path, *, cores: int = 0) -> None:
-    """Measure the project's first sequence and write flat JSON, keys ``area.measure``.
+    """Measure the project's first sequence and write flat JSON with the keys ``area.measure``.
 
-    Figures of other commands that are in the file stay.
+    Makes a virtual recording first, then runs all stages up to the metrics through the workflow, so
+    that process starts are included and the studio is not. Figures of other commands in the file
+    are kept. Raises UserError if a stage fails.
 
-    The recording is made before, if it is a virtual one. Then every stage from the recordings to
-    the metrics is computed anew through the workflow: process starts count, the studio does not.
-    ``metrics.seconds_per_frame`` is of the whole stage, ``verdict.seconds_per_frame`` the part of
-    it that is :func:`judgement`'s. ``end_to_end.peak_memory_mb`` is the largest sum of resident
-    memory over all processes of the run; a stage's is its own process's. ``frames.fps`` is
-    :func:`extraction`'s. Raises UserError where a stage fails.
+    - ``STAGE.seconds_per_frame``, ``STAGE.peak_memory_mb``: job of one stage.
+    - ``verdict.seconds_per_frame``: the part of the metrics stage of :func:`judgement`.
+    - ``end_to_end.peak_memory_mb``: largest sum of the resident memory of all processes.
+    - ``frames.fps``: speed of :func:`extraction`.
     """
     project = load_project(settings)
     sequence = next(iter(project.sequences))
@@ -65,20 +65,18 @@ def measure(settings: Path, output: Path, *, cores: int = 0) -> None:
 
 
 def add_figures(output: Path, figures: Mapping[str, float]) -> None:
-    """Put figures ``area.measure`` into the JSON that is there, for their areas' older ones.
+    """Replace all figures of the given figures' areas in a JSON file; keep those of other areas.
 
-    What is there of other areas stays: several commands write into one file. Raises UserError where
-    the file is no JSON object.
+    Raises UserError if the file is no JSON object.
     """
     areas = {f"{key.partition('.')[0]}." for key in figures}
     put_figures(output, figures, instead_of=tuple(areas))
 
 
 def put_figures(output: Path, figures: Mapping[str, float], *, instead_of: tuple[str, ...]) -> None:
-    """Put figures into the JSON that is there, in place of those of the same names and of those
-    that begin with any of ``instead_of``.
+    """Add figures to a JSON file; those whose name begins with any of ``instead_of`` are removed.
 
-    Raises UserError where the file is no JSON object.
+    Raises UserError if the file is no JSON object.
     """
     known = {}
     if output.exists():
@@ -92,7 +90,7 @@ def put_figures(output: Path, figures: Mapping[str, float], *, instead_of: tuple
 
 
 def _run(settings: Path, target: str, cores: int) -> tuple[float, int]:
-    """Run the workflow up to ``target``: seconds, and peak resident bytes of all its processes."""
+    """Run the workflow up to ``target``; returns seconds and peak resident bytes of its processes."""
     import psutil
 
     start = time.monotonic()
@@ -116,26 +114,25 @@ def _run(settings: Path, target: str, cores: int) -> tuple[float, int]:
 
 
 def _stages(project: Project, sequence: str, frames: int) -> dict[str, float]:
-    """Each stage's own figures, from the workflow's benchmark files."""
+    """Figures of each stage, from the workflow's benchmark files."""
     figures = {}
     for stage in MEASURED:
         path = Path("benchmarks") / project.config.dataset / sequence / f"{stage}.tsv"
         with open(path, encoding="utf-8") as file:
             row = next(csv.DictReader(file, delimiter="\t"))
         figures[f"{stage}.seconds_per_frame"] = round(float(row["s"]) / frames, 4)
-        # Too short a job is never sampled
+        # psutil does not sample a very short job
         if row["max_rss"] not in ("-", "NA"):
             figures[f"{stage}.peak_memory_mb"] = float(row["max_rss"])
     return figures
 
 
 def extraction(project: Project, sequence: str, frames: int) -> dict[str, float]:
-    """Speed of the frames stage alone, and its artefact's size beside the recordings' own.
+    """Speed of the frames stage, and the size of its artefact relative to the recordings.
 
-    ``frames.fps``: frame sets of all cameras a second, the median of ``EXTRACTIONS`` runs within
-    one process whose imports are done and whose input the system has read before.
-    ``frames.bytes_ratio``: bytes of frames.h5 over bytes of the recording files, whole: colour and
-    depth packets, and whatever else was recorded (infrared, inertial samples, attachments).
+    - ``frames.fps``: frame sets per second, median of ``EXTRACTIONS`` runs in one process after a
+      first run.
+    - ``frames.bytes_ratio``: bytes of frames.h5 over bytes of the recording files.
     """
     seconds = []
     with tempfile.TemporaryDirectory(dir=project.results) as folder:

@@ -1,4 +1,4 @@
-"""Killed, terminated, or started on damaged results: the same command goes on to the same bytes."""
+"""Killed, terminated, or started on damaged results: the same command continues to the same bytes."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from tests.chaos.victim import Victim, damage, identical, kill_in
 from tests.helpers.flow import ONE, OTHER, Flow
 
 ENDS_WITHIN_S = 60.0
-STAGE_S = 0.5  # a replayed stage waits, so that signals meet it at work
+STAGE_S = 0.5  # duration of a replayed stage, in which signals can reach it
 
 
 @pytest.fixture(scope="module")
 def peaceful(flow: Flow, tmp_path_factory: pytest.TempPathFactory) -> Victim:
-    """The finished run in another place, of which nothing is out of date."""
+    """A copy of the finished project in which everything is up to date."""
     return _copied(flow.results, tmp_path_factory.mktemp("peaceful"))
 
 
 @pytest.fixture
 def victim(flow: Flow, tmp_path_factory: pytest.TempPathFactory) -> Victim:
-    """Another copy, without Snakemake's own folder."""
+    """Another copy, without Snakemake's folder."""
     return _copied(flow.results, tmp_path_factory.mktemp("victim"))
 
 
@@ -36,32 +36,32 @@ def _copied(results: Path, folder: Path) -> Victim:
     return other
 
 
-def test_killed_in_a_stage_and_with_damaged_results_it_goes_on(
+def test_a_killed_run_continues_and_replaces_damaged_results(
     victim: Victim, peaceful: Victim
 ) -> None:
-    victim.flow.artefact(ONE, "person").unlink()
-    assert kill_in(victim, {(ONE, "person")}, {(ONE, "person"): 2.0}) == (ONE, "person")
-    cut, flipped = victim.flow.artefact(OTHER, "scene"), victim.flow.results / "heatmaps.h5"
+    victim.flow.artefact(ONE, "metrics").unlink()
+    assert kill_in(victim, {(ONE, "metrics")}, {(ONE, "metrics"): 2.0}) == (ONE, "metrics")
+    cut, flipped = victim.flow.artefact(OTHER, "metrics"), victim.flow.results / "heatmaps.h5"
     cut.write_bytes(cut.read_bytes()[:-1000])
     damage(flipped)
-    status, said = victim.go_on()
-    assert status == 0, said[-3000:]
-    assert "was killed: going on where it stopped" in said
+    status, output = victim.go_on()
+    assert status == 0, output[-3000:]
+    assert "was killed: going on where it stopped" in output
     assert victim.left_over() == []
     assert [name for name, same in identical(victim, peaceful).items() if not same] == []
 
 
-def test_damage_below_a_result_that_comes_to_the_same_is_mended_by_one_command(
+def test_one_command_replaces_damage_downstream_of_unchanged_results(
     victim: Victim, peaceful: Victim
 ) -> None:
-    """Snakemake plans the first of these alone: between them all is as it was."""
+    """Snakemake plans only the first one: the outputs between them do not change."""
     for damaged in (
-        *(victim.flow.artefact(OTHER, stage) for stage in ("scene", "joint")),
+        *(victim.flow.artefact(OTHER, stage) for stage in ("joint", "summary")),
         victim.flow.results / "heatmaps.h5",
     ):
         damaged.write_bytes(damaged.read_bytes()[:-1000])
-    status, said = victim.go_on()
-    assert status == 0, said[-3000:]
+    status, output = victim.go_on()
+    assert status == 0, output[-3000:]
     assert [name for name, same in identical(victim, peaceful).items() if not same] == []
 
 
@@ -76,8 +76,8 @@ def test_a_terminated_run_reports_once_and_leaves_no_parts(victim: Victim, numbe
     os.kill(run.pid, number) if number == signal.SIGTERM else os.killpg(run.pid, number)
     name = signal.Signals(number).name
     assert run.wait(ENDS_WITHIN_S) == 128 + number
-    said = victim.flow.transcript.read_text()
-    assert f"terminated by {name}: " in said and "Traceback" not in said
-    told = (victim.logs / ONE / "person.log").read_text()
-    assert told.rstrip().splitlines()[-1].partition("failed: ")[2].startswith("unexpected end")
+    output = victim.flow.transcript.read_text()
+    assert f"terminated by {name}: " in output and "Traceback" not in output
+    log = (victim.logs / ONE / "person.log").read_text()
+    assert log.rstrip().splitlines()[-1].partition("failed: ")[2].startswith("unexpected end")
     assert victim.left_over() == [] and not victim.flow.artefact(ONE, "person").exists()

@@ -1,6 +1,6 @@
-"""What an edit re-runs, on a finished run: exactly the stages that it concerns.
+"""Stages that an edit re-runs in a finished project.
 
-Most questions go to a Snakemake that has started already; some start it as a user does.
+Most tests ask a Snakemake process that is already running; some start one as a user does.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ FLOOR = "floor: [[0.0, 1.0, 2.0], [1.0, 1.0, 2.0], [0.0, 1.0, 3.0]]\n"
 
 @contextmanager
 def edited(path: Path, text: str) -> Iterator[None]:
-    """Write ``text`` for a while; afterwards the file is as it was, or gone."""
+    """Write ``text`` within the block; afterwards restore or delete the file."""
     before = path.read_bytes() if path.exists() else None
     path.parent.mkdir(exist_ok=True)
     path.write_text(text)
@@ -58,7 +58,7 @@ def test_running_again_does_nothing(flow: Flow) -> None:
     assert "Nothing to be done" in done.stderr
 
 
-def test_touching_re_runs_nothing(flow: Flow) -> None:
+def test_touching_reruns_nothing(flow: Flow) -> None:
     for path in [*flow.results.rglob("*.h5"), *(flow.folder / "config").rglob("*.*")]:
         os.utime(path)
     assert flow.pending() == set()
@@ -81,7 +81,7 @@ def test_touching_re_runs_nothing(flow: Flow) -> None:
         ("# nothing yet\ncontact:\n", set()),
     ],
 )
-def test_a_new_annotation_re_runs_its_sequence_from_the_stage_that_reads_it(
+def test_a_new_annotation_reruns_from_the_stage_that_reads_it(
     flow: Flow, text: str, stages: set[str]
 ) -> None:
     with edited(flow.annotation(OTHER), text):
@@ -89,7 +89,7 @@ def test_a_new_annotation_re_runs_its_sequence_from_the_stage_that_reads_it(
     assert pending == {(OTHER, stage) for stage in stages} | ({DATASET} if stages else set())
 
 
-def test_several_targets_after_an_edit_are_each_made_anew(flow: Flow) -> None:
+def test_several_targets_are_remade_after_an_edit(flow: Flow) -> None:
     targets = [
         str(flow.artefact(ONE, stage).relative_to(flow.folder)) for stage in ("joint", "summary")
     ]
@@ -100,8 +100,8 @@ def test_several_targets_after_an_edit_are_each_made_anew(flow: Flow) -> None:
     assert set(jobs) == {"joint", "metrics", "summary"}
 
 
-def test_editing_one_section_leaves_the_stages_of_the_others(flow: Flow) -> None:
-    """The run has contact and floor annotated; then one of the two is edited or both touched."""
+def test_a_section_reruns_only_its_own_stages(flow: Flow) -> None:
+    """Contact and floor are annotated; then one of them is edited, or both are reordered."""
     path = flow.annotation(OTHER)
     with edited(path, CONTACT + FLOOR):
         flow.rewrite_manifests()
@@ -124,7 +124,7 @@ def test_editing_one_section_leaves_the_stages_of_the_others(flow: Flow) -> None
         ("body_fit/problem", {"body_fit", "joint"}),
     ],
 )
-def test_editing_an_energy_term_re_runs_what_reaches_it(
+def test_editing_a_term_reruns_the_stages_that_reach_it(
     flow: Flow, term: str, stages: set[str]
 ) -> None:
     path = flow.folder / "intercap_core" / f"{term}.py"
@@ -133,38 +133,17 @@ def test_editing_an_energy_term_re_runs_what_reaches_it(
     assert pending == stages | {"metrics", *AFTER_METRICS, "dataset"}
 
 
-def test_an_import_inside_a_function_counts(flow: Flow) -> None:
-    core = flow.folder / "intercap_core"
-    term = core / "body_fit" / "hidden_term.py"
-    person = core / "stages" / "person.py"
-    with (
-        edited(term, "WEIGHT = 1\n"),
-        edited(
-            person,
-            person.read_text()
-            + "\n\ndef _late():\n    from intercap_core.body_fit import hidden_term\n\n"
-            "    return hidden_term\n",
-        ),
-    ):
-        flow.rewrite_manifests()
-        assert flow.pending() == set()
-        term.write_text("WEIGHT = 2\n")
-        pending = {rule for _, rule in flow.pending()}
-    flow.rewrite_manifests()
-    assert pending == AFTER_SCENE - {"scene"} | {"dataset"}
-
-
-def test_rewording_a_docstring_re_runs_nothing(flow: Flow) -> None:
+def test_rewording_a_docstring_reruns_nothing(flow: Flow) -> None:
     path = flow.folder / "intercap_core" / "joint" / "terms" / "ground.py"
     with edited(path, "# a comment\n" + path.read_text().replace('"""', '"""Reworded: ', 1)):
         assert flow.pending() == set()
 
 
-def test_a_setting_re_runs_its_own_stage(flow: Flow) -> None:
+def test_a_setting_reruns_its_own_stage(flow: Flow) -> None:
     path = flow.folder / flow.settings
     settings = yaml.safe_load(path.read_text())
     with edited(path, yaml.safe_dump({**settings, "page": {"frames": 2}})):
-        # the site's first page lists the settings that are not the defaults
+        # the site's first page lists settings that differ from the defaults
         assert flow.pending() == {(name, "page") for name in (ONE, OTHER)} | {DATASET}
     with edited(path, yaml.safe_dump({**settings, "joint": {"ground_weight": 2.0}})):
         rules = {"joint", "metrics", *AFTER_METRICS}
@@ -172,8 +151,8 @@ def test_a_setting_re_runs_its_own_stage(flow: Flow) -> None:
         assert flow.pending() == after | {DATASET}
 
 
-def test_another_model_re_runs_the_detections(flow: Flow) -> None:
-    """The same path counts by what the file holds."""
+def test_another_model_reruns_the_detections(flow: Flow) -> None:
+    """A model counts by its content, not by its path."""
     path, model = flow.folder / flow.settings, flow.folder / "config" / "test" / "model.onnx"
     settings = yaml.safe_load(path.read_text())
     text = yaml.safe_dump({**settings, "detections": {"segmentation_model": model.name}})
@@ -187,8 +166,8 @@ def test_another_model_re_runs_the_detections(flow: Flow) -> None:
     flow.rewrite_manifests()
 
 
-def test_results_in_another_place_know_what_they_were_made_from(flow: Flow) -> None:
-    """No bookkeeping beside the results, files of another date: an edit is seen all the same."""
+def test_moved_results_stay_up_to_date(flow: Flow) -> None:
+    """Edits are found without Snakemake's bookkeeping and with other dates of files."""
     bookkeeping, aside = flow.folder / ".snakemake", flow.folder / "aside"
     bookkeeping.rename(aside)
     elsewhere = flow.folder / "elsewhere"
@@ -211,7 +190,7 @@ def test_results_in_another_place_know_what_they_were_made_from(flow: Flow) -> N
         aside.rename(bookkeeping)
 
 
-def test_what_is_gone_is_made_again_though_what_follows_is_there(flow: Flow) -> None:
+def test_a_deleted_output_is_remade_though_later_ones_exist(flow: Flow) -> None:
     path = flow.artefact(OTHER, "metrics")
     aside = path.with_name("aside")
     path.rename(aside)
@@ -222,8 +201,8 @@ def test_what_is_gone_is_made_again_though_what_follows_is_there(flow: Flow) -> 
     assert flow.pending() == set()
 
 
-def test_a_result_of_other_settings_that_is_put_back_is_seen(flow: Flow) -> None:
-    """As by a job that outlived its run, or by a copy: the file is newer than all that follows."""
+def test_a_restored_result_of_other_settings_is_stale(flow: Flow) -> None:
+    """The file is newer than all later outputs, as after a job that outlived its run."""
     path = flow.artefact(ONE, "scene")
     whole = path.read_bytes()
     text = artefacts.made_from(path)
@@ -232,22 +211,22 @@ def test_a_result_of_other_settings_that_is_put_back_is_seen(flow: Flow) -> None
     settings = {**record.given["settings"], "voxel_mm": 0.5}
     write_manifest(path, replace(record, given={**record.given, "settings": settings}))
     assert (ONE, "scene") in flow.pending()
-    said = flow.intercap("status", flow.settings).stdout
-    assert f"scene out of date in {ONE}: settings: voxel_mm 0.5 → none" in said
+    output = flow.intercap("status", flow.settings).stdout
+    assert f"scene out of date in {ONE}: settings: voxel_mm 0.5 → none" in output
     path.write_bytes(whole)
     assert flow.pending() == set()
 
 
-def test_another_processor_is_told_and_runs_nothing(flow: Flow) -> None:
+def test_another_processor_is_reported_and_reruns_nothing(flow: Flow) -> None:
     path = flow.artefact(ONE, "joint")
     whole = path.read_bytes()
     record = Manifest.from_text(artefacts.made_from(path))
     assert record is not None
     write_manifest(path, replace(record, machine={"device": "cuda", "cpu": "another"}))
     assert flow.pending() == set()
-    said = flow.intercap("status", flow.settings).stdout
-    assert "2 done of 2 sequences" in said
-    assert "1 results were made on another machine or device (cuda, another)" in said
+    output = flow.intercap("status", flow.settings).stdout
+    assert "2 done of 2 sequences" in output
+    assert "1 results were made on another machine or device (cuda, another)" in output
     path.write_bytes(whole)
 
 

@@ -25,7 +25,7 @@ RULES = dict(re.findall(r"^rule (\w+):\n(.*?)(?=^rule |\Z)", TEXT, re.DOTALL | r
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_a_rule_s_inputs_are_what_its_stage_reads(stage: str) -> None:
+def test_rules_have_the_inputs_of_their_stages(stage: str) -> None:
     run = importlib.import_module(f"intercap_core.stages.{stage}").run
     names = set(inspect.signature(run).parameters)
     reads = set(STAGES[stage].reads)
@@ -34,8 +34,8 @@ def test_a_rule_s_inputs_are_what_its_stage_reads(stage: str) -> None:
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_all_that_a_stage_is_given_is_in_its_record(stage: str) -> None:
-    """Every argument but artefacts and output is recorded, and the device as one of a machine."""
+def test_manifests_contain_all_arguments_of_a_stage(stage: str) -> None:
+    """Artefacts and output are not arguments in this sense; the device belongs to the machine."""
     run = importlib.import_module(f"intercap_core.stages.{stage}").run
     names = set(inspect.signature(run).parameters) - set(SEQUENCE_STAGES) - {"output", "paths"}
     for group, members in (("models", SequenceModels), ("fit_settings", FitSettings)):
@@ -52,7 +52,7 @@ def test_all_that_a_stage_is_given_is_in_its_record(stage: str) -> None:
     assert set(made_from.artefacts) == set(STAGES[stage].reads)
 
 
-def test_a_stage_cannot_read_a_column_that_is_not_recorded() -> None:
+def test_stages_cannot_read_undeclared_columns() -> None:
     row = next(iter(load_project(ROOT / "config/test/config.yaml").sequences.values()))
     with pytest.raises(AttributeError):
         _ = stage_inputs.restrict_row("frames", row).intent
@@ -60,7 +60,7 @@ def test_a_stage_cannot_read_a_column_that_is_not_recorded() -> None:
 
 
 @pytest.mark.parametrize("rule", sorted(RULES))
-def test_every_rule_says_what_it_needs(rule: str) -> None:
+def test_rules_declare_log_resources_and_message(rule: str) -> None:
     for part in ('"""', "output:", "log:", "benchmark:", "mem_mb=", "runtime=", "message:"):
         assert part in RULES[rule], part
     assert rule == "broken_annotation" or f'mark=out_of_date("{rule}")' in RULES[rule]
@@ -81,7 +81,7 @@ def test_the_slurm_profile_is_understood() -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_the_rule_graph_in_the_docs_is_in_step() -> None:
+def test_the_rule_graph_in_the_docs_is_up_to_date() -> None:
     sys.path.insert(0, str(ROOT / "tools"))
     try:
         from write_rule_graph import page
