@@ -1,13 +1,14 @@
-"""Say whether two results folders hold the same: bytes by SHA-256, and how far artefacts differ.
+"""Compare two results folders: bytes of files, and differences between artefacts.
 
     python tools/compare_results.py BEFORE AFTER [--tolerance 1e-6]
 
-For changes that must not change what is computed: run the same settings before and after on the
-same machine with the same threads. Files of other bytes are listed; of an artefact (.h5) every
-dataset that differs: the largest difference, as a share of the largest absolute value, and how many
-whole numbers, flags or words are others. Exit status 1 where a file is missing on one side, where a
-file that is no artefact differs, and where a dataset differs by more than the tolerance (default 0)
-or in a discrete value.
+Use it for changes that must not change results: run the same settings before and after, on the same
+machine and with the same threads. Lists files with different bytes. For an artefact (.h5), lists
+each dataset that differs, with the largest difference relative to the largest absolute value, and
+the number of different integers, flags and texts.
+
+Exits with status 1 if a file exists on one side only, if a file that is no artefact differs, or if
+a dataset differs by more than the tolerance (default 0) or in a discrete value.
 """
 
 from __future__ import annotations
@@ -24,10 +25,12 @@ import numpy as np
 
 
 class Difference(NamedTuple):
-    """Of one dataset: the largest relative difference, and the number of other discrete values."""
+    """Difference between two datasets."""
 
     relative: float
+    """Largest difference relative to the largest absolute value."""
     discrete: int
+    """Number of different integers, flags and texts."""
 
 
 def digests(folder: Path) -> dict[str, str]:
@@ -43,7 +46,7 @@ def digests(folder: Path) -> dict[str, str]:
 
 
 def differences(before: Path, after: Path) -> dict[str, Difference]:
-    """Datasets and attributes of two artefacts that are not the same."""
+    """Datasets and attributes that differ between two artefacts."""
     with h5py.File(before) as one, h5py.File(after) as two:
         found = {
             f"attribute {name}": Difference(0.0, 1)
@@ -80,7 +83,7 @@ def _difference(before: np.ndarray, after: np.ndarray) -> Difference:
 
 
 def main() -> int:
-    """Compare and print; the exit status."""
+    """Print the comparison; returns the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("before", type=Path)
     parser.add_argument("after", type=Path)

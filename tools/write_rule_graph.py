@@ -11,14 +11,14 @@ PAGE = ROOT / "docs" / "workflow.md"
 INTRODUCTION = """\
 # The workflow
 
-Rules and what they hand on, drawn by `snakemake --rulegraph mermaid-js`; `make docs` renews this
-page. Every rule but `dataset` and `all` runs once a sequence. `studio` is there only for virtual
-recordings, and `broken_annotation` (not drawn) only where an annotation file cannot be used.
+Graph of the rules by `snakemake --rulegraph mermaid-js`; `make docs` writes this page. All rules
+except `dataset` and `all` run once per sequence. `studio` exists only for virtual recordings, and
+`broken_annotation` (not drawn) only for invalid annotation files.
 """
 
 
 def page() -> str:
-    """The page's text. Raises CalledProcessError where Snakemake refuses the workflow."""
+    """Text of the page; raises CalledProcessError if Snakemake rejects the workflow."""
     done = subprocess.run(
         [
             *(sys.executable, "-m", "snakemake", "--rulegraph", "mermaid-js", "--quiet", "all"),

@@ -90,7 +90,7 @@ def put_figures(output: Path, figures: Mapping[str, float], *, instead_of: tuple
 
 
 def _run(settings: Path, target: str, cores: int) -> tuple[float, int]:
-    """Run the workflow up to ``target``; returns seconds and peak resident bytes of its processes."""
+    """Run the workflow up to ``target``; returns seconds and peak resident bytes."""
     import psutil
 
     start = time.monotonic()

@@ -1,4 +1,4 @@
-"""Killed, terminated, or started on damaged results: the same command continues to the same bytes."""
+"""A run that was killed or terminated, or has damaged results, continues to the same bytes."""
 
 from __future__ import annotations
 
