@@ -29,7 +29,7 @@ from intercap_core.body.parameters import BodyParameters
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.output.export.upright import z_up_frame
+from intercap_core.output.export.motion import z_up_frame
 from intercap_core.project import Project, load_project
 from intercap_core.schemas import BODY_FIT, JOINT, OBJECT_TRACK, SCENE
 

@@ -12,24 +12,26 @@ from typing import Any
 
 from starlette.exceptions import HTTPException
 
+from intercap_core import artefacts
 from intercap_core.annotate import (
     before,
     document,
+    objects,
     questions,
     rerun,
     result,
     snap,
-    surface,
-    symmetry,
 )
-from intercap_core.annotate.images import Pictures
-from intercap_core.annotate.opened import Opened
-from intercap_core.annotate.sequences import SequenceList
+from intercap_core.annotate.opened import Opened, Pictures
+from intercap_core.annotate.questions import answers_path
 from intercap_core.commands.check import fault_of_cameras
 from intercap_core.config import Annotation, ObjectEntry, ObjectPose
 from intercap_core.errors import UserError
-from intercap_core.project import load_project
-from intercap_core.schemas import CONTACT_REGIONS
+from intercap_core.evaluation.figures import SequenceMetrics
+from intercap_core.evaluation.verdict.figures import stated_errors
+from intercap_core.output.site.tables import sequence_table
+from intercap_core.project import Project, load_project
+from intercap_core.schemas import CONTACT_REGIONS, SUMMARY
 
 _MOST = 1e9  # of a number that a page tells
 OPEN_SEQUENCES = 3  # with their images and meshes in memory
@@ -185,7 +187,7 @@ class Annotator:
 
     def read_surface(self, name: str) -> dict[str, Any]:
         """Where people are likely to touch the sequence's object."""
-        return surface.read_surface(self.project, self._object(name))
+        return objects.read_surface(self.project, self._object(name))
 
     def surface(self, name: str, told: dict[str, Any]) -> dict[str, Any]:
         """Keep where people are likely to touch the object, for all sequences that have it."""
@@ -195,13 +197,13 @@ class Annotator:
         if any(not 0 <= v < _MOST for v in vertices):
             raise UserError("a vertex is not one of the mesh's")
         digest = str(told["digest"])
-        saved = surface.save_surface(self.project, self._object(name), vertices, digest)
+        saved = objects.save_surface(self.project, self._object(name), vertices, digest)
         self.project = load_project(self.settings)
         return saved
 
     def read_symmetry(self, name: str) -> dict[str, Any]:
         """How the sequence's object can be turned and look the same."""
-        return symmetry.read_symmetry(self.project, self._object(name))
+        return objects.read_symmetry(self.project, self._object(name))
 
     def symmetry(self, name: str, told: dict[str, Any]) -> dict[str, Any]:
         """Keep the object's symmetry, for all sequences that have it."""
@@ -209,7 +211,7 @@ class Annotator:
         if not isinstance(wanted, dict):
             raise UserError("symmetry is discrete, continuous or sphere")
         entry = self._object(name)
-        saved = symmetry.save_symmetry(self.project, entry, wanted, str(told["digest"]))
+        saved = objects.save_symmetry(self.project, entry, wanted, str(told["digest"]))
         self.project = load_project(self.settings)
         return saved
 
@@ -305,3 +307,58 @@ def _pose(told: dict[str, Any]) -> ObjectPose:
     if faults:
         raise UserError(f"{faults[0]['where']}: {faults[0]['words']}")
     return ObjectPose.model_validate(told)
+
+
+class SequenceList:
+    """Rows of all sequences; a summary is read again only where it is another file."""
+
+    def __init__(self) -> None:
+        self._known: dict[Path, tuple[tuple[int, int], SequenceMetrics | str]] = {}
+
+    def rows(self, project: Project) -> list[dict[str, Any]]:
+        """A row a sequence, worst first by the report's own rank, those without a result last."""
+        rows, measured = [], []
+        for name, row in project.sequences.items():
+            found = self._summary(project.artefact(name, "summary"))
+            annotation = project.annotation_path(name)
+            one: dict[str, Any] = {
+                "name": name, "subject": row.subject, "object": row.object or "", "rank": None,
+                "annotated": annotation.is_file(),
+                "answered": answers_path(annotation).is_file(),
+                "frames_there": project.artefact(name, "frames").is_file(),
+                "note": found if isinstance(found, str) else "",
+            }  # fmt: skip
+            if isinstance(found, SequenceMetrics):
+                measured.append(found)
+                one |= {
+                    "frames": len(found),
+                    "flagged": int(found.values["flagged"].sum()),
+                    "errors": {
+                        e.part: round(e.stated, 1) if e.stated == e.stated else None
+                        for e in stated_errors(found)
+                    },
+                }
+            rows.append(one)
+        if measured:
+            table = sequence_table(measured, {})
+            ranks = dict(zip(table["sequence"], table["rank"], strict=True))
+            for one in rows:
+                one["rank"] = int(ranks[one["name"]]) if one["name"] in ranks else None
+        return sorted(rows, key=lambda one: (one["rank"] is None, one["rank"] or 0))
+
+    def _summary(self, path: Path) -> SequenceMetrics | str:
+        """A sequence's figures, or why there are none."""
+        try:
+            stat = path.stat()
+        except OSError:
+            return "no result yet"
+        stamp = stat.st_mtime_ns, stat.st_size
+        known = self._known.get(path)
+        if known is None or known[0] != stamp:
+            try:
+                with artefacts.read(path, SUMMARY) as artefact:
+                    known = stamp, SequenceMetrics.of(artefact)
+            except UserError as error:
+                known = stamp, str(error)
+            self._known[path] = known
+        return known[1]

@@ -20,7 +20,7 @@ from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.output.viewer import page as page_of
 from intercap_core.output.viewer.content import gather
-from intercap_core.output.viewer.package import payload, unpacked
+from intercap_core.output.viewer.page import payload, unpacked
 from intercap_core.pipeline.provenance import read_manifest
 from intercap_core.schemas import BODY_FIT, JOINT, METRICS, OBJECT_TRACK, PERSON, SCENE
 from intercap_core.sequence_inputs import SequencePaths

@@ -17,7 +17,7 @@ from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.errors import UserError
 from intercap_core.evaluation.flags import exchanged, ranges
 from intercap_core.formats.detections.read import Detections
-from intercap_core.output.viewer.package import payload
+from intercap_core.output.viewer.page import payload
 from intercap_core.person.left_right import excess_build_cost
 from intercap_core.person.sides import ARMS, LEGS, images_with_stated_sides, swap_sides
 from intercap_core.schemas import BODY_FIT, JOINT, PERSON, SCENE

@@ -19,17 +19,13 @@ from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.output.export import amass, body_files, bop, coco, contact, glb, intercap, meshes
-from intercap_core.output.export.about import About, BodyFile
+from intercap_core.output.export import body_files, bop, coco, contact, glb, meshes, parameters
+from intercap_core.output.export.about import About, BodyFile, Deviations, Verdict
 from intercap_core.output.export.body_files import Written
-from intercap_core.output.export.coordinates import Coordinates
-from intercap_core.output.export.deviations import Deviations
-from intercap_core.output.export.motion import Motion, read_motion
+from intercap_core.output.export.contact import TouchingSurfaces
+from intercap_core.output.export.motion import Coordinates, Motion, read_motion, z_up_frame
 from intercap_core.output.export.readme import needs_object, readme
 from intercap_core.output.export.silhouettes import Exposures, body_vertices, object_poses
-from intercap_core.output.export.touching import TouchingSurfaces
-from intercap_core.output.export.upright import z_up_frame
-from intercap_core.output.export.verdict import Verdict
 from intercap_core.schemas import JOINT, SCENE
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 from intercap_core.stages.folders import EXPORT_MARKER, check_replaceable, replaced
@@ -85,9 +81,9 @@ def run(
         for name in formats:
             if name == "intercap":
                 (folder / "intercap").mkdir()
-                intercap.write(folder / "intercap" / "res.pkl", motion, about)
+                parameters.write_intercap(folder / "intercap" / "res.pkl", motion, about)
             elif name == "amass":
-                amass.write(folder / "amass", viewed, about)
+                parameters.write_amass(folder / "amass", viewed, about)
             elif name == "bop" and object_ is not None and mesh is not None:
                 number = bop.object_id(object_.mesh)
                 bop.write(

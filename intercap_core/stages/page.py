@@ -25,12 +25,12 @@ from intercap_core.formats.detections.read import Detections
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.output.site.body import read_fit
-from intercap_core.output.site.capture import read_capture
+from intercap_core.output.site.body_section import read_fit
+from intercap_core.output.site.capture_section import read_capture
 from intercap_core.output.site.closeups import CloseUp, closeup, holds, read_handling
 from intercap_core.output.site.overlays import Fit, Overlay, choose_cameras, choose_frames, overlays
 from intercap_core.output.site.sequence_page import SequenceContent, ViewerParts, page
-from intercap_core.output.site.track import TrackFacts, read_track
+from intercap_core.output.site.track_section import TrackFacts, read_track
 from intercap_core.output.viewer import page as viewer
 from intercap_core.schemas import JOINT, OBJECT_TRACK, SCENE
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths

@@ -19,8 +19,7 @@ import h5py
 import uvicorn
 
 from intercap_core.annotate.annotator import Annotator
-from intercap_core.annotate.guard import TOKEN_HEADER
-from intercap_core.annotate.server import application
+from intercap_core.annotate.server import TOKEN_HEADER, application
 from intercap_core.person.sides import swap_sides
 from tests.helpers import fitted_capture as fitted
 

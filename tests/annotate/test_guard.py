@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from intercap_core.annotate.guard import MAX_BODY, TOKEN_HEADER, refusal
+from intercap_core.annotate.server import MAX_BODY, TOKEN_HEADER, refusal
 
 TOKEN = "a-token"
 PAGE = {"host": "127.0.0.1:8123"}

@@ -19,7 +19,7 @@ import yaml
 from intercap_core.annotate import rerun
 from intercap_core.config import Annotation
 from intercap_core.errors import UserError
-from intercap_core.output.viewer.package import unpacked
+from intercap_core.output.viewer.page import unpacked
 from tests.annotate.served import NAME, Served, annotation, artefact, copied, served, small_project
 
 OF = f"sequences/{NAME}"

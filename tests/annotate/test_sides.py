@@ -12,7 +12,7 @@ import pytest
 from intercap_core.annotate import questions, result, sides
 from intercap_core.annotate.opened import Opened
 from intercap_core.errors import UserError
-from intercap_core.output.viewer.package import unpacked
+from intercap_core.output.viewer.page import unpacked
 from intercap_core.project import load_project
 from tests.annotate.served import NAME, annotation, artefact, copied, detect, small_project
 

@@ -12,7 +12,7 @@ from intercap_core.config import SceneSettings
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply, invert
-from intercap_core.output.export.upright import z_up_frame
+from intercap_core.output.export.motion import z_up_frame
 from intercap_core.scene import camera_verdicts
 from intercap_core.schemas import SCENE
 from intercap_core.stages import scene

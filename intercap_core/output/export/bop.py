@@ -15,9 +15,8 @@ import trimesh
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.output.export.about import About
-from intercap_core.output.export.coordinates import Coordinates
 from intercap_core.output.export.meshes import ply
-from intercap_core.output.export.motion import Motion
+from intercap_core.output.export.motion import Coordinates, Motion
 from intercap_core.output.export.silhouettes import Exposures, Shown, frames_of, images_of
 
 UNITS = "millimetres, radians, pixels; rotations are matrices row by row"

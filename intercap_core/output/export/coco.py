@@ -14,8 +14,7 @@ from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.output.export.about import About
-from intercap_core.output.export.coordinates import Coordinates
-from intercap_core.output.export.motion import Motion
+from intercap_core.output.export.motion import Coordinates, Motion
 from intercap_core.output.export.silhouettes import Exposures, Shown, images_of
 
 PERSON, OBJECT = 1, 2

@@ -23,8 +23,7 @@ from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.normals import vertex_normals
 from intercap_core.object_track.light import linear
 from intercap_core.output.export.about import About
-from intercap_core.output.export.coordinates import Coordinates
-from intercap_core.output.export.motion import Motion
+from intercap_core.output.export.motion import Coordinates, Motion
 
 _FLOAT, _USHORT, _UINT, _UBYTE = 5126, 5123, 5125, 5121
 _ARRAY, _ELEMENTS = 34962, 34963  # buffer targets

@@ -11,8 +11,7 @@ import trimesh
 
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.output.export.about import About
-from intercap_core.output.export.coordinates import Coordinates
-from intercap_core.output.export.motion import Motion
+from intercap_core.output.export.motion import Coordinates, Motion
 
 Kind = Literal["ply", "obj"]
 _DIGITS = 6  # of an obj's coordinates: micrometres

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -113,3 +114,79 @@ def read_motion(
         up=np.full(3, np.nan) if zup_from_master is None else zup_from_master[2, :3].copy(),
         made_by=str(told.get("made_by", "")),
     )
+
+
+METRES = "metres, radians, seconds"
+_ALONG = 1e-4  # of a unit vector's components, from which on it is not along an axis
+
+
+@dataclass(frozen=True, eq=False)
+class Coordinates:
+    """``frame`` in words; ``up`` (3,) the unit vector up in it, NaN = not known; ``units``."""
+
+    frame: str
+    up: np.ndarray
+    units: str = METRES
+
+    @classmethod
+    def of(cls, motion: Motion, units: str = METRES) -> Coordinates:
+        """Those of a motion."""
+        return cls(motion.frame, motion.up, units)
+
+    @property
+    def up_axis(self) -> str:
+        """The axis that points up, as ``z`` or ``-y``, else that there is none."""
+        for axis, value in zip("xyz", self.up, strict=True):
+            if abs(abs(value) - 1) < _ALONG**2:
+                return axis if value > 0 else f"-{axis}"
+        return "none: the vector up is" if np.isfinite(self.up).all() else "not known"
+
+    def told(self) -> dict[str, Any]:
+        """In the words of JSON."""
+        return {
+            "frame": self.frame,
+            "up_axis": self.up_axis,
+            "up": listed(self.up, 6),
+            "units": self.units,
+        }
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The same as arrays."""
+        return {
+            "frame": np.array(self.frame),
+            "up_axis": np.array(self.up_axis),
+            "up": self.up.astype(np.float64),
+            "units": np.array(self.units),
+        }
+
+    def lines(self) -> list[str]:
+        """The same for the head of a text file, a line each."""
+        up = " ".join(f"{value:.6f}" for value in self.up)
+        return [f"frame: {self.frame}", f"up: {self.up_axis} ({up})", f"units: {self.units}"]
+
+
+_BY_FLOOR = "z-up: gravity-aligned, ground at z = 0, metres"
+_BY_STATED_FLOOR = "z-up: up and ground at z = 0 as stated with the calibration, metres"
+_BY_HINT = {
+    "gravity": "by the gravity sensors",
+    "stated": "as stated with the calibration",
+    "cameras": "by the mean of the cameras' own up, which may be tilted",
+}
+
+
+def z_up_frame(scene: artefacts.Artefact) -> str:
+    """The frame to which ``zup_from_master`` of a scene artefact leads."""
+    said = scene.attributes
+    if said["ground_found"]:
+        return _BY_STATED_FLOOR if said["ground_source"] == "stated" else _BY_FLOOR
+    hint = _BY_HINT.get(str(said.get("up_source")), "by a hint that the scene does not name")
+    return f"z-up: {hint}; no floor is known, z = 0 at the master camera, metres"
+
+
+def listed(values: np.ndarray, digits: int) -> Any:
+    """An array of any shape as lists of numbers of so many decimals, None where one is not
+    finite."""
+    if values.ndim:
+        return [listed(part, digits) for part in values]
+    number = float(values)
+    return round(number, digits) if np.isfinite(number) else None

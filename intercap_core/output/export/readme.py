@@ -9,11 +9,9 @@ from intercap_core.body.maps import maps_path
 from intercap_core.evaluation.contact import CONTACT_M
 from intercap_core.evaluation.verdict.figures import StatedError
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.output.export.about import About
+from intercap_core.output.export.about import SOURCE, About
 from intercap_core.output.export.body_files import Written
-from intercap_core.output.export.coordinates import Coordinates
-from intercap_core.output.export.deviations import SOURCE
-from intercap_core.output.export.motion import Motion
+from intercap_core.output.export.motion import Coordinates, Motion
 
 _HEAD = """\
 {sequence}: subject {subject} ({gender} body file), object {object}, {frames} frames at {fps:g} fps

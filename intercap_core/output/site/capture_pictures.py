@@ -11,7 +11,7 @@ from intercap_core import artefacts
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import apply
-from intercap_core.output.site.overlays import encode_jpeg
+from intercap_core.output.site.drawing import encode_jpeg
 from intercap_core.output.site.point_cloud import FusedCloud, View, fuse, measured_points, splat
 
 # One colour a camera, told apart on light and dark ground

@@ -26,8 +26,8 @@ from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.render import render_scene
 from intercap_core.geometry.rigid.shots import Drawable
-from intercap_core.output.site.overlays import BODY_COLOUR, OBJECT_COLOUR, encode_jpeg
-from intercap_core.output.site.shading import Painted, draw
+from intercap_core.output.site.drawing import Painted, draw, encode_jpeg
+from intercap_core.output.site.overlays import BODY_COLOUR, OBJECT_COLOUR
 from intercap_core.schemas import JOINT, SCENE
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 

@@ -13,9 +13,9 @@ from markupsafe import Markup
 
 from intercap_core.output.site.capture_pictures import CapturePicture
 from intercap_core.output.site.closeups import CloseUp
+from intercap_core.output.site.drawing import Sheet
 from intercap_core.output.site.heat_pictures import HeatPicture
 from intercap_core.output.site.overlays import Overlay
-from intercap_core.output.site.sheets import Sheet
 
 _TEMPLATES = Path(__file__).parent / "templates"
 _POLICY = (  # what a page may load: nothing but itself

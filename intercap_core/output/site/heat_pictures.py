@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 import trimesh
@@ -15,7 +14,7 @@ from intercap_core.body.model import BodyModel
 from intercap_core.evaluation.summary import SurfaceHeat
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.transforms import rigid
-from intercap_core.output.site.shading import Painted, Picture, draw
+from intercap_core.output.site.drawing import Painted, draw, encode_png
 
 # From no contact to the map's maximum, sRGB: grey skin, yellow, red, dark red
 COLOUR_STOPS = ((0.80, 0.81, 0.83), (0.99, 0.80, 0.25), (0.91, 0.26, 0.15), (0.40, 0.02, 0.12))
@@ -134,12 +133,3 @@ def _look(
     pose = rigid(turn, np.array([0, 0, distance]) - middle)
     picture = draw([Painted(vertices, faces, paint, pose)], lens)
     return HeatPicture(caption, encode_png(picture), *size)
-
-
-def encode_png(picture: Picture) -> bytes:
-    """PNG with transparency."""
-    alpha = picture.alpha[..., None]
-    straight = picture.rgb / np.maximum(alpha, 1e-6)
-    bgra = np.concatenate([straight[..., ::-1], alpha], 2)
-    pixels = np.rint(np.clip(bgra, 0, 1) * 255).astype(np.uint8)
-    return cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes()

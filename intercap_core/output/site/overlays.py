@@ -17,7 +17,7 @@ from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.render import render_scene
 from intercap_core.geometry.rigid.shots import Drawable
-from intercap_core.output.site.shading import Painted, draw
+from intercap_core.output.site.drawing import Painted, draw, encode_jpeg
 
 BODY_COLOUR = (0.42, 0.66, 0.92)
 OBJECT_COLOUR = (1.0, 0.62, 0.18)
@@ -27,7 +27,6 @@ _MARGIN = 0.10  # of the crop's size, around body and object
 _MIN_ASPECT, _MAX_ASPECT = 0.6, 1.6
 _SURVEY_SCALE = 0.15  # of the image, for choosing cameras
 _APART_DEG = 50.0  # between the viewing directions of the cameras that are shown
-_JPEG_QUALITY = 82
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,13 +180,6 @@ def overlays(
             laid = picture.over(crop[..., ::-1] / np.float32(255), _OPACITY)
             result.append(Overlay(camera.name, t, encode_jpeg(laid), lens.width, lens.height))
     return result
-
-
-def encode_jpeg(rgb: np.ndarray) -> bytes:
-    """JPEG of an image (H, W, 3) in 0..1."""
-    bgr = np.rint(np.clip(rgb[..., ::-1], 0, 1) * 255).astype(np.uint8)
-    options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
-    return cv2.imencode(".jpg", bgr, options)[1].tobytes()
 
 
 def _painted(

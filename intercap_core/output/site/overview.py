@@ -13,7 +13,7 @@ from intercap_core.evaluation import figures, flags
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.summary import SequenceSummary
 from intercap_core.evaluation.verdict.figures import mean_stated
-from intercap_core.output.site import measures, verdict
+from intercap_core.output.site import measures
 from intercap_core.output.site.embed import css, embedded, render, span, tile
 from intercap_core.output.site.heat_pictures import COLOUR_STOPS, HeatPicture
 from intercap_core.versions import versions
@@ -110,7 +110,7 @@ def page(content: DatasetContent) -> str:
         "counts": _counts(measured),
         "groups": [(name, _printed(table)) for name, table in content.groups.items()],
         "truth": measures.truth(measured),
-        "verdict": verdict.context(measured, set()),
+        "verdict": measures.verdict(measured, set()),
         "penetration": measures.penetration(measured),
         "clouds": measures.clouds(content.dataset, measured),
         "acceleration": measures.accelerations(measured),

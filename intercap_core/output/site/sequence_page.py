@@ -13,13 +13,13 @@ from intercap_core.config import ContactInterval
 from intercap_core.evaluation import figures, flags
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.verdict.figures import stated_errors
-from intercap_core.output.site import body, capture, charts, measures, track, verdict
-from intercap_core.output.site.body import BodyFacts
-from intercap_core.output.site.capture import CaptureFacts
+from intercap_core.output.site import body_section, capture_section, charts, measures, track_section
+from intercap_core.output.site.body_section import BodyFacts
+from intercap_core.output.site.capture_section import CaptureFacts
 from intercap_core.output.site.closeups import CloseUp
 from intercap_core.output.site.embed import css, embedded, render, span, tile
 from intercap_core.output.site.overlays import BODY_COLOUR, OBJECT_COLOUR, Overlay
-from intercap_core.output.site.track import TrackFacts
+from intercap_core.output.site.track_section import TrackFacts
 from intercap_core.schemas import METRIC_REGIONS
 from intercap_core.versions import versions
 
@@ -83,7 +83,7 @@ def page(content: SequenceContent) -> str:
         "timeline": charts.timeline(_bands(s, content.annotated), len(s)),
         "annotated": content.annotated is not None,
         "residuals": _residuals(s),
-        "verdict": verdict.context([s], {s.name}),
+        "verdict": measures.verdict([s], {s.name}),
         "truth": measures.truth([s]),
         "flagged_runs": [
             {"frames": span(first, last), "reason": reason}
@@ -96,8 +96,10 @@ def page(content: SequenceContent) -> str:
         "note": content.note,
         "closeups": [embedded(picture, picture.hold.caption) for picture in content.closeups],
         "capture": _capture(content.capture),
-        "track": None if content.track is None else _with_sheet(track.context(content.track)),
-        "body": _with_sheet(body.context(content.body)),
+        "track": None
+        if content.track is None
+        else _with_sheet(track_section.context(content.track)),
+        "body": _with_sheet(body_section.context(content.body)),
         "colours": {"body": css(BODY_COLOUR), "object": css(OBJECT_COLOUR)},
         "made_by": list(content.made_by.items()),
         "versions": [*versions(), ("body file", content.body_file)],
@@ -261,7 +263,7 @@ def _energies(terms: Sequence[tuple[str, float, float]]) -> str:
 
 
 def _capture(facts: CaptureFacts) -> dict[str, Any]:
-    found = capture.context(facts)
+    found = capture_section.context(facts)
     found["pictures"] = [[embedded(p, p.caption) for p in row] for row in found["pictures"]]
     return found
 

@@ -26,8 +26,7 @@ from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.output.export.upright import z_up_frame
-from intercap_core.output.viewer.package import quantised
+from intercap_core.output.export.motion import z_up_frame
 from intercap_core.output.viewer.skinning import skinned
 from intercap_core.schemas import BODY_FIT, JOINT, METRICS, OBJECT_TRACK, SCENE
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
@@ -304,3 +303,12 @@ def _add_truth(content: Content, true: Truth, zup: np.ndarray) -> None:
         content.arrays["truth/object_vertices"] = true.object_vertices.astype(np.float32)
         content.arrays["truth/object_faces"] = true.object_faces.astype(np.uint32)
         _add_poses(content, "truth", true.rotation, true.translation, zup)
+
+
+def quantised(points: np.ndarray) -> tuple[np.ndarray, list[float], float]:
+    """Points (..., 3) as uint16 steps above a corner, the corner (3,) and the step, metres."""
+    flat = points.reshape(-1, 3)
+    low = flat.min(0) if len(flat) else np.zeros(3)
+    extent = float((flat.max(0) - low).max()) if len(flat) else 1.0
+    step = max(extent, 1e-6) / 65535
+    return np.rint((points - low) / step).astype(np.uint16), low.tolist(), step

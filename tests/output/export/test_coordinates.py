@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from intercap_core.inputs import safe_pickle
-from intercap_core.output.export.coordinates import Coordinates
+from intercap_core.output.export.motion import Coordinates
 from tests.helpers import exported
 from tests.helpers import fitted_capture as fitted
 

@@ -32,10 +32,9 @@ from intercap_core.geometry.camera.masks import decode
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 from intercap_core.inputs import safe_pickle
 from intercap_core.output.export import bop, coco
-from intercap_core.output.export.about import About, BodyFile
+from intercap_core.output.export.about import About, BodyFile, Verdict
 from intercap_core.output.export.motion import read_motion
 from intercap_core.output.export.silhouettes import Exposures, object_poses
-from intercap_core.output.export.verdict import Verdict
 from intercap_core.schemas import METRICS
 from intercap_core.stages import export
 from tests.helpers import exported
@@ -530,7 +529,7 @@ def test_an_export_that_fails_leaves_the_earlier_one(
     def full(*_: Any) -> None:
         raise OSError("no space left on device")
 
-    monkeypatch.setattr(export.intercap, "write", full)
+    monkeypatch.setattr(export.parameters, "write_intercap", full)
     with pytest.raises(OSError, match="no space"):
         exported.run(capture, out, formats=("intercap",))
     assert [p.name for p in tmp_path.rglob("*")] == ["out", export.MARKER]

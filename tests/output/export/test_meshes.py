@@ -13,9 +13,8 @@ import trimesh
 from intercap_core import artefacts
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.output.export import meshes
-from intercap_core.output.export.about import About, BodyFile
+from intercap_core.output.export.about import About, BodyFile, Verdict
 from intercap_core.output.export.motion import read_motion
-from intercap_core.output.export.verdict import Verdict
 from intercap_core.schemas import JOINT
 from tests.helpers import exported
 from tests.helpers import fitted_capture as fitted

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from intercap_core.output.release.splits import TEST, TRAIN, split
+from intercap_core.output.release.card import TEST, TRAIN, split
 
 NAMES = st.text("abcdefghij0123456789_", min_size=1, max_size=6)
 

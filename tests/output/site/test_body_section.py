@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from intercap_core.errors import UserError
-from intercap_core.output.site import body, charts
-from intercap_core.output.site.body_pictures import FIT_COLOUR, KEYPOINT_COLOUR
-from intercap_core.output.site.sheets import Crop
+from intercap_core.output.site import body_section, charts
+from intercap_core.output.site.body_section import FIT_COLOUR, KEYPOINT_COLOUR
+from intercap_core.output.site.drawing import Crop
 from tests.helpers import fitted_capture as fitted
 
 SETS = 6
@@ -33,16 +33,16 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
     return found
 
 
-def _facts(made: fitted.Capture, **instead: Path) -> body.BodyFacts:
+def _facts(made: fitted.Capture, **instead: Path) -> body_section.BodyFacts:
     paths = replace(made.inputs("frames", "scene", "person", "body_fit"), **instead)
-    return body.read_fit(paths, made.models)
+    return body_section.read_fit(paths, made.models)
 
 
 def test_states_of_fit_and_views_and_deviations_by_joint(made: fitted.Capture) -> None:
     facts = _facts(made)
     assert facts.state == ["moving", "lost", *["moving"] * (SETS - 2)]
     assert facts.sigma_mm[0, 20] == pytest.approx(20)
-    found = body.context(facts)
+    found = body_section.context(facts)
     timeline = found["timeline"]
     assert "1 bridged" in timeline and timeline.count('class="state lost"') == 1
     # 8 px of 1080 rows are 2 px of 270

@@ -14,7 +14,7 @@ import pytest
 
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera, Rig
-from intercap_core.output.site import capture, charts
+from intercap_core.output.site import capture_section, charts
 from intercap_core.output.site.capture_pictures import CapturePicture, choose_set, floor_profiles
 from intercap_core.output.site.point_cloud import FusedCloud, View, fuse, splat
 from tests.helpers import fitted_capture as fitted
@@ -38,11 +38,11 @@ def _decoded(picture: CapturePicture) -> np.ndarray:
 
 
 def test_pictures_are_drawn_before_and_after_where_poses_changed(made: fitted.Capture) -> None:
-    facts = capture.read_capture(made.paths["frames"], made.paths["scene"])
+    facts = capture_section.read_capture(made.paths["frames"], made.paths["scene"])
     assert facts.pictures is not None and facts.pictures.when == ("before", "after")
     before, after = (_decoded(picture).astype(int) for picture in facts.pictures.views[0])
     assert np.abs(before - after).max() > 60
-    again = capture.read_capture(made.paths["frames"], made.paths["scene"])
+    again = capture_section.read_capture(made.paths["frames"], made.paths["scene"])
     assert again.pictures is not None
     assert [p.data for row in again.pictures.views for p in row] == [
         p.data for row in facts.pictures.views for p in row
@@ -53,7 +53,7 @@ def test_pictures_are_drawn_before_and_after_where_poses_changed(made: fitted.Ca
 
 
 def test_facts_of_cameras_and_pairs(made: fitted.Capture) -> None:
-    facts = capture.read_capture(made.paths["frames"], made.paths["scene"])
+    facts = capture_section.read_capture(made.paths["frames"], made.paths["scene"])
     moved = [camera.moved for camera in facts.cameras]
     assert moved == pytest.approx([0, 0.012, 0], abs=1e-6)
     assert [camera.turned_deg for camera in facts.cameras] == pytest.approx([0, 0, 0], abs=1e-4)
@@ -70,16 +70,16 @@ def test_a_depth_bias_is_told_with_its_deviation(made: fitted.Capture, tmp_path:
         covariance[2, 3:6, 2, 3:6] = 1e-6 * np.eye(3)  # of the pose alone
         file["camera_covariance"][...] = covariance
         file["depth_size"][2] = 0
-    facts = capture.read_capture(made.paths["frames"], scene)
+    facts = capture_section.read_capture(made.paths["frames"], scene)
     assert [camera.depth_bias_sigma for camera in facts.cameras[:2]] == pytest.approx(
         [0.0003, 0.0012]
     )
-    rows = capture.context(facts)["cameras"]
+    rows = capture_section.context(facts)["cameras"]
     assert [row["bias"] for row in rows] == ["2.1 ± 0.3", "-4.0 ± 1.2", ""]
     (third,) = [
         replace(camera, depth_bias=0.001) for camera in facts.cameras if camera.name == "k3"
     ]
-    assert capture.context(replace(facts, cameras=[third]))["cameras"][0]["bias"] == "1.0"
+    assert capture_section.context(replace(facts, cameras=[third]))["cameras"][0]["bias"] == "1.0"
 
 
 REDUCTIONS = {
@@ -96,11 +96,11 @@ REDUCTIONS = {
 @pytest.mark.parametrize("name", REDUCTIONS)
 def test_any_rig_has_its_page(made: fitted.Capture, name: str, tmp_path: Path) -> None:
     paths = REDUCTIONS[name].apply({s: made.paths[s] for s in STAGES}, tmp_path)
-    facts = capture.read_capture(paths["frames"], paths["scene"])
+    facts = capture_section.read_capture(paths["frames"], paths["scene"])
     assert facts.note == ""
     assert facts.pictures is not None
     assert all(_decoded(p).std() > 1 for row in facts.pictures.views for p in row)
-    found = capture.context(facts)
+    found = capture_section.context(facts)
     assert len(found["cameras"]) == len(facts.cameras)
     assert "nan" not in found["timeline"] and "nan" not in found["pairs"]
     if name == "one camera":
@@ -114,28 +114,28 @@ def test_states_of_a_cameras_frames() -> None:
     depth = np.array([1, 0, 1, 0, 1, 0], bool)
     slip = np.array([0, 0, 0, 0, 2, 0])
     dropped = np.array([0, 0, 0, 0, 0, 1], bool)
-    states = capture.camera_states(colour, depth, slip, dropped)
+    states = capture_section.camera_states(colour, depth, slip, dropped)
     assert states == ["recorded", "part", "part", "missing", "slipped", "dropped"]
-    without = capture.camera_states(colour, 0 * colour > 0, 0 * slip, dropped)
+    without = capture_section.camera_states(colour, 0 * colour > 0, 0 * slip, dropped)
     assert without == ["recorded", "recorded", "missing", "missing", "recorded", "dropped"]
 
 
 def test_the_timeline_tells_how_late_slipped_images_are(made: fitted.Capture) -> None:
-    facts = capture.read_capture(made.paths["frames"], made.paths["scene"])
+    facts = capture_section.read_capture(made.paths["frames"], made.paths["scene"])
     late = replace(
         facts.cameras[1],
         state=["recorded", "slipped", "slipped", "slipped", "missing", "recorded"],
         slip=[0, 2, 2, 1, 0, 0],
     )
-    drawn = capture.context(replace(facts, cameras=[facts.cameras[0], late]))["timeline"]
+    drawn = capture_section.context(replace(facts, cameras=[facts.cameras[0], late]))["timeline"]
     assert "1–2: shows an older moment, 2 frames before" in drawn
     assert "3: shows an older moment, 1 frame before" in drawn
     assert "3 slipped by 1 or 2" in drawn and "1 missing" in drawn
 
 
 def test_gaps_are_where_time_runs_on() -> None:
-    assert capture.gaps(np.array([0, 1, 2, 5, 6]) / 15, 15) == [(2, 2)]
-    assert capture.gaps(np.zeros(1), 15) == []
+    assert capture_section.gaps(np.array([0, 1, 2, 5, 6]) / 15, 15) == [(2, 2)]
+    assert capture_section.gaps(np.zeros(1), 15) == []
 
 
 def test_names_and_notes_are_no_markup(made: fitted.Capture, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import trimesh
 
 from intercap_core.evaluation.summary import SurfaceHeat
 from intercap_core.geometry.camera.intrinsics import Intrinsics
-from intercap_core.output.site import charts, heat_pictures, overlays, shading
+from intercap_core.output.site import charts, drawing, heat_pictures, overlays
 
 
 def test_ticks_are_round_and_inside() -> None:
@@ -76,10 +76,10 @@ def test_pictures_hide_what_is_behind_and_keep_colours() -> None:
     place[2, 3] = 2
     behind = place.copy()
     behind[:3, 3] = [0.25, 0, 3]
-    picture = shading.draw(
+    picture = drawing.draw(
         [
-            shading.Painted(ball.vertices, ball.faces, green, behind),
-            shading.Painted(ball.vertices, ball.faces, red, place),
+            drawing.Painted(ball.vertices, ball.faces, green, behind),
+            drawing.Painted(ball.vertices, ball.faces, red, place),
         ],
         lens,
     )

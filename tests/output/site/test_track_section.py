@@ -11,8 +11,8 @@ import pytest
 
 from intercap_core.geometry.camera.masks import encode
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.output.site import track
-from intercap_core.output.site.track_pictures import CANDIDATE_COLOUR, TRACK_COLOUR
+from intercap_core.output.site import track_section
+from intercap_core.output.site.track_section import CANDIDATE_COLOUR, TRACK_COLOUR
 from intercap_core.sequence_inputs import SequencePaths
 from tests.helpers import fitted_capture as fitted
 
@@ -35,10 +35,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
     return found
 
 
-def _facts(made: fitted.Capture, frames: Path | None = None) -> track.TrackFacts:
+def _facts(made: fitted.Capture, frames: Path | None = None) -> track_section.TrackFacts:
     whole = encode(np.ones((270, 480), bool))
     kept = [whole, b"", b""]
-    return track.read_track(
+    return track_section.read_track(
         SequencePaths(
             frames=frames or made.paths["frames"],
             scene=made.paths["scene"],
@@ -55,7 +55,7 @@ def test_states_of_track_and_views(made: fitted.Capture) -> None:
     assert facts.recovered == [2]
     assert facts.sigma_mm == pytest.approx(np.full(SETS, 2.0))
     assert facts.sigma_deg == pytest.approx(np.full(SETS, np.degrees(0.01)))
-    found = track.context(facts)
+    found = track_section.context(facts)
     timeline = found["timeline"]
     assert timeline.count('class="state lost"') == 1 and "1 lost · 1 doubtful" in timeline
     assert 'class="state partly"' in timeline and 'class="state agrees"' in timeline
@@ -64,10 +64,12 @@ def test_states_of_track_and_views(made: fitted.Capture) -> None:
 
 def test_a_carried_frame_is_told_as_such_before_it_is_doubtful() -> None:
     none, all_ = np.zeros(3, bool), np.ones(3, bool)
-    found = track._states(
+    found = track_section._states(
         gone=none, lost=np.arange(3) == 0, carried=np.arange(3) < 2, doubtful=all_, resting=none
     )
-    assert found == ["lost", "carried", "doubtful"] and set(found) <= set(track.TRACK_STATES)
+    assert found == ["lost", "carried", "doubtful"] and set(found) <= set(
+        track_section.TRACK_STATES
+    )
 
 
 def test_the_sheet_shows_both_outlines_in_every_camera(made: fitted.Capture) -> None:

@@ -10,7 +10,8 @@ import torch
 
 from intercap_core.body.model import BodyModel
 from intercap_core.output.viewer import skinning
-from intercap_core.output.viewer.package import payload, quantised, unpacked
+from intercap_core.output.viewer.content import quantised
+from intercap_core.output.viewer.page import payload, unpacked
 from tests.helpers.bodies import open_body
 
 FRAMES = 7

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from intercap_core.annotate import document, surface, symmetry
+from intercap_core.annotate import document, objects
 from intercap_core.errors import UserError
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.project import Project, load_project
@@ -34,9 +34,9 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Project:
 
 def test_a_first_list_is_written_and_named(project: Project) -> None:
     entry = project.objects["cup"]
-    told = surface.read_surface(project, entry)
+    told = objects.read_surface(project, entry)
     assert told["vertices"] == [] and told["digest"] == document.NO_FILE and told["sequences"] == 1
-    saved = surface.save_surface(project, entry, [3, 4, 50], told["digest"])
+    saved = objects.save_surface(project, entry, [3, 4, 50], told["digest"])
     assert saved["vertices"] == [3, 4, 50]
     assert Path("objects.yaml").read_text() == (
         "# ours\ncup:\n  mesh: cup.ply # scanned\n  contact_vertices: cup.contact.json\n"
@@ -47,39 +47,39 @@ def test_a_first_list_is_written_and_named(project: Project) -> None:
 
 def test_a_list_that_changed_meanwhile_stays(project: Project) -> None:
     entry = project.objects["cup"]
-    first = surface.read_surface(project, entry)
-    surface.save_surface(project, entry, [3], first["digest"])
+    first = objects.read_surface(project, entry)
+    objects.save_surface(project, entry, [3], first["digest"])
     entry = load_project(Path("config.yaml")).objects["cup"]
     with pytest.raises(UserError, match="meanwhile"):
-        surface.save_surface(project, entry, [4], first["digest"])
-    assert surface.read_surface(project, entry)["vertices"] == [3]
+        objects.save_surface(project, entry, [4], first["digest"])
+    assert objects.read_surface(project, entry)["vertices"] == [3]
 
 
 @pytest.mark.parametrize("vertices", [[], [-1], [10**9]])
 def test_what_is_no_vertex_is_refused(project: Project, vertices: list[int]) -> None:
     with pytest.raises(UserError, match="vertices"):
-        surface.save_surface(project, project.objects["cup"], vertices, document.NO_FILE)
+        objects.save_surface(project, project.objects["cup"], vertices, document.NO_FILE)
 
 
 def test_a_symmetry_is_written_and_taken_away(project: Project) -> None:
     entry = project.objects["cup"]
     before = Path("objects.yaml").read_text()
-    told = symmetry.read_symmetry(project, entry)
+    told = objects.read_symmetry(project, entry)
     about_z = {"continuous": [{"axis": [0, 0, 1]}]}
-    saved = symmetry.save_symmetry(project, entry, about_z, told["digest"])
+    saved = objects.save_symmetry(project, entry, about_z, told["digest"])
     assert saved["symmetry"] == about_z
     assert "# scanned" in Path("objects.yaml").read_text()
     again = load_project(Path("config.yaml")).objects["cup"]
     assert again.symmetry.continuous[0].axis == (0.0, 0.0, 1.0)
-    symmetry.save_symmetry(project, again, {}, saved["digest"])
+    objects.save_symmetry(project, again, {}, saved["digest"])
     assert Path("objects.yaml").read_text() == before
 
 
 def test_an_impossible_symmetry_and_another_file_are_refused(project: Project) -> None:
     entry = project.objects["cup"]
-    told = symmetry.read_symmetry(project, entry)
+    told = objects.read_symmetry(project, entry)
     with pytest.raises(UserError, match="impossible"):
-        symmetry.save_symmetry(project, entry, {"discrete": [[1, 2]]}, told["digest"])
+        objects.save_symmetry(project, entry, {"discrete": [[1, 2]]}, told["digest"])
     Path("objects.yaml").write_text("cup: {mesh: cup.ply}\n")
     with pytest.raises(UserError, match="meanwhile"):
-        symmetry.save_symmetry(project, entry, {"sphere": True}, told["digest"])
+        objects.save_symmetry(project, entry, {"sphere": True}, told["digest"])
