@@ -21,11 +21,11 @@ from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings  # n
 from intercap_core.geometry.camera.intrinsics import Intrinsics  # noqa: E402
 from intercap_core.geometry.camera.transforms import invert, rigid  # noqa: E402
 from intercap_core.studio.interactions import interaction_named  # noqa: E402
-from intercap_core.studio.looks import body_colours  # noqa: E402
 from intercap_core.studio.recording import surfaces_at  # noqa: E402
 from intercap_core.studio.render import Photographer, View  # noqa: E402
 from intercap_core.studio.skeleton import unit  # noqa: E402
 from intercap_core.studio.stage import Moment, Stage  # noqa: E402
+from intercap_core.studio.subjects import body_colours  # noqa: E402
 
 
 def object_entry(name: str) -> ObjectEntry:

@@ -1,4 +1,4 @@
-"""Make one virtual capture: recordings, detections, calibration, and its truth."""
+"""Make one virtual capture: recordings, detections, calibration, truth and an erring annotation."""
 
 from __future__ import annotations
 
@@ -6,19 +6,222 @@ import hashlib
 import json
 import logging
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+import open3d as o3d
 import yaml
+from scipy.spatial.transform import Rotation
 
+from intercap_core import artefacts
 from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
 from intercap_core.errors import UserError
 from intercap_core.progress import Progress
+from intercap_core.schemas import CONTACT_REGIONS, TRUTH
 from intercap_core.studio.keypoints import Detector
 from intercap_core.studio.layouts import FOLDERS
 from intercap_core.studio.masks import Segmenter
-from intercap_core.studio.recording import Kinect
-from intercap_core.studio.stage import Stage
-from intercap_core.studio.truth import erring_annotation, erring_starts, write_truth
+from intercap_core.studio.recording import Kinect, Recorded
+from intercap_core.studio.render import scene_of
+from intercap_core.studio.rig import STAGGER_S
+from intercap_core.studio.skeleton import turn, unit
+from intercap_core.studio.stage import Moment, Stage
+
+CONTACT_M = 0.0045
+SEEN_PIXELS, SEEN_SHARE = 40, 0.05  # of the object, for a view to count as seeing it
+OFF_SURFACE_M = 0.001
+ABOVE_SOLE_M = 0.03  # what a sole stands on is sought from here
+ANNOTATION_ERROR_M, ANNOTATION_ERROR_DEG, ANNOTATION_ERROR_FRAMES = 0.010, 5.0, 5
+
+
+def write_truth(
+    path: Path,
+    stage: Stage,
+    moment: Moment,
+    sequence: str,
+    capture: StudioCapture,
+    recorded: Sequence[Recorded],
+) -> np.ndarray:
+    """Write the truth artefact of the set times' ``moment``; ``recorded`` by each camera.
+
+    Returns the true region contact (T, R).
+    """
+    rig = stage.rig
+    master = rig.master_from_stage
+    pose = master @ moment.stage_from_object
+    contact = region_contact(stage, moment)
+    body_visible, object_visible = visible(stage, moment)
+    seen = np.stack([camera.object_pixels for camera in recorded], 1)
+    whole = np.stack([camera.object_whole for camera in recorded], 1)
+    views = (seen >= SEEN_PIXELS) & (seen >= SEEN_SHARE * np.maximum(whole, 1))
+    normal = master[:3, 2]
+    with artefacts.write(
+        path,
+        TRUTH,
+        sequence=sequence,
+        interaction=capture.interaction,
+        subject=capture.subject,
+        object=stage.thing.name,
+        ground_offset=float(-normal @ master[:3, 3]),
+        fps=float(stage.fps),
+        room=stage.furnishing,
+        faults=", ".join(_faults(stage, capture)),
+    ) as file:
+        if stage.passer_by:
+            file.attributes["passer_by"] = stage.passer_by.subject.name
+        if stage.subject.sole_m:
+            file.attributes["sole_m"] = stage.subject.sole_m
+        file.put("times", stage.set_times)
+        file.put("body_vertices", stage.to_master(moment.body))
+        file.put("body_faces", stage.subject.faces)
+        file.put("correspondence_face", stage.subject.fitted_face)
+        file.put("correspondence_weights", stage.subject.fitted_bary)
+        file.put("joints", stage.to_master(moment.joints))
+        file.put("fingertips", stage.to_master(moment.tips))
+        if stage.thing:
+            file.put("object_vertices", stage.thing.vertices)
+            file.put("object_faces", stage.thing.faces)
+            file.put("rotation", pose[:, :3, :3])
+            file.put("translation", pose[:, :3, 3])
+            file.put("object_views", views.sum(1))
+        file.put("region_names", CONTACT_REGIONS)
+        file.put("region_contact", contact)
+        file.put("camera_names", rig.true.names)
+        file.put("master_from_colour", rig.true.master_from_colour)
+        file.put("time_offset", rig.offset_s + STAGGER_S * np.arange(len(rig.offset_s)))
+        file.put("slip", rig.slip)
+        file.put("recorded", np.stack([camera.colour for camera in recorded], 1))
+        file.put("depth_bias", [camera.depth_bias for camera in recorded])
+        file.put("depth_recorded", np.stack([camera.depth for camera in recorded], 1))
+        file.put("ground_normal", normal)
+        if stage.interaction.leaves_floor:
+            file.put("support_height", support_height(stage, moment))
+        file.put("body_visible", body_visible)
+        if stage.thing:
+            file.put("object_visible", object_visible)
+    return contact
+
+
+def _faults(stage: Stage, capture: StudioCapture) -> list[str]:
+    """The faults that were asked for, those of one camera with its name."""
+    names, broken = stage.rig.true.names, stage.failures.broken
+    return [f"{kind} {names[broken[kind]]}" if kind in broken else kind for kind in capture.faults]
+
+
+def region_contact(stage: Stage, moment: Moment) -> np.ndarray:
+    """(T, R): some point of the region is within ``CONTACT_M`` of the object."""
+    regions = stage.fitted.regions
+    result = np.zeros((len(moment.body), len(CONTACT_REGIONS)), bool)
+    if not stage.thing:
+        return result
+    for t, pose in enumerate(moment.stage_from_object):
+        points = stage.subject.on_fitted_topology(moment.body[t : t + 1])[0]
+        local = (points - pose[:3, 3]) @ pose[:3, :3]
+        near = ((local > stage.bounds[0] - 0.01) & (local < stage.bounds[1] + 0.01)).all(1)
+        touching = np.zeros(len(points), bool)
+        touching[near] = stage.thing.surface.signed_distance(local[near]) <= CONTACT_M
+        result[t] = [touching[regions[name]].any() for name in CONTACT_REGIONS]
+    return result
+
+
+def support_height(stage: Stage, moment: Moment) -> np.ndarray:
+    """(T, 2): the highest surface of the room under each sole, left and right, above the floor."""
+    room, regions = stage.room, stage.fitted.regions
+    scene = scene_of((room.vertices, room.faces))
+    result = np.zeros((len(moment.body), 2))
+    for t, points in enumerate(stage.subject.on_fitted_topology(moment.body)):
+        for side, foot in enumerate(("left_foot", "right_foot")):
+            start = points[regions[foot]] + (0, 0, ABOVE_SOLE_M)
+            down = np.broadcast_to([0.0, 0.0, -1.0], start.shape)
+            rays = np.concatenate([start, down], 1).astype(np.float32)
+            far = scene.cast_rays(o3d.core.Tensor.from_numpy(rays))["t_hit"].numpy()
+            result[t, side] = (start[:, 2] - far).max()
+    return result
+
+
+def visible(stage: Stage, moment: Moment) -> tuple[np.ndarray, np.ndarray]:
+    """Which body vertices (T, V), clothed, and object vertices (T, Vo) some camera truly sees."""
+    thing, faces = stage.thing, stage.subject.faces
+    count = moment.clothed.shape[1]
+    result = np.zeros((len(moment.clothed), count + len(thing.vertices)), bool)
+    stage_from_master = np.linalg.inv(stage.rig.master_from_stage)
+    passing = stage.passer_by.at(stage.set_times) if stage.passer_by else None
+    for t, pose in enumerate(moment.stage_from_object):
+        moved = thing.vertices @ pose[:3, :3].T + pose[:3, 3]
+        drawn = [(moved, thing.faces)] if thing else []
+        points = np.concatenate([moment.clothed[t], moved])
+        normals = np.concatenate(
+            [stage.subject.normals(moment.clothed[t][None])[0],
+             stage.thing_normals @ pose[:3, :3].T]
+        )  # fmt: skip
+        room = stage.room
+        if passing and passing.present[t]:
+            drawn.append((passing.clothed[t], faces))
+        scene = scene_of((moment.clothed[t], faces), *drawn, (room.vertices, room.faces))
+        for camera in stage.rig.true:
+            place = stage_from_master @ camera.master_from_colour
+            to_eye = place[:3, 3] - points
+            ids = np.flatnonzero(~result[t] & ((to_eye * normals).sum(1) > 0))
+            local = (points[ids] - place[:3, 3]) @ place[:3, :3]
+            ids = ids[np.asarray(camera.colour.sees(local))]
+            start = points[ids] + OFF_SURFACE_M * normals[ids]
+            rays = np.concatenate([start, place[:3, 3] - start], 1).astype(np.float32)
+            hidden = scene.test_occlusions(o3d.core.Tensor.from_numpy(rays), tnear=0.0, tfar=1.0)
+            result[t, ids] = ~hidden.numpy()
+    return result[:, :count], result[:, count:]
+
+
+def erring_annotation(stage: Stage, moment: Moment, contact: np.ndarray) -> dict[str, Any]:
+    """An annotation as a person makes it: off by up to 10 mm, 5 degrees, 5 frames."""
+    rng, scale = stage.noise.rng("annotation"), min(stage.noise.scale, 1.0)
+
+    def off(size: float) -> np.ndarray:
+        return unit(rng.normal(size=3)) * rng.uniform(0, size) * scale
+
+    intervals = []
+    for region, name in enumerate(CONTACT_REGIONS):
+        padded = np.concatenate([[False], contact[:, region], [False]]).astype(int)
+        starts, ends = np.flatnonzero(np.diff(padded) > 0), np.flatnonzero(np.diff(padded) < 0)
+        for start, end in zip(starts, ends, strict=True):
+            reach = round(ANNOTATION_ERROR_FRAMES * scale)
+            first = int(np.clip(start + rng.integers(-reach, reach + 1), 0, stage.frames - 1))
+            last = int(np.clip(end + rng.integers(-reach, reach + 1), first + 1, stage.frames))
+            intervals.append({"part": name, "start": first, "end": last})
+    frame = int(rng.integers(0, max(1, stage.frames // 5)))
+    pose = stage.rig.master_from_stage @ moment.stage_from_object[frame]
+    rotation = turn(np.radians(off(ANNOTATION_ERROR_DEG))) @ pose[:3, :3]
+    floor = []
+    for angle in np.arange(4) * np.pi / 2 + rng.uniform(0, 1):
+        point = np.array([1.2 * np.cos(angle), 1.2 * np.sin(angle), 0.0])
+        floor.append((stage.to_master(point) + off(ANNOTATION_ERROR_M)).round(5).tolist())
+    if not stage.thing:
+        return {"floor": floor}
+    return {
+        "contact": intervals,
+        "object_pose": {
+            "frame": frame,
+            "rotation_vector": Rotation.from_matrix(rotation).as_rotvec().round(6).tolist(),
+            "translation": (pose[:3, 3] + off(ANNOTATION_ERROR_M)).round(6).tolist(),
+        },
+        "floor": floor,
+    }
+
+
+def erring_starts(stage: Stage, sigma: float) -> dict[str, Any]:
+    """When each camera's first image was taken, as somebody reads it off a clock that counts the
+    hours of a day, wrong by ``sigma`` s."""
+    rng = stage.noise.rng("stated starts")
+    clock = float(rng.uniform(0, 86_400))
+    starts = {}
+    for c, name in enumerate(stage.rig.true.names):
+        lost = stage.rig.missing[c]
+        first = min(t for t in range(0, stage.frames, stage.every[c]) if t not in lost)
+        taken = stage.set_times[first] - stage.rig.late_s[c]
+        starts[name] = round(clock + float(taken + rng.normal(0, sigma)), 4)
+    return {"starts": starts, "starts_sigma": max(sigma, 0.001)}
+
 
 log = logging.getLogger(__name__)
 

@@ -23,10 +23,10 @@ from intercap_core.config import LayoutName
 from intercap_core.formats.calibration.extrinsics import Extrinsics, write_rig_file
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Rig
-from intercap_core.studio.alignment import Aligner
 from intercap_core.studio.calibration import write_calibration
 from intercap_core.studio.capture_folder import (
     SOUND_RATE,
+    Aligner,
     CameraFiles,
     CaptureFolder,
     Device,

@@ -1,17 +1,19 @@
 """True objects of the studio: the catalogue's meshes made a little different from what is tracked.
 
 A real object is never the scanned mesh: it is scaled by half a percent, its surface is off by a
-smooth part of its size, and another scan would have other triangles.
-"""
+smooth part of its size, and another scan would have other triangles."""
 
 from __future__ import annotations
 
 import zlib
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from intercap_core.config import ObjectEntry
+from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh_files import load_mesh
 
 SCALE_ERROR = 0.005  # of the true size, up or down
@@ -21,6 +23,43 @@ SCALE_ERROR = 0.005  # of the true size, up or down
 SURFACE_ERROR = 0.006
 WAVELENGTHS = (0.25, 0.9)  # of the surface error, in parts of the object's radius
 WAVES = 48
+
+
+PAINTS = ((0.92, 0.91, 0.88), (0.13, 0.13, 0.14), (0.70, 0.12, 0.13), (0.11, 0.28, 0.60),
+          (0.84, 0.42, 0.17), (0.16, 0.46, 0.31), (0.88, 0.76, 0.24),
+          (0.50, 0.51, 0.53))  # fmt: skip
+PRINTS = (3, 7)  # spots of another colour on a printed object, at least and below
+PRINT_RADIUS = (0.15, 0.45)  # of a spot, in parts of the object's radius
+
+
+@dataclass(frozen=True)
+class TrueObject:
+    """The object as it truly is: its frame, metres; ``colours`` (V, 3) uint8 RGB."""
+
+    name: str
+    vertices: np.ndarray
+    faces: np.ndarray
+    colours: np.ndarray
+
+    @classmethod
+    def nothing(cls) -> TrueObject:
+        """What a person alone handles: a mesh without a face."""
+        vertices, faces = np.zeros((0, 3)), np.zeros((0, 3), np.int32)
+        return cls("", vertices, faces, vertices)
+
+    def __bool__(self) -> bool:
+        """Whether there is an object."""
+        return len(self.faces) > 0
+
+    @cached_property
+    def surface(self) -> DistanceField:
+        """Distances to it."""
+        return DistanceField(self.vertices, self.faces, threads=1)
+
+    @property
+    def standing_height(self) -> float:
+        """Height of the origin when the object stands on the floor."""
+        return float(-self.vertices[:, 2].min())
 
 
 def true_mesh(entry: ObjectEntry, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -95,3 +134,57 @@ def _smooth_displacement(
     field -= np.cross(motion[:3], vertices) + motion[3:]
     rms = np.sqrt(weight @ (field * normals).sum(1) ** 2)
     return field * SURFACE_ERROR * radius / rms
+
+
+GAP_M = 0.0003  # skin that was pressed stays this far outside, so that float32 keeps it outside
+NEAR_M = 0.01
+
+
+def press_out(
+    points: np.ndarray,
+    surface: DistanceField,
+    stage_from_object: np.ndarray,
+    bounds: np.ndarray,
+) -> np.ndarray:
+    """Move points (N, 3) of the stage that are inside the object to its surface.
+
+    ``bounds`` (2, 3) is the object's box in its own frame. The displacement is as deep as the
+    point was, so it fades to nothing where the skin leaves the object.
+    """
+    rotation, translation = stage_from_object[:3, :3], stage_from_object[:3, 3]
+    local = (points - translation) @ rotation
+    near = ((local > bounds[0] - NEAR_M) & (local < bounds[1] + NEAR_M)).all(1)
+    ids = np.flatnonzero(near)
+    if len(ids) == 0:
+        return points
+    ids = ids[surface.signed_distance(local[ids]) < GAP_M]
+    if len(ids) == 0:
+        return points
+    moved = points.copy()
+    at = local[ids]
+    for _ in range(3):  # at a thin edge the nearest surface may change side
+        inside = surface.signed_distance(at) < 0.5 * GAP_M
+        if not inside.any():
+            break
+        closest = surface.closest(at[inside])
+        at[inside] = closest.points + GAP_M * closest.normals
+    moved[ids] = at @ rotation.T + translation
+    return moved
+
+
+def object_colours(
+    look: str, vertices: np.ndarray, colours: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """Colours (V, 3) RGB in [0, 1] of a true object whose mesh has ``colours`` (V, 3): those
+    ('mesh'), one for all ('plain') or one with spots of others that no scan knows ('printed')."""
+    if look == "mesh":
+        return colours
+    first, *others = np.array(PAINTS)[rng.permutation(len(PAINTS))]
+    found = np.tile(first, (len(vertices), 1))
+    if look == "printed":
+        radius = np.linalg.norm(vertices - vertices.mean(0), axis=1).max()
+        for paint in others[: rng.integers(*PRINTS)]:
+            middle = vertices[rng.integers(len(vertices))]
+            reach = radius * rng.uniform(*PRINT_RADIUS)
+            found[np.linalg.norm(vertices - middle, axis=1) < reach] = paint
+    return found

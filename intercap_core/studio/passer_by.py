@@ -14,11 +14,10 @@ import numpy as np
 from intercap_core.errors import UserError
 from intercap_core.studio.controls import Footwork, Step, Wander
 from intercap_core.studio.hands import RELAXED
-from intercap_core.studio.looks import body_colours
 from intercap_core.studio.motion import LEG_REACH, Puppet, Trunk
 from intercap_core.studio.noise import NoiseSource
 from intercap_core.studio.room import FLOOR_HALF_M, Room
-from intercap_core.studio.subjects import Subject, subject_names
+from intercap_core.studio.subjects import Subject, body_colours, subject_names
 
 PASSES_M = (0.8, 1.6)  # from the subject's pelvis, where nearest
 # Of the walker's middle: half the shoulders are 0.23 m

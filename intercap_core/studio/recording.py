@@ -12,16 +12,14 @@ from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import invert
 from intercap_core.studio.calibration import ACCELEROMETER_FROM_DEPTH
 from intercap_core.studio.capture_folder import CaptureFolder, Device, Shot
-from intercap_core.studio.failures import CLOCK_FALLS_BACK_SETS
 from intercap_core.studio.keypoints import Detector, to_json
-from intercap_core.studio.looks import body_colours
 from intercap_core.studio.masks import Labels, Segmenter
 from intercap_core.studio.passer_by import Passing
 from intercap_core.studio.render import BODY, OBJECT, PASSER_BY, Cast, Photographer, Surface, View
 from intercap_core.studio.rig import STAGGER_S
-from intercap_core.studio.sensor import DepthSensor
-from intercap_core.studio.sound import heard
+from intercap_core.studio.sensors import DepthSensor, heard
 from intercap_core.studio.stage import Moment, Stage
+from intercap_core.studio.subjects import body_colours
 
 START_US = 1_000_000  # device time of the first set
 GRAVITY = 9.81
@@ -30,6 +28,9 @@ ACCELEROMETER_NOISE, GYROSCOPE_NOISE = 0.03, 0.004  # m/s^2, rad/s
 EXPOSURE_S = 1 / 60  # of a colour image in a lit room
 # A joint lies inside the body: it is hidden only by what is nearer by more than this (metres)
 COVER_M = {"body": 0.13, "hand": 0.03, "face": 0.02}
+
+
+CLOCK_FALLS_BACK_SETS = 10  # by which a clock jumps back where that is asked for
 
 
 @dataclass(frozen=True)

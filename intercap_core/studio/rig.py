@@ -1,12 +1,11 @@
-"""Six Azure Kinects in a ring: true lenses and poses, what they claim, and when they expose.
+"""Azure Kinects in a ring: true lenses and poses, what they claim, when they expose, what fails.
 
-Lens values are typical of devices' own calibrations; no two devices are the same.
-"""
+Lens values are typical of devices' own calibrations; no two devices are the same."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from intercap_core.formats.calibration.k4a import COLOUR_MODES, DEPTH_MODES, Mod
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import invert, rigid
+from intercap_core.studio.noise import NoiseSource
 from intercap_core.studio.skeleton import turn, unit
 
 RADIUS_M, RADIUS_SPREAD_M = 2.55, 0.2
@@ -243,3 +243,66 @@ def _slips(
     missing[late].update(range(int(rng.integers(0, 3))))
     missing[early].update(range(frames - int(rng.integers(0, 3)), frames))
     return tuple(frozenset(m) for m in missing), slip
+
+
+CLOCK_JITTER_S = 100e-6  # of a subordinate's device times, at noise 1
+MAX_JITTER = 3.0  # times the above
+DEPTH_GAPS = (1, 3)  # episodes without depth in one camera
+DEPTH_GAP_FRAMES = (1, 3)
+ONE_CAMERA_EACH = (
+    "dead_half", "no_depth", "zero_depth", "same_serial", "backwards_clock", "wrong_resolution"
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Failures:
+    """Of every camera of one capture.
+
+    ``jitter_s`` (T, C): what device times are off from an even beat; ``depth_empty`` and
+    ``depth_away`` (T, C) bool: the depth image holds nothing, or there is none; ``broken``: fault
+    to the camera's index (:data:`ONE_CAMERA_EACH`).
+    """
+
+    jitter_s: np.ndarray
+    depth_empty: np.ndarray
+    depth_away: np.ndarray
+    broken: dict[str, int] = field(default_factory=dict)
+
+    @classmethod
+    def draw(
+        cls,
+        noise: NoiseSource,
+        *,
+        frames: int,
+        cameras: int,
+        faults: Sequence[str] = (),
+        depth: bool = True,
+    ) -> Failures:
+        """Decide what fails; the master's clock is the one that the sets go by."""
+        jitter = np.zeros((frames, cameras))
+        empty, away = np.zeros((2, frames, cameras), bool)
+        rng = noise.rng("clocks")
+        steps = np.clip(rng.normal(size=(frames, cameras)), -MAX_JITTER, MAX_JITTER)
+        jitter[:, 1:] = steps[:, 1:] * CLOCK_JITTER_S * noise.scale
+        rng = noise.rng("depth gaps")
+        if noise.scale > 0 and cameras > 1 and frames >= 8:
+            camera = int(rng.integers(1, cameras))
+            for _ in range(int(rng.integers(DEPTH_GAPS[0], DEPTH_GAPS[1] + 1))):
+                start = int(rng.integers(0, frames - 1))
+                length = int(rng.integers(DEPTH_GAP_FRAMES[0], DEPTH_GAP_FRAMES[1] + 1))
+                which = empty if rng.random() < 0.5 else away
+                which[start : start + length, camera] = True
+        away |= not depth
+        broken = _assigned(noise, cameras, faults)
+        if "no_depth" in broken:
+            away[:, broken["no_depth"]] = True
+        if "zero_depth" in broken:
+            empty[:, broken["zero_depth"]] = True
+        return cls(jitter, empty, away, broken)
+
+
+def _assigned(noise: NoiseSource, cameras: int, faults: Sequence[str]) -> dict[str, int]:
+    """A subordinate camera for each fault of one camera, different ones while there are enough."""
+    order = 1 + noise.rng("faults").permutation(max(cameras - 1, 1))
+    named = [fault for fault in ONE_CAMERA_EACH if fault in faults]
+    return {fault: int(order[i % len(order)]) for i, fault in enumerate(named)}

@@ -13,8 +13,6 @@ from typing import Literal, NamedTuple
 import cv2
 import numpy as np
 
-from intercap_core.studio.interactions.base import Box
-
 FLOOR_HALF_M = 6.0
 WALL_HEIGHT_M = 2.7
 WALL_DISTANCE_M = (3.0, 3.7)
@@ -23,6 +21,25 @@ TWIN_DISTANCE_M = (1.5, 1.75)
 LOW_M, STAND_M = 0.35, (0.45, 0.75)  # what is lower stands on a box of such a height
 PILLAR_DISTANCE_M, PILLAR_HALF_M, PILLAR_HEIGHT_M = (1.2, 1.5), (0.03, 0.05), 1.9
 PILLARS_MAX = 3
+
+
+@dataclass(frozen=True)
+class Box:
+    """A piece of static furniture: upright box, ``low`` and ``high`` corners (3,), heading rad
+    about its middle; ``material`` names its looks."""
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+    heading: float = 0.0
+    material: str = "wood"
+
+    def moved(self, transform: np.ndarray) -> Box:
+        """The box turned about the vertical and shifted by a transform (4, 4)."""
+        middle = (np.array(self.low) + self.high) / 2
+        shift = transform[:3, :3] @ middle + transform[:3, 3] - middle
+        low, high = np.array(self.low) + shift, np.array(self.high) + shift
+        turned = np.arctan2(transform[1, 0], transform[0, 0])
+        return Box(tuple(low), tuple(high), self.heading + float(turned), self.material)
 
 
 class Twin(NamedTuple):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -9,30 +10,29 @@ import numpy as np
 
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
-from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
+from intercap_core.config import LayoutName, ObjectEntry, StudioCapture, StudioSettings
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.transforms import invert
 from intercap_core.geometry.rigid.normals import vertex_normals
-from intercap_core.studio.failures import Failures, check_faults
+from intercap_core.studio.capture_folder import SWAPPED
 from intercap_core.studio.interactions import interaction_named
-from intercap_core.studio.interactions.base import TrueObject
-from intercap_core.studio.layouts import camera_names
-from intercap_core.studio.looks import object_colours
+from intercap_core.studio.layouts import FOLDERS, camera_names
 from intercap_core.studio.mkv import KINECT_RATES
 from intercap_core.studio.motion import Puppet
 from intercap_core.studio.noise import NoiseSource
-from intercap_core.studio.objects import true_mesh
+from intercap_core.studio.objects import TrueObject, object_colours, press_out, true_mesh
 from intercap_core.studio.passer_by import PasserBy, Passing
-from intercap_core.studio.rig import StudioRig, build_rig, started_apart
+from intercap_core.studio.rig import Failures, StudioRig, build_rig, started_apart
 from intercap_core.studio.room import Furnishing, Twin, build_room
-from intercap_core.studio.shoes import in_heavy_shoes
-from intercap_core.studio.subjects import Subject, build_names, subject_names
-from intercap_core.studio.tissue import press_out
+from intercap_core.studio.subjects import Subject, build_names, in_heavy_shoes, subject_names
 
 BARE_ROOM_SHARE = 0.2  # of the captures have a floor and nothing else
 OFF_CENTRE_M = 0.12  # how far the action is from the middle of the ring
 LOOKS = ("mesh", "plain", "printed")  # of the object, as likely as each other
 SMALL_M = 0.35  # a smaller object may be hidden from most cameras
+
+
+ANY_LAYOUT = frozenset({"dead_half", "no_depth", "zero_depth", "no_overlap"})
 
 
 @dataclass(frozen=True)
@@ -281,6 +281,30 @@ def _check_rates(capture: StudioCapture, settings: StudioSettings) -> None:
                 f"expected one of {', '.join(map(str, KINECT_RATES))} or, in layout plain, a whole "
                 "number; correct 'every'"
             )
+
+
+def check_faults(faults: Sequence[str], *, layout: LayoutName, cameras: int, frames: int) -> None:
+    """Raise UserError where a capture asks for faults that it cannot have."""
+    strange = set(faults) - ANY_LAYOUT - FOLDERS[layout].own_faults
+    if strange:
+        raise UserError(
+            f"studio: recordings of layout {layout!r} cannot have fault {min(strange)}; take the "
+            "fault out or choose another layout"
+        )
+    if "swapped_lenses" in faults and cameras <= max(SWAPPED):
+        raise UserError(
+            f"studio: fault swapped_lenses is of cameras 4 and 5, 'cameras' is {cameras}; use more"
+        )
+    if faults and cameras < 2:
+        raise UserError(
+            f"studio: faults {', '.join(faults)} need a second camera, 'cameras' is {cameras}; "
+            "use more cameras or no faults"
+        )
+    if {"dead_half", "backwards_clock"} & set(faults) and frames < 4:
+        raise UserError(
+            f"studio: faults dead_half and backwards_clock need 4 frames, 'frames' is {frames}; "
+            "make the capture longer or take the fault out"
+        )
 
 
 def _placed(rng: np.random.Generator, centre: tuple[float, float]) -> np.ndarray:

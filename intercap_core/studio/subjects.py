@@ -8,7 +8,7 @@ approximate dual quaternion blending"), with muscles that bulge and 5 to 20 mm o
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -244,3 +244,83 @@ def _quaternion_product(vector: np.ndarray, quaternion: np.ndarray) -> np.ndarra
     v, w = quaternion[..., :3], quaternion[..., 3:]
     imaginary = w * vector + np.cross(vector, v)
     return np.concatenate([imaginary, -(vector * v).sum(-1, keepdims=True)], -1)
+
+
+SOLE_M = 0.022
+LEATHER_M = (0.010, 0.015)
+THICKEST_M = 0.045  # a sole fills the arch of a foot, and no more
+SHAFT_M = 0.01  # how far above the ankles shoes end
+RIM_M = 0.02  # over which the leather gets thin there
+SLOPING = 0.3  # how far down normals point from where on the skin is over the sole
+FEET = ((7, 10), (8, 11))  # joints: ankle and ball of the left foot, of the right one
+
+
+def shoe_area(subject: Subject) -> np.ndarray:
+    """Which vertices (V,) are in the shoes."""
+    share = np.asarray(subject.weights[:, [joint for foot in FEET for joint in foot]].sum(1))
+    return (share.ravel() > 0.5) & (subject.rest[:, 1] < _top(subject))
+
+
+def in_heavy_shoes(subject: Subject, rng: np.random.Generator) -> Subject:
+    """The same person in heavy shoes, which are part of the clothing; ``rng`` draws the leather."""
+    leather = rng.uniform(*LEATHER_M)
+    down = -subject.normals(subject.rest[None])[0, :, 1]
+    clothing, height = subject.clothing.copy(), subject.rest[:, 1]
+    worn = shoe_area(subject)
+    for foot in FEET:
+        share = np.asarray(subject.weights[:, foot].sum(1)).ravel()
+        own = np.flatnonzero(worn & (share > 0.5))
+        ground = height[own].min() - SOLE_M
+        # along the normal down to the sole, but not farther to the side than leather may be thick
+        across = np.sqrt(np.maximum(1 - down[own] ** 2, 1e-6))
+        deep = (height[own] - ground) / np.maximum(down[own], SLOPING)
+        sole = np.minimum(deep, LEATHER_M[1] / across)
+        sides = leather * np.clip((_top(subject) - height[own]) / RIM_M, 0.3, 1)
+        below = np.maximum(sides, np.minimum(sole, THICKEST_M))
+        clothing[own] = np.where(down[own] > SLOPING, below, sides)
+    return replace(subject, clothing=clothing, sole_m=SOLE_M)
+
+
+def _top(subject: Subject) -> float:
+    """Height in the T-pose at which shoes end, metres."""
+    return float(subject.rest_joints[[7, 8], 1].mean()) + SHAFT_M
+
+
+SKIN = ((0.87, 0.68, 0.56), (0.72, 0.52, 0.40), (0.50, 0.34, 0.25), (0.93, 0.76, 0.66))
+HAIR = ((0.10, 0.07, 0.05), (0.28, 0.18, 0.10), (0.16, 0.15, 0.15), (0.45, 0.32, 0.18))
+SHIRTS = ((0.25, 0.38, 0.62), (0.60, 0.62, 0.64), (0.55, 0.22, 0.20), (0.20, 0.42, 0.30),
+          (0.80, 0.72, 0.45))  # fmt: skip
+TROUSERS = ((0.13, 0.15, 0.24), (0.30, 0.28, 0.25), (0.10, 0.10, 0.11), (0.42, 0.40, 0.36))
+SHOES = ((0.12, 0.12, 0.13), (0.75, 0.75, 0.74), (0.35, 0.20, 0.12))
+
+
+def body_colours(subject: Subject, rng: np.random.Generator) -> np.ndarray:
+    """Colours (V, 3) RGB in [0, 1] of the clothed surface."""
+    share = np.asarray(subject.weights.todense())
+    rest, joints = subject.rest, subject.rest_joints
+
+    def of(*names: str) -> np.ndarray:
+        return share[:, [JOINT_INDEX[n] for n in names]].sum(1)
+
+    def pick(palette: tuple[tuple[float, float, float], ...]) -> np.ndarray:
+        return np.array(palette[rng.integers(len(palette))]) * rng.uniform(0.92, 1.06)
+
+    colours = np.tile(pick(SKIN), (len(rest), 1))
+    dressed = subject.clothing > 0.001
+    legs = of("left_hip", "right_hip", "left_knee", "right_knee") + of("pelvis")
+    colours[dressed] = pick(SHIRTS)
+    colours[dressed & (legs > 0.5)] = pick(TROUSERS)
+    colours[shoe_area(subject)] = pick(SHOES)
+    eyes = joints[[JOINT_INDEX["left_eye_smplhf"], JOINT_INDEX["right_eye_smplhf"]]].mean(0)
+    head = of("head") > 0.5
+    scalp = rest[:, 1] > eyes[1] + 0.045
+    nape = (rest[:, 2] < eyes[2] - 0.095) & (rest[:, 1] > eyes[1] - 0.07)
+    colours[head & (scalp | nape)] = pick(HAIR)
+    is_eye = of("left_eye_smplhf", "right_eye_smplhf") > 0.5
+    colours[is_eye] = (0.92, 0.92, 0.92)
+    pupil = is_eye & (rest[:, 2] > rest[is_eye, 2].max() - 0.003) if is_eye.any() else is_eye
+    colours[pupil] = (0.12, 0.09, 0.07)
+    lips = (of("jaw") > 0.2) & (np.abs(rest[:, 0]) < 0.02)
+    colours[lips & head & (rest[:, 2] > eyes[2])] *= (1.0, 0.82, 0.84)
+    weave = rng.normal(1, 0.035, (len(rest), 1))
+    return np.clip(colours * weave, 0, 1)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from intercap_core.geometry.camera.rig import Camera
-from intercap_core.studio.alignment import Aligner
+from intercap_core.studio.capture_folder import Aligner
 from tests.helpers.aligned_depth import depth_on_colour as mean_of_samples
 from tests.helpers.synthetic_capture import FURNITURE, ring, room_depth
 

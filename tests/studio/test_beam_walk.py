@@ -8,9 +8,9 @@ import pytest
 from intercap_core.config import StudioCapture, StudioSettings
 from intercap_core.evaluation.motion import Floor, support
 from intercap_core.geometry.camera.transforms import apply, invert
-from intercap_core.studio.interactions.beam_walk import BEAM_HALF_M, BEAM_HEIGHT_M, BeamWalk
+from intercap_core.studio.capture import support_height
+from intercap_core.studio.interactions.alone import BEAM_HALF_M, BEAM_HEIGHT_M, BeamWalk
 from intercap_core.studio.stage import Stage
-from intercap_core.studio.truth import support_height
 
 FPS, FLOOR = 15, Floor(np.array([0.0, 0.0, 1.0]), 0.0)
 

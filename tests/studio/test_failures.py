@@ -15,11 +15,10 @@ from intercap_core.formats.calibration.k4a import DEPTH_MODES
 from intercap_core.formats.recordings.k4a import KinectFile
 from intercap_core.schemas import TRUTH
 from intercap_core.studio.capture import make_capture
-from intercap_core.studio.failures import Failures, check_faults
 from intercap_core.studio.keypoints import Detector
 from intercap_core.studio.noise import NoiseSource
 from intercap_core.studio.recording import START_US
-from intercap_core.studio.rig import StudioRig, build_rig, started_apart
+from intercap_core.studio.rig import Failures, StudioRig, build_rig, check_faults, started_apart
 from intercap_core.studio.room import build_room
 from intercap_core.studio.stage import check_capture
 

@@ -13,11 +13,11 @@ from intercap_core.errors import UserError
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.surface_samples import sample_surface
 from intercap_core.schemas import CONTACT_REGIONS
+from intercap_core.studio.capture import region_contact
 from intercap_core.studio.hands import OPEN, Hand, shape
 from intercap_core.studio.skeleton import REACH_FREE, Skeleton, turn
 from intercap_core.studio.stage import Moment, Stage
 from intercap_core.studio.subjects import Subject
-from intercap_core.studio.truth import region_contact
 
 
 @dataclass(frozen=True)

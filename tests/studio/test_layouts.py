@@ -22,12 +22,11 @@ from intercap_core.formats.recordings.layouts import open_layout
 from intercap_core.formats.recordings.source import Image
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import apply, invert
-from intercap_core.studio.alignment import Aligner
 from intercap_core.studio.capture import make_capture
-from intercap_core.studio.capture_folder import Device, Shot
-from intercap_core.studio.failures import check_faults
+from intercap_core.studio.capture_folder import Aligner, Device, Shot
 from intercap_core.studio.layouts import FOLDERS, camera_names
 from intercap_core.studio.rig import StudioRig, build_rig
+from intercap_core.studio.stage import check_faults
 
 FPS, SETS = 15, (0, 1, 4)
 LAYOUTS = get_args(LayoutName)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from intercap_core.studio.looks import object_colours
+from intercap_core.studio.objects import object_colours
 
 
 @pytest.fixture

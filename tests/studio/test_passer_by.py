@@ -16,12 +16,12 @@ from intercap_core.geometry.camera.transforms import invert
 from intercap_core.schemas import TRUTH
 from intercap_core.studio.capture import make_capture
 from intercap_core.studio.keypoints import Detector
-from intercap_core.studio.looks import body_colours
 from intercap_core.studio.noise import NoiseSource
 from intercap_core.studio.passer_by import PASSES_M, PasserBy
 from intercap_core.studio.recording import surfaces_at
 from intercap_core.studio.render import BODY, OBJECT, PASSER_BY, View, scene_of
 from intercap_core.studio.stage import Stage
+from intercap_core.studio.subjects import body_colours
 
 Entry = Callable[[str], ObjectEntry]
 CAPTURE = StudioCapture(

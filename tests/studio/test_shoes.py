@@ -13,9 +13,16 @@ from intercap_core.errors import UserError
 from intercap_core.evaluation.motion import support
 from intercap_core.evaluation.truth import Truth
 from intercap_core.studio.capture import make_capture
-from intercap_core.studio.shoes import FEET, LEATHER_M, SOLE_M, in_heavy_shoes, shoe_area
 from intercap_core.studio.stage import Stage, check_capture
-from intercap_core.studio.subjects import Subject, subject_names
+from intercap_core.studio.subjects import (
+    FEET,
+    LEATHER_M,
+    SOLE_M,
+    Subject,
+    in_heavy_shoes,
+    shoe_area,
+    subject_names,
+)
 
 Entry = Callable[[str], ObjectEntry]
 SETTINGS = StudioSettings(captures={}, cameras=1, colour_mode="720P")

@@ -10,6 +10,7 @@ import pytest
 
 from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
 from intercap_core.evaluation.motion import SLIP_S, slip_speed
+from intercap_core.studio.capture import CONTACT_M, region_contact
 from intercap_core.studio.interactions.slipping import (
     GLIDE_M,
     TURN_DEG,
@@ -19,7 +20,6 @@ from intercap_core.studio.interactions.slipping import (
     along_and_about,
 )
 from intercap_core.studio.stage import Moment, Stage
-from intercap_core.studio.truth import CONTACT_M, region_contact
 
 FPS = 15
 Entry = Callable[[str], ObjectEntry]

@@ -11,12 +11,12 @@ from intercap_core.config import SequenceEntry, StudioCapture, StudioSettings
 from intercap_core.formats.recordings.layouts import open_layout
 from intercap_core.formats.recordings.sound import SOUND_RATE, Sound
 from intercap_core.formats.recordings.sound_delays import delay_between, sound_starts
+from intercap_core.studio.capture import erring_starts
 from intercap_core.studio.capture_folder import SOUND_RATE as STUDIO_RATE
 from intercap_core.studio.capture_folder import Device, Shot
 from intercap_core.studio.layouts import FOLDERS
-from intercap_core.studio.sound import MAX_LATENCY_S, heard
+from intercap_core.studio.sensors import MAX_LATENCY_S, heard
 from intercap_core.studio.stage import Stage
-from intercap_core.studio.truth import erring_starts
 
 SECONDS = 3.0
 TRAVEL_S = 0.012  # between two places of the ring: 4 m

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from intercap_core.errors import UserError
+from intercap_core.studio.interactions.alone import BeamWalk, WalkAndWave
 from intercap_core.studio.interactions.base import Interaction
-from intercap_core.studio.interactions.beam_walk import BeamWalk
-from intercap_core.studio.interactions.bottle_drink import BottleDrink
-from intercap_core.studio.interactions.chair_sit import ChairSit
-from intercap_core.studio.interactions.checking import BottleCheck, CupCheck, FootballCheck
-from intercap_core.studio.interactions.cup_drink import CupDrink
+from intercap_core.studio.interactions.carrying import SuitcaseCarry, ToolboxCarry
+from intercap_core.studio.interactions.drinking import BottleDrink, CupDrink
 from intercap_core.studio.interactions.football_kick import FootballKick
-from intercap_core.studio.interactions.passing import BottlePass, CupPass, FootballPass
+from intercap_core.studio.interactions.presenting import (
+    BottleCheck,
+    BottlePass,
+    CupCheck,
+    CupPass,
+    FootballCheck,
+    FootballPass,
+)
+from intercap_core.studio.interactions.sitting import ChairSit, StoolSit
 from intercap_core.studio.interactions.skateboard_ride import SkateboardRide
 from intercap_core.studio.interactions.slipping import BottleRegrasp, RacquetGlide, UmbrellaTurn
-from intercap_core.studio.interactions.stool_sit import StoolSit
-from intercap_core.studio.interactions.suitcase_carry import SuitcaseCarry
 from intercap_core.studio.interactions.swinging import RacquetSwing, UmbrellaSwing
-from intercap_core.studio.interactions.toolbox_carry import ToolboxCarry
-from intercap_core.studio.interactions.walk_and_wave import WalkAndWave
 
 INTERACTIONS: dict[str, type[Interaction]] = {
     "suitcase_carry": SuitcaseCarry,

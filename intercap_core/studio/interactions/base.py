@@ -4,65 +4,16 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numpy as np
 
 from intercap_core.geometry.camera.transforms import invert
-from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.studio.controls import Wander
 from intercap_core.studio.motion import Puppet
+from intercap_core.studio.objects import TrueObject
+from intercap_core.studio.room import Box
 
 SCRIPT_S = 3.0  # a script's own length; longer recordings play it slower
-
-
-@dataclass(frozen=True)
-class TrueObject:
-    """The object as it truly is: its frame, metres; ``colours`` (V, 3) uint8 RGB."""
-
-    name: str
-    vertices: np.ndarray
-    faces: np.ndarray
-    colours: np.ndarray
-
-    @classmethod
-    def nothing(cls) -> TrueObject:
-        """What a person alone handles: a mesh without a face."""
-        vertices, faces = np.zeros((0, 3)), np.zeros((0, 3), np.int32)
-        return cls("", vertices, faces, vertices)
-
-    def __bool__(self) -> bool:
-        """Whether there is an object."""
-        return len(self.faces) > 0
-
-    @cached_property
-    def surface(self) -> DistanceField:
-        """Distances to it."""
-        return DistanceField(self.vertices, self.faces, threads=1)
-
-    @property
-    def standing_height(self) -> float:
-        """Height of the origin when the object stands on the floor."""
-        return float(-self.vertices[:, 2].min())
-
-
-@dataclass(frozen=True)
-class Box:
-    """A piece of static furniture: upright box, ``low`` and ``high`` corners (3,), heading rad
-    about its middle; ``material`` names its looks."""
-
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
-    heading: float = 0.0
-    material: str = "wood"
-
-    def moved(self, transform: np.ndarray) -> Box:
-        """The box turned about the vertical and shifted by a transform (4, 4)."""
-        middle = (np.array(self.low) + self.high) / 2
-        shift = transform[:3, :3] @ middle + transform[:3, 3] - middle
-        low, high = np.array(self.low) + shift, np.array(self.high) + shift
-        turned = np.arctan2(transform[1, 0], transform[0, 0])
-        return Box(tuple(low), tuple(high), self.heading + float(turned), self.material)
 
 
 @dataclass(frozen=True)

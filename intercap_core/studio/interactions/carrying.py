@@ -1,5 +1,4 @@
-"""Walk up to a thing that stands on the floor, take it by the handle on its top, carry it two
-steps, put it down."""
+"""Take an object that stands on the floor by its handle, carry it two steps, put it down."""
 
 from __future__ import annotations
 
@@ -197,3 +196,40 @@ class HandleCarry(Interaction):
         pose = np.where((times <= ATTACH_S)[:, None, None], self.taken, carried)
         pose = np.where((times >= RELEASE_S)[:, None, None], self.put, pose)
         return Performance(world, pelvis, pose)
+
+
+LIFT_M = (0.14, 0.20)
+
+
+class SuitcaseCarry(HandleCarry):
+    """The case's trolley bar is on the side away from the hand."""
+
+    object_class = "suitcase"
+    bar_half, beside, above = 0.008, 0.235, 0.14
+    lifted_s, lower_s = 1.55, 1.95
+    stoop_from, stoop_down, stoop_back, stoop_bend = 0.55, 0.24, 0.05, 0.42
+
+    def lifted(self) -> float:
+        return self.rng.uniform(*LIFT_M)
+
+
+ARM_SHARE = (0.83, 0.89)  # of the arm's length: how far below the shoulder the wrist carries
+SHOULDER_OF_HEIGHT = 0.81  # a standing person's shoulder, as a share of the height
+
+
+class ToolboxCarry(HandleCarry):
+    """The grip is a hand's width above the floor: knees and back bend far down."""
+
+    object_class = "toolbox"
+    bar_half, beside, above = 0.014, 0.225, 0.22
+    knuckles_aside = (0.020, 0.030, 0.040)
+    knuckles_below = (0.022, 0.028, 0.034, 0.040)
+    lifted_s, lower_s = 1.70, 1.80
+    stoop_from, stoop_down, stoop_back, stoop_bend = 0.28, 0.50, 0.08, 0.62
+
+    def lifted(self) -> float:
+        """The arm hangs almost straight while it carries."""
+        puppet = self.puppet
+        shoulder = SHOULDER_OF_HEIGHT * puppet.subject.height_m
+        wrist = shoulder - self.rng.uniform(*ARM_SHARE) * puppet.arm
+        return wrist - float((self.taken @ self.object_from_wrist)[2, 3])

@@ -9,8 +9,7 @@ from intercap_core.studio.controls import Pose, plateau, ramp
 from intercap_core.studio.hands import OPEN, RELAXED, HandShape, part_of
 from intercap_core.studio.interactions.base import transform
 from intercap_core.studio.interactions.grasps import backed_off
-from intercap_core.studio.interactions.handling import LEFT, RIGHT, Handling
-from intercap_core.studio.interactions.taking import by_the_wall
+from intercap_core.studio.interactions.handling import LEFT, RIGHT, Handling, by_the_wall
 from intercap_core.studio.motion import Trunk
 from intercap_core.studio.skeleton import turn
 
@@ -165,3 +164,19 @@ class Drinking(Handling):
     def raised(self, times: np.ndarray, side: int) -> np.ndarray:
         """The elbow is lifted a little to drink."""
         return (0.0, 0.1)[side] * plateau(times, 1.2, 1.7, 2.0, 2.4)
+
+
+class BottleDrink(Drinking):
+    """The bottle leans over the horizontal: its bottom is higher than the lips."""
+
+    object_class = "bottle"
+    tilt_deg = (66.0, 80.0)
+    head_back = 0.42
+    grip_height_m = 0.01
+    lips_at_edge = False
+
+
+class CupDrink(Drinking):
+    """The hand around the wall, the rim's near edge at the lips."""
+
+    object_class = "cup"

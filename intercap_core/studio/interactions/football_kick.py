@@ -7,8 +7,7 @@ import numpy as np
 from intercap_core.studio.controls import Footwork, Guide, Pose, Step, bump, plateau, ramp
 from intercap_core.studio.hands import RELAXED
 from intercap_core.studio.interactions.base import SCRIPT_S, Interaction, Performance
-from intercap_core.studio.interactions.feet import Foot, moved, still
-from intercap_core.studio.motion import LEG_REACH, Trunk
+from intercap_core.studio.motion import LEG_REACH, Foot, Trunk, moved, still
 from intercap_core.studio.skeleton import turn, unit
 
 RIGHT, LEFT = 1, 0

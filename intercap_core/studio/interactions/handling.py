@@ -1,4 +1,4 @@
-"""What scripts share in which hands take a thing, move it and put it down."""
+"""Base of the scripts in which hands take an object, move it and put it down."""
 
 from __future__ import annotations
 
@@ -10,9 +10,17 @@ import numpy as np
 from intercap_core.geometry.camera.transforms import invert
 from intercap_core.studio.controls import Footwork, Pose, Step, ramp
 from intercap_core.studio.hands import RELAXED, HandShape
-from intercap_core.studio.interactions.base import SCRIPT_S, Box, Interaction, Performance, upright
-from intercap_core.studio.interactions.grasps import Grip
+from intercap_core.studio.interactions.base import SCRIPT_S, Interaction, Performance, upright
+from intercap_core.studio.interactions.grasps import (
+    WRAP_OPEN,
+    Approach,
+    Grip,
+    around_wall,
+    laid_on,
+    wrapped,
+)
 from intercap_core.studio.motion import LEG_REACH, Trunk, facing
+from intercap_core.studio.room import Box
 from intercap_core.studio.skeleton import turn
 
 RIGHT, LEFT = 1, 0
@@ -232,3 +240,33 @@ def _matrices(pose: Pose) -> np.ndarray:
     result = np.broadcast_to(np.eye(4), (len(pose.position), 4, 4)).copy()
     result[:, :3, :3], result[:, :3, 3] = pose.rotation, pose.position
     return result
+
+
+PALMS_BELOW_M = 0.01  # the middle of a thing held between palms
+
+
+def between_palms(script: Handling) -> dict[int, Grip]:
+    """A palm on either side of the thing, fingers ahead and a little down."""
+    grips = {}
+    for side in SIDES:
+        inward = (-1.0, 1.0)[side]
+        at = script.taken[:3, 3] - (0.0, 0.0, PALMS_BELOW_M)
+        approach = Approach(at, np.array([0.9, 0.25 * inward, -0.35]),
+                            np.array([0.15, inward, 0.18]),
+                            floor=script.top + FINGERS_REST_M)  # fmt: skip
+        grips[side] = laid_on(script.puppet, side, script.thing.surface, script.taken, approach)
+    return grips
+
+
+def by_the_wall(script: Handling, height: float) -> Grip:
+    """The right hand around an upright wall, ``height`` metres above the thing's origin or as low
+    as the plinth lets it."""
+    at = script.taken[:3, 3] + (0, 0, height)
+    return wrapped(script.puppet, RIGHT, WRAP_OPEN, script.thing.surface, script.taken,
+                   around_wall(at, script.top + FINGERS_REST_M))  # fmt: skip
+
+
+def palm_below(script: Handling) -> Grip:
+    """The thing's bottom on the left palm, fingers ahead and to the right."""
+    below = Approach(script.taken[:3, 3], np.array([0.75, -0.65, -0.05]), np.array([0, 0, 1.0]))
+    return laid_on(script.puppet, LEFT, script.thing.surface, script.taken, below)

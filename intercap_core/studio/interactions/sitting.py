@@ -27,8 +27,7 @@ from intercap_core.studio.interactions.base import (
     transform,
     upright,
 )
-from intercap_core.studio.interactions.feet import Foot, still
-from intercap_core.studio.motion import LEG_REACH, Trunk
+from intercap_core.studio.motion import LEG_REACH, Foot, Trunk, still
 from intercap_core.studio.skeleton import local_rotations, unit
 
 RIGHT, LEFT = 1, 0
@@ -254,3 +253,102 @@ class Sitting(Interaction):
         puppet.fingers(world, LEFT, puppet.finger_track(LEFT, RELAXED, []))
         pose = np.broadcast_to(self.seat, (len(times), 4, 4)).copy()
         return Performance(world, pelvis, pose)
+
+
+HOVER_M = (0.006, 0.016)
+
+
+class StoolSit(Sitting):
+    """A round seat without a back; the left hand hangs beside its rim."""
+
+    object_class = "stool"
+    palm_at = (-0.02, -0.16)
+    hanging = 1.0
+
+    def plan(self) -> None:
+        super().plan()
+        self.hover_place = self._beside_seat(self.rng.uniform(*HOVER_M))
+
+    def turned(self) -> float:
+        return self.rng.uniform(0, np.pi / 2)
+
+    def _beside_seat(self, hover: float) -> np.ndarray:
+        """The left hand hanging beside the seat's rim, ``hover`` metres away."""
+        hand = self.puppet.hands[LEFT]
+        fingers, palm = unit(np.array([0.15, 0.10, -1.0])), np.array([0.0, -1.0, -0.1])
+        rotation = self.puppet.wrist_rotation(LEFT, fingers, palm)
+        place = np.array([0.02, 0.20, self.seat_top - 0.02]) - rotation @ hand.knuckles.mean(0)
+        return self.approached(LEFT, RELAXED, rotation, place, np.array([0, 1.0, 0]), hover)
+
+    def left_wrist(
+        self,
+        idle: Pose,
+        world: np.ndarray,
+        pelvis: np.ndarray,
+        times: np.ndarray,
+    ) -> Pose:
+        count = len(times)
+        place = self.hover_place
+        aside = place.copy()
+        aside[:3, 3] += (0.0, 0.07, 0.06)
+        wrist = idle.towards(Pose.still(aside, count), ramp(times, 0.9, SEATED_S))
+        wrist = wrist.towards(Pose.still(place, count), ramp(times, 1.38, 1.66))
+        return wrist.towards(Pose.still(aside, count), ramp(times, 1.92, 2.15))
+
+
+BACK_PRESSED_M = 0.006  # the back gives way by this much on the slats
+OVER_SEAT_M = 0.04  # what is lower meets the seat
+SITS_ABOVE_M = 0.13  # the pelvis above the seat, about
+UPRIGHT_RAD, RECLINED_RAD = 0.08, 0.65
+FARTHEST_AHEAD_M = 0.04  # of the pelvis from the seat's middle
+
+
+class ChairSit(Sitting):
+    """The chair's front is ahead; both hands come to rest on the thighs."""
+
+    object_class = "chair"
+    palm_at = (-0.02, -0.19)
+    rise_s, risen_s = 2.40, 3.20
+    sat_back = -0.12
+    front_edge, on_thigh_s = 0.262, 1.95
+    back_by_s = 0.12
+
+    def turned(self) -> float:
+        return np.pi / 2 + self.rng.normal(0, 0.03)
+
+    def sit(self) -> None:
+        """Sit as far back as an upright back has room, then lean until it is pressed."""
+        subject = self.puppet.subject
+        bones = [JOINT_INDEX[name] for name in ("pelvis", "spine1", "spine2", "spine3")]
+        share = np.asarray(subject.weights[:, bones].sum(1)).ravel()
+        back = part_of(subject, np.flatnonzero(share > 0.5))
+        when = np.array([(SEATED_S + self.rise_s) / 2])
+
+        def pressed() -> bool:
+            trunk = self.trunk(when, still=True)
+            local = local_rotations(self.puppet.trunk(trunk))
+            posed = back.skin(local, trunk.pelvis - subject.rest_joints[0]).vertices[0]
+            at = (posed - self.seat[:3, 3]) @ self.seat[:3, :3]
+            at = at[at[:, 2] + self.seat[2, 3] > self.seat_top + OVER_SEAT_M]
+            return float(self.thing.surface.signed_distance(at).min()) < -BACK_PRESSED_M
+
+        self.seated_height, self.recline = self.seat_top + SITS_ABOVE_M, UPRIGHT_RAD
+        low, high = self.sat_back, FARTHEST_AHEAD_M
+        for _ in range(12):
+            self.sat_back = (low + high) / 2
+            if pressed():
+                low = self.sat_back
+            else:
+                high = self.sat_back
+        self.sat_back = high
+        for _ in range(2):
+            super().sit()
+            low, high = 0.0, RECLINED_RAD
+            for _ in range(12):
+                self.recline = (low + high) / 2
+                if pressed():
+                    high = self.recline
+                else:
+                    low = self.recline
+            self.recline = low
+        super().sit()

@@ -9,8 +9,7 @@ import numpy as np
 from intercap_core.studio.controls import Footwork, Guide, Pose, Step, plateau, ramp
 from intercap_core.studio.hands import RELAXED
 from intercap_core.studio.interactions.base import SCRIPT_S, Interaction, Performance, upright
-from intercap_core.studio.interactions.feet import Foot, moved, still
-from intercap_core.studio.motion import LEG_REACH, Trunk
+from intercap_core.studio.motion import LEG_REACH, Foot, Trunk, moved, still
 
 RIGHT, LEFT = 1, 0
 PUSH_S, PUSHED_S, STOP_S = 0.80, 1.02, 2.15

@@ -9,10 +9,9 @@ import numpy as np
 
 from intercap_core.studio.controls import Pose, plateau, ramp
 from intercap_core.studio.hands import HandShape
-from intercap_core.studio.interactions.checking import ATTACH_S, RELEASE_S, BottleCheck
-from intercap_core.studio.interactions.handling import RIGHT
+from intercap_core.studio.interactions.handling import RIGHT, by_the_wall
+from intercap_core.studio.interactions.presenting import ATTACH_S, RELEASE_S, BottleCheck
 from intercap_core.studio.interactions.swinging import RacquetSwing, UmbrellaSwing
-from intercap_core.studio.interactions.taking import by_the_wall
 from intercap_core.studio.skeleton import turn
 
 GLIDE_M = 0.032  # along the grip, towards the head and back

@@ -1,0 +1,225 @@
+"""Take an object from a plinth and turn it before the eyes, or pass it to another plinth."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from intercap_core.studio.controls import Pose, Step, bump, plateau, ramp
+from intercap_core.studio.interactions.base import upright
+from intercap_core.studio.interactions.handling import (
+    LEFT,
+    PLINTH_HALF_M,
+    RIGHT,
+    SIDES,
+    Handling,
+    between_palms,
+    by_the_wall,
+    palm_below,
+)
+from intercap_core.studio.motion import Trunk
+
+ATTACH_S, RELEASE_S = 0.96, 2.52
+JOIN_S, PART_S = 1.56, 1.96  # while a second hand helps
+RAISED_S = (1.36, 2.12)
+
+
+class Checking(Handling):
+    """What the two ways of checking share: the path and the trunk."""
+
+    highlight = 1.75
+    centre = (0.20, 0.0)
+    top_of_height = 0.52
+    aside = 0.0
+    before_eyes = (0.0, -0.35, 0.72)  # from the head's joint: left, up, ahead, arm lengths
+    tip_deg = 35.0  # towards the eyes, and half of it away
+    spin_deg = 25.0  # about the vertical
+    roll_deg = 18.0  # to the sides
+
+    def plan(self) -> None:
+        self.set_out(self.top_of_height, self.aside)
+        self.size = self.rng.uniform(0.8, 1.2, 3)  # of each turn
+        self.order = self.rng.choice([-1.0, 1.0], 2)  # to which side first
+        self.grasp()
+
+    def grasp(self) -> None:
+        """Plan the grips."""
+        raise NotImplementedError
+
+    def trunk(self, times: np.ndarray) -> Trunk:
+        """Lean to the plinth, straighten up, look at the thing, lean again."""
+        reach = plateau(times, 0.35, 0.9, 1.0, 1.5) + plateau(times, 2.0, 2.45, 2.55, 3.0)
+        look = plateau(times, 1.1, 1.5, 2.0, 2.4)
+        trunk = self.leaning(times, reach, 0.30 * reach + 0.22 * look)
+        trunk.bend[:, 1] -= 0.06 * self.order[0] * bump(times, 1.2, 2.2)
+        return trunk
+
+    def raised(self, times: np.ndarray, side: int) -> np.ndarray:
+        """The helping arm's elbow is away from the body while its hand is before the chest."""
+        return (0.4 * plateau(times, 0.9, 1.3, 2.0, 2.4), np.zeros(len(times)))[side]
+
+    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> Pose:
+        """From the plinth to before the eyes, turned there about three axes, and back."""
+        count = len(times)
+        head = self.puppet.joint_on_trunk(world, pelvis, "head")
+        tip, spin, roll = np.radians((self.tip_deg, self.spin_deg, self.roll_deg)) * self.size
+        first, second = self.order
+        about = np.zeros((count, 3))
+        about[:, 1] = tip * (0.5 * bump(times, 1.75, 2.3) - bump(times, 1.2, 1.85))
+        about[:, 2] = spin * first * (bump(times, 1.3, 1.8) - bump(times, 1.6, 2.2))
+        about[:, 0] = roll * second * bump(times, 1.45, 2.1)
+        offset = self.puppet.arm * np.array(self.before_eyes)
+        shown = self.before_chest(world, head, offset, about)
+        lift = np.array([0.0, 0, 0.04])
+        thing = Pose.still(self.taken, count)
+        thing = thing.towards(shown, ramp(times, ATTACH_S, RAISED_S[0]), lift)
+        return thing.towards(
+            Pose.still(self.put, count), ramp(times, RAISED_S[1], RELEASE_S - 0.03), lift
+        )
+
+
+class FootballCheck(Checking):
+    """The ball between both palms."""
+
+    object_class = "football"
+    tip_deg = 40.0
+
+    def grasp(self) -> None:
+        """Both palms from the start."""
+        self.grips = between_palms(self)
+        self.hold_s = dict.fromkeys(SIDES, (ATTACH_S, RELEASE_S))
+
+
+class CheckingByTheWall(Checking):
+    """The right hand around its wall; the left comes under it while it is turned."""
+
+    top_of_height = 0.555
+    aside = -0.10
+    grip_height_m = 0.0
+
+    def grasp(self) -> None:
+        """The wall as one drinks, then the bottom on the left palm."""
+        self.grips = {RIGHT: by_the_wall(self, self.grip_height_m), LEFT: palm_below(self)}
+        self.hold_s = {RIGHT: (ATTACH_S, RELEASE_S), LEFT: (JOIN_S, PART_S)}
+        self.haste[LEFT] = 0.6
+
+
+class BottleCheck(CheckingByTheWall):
+    """The bottle by its body, its bottom on the other palm."""
+
+    object_class = "bottle"
+    grip_height_m = 0.01
+    before_eyes = (0.06, -0.42, 0.64)
+    tip_deg = 20.0
+
+
+class CupCheck(CheckingByTheWall):
+    """The cup by its wall, its bottom on the other palm; one looks into it."""
+
+    object_class = "cup"
+    tip_deg = 38.0
+
+
+PASSED_S = 2.58
+AHEAD_M = 0.50  # the thing on the second plinth, from where the person then stands
+
+
+class Passing(Handling):
+    """What the ways of passing share; the second plinth is to the left of the first."""
+
+    highlight = 1.85
+    centre = (0.15, 0.40)
+    top_of_height = 0.52
+    aside = 0.0  # of the thing, to the left
+    carried = (0.0, 0.20, 0.36)  # from the pelvis: left, up, ahead, metres
+    offered_up_m = 0.33
+
+    def plan(self) -> None:
+        rng, w = self.rng, self.puppet.hip_width * 1.05
+        turned = np.radians(rng.uniform(62, 84))
+        way = np.array([np.cos(turned), np.sin(turned)])
+        left = np.array([-way[1], way[0]])
+        stand = rng.uniform(0.50, 0.60) * way
+
+        def foot(side: int, start: float, end: float, place: np.ndarray, share: float) -> Step:
+            place = place + (w, -w)[side] * left
+            return Step(side, start, end, (float(place[0]), float(place[1])), share * turned)
+
+        self.set_out(
+            self.top_of_height,
+            self.aside,
+            [
+                foot(LEFT, 1.04, 1.40, 0.45 * stand, 0.7),
+                foot(RIGHT, 1.30, 1.70, stand, 1.0),
+                foot(LEFT, 1.62, 1.96, stand, 1.0),
+            ],
+        )
+        top = self.top - rng.uniform(0.02, 0.10)
+        table = stand + (0.40 + PLINTH_HALF_M) * way + self.aside * left
+        self.table((table[0], table[1]), (PLINTH_HALF_M, PLINTH_HALF_M), top, turned)
+        place = stand + (AHEAD_M + rng.uniform(0, 0.04)) * way
+        place = place + (self.aside + rng.uniform(-0.03, 0.03)) * left
+        heading = np.arctan2(self.taken[1, 0], self.taken[0, 0]) + turned + rng.normal(0, 0.15)
+        self.put = upright(place[0], place[1], top + self.thing.standing_height, heading)
+        self.grasp()
+
+    def grasp(self) -> None:
+        """Plan the grips."""
+        raise NotImplementedError
+
+    def trunk(self, times: np.ndarray) -> Trunk:
+        """Lean to the plinth, walk upright, offer, lean to the other plinth."""
+        reach = plateau(times, 0.35, 0.9, 1.0, 1.45) + plateau(times, 2.1, 2.5, 2.6, 3.0)
+        trunk = self.leaning(times, reach, 0.30 * reach)
+        trunk.head[:, 1] += 0.30 * plateau(times, 1.0, 1.3, 1.5, 1.9)
+        return trunk
+
+    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> Pose:
+        """From the plinth to before the belly, held out, to the other plinth."""
+        count = len(times)
+        level = np.zeros((count, 3))
+        lift = np.array([0.0, 0, 0.04])
+        carried = self.before_chest(world, pelvis, np.array(self.carried), level)
+        offer = np.array([self.carried[0], self.offered_up_m, 0.93 * self.puppet.arm])
+        level[:, 1] = 0.20  # tipped a little to whom it is offered
+        offered = self.before_chest(world, pelvis, offer, level)
+        thing = Pose.still(self.taken, count).towards(carried, ramp(times, ATTACH_S, 1.42), lift)
+        thing = thing.towards(offered, ramp(times, 1.62, 2.05))
+        return thing.towards(Pose.still(self.put, count), ramp(times, 2.12, PASSED_S - 0.03), lift)
+
+
+class PassingByTheWall(Passing):
+    """The right hand around its wall."""
+
+    top_of_height = 0.555
+    aside = -0.10
+    carried = (-0.10, 0.20, 0.36)
+    grip_height_m = 0.0
+
+    def grasp(self) -> None:
+        """The wall as one drinks."""
+        self.grips = {RIGHT: by_the_wall(self, self.grip_height_m)}
+        self.hold_s = {RIGHT: (ATTACH_S, PASSED_S)}
+
+
+class CupPass(PassingByTheWall):
+    """The cup, in one hand."""
+
+    object_class = "cup"
+
+
+class BottlePass(PassingByTheWall):
+    """The bottle, in one hand."""
+
+    object_class = "bottle"
+    grip_height_m = 0.01
+
+
+class FootballPass(Passing):
+    """The ball, between both palms."""
+
+    object_class = "football"
+
+    def grasp(self) -> None:
+        """Both palms from the start."""
+        self.grips = between_palms(self)
+        self.hold_s = dict.fromkeys(SIDES, (ATTACH_S, PASSED_S))
