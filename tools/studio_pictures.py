@@ -22,9 +22,9 @@ from intercap_core.geometry.camera.intrinsics import Intrinsics  # noqa: E402
 from intercap_core.geometry.camera.transforms import invert, rigid  # noqa: E402
 from intercap_core.studio.interactions import interaction_named  # noqa: E402
 from intercap_core.studio.recording import surfaces_at  # noqa: E402
-from intercap_core.studio.render import Photographer, View  # noqa: E402
+from intercap_core.studio.render import Photographer, RoomView  # noqa: E402
 from intercap_core.studio.skeleton import unit  # noqa: E402
-from intercap_core.studio.stage import Moment, Stage  # noqa: E402
+from intercap_core.studio.stage import StageState, StudioStage  # noqa: E402
 from intercap_core.studio.subjects import body_colours  # noqa: E402
 
 
@@ -40,7 +40,7 @@ def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
     return rigid(np.stack([right, np.cross(forward, right), forward], 1), eye)
 
 
-def picture(stage: Stage, view: View, moment: Moment, t: int) -> np.ndarray:
+def picture(stage: StudioStage, view: RoomView, moment: StageState, t: int) -> np.ndarray:
     colours = body_colours(stage.subject, stage.noise.rng("looks"))
     photographer = Photographer(view, np.ones(3), np.random.default_rng(0))
     return photographer.photograph(view.cast(surfaces_at(stage, moment, t, colours)))
@@ -60,14 +60,14 @@ def main() -> None:
         return
     interaction, subject, seed, thing = options.what
     capture = StudioCapture(interaction=interaction, subject=subject, seed=int(seed), frames=45)
-    stage = Stage(capture, StudioSettings(captures={}), object_entry(thing))
+    stage = StudioStage(capture, StudioSettings(captures={}), object_entry(thing))
     moment = stage.at(np.array(options.times))
     rows = []
     stage_from_master = invert(stage.rig.master_from_stage)
     for index in (0, 3):
         camera = stage.rig.true[index]
         pose = stage_from_master @ camera.master_from_colour
-        view = View(camera.colour.scaled(0.5), pose, stage.room, coloured=True)
+        view = RoomView(camera.colour.scaled(0.5), pose, stage.room, coloured=True)
         images = [picture(stage, view, moment, t) for t in range(len(options.times))]
         rows.append(np.hstack([im[80:460, 240:720] for im in images]))
     name = f"studio_{interaction}"
@@ -80,18 +80,18 @@ def sheet_row(interaction: str, subject: str, seed: str, times: list[float]) -> 
     capture = StudioCapture(interaction=interaction, subject=subject, seed=int(seed), frames=45,
                             room="bare")  # fmt: skip
     thing = object_entry(interaction_named(interaction).object_class)
-    stage = Stage(capture, StudioSettings(captures={}, cameras=1), thing)
+    stage = StudioStage(capture, StudioSettings(captures={}, cameras=1), thing)
     place = stage.stage_from_script
     target = np.array([*stage.interaction.centre, 0.95])
     eye = target + 2.6 * np.array([0.60, -0.72, 0.34])
     eye, target = (place[:3, :3] @ at + place[:3, 3] for at in (eye, target))
-    view = View(Intrinsics(300, 330, 400.0, 400.0, 149.5, 164.5), look_at(eye, target),
+    view = RoomView(Intrinsics(300, 330, 400.0, 400.0, 149.5, 164.5), look_at(eye, target),
                 stage.room, coloured=True)  # fmt: skip
     moment = stage.at(np.array(times))
     return np.hstack([picture(stage, view, moment, t) for t in range(len(times))])
 
 
-def close_ups(stage: Stage, times: list[float]) -> np.ndarray:
+def close_ups(stage: StudioStage, times: list[float]) -> np.ndarray:
     """Each time from two sides, centred where body and object are nearest."""
     moment = stage.at(np.array(times))
     lens = Intrinsics(420, 420, 900.0, 900.0, 209.5, 209.5)
@@ -99,13 +99,13 @@ def close_ups(stage: Stage, times: list[float]) -> np.ndarray:
     for t in range(len(times)):
         pose = moment.stage_from_object[t]
         local = (moment.body[t] - pose[:3, 3]) @ pose[:3, :3]
-        distance = stage.thing.surface.signed_distance(local)
+        distance = stage.prop.surface.signed_distance(local)
         target = moment.body[t][np.argsort(distance)[:60]].mean(0)
         away = unit(target - moment.joints[t, 0])
         for row, side in enumerate((1.0, -1.0)):
             across = np.cross(away, [0, 0, 1.0]) * side
             eye = target + 0.95 * unit(0.7 * away * (1, 1, 0) + 0.9 * across + (0, 0, 0.45))
-            view = View(lens, look_at(eye, target), stage.room, coloured=True)
+            view = RoomView(lens, look_at(eye, target), stage.room, coloured=True)
             rows[row].append(picture(stage, view, moment, t))
     return np.vstack([np.hstack(row) for row in rows])
 

@@ -22,12 +22,12 @@ from intercap_core.progress import Progress
 from intercap_core.schemas import CONTACT_REGIONS, TRUTH
 from intercap_core.studio.keypoints import Detector
 from intercap_core.studio.layouts import FOLDERS
-from intercap_core.studio.masks import Segmenter
-from intercap_core.studio.recording import Kinect, Recorded
+from intercap_core.studio.masks import MaskSimulator
+from intercap_core.studio.recording import CameraRecord, Kinect
 from intercap_core.studio.render import scene_of
 from intercap_core.studio.rig import STAGGER_S
 from intercap_core.studio.skeleton import turn, unit
-from intercap_core.studio.stage import Moment, Stage
+from intercap_core.studio.stage import StageState, StudioStage
 
 CONTACT_M = 0.0045
 SEEN_PIXELS, SEEN_SHARE = 40, 0.05  # of the object, for a view to count as seeing it
@@ -38,11 +38,11 @@ ANNOTATION_ERROR_M, ANNOTATION_ERROR_DEG, ANNOTATION_ERROR_FRAMES = 0.010, 5.0, 
 
 def write_truth(
     path: Path,
-    stage: Stage,
-    moment: Moment,
+    stage: StudioStage,
+    moment: StageState,
     sequence: str,
     capture: StudioCapture,
-    recorded: Sequence[Recorded],
+    recorded: Sequence[CameraRecord],
 ) -> np.ndarray:
     """Write the truth artefact of the set times' ``moment``; ``recorded`` by each camera.
 
@@ -63,7 +63,7 @@ def write_truth(
         sequence=sequence,
         interaction=capture.interaction,
         subject=capture.subject,
-        object=stage.thing.name,
+        object=stage.prop.name,
         ground_offset=float(-normal @ master[:3, 3]),
         fps=float(stage.fps),
         room=stage.furnishing,
@@ -80,9 +80,9 @@ def write_truth(
         file.put("correspondence_weights", stage.subject.fitted_bary)
         file.put("joints", stage.to_master(moment.joints))
         file.put("fingertips", stage.to_master(moment.tips))
-        if stage.thing:
-            file.put("object_vertices", stage.thing.vertices)
-            file.put("object_faces", stage.thing.faces)
+        if stage.prop:
+            file.put("object_vertices", stage.prop.vertices)
+            file.put("object_faces", stage.prop.faces)
             file.put("rotation", pose[:, :3, :3])
             file.put("translation", pose[:, :3, 3])
             file.put("object_views", views.sum(1))
@@ -99,34 +99,34 @@ def write_truth(
         if stage.interaction.leaves_floor:
             file.put("support_height", support_height(stage, moment))
         file.put("body_visible", body_visible)
-        if stage.thing:
+        if stage.prop:
             file.put("object_visible", object_visible)
     return contact
 
 
-def _faults(stage: Stage, capture: StudioCapture) -> list[str]:
+def _faults(stage: StudioStage, capture: StudioCapture) -> list[str]:
     """The faults that were asked for, those of one camera with its name."""
     names, broken = stage.rig.true.names, stage.failures.broken
     return [f"{kind} {names[broken[kind]]}" if kind in broken else kind for kind in capture.faults]
 
 
-def region_contact(stage: Stage, moment: Moment) -> np.ndarray:
+def region_contact(stage: StudioStage, moment: StageState) -> np.ndarray:
     """(T, R): some point of the region is within ``CONTACT_M`` of the object."""
     regions = stage.fitted.regions
     result = np.zeros((len(moment.body), len(CONTACT_REGIONS)), bool)
-    if not stage.thing:
+    if not stage.prop:
         return result
     for t, pose in enumerate(moment.stage_from_object):
         points = stage.subject.on_fitted_topology(moment.body[t : t + 1])[0]
         local = (points - pose[:3, 3]) @ pose[:3, :3]
         near = ((local > stage.bounds[0] - 0.01) & (local < stage.bounds[1] + 0.01)).all(1)
         touching = np.zeros(len(points), bool)
-        touching[near] = stage.thing.surface.signed_distance(local[near]) <= CONTACT_M
+        touching[near] = stage.prop.surface.signed_distance(local[near]) <= CONTACT_M
         result[t] = [touching[regions[name]].any() for name in CONTACT_REGIONS]
     return result
 
 
-def support_height(stage: Stage, moment: Moment) -> np.ndarray:
+def support_height(stage: StudioStage, moment: StageState) -> np.ndarray:
     """(T, 2): the highest surface of the room under each sole, left and right, above the floor."""
     room, regions = stage.room, stage.fitted.regions
     scene = scene_of((room.vertices, room.faces))
@@ -141,20 +141,20 @@ def support_height(stage: Stage, moment: Moment) -> np.ndarray:
     return result
 
 
-def visible(stage: Stage, moment: Moment) -> tuple[np.ndarray, np.ndarray]:
+def visible(stage: StudioStage, moment: StageState) -> tuple[np.ndarray, np.ndarray]:
     """Which body vertices (T, V), clothed, and object vertices (T, Vo) some camera truly sees."""
-    thing, faces = stage.thing, stage.subject.faces
+    prop, faces = stage.prop, stage.subject.faces
     count = moment.clothed.shape[1]
-    result = np.zeros((len(moment.clothed), count + len(thing.vertices)), bool)
+    result = np.zeros((len(moment.clothed), count + len(prop.vertices)), bool)
     stage_from_master = np.linalg.inv(stage.rig.master_from_stage)
     passing = stage.passer_by.at(stage.set_times) if stage.passer_by else None
     for t, pose in enumerate(moment.stage_from_object):
-        moved = thing.vertices @ pose[:3, :3].T + pose[:3, 3]
-        drawn = [(moved, thing.faces)] if thing else []
+        moved = prop.vertices @ pose[:3, :3].T + pose[:3, 3]
+        drawn = [(moved, prop.faces)] if prop else []
         points = np.concatenate([moment.clothed[t], moved])
         normals = np.concatenate(
             [stage.subject.normals(moment.clothed[t][None])[0],
-             stage.thing_normals @ pose[:3, :3].T]
+             stage.prop_normals @ pose[:3, :3].T]
         )  # fmt: skip
         room = stage.room
         if passing and passing.present[t]:
@@ -173,7 +173,9 @@ def visible(stage: Stage, moment: Moment) -> tuple[np.ndarray, np.ndarray]:
     return result[:, :count], result[:, count:]
 
 
-def erring_annotation(stage: Stage, moment: Moment, contact: np.ndarray) -> dict[str, Any]:
+def erring_annotation(
+    stage: StudioStage, moment: StageState, contact: np.ndarray
+) -> dict[str, Any]:
     """An annotation as a person makes it: off by up to 10 mm, 5 degrees, 5 frames."""
     rng, scale = stage.noise.rng("annotation"), min(stage.noise.scale, 1.0)
 
@@ -196,7 +198,7 @@ def erring_annotation(stage: Stage, moment: Moment, contact: np.ndarray) -> dict
     for angle in np.arange(4) * np.pi / 2 + rng.uniform(0, 1):
         point = np.array([1.2 * np.cos(angle), 1.2 * np.sin(angle), 0.0])
         floor.append((stage.to_master(point) + off(ANNOTATION_ERROR_M)).round(5).tolist())
-    if not stage.thing:
+    if not stage.prop:
         return {"floor": floor}
     return {
         "contact": intervals,
@@ -209,7 +211,7 @@ def erring_annotation(stage: Stage, moment: Moment, contact: np.ndarray) -> dict
     }
 
 
-def erring_starts(stage: Stage, sigma: float) -> dict[str, Any]:
+def erring_starts(stage: StudioStage, sigma: float) -> dict[str, Any]:
     """When each camera's first image was taken, as somebody reads it off a clock that counts the
     hours of a day, wrong by ``sigma`` s."""
     rng = stage.noise.rng("stated starts")
@@ -257,11 +259,11 @@ def make_capture(
         shutil.rmtree(output)
     output.mkdir(parents=True)
     (output / MARK).touch()
-    stage = Stage(capture, settings, objects)
+    stage = StudioStage(capture, settings, objects)
     folder = FOLDERS[capture.layout](output, capture, stage.failures.broken)
     detector = Detector.build(stage.noise, stage.frames, capture.keypoint_bias)
-    segmenter = Segmenter(
-        stage.noise, stage.frames, stage.thing.name, passer_by=stage.passer_by is not None
+    segmenter = MaskSimulator(
+        stage.noise, stage.frames, stage.prop.name, passer_by=stage.passer_by is not None
     )
     recorded = []
     progress = Progress(log, "recorded", len(stage.rig.true), "cameras")

@@ -111,7 +111,7 @@ class Device:
 
 
 @dataclass(frozen=True)
-class Shot:
+class DeviceFrame:
     """What a device delivers of set ``t``: a JPEG, depth (H, W) uint16 mm or None, and inertial
     samples (acceleration, turning rate, device time)."""
 
@@ -126,7 +126,7 @@ class CameraFiles(ABC):
     """One camera's files, open; use as a context manager."""
 
     @abstractmethod
-    def write(self, shot: Shot) -> None:
+    def write(self, shot: DeviceFrame) -> None:
         """Add a shot."""
 
     def close(self) -> None:  # noqa: B027 (folders have nothing to close)
@@ -199,10 +199,10 @@ class ImageFiles(CameraFiles):
         self._aligner = aligner
 
     @abstractmethod
-    def _paths(self, shot: Shot) -> tuple[Path | None, Path]:
+    def _paths(self, shot: DeviceFrame) -> tuple[Path | None, Path]:
         """Where colour (None: no file of its own) and depth go."""
 
-    def write(self, shot: Shot) -> None:
+    def write(self, shot: DeviceFrame) -> None:
         colour, depth = self._paths(shot)
         if colour is not None:
             colour.parent.mkdir(parents=True, exist_ok=True)

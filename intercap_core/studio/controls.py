@@ -14,14 +14,6 @@ from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
 from intercap_core.studio.skeleton import blend
 
-GRID_STEP_S = 0.005
-GRID_MARGIN_S = 1.0
-BODY_LAG_S = 0.11  # the trunk follows the feet as if smoothed by this much
-SWAY_TO_STANCE = 0.35  # share of the way to the standing foot that the pelvis shifts in a step
-STEP_LIFT_M = 0.075
-STEP_UP_SHARE = 0.55  # of a step's time in which a foot is brought up, or down, an edge
-SOLE_FRONT_M = 0.12  # the ball of the foot, ahead of the ankle
-
 
 def ramp(times: np.ndarray, start: float, end: float) -> np.ndarray:
     """0 before ``start``, 1 after ``end``, least jerk between (Flash and Hogan 1985)."""
@@ -68,27 +60,29 @@ class Wander:
 
 
 @dataclass(frozen=True)
-class Pose:
+class WristPose:
     """Where a wrist is wanted: positions (N, 3) and rotations stage_from_rest (N, 3, 3)."""
 
     position: np.ndarray
     rotation: np.ndarray
 
     @classmethod
-    def still(cls, transform: np.ndarray, count: int) -> Pose:
+    def still(cls, transform: np.ndarray, count: int) -> WristPose:
         """One transform (4, 4) at all of ``count`` moments."""
         return cls(
             np.broadcast_to(transform[:3, 3], (count, 3)),
             np.broadcast_to(transform[:3, :3], (count, 3, 3)),
         )
 
-    def towards(self, other: Pose, share: np.ndarray, arc: np.ndarray | None = None) -> Pose:
+    def towards(
+        self, other: WristPose, share: np.ndarray, arc: np.ndarray | None = None
+    ) -> WristPose:
         """Go to ``other`` by ``share`` (N,), over a detour of ``arc`` (3,) metres in the middle."""
         s = share[:, None]
         position = (1 - s) * self.position + s * other.position
         if arc is not None:
             position = position + 4 * s * (1 - s) * arc
-        return Pose(position, blend(self.rotation, other.rotation, share))
+        return WristPose(position, blend(self.rotation, other.rotation, share))
 
 
 @dataclass(frozen=True)
@@ -136,6 +130,13 @@ class Footwork:
     ankle_height: np.ndarray
     end_s: float
     guides: Sequence[Guide] = ()
+    grid_step_s = 0.005  # sampling of the pelvis track
+    grid_margin_s = 1.0  # of the track before and after the script
+    body_lag_s = 0.11  # the trunk follows the feet, smoothed by this standard deviation
+    sway_to_stance = 0.35  # share of the way to the standing foot that the pelvis shifts in a step
+    step_lift_m = 0.075  # height of a foot in the middle of a step, metres
+    step_up_share = 0.55  # share of a step's time in which a foot is brought up, or down, an edge
+    sole_front_m = 0.12  # the ball of the foot, ahead of the ankle, metres
 
     def feet(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Ankles (N, 2, 3), headings (N, 2), pitch (N, 2; positive toes down) at ``times``."""
@@ -155,9 +156,9 @@ class Footwork:
             roll = np.sin(np.pi * u) ** 3 * np.cos(np.pi * u) * min(1.0, length / 0.4)
             roll = np.where((u > 0) & (u < 1), roll * (0.9 + 0.25 * np.cos(np.pi * u)), 0)
             pitch[:, step.foot] += roll
-            lift = STEP_LIFT_M * min(1.0, 0.4 + length / 0.5) * np.sin(np.pi * u) ** 2
+            lift = self.step_lift_m * min(1.0, 0.4 + length / 0.5) * np.sin(np.pi * u) ** 2
             # the ball or the heel stays above the floor as the foot rolls
-            ankle[:, step.foot, 2] += lift + SOLE_FRONT_M * roll**2 / np.hypot(roll, 0.12)
+            ankle[:, step.foot, 2] += lift + self.sole_front_m * roll**2 / np.hypot(roll, 0.12)
             ankle[:, step.foot, 2] += self._rise(times, step, raised[step.foot])
             if step.aside:
                 out = (step.aside, -step.aside)[step.foot] * np.sin(np.pi * u) ** 2
@@ -178,7 +179,7 @@ class Footwork:
     @staticmethod
     def _rise(times: np.ndarray, step: Step, before: float) -> np.ndarray:
         """Metres (N,) by which a step brings a foot up from ``before``: up first, down last."""
-        rise, reach = step.height - before, STEP_UP_SHARE * (step.end - step.start)
+        rise, reach = step.height - before, Footwork.step_up_share * (step.end - step.start)
         if rise > 0:
             return rise * ramp(times, step.start, step.start + reach)
         return rise * ramp(times, step.end - reach, step.end)
@@ -197,13 +198,15 @@ class Footwork:
         ``leg`` usable length hip to ankle, ``hip_width`` from the midline, ``hip_drop`` the hips
         below the pelvis, ``stand`` the highest pelvis above what one stands on, all metres.
         """
-        grid = np.arange(-GRID_MARGIN_S, self.end_s + GRID_MARGIN_S, GRID_STEP_S)
+        grid = np.arange(-self.grid_margin_s, self.end_s + self.grid_margin_s, self.grid_step_s)
         ankle, heading, _ = self.feet(grid)
         middle = ankle[:, :, :2].mean(1)
         for step in self.steps:
             stance = ankle[:, 1 - step.foot, :2] - middle
-            middle = middle + SWAY_TO_STANCE * bump(grid, step.start, step.end)[:, None] * stance
-        lag = BODY_LAG_S / GRID_STEP_S
+            middle = (
+                middle + self.sway_to_stance * bump(grid, step.start, step.end)[:, None] * stance
+            )
+        lag = self.body_lag_s / self.grid_step_s
         middle = gaussian_filter1d(middle, lag, axis=0, mode="nearest")
         facing = gaussian_filter1d(heading.mean(1), lag, mode="nearest")
         across = np.stack([-np.sin(facing), np.cos(facing)], 1)
@@ -213,7 +216,7 @@ class Footwork:
             far = np.linalg.norm(ankle[:, foot, :2] - hip, axis=1)
             reach = np.sqrt(np.maximum(leg**2 - far**2, 0.01)) + ankle[:, foot, 2] + hip_drop
             top = np.minimum(top, reach)
-        window = int(6 * 0.05 / GRID_STEP_S) | 1
-        top = gaussian_filter1d(minimum_filter1d(top, window, mode="nearest"), 0.05 / GRID_STEP_S,
-                                mode="nearest", truncate=3.0)  # fmt: skip
+        window = int(6 * 0.05 / self.grid_step_s) | 1
+        lowest = minimum_filter1d(top, window, mode="nearest")
+        top = gaussian_filter1d(lowest, 0.05 / self.grid_step_s, mode="nearest", truncate=3.0)
         return CubicSpline(grid, np.column_stack([middle, top, facing]))

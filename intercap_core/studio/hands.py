@@ -15,14 +15,12 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.geometry.rigid.distance import DistanceField
-from intercap_core.studio.skeleton import Skeleton, turn, unit
+from intercap_core.studio.skeleton import PuppetSkeleton, turn, unit
 from intercap_core.studio.subjects import Subject
 
 FINGERS = ("index", "middle", "pinky", "ring", "thumb")  # in the order of the joints
 THUMB = FINGERS.index("thumb")
 TISSUE_M = 0.0012  # a finger closes until its skin is pressed in by this much
-SCAN_DEG = 5.0
-BISECTIONS = 8
 # Largest flexion of MCP, PIP, DIP, and of the thumb's CMC, MCP, IP, degrees (AAOS tables)
 LIMITS = {"finger": (85.0, 100.0, 65.0), "thumb": (35.0, 50.0, 65.0)}
 
@@ -65,12 +63,15 @@ FLAT = shape((-3, 3, 2), (0, 2, 4), 5, 4)
 class Hand:
     """One hand of a subject: ``side`` 0 left, 1 right."""
 
+    scan_deg = 5.0  # step at which flexion is scanned for contact
+    bisections = 8  # of the flexion at contact
+
     def __init__(self, subject: Subject, side: int) -> None:
         self.side = side
         self.name = ("left", "right")[side]
         self.first = 25 + 15 * side
         self.wrist = JOINT_INDEX[f"{self.name}_wrist"]
-        self.rest = Skeleton(subject.rest_joints)
+        self.rest = PuppetSkeleton(subject.rest_joints)
         self.out = np.array([1.0 if side == 0 else -1.0, 0, 0])  # where the fingers point at rest
         self.palm = np.array([0.0, -1, 0])  # where the palm faces at rest
         self.radial = np.array([0.0, 0, 1])  # where the thumb is at rest
@@ -164,7 +165,7 @@ class Hand:
                     points = self.skin(poses)[:, moved]
                     return self._distance(points, surface, object_from_wrist)
 
-                angles = np.arange(flexion[f, j], largest[j] + SCAN_DEG, SCAN_DEG)
+                angles = np.arange(flexion[f, j], largest[j] + self.scan_deg, self.scan_deg)
                 if len(angles) < 2:
                     continue
                 hits = np.flatnonzero(least(angles) < -tissue)
@@ -173,7 +174,7 @@ class Hand:
                     continue
                 low = angles[max(hits[0] - 1, 0)]
                 high = angles[hits[0]] if hits[0] else low
-                for _ in range(BISECTIONS):
+                for _ in range(self.bisections):
                     middle = (low + high) / 2
                     if least(np.array([middle]))[0] < -tissue:
                         high = middle

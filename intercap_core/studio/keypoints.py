@@ -16,19 +16,6 @@ from intercap_core.body.keypoints import BODY, CONTOUR, FACE, KEYPOINT_NAMES, LE
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.studio.noise import NoiseSource
 
-BODY_BIAS_M = (0.010, 0.020)  # fixed, of each body joint
-HAND_BIAS_M, FACE_BIAS_M = (0.002, 0.005), (0.001, 0.004)
-VIEW_BIAS_PX = 2.0  # at 1080p
-JITTER_PX, HAND_JITTER_PX, FACE_JITTER_PX = 2.4, 2.0, 1.2
-FAST_JITTER = 0.4  # share of the jitter that changes from frame to frame
-JITTER_S = 0.5
-HIDDEN_SHIFT_M, HIDDEN_HAND_SHIFT_M = 0.045, 0.030
-SWAP_PROBABILITY, SWAP_S = 0.015, 0.3
-MISS_PROBABILITY, MISS_S = 0.012, 0.25
-BYSTANDER_PROBABILITY, BYSTANDER_S = 0.08, 1.0
-FEWEST_SEEN = 8  # of a passer-by's 25 body joints, or nobody is found
-BLIND = 0.35  # how little the confidence knows about the true error, 0 all to 1 nothing
-
 _SWAPPED = np.arange(135)
 for _i, _name in enumerate(KEYPOINT_NAMES[:25]):
     if _name.startswith("left_"):
@@ -48,6 +35,25 @@ class Detector:
     noise: NoiseSource
     frames: int
     body_bias: np.ndarray
+    body_bias_m = (0.010, 0.020)  # range of the fixed bias of each body joint, metres
+    hand_bias_m = (0.002, 0.005)  # of each hand joint, metres
+    face_bias_m = (0.001, 0.004)  # of each face point, metres
+    view_bias_px = 2.0  # standard deviation of the bias of a view, px at 1080p
+    jitter_px = 2.4  # of body joints, px at 1080p
+    hand_jitter_px = 2.0  # of hand joints, px at 1080p
+    face_jitter_px = 1.2  # of face points, px at 1080p
+    fast_jitter = 0.4  # share of the jitter that is independent from frame to frame
+    jitter_s = 0.5  # correlation time of the rest
+    hidden_shift_m = 0.045  # error of a hidden body joint, metres
+    hidden_hand_shift_m = 0.030  # error of a hidden hand joint, metres
+    swap_probability = 0.015  # of an exchange of left and right
+    swap_s = 0.3  # duration of an exchange
+    miss_probability = 0.012  # of a person who is not detected
+    miss_s = 0.25  # duration of a miss
+    bystander_probability = 0.08  # of a person who does not exist
+    bystander_s = 1.0  # duration of a false person
+    fewest_visible = 8  # visible body joints of 25 below which a passer-by is not detected
+    blind = 0.35  # share of the confidence that is independent of the true error
 
     @classmethod
     def build(cls, noise: NoiseSource, frames: int, body_bias: float = 1.0) -> Detector:
@@ -55,9 +61,9 @@ class Detector:
         cameras."""
         rng = noise.detector_rng("keypoint bias")
         size = np.empty(135)
-        size[BODY] = body_bias * rng.uniform(*BODY_BIAS_M, 25)
-        size[25:67] = rng.uniform(*HAND_BIAS_M, 42)
-        size[67:] = rng.uniform(*FACE_BIAS_M, 68)
+        size[BODY] = body_bias * rng.uniform(*cls.body_bias_m, 25)
+        size[25:67] = rng.uniform(*cls.hand_bias_m, 42)
+        size[67:] = rng.uniform(*cls.face_bias_m, 68)
         size[[0, 15, 16, 17, 18]] *= 0.35  # nose, eyes, ears are seen, not guessed
         direction = rng.normal(size=(135, 3))
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -86,21 +92,25 @@ class Detector:
         unit_px = per_metre / 370.0  # 1 where the subject is as large as at 2.5 m in 1080p
 
         jitter = np.empty(135)
-        jitter[BODY], jitter[25:67], jitter[67:] = JITTER_PX, HAND_JITTER_PX, FACE_JITTER_PX
-        slow = noise.process(rng, self.frames, 270, JITTER_S).reshape(-1, 135, 2)
+        jitter[BODY], jitter[25:67], jitter[67:] = (
+            self.jitter_px,
+            self.hand_jitter_px,
+            self.face_jitter_px,
+        )
+        slow = noise.process(rng, self.frames, 270, self.jitter_s).reshape(-1, 135, 2)
         fast = noise.tails(rng.normal(size=slow.shape))
-        group = noise.process(rng, self.frames, 4, JITTER_S).reshape(-1, 2, 2)
-        wander = np.sqrt(1 - FAST_JITTER**2) * slow + FAST_JITTER * fast
+        group = noise.process(rng, self.frames, 4, self.jitter_s).reshape(-1, 2, 2)
+        wander = np.sqrt(1 - self.fast_jitter**2) * slow + self.fast_jitter * fast
         wander[:, LEFT_HAND] += 0.9 * group[:, :1]
         wander[:, RIGHT_HAND] += 0.9 * group[:, 1:]
         error = wander * (jitter * scale)[:, None]
-        view_bias = noise.tails(rng.normal(size=(135, 2))) * VIEW_BIAS_PX * scale
+        view_bias = noise.tails(rng.normal(size=(135, 2))) * self.view_bias_px * scale
         view_bias[67:] *= 0.4
         error += view_bias
 
-        hidden_share = noise.process(rng, self.frames, 270, JITTER_S).reshape(-1, 135, 2)
-        shift = np.full(135, HIDDEN_SHIFT_M)
-        shift[25:67], shift[67:] = HIDDEN_HAND_SHIFT_M, 0.015
+        hidden_share = noise.process(rng, self.frames, 270, self.jitter_s).reshape(-1, 135, 2)
+        shift = np.full(135, self.hidden_shift_m)
+        shift[25:67], shift[67:] = self.hidden_hand_shift_m, 0.015
         hallucinated = hidden_share * shift[:, None] * 370.0 * scale
         error += np.where(hidden[..., None], hallucinated, 0)
         pixels = pixels + error * unit_px
@@ -130,7 +140,7 @@ class Detector:
         chance = self.noise.process(rng, self.frames, 135, 0.3)
         guess = 0.86 - 0.012 * size - 0.22 * hidden + 0.08 * chance
         ignorant = 0.72 + 0.13 * self.noise.process(rng, self.frames, 135, 0.3)
-        confidence = (1 - BLIND) * guess + BLIND * ignorant
+        confidence = (1 - self.blind) * guess + self.blind * ignorant
         confidence[:, 25:67] -= 0.12
         return np.clip(confidence, 0.02, 0.98)
 
@@ -141,9 +151,9 @@ class Detector:
         confidence: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Left and right of the whole body or of the legs, exchanged for a short while."""
-        chance = np.full((self.frames, 2), SWAP_PROBABILITY)
-        shared = self.noise.process(rng, self.frames, 1, SWAP_S)[:, 0]
-        swapped = self.noise.episodes(rng, self.frames, chance, shared, SWAP_S, 0.0)
+        chance = np.full((self.frames, 2), self.swap_probability)
+        shared = self.noise.process(rng, self.frames, 1, self.swap_s)[:, 0]
+        swapped = self.noise.episodes(rng, self.frames, chance, shared, self.swap_s, 0.0)
         pixels, confidence = pixels.copy(), confidence.copy()
         for t in np.flatnonzero(swapped.any(1)):
             rows = np.arange(67) if swapped[t, 0] else _LEGS
@@ -159,11 +169,13 @@ class Detector:
         rng = noise.detector_rng("people", camera.name)
         one = np.ones((self.frames, 1))
         shared = noise.detector_rng("people")
-        common = noise.process(shared, self.frames, 1, MISS_S)[:, 0]
-        missed = noise.episodes(rng, self.frames, one * MISS_PROBABILITY, common, MISS_S, 0.3)[:, 0]
-        common = noise.process(shared, self.frames, 1, BYSTANDER_S)[:, 0]
+        common = noise.process(shared, self.frames, 1, self.miss_s)[:, 0]
+        missed = noise.episodes(
+            rng, self.frames, one * self.miss_probability, common, self.miss_s, 0.3
+        )[:, 0]
+        common = noise.process(shared, self.frames, 1, self.bystander_s)[:, 0]
         bystander = noise.episodes(
-            rng, self.frames, one * BYSTANDER_PROBABILITY, common, BYSTANDER_S, 0.4
+            rng, self.frames, one * self.bystander_probability, common, self.bystander_s, 0.4
         )[:, 0]
         width, height = camera.colour.width, camera.colour.height
         place = np.array([rng.uniform(0.1, 0.9) * width, rng.uniform(0.3, 0.5) * height])
@@ -192,9 +204,11 @@ class Detector:
         noise = self.noise
         rng = noise.detector_rng("passer-by", camera.name)
         one, common = np.ones((self.frames, 1)), np.zeros(self.frames)
-        missed = noise.episodes(rng, self.frames, one * MISS_PROBABILITY, common, MISS_S, 0.0)[:, 0]
+        missed = noise.episodes(
+            rng, self.frames, one * self.miss_probability, common, self.miss_s, 0.0
+        )[:, 0]
         seen = (passer_by[:, BODY, 2] > 0) & ~hidden[:, BODY]
-        found = (seen.sum(1) >= FEWEST_SEEN) & ~missed
+        found = (seen.sum(1) >= self.fewest_visible) & ~missed
         result = []
         for t, have in enumerate(people):
             place = int(rng.integers(len(have) + 1))

@@ -30,8 +30,8 @@ from intercap_core.studio.capture_folder import (
     CameraFiles,
     CaptureFolder,
     Device,
+    DeviceFrame,
     ImageFiles,
-    Shot,
 )
 from intercap_core.studio.mkv import MkvWriter
 from intercap_core.studio.rig import STAGGER_S
@@ -78,7 +78,7 @@ class _KinectFile(CameraFiles):
         )
         self._last_us = 0
 
-    def write(self, shot: Shot) -> None:
+    def write(self, shot: DeviceFrame) -> None:
         if shot.time_us < self._last_us:
             self._writer.turn_back()
         self._last_us = shot.time_us
@@ -134,7 +134,7 @@ class _ReleaseFiles(ImageFiles):
         super().__init__(aligner)
         self._folder, self._fps = folder, fps
 
-    def _paths(self, shot: Shot) -> tuple[Path, Path]:
+    def _paths(self, shot: DeviceFrame) -> tuple[Path, Path]:
         name = f"{_release_number(shot.t, self._fps):05d}"
         return self._folder / "color" / f"{name}.jpg", self._folder / "depth" / f"{name}.png"
 
@@ -196,7 +196,7 @@ class _BehaveFiles(ImageFiles):
         super().__init__(aligner)
         self._folder, self._name, self._fps = folder, name, fps
 
-    def _paths(self, shot: Shot) -> tuple[Path, Path]:
+    def _paths(self, shot: DeviceFrame) -> tuple[Path, Path]:
         folder = _behave_frame(self._folder, shot.t, self._fps)
         return folder / f"{self._name}.color.jpg", folder / f"{self._name}.depth.png"
 
@@ -241,11 +241,11 @@ class _PlainFiles(ImageFiles):
         self._folder = folder
         self._times: list[str] = []
 
-    def _paths(self, shot: Shot) -> tuple[Path, Path]:
+    def _paths(self, shot: DeviceFrame) -> tuple[Path, Path]:
         name = f"{shot.t:06d}"
         return self._folder / f"{name}.jpg", self._folder / "depth" / f"{name}.png"
 
-    def write(self, shot: Shot) -> None:
+    def write(self, shot: DeviceFrame) -> None:
         super().write(shot)
         self._times.append(f"{shot.t:06d}, {shot.time_us / 1e6:.6f}\n")
 
@@ -270,10 +270,10 @@ class _PlainVideo(ImageFiles):
         if device.sound is not None:
             self._write_sound(device.sound)
 
-    def _paths(self, shot: Shot) -> tuple[Path | None, Path]:
+    def _paths(self, shot: DeviceFrame) -> tuple[Path | None, Path]:
         return None, self._folder / "depth" / f"{len(self._times):06d}.png"
 
-    def write(self, shot: Shot) -> None:
+    def write(self, shot: DeviceFrame) -> None:
         super().write(shot)
         packet = av.Packet(shot.jpeg)
         packet.stream, packet.time_base = self._stream, MICROSECOND

@@ -1,7 +1,7 @@
 """Instance candidates that err as a segmentation network does, in COCO's result format.
 
 What goes wrong lasts for a third of a second to a second and is partly the same in all views:
-borders, labels, misses, blobs of person and object, things that are not there. Score and order say
+borders, labels, misses, blobs of person and object, objects that are not there. Score and order say
 nothing about which candidate is right.
 """
 
@@ -36,18 +36,8 @@ CATEGORY_IDS = {
     "cup": 47, "bowl": 51, "apple": 53, "chair": 62, "potted plant": 64, "dining table": 67,
     "toilet": 70, "tv": 72, "refrigerator": 82, "book": 84, "clock": 85, "vase": 86,
 }  # fmt: skip
-BORDER_PX = 2.2  # RMS at 1080p; capped at MAX_BORDER_PX
-MAX_BORDER_PX = 5.0
-WRONG_LABEL, MERGED, SPLIT = 0.15, 0.06, 0.05
-MISS_FREE, MISS_HIDDEN = 0.10, 0.85  # chance of a miss when in full view, when all is hidden
-MISS_BLURRED, BLUR_PX = 0.7, 12.0  # chance of a miss when blurred by much more than so many pixels
-PERSON_MISSED = 0.015
-CLUTTER = 0.35  # chance of each false instance in a frame
-TWIN = 0.85  # chance of another thing of the object's class
 EPISODE_S = (0.3, 1.0)
 AGREEMENT = 0.5
-MIN_PIXELS = 30
-MARGIN_PX = 12  # room for a border that moves out, at any noise
 
 
 @dataclass(frozen=True)
@@ -64,7 +54,7 @@ class Labels:
     blur_px: float
 
 
-class Segmenter:
+class MaskSimulator:
     """The network over one recording; every camera's errors partly agree."""
 
     def __init__(
@@ -79,7 +69,7 @@ class Segmenter:
         }
 
     def camera(self, name: str, clutter: np.ndarray | None, size: tuple[int, int]) -> CameraMasks:
-        """The errors of one camera; ``clutter`` (H, W) bool: a thing of the room that is of the
+        """The errors of one camera; ``clutter`` (H, W) bool: a object of the room that is of the
         object's class, or None; ``size`` width and height of its images."""
         return CameraMasks(self, name, clutter, size)
 
@@ -87,9 +77,24 @@ class Segmenter:
 class CameraMasks:
     """Candidates of one camera, frame by frame in any order."""
 
+    border_px = 2.2  # RMS displacement of borders, px at 1080p
+    max_border_px = 5.0  # largest displacement, px at 1080p
+    wrong_label = 0.15  # probability of a wrong label
+    merged = 0.06  # probability of one mask for person and object
+    split = 0.05  # probability of half the object's mask
+    miss_free = 0.10  # probability of a miss in full view
+    miss_hidden = 0.85  # probability of a miss when all is hidden
+    miss_blurred = 0.7  # probability of a miss at strong motion blur
+    blur_px = 12.0  # motion during the exposure that counts as strong, px at 1080p
+    person_missed = 0.015  # probability of a missed person
+    clutter = 0.35  # probability of each false instance in a frame
+    twin = 0.85  # probability that another object of the same class is detected
+    min_pixels = 30  # smaller masks are not detected
+    margin_px = 12  # room around a mask for a border that moves outward
+
     def __init__(
         self,
-        network: Segmenter,
+        network: MaskSimulator,
         name: str,
         clutter: np.ndarray | None,
         size: tuple[int, int],
@@ -105,9 +110,9 @@ class CameraMasks:
                 rng, frames, one * probability, network._shared[kind], seconds, AGREEMENT
             )[:, 0]
 
-        self._wrong_label = episodes("label", WRONG_LABEL)
-        self._merged, self._split = episodes("merge", MERGED), episodes("split", SPLIT)
-        self._person_missed = episodes("person", PERSON_MISSED)
+        self._wrong_label = episodes("label", self.wrong_label)
+        self._merged, self._split = episodes("merge", self.merged), episodes("split", self.split)
+        self._person_missed = episodes("person", self.person_missed)
         miss = noise.process(rng, frames, 1, rng.uniform(*EPISODE_S))[:, 0]
         self._miss = np.sqrt(AGREEMENT) * network._shared["miss"] + np.sqrt(1 - AGREEMENT) * miss
         self._wrong = rng.integers(0, 1000, frames // 8 + 2)
@@ -115,9 +120,9 @@ class CameraMasks:
         self._waves = noise.process(rng, frames, 24, rng.uniform(*EPISODE_S)).reshape(-1, 2, 12)
         self._directions = rng.normal(size=(2, 12, 2))
         self._phases = rng.uniform(0, 2 * np.pi, (2, 12))
-        self._twin = clutter if clutter is not None and clutter.sum() > MIN_PIXELS else None
-        self._clutter = self._things()
-        often = [TWIN] * (self._twin is not None) + [CLUTTER] * len(self._clutter)
+        self._twin = clutter if clutter is not None and clutter.sum() > self.min_pixels else None
+        self._clutter = self._false_instances()
+        often = [self.twin] * (self._twin is not None) + [self.clutter] * len(self._clutter)
         self._clutter_on = np.stack(
             [noise.episodes(rng, frames, one * chance, miss, 0.7, 0.0)[:, 0] for chance in often], 1
         )
@@ -132,15 +137,15 @@ class CameraMasks:
         self._waves = np.concatenate([self._waves, waves], 1)
         self._directions = np.concatenate([self._directions, rng.normal(size=(1, 12, 2))])
         self._phases = np.concatenate([self._phases, rng.uniform(0, 2 * np.pi, (1, 12))])
-        chance, common = np.full((frames, 1), PERSON_MISSED), np.zeros(frames)
+        chance, common = np.full((frames, 1), self.person_missed), np.zeros(frames)
         seconds = rng.uniform(*EPISODE_S)
         self._other_missed = noise.episodes(rng, frames, chance, common, seconds, 0.0)[:, 0]
         self._other_score = noise.process(rng, frames, 1, 0.3)[:, 0]
 
-    def _things(self) -> list[tuple[str, dict[str, Any]]]:
+    def _false_instances(self) -> list[tuple[str, dict[str, Any]]]:
         """False instances of this view that stand still: label and RLE."""
         width, height = self.size
-        things = []
+        instances = []
         for _ in range(3):
             label = OTHER_THINGS[self._rng.integers(len(OTHER_THINGS))]
             blob = np.zeros((height, width), np.uint8)
@@ -148,19 +153,19 @@ class CameraMasks:
             axes = self._rng.uniform(15, 90, 2) * width / 1920
             angle = self._rng.uniform(0, 180)
             cv2.ellipse(blob, centre, (int(axes[0]), int(axes[1])), angle, 0, 360, 1, -1)
-            things.append((label, _encode(blob, 0, 0, self.size)))
-        return things
+            instances.append((label, _encode(blob, 0, 0, self.size)))
+        return instances
 
     def candidates(self, t: int, truth: Labels) -> list[dict[str, Any]]:
         """COCO results of set ``t`` without image_id, in random order."""
         found: list[tuple[str, dict[str, Any], float]] = []
         person = self._bordered(truth, BODY, t)
-        thing = self._bordered(truth, OBJECT, t)
+        prop = self._bordered(truth, OBJECT, t)
         score = 0.72 + 0.12 * self._score[t]
-        if self._merged[t] and thing is not None and person is not None:
-            person = person | thing
+        if self._merged[t] and prop is not None and person is not None:
+            person = person | prop
             if self._score[t, 3] > 0:
-                thing = None
+                prop = None
         if person is not None and not self._person_missed[t]:
             found.append(("person", self._rle(person, truth), score[0] + 0.15))
         if self.network.passer_by and not self._other_missed[t]:
@@ -169,15 +174,15 @@ class CameraMasks:
                 found.append(
                     ("person", self._rle(other, truth), 0.87 + 0.12 * self._other_score[t])
                 )
-        missed = MISS_FREE + (MISS_HIDDEN - MISS_FREE) * (1 - truth.visible) ** 2
-        blur = truth.blur_px / (BLUR_PX * self.size[0] / 1920)
-        missed = 1 - (1 - missed) * (1 - MISS_BLURRED * (1 - np.exp(-(blur**2))))
+        missed = self.miss_free + (self.miss_hidden - self.miss_free) * (1 - truth.visible) ** 2
+        blur = truth.blur_px / (self.blur_px * self.size[0] / 1920)
+        missed = 1 - (1 - missed) * (1 - self.miss_blurred * (1 - np.exp(-(blur**2))))
         threshold = np.clip(missed * self.noise.scale, 0, 0.97)
         rank = 0.5 * (1 + np.tanh(0.8 * self._miss[t]))
-        if thing is not None and rank > threshold:
+        if prop is not None and rank > threshold:
             if self._split[t]:
-                thing = self._half(thing, t)
-            found.append((self._object_label(t), self._rle(thing, truth), score[1]))
+                prop = self._half(prop, t)
+            found.append((self._object_label(t), self._rle(prop, truth), score[1]))
         for k, (label, rle) in enumerate(self._standing(truth)):
             if self._clutter_on[t, k] and coco.area(rle):
                 found.append((label, rle, score[4 + k] - 0.08))
@@ -214,9 +219,9 @@ class CameraMasks:
     def _bordered(self, truth: Labels, kind: int, t: int) -> np.ndarray | None:
         """A mask (h + 2m, w + 2m) with its border moved, or None where too little is seen."""
         mask = truth.identity == kind
-        if mask.sum() < MIN_PIXELS:
+        if mask.sum() < self.min_pixels:
             return None
-        margin = MARGIN_PX
+        margin = self.margin_px
         whole = np.pad(mask, margin).astype(np.uint8)
         x0, y0, width, height = cv2.boundingRect(whole)
         part = (
@@ -238,11 +243,13 @@ class CameraMasks:
             wave = np.cos(direction[0] * x + direction[1] * y + self._phases[which, k])
             coarse += self._waves[t, which, k] * np.sqrt(2 / 12) * wave
         scale = self.size[0] / 1920 * self.noise.scale
-        coarse = np.clip(coarse * BORDER_PX * scale, -MAX_BORDER_PX * scale, MAX_BORDER_PX * scale)
+        coarse = np.clip(
+            coarse * self.border_px * scale, -self.max_border_px * scale, self.max_border_px * scale
+        )
         offset = cv2.resize(coarse.astype(np.float32), padded.shape[::-1])
         moved = np.zeros(whole.shape, bool)
         moved[part] = (inside - outside + offset) > 0
-        return moved if moved.sum() >= MIN_PIXELS else None
+        return moved if moved.sum() >= self.min_pixels else None
 
     def _half(self, mask: np.ndarray, t: int) -> np.ndarray:
         """Part of a mask, as when a network takes one object for two."""
@@ -255,7 +262,7 @@ class CameraMasks:
         return part
 
     def _rle(self, mask: np.ndarray, truth: Labels) -> dict[str, Any]:
-        return _encode(mask, truth.x0 - MARGIN_PX, truth.y0 - MARGIN_PX, truth.size)
+        return _encode(mask, truth.x0 - self.margin_px, truth.y0 - self.margin_px, truth.size)
 
 
 def _encode(mask: np.ndarray, x0: int, y0: int, size: tuple[int, int]) -> dict[str, Any]:

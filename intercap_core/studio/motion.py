@@ -10,12 +10,13 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from intercap_core.body.joints import JOINT_INDEX
-from intercap_core.studio.controls import Pose, ramp
+from intercap_core.studio.controls import Footwork, WristPose, ramp
 from intercap_core.studio.hands import Hand, HandShape, part_of
 from intercap_core.studio.skeleton import (
-    Skeleton,
+    PuppetSkeleton,
     blend,
     carry,
     local_rotations,
@@ -26,16 +27,10 @@ from intercap_core.studio.skeleton import (
 from intercap_core.studio.subjects import PosedSubject, Subject
 
 SIDES = ("left", "right")
+LEFT, RIGHT = range(2)
 # How a bend of the trunk is shared along it, from the pelvis up
 TRUNK = {"pelvis": 0.30, "spine1": 0.20, "spine2": 0.20, "spine3": 0.30}
-ARM_REACH = 0.960  # of the arm's length; the trunk helps beyond
-ASSIST_STEPS = 8
-FOREARM_TWIST = 0.6  # share of the wrist's roll that the forearm takes
-LEG_REACH = 0.984
-SETTLE_M = 0.004  # over which the pelvis gives way where a leg is at its reach
-HAND_HALF = 0.045  # half a hand, a sleeve and a trouser leg, metres: between the wrist and the hip
 SPLAY = 0.12  # rad, feet and knees outward
-STAND = 0.990  # of the leg's length when standing
 _J = JOINT_INDEX
 
 
@@ -99,9 +94,17 @@ def _thigh_height(subject: Subject, side: int) -> float:
 class Puppet:
     """One subject that can be posed."""
 
+    arm_reach = 0.960  # share of the arm's length beyond which the trunk helps
+    assist_steps = 8  # iterations in which the trunk bends to help an arm
+    forearm_twist = 0.6  # share of the wrist's roll that the forearm takes
+    leg_reach = 0.984  # usable share of the leg's length
+    settle_m = 0.004  # softness with which the pelvis sinks where a leg is at its reach, metres
+    hand_half_m = 0.045  # half a hand, a sleeve and a trouser leg, metres
+    stand_share = 0.990  # hip height when standing, share of the leg's length
+
     def __init__(self, subject: Subject) -> None:
         self.subject = subject
-        self.skeleton = Skeleton(subject.rest_joints)
+        self.skeleton = PuppetSkeleton(subject.rest_joints)
         self.hands = (Hand(subject, 0), Hand(subject, 1))
         rest = subject.rest_joints
         # people are not symmetric: both arms' lengths, and the shorter of both sides
@@ -115,7 +118,7 @@ class Puppet:
         self.ankle_height = np.array([_sole_depth(subject, side) for side in (0, 1)])
         self.girth = _girth(subject)
         self.thigh_height = [_thigh_height(subject, side) for side in (0, 1)]
-        self.stand = STAND * self.leg + float(self.ankle_height.min()) + self.hip_drop
+        self.stand = self.stand_share * self.leg + float(self.ankle_height.min()) + self.hip_drop
 
     # --- the parts of a pose ---------------------------------------------------------------
 
@@ -143,6 +146,14 @@ class Puppet:
         world[:, 40:55] = world[:, 21:22]
         return world
 
+    def pelvis_track(self, footwork: Footwork, hip_width: float | None = None) -> CubicSpline:
+        """Pelvis position and heading (4 channels) over time that follows the feet.
+
+        ``hip_width``: from the midline to each hip, metres; None: this person's.
+        """
+        width = self.hip_width if hip_width is None else hip_width
+        return footwork.pelvis(self.leg_reach * self.leg, width, self.hip_drop, self.stand)
+
     def settled(self, trunk: Trunk, ankle: np.ndarray) -> Trunk:
         """The same trunk, lower where a leg could not reach its ankle (N, 2, 3)."""
         rotation = self.trunk(trunk)[:, 0]
@@ -150,10 +161,10 @@ class Puppet:
         for side, name in enumerate(SIDES):
             hip = trunk.pelvis + rotation @ self.skeleton.bone("pelvis", f"{name}_hip")
             far = np.linalg.norm(hip[:, :2] - ankle[:, side, :2], axis=1)
-            reach = np.sqrt(np.maximum((LEG_REACH * self.leg) ** 2 - far**2, 0.01))
+            reach = np.sqrt(np.maximum((self.leg_reach * self.leg) ** 2 - far**2, 0.01))
             excess = np.maximum(excess, hip[:, 2] - ankle[:, side, 2] - reach)
         pelvis = trunk.pelvis.copy()
-        pelvis[:, 2] -= SETTLE_M * np.logaddexp(0, excess / SETTLE_M)
+        pelvis[:, 2] -= self.settle_m * np.logaddexp(0, excess / self.settle_m)
         return replace(trunk, pelvis=pelvis)
 
     def legs(
@@ -177,7 +188,9 @@ class Puppet:
             foot, toes = feet[:, side].swapaxes(0, 1)
             ahead = facing(heading[:, side] + sign * splay)[:, :, 2]
             pole = unit(world[:, 0, :, 2] * np.array([1, 1, 0.2])) + 1.5 * ahead
-            upper, lower = self.skeleton.limb(names, hip, ankle[:, side], pole, hinge, LEG_REACH)
+            upper, lower = self.skeleton.limb(
+                names, hip, ankle[:, side], pole, hinge, self.leg_reach
+            )
             world[:, _J[names[0]]], world[:, _J[names[1]]] = upper, lower
             world[:, _J[names[2]]], world[:, _J[f"{name}_foot"]] = foot, toes
 
@@ -205,7 +218,7 @@ class Puppet:
         pelvis: np.ndarray,
         side: int,
         swing: np.ndarray,
-    ) -> Pose:
+    ) -> WristPose:
         """The wrist of an arm that hangs and swings by ``swing`` (N,) metres forward."""
         sign = (1.0, -1.0)[side]
         # where the chest's left is: its front may point down and back in a deep stoop
@@ -214,34 +227,34 @@ class Puppet:
         shoulder = self.arm_root(world, pelvis, side)
         reach = 0.955 * self.arms[side]
         # beside the hips, however broad they are
-        beside = self.girth + HAND_HALF - sign * ((shoulder - pelvis) * left).sum(1)
+        beside = self.girth + self.hand_half_m - sign * ((shoulder - pelvis) * left).sum(1)
         out = np.clip(beside, 0.085, 0.6 * reach)
         down = np.sqrt((0.97 * reach) ** 2 - out**2)
         position = shoulder + sign * out[:, None] * left - down[:, None] * up
         position += (0.05 + swing)[:, None] * forward
         fingers = unit(-up + (0.10 + swing)[:, None] * forward - 0.02 * sign * left)
         palm = unit(-sign * left - 0.25 * forward)
-        return Pose(position, self.wrist_rotation(side, fingers, palm))
+        return WristPose(position, self.wrist_rotation(side, fingers, palm))
 
     def wrist_rotation(self, side: int, fingers: np.ndarray, palm: np.ndarray) -> np.ndarray:
         """Rotation(s) that point the fingers and face the palm along directions (..., 3)."""
         hand = self.hands[side]
         return carry(hand.out, hand.palm, fingers, palm)
 
-    def assist(self, trunk: Trunk, targets: dict[int, tuple[Pose, np.ndarray]]) -> Trunk:
+    def assist(self, trunk: Trunk, targets: dict[int, tuple[WristPose, np.ndarray]]) -> Trunk:
         """Bend the trunk a little more where an arm could not reach.
 
         ``targets``: side to (wrist target, weight (N,) in [0, 1]).
         """
         bend = trunk.bend.copy()
-        for _ in range(ASSIST_STEPS):
+        for _ in range(self.assist_steps):
             current = Trunk(trunk.pelvis, trunk.heading, bend, trunk.head)
             world = self.trunk(current)
             base = facing(trunk.heading)
             for side, (target, weight) in targets.items():
                 shoulder = self.arm_root(world, trunk.pelvis, side)
                 way = target.position - shoulder
-                excess = np.linalg.norm(way, axis=1) - ARM_REACH * self.arms[side]
+                excess = np.linalg.norm(way, axis=1) - self.arm_reach * self.arms[side]
                 excess = weight * 0.5 * (excess + np.sqrt(excess**2 + 0.01**2))
                 lever = shoulder - trunk.pelvis
                 axis = np.cross(lever, unit(way)) / (lever**2).sum(1, keepdims=True)
@@ -254,7 +267,7 @@ class Puppet:
         world: np.ndarray,
         pelvis: np.ndarray,
         side: int,
-        wrist: Pose,
+        wrist: WristPose,
         raised: np.ndarray | float = 0.0,
     ) -> None:
         """Set one arm for a wrist pose, in place; ``raised`` (N,) lifts the elbow outward."""
@@ -270,10 +283,12 @@ class Puppet:
         hand = self.hands[side]
         hinge = np.array([0.0, -sign, 0])
         names = (f"{name}_shoulder", f"{name}_elbow", f"{name}_wrist")
-        upper, lower = self.skeleton.limb(names, shoulder, wrist.position, pole, hinge, LEG_REACH)
+        upper, lower = self.skeleton.limb(
+            names, shoulder, wrist.position, pole, hinge, self.leg_reach
+        )
         forearm = unit(self.skeleton.bone(names[1], names[2]))
         roll = twist_angle(np.swapaxes(lower, -1, -2) @ wrist.rotation, forearm)
-        lower = lower @ turn(FOREARM_TWIST * roll[:, None] * forearm)
+        lower = lower @ turn(self.forearm_twist * roll[:, None] * forearm)
         world[:, _J[names[0]]], world[:, _J[names[1]]] = upper, lower
         world[:, _J[names[2]]] = wrist.rotation
         world[:, hand.first : hand.first + 15] = wrist.rotation[:, None]

@@ -14,24 +14,13 @@ import numpy as np
 from intercap_core.errors import UserError
 from intercap_core.studio.controls import Footwork, Step, Wander
 from intercap_core.studio.hands import RELAXED
-from intercap_core.studio.motion import LEG_REACH, Puppet, Trunk
+from intercap_core.studio.motion import Puppet, Trunk
 from intercap_core.studio.noise import NoiseSource
 from intercap_core.studio.room import FLOOR_HALF_M, Room
 from intercap_core.studio.subjects import Subject, body_colours, subject_names
 
-PASSES_M = (0.8, 1.6)  # from the subject's pelvis, where nearest
-# Of the walker's middle: half the shoulders are 0.23 m
-CLEAR_OF_OBJECT_M, CLEAR_OF_THINGS_M, CLEAR_OF_CAMERAS_M = 0.65, 0.33, 0.45
-PASSES_WITHIN = (0.3, 0.7)  # of the recording
-TRIES = 3000
-STEP_S = (0.46, 0.54)
-STRIDE = (0.72, 0.84)  # of a leg's length, from one foot to the other
-SWINGS = 0.94  # of a step's time in which the foot is in the air
-ARM_SWING_M, LEAN, COUNTER_TURN = 0.16, 0.05, 0.08  # metres; rad of the trunk
-SWAY_RAD = 0.01  # of trunk and head
-PLACE_S = 0.03  # the way is tried at such steps
 CELL_M = 0.05  # of the floor plan
-FLOOR_UP_M, WALLS_BEYOND_M = 0.03, 2.8  # what of the room is a thing that one walks around
+FLOOR_UP_M, WALLS_BEYOND_M = 0.03, 2.8  # what of the room is a object that one walks around
 OTHER_COLOURS = 0.25  # at least this far from the subject's, mean of the clothed surface, RGB
 _CORNERS = np.array([[a, b, 4 - a - b] for a in range(5) for b in range(5 - a)]) / 4
 
@@ -68,9 +57,25 @@ class Way:
 class PasserBy:
     """The other person of one recording, who ``stands`` or walks.
 
-    ``times`` (N,) s over the recording, at which ``pelvis`` (N, 2) and ``thing`` (N, 2) are the
+    ``times`` (N,) s over the recording, at which ``pelvis`` (N, 2) and ``prop`` (N, 2) are the
     places of subject and object on the floor, in the stage; ``eyes`` (C, 2) those of the cameras.
     """
+
+    passes_m = (0.8, 1.6)  # range of the least distance from the subject's pelvis, metres
+    # of the walker's middle from the object, metres; half the shoulders are 0.23
+    clear_of_object_m = 0.65
+    clear_of_furniture_m = 0.33  # from furniture, metres
+    clear_of_cameras_m = 0.45  # from cameras, metres
+    passes_within = (0.3, 0.7)  # when the least distance is reached, share of the recording
+    tries = 3000  # random ways that are tried
+    step_range_s = (0.46, 0.54)  # duration of a step
+    stride_range = (0.72, 0.84)  # stride, in leg lengths
+    swing_share = 0.94  # share of a step's time in which the foot is in the air
+    arm_swing_m = 0.16  # amplitude of the wrist, metres
+    lean_rad = 0.05  # of the trunk
+    counter_turn_rad = 0.08  # of the trunk against the pelvis
+    sway_rad = 0.01  # of trunk and head, RMS
+    place_s = 0.03  # time step at which a way is tested
 
     def __init__(
         self,
@@ -80,7 +85,7 @@ class PasserBy:
         eyes: np.ndarray,
         times: np.ndarray,
         pelvis: np.ndarray,
-        thing: np.ndarray,
+        prop: np.ndarray,
         *,
         stands: bool = False,
     ) -> None:
@@ -89,36 +94,39 @@ class PasserBy:
         self.subject = Subject.load(others[rng.integers(len(others))])
         self.puppet = Puppet(self.subject)
         self.colours = _other_colours(noise, self.subject, subject)
-        self.step_s, stride = rng.uniform(*STEP_S), rng.uniform(*STRIDE) * self.puppet.leg
+        self.step_s, stride = (
+            rng.uniform(*self.step_range_s),
+            rng.uniform(*self.stride_range) * self.puppet.leg,
+        )
         self.stands, self.speed = stands, 0.0 if stands else stride / self.step_s
-        self.sway = Wander(6, SWAY_RAD, noise.rng("passer-by sways"))
-        self.way = self._way(rng, _things(room), eyes, times, pelvis, thing)
+        self.sway = Wander(6, self.sway_rad, noise.rng("passer-by sways"))
+        self.way = self._way(rng, _obstacles(room), eyes, times, pelvis, prop)
         self._walk(stride)
 
     def _way(
         self,
         rng: np.random.Generator,
-        things: np.ndarray,
+        obstacles: np.ndarray,
         eyes: np.ndarray,
         times: np.ndarray,
         pelvis: np.ndarray,
-        thing: np.ndarray,
+        prop: np.ndarray,
     ) -> Way:
         """A way that fits; raises UserError where none does."""
-        fine = np.linspace(times[0], times[-1], 1 + int(np.ptp(times) / PLACE_S))
-        for _ in range(TRIES):
-            heading, far = rng.uniform(0, 2 * np.pi), rng.uniform(*PASSES_M)
-            moment = round(rng.uniform(*PASSES_WITHIN) * (len(times) - 1))
+        fine = np.linspace(times[0], times[-1], 1 + int(np.ptp(times) / self.place_s))
+        for _ in range(self.tries):
+            heading, far = rng.uniform(0, 2 * np.pi), rng.uniform(*self.passes_m)
+            moment = round(rng.uniform(*self.passes_within) * (len(times) - 1))
             left = np.array([-np.sin(heading), np.cos(heading)])
             looks = heading - np.pi / 2 if self.stands else heading  # at the subject
             way = Way(pelvis[moment] + far * left, looks, float(times[moment]))
             path, places = way.at(times, self.speed), way.at(fine, self.speed)
             nearest = np.linalg.norm(path - pelvis, axis=1).min()
             if (
-                PASSES_M[0] <= nearest <= PASSES_M[1]
-                and np.linalg.norm(path - thing, axis=1).min() > CLEAR_OF_OBJECT_M
-                and _gap(places, things) > CLEAR_OF_THINGS_M
-                and _gap(places, eyes) > CLEAR_OF_CAMERAS_M
+                self.passes_m[0] <= nearest <= self.passes_m[1]
+                and np.linalg.norm(path - prop, axis=1).min() > self.clear_of_object_m
+                and _gap(places, obstacles) > self.clear_of_furniture_m
+                and _gap(places, eyes) > self.clear_of_cameras_m
             ):
                 return way
         raise UserError(
@@ -137,12 +145,10 @@ class PasserBy:
         for k in range(count):
             begin, foot = k * self.step_s, k % 2
             place = ((k + 1.5) * stride, (across, -across)[foot])
-            steps.append(Step(foot, begin, begin + SWINGS * self.step_s, place))
+            steps.append(Step(foot, begin, begin + self.swing_share * self.step_s, place))
         self.seconds = count * self.step_s
         self.footwork = Footwork(start, 0.0, steps, puppet.ankle_height, self.seconds)
-        self.track = self.footwork.pelvis(
-            LEG_REACH * puppet.leg, across, puppet.hip_drop, puppet.stand
-        )
+        self.track = puppet.pelvis_track(self.footwork, across)
 
     def at(self, times: np.ndarray) -> Passing:
         """The person at recording times (N,); present while on the floor of the room."""
@@ -167,14 +173,17 @@ class PasserBy:
         bend, head = np.zeros((2, len(own), 3))
         walks = 0.0 if self.stands else 1.0
         sway = self.sway(times)
-        bend[:, 0], bend[:, 1] = LEAN * walks, walks * COUNTER_TURN * np.sin(phase - np.pi / 2)
+        bend[:, 0], bend[:, 1] = (
+            self.lean_rad * walks,
+            walks * self.counter_turn_rad * np.sin(phase - np.pi / 2),
+        )
         bend, head = bend + sway[:, :3], head + sway[:, 3:]
         trunk = puppet.settled(Trunk(track[:, :3], track[:, 3], bend, head), feet[0])
         world = puppet.trunk(trunk)
         puppet.legs(world, trunk.pelvis, *feet)
         # an arm is ahead while the foot of its side is behind
         for side, sign in enumerate((1.0, -1.0)):
-            swing = sign * walks * ARM_SWING_M * np.cos(phase)
+            swing = sign * walks * self.arm_swing_m * np.cos(phase)
             puppet.arm_to(
                 world, trunk.pelvis, side, puppet.idle_wrist(world, trunk.pelvis, side, swing)
             )
@@ -186,7 +195,7 @@ class PasserBy:
         return turned @ world, (trunk.pelvis - [middle, 0, 0]) @ turned.T + place
 
 
-def _things(room: Room) -> np.ndarray:
+def _obstacles(room: Room) -> np.ndarray:
     """Points (N, 2) of what stands about, on the floor plan."""
     corners = room.vertices[room.faces]
     points = np.einsum("sk,fkc->fsc", _CORNERS, corners).reshape(-1, 3)
@@ -196,11 +205,11 @@ def _things(room: Room) -> np.ndarray:
     return CELL_M * np.unique(cells, axis=0)
 
 
-def _gap(path: np.ndarray, things: np.ndarray) -> float:
-    """How near a path (N, 2) comes to things (M, 2), metres."""
-    if not len(things):
+def _gap(path: np.ndarray, obstacles: np.ndarray) -> float:
+    """How near a path (N, 2) comes to objects (M, 2), metres."""
+    if not len(obstacles):
         return np.inf
-    return float(np.linalg.norm(path[:, None] - things, axis=2).min())
+    return float(np.linalg.norm(path[:, None] - obstacles, axis=2).min())
 
 
 def _other_colours(noise: NoiseSource, passer_by: Subject, subject: Subject) -> np.ndarray:

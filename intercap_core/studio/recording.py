@@ -11,30 +11,31 @@ import numpy as np
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import invert
 from intercap_core.studio.calibration import ACCELEROMETER_FROM_DEPTH
-from intercap_core.studio.capture_folder import CaptureFolder, Device, Shot
+from intercap_core.studio.capture_folder import CaptureFolder, Device, DeviceFrame
 from intercap_core.studio.keypoints import Detector, to_json
-from intercap_core.studio.masks import Labels, Segmenter
+from intercap_core.studio.masks import Labels, MaskSimulator
 from intercap_core.studio.passer_by import Passing
-from intercap_core.studio.render import BODY, OBJECT, PASSER_BY, Cast, Photographer, Surface, View
+from intercap_core.studio.render import (
+    BODY,
+    OBJECT,
+    PASSER_BY,
+    Cast,
+    MovingSurface,
+    Photographer,
+    RoomView,
+)
 from intercap_core.studio.rig import STAGGER_S
 from intercap_core.studio.sensors import DepthSensor, heard
-from intercap_core.studio.stage import Moment, Stage
+from intercap_core.studio.stage import StageState, StudioStage
 from intercap_core.studio.subjects import body_colours
 
-START_US = 1_000_000  # device time of the first set
-GRAVITY = 9.81
-IMU_PER_FRAME = 8
-ACCELEROMETER_NOISE, GYROSCOPE_NOISE = 0.03, 0.004  # m/s^2, rad/s
 EXPOSURE_S = 1 / 60  # of a colour image in a lit room
 # A joint lies inside the body: it is hidden only by what is nearer by more than this (metres)
 COVER_M = {"body": 0.13, "hand": 0.03, "face": 0.02}
 
 
-CLOCK_FALLS_BACK_SETS = 10  # by which a clock jumps back where that is asked for
-
-
 @dataclass(frozen=True)
-class Recorded:
+class CameraRecord:
     """What one camera has of every set: ``object_pixels`` (T,) of the object that are seen,
     ``object_whole`` (T,) that it would cover if nothing hid it; ``colour`` and ``depth`` (T,) bool:
     there is an image whose device time is the set's, and depth that is not empty. ``depth_bias``:
@@ -50,7 +51,14 @@ class Recorded:
 class Kinect:
     """One device of the rig over one capture."""
 
-    def __init__(self, stage: Stage, index: int, colour_mode: str) -> None:
+    start_us = 1_000_000  # device time of the first set
+    gravity = 9.81  # m/s^2
+    imu_per_frame = 8  # inertial samples of each set
+    accelerometer_noise = 0.03  # standard deviation, m/s^2
+    gyroscope_noise = 0.004  # standard deviation, rad/s
+    clock_jump_sets = 10  # sets by which a clock with fault backwards_clock jumps back
+
+    def __init__(self, stage: StudioStage, index: int, colour_mode: str) -> None:
         self.stage, self.index, self.colour_mode = stage, index, colour_mode
         self.true: Camera = stage.rig.true[index]
         self.claimed: Camera = stage.rig.claimed[index]
@@ -79,10 +87,12 @@ class Kinect:
         stagger = round(STAGGER_S * 1e6) * self.index
         jitter = round(self.stage.failures.jitter_s[t, self.index] * 1e6)
         if self.fallen_back(t):
-            t -= min(CLOCK_FALLS_BACK_SETS, self.stage.frames // 2)
-        return START_US + round(t * 1e6 / self.stage.fps) + stagger + jitter
+            t -= min(self.clock_jump_sets, self.stage.frames // 2)
+        return self.start_us + round(t * 1e6 / self.stage.fps) + stagger + jitter
 
-    def record(self, folder: CaptureFolder, detector: Detector, segmenter: Segmenter) -> Recorded:
+    def record(
+        self, folder: CaptureFolder, detector: Detector, segmenter: MaskSimulator
+    ) -> CameraRecord:
         """Write the recording, keypoints/<camera>/ and candidates/<camera>.json."""
         stage, name = self.stage, self.true.name
         moment = stage.at(self.exposures)
@@ -90,8 +100,8 @@ class Kinect:
         colour_pose = stage_from_master @ self.true.master_from_colour
         depth_pose = stage_from_master @ self.true.master_from_depth
         assert self.true.depth is not None
-        colour_view = View(self.true.colour, colour_pose, stage.room, coloured=True)
-        depth_view = View(self.true.depth, depth_pose, stage.room, coloured=False)
+        colour_view = RoomView(self.true.colour, colour_pose, stage.room, coloured=True)
+        depth_view = RoomView(self.true.depth, depth_pose, stage.room, coloured=False)
         sensor = DepthSensor(depth_view, stage.noise, name, stage.depth_mode)
         rng = stage.noise.rng("photo", name)
         gain = rng.uniform(0.92, 1.06) * rng.uniform(0.97, 1.03, 3)
@@ -128,16 +138,16 @@ class Kinect:
                 if empty[t]:
                     depth[:] = 0
                 recorded_depth = depth if has_depth[t] else None
-                files.write(Shot(t, self.device_time_us(t), jpeg, recorded_depth, inertial))
+                files.write(DeviceFrame(t, self.device_time_us(t), jpeg, recorded_depth, inertial))
                 hidden[t] = _hidden(cast, colour_view, points[t])
                 if passing and passing.present[t]:
                     others_hidden[t] = _hidden(cast, colour_view, others[t])
                 seen[t] = int((cast.identity == OBJECT).sum())
-                for thing in [surface for surface in surfaces if surface.kind == OBJECT]:
+                for prop in [surface for surface in surfaces if surface.kind == OBJECT]:
                     same = order and np.array_equal(
-                        thing.stage_from_mesh, moment.stage_from_object[self.sets[order - 1]]
+                        prop.stage_from_mesh, moment.stage_from_object[self.sets[order - 1]]
                     )
-                    whole[t] = whole[self.sets[order - 1]] if same else colour_view.count(thing)
+                    whole[t] = whole[self.sets[order - 1]] if same else colour_view.count(prop)
                 truth = Labels(
                     cast.identity, cast.x0, cast.y0, size, seen[t] / max(whole[t], 1), blur[t]
                 )
@@ -154,7 +164,7 @@ class Kinect:
         self._write_keypoints(folder, people)
         colour = np.zeros(stage.frames, bool)
         colour[[t for t in self.sets if not self.fallen_back(t)]] = True
-        return Recorded(seen, whole, colour, colour & has_depth & ~empty, sensor.bias)
+        return CameraRecord(seen, whole, colour, colour & has_depth & ~empty, sensor.bias)
 
     def _sound(self) -> np.ndarray:
         """What the device hears from its first image to its last."""
@@ -171,15 +181,15 @@ class Kinect:
     ) -> list[tuple[np.ndarray, np.ndarray, int]]:
         """Acceleration, turning rate and device time over one period of a device that stands
         still: its accelerometer feels the ground push up."""
-        up = ACCELEROMETER_FROM_DEPTH @ stage_from_depth[:3, :3].T @ (0, 0, GRAVITY)
+        up = ACCELEROMETER_FROM_DEPTH @ stage_from_depth[:3, :3].T @ (0, 0, self.gravity)
         first, period = self.device_time_us(t), 1_000_000 // self.stage.fps
         return [
             (
-                up + rng.normal(0, ACCELEROMETER_NOISE, 3),
-                rng.normal(0, GYROSCOPE_NOISE, 3),
-                first + k * period // IMU_PER_FRAME,
+                up + rng.normal(0, self.accelerometer_noise, 3),
+                rng.normal(0, self.gyroscope_noise, 3),
+                first + k * period // self.imu_per_frame,
             )
-            for k in range(IMU_PER_FRAME)
+            for k in range(self.imu_per_frame)
         ]
 
     def _write_candidates(self, folder: Path, candidates: list[dict[str, object]]) -> None:
@@ -190,7 +200,7 @@ class Kinect:
     def _detected(
         self,
         detector: Detector,
-        moment: Moment | Passing,
+        moment: StageState | Passing,
         points: np.ndarray,
         hidden: np.ndarray,
         *who: str,
@@ -210,32 +220,32 @@ class Kinect:
 
 
 def surfaces_at(
-    stage: Stage,
-    moment: Moment,
+    stage: StudioStage,
+    moment: StageState,
     t: int,
     colours: np.ndarray,
     passing: Passing | None = None,
-) -> list[Surface]:
+) -> list[MovingSurface]:
     """The clothed body, the object and a passer-by, those that are there at one moment."""
-    thing, subject = stage.thing, stage.subject
+    prop, subject = stage.prop, stage.subject
     faces = subject.faces.astype(np.int32)
 
-    def person(kind: int, clothed: np.ndarray, colours: np.ndarray) -> Surface:
+    def person(kind: int, clothed: np.ndarray, colours: np.ndarray) -> MovingSurface:
         normals = subject.normals(clothed[None])[0]
-        return Surface(kind, clothed, faces, normals, colours, np.eye(4))
+        return MovingSurface(kind, clothed, faces, normals, colours, np.eye(4))
 
     surfaces = [person(BODY, moment.clothed[t], colours)]
-    if thing:
+    if prop:
         pose = moment.stage_from_object[t]
         surfaces.append(
-            Surface(OBJECT, thing.vertices, thing.faces, stage.thing_normals, thing.colours, pose)
+            MovingSurface(OBJECT, prop.vertices, prop.faces, stage.prop_normals, prop.colours, pose)
         )
     if stage.passer_by and passing and passing.present[t]:
         surfaces.append(person(PASSER_BY, passing.clothed[t], stage.passer_by.colours))
     return surfaces
 
 
-def _blur_px(view: View, times: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _blur_px(view: RoomView, times: np.ndarray, points: np.ndarray) -> np.ndarray:
     """How far (T,) points (T, 3) seen at ``times`` (T,) move in the image while it is exposed."""
     at = points @ view.camera_from_stage[:3, :3].T + view.camera_from_stage[:3, 3]
     shift = np.linalg.norm(np.gradient(view.lens.project(at), axis=0), axis=1)
@@ -243,7 +253,7 @@ def _blur_px(view: View, times: np.ndarray, points: np.ndarray) -> np.ndarray:
     return shift / np.maximum(np.abs(np.gradient(times)), EXPOSURE_S) * EXPOSURE_S
 
 
-def _hidden(cast: Cast, view: View, points: np.ndarray) -> np.ndarray:
+def _hidden(cast: Cast, view: RoomView, points: np.ndarray) -> np.ndarray:
     """Which keypoints (135,) of those in the image something stands before."""
     cover = np.full(135, COVER_M["body"])
     cover[25:67], cover[67:] = COVER_M["hand"], COVER_M["face"]

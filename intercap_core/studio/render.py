@@ -1,7 +1,7 @@
-"""Images of the stage: the static room by ray casting, once a camera; moving things every frame.
+"""Images of the stage: the static room by ray casting, once a camera; moving objects every frame.
 
 Rays are not normalised (z = 1 in the camera's frame), so a hit's parameter is its depth z. Moving
-things are drawn by a z-buffer over the same rays: half the cost of building a tree for a body that
+objects are drawn by a z-buffer over the same rays: half the cost of building a tree for a body that
 is another one in every image.
 """
 
@@ -28,13 +28,10 @@ VOID = 0.04  # grey of what lies beyond the room
 # Directions to the lamps and their strength: two ceiling lamps
 LAMPS = (((0.45, 0.3, 0.85), 0.42), ((-0.6, -0.25, 0.75), 0.30))
 CAMERA_GAMMA = 2.2  # light adds up, grey levels are its power 1 / 2.2, as sRGB's nearly are
-SENSOR_NOISE = 2.0  # grey levels
-EDGE_BLUR_PX = 0.55
-JPEG_QUALITY = 85
 
 
 @dataclass(frozen=True)
-class Surface:
+class MovingSurface:
     """A closed moving mesh, BODY, OBJECT or PASSER_BY, in its own frame: vertices (V, 3), faces
     (F, 3), unit normals (V, 3), colours (V, 3) RGB in [0, 1], and where it is, stage_from_mesh."""
 
@@ -48,7 +45,7 @@ class Surface:
 
 @dataclass(frozen=True)
 class Cast:
-    """What moving things look like in a window whose first pixel is (x0, y0).
+    """What moving objects look like in a window whose first pixel is (x0, y0).
 
     ``identity`` (h, w) uint8 BODY, OBJECT, PASSER_BY or 0 where the room is nearer. Of the n pixels
     that are not 0: ``pixels`` (n,) flat index in the window, ``depth`` (n,) z in metres, ``normal``
@@ -96,7 +93,7 @@ def shade(normals: np.ndarray) -> np.ndarray:
     return light ** np.float32(1 / CAMERA_GAMMA)
 
 
-class View:
+class RoomView:
     """One lens of one camera: its rays and what it sees of the empty room."""
 
     def __init__(
@@ -150,11 +147,11 @@ class View:
         rays[..., :3], rays[..., 3:] = self.eye, directions
         return rays
 
-    def _drawable(self, surface: Surface) -> Drawable:
+    def _drawable(self, surface: MovingSurface) -> Drawable:
         pose = self.camera_from_stage @ surface.stage_from_mesh
         return Drawable(surface.vertices, surface.faces, pose)
 
-    def cast(self, surfaces: Sequence[Surface]) -> Cast:
+    def cast(self, surfaces: Sequence[MovingSurface]) -> Cast:
         """Draw ``surfaces`` over the room."""
         drawn = render_scene(
             [self._drawable(s) for s in surfaces], self.lens, margin_px=BOX_MARGIN_PX
@@ -175,7 +172,7 @@ class View:
             )  # fmt: skip
         return Cast(drawn.x0, drawn.y0, identity, pixels, depth, normal, colour)
 
-    def count(self, surface: Surface) -> int:
+    def count(self, surface: MovingSurface) -> int:
         """Pixels that a surface would cover if nothing hid it."""
         return int(render_scene([self._drawable(surface)], self.lens).mask.sum())
 
@@ -265,14 +262,18 @@ class Photographer:
     """Turns casts of one colour view into JPEG images; ``gain`` (3,) of linear RGB is its white
     balance."""
 
-    def __init__(self, view: View, gain: np.ndarray, rng: np.random.Generator) -> None:
+    sensor_noise = 2.0  # standard deviation, grey levels
+    edge_blur_px = 0.55  # blur of the edges of moving surfaces
+    jpeg_quality = 85  # of the device's compression
+
+    def __init__(self, view: RoomView, gain: np.ndarray, rng: np.random.Generator) -> None:
         self.view = view
         self.gain = (gain ** (1 / CAMERA_GAMMA)).astype(np.float32)
         room = np.clip(view.colour * self.gain * 255, 0, 255)
         self._room = np.ascontiguousarray(room[..., ::-1].astype(np.uint8))
         # sensor noise: one tile, taken at another place in each image
         size = (view.lens.height + 64, view.lens.width + 64, 3)
-        tile = gaussian(rng, size) * np.float32(SENSOR_NOISE)
+        tile = gaussian(rng, size) * np.float32(self.sensor_noise)
         tile = np.rint(cv2.GaussianBlur(tile, (0, 0), 0.6) * np.float32(1.6))
         self._brighter = np.maximum(tile, 0).astype(np.uint8)
         self._darker = np.maximum(-tile, 0).astype(np.uint8)
@@ -285,7 +286,7 @@ class Photographer:
             lit = cast.colour * shade(cast.normal)[:, None] * self.gain * np.float32(255)
             image[cast.image_pixels] = np.clip(lit, 0, 255)[:, ::-1].astype(np.uint8)
             window = image[cast.window]
-            window[...] = cv2.GaussianBlur(window, (3, 3), EDGE_BLUR_PX)
+            window[...] = cv2.GaussianBlur(window, (3, 3), self.edge_blur_px)
         y, x = self._rng.integers(0, 64, 2)
         part = slice(y, y + image.shape[0]), slice(x, x + image.shape[1])
         cv2.add(image, self._brighter[part], image)
@@ -293,4 +294,6 @@ class Photographer:
 
     def jpeg(self, image: np.ndarray) -> bytes:
         """Compress as the device does."""
-        return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+        return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality])[
+            1
+        ].tobytes()

@@ -16,7 +16,7 @@ import numpy as np
 FLOOR_HALF_M = 6.0
 WALL_HEIGHT_M = 2.7
 WALL_DISTANCE_M = (3.0, 3.7)
-TWIN_SCALE = (0.87, 0.94, 1.07, 1.15)  # sizes of another thing of the object's class
+TWIN_SCALE = (0.87, 0.94, 1.07, 1.15)  # sizes of another object of the object's class
 TWIN_DISTANCE_M = (1.5, 1.75)
 LOW_M, STAND_M = 0.35, (0.45, 0.75)  # what is lower stands on a box of such a height
 PILLAR_DISTANCE_M, PILLAR_HALF_M, PILLAR_HEIGHT_M = (1.2, 1.5), (0.03, 0.05), 1.9
@@ -43,7 +43,7 @@ class Box:
 
 
 class Twin(NamedTuple):
-    """What another thing of the object's class looks like: vertices (V, 3) standing, z up, and
+    """What another object of the object's class looks like: vertices (V, 3) standing, z up, and
     faces (F, 3)."""
 
     vertices: np.ndarray
@@ -62,7 +62,7 @@ class Room:
     faces: np.ndarray
     material: np.ndarray
     materials: tuple[Callable[[np.ndarray, np.ndarray], np.ndarray], ...]
-    distractor: int  # index of the material of a thing that detectors take for the object
+    distractor: int  # index of the material of a object that detectors take for the object
 
 
 def build_room(
@@ -81,7 +81,7 @@ def build_room(
     pillars between them and the place ``hidden`` (2,), where given. ``twin`` stands about as well.
     """
     boxes = list(furniture)
-    things: list[Twin] = []
+    twins: list[Twin] = []
     if furnishing == "sparse":
         boxes += [_lowered(piece) for piece in _pieces(rng, eyes)[1:3]]
     elif furnishing == "furnished":
@@ -89,11 +89,11 @@ def build_room(
         if hidden is not None:
             boxes += _pillars(rng, eyes, hidden)
         if twin is not None:
-            stand, thing = _twin(rng, eyes, twin)
+            stand, twin_mesh = _twin(rng, eyes, twin)
             boxes += stand
-            things.append(thing)
+            twins.append(twin_mesh)
     names = list(dict.fromkeys(["floor", *(box.material for box in boxes)]))
-    names += ["distractor"] * len(things)
+    names += ["distractor"] * len(twins)
     vertices = [np.array([[x, y, 0.0] for x in (-1, 1) for y in (-1, 1)]) * FLOOR_HALF_M]
     faces, material = [np.array([[0, 2, 1], [1, 2, 3]])], [np.zeros(2, int)]
     count = 4
@@ -103,11 +103,11 @@ def build_room(
         faces.append(triangles + count)
         material.append(np.full(len(triangles), names.index(box.material)))
         count += len(corners)
-    for thing in things:
-        vertices.append(thing.vertices)
-        faces.append(thing.faces + count)
-        material.append(np.full(len(thing.faces), names.index("distractor")))
-        count += len(thing.vertices)
+    for twin_mesh in twins:
+        vertices.append(twin_mesh.vertices)
+        faces.append(twin_mesh.faces + count)
+        material.append(np.full(len(twin_mesh.faces), names.index("distractor")))
+        count += len(twin_mesh.vertices)
     looks = tuple(_look(name, rng) for name in names)
     distractor = names.index("distractor") if "distractor" in names else -1
     return Room(np.vstack(vertices), np.vstack(faces), np.concatenate(material), looks, distractor)
@@ -166,7 +166,7 @@ def _between(eyes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _twin(rng: np.random.Generator, eyes: np.ndarray, twin: Twin) -> tuple[list[Box], Twin]:
-    """Another thing of the object's class, of another size, and what it stands on."""
+    """Another object of the object's class, of another size, and what it stands on."""
     between, gaps = _between(eyes)
     gap = int(rng.integers(len(between)))
     angle = between[gap] + gaps[gap] * rng.uniform(-0.2, 0.2)

@@ -15,17 +15,8 @@ from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.transforms import invert
 from intercap_core.studio.capture_folder import SOUND_RATE as RATE
 from intercap_core.studio.noise import NoiseSource, gaussian
-from intercap_core.studio.render import Cast, View
-from intercap_core.studio.stage import Stage
-
-NOISE_M, NOISE_PER_M2 = 0.0006, 0.00058  # standard deviation = a + b z^2
-SMOOTH_SHARE = 0.45  # of the noise's variance that neighbours share
-BIAS_M = 0.003  # of a camera
-RIPPLE_M, RIPPLE_PERIOD_M = 0.0012, 0.75  # error that waves with distance
-EDGE_M = 0.04  # a step in depth that makes flying pixels
-FLYING, LOST_AT_EDGE = 0.35, 0.30  # shares of the pixels on a step
-GRAZING_COSINE = 0.16
-DARK = 0.10  # albedo below which the light does not always come back
+from intercap_core.studio.render import Cast, RoomView
+from intercap_core.studio.stage import StudioStage
 
 
 @dataclass(frozen=True)
@@ -49,9 +40,21 @@ LIMITS = {
 class DepthSensor:
     """One depth camera looking at the room through ``view``; errors from ``noise``."""
 
+    noise_m = 0.0006  # standard deviation of depth at distance 0, metres
+    noise_per_m2 = 0.00058  # growth of the standard deviation with squared distance
+    smooth_share = 0.45  # share of the noise's variance that neighbouring pixels have in common
+    bias_m = 0.003  # standard deviation of a camera's constant error, metres
+    ripple_m = 0.0012  # amplitude of the error that oscillates with distance, metres
+    ripple_period_m = 0.75  # its period, metres
+    edge_m = 0.04  # step in depth that makes flying pixels, metres
+    flying = 0.35  # share of flying pixels on a step
+    lost_at_edge = 0.30  # share of invalid pixels on a step
+    grazing_cosine = 0.16  # surfaces below this cosine of incidence get holes
+    dark = 0.10  # surfaces below this albedo get holes
+
     def __init__(
         self,
-        view: View,
+        view: RoomView,
         noise: NoiseSource,
         name: str,
         mode: str = "NFOV_UNBINNED",
@@ -59,7 +62,7 @@ class DepthSensor:
         self.view, self._noise, self._limits = view, noise, LIMITS[mode]
         rng = noise.rng("depth", name)
         self._rng = rng
-        self.bias = float(noise.tails(rng.normal(size=1))[0]) * BIAS_M * noise.scale
+        self.bias = float(noise.tails(rng.normal(size=1))[0]) * self.bias_m * noise.scale
         self._ripple = rng.uniform(0, 2 * np.pi)
         direction = view.directions()
         self._direction = direction / np.maximum(
@@ -76,12 +79,12 @@ class DepthSensor:
     def _risk(self, depth: np.ndarray, cosine: np.ndarray, albedo: np.ndarray) -> np.ndarray:
         """Share (...) of holes on surfaces at grazing angles and on dark ones."""
         scale = self._noise.scale
-        risk = 0.9 * np.clip(1 - np.abs(cosine) / (GRAZING_COSINE * (0.5 + 0.5 * scale)), 0, 1)
-        risk += np.clip(1 - albedo / DARK, 0, 1) * np.clip(depth / 4 - 0.2, 0, 0.7)
+        risk = 0.9 * np.clip(1 - np.abs(cosine) / (self.grazing_cosine * (0.5 + 0.5 * scale)), 0, 1)
+        risk += np.clip(1 - albedo / self.dark, 0, 1) * np.clip(depth / 4 - 0.2, 0, 0.7)
         return risk * min(scale, 1.5)
 
     def image(self, cast: Cast) -> np.ndarray:
-        """Depth (H, W) uint16 in millimetres, 0 = invalid, of the room with moving things."""
+        """Depth (H, W) uint16 in millimetres, 0 = invalid, of the room with moving objects."""
         rng, scale = self._rng, np.float32(self._noise.scale)
         depth, invalid = self._room.copy(), ~self._finite | ~self._in_field | self._static_holes
         if len(cast.pixels):
@@ -93,19 +96,19 @@ class DepthSensor:
             invalid[at] = ~self._in_field[at] | (blotches < risk)
         self._edges(depth, invalid, scale)
         white, error = gaussian(rng, depth.shape), gaussian(rng, depth.shape)
-        error *= np.float32(np.sqrt(1 - SMOOTH_SHARE))
+        error *= np.float32(np.sqrt(1 - self.smooth_share))
         kernel = cv2.getGaussianKernel(3, 0.9)
-        unit = np.sqrt(SMOOTH_SHARE) / np.linalg.norm(kernel @ kernel.T)
+        unit = np.sqrt(self.smooth_share) / np.linalg.norm(kernel @ kernel.T)
         error += cv2.GaussianBlur(white, (3, 3), 0.9) * np.float32(unit)
         if self._noise.family == "b":  # now and then a pixel is far off
             error *= np.where(np.abs(white) > 2.2, np.float32(3.0), np.float32(0.85))
         sigma = depth * depth
-        sigma *= np.float32(NOISE_PER_M2)
-        sigma += np.float32(NOISE_M)
+        sigma *= np.float32(self.noise_per_m2)
+        sigma += np.float32(self.noise_m)
         error *= sigma
         error *= np.float32(self._limits.noise)
-        phase = depth * np.float32(2 * np.pi / RIPPLE_PERIOD_M) + np.float32(self._ripple)
-        error += np.float32(RIPPLE_M) * np.sin(phase)
+        phase = depth * np.float32(2 * np.pi / self.ripple_period_m) + np.float32(self._ripple)
+        error += np.float32(self.ripple_m) * np.sin(phase)
         error *= scale
         error += depth
         error += np.float32(self.bias)
@@ -117,11 +120,11 @@ class DepthSensor:
         """Mix depths across steps, or lose them, in place."""
         kernel = np.ones((3, 3), np.uint8)
         near, far = cv2.erode(depth, kernel).ravel(), cv2.dilate(depth, kernel).ravel()
-        at = np.flatnonzero((far - near > EDGE_M) & (near > 0))
+        at = np.flatnonzero((far - near > self.edge_m) & (near > 0))
         chance, share = self._rng.random((2, len(at)), np.float32)
         strength = min(float(scale), 1.5)
-        flying = chance < FLYING * strength
-        gone = ~flying & (chance < (FLYING + LOST_AT_EDGE) * strength)
+        flying = chance < self.flying * strength
+        gone = ~flying & (chance < (self.flying + self.lost_at_edge) * strength)
         invalid.ravel()[at[gone]] = True
         at, share = at[flying], share[flying]
         here = depth.ravel()[at]
@@ -169,7 +172,7 @@ class _Event:
     place: np.ndarray
 
 
-def heard(stage: Stage, index: int, first_s: float, seconds: float) -> np.ndarray:
+def heard(stage: StudioStage, index: int, first_s: float, seconds: float) -> np.ndarray:
     """Samples (N,) float32 at :data:`.SOUND_RATE` of camera ``index``, ``seconds`` long from the
     true time ``first_s`` on, as the device lays them beside its images."""
     rng = stage.noise.rng("microphone", stage.rig.true.names[index])
@@ -191,7 +194,7 @@ def heard(stage: Stage, index: int, first_s: float, seconds: float) -> np.ndarra
     return (LOUDEST * sound / max(np.abs(sound).max(initial=0.0), 1e-9)).astype(np.float32)
 
 
-def _room(stage: Stage, rng: np.random.Generator) -> np.ndarray:
+def _room(stage: StudioStage, rng: np.random.Generator) -> np.ndarray:
     """The room's answer to a click, between this device and somebody in the middle."""
     fall = stage.noise.rng("reverberation").uniform(*REVERBERATION_S)
     times = np.arange(round(fall * RATE)) / RATE
@@ -202,7 +205,7 @@ def _room(stage: Stage, rng: np.random.Generator) -> np.ndarray:
     return tail
 
 
-def _events(stage: Stage) -> list[_Event]:
+def _events(stage: StudioStage) -> list[_Event]:
     """The same for every camera: steps on the floor below the person, syllables at the mouth."""
     rng = stage.noise.rng("sound")
     played = stage.interaction.perform(

@@ -58,7 +58,7 @@ def carry(
 
 
 @dataclass(frozen=True)
-class Skeleton:
+class PuppetSkeleton:
     """Rest joints (55, 3) of one person in the T-pose, metres."""
 
     rest: np.ndarray

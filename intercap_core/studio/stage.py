@@ -36,7 +36,7 @@ ANY_LAYOUT = frozenset({"dead_half", "no_depth", "zero_depth", "no_overlap"})
 
 
 @dataclass(frozen=True)
-class Moment:
+class StageState:
     """N moments in the stage frame, metres: ``body`` and ``clothed`` (N, V, 3), ``joints``
     (N, 55, 3), ``tips`` (N, 10, 3) thumb to little finger, left then right, ``pelvis`` (N, 3, 3)
     stage_from_rest rotations, ``stage_from_object`` (N, 4, 4), NaN where there is no object."""
@@ -49,7 +49,7 @@ class Moment:
     stage_from_object: np.ndarray
 
 
-class Stage:
+class StudioStage:
     """Everything that is true about one capture.
 
     Raises UserError for a subject, interaction or object that does not fit.
@@ -76,12 +76,12 @@ class Stage:
         if capture.shoes == "heavy":
             self.subject = in_heavy_shoes(self.subject, self.noise.rng("shoes"))
         self.puppet = Puppet(self.subject)
-        self.thing = TrueObject.nothing() if entry is None else self._thing(entry, capture)
-        corners = self.thing.vertices
+        self.prop = TrueObject.nothing() if entry is None else self._true_prop(entry, capture)
+        corners = self.prop.vertices
         self.bounds = np.stack([corners.min(0, initial=np.inf), corners.max(0, initial=-np.inf)])
         size = float(np.ptp(self.bounds, 0).max())
         kind = interaction_named(capture.interaction)
-        self.interaction = kind(self.puppet, self.thing, self.noise.rng("script"))
+        self.interaction = kind(self.puppet, self.prop, self.noise.rng("script"))
         rng = self.noise.rng("room")
         self.stage_from_script = _placed(rng, self.interaction.centre)
         self.rig: StudioRig = build_rig(
@@ -116,14 +116,14 @@ class Stage:
             furniture,
             eyes[:, :2, 3],
             furnishing=self.furnishing,
-            twin=Twin(corners, self.thing.faces) if self.thing else None,
-            hidden=self._highlight() if self.thing and size < SMALL_M else None,
+            twin=Twin(corners, self.prop.faces) if self.prop else None,
+            hidden=self._highlight() if self.prop and size < SMALL_M else None,
         )
         self.passer_by = None
         if capture.passer_by != "nobody":
             self.passer_by = self._passer_by(eyes[:, :2, 3], stands=capture.passer_by == "stands")
 
-    def _thing(self, entry: ObjectEntry, capture: StudioCapture) -> TrueObject:
+    def _true_prop(self, entry: ObjectEntry, capture: StudioCapture) -> TrueObject:
         """The object as it truly is in this capture."""
         vertices, faces, colours = true_mesh(entry, capture.seed)
         rng = self.noise.rng("look")
@@ -142,8 +142,8 @@ class Stage:
         )
         place = self.stage_from_script
         pelvis = played.pelvis @ place[:3, :3].T + place[:3, 3]
-        thing = (
-            (place @ played.stage_from_object)[:, :2, 3] if self.thing else np.full((1, 2), np.inf)
+        prop = (
+            (place @ played.stage_from_object)[:, :2, 3] if self.prop else np.full((1, 2), np.inf)
         )
         return PasserBy(
             self.noise,
@@ -152,7 +152,7 @@ class Stage:
             eyes,
             self.set_times,
             pelvis[:, :2],
-            thing,
+            prop,
             stands=stands,
         )
 
@@ -167,16 +167,16 @@ class Stage:
         return np.arange(self.frames) / self.fps
 
     @cached_property
-    def thing_normals(self) -> np.ndarray:
+    def prop_normals(self) -> np.ndarray:
         """Smooth outward normals (Vo, 3) of the object, its frame."""
-        return vertex_normals(self.thing.vertices, self.thing.faces)
+        return vertex_normals(self.prop.vertices, self.prop.faces)
 
     @cached_property
     def fitted(self) -> BodyModel:
         """The open body, for the names of its points."""
         return BodyModel.load()
 
-    def at(self, times: np.ndarray) -> Moment:
+    def at(self, times: np.ndarray) -> StageState:
         """Everything at recording times (N,), seconds since the first set."""
         script = self.interaction.script_times(times, self.duration)
         played = self.interaction.perform(script)
@@ -186,14 +186,14 @@ class Stage:
         stage_from_object = place @ played.stage_from_object
         posed = self.puppet.skin(world, pelvis)
         body, clothed = posed.vertices.copy(), posed.clothed.copy()
-        for n in range(len(times) if self.thing else 0):
+        for n in range(len(times) if self.prop else 0):
             for points in (body, clothed):
                 points[n] = press_out(
-                    points[n], self.thing.surface, stage_from_object[n], self.bounds
+                    points[n], self.prop.surface, stage_from_object[n], self.bounds
                 )
         order = [4, 0, 1, 3, 2]  # thumb, index, middle, ring, little finger
         tips = posed.tips[:, [*order, *(5 + i for i in order)]]
-        return Moment(
+        return StageState(
             body,
             clothed,
             posed.joints,
@@ -202,7 +202,7 @@ class Stage:
             stage_from_object,
         )
 
-    def keypoints(self, moment: Moment | Passing) -> np.ndarray:
+    def keypoints(self, moment: StageState | Passing) -> np.ndarray:
         """The 135 true keypoints (N, 135, 3) in the stage; all people share one mesh."""
         chart = self.fitted.keypoint_map
         corners = self.subject.faces[self.subject.fitted_face[chart.vertex_ids]]

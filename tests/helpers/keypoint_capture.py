@@ -25,7 +25,7 @@ from intercap_core.studio.keypoints import Detector
 from intercap_core.studio.recording import COVER_M, Kinect
 from intercap_core.studio.render import scene_of
 from intercap_core.studio.skeleton import local_rotations
-from intercap_core.studio.stage import Stage
+from intercap_core.studio.stage import StudioStage
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"
 COVER_EVERY_S = 0.2  # what hides what is worked out this often
@@ -69,7 +69,9 @@ def keypoint_capture(
             "slips": slips,
         }
     )
-    stage = Stage(capture, settings, _object_entry(interaction_named(interaction).object_class))
+    stage = StudioStage(
+        capture, settings, _object_entry(interaction_named(interaction).object_class)
+    )
     detector = Detector.build(stage.noise, stage.frames)
     kinects = [Kinect(stage, index, settings.colour_mode) for index in range(cameras)]
     shown = [_points(stage, kinect.exposures) for kinect in kinects]
@@ -94,7 +96,7 @@ def _object_entry(name: str) -> ObjectEntry:
     return ObjectEntry(name=name, mesh=CONFIG / found["mesh"], labels=found["labels"])
 
 
-def _points(stage: Stage, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _points(stage: StudioStage, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The true keypoints (N, 135, 3) and pelvis rotations (N, 3, 3) in the stage at recording
     ``times`` (N,); flesh is not pressed in."""
     chart, subject = stage.fitted.keypoint_map, stage.subject
@@ -113,7 +115,7 @@ def _points(stage: Stage, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return chart.matrix @ np.concatenate([seen, posed.joints], 1), world[:, 0]
 
 
-def _hidden(stage: Stage, points: list[np.ndarray]) -> np.ndarray:
+def _hidden(stage: StudioStage, points: list[np.ndarray]) -> np.ndarray:
     """Which keypoints (C, T, 135) something stands before, from ``points`` (T, 135, 3) a view."""
     cover = np.full(135, COVER_M["body"])
     cover[25:67], cover[67:] = COVER_M["hand"], COVER_M["face"]
@@ -124,7 +126,7 @@ def _hidden(stage: Stage, points: list[np.ndarray]) -> np.ndarray:
     eyes = apply(invert(stage.rig.master_from_stage), stage.rig.true.master_from_colour[:, :3, 3])
     hidden = np.zeros((len(points), stage.frames, 135), bool)
     for n, t in enumerate(looked):
-        pose, thing = moments.stage_from_object[n], stage.thing
+        pose, thing = moments.stage_from_object[n], stage.prop
         scene = scene_of(
             (moments.clothed[n], stage.subject.faces),
             (apply(pose, thing.vertices), thing.faces),

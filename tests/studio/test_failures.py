@@ -17,10 +17,10 @@ from intercap_core.schemas import TRUTH
 from intercap_core.studio.capture import make_capture
 from intercap_core.studio.keypoints import Detector
 from intercap_core.studio.noise import NoiseSource
-from intercap_core.studio.recording import START_US
-from intercap_core.studio.rig import Failures, StudioRig, build_rig, check_faults, started_apart
+from intercap_core.studio.recording import Kinect
+from intercap_core.studio.rig import Failures, StudioRig, build_rig, started_apart
 from intercap_core.studio.room import build_room
-from intercap_core.studio.stage import check_capture
+from intercap_core.studio.stage import check_capture, check_faults
 
 FRAMES, FPS = 8, 5
 
@@ -132,7 +132,7 @@ def test_faults_are_in_the_recordings_and_in_the_truth(broken_capture: Path) -> 
         assert not depth[0][:20, :20].any() and depth[0][200:300, 200:300].any()
         gravity = [p for p in packets if p.kind == "imu"]
         assert len(gravity) >= len(colour)
-        sets = np.rint((np.array(colour) - START_US) * FPS / 1e6).astype(int)
+        sets = np.rint((np.array(colour) - Kinect.start_us) * FPS / 1e6).astype(int)
         if faults["dead_half"] == name:
             assert sets.max() < FRAMES // 2 and not recorded[FRAMES // 2 :, index].any()
         elif faults["backwards_clock"] == name:

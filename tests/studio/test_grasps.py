@@ -10,15 +10,16 @@ import trimesh
 
 from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
 from intercap_core.geometry.rigid.distance import DistanceField
-from intercap_core.studio.interactions.grasps import DIRECTIONS, Hollow
-from intercap_core.studio.interactions.handling import RIGHT, Handling
-from intercap_core.studio.stage import Stage
+from intercap_core.studio.interactions.grasps import Hollow
+from intercap_core.studio.interactions.handling import HandlingScript
+from intercap_core.studio.motion import RIGHT
+from intercap_core.studio.stage import StudioStage
 
 
 def test_half_of_all_directions_meet_a_wide_wall_and_all_a_shell() -> None:
     wall = trimesh.creation.box((20.0, 20.0, 0.02))
     share = Hollow(DistanceField(wall.vertices, wall.faces)).share(np.array([[0, 0, 0.02]]))
-    assert share[0] == pytest.approx(0.5, abs=2 / DIRECTIONS)
+    assert share[0] == pytest.approx(0.5, abs=2 / Hollow.directions)
     shell = trimesh.creation.icosphere(subdivisions=2, radius=0.1)
     inside = Hollow(DistanceField(shell.vertices, shell.faces)).share(np.zeros((1, 3)))
     assert inside[0] == 1
@@ -27,11 +28,11 @@ def test_half_of_all_directions_meet_a_wide_wall_and_all_a_shell() -> None:
 @pytest.mark.parametrize("subject", ["s03", "s06"])
 def test_no_finger_is_in_the_cup(subject: str, object_entry: Callable[[str], ObjectEntry]) -> None:
     capture = StudioCapture(interaction="cup_drink", subject=subject, seed=911, frames=3)
-    stage = Stage(capture, StudioSettings(captures={}, cameras=1), object_entry("cup"))
+    stage = StudioStage(capture, StudioSettings(captures={}, cameras=1), object_entry("cup"))
     script = stage.interaction
-    assert isinstance(script, Handling)
+    assert isinstance(script, HandlingScript)
     low, high = stage.bounds[:, 2]
-    hollow = Hollow(stage.thing.surface)
+    hollow = Hollow(stage.prop.surface)
     assert hollow.holds(np.array([[0.0, 0.0, (low + high) / 2]]))
     assert not hollow.holds(np.array([[0.0, 0.0, high + 0.02]]))
     hand, grip = stage.puppet.hands[RIGHT], script.grips[RIGHT]

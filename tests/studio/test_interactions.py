@@ -15,8 +15,8 @@ from intercap_core.geometry.rigid.surface_samples import sample_surface
 from intercap_core.schemas import CONTACT_REGIONS
 from intercap_core.studio.capture import region_contact
 from intercap_core.studio.hands import OPEN, Hand, shape
-from intercap_core.studio.skeleton import REACH_FREE, Skeleton, turn
-from intercap_core.studio.stage import Moment, Stage
+from intercap_core.studio.skeleton import REACH_FREE, PuppetSkeleton, turn
+from intercap_core.studio.stage import StageState, StudioStage
 from intercap_core.studio.subjects import Subject
 
 
@@ -105,19 +105,21 @@ Entry = Callable[[str], ObjectEntry]
 
 
 @pytest.fixture(scope="module", params=list(CASES))
-def played(request: pytest.FixtureRequest, object_entry: Entry) -> tuple[str, Stage, Moment]:
+def played(
+    request: pytest.FixtureRequest, object_entry: Entry
+) -> tuple[str, StudioStage, StageState]:
     name = request.param
     case = CASES[name]
     capture = StudioCapture(interaction=name, subject=case.subject, seed=case.seed, frames=45)
-    stage = Stage(capture, StudioSettings(captures={}, cameras=2), object_entry(case.thing))
+    stage = StudioStage(capture, StudioSettings(captures={}, cameras=2), object_entry(case.thing))
     return name, stage, stage.at(stage.set_times)
 
 
-def signed_distance(stage: Stage, points: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    return stage.thing.surface.signed_distance((points - pose[:3, 3]) @ pose[:3, :3])
+def signed_distance(stage: StudioStage, points: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    return stage.prop.surface.signed_distance((points - pose[:3, 3]) @ pose[:3, :3])
 
 
-def test_nothing_enters_the_object(played: tuple[str, Stage, Moment]) -> None:
+def test_nothing_enters_the_object(played: tuple[str, StudioStage, StageState]) -> None:
     _, stage, moment = played
     for t in range(2, stage.frames, 5):
         for surface in (moment.body[t], moment.clothed[t]):
@@ -126,10 +128,10 @@ def test_nothing_enters_the_object(played: tuple[str, Stage, Moment]) -> None:
             assert inside.size == 0 or -inside.mean() < 0.002
 
 
-def test_the_object_does_not_enter_the_body(played: tuple[str, Stage, Moment]) -> None:
+def test_the_object_does_not_enter_the_body(played: tuple[str, StudioStage, StageState]) -> None:
     """A board is thinner than the way between two vertices of the skin, and so may be a step."""
     _, stage, moment = played
-    thing = stage.thing
+    thing = stage.prop
     samples = sample_surface(thing.vertices, thing.faces, 2000).of(thing.vertices, thing.faces)
     for t in range(1, stage.frames, 4):
         pose = moment.stage_from_object[t]
@@ -137,7 +139,9 @@ def test_the_object_does_not_enter_the_body(played: tuple[str, Stage, Moment]) -
         assert -body.signed_distance(samples @ pose[:3, :3].T + pose[:3, 3]).min() < 0.015
 
 
-def test_flesh_is_pressed_in_by_no_more_than_it_gives(played: tuple[str, Stage, Moment]) -> None:
+def test_flesh_is_pressed_in_by_no_more_than_it_gives(
+    played: tuple[str, StudioStage, StageState],
+) -> None:
     """Before the tissue gives way: millimetres at a hand, a centimetre and a half on a seat."""
     name, stage, _ = played
     performed = stage.interaction.perform(np.arange(0.0, 3.0, 0.12))
@@ -149,7 +153,7 @@ def test_flesh_is_pressed_in_by_no_more_than_it_gives(played: tuple[str, Stage, 
     assert -deepest < CASES[name].pressed_m
 
 
-def test_expected_regions_touch_for_long(played: tuple[str, Stage, Moment]) -> None:
+def test_expected_regions_touch_for_long(played: tuple[str, StudioStage, StageState]) -> None:
     name, stage, moment = played
     expected, (first, last) = CASES[name].regions, CASES[name].contact
     contact = region_contact(stage, moment)
@@ -159,7 +163,7 @@ def test_expected_regions_touch_for_long(played: tuple[str, Stage, Moment]) -> N
     assert not contact[:5].any()
 
 
-def test_hands_stay_out_of_the_body(played: tuple[str, Stage, Moment]) -> None:
+def test_hands_stay_out_of_the_body(played: tuple[str, StudioStage, StageState]) -> None:
     """As far as flesh gives way, but for a thumb that passes the hip as one sits down."""
     _, stage, moment = played
     part = stage.subject.weights.toarray().argmax(1)
@@ -174,7 +178,7 @@ def test_hands_stay_out_of_the_body(played: tuple[str, Stage, Moment]) -> None:
         assert max(depths) < 0.055 and np.median(depths) < 0.015
 
 
-def test_planted_feet_do_not_slide_or_sink(played: tuple[str, Stage, Moment]) -> None:
+def test_planted_feet_do_not_slide_or_sink(played: tuple[str, StudioStage, StageState]) -> None:
     _, stage, moment = played
     ankle, _, pitch = stage.interaction.footwork.feet(stage.set_times)
     height = stage.puppet.ankle_height
@@ -189,19 +193,21 @@ def test_planted_feet_do_not_slide_or_sink(played: tuple[str, Stage, Moment]) ->
     assert np.median(np.abs(lowest[stands])) < 0.002
 
 
-def test_a_resting_object_does_not_move(played: tuple[str, Stage, Moment]) -> None:
+def test_a_resting_object_does_not_move(played: tuple[str, StudioStage, StageState]) -> None:
     name, stage, moment = played
     for start, end in CASES[name].rests:
         assert end - start >= 0.4
         resting = (stage.set_times >= start) & (stage.set_times <= end)
         poses = moment.stage_from_object[resting]
         assert np.abs(poses - poses[0]).max() < 1e-12
-    lowest = (stage.thing.vertices @ moment.stage_from_object[-1, 2, :3]).min()
+    lowest = (stage.prop.vertices @ moment.stage_from_object[-1, 2, :3]).min()
     if CASES[name].on_floor:
         assert abs(lowest + moment.stage_from_object[-1, 2, 3]) < 1e-6
 
 
-def test_object_and_hand_move_together_without_a_jump(played: tuple[str, Stage, Moment]) -> None:
+def test_object_and_hand_move_together_without_a_jump(
+    played: tuple[str, StudioStage, StageState],
+) -> None:
     name, stage, _ = played
     case = CASES[name]
     times = np.arange(0, 3, 0.01)
@@ -217,7 +223,7 @@ def test_a_kicked_ball_slides_then_rolls_then_stops(object_entry: Entry) -> None
     case = CASES["football_kick"]
     capture = StudioCapture(interaction="football_kick", subject=case.subject, seed=case.seed,
                             frames=45)  # fmt: skip
-    stage = Stage(capture, StudioSettings(captures={}, cameras=1), object_entry(case.thing))
+    stage = StudioStage(capture, StudioSettings(captures={}, cameras=1), object_entry(case.thing))
     times = np.arange(2.0, 3.0, 0.02)
     pose = stage.interaction.perform(times).stage_from_object
     speed = np.linalg.norm(np.diff(pose[:, :2, 3], axis=0), axis=1) / 0.02
@@ -238,7 +244,9 @@ def test_a_longer_recording_is_slower_and_a_short_one_shows_the_highlight(
         capture = StudioCapture(
             interaction="stool_sit", subject=case.subject, seed=case.seed, frames=frames
         )
-        stage = Stage(capture, StudioSettings(captures={}, cameras=1), object_entry(case.thing))
+        stage = StudioStage(
+            capture, StudioSettings(captures={}, cameras=1), object_entry(case.thing)
+        )
         script = stage.interaction.script_times(stage.set_times, stage.duration)
         speeds.append(np.diff(script)[0] * 15)
     assert speeds == pytest.approx([1.0, 0.5])
@@ -250,14 +258,14 @@ def test_wrong_object_or_subject_is_refused(object_entry: Entry) -> None:
     settings = StudioSettings(captures={}, cameras=1)
     capture = StudioCapture(interaction="cup_drink", subject="s01", seed=1, frames=3)
     with pytest.raises(UserError, match="needs object 'cup'"):
-        Stage(capture, settings, object_entry("stool"))
+        StudioStage(capture, settings, object_entry("stool"))
     nobody = capture.model_copy(update={"subject": "nobody"})
     with pytest.raises(UserError, match="no subject 'nobody'"):
-        Stage(nobody, settings, object_entry("cup"))
+        StudioStage(nobody, settings, object_entry("cup"))
 
 
 def test_limb_reaches_its_target_and_bends_to_the_pole() -> None:
-    skeleton = Skeleton(Subject.load("s03").rest_joints)
+    skeleton = PuppetSkeleton(Subject.load("s03").rest_joints)
     rng = np.random.default_rng(0)
     names = ("left_hip", "left_knee", "left_ankle")
     length = skeleton.length(*names)

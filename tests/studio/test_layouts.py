@@ -23,7 +23,7 @@ from intercap_core.formats.recordings.source import Image
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.studio.capture import make_capture
-from intercap_core.studio.capture_folder import Aligner, Device, Shot
+from intercap_core.studio.capture_folder import Aligner, Device, DeviceFrame
 from intercap_core.studio.layouts import FOLDERS, camera_names
 from intercap_core.studio.rig import StudioRig, build_rig
 from intercap_core.studio.stage import check_faults
@@ -55,7 +55,7 @@ def write(folder: Path, layout: LayoutName, faults: tuple[str, ...] = (),
         with place.open(device) as files:
             for t in SETS:
                 time_us = 1_000_000 + round(t * 1e6 / FPS) + 160 * index
-                files.write(Shot(t, time_us, jpeg, depth if t else None, []))
+                files.write(DeviceFrame(t, time_us, jpeg, depth if t else None, []))
     place.write_calibration(rig.claimed, FPS)
     return rig, jpeg, depth
 

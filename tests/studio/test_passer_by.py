@@ -17,10 +17,10 @@ from intercap_core.schemas import TRUTH
 from intercap_core.studio.capture import make_capture
 from intercap_core.studio.keypoints import Detector
 from intercap_core.studio.noise import NoiseSource
-from intercap_core.studio.passer_by import PASSES_M, PasserBy
+from intercap_core.studio.passer_by import PasserBy
 from intercap_core.studio.recording import surfaces_at
-from intercap_core.studio.render import BODY, OBJECT, PASSER_BY, View, scene_of
-from intercap_core.studio.stage import Stage
+from intercap_core.studio.render import BODY, OBJECT, PASSER_BY, RoomView, scene_of
+from intercap_core.studio.stage import StudioStage
 from intercap_core.studio.subjects import body_colours
 
 Entry = Callable[[str], ObjectEntry]
@@ -31,23 +31,23 @@ SETTINGS = StudioSettings(captures={}, cameras=3, colour_mode="720P", fps=5)
 
 
 @pytest.fixture(scope="module")
-def stage(object_entry: Entry) -> Stage:
-    return Stage(CAPTURE, SETTINGS, object_entry("stool"))
+def stage(object_entry: Entry) -> StudioStage:
+    return StudioStage(CAPTURE, SETTINGS, object_entry("stool"))
 
 
 @pytest.fixture(scope="module")
-def walker(stage: Stage) -> PasserBy:
+def walker(stage: StudioStage) -> PasserBy:
     assert stage.passer_by is not None
     return stage.passer_by
 
 
-def test_somebody_else_walks_past_and_touches_nothing(stage: Stage, walker: PasserBy) -> None:
+def test_somebody_else_walks_past_and_touches_nothing(stage: StudioStage, walker: PasserBy) -> None:
     times = np.arange(0, stage.duration, 1 / 30)
     moment, passing = stage.at(times), walker.at(times)
     assert walker.subject.name != stage.subject.name and passing.present.all()
     apart = np.linalg.norm((passing.joints - moment.joints)[:, 0, :2], axis=1)
-    assert PASSES_M[0] - 0.05 < apart.min() < PASSES_M[1] + 0.05
-    things = stage.thing.vertices[::50]
+    assert PasserBy.passes_m[0] - 0.05 < apart.min() < PasserBy.passes_m[1] + 0.05
+    things = stage.prop.vertices[::50]
     for t in range(0, len(times), 5):
         pose = moment.stage_from_object[t]
         at = things @ pose[:3, :3].T + pose[:3, 3]
@@ -59,7 +59,7 @@ def test_somebody_else_walks_past_and_touches_nothing(stage: Stage, walker: Pass
 
 
 def test_somebody_else_stands_by_and_looks_on(object_entry: Entry) -> None:
-    stage = Stage(
+    stage = StudioStage(
         CAPTURE.model_copy(update={"passer_by": "stands"}), SETTINGS, object_entry("stool")
     )
     times = np.arange(0, stage.duration, 1 / 15)
@@ -69,7 +69,7 @@ def test_somebody_else_stands_by_and_looks_on(object_entry: Entry) -> None:
     assert np.ptp(passing.joints[:, 0], axis=0).max() > 0
     towards = (moment.joints - passing.joints)[:, 0, :2]
     apart = np.linalg.norm(towards, axis=1)
-    assert PASSES_M[0] - 0.05 < apart.min() < PASSES_M[1] + 0.05
+    assert PasserBy.passes_m[0] - 0.05 < apart.min() < PasserBy.passes_m[1] + 0.05
     ahead = passing.pelvis[:, :2, 2]  # the pelvis' z looks ahead
     assert ((ahead * towards).sum(1) / apart > 0.5).all()
     assert np.abs(passing.clothed[..., 2].min(1)).max() < 0.003
@@ -81,8 +81,10 @@ def test_the_walker_comes_from_the_edge_and_leaves(walker: PasserBy) -> None:
     assert present.tolist() == [False, True, True, True, False]
 
 
-def test_nothing_else_of_the_recording_changes(stage: Stage, object_entry: Entry) -> None:
-    alone = Stage(CAPTURE.model_copy(update={"passer_by": False}), SETTINGS, object_entry("stool"))
+def test_nothing_else_of_the_recording_changes(stage: StudioStage, object_entry: Entry) -> None:
+    alone = StudioStage(
+        CAPTURE.model_copy(update={"passer_by": False}), SETTINGS, object_entry("stool")
+    )
     ours, theirs = (s.at(s.set_times[::4]) for s in (stage, alone))
     np.testing.assert_array_equal(ours.body, theirs.body)
     np.testing.assert_array_equal(ours.stage_from_object, theirs.stage_from_object)
@@ -90,7 +92,7 @@ def test_nothing_else_of_the_recording_changes(stage: Stage, object_entry: Entry
     np.testing.assert_array_equal(stage.rig.offset_s, alone.rig.offset_s)
 
 
-def test_each_hides_what_is_behind(stage: Stage, walker: PasserBy) -> None:
+def test_each_hides_what_is_behind(stage: StudioStage, walker: PasserBy) -> None:
     """Against rays that are cast through all surfaces at once."""
     times = np.array([0.0, walker.way.when, 1.8])
     moment, passing = stage.at(times), walker.at(times)
@@ -99,7 +101,7 @@ def test_each_hides_what_is_behind(stage: Stage, walker: PasserBy) -> None:
     drawn_of_walker = 0
     for camera in stage.rig.true:
         pose = stage_from_master @ camera.master_from_colour
-        view = View(camera.colour.scaled(0.2), pose, stage.room, coloured=True)
+        view = RoomView(camera.colour.scaled(0.2), pose, stage.room, coloured=True)
         for t in range(len(times)):
             surfaces = surfaces_at(stage, moment, t, colours, passing)
             cast = view.cast(surfaces)
@@ -135,7 +137,7 @@ def test_detectors_find_both_people_in_any_order(tmp_path: Path, object_entry: E
     assert several > CAPTURE.frames and persons > CAPTURE.frames
 
 
-def test_a_walker_is_anywhere_in_a_file_and_only_where_seen(stage: Stage) -> None:
+def test_a_walker_is_anywhere_in_a_file_and_only_where_seen(stage: StudioStage) -> None:
     detector = Detector.build(NoiseSource(3, 1.0, "a", 5.0), 60)
     subject, walker = np.zeros((135, 3)), np.ones((60, 135, 3))
     hidden = np.zeros((60, 135), bool)

@@ -12,8 +12,8 @@ from intercap_core.studio.render import (
     BODY,
     CAMERA_GAMMA,
     OBJECT,
-    Surface,
-    View,
+    MovingSurface,
+    RoomView,
     scene_of,
     shade,
 )
@@ -24,7 +24,7 @@ from intercap_core.studio.subjects import Subject
 
 
 @pytest.fixture(scope="module")
-def surfaces() -> tuple[Surface, Surface]:
+def surfaces() -> tuple[MovingSurface, MovingSurface]:
     """A person in the T-pose on the floor and a ball before the chest, colours by place."""
     subject = Subject.load("s01")
     upright = turn(np.array([np.pi / 2, 0, 0]))  # the rest pose has y up
@@ -34,8 +34,8 @@ def surfaces() -> tuple[Surface, Surface]:
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.15)
     place = rigid(turn(np.array([0.3, 0.2, 0.1])), np.array([0.25, 0.3, 1.2]))
     return (
-        Surface(BODY, posed, subject.faces, normals, 0.5 + 0.2 * posed, np.eye(4)),
-        Surface(
+        MovingSurface(BODY, posed, subject.faces, normals, 0.5 + 0.2 * posed, np.eye(4)),
+        MovingSurface(
             OBJECT, np.array(ball.vertices), np.array(ball.faces), ball.vertices / 0.15,
             0.5 + 0.2 * ball.vertices, place,
         ),
@@ -44,14 +44,14 @@ def surfaces() -> tuple[Surface, Surface]:
 
 @pytest.mark.parametrize("index", [0, 1])
 def test_moving_things_are_drawn_where_rays_hit_them(
-    surfaces: tuple[Surface, Surface], index: int
+    surfaces: tuple[MovingSurface, MovingSurface], index: int
 ) -> None:
     rig = build_rig(np.random.default_rng(1), cameras=2, frames=9, colour_mode="720P", noise=1.0)
     camera = rig.true[index]
     assert camera.depth is not None
     pose = invert(rig.master_from_stage) @ camera.master_from_depth
     room = build_room(np.random.default_rng(0), [], np.eye(2), furnishing="bare")
-    view = View(camera.depth, pose, room, coloured=False)
+    view = RoomView(camera.depth, pose, room, coloured=False)
     cast = view.cast(surfaces)
     scene = scene_of(*((apply(s.stage_from_mesh, s.vertices), s.faces) for s in surfaces))
     directions = view.directions()[cast.window]

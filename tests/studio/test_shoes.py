@@ -13,7 +13,7 @@ from intercap_core.errors import UserError
 from intercap_core.evaluation.motion import support
 from intercap_core.evaluation.truth import Truth
 from intercap_core.studio.capture import make_capture
-from intercap_core.studio.stage import Stage, check_capture
+from intercap_core.studio.stage import StudioStage, check_capture
 from intercap_core.studio.subjects import (
     FEET,
     LEATHER_M,
@@ -53,7 +53,7 @@ def test_a_person_stands_on_the_soles(object_entry: Entry) -> None:
         capture = StudioCapture(
             interaction="suitcase_carry", subject="s06", seed=11, frames=20, shoes=shoes
         )
-        stage = Stage(capture, SETTINGS, object_entry("suitcase"))
+        stage = StudioStage(capture, SETTINGS, object_entry("suitcase"))
         moment = stage.at(stage.set_times[::2])
         lowest[shoes] = [part[..., 2].min(1) for part in (moment.body, moment.clothed)]
     for shoes in lowest:

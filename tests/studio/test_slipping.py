@@ -12,14 +12,12 @@ from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
 from intercap_core.evaluation.motion import SLIP_S, slip_speed
 from intercap_core.studio.capture import CONTACT_M, region_contact
 from intercap_core.studio.interactions.slipping import (
-    GLIDE_M,
-    TURN_DEG,
     BottleRegrasp,
     RacquetGlide,
     UmbrellaTurn,
     along_and_about,
 )
-from intercap_core.studio.stage import Moment, Stage
+from intercap_core.studio.stage import StageState, StudioStage
 
 FPS = 15
 Entry = Callable[[str], ObjectEntry]
@@ -29,8 +27,8 @@ Entry = Callable[[str], ObjectEntry]
 class Held:
     """A recording of 45 sets and where its skin is on the thing (T, V, 3), metres."""
 
-    stage: Stage
-    moment: Moment
+    stage: StudioStage
+    moment: StageState
     local: np.ndarray
     distance: np.ndarray
 
@@ -42,7 +40,7 @@ class Held:
         """Metres a second (T,): the metric's, of a fit that sticks where it touches."""
 
         def normals_at(points: np.ndarray) -> np.ndarray:
-            return self.stage.thing.surface.closest(points).normals
+            return self.stage.prop.surface.closest(points).normals
 
         found = np.full(len(self.local), np.nan)
         for t in range(len(self.local)):
@@ -58,14 +56,16 @@ def held(object_entry: Entry) -> Callable[[str, str, str, int], Held]:
     def play(name: str, thing: str, subject: str, seed: int) -> Held:
         if name not in known:
             capture = StudioCapture(interaction=name, subject=subject, seed=seed, frames=45)
-            stage = Stage(capture, StudioSettings(captures={}, cameras=1), object_entry(thing))
+            stage = StudioStage(
+                capture, StudioSettings(captures={}, cameras=1), object_entry(thing)
+            )
             moment = stage.at(stage.set_times)
             rotation = moment.stage_from_object[:, :3, :3]
             local = (moment.body - moment.stage_from_object[:, None, :3, 3]) @ rotation
-            reach = np.linalg.norm(stage.thing.vertices, axis=1).max() + 0.02
+            reach = np.linalg.norm(stage.prop.vertices, axis=1).max() + 0.02
             distance = np.full(local.shape[:2], np.inf)
             near = np.linalg.norm(local, axis=2) < reach
-            distance[near] = stage.thing.surface.signed_distance(local[near])
+            distance[near] = stage.prop.surface.signed_distance(local[near])
             known[name] = Held(stage, moment, local, distance)
         return known[name]
 
@@ -100,7 +100,7 @@ def test_truth_slips_as_fast_as_the_hand_glides(held: Callable[..., Held]) -> No
     start, end, back, home = RacquetGlide.glide_s
     slip = recording.true_slip()
     along = recording.stage.interaction.slide(recording.stage.set_times)[:, 2, 3]
-    assert along.max() == pytest.approx(GLIDE_M)
+    assert along.max() == pytest.approx(RacquetGlide.glide_m)
     window = round(SLIP_S * FPS)
     intended = np.abs(along[window:] - along[:-window]) * FPS / window
     for part in (between(start, end), between(back, home)):
@@ -113,7 +113,7 @@ def test_truth_slips_as_fast_as_the_handle_turns(held: Callable[..., Held]) -> N
     start, end, back, home = UmbrellaTurn.turn_s
     turned = recording.stage.interaction.slide(recording.stage.set_times)[:, :3, :3]
     angle = np.arccos(np.clip((np.trace(turned, axis1=1, axis2=2) - 1) / 2, -1, 1))
-    assert angle.max() == pytest.approx(np.radians(TURN_DEG))
+    assert angle.max() == pytest.approx(np.radians(UmbrellaTurn.turn_deg))
     slip = recording.true_slip()
     window = round(SLIP_S * FPS)
     turns = np.abs(angle[window:] - angle[:-window]) * FPS / window

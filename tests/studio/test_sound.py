@@ -13,16 +13,16 @@ from intercap_core.formats.recordings.sound import SOUND_RATE, Sound
 from intercap_core.formats.recordings.sound_delays import delay_between, sound_starts
 from intercap_core.studio.capture import erring_starts
 from intercap_core.studio.capture_folder import SOUND_RATE as STUDIO_RATE
-from intercap_core.studio.capture_folder import Device, Shot
+from intercap_core.studio.capture_folder import Device, DeviceFrame
 from intercap_core.studio.layouts import FOLDERS
 from intercap_core.studio.sensors import MAX_LATENCY_S, heard
-from intercap_core.studio.stage import Stage
+from intercap_core.studio.stage import StudioStage
 
 SECONDS = 3.0
 TRAVEL_S = 0.012  # between two places of the ring: 4 m
 
 
-def stage_of(seed: int, apart: float = 0.9) -> Stage:
+def stage_of(seed: int, apart: float = 0.9) -> StudioStage:
     capture = StudioCapture(
         interaction="walk_and_wave", subject="s03", seed=seed, frames=90, starts_apart=apart,
         layout="plain", depth=False, video=True, sound=True,
@@ -30,7 +30,7 @@ def stage_of(seed: int, apart: float = 0.9) -> Stage:
     settings = StudioSettings.model_validate(
         {"captures": {}, "fps": 30, "colour_mode": "720P", "cameras": 4}
     )
-    return Stage(capture, settings, None)
+    return StudioStage(capture, settings, None)
 
 
 def listened(samples: np.ndarray) -> Sound:
@@ -76,7 +76,7 @@ def test_a_video_carries_what_was_heard(tmp_path):
     device = Device(0, camera, "1", "720P", "NFOV_UNBINNED", False, 30, 1_000_000, samples)
     with place.open(device) as files:
         for t in range(60):
-            files.write(Shot(t, 1_000_000 + round(t * 1e6 / 30), jpeg, None, []))
+            files.write(DeviceFrame(t, 1_000_000 + round(t * 1e6 / 30), jpeg, None, []))
     place.write_calibration(stage.rig.claimed, 30)
     row = SequenceEntry(
         sequence="one", subject="p", recordings=tmp_path, layout="plain",

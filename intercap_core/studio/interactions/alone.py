@@ -4,20 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.studio.controls import Footwork, Pose, Step, plateau
+from intercap_core.studio.controls import Step, WristPose, plateau
 from intercap_core.studio.hands import RELAXED, shape
-from intercap_core.studio.interactions.base import SCRIPT_S, Interaction, Performance
-from intercap_core.studio.motion import LEG_REACH, SIDES, Foot, Trunk
+from intercap_core.studio.interactions.base import Interaction, Performance
+from intercap_core.studio.motion import LEFT, RIGHT, SIDES, Foot, Trunk
 from intercap_core.studio.room import Box
 from intercap_core.studio.skeleton import unit
-
-LEFT, RIGHT = 0, 1
-BEAM_HALF_M, BEAM_HEIGHT_M = 0.05, (0.15, 0.30)
-STRIDE_M = (0.32, 0.38)  # along the beam
-BEFORE_M = 0.10  # toes on the floor from the beam's end
-BEYOND_M = 0.06  # heels and toes on the beam from its ends
-ASIDE_M = 0.11  # a foot swings past the one that stands
-STEP_S = ((0.05, 0.52), (0.50, 0.94), (0.92, 1.32), (1.30, 1.70), (1.68, 2.18), (2.16, 2.60))
 
 
 class BeamWalk(Interaction):
@@ -26,36 +18,41 @@ class BeamWalk(Interaction):
     leaves_floor = True
     highlight = 1.3
     centre = (0.0, 0.0)
+    beam_half_m = 0.05  # half the beam's width, metres
+    beam_height_m = (0.15, 0.30)  # range, metres
+    stride_m = (0.32, 0.38)  # range along the beam, metres
+    toe_gap_m = 0.10  # from the toes on the floor to the beam's end, metres
+    margin_m = 0.06  # from heels and toes on the beam to its ends, metres
+    aside_m = 0.11  # sideways detour of a foot around the standing foot, metres
+    # start and end of each step, script time
+    step_s = ((0.05, 0.52), (0.50, 0.94), (0.92, 1.32), (1.30, 1.70), (1.68, 2.18), (2.16, 2.60))
 
     def plan(self) -> None:
         rng, puppet = self.rng, self.puppet
-        self.height = float(rng.uniform(*BEAM_HEIGHT_M))
-        stride, first = rng.uniform(*STRIDE_M), int(rng.integers(2))
+        self.height = float(rng.uniform(*self.beam_height_m))
+        stride, first = rng.uniform(*self.stride_m), int(rng.integers(2))
         heel, toe = self._soles()
-        length = heel + toe + 3 * stride + 2 * BEYOND_M
+        length = heel + toe + 3 * stride + 2 * self.margin_m
         low = -length / 2
         self.furniture.append(
-            Box((low, -BEAM_HALF_M, 0.0), (-low, BEAM_HALF_M, self.height), 0.0, "wood")
+            Box((low, -self.beam_half_m, 0.0), (-low, self.beam_half_m, self.height), 0.0, "wood")
         )
         w = puppet.hip_width * 0.9
         sides = np.array([w, -w])
-        before, after = low - BEFORE_M - toe, -low + BEFORE_M + heel
+        before, after = low - self.toe_gap_m - toe, -low + self.toe_gap_m + heel
         start = np.stack([np.full(2, before) + rng.normal(0, 0.01, 2), sides], 1)
         steps = []
-        for count, (begin, end) in enumerate(STEP_S):
+        for count, (begin, end) in enumerate(self.step_s):
             foot = first if count % 2 == 0 else 1 - first
             if count < 4:
-                x = low + BEYOND_M + heel + count * stride
+                x = low + self.margin_m + heel + count * stride
                 place = (float(x), float(rng.normal(0, 0.005)))
-                aside = ASIDE_M if count else 0.0
+                aside = self.aside_m if count else 0.0
                 steps.append(Step(foot, begin, end, place, 0.0, self.height, aside))
             else:
                 place = (float(after + rng.uniform(0, 0.03)), float(sides[foot]))
-                steps.append(Step(foot, begin, end, place, 0.0, 0.0, ASIDE_M))
-        self.footwork = Footwork(start, 0.0, steps, puppet.ankle_height, SCRIPT_S)
-        self.pelvis_track = self.footwork.pelvis(
-            LEG_REACH * puppet.leg, puppet.hip_width, puppet.hip_drop, puppet.stand
-        )
+                steps.append(Step(foot, begin, end, place, 0.0, 0.0, self.aside_m))
+        self.walk(start, steps)
 
     def _soles(self) -> tuple[float, float]:
         """How far heels and toes reach behind and ahead of the ankles, metres."""
@@ -89,14 +86,12 @@ class BeamWalk(Interaction):
             out = balance[:, None] * (0.26 * outward + (0, 0, 0.16))
             unsteady = 4 * balance[:, None] * swing[:, [side]] * (0, 0, 1)
             puppet.arm_to(
-                world, pelvis, side, Pose(wrist.position + out + unsteady, wrist.rotation)
+                world, pelvis, side, WristPose(wrist.position + out + unsteady, wrist.rotation)
             )
             puppet.fingers(world, side, puppet.finger_track(side, RELAXED, []))
         return Performance(world, pelvis, np.full((len(times), 4, 4), np.nan))
 
 
-RAISED_S = (1.05, 1.65, 2.55, 3.05)  # the hand goes up, is up, goes down, is down
-WAVE_HZ, WAVE_M = 1.6, 0.09  # of the raised hand, to the sides
 FLAT = shape((4, 2, 2), (8, 3, -8), 10, 0)
 
 
@@ -105,6 +100,10 @@ class WalkAndWave(Interaction):
 
     highlight = 1.5
     centre = (0.0, 0.0)
+    # start and end of raising and of lowering the hand, script time
+    raised_s = (1.05, 1.65, 2.55, 3.05)
+    wave_hz = 1.6  # frequency of the wave
+    wave_m = 0.09  # amplitude of the wave to the sides, metres
 
     def plan(self) -> None:
         rng, puppet = self.rng, self.puppet
@@ -121,10 +120,7 @@ class WalkAndWave(Interaction):
             Step(RIGHT, 0.84, 1.28, tuple(end - w * across), turned),
             Step(LEFT, 1.26, 1.66, tuple(end + w * across), turned),
         ]
-        self.footwork = Footwork(start, 0.0, steps, puppet.ankle_height, SCRIPT_S)
-        self.pelvis_track = self.footwork.pelvis(
-            LEG_REACH * puppet.leg, puppet.hip_width, puppet.hip_drop, puppet.stand
-        )
+        self.walk(start, steps)
 
     def _trunk(self, times: np.ndarray) -> Trunk:
         track, sway = self.pelvis_track(times), self.sway(times)
@@ -136,24 +132,24 @@ class WalkAndWave(Interaction):
         head[:, 1] += 0.3 * np.sign(self.turned) * plateau(times, 0.5, 0.9, 1.4, 1.8)
         return Trunk(pelvis, track[:, 3], bend, head)
 
-    def _waving(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> Pose:
+    def _waving(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> WristPose:
         """The raised wrist (N), the palm ahead."""
         puppet, sign = self.puppet, (1.0, -1.0)[self.side]
         left, up, ahead = (world[:, 9, :, axis] for axis in range(3))
-        wave = WAVE_M * np.sin(2 * np.pi * WAVE_HZ * (times - RAISED_S[1]))[:, None]
+        wave = self.wave_m * np.sin(2 * np.pi * self.wave_hz * (times - self.raised_s[1]))[:, None]
         place = puppet.arm_root(world, pelvis, self.side) + puppet.arm * (
             0.32 * sign * left + 0.48 * up + 0.42 * ahead
         )
         fingers = unit(up + (wave / puppet.arm) * left + 0.15 * ahead)
         rotation = puppet.wrist_rotation(self.side, fingers, unit(ahead - 0.15 * up))
-        return Pose(place + wave * left, rotation)
+        return WristPose(place + wave * left, rotation)
 
     def perform(self, times: np.ndarray) -> Performance:
         puppet, feet = self.puppet, self.footwork.feet(times)
         trunk = puppet.settled(self._trunk(times), feet[0])
         world, pelvis = puppet.trunk(trunk), trunk.pelvis
         puppet.legs(world, pelvis, *feet)
-        up = plateau(times, *RAISED_S)
+        up = plateau(times, *self.raised_s)
         walking = plateau(times, -0.4, 0.1, 1.1, 1.5)
         stride = 0.13 * walking * np.sin(2 * np.pi * (times - 0.05) / 0.82)
         for side, sign in ((LEFT, 1.0), (RIGHT, -1.0)):

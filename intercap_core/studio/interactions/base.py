@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from intercap_core.geometry.camera.transforms import invert
-from intercap_core.studio.controls import Wander
+from intercap_core.studio.controls import Footwork, Guide, Step, Wander
 from intercap_core.studio.motion import Puppet
 from intercap_core.studio.objects import TrueObject
 from intercap_core.studio.room import Box
@@ -37,7 +38,7 @@ class Interaction(ABC):
     """
 
     puppet: Puppet
-    thing: TrueObject
+    prop: TrueObject
     rng: np.random.Generator
     furniture: list[Box] = field(default_factory=list)
     object_class = ""
@@ -59,6 +60,18 @@ class Interaction(ABC):
     @abstractmethod
     def perform(self, times: np.ndarray) -> Performance:
         """Play the script at script times (N,), any order."""
+
+    def walk(
+        self,
+        start: np.ndarray,
+        steps: Sequence[Step],
+        *,
+        heading: float = 0.0,
+        guides: Sequence[Guide] = (),
+    ) -> None:
+        """Stand at ``start`` (2, 2), left and right, with ``heading`` rad, then take the steps."""
+        self.footwork = Footwork(start, heading, steps, self.puppet.ankle_height, SCRIPT_S, guides)
+        self.pelvis_track = self.puppet.pelvis_track(self.footwork)
 
     def script_times(self, times: np.ndarray, duration: float) -> np.ndarray:
         """Script times of recording times (N,), seconds from its first set.

@@ -6,34 +6,26 @@ from itertools import product
 
 import numpy as np
 
-from intercap_core.studio.controls import Footwork, Pose, Step, bump, plateau, ramp
+from intercap_core.studio.controls import Step, WristPose, bump, plateau, ramp
 from intercap_core.studio.hands import RELAXED, HandShape, shape
 from intercap_core.studio.interactions.base import (
-    SCRIPT_S,
     Interaction,
     Performance,
     held_object,
     transform,
     upright,
 )
-from intercap_core.studio.motion import LEG_REACH, Trunk
+from intercap_core.studio.motion import LEFT, RIGHT, Trunk
 from intercap_core.studio.skeleton import turn
-
-RIGHT, LEFT = 1, 0
-ATTACH_S, RELEASE_S = 1.08, 2.46
-KNUCKLES_DEG, TILTS_DEG = (36, 44, 52, 60), (10, 20, 30, 40)  # hands that are tried
-STRAIN_M = 0.0005  # room that 10 degrees less in the wrist are worth
-SPARSE = 3  # every third point of the skin is enough to try a hand
-WITHDRAWN_M = np.array([0.0, 0.03, 0.0])  # on its way in the hand has to pass here
 
 
 class HandleCarry(Interaction):
-    """The thing stands to the right of the person's way, its handle along the way."""
+    """The object stands to the right of the person's way, its handle along the way."""
 
     highlight = 1.5
     centre = (0.22, -0.15)
-    # What a thing asks for: half the thickness of the handle's bar, the room between hip and the
-    # thing's middle, where the knuckles are tried beside and below the bar, the height above the
+    # What a object asks for: half the thickness of the handle's bar, the room between hip and the
+    # object's middle, where the knuckles are tried beside and below the bar, the height above the
     # grip from which the hand goes down to it, all in metres
     bar_half: float
     beside: float
@@ -49,15 +41,23 @@ class HandleCarry(Interaction):
     stoop_down: float
     stoop_back: float
     stoop_bend: float
+    attach_s = 1.08  # grasp, script time
+    release_s = 2.46  # release, script time
+    knuckles_deg = (36, 44, 52, 60)  # knuckle flexions of the hands that are tried
+    tilts_deg = (10, 20, 30, 40)  # wrist tilts that are tried
+    strain_m = 0.0005  # clearance that 10 degrees less wrist tilt are worth, metres
+    sparse = 3  # every n-th skin point is enough to try a hand
+    # the hand also passes this far from the grasp on its way in, metres
+    withdrawn_m = np.array([0.0, 0.03, 0.0])
 
     def plan(self) -> None:
         rng, puppet = self.rng, self.puppet
         side_way = -(puppet.hip_width + self.beside + rng.uniform(0, 0.02))
-        height = self.thing.standing_height
+        height = self.prop.standing_height
         ahead, turned = 0.02 + rng.normal(0, 0.01), np.pi + rng.normal(0, 0.03, 2)
-        self.taken = upright(ahead, side_way, height, turned[0])
+        self.pick_pose = upright(ahead, side_way, height, turned[0])
         stride = 0.43 + 0.05 * rng.random()
-        self.put = upright(2 * stride - 0.02, side_way - 0.02, height, turned[1])
+        self.place_pose = upright(2 * stride - 0.02, side_way - 0.02, height, turned[1])
         w = puppet.hip_width * 0.95
         start = np.array([[-0.62, w], [-0.68, -w]])
         steps = [
@@ -67,30 +67,27 @@ class HandleCarry(Interaction):
             Step(LEFT, 1.60, 2.02, (2 * stride - 0.04, w)),
             Step(RIGHT, 2.00, 2.34, (2 * stride - 0.22, -w)),
         ]
-        self.footwork = Footwork(start, 0.0, steps, puppet.ankle_height, SCRIPT_S)
-        self.pelvis_track = self.footwork.pelvis(
-            LEG_REACH * puppet.leg, puppet.hip_width, puppet.hip_drop, puppet.stand
-        )
+        self.walk(start, steps)
         self._grasp()
         self.lift = self.lifted()
 
     def lifted(self) -> float:
-        """How high the thing is carried, from the floor, metres."""
+        """How high the object is carried, from the floor, metres."""
         raise NotImplementedError
 
     def _grasp(self) -> None:
         """Fingers level under the handle's bar where they have most room, then curled up.
 
-        The hand comes from the thing's +y, its thumb towards -x.
+        The hand comes from the object's +y, its thumb towards -x.
         """
-        hand, surface = self.puppet.hands[RIGHT], self.thing.surface
-        near = (np.abs(self.thing.vertices[:, :2]) < (0.04, 0.02)).all(1)
-        bar_height = self.thing.vertices[near, 2].max() - self.bar_half
+        hand, surface = self.puppet.hands[RIGHT], self.prop.surface
+        near = (np.abs(self.prop.vertices[:, :2]) < (0.04, 0.02)).all(1)
+        bar_height = self.prop.vertices[near, 2].max() - self.bar_half
         best = (-np.inf, RELAXED, np.eye(4))
-        for knuckle_deg in KNUCKLES_DEG:
+        for knuckle_deg in self.knuckles_deg:
             hook = shape((knuckle_deg, 4, 3), (0, -10, 0), 15, 0)
-            skin = hand.skin(hand.local(hook)[None])[0, ::SPARSE]
-            for tilt_deg in TILTS_DEG:
+            skin = hand.skin(hand.local(hook)[None])[0, :: self.sparse]
+            for tilt_deg in self.tilts_deg:
                 sin, cos = np.sin(np.radians(tilt_deg)), np.cos(np.radians(tilt_deg))
                 rotation = self.puppet.wrist_rotation(
                     RIGHT, np.array([0, -sin, -cos]), np.array([0, -cos, sin])
@@ -99,9 +96,9 @@ class HandleCarry(Interaction):
                 knuckle = rotation @ hand.knuckles.mean(0)
                 for aside, below in product(self.knuckles_aside, self.knuckles_below):
                     place = np.array([0.0, aside, bar_height - below]) - knuckle
-                    on_the_way = np.concatenate([turned + place, turned + place + WITHDRAWN_M])
+                    on_the_way = np.concatenate([turned + place, turned + place + self.withdrawn_m])
                     room = float(surface.signed_distance(on_the_way).min())
-                    room -= STRAIN_M * tilt_deg / 10
+                    room -= self.strain_m * tilt_deg / 10
                     if room > best[0]:
                         best = (room, hook, transform(rotation, place))
         _, self.hook, self.object_from_wrist = best
@@ -131,11 +128,14 @@ class HandleCarry(Interaction):
         )
         return Trunk(pelvis, track[:, 3], bend, head)
 
-    def _right_wrist(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> Pose:
+    def _right_wrist(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> WristPose:
         count = len(times)
         swing = 0.10 * bump(times, 0.35, 0.9) + self.arm_swing(times)[:, 0]
         idle = self.puppet.idle_wrist(world, pelvis, RIGHT, swing)
-        first, last = self.taken @ self.object_from_wrist, self.put @ self.object_from_wrist
+        first, last = (
+            self.pick_pose @ self.object_from_wrist,
+            self.place_pose @ self.object_from_wrist,
+        )
         aside = np.array([0.0, -0.085, 0.0])
         before, after = first.copy(), last.copy()
         before[:3, 3] += aside
@@ -144,7 +144,7 @@ class HandleCarry(Interaction):
         over[:3, 3] += (-0.03, -0.03, self.above)
         off[:3, 3] += (-0.02, -0.04, self.above)
         held = np.array([0.0, first[1, 3], first[2, 3] + self.lift])
-        along = pelvis[:, 0] + (first[0, 3] - self.taken[0, 3]) - 0.02
+        along = pelvis[:, 0] + (first[0, 3] - self.pick_pose[0, 3]) - 0.02
         position = np.broadcast_to(held, (count, 3)).copy()
         share = ramp(times, 1.2, 2.3)
         position[:, 0] = along
@@ -154,15 +154,17 @@ class HandleCarry(Interaction):
         tilt[:, 1] = (
             0.05 * np.sin(2 * np.pi * (times - 1.2) / 0.82) * plateau(times, 1.2, 1.5, 1.9, 2.2)
         )
-        between = Pose.still(first, count).towards(Pose.still(last, count), share)
-        carried = Pose(position, turn(tilt) @ between.rotation)
-        wrist = idle.towards(Pose.still(over, count), ramp(times, 0.25, 0.90))
-        wrist = wrist.towards(Pose.still(before, count), ramp(times, 0.62, 0.95))
-        wrist = wrist.towards(Pose.still(first, count), ramp(times, 0.94, 1.04))
-        wrist = wrist.towards(carried, ramp(times, ATTACH_S, self.lifted_s))
-        wrist = wrist.towards(Pose.still(last, count), ramp(times, self.lower_s, RELEASE_S - 0.02))
-        wrist = wrist.towards(Pose.still(after, count), ramp(times, 2.53, 2.65))
-        wrist = wrist.towards(Pose.still(off, count), ramp(times, 2.62, 2.86))
+        between = WristPose.still(first, count).towards(WristPose.still(last, count), share)
+        carried = WristPose(position, turn(tilt) @ between.rotation)
+        wrist = idle.towards(WristPose.still(over, count), ramp(times, 0.25, 0.90))
+        wrist = wrist.towards(WristPose.still(before, count), ramp(times, 0.62, 0.95))
+        wrist = wrist.towards(WristPose.still(first, count), ramp(times, 0.94, 1.04))
+        wrist = wrist.towards(carried, ramp(times, self.attach_s, self.lifted_s))
+        wrist = wrist.towards(
+            WristPose.still(last, count), ramp(times, self.lower_s, self.release_s - 0.02)
+        )
+        wrist = wrist.towards(WristPose.still(after, count), ramp(times, 2.53, 2.65))
+        wrist = wrist.towards(WristPose.still(off, count), ramp(times, 2.62, 2.86))
         return wrist.towards(idle, ramp(times, 2.80, 3.40))
 
     def perform(self, times: np.ndarray) -> Performance:
@@ -182,7 +184,7 @@ class HandleCarry(Interaction):
         swing = -0.10 * bump(times, 0.0, 0.5) + 0.14 * bump(times, 1.2, 1.7)
         left = puppet.idle_wrist(world, pelvis, LEFT, swing + self.arm_swing(times)[:, 1])
         balance = plateau(times, 0.7, 1.0, 2.5, 2.9)[:, None]
-        left = Pose(left.position + balance * np.array([0.06, 0.10, 0.05]), left.rotation)
+        left = WristPose(left.position + balance * np.array([0.06, 0.10, 0.05]), left.rotation)
         puppet.arm_to(world, pelvis, LEFT, left)
         stages: list[tuple[np.ndarray, HandShape]] = [
             (ramp(times, 0.5, 0.88), self.hook),
@@ -193,12 +195,9 @@ class HandleCarry(Interaction):
         puppet.fingers(world, RIGHT, puppet.finger_track(RIGHT, RELAXED, stages))
         puppet.fingers(world, LEFT, puppet.finger_track(LEFT, RELAXED, []))
         carried = held_object(puppet, world, pelvis, RIGHT, self.object_from_wrist)
-        pose = np.where((times <= ATTACH_S)[:, None, None], self.taken, carried)
-        pose = np.where((times >= RELEASE_S)[:, None, None], self.put, pose)
+        pose = np.where((times <= self.attach_s)[:, None, None], self.pick_pose, carried)
+        pose = np.where((times >= self.release_s)[:, None, None], self.place_pose, pose)
         return Performance(world, pelvis, pose)
-
-
-LIFT_M = (0.14, 0.20)
 
 
 class SuitcaseCarry(HandleCarry):
@@ -208,13 +207,10 @@ class SuitcaseCarry(HandleCarry):
     bar_half, beside, above = 0.008, 0.235, 0.14
     lifted_s, lower_s = 1.55, 1.95
     stoop_from, stoop_down, stoop_back, stoop_bend = 0.55, 0.24, 0.05, 0.42
+    lift_m = (0.14, 0.20)  # range of the height above the floor, metres
 
     def lifted(self) -> float:
-        return self.rng.uniform(*LIFT_M)
-
-
-ARM_SHARE = (0.83, 0.89)  # of the arm's length: how far below the shoulder the wrist carries
-SHOULDER_OF_HEIGHT = 0.81  # a standing person's shoulder, as a share of the height
+        return self.rng.uniform(*self.lift_m)
 
 
 class ToolboxCarry(HandleCarry):
@@ -226,10 +222,12 @@ class ToolboxCarry(HandleCarry):
     knuckles_below = (0.022, 0.028, 0.034, 0.040)
     lifted_s, lower_s = 1.70, 1.80
     stoop_from, stoop_down, stoop_back, stoop_bend = 0.28, 0.50, 0.08, 0.62
+    arm_share = (0.83, 0.89)  # range of the wrist below the shoulder, shares of the arm's length
+    shoulder_share = 0.81  # a standing person's shoulder, share of the height
 
     def lifted(self) -> float:
         """The arm hangs almost straight while it carries."""
         puppet = self.puppet
-        shoulder = SHOULDER_OF_HEIGHT * puppet.subject.height_m
-        wrist = shoulder - self.rng.uniform(*ARM_SHARE) * puppet.arm
-        return wrist - float((self.taken @ self.object_from_wrist)[2, 3])
+        shoulder = self.shoulder_share * puppet.subject.height_m
+        wrist = shoulder - self.rng.uniform(*self.arm_share) * puppet.arm
+        return wrist - float((self.pick_pose @ self.object_from_wrist)[2, 3])

@@ -5,22 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from intercap_core.body.joints import JOINT_INDEX
-from intercap_core.studio.controls import Pose, plateau, ramp
+from intercap_core.studio.controls import WristPose, plateau, ramp
 from intercap_core.studio.hands import OPEN, RELAXED, HandShape, part_of
 from intercap_core.studio.interactions.base import transform
 from intercap_core.studio.interactions.grasps import backed_off
-from intercap_core.studio.interactions.handling import LEFT, RIGHT, Handling, by_the_wall
-from intercap_core.studio.motion import Trunk
+from intercap_core.studio.interactions.handling import HandlingScript, by_the_wall
+from intercap_core.studio.motion import LEFT, RIGHT, Trunk
 from intercap_core.studio.skeleton import turn
 
-ATTACH_S, RELEASE_S = 1.06, 2.50
-PLINTH_OF_HEIGHT = 0.565  # its top, as a share of the person's height
-ASIDE_M = -0.12  # of the plinth, to the left
-LIP_GAP_M = 0.0008  # the vessel rests this close to the lips
-HOVER_M = (0.007, 0.018)  # how near the other hand comes without touching
 
-
-class Drinking(Handling):
+class Drinking(HandlingScript):
     """The vessel's x axis points to the person's left; the right hand holds the wall."""
 
     highlight = 1.75
@@ -29,14 +23,20 @@ class Drinking(Handling):
     head_back = 0.22  # rad
     grip_height_m = 0.0  # of the palm, from the vessel's origin
     lips_at_edge = True  # the lips touch the rim's near edge, else the middle of the mouth
+    attach_s = 1.06  # grasp, script time
+    release_s = 2.50  # release, script time
+    plinth_share = 0.565  # height of the plinth's top, share of the person's height
+    aside_m = -0.12  # the plinth, metres to the left
+    lip_gap_m = 0.0008  # between the vessel and the lips, metres
+    hover_m = (0.007, 0.018)  # range of the gap between the other hand and the vessel, metres
 
     def plan(self) -> None:
         rng = self.rng
-        self.set_out(PLINTH_OF_HEIGHT, ASIDE_M)
+        self.set_out(self.plinth_share, self.aside_m)
         self.tilt = np.radians(rng.uniform(*self.tilt_deg))
-        self.hover = rng.uniform(*HOVER_M)
+        self.hover = rng.uniform(*self.hover_m)
         self.grips[RIGHT] = by_the_wall(self, self.grip_height_m)
-        self.hold_s[RIGHT] = (ATTACH_S, RELEASE_S)
+        self.hold_s[RIGHT] = (self.attach_s, self.release_s)
         self._drinking_place()
         self._hovering_place()
 
@@ -57,10 +57,10 @@ class Drinking(Handling):
         up = np.array([0.0, np.cos(self.tilt), -np.sin(self.tilt)])
         side = np.array([1.0, 0, 0])
         rotation = np.stack([side, np.cross(up, side), up], 1)
-        rim_up = self.thing.vertices[:, 2].max()
+        rim_up = self.prop.vertices[:, 2].max()
         near_rim = rotation @ np.array([0.0, 0, rim_up])
         if self.lips_at_edge:
-            rim = self.thing.vertices[self.thing.vertices[:, 2] > rim_up - 0.003]
+            rim = self.prop.vertices[self.prop.vertices[:, 2] > rim_up - 0.003]
             across = np.cross(side, up)
             across *= -np.sign(across[2])
             near_rim = near_rim + np.linalg.norm(rim[:, :2], axis=1).max() * across
@@ -69,11 +69,11 @@ class Drinking(Handling):
         for _ in range(18):
             ahead = (low + high) / 2
             centre = mouth + np.array([0, 0, ahead]) - near_rim
-            if self.thing.surface.signed_distance((face - centre) @ rotation).min() < LIP_GAP_M:
+            if self.prop.surface.signed_distance((face - centre) @ rotation).min() < self.lip_gap_m:
                 low = ahead
             else:
                 high = ahead
-        self.head_from_thing = transform(rotation, mouth + np.array([0, 0, high]) - near_rim)
+        self.head_from_prop = transform(rotation, mouth + np.array([0, 0, high]) - near_rim)
 
     @property
     def mouth(self) -> np.ndarray:
@@ -94,9 +94,9 @@ class Drinking(Handling):
         palm = np.array([-0.45, -0.85, 0.0])
         rotation = self.puppet.wrist_rotation(LEFT, fingers / np.linalg.norm(fingers), palm)
         skin = hand.skin(hand.local(OPEN)[None])[0] @ rotation.T
-        place = self.taken[:3, 3] - skin[hand.palm_ids].mean(0) - 0.03 * fingers
-        place[2] = self.taken[2, 3] + 0.03 - skin[:, 2].mean()
-        self.left_place = backed_off(hand, OPEN, self.thing.surface, self.taken,
+        place = self.pick_pose[:3, 3] - skin[hand.palm_ids].mean(0) - 0.03 * fingers
+        place[2] = self.pick_pose[2, 3] + 0.03 - skin[:, 2].mean()
+        self.left_place = backed_off(hand, OPEN, self.prop.surface, self.pick_pose,
                                      transform(rotation, place), -palm, self.hover)  # fmt: skip
 
     # --- the script --------------------------------------------------------------------------
@@ -111,24 +111,26 @@ class Drinking(Handling):
         trunk.head[:, 1] -= 0.12 * reach
         return trunk
 
-    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> Pose:
+    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> WristPose:
         """From the plinth to the lips, tilted there, and back."""
         count = len(times)
         head = np.broadcast_to(np.eye(4), (count, 4, 4)).copy()
         head[:, :3, :3] = world[:, JOINT_INDEX["head"]]
         head[:, :3, 3] = self.puppet.joint_on_trunk(world, pelvis, "head")
-        at_lips = head @ self.head_from_thing
+        at_lips = head @ self.head_from_prop
         # before and after the drink it is upright, a little lower and ahead of the lips
         upright_share = 1 - plateau(times, 1.45, 1.80, 2.00, 2.30)
         ease = np.zeros((count, 3))
         ease[:, 0] = upright_share * self.tilt * 0.85
         away = head[:, :3, :3] @ np.array([0.0, -0.035, 0.055])
         position = at_lips[:, :3, 3] + upright_share[:, None] * away
-        drinking = Pose(position, at_lips[:, :3, :3] @ turn(ease))
+        drinking = WristPose(position, at_lips[:, :3, :3] @ turn(ease))
         lift = np.array([0.0, 0, 0.05])
-        thing = Pose.still(self.taken, count)
-        thing = thing.towards(drinking, ramp(times, ATTACH_S, 1.72), lift)
-        return thing.towards(Pose.still(self.put, count), ramp(times, 2.02, RELEASE_S - 0.03), lift)
+        prop = WristPose.still(self.pick_pose, count)
+        prop = prop.towards(drinking, ramp(times, self.attach_s, 1.72), lift)
+        return prop.towards(
+            WristPose.still(self.place_pose, count), ramp(times, 2.02, self.release_s - 0.03), lift
+        )
 
     def wrist(
         self,
@@ -136,18 +138,18 @@ class Drinking(Handling):
         world: np.ndarray,
         pelvis: np.ndarray,
         times: np.ndarray,
-        thing: np.ndarray,
-    ) -> Pose:
+        prop: np.ndarray,
+    ) -> WristPose:
         """The right hand handles the vessel; the left only comes near."""
-        wrist = super().wrist(side, world, pelvis, times, thing)
+        wrist = super().wrist(side, world, pelvis, times, prop)
         if side == RIGHT:
             return wrist
         count = len(times)
         away = self.left_place.copy()
         away[:3, 3] += (-0.10, 0.10, 0.10)
-        near = wrist.towards(Pose.still(away, count), ramp(times, 0.2, 0.75))
-        near = near.towards(Pose.still(self.left_place, count), ramp(times, 0.65, 0.95))
-        near = near.towards(Pose.still(away, count), ramp(times, 1.02, 1.3))
+        near = wrist.towards(WristPose.still(away, count), ramp(times, 0.2, 0.75))
+        near = near.towards(WristPose.still(self.left_place, count), ramp(times, 0.65, 0.95))
+        near = near.towards(WristPose.still(away, count), ramp(times, 1.02, 1.3))
         return near.towards(wrist, ramp(times, 1.2, 1.8))
 
     def finger_keys(self, side: int, times: np.ndarray) -> list[tuple[np.ndarray, HandShape]]:

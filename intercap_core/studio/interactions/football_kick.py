@@ -4,25 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.studio.controls import Footwork, Guide, Pose, Step, bump, plateau, ramp
+from intercap_core.studio.controls import Guide, Step, WristPose, bump, plateau, ramp
 from intercap_core.studio.hands import RELAXED
 from intercap_core.studio.interactions.base import SCRIPT_S, Interaction, Performance
-from intercap_core.studio.motion import LEG_REACH, Foot, Trunk, moved, still
+from intercap_core.studio.motion import LEFT, RIGHT, Foot, Trunk, moved, still
 from intercap_core.studio.skeleton import turn, unit
-
-RIGHT, LEFT = 1, 0
-SOLE_S, SOLE_OFF_S = 0.80, 1.02  # the sole is on the ball between these
-SWING_S, SWUNG_S = 1.28, 2.00
-PRESSED_M = 0.001
-HOVER_SHARE, HOVER_M = 0.35, (0.006, 0.016)  # how often, and by how much, the sole only comes near
-TOE_CLEAR_M = 0.012  # the toes above the floor as the foot swings through
-BACKSWING_M, THROUGH_M = 0.27, 0.37  # the ankle behind and beyond where it meets the ball
-STEP_S = 0.004
-NEAR_M = 0.01  # the ball is as good as round for a foot that is this far
-GRAVITY = 9.81
-SLIDING_FRICTION = (0.40, 0.55)  # of a ball on a hard floor
-ROLLING_FRICTION = (0.13, 0.18)  # on a thick carpet
-SPIN_UP = 1.5  # m r^2 over the moment of inertia: a thin shell
 
 
 class FootballKick(Interaction):
@@ -32,20 +18,38 @@ class FootballKick(Interaction):
     feet_meet_object = True
     highlight = 1.7
     centre = (0.50, -0.05)
+    sole_s = 0.80  # the sole comes to rest on the ball, script time
+    sole_off_s = 1.02  # the sole leaves the ball, script time
+    swing_s = 1.28  # start of the kicking swing, script time
+    swung_s = 2.00  # end of the kicking swing, script time
+    pressed_m = 0.001  # depth to which the ball presses the skin, metres
+    hover_share = 0.35  # share of the recordings in which the sole stops short of the ball
+    hover_m = (0.006, 0.016)  # range of the gap between sole and ball in them, metres
+    toe_clear_m = 0.012  # toes above the floor as the foot swings through, metres
+    backswing_m = 0.27  # ankle behind the place where it meets the ball, metres
+    through_m = 0.37  # ankle beyond that place at the end of the swing, metres
+    integration_s = 0.004  # time step of the rolling ball
+    near_m = 0.01  # from farther off, the ball is treated as a sphere, metres
+    gravity = 9.81  # m/s^2
+    sliding_friction = (0.40, 0.55)  # coefficient of a ball on a hard floor
+    rolling_friction = (0.13, 0.18)  # coefficient on a thick carpet
+    spin_up = 1.5  # m r^2 over the moment of inertia of a thin shell
 
     def plan(self) -> None:
         rng, puppet = self.rng, self.puppet
-        self.radius = float(np.linalg.norm(self.thing.vertices, axis=1).mean())
+        self.radius = float(np.linalg.norm(self.prop.vertices, axis=1).mean())
         self.first_turn = turn(unit(rng.normal(size=3)) * rng.uniform(0, np.pi))
-        lowest = float((self.thing.vertices @ self.first_turn[2]).min())
+        lowest = float((self.prop.vertices @ self.first_turn[2]).min())
         self.spot = np.array([0.24 + rng.uniform(0, 0.04), -puppet.hip_width, -lowest])
         direction = rng.normal(0, 0.06)
         self.ahead = np.array([np.cos(direction), np.sin(direction), 0.0])
-        sole_gap = rng.uniform(*HOVER_M) if rng.random() < HOVER_SHARE else -PRESSED_M
-        sliding, rolling = rng.uniform(*SLIDING_FRICTION), rng.uniform(*ROLLING_FRICTION)
+        sole_gap = (
+            rng.uniform(*self.hover_m) if rng.random() < self.hover_share else -self.pressed_m
+        )
+        sliding, rolling = rng.uniform(*self.sliding_friction), rng.uniform(*self.rolling_friction)
         self.foot = Foot(puppet, RIGHT)
         self._footwork(sole_gap)
-        self._roll(GRAVITY * sliding, GRAVITY * rolling)
+        self._roll(self.gravity * sliding, self.gravity * rolling)
 
     # --- the foot ----------------------------------------------------------------------------
 
@@ -53,16 +57,16 @@ class FootballKick(Interaction):
         """Least signed distance of skin (n, 3) to the ball that was moved by ``rolled`` metres."""
         local = (skin - self.spot - rolled * self.ahead) @ self.first_turn
         far = float(np.linalg.norm(local, axis=1).min()) - self.radius
-        return far if far > NEAR_M else float(self.thing.surface.signed_distance(local).min())
+        return far if far > self.near_m else float(self.prop.surface.signed_distance(local).min())
 
     def _pushed(self, skin: np.ndarray, rolled: float) -> float:
         """How far the ball is after the foot has pushed it away, metres."""
-        if self._gap(skin, rolled) >= -PRESSED_M:
+        if self._gap(skin, rolled) >= -self.pressed_m:
             return rolled
         low, high = rolled, rolled + 0.02
         for _ in range(10):
             middle = (low + high) / 2
-            if self._gap(skin, middle) < -PRESSED_M:
+            if self._gap(skin, middle) < -self.pressed_m:
                 low = middle
             else:
                 high = middle
@@ -74,10 +78,10 @@ class FootballKick(Interaction):
         on_ball = np.array([x - 0.11, y, self.radius, -0.10, 0.0])
         on_ball = self.foot.backed_off(on_ball, np.array([0, 0, 0.4, 0, 0]), sole_gap, self._gap)
         strike = np.array([x, y - 0.01, 0.5, 0.62, 0.0])
-        strike[2] += TOE_CLEAR_M - self.foot.skin(strike[None])[0, :, 2].min()
+        strike[2] += self.toe_clear_m - self.foot.skin(strike[None])[0, :, 2].min()
         self.strike = self.foot.backed_off(strike, np.array([-0.5, 0, 0, 0, 0]), 0.0, self._gap)
-        self.back = moved(self.strike, -BACKSWING_M, 0, sole + 0.20 - self.strike[2], 0.12)
-        self.through = moved(self.strike, THROUGH_M, 0.03, sole + 0.17 - self.strike[2], -0.1)
+        self.back = moved(self.strike, -self.backswing_m, 0, sole + 0.20 - self.strike[2], 0.12)
+        self.through = moved(self.strike, self.through_m, 0.03, sole + 0.17 - self.strike[2], -0.1)
         beside = self.strike[0] + 0.03
         start = np.array([[beside - 0.36, w], [beside - 0.30, -w]])
         steps = [
@@ -88,20 +92,17 @@ class FootballKick(Interaction):
         guides = [
             Guide(RIGHT, 0.26, 0.58, still(moved(over, -0.16, 0, 0.02, 0.2))),
             Guide(RIGHT, 0.46, 0.74, still(over)),
-            Guide(RIGHT, 0.66, SOLE_S, still(on_ball)),
-            Guide(RIGHT, SOLE_OFF_S, 1.16, still(over)),
+            Guide(RIGHT, 0.66, self.sole_s, still(on_ball)),
+            Guide(RIGHT, self.sole_off_s, 1.16, still(over)),
             Guide(RIGHT, 1.04, 1.38, self._swing),
-            Guide(RIGHT, SWUNG_S - 0.08, 2.50),
+            Guide(RIGHT, self.swung_s - 0.08, 2.50),
         ]
-        self.footwork = Footwork(start, 0.0, steps, puppet.ankle_height, SCRIPT_S, guides)
-        self.pelvis_track = self.footwork.pelvis(
-            LEG_REACH * puppet.leg, puppet.hip_width, puppet.hip_drop, puppet.stand
-        )
+        self.walk(start, steps, guides=guides)
 
     def _swing(self, times: np.ndarray) -> np.ndarray:
         """The kicking foot (N, 5): from behind down to the ball and up again beyond it."""
-        share = ramp(times, SWING_S, SWUNG_S)
-        met = BACKSWING_M / (BACKSWING_M + THROUGH_M)
+        share = ramp(times, self.swing_s, self.swung_s)
+        met = self.backswing_m / (self.backswing_m + self.through_m)
         path = self.back + share[:, None] * (self.through - self.back)
         straight = self.back + met * (self.through - self.back)
         beyond = (share - met) / np.where(share < met, met, 1 - met)
@@ -118,20 +119,23 @@ class FootballKick(Interaction):
         A foot that comes nearer pushes it away; friction with the floor slows the ball and spins
         it up until it rolls.
         """
-        self.clock = np.arange(SWING_S, SCRIPT_S + 1.0, STEP_S)
+        self.clock = np.arange(self.swing_s, SCRIPT_S + 1.0, self.integration_s)
         self.moved, self.turned = np.zeros((2, len(self.clock)))
-        swing = self.clock[self.clock < SWUNG_S]
+        swing = self.clock[self.clock < self.swung_s]
         skin = self.foot.skin(self._swing(swing))
         speed = spin = 0.0
         for n in range(1, len(self.clock)):
             slips = spin * self.radius < speed - 1e-9
-            speed = max(speed - (sliding if slips else rolling) * STEP_S, 0.0)
-            spin = min(spin + SPIN_UP * sliding / self.radius * STEP_S, speed / self.radius)
+            speed = max(speed - (sliding if slips else rolling) * self.integration_s, 0.0)
+            spin = min(
+                spin + self.spin_up * sliding / self.radius * self.integration_s,
+                speed / self.radius,
+            )
             if n < len(swing):
                 pushed = self._pushed(skin[n], self.moved[n - 1]) - self.moved[n - 1]
-                speed = max(speed, pushed / STEP_S)
-            self.moved[n] = self.moved[n - 1] + speed * STEP_S
-            self.turned[n] = self.turned[n - 1] + spin * STEP_S
+                speed = max(speed, pushed / self.integration_s)
+            self.moved[n] = self.moved[n - 1] + speed * self.integration_s
+            self.turned[n] = self.turned[n - 1] + spin * self.integration_s
 
     def _ball(self, times: np.ndarray) -> np.ndarray:
         """stage_from_object (N, 4, 4): the lowest point of the ball is on the floor."""
@@ -141,7 +145,7 @@ class FootballKick(Interaction):
         pose[:, :3, :3] = turn(turned[:, None] * axis) @ self.first_turn
         moved = np.interp(times, self.clock, self.moved)
         pose[:, :2, 3] = (self.spot + moved[:, None] * self.ahead)[:, :2]
-        pose[:, 2, 3] = -(pose[:, 2, :3] @ self.thing.vertices.T).min(1)
+        pose[:, 2, 3] = -(pose[:, 2, :3] @ self.prop.vertices.T).min(1)
         return pose
 
     # --- the script --------------------------------------------------------------------------
@@ -176,6 +180,8 @@ class FootballKick(Interaction):
             wrist = puppet.idle_wrist(world, trunk.pelvis, side, swing)
             out = (0.10 * balance)[:, None] * np.array([0, sign, 0])
             out[:, 2] += 0.05 * balance
-            puppet.arm_to(world, trunk.pelvis, side, Pose(wrist.position + out, wrist.rotation))
+            puppet.arm_to(
+                world, trunk.pelvis, side, WristPose(wrist.position + out, wrist.rotation)
+            )
             puppet.fingers(world, side, puppet.finger_track(side, RELAXED, []))
         return Performance(world, trunk.pelvis, self._ball(times))

@@ -24,11 +24,6 @@ FINGER_MEETS_M, THUMB_NEAR_M = 0.002, 0.008  # such a grasp is good enough
 FAR_M = 0.03  # a finger that ends farther off counts as this far
 # The grasped surface meets the hand this far beyond the palm's middle, towards the fingers
 ALONG_FINGERS_M = 0.030
-# Nobody holds a thing with a finger in its hollow. A point that is this far off the surface is in a
-# hollow where more than this share of all directions meets the thing: half of them do on a flat
-# wall, six in ten a few millimetres below a cup's rim, nearly all at its bottom.
-OFF_WALL_M, HOLLOW_SHARE = 0.0015, 0.60
-DIRECTIONS = 128
 THUMB_BENDS = (1.0, 0.5, 0.15)  # of the thumb's largest flexion, in the order of tries
 OPPOSITIONS_DEG = (60.0, 45.0, 30.0, 75.0, 90.0, 15.0, 0.0)  # of the thumb, in the order of tries
 WRAP_OPEN = shape((10, 12, 6), (0, 4, 6), 45)
@@ -77,30 +72,36 @@ def backed_off(
 class Hollow:
     """The inside of vessels, and of all else that surrounds a point without being solid there."""
 
+    off_wall_m = 0.0015  # points nearer to the surface are not tested, metres
+    # share of directions that meet the object from inside a hollow: 0.5 before a flat wall, 0.6 a
+    # few millimetres below a cup's rim, nearly 1 at its bottom
+    hollow_share = 0.60
+    directions = 128  # rays from each point
+
     def __init__(self, surface: DistanceField) -> None:
         self._surface = surface
-        steps = np.arange(DIRECTIONS) + 0.5
-        height, angle = 1 - 2 * steps / DIRECTIONS, np.pi * (1 + np.sqrt(5)) * steps
+        steps = np.arange(self.directions) + 0.5
+        height, angle = 1 - 2 * steps / self.directions, np.pi * (1 + np.sqrt(5)) * steps
         around = np.sqrt(1 - height**2)
         self._directions = np.stack(
             [around * np.cos(angle), around * np.sin(angle), height], 1
         )  # even over the sphere (Fibonacci's spiral)
 
     def share(self, points: np.ndarray) -> np.ndarray:
-        """Share (n,) of all directions from points (n, 3), the thing's frame, that meet it."""
-        start = np.repeat(points, DIRECTIONS, 0)
+        """Share (n,) of all directions from points (n, 3), the object's frame, that meet it."""
+        start = np.repeat(points, self.directions, 0)
         hit = self._surface.met(start, np.tile(self._directions, (len(points), 1)))
-        return hit.reshape(len(points), DIRECTIONS).mean(1)
+        return hit.reshape(len(points), self.directions).mean(1)
 
     def holds(self, points: np.ndarray) -> bool:
-        """Whether one of the points (n, 3), the thing's frame, is in a hollow."""
-        off = points[self._surface.signed_distance(points) > OFF_WALL_M]
-        return bool(len(off) and self.share(off).max() > HOLLOW_SHARE)
+        """Whether one of the points (n, 3), the object's frame, is in a hollow."""
+        off = points[self._surface.signed_distance(points) > self.off_wall_m]
+        return bool(len(off) and self.share(off).max() > self.hollow_share)
 
 
 @dataclass(frozen=True)
 class Approach:
-    """How a palm comes to a thing: to the point ``at`` (3,) of the stage along ``palm`` (3,), with
+    """How a palm comes to a object: to the point ``at`` (3,) of the stage along ``palm`` (3,), with
     ``fingers`` (3,) ahead, ``along`` metres beyond the palm's middle, above ``floor`` metres."""
 
     at: np.ndarray
@@ -120,7 +121,7 @@ class Approach:
         thumb: bool = False,
     ) -> np.ndarray:
         """The wrist (4, 4) of the stage once the palm or a finger (with ``thumb``: or the thumb) is
-        pressed against the thing."""
+        pressed against the object."""
         hand = puppet.hands[side]
         fingers, palm = unit(np.asarray(self.fingers)), unit(np.asarray(self.palm))
         rotation = puppet.wrist_rotation(side, fingers, palm)
@@ -146,7 +147,7 @@ def laid_on(
     stage_from_object: np.ndarray,
     approach: Approach,
 ) -> Grip:
-    """A flat hand laid on the thing, the thumb along it, fingers bent until they meet it."""
+    """A flat hand laid on the object, the thumb along it, fingers bent until they meet it."""
     hand = puppet.hands[side]
     wrist = approach.wrist(puppet, side, LAID, surface, stage_from_object, thumb=True)
     pose = invert(stage_from_object) @ wrist
@@ -162,10 +163,10 @@ def wrapped(
     stage_from_object: np.ndarray,
     approaches: Iterable[Approach],
 ) -> Grip:
-    """Palm against the thing, fingers around it, then the thumb from where it has room.
+    """Palm against the object, fingers around it, then the thumb from where it has room.
 
-    No finger is in a hollow of the thing, open or closed.
-    Of ``approaches`` the first is kept in which all fingers meet the thing or nearly do, else the
+    No finger is in a hollow of the object, open or closed.
+    Of ``approaches`` the first is kept in which all fingers meet the object or nearly do, else the
     best.
     """
     hand, hollow = puppet.hands[side], Hollow(surface)

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from intercap_core.geometry.camera.transforms import invert
-from intercap_core.studio.controls import Footwork, Pose, Step, ramp
+from intercap_core.studio.controls import Step, WristPose, ramp
 from intercap_core.studio.hands import RELAXED, HandShape
-from intercap_core.studio.interactions.base import SCRIPT_S, Interaction, Performance, upright
+from intercap_core.studio.interactions.base import Interaction, Performance, upright
 from intercap_core.studio.interactions.grasps import (
     WRAP_OPEN,
     Approach,
@@ -19,31 +19,31 @@ from intercap_core.studio.interactions.grasps import (
     laid_on,
     wrapped,
 )
-from intercap_core.studio.motion import LEG_REACH, Trunk, facing
+from intercap_core.studio.motion import LEFT, RIGHT, Trunk, facing
 from intercap_core.studio.room import Box
 from intercap_core.studio.skeleton import turn
 
-RIGHT, LEFT = 1, 0
 SIDES = (RIGHT, LEFT)
-OVER_M = np.array([0.0, 0.0, 0.10])  # and comes from, and goes, this much above
-PLINTH_HALF_M = 0.17
-FINGERS_REST_M = 0.004  # a hand stays this far above a table
 
 
-class Handling(Interaction):
-    """One thing is taken by the leading hand, moved along a path, and put down.
+class HandlingScript(Interaction):
+    """One object is taken by the leading hand, moved along a path, and put down.
 
-    ``plan`` sets where the thing is ``taken`` and ``put`` (4, 4), a grip for each hand that holds
-    it, and from when to when in ``hold_s``. The thing follows the leading hand's own pose; the
-    other hand follows the thing.
+    ``plan`` sets the object's first pose ``pick_pose`` and last pose ``place_pose`` (4, 4), a grip
+    for each hand that holds it, and the times of each grip in ``hold_s``. The object follows the
+    leading hand; the other hand follows the object.
     """
 
     lead = RIGHT
-    clear_m = 0.075  # an open hand leaves the thing by this much, away from its palm,
+    clear_m = 0.075  # an open hand leaves the object by this much, away from its palm,
     back_m = 0.03  # and towards the wrist
-    rests_until_s = 0.0  # the thing stays where it is until then, held or not
-    taken: np.ndarray
-    put: np.ndarray
+    rests_until_s = 0.0  # the object stays where it is until then, held or not
+    pick_pose: np.ndarray
+    place_pose: np.ndarray
+    # an approaching or leaving hand passes this far above, metres
+    over_m = np.array([0.0, 0.0, 0.10])
+    plinth_half_m = 0.17  # half the side of a plinth, metres
+    fingers_rest_m = 0.004  # a hand stays this far above a table, metres
 
     def __post_init__(self) -> None:
         self.grips: dict[int, Grip] = {}
@@ -54,8 +54,8 @@ class Handling(Interaction):
     # --- what a script decides -----------------------------------------------------------------
 
     @abstractmethod
-    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> Pose:
-        """Where the thing is wanted (N): ``taken`` until it is held, ``put`` when it is left."""
+    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> WristPose:
+        """Planned poses (N) of the object, from ``pick_pose`` to ``place_pose``."""
 
     @abstractmethod
     def trunk(self, times: np.ndarray) -> Trunk:
@@ -69,7 +69,7 @@ class Handling(Interaction):
         }
 
     def slide(self, times: np.ndarray) -> np.ndarray:
-        """How the leading hand has moved along the thing since it took it (N, 4, 4), the thing's
+        """How the leading hand has moved along the object since it took it (N, 4, 4), the object's
         frame: what is held slips, turns in the fingers or is taken anew."""
         return np.broadcast_to(np.eye(4), (len(times), 4, 4))
 
@@ -78,21 +78,13 @@ class Handling(Interaction):
         return np.zeros(len(times))
 
     def object_from_wrist(self, side: int, times: np.ndarray) -> np.ndarray:
-        """Where a hand's wrist is on the thing (N, 4, 4) at script times."""
+        """Where a hand's wrist is on the object (N, 4, 4) at script times."""
         grip = self.grips[side].object_from_wrist
         if side == self.lead:
             return self.slide(times) @ grip
         return np.broadcast_to(grip, (len(times), 4, 4))
 
     # --- helpers of plans ------------------------------------------------------------------------
-
-    def walk(self, start: np.ndarray, steps: Sequence[Step]) -> None:
-        """Stand at ``start`` (2, 2), left and right, then take the steps."""
-        puppet = self.puppet
-        self.footwork = Footwork(start, 0.0, steps, puppet.ankle_height, SCRIPT_S)
-        self.pelvis_track = self.footwork.pelvis(
-            LEG_REACH * puppet.leg, puppet.hip_width, puppet.hip_drop, puppet.stand
-        )
 
     def table(
         self,
@@ -108,20 +100,22 @@ class Handling(Interaction):
 
     def set_out(self, top_of_height: float, aside: float, further: Sequence[Step] = ()) -> None:
         """A plinth ahead and ``aside`` (metres to the left), its top at a share of the person's
-        height; the thing on it, its x axis about to the left; two steps up to it and ``further``
+        height; the object on it, its x axis about to the left; two steps up to it and ``further``
         ones."""
         rng, puppet = self.rng, self.puppet
         self.top = top_of_height * puppet.subject.height_m + rng.uniform(-0.03, 0.03)
-        self.table((0.38 + PLINTH_HALF_M, aside), (PLINTH_HALF_M, PLINTH_HALF_M), self.top)
-        self.taken = upright(
+        self.table(
+            (0.38 + self.plinth_half_m, aside), (self.plinth_half_m, self.plinth_half_m), self.top
+        )
+        self.pick_pose = upright(
             0.46 + rng.uniform(0, 0.03), aside - 0.01 + rng.uniform(-0.03, 0.03),
-            self.top + self.thing.standing_height, np.radians(95) + rng.normal(0, 0.15),
+            self.top + self.prop.standing_height, np.radians(95) + rng.normal(0, 0.15),
         )  # fmt: skip
-        self.put = upright(
-            self.taken[0, 3] + rng.uniform(-0.01, 0.04),
-            self.taken[1, 3] + rng.uniform(-0.03, 0.05),
-            self.taken[2, 3],
-            np.arctan2(self.taken[1, 0], self.taken[0, 0]) + rng.normal(0, 0.2),
+        self.place_pose = upright(
+            self.pick_pose[0, 3] + rng.uniform(-0.01, 0.04),
+            self.pick_pose[1, 3] + rng.uniform(-0.03, 0.05),
+            self.pick_pose[2, 3],
+            np.arctan2(self.pick_pose[1, 0], self.pick_pose[0, 0]) + rng.normal(0, 0.2),
         )
         w = puppet.hip_width * 1.05
         steps = [Step(RIGHT, 0.02, 0.40, (0.0, -w)), Step(LEFT, 0.34, 0.72, (0.02, w))]
@@ -145,12 +139,12 @@ class Handling(Interaction):
         origin: np.ndarray,
         offset: np.ndarray,
         about: np.ndarray,
-    ) -> Pose:
-        """The thing (N) held before the person: ``offset`` (3,) metres to the left, up and ahead
+    ) -> WristPose:
+        """The object (N) held before the person: ``offset`` (3,) metres to the left, up and ahead
         of ``origin`` (N, 3), turned by ``about`` (N, 3) from how it was taken."""
         person = facing(np.arctan2(world[:, 9, 1, 2], world[:, 9, 0, 2]))
         heading = person @ facing(np.zeros(1))[0].T
-        return Pose(origin + person @ offset, heading @ turn(about) @ self.taken[:3, :3])
+        return WristPose(origin + person @ offset, heading @ turn(about) @ self.pick_pose[:3, :3])
 
     # --- playing ----------------------------------------------------------------------------
 
@@ -160,22 +154,22 @@ class Handling(Interaction):
         world: np.ndarray,
         pelvis: np.ndarray,
         times: np.ndarray,
-        thing: np.ndarray,
-    ) -> Pose:
-        """The wrist (N) of a hand: to the ``thing`` (N, 4, 4), with it, away from it."""
+        prop: np.ndarray,
+    ) -> WristPose:
+        """The wrist (N) of a hand: to the ``prop`` (N, 4, 4), with it, away from it."""
         swing = self.arm_swing(times)[:, SIDES.index(side)]
         idle = self.puppet.idle_wrist(world, pelvis, side, swing)
         if side not in self.grips:
             return idle
         (on, off), q = self.hold_s[side], self.haste.get(side, 1.0)
         hand = self.puppet.hands[side]
-        at = thing @ self.object_from_wrist(side, times)
+        at = prop @ self.object_from_wrist(side, times)
         beside = at.copy()
         beside[:, :3, 3] += at[:, :3, :3] @ (-self.clear_m * hand.palm - self.back_m * hand.out)
         over = beside.copy()
         raised = 1 - np.clip(at[:, 2:3, :3] @ hand.palm, 0, 1)  # a palm below stays below
-        over[:, :3, 3] += raised * OVER_M - 0.06 * (at[:, :3, :3] @ hand.out)
-        goal, near, far = (Pose(m[:, :3, 3], m[:, :3, :3]) for m in (at, beside, over))
+        over[:, :3, 3] += raised * self.over_m - 0.06 * (at[:, :3, :3] @ hand.out)
+        goal, near, far = (WristPose(m[:, :3, 3], m[:, :3, :3]) for m in (at, beside, over))
         wrist = idle.towards(far, ramp(times, on - 0.90 * q, on - 0.38 * q))
         wrist = wrist.towards(near, ramp(times, on - 0.50 * q, on - 0.20 * q))
         wrist = wrist.towards(goal, ramp(times, on - 0.26 * q, on - 0.06 * q))
@@ -196,15 +190,15 @@ class Handling(Interaction):
         ]
 
     def perform(self, times: np.ndarray) -> Performance:
-        """Play the script: trunk, legs, the leading arm, the thing with it, the other arm."""
+        """Play the script: trunk, legs, the leading arm, the object with it, the other arm."""
         puppet, lead = self.puppet, self.lead
         trunk, feet = self.trunk(times), self.footwork.feet(times)
         world = puppet.trunk(trunk)
         needs = self.needs(times)
         for _ in range(2):
-            thing = _matrices(self.path(world, trunk.pelvis, times))
+            prop = _matrices(self.path(world, trunk.pelvis, times))
             targets = {
-                side: (self.wrist(side, world, trunk.pelvis, times, thing), needs[side])
+                side: (self.wrist(side, world, trunk.pelvis, times, prop), needs[side])
                 for side in SIDES
                 if side in needs
             }
@@ -212,61 +206,61 @@ class Handling(Interaction):
             world = puppet.trunk(trunk)
         pelvis = trunk.pelvis
         puppet.legs(world, pelvis, *feet)
-        thing = _matrices(self.path(world, pelvis, times))
+        prop = _matrices(self.path(world, pelvis, times))
         for side in (lead, 1 - lead):
-            wrist = self.wrist(side, world, pelvis, times, thing)
+            wrist = self.wrist(side, world, pelvis, times, prop)
             puppet.arm_to(world, pelvis, side, wrist, self.raised(times, side))
             if side == lead:
-                thing = self._held(world, pelvis, times)
+                prop = self._held(world, pelvis, times)
         for side in SIDES:
             track = puppet.finger_track(side, RELAXED, self.finger_keys(side, times))
             puppet.fingers(world, side, track)
-        return Performance(world, pelvis, thing)
+        return Performance(world, pelvis, prop)
 
     def _held(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """The thing (N, 4, 4): at rest, as the leading hand has it, at rest."""
+        """The object (N, 4, 4): at rest, as the leading hand has it, at rest."""
         joints = self.puppet.skeleton.forward(world, pelvis)
         index = self.puppet.hands[self.lead].wrist
-        wrist = _matrices(Pose(joints[:, index], world[:, index]))
+        wrist = _matrices(WristPose(joints[:, index], world[:, index]))
         held = wrist @ invert(self.object_from_wrist(self.lead, times))
         on, off = self.hold_s[self.lead]
         on = max(on, self.rests_until_s)
-        pose = np.where((times <= on)[:, None, None], self.taken, held)
-        return np.where((times >= off)[:, None, None], self.put, pose)
+        pose = np.where((times <= on)[:, None, None], self.pick_pose, held)
+        return np.where((times >= off)[:, None, None], self.place_pose, pose)
 
 
-def _matrices(pose: Pose) -> np.ndarray:
+def _matrices(pose: WristPose) -> np.ndarray:
     """(N, 4, 4) of poses (N)."""
     result = np.broadcast_to(np.eye(4), (len(pose.position), 4, 4)).copy()
     result[:, :3, :3], result[:, :3, 3] = pose.rotation, pose.position
     return result
 
 
-PALMS_BELOW_M = 0.01  # the middle of a thing held between palms
+PALMS_BELOW_M = 0.01  # the middle of a object held between palms
 
 
-def between_palms(script: Handling) -> dict[int, Grip]:
-    """A palm on either side of the thing, fingers ahead and a little down."""
+def between_palms(script: HandlingScript) -> dict[int, Grip]:
+    """A palm on either side of the object, fingers ahead and a little down."""
     grips = {}
     for side in SIDES:
         inward = (-1.0, 1.0)[side]
-        at = script.taken[:3, 3] - (0.0, 0.0, PALMS_BELOW_M)
+        at = script.pick_pose[:3, 3] - (0.0, 0.0, PALMS_BELOW_M)
         approach = Approach(at, np.array([0.9, 0.25 * inward, -0.35]),
                             np.array([0.15, inward, 0.18]),
-                            floor=script.top + FINGERS_REST_M)  # fmt: skip
-        grips[side] = laid_on(script.puppet, side, script.thing.surface, script.taken, approach)
+                            floor=script.top + HandlingScript.fingers_rest_m)  # fmt: skip
+        grips[side] = laid_on(script.puppet, side, script.prop.surface, script.pick_pose, approach)
     return grips
 
 
-def by_the_wall(script: Handling, height: float) -> Grip:
-    """The right hand around an upright wall, ``height`` metres above the thing's origin or as low
+def by_the_wall(script: HandlingScript, height: float) -> Grip:
+    """The right hand around an upright wall, ``height`` metres above the object's origin or as low
     as the plinth lets it."""
-    at = script.taken[:3, 3] + (0, 0, height)
-    return wrapped(script.puppet, RIGHT, WRAP_OPEN, script.thing.surface, script.taken,
-                   around_wall(at, script.top + FINGERS_REST_M))  # fmt: skip
+    at = script.pick_pose[:3, 3] + (0, 0, height)
+    return wrapped(script.puppet, RIGHT, WRAP_OPEN, script.prop.surface, script.pick_pose,
+                   around_wall(at, script.top + HandlingScript.fingers_rest_m))  # fmt: skip
 
 
-def palm_below(script: Handling) -> Grip:
-    """The thing's bottom on the left palm, fingers ahead and to the right."""
-    below = Approach(script.taken[:3, 3], np.array([0.75, -0.65, -0.05]), np.array([0, 0, 1.0]))
-    return laid_on(script.puppet, LEFT, script.thing.surface, script.taken, below)
+def palm_below(script: HandlingScript) -> Grip:
+    """The object's bottom on the left palm, fingers ahead and to the right."""
+    below = Approach(script.pick_pose[:3, 3], np.array([0.75, -0.65, -0.05]), np.array([0, 0, 1.0]))
+    return laid_on(script.puppet, LEFT, script.prop.surface, script.pick_pose, below)

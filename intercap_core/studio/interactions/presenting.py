@@ -4,26 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.studio.controls import Pose, Step, bump, plateau, ramp
+from intercap_core.studio.controls import Step, WristPose, bump, plateau, ramp
 from intercap_core.studio.interactions.base import upright
 from intercap_core.studio.interactions.handling import (
-    LEFT,
-    PLINTH_HALF_M,
-    RIGHT,
     SIDES,
-    Handling,
+    HandlingScript,
     between_palms,
     by_the_wall,
     palm_below,
 )
-from intercap_core.studio.motion import Trunk
-
-ATTACH_S, RELEASE_S = 0.96, 2.52
-JOIN_S, PART_S = 1.56, 1.96  # while a second hand helps
-RAISED_S = (1.36, 2.12)
+from intercap_core.studio.motion import LEFT, RIGHT, Trunk
 
 
-class Checking(Handling):
+class Checking(HandlingScript):
     """What the two ways of checking share: the path and the trunk."""
 
     highlight = 1.75
@@ -34,6 +27,11 @@ class Checking(Handling):
     tip_deg = 35.0  # towards the eyes, and half of it away
     spin_deg = 25.0  # about the vertical
     roll_deg = 18.0  # to the sides
+    attach_s = 0.96  # grasp, script time
+    release_s = 2.52  # release, script time
+    join_s = 1.56  # the second hand takes hold, script time
+    part_s = 1.96  # the second hand lets go, script time
+    raised_s = (1.36, 2.12)  # start and end of the turning before the eyes, script time
 
     def plan(self) -> None:
         self.set_out(self.top_of_height, self.aside)
@@ -46,7 +44,7 @@ class Checking(Handling):
         raise NotImplementedError
 
     def trunk(self, times: np.ndarray) -> Trunk:
-        """Lean to the plinth, straighten up, look at the thing, lean again."""
+        """Lean to the plinth, straighten up, look at the object, lean again."""
         reach = plateau(times, 0.35, 0.9, 1.0, 1.5) + plateau(times, 2.0, 2.45, 2.55, 3.0)
         look = plateau(times, 1.1, 1.5, 2.0, 2.4)
         trunk = self.leaning(times, reach, 0.30 * reach + 0.22 * look)
@@ -57,7 +55,7 @@ class Checking(Handling):
         """The helping arm's elbow is away from the body while its hand is before the chest."""
         return (0.4 * plateau(times, 0.9, 1.3, 2.0, 2.4), np.zeros(len(times)))[side]
 
-    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> Pose:
+    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> WristPose:
         """From the plinth to before the eyes, turned there about three axes, and back."""
         count = len(times)
         head = self.puppet.joint_on_trunk(world, pelvis, "head")
@@ -70,10 +68,12 @@ class Checking(Handling):
         offset = self.puppet.arm * np.array(self.before_eyes)
         shown = self.before_chest(world, head, offset, about)
         lift = np.array([0.0, 0, 0.04])
-        thing = Pose.still(self.taken, count)
-        thing = thing.towards(shown, ramp(times, ATTACH_S, RAISED_S[0]), lift)
-        return thing.towards(
-            Pose.still(self.put, count), ramp(times, RAISED_S[1], RELEASE_S - 0.03), lift
+        prop = WristPose.still(self.pick_pose, count)
+        prop = prop.towards(shown, ramp(times, self.attach_s, self.raised_s[0]), lift)
+        return prop.towards(
+            WristPose.still(self.place_pose, count),
+            ramp(times, self.raised_s[1], self.release_s - 0.03),
+            lift,
         )
 
 
@@ -86,7 +86,7 @@ class FootballCheck(Checking):
     def grasp(self) -> None:
         """Both palms from the start."""
         self.grips = between_palms(self)
-        self.hold_s = dict.fromkeys(SIDES, (ATTACH_S, RELEASE_S))
+        self.hold_s = dict.fromkeys(SIDES, (self.attach_s, self.release_s))
 
 
 class CheckingByTheWall(Checking):
@@ -99,7 +99,7 @@ class CheckingByTheWall(Checking):
     def grasp(self) -> None:
         """The wall as one drinks, then the bottom on the left palm."""
         self.grips = {RIGHT: by_the_wall(self, self.grip_height_m), LEFT: palm_below(self)}
-        self.hold_s = {RIGHT: (ATTACH_S, RELEASE_S), LEFT: (JOIN_S, PART_S)}
+        self.hold_s = {RIGHT: (self.attach_s, self.release_s), LEFT: (self.join_s, self.part_s)}
         self.haste[LEFT] = 0.6
 
 
@@ -119,19 +119,19 @@ class CupCheck(CheckingByTheWall):
     tip_deg = 38.0
 
 
-PASSED_S = 2.58
-AHEAD_M = 0.50  # the thing on the second plinth, from where the person then stands
-
-
-class Passing(Handling):
+class Passing(HandlingScript):
     """What the ways of passing share; the second plinth is to the left of the first."""
 
     highlight = 1.85
     centre = (0.15, 0.40)
     top_of_height = 0.52
-    aside = 0.0  # of the thing, to the left
+    aside = 0.0  # of the object, to the left
     carried = (0.0, 0.20, 0.36)  # from the pelvis: left, up, ahead, metres
     offered_up_m = 0.33
+    attach_s = 0.96  # grasp, script time
+    release_s = 2.58  # release, script time
+    # the object on the second plinth, ahead of the person who stands before it, metres
+    ahead_m = 0.50
 
     def plan(self) -> None:
         rng, w = self.rng, self.puppet.hip_width * 1.05
@@ -154,12 +154,14 @@ class Passing(Handling):
             ],
         )
         top = self.top - rng.uniform(0.02, 0.10)
-        table = stand + (0.40 + PLINTH_HALF_M) * way + self.aside * left
-        self.table((table[0], table[1]), (PLINTH_HALF_M, PLINTH_HALF_M), top, turned)
-        place = stand + (AHEAD_M + rng.uniform(0, 0.04)) * way
+        table = stand + (0.40 + self.plinth_half_m) * way + self.aside * left
+        self.table((table[0], table[1]), (self.plinth_half_m, self.plinth_half_m), top, turned)
+        place = stand + (self.ahead_m + rng.uniform(0, 0.04)) * way
         place = place + (self.aside + rng.uniform(-0.03, 0.03)) * left
-        heading = np.arctan2(self.taken[1, 0], self.taken[0, 0]) + turned + rng.normal(0, 0.15)
-        self.put = upright(place[0], place[1], top + self.thing.standing_height, heading)
+        heading = (
+            np.arctan2(self.pick_pose[1, 0], self.pick_pose[0, 0]) + turned + rng.normal(0, 0.15)
+        )
+        self.place_pose = upright(place[0], place[1], top + self.prop.standing_height, heading)
         self.grasp()
 
     def grasp(self) -> None:
@@ -173,7 +175,7 @@ class Passing(Handling):
         trunk.head[:, 1] += 0.30 * plateau(times, 1.0, 1.3, 1.5, 1.9)
         return trunk
 
-    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> Pose:
+    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> WristPose:
         """From the plinth to before the belly, held out, to the other plinth."""
         count = len(times)
         level = np.zeros((count, 3))
@@ -182,9 +184,13 @@ class Passing(Handling):
         offer = np.array([self.carried[0], self.offered_up_m, 0.93 * self.puppet.arm])
         level[:, 1] = 0.20  # tipped a little to whom it is offered
         offered = self.before_chest(world, pelvis, offer, level)
-        thing = Pose.still(self.taken, count).towards(carried, ramp(times, ATTACH_S, 1.42), lift)
-        thing = thing.towards(offered, ramp(times, 1.62, 2.05))
-        return thing.towards(Pose.still(self.put, count), ramp(times, 2.12, PASSED_S - 0.03), lift)
+        prop = WristPose.still(self.pick_pose, count).towards(
+            carried, ramp(times, self.attach_s, 1.42), lift
+        )
+        prop = prop.towards(offered, ramp(times, 1.62, 2.05))
+        return prop.towards(
+            WristPose.still(self.place_pose, count), ramp(times, 2.12, self.release_s - 0.03), lift
+        )
 
 
 class PassingByTheWall(Passing):
@@ -198,7 +204,7 @@ class PassingByTheWall(Passing):
     def grasp(self) -> None:
         """The wall as one drinks."""
         self.grips = {RIGHT: by_the_wall(self, self.grip_height_m)}
-        self.hold_s = {RIGHT: (ATTACH_S, PASSED_S)}
+        self.hold_s = {RIGHT: (self.attach_s, self.release_s)}
 
 
 class CupPass(PassingByTheWall):
@@ -222,4 +228,4 @@ class FootballPass(Passing):
     def grasp(self) -> None:
         """Both palms from the start."""
         self.grips = between_palms(self)
-        self.hold_s = dict.fromkeys(SIDES, (ATTACH_S, PASSED_S))
+        self.hold_s = dict.fromkeys(SIDES, (self.attach_s, self.release_s))

@@ -10,34 +10,18 @@ import numpy as np
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.geometry.camera.transforms import invert
 from intercap_core.studio.controls import (
-    SOLE_FRONT_M,
     Footwork,
     Guide,
-    Pose,
     Step,
+    WristPose,
     bump,
     plateau,
     ramp,
 )
 from intercap_core.studio.hands import FLAT, RELAXED, HandShape, part_of
-from intercap_core.studio.interactions.base import (
-    SCRIPT_S,
-    Interaction,
-    Performance,
-    transform,
-    upright,
-)
-from intercap_core.studio.motion import LEG_REACH, Foot, Trunk, still
+from intercap_core.studio.interactions.base import Interaction, Performance, transform, upright
+from intercap_core.studio.motion import LEFT, RIGHT, Foot, Trunk, still
 from intercap_core.studio.skeleton import local_rotations, unit
-
-RIGHT, LEFT = 1, 0
-SIT_S, SEATED_S = 0.68, 1.50
-CALF_M, THIGH_M = 0.055, 0.065  # half their thickness, at the knee
-AROUND_M = 0.14  # sidewards, between the lap and hanging
-PALM_M = 0.056  # from the wrist to what a level palm lies on, with trousers
-STEEPEST_RAD = 0.75  # of a foot that stands on its ball
-PRESSED_M = 0.014  # flesh gives way by this much on the seat
-TOUCH_M = 0.0006  # how deep the palm presses the seat
 
 
 class Sitting(Interaction):
@@ -53,17 +37,26 @@ class Sitting(Interaction):
     front_edge = 0.0  # the seat's front from its middle, metres; 0 where the legs may spread
     back_by_s = 0.30  # before the person sits, the pelvis is above its place
     on_thigh_s = 1.74  # when the hands lie on the thighs
+    sit_s = 0.68  # start of sitting down, script time
+    seated_s = 1.50  # end of sitting down, script time
+    calf_m = 0.055  # half the calf's thickness at the knee
+    thigh_m = 0.065  # half the thigh's thickness at the knee
+    around_m = 0.14  # sideways detour of a hand between lap and hanging
+    palm_m = 0.056  # from the wrist to the surface below a level palm, trousers included
+    steepest_rad = 0.75  # pitch of a foot that stands on its ball, at most
+    pressed_m = 0.014  # depth to which the seat presses the flesh
+    touch_m = 0.0006  # depth to which the palm presses the seat
 
     def plan(self) -> None:
         rng, puppet = self.rng, self.puppet
         thigh = puppet.skeleton.length("left_hip", "left_knee")
-        self.seat = upright(0.0, 0.0, self.thing.standing_height, self.turned())
-        middle = (np.abs(self.thing.vertices[:, :2]) < 0.10).all(1)
-        self.seat_top = self.seat[2, 3] + self.thing.vertices[middle, 2].max()
+        self.seat = upright(0.0, 0.0, self.prop.standing_height, self.turned())
+        middle = (np.abs(self.prop.vertices[:, :2]) < 0.10).all(1)
+        self.seat_top = self.seat[2, 3] + self.prop.vertices[middle, 2].max()
         # feet before the seat's middle, the calves clear of its front
-        self.sat_back = max(self.sat_back, self.front_edge + CALF_M - thigh)
+        self.sat_back = max(self.sat_back, self.front_edge + self.calf_m - thigh)
         self.ahead = thigh * rng.uniform(0.90, 0.98) + self.sat_back
-        self.ahead = max(self.ahead, self.front_edge + 2 * CALF_M + rng.uniform(0.0, 0.02))
+        self.ahead = max(self.ahead, self.front_edge + 2 * self.calf_m + rng.uniform(0.0, 0.02))
         w = puppet.hip_width * 1.15
         before = 0.16
         start = np.array([[self.ahead + before, w], [self.ahead + before - 0.03, -w]])
@@ -71,12 +64,7 @@ class Sitting(Interaction):
             Step(RIGHT, 0.02, 0.40, (self.ahead - 0.01, -w)),
             Step(LEFT, 0.32, 0.70, (self.ahead + 0.01, w)),
         ]
-        self.footwork = Footwork(
-            start, 0.0, steps, puppet.ankle_height, SCRIPT_S, self._heels(steps)
-        )
-        self.pelvis_track = self.footwork.pelvis(
-            LEG_REACH * puppet.leg, puppet.hip_width, puppet.hip_drop, puppet.stand
-        )
+        self.walk(start, steps, guides=self._heels(steps))
         self.seated_height = self.seat_top + 0.12
         self.sit()
         self.palm_place = self._palm_on_seat()
@@ -85,13 +73,13 @@ class Sitting(Interaction):
         """Feet of people whose knees are lower than the seat stand on their balls meanwhile."""
         puppet, guides = self.puppet, []
         knee = puppet.skeleton.length("left_knee", "left_ankle") + float(puppet.ankle_height[0])
-        missing = self.seat_top + THIGH_M - knee if self.front_edge else 0.0
-        pitch = float(np.clip(missing / SOLE_FRONT_M, 0.0, STEEPEST_RAD))
+        missing = self.seat_top + self.thigh_m - knee if self.front_edge else 0.0
+        pitch = float(np.clip(missing / Footwork.sole_front_m, 0.0, self.steepest_rad))
         for step in steps:
             place = np.array([*step.place, 0.0, pitch, step.heading])
             place[2] = -Foot(puppet, step.foot).skin(place[None])[0, :, 2].min()
             on_ball = still(place)
-            guides.append(Guide(step.foot, SIT_S + 0.1, SEATED_S - 0.2, on_ball))
+            guides.append(Guide(step.foot, self.sit_s + 0.1, self.seated_s - 0.2, on_ball))
             guides.append(Guide(step.foot, self.rise_s + 0.1, self.risen_s - 0.1))
         return guides if pitch else []
 
@@ -105,7 +93,7 @@ class Sitting(Interaction):
         low_part = [JOINT_INDEX[n] for n in ("pelvis", "left_hip", "right_hip", "spine1")]
         share = np.asarray(subject.weights[:, low_part].sum(1)).ravel()
         seat = part_of(subject, np.flatnonzero(share > 0.5))
-        when = np.array([(SEATED_S + self.rise_s) / 2])
+        when = np.array([(self.seated_s + self.rise_s) / 2])
         low, high = self.seat_top + 0.02, self.seat_top + 0.22
         for _ in range(14):
             middle = (low + high) / 2
@@ -115,7 +103,7 @@ class Sitting(Interaction):
             puppet.legs(world, trunk.pelvis, *self.footwork.feet(when))
             posed = seat.skin(local_rotations(world), trunk.pelvis - subject.rest_joints[0])
             local = (posed.vertices[0] - self.seat[:3, 3]) @ self.seat[:3, :3]
-            if self.thing.surface.signed_distance(local).min() < -PRESSED_M:
+            if self.prop.surface.signed_distance(local).min() < -self.pressed_m:
                 low = middle
             else:
                 high = middle
@@ -128,7 +116,7 @@ class Sitting(Interaction):
         palm = unit(np.array([0.08, -0.38, -0.90]))
         rotation = self.puppet.wrist_rotation(RIGHT, fingers, palm)
         place = np.array([*self.palm_at, self.seat_top + 0.10]) - rotation @ hand.knuckles.mean(0)
-        return self.approached(RIGHT, FLAT, rotation, place, np.array([0, 0, 1.0]), -TOUCH_M)
+        return self.approached(RIGHT, FLAT, rotation, place, np.array([0, 0, 1.0]), -self.touch_m)
 
     def approached(
         self,
@@ -145,7 +133,7 @@ class Sitting(Interaction):
         for _ in range(18):
             middle = (low + high) / 2
             pose = invert(self.seat) @ transform(rotation, place + middle * away)
-            if self.puppet.hands[side].gap(hand_shape, self.thing.surface, pose) < gap:
+            if self.puppet.hands[side].gap(hand_shape, self.prop.surface, pose) < gap:
                 low = middle
             else:
                 high = middle
@@ -156,10 +144,12 @@ class Sitting(Interaction):
         sway = self.sway(times) * (0.0 if still else 1.0)
         shift = self.weight_shift(times) * (0.0 if still else 1.0)
         # the hips go back before they go down, and up before they come forward
-        down = ramp(times, SIT_S, SEATED_S) - ramp(times, self.rise_s, self.risen_s)
-        back = ramp(times, SIT_S - 0.12, SEATED_S - self.back_by_s)
+        down = ramp(times, self.sit_s, self.seated_s) - ramp(times, self.rise_s, self.risen_s)
+        back = ramp(times, self.sit_s - 0.12, self.seated_s - self.back_by_s)
         back -= ramp(times, self.rise_s + 0.16, self.risen_s + 0.05)
-        lean = plateau(times, SIT_S - 0.12, SIT_S + 0.36, SEATED_S - 0.20, SEATED_S + 0.20)
+        lean = plateau(
+            times, self.sit_s - 0.12, self.sit_s + 0.36, self.seated_s - 0.20, self.seated_s + 0.20
+        )
         up = self.rise_s
         lean = lean + plateau(times, up - 0.30, up + 0.05, up + 0.30, self.risen_s)
         feel = plateau(times, 0.72, 1.16, 1.30, 1.75)
@@ -176,7 +166,7 @@ class Sitting(Interaction):
         head[:, 1] -= 0.3 * feel
         return Trunk(pelvis, track[:, 3], bend, head)
 
-    def on_thigh(self, world: np.ndarray, pelvis: np.ndarray, side: int) -> Pose:
+    def on_thigh(self, world: np.ndarray, pelvis: np.ndarray, side: int) -> WristPose:
         """The wrist over the thigh of its side, the palm down."""
         puppet, sign = self.puppet, (1.0, -1.0)[side]
         name = ("left", "right")[side]
@@ -185,12 +175,14 @@ class Sitting(Interaction):
         bone = puppet.skeleton.bone(f"{name}_hip", f"{name}_knee")
         along = unit(thigh @ bone)
         above = unit(thigh @ np.array([0, 0, 1.0]))
-        position = hip + 0.52 * (thigh @ bone) + (puppet.thigh_height[side] + PALM_M) * above
+        position = hip + 0.52 * (thigh @ bone) + (puppet.thigh_height[side] + self.palm_m) * above
         position[:, 1] += 0.012 * sign
         fingers = unit(along + np.array([0.0, -0.15 * sign, 0.0]) + 0.10 * above)
-        return Pose(position, puppet.wrist_rotation(side, fingers, -above))
+        return WristPose(position, puppet.wrist_rotation(side, fingers, -above))
 
-    def _wrist(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray, side: int) -> Pose:
+    def _wrist(
+        self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray, side: int
+    ) -> WristPose:
         count = len(times)
         swing = 0.06 * bump(times, 0, 0.5) * (1, -1)[side] + self.arm_swing(times)[:, side]
         idle = self.puppet.idle_wrist(world, pelvis, side, swing)
@@ -202,28 +194,28 @@ class Sitting(Interaction):
         place = self.palm_place
         aside = place.copy()
         aside[:3, 3] += (0.0, -0.05, 0.11)
-        wrist = idle.towards(Pose.still(aside, count), ramp(times, 0.54, 1.00))
-        wrist = wrist.towards(Pose.still(place, count), ramp(times, 0.86, 1.12))
+        wrist = idle.towards(WristPose.still(aside, count), ramp(times, 0.54, 1.00))
+        wrist = wrist.towards(WristPose.still(place, count), ramp(times, 0.86, 1.12))
         # out of the way of the hips that come down beside it
         off = aside.copy()
         off[1, 3] -= 0.10
-        wrist = wrist.towards(Pose.still(off, count), ramp(times, 1.12, 1.34))
+        wrist = wrist.towards(WristPose.still(off, count), ramp(times, 1.12, 1.34))
         lifting = ramp(times, 1.36, self.on_thigh_s)
         wrist = self._around_thigh(wrist.towards(thigh, lifting), lifting, RIGHT)
         return self._around_thigh(wrist.towards(idle, rising), rising, RIGHT)
 
-    def _around_thigh(self, wrist: Pose, share: np.ndarray, side: int) -> Pose:
+    def _around_thigh(self, wrist: WristPose, share: np.ndarray, side: int) -> WristPose:
         """The wrist led outwards while it is on its way (``share`` (N,)) past the thigh."""
-        out = AROUND_M * 4 * share * (1 - share) * (1, -1)[side]
-        return Pose(wrist.position + out[:, None] * np.array([0.0, 1.0, 0.0]), wrist.rotation)
+        out = self.around_m * 4 * share * (1 - share) * (1, -1)[side]
+        return WristPose(wrist.position + out[:, None] * np.array([0.0, 1.0, 0.0]), wrist.rotation)
 
     def left_wrist(
         self,
-        idle: Pose,
+        idle: WristPose,
         world: np.ndarray,
         pelvis: np.ndarray,
         times: np.ndarray,
-    ) -> Pose:
+    ) -> WristPose:
         """The left wrist (N) until the person rises."""
         return idle.towards(self.on_thigh(world, pelvis, LEFT), ramp(times, 0.50, 1.10))
 
@@ -255,19 +247,17 @@ class Sitting(Interaction):
         return Performance(world, pelvis, pose)
 
 
-HOVER_M = (0.006, 0.016)
-
-
 class StoolSit(Sitting):
     """A round seat without a back; the left hand hangs beside its rim."""
 
     object_class = "stool"
     palm_at = (-0.02, -0.16)
     hanging = 1.0
+    hover_m = (0.006, 0.016)  # range of the gap between the left hand and the seat, metres
 
     def plan(self) -> None:
         super().plan()
-        self.hover_place = self._beside_seat(self.rng.uniform(*HOVER_M))
+        self.hover_place = self._beside_seat(self.rng.uniform(*self.hover_m))
 
     def turned(self) -> float:
         return self.rng.uniform(0, np.pi / 2)
@@ -282,25 +272,18 @@ class StoolSit(Sitting):
 
     def left_wrist(
         self,
-        idle: Pose,
+        idle: WristPose,
         world: np.ndarray,
         pelvis: np.ndarray,
         times: np.ndarray,
-    ) -> Pose:
+    ) -> WristPose:
         count = len(times)
         place = self.hover_place
         aside = place.copy()
         aside[:3, 3] += (0.0, 0.07, 0.06)
-        wrist = idle.towards(Pose.still(aside, count), ramp(times, 0.9, SEATED_S))
-        wrist = wrist.towards(Pose.still(place, count), ramp(times, 1.38, 1.66))
-        return wrist.towards(Pose.still(aside, count), ramp(times, 1.92, 2.15))
-
-
-BACK_PRESSED_M = 0.006  # the back gives way by this much on the slats
-OVER_SEAT_M = 0.04  # what is lower meets the seat
-SITS_ABOVE_M = 0.13  # the pelvis above the seat, about
-UPRIGHT_RAD, RECLINED_RAD = 0.08, 0.65
-FARTHEST_AHEAD_M = 0.04  # of the pelvis from the seat's middle
+        wrist = idle.towards(WristPose.still(aside, count), ramp(times, 0.9, self.seated_s))
+        wrist = wrist.towards(WristPose.still(place, count), ramp(times, 1.38, 1.66))
+        return wrist.towards(WristPose.still(aside, count), ramp(times, 1.92, 2.15))
 
 
 class ChairSit(Sitting):
@@ -312,6 +295,12 @@ class ChairSit(Sitting):
     sat_back = -0.12
     front_edge, on_thigh_s = 0.262, 1.95
     back_by_s = 0.12
+    back_pressed_m = 0.006  # depth to which the slats press the back, metres
+    over_seat_m = 0.04  # skin less than this above the seat is not tested against the back, metres
+    sits_above_m = 0.13  # first guess of the pelvis above the seat, metres
+    upright_rad = 0.08  # recline at which the sitting place is found
+    reclined_rad = 0.65  # recline, at most
+    farthest_ahead_m = 0.04  # the pelvis ahead of the seat's middle, at most, metres
 
     def turned(self) -> float:
         return np.pi / 2 + self.rng.normal(0, 0.03)
@@ -322,18 +311,18 @@ class ChairSit(Sitting):
         bones = [JOINT_INDEX[name] for name in ("pelvis", "spine1", "spine2", "spine3")]
         share = np.asarray(subject.weights[:, bones].sum(1)).ravel()
         back = part_of(subject, np.flatnonzero(share > 0.5))
-        when = np.array([(SEATED_S + self.rise_s) / 2])
+        when = np.array([(self.seated_s + self.rise_s) / 2])
 
         def pressed() -> bool:
             trunk = self.trunk(when, still=True)
             local = local_rotations(self.puppet.trunk(trunk))
             posed = back.skin(local, trunk.pelvis - subject.rest_joints[0]).vertices[0]
             at = (posed - self.seat[:3, 3]) @ self.seat[:3, :3]
-            at = at[at[:, 2] + self.seat[2, 3] > self.seat_top + OVER_SEAT_M]
-            return float(self.thing.surface.signed_distance(at).min()) < -BACK_PRESSED_M
+            at = at[at[:, 2] + self.seat[2, 3] > self.seat_top + self.over_seat_m]
+            return float(self.prop.surface.signed_distance(at).min()) < -self.back_pressed_m
 
-        self.seated_height, self.recline = self.seat_top + SITS_ABOVE_M, UPRIGHT_RAD
-        low, high = self.sat_back, FARTHEST_AHEAD_M
+        self.seated_height, self.recline = self.seat_top + self.sits_above_m, self.upright_rad
+        low, high = self.sat_back, self.farthest_ahead_m
         for _ in range(12):
             self.sat_back = (low + high) / 2
             if pressed():
@@ -343,7 +332,7 @@ class ChairSit(Sitting):
         self.sat_back = high
         for _ in range(2):
             super().sit()
-            low, high = 0.0, RECLINED_RAD
+            low, high = 0.0, self.reclined_rad
             for _ in range(12):
                 self.recline = (low + high) / 2
                 if pressed():

@@ -6,20 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from intercap_core.studio.controls import Footwork, Guide, Pose, Step, plateau, ramp
+from intercap_core.studio.controls import Guide, Step, WristPose, plateau, ramp
 from intercap_core.studio.hands import RELAXED
-from intercap_core.studio.interactions.base import SCRIPT_S, Interaction, Performance, upright
-from intercap_core.studio.motion import LEG_REACH, Foot, Trunk, moved, still
-
-RIGHT, LEFT = 1, 0
-PUSH_S, PUSHED_S, STOP_S = 0.80, 1.02, 2.15
-SPEED_M_S = (0.85, 1.15)  # once pushed off
-STANCE_M = 0.16  # each foot from the board's middle
-TURNED_RAD = 0.52  # the person looks this much towards where the board rolls
-PRESSED_M = 0.002
-HOVER_SHARE, HOVER_M = 0.35, (0.006, 0.016)  # how often the first foot stops short of the deck
-ASIDE_M = 0.34  # the feet on the floor from the board's middle line
-LIFT_M = 0.08  # above the deck before and after a foot stands on it
+from intercap_core.studio.interactions.base import Interaction, Performance, upright
+from intercap_core.studio.motion import LEFT, RIGHT, Foot, Trunk, moved, still
 
 
 class SkateboardRide(Interaction):
@@ -28,61 +18,75 @@ class SkateboardRide(Interaction):
     object_class = "skateboard"
     feet_meet_object = True
     highlight = 1.5
+    push_s = 0.80  # start of the push, script time
+    pushed_s = 1.02  # end of the push, script time
+    stop_s = 2.15  # the board stops, script time
+    speed_m_s = (0.85, 1.15)  # range of the speed after the push
+    stance_m = 0.16  # each foot from the board's middle, metres
+    turned_rad = 0.52  # the person turns this far towards the rolling direction
+    pressed_m = 0.002  # depth to which the deck presses the sole, metres
+    hover_share = 0.35  # share of the recordings in which the first foot stops short of the deck
+    hover_m = (0.006, 0.016)  # range of the gap in them, metres
+    aside_m = 0.34  # the feet on the floor from the board's middle line, metres
+    lift_m = 0.08  # a foot above the deck before and after it stands there, metres
 
     def plan(self) -> None:
         rng, puppet = self.rng, self.puppet
         self.way = float(rng.choice((-1, 1)))  # the right foot is in front on the way to +x
         self.front = RIGHT if self.way > 0 else LEFT
         self.flipped = float(rng.choice((0.0, np.pi)))
-        speed = rng.uniform(*SPEED_M_S)
+        speed = rng.uniform(*self.speed_m_s)
         self.speed = speed
-        self.rolled_m = speed * (STOP_S - PUSH_S) / 2
+        self.rolled_m = speed * (self.stop_s - self.push_s) / 2
         self.centre = (self.way * self.rolled_m / 2, -0.10)
-        heading = np.pi / 2 - self.way * TURNED_RAD + rng.normal(0, 0.05)
-        height = self.thing.standing_height
+        heading = np.pi / 2 - self.way * self.turned_rad + rng.normal(0, 0.05)
+        height = self.prop.standing_height
         self.board = upright(0.0, 0.0, height, self.flipped + rng.normal(0, 0.01))
         self.on_deck = [self._on_deck(side, heading) for side in (LEFT, RIGHT)]
-        hover = rng.uniform(*HOVER_M) if rng.random() < HOVER_SHARE else 0.0
+        hover = rng.uniform(*self.hover_m) if rng.random() < self.hover_share else 0.0
         steps, guides, start = [], [], np.empty((2, 2))
         w = puppet.hip_width
         for side, sign in ((LEFT, -1.0), (RIGHT, 1.0)):
-            behind = np.array([1.1 * w * sign, -ASIDE_M + 0.02 * rng.random()])
+            behind = np.array([1.1 * w * sign, -self.aside_m + 0.02 * rng.random()])
             start[side] = behind
             shift = np.array([self.way * self.rolled_m, 0.0]) + rng.normal(0, (0.02, 0.01))
             last = behind + shift
             steps.append(Step(side, 1.30, 1.70, (float(last[0]), float(last[1])), heading))
             guides += self._guides(side, hover)
-        self.footwork = Footwork(start, heading, steps, puppet.ankle_height, SCRIPT_S, guides)
-        self.pelvis_track = self.footwork.pelvis(
-            LEG_REACH * puppet.leg, puppet.hip_width, puppet.hip_drop, puppet.stand
-        )
+        self.walk(start, steps, heading=heading, guides=guides)
 
     def _on_deck(self, side: int, heading: float) -> np.ndarray:
         """The place (5,) of a foot that stands on the board, its sole lightly pressed."""
         foot = Foot(self.puppet, side)
         sign = (-1.0, 1.0)[side]
         ahead = np.array([np.cos(heading), np.sin(heading)])
-        at = np.array([STANCE_M * sign, 0.0]) - 0.05 * ahead
+        at = np.array([self.stance_m * sign, 0.0]) - 0.05 * ahead
         place = np.array([*at, self.board[2, 3], 0.0, heading])
 
         def distance(skin: np.ndarray) -> float:
             local = (skin - self.board[:3, 3]) @ self.board[:3, :3]
-            return float(self.thing.surface.signed_distance(local).min())
+            return float(self.prop.surface.signed_distance(local).min())
 
-        return foot.backed_off(place, np.array([0, 0, 0.4, 0, 0]), -PRESSED_M, distance)
+        return foot.backed_off(place, np.array([0, 0, 0.4, 0, 0]), -self.pressed_m, distance)
 
     def _guides(self, side: int, hover: float) -> list[Guide]:
         """From the floor over the deck's edge, onto the deck, and back."""
         on = self.on_deck[side]
         ride, over, up = (
             self._along(place)
-            for place in (on, moved(on, 0, -0.13, LIFT_M, 0.1), moved(on, 0, -0.26, LIFT_M, 0.2))
+            for place in (
+                on,
+                moved(on, 0, -0.13, self.lift_m, 0.1),
+                moved(on, 0, -0.26, self.lift_m, 0.2),
+            )
         )
         if side == self.front:
             late = 0.20 if hover else 0.0
             guides = [Guide(side, 0.04, 0.30, up), Guide(side, 0.20, 0.44, over)]
             if hover:
-                guides.append(Guide(side, 0.34, 0.54, still(moved(on, 0, 0, PRESSED_M + hover))))
+                guides.append(
+                    Guide(side, 0.34, 0.54, still(moved(on, 0, 0, self.pressed_m + hover)))
+                )
             guides.append(Guide(side, 0.38 + late, 0.62 + late, ride))
             leave = 2.54
         else:
@@ -98,10 +102,10 @@ class SkateboardRide(Interaction):
 
     def _rolled(self, times: np.ndarray) -> np.ndarray:
         """How far the board has rolled (N,): pushed evenly, then slowed evenly to a stop."""
-        pushed = np.clip(times - PUSH_S, 0, PUSHED_S - PUSH_S)
-        slowed = np.clip(times - PUSHED_S, 0, STOP_S - PUSHED_S)
-        first = self.speed * pushed**2 / (2 * (PUSHED_S - PUSH_S))
-        return first + self.speed * (slowed - slowed**2 / (2 * (STOP_S - PUSHED_S)))
+        pushed = np.clip(times - self.push_s, 0, self.pushed_s - self.push_s)
+        slowed = np.clip(times - self.pushed_s, 0, self.stop_s - self.pushed_s)
+        first = self.speed * pushed**2 / (2 * (self.pushed_s - self.push_s))
+        return first + self.speed * (slowed - slowed**2 / (2 * (self.stop_s - self.pushed_s)))
 
     def _along(self, place: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
         """A place (5,) that moves with the board."""
@@ -136,7 +140,9 @@ class SkateboardRide(Interaction):
             wrist = puppet.idle_wrist(world, trunk.pelvis, side, self.arm_swing(times)[:, side])
             outward = sign * world[:, 9, :, 0] * (1, 1, 0)
             out = balance[:, None] * (0.20 * outward + (0, 0, 0.12))
-            puppet.arm_to(world, trunk.pelvis, side, Pose(wrist.position + out, wrist.rotation))
+            puppet.arm_to(
+                world, trunk.pelvis, side, WristPose(wrist.position + out, wrist.rotation)
+            )
             puppet.fingers(world, side, puppet.finger_track(side, RELAXED, []))
         pose = np.broadcast_to(self.board, (len(times), 4, 4)).copy()
         pose[:, 0, 3] += self.way * self._rolled(times)

@@ -1,23 +1,19 @@
 """Scripts in which what is held truly moves in the hand: a glide, a turn, a re-grasp.
 
-Only ``slide`` says how fast skin and thing pass each other; truth follows from it.
+Only ``slide`` says how fast skin and object pass each other; truth follows from it.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.studio.controls import Pose, plateau, ramp
+from intercap_core.studio.controls import WristPose, plateau, ramp
 from intercap_core.studio.hands import HandShape
-from intercap_core.studio.interactions.handling import RIGHT, by_the_wall
-from intercap_core.studio.interactions.presenting import ATTACH_S, RELEASE_S, BottleCheck
+from intercap_core.studio.interactions.handling import by_the_wall
+from intercap_core.studio.interactions.presenting import BottleCheck
 from intercap_core.studio.interactions.swinging import RacquetSwing, UmbrellaSwing
+from intercap_core.studio.motion import RIGHT
 from intercap_core.studio.skeleton import turn
-
-GLIDE_M = 0.032  # along the grip, towards the head and back
-TURN_DEG = 55.0  # of the umbrella about its handle, and back
-REGRASP_UP_M, REGRASP_DEG = 0.022, 28.0  # along and about the bottle
-REGRASP_OFF_M = 0.012  # the open hand leaves the bottle by this much meanwhile
 
 
 def along_and_about(along: np.ndarray, about: np.ndarray, axis: np.ndarray) -> np.ndarray:
@@ -38,10 +34,11 @@ class RacquetGlide(RacquetSwing):
     butt as it swings through."""
 
     glide_s = (1.14, 1.44, 1.66, 1.98)  # from, until, back from, until
+    glide_m = 0.032  # along the grip, towards the head and back, metres
 
     def slide(self, times: np.ndarray) -> np.ndarray:
         """Along the grip, which is as thick everywhere."""
-        along = GLIDE_M * plateau(times, *self.glide_s)
+        along = self.glide_m * plateau(times, *self.glide_s)
         return along_and_about(along, np.zeros(len(times)), np.zeros(2))
 
 
@@ -49,13 +46,14 @@ class UmbrellaTurn(UmbrellaSwing):
     """The straight handle turns in the fingers while it points ahead, and back."""
 
     turn_s = (1.16, 1.50, 1.62, 2.02)
+    turn_deg = 55.0  # about the handle, and back
 
     def slide(self, times: np.ndarray) -> np.ndarray:
-        """About the middle of the handle where it is held; the thing turns the other way."""
-        near = np.abs(self.thing.vertices[:, 2] - self.handle_m) < 0.03
-        held = self.thing.vertices[near, :2]
+        """About the middle of the handle where it is held; the object turns the other way."""
+        near = np.abs(self.prop.vertices[:, 2] - self.handle_m) < 0.03
+        held = self.prop.vertices[near, :2]
         axis = (held.min(0) + held.max(0)) / 2
-        about = np.radians(TURN_DEG) * plateau(times, *self.turn_s)
+        about = np.radians(self.turn_deg) * plateau(times, *self.turn_s)
         return along_and_about(np.zeros(len(times)), about, axis)
 
 
@@ -65,11 +63,14 @@ class BottleRegrasp(BottleCheck):
 
     regrasp_s = (1.04, 1.12, 1.26, 1.36)  # opens from, is open, closes from, is closed
     rests_until_s = 1.36
+    regrasp_up_m = 0.022  # shift of the hand along the bottle, metres
+    regrasp_deg = 28.0  # turn of the hand about the bottle
+    regrasp_off_m = 0.012  # gap between the open hand and the bottle meanwhile, metres
 
     def grasp(self) -> None:
         """The wall, with the right hand alone."""
         self.grips = {RIGHT: by_the_wall(self, self.grip_height_m)}
-        self.hold_s = {RIGHT: (ATTACH_S, RELEASE_S)}
+        self.hold_s = {RIGHT: (self.attach_s, self.release_s)}
 
     def raised(self, times: np.ndarray, side: int) -> np.ndarray:
         """No arm helps."""
@@ -79,17 +80,18 @@ class BottleRegrasp(BottleCheck):
         """From the first place to the second while the hand is open."""
         opens, off, back, closed = self.regrasp_s
         share = ramp(times, (opens + off) / 2, (back + closed) / 2)
-        moved = along_and_about(REGRASP_UP_M * share, np.radians(REGRASP_DEG) * share, np.zeros(2))
+        about = np.radians(self.regrasp_deg) * share
+        moved = along_and_about(self.regrasp_up_m * share, about, np.zeros(2))
         hand = self.puppet.hands[RIGHT]
         away = self.grips[RIGHT].object_from_wrist[:3, :3] @ -hand.palm
-        away = away * REGRASP_OFF_M * plateau(times, *self.regrasp_s)[:, None]
+        away = away * self.regrasp_off_m * plateau(times, *self.regrasp_s)[:, None]
         moved[:, :3, 3] += np.einsum("nij,nj->ni", moved[:, :3, :3], away)
         return moved
 
-    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> Pose:
+    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> WristPose:
         """Before the eyes and back, but that it rests until it is held anew."""
         way = super().path(world, pelvis, times)
-        still = Pose.still(self.taken, len(times))
+        still = WristPose.still(self.pick_pose, len(times))
         return still.towards(way, ramp(times, self.rests_until_s, 1.80))
 
     def finger_keys(self, side: int, times: np.ndarray) -> list[tuple[np.ndarray, HandShape]]:

@@ -1,4 +1,4 @@
-"""Take a long thing that lies on a block by its handle, swing it, lay it down again."""
+"""Take a long object that lies on a block by its handle, swing it, lay it down again."""
 
 from __future__ import annotations
 
@@ -10,17 +10,12 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from intercap_core.geometry.camera.transforms import invert
-from intercap_core.studio.controls import Pose, Step, plateau, ramp
+from intercap_core.studio.controls import Step, WristPose, plateau, ramp
 from intercap_core.studio.interactions.base import transform
 from intercap_core.studio.interactions.grasps import WRAP_OPEN, Approach, wrapped
-from intercap_core.studio.interactions.handling import PLINTH_HALF_M, RIGHT, Handling
-from intercap_core.studio.motion import Trunk
+from intercap_core.studio.interactions.handling import HandlingScript
+from intercap_core.studio.motion import RIGHT, Trunk
 from intercap_core.studio.skeleton import unit
-
-ATTACH_S, RELEASE_S = 0.96, 2.56
-BLOCK_OF_HEIGHT = 0.49  # its top, as a share of the person's height
-BLOCK_HALF_M = 0.23  # across the person's way
-OVERHANG_M = 0.085  # from the middle of the hand to the block's edge
 
 
 @dataclass(frozen=True)
@@ -36,27 +31,32 @@ class Key:
     end: float
 
 
-class Swinging(Handling):
+class Swinging(HandlingScript):
     """The handle overhangs the block's right edge; the far end points to the left."""
 
     highlight = 1.65
     centre = (0.25, 0.0)
-    handle_m = 0.0  # the middle of the hand along the thing's z axis, from its origin
+    handle_m = 0.0  # the middle of the hand along the object's z axis, from its origin
     far_end = 1.0  # where the far end is along z, +1 or -1
-    side_up = 1.0  # which side of the thing is up while it lies, along y
+    side_up = 1.0  # which side of the object is up while it lies, along y
     clear_m, back_m = 0.045, 0.075  # the thumb is behind the handle
     keys: tuple[Key, ...] = ()
     turn_back_rad, turn_through_rad = 0.0, 0.0  # of the chest, to the right and to the left
     back_s, through_s = (1.0, 1.35, 1.4, 1.7), (1.45, 1.75, 1.9, 2.3)
+    attach_s = 0.96  # grasp, script time
+    release_s = 2.56  # release, script time
+    block_share = 0.49  # height of the block's top, share of the person's height
+    block_half_m = 0.23  # half the block's size across the person's way, metres
+    overhang_m = 0.085  # from the middle of the hand to the block's edge, metres
 
     def plan(self) -> None:
         rng, puppet = self.rng, self.puppet
-        self.top = BLOCK_OF_HEIGHT * puppet.subject.height_m + rng.uniform(-0.03, 0.03)
-        edge = -0.14 + OVERHANG_M
-        self.table((0.40 + PLINTH_HALF_M, edge + BLOCK_HALF_M), (PLINTH_HALF_M, BLOCK_HALF_M),
-                   self.top)  # fmt: skip
-        self.taken = self._lying(0.50 + rng.uniform(-0.015, 0.015), rng.normal(0, 0.06))
-        self.put = self._lying(0.52 + rng.uniform(-0.015, 0.02), rng.normal(0, 0.10))
+        self.top = self.block_share * puppet.subject.height_m + rng.uniform(-0.03, 0.03)
+        edge = -0.14 + self.overhang_m
+        half = (self.plinth_half_m, self.block_half_m)
+        self.table((0.40 + half[0], edge + half[1]), half, self.top)
+        self.pick_pose = self._lying(0.50 + rng.uniform(-0.015, 0.015), rng.normal(0, 0.06))
+        self.place_pose = self._lying(0.52 + rng.uniform(-0.015, 0.02), rng.normal(0, 0.10))
         w = puppet.hip_width * 1.1
         steps = [
             Step(RIGHT, 0.02, 0.40, (0.02, -w)),
@@ -66,16 +66,16 @@ class Swinging(Handling):
         ]
         self.walk(np.array([[-0.24, w], [-0.22, -w]]), steps)
         self.size = rng.uniform(0.9, 1.1, 3)
-        self.grips[RIGHT] = wrapped(puppet, RIGHT, WRAP_OPEN, self.thing.surface, self.taken,
+        self.grips[RIGHT] = wrapped(puppet, RIGHT, WRAP_OPEN, self.prop.surface, self.pick_pose,
                                     self._approaches())  # fmt: skip
-        self.hold_s[RIGHT] = (ATTACH_S, RELEASE_S)
+        self.hold_s[RIGHT] = (self.attach_s, self.release_s)
 
     def _lying(self, ahead: float, yaw: float) -> np.ndarray:
-        """The thing (4, 4) on the block: it rests on the two points on either side of its centre
+        """The object (4, 4) on the block: it rests on the two points on either side of its centre
         of mass, its handle's middle ``ahead`` of the person."""
-        along = self.far_end * self.thing.vertices[:, 2]
-        height = self.side_up * self.thing.vertices[:, 1]
-        on_block = along > self.far_end * self.handle_m + OVERHANG_M
+        along = self.far_end * self.prop.vertices[:, 2]
+        height = self.side_up * self.prop.vertices[:, 1]
+        on_block = along > self.far_end * self.handle_m + self.overhang_m
         outline = np.stack([along, height], 1)[on_block]
         hull = ConvexHull(outline)
         ends = outline[hull.simplices]  # (E, 2, 2)
@@ -88,16 +88,16 @@ class Swinging(Handling):
         y = self.side_up * unit(np.array([0, 0, 1.0]) - far[2] * far)
         rotation = np.stack([np.cross(y, z), y, z], 1)
         place = np.array([ahead, -0.14, 0.0]) - rotation @ np.array([0, 0, self.handle_m])
-        turned = self.thing.vertices[on_block] @ rotation.T
+        turned = self.prop.vertices[on_block] @ rotation.T
         place[2] = self.top - turned[:, 2].min()
         return transform(rotation, place)
 
     def _approaches(self) -> Iterator[Approach]:
         """The palm from above and behind, fingers across the handle."""
-        across = self.far_end * self.taken[:3, 2]
+        across = self.far_end * self.pick_pose[:3, 2]
         ahead = np.array([across[1], -across[0], 0.0])
         for shift, along in product((0.0, 0.012, -0.012), (0.034, 0.026, 0.042)):
-            at = self.taken[:3, 3] + (self.far_end * self.handle_m + shift) * across
+            at = self.pick_pose[:3, 3] + (self.far_end * self.handle_m + shift) * across
             yield Approach(at, 0.92 * ahead + (0, 0, -0.40), -0.40 * ahead + (0, 0, -0.92), along)
 
     def trunk(self, times: np.ndarray) -> Trunk:
@@ -111,29 +111,29 @@ class Swinging(Handling):
         trunk.head[:, 1] += 0.35 * swing - 0.15 * reach
         return trunk
 
-    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> Pose:
-        """The hand's way through the keys, as the thing sees it."""
+    def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> WristPose:
+        """The hand's way through the keys, as the object sees it."""
         count, puppet = len(times), self.puppet
         grip = self.grips[RIGHT].object_from_wrist
         rest = puppet.subject.rest_joints
         shoulder = np.array([0.0, rest[17, 0], rest[17, 1] - rest[0, 1]])
         shoulder = pelvis * (1, 1, 0) + (0, 0, puppet.stand) + shoulder
-        wrist = Pose.still(self.taken @ grip, count)
+        wrist = WristPose.still(self.pick_pose @ grip, count)
         for key in self.keys:
             fingers, thumb = unit(np.array(key.fingers)), unit(np.array(key.thumb))
             thumb = unit(thumb - fingers * (fingers @ thumb))
             rotation = puppet.wrist_rotation(RIGHT, fingers, np.cross(thumb, fingers))
             place = shoulder + puppet.arm * self.size * key.wrist
-            goal = Pose(place, np.broadcast_to(rotation, (count, 3, 3)))
+            goal = WristPose(place, np.broadcast_to(rotation, (count, 3, 3)))
             wrist = wrist.towards(goal, ramp(times, key.start, key.end))
-        at_rest = self.put @ self.object_from_wrist(RIGHT, times)
-        last = Pose(at_rest[:, :3, 3], at_rest[:, :3, :3])
-        above = Pose(last.position + np.array([0.0, -0.02, 0.10]), last.rotation)
+        at_rest = self.place_pose @ self.object_from_wrist(RIGHT, times)
+        last = WristPose(at_rest[:, :3, 3], at_rest[:, :3, :3])
+        above = WristPose(last.position + np.array([0.0, -0.02, 0.10]), last.rotation)
         wrist = wrist.towards(above, ramp(times, 2.0, 2.44))
-        wrist = wrist.towards(last, ramp(times, 2.32, RELEASE_S - 0.03))
+        wrist = wrist.towards(last, ramp(times, 2.32, self.release_s - 0.03))
         wrist_from_object = invert(self.object_from_wrist(RIGHT, times))
         offset = np.einsum("nij,nj->ni", wrist.rotation, wrist_from_object[:, :3, 3])
-        return Pose(wrist.position + offset, wrist.rotation @ wrist_from_object[:, :3, :3])
+        return WristPose(wrist.position + offset, wrist.rotation @ wrist_from_object[:, :3, :3])
 
     def raised(self, times: np.ndarray, side: int) -> np.ndarray:
         """The elbow is a little away from the body in the swing."""
@@ -147,7 +147,7 @@ class RacquetSwing(Swinging):
     handle_m = -0.27
     turn_back_rad, turn_through_rad = 0.45, 0.50
     keys = (
-        Key((0.62, -0.22, -0.40), (0.80, 0.00, -0.60), (0.60, -0.05, 0.80), ATTACH_S, 1.28),
+        Key((0.62, -0.22, -0.40), (0.80, 0.00, -0.60), (0.60, -0.05, 0.80), 0.96, 1.28),
         Key((-0.30, -0.60, -0.55), (-0.05, -0.70, -0.70), (-0.70, -0.55, 0.45), 1.12, 1.46),
         Key((0.60, -0.25, -0.62), (0.50, -0.15, -0.85), (0.25, -0.95, 0.05), 1.42, 1.64),
         Key((0.62, 0.35, -0.10), (0.75, 0.60, 0.20), (0.10, -0.10, 1.00), 1.54, 1.74),
@@ -165,7 +165,7 @@ class UmbrellaSwing(Swinging):
     turn_back_rad, turn_through_rad = 0.10, 0.20
     back_s, through_s = (1.55, 1.85, 1.95, 2.25), (1.25, 1.5, 1.6, 1.9)
     keys = (
-        Key((0.70, 0.00, -0.35), (0.60, 0.00, -0.80), (0.80, 0.05, 0.45), ATTACH_S, 1.34),
+        Key((0.70, 0.00, -0.35), (0.60, 0.00, -0.80), (0.80, 0.05, 0.45), 0.96, 1.34),
         Key((0.66, 0.30, -0.30), (0.50, 0.35, -0.80), (0.35, 0.90, 0.25), 1.28, 1.62),
         Key((0.50, -0.45, -0.62), (0.30, -0.35, -0.90), (0.55, -0.75, -0.30), 1.56, 1.94),
     )
