@@ -36,10 +36,9 @@ from intercap_core.evaluation.body import vertex_error
 from intercap_core.evaluation.truth import Truth
 from intercap_core.formats.detections.read import Detections
 from intercap_core.formats.recordings.frames import Frames
-from intercap_core.geometry.camera.transforms import rigid
+from intercap_core.geometry.camera.transforms import apply_step, rigid
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.geometry.rigid.twist import moved
 from intercap_core.joint.contact.detect import contact_probability, region_motion
 from intercap_core.joint.floor import Ground
 from intercap_core.joint.geometry import Geometry
@@ -119,7 +118,7 @@ class ObjectClip:
     def annotated(self) -> np.ndarray:
         """The first frame's pose (4, 4) with the error of an annotation: 10 mm and 5 degrees."""
         pose = rigid(self.true_rotation[0], self.true_translation[0])
-        return moved(pose, ANNOTATION_ERROR)
+        return apply_step(pose, ANNOTATION_ERROR)
 
     @property
     def step_s(self) -> float:

@@ -28,11 +28,10 @@ from intercap_core.config import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera
-from intercap_core.geometry.camera.transforms import rigid
+from intercap_core.geometry.camera.transforms import apply_step, rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.render import CpuRenderer, Renderer, open_renderer
 from intercap_core.geometry.rigid.shots import Shot, Surface
-from intercap_core.geometry.rigid.twist import moved
 from intercap_core.object_track.fit import MotionPrior, fit_pose
 from intercap_core.object_track.reduced_mask import EMPTY, ReducedMask, reduced_lens
 from intercap_core.object_track.view import Candidate, View, ViewGeometry
@@ -87,7 +86,7 @@ class Scene:
 
     def fit(self, renderer: Renderer) -> np.ndarray:
         """The pose (4, 4) fitted as in a pass, from a little off."""
-        start = moved(self.pose, OFF)
+        start = apply_step(self.pose, OFF)
         prior = MotionPrior(start)
         return fit_pose(
             self.mesh, self.views, start, prior=prior, min_overlap=0.3, background_term=True,

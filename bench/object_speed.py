@@ -34,8 +34,7 @@ from bench.object_scaling import tracking_scaling
 from intercap_core.commands.run import run_workflow
 from intercap_core.errors import UserError
 from intercap_core.evaluation.object_pose import LOST_ROTATION_DEG, LOST_TRANSLATION_M
-from intercap_core.geometry.camera.transforms import rigid
-from intercap_core.geometry.rigid.twist import moved
+from intercap_core.geometry.camera.transforms import apply_step, rigid
 from intercap_core.object_track.constants import FIT_ROUNDS
 from intercap_core.object_track.fit import MotionPrior, fit_pose
 from intercap_core.object_track.given_poses import GivenPose
@@ -407,7 +406,9 @@ def _offset_start(clip: ObjectClip, t: int) -> np.ndarray:
     turn, shift = np.random.default_rng(t).normal(size=(2, 3))
     turn *= np.radians(OFF_DEG) / np.linalg.norm(turn)
     shift *= OFF_M / np.linalg.norm(shift)
-    return moved(rigid(clip.true_rotation[t], clip.true_translation[t]), np.append(turn, shift))
+    return apply_step(
+        rigid(clip.true_rotation[t], clip.true_translation[t]), np.append(turn, shift)
+    )
 
 
 def _convergence_of_ours(

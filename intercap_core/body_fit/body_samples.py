@@ -121,7 +121,7 @@ def _outer(points: np.ndarray, faces: np.ndarray, joint: np.ndarray) -> np.ndarr
     import scipy.sparse.csgraph
 
     from intercap_core.body_fit.first_hit import first_hits
-    from intercap_core.geometry.rigid.normals import vertex_normals
+    from intercap_core.geometry.rigid.surfaces import vertex_normals
 
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     graph = scipy.sparse.coo_matrix(

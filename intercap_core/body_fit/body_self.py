@@ -322,7 +322,7 @@ def _residuals(points: Tensor, pairs: Pairs) -> Tensor:
 def _thickness(points: np.ndarray, faces: np.ndarray, vertex: np.ndarray) -> np.ndarray:
     """Thickness (N,) of the body at each vertex, along its normal, metres."""
     from intercap_core.body_fit.first_hit import first_hits
-    from intercap_core.geometry.rigid.normals import vertex_normals
+    from intercap_core.geometry.rigid.surfaces import vertex_normals
 
     normals = vertex_normals(points, faces)[vertex]
     return first_hits(points, faces, points[vertex] - 1e-3 * normals, -normals)

@@ -44,7 +44,7 @@ from intercap_core.body_fit.terms import Views
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.solve.robust import SIGMA_PER_MAD
 from intercap_core.geometry.solve.thread_pool import ThreadPool
-from intercap_core.geometry.solve.velocity import limited_velocity
+from intercap_core.geometry.solve.time_series import limited_velocity
 
 
 def measured_doubt(confidence: Tensor, error: Tensor) -> float:

@@ -33,7 +33,7 @@ from intercap_core.body_fit.constants import (
     SHORTEST_OUTLINE_PX,
 )
 from intercap_core.geometry.camera.intrinsics import Intrinsics
-from intercap_core.geometry.camera.mask_pixels_kernel import drawn
+from intercap_core.geometry.camera.mask_pixels import drawn
 from intercap_core.geometry.camera.masks import Runs
 
 _BORDER_PX = 2  # of the image

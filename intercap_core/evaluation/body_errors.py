@@ -27,8 +27,8 @@ from intercap_core.evaluation.tracks import BodyTrack, read_body
 from intercap_core.evaluation.truth import Truth, body_errors
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig
-from intercap_core.geometry.rigid.surface_samples import sample_surface
 from intercap_core.geometry.rigid.surface_tree import SurfaceTree
+from intercap_core.geometry.rigid.surfaces import sample_surface
 from intercap_core.schemas import SCENE, TRUTH
 from intercap_core.sequence_inputs import SequencePaths
 

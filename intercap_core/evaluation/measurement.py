@@ -22,8 +22,8 @@ from intercap_core.evaluation.tracks import BodyTrack, ObjectTrack
 from intercap_core.evaluation.truth import Truth
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.geometry.rigid.surface_samples import sample_surface
 from intercap_core.geometry.rigid.surface_tree import SurfaceTree
+from intercap_core.geometry.rigid.surfaces import sample_surface
 from intercap_core.progress import Progress
 from intercap_core.schemas import CONTACT_REGIONS
 

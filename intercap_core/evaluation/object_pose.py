@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from intercap_core.evaluation.body import MEDIAN_CHI_3
-from intercap_core.geometry.rigid.pose import rotation_log
+from intercap_core.geometry.camera.transforms import rotation_log
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 
 LOST_TRANSLATION_M = 0.050

@@ -13,9 +13,9 @@ from intercap_core.evaluation.measurement import Values
 from intercap_core.evaluation.motion import foot_errors, slip_speed, support
 from intercap_core.evaluation.proximity import PosedObject
 from intercap_core.evaluation.tracks import BodyTrack, ObjectTrack
+from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.geometry.rigid.pose import Pose
 from intercap_core.schemas import METRIC_REGIONS
 
 _FEET = ("left_foot", "right_foot")  # regions of the soles
@@ -137,7 +137,7 @@ class StageErrors:
         assert self._true_distance is not None and self._object is not None
         if not track.known:
             return {"slip": np.full(len(held), np.nan)}
-        pose, true = (Pose(of.rotation, of.translation).matrix for of in (track, self._truth))
+        pose, true = (rigid(of.rotation, of.translation) for of in (track, self._truth))
         symmetry = self._object.mesh.symmetry  # a rotation about a symmetry axis is no slip
         pose = np.array(
             [symmetry.nearest_equivalent_pose(a, b) for a, b in zip(pose, true, strict=True)]

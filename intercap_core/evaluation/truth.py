@@ -14,7 +14,7 @@ from intercap_core.evaluation import body, contact, motion, object_pose
 from intercap_core.evaluation.motion import Floor
 from intercap_core.evaluation.tracks import BodyTrack, ObjectTrack
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.geometry.rigid.surface_samples import SurfaceSamples
+from intercap_core.geometry.rigid.surfaces import SurfaceSamples
 from intercap_core.schemas import METRIC_REGIONS, TRUTH
 
 

@@ -12,7 +12,7 @@ from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.geometry.rigid.surface_samples import sample_surface
+from intercap_core.geometry.rigid.surfaces import sample_surface
 from intercap_core.geometry.solve.thread_pool import ThreadPool
 from intercap_core.joint.proximity import Proximity, Surface, proximity
 from intercap_core.joint.skin import Patches, Skin

@@ -9,8 +9,8 @@ import numpy as np
 
 from intercap_core.artefacts import Artefact
 from intercap_core.body.parameters import TRANSL
-from intercap_core.geometry.camera.transforms import rigid
-from intercap_core.geometry.rigid.twist import moved, twists
+from intercap_core.geometry.camera.transforms import apply_step, rigid
+from intercap_core.geometry.solve.time_series import rigid_velocity
 from intercap_core.joint.state import State
 
 # A tracked pose is never surer than this, rad and metres: the meshes differ from the things
@@ -93,7 +93,7 @@ class TrackedPoses:
         floor = np.where(other, np.hypot(_FLOOR, _AMBIGUOUS), _FLOOR)
         spread = np.where(tracked[:, None], floor, _BRIDGED) ** 2
         total += np.eye(6) * spread[:, None, :]
-        twist = twists(rigid(rotation, translation), ~lost, times)
+        twist = rigid_velocity(rigid(rotation, translation), ~lost, times)
         twist[resting] = 0
         share = visible / np.maximum(visible.sum(axis=1, keepdims=True), 1)
         return cls(
@@ -113,7 +113,7 @@ class TrackedPoses:
         """The poses if the cameras had these offsets (C,), seconds: earlier by the mean change of
         the views that show the object."""
         late = self.share @ (time_offset - self.time_offset)
-        poses = moved(rigid(self.rotation, self.translation), -late[:, None] * self.twist)
+        poses = apply_step(rigid(self.rotation, self.translation), -late[:, None] * self.twist)
         return replace(
             self, rotation=poses[:, :3, :3], translation=poses[:, :3, 3], time_offset=time_offset
         )

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from intercap_core.geometry.rigid.paint import Paint
+from intercap_core.geometry.rigid.mesh import Paint
 from intercap_core.object_track.constants import (
     COLOUR_COST_MAX,
     COLOUR_HALF_SAMPLES_PX,

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from intercap_core.geometry.camera.transforms import apply_step, step_between
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.geometry.rigid.twist import moved, step_between
 from intercap_core.object_track.constants import (
     HELD_M,
     HELD_M_S,
@@ -100,7 +100,7 @@ class Gap:
                 return None
             carried.append(motion.carry(pose))
         share = (self.times[t] - self.times[self.before]) / self.seconds
-        return moved(carried[0], share * step_between(*carried))
+        return apply_step(carried[0], share * step_between(*carried))
 
     def _hold(self, t: int) -> np.ndarray:
         """What a hold tells of frame ``t`` (6, 6): the less, the longer before and after it."""

@@ -116,7 +116,7 @@ NEAREST_QUANTILE = 0.1
 REDUCED_SILHOUETTE_PX = 80
 REDUCED_DEPTH_PX = 60
 MAX_REDUCTION = 4  # every n-th pixel at most
-# Faces of the mesh that is rendered; kept within 0.5 mm of the full one (rigid.constants).
+# Faces of the mesh that is rendered; kept within 0.5 mm of the full one (rigid.mesh).
 TRACKING_FACES = 600
 # Bytes of views kept: 90 frame sets of six unreduced depth images, 360 of a suitcase's.
 VIEW_CACHE_BYTES = 800_000_000

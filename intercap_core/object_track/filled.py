@@ -7,8 +7,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from intercap_core.geometry.camera.transforms import step_between
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.geometry.rigid.twist import step_between, twists
+from intercap_core.geometry.solve.time_series import rigid_velocity
 from intercap_core.object_track.bridges import Bridge, Gap
 from intercap_core.object_track.constants import (
     CARRIED_LOG_RATIO,
@@ -101,7 +102,7 @@ def _apart(mesh: ObjectMesh, one: Bridge, two: Bridge) -> bool:
 def _seen(observer: Observer, way: Bridge, times: np.ndarray) -> list[Fit]:
     """How the images see the object on this way; where a hand carries it, at poses that both agree
     on."""
-    motion = twists(way.poses, np.ones(len(way.frames), bool), times[way.frames])
+    motion = rigid_velocity(way.poses, np.ones(len(way.frames), bool), times[way.frames])
     result = []
     for t, pose, information, twist in zip(
         way.frames.tolist(), way.poses, way.information, motion, strict=True

@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from intercap_core.geometry.camera.transforms import apply_step, step_between
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.render import Renderer, default_renderer
 from intercap_core.geometry.rigid.shots import Rendering, Surface
-from intercap_core.geometry.rigid.twist import moved, step_between
 from intercap_core.object_track.constants import (
     CONTOUR_SCALES_PX,
     DEPTH_SCALES_M,
@@ -126,7 +126,7 @@ def fit_pose(
             information, step = _step(
                 renderer, fits, prior, drawn_pose, depth_scale, contour_scale, background_term
             )
-            pose = moved(drawn_pose, step)
+            pose = apply_step(drawn_pose, step)
             settled = depth_scale <= DEPTH_SCALES_M[1] and contour_scale <= CONTOUR_SCALES_PX[1]
             depth_scale = max(depth_scale * SCALE_SHRINKAGE, DEPTH_SCALES_M[1])
             contour_scale = max(contour_scale * SCALE_SHRINKAGE, CONTOUR_SCALES_PX[1])
@@ -270,5 +270,5 @@ def seen_by(pose: np.ndarray, views: list[View], twist: np.ndarray | None) -> li
     moves = (np.abs(steps[:, :3]).max(1) > UNMOVED_RAD) | (np.abs(steps[:, 3:]).max(1) > UNMOVED_M)
     if not moves.any():
         return [pose] * len(views)
-    later = moved(np.broadcast_to(pose, (len(views), 4, 4)), steps)
+    later = apply_step(np.broadcast_to(pose, (len(views), 4, 4)), steps)
     return [own if moves[i] else pose for i, own in enumerate(later)]

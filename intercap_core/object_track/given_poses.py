@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from intercap_core.geometry.camera.transforms import step_between
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.geometry.rigid.twist import step_between
 from intercap_core.object_track.constants import (
     COMMON_ERROR_VARIANCE,
     COMMON_TURN_VARIANCE,

@@ -6,7 +6,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from intercap_core.geometry.rigid.twist import step_between, twists
+from intercap_core.geometry.camera.transforms import step_between
+from intercap_core.geometry.solve.time_series import rigid_velocity
 from intercap_core.object_track.constants import (
     BASIN,
     CONTRADICTED_LOG_RATIO,
@@ -107,7 +108,9 @@ class Hypotheses:
         frames = [t for t, k in enumerate(decoded.path) if k != NOT_SEEN]
         for t in frames:
             poses[t] = self.fits[t][decoded.path[t]].pose
-        motion = twists(unwrapped(self._observer.mesh.symmetry, poses, known), known, self._times)
+        motion = rigid_velocity(
+            unwrapped(self._observer.mesh.symmetry, poses, known), known, self._times
+        )
         changed = set()
         for t in frames:
             late = max(abs(view.geometry.time_offset_s) for view in self._observer.views(t))

@@ -11,8 +11,7 @@ import numpy as np
 
 from intercap_core.config import ObjectTrackSettings
 from intercap_core.geometry.rigid.distance import DistanceField
-from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.geometry.rigid.paint import Paint
+from intercap_core.geometry.rigid.mesh import ObjectMesh, Paint
 from intercap_core.geometry.rigid.render import Renderer, open_renderer
 from intercap_core.object_track.constants import (
     ASSESS_MIN_OVERLAP,

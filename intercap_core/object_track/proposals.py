@@ -8,8 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from intercap_core.geometry.rigid.pose import rotation_exp
-from intercap_core.geometry.rigid.twist import moved, step_between
+from intercap_core.geometry.camera.transforms import apply_step, rotation_exp, step_between
 from intercap_core.object_track.constants import (
     ANNOTATION_FRAMES,
     BASIN,
@@ -285,7 +284,7 @@ class Proposals:
                 rate = step_between(same(poses[near[1]], here), here) / (
                     self._times[near[0]] - self._times[near[1]]
                 )
-                found.append(moved(here, rate * ahead))
+                found.append(apply_step(here, rate * ahead))
                 rates.append(rate)
             for pose in self._observer.carried(near[0], t, here):
                 found.append(pose)
@@ -294,7 +293,7 @@ class Proposals:
             a, b = before[0], after[0]
             gap = self._times[b] - self._times[a]
             rate = step_between(poses[a], same(poses[b], poses[a])) / gap
-            found.append(moved(poses[a], rate * (self._times[t] - self._times[a])))
+            found.append(apply_step(poses[a], rate * (self._times[t] - self._times[a])))
             rates.append(rate)
         return np.array(found).reshape(-1, 4, 4), np.array(rates).reshape(-1, 6)
 

@@ -11,8 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.geometry.rigid.pose import rotation_exp
-from intercap_core.geometry.rigid.twist import step_between
+from intercap_core.geometry.camera.transforms import rotation_exp, step_between
 from intercap_core.object_track.constants import (
     BLIP_APART_SQUARED,
     BLIP_FRAMES,

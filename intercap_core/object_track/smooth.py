@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-from intercap_core.geometry.rigid.pose import rotation_log
-from intercap_core.geometry.rigid.twist import moved, step_between
+from intercap_core.geometry.camera.transforms import apply_step, rotation_log, step_between
 from intercap_core.geometry.solve.robust import geman_mcclure_weight
 from intercap_core.object_track.constants import (
     ACCELERATION_M_S2,
@@ -115,7 +114,7 @@ def smooth(
         step /= np.maximum(
             1.0, np.linalg.norm(step[:, :3], axis=1, keepdims=True) / SMOOTH_MAX_TURN_RAD
         )
-        state = moved(state, step)
+        state = apply_step(state, step)
         if (np.abs(step) < SMOOTH_CONVERGED).all():
             break
     covariance = _covariance(_banded(bands), count)[node]
@@ -166,7 +165,7 @@ def _without_blips(poses: np.ndarray, times: np.ndarray) -> np.ndarray:
             # without a wrong frame the motion is smooth; between two places it never is
             if (np.linalg.norm(ends[part], axis=1) < IMPACT_SIGMAS * limit).all():
                 share = (times[t] - times[t - 1]) / (times[t + 1] - times[t - 1])
-                result[t] = moved(poses[t - 1], share * past)
+                result[t] = apply_step(poses[t - 1], share * past)
     return result
 
 

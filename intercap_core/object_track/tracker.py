@@ -13,9 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.config import ObjectTrackSettings
-from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.geometry.rigid.paint import Paint
-from intercap_core.geometry.rigid.twist import step_between
+from intercap_core.geometry.camera.transforms import step_between
+from intercap_core.geometry.rigid.mesh import ObjectMesh, Paint
 from intercap_core.object_track.colour_decision import ColourDecision
 from intercap_core.object_track.constants import (
     ABSENT_LOG_RATIO,

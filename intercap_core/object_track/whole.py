@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from intercap_core.geometry.rigid.twist import twists
+from intercap_core.geometry.solve.time_series import rigid_velocity
 from intercap_core.object_track.constants import (
     BASIN,
     BRIDGED_S,
@@ -122,7 +122,7 @@ class WholeTrack:
         poses = np.array([fit.pose for fit in fits])
         filled = fill(self._observer, poses, lost, self._times, self._share)
         poses = filled.poses
-        motion = twists(poses, ~lost, self._times)
+        motion = rigid_velocity(poses, ~lost, self._times)
         blind = lost.copy()
         for given in held:
             blind[given.frame] |= fits[given.frame].log_ratio < SEEN_LOG_RATIO
@@ -133,7 +133,7 @@ class WholeTrack:
         stated = self._stated(held, poses, found)
         looked = poses.copy()
         track, covariance, segment = self._solved(looked, found, filled, stated, poses)
-        motion = twists(track, np.ones(len(fits), bool), self._times)
+        motion = rigid_velocity(track, np.ones(len(fits), bool), self._times)
         motion[segment >= 0] = 0
         for t in reversed(
             self._worth_a_look(segment)

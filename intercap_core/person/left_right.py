@@ -25,7 +25,7 @@ import numpy as np
 from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.triangulation import midpoints, rays_of
-from intercap_core.geometry.solve.viterbi import cheapest_sequence
+from intercap_core.geometry.solve.time_series import cheapest_sequence
 from intercap_core.person.sides import (
     ARMS,
     HEAD,

@@ -21,8 +21,7 @@ from intercap_core.geometry.camera.triangulation import (
     reproject,
     triangulate,
 )
-from intercap_core.geometry.solve.velocity import limited_velocity
-from intercap_core.geometry.solve.viterbi import cheapest_sequence
+from intercap_core.geometry.solve.time_series import cheapest_sequence, limited_velocity
 from intercap_core.person.left_right import find_mirrored, make_views_agree
 from intercap_core.person.sides import LIMBS, PARTNER, exchange_limb, exchange_points
 

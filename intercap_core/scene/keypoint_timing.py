@@ -19,7 +19,7 @@ import numpy as np
 
 from intercap_core.formats.recordings.synchronise import images_of_moments
 from intercap_core.geometry.camera.rig import Rig
-from intercap_core.geometry.solve.gaps import filled_linearly
+from intercap_core.geometry.solve.time_series import filled_linearly
 from intercap_core.scene.keypoint_motion import KeypointMotion, build_motion
 
 # Of the poses as they are given, beside the offsets in the keypoints' equations: rotation, rad, and

@@ -15,8 +15,7 @@ from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import Detections
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.transforms import rigid
-from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.geometry.rigid.paint import Paint
+from intercap_core.geometry.rigid.mesh import ObjectMesh, Paint
 from intercap_core.object_track.absent import NOT_NAMED, SOURCE, absent_track
 from intercap_core.object_track.constants import NOTHING_LOG_RATIO, TOLD_SHARE, TRACKING_FACES
 from intercap_core.object_track.given_poses import GivenPose

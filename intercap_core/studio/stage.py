@@ -13,7 +13,7 @@ from intercap_core.body.model import BodyModel
 from intercap_core.config import LayoutName, ObjectEntry, StudioCapture, StudioSettings
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.transforms import invert
-from intercap_core.geometry.rigid.normals import vertex_normals
+from intercap_core.geometry.rigid.surfaces import vertex_normals
 from intercap_core.studio.capture_folder import SWAPPED
 from intercap_core.studio.interactions import interaction_named
 from intercap_core.studio.layouts import FOLDERS, camera_names

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from intercap_core.body_fit.first_hit import first_hits
-from intercap_core.geometry.rigid.normals import vertex_normals
-from intercap_core.geometry.rigid.open3d_core import o3d
+from intercap_core.geometry.rigid.distance import o3d
+from intercap_core.geometry.rigid.surfaces import vertex_normals
 from tests.helpers.bodies import open_body
 
 

@@ -17,8 +17,8 @@ from intercap_core.evaluation.proximity import (
     visible_to_cloud,
 )
 from intercap_core.evaluation.scene_errors import displacement, rig_centre
-from intercap_core.geometry.rigid.surface_samples import sample_surface
 from intercap_core.geometry.rigid.surface_tree import SurfaceTree
+from intercap_core.geometry.rigid.surfaces import sample_surface
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from intercap_core.config import ObjectTrackSettings
-from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.geometry.rigid.paint import Paint
+from intercap_core.geometry.rigid.mesh import ObjectMesh, Paint
 from intercap_core.geometry.rigid.render import CpuRenderer
 from intercap_core.geometry.rigid.shots import Shot, Surface
 from intercap_core.object_track.colour_decision import ColourDecision

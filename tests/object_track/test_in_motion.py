@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from intercap_core.config import ObjectTrackSettings
+from intercap_core.geometry.camera.transforms import apply_step, step_between
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.geometry.rigid.twist import moved, step_between
 from intercap_core.object_track.constants import MAX_HYPOTHESES
 from intercap_core.object_track.decoder import Decoded
 from intercap_core.object_track.fit import Fit, seen_by
@@ -93,8 +93,8 @@ def test_a_motion_is_the_same_by_the_shift_of_any_point() -> None:
     pose[:3, 3], other[:3, 3] = rng.normal(size=(2, 3))
     twist = 0.001 * rng.normal(size=6)
     of_other = about(twist, pose[:3, 3], other[:3, 3])
-    together = moved(pose, twist) @ np.linalg.inv(pose) @ other
-    np.testing.assert_allclose(moved(other, of_other), together, atol=1e-5)
+    together = apply_step(pose, twist) @ np.linalg.inv(pose) @ other
+    np.testing.assert_allclose(apply_step(other, of_other), together, atol=1e-5)
     np.testing.assert_allclose(about(of_other, other[:3, 3], pose[:3, 3]), twist, atol=1e-15)
 
 

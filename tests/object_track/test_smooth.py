@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from intercap_core.geometry.rigid.twist import moved
+from intercap_core.geometry.camera.transforms import apply_step
 from intercap_core.object_track.rest import resting
 from intercap_core.object_track.smooth import FrameEvidence, smooth
 
@@ -23,7 +23,7 @@ def looks_at(poses: np.ndarray, sigma: np.ndarray = SIGMA, seed: int = 0) -> Fra
     noise = rng.normal(size=(len(poses), 6)) * sigma
     # the minimum lies at the truth + noise, seen from beside the truth
     gradient = np.einsum("tij,tj->ti", information, beside - noise)
-    return FrameEvidence(moved(poses, beside), information, gradient)
+    return FrameEvidence(apply_step(poses, beside), information, gradient)
 
 
 def lifted(count: int, starts: int, stops: int) -> np.ndarray:
@@ -48,7 +48,7 @@ def test_smoothing_helps_and_knows_how_sure_it_is() -> None:
     times = np.arange(60) / 30.0
     evidence = looks_at(true)
     found, covariance = smooth(evidence, evidence.poses, np.arange(60), times, CENTRE)
-    alone = moved(evidence.poses, evidence.own)
+    alone = apply_step(evidence.poses, evidence.own)
     assert shift(found, true).mean() < 0.7 * shift(alone, true).mean()
     error = found[:, :3, 3] - true[:, :3, 3]
     solved = np.linalg.solve(covariance[:, 3:, 3:], error[..., None])[..., 0]

@@ -11,7 +11,7 @@ import pytest
 from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
 from intercap_core.errors import UserError
 from intercap_core.geometry.rigid.distance import DistanceField
-from intercap_core.geometry.rigid.surface_samples import sample_surface
+from intercap_core.geometry.rigid.surfaces import sample_surface
 from intercap_core.schemas import CONTACT_REGIONS
 from intercap_core.studio.capture import region_contact
 from intercap_core.studio.hands import OPEN, Hand, shape

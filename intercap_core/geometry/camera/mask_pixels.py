@@ -1,12 +1,18 @@
-"""The depth pixels that show what a mask of the colour image covers."""
+"""The depth pixels that show what a mask of the colour image covers.
+
+The kernel is the look-up of :mod:`intercap_core.geometry.camera.clouds`, restricted to pixels that
+can reach the mask, and like it in single precision.
+"""
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 
-from intercap_core.geometry.camera import mask_pixels_kernel
 from intercap_core.geometry.camera.clouds import CELL_SPACINGS, HIDDEN_BEHIND_M
 from intercap_core.geometry.camera.masks import Runs
+from intercap_core.geometry.camera.projection import MIN_DEPTH_M
+from intercap_core.geometry.camera.projection_kernels import distort
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import apply
 
@@ -14,6 +20,8 @@ Window = tuple[slice, slice]
 
 _PROBED_M = (0.7, 2.0, 6.0)  # depths at which the window's corners are looked for
 _WINDOW_MARGIN_PX = 6
+_MIN_DEPTH, _MILLIMETRE = np.float32(MIN_DEPTH_M), np.float32(1e-3)
+_ONE, _HALF = np.float32(1), np.float32(0.5)
 _NO_BACKGROUND = np.zeros((0, 0), np.uint16)
 
 
@@ -57,7 +65,7 @@ def mask_pixels(
     assert camera.depth is not None and camera.colour_from_depth is not None
     colour, (rows, columns) = camera.colour, window
     spacing = max(colour.fx / camera.depth.fx, colour.fy / camera.depth.fy, 1.0)
-    return mask_pixels_kernel.mask_pixels(
+    return _mask_pixels(
         depth,
         _NO_BACKGROUND if background is None else background,
         int(1000 * before_m),
@@ -74,3 +82,126 @@ def mask_pixels(
         # on the colour grid nothing hides: the pixels are the colour image's
         np.float32(np.inf if camera.aligned else HIDDEN_BEHIND_M),
     )
+
+
+@numba.njit(cache=True, nogil=True)
+def _mask_pixels(
+    depth,
+    background,
+    before_mm,
+    rows,
+    columns,
+    every,
+    rays,
+    pose,
+    lens,
+    size,
+    ends,
+    box,
+    cell,
+    hidden_m,
+):
+    """Flat pixels (M,), ascending, of every ``every``-th column of as many rows of a window.
+
+    ``depth`` (H,W) uint16 mm, part ``rows`` (first, end), ``columns`` (first, end) of it;
+    ``background`` (H,W) mm, or empty: pixels that are not ``before_mm`` nearer do not count, and
+    hide nothing. ``rays`` (H,W,2) of the depth lens, ``pose`` (4,4) colour_from_depth, ``lens``
+    thirteen parameters and ``size`` (height, width) of the colour image; ``ends`` of the mask's
+    runs and its ``box`` x, y, width, height, not empty. What is ``hidden_m`` behind another pixel
+    in one of the cells around, of ``cell`` colour pixels, is hidden. All but integers float32.
+    """
+    mask = drawn(ends, box, size[0])
+    across, down = int(size[1] / cell) + 1, int(size[0] / cell) + 1
+    # cells around those that the mask touches
+    left, top = max(int(box[0] / cell) - 2, 0), max(int(box[1] / cell) - 2, 0)
+    right = min(int((box[0] + box[2]) / cell) + 3, across)
+    bottom = min(int((box[1] + box[3]) / cell) + 3, down)
+    nearest = np.full((bottom - top, right - left), np.float32(np.inf))
+    height, width = rows[1] - rows[0], columns[1] - columns[0]
+    u, v, z = (
+        np.empty((height, width), np.float32),
+        np.empty((height, width), np.float32),
+        np.empty((height, width), np.float32),
+    )
+    counts = np.empty(width, np.bool_)
+    for r in range(height):
+        near = depth[rows[0] + r, columns[0] : columns[1]]
+        if background.size:
+            behind = background[rows[0] + r, columns[0] : columns[1]]
+            for c in range(width):
+                farther = np.int32(behind[c]) - np.int32(before_mm)
+                counts[c] = (near[c] > 0) & ((behind[c] == 0) | (np.int32(near[c]) < farther))
+        else:
+            for c in range(width):
+                counts[c] = near[c] > 0
+        first, last = 0, width
+        while first < last and not counts[first]:
+            first += 1
+        while first < last and not counts[last - 1]:
+            last -= 1
+        z[r, :first], z[r, last:] = 0, 0
+        row = rays[rows[0] + r, columns[0] + first : columns[0] + last]
+        at = slice(first, last)
+        _project(near[at], counts[at], row, pose, lens, u[r, at], v[r, at], z[r, at])
+        for c in range(first, last):
+            if z[r, c] > 0:
+                i = int(np.floor((v[r, c] + _HALF) / cell)) - top
+                j = int(np.floor((u[r, c] + _HALF) / cell)) - left
+                if 0 <= i < bottom - top and 0 <= j < right - left:
+                    nearest[i, j] = min(nearest[i, j], z[r, c])
+    index = np.empty((-(-height // every)) * (-(-width // every)), np.int64)
+    count = 0
+    for r in range(0, height, every):
+        for c in range(0, width, every):
+            if not z[r, c] > 0:
+                continue
+            x, y = int(np.rint(u[r, c])) - box[0], int(np.rint(v[r, c])) - box[1]
+            if not (0 <= x < box[2] and 0 <= y < box[3] and mask[x, y]):
+                continue
+            i = int(np.floor((v[r, c] + _HALF) / cell)) - top
+            j = int(np.floor((u[r, c] + _HALF) / cell)) - left
+            front = z[r, c]
+            for k in range(max(i - 1, 0), min(i + 2, bottom - top)):
+                for m in range(max(j - 1, 0), min(j + 2, right - left)):
+                    front = min(front, nearest[k, m])
+            if not z[r, c] > front + hidden_m:
+                index[count] = (rows[0] + r) * depth.shape[1] + columns[0] + c
+                count += 1
+    return index[:count].copy()
+
+
+@numba.njit(cache=True, nogil=True)
+def drawn(ends, box, height):
+    """The mask's box (w,h), column by column."""
+    mask = np.zeros((box[2], box[3]), np.bool_)
+    for run in range(1, len(ends), 2):
+        column, row = ends[run - 1] // height, ends[run - 1] % height
+        for _ in range(ends[run] - ends[run - 1]):
+            mask[column - box[0], row - box[1]] = True
+            row += 1
+            if row == height:
+                column, row = column + 1, 0
+    return mask
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")  # divisions that fail are no exceptions
+def _project(near, counts, rays, pose, lens, u, v, z):
+    """Colour pixels and depth (W,) of a row of depth pixels; depth 0 where the pixel does not count
+    or its point is outside the calibration's radius."""
+    fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, limit = lens
+    distortion = (k1, k2, p1, p2, k3, k4, k5, k6)
+    a, b, c, d = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
+    e, f, g, h = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
+    i, j, k, m = pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3]
+    for at in range(len(near)):
+        pz = np.float32(near[at]) * _MILLIMETRE
+        px, py = rays[at, 0] * pz, rays[at, 1] * pz
+        x, y = a * px + b * py + c * pz + d, e * px + f * py + g * pz + h
+        depth = i * px + j * py + k * pz + m
+        reach = limit * depth
+        inside = counts[at] & (depth > _MIN_DEPTH) & (x * x + y * y <= reach * reach)
+        inverse = _ONE / max(depth, _MIN_DEPTH)
+        x, y = x * inverse, y * inverse
+        xd, yd = distort(x, y, distortion)
+        u[at], v[at] = fx * xd + cx, fy * yd + cy
+        z[at] = depth if inside else np.float32(0)

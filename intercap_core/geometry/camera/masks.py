@@ -11,10 +11,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cached_property
 
+import numba
 import numpy as np
 from pycocotools import mask as coco_mask
 
 _FARTHEST_CORNER = 1e5  # px from the image's corner; the C code counts every pixel of an edge
+_FINE, _STRANGE, _CUT, _LONG, _NEGATIVE = range(5)  # results of :func:`_run_ends`
+_ZERO = 48  # first character of the alphabet
+_LONGEST_NUMBER = 7  # characters of 5 bits: enough for a run of 2^34 pixels
 _LONGEST_OUTLINE = 1e6  # px; the C code keeps five points of each, and counts them in 32 bits
 
 
@@ -44,9 +48,7 @@ class Runs:
     @cached_property
     def box(self) -> tuple[int, int, int, int]:
         """x, y, width, height of the pixels set; all 0 where there are none."""
-        from intercap_core.geometry.camera import masks_kernel
-
-        x, y, width, height = masks_kernel.box(self.ends, self.height)
+        x, y, width, height = _box(self.ends, self.height)
         return x, y, width, height
 
     def sample(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -153,18 +155,79 @@ def _compress(segmentation: object, height: int, width: int) -> bytes:
 
 def _parse(rle: bytes) -> np.ndarray:
     """Ends (n,) int64 of the runs of a compressed RLE."""
-    from intercap_core.geometry.camera import masks_kernel
-
     if not rle:
         raise ValueError("its RLE is empty")
-    ends, problem = masks_kernel.parse(np.frombuffer(rle, np.uint8))
-    if problem != masks_kernel.FINE:
+    ends, problem = _run_ends(np.frombuffer(rle, np.uint8))
+    if problem != _FINE:
         raise ValueError(
             {
-                masks_kernel.STRANGE: "its RLE holds characters that COCO's alphabet does not have",
-                masks_kernel.CUT: "its RLE is cut within a number",
-                masks_kernel.LONG: "its RLE holds a number that is too long",
-                masks_kernel.NEGATIVE: "its RLE holds a run of negative length",
+                _STRANGE: "its RLE holds characters that COCO's alphabet does not have",
+                _CUT: "its RLE is cut within a number",
+                _LONG: "its RLE holds a number that is too long",
+                _NEGATIVE: "its RLE holds a run of negative length",
             }[problem]
         )
     return ends
+
+
+@numba.njit(cache=True, nogil=True)
+def _run_ends(characters):
+    """Ends (n,) int64 of the runs of a string's ``characters`` (m,) uint8, and what is wrong with
+    it, ``_FINE`` = nothing.
+
+    Each number is written in groups of 5 bits, lowest first, bit 5 = more follow, bit 4 of the
+    last = sign; from the fourth on it is the difference to the number two before.
+    """
+    ends = np.empty(len(characters), np.int64)
+    first = ends[:0]
+    for character in characters:
+        if character < _ZERO or character > _ZERO + 63:
+            return first, _STRANGE
+    if (characters[-1] - _ZERO) & 0x20:
+        return first, _CUT
+    count, digits, value = 0, 0, np.int64(0)
+    one, before, end = np.int64(0), np.int64(0), np.int64(0)  # the last number, the one before it
+    too_long = negative = False
+    for character in characters:
+        bits = np.int64(character) - _ZERO
+        if digits >= _LONGEST_NUMBER:
+            too_long = True
+            break
+        value |= (bits & 0x1F) << (5 * digits)
+        digits += 1
+        if bits & 0x20:
+            continue
+        if bits & 0x10:
+            value -= np.int64(1) << (5 * digits)
+        if count > 2:
+            value += before
+        if value < 0:
+            negative = True
+        end += value
+        ends[count] = end
+        before, one = one, value
+        count, digits, value = count + 1, 0, np.int64(0)
+    if too_long:
+        return first, _LONG
+    return ends[:count].copy(), _NEGATIVE if negative else _FINE
+
+
+@numba.njit(cache=True, nogil=True)
+def _box(ends, height):
+    """x, y, width, height of what runs with these ``ends`` (n,) set; all 0 where there is none."""
+    left, right, top, bottom = -1, 0, height, -1
+    for run in range(1, len(ends), 2):
+        start, stop = ends[run - 1], ends[run]
+        if stop <= start:
+            continue
+        last = stop - 1
+        if left < 0:
+            left = start // height
+        right = last // height
+        if start // height != right:  # over a column's end
+            top, bottom = 0, height - 1
+        else:
+            top, bottom = min(top, start % height), max(bottom, last % height)
+    if left < 0:
+        return 0, 0, 0, 0
+    return left, top, right - left + 1, bottom - top + 1

@@ -1,8 +1,18 @@
-"""Rigid transforms ``a_from_b``: (..., 4, 4) arrays with x_a = R x_b + t, metres."""
+"""Rigid transforms ``a_from_b``: arrays (..., 4, 4) with x_a = R x_b + t, metres.
+
+The solvers update a transform by a step of six numbers in frame a: a rotation vector w (rad), which
+turns the object about its own origin, and a shift d (m) of that origin::
+
+    R <- exp(w) R,    t <- t + d
+
+This is the exponential map of SO(3) x R^3, not that of SE(3): the rotation does not carry the
+origin along a helix. The derivatives of the energy terms belong to this update.
+"""
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 
 def invert(a_from_b: np.ndarray) -> np.ndarray:
@@ -41,3 +51,28 @@ def is_rigid(transform: np.ndarray, tolerance: float = 1e-4) -> bool:
         and np.linalg.det(rotation) > 0
         and np.abs(transform[3] - (0, 0, 0, 1)).max() < tolerance
     )
+
+
+def apply_step(a_from_b: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Return transforms (..., 4, 4) updated by steps (..., 6): rotation vector, then shift."""
+    turn = rotation_exp(step[..., :3])
+    return rigid(turn @ a_from_b[..., :3, :3], a_from_b[..., :3, 3] + step[..., 3:])
+
+
+def step_between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Return steps (..., 6) that lead from ``start`` to ``end`` (..., 4, 4): the inverse of
+    :func:`apply_step`, with rotations of at most pi."""
+    turn = rotation_log(end[..., :3, :3] @ np.swapaxes(start[..., :3, :3], -1, -2))
+    return np.concatenate([turn, end[..., :3, 3] - start[..., :3, 3]], axis=-1)
+
+
+def rotation_exp(vector: np.ndarray) -> np.ndarray:
+    """Return rotation matrices (..., 3, 3) of rotation vectors (..., 3), rad."""
+    flat = Rotation.from_rotvec(vector.reshape(-1, 3)).as_matrix()
+    return flat.reshape(*vector.shape[:-1], 3, 3)
+
+
+def rotation_log(rotation: np.ndarray) -> np.ndarray:
+    """Return rotation vectors (..., 3), rad, of length at most pi, of matrices (..., 3, 3)."""
+    flat = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec()
+    return flat.reshape(*rotation.shape[:-2], 3)

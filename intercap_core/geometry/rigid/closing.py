@@ -17,7 +17,7 @@ import numpy as np
 import trimesh
 
 from intercap_core.errors import UserError
-from intercap_core.geometry.rigid.mesh import colours_of, read_mesh
+from intercap_core.geometry.rigid.mesh_files import colours_of, read_mesh
 
 SAME_PLACE_DECIMALS = 7  # vertices nearer than 0.1 micrometre are one, as the stages join them
 WRITTEN = (".ply", ".obj")

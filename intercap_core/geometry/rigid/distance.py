@@ -1,4 +1,4 @@
-"""Distances to a mesh's surface: signed distance, closest points, inside or outside.
+"""Queries of a triangle mesh by Embree's tree: distances, inside or outside, and visibility.
 
 Open3D's RaycastingScene (Embree) in the mesh's own frame: the tree is built once and points move,
 so a rigid object's field is built once for all its poses. Inside of a surface with open edges is
@@ -9,13 +9,21 @@ outside inside. Its holes are closed, for the depth of what is inside, by the co
 
 from __future__ import annotations
 
+import os
+import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.machinery import EXTENSION_SUFFIXES
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
+from pathlib import Path
+from typing import Any
 
 import igl
 import numpy as np
 import trimesh
 
-from intercap_core.geometry.rigid.open3d_core import o3d
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.rigid.surfaces import vertex_normals
 
 # Directions along which crossings are counted: one for a watertight mesh (measured without a sign
 # error on 10 k points), a vote of all where it says "inside", as a ray may pass along an edge. No
@@ -26,6 +34,44 @@ _DIRECTIONS = np.array(
 )  # fmt: skip
 # Distances that differ by less are those to the same point, metres: float32 at an object's size.
 _SAME_PLACE = 1e-6
+VISIBLE_OFFSET_M = 0.001  # a vertex is lifted off its own surface before the ray is cast
+_OPEN3D_CORE = "open3d.cpu.pybind"
+
+
+def _load_open3d() -> Any:
+    """Open3D's compiled core without the package around it; the package for other builds.
+
+    ``import open3d`` takes 1.7 s, of which 1.3 s go to scikit-learn, pandas and dash, which nothing
+    here uses. The core has the same ``core``, ``t``, ``geometry`` and ``utility``, and the whole
+    package can still be imported afterwards.
+    """
+    if _OPEN3D_CORE in sys.modules:
+        return sys.modules[_OPEN3D_CORE]
+    package = find_spec("open3d")
+    folders = list(package.submodule_search_locations or ()) if package else []
+    files = [
+        path
+        for folder in folders
+        for suffix in EXTENSION_SUFFIXES
+        for path in Path(folder, "cpu").glob(f"pybind*{suffix}")
+    ]
+    gpu_build = any(Path(folder, "cuda").is_dir() for folder in folders)
+    if not files or gpu_build or "open3d" in sys.modules:
+        import open3d
+
+        return open3d
+    # as the package does before it loads the same file
+    os.environ["KMP_DUPLICATE_LIB_OK"] = "True"
+    os.environ["TCM_ENABLE"] = "1"
+    spec = spec_from_file_location(_OPEN3D_CORE, files[0])
+    assert spec is not None and spec.loader is not None
+    module = module_from_spec(spec)
+    sys.modules[_OPEN3D_CORE] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+o3d = _load_open3d()
 
 
 @dataclass(frozen=True)
@@ -200,6 +246,50 @@ class _OpenSurface:
         place, normals = found.points.copy(), found.normals.copy()
         place[at[closer]], normals[at[closer]] = hull.points[closer], hull.normals[closer]
         return Closest(place, found.faces, found.barycentric, normals)
+
+
+class OcclusionScene:
+    """Which vertices of a mesh a camera sees, the mesh itself and others in the way.
+
+    All meshes in one common frame. Built once for a frame of the capture, asked for each camera.
+    ``offset_m`` lifts a vertex off its own surface before the ray is cast.
+    """
+
+    def __init__(
+        self,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        occluders: Sequence[tuple[np.ndarray, np.ndarray]] = (),
+        *,
+        offset_m: float = VISIBLE_OFFSET_M,
+        threads: int = 0,
+    ) -> None:
+        self._scene = o3d.t.geometry.RaycastingScene(nthreads=threads)
+        for points, triangles in [(vertices, faces), *occluders]:
+            self._scene.add_triangles(
+                o3d.core.Tensor.from_numpy(np.ascontiguousarray(points, np.float32)),
+                o3d.core.Tensor.from_numpy(np.ascontiguousarray(triangles, np.uint32)),
+            )
+        self._vertices = np.asarray(vertices, np.float64)
+        self._normals = vertex_normals(self._vertices, faces)
+        self._offset = offset_m
+
+    def visible(self, intrinsics: Intrinsics, camera_from_mesh: np.ndarray) -> np.ndarray:
+        """Whether each vertex (V,) is in the image, faces the camera and is not hidden."""
+        rotation, translation = camera_from_mesh[:3, :3], camera_from_mesh[:3, 3]
+        eye = -rotation.T @ translation
+        to_eye = eye - self._vertices
+        seen = np.einsum("ij,ij->i", to_eye, self._normals) > 0
+        seen &= intrinsics.sees(self._vertices @ rotation.T + translation)
+        ids = np.flatnonzero(seen)
+        if len(ids):
+            start = self._vertices[ids] + self._offset * self._normals[ids]
+            rays = np.concatenate([start, eye - start], 1).astype(np.float32)
+            hidden = self._scene.test_occlusions(
+                o3d.core.Tensor.from_numpy(rays), tnear=0.0, tfar=1.0
+            )
+            seen[ids[hidden.numpy()]] = False
+        return seen
 
 
 def _scene(vertices: np.ndarray, faces: np.ndarray, threads: int) -> o3d.t.geometry.RaycastingScene:

@@ -13,22 +13,25 @@ import trimesh
 
 from intercap_core.config import ObjectEntry
 from intercap_core.errors import UserError
-from intercap_core.geometry.rigid.constants import (
-    HANDLED_MAX_M,
-    HANDLED_MIN_M,
-    MAX_EXTENT_M,
-    MAX_FROM_ORIGIN_M,
-    MAX_OPEN_EDGES,
-    MIN_EXTENT_M,
-    MIN_FILLED,
-    SIMPLIFIED_TOLERANCE_M,
-)
 from intercap_core.geometry.rigid.contact_vertices import read_contact_vertices
-from intercap_core.geometry.rigid.mesh_files import TEXTURE_ERRORS, load_mesh
+from intercap_core.geometry.rigid.mesh_files import TEXTURE_ERRORS, colours_of, load_mesh, read_mesh
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 
 log = logging.getLogger(__name__)
 
+# Sizes of objects that people handle, metres; outside the second pair the file is in another unit.
+HANDLED_MAX_M, HANDLED_MIN_M = 3.0, 0.02
+MAX_EXTENT_M, MIN_EXTENT_M = 5.0, 0.01
+# Of an object's vertices from the origin of its file, metres: scans are as far off as a room is
+# wide, and single precision there ends at micrometres.
+MAX_FROM_ORIGIN_M = 50.0
+# Share of its bounding cube that a body fills; less is a flat sheet with rounding errors.
+MIN_FILLED = 1e-8
+# Share of edges that do not join two faces: a quarter of a lidless box's of few faces; above the
+# limit the faces are loose, and inside and outside mean nothing.
+MAX_OPEN_EDGES = 0.35
+SIMPLIFIED_TOLERANCE_M = 0.0005  # of a vertex from the simplified surface: below the sensor's noise
+PAINT_POINTS = 20000  # of a coloured surface: a few in each patch that a camera can tell apart
 UNITS = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254}
 
 
@@ -110,8 +113,7 @@ class ObjectMesh:
         is small enough, and as many faces as it takes to keep every vertex within
         ``tolerance_m`` of the simplified surface.
         """
-        from intercap_core.geometry.rigid.distance import DistanceField
-        from intercap_core.geometry.rigid.open3d_core import o3d
+        from intercap_core.geometry.rigid.distance import DistanceField, o3d
 
         full = o3d.geometry.TriangleMesh(
             o3d.utility.Vector3dVector(self.vertices), o3d.utility.Vector3iVector(self.faces)
@@ -150,40 +152,52 @@ class ObjectMesh:
         return float(pdist(self.vertices[ConvexHull(self.vertices).vertices]).max())
 
 
-def read_mesh(path: Path) -> trimesh.Trimesh:
-    """The mesh of a file as it is; raises UserError, naming the file, where it is no mesh."""
-    if not path.is_file():
-        raise UserError(f"{path}: there is no such mesh; correct 'mesh' in objects.yaml")
-    mesh = load_mesh(path)
-    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        stray = faces.min() if faces.min() < 0 else faces.max()
-        raise UserError(
-            f"{path}: a face names vertex {stray}, there are {len(vertices)}; export the mesh again"
-        )
-    used = np.zeros(len(vertices), bool)
-    used[faces] = True
-    bad = np.flatnonzero(used & ~np.isfinite(vertices).all(1))
-    if len(bad):
-        raise UserError(
-            f"{path}: vertex {bad[0]} is not a number (and {len(bad) - 1} more); export the mesh "
-            "again"
-        )
-    return mesh
+@dataclass(frozen=True, eq=False)
+class Paint:
+    """Evenly spread points of a coloured surface: ``points`` and outward unit ``normals`` (N, 3) in
+    the object's frame, metres; ``colours`` (N, 3) uint8, sRGB."""
+
+    points: np.ndarray
+    normals: np.ndarray
+    colours: np.ndarray
+
+    @classmethod
+    def load(cls, path: Path, outward: ObjectMesh) -> Paint | None:
+        """The colours of a mesh file; None where it has none or only one.
+
+        ``outward`` is the object that was loaded from it and knows which side of a face is out. A
+        texture that cannot be read counts as none.
+        """
+        from intercap_core.geometry.rigid.distance import DistanceField
+
+        mesh = load_mesh(path)
+        visual = mesh.visual
+        if visual is None or not visual.defined:
+            return None
+        sampled = trimesh.sample.sample_surface(mesh, PAINT_POINTS, seed=0, return_barycentric=True)
+        points, face, weights = sampled[0], sampled[1], sampled[2]
+        try:
+            colours = _colours(mesh, face, weights)
+        except TEXTURE_ERRORS:
+            return None
+        if not np.ptp(colours, axis=0).any():
+            return None
+        points = np.asarray(points)
+        surface = DistanceField(outward.vertices, outward.faces, watertight=outward.watertight)
+        return cls(points, surface.closest(points).normals, colours)
 
 
-def colours_of(mesh: trimesh.Trimesh) -> np.ndarray:
-    """Colours (V, 4) uint8 of the vertices, from a texture where there is one, else grey."""
-    visual: Any = mesh.visual
-    try:
-        if visual is not None and visual.kind == "texture":
-            visual = visual.to_color()
-        colours = np.asarray(getattr(visual, "vertex_colors", ()), np.uint8)
-    except TEXTURE_ERRORS:
-        colours = np.zeros(0, np.uint8)  # a texture that is not there, or is no image
-    if colours.shape != (len(mesh.vertices), 4):
-        return np.full((len(mesh.vertices), 4), (128, 128, 128, 255), np.uint8)
-    return colours
+def _colours(mesh: Any, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Colours (N, 3) uint8 at barycentric ``weights`` (N, 3) of faces (N,)."""
+    corners = mesh.faces[face]
+    if mesh.visual.kind != "texture":
+        of_corner = np.asarray(mesh.visual.vertex_colors, float)[corners, :3]
+        return np.rint(np.einsum("nk,nkc->nc", weights, of_corner)).astype(np.uint8)
+    material = mesh.visual.material
+    if hasattr(material, "to_simple"):
+        material = material.to_simple()
+    at = np.einsum("nk,nkc->nc", weights, np.asarray(mesh.visual.uv, float)[corners])
+    return trimesh.visual.color.uv_to_color(at, material.image)[:, :3]
 
 
 def _check_size(path: Path, mesh: trimesh.Trimesh) -> None:

@@ -69,6 +69,42 @@ def load_mesh(path: Path) -> Any:
     return mesh
 
 
+def read_mesh(path: Path) -> trimesh.Trimesh:
+    """The mesh of a file as it is; raises UserError, naming the file, where it is no mesh."""
+    if not path.is_file():
+        raise UserError(f"{path}: there is no such mesh; correct 'mesh' in objects.yaml")
+    mesh = load_mesh(path)
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        stray = faces.min() if faces.min() < 0 else faces.max()
+        raise UserError(
+            f"{path}: a face names vertex {stray}, there are {len(vertices)}; export the mesh again"
+        )
+    used = np.zeros(len(vertices), bool)
+    used[faces] = True
+    bad = np.flatnonzero(used & ~np.isfinite(vertices).all(1))
+    if len(bad):
+        raise UserError(
+            f"{path}: vertex {bad[0]} is not a number (and {len(bad) - 1} more); export the mesh "
+            "again"
+        )
+    return mesh
+
+
+def colours_of(mesh: trimesh.Trimesh) -> np.ndarray:
+    """Colours (V, 4) uint8 of the vertices, from a texture where there is one, else grey."""
+    visual: Any = mesh.visual
+    try:
+        if visual is not None and visual.kind == "texture":
+            visual = visual.to_color()
+        colours = np.asarray(getattr(visual, "vertex_colors", ()), np.uint8)
+    except TEXTURE_ERRORS:
+        colours = np.zeros(0, np.uint8)  # a texture that is not there, or is no image
+    if colours.shape != (len(mesh.vertices), 4):
+        return np.full((len(mesh.vertices), 4), (128, 128, 128, 255), np.uint8)
+    return colours
+
+
 class _Beside(trimesh.resolvers.Resolver):
     """Files beside the mesh by the last part of the name that it gives them."""
 

@@ -11,8 +11,17 @@ import numba
 import numpy as np
 
 from intercap_core.geometry.camera.projection_kernels import project_point
-from intercap_core.geometry.rigid.constants import BEND, BOX_MARGIN_PX, LARGE_PX, NEAR_M, SLACK_PX
 
+# Triangles that reach nearer than this are left out, metres: no Kinect images them (the data sheet
+# of the Azure Kinect begins at 0.25 m).
+NEAR_M = 0.05
+# Straight edges between projected corners bend by less in any known lens, pixels.
+BOX_MARGIN_PX = 2
+# How far a triangle's edge of L px may bend: L^2 times this over the focal length. Chords between
+# any two pixels of Azure Kinects' colour and depth images need at most 0.135.
+BEND = 0.15
+SLACK_PX = 0.1  # rounding of the ray table and of small windows
+LARGE_PX = 6.0  # of a triangle from which its edges bound each row
 NO_FACE = -1
 
 

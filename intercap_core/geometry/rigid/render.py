@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 
@@ -19,9 +19,6 @@ from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.rigid import raster
 from intercap_core.geometry.rigid.shots import Drawable, Rendering, Shot, Surface
 from intercap_core.geometry.solve.thread_pool import ThreadPool
-
-if TYPE_CHECKING:
-    pass
 
 Device = Literal["auto", "cpu", "cuda"]
 
@@ -77,7 +74,7 @@ class CpuRenderer:
 
     def visible(self, surface: Surface, shots: Sequence[Shot]) -> np.ndarray:
         """See :class:`Renderer`."""
-        from intercap_core.geometry.rigid.visibility import OcclusionScene
+        from intercap_core.geometry.rigid.distance import OcclusionScene
 
         scene = OcclusionScene(surface.vertices, surface.faces, threads=self.pool.threads)
         return np.array([scene.visible(shot.lens, shot.camera_from_mesh) for shot in shots])

@@ -1,16 +1,22 @@
 """Distances to a mesh that moves or bends, of many points and up to a reach.
 
-Where Embree's tree (:mod:`intercap_core.geometry.rigid.distance`) is made anew for every shape and
-searches
-as far as it must, this one keeps its faces' order and gives up at the reach, at a third of the time
-where most points are out of it.
+Embree's tree (:mod:`intercap_core.geometry.rigid.distance`) is built again for every shape and
+searches without a limit. This tree keeps the order of its faces and stops at the reach, at a third
+of the time where most points are out of it.
+
+The tree is a perfect binary tree of boxes. Node 0 is the root, 2 i + 1 and 2 i + 2 are the children
+of node i, and the last level's nodes, the leaves, share the faces evenly, in an order that keeps
+neighbours together. So the tree has no pointers, and boxes of a mesh that moves are made anew in
+one pass over it.
 """
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 
-from intercap_core.geometry.rigid import surface_tree_kernel as kernel
+LEAF_FACES = 4  # at most, on the tree's last level
+_ROUNDING = 1e-6  # metres, of distances in single precision
 
 
 class SurfaceTree:
@@ -23,14 +29,14 @@ class SurfaceTree:
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
         faces = np.asarray(faces, np.int64)
         centroids = np.asarray(vertices, np.float32)[faces].mean(axis=1)
-        self._levels = max(0, int(np.ceil(np.log2(len(faces) / kernel.LEAF_FACES))))
-        self._corners = faces[kernel.ordered(centroids, self._levels)].astype(np.int32)
+        self._levels = max(0, int(np.ceil(np.log2(len(faces) / LEAF_FACES))))
+        self._corners = faces[_ordered(centroids, self._levels)].astype(np.int32)
         self.closed = _closed(faces)
 
     def shaped(self, vertices: np.ndarray) -> ShapedSurface:
         """The mesh with its vertices at (V, 3)."""
         placed = np.ascontiguousarray(vertices, np.float32)
-        triangles, boxes = kernel.fitted(placed, self._corners, self._levels)
+        triangles, boxes = _fitted(placed, self._corners, self._levels)
         return ShapedSurface(triangles, boxes, self._levels)
 
 
@@ -47,7 +53,7 @@ class ShapedSurface:
         follow each other are neighbours.
         """
         queries, most = np.ascontiguousarray(points, np.float32), np.float32(reach * reach)
-        found = kernel.nearest(queries, self._triangles, self._boxes, self._levels, most)
+        found = _nearest(queries, self._triangles, self._boxes, self._levels, most)
         return np.where(found < most, np.sqrt(found.astype(np.float64)), reach)
 
     def signed_distance(self, points: np.ndarray, reach: float, deepest: float) -> np.ndarray:
@@ -59,14 +65,14 @@ class ShapedSurface:
         itself counts as outside. Points that are no numbers are at ``reach``.
         """
         queries = np.ascontiguousarray(points, np.float32)
-        return kernel.signed(
+        return _signed(
             queries, self._triangles, self._boxes, self._levels, float(reach), float(deepest)
         )
 
     def blocks(self, starts: np.ndarray, ends: np.ndarray, blocked: np.ndarray) -> None:
         """Set ``blocked`` (N,) bool where the way from ``starts`` to ``ends`` (N, 3) meets the
         surface; what is set already is not asked."""
-        kernel.block(
+        _block(
             np.ascontiguousarray(starts, np.float64),
             np.ascontiguousarray(ends, np.float64),
             self._triangles,
@@ -80,3 +86,309 @@ def _closed(faces: np.ndarray) -> bool:
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     numbers = edges[:, 0] * (int(faces.max()) + 1) + edges[:, 1]
     return not (np.unique(numbers, return_counts=True)[1] % 2).any()
+
+
+@numba.njit(cache=True, nogil=True)
+def _ordered(centroids, levels):
+    """Faces (F,) int32 in the order of the leaves of a tree of ``levels`` splits: each node's are
+    halved at the median of their centroids (F, 3) along the longest side."""
+    count = len(centroids)
+    order = np.arange(count).astype(np.int32)
+    for level in range(levels):
+        for node in range(1 << level):
+            start, end = (count * node) >> level, (count * (node + 1)) >> level
+            part = order[start:end].copy()
+            longest, axis = np.float32(-1), 0
+            for k in range(3):
+                low, high = np.float32(np.inf), np.float32(-np.inf)
+                for face in part:
+                    low, high = min(low, centroids[face, k]), max(high, centroids[face, k])
+                if high - low > longest:
+                    longest, axis = high - low, k
+            along = np.empty(len(part), np.float32)
+            for i in range(len(part)):
+                along[i] = centroids[part[i], axis]
+            order[start:end] = part[np.argsort(along, kind="mergesort")]
+    return order
+
+
+@numba.njit(cache=True, nogil=True)
+def _fitted(vertices, corners, levels):
+    """Corners (F, 3, 3) of the faces ``corners`` (F, 3) in the leaves' order, and the boxes (N, 6)
+    of all nodes: least and largest coordinates."""
+    count, leaves = len(corners), 1 << levels
+    triangles = np.empty((count, 3, 3), np.float32)
+    boxes = np.empty((2 * leaves - 1, 6), np.float32)
+    for leaf in range(leaves):
+        box = boxes[leaves - 1 + leaf]
+        box[:3], box[3:] = np.inf, -np.inf
+        for at in range((count * leaf) >> levels, (count * (leaf + 1)) >> levels):
+            for c in range(3):
+                for k in range(3):
+                    value = vertices[corners[at, c], k]
+                    triangles[at, c, k] = value
+                    box[k], box[3 + k] = min(box[k], value), max(box[3 + k], value)
+    for node in range(leaves - 2, -1, -1):
+        for k in range(3):
+            boxes[node, k] = min(boxes[2 * node + 1, k], boxes[2 * node + 2, k])
+            boxes[node, 3 + k] = max(boxes[2 * node + 1, 3 + k], boxes[2 * node + 2, 3 + k])
+    return triangles, boxes
+
+
+@numba.njit(cache=True, nogil=True)
+def _nearest(points, triangles, boxes, levels, reach_sq):
+    """Squared distance (M,) of points (M, 3) to the mesh, at most ``reach_sq``. Points that follow
+    each other had better be neighbours: each search starts from the face that was found last."""
+    found = np.empty(len(points), np.float32)
+    stack, reach = np.empty(levels + 2, np.int32), np.empty(levels + 2, np.float32)
+    last = 0
+    for m in range(len(points)):
+        x, y, z = points[m, 0], points[m, 1], points[m, 2]
+        found[m], last = _search(
+            x, y, z, triangles, boxes, levels, np.float32(reach_sq), last, stack, reach
+        )
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def _signed(points, triangles, boxes, levels, reach, deepest):
+    """Signed distance (M,), metres, of points (M, 3) float32 to a closed mesh, negative inside: at
+    most ``reach``, at least -``deepest``. Points that are no numbers are as far as can be.
+
+    Inside is where a ray crosses the mesh an odd number of times. A ball that does not reach the
+    mesh is on one side of it: a ray is cast only of a point whose ball does not hold the last point
+    of which that is known, and that is not in this one's ball.
+    """
+    found = np.empty(len(points), np.float64)
+    stack, ahead = np.empty(levels + 2, np.int32), np.empty(levels + 2, np.float32)
+    last, within = 0, False
+    # of the last known point, and the radius of its ball
+    cx, cy, cz, clear = np.inf, np.inf, np.inf, -np.inf
+    reach_sq, deepest_sq = np.float32(reach * reach), np.float32(deepest * deepest)
+    for m in range(len(points)):
+        x, y, z = points[m, 0], points[m, 1], points[m, 2]
+        if not (np.isfinite(x) and np.isfinite(y) and np.isfinite(z)):
+            found[m] = reach
+            continue
+        square, last = _search(x, y, z, triangles, boxes, levels, reach_sq, last, stack, ahead)
+        far = not square < reach_sq
+        distance = reach if far else np.sqrt(np.float64(square))
+        off = np.sqrt((x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2)
+        if not off < max(distance, clear) - _ROUNDING:
+            within = _odd(x, y, z, triangles, boxes, levels, stack)
+            clear = -np.inf
+        if distance > clear - off:
+            cx, cy, cz, clear = np.float64(x), np.float64(y), np.float64(z), distance
+        if within and far:
+            square, last = _search(
+                x, y, z, triangles, boxes, levels, deepest_sq, last, stack, ahead
+            )
+            distance = np.sqrt(np.float64(square)) if square < deepest_sq else deepest
+        found[m] = -distance if within else distance
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def _block(starts, ends, triangles, boxes, levels, blocked):
+    """Set ``blocked`` (M,) bool where the way from ``starts`` to ``ends`` (M, 3) float64 meets the
+    mesh, from either side; what is set already is passed over.
+
+    Ways that follow each other had better be neighbours: the face that was met last comes first.
+    """
+    leaves, count = 1 << levels, len(triangles)
+    stack = np.empty(levels + 2, np.int32)
+    last = 0
+    for m in range(len(starts)):
+        if blocked[m]:
+            continue
+        x, y, z = starts[m, 0], starts[m, 1], starts[m, 2]
+        u, v, w = ends[m, 0] - x, ends[m, 1] - y, ends[m, 2] - z
+        if _meets(x, y, z, u, v, w, triangles, last):
+            blocked[m] = True
+            continue
+        a, b, c = _inverse(u), _inverse(v), _inverse(w)
+        size, stack[0] = 1, 0
+        while size:
+            size -= 1
+            node = stack[size]
+            near, far = 0.0, 1.0
+            for k in range(3):
+                at, over = (x, a) if k == 0 else ((y, b) if k == 1 else (z, c))
+                one, other = (boxes[node, k] - at) * over, (boxes[node, 3 + k] - at) * over
+                near, far = max(near, min(one, other)), min(far, max(one, other))
+            if near > far + _ROUNDING:
+                continue
+            if node < leaves - 1:
+                stack[size], stack[size + 1] = 2 * node + 2, 2 * node + 1
+                size += 2
+                continue
+            leaf = node - leaves + 1
+            for at in range((count * leaf) >> levels, (count * (leaf + 1)) >> levels):
+                if _meets(x, y, z, u, v, w, triangles, at):
+                    blocked[m], last = True, at
+                    size = 0
+                    break
+
+
+@numba.njit(inline="always")
+def _inverse(value):
+    """1 over a component of a way, finite where that is 0."""
+    return 1.0 / value if abs(value) > 1e-12 else 1e12
+
+
+@numba.njit(cache=True, nogil=True)
+def _meets(x, y, z, u, v, w, triangles, at):
+    """Whether the way from a point (x, y, z) by (u, v, w) meets one of triangles (F, 3, 3) (Moeller
+    and Trumbore 1997)."""
+    ax, ay, az = triangles[at, 0, 0], triangles[at, 0, 1], triangles[at, 0, 2]
+    bx, by, bz = triangles[at, 1, 0] - ax, triangles[at, 1, 1] - ay, triangles[at, 1, 2] - az
+    cx, cy, cz = triangles[at, 2, 0] - ax, triangles[at, 2, 1] - ay, triangles[at, 2, 2] - az
+    px, py, pz = v * cz - w * cy, w * cx - u * cz, u * cy - v * cx
+    volume = bx * px + by * py + bz * pz
+    if volume == 0:
+        return False
+    tx, ty, tz = x - ax, y - ay, z - az
+    s = (tx * px + ty * py + tz * pz) / volume
+    if not 0 <= s <= 1:
+        return False
+    qx, qy, qz = ty * bz - tz * by, tz * bx - tx * bz, tx * by - ty * bx
+    t = (u * qx + v * qy + w * qz) / volume
+    if t < 0 or s + t > 1:
+        return False
+    along = (cx * qx + cy * qy + cz * qz) / volume
+    return 0 <= along <= 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _search(x, y, z, triangles, boxes, levels, most, last, stack, reach):
+    """Squared distance of a point to the mesh, at most ``most``, and the face where it is found,
+    sought from face ``last`` on."""
+    leaves, count = 1 << levels, len(triangles)
+    best = min(_to_triangle(x, y, z, triangles, last), most)
+    size = 1
+    stack[0], reach[0] = 0, _to_box(x, y, z, boxes, 0)
+    while size:
+        size -= 1
+        if reach[size] >= best:
+            continue
+        node = stack[size]
+        while node < leaves - 1:
+            left, right = 2 * node + 1, 2 * node + 2
+            a, b = _to_box(x, y, z, boxes, left), _to_box(x, y, z, boxes, right)
+            if a > b:
+                left, right, a, b = right, left, b, a
+            if b < best:
+                stack[size], reach[size] = right, b
+                size += 1
+            if a >= best:
+                node = -1
+                break
+            node = left
+        if node < 0:
+            continue
+        leaf = node - leaves + 1
+        for at in range((count * leaf) >> levels, (count * (leaf + 1)) >> levels):
+            distance = _to_triangle(x, y, z, triangles, at)
+            if distance < best:
+                best, last = distance, at
+    return best, last
+
+
+@numba.njit(cache=True, nogil=True)
+def _odd(x, y, z, triangles, boxes, levels, stack):
+    """Whether a ray along the third axis crosses the mesh an odd number of times."""
+    leaves, count = 1 << levels, len(triangles)
+    odd = False
+    size, stack[0] = 1, 0
+    while size:
+        size -= 1
+        node = stack[size]
+        box = boxes[node]
+        if not (box[0] <= x <= box[3] and box[1] <= y <= box[4] and z <= box[5]):
+            continue
+        if node < leaves - 1:
+            stack[size], stack[size + 1] = 2 * node + 2, 2 * node + 1
+            size += 2
+            continue
+        leaf = node - leaves + 1
+        for at in range((count * leaf) >> levels, (count * (leaf + 1)) >> levels):
+            odd ^= _crosses(x, y, z, triangles[at])
+    return odd
+
+
+@numba.njit(cache=True, nogil=True)
+def _crosses(x, y, z, corners):
+    """Whether a ray along the third axis crosses a triangle (3, 3).
+
+    In double precision, and as if the point were off by an infinitely small (e, e^2) where it is
+    on an edge's line: faces that share an edge decide alike, so that a ray through an edge or a
+    corner of a closed mesh crosses it as often as its neighbours do (Edelsbrunner and Mucke 1990).
+    """
+    total, height, sign = 0.0, 0.0, 0
+    for k in range(3):
+        a, b, c = corners[k], corners[(k + 1) % 3], corners[(k + 2) % 3]
+        # an edge is looked at from the same end by both of its faces
+        turned = a[0] > b[0] or (a[0] == b[0] and a[1] > b[1])
+        if turned:
+            a, b = b, a
+        ax, ay = np.float64(a[0]), np.float64(a[1])
+        ux, uy = np.float64(b[0]) - ax, np.float64(b[1]) - ay
+        area = ux * (np.float64(y) - ay) - uy * (np.float64(x) - ax)
+        side = area
+        if side == 0:
+            side = -uy if uy != 0 else ux
+        if turned:
+            area, side = -area, -side
+        way = 1 if side > 0 else -1
+        if side == 0 or (sign and way != sign):  # an edge of no length, or outside of this one
+            return False
+        sign = way
+        total += area
+        height += area * np.float64(c[2])
+    return total != 0 and height / total > z
+
+
+@numba.njit(inline="always")
+def _to_box(x, y, z, boxes, node):
+    """Squared distance of a point to a node's box, 0 inside."""
+    a = max(boxes[node, 0] - x, x - boxes[node, 3], np.float32(0))
+    b = max(boxes[node, 1] - y, y - boxes[node, 4], np.float32(0))
+    c = max(boxes[node, 2] - z, z - boxes[node, 5], np.float32(0))
+    return a * a + b * b + c * c
+
+
+@numba.njit(inline="always")
+def _to_triangle(x, y, z, triangles, at):
+    """Squared distance of a point to one of triangles (F, 3, 3) (Ericson, Real-Time Collision
+    Detection, 5.1.5: by the region of the triangle's plane that the point projects to)."""
+    ax, ay, az = triangles[at, 0, 0], triangles[at, 0, 1], triangles[at, 0, 2]
+    ux, uy, uz = triangles[at, 1, 0] - ax, triangles[at, 1, 1] - ay, triangles[at, 1, 2] - az
+    vx, vy, vz = triangles[at, 2, 0] - ax, triangles[at, 2, 1] - ay, triangles[at, 2, 2] - az
+    px, py, pz = x - ax, y - ay, z - az
+    uu, uv, vv = (
+        ux * ux + uy * uy + uz * uz,
+        ux * vx + uy * vy + uz * vz,
+        vx * vx + vy * vy + vz * vz,
+    )
+    d1, d2 = ux * px + uy * py + uz * pz, vx * px + vy * py + vz * pz
+    d3, d4, d5, d6 = d1 - uu, d2 - uv, d1 - uv, d2 - vv
+    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
+    zero, one = np.float32(0), np.float32(1)
+    if d1 <= 0 and d2 <= 0:
+        s, t = zero, zero
+    elif d3 >= 0 and d4 <= d3:
+        s, t = one, zero
+    elif d6 >= 0 and d5 <= d6:
+        s, t = zero, one
+    elif vc <= 0 and d1 >= 0 and d3 <= 0:
+        s, t = d1 / (d1 - d3), zero
+    elif vb <= 0 and d2 >= 0 and d6 <= 0:
+        s, t = zero, d2 / (d2 - d6)
+    elif va <= 0 and d4 >= d3 and d5 >= d6:
+        t = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        s = one - t
+    else:
+        scale = one / (va + vb + vc)
+        s, t = vb * scale, vc * scale
+    qx, qy, qz = px - s * ux - t * vx, py - s * uy - t * vy, pz - s * uz - t * vz
+    return qx * qx + qy * qy + qz * qz

@@ -13,8 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.config import Symmetry
-from intercap_core.geometry.rigid.constants import MAX_DISCRETE, SAME_TRANSFORM
-from intercap_core.geometry.rigid.pose import rotation_exp
+from intercap_core.geometry.camera.transforms import rigid, rotation_exp
+
+MAX_DISCRETE = 128  # elements of a symmetry group; the icosahedron's rotation group has 60
+SAME_TRANSFORM = 1e-3  # transforms nearer than this, per entry, are one: tables carry 4 digits
 
 
 @dataclass(frozen=True)
@@ -45,9 +47,9 @@ class SymmetryGroup:
         given = np.array(symmetry.discrete, np.float64).reshape(-1, 4, 4)
         for row, transform in enumerate(given):
             rotation = transform[:3, :3]
-            rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+            orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
             if (
-                not rigid
+                not orthonormal
                 or np.linalg.det(rotation) < 0
                 or not np.allclose(transform[3], (0, 0, 0, 1))
             ):
@@ -92,7 +94,7 @@ class SymmetryGroup:
         """The pose (4, 4) equivalent to ``pose`` whose rotation is closest to ``reference``'s."""
         rotation = self.nearest_equivalent(pose[:3, :3], reference[:3, :3])
         if self.sphere:
-            return _transform(rotation, pose[:3, 3])
+            return rigid(rotation, pose[:3, 3])
         # the element S = pose^-1 equivalent has the rotation found; its translation follows from
         # which discrete element it contains
         element = pose[:3, :3].T @ rotation
@@ -128,7 +130,7 @@ class SymmetryGroup:
     def _about_axis(self, rotation: np.ndarray) -> np.ndarray:
         """``rotation`` (3, 3) as a motion that keeps the axis in place."""
         assert self.offset is not None
-        return _transform(rotation, self.offset - rotation @ self.offset)
+        return rigid(rotation, self.offset - rotation @ self.offset)
 
     def _aligned(self, rotation: np.ndarray, reference: np.ndarray) -> np.ndarray:
         """One candidate (..., n, 3, 3) a discrete element, turned about the axis at its best.
@@ -162,10 +164,3 @@ def _closure(generators: np.ndarray) -> np.ndarray:
             )
         queue += [candidate @ generator for generator in generators]
     return np.array(elements)
-
-
-def _transform(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    transform = np.eye(4)
-    transform[:3, :3] = rotation
-    transform[:3, 3] = translation
-    return transform

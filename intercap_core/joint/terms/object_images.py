@@ -23,12 +23,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.config import ObjectTrackSettings
-from intercap_core.geometry.camera.transforms import rigid
+from intercap_core.geometry.camera.transforms import rigid, step_between
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.render import open_renderer
-from intercap_core.geometry.rigid.twist import step_between, twists
 from intercap_core.geometry.solve.robust import geman_mcclure_weight
 from intercap_core.geometry.solve.thread_pool import ThreadPool
+from intercap_core.geometry.solve.time_series import rigid_velocity
 from intercap_core.joint.cameras import BIAS, FREEDOMS, SHIFT, TURN, Cameras, Sights
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.sequential import TrackedPoses
@@ -249,7 +249,7 @@ class ObjectImagesData(Term):
     def _motion(self, poses: np.ndarray) -> np.ndarray:
         """Twists (T, 6) of the tracked frames' poses (T, 4, 4)."""
         tracked = self._tracked
-        motion = twists(poses, tracked.seen, tracked.times)
+        motion = rigid_velocity(poses, tracked.seen, tracked.times)
         motion[tracked.resting] = 0
         return motion
 

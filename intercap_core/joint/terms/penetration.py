@@ -45,8 +45,7 @@ from scipy.spatial import cKDTree
 
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.geometry.rigid.distance import DistanceField
-from intercap_core.geometry.rigid.normals import vertex_normals
-from intercap_core.geometry.rigid.surface_samples import sample_surface
+from intercap_core.geometry.rigid.surfaces import sample_surface, vertex_normals
 from intercap_core.joint.equations import NormalEquations
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.proximity import ON_SURFACE, along_by_object

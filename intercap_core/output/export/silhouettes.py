@@ -13,11 +13,11 @@ import torch
 
 from intercap_core.geometry.camera.masks import encode_window
 from intercap_core.geometry.camera.rig import Camera, Rig
-from intercap_core.geometry.camera.transforms import rigid
+from intercap_core.geometry.camera.transforms import apply_step, rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.render import render, render_scene
 from intercap_core.geometry.rigid.shots import Drawable, Rendering
-from intercap_core.geometry.rigid.twist import moved, twists
+from intercap_core.geometry.solve.time_series import rigid_velocity
 from intercap_core.output.export.motion import Motion
 
 _BATCH = 32
@@ -89,9 +89,9 @@ def object_poses(motion: Motion, rig: Rig, exposures: Exposures) -> Iterator[dic
     poses = rigid(motion.rotation, motion.translation)
     known = np.isfinite(poses).all(axis=(1, 2))
     twist = np.zeros((len(motion), 6))
-    twist[known] = twists(poses[known], np.ones(known.sum(), bool), exposures.times[known])
+    twist[known] = rigid_velocity(poses[known], np.ones(known.sum(), bool), exposures.times[known])
     for number in range(len(rig)):
-        seen = moved(poses, exposures.time_offset[number] * twist)
+        seen = apply_step(poses, exposures.time_offset[number] * twist)
         yield {image: seen[t] for image, t in sorted(frames_of(exposures, number).items())}
 
 

@@ -11,9 +11,9 @@ import numpy as np
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera, Rig
-from intercap_core.geometry.rigid.normals import vertex_normals
 from intercap_core.geometry.rigid.render import render_scene
 from intercap_core.geometry.rigid.shots import Drawable, Rendering
+from intercap_core.geometry.rigid.surfaces import vertex_normals
 
 _JPEG_QUALITY = 82
 _AMBIENT = 0.38

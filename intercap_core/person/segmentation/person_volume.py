@@ -15,7 +15,7 @@ import numpy as np
 from intercap_core.artefacts import Artefact
 from intercap_core.body.keypoints import KEYPOINT_NAMES, LIMB_BONES, of_side
 from intercap_core.geometry.camera.transforms import apply
-from intercap_core.geometry.solve.velocity import limited_velocity
+from intercap_core.geometry.solve.time_series import limited_velocity
 
 # Half breadths and girths over 2 pi of NASA-STD-3000, section 3.3; the last of each row, how
 # uncertain the surface is (one margin: clothing and build), is tuned on the studio. Radii at the

@@ -102,7 +102,7 @@ def test_warps_form_is_the_plain_one(seed):
     wp = pytest.importorskip(
         "warp", reason="warp is not installed (pip install 'intercap-core[gpu]')"
     )
-    from intercap_core.geometry.rigid import warp_kernels
+    from intercap_core.geometry.rigid import render_warp
 
     lens, points = random_lens(seed), random_points(seed)
     shape = (1, len(points))
@@ -113,5 +113,5 @@ def test_warps_form_is_the_plain_one(seed):
     corners = wp.empty(shape, dtype=wp.vec3d, device="cpu")
     pixels = wp.empty(shape, dtype=wp.vec2d, device="cpu")
     inputs = [vertices, poses, lens_of, lenses, corners, pixels]
-    wp.launch(warp_kernels.place, shape, inputs, device="cpu")
+    wp.launch(render_warp.place, shape, inputs, device="cpu")
     np.testing.assert_allclose(pixels.numpy()[0], project(points, lens), rtol=1e-12, atol=1e-9)

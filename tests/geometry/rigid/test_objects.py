@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from intercap_core.geometry.rigid.distance import DistanceField
-from intercap_core.geometry.rigid.normals import vertex_normals
+from intercap_core.geometry.rigid.surfaces import vertex_normals
 from intercap_core.studio.objects import true_mesh
 from tests.geometry.rigid.conftest import CONFIG, catalogue
 

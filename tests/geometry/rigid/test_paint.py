@@ -6,8 +6,7 @@ import trimesh
 from PIL import Image
 
 from intercap_core.config import ObjectEntry
-from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.geometry.rigid.paint import Paint
+from intercap_core.geometry.rigid.mesh import ObjectMesh, Paint
 from tests.geometry.rigid.conftest import catalogue
 
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from intercap_core.geometry.rigid.point_grid import PointGrid
-from intercap_core.geometry.rigid.point_grid_kernel import MOST_CELLS, gridded
+from intercap_core.geometry.rigid.point_grid import MOST_CELLS, PointGrid, gridded
 
 RANDOM = np.random.default_rng(0)
 SHAPES = {

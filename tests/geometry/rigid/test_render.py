@@ -7,9 +7,9 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.rigid.distance import OcclusionScene
 from intercap_core.geometry.rigid.render import render, render_scene
 from intercap_core.geometry.rigid.shots import Drawable
-from intercap_core.geometry.rigid.visibility import OcclusionScene
 
 PINHOLE = Intrinsics(640, 576, 504.0, 505.0, 321.3, 287.6)
 LENS = Intrinsics(  # a Kinect's colour lens at half size: strong rational distortion

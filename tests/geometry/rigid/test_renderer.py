@@ -8,6 +8,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from intercap_core.errors import UserError
+from intercap_core.geometry.rigid.distance import OcclusionScene
 from intercap_core.geometry.rigid.render import (
     CpuRenderer,
     Renderer,
@@ -16,7 +17,6 @@ from intercap_core.geometry.rigid.render import (
     render,
 )
 from intercap_core.geometry.rigid.shots import Shot, Surface
-from intercap_core.geometry.rigid.visibility import OcclusionScene
 from tests.geometry.rigid.test_render import LENS, PINHOLE
 
 BOUNDARY_PX = 2  # of an image, where fused multiplications may decide otherwise

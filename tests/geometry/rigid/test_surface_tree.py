@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from intercap_core.geometry.rigid.distance import DistanceField
-from intercap_core.geometry.rigid.open3d_core import o3d
+from intercap_core.geometry.rigid.distance import DistanceField, o3d
 from intercap_core.geometry.rigid.surface_tree import SurfaceTree
 
 

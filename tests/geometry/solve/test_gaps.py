@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.geometry.solve.gaps import filled_linearly
+from intercap_core.geometry.solve.time_series import filled_linearly
 
 
 def test_gaps_are_straight_and_ends_are_held():

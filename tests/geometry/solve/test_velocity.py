@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from intercap_core.geometry.solve.velocity import limited_velocity
+from intercap_core.geometry.solve.time_series import limited_velocity
 
 TIMES = np.array([0.0, 0.066, 0.134, 0.2, 0.266, 0.333, 0.4])
 

@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from intercap_core.geometry.solve.viterbi import cheapest_sequence
+from intercap_core.geometry.solve.time_series import cheapest_sequence
 
 
 @pytest.mark.parametrize("ends", [True, False])

@@ -1,4 +1,4 @@
-"""Points spread evenly over a mesh's surface."""
+"""Normals of triangle meshes, and points spread evenly over their surface."""
 
 from __future__ import annotations
 
@@ -10,6 +10,20 @@ import numpy as np
 # without a random generator (Roberts 2018, "The Unreasonable Effectiveness of Quasirandom
 # Sequences").
 _STEP_U, _STEP_V = 0.7548776662466927, 0.5698402909980532
+
+
+def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Area-weighted outward unit normals (V, 3)."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    face_normals = np.cross(b - a, c - a)
+    normals = np.stack(
+        [
+            np.bincount(faces.ravel(), np.repeat(face_normals[:, axis], 3), minlength=len(vertices))
+            for axis in range(3)
+        ],
+        1,
+    )
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-18)
 
 
 @dataclass(frozen=True, eq=False)

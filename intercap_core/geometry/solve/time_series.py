@@ -1,12 +1,30 @@
-"""Velocities from positions of single frames, some of which are wrong."""
+"""Samples over time: gaps, velocities, and the cheapest sequence of states."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from intercap_core.geometry.camera.transforms import rotation_log
+
 MAX_GAP_S = 0.25  # positions farther apart in time say little about the velocity between
 EVEN = 0.2  # steps that differ by less are taken as equal by the fourth-order term
 LIMIT = 2.0  # of the slower one-sided difference, beyond which the other one is a jump
+# Fastest thrown or kicked object, m/s and rad/s; anything faster is a jump of the track.
+MAX_SPEED_M_S, MAX_TURN_RAD_S = 8.0, 20.0
+
+
+def filled_linearly(values: np.ndarray, at: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Values (T, D) with the rows that are not ``known`` (T,) replaced by straight lines.
+
+    ``at`` (T,) increasing: times or frame numbers. Known rows stay as they are; before the first
+    and after the last one their values are held. Without any known row the values are returned as
+    they are.
+    """
+    result = values.copy()
+    if known.any() and not known.all():
+        for column in range(values.shape[1]):
+            result[~known, column] = np.interp(at[~known], at[known], values[known, column])
+    return result
 
 
 def limited_velocity(
@@ -52,6 +70,21 @@ def limited_rate(
     return _shortened(np.where(two, central, ahead + behind), max_speed)
 
 
+def rigid_velocity(poses: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Turn (rad/s, from the left) and shift of the origin (m/s) in a second: (T, 6).
+
+    ``poses`` (T, 4, 4) master_from_object, believed where ``known`` (T,); ``times`` (T,) seconds.
+    Zero where nothing is known; limited, so that a single jump hardly affects its neighbours.
+    """
+    if len(poses) < 2:
+        return np.zeros((len(poses), 6))
+    turns = rotation_log(poses[1:, :3, :3] @ poses[:-1, :3, :3].transpose(0, 2, 1))
+    turn = limited_rate(turns, times, max_speed=MAX_TURN_RAD_S, known=known)
+    shifts = np.diff(poses[:, :3, 3], axis=0)
+    shift = limited_rate(shifts, times, max_speed=MAX_SPEED_M_S, known=known)
+    return np.concatenate([turn, shift], axis=1)
+
+
 def _fourth_order(slope: np.ndarray, both: np.ndarray, step: np.ndarray) -> np.ndarray:
     """What second neighbours add to a central difference (T, ..., D), from ``slope`` and ``both``
     (T-1, ...) between positions: (8 (x_1 - x_-1) - (x_2 - x_-2)) / 12 less (x_1 - x_-1) / 2."""
@@ -72,3 +105,23 @@ def _length(vectors: np.ndarray) -> np.ndarray:
 
 def _shortened(vectors: np.ndarray, longest: np.ndarray | float) -> np.ndarray:
     return vectors * np.minimum(1.0, longest / np.maximum(_length(vectors), 1e-12))
+
+
+def cheapest_sequence(
+    first: np.ndarray, steps: np.ndarray, last: np.ndarray | None = None
+) -> np.ndarray:
+    """States (T,) int64 that minimise first[s_0] + sum_t steps[t, s_t, s_t+1] + last[s_T-1].
+
+    ``first`` and ``last`` (S,) are costs of the states that a sequence begins and ends in;
+    ``steps`` (T - 1, S, S) of going from one state to the next, the next one's own cost included.
+    Of equal costs the lowest state is taken.
+    """
+    total, came_from = np.asarray(first), []
+    for step in steps:
+        reach = total[:, None] + step
+        came_from.append(reach.argmin(0))
+        total = reach.min(0)
+    chosen = [int((total if last is None else total + last).argmin())]
+    for back in reversed(came_from):
+        chosen.append(int(back[chosen[-1]]))
+    return np.array(chosen[::-1])
