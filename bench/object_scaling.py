@@ -30,7 +30,7 @@ from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import apply_step, rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.geometry.rigid.render import CpuRenderer, Renderer, open_renderer
+from intercap_core.geometry.rigid.render import Renderer
 from intercap_core.geometry.rigid.shots import Shot, Surface
 from intercap_core.object_track.fit import MotionPrior, fit_pose
 from intercap_core.object_track.reduced_mask import EMPTY, ReducedMask, reduced_lens
@@ -95,8 +95,8 @@ class Scene:
 
 
 def tracking_scaling(mesh: ObjectMesh) -> dict[str, float]:
-    """Milliseconds a fit of one frame by views, faces, pixels and threads; an image's by device."""
-    renderer = CpuRenderer()
+    """Milliseconds a fit of one frame by views, faces, pixels and threads; of an image."""
+    renderer = Renderer()
     usual = with_faces(mesh, USUAL_FACES)
     found = {}
     for count in VIEWS:
@@ -110,13 +110,12 @@ def tracking_scaling(mesh: ObjectMesh) -> dict[str, float]:
         found[f"fit_ms_step_{step}"] = _least_ms(lambda scene=scene: scene.fit(renderer))
     scene = Scene.make(usual)
     for threads in THREADS:
-        crew = CpuRenderer(threads)
+        crew = Renderer(threads)
         found[f"fit_ms_threads_{threads}"] = _least_ms(lambda crew=crew: scene.fit(crew))
-    for device, drawing in _devices().items():
-        for count in SHOTS:
-            shots = _shots(scene, count)
-            ms = _least_ms(lambda d=drawing, s=shots: d.draw(Surface.of(usual), s)) / count
-            found[f"draw_ms_{device}_{count}_images"] = ms
+    for count in SHOTS:
+        shots = _shots(scene, count)
+        ms = _least_ms(lambda s=shots: renderer.draw(Surface.of(usual), s)) / count
+        found[f"draw_ms_cpu_{count}_images"] = ms
     return found
 
 
@@ -148,7 +147,7 @@ def _view(mesh: ObjectMesh, geometry: ViewGeometry, pose: np.ndarray) -> View:
     """What a camera sees of the object alone."""
     lens = geometry.depth_lens
     assert lens is not None
-    silhouette, drawn = CpuRenderer().draw(
+    silhouette, drawn = Renderer().draw(
         Surface.of(mesh),
         [
             Shot(geometry.lens, geometry.colour_from_master @ pose),
@@ -170,12 +169,6 @@ def _shots(scene: Scene, count: int) -> list[Shot]:
         turned = rigid(Rotation.random(rng=rng).as_matrix(), scene.pose[:3, 3])
         shots.append(Shot(geometry.lens, geometry.colour_from_master @ turned))
     return shots
-
-
-def _devices() -> dict[str, Renderer]:
-    """The CPU, and a GPU where there is one."""
-    best = open_renderer("auto")
-    return {"cpu": CpuRenderer()} | ({"cuda": best} if best.device != "cpu" else {})
 
 
 def _least_ms(work: Callable[[], object]) -> float:

@@ -171,7 +171,7 @@ class ObjectTrackSettings(Model):
     lost_overlap: Fraction = 0.25
     """The track is lost if the mean overlap over its views is below this value."""
     render_on: Literal["cpu", "cuda", "auto"] = "cpu"
-    """Device that renders the object; cuda needs the extra `gpu`; auto = cuda if it is usable."""
+    """Device that renders the object; auto = cpu, and cuda is refused with an error."""
 
 
 class BodyFitSettings(Model):

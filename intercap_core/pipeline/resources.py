@@ -94,8 +94,6 @@ def on_gpu(project: Project, rule: str) -> bool:
     config = project.config
     if rule in STAGES and STAGES[rule].on_device:
         return config.device == "cuda"
-    if rule == "object_track":
-        return config.object_track.render_on == "cuda"
     detectors = config.detections
     models = (
         (detectors.segmentation_model, detectors.segmentation_device),

@@ -9,7 +9,7 @@ import pytest
 
 from intercap_core.config import ObjectTrackSettings
 from intercap_core.geometry.rigid.mesh import ObjectMesh, Paint
-from intercap_core.geometry.rigid.render import CpuRenderer
+from intercap_core.geometry.rigid.render import Renderer
 from intercap_core.geometry.rigid.shots import Shot, Surface
 from intercap_core.object_track.colour_decision import ColourDecision
 from intercap_core.object_track.constants import PATCHES_ACROSS
@@ -64,7 +64,7 @@ def observer_of(
 ) -> Observer:
     """Its pictures show the true object in these colours, lit from above, each camera's gain on
     it."""
-    mesh, renderer = capture.mesh, CpuRenderer()
+    mesh, renderer = capture.mesh, Renderer()
 
     def pictures(t: int) -> list[np.ndarray | None]:
         rng = np.random.default_rng(t)

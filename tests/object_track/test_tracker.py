@@ -9,7 +9,7 @@ from intercap_core.config import ObjectPose, ObjectTrackSettings
 from intercap_core.errors import UserError
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.geometry.rigid.render import CpuRenderer
+from intercap_core.geometry.rigid.render import Renderer
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 from intercap_core.object_track.fit import MotionPrior, assess_all, fit_pose
 from intercap_core.object_track.given_poses import GivenPose
@@ -97,23 +97,11 @@ def test_fit_recovers_from_six_centimetres_and_twenty_degrees(
 def test_fit_is_the_same_whatever_the_threads_do(mesh, capture, views):
     start = _disturbed(capture.poses[0], 0.03, 10, 5)
     one, *others = (
-        _fit(mesh, views, start, renderer=CpuRenderer(threads)) for threads in (1, 3, 3, 2)
+        _fit(mesh, views, start, renderer=Renderer(threads)) for threads in (1, 3, 3, 2)
     )
     for other in others:
         assert other.pose.tobytes() == one.pose.tobytes()
         assert other.covariance.tobytes() == one.covariance.tobytes() and other.views == one.views
-
-
-def test_fit_drawn_by_warp_is_the_same(mesh, capture, views):
-    pytest.importorskip("warp", reason="warp is not installed (pip install 'intercap-core[gpu]')")
-    from intercap_core.geometry.rigid.render_warp import WarpRenderer
-
-    start = _disturbed(capture.poses[0], 0.03, 10, 6)
-    one, two = (
-        _fit(mesh, views, start, renderer=renderer)
-        for renderer in (CpuRenderer(), WarpRenderer("cpu"))
-    )
-    np.testing.assert_allclose(one.pose, two.pose, atol=1e-7)
 
 
 def test_poses_assessed_together_are_those_assessed_alone(mesh, capture, views):

@@ -79,7 +79,6 @@ def test_stages_on_a_gpu_are_those_of_the_settings() -> None:
 
     assert found() == set()
     assert found(device="cuda") == {"body_fit", "joint"}
-    assert found(object_track={"render_on": "cuda"}) == {"object_track"}
     # without a model nothing runs on it
     assert found(detections={"keypoint_device": "cuda"}) == set()
     more = memory_mb(project(device="cuda"), "joint", SHORT) - memory_mb(project(), "joint", SHORT)

@@ -292,14 +292,14 @@ class OcclusionScene:
         return seen
 
 
-def _scene(vertices: np.ndarray, faces: np.ndarray, threads: int) -> o3d.t.geometry.RaycastingScene:
+def _scene(vertices: np.ndarray, faces: np.ndarray, threads: int) -> Any:
     """The search tree of float32 vertices (V, 3) and uint32 faces (F, 3)."""
     scene = o3d.t.geometry.RaycastingScene(nthreads=threads)
     scene.add_triangles(o3d.core.Tensor.from_numpy(vertices), o3d.core.Tensor.from_numpy(faces))
     return scene
 
 
-def _closest(scene: o3d.t.geometry.RaycastingScene, points: np.ndarray) -> Closest:
+def _closest(scene: Any, points: np.ndarray) -> Closest:
     query = o3d.core.Tensor.from_numpy(np.ascontiguousarray(points, np.float32).reshape(-1, 3))
     answer = scene.compute_closest_points(query)
     uv = answer["primitive_uvs"].numpy().astype(np.float64)

@@ -1,8 +1,9 @@
 """Masks, depth and face ids of meshes in real cameras, for many views and poses at once.
 
-One interface, :class:`Renderer`, and two backends: the z-buffer of :mod:`.raster` on the CPU and
-the same in :mod:`.render_warp` on a GPU. Lenses are exact (a pixel is covered where its undistorted
-ray passes through the triangle) and only the projected box of the object is drawn.
+A pixel is covered where its undistorted ray passes through the triangle, and its depth is where the
+ray meets the triangle's plane: exact for any lens. Only the search window of a triangle comes from
+its projected corners, and only the projected box of the object is drawn. The z-buffer is compiled
+for the CPU and runs without the interpreter's lock.
 """
 
 from __future__ import annotations
@@ -10,46 +11,35 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Literal, Protocol
+from typing import Literal
 
+import numba
 import numpy as np
 
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.intrinsics import Intrinsics
-from intercap_core.geometry.rigid import raster
+from intercap_core.geometry.camera.projection_kernels import project_point
 from intercap_core.geometry.rigid.shots import Drawable, Rendering, Shot, Surface
 from intercap_core.geometry.solve.thread_pool import ThreadPool
 
-Device = Literal["auto", "cpu", "cuda"]
+# Triangles that reach nearer than this are left out, metres: no Kinect images them (the data sheet
+# of the Azure Kinect begins at 0.25 m).
+NEAR_M = 0.05
+# Straight edges between projected corners bend by less in any known lens, pixels.
+BOX_MARGIN_PX = 2
+# How far a triangle's edge of L px may bend: L^2 times this over the focal length. Chords between
+# any two pixels of Azure Kinects' colour and depth images need at most 0.135.
+BEND = 0.15
+SLACK_PX = 0.1  # rounding of the ray table and of small windows
+LARGE_PX = 6.0  # of a triangle from which its edges bound each row
+NO_FACE = -1
 
 
-class Renderer(Protocol):
-    """Draws one mesh in many views and poses at once. A shot's image does not depend on the others.
+class Renderer:
+    """Draws one mesh in many views and poses at once, on ``threads`` threads.
 
-    ``device`` names where it runs, ``pool`` are the threads that the host may use beside it.
+    A shot's image does not depend on the others.
     """
-
-    device: str
-    pool: ThreadPool
-
-    def draw(
-        self, surface: Surface, shots: Sequence[Shot], *, margin_px: int = 0
-    ) -> list[Rendering]:
-        """The smallest window that holds the mesh, widened by ``margin_px``, of every shot."""
-        ...
-
-    def visible(self, surface: Surface, shots: Sequence[Shot]) -> np.ndarray:
-        """Whether each shot (N) sees each vertex: (N, V) bool.
-
-        It does where the vertex is in the image, faces the camera and the mesh does not hide it.
-        """
-        ...
-
-
-class CpuRenderer:
-    """The z-buffer compiled for the CPU, shots side by side on ``threads`` threads."""
-
-    device = "cpu"
 
     def __init__(self, threads: int = 1) -> None:
         self.pool = ThreadPool(threads)
@@ -57,61 +47,53 @@ class CpuRenderer:
     def draw(
         self, surface: Surface, shots: Sequence[Shot], *, margin_px: int = 0
     ) -> list[Rendering]:
-        """See :class:`Renderer`."""
+        """The smallest window that holds the mesh, widened by ``margin_px``, of every shot."""
         vertices = np.ascontiguousarray(surface.vertices, np.float64)
         faces = np.ascontiguousarray(surface.faces, np.int32)
 
-        def one(shot: Shot) -> Rendering:
+        def draw_shot(shot: Shot) -> Rendering:
             lens = shot.lens
             pose = np.ascontiguousarray(shot.camera_from_mesh, np.float64)
             return Rendering(
-                *raster.draw_alone(
+                *_draw_alone(
                     vertices, faces, surface.cull_back, pose, lens.parameters, lens.rays, margin_px
                 )
             )
 
-        return self.pool.map(one, shots)
+        return self.pool.map(draw_shot, shots)
 
     def visible(self, surface: Surface, shots: Sequence[Shot]) -> np.ndarray:
-        """See :class:`Renderer`."""
+        """Whether each shot (N) sees each vertex: (N, V) bool.
+
+        A vertex is visible if it is in the image, faces the camera and is not hidden by the mesh.
+        """
         from intercap_core.geometry.rigid.distance import OcclusionScene
 
         scene = OcclusionScene(surface.vertices, surface.faces, threads=self.pool.threads)
         return np.array([scene.visible(shot.lens, shot.camera_from_mesh) for shot in shots])
 
 
-def open_renderer(device: Device = "auto", *, threads: int | None = None) -> Renderer:
-    """The renderer of a device; ``auto`` takes a GPU where there is one that can be used.
+def open_renderer(
+    device: Literal["auto", "cpu", "cuda"] = "auto", *, threads: int | None = None
+) -> Renderer:
+    """Return the renderer of a device: the CPU for ``cpu`` and ``auto``.
 
-    ``threads`` of the host: by default as many as the job may use (OMP_NUM_THREADS, else one).
-    Raises UserError where ``cuda`` is asked for and there is no such device or no warp.
+    Args:
+        device: the setting ``object_track.render_on``. Raises UserError for ``cuda``.
+        threads: default as many as the job may use (OMP_NUM_THREADS, else one).
     """
-    threads = _threads_of_job() if threads is None else threads
-    if device == "cpu":
-        return CpuRenderer(threads)
-    try:
-        from intercap_core.geometry.rigid.render_warp import WarpRenderer, has_cuda
-    except ImportError:
-        if device == "auto":
-            return CpuRenderer(threads)
+    if device == "cuda":
         raise UserError(
-            "rendering on device 'cuda' needs warp, which is not installed; run "
-            "pip install 'intercap-core[gpu]', or set object_track.render_on: cpu"
-        ) from None
-    if has_cuda():
-        return WarpRenderer("cuda:0", threads=threads)
-    if device == "auto":
-        return CpuRenderer(threads)
-    raise UserError(
-        "rendering was asked for on device 'cuda', but warp finds no such device here; set "
-        "object_track.render_on: cpu, or run on a machine that has one"
-    )
+            "object_track.render_on is 'cuda', expected 'cpu' or 'auto': objects are drawn on the "
+            "CPU only; set object_track.render_on: cpu"
+        )
+    return Renderer(_threads_of_job() if threads is None else threads)
 
 
 @lru_cache(maxsize=1)
 def default_renderer() -> Renderer:
     """The CPU, with as many threads as the job may use."""
-    return CpuRenderer(_threads_of_job())
+    return Renderer(_threads_of_job())
 
 
 def _threads_of_job() -> int:
@@ -144,7 +126,7 @@ def render_scene(
     parameters, rays = intrinsics.parameters, intrinsics.rays
     box = np.array([np.inf, np.inf, -np.inf, -np.inf])
     placed = [
-        raster.place(
+        _place(
             np.ascontiguousarray(drawable.vertices, np.float64),
             np.ascontiguousarray(drawable.camera_from_mesh, np.float64),
             parameters,
@@ -152,15 +134,168 @@ def render_scene(
         )
         for drawable in drawables
     ]
-    x0, y0, x1, y1 = raster.window_of(box, margin_px, intrinsics.width, intrinsics.height)
-    depth, face, body = raster.blank(y1 - y0, x1 - x0)
+    x0, y0, x1, y1 = _window_of(box, margin_px, intrinsics.width, intrinsics.height)
+    depth, face, body = _blank(y1 - y0, x1 - x0)
     if x1 > x0:
         focal = min(intrinsics.fx, intrinsics.fy)
         for number, (drawable, (corners, pixels)) in enumerate(zip(drawables, placed, strict=True)):
             faces = np.ascontiguousarray(drawable.faces, np.int32)
-            raster.draw(
+            _draw(
                 corners, pixels, x0, y0, faces, rays, focal, drawable.cull_back,
                 np.int16(number), depth, face, body,
             )  # fmt: skip
-        raster.finish(depth, face)
+        _finish(depth, face)
     return Rendering(x0, y0, depth, face, body)
+
+
+@numba.njit(cache=True, nogil=True)
+def _place(vertices, pose, parameters, box):
+    """Corners (V, 3) in the camera's frame and their pixels (V, 2); ``pose`` (4, 4).
+
+    Widens ``box`` (4,) = left, top, right, bottom by the points that are not too near.
+    """
+    count = vertices.shape[0]
+    corners, pixels = np.empty((count, 3)), np.empty((count, 2))
+    for i in range(count):
+        x, y, z = vertices[i, 0], vertices[i, 1], vertices[i, 2]
+        for axis in range(3):
+            corners[i, axis] = (
+                pose[axis, 0] * x + pose[axis, 1] * y + pose[axis, 2] * z + pose[axis, 3]
+            )
+        u, v = project_point(corners[i, 0], corners[i, 1], corners[i, 2], parameters)
+        pixels[i, 0], pixels[i, 1] = u, v
+        if corners[i, 2] > NEAR_M:
+            box[0], box[1] = min(box[0], u), min(box[1], v)
+            box[2], box[3] = max(box[2], u), max(box[3], v)
+    return corners, pixels
+
+
+@numba.njit(cache=True, nogil=True)
+def _window_of(box, margin_px, width, height):
+    """The box widened by a margin and clipped to the image: x0, y0, x1, y1; zeros where empty."""
+    margin = margin_px + BOX_MARGIN_PX
+    x0 = max(np.floor(min(box[0], 1e6)) - margin, 0.0)
+    y0 = max(np.floor(min(box[1], 1e6)) - margin, 0.0)
+    x1 = min(np.ceil(max(box[2], -1e6)) + margin + 1, float(width))
+    y1 = min(np.ceil(max(box[3], -1e6)) + margin + 1, float(height))
+    if x1 <= x0 or y1 <= y0:
+        return 0, 0, 0, 0
+    return int(x0), int(y0), int(x1), int(y1)
+
+
+@numba.njit(cache=True, nogil=True)
+def _draw(corners, pixels, x0, y0, faces, rays, focal, cull_back, number, depth, face, body):
+    """Z-buffer one mesh into a window: corners (V, 3) camera frame, pixels (V, 2) of the image.
+
+    ``rays`` (H, W, 2) of the whole image, ``focal`` its focal length in pixels; ``depth`` (h, w),
+    infinite where nothing was drawn yet, ``face`` and ``body`` (h, w) are overwritten where this
+    mesh, called ``number``, is nearer.
+    """
+    height, width = depth.shape
+    bounds = np.empty((3, 3))
+    for f in range(faces.shape[0]):
+        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+        ax, ay, az = corners[i, 0], corners[i, 1], corners[i, 2]
+        bx, by, bz = corners[j, 0], corners[j, 1], corners[j, 2]
+        cx, cy, cz = corners[k, 0], corners[k, 1], corners[k, 2]
+        # sides of the pyramid from the camera through the triangle: a x b, b x c, c x a
+        n0x, n0y, n0z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+        volume = n0x * cx + n0y * cy + n0z * cz  # of the pyramid; negative where facing us
+        if volume == 0.0 or (cull_back and volume > 0.0):
+            continue
+        if az < NEAR_M or bz < NEAR_M or cz < NEAR_M:
+            continue
+        left = min(pixels[i, 0], pixels[j, 0], pixels[k, 0]) - x0
+        right = max(pixels[i, 0], pixels[j, 0], pixels[k, 0]) - x0
+        top = min(pixels[i, 1], pixels[j, 1], pixels[k, 1]) - y0
+        bottom = max(pixels[i, 1], pixels[j, 1], pixels[k, 1]) - y0
+        extent = max(right - left, bottom - top)
+        slack = SLACK_PX + BEND * extent * extent / focal
+        u0, u1 = max(left - slack, 0.0), min(right + slack, width - 1.0)
+        v0, v1 = max(top - slack, 0.0), min(bottom + slack, height - 1.0)
+        if u0 > u1 or v0 > v1:
+            continue
+        first, last = int(np.ceil(u0)), int(u1) + 1
+        n1x, n1y, n1z = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
+        n2x, n2y, n2z = cy * az - cz * ay, cz * ax - cx * az, cx * ay - cy * ax
+        sx, sy, sz = n0x + n1x + n2x, n0y + n1y + n2y, n0z + n1z + n2z  # the plane's normal
+        sign = 1.0 if volume > 0.0 else -1.0
+        narrow = extent > LARGE_PX
+        if narrow:
+            _bound(0, pixels[i], pixels[j], pixels[k], x0, y0, slack, bounds)
+            _bound(1, pixels[j], pixels[k], pixels[i], x0, y0, slack, bounds)
+            _bound(2, pixels[k], pixels[i], pixels[j], x0, y0, slack, bounds)
+        for v in range(int(np.ceil(v0)), int(v1) + 1):
+            if narrow:
+                low, high = u0, u1
+                for edge in range(3):
+                    bound = bounds[edge, 0] * v + bounds[edge, 1]
+                    if bounds[edge, 2] > 0.0:
+                        low = max(low, bound)
+                    elif bounds[edge, 2] < 0.0:
+                        high = min(high, bound)
+                first, last = int(np.ceil(low)), int(high) + 1
+            for u in range(first, last):
+                x, y = np.float64(rays[y0 + v, x0 + u, 0]), np.float64(rays[y0 + v, x0 + u, 1])
+                if (
+                    sign * (n0x * x + n0y * y + n0z) >= 0.0
+                    and sign * (n1x * x + n1y * y + n1z) >= 0.0
+                    and sign * (n2x * x + n2y * y + n2z) >= 0.0
+                ):
+                    z = np.float32(volume / (sx * x + sy * y + sz))
+                    if z < depth[v, u]:
+                        depth[v, u] = z
+                        face[v, u] = f
+                        body[v, u] = number
+
+
+@numba.njit(cache=True, nogil=True)
+def _bound(edge, p, q, opposite, x0, y0, slack, bounds):
+    """Which columns of a row may lie on the inner side of the projected edge p q, or within
+    ``slack`` px outside: from (1) or up to (-1) ``bounds[edge, 0]`` * row + ``bounds[edge, 1]``,
+    the sign in ``bounds[edge, 2]``; 0 for all columns. Pixels (2,) of the image."""
+    du, dv = q[0] - p[0], q[1] - p[1]
+    inner = du * (opposite[1] - p[1]) - dv * (opposite[0] - p[0])
+    side = 1.0 if inner > 0.0 else -1.0
+    across, along = -side * dv, side * du  # of the distance from the edge, times its length
+    if inner == 0.0 or abs(across) < 1e-9:
+        bounds[edge, 2] = 0.0
+        return
+    offset = across * (p[0] - x0) + along * (p[1] - y0) - slack * np.sqrt(du * du + dv * dv)
+    bounds[edge, 0] = -along / across
+    bounds[edge, 1] = offset / across
+    bounds[edge, 2] = 1.0 if across > 0.0 else -1.0
+
+
+@numba.njit(cache=True, nogil=True)
+def _blank(height, width):
+    """Buffers of a window (h, w) with nothing drawn: depth, face, body."""
+    depth = np.full((height, width), np.float32(np.inf), np.float32)
+    face = np.full((height, width), np.int32(NO_FACE), np.int32)
+    body = np.full((height, width), np.int16(NO_FACE), np.int16)
+    return depth, face, body
+
+
+@numba.njit(cache=True, nogil=True)
+def _finish(depth, face):
+    """Depth 0 where nothing was hit."""
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            if face[v, u] < 0:
+                depth[v, u] = 0
+
+
+@numba.njit(cache=True, nogil=True)
+def _draw_alone(vertices, faces, cull_back, pose, parameters, rays, margin_px):
+    """One mesh in the smallest window that holds it: x0, y0, depth, face, body."""
+    box = np.array([np.inf, np.inf, -np.inf, -np.inf])
+    corners, pixels = _place(vertices, pose, parameters, box)
+    x0, y0, x1, y1 = _window_of(box, margin_px, rays.shape[1], rays.shape[0])
+    depth, face, body = _blank(y1 - y0, x1 - x0)
+    if x1 > x0:
+        focal = min(parameters[0], parameters[1])
+        _draw(
+            corners, pixels, x0, y0, faces, rays, focal, cull_back, np.int16(0), depth, face, body
+        )  # fmt: skip
+        _finish(depth, face)
+    return x0, y0, depth, face, body

@@ -76,7 +76,7 @@ class ObjectImages:
         self._settings, self._labels = settings, labels
         self._renderer = open_renderer(settings.render_on, threads=1)
         self._threads = ThreadPool()
-        if threads is not None and self._renderer.device == "cpu":
+        if threads is not None:
             self._threads = threads
         self.mesh, self.cameras = mesh.simplified(TRACKING_FACES), recording.cameras
         self.count = recording.count

@@ -95,23 +95,3 @@ def test_single_precision_stays_single(seed):
         xd, yd = distort(point[0] * inverse, point[1] * inverse, tuple(single[4:12]))
         found = single[:2] * np.array([xd, yd], np.float32) + single[2:4]
         assert np.array_equal(found, pixel)
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_warps_form_is_the_plain_one(seed):
-    wp = pytest.importorskip(
-        "warp", reason="warp is not installed (pip install 'intercap-core[gpu]')"
-    )
-    from intercap_core.geometry.rigid import render_warp
-
-    lens, points = random_lens(seed), random_points(seed)
-    shape = (1, len(points))
-    vertices = wp.array(points, dtype=wp.vec3d, device="cpu")
-    poses = wp.array(np.eye(4)[None], dtype=wp.mat44d, device="cpu")
-    lens_of = wp.array(np.zeros(1, np.int32), dtype=wp.int32, device="cpu")
-    lenses = wp.array(lens[None], dtype=wp.float64, device="cpu")
-    corners = wp.empty(shape, dtype=wp.vec3d, device="cpu")
-    pixels = wp.empty(shape, dtype=wp.vec2d, device="cpu")
-    inputs = [vertices, poses, lens_of, lenses, corners, pixels]
-    wp.launch(render_warp.place, shape, inputs, device="cpu")
-    np.testing.assert_allclose(pixels.numpy()[0], project(points, lens), rtol=1e-12, atol=1e-9)
