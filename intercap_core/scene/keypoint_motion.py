@@ -173,7 +173,7 @@ class KeypointMotion:
     @cached_property
     def expected(self) -> np.ndarray:
         """Pixels (T, C, K, 2) of the points."""
-        return _project(self.paths.points, self.rig)[0]
+        return _pixels_of(self.paths.points, self.rig)
 
     @cached_property
     def speed_px(self) -> np.ndarray:
@@ -189,7 +189,7 @@ class KeypointMotion:
         """How far (T, C, K, 2), px, the points would be seen from where they are expected by
         images that are ``seconds`` older; NaN where the path is not known."""
         points = self.paths.at(self.times - seconds)
-        return _project(points, self.rig)[0] - self.expected
+        return _pixels_of(points, self.rig) - self.expected
 
     @cached_property
     def projector(self) -> np.ndarray:
@@ -239,7 +239,7 @@ def build_motion(
         expected, by_point = _project(smooth, rig)
         known = seen & np.isfinite(expected[..., 0])
         raw = np.where(known[..., None], pixels - expected, np.nan)
-        bias = _nanmedian(np.where(valid[..., None], raw, np.nan))
+        bias = known_median(np.where(valid[..., None], raw, np.nan))
         residual = raw - bias
         size = np.linalg.norm(residual, axis=-1)
         sigma = np.maximum(_scatter(size, known), MOTION_SIGMA_FLOOR_PX * scale)
@@ -263,7 +263,7 @@ def _seeing(
     sigma: np.ndarray,
     bias: np.ndarray,
 ) -> KeypointMotion:
-    expected, _ = _project(paths.points, rig)
+    expected = _pixels_of(paths.points, rig)
     seen = seen & np.isfinite(expected[..., 0])
     residual = np.where(seen[..., None], pixels - expected - bias, 0.0)
     valid = seen & (np.linalg.norm(residual, axis=-1) < OUTLIER_SIGMA * sigma)
@@ -291,13 +291,27 @@ def _triangulated(pixels: np.ndarray, seen: np.ndarray, rig: Rig) -> tuple[np.nd
 
 def _project(points: np.ndarray, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
     """Pixels (T, C, K, 2) and their derivatives (T, C, K, 2, 3) by points (T, K, 3)."""
+    pixels, by_camera = projection.project_with_jacobian(
+        _in_cameras(points, rig), rig.colour_parameters[:, None]
+    )
+    return _where_known(points, pixels), by_camera @ rig.colour_from_master[:, None, :3, :3]
+
+
+def _pixels_of(points: np.ndarray, rig: Rig) -> np.ndarray:
+    """Pixels (T, C, K, 2) of points (T, K, 3)."""
+    pixels = projection.project(_in_cameras(points, rig), rig.colour_parameters[:, None])
+    return _where_known(points, pixels)
+
+
+def _in_cameras(points: np.ndarray, rig: Rig) -> np.ndarray:
+    """Points (T, K, 3) in the frame of each colour camera, (T, C, K, 3)."""
     in_camera = np.moveaxis(apply(rig.colour_from_master, points.reshape(-1, 3)), 0, 1)
-    in_camera = np.swapaxes(in_camera.reshape(*points.shape[:2], len(rig), 3), 1, 2)
-    pixels, by_camera = projection.project_with_jacobian(in_camera, rig.colour_parameters[:, None])
-    by_point = by_camera @ rig.colour_from_master[:, None, :3, :3]
-    # A point that is not known must not come out as one at the smallest depth.
-    lost = ~np.isfinite(points[..., 0])[:, None]
-    return np.where(lost[..., None], np.nan, pixels), by_point
+    return np.swapaxes(in_camera.reshape(*points.shape[:2], len(rig), 3), 1, 2)
+
+
+def _where_known(points: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """``pixels``, NaN where the point is: projection would place it at the smallest depth."""
+    return np.where(~np.isfinite(points[..., 0])[:, None, :, None], np.nan, pixels)
 
 
 def _refitted(
@@ -323,16 +337,16 @@ def _refitted(
 def _scatter(size: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Robust standard deviation (C, K) a coordinate of residuals of length ``size`` (T, C, K);
     few samples count little against the view's others."""
-    of_point = _nanmedian(np.where(known, size, np.nan)) / 1.177  # of a Rayleigh median
+    of_point = known_median(np.where(known, size, np.nan)) / 1.177  # of a Rayleigh median
     number = known.sum(0)
-    of_view = _nanmedian(np.where(number > 0, of_point, np.nan).T)[:, None]
+    of_view = known_median(np.where(number > 0, of_point, np.nan).T)[:, None]
     of_view = np.where(number.any(1, keepdims=True), of_view, np.inf)
     share = number / (number + 5.0)
     few = np.where(number > 0, of_view, 0.0)
     return np.where(number > 0, share * of_point + (1 - share) * few, of_view)
 
 
-def _nanmedian(values: np.ndarray) -> np.ndarray:
+def known_median(values: np.ndarray) -> np.ndarray:
     """Median over the first axis, 0 where there is none."""
     order = np.sort(values, 0)  # NaN last
     count = np.isfinite(values).sum(0)

@@ -58,10 +58,11 @@ class TimeNoise:
     def precision(self, times: np.ndarray, variance: np.ndarray) -> np.ndarray:
         """Inverse covariances (N, T, T) of N series, in units of ``scale``; ``variance`` (N, T) is
         added to each sample: :data:`MISSING_VARIANCE` where there is none."""
-        whole = np.broadcast_to(self.covariance(times), (*variance.shape, len(times))).copy()
+        unique, of_series = np.unique(variance, axis=0, return_inverse=True)
+        whole = np.broadcast_to(self.covariance(times), (*unique.shape, len(times))).copy()
         rows = np.arange(len(times))
-        whole[:, rows, rows] += variance
-        return np.linalg.inv(whole) / self.scale**2
+        whole[:, rows, rows] += unique
+        return (np.linalg.inv(whole) / self.scale**2)[of_series.ravel()]
 
 
 def fit_noise(times: np.ndarray, series: np.ndarray, valid: np.ndarray) -> TimeNoise:

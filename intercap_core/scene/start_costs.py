@@ -21,7 +21,7 @@ from intercap_core.geometry.camera.transforms import invert
 from intercap_core.geometry.camera.triangulation import pixel_scale
 from intercap_core.person.subject_joints import MAX_IMAGE_SPEED_RAD_S
 from intercap_core.person.tracks import MAX_LINK_GAP_S
-from intercap_core.scene.keypoint_motion import MIN_CONFIDENCE
+from intercap_core.scene.keypoint_motion import MIN_CONFIDENCE, known_median
 
 MAX_PEOPLE = 3  # of an image, the surest
 LINK_SLACK_RAD = 0.05  # scatter of a person's middles between images; a detector's few pixels
@@ -131,10 +131,14 @@ class PairCosts:
     def of(cls, rays: np.ndarray, rig: Rig, reach: int, fewest: float) -> PairCosts:
         """From ``rays`` (T, C, P, K, 2); lags at which fewer than ``fewest`` sets tell stay NaN."""
         lags = range(-2 * reach, 2 * reach + 1)
-        cost = {
-            (a, b): np.stack([_cost(rays, rig, a, b, lag, fewest) for lag in lags])
-            for a, b in combinations(range(len(rig)), 2)
-        }
+        occupied = np.isfinite(rays[..., 0]).any((0, 3))  # (C, P)
+        people = [rays[:, c, places] for c, places in enumerate(occupied)]
+        cost = {}
+        for a, b in combinations(range(len(rig)), 2):
+            epipolar = _PairEpipolar.of(rig, a, b)
+            cost[a, b] = np.stack(
+                [_cost(people[a], people[b], epipolar, lag, fewest) for lag in lags]
+            )
         return cls(cost, len(rig), reach)
 
     def series(self, camera: int, late: int, others: Sequence[int], sets: np.ndarray) -> np.ndarray:
@@ -164,18 +168,20 @@ class PairCosts:
         return cost
 
 
-def _cost(rays: np.ndarray, rig: Rig, a: int, b: int, lag: int, fewest: float) -> np.ndarray:
+def _cost(
+    rays_a: np.ndarray, rays_b: np.ndarray, epipolar: _PairEpipolar, lag: int, fewest: float
+) -> np.ndarray:
     """One lag's costs (T,) of :class:`PairCosts`: of each person whom camera a follows, and the
     one of
     camera b who agrees best all along, how far the distances to each other's epipolar lines are
     from their medians over time; the mean over people by how much they move."""
-    sets = len(rays)
+    sets = len(rays_a)
     found = np.full(sets, np.nan)
     at = slice(max(0, -lag), min(sets, sets - lag))
     if at.stop - at.start < fewest:
         return found
-    first = rays[at, a]
-    distance = _epipolar(first, rays[at.start + lag : at.stop + lag, b], rig, a, b)
+    first = rays_a[at]
+    distance = epipolar.distances(first, rays_b[at.start + lag : at.stop + lag])
     seen = np.isfinite(distance).sum(0, keepdims=True)
     distance = np.where(seen >= fewest, distance, np.nan)  # of people who are seen for long enough
     known = np.isfinite(distance).any(-1)  # (T, P, Q)
@@ -185,7 +191,7 @@ def _cost(rays: np.ndarray, rig: Rig, a: int, b: int, lag: int, fewest: float) -
     for p in np.flatnonzero(np.isfinite(size).any(1)):
         own = distance[:, p, np.nanargmin(size[p])]
         own = own[:, np.isfinite(own).any(0)]
-        change = (own - np.nanmedian(own, axis=0)) / EPIPOLAR_PX_AT_1080P
+        change = (own - known_median(own)) / EPIPOLAR_PX_AT_1080P
         cost[p] = known_mean((change**2 / (1 + change**2)).T)
         weight[p] = np.where(np.isfinite(cost[p]), _moves(first[:, p]), np.nan)
     found[at] = known_mean(weight * cost) / known_mean(weight)
@@ -198,18 +204,30 @@ def _moves(rays: np.ndarray) -> float:
     return _NO_MOTION_RAD + float(np.nanmean(np.sqrt(np.nanvar(rays, axis=0).sum(-1))))
 
 
-def _epipolar(first: np.ndarray, second: np.ndarray, rig: Rig, a: int, b: int) -> np.ndarray:
-    """Signed distances (T, P, Q, K) of people (T, P, K, 2) of camera a and (T, Q, K, 2) of b from
-    each other's epipolar lines, pixels at 1080p (Sampson)."""
-    b_from_a = invert(rig[b].master_from_colour) @ rig[a].master_from_colour
-    x, y, z = b_from_a[:3, 3]
-    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ b_from_a[:3, :3]
-    scale = pixel_scale(rig)
-    focal = np.mean([rig[c].colour.fx / scale[c] for c in (a, b)])
-    one, two = (np.concatenate([p, np.ones_like(p[..., :1])], -1) for p in (first, second))
-    line, back = (one @ essential.T)[:, :, None], (two @ essential)[:, None]
-    size = np.sqrt((line[..., :2] ** 2).sum(-1) + (back[..., :2] ** 2).sum(-1))
-    return focal * (line * two[:, None]).sum(-1) / np.maximum(size, 1e-12)
+@dataclass(frozen=True, eq=False)
+class _PairEpipolar:
+    """Epipolar geometry of the cameras a and b."""
+
+    essential: np.ndarray
+    """(3, 3) essential matrix: ``y' essential x`` = 0 for rays x of a and y of b."""
+    focal: float
+    """Mean focal length, pixels at 1080p."""
+
+    @classmethod
+    def of(cls, rig: Rig, a: int, b: int) -> _PairEpipolar:
+        b_from_a = invert(rig[b].master_from_colour) @ rig[a].master_from_colour
+        x, y, z = b_from_a[:3, 3]
+        essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ b_from_a[:3, :3]
+        scale = pixel_scale(rig)
+        return cls(essential, np.mean([rig[c].colour.fx / scale[c] for c in (a, b)]))
+
+    def distances(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        """Signed distances (T, P, Q, K) of rays (T, P, K, 2) of a and (T, Q, K, 2) of b from each
+        other's epipolar lines, pixels at 1080p (Sampson)."""
+        one, two = (np.concatenate([p, np.ones_like(p[..., :1])], -1) for p in (first, second))
+        line, back = (one @ self.essential.T)[:, :, None], (two @ self.essential)[:, None]
+        size = np.sqrt((line[..., :2] ** 2).sum(-1) + (back[..., :2] ** 2).sum(-1))
+        return self.focal * (line * two[:, None]).sum(-1) / np.maximum(size, 1e-12)
 
 
 def known_mean(values: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,32 @@ _HEIGHTS = {
 }  # fmt: skip
 _ASIDE = {"shoulder": 0.19, "elbow": 0.27, "wrist": 0.32, "eye": 0.035, "ear": 0.08}
 _AHEAD = {"nose": 0.12, "eye": 0.1, "wrist": 0.15, "big_toe": 0.2, "small_toe": 0.17, "heel": -0.05}
+
+
+@dataclass(frozen=True)
+class DelayedPeople:
+    """Detections of cameras that were started late."""
+
+    images: list[list[list[np.ndarray] | None]]
+    """(T, C) lists of people (135, 3); None = no image."""
+    late: np.ndarray
+    """(C,) frame sets by which each camera's images are late."""
+
+    @property
+    def num_sets(self) -> int:
+        return len(self.images)
+
+    def people(self, t: int, c: int) -> np.ndarray:
+        """People (P, 135, 3) in camera ``c``'s image of set ``t``."""
+        image = t - int(self.late[c])
+        people = self.images[image][c] if 0 <= image < len(self.images) else None
+        return np.array(people or []).reshape(-1, 135, 3)
+
+    @property
+    def available(self) -> np.ndarray:
+        """(T, C) bool: the image shows somebody."""
+        views = range(len(self.late))
+        return np.array([[len(self.people(t, c)) > 0 for c in views] for t in range(self.num_sets)])
 
 
 def stick_person() -> np.ndarray:
@@ -50,6 +77,19 @@ def walking(
         c, s = np.cos(turn * t), np.sin(turn * t)
         result[t] = person @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
         result[t, :, :2] += start + t * step
+    return result
+
+
+def walker(times: np.ndarray) -> np.ndarray:
+    """(T, 135, 3), z up, at ``times`` (T,) s: the stick person walks to and fro, swinging the
+    arms."""
+    person = stick_person()
+    result = np.broadcast_to(person, (len(times), 135, 3)).copy()
+    result[:, :, 0] += 0.4 * np.sin(1.9 * times)[:, None]
+    result[:, :, 1] += 0.2 * np.sin(3.1 * times + 1)[:, None]
+    swing = 0.2 * np.sin(5.0 * times)[:, None]
+    result[:, 2:5, 0] += swing
+    result[:, 5:8, 0] -= swing
     return result
 
 

@@ -1,4 +1,4 @@
-"""Silent slips and time offsets from keypoints, on studio captures and on walking stick people."""
+"""Silent slips and time offsets from the keypoints of a walking stick person."""
 
 from __future__ import annotations
 
@@ -11,25 +11,12 @@ from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.geometry.camera.triangulation import reproject
 from intercap_core.scene.keypoint_timing import WINDOW_SETS, find_offsets
 from intercap_core.scene.slips import find_slips, interval_gains, longest_slip
-from tests.helpers.keypoint_capture import KeypointCapture, keypoint_capture, subject_keypoints
 from tests.helpers.synthetic_capture import ring
-from tests.helpers.synthetic_people import stick_person
+from tests.helpers.synthetic_people import walker
 
 FPS = 15.0
 RIG, UP = ring()
 TIMES = np.arange(40) / FPS
-
-
-def walker(times: np.ndarray) -> np.ndarray:
-    """(T, 135, 3), z up: a stick person who walks to and fro and swings the arms."""
-    person = stick_person()
-    result = np.broadcast_to(person, (len(times), 135, 3)).copy()
-    result[:, :, 0] += 0.4 * np.sin(1.9 * times)[:, None]
-    result[:, :, 1] += 0.2 * np.sin(3.1 * times + 1)[:, None]
-    swing = 0.2 * np.sin(5.0 * times)[:, None]
-    result[:, 2:5, 0] += swing
-    result[:, 5:8, 0] -= swing
-    return result
 
 
 def seen(exposures: np.ndarray, seed: int = 0, moving: bool = True) -> np.ndarray:
@@ -46,35 +33,6 @@ def seen(exposures: np.ndarray, seed: int = 0, moving: bool = True) -> np.ndarra
 
 def exposures(slip: np.ndarray, offset: np.ndarray | float = 0.0, fps: float = FPS) -> np.ndarray:
     return np.arange(len(slip))[:, None] / fps - slip / fps + offset
-
-
-@pytest.fixture(scope="module")
-def captures() -> list[KeypointCapture]:
-    return [
-        keypoint_capture("stool_sit", seed=9301, subject="s02"),
-        keypoint_capture("suitcase_carry", seed=9302, subject="s03", family="b"),
-    ]
-
-
-def test_all_slips_of_studio_captures_are_found_and_no_others(captures):
-    for capture in captures:
-        keypoints = subject_keypoints(capture)
-        found = find_slips(keypoints, capture.rig, capture.times, capture.fps)
-        true = [(c, int(capture.slip[:, c].max())) for c in range(6) if capture.slip[:, c].any()]
-        assert len(true) == 2
-        assert sorted((i.camera, i.slip) for i in found.intervals) == true
-        assert not ((capture.slip == 0) & (found.slip != 0)).any()
-
-
-def test_offsets_of_studio_captures(captures):
-    errors, normalised = [], []
-    for capture in captures:
-        found = find_offsets(subject_keypoints(capture), capture.slip, capture.rig, capture.times)
-        assert found.offset[0] == 0 and np.isfinite(found.sigma).all()
-        errors.append((found.offset - capture.offset)[1:])
-        normalised.append(errors[-1] / found.sigma[1:])
-    assert np.sqrt(np.mean(np.square(errors))) < 0.002
-    assert np.sqrt(np.mean(np.square(normalised))) < 2.0
 
 
 def test_nothing_is_found_where_nothing_slips():
