@@ -82,7 +82,7 @@ def folders(package: Path) -> list[str]:
     return sorted(path.name for path in (package.parent / "cache/intercap/kernels").iterdir())
 
 
-def test_an_edit_in_another_file_is_seen_and_nothing_is_compiled_twice(package: Path) -> None:
+def test_an_edit_in_another_file_recompiles_once(package: Path) -> None:
     assert called(package) == (11.0, 1, 0)
     assert called(package) == (11.0, 0, 1)
     inner, constants = package / "solve" / "inner.py", package / "solve" / "constants.py"
@@ -109,7 +109,7 @@ def test_numba_imported_first_and_a_folder_of_the_user(package: Path) -> None:
     assert not list(package.rglob("*.nb?"))
 
 
-def test_a_home_that_cannot_be_written_leaves_the_temporary_folder(package: Path) -> None:
+def test_without_a_writable_home_kernels_are_temporary(package: Path) -> None:
     blocked = package.parent / "blocked"
     blocked.write_text("a file, so no folder can be made here")
     temporary = package.parent / "temporary"
@@ -136,7 +136,7 @@ def test_several_processes_at_once(package: Path) -> None:
     assert len(list(Path(cache).iterdir())) == 1
 
 
-def test_folders_unused_for_weeks_are_emptied_but_for_the_last_few(tmp_path: Path) -> None:
+def test_old_folders_are_emptied_except_the_most_recent(tmp_path: Path) -> None:
     now_s, old_s = time.time(), (UNUSED_DAYS + 1) * DAY_S
     made = []
     for index in range(KEPT_FOLDERS + 3):

@@ -136,7 +136,7 @@ def test_a_changed_file_of_an_export_is_named(tmp_path: Path) -> None:
     assert find_damage(folder) == ""
 
 
-def test_wherever_the_disk_ends_nothing_is_left_and_no_process_crashes(tmp_path: Path) -> None:
+def test_a_full_disk_leaves_no_file_and_no_crash(tmp_path: Path) -> None:
     results, unharmed = tmp_path / "results", tmp_path / "unharmed"
     results.mkdir()
     done = subprocess.run(
@@ -149,7 +149,7 @@ def test_wherever_the_disk_ends_nothing_is_left_and_no_process_crashes(tmp_path:
     assert said == sorted(said), "more room, and yet it failed"
 
 
-def test_a_signal_in_the_midst_of_a_write_ends_the_process_in_order(tmp_path: Path) -> None:
+def test_a_signal_during_a_write_ends_the_process_cleanly(tmp_path: Path) -> None:
     results = tmp_path / "results"
     results.mkdir()
     for number in range(5):

@@ -90,7 +90,7 @@ def test_what_differs_is_named(changed: dict, words: str) -> None:
     assert now.differences(MADE) == [words]
 
 
-def test_every_changed_letter_of_an_artefact_is_found_or_harmless(tmp_path: Path) -> None:
+def test_changed_bytes_of_an_artefact_are_found_or_harmless(tmp_path: Path) -> None:
     """Attributes, records and values: no flipped bit gives another content without a word."""
     path = _artefact(tmp_path / "x.h5")
     long = replace(MADE, code={f"room{i}": "0123456789abcdef" for i in range(200)})

@@ -53,7 +53,7 @@ def test_what_was_measured_fits_with_a_margin(
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_longer_recordings_ask_for_no_less_and_every_attempt_for_more(stage: str) -> None:
+def test_requests_grow_with_length_and_attempt(stage: str) -> None:
     tiny = project()
     for ask in (memory_mb, minutes):
         assert ask(tiny, stage, SHORT) <= ask(tiny, stage, FEW) <= ask(tiny, stage, LONG)
@@ -85,7 +85,7 @@ def test_stages_on_a_gpu_are_those_of_the_settings() -> None:
     assert more == CUDA_MB
 
 
-def test_the_extent_of_a_virtual_recording_is_that_of_its_settings() -> None:
+def test_virtual_recordings_have_the_extent_of_their_settings() -> None:
     assert extent_of(project(), "cup_drink_s04") == Extent(6, 3)
 
 

@@ -78,7 +78,7 @@ def submitted(folder: Path, number: str) -> SubmittedJobInfo:
     return SubmittedJobInfo(job, number, aux)
 
 
-def test_of_a_controller_that_does_not_answer_nothing_else_is_asked(
+def test_jobs_stay_active_if_the_controller_does_not_answer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(plugin, "states", lambda name: None)

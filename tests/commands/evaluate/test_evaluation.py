@@ -142,7 +142,7 @@ def test_every_object_and_number_of_views_is_printed(capsys: pytest.CaptureFixtu
     assert "nan" not in printed
 
 
-def test_bodies_with_less_are_fitted_to_recordings_that_others_make() -> None:
+def test_reduced_bodies_share_recordings() -> None:
     projects = [load_project(path) for path in BODY_SETTINGS]
     first = projects[0]
     assert first.config.studio is not None
@@ -213,7 +213,7 @@ def test_keys_of_bodies_name_the_variant_and_the_interaction() -> None:
     assert flat["body.two_view_bad_frames_recall"] == 0
 
 
-def test_bodies_are_printed_by_interaction_rig_joint_and_worst_frame(
+def test_bodies_are_printed_by_interaction_and_rig(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     body_evaluation.print_bodies(_bodies())
