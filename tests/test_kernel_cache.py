@@ -117,7 +117,7 @@ def test_without_a_writable_home_kernels_are_temporary(package: Path) -> None:
     variables = {"XDG_CACHE_HOME": str(blocked), "TMPDIR": str(temporary)}
     done = python(package, "import intercap_core", **variables)
     assert done.returncode == 0
-    assert "compiled kernels are kept in " + str(temporary) in done.stderr
+    assert "compiled kernels are cached in " + str(temporary) in done.stderr
     (base,) = temporary.iterdir()
     assert stat.S_IMODE(base.stat().st_mode) == 0o700
     assert called(package, **variables) == (11.0, 1, 0)
