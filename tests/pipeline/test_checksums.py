@@ -152,7 +152,7 @@ def test_a_full_disk_leaves_no_file_and_no_crash(tmp_path: Path) -> None:
 def test_a_signal_during_a_write_ends_the_process_cleanly(tmp_path: Path) -> None:
     results = tmp_path / "results"
     results.mkdir()
-    for number in range(5):
+    for number in range(0, 6, 2):
         run = subprocess.Popen(
             [sys.executable, "-c", TOLD, str(results / "a.h5")],
             stdout=subprocess.PIPE, cwd=Path(__file__).parents[2],

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import pickle
-from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -142,16 +141,6 @@ def test_a_person_alone_counts_who_has_come_to_the_export(project: Project) -> N
         assert not field.exported_alone(folder)
     finally:
         kept.rename(body)
-
-
-def test_the_evaluation_times_the_verdict(project: Project) -> None:
-    """The stage with it less the stage without it, of the first recording that has come so far."""
-    nowhere = replace(project, sequences={"nobody": project.sequences[NAME]})
-    assert field.PART.time_one([nowhere]) == {}
-    assert replace(field.PART, timed=None).time_one([project]) == {}
-    found = field.PART.time_one([nowhere, project])
-    assert list(found) == ["verdict.seconds_per_frame"]
-    assert abs(found["verdict.seconds_per_frame"]) < 60  # of 6 frames, beside whatever else runs
 
 
 def test_the_report_leaves_objects_and_contact_out(project: Project) -> None:
