@@ -1,6 +1,7 @@
 """Digests of the code that each stage uses: a change of the core makes stale what it concerns.
 
-The modules that a stage reaches are found by following imports, including those inside functions.
+The modules that a stage reaches are found by following imports, including those inside functions,
+and calls of ``plugins.modules_of``.
 The digest covers their syntax trees without docstrings and comments, and the data files next to
 them: a reworded docstring makes nothing stale. Modules of declarations that all stages share
 (settings, schemas, project, constants) are followed name by name, so that a new setting of one
@@ -256,6 +257,8 @@ def _imports(node: ast.stmt, module: str, root: Path) -> list[tuple[str, str]]:
             base = _absolute(inner, module, root)
             targets = [(base, alias.name) for alias in inner.names]
             targets += [(f"{base}.{alias.name}", WHOLE) for alias in inner.names]
+        elif isinstance(inner, ast.Call):
+            targets = [(name, WHOLE) for name in _discovered(inner, root)]
         else:
             continue
         for name, used in targets:
@@ -263,6 +266,18 @@ def _imports(node: ast.stmt, module: str, root: Path) -> list[tuple[str, str]]:
                 found.append((name, used))
                 found += [(parent, WHOLE) for parent in _parents(name)]
     return found
+
+
+def _discovered(call: ast.Call, root: Path) -> list[str]:
+    """The modules that ``plugins.modules_of("package")`` imports; [] for any other call."""
+    function = call.func
+    name = function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")
+    argument = call.args[0] if call.args else None
+    package = argument.value if isinstance(argument, ast.Constant) else None
+    if name != "modules_of" or not isinstance(package, str):
+        return []
+    files = sorted(_path(package, root).parent.glob("*.py"))
+    return [f"{package}.{file.stem}" for file in files if file.stem != "__init__"]
 
 
 def _absolute(node: ast.ImportFrom, module: str, root: Path) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 
@@ -65,6 +66,17 @@ def test_imports_are_walked(package: Path) -> None:
     assert reached(package, "stages.scene") == {
         *("", "energy", "energy.ground", "solve", "solve.banded", "stages", "stages.scene"),
     }
+
+
+def test_discovered_modules_are_reached(package: Path) -> None:
+    (package / "stages/scene.py").write_text(
+        "from intercap_core.plugins import modules_of\nFOUND = modules_of('intercap_core.energy')\n"
+    )
+    before = code_digest("stages.scene", root=package)
+    assert {"energy.contact", "energy.ground"} <= reached(package, "stages.scene")
+    (package / "energy/new.py").write_text("WEIGHT = 3\n")
+    os.utime(package / "stages/scene.py", ns=(1, 1))  # its imports are cached by its date
+    assert code_digest("stages.scene", root=package) != before
 
 
 @pytest.mark.parametrize(
