@@ -63,12 +63,12 @@ def check_detector(project: Project) -> list[Fault]:
     """
     settings = project.config.detections
     if settings.keypoint_model is not None:
-        from intercap_core.formats.detections.models.onnx_pose import PoseModel
+        from intercap_core.formats.detections.onnx_pose import PoseModel
 
         PoseModel.load(settings)
     if settings.segmentation_model is None:
         return []
-    from intercap_core.formats.detections.models.onnx_segmentation import Segmenter
+    from intercap_core.formats.detections.onnx_segmentation import Segmenter
 
     classes = Segmenter.load(settings).classes
     return [

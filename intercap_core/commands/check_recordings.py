@@ -13,8 +13,7 @@ import numpy as np
 from intercap_core.config import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.detections import candidate_files, keypoint_files
-from intercap_core.formats.recordings.containers import RecordingPreview
-from intercap_core.formats.recordings.source import RecordingLayout
+from intercap_core.formats.recordings.source import RecordingLayout, RecordingPreview
 
 # Length of a recording as a share of the other cameras' or of the length that its header states.
 MIN_LENGTH_SHARE = 0.5  # a shorter one is a fault

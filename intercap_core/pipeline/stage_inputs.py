@@ -15,7 +15,7 @@ from pydantic import BaseModel
 from intercap_core.config import Annotation, BodyModels, Config, SequenceEntry
 from intercap_core.formats.recordings.behave import find_intrinsics_folder
 from intercap_core.formats.recordings.layouts import input_files
-from intercap_core.formats.released.file_names import intercap_file
+from intercap_core.formats.released import intercap_file
 from intercap_core.output.site.settings import changed
 from intercap_core.pipeline.checksums import InputChecksums
 from intercap_core.pipeline.code_digest import stage_code

@@ -197,7 +197,7 @@ def _segment(
     settings: DetectionsSettings,
 ) -> None:
     """Let the model find instances in the images of which no file says anything."""
-    from intercap_core.formats.detections.models.onnx_segmentation import Segmenter
+    from intercap_core.formats.detections.onnx_segmentation import Segmenter
 
     wanted = _unknown(images, [d.candidates_found for d in found])
     if not wanted:
@@ -222,7 +222,7 @@ def _find_people(
     settings: DetectionsSettings,
 ) -> None:
     """Let the model find keypoints in the images of which no file says anything."""
-    from intercap_core.formats.detections.models.onnx_pose import PoseModel
+    from intercap_core.formats.detections.onnx_pose import PoseModel
 
     wanted = _unknown(images, [d.keypoints_found for d in found])
     if not wanted:

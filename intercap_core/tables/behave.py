@@ -8,7 +8,7 @@ from typing import Any
 
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.behave import frame_folders
-from intercap_core.formats.released.file_names import PERSON_MESH
+from intercap_core.formats.released import PERSON_MESH
 from intercap_core.inputs.files import Unreadable
 from intercap_core.inputs.json_files import read_json
 from intercap_core.tables.project_files import Draft, Row

@@ -9,10 +9,9 @@ import cv2
 import numpy as np
 
 from intercap_core.formats.calibration.extrinsics import Extrinsics, read_extrinsics, write_rig_file
-from intercap_core.formats.calibration.files import read_calibration
+from intercap_core.formats.calibration.files import RecordedCameras, read_calibration
 from intercap_core.formats.calibration.k4a import colour_from_accelerometer
 from intercap_core.formats.calibration.k4a import read_calibration as read_kinect
-from intercap_core.formats.calibration.other import Recorded
 from intercap_core.formats.recordings import behave, intercap
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.transforms import is_rigid
@@ -168,7 +167,7 @@ def _make_storage(folder: Path) -> None:
         storage.release()
 
 
-def _calibration(name: str, recorded: Recorded, scale: float | None) -> object:
+def _calibration(name: str, recorded: RecordedCameras, scale: float | None) -> object:
     def read(folder: Path) -> None:
         found = read_calibration(folder / name, recorded, scale=scale)
         check_extrinsics(found.extrinsics)

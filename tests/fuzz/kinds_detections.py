@@ -18,8 +18,8 @@ from intercap_core.formats.detections.image_numbers import CameraImages
 from intercap_core.formats.detections.instance import Instance
 from intercap_core.formats.detections.keypoint_files import look_at_keypoints
 from intercap_core.formats.detections.keypoint_layouts import WHOLE_BODY
-from intercap_core.formats.detections.models.onnx_pose import PoseModel
-from intercap_core.formats.detections.models.onnx_segmentation import Segmenter
+from intercap_core.formats.detections.onnx_pose import PoseModel
+from intercap_core.formats.detections.onnx_segmentation import Segmenter
 from intercap_core.geometry.camera import masks
 from tests.fuzz.kind import ImplausibleError, Kind, finite, within
 from tests.helpers import tiny_onnx, tiny_pose

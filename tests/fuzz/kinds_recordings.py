@@ -10,8 +10,12 @@ import av
 import cv2
 import numpy as np
 
-from intercap_core.formats.recordings.encoded import encoded_size
-from intercap_core.formats.recordings.image_files import DamagedImage, read_colour, read_depth
+from intercap_core.formats.recordings.image_files import (
+    DamagedImage,
+    encoded_size,
+    read_colour,
+    read_depth,
+)
 from intercap_core.formats.recordings.k4a import KinectRecording
 from intercap_core.formats.recordings.source import CameraRecording
 from intercap_core.formats.recordings.timestamps import pair_images, read_timestamps

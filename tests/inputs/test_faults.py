@@ -16,7 +16,7 @@ import torch
 from intercap_core.commands.check import faults_of_truth
 from intercap_core.config import Annotation
 from intercap_core.errors import UserError
-from intercap_core.formats.recordings.encoded import encoded_size
+from intercap_core.formats.recordings.image_files import encoded_size
 from intercap_core.formats.recordings.k4a import KinectFile
 from intercap_core.geometry.camera import masks
 from intercap_core.geometry.rigid.mesh import colours_of

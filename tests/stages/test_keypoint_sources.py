@@ -114,7 +114,7 @@ def test_without_a_model_nothing_is_loaded():
     words = (
         "import sys, intercap_core.stages.detections; "
         "sys.exit('onnxruntime' in sys.modules or "
-        "'intercap_core.formats.detections.models.onnx_pose' "
+        "'intercap_core.formats.detections.onnx_pose' "
         "in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", words]).returncode == 0

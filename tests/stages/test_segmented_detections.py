@@ -86,7 +86,7 @@ def test_without_a_model_nothing_is_loaded(capture):
     words = (
         "import sys, intercap_core.stages.detections; "
         "sys.exit('onnxruntime' in sys.modules or "
-        "'intercap_core.formats.detections.models.onnx_model' "
+        "'intercap_core.formats.detections.onnx_model' "
         "in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", words]).returncode == 0

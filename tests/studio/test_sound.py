@@ -9,8 +9,8 @@ from scipy import signal
 
 from intercap_core.config import SequenceEntry, StudioCapture, StudioSettings
 from intercap_core.formats.recordings.layouts import open_layout
-from intercap_core.formats.recordings.sound import SOUND_RATE, Sound
 from intercap_core.formats.recordings.sound_delays import delay_between, sound_starts
+from intercap_core.formats.recordings.source import SOUND_RATE, Sound
 from intercap_core.studio.capture import erring_starts
 from intercap_core.studio.capture_folder import SOUND_RATE as STUDIO_RATE
 from intercap_core.studio.capture_folder import Device, DeviceFrame

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from intercap_core.cli import app
 from intercap_core.commands.check import faults_of_sequences
 from intercap_core.errors import UserError
-from intercap_core.formats.released.file_names import PERSON_MESH
+from intercap_core.formats.released import PERSON_MESH
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.project import load_project
 from intercap_core.stages import frames as frames_stage

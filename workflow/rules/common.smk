@@ -7,7 +7,7 @@ from snakemake.exceptions import WorkflowError
 
 from intercap_core.formats.recordings.layouts import input_files
 from intercap_core.errors import UserError
-from intercap_core.formats.released.file_names import files_of
+from intercap_core.formats.released import files_of
 from intercap_core.pipeline.plan import DATASET, STUDIO, Plan
 from intercap_core.pipeline.resources import (
     extent_of,

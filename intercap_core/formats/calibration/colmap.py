@@ -1,7 +1,7 @@
 """Calibrations of COLMAP: a folder with ``cameras`` and ``images``, both ``.bin`` or both ``.txt``.
 
-Poses are x_camera = R x_world + T with OpenCV's axes, the quaternion w x y z; the world has no
-scale. The first pixel's centre is at (0.5, 0.5), here at (0, 0).
+Poses are x_camera = R x_world + T with OpenCV's axes and a quaternion w x y z. The world has no
+scale. The centre of the first pixel is (0.5, 0.5); here it is (0, 0).
 """
 
 from __future__ import annotations
@@ -15,51 +15,65 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from intercap_core.errors import UserError
+from intercap_core.formats.calibration.files import (
+    CalibrationReader,
+    RecordedCameras,
+    group_images_by_camera,
+    to_calibration,
+)
 from intercap_core.formats.calibration.opencv import MAX_SIDE, Calibration, opencv_lens
-from intercap_core.formats.calibration.other import Recorded, fixed_cameras, put_together
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.inputs.files import MAX_MODEL_BYTES, decoded, read_bytes, read_text
 from intercap_core.inputs.json_files import whole
 from intercap_core.inputs.quotes import printable, quoted
 
-FIRST_PIXEL = 0.5  # where its centre is, in COLMAP's coordinates
-# Number, name, places of fx fy cx cy among the parameters, and of OpenCV's coefficients after them.
+
+class LensModel(NamedTuple):
+    """A camera model of COLMAP (src/colmap/sensor/models.h)."""
+
+    name: str
+    parameters: int
+    """How many parameters it has."""
+    matrix: tuple[int, int, int, int]
+    """Positions of fx, fy, cx, cy among them."""
+    distortion: tuple[int, ...]
+    """Positions of OpenCV's coefficients."""
+
+
 MODELS = {
-    0: ("SIMPLE_PINHOLE", 3, (0, 0, 1, 2), ()),
-    1: ("PINHOLE", 4, (0, 1, 2, 3), ()),
-    2: ("SIMPLE_RADIAL", 4, (0, 0, 1, 2), (3,)),
-    3: ("RADIAL", 5, (0, 0, 1, 2), (3, 4)),
-    4: ("OPENCV", 8, (0, 1, 2, 3), (4, 5, 6, 7)),
-    6: ("FULL_OPENCV", 12, (0, 1, 2, 3), (4, 5, 6, 7, 8, 9, 10, 11)),
+    0: LensModel("SIMPLE_PINHOLE", 3, (0, 0, 1, 2), ()),
+    1: LensModel("PINHOLE", 4, (0, 1, 2, 3), ()),
+    2: LensModel("SIMPLE_RADIAL", 4, (0, 0, 1, 2), (3,)),
+    3: LensModel("RADIAL", 5, (0, 0, 1, 2), (3, 4)),
+    4: LensModel("OPENCV", 8, (0, 1, 2, 3), (4, 5, 6, 7)),
+    6: LensModel("FULL_OPENCV", 12, (0, 1, 2, 3), (4, 5, 6, 7, 8, 9, 10, 11)),
 }
-# Those that are no polynomial or rational lens in the tangent of the angle.
+# These are no polynomial or rational function of the tangent of the angle.
 UNSUPPORTED = {
     5: "OPENCV_FISHEYE", 7: "FOV", 8: "SIMPLE_RADIAL_FISHEYE", 9: "RADIAL_FISHEYE",
     10: "THIN_PRISM_FISHEYE", 11: "RAD_TAN_THIN_PRISM_FISHEYE",
 }  # fmt: skip
-NUMBERS = {model[0]: number for number, model in MODELS.items()}
-_ADVICE = "export the model again"
-MAX_NAME = 4096  # bytes: a path that is longer is none
+NUMBERS = {model.name: number for number, model in MODELS.items()}
 
 
 class _Image(NamedTuple):
     quaternion: tuple[float, ...]
-    shift: tuple[float, ...]
+    translation: tuple[float, ...]
     camera: int
     name: str
 
 
-def is_colmap(folder: Path) -> bool:
-    """Whether the folder holds a sparse model."""
-    return _suffix(folder) is not None
+def _suffix(folder: Path) -> str | None:
+    """Suffix of the model's files. Binary files go first, as in COLMAP itself."""
+    for suffix in (".bin", ".txt"):
+        if all((folder / f"{name}{suffix}").is_file() for name in ("cameras", "images")):
+            return suffix
+    return None
 
 
-def read_colmap_calibration(folder: Path, recorded: Recorded, scale: float | None) -> Calibration:
-    """Read a sparse model; the binary files go before the text, as in COLMAP itself.
-
-    Raises UserError naming file, camera or image.
-    """
+def _read(folder: Path, recorded: RecordedCameras, scale: float | None) -> Calibration:
+    """Read a sparse model; raises UserError naming file, camera or image."""
     suffix = _suffix(folder)
     lenses_file, images_file = folder / f"cameras{suffix}", folder / f"images{suffix}"
     if suffix == ".bin":
@@ -68,53 +82,55 @@ def read_colmap_calibration(folder: Path, recorded: Recorded, scale: float | Non
     else:
         lenses = dict(_text_lenses(lenses_file))
         images = list(_text_images(images_file))
-    placed = []
+    posed = []
     for image in images:
         if image.camera not in lenses:
             raise UserError(
                 f"{images_file}: image {quoted(image.name)} is of camera {image.camera}, which "
                 f"{lenses_file.name} does not have; export the model again"
             )
-        placed.append((image.name, lenses[image.camera], _pose(image, images_file)))
-    cameras = fixed_cameras(folder, placed, recorded, scale=scale)
+        posed.append((image.name, lenses[image.camera], _pose(image, images_file)))
+    cameras = group_images_by_camera(folder, posed, recorded, scale=scale)
     unit = "its reconstruction is known but for its size"
-    return put_together(folder, "COLMAP", cameras, recorded, scale=scale, unit=unit)
+    return to_calibration(folder, "COLMAP", cameras, recorded, scale=scale, unit=unit)
 
 
-def _suffix(folder: Path) -> str | None:
-    for suffix in (".bin", ".txt"):
-        if all((folder / f"{name}{suffix}").is_file() for name in ("cameras", "images")):
-            return suffix
-    return None
+READER = CalibrationReader(
+    tool="COLMAP",
+    rank=1,
+    recognises=lambda path: _suffix(path) is not None,
+    read=_read,
+    parts=("cameras.txt", "images.txt", "cameras.bin", "images.bin"),
+)
 
 
 def _pose(image: _Image, path: Path) -> np.ndarray:
     w, x, y, z = image.quaternion
-    numbers = np.array([*image.quaternion, *image.shift])
+    numbers = np.array([*image.quaternion, *image.translation])
     if not np.isfinite(numbers).all() or abs(np.linalg.norm(image.quaternion) - 1) > 0.01:
         raise UserError(
             f"{path}: image {quoted(image.name)} has no unit quaternion and translation; export "
             "the model again"
         )
-    return rigid(Rotation.from_quat([x, y, z, w]).as_matrix(), np.array(image.shift))
+    return rigid(Rotation.from_quat([x, y, z, w]).as_matrix(), np.array(image.translation))
 
 
-def _lens(model: int, size: tuple[int, int], numbers: list[float], where: str) -> Intrinsics:
-    name, count, places, bends = MODELS[model]
-    if len(numbers) != count:
+def _lens(number: int, size: tuple[int, int], values: list[float], where: str) -> Intrinsics:
+    model = MODELS[number]
+    if len(values) != model.parameters:
         raise UserError(
-            f"{where}: model {name} has {len(numbers)} parameters, expected {count}; export the "
-            "model again"
+            f"{where}: model {model.name} has {len(values)} parameters, expected "
+            f"{model.parameters}; export the model again"
         )
-    fx, fy, cx, cy = (numbers[place] for place in places)
-    matrix = [[fx, 0, cx - FIRST_PIXEL], [0, fy, cy - FIRST_PIXEL], [0, 0, 1]]
-    distortion = [numbers[place] for place in bends]
+    fx, fy, cx, cy = (values[at] for at in model.matrix)
+    matrix = [[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]]
+    distortion = [values[at] for at in model.distortion]
     if not all(0 < n <= MAX_SIDE for n in size):
         raise UserError(f"{where}: images of {size[0]}x{size[1]} pixels; export the model again")
     return opencv_lens(size, matrix, distortion + [0.0] * max(0, 4 - len(distortion)), where)
 
 
-def _refuse(model: str, where: str) -> UserError:
+def _unsupported(model: str, where: str) -> UserError:
     return UserError(
         f"{where}: model {model} cannot be represented, expected {', '.join(NUMBERS)}; undistort "
         "the recordings (colmap image_undistorter), or reconstruct with one of these models"
@@ -122,7 +138,7 @@ def _refuse(model: str, where: str) -> UserError:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    text = read_text(path, MAX_MODEL_BYTES, advice=_ADVICE)
+    text = read_text(path, MAX_MODEL_BYTES, advice="export the model again")
     for number, line in enumerate(text.splitlines(), start=1):
         if not line.lstrip().startswith("#"):
             yield number, line.strip()
@@ -136,15 +152,15 @@ def _text_lenses(path: Path) -> Iterator[tuple[int, Intrinsics]]:
         try:
             identity, model, width, height, *rest = line.split()
             camera, size = whole(identity), (whole(width), whole(height))
-            numbers = [float(word) for word in rest]
+            values = [float(word) for word in rest]
         except ValueError:
             raise UserError(
                 f"{where}: expected CAMERA_ID MODEL WIDTH HEIGHT and parameters; export the model "
                 "again"
             ) from None
         if model not in NUMBERS:
-            raise _refuse(printable(model[:40]), where)
-        yield camera, _lens(NUMBERS[model], size, numbers, where)
+            raise _unsupported(printable(model[:40]), where)
+        yield camera, _lens(NUMBERS[model], size, values, where)
 
 
 def _text_images(path: Path) -> Iterator[_Image]:
@@ -164,15 +180,15 @@ def _text_images(path: Path) -> Iterator[_Image]:
                 "export the model again"
             )
         yield _Image(tuple(values[:4]), tuple(values[4:]), identity, name)
-        next(lines, None)  # its points, a line that may be empty
+        next(lines, None)  # the line of the image's points, which may be empty
 
 
 class _Bytes:
-    """A binary file, little endian, read from its start; ends with a UserError where it is cut."""
+    """A little-endian file, read from its start; raises UserError at an early end."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._at = path, 0
-        self._content = read_bytes(path, MAX_MODEL_BYTES, advice=_ADVICE)
+        self._content = read_bytes(path, MAX_MODEL_BYTES, advice="export the model again")
 
     def take(self, form: str) -> tuple[Any, ...]:
         end = self._at + struct.calcsize("<" + form)
@@ -183,7 +199,7 @@ class _Bytes:
         return values
 
     def name(self) -> str:
-        end = self._content.find(b"\0", self._at, self._at + MAX_NAME)
+        end = self._content.find(b"\0", self._at, self._at + 4096)  # longer than any path
         if end < 0:
             raise UserError(f"{self._path}: an image has no name; copy or export it again")
         name = decoded(self._path, self._content[self._at : end])
@@ -199,14 +215,14 @@ def _binary_lenses(content: _Bytes, path: Path) -> Iterator[tuple[int, Intrinsic
         camera, model, width, height = content.take("iiQQ")
         where = f"{path}: camera {camera}"
         if model not in MODELS:
-            raise _refuse(UNSUPPORTED.get(model, f"number {model}"), where)
-        numbers = list(content.take(f"{MODELS[model][1]}d"))
-        yield camera, _lens(model, (width, height), numbers, where)
+            raise _unsupported(UNSUPPORTED.get(model, f"number {model}"), where)
+        values = list(content.take(f"{MODELS[model].parameters}d"))
+        yield camera, _lens(model, (width, height), values, where)
 
 
 def _binary_images(content: _Bytes) -> Iterator[_Image]:
     for _ in range(content.take("Q")[0]):
         _, *values, camera = content.take("i7di")
         name = content.name()
-        content.skip(24 * content.take("Q")[0])  # its points: x, y and an identity each
+        content.skip(24 * content.take("Q")[0])  # points: x, y and an identity of 8 bytes each
         yield _Image(tuple(values[:4]), tuple(values[4:]), camera, name)

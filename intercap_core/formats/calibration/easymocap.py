@@ -1,9 +1,9 @@
 """Calibrations of EasyMocap: a folder with ``intri.yml`` and ``extri.yml``, as OpenCV writes YAML.
 
-``names`` lists the cameras; of each, ``K_<name>`` and ``dist_<name>`` (older files: ``D_<name>``)
-stand in the one, the rotation vector ``R_<name>``, its matrix ``Rot_<name>`` and ``T_<name>`` with
-x_camera = R x_world + T in the other; metres. ``W_`` and ``H_`` are the image's size where they are
-there; else it is that of the recordings.
+``names`` lists the cameras. Of each camera, ``intri.yml`` holds ``K_<name>`` and ``dist_<name>``
+(older files: ``D_<name>``). ``extri.yml`` holds the rotation vector ``R_<name>``, its matrix
+``Rot_<name>`` and ``T_<name>`` with x_camera = R x_world + T, metres. ``W_<name>`` and ``H_<name>``
+are the image's size; without them it is that of the recordings.
 """
 
 from __future__ import annotations
@@ -14,23 +14,25 @@ from typing import Any
 import numpy as np
 
 from intercap_core.errors import UserError
+from intercap_core.formats.calibration.files import (
+    CalibrationReader,
+    RecordedCameras,
+    ToolCamera,
+    to_calibration,
+)
 from intercap_core.formats.calibration.opencv import (
     Calibration,
-    image_size_of,
     load_opencv,
     opencv_lens,
     opencv_pose,
+    parse_image_size,
 )
-from intercap_core.formats.calibration.other import OtherCamera, Recorded, put_together
 from intercap_core.inputs.quotes import quoted
 
 INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
-SAME_ROTATION = 1e-3  # of the entries of one rotation's two forms; files have six digits
 
 
-def read_easymocap_calibration(
-    folder: Path, recorded: Recorded, scale: float | None
-) -> Calibration:
+def _read(folder: Path, recorded: RecordedCameras, scale: float | None) -> Calibration:
     """Read the pair of files; raises UserError naming file, camera and field."""
     for name in (INTRINSICS, EXTRINSICS):
         if not (folder / name).is_file():
@@ -48,14 +50,19 @@ def read_easymocap_calibration(
         matrix = _entry(lenses, f"K_{name}", where)
         if distortion is None:
             raise UserError(f"{where}: has no dist_{name}; add it (zeros for a plain lens)")
-        size = _size(lenses, name, where, recorded)
-        lens = opencv_lens(size, matrix, distortion, where)
-        cameras.append(
-            OtherCamera(
-                (name,), lens, _pose(poses, name, f"{folder / EXTRINSICS}: camera {quoted(name)}")
-            )
-        )
-    return put_together(folder, "EasyMocap", cameras, recorded, scale=scale, unit=None)
+        lens = opencv_lens(_size(lenses, name, where, recorded), matrix, distortion, where)
+        pose = _pose(poses, name, f"{folder / EXTRINSICS}: camera {quoted(name)}")
+        cameras.append(ToolCamera((name,), lens, pose))
+    return to_calibration(folder, "EasyMocap", cameras, recorded, scale=scale, unit=None)
+
+
+READER = CalibrationReader(
+    tool="EasyMocap",
+    rank=0,
+    recognises=lambda path: any((path / name).is_file() for name in (INTRINSICS, EXTRINSICS)),
+    read=_read,
+    parts=(INTRINSICS, EXTRINSICS),
+)
 
 
 def _entry(content: dict[str, Any], key: str, where: str) -> Any:
@@ -64,10 +71,12 @@ def _entry(content: dict[str, Any], key: str, where: str) -> Any:
     return content[key]
 
 
-def _size(content: dict[str, Any], name: str, where: str, recorded: Recorded) -> tuple[int, int]:
+def _size(
+    content: dict[str, Any], name: str, where: str, recorded: RecordedCameras
+) -> tuple[int, int]:
     stated = [content.get(f"{key}_{name}") for key in "WH"]
     if None not in stated:
-        return image_size_of(stated, where)
+        return parse_image_size(stated, where)
     size = recorded.size_of(name)
     if size is None:
         raise UserError(
@@ -78,12 +87,12 @@ def _size(content: dict[str, Any], name: str, where: str, recorded: Recorded) ->
 
 
 def _pose(content: dict[str, Any], name: str, where: str) -> np.ndarray:
-    shift = _entry(content, f"T_{name}", where)
-    vector, matrix = content.get(f"R_{name}"), content.get(f"Rot_{name}")
-    turns = [turn for turn in (vector, matrix) if turn is not None]
-    if not turns:
+    translation = _entry(content, f"T_{name}", where)
+    rotations = [content.get(f"{key}_{name}") for key in ("R", "Rot")]
+    rotations = [rotation for rotation in rotations if rotation is not None]
+    if not rotations:
         raise UserError(f"{where}: has no R_{name}; calibrate this camera too")
-    poses = [opencv_pose(turn, shift, where) for turn in turns]
-    if np.abs(poses[0] - poses[-1]).max() > SAME_ROTATION:
+    poses = [opencv_pose(rotation, translation, where) for rotation in rotations]
+    if np.abs(poses[0] - poses[-1]).max() > 1e-3:  # files have six digits
         raise UserError(f"{where}: R_{name} and Rot_{name} are two rotations; keep the right one")
     return poses[0]

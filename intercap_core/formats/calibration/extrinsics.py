@@ -1,4 +1,4 @@
-"""Files that say where the cameras of a capture are."""
+"""Poses of the cameras: rig files, and folders as the InterCap data set has them."""
 
 from __future__ import annotations
 
@@ -17,32 +17,31 @@ from intercap_core.geometry.camera.transforms import invert, is_rigid, rigid
 from intercap_core.inputs.json_files import read_object
 from intercap_core.inputs.quotes import printable, quoted
 
-MAX_DISTANCE_M = 100.0  # from the file's origin; farther: the file is in millimetres
-MAX_APART_M = 30.0  # of a camera from the master: a hall; farther: the file is in centimetres
-MIN_APART_M = 0.003  # of two cameras' centres of projection; a phone's lenses are 10 mm apart
-CAMERA_NAME = re.compile(r"[A-Za-z0-9_-]+")  # names datasets and files
-RELEASE_NAME = re.compile(r"Color(?:_(\d+))?\.json")
+MAX_DISTANCE_M = 100.0  # of a camera from the file's origin; beyond it, the file is in millimetres
+MAX_TO_MASTER_M = 30.0  # a sports hall; beyond it, the file is in centimetres
+MIN_APART_M = 0.003  # between two centres of projection; the lenses of a phone are 10 mm apart
+CAMERA_NAME = re.compile(r"[A-Za-z0-9_-]+")  # also the names of HDF5 groups and of files
 
 
 @dataclass(frozen=True)
 class Extrinsics:
-    """Poses of the colour cameras: name -> (4, 4), metres; the master's is the identity.
-
-    ``master_from_world`` (4, 4), metres: from the frame that the file itself is written in.
-    """
+    """Poses of the colour cameras."""
 
     master: str
+    """Name of the master camera."""
     master_from_colour: dict[str, np.ndarray]
+    """(4, 4) of each camera by name, metres; exactly the identity for the master."""
     master_from_world: np.ndarray = field(default_factory=lambda: np.eye(4))
+    """(4, 4), metres: from the frame in which the file states its poses."""
 
 
 def read_extrinsics(path: Path) -> Extrinsics:
-    """Read camera poses from a rig file, or from a folder as the InterCap dataset has it.
+    """Read camera poses from a rig file, or from a folder as the InterCap data set has it.
 
     A rig file is JSON: ``{"master": "k1", "cameras": {"k1": {"master_from_camera": 4x4}, ...}}``,
     metres. A folder holds ``Color.json``, ``Color_2.json``, ... with a rotation vector ``R`` and a
     translation ``T``, x_camera = R x_world + T; the cameras are named k1, k2, ... and k1 is the
-    master. Raises UserError naming file and camera where something is missing or impossible.
+    master. Raises UserError naming file and camera if something is missing or impossible.
     """
     path = Path(path)
     return _read_release_folder(path) if path.is_dir() else _read_rig_file(path)
@@ -69,8 +68,8 @@ def _read_rig_file(path: Path) -> Extrinsics:
         )
     if master not in cameras:
         raise UserError(
-            f"{path}: master {quoted(master)} is none of the cameras ({named(cameras)}); correct "
-            "the name or add the camera"
+            f"{path}: master {quoted(master)} is none of the cameras ({list_names(cameras)}); "
+            "correct the name or add the camera"
         )
     poses = {}
     for name, entry in cameras.items():
@@ -78,11 +77,7 @@ def _read_rig_file(path: Path) -> Extrinsics:
             pose = np.array(entry["master_from_camera"], np.float64)
         except (KeyError, TypeError, ValueError, OverflowError):
             pose = np.zeros(0)
-        if not CAMERA_NAME.fullmatch(name):
-            raise UserError(
-                f"{path}: camera {quoted(name)} has a name that no file can have, expected "
-                "letters, digits, '_' and '-'; rename it"
-            )
+        check_camera_name(path, name)
         if not is_rigid(pose):
             raise UserError(
                 f"{path}: camera {name!r} has no rigid 4x4 'master_from_camera' (rows of rotation "
@@ -90,17 +85,19 @@ def _read_rig_file(path: Path) -> Extrinsics:
             )
         check_distance(path, f"camera {name!r}", pose[:3, 3])
         poses[name] = pose
-    return placed(path, master, poses)
+    return relate_to_master(path, master, poses)
 
 
 def _read_release_folder(folder: Path) -> Extrinsics:
     try:
-        matches = {p: RELEASE_NAME.fullmatch(p.name) for p in folder.iterdir()}
+        matches = {
+            path: re.fullmatch(r"Color(?:_(\d+))?\.json", path.name) for path in folder.iterdir()
+        }
     except OSError as error:
         raise UserError(
             f"{folder}: cannot be read ({error.strerror}); check its permissions"
         ) from None
-    files = {int(m.group(1) or 1): p for p, m in matches.items() if m}
+    files = {int(match.group(1) or 1): path for path, match in matches.items() if match}
     if 1 not in files:
         raise UserError(
             f"{folder}: holds no Color.json (the master camera); give the folder of Color*.json "
@@ -110,25 +107,37 @@ def _read_release_folder(folder: Path) -> Extrinsics:
     for number, path in sorted(files.items()):
         content = read_object(path)
         try:
-            turn, shift = (np.array(content[k], np.float64).reshape(3) for k in ("R", "T"))
+            rotation, translation = (
+                np.array(content[key], np.float64).reshape(3) for key in ("R", "T")
+            )
         except (KeyError, TypeError, ValueError, OverflowError):
             raise UserError(
                 f"{path}: expected a rotation vector 'R' and a translation 'T' of three numbers "
                 "each; correct it"
             ) from None
-        if not (np.isfinite(turn).all() and np.isfinite(shift).all()):
+        if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
             raise UserError(
                 f"{path}: rotation vector 'R' or translation 'T' holds no finite number; calibrate "
                 "this camera again"
             )
-        check_distance(path, "the camera", shift)
-        poses[f"k{number}"] = invert(rigid(Rotation.from_rotvec(turn).as_matrix(), shift))
-    return placed(folder, "k1", poses)
+        check_distance(path, "the camera", translation)
+        camera_from_world = rigid(Rotation.from_rotvec(rotation).as_matrix(), translation)
+        poses[f"k{number}"] = invert(camera_from_world)
+    return relate_to_master(folder, "k1", poses)
 
 
-def check_distance(path: Path, camera: str, shift: np.ndarray) -> None:
-    """Raise UserError where a translation (3,) is too far for metres."""
-    distance = float(np.abs(shift).max())
+def check_camera_name(path: Path, name: str) -> None:
+    """Raise UserError for a name that cannot be part of a file's name."""
+    if not CAMERA_NAME.fullmatch(name):
+        raise UserError(
+            f"{path}: camera {quoted(name)} has a name that no file can have, expected "
+            "letters, digits, '_' and '-'; rename it"
+        )
+
+
+def check_distance(path: Path, camera: str, translation: np.ndarray) -> None:
+    """Raise UserError if a translation (3,) is too long to be in metres."""
+    distance = float(np.abs(translation).max())
     if distance > MAX_DISTANCE_M:
         raise UserError(
             f"{path}: {camera} has a translation of {distance:.4g} m, expected at most "
@@ -136,35 +145,34 @@ def check_distance(path: Path, camera: str, shift: np.ndarray) -> None:
         )
 
 
-def placed(path: Path, master: str, world_from_camera: dict[str, np.ndarray]) -> Extrinsics:
-    """The poses in the master's frame; raises UserError, naming the file, where two cameras are in
-    one place or one is farther off than a room is wide."""
-    found = relative_to(master, world_from_camera)
-    centres = {name: pose[:3, 3] for name, pose in found.master_from_colour.items()}
+def relate_to_master(
+    path: Path, master: str, world_from_camera: dict[str, np.ndarray]
+) -> Extrinsics:
+    """Express poses (4, 4) in the master's frame.
+
+    Raises UserError, naming the file, if two cameras are in one place or a camera is farther from
+    the master than a hall is long.
+    """
+    master_from_world = invert(world_from_camera[master])
+    poses = {name: master_from_world @ pose for name, pose in world_from_camera.items()}
+    poses[master] = np.eye(4)
+    centres = {name: pose[:3, 3] for name, pose in poses.items()}
     for name, centre in centres.items():
-        if (far := float(np.linalg.norm(centre))) > MAX_APART_M:
+        if (distance := float(np.linalg.norm(centre))) > MAX_TO_MASTER_M:
             raise UserError(
-                f"{path}: camera {name!r} is {far:.4g} m from {master!r}, expected at most "
-                f"{MAX_APART_M:.0f} m, so it is likely in centimetres; write it in metres"
+                f"{path}: camera {name!r} is {distance:.4g} m from {master!r}, expected at most "
+                f"{MAX_TO_MASTER_M:.0f} m, so it is likely in centimetres; write it in metres"
             )
-        for other, there in centres.items():
-            if other < name and np.linalg.norm(centre - there) < MIN_APART_M:
+        for other, other_centre in centres.items():
+            if other < name and np.linalg.norm(centre - other_centre) < MIN_APART_M:
                 raise UserError(
                     f"{path}: cameras {other!r} and {name!r} are in one place; correct the pose of "
                     "one of them"
                 )
-    return found
+    return Extrinsics(master, poses, master_from_world)
 
 
-def named(cameras: Iterable[str]) -> str:
-    """Names of cameras for a message, the first of many."""
+def list_names(cameras: Iterable[str]) -> str:
+    """Names of cameras for a message; of more than twelve, the first twelve."""
     names = [printable(str(name)[:40]) for name in islice(cameras, 13)]
     return ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
-
-
-def relative_to(master: str, world_from_camera: dict[str, np.ndarray]) -> Extrinsics:
-    """Express the poses in the master's frame; exactly the identity for the master itself."""
-    master_from_world = invert(world_from_camera[master])
-    poses = {name: master_from_world @ pose for name, pose in world_from_camera.items()}
-    poses[master] = np.eye(4)
-    return Extrinsics(master, poses, master_from_world)

@@ -1,72 +1,124 @@
-"""Calibrations in any form that is read; which one it is, the file or folder itself says."""
+"""Calibrations in any supported form, and what the readers of other tools' files share.
+
+``read_calibration`` asks the reader of each tool whether it recognises the file or folder; what no
+reader recognises is read in OpenCV's terms. A module of this package that defines ``READER``, a
+:class:`CalibrationReader`, adds a tool.
+"""
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from scipy.spatial.transform import Rotation
 
 from intercap_core.errors import UserError
-from intercap_core.formats.calibration.colmap import is_colmap, read_colmap_calibration
-from intercap_core.formats.calibration.easymocap import (
-    EXTRINSICS,
-    INTRINSICS,
-    read_easymocap_calibration,
+from intercap_core.formats.calibration.extrinsics import (
+    MAX_DISTANCE_M,
+    check_camera_name,
+    list_names,
+    relate_to_master,
 )
-from intercap_core.formats.calibration.nerfstudio import (
-    TRANSFORMS,
-    is_nerfstudio,
-    read_nerfstudio_calibration,
+from intercap_core.formats.calibration.opencv import (
+    CalibratedCamera,
+    Calibration,
+    read_opencv_calibration,
 )
-from intercap_core.formats.calibration.opencv import Calibration, read_opencv_calibration
-from intercap_core.formats.calibration.other import Recorded
-from intercap_core.formats.calibration.toml import read_toml_calibration
-from intercap_core.inputs.files import Unreadable
-from intercap_core.inputs.json_files import read_json
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.transforms import invert
+from intercap_core.plugins import modules_of
 
-PARTS = {  # a file that is half of a calibration: its folder is the whole
-    INTRINSICS, EXTRINSICS, "cameras.txt", "images.txt", "cameras.bin", "images.bin",
-}  # fmt: skip
+# Metres between the two cameras farthest apart, at least. Below it, the scale is wrong: cameras
+# that record a whole person stand farther apart.
+MIN_RIG_M = 0.05
+# Images of one camera whose poses differ by more were not taken from one place. Reconstructions of
+# rooms are accurate to millimetres and tenths of a degree.
+SAME_POSE_M = 0.01
+SAME_POSE_DEG = 0.3
+
+
+@dataclass(frozen=True)
+class RecordedCameras:
+    """Facts about the recordings that help to read a calibration."""
+
+    names: Collection[str] = ()
+    """Names of the recorded cameras."""
+    size_of: Callable[[str], tuple[int, int] | None] = field(default=lambda name: None)
+    """Width and height of a camera's first image; None if it cannot be read."""
+
+
+@dataclass(frozen=True)
+class CalibrationReader:
+    """Reader of the calibration files of one tool."""
+
+    tool: str
+    """Name of the tool."""
+    rank: int
+    """Readers are asked in this order: a lower rank first."""
+    recognises: Callable[[Path], bool]
+    """Whether a file or folder is a calibration of the tool."""
+    read: Callable[[Path, RecordedCameras, float | None], Calibration]
+    """Reads a path that is recognised; the last argument is metres for one unit of the file."""
+    parts: tuple[str, ...] = ()
+    """Names of files that hold half of a calibration; the user names their folder instead."""
+
+
+@dataclass(frozen=True, eq=False)
+class ToolCamera:
+    """One camera as a tool calibrated it, with OpenCV's axes."""
+
+    names: tuple[str, ...]
+    """Names that the recording may have, the most likely one first."""
+    lens: Intrinsics
+    """Lens of the colour camera."""
+    camera_from_world: np.ndarray
+    """(4, 4), in the file's unit of length."""
+
+
+@cache
+def calibration_readers() -> tuple[CalibrationReader, ...]:
+    """The readers of all tools, in the order in which they are asked."""
+    modules = modules_of("intercap_core.formats.calibration")
+    readers = [module.READER for module in modules if hasattr(module, "READER")]
+    return tuple(sorted(readers, key=lambda reader: (reader.rank, reader.tool)))
 
 
 def read_calibration(
-    path: Path, recorded: Recorded | None = None, *, scale: float | None = None
+    path: Path, recorded: RecordedCameras | None = None, *, scale: float | None = None
 ) -> Calibration:
-    """Read a calibration in OpenCV's terms, or of Pose2Sim, Anipose, EasyMocap, COLMAP, nerfstudio.
+    """Read a calibration in OpenCV's terms or of another tool.
 
-    ``recorded``: what the recordings say of their cameras. ``scale``: metres for one unit of the
-    file, None = not stated. Raises UserError as the format's reader does, and for a scale with a
-    file that is in metres by its own definition.
+    Raises UserError as the format's reader does, and for a scale with a file that is in metres by
+    its own definition.
+
+    Args:
+        path: file or folder.
+        recorded: names and image sizes of the recorded cameras.
+        scale: metres for one unit of the file, None = not stated.
     """
-    path, recorded = Path(path), recorded or Recorded()
-    other = read_other_calibration(path, recorded, scale)
-    if other is not None:
-        return other
+    path = Path(path)
+    calibration = read_tool_calibration(path, recorded or RecordedCameras(), scale)
+    if calibration is not None:
+        return calibration
     refuse_scale(path, scale)
     return read_opencv_calibration(path)
 
 
-def read_other_calibration(
-    path: Path, recorded: Recorded, scale: float | None
+def read_tool_calibration(
+    path: Path, recorded: RecordedCameras, scale: float | None
 ) -> Calibration | None:
-    """Read a calibration of another tool; None where the path is none of these."""
-    if path.is_dir():
-        if any((path / name).is_file() for name in (INTRINSICS, EXTRINSICS)):
-            return read_easymocap_calibration(path, recorded, scale)
-        if is_colmap(path):
-            return read_colmap_calibration(path, recorded, scale)
-        if (path / TRANSFORMS).is_file():
-            return read_nerfstudio_calibration(path / TRANSFORMS, recorded, scale)
-        return _one_toml_file(path, recorded, scale)
-    if path.name in PARTS:
+    """Read a calibration of another tool; None if no reader recognises the path."""
+    if not path.is_dir() and any(path.name in reader.parts for reader in calibration_readers()):
         raise UserError(f"{path}: is a part of a calibration; name its folder, {path.parent}")
-    if path.suffix.lower() == ".toml":
-        return read_toml_calibration(path, recorded, scale)
-    if path.suffix.lower() == ".json" and _has_frames(path):
-        return read_nerfstudio_calibration(path, recorded, scale)
-    return None
+    reader = next((reader for reader in calibration_readers() if reader.recognises(path)), None)
+    return None if reader is None else reader.read(path, recorded, scale)
 
 
 def refuse_scale(path: Path, scale: float | None) -> None:
-    """Raise UserError for a scale that is stated beside a file in metres."""
+    """Raise UserError if a scale is stated for a file in metres."""
     if scale is not None:
         raise UserError(
             f"{path}: is in metres, yet column calibration_scale of the table of sequences says "
@@ -74,18 +126,121 @@ def refuse_scale(path: Path, scale: float | None) -> None:
         )
 
 
-def _one_toml_file(folder: Path, recorded: Recorded, scale: float | None) -> Calibration | None:
-    files = sorted(folder.glob("[!.]*.toml"))
-    if len(files) > 1:
+def to_calibration(
+    path: Path,
+    tool: str,
+    cameras: Sequence[ToolCamera],
+    recorded: RecordedCameras,
+    *,
+    scale: float | None,
+    unit: str | None,
+) -> Calibration:
+    """Name the cameras as the recordings do and scale them to metres; the first is the master.
+
+    Raises UserError for names that are unsafe, used twice or absent from the recordings, and for a
+    scale that is missing or impossible.
+
+    Args:
+        path: file or folder, for messages.
+        tool: name of the tool, for messages.
+        cameras: the cameras in the file's order.
+        recorded: names of the recorded cameras.
+        scale: metres for one unit of the file, as the user states it.
+        unit: what is known of a unit that the file does not fix; None if it is the metre.
+    """
+    if not cameras:
+        raise UserError(f"{path}: holds no camera; calibrate again, or name another file")
+    if unit is not None and scale is None:
         raise UserError(
-            f"{folder}: holds {', '.join(file.name for file in files)}; name the one that is the "
-            "calibration"
+            f"{path}: {unit}, so nothing says how long a metre is in this file of {tool}; state "
+            "metres for one of its units in column calibration_scale of the table of sequences "
+            "(1 = metres, 0.001 = millimetres; else a distance that you measured between two "
+            "cameras, divided by that in the file)"
         )
-    return read_toml_calibration(files[0], recorded, scale) if files else None
+    poses: dict[str, np.ndarray] = {}
+    calibrated: dict[str, CalibratedCamera] = {}
+    for camera in cameras:
+        name = next((n for n in camera.names if n in recorded.names), camera.names[0])
+        check_camera_name(path, name)
+        if name in poses:
+            raise UserError(f"{path}: two cameras are named {name!r}; rename one")
+        pose = camera.camera_from_world.copy()
+        pose[:3, 3] *= scale or 1.0
+        poses[name] = invert(pose)
+        calibrated[name] = CalibratedCamera(camera.lens)
+    if recorded.names and not set(poses) & set(recorded.names):
+        raise UserError(
+            f"{path}: its cameras are {list_names(poses)}, the recordings are of "
+            f"{list_names(sorted(recorded.names))}: none is the same; give both the same names"
+        )
+    _check_size(path, np.stack([pose[:3, 3] for pose in poses.values()]), scale)
+    return Calibration(calibrated, relate_to_master(path, next(iter(poses)), poses))
 
 
-def _has_frames(path: Path) -> bool:
-    try:
-        return is_nerfstudio(read_json(path))
-    except Unreadable:
-        return False  # the reader of OpenCV's files says what is wrong with it
+def group_images_by_camera(
+    path: Path,
+    images: Iterable[tuple[str, Intrinsics, np.ndarray]],
+    recorded: RecordedCameras,
+    *,
+    scale: float | None,
+) -> list[ToolCamera]:
+    """Return one camera for all images of each fixed camera, in order of the cameras' names.
+
+    An image belongs to the recorded camera that a folder of its path or its own name states;
+    otherwise to its folder, or to itself. Raises UserError for a camera whose images were taken
+    from several places.
+
+    Args:
+        path: the calibration, for messages.
+        images: path, lens and camera_from_world (4, 4), in the file's unit, of each image.
+        recorded: names of the recorded cameras.
+        scale: metres for one unit of the file; None = only rotations are compared.
+    """
+    by_camera: dict[str, list[tuple[str, Intrinsics, np.ndarray]]] = {}
+    for image, lens, pose in images:
+        by_camera.setdefault(_camera_of(image, recorded.names), []).append((image, lens, pose))
+    for name, own in by_camera.items():
+        first, _, first_pose = own[0]
+        for image, _, pose in own[1:]:
+            distance = float(np.linalg.norm(invert(pose)[:3, 3] - invert(first_pose)[:3, 3]))
+            distance *= scale or 0.0
+            rotation = Rotation.from_matrix(pose[:3, :3] @ first_pose[:3, :3].T)
+            angle = np.degrees(rotation.magnitude())
+            if distance > SAME_POSE_M or angle > SAME_POSE_DEG:
+                raise UserError(
+                    f"{path}: camera {name!r} has {len(own)} images, of which {first} and "
+                    f"{image} are {distance:.3g} m and {angle:.2g} degrees apart, expected one "
+                    "place for each fixed camera; keep one image a camera, in a folder named after "
+                    "the camera or named so itself"
+                )
+    return [
+        ToolCamera((name,), by_camera[name][0][1], by_camera[name][0][2])
+        for name in sorted(by_camera)
+    ]
+
+
+def _camera_of(image: str, recorded: Collection[str]) -> str:
+    path = PurePosixPath(image.replace("\\", "/"))
+    folders = [part for part in path.parent.parts if part not in (".", "..", "/")]
+    for name in [*reversed(folders), path.stem]:
+        if name in recorded:
+            return name
+    own = [name for name in folders if name != "images"]
+    return own[-1] if own else path.stem
+
+
+def _check_size(path: Path, centres: np.ndarray, scale: float | None) -> None:
+    extent = np.linalg.norm(centres[:, None] - centres[None], axis=-1).max()
+    farthest = np.abs(centres).max()
+    stated = "" if scale is None else f" with calibration_scale {scale:g}"
+    if farthest > MAX_DISTANCE_M:
+        raise UserError(
+            f"{path}: a camera is {farthest:.4g} m from the origin{stated}, expected at most "
+            f"{MAX_DISTANCE_M:.0f} m; state the unit in column calibration_scale of the table of "
+            "sequences (0.001 = the file is in millimetres)"
+        )
+    if len(centres) > 1 and extent < MIN_RIG_M:
+        raise UserError(
+            f"{path}: all its cameras lie within {1000 * extent:.3g} mm{stated}, expected at least "
+            f"{1000 * MIN_RIG_M:.0f} mm; correct the scale, or calibrate again"
+        )

@@ -1,8 +1,9 @@
-"""Azure Kinect calibration JSON to lenses, for every colour and depth mode.
+"""Lenses of Azure Kinects from their calibration JSON, for every colour and depth mode.
 
-The lenses in the JSON are unitised: multiplied by the binned sensor size they give pixels of the
-whole (4:3 colour, square depth) image with (0, 0) at the *corner* of the first pixel; a mode then
-crops. Sizes and crops are those of the Azure Kinect Sensor SDK (MIT), ``src/transformation``.
+Lenses in the JSON are unitised: multiplied by the size of the binned sensor they give pixels of the
+whole image (4:3 for colour, square for depth) with (0, 0) at the *corner* of the first pixel. Each
+mode then crops. Sizes and crops are those of the Azure Kinect Sensor SDK (MIT),
+``src/transformation``.
 """
 
 from __future__ import annotations
@@ -13,14 +14,18 @@ from typing import Any
 import numpy as np
 
 from intercap_core.errors import UserError
-from intercap_core.formats.calibration.opencv import MAX_LENSES_APART_M
-from intercap_core.formats.calibration.plausible import METRIC_RADIUS, lens_fault
+from intercap_core.formats.calibration.opencv import (
+    MAX_LENSES_APART_M,
+    MIN_METRIC_RADIUS,
+    lens_fault,
+)
 from intercap_core.geometry.camera.intrinsics import DEFAULT_METRIC_RADIUS, Intrinsics
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import invert, is_rigid, rigid
 from intercap_core.inputs.json_files import parse_json
 from intercap_core.inputs.quotes import quoted
 
+# Names in the JSON.
 DEPTH_LOCATION = "CALIBRATION_CameraLocationD0"
 COLOUR_LOCATION = "CALIBRATION_CameraLocationPV0"
 LENS_MODEL = "CALIBRATION_LensDistortionModelBrownConrady"
@@ -29,11 +34,14 @@ ACCELEROMETER = "CALIBRATION_InertialSensorType_Accelerometer"
 
 @dataclass(frozen=True)
 class Mode:
-    """How a mode's image is cut from the binned sensor, pixels."""
+    """How the image of a mode is cut from the binned sensor: (width, height), pixels."""
 
     binned: tuple[int, int]
+    """Size of the binned sensor."""
     crop: tuple[int, int]
+    """Columns and rows that are cut off at the left and at the top."""
     size: tuple[int, int]
+    """Size of the image."""
 
 
 COLOUR_MODES = {
@@ -50,15 +58,15 @@ DEPTH_MODES = {
     "WFOV_2X2BINNED": Mode((512, 512), (0, 0), (512, 512)),
     "WFOV_UNBINNED": Mode((1024, 1024), (0, 0), (1024, 1024)),
 }
-# Positions of k1, k2, p1, p2, k3, k4, k5, k6 among the JSON's ModelParameters, whose order is
-# cx, cy, fx, fy, k1, k2, k3, k4, k5, k6, codx, cody, p2, p1.
+# Positions of k1, k2, p1, p2, k3, k4, k5, k6 among the JSON's ModelParameters. Their order is cx,
+# cy, fx, fy, k1, k2, k3, k4, k5, k6, codx, cody, p2, p1.
 DISTORTION_POSITIONS = (4, 5, 13, 12, 6, 7, 8, 9)
 
 
 def lens_of(entry: dict[str, Any], mode: Mode) -> Intrinsics:
     """Make the lens of one camera entry of the JSON in ``mode``.
 
-    Raises ValueError, KeyError or TypeError where the entry is not as the SDK writes it, and
+    Raises ValueError, KeyError or TypeError if the entry is not as the SDK writes it, and
     ValueError for a lens that no camera has.
     """
     intrinsics = entry["Intrinsics"]
@@ -73,7 +81,7 @@ def lens_of(entry: dict[str, Any], mode: Mode) -> Intrinsics:
         raise ValueError("its centre of distortion (codx, cody) is not 0, which is not supported")
     (binned_w, binned_h), (crop_x, crop_y) = mode.binned, mode.crop
     radius = float(entry.get("MetricRadius", 0.0))
-    # what is smaller means "not given" (the SDK's own test)
+    # NaN stays, and is refused below.
     lens = Intrinsics(
         *mode.size,
         fx=values[2] * binned_w,
@@ -81,7 +89,7 @@ def lens_of(entry: dict[str, Any], mode: Mode) -> Intrinsics:
         cx=values[0] * binned_w - crop_x - 0.5,
         cy=values[1] * binned_h - crop_y - 0.5,
         distortion=values[list(DISTORTION_POSITIONS)],
-        metric_radius=radius if not radius <= METRIC_RADIUS[0] else DEFAULT_METRIC_RADIUS,
+        metric_radius=radius if not radius <= MIN_METRIC_RADIUS else DEFAULT_METRIC_RADIUS,
     )
     fault = lens_fault(lens)
     if fault is not None:
@@ -115,9 +123,15 @@ def read_calibration(
 ) -> Camera:
     """Make a :class:`Camera` of a calibration JSON as Azure Kinect recordings hold it.
 
-    ``colour_mode`` is a key of ``COLOUR_MODES``, ``depth_mode`` one of ``DEPTH_MODES`` or None for
-    a recording without depth. The pose (4, 4) defaults to the identity. Raises UserError naming
-    ``source`` where the JSON or the mode is not what a recording holds.
+    Raises UserError naming ``source`` if the JSON or the mode is unknown.
+
+    Args:
+        content: the JSON.
+        colour_mode: key of ``COLOUR_MODES``.
+        depth_mode: key of ``DEPTH_MODES``; None for a recording without depth.
+        name: name of the camera.
+        source: the recording, for messages.
+        master_from_colour: pose (4, 4), metres; None = the identity.
     """
     for kind, mode, known in (
         ("colour", colour_mode, COLOUR_MODES),
@@ -144,9 +158,9 @@ def read_calibration(
 
 
 def colour_from_accelerometer(content: bytes, *, source: str) -> np.ndarray | None:
-    """Return the rotation (3, 3) from the accelerometer to the colour camera, None without one.
+    """Rotation (3, 3) from the accelerometer to the colour camera; None without an accelerometer.
 
-    Raises UserError naming ``source`` where the JSON is broken.
+    Raises UserError naming ``source`` if the JSON is broken.
     """
     try:
         sensors = _sensors(content, "InertialSensors", "SensorType")

@@ -1,8 +1,8 @@
-"""Calibration files in OpenCV's terms: lenses, depth lenses and poses of all cameras of a rig.
+"""Calibration files in OpenCV's terms, and the checks of every lens that a file states.
 
-JSON or YAML, by hand or as ``cv2.FileStorage`` writes it; docs/recordings.md shows an example.
-A lens has 4, 5 or 8 distortion coefficients in OpenCV's order (k1, k2, p1, p2[, k3[, k4, k5, k6]]);
-a pose is R, T of x_camera = R x_world + T, metres.
+A file is JSON or YAML, written by hand or by ``cv2.FileStorage``; docs/recordings.md shows an
+example. A lens has 4, 5 or 8 distortion coefficients in OpenCV's order (k1, k2, p1, p2[, k3[, k4,
+k5, k6]]). A pose is R, T of x_camera = R x_world + T, metres.
 """
 
 from __future__ import annotations
@@ -21,10 +21,9 @@ from intercap_core.formats.calibration.extrinsics import (
     CAMERA_NAME,
     Extrinsics,
     check_distance,
-    named,
-    placed,
+    list_names,
+    relate_to_master,
 )
-from intercap_core.formats.calibration.plausible import LONGEST_OFFSET_S, check_lens, check_rate
 from intercap_core.geometry.camera.intrinsics import DEFAULT_METRIC_RADIUS, Intrinsics
 from intercap_core.geometry.camera.projection import radial_fraction
 from intercap_core.geometry.camera.transforms import invert, is_rigid, rigid
@@ -34,41 +33,69 @@ from intercap_core.inputs.json_files import read_json
 from intercap_core.inputs.numbers import numbers_of
 from intercap_core.inputs.quotes import quoted
 
-SUFFIXES = (".json", ".yaml", ".yml")
-COEFFICIENTS = (4, 5, 8)
-ALIGNED = "aligned"
-MAX_LENSES_APART_M = 1.0  # colour and depth lens of one camera; farther: the file is in millimetres
+# Focal lengths in units of the longer side of the image. 0.2 sees 136 degrees across, about the
+# limit of a pinhole with distortion (the wide depth mode of the Azure Kinect has 0.49). 20 sees 3
+# degrees, as an 800 mm lens before a full-frame sensor.
+MIN_FOCAL_SIDES = 0.2
+MAX_FOCAL_SIDES = 20.0
+MAX_ASPECT = 2.0  # of fx to fy or fy to fx; anamorphic lenses squeeze by 2
+MAX_OFF_IMAGE = 1.0  # image widths by which a principal point may lie outside, as of cropped images
+# Radius of the normalised image plane up to which a lens is defined: the Azure Kinect's is 1.7, 10
+# is at 84 degrees. The Azure Kinect Sensor SDK takes a radius below 1e-4 as "not stated".
+MIN_METRIC_RADIUS = 1e-4
+MAX_METRIC_RADIUS = 10.0
+# The distorted image must grow with the angle over a quarter of the shorter side around its centre,
+# otherwise the coefficients are in another order or of another lens.
+LEAST_COVERED = 0.25
+# Factor by which the distortion may change the scale between centre and edge. Measured lenses stay
+# between a quarter and 2 (130 degrees of a GoPro: 0.3 at the corner).
+MAX_SCALE_CHANGE = 4.0
+MAX_TANGENTIAL = 0.5  # of the image's radius, at its edge; a lens that is mounted askew has 0.01
+MIN_FPS, MAX_FPS = 0.05, 10_000.0  # time lapse to high-speed cameras
+LONGEST_OFFSET_S = 1e9  # of clocks that count from 1970
+# Between the colour and the depth lens of a camera; beyond it, the file is in millimetres.
+MAX_LENSES_APART_M = 1.0
 MAX_SIDE = 32_768  # px of an image; the largest sensors have half of it
-MAX_OFF_CENTRE = 0.25  # of the image's width or height, of a principal point; 0.03 is usual
+# Shares of the image by which a principal point lies off its middle; 0.03 is usual.
+MAX_OFF_CENTRE = 0.25
+_MATRIX_TYPES = ("opencv-matrix", "opencv-nd-matrix")  # OpenCV 5 writes vectors as the latter
 
 
 @dataclass(frozen=True, eq=False)
 class CalibratedCamera:
-    """One camera of the file; ``fps`` None = not stated; times are in seconds."""
+    """One camera of a calibration."""
 
     colour: Intrinsics
+    """Lens of the colour camera."""
     depth: Intrinsics | None = None
+    """Lens of the depth camera; None without depth."""
     colour_from_depth: np.ndarray | None = None
+    """(4, 4), metres."""
     fps: float | None = None
+    """Images a second; None = not stated."""
     time_offset: float = 0.0
+    """Seconds that are added to the times of all images."""
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """A whole file: cameras by name, and their poses."""
+    """All cameras of a calibration and their poses."""
 
     cameras: dict[str, CalibratedCamera]
+    """Lenses by the camera's name."""
     extrinsics: Extrinsics
+    """Poses of the same cameras."""
 
 
 def read_opencv_calibration(path: Path) -> Calibration:
     """Read a calibration file, or a folder with one file a camera, ``<camera>.json|yaml|yml``.
 
-    Raises UserError naming file, camera and field where something is missing or impossible.
+    Raises UserError naming file, camera and field if something is missing or impossible.
     """
     path = Path(path)
     if path.is_dir():
-        files = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
+        suffixes = (".json", ".yaml", ".yml")
+        files = sorted(file for file in path.iterdir() if file.suffix.lower() in suffixes)
         content: dict[str, Any] = {"cameras": {file.stem: load_opencv(file) for file in files}}
     else:
         content = load_opencv(path)
@@ -81,10 +108,10 @@ def read_opencv_calibration(path: Path) -> Calibration:
     master = content.get("master", next(iter(entries)))
     if not isinstance(master, str) or master not in entries:
         raise UserError(
-            f"{path}: master {quoted(master)} is none of the cameras ({named(entries)}); "
+            f"{path}: master {quoted(master)} is none of the cameras ({list_names(entries)}); "
             "correct the name or add the camera"
         )
-    fps = _rate(content, "fps", f"{path}")
+    fps = _rate(content, f"{path}")
     cameras, poses = {}, {}
     for name, entry in entries.items():
         where = f"{path}: camera {quoted(name)}"
@@ -95,18 +122,19 @@ def read_opencv_calibration(path: Path) -> Calibration:
             )
         cameras[str(name)] = _camera(entry, where, fps)
         poses[str(name)] = _pose(entry, where, path, is_master=name == master)
-    return Calibration(cameras, placed(path, str(master), poses))
+    return Calibration(cameras, relate_to_master(path, str(master), poses))
 
 
 def opencv_lens(size: tuple[int, int], matrix: Any, coefficients: Any, where: str) -> Intrinsics:
     """Make a lens of ``size`` (width, height) from a matrix (3, 3) and 4, 5 or 8 coefficients.
 
-    Its metric radius ends where the distortion turns back, so that nothing outside the view is
-    projected into the image. Raises UserError, beginning with ``where``, for what is no lens.
+    Its metric radius ends at the angle beyond which the distortion turns back, so that nothing
+    outside the view is projected into the image. Raises UserError, beginning with ``where``, for
+    numbers that describe no lens.
     """
     k, d = numbers_of(matrix, where, "camera_matrix"), numbers_of(coefficients, where, "distortion")
     d = d.ravel()
-    if d.size not in COEFFICIENTS:
+    if d.size not in (4, 5, 8):
         more = (
             "; thin prism and tilt are not supported: calibrate with CALIB_RATIONAL_MODEL alone"
             if d.size in (12, 14)
@@ -115,8 +143,8 @@ def opencv_lens(size: tuple[int, int], matrix: Any, coefficients: Any, where: st
         raise UserError(
             f"{where}: distortion_coefficients has {d.size} numbers, expected 4, 5 or 8{more}"
         )
-    plain = k.shape == (3, 3) and k[0, 1] == 0 and k[1, 0] == 0 and (k[2] == [0, 0, 1]).all()
-    if not plain or min(k[0, 0], k[1, 1]) <= 0:
+    is_plain = k.shape == (3, 3) and k[0, 1] == 0 and k[1, 0] == 0 and (k[2] == [0, 0, 1]).all()
+    if not is_plain or min(k[0, 0], k[1, 1]) <= 0:
         raise UserError(
             f"{where}: camera_matrix is no [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels; "
             "correct it"
@@ -137,10 +165,10 @@ def opencv_lens(size: tuple[int, int], matrix: Any, coefficients: Any, where: st
 
 
 def turning_radius(distortion: np.ndarray) -> float:
-    """Return the radius up to which a point farther out is also imaged farther out.
+    """Radius up to which a point that lies farther out is also imaged farther out.
 
-    ``distortion`` (8,). The radial part of OpenCV's model, r d(r^2), must grow and stay finite;
-    5 where it does so over all of 80 degrees.
+    The radial part of OpenCV's model, r d(r^2), must grow and stay finite up to there. The result
+    is at most 5, which is at 79 degrees. ``distortion`` has the shape (8,).
     """
     radius = np.linspace(0, 5, 50001)
     lens = np.concatenate([(1, 1, 0, 0), distortion, (np.inf,)])
@@ -151,89 +179,109 @@ def turning_radius(distortion: np.ndarray) -> float:
     return float(radius[max(1, bad[0])] if len(bad) else radius[-1])
 
 
-def _camera(entry: dict[str, Any], where: str, fps: float | None) -> CalibratedCamera:
-    colour = _lens(entry, where)
-    offset = numbers_of(entry.get("time_offset", 0.0), where, "time_offset")
-    if offset.size != 1:
-        raise UserError(
-            f"{where}: time_offset is {quoted(offset.tolist())}, expected seconds; correct it"
-        )
-    if abs(offset.ravel()[0]) > LONGEST_OFFSET_S:
-        raise UserError(
-            f"{where}: time_offset is {offset.ravel()[0]:.4g}, expected seconds; correct it"
-        )
-    depth = entry.get("depth")
-    lens, between = None, None
-    if depth == ALIGNED:
-        lens, between = colour, np.eye(4)
-    elif isinstance(depth, dict):
-        lens = _lens(depth, f"{where}, depth")
-        between = numbers_of(depth.get("colour_from_depth"), where, "depth.colour_from_depth")
-        if not is_rigid(between):
-            raise UserError(
-                f"{where}: depth.colour_from_depth is no rigid 4x4 transform (x_colour = R x_depth "
-                "+ t, metres, last row 0 0 0 1); correct it"
-            )
-        apart = float(np.linalg.norm(between[:3, 3]))
-        if apart > MAX_LENSES_APART_M:
-            raise UserError(
-                f"{where}: depth.colour_from_depth moves by {apart:.4g} m, expected at most "
-                f"{MAX_LENSES_APART_M:.0f} m, so it is likely in millimetres; write it in metres"
-            )
-    elif depth is not None:
-        raise UserError(
-            f"{where}: depth is {quoted(depth, 40)}, expected {ALIGNED!r} or a lens with "
-            "colour_from_depth; correct it"
-        )
-    own = _rate(entry, "fps", where)
-    return CalibratedCamera(colour, lens, between, own or fps, float(offset.ravel()[0]))
+def check_lens(lens: Intrinsics, where: str) -> Intrinsics:
+    """Return the lens; raises UserError, beginning with ``where``, if no camera has such a lens."""
+    fault = lens_fault(lens)
+    if fault is not None:
+        raise UserError(f"{where}: {fault}; calibrate again, or give this camera's own calibration")
+    return lens
 
 
-def image_size_of(size: Any, where: str) -> tuple[int, int]:
+def lens_fault(lens: Intrinsics) -> str | None:
+    """Why the lens is impossible, for a message; None if it is possible."""
+    side = max(lens.width, lens.height)
+    low, high = MIN_FOCAL_SIDES * side, MAX_FOCAL_SIDES * side
+    if not np.isfinite(lens.parameters).all():
+        return "the lens has a value that is not a finite number"
+    for name, focal in (("fx", lens.fx), ("fy", lens.fy)):
+        if not low <= focal <= high:
+            return (
+                f"{name} is {focal:.4g} px, expected {low:.0f} to {high:.0f} for images of "
+                f"{lens.width}x{lens.height}"
+            )
+    if not 1 / MAX_ASPECT <= lens.fx / lens.fy <= MAX_ASPECT:
+        return f"fx {lens.fx:.4g} and fy {lens.fy:.4g} differ by more than {MAX_ASPECT:g} times"
+    for name, centre, size in (("cx", lens.cx, lens.width), ("cy", lens.cy, lens.height)):
+        if not -MAX_OFF_IMAGE * size <= centre <= (1 + MAX_OFF_IMAGE) * size:
+            return f"{name} is {centre:.4g} px, far outside the image's {size}"
+    if not MIN_METRIC_RADIUS <= lens.metric_radius <= MAX_METRIC_RADIUS:
+        return (
+            f"its metric radius is {lens.metric_radius:.4g}, expected {MIN_METRIC_RADIUS:g} to "
+            f"{MAX_METRIC_RADIUS:g}"
+        )
+    return _distortion_fault(lens)
+
+
+def _distortion_fault(lens: Intrinsics) -> str | None:
+    """Why the distortion is impossible; None if it is possible.
+
+    Within the image, a point that lies farther out must be imaged farther out, and the scale may
+    change only so far.
+    """
+    focal = min(lens.fx, lens.fy)
+    edge = min(lens.width, lens.height) / 2 / focal  # radius of the normalised image plane
+    distortion = np.asarray(lens.distortion, np.float64)
+    radius = np.concatenate([[0], np.geomspace(1e-6, 1e-2, 200), np.linspace(0.01, 5, 4992)[1:]])
+    coefficients = np.concatenate([(1, 1, 0, 0), distortion, (np.inf,)])
+    with np.errstate(all="ignore"):
+        above, below = radial_fraction(radius * radius, coefficients)
+        image = radius * above / below
+        grows = (np.diff(image) > 0) & (below[1:] > 0) & np.isfinite(image[1:])
+    turn = int(np.argmin(grows)) if not grows.all() else len(grows)
+    covered = float(image[turn]) if np.isfinite(image[turn]) else 0.0
+    shown = np.array2string(distortion, precision=4, max_line_width=200)
+    if covered < 2 * LEAST_COVERED * edge:
+        return (
+            f"the distortion {shown} turns back {covered * focal:.0f} px from the centre of images "
+            f"of {lens.width}x{lens.height}"
+        )
+    inside = image[: turn + 1] <= edge
+    slope = np.diff(image[: turn + 1]) / np.diff(radius[: turn + 1])
+    steepest = float(slope[inside[:-1]].max(initial=1.0))
+    if steepest > MAX_SCALE_CHANGE:
+        return (
+            f"the distortion {shown} scales the image's edge {steepest:.3g} times its centre, "
+            f"expected at most {MAX_SCALE_CHANGE:g}"
+        )
+    tangential = 3 * float(np.abs(distortion[2:4]).max()) * min(edge, radius[turn])
+    if tangential > MAX_TANGENTIAL:
+        return f"the tangential distortion {shown} moves the image's edge by {tangential:.0%}"
+    return None
+
+
+def check_rate(fps: float | None, where: str) -> None:
+    """Raise UserError for a frame rate that no camera has."""
+    if fps is not None and not MIN_FPS <= fps <= MAX_FPS:
+        raise UserError(
+            f"{where}: fps is {fps:.4g}, expected {MIN_FPS:g} to {MAX_FPS:g}; correct it"
+        )
+
+
+def parse_number(value: Any, where: str, field: str, expected: str = "one number") -> float:
+    """A single finite number; raises UserError, beginning with ``where``, for anything else."""
+    numbers = numbers_of(value, where, field)
+    if numbers.size != 1:
+        raise UserError(f"{where}: {field} is {quoted(value, 40)}, expected {expected}; correct it")
+    return float(numbers.ravel()[0])
+
+
+def parse_image_size(size: Any, where: str) -> tuple[int, int]:
     """Width and height in whole pixels; raises UserError, beginning with ``where``, otherwise."""
     numbers = numbers_of(size, where, "image_size").ravel()
-    if (
-        numbers.size != 2
-        or (numbers < 1).any()
-        or ((numbers != numbers.round()) | (numbers > MAX_SIDE)).any()
-    ):
+    whole = (numbers == numbers.round()) & (numbers >= 1) & (numbers <= MAX_SIDE)
+    if numbers.size != 2 or not whole.all():
         raise UserError(
             f"{where}: image_size is {quoted(size)}, expected width and height in pixels"
         )
     return int(numbers[0]), int(numbers[1])
 
 
-def _lens(entry: dict[str, Any], where: str) -> Intrinsics:
-    for key in ("camera_matrix", "distortion_coefficients"):
-        if key not in entry:
-            raise UserError(f"{where}: has no {key}; add it")
-    size = entry.get("image_size", [entry.get("image_width"), entry.get("image_height")])
-    return opencv_lens(
-        image_size_of(size, where), entry["camera_matrix"], entry["distortion_coefficients"], where
-    )
-
-
-def _pose(entry: dict[str, Any], where: str, path: Path, *, is_master: bool) -> np.ndarray:
-    """World from camera (4, 4)."""
-    turn, shift = (entry.get(a, entry.get(b)) for a, b in (("R", "rvec"), ("T", "tvec")))
-    if turn is None and shift is None and is_master:
-        return np.eye(4)
-    if turn is None or shift is None:
-        raise UserError(
-            f"{where}: has no pose; add R (3x3, or a rotation vector) and T with x_camera = R "
-            "x_world + T, metres"
-        )
-    camera_from_world = opencv_pose(turn, shift, where)
-    check_distance(path, f"camera {where.rpartition(' ')[2]}", camera_from_world[:3, 3])
-    return invert(camera_from_world)
-
-
-def opencv_pose(turn: Any, shift: Any, where: str) -> np.ndarray:
+def opencv_pose(rotation: Any, translation: Any, where: str) -> np.ndarray:
     """Camera from world (4, 4) of a rotation, a matrix (3, 3) or vector (3,), and a translation.
 
-    Raises UserError, beginning with ``where``, for what is none.
+    Raises UserError, beginning with ``where``, for numbers that are no pose.
     """
-    r, t = numbers_of(turn, where, "R"), numbers_of(shift, where, "T").ravel()
+    r, t = numbers_of(rotation, where, "R"), numbers_of(translation, where, "T").ravel()
     r = Rotation.from_rotvec(r.ravel()).as_matrix() if r.size == 3 else r
     if t.size != 3 or r.shape != (3, 3) or not is_rigid(rigid(r, t)):
         raise UserError(
@@ -242,25 +290,83 @@ def opencv_pose(turn: Any, shift: Any, where: str) -> np.ndarray:
     return rigid(r, t)
 
 
-def _rate(entry: dict[str, Any], field: str, where: str) -> float | None:
-    value = entry.get(field)
+def _camera(entry: dict[str, Any], where: str, fps: float | None) -> CalibratedCamera:
+    colour = _lens(entry, where)
+    offset = parse_number(entry.get("time_offset", 0.0), where, "time_offset", "seconds")
+    if abs(offset) > LONGEST_OFFSET_S:
+        raise UserError(f"{where}: time_offset is {offset:.4g}, expected seconds; correct it")
+    depth = entry.get("depth")
+    lens, colour_from_depth = None, None
+    if depth == "aligned":
+        lens, colour_from_depth = colour, np.eye(4)
+    elif isinstance(depth, dict):
+        lens = _lens(depth, f"{where}, depth")
+        field = "depth.colour_from_depth"
+        colour_from_depth = numbers_of(depth.get("colour_from_depth"), where, field)
+        if not is_rigid(colour_from_depth):
+            raise UserError(
+                f"{where}: {field} is no rigid 4x4 transform (x_colour = R x_depth + t, metres, "
+                "last row 0 0 0 1); correct it"
+            )
+        distance = float(np.linalg.norm(colour_from_depth[:3, 3]))
+        if distance > MAX_LENSES_APART_M:
+            raise UserError(
+                f"{where}: {field} moves by {distance:.4g} m, expected at most "
+                f"{MAX_LENSES_APART_M:.0f} m, so it is likely in millimetres; write it in metres"
+            )
+    elif depth is not None:
+        raise UserError(
+            f"{where}: depth is {quoted(depth, 40)}, expected 'aligned' or a lens with "
+            "colour_from_depth; correct it"
+        )
+    return CalibratedCamera(colour, lens, colour_from_depth, _rate(entry, where) or fps, offset)
+
+
+def _lens(entry: dict[str, Any], where: str) -> Intrinsics:
+    for key in ("camera_matrix", "distortion_coefficients"):
+        if key not in entry:
+            raise UserError(f"{where}: has no {key}; add it")
+    stated = entry.get("image_size", [entry.get("image_width"), entry.get("image_height")])
+    size = parse_image_size(stated, where)
+    return opencv_lens(size, entry["camera_matrix"], entry["distortion_coefficients"], where)
+
+
+def _pose(entry: dict[str, Any], where: str, path: Path, *, is_master: bool) -> np.ndarray:
+    """World from camera (4, 4)."""
+    rotation, translation = (
+        entry.get(key, entry.get(other)) for key, other in (("R", "rvec"), ("T", "tvec"))
+    )
+    if rotation is None and translation is None and is_master:
+        return np.eye(4)
+    if rotation is None or translation is None:
+        raise UserError(
+            f"{where}: has no pose; add R (3x3, or a rotation vector) and T with x_camera = R "
+            "x_world + T, metres"
+        )
+    camera_from_world = opencv_pose(rotation, translation, where)
+    check_distance(path, f"camera {where.rpartition(' ')[2]}", camera_from_world[:3, 3])
+    return invert(camera_from_world)
+
+
+def _rate(entry: dict[str, Any], where: str) -> float | None:
+    value = entry.get("fps")
     if value is None:
         return None
-    number = numbers_of(value, where, field)
-    if number.size != 1 or number.ravel()[0] <= 0:
-        raise UserError(f"{where}: {field} is {quoted(value)}, expected one positive number")
-    check_rate(float(number.ravel()[0]), where)
-    return float(number.ravel()[0])
-
-
-_MATRIX_TYPES = ("opencv-matrix", "opencv-nd-matrix")  # OpenCV 5 writes vectors as the latter
-_MATRIX_TAGS = [f"tag:yaml.org,2002:{name}" for name in _MATRIX_TYPES]
+    fps = parse_number(value, where, "fps", "one positive number")
+    if fps <= 0:
+        raise UserError(
+            f"{where}: fps is {quoted(value)}, expected one positive number; correct it"
+        )
+    check_rate(fps, where)
+    return fps
 
 
 class _Loader(yaml_files.Loader):
-    """The safe loader, which also knows OpenCV's matrices."""
+    """The safe loader, extended by OpenCV's matrices."""
 
-    kinds = yaml_files.KINDS | dict.fromkeys(_MATRIX_TAGS, yaml.MappingNode)
+    kinds = yaml_files.KINDS | dict.fromkeys(
+        [f"tag:yaml.org,2002:{name}" for name in _MATRIX_TYPES], yaml.MappingNode
+    )
 
 
 def _matrix(entry: dict[Any, Any]) -> Any:
@@ -276,8 +382,8 @@ def _yaml_matrix(loader: yaml.SafeLoader, node: Any) -> Any:
     return _matrix(loader.construct_mapping(node, deep=True))
 
 
-for _tag in _MATRIX_TAGS:
-    _Loader.add_constructor(_tag, _yaml_matrix)
+for _name in _MATRIX_TYPES:
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_name}", _yaml_matrix)
 
 
 def _json_object(entry: dict[str, Any]) -> Any:
@@ -287,12 +393,12 @@ def _json_object(entry: dict[str, Any]) -> Any:
 def load_opencv(path: Path) -> dict[str, Any]:
     """Read a JSON or YAML file, by hand or of ``cv2.FileStorage``: matrices become nested lists.
 
-    Raises UserError where it is none, or holds no names and values.
+    Raises UserError if it is neither, or holds no names and values.
     """
     try:
         if path.suffix.lower() == ".json":
             content = read_json(path, entry=_json_object)
-        else:  # OpenCV's first line, %YAML:1.0, is none of YAML's own
+        else:  # OpenCV's first line, %YAML:1.0, is not YAML
             content = yaml_files.read_yaml(
                 path,
                 MAX_CALIBRATION_BYTES,

@@ -21,7 +21,7 @@ from intercap_core.formats.detections.instance import (
     scale_to,
 )
 from intercap_core.formats.recordings.behave import frame_folders
-from intercap_core.formats.recordings.encoded import encoded_size
+from intercap_core.formats.recordings.image_files import encoded_size
 from intercap_core.inputs.files import MAX_IMAGE_BYTES, Unreadable, read_bytes
 from intercap_core.inputs.quotes import printable
 

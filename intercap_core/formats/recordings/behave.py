@@ -16,8 +16,12 @@ import numpy as np
 
 from intercap_core.config import SequenceEntry
 from intercap_core.errors import UserError
-from intercap_core.formats.calibration.extrinsics import MAX_DISTANCE_M, Extrinsics, placed
-from intercap_core.formats.calibration.plausible import check_lens
+from intercap_core.formats.calibration.extrinsics import (
+    MAX_DISTANCE_M,
+    Extrinsics,
+    relate_to_master,
+)
+from intercap_core.formats.calibration.opencv import check_lens
 from intercap_core.formats.recordings.image_files import AlignedRecording, ImagePair, common_size
 from intercap_core.formats.recordings.source import RecordingLayout
 from intercap_core.geometry.camera.intrinsics import DEFAULT_METRIC_RADIUS, Intrinsics
@@ -148,7 +152,9 @@ def read_poses(folder: Path) -> Extrinsics:
             f"{folder}: holds no 1/config.json (the pose of the master, Kinect 1); give the folder "
             "calibs/<date>/config of the data set"
         )
-    return Extrinsics(MASTER, placed(folder, MASTER, world_from_colour).master_from_colour)
+    return Extrinsics(
+        MASTER, relate_to_master(folder, MASTER, world_from_colour).master_from_colour
+    )
 
 
 def find_intrinsics_folder(calibration: Path) -> Path | None:

@@ -11,9 +11,8 @@ import numpy as np
 
 from intercap_core import artefacts
 from intercap_core.errors import UserError
-from intercap_core.formats.recordings.encoded import encoded_size
-from intercap_core.formats.recordings.sound import Sound
-from intercap_core.formats.recordings.source import CameraRecording, Image, RecordingLayout
+from intercap_core.formats.recordings.image_files import encoded_size
+from intercap_core.formats.recordings.source import CameraRecording, Image, RecordingLayout, Sound
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.inputs.quotes import printable
 from intercap_core.progress import Progress

@@ -24,30 +24,37 @@ from av.stream import Discard
 from intercap_core.config import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import read_extrinsics
-from intercap_core.formats.calibration.files import read_other_calibration, refuse_scale
+from intercap_core.formats.calibration.files import (
+    RecordedCameras,
+    read_tool_calibration,
+    refuse_scale,
+)
 from intercap_core.formats.calibration.k4a import (
     COLOUR_MODES,
     DEPTH_MODES,
     colour_from_accelerometer,
     read_calibration,
 )
-from intercap_core.formats.calibration.other import Recorded
-from intercap_core.formats.calibration.plausible import check_rate
-from intercap_core.formats.recordings.containers import (
-    LATEST_US,
-    RecordingPreview,
-    open_container,
-    preview_video,
-    segment_end,
-)
-from intercap_core.formats.recordings.encoded import (
+from intercap_core.formats.calibration.opencv import check_rate
+from intercap_core.formats.recordings.image_files import (
     JPEG_QUALITY,
     RAW_FORMATS,
     decode_raw,
     encode_jpeg,
     encoded_size,
 )
-from intercap_core.formats.recordings.source import CameraRecording, Image, RecordingLayout
+from intercap_core.formats.recordings.source import (
+    CameraRecording,
+    Image,
+    RecordingLayout,
+    RecordingPreview,
+)
+from intercap_core.formats.recordings.video import (
+    LATEST_US,
+    open_container,
+    preview_video,
+    segment_end,
+)
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.inputs.files import read_bytes
 from intercap_core.inputs.quotes import quoted
@@ -338,7 +345,7 @@ class KinectLayout(RecordingLayout):
         super().__init__(sequence)
         self.names = sorted(path.stem for path in sequence.recordings.glob("[!.]*.mkv"))
         path, scale = sequence.calibration, sequence.calibration_scale
-        other = read_other_calibration(path, Recorded(self.names), scale)
+        other = read_tool_calibration(path, RecordedCameras(self.names), scale)
         if other is None:
             refuse_scale(path, scale)
         self.extrinsics = read_extrinsics(path) if other is None else other.extrinsics

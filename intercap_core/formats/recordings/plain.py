@@ -14,8 +14,7 @@ import numpy as np
 from intercap_core.config import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import CAMERA_NAME
-from intercap_core.formats.calibration.files import read_calibration
-from intercap_core.formats.calibration.other import Recorded
+from intercap_core.formats.calibration.files import RecordedCameras, read_calibration
 from intercap_core.formats.recordings.image_files import FilesRecording, common_size
 from intercap_core.formats.recordings.source import CameraRecording, RecordingLayout
 from intercap_core.formats.recordings.timestamps import (
@@ -43,7 +42,7 @@ class PlainLayout(RecordingLayout):
         self.names = [name for name in found if CAMERA_NAME.fullmatch(name)]
         calibration = read_calibration(
             sequence.calibration,
-            Recorded(self.names, self._size_of),
+            RecordedCameras(self.names, self._size_of),
             scale=sequence.calibration_scale,
         )
         self._known, self.extrinsics = calibration.cameras, calibration.extrinsics

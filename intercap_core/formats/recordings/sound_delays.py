@@ -16,7 +16,7 @@ from itertools import combinations
 import numpy as np
 from scipy import fft
 
-from intercap_core.formats.recordings.sound import SOUND_RATE, Sound
+from intercap_core.formats.recordings.source import SOUND_RATE, Sound
 
 BAND_HZ = (150.0, 3500.0)  # above hum and handling, below the resampler's edge
 WINDOWS = 8  # of a track, evenly over it

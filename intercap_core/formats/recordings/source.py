@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Literal, NamedTuple, Self
@@ -19,9 +20,35 @@ import numpy as np
 
 from intercap_core.config import SequenceEntry
 from intercap_core.formats.calibration.extrinsics import Extrinsics
-from intercap_core.formats.recordings.containers import RecordingPreview
-from intercap_core.formats.recordings.sound import Sound
 from intercap_core.geometry.camera.rig import Camera
+
+SOUND_RATE = 8000  # samples a second: telephony's, steps and voices are within 4 kHz
+
+
+class RecordingPreview(NamedTuple):
+    """What a look at a recording shows without reading all of it.
+
+    ``size`` (width, height) of the first colour image, None = none can be read. ``images`` counts
+    the colour images that are there (one by one where ``counted``, else by duration and rate),
+    ``seconds`` lasts from the first to the last; None = nothing says. ``share`` of what the head
+    states is in the file. ``faults`` are what else is wrong, in words that follow its name.
+    """
+
+    size: tuple[int, int] | None
+    images: int | None
+    seconds: float | None
+    share: float = 1.0
+    faults: tuple[str, ...] = ()
+    counted: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Sound:
+    """``samples`` (N,) float32 at :data:`SOUND_RATE`; the first one was recorded ``first_s``
+    seconds after the first image, by the file's own clock."""
+
+    samples: np.ndarray
+    first_s: float
 
 
 class Image(NamedTuple):

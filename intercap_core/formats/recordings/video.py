@@ -6,6 +6,7 @@ image cannot be read without those before it.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,21 +15,198 @@ import av
 import numpy as np
 
 from intercap_core.errors import UserError
-from intercap_core.formats.calibration.plausible import check_rate
-from intercap_core.formats.recordings.containers import (
-    LATEST_US,
-    MAX_SIDE,
-    RecordingPreview,
-    open_container,
-    preview_video,
+from intercap_core.formats.calibration.opencv import check_rate
+from intercap_core.formats.recordings.image_files import (
+    JPEG_QUALITY,
+    encode_jpeg,
+    encoded_size,
+    faults_of_files,
+    read_pairs,
 )
-from intercap_core.formats.recordings.encoded import JPEG_QUALITY, encode_jpeg
-from intercap_core.formats.recordings.image_files import faults_of_files, read_pairs
-from intercap_core.formats.recordings.sound import Sound, read_sound
-from intercap_core.formats.recordings.source import CameraRecording, Image
+from intercap_core.formats.recordings.source import (
+    SOUND_RATE,
+    CameraRecording,
+    Image,
+    RecordingPreview,
+    Sound,
+)
 from intercap_core.formats.recordings.timestamps import Timestamps, pair_images
 from intercap_core.geometry.camera.rig import Camera
-from intercap_core.inputs.files import Unreadable
+from intercap_core.inputs.files import Unreadable, check_file
+
+# By content a file may also be a list of other files or addresses, which FFmpeg would follow.
+FORMATS = "matroska,webm,mov,mp4,m4a,3gp,3g2,mj2,avi,mpeg,mpegts,mpegvideo"
+LATEST_US = 10**15  # of a device's clock: some thirty years; later ones are damage
+MAX_SIDE = 16_384  # px of an image that is decoded
+
+
+def open_container(path: Path, **options: str) -> Any:
+    """Open a regular file; raises Unreadable where it is none, and what PyAV raises where it is no
+    container of :data:`FORMATS`."""
+    check_file(path, None)
+    return av.open(
+        f"file:{path}",
+        options={"format_whitelist": FORMATS, "protocol_whitelist": "file", **options},
+        metadata_errors="replace",
+    )
+
+
+FIRST_PACKETS = 60  # within these some image must decode: two seconds
+_MATROSKA = "matroska"
+_SEGMENT_ID = b"\x18\x53\x80\x67"
+
+
+def preview_video(path: Path, stream_index: int, fps: float) -> RecordingPreview:
+    """Look at one track of a video file that opens."""
+    with open_container(path) as container:
+        stream: Any = container.streams[stream_index]
+        # read here: a stream of a closed container is freed memory
+        stated, frames = float(container.duration or 0) / av.time_base, int(stream.frames)
+        length = os.path.getsize(path)
+        entries = getattr(stream, "index_entries", None) or ()
+        if _MATROSKA in container.format.name:
+            share = _share_of_segment(path, length)
+            seconds = stated * share if stated else None
+        elif frames and len(entries) == frames:
+            there = sum(entry.pos + entry.size <= length for entry in entries)
+            share = there / frames
+            seconds = float(stream.duration * stream.time_base) * share if stream.duration else None
+        else:
+            seconds = _last_time(container, stream)
+            share = 1.0
+            if frames and seconds is not None:
+                share = min(1.0, (round(seconds * fps) + 1) / frames)
+    with open_container(path) as container:
+        size = _first_size(container, container.streams[stream_index])
+    if seconds is None:
+        return RecordingPreview(size, None, None, share, counted=False)
+    counted = frames > 0
+    images = round(frames * share) if counted else max(1, round(seconds * fps))
+    return RecordingPreview(size, images, seconds, share, counted=counted)
+
+
+def _first_size(container: Any, stream: Any) -> tuple[int, int] | None:
+    """Size of the first image that decodes, turned as its file says."""
+    try:
+        for number, packet in enumerate(container.demux(stream)):
+            if number > FIRST_PACKETS:
+                return None
+            if stream.codec_context.name == "mjpeg":
+                size = encoded_size(bytes(packet))
+                if size is not None:
+                    return size
+                continue
+            for frame in packet.decode():
+                turned = round((getattr(frame, "rotation", 0) or 0) / 90) % 2
+                return (frame.height, frame.width) if turned else (frame.width, frame.height)
+    except (av.error.FFmpegError, OSError):
+        pass
+    return None
+
+
+def _last_time(container: Any, stream: Any) -> float | None:
+    """Seconds from the first image to the last that can be read; None where there is none."""
+    times: list[float] = []
+    try:
+        if container.duration:
+            container.seek((container.start_time or 0) + container.duration, backward=True)
+        for packet in container.demux(stream):
+            if packet.size and packet.pts is not None:
+                times.append(float(packet.pts * packet.time_base))
+    except (av.error.FFmpegError, OSError):
+        pass
+    start = float(stream.start_time * stream.time_base) if stream.start_time else 0.0
+    return float(np.max(times)) - start if times else None
+
+
+def _share_of_segment(path: Path, length: int) -> float:
+    """Which share of the bytes that a Matroska file's Segment states is there; 1 = it does not."""
+    with open(path, "rb") as file:
+        end = segment_end(file.read(4096))
+    return 1.0 if end is None else min(1.0, length / end)
+
+
+def segment_end(head: bytes) -> int | None:
+    """Where the Segment of a Matroska file ends, bytes; None where it was never finished.
+
+    ``head`` is the file's beginning. Source: RFC 8794, section 6; RFC 9559, section 5.1.
+    """
+    at = head.find(_SEGMENT_ID)
+    if at < 0 or at + 5 > len(head):
+        return None
+    width = 9 - head[at + 4].bit_length()  # of the length that follows the id
+    field = head[at + 4 : at + 4 + width]
+    stated = int.from_bytes(field, "big") & ((1 << 7 * width) - 1)
+    return None if stated == (1 << 7 * width) - 1 else at + 4 + width + stated
+
+
+MAX_SOUND_S = 600.0  # that are read: 19 MB a camera
+JUMP_S = 0.05  # by which a packet's time differs from the samples before it: a gap
+
+
+def read_sound(path: Path, first_image_s: float) -> Sound | None:
+    """Read a video's first sound track; None where it has none that can be decoded.
+
+    ``first_image_s`` is the time of the first image on the file's clock. Damaged packets are left
+    out, as gaps.
+    """
+    parts: list[np.ndarray] = []
+    start: float | None = None
+    count = 0
+    for time_s, samples in _pieces(path):
+        if start is None:
+            start = time_s
+        gap = round((time_s - start) * SOUND_RATE) - count
+        if gap > JUMP_S * SOUND_RATE:
+            if count + gap > MAX_SOUND_S * SOUND_RATE:
+                break
+            parts.append(np.zeros(gap, np.float32))
+            count += gap
+        parts.append(samples)
+        count += len(samples)
+        if count >= MAX_SOUND_S * SOUND_RATE:
+            break
+    if start is None or not count:
+        return None
+    return Sound(np.concatenate(parts), start - first_image_s)
+
+
+def _pieces(path: Path) -> Iterator[tuple[float, np.ndarray]]:
+    """Times on the file's clock and samples (n,), as they are decoded."""
+    try:
+        container = open_container(path)
+    except (Unreadable, av.error.FFmpegError, OSError):
+        return
+    with container:
+        streams: Any = container.streams.audio
+        if not streams or streams[0].codec_context is None:
+            return
+        resampler = av.AudioResampler(format="flt", layout="mono", rate=SOUND_RATE)
+        after = 0.0
+        for frame in _frames(container, streams[0]):
+            after = frame.time if frame.time is not None else after
+            if not frame.sample_rate or not abs(after) < LATEST_US * 1e-6:
+                continue
+            time_s, after = after, after + frame.samples / frame.sample_rate
+            try:
+                for made in resampler.resample(frame):
+                    yield time_s, made.to_ndarray().ravel().astype(np.float32)
+            except (av.error.FFmpegError, ValueError):
+                continue
+
+
+def _frames(container: Any, stream: Any) -> Iterator[Any]:
+    demuxed = container.demux(stream)
+    while True:
+        try:
+            packet = next(demuxed)
+        except (StopIteration, av.error.FFmpegError, OSError):
+            return
+        try:
+            yield from packet.decode()
+        except (av.error.FFmpegError, OSError):
+            continue
+
 
 FEW_IMAGES = 0.02  # by which a count from duration and rate may be wrong
 

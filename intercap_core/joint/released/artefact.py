@@ -18,13 +18,14 @@ from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.frames import Frames
-from intercap_core.formats.released.file_names import (
+from intercap_core.formats.released import (
     BEHAVE_OBJECT,
     BEHAVE_PERSON,
     INTERCAP,
+    Recording,
+    Results,
     intercap_file,
 )
-from intercap_core.formats.released.results import Recording, Results
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.joint.released import behave as release_behave

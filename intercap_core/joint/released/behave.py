@@ -21,7 +21,12 @@ from intercap_core.body.parameters import POSE_BLOCKS, TRANSL
 from intercap_core.config import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.behave import frame_folders
-from intercap_core.formats.released.behave_files import (
+from intercap_core.formats.released import (
+    BEHAVE_OBJECT,
+    BEHAVE_PERSON,
+    PERSON_MESH,
+    Recording,
+    Results,
     Skin,
     object_fits,
     object_poses_at_30_fps,
@@ -30,8 +35,6 @@ from intercap_core.formats.released.behave_files import (
     read_person_pose,
     read_skin,
 )
-from intercap_core.formats.released.file_names import BEHAVE_OBJECT, BEHAVE_PERSON, PERSON_MESH
-from intercap_core.formats.released.results import Recording, Results
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh import read_mesh
 from intercap_core.joint.released.surface_fit import fit_surfaces

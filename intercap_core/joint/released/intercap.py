@@ -10,8 +10,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from intercap_core.errors import UserError
-from intercap_core.formats.released.file_names import INTERCAP, intercap_file
-from intercap_core.formats.released.results import Results, check_metres, check_radians
+from intercap_core.formats.released import (
+    INTERCAP,
+    Results,
+    check_metres,
+    check_radians,
+    intercap_file,
+)
 from intercap_core.inputs import safe_pickle
 from intercap_core.inputs.arrays import read_arrays
 

@@ -25,7 +25,7 @@ from intercap_core.body_fit import body_cloud
 from intercap_core.body_fit.body_constants import MATCH_COSINE
 from intercap_core.body_fit.body_samples import choose_samples
 from intercap_core.body_fit.body_surface import Surface
-from intercap_core.formats.released.behave_files import Skin
+from intercap_core.formats.released import Skin
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.surfaces import vertex_normals
 from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations, minimise

@@ -13,7 +13,7 @@ from intercap_core.config import DetectionsSettings  # noqa: E402
 from intercap_core.errors import UserError  # noqa: E402
 from intercap_core.formats.detections.instance import Instance  # noqa: E402
 from intercap_core.formats.detections.keypoint_layouts import LAYOUTS  # noqa: E402
-from intercap_core.formats.detections.models.onnx_pose import Crop, PoseModel, person_boxes, tiles  # noqa: E402
+from intercap_core.formats.detections.onnx_pose import Crop, PoseModel, person_boxes, tiles  # noqa: E402
 from tests.helpers import tiny_onnx  # noqa: E402
 
 SIZE = (640, 360)

@@ -14,9 +14,8 @@ tiny_onnx = pytest.importorskip("tests.helpers.tiny_onnx", exc_type=ImportError)
 
 from intercap_core.config import DetectionsSettings  # noqa: E402
 from intercap_core.errors import UserError  # noqa: E402
-from intercap_core.formats.detections.models.onnx_model import OnnxModel, fit_within, parse_names  # noqa: E402
-from intercap_core.formats.detections.models.onnx_outputs import suppressed  # noqa: E402
-from intercap_core.formats.detections.models.onnx_segmentation import Segmenter  # noqa: E402
+from intercap_core.formats.detections.onnx_model import OnnxModel, fit_within, parse_names  # noqa: E402
+from intercap_core.formats.detections.onnx_segmentation import Segmenter, suppressed  # noqa: E402
 from intercap_core.geometry.camera import masks  # noqa: E402
 
 WIDTH, HEIGHT = 320, 180

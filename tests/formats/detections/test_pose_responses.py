@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from intercap_core.formats.detections.models.onnx_pose import (
+from intercap_core.formats.detections.onnx_pose import (
     heatmap_points,
     peaks,
     simcc_points,

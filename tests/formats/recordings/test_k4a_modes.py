@@ -12,7 +12,7 @@ from intercap_core.config import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import Extrinsics, write_rig_file
 from intercap_core.formats.calibration.k4a import COLOUR_MODES, DEPTH_MODES
-from intercap_core.formats.recordings.encoded import JPEG_QUALITY
+from intercap_core.formats.recordings.image_files import JPEG_QUALITY
 from intercap_core.formats.recordings.k4a import KinectLayout
 from intercap_core.formats.recordings.source import CameraRecording, Image
 from intercap_core.geometry.camera.intrinsics import Intrinsics

@@ -13,8 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from intercap_core.errors import UserError
-from intercap_core.formats.calibration.files import read_calibration
-from intercap_core.formats.calibration.other import Recorded
+from intercap_core.formats.calibration.files import RecordedCameras, read_calibration
 from intercap_core.geometry.camera.transforms import rigid
 from tests.helpers import other_calibrations as written
 
@@ -60,7 +59,7 @@ FORMS: dict[str, tuple[Write, float | None]] = {
         lambda folder: written.write_nerfstudio(folder, VIEWS, metres=2.5).parent, 2.5,
     ),
 }  # fmt: skip
-RECORDED = Recorded(tuple(VIEWS), lambda name: VIEWS[name].size)
+RECORDED = RecordedCameras(tuple(VIEWS), lambda name: VIEWS[name].size)
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -93,7 +92,7 @@ def test_pose2sim_by_hand(tmp_path):
         f"rotation = [ {np.pi / 2}, 0.0, 0.0]\ntranslation = [ 0.0, 1.0, 4.0]\nfisheye = false\n\n"
         "[metadata]\nadjusted = false\nerror = 0.0\n"
     )
-    calibration = read_calibration(path, Recorded(("cam01",)))
+    calibration = read_calibration(path, RecordedCameras(("cam01",)))
     world = calibration.extrinsics.master_from_world
     # x_camera = R x + T: (0.5, 2, 1.5) goes to (0.5, -1.5 + 1, 2 + 4)
     np.testing.assert_allclose(world @ [0.5, 2, 1.5, 1], [0.5, -0.5, 6, 1], atol=1e-12)
@@ -111,7 +110,7 @@ def test_nerfstudio_by_hand(tmp_path):
         "frames": [{"file_path": "./images/top.jpeg", "transform_matrix": frame.tolist()}],
     }  # fmt: skip
     (tmp_path / "transforms.json").write_text(json.dumps(content))
-    calibration = read_calibration(tmp_path, Recorded(("top",)), scale=1.0)
+    calibration = read_calibration(tmp_path, RecordedCameras(("top",)), scale=1.0)
     point = (calibration.extrinsics.master_from_world @ [1, 2, 0, 1])[:3]
     np.testing.assert_allclose(point, [1, -2, 5])
     seen = calibration.cameras["top"].colour.project(point)
@@ -285,8 +284,10 @@ def test_millimetres_where_metres_are_usual(tmp_path):
 def test_names_that_are_none_of_the_recordings(tmp_path):
     path = written.write_pose2sim(tmp_path, VIEWS)
     with pytest.raises(UserError, match="left, front, right, the recordings are of k1, k2: none"):
-        read_calibration(path, Recorded(("k1", "k2")))
-    tables = Recorded(("cam_0", "cam_1", "cam_2"))  # Anipose's tables serve where its names do not
+        read_calibration(path, RecordedCameras(("k1", "k2")))
+    tables = RecordedCameras(
+        ("cam_0", "cam_1", "cam_2")
+    )  # Anipose's tables serve where its names do not
     anipose = read_calibration(written.write_anipose(tmp_path, VIEWS), tables, scale=0.001)
     assert list(anipose.cameras) == ["cam_0", "cam_1", "cam_2"]
 
@@ -294,7 +295,7 @@ def test_names_that_are_none_of_the_recordings(tmp_path):
 def test_easymocap_without_any_size(tmp_path):
     path = written.write_easymocap(tmp_path, VIEWS)
     with pytest.raises(UserError, match="has no W_left and H_left, and no recording"):
-        read_calibration(path, Recorded(("left",)))
+        read_calibration(path, RecordedCameras(("left",)))
 
 
 def test_parts_and_doubtful_folders(tmp_path):

@@ -12,7 +12,9 @@ import trimesh
 
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.errors import UserError
-from intercap_core.formats.released.behave_files import (
+from intercap_core.formats.released import (
+    PERSON_MESH,
+    files_of,
     object_fits,
     object_poses_at_30_fps,
     person_poses_at_30_fps,
@@ -20,7 +22,6 @@ from intercap_core.formats.released.behave_files import (
     read_person_pose,
     read_skin,
 )
-from intercap_core.formats.released.file_names import PERSON_MESH, files_of
 from tests.helpers.behave_results import write_30_fps, write_mesh
 
 # SMPL-H's joints as its publishers list them: the body, then the hands

@@ -20,7 +20,7 @@ from intercap_core.body.parameters import POSE_BLOCKS, BodyParameters
 from intercap_core.config import MetricsSettings
 from intercap_core.errors import UserError
 from intercap_core.evaluation.figures import SequenceMetrics
-from intercap_core.formats.released.results import Recording
+from intercap_core.formats.released import Recording
 from intercap_core.geometry.rigid.mesh import read_mesh
 from intercap_core.joint.released.artefact import read_results
 from intercap_core.pipeline.outcome import line

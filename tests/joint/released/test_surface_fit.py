@@ -11,7 +11,7 @@ import torch
 from intercap_core.body.loading import load_body_file
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import NUM_POSE, TRANSL
-from intercap_core.formats.released.behave_files import Skin
+from intercap_core.formats.released import Skin
 from intercap_core.joint.released.surface_fit import _Problem, _Rows, fit_surfaces
 from tests.helpers.bodies import random_normal
 

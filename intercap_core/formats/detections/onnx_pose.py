@@ -22,7 +22,7 @@ from intercap_core.config import DetectionsSettings
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.instance import PERSON_LABEL, Instance
 from intercap_core.formats.detections.keypoint_layouts import KNOWN_COUNTS, LAYOUTS, to_shared
-from intercap_core.formats.detections.models.onnx_model import OnnxModel
+from intercap_core.formats.detections.onnx_model import OnnxModel
 
 HeatmapGrid = Literal["msra", "udp"]
 

@@ -2,8 +2,8 @@
 
 Both write ``name``, ``size`` (width, height), ``matrix``, ``distortions`` (OpenCV's 4 or 5),
 ``rotation`` (a rotation vector) and ``translation`` with x_camera = R x_world + T. Pose2Sim adds
-``fisheye`` to every camera and works in metres; Anipose works in the unit in which the board's
-squares were stated, which the file does not say.
+``fisheye`` to every camera and works in metres. Anipose works in the unit in which the squares of
+the board were stated, which the file does not say.
 """
 
 from __future__ import annotations
@@ -13,23 +13,39 @@ from pathlib import Path
 from typing import Any
 
 from intercap_core.errors import UserError
+from intercap_core.formats.calibration.files import (
+    CalibrationReader,
+    RecordedCameras,
+    ToolCamera,
+    to_calibration,
+)
 from intercap_core.formats.calibration.opencv import (
     Calibration,
-    image_size_of,
     opencv_lens,
     opencv_pose,
+    parse_image_size,
 )
-from intercap_core.formats.calibration.other import OtherCamera, Recorded, put_together
 from intercap_core.inputs.json_files import read_toml
 from intercap_core.inputs.quotes import quoted
 
 FIELDS = ("size", "matrix", "distortions", "rotation", "translation")
-# Pose2Sim names a camera after its folder of intrinsic images, its videos are named without these.
-POSE2SIM_FOLDER = re.compile(r"int_(.+)_img")
 
 
-def read_toml_calibration(path: Path, recorded: Recorded, scale: float | None) -> Calibration:
-    """Read a file of Pose2Sim or Anipose; raises UserError naming file, camera and field."""
+def _toml_files(path: Path) -> list[Path]:
+    if path.is_dir():
+        return sorted(path.glob("[!.]*.toml"))
+    return [path] if path.suffix.lower() == ".toml" else []
+
+
+def _read(path: Path, recorded: RecordedCameras, scale: float | None) -> Calibration:
+    """Read a file, or the only TOML file of a folder; raises UserError naming camera and field."""
+    files = _toml_files(path)
+    if len(files) > 1:
+        raise UserError(
+            f"{path}: holds {', '.join(file.name for file in files)}; name the one that is the "
+            "calibration"
+        )
+    path = files[0]
     tables = _camera_tables(path)
     cameras = []
     for section, table in tables.items():
@@ -42,17 +58,13 @@ def read_toml_calibration(path: Path, recorded: Recorded, scale: float | None) -
                 f"{where}: is calibrated as a fisheye, which cannot be represented; undistort its "
                 "recording, or calibrate it with the standard model (fisheye = false)"
             )
-        size = image_size_of(table["size"], where)
-        cameras.append(
-            OtherCamera(
-                _names(section, table, where),
-                opencv_lens(size, table["matrix"], table["distortions"], where),
-                opencv_pose(table["rotation"], table["translation"], where),
-            )
-        )
+        size = parse_image_size(table["size"], where)
+        lens = opencv_lens(size, table["matrix"], table["distortions"], where)
+        pose = opencv_pose(table["rotation"], table["translation"], where)
+        cameras.append(ToolCamera(_names(section, table, where), lens, pose))
     pose2sim = all("fisheye" in table for table in tables.values())
     unit = "its translations are in the unit in which the board's squares were stated"
-    return put_together(
+    return to_calibration(
         path,
         "Pose2Sim" if pose2sim else "Anipose",
         cameras,
@@ -60,6 +72,14 @@ def read_toml_calibration(path: Path, recorded: Recorded, scale: float | None) -
         scale=scale,
         unit=None if pose2sim else unit,
     )
+
+
+READER = CalibrationReader(
+    tool="Pose2Sim or Anipose",
+    rank=3,
+    recognises=lambda path: bool(_toml_files(path)),
+    read=_read,
+)
 
 
 def _camera_tables(path: Path) -> dict[str, dict[str, Any]]:
@@ -78,8 +98,10 @@ def _camera_tables(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def _names(section: str, table: dict[str, Any], where: str) -> tuple[str, ...]:
+    """Names that the camera's recording may have."""
     name = table.get("name", section)
     if not isinstance(name, str):
         raise UserError(f"{where}: name is {quoted(name, 40)}, expected text; correct it")
-    folder = POSE2SIM_FOLDER.fullmatch(name)
+    # Pose2Sim names a camera after its folder of images of the board, int_<name>_img.
+    folder = re.fullmatch(r"int_(.+)_img", name)
     return (name, section, *([folder[1]] if folder else []))

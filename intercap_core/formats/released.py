@@ -11,20 +11,113 @@ frame of Kinect 1's colour camera, metres and radians.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from intercap_core.config import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.behave import FRAME_FOLDER
-from intercap_core.formats.released.constants import PERSON_EXTENT_M
-from intercap_core.formats.released.file_names import BEHAVE_OBJECT, BEHAVE_PERSON
-from intercap_core.formats.released.results import check_metres, check_radians
 from intercap_core.inputs import safe_pickle
 from intercap_core.inputs.arrays import read_arrays
+
+MOST_M = 100.0  # a place beyond this is in other units
+MOST_RAD = 100.0  # as is a rotation vector
+PERSON_EXTENT_M = (0.5, 3.0)  # largest side of a person's box, crouched to with an arm up
+INTERCAP = ("res.pkl", "res.npz", "res_2.pkl", "res_1.pkl")  # the newest first
+BEHAVE_PERSON, BEHAVE_OBJECT = "smpl_fit_all.npz", "object_fit_all.npz"  # parameters at 30 fps
+PERSON_MESH = Path("person", "fit02", "person_fit.ply")  # in the folder of a frame of BEHAVE
+
+
+def intercap_file(path: Path) -> Path:
+    """The file of results in a folder, the folder itself where it has none; a file as it is."""
+    return next((path / name for name in INTERCAP if (path / name).is_file()), path)
+
+
+def files_of(path: Path) -> list[Path]:
+    """What the workflow watches of results: a file, or BEHAVE's folder and what it holds itself.
+
+    The folder stands for the thousands of files in its folders of frames: its time changes when a
+    frame comes or goes, and looking at all of them would keep a run that has nothing to do busy.
+    """
+    own = intercap_file(path)
+    inside = (path / name for name in (BEHAVE_PERSON, BEHAVE_OBJECT))
+    return [own, *(file for file in inside if own == path and file.is_file())]
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """The sequence that results are asked for.
+
+    ``times`` (T,): of its frame sets, seconds on the clock of the recordings themselves (not from
+    the first on). ``object_``: None = a person alone. ``body``: the body file whose surface is
+    fitted where results are of another body, with ``betas`` numbers of the shape.
+    """
+
+    sequence: str
+    times: np.ndarray
+    object_: ObjectEntry | None
+    body: Path
+    betas: int
+
+
+@dataclass(frozen=True, eq=False)
+class Results:
+    """T frames, master camera's frame, metres and radians.
+
+    ``turns``: rotation vectors by SMPL-X's names, (T, 3) or (T, 63); ``hands``: left and right,
+    (T, 45) full poses, or (T, n) components over the hand's mean pose; ``transl`` (T, 3), ``betas``
+    and ``expression`` (T, n). ``rotation`` (T, 3, 3) and ``translation`` (T, 3) are
+    master_from_object, NaN throughout where there is no object. ``source``: what they are, in
+    words. ``reasons`` (T,): why a frame has no result, or should not be trusted; empty = neither is
+    told. ``surface_distance`` (T, 2): mean and 95th percentile of how far a body that was converted
+    is from the surface that the results have; None where nothing was converted.
+    """
+
+    path: Path
+    turns: Mapping[str, np.ndarray]
+    hands: tuple[np.ndarray, np.ndarray]
+    transl: np.ndarray
+    betas: np.ndarray
+    expression: np.ndarray
+    rotation: np.ndarray
+    translation: np.ndarray
+    source: str
+    reasons: Sequence[str] = ()
+    surface_distance: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return len(self.transl)
+
+    @property
+    def known(self) -> np.ndarray:
+        """Frames (T,) whose every number is finite; of the object where there is one."""
+        body = [*self.turns.values(), *self.hands, self.transl, self.betas, self.expression]
+        parts = [np.isfinite(part).all(axis=1) for part in body]
+        if np.isfinite(self.translation).any():
+            parts += [np.isfinite(self.rotation).all((1, 2)), np.isfinite(self.translation).all(1)]
+        return np.all(parts, axis=0)
+
+
+def check_range(path: Path, name: str, values: np.ndarray, most: float) -> None:
+    """Raise UserError where finite ``values`` are so large that their unit is another one."""
+    finite = np.abs(values[np.isfinite(values)])
+    if (finite > most).any():
+        raise UserError(f"{path}: {name} reaches {finite.max():.0f}; expected metres and radians")
+
+
+def check_metres(path: Path, name: str, values: np.ndarray) -> None:
+    """The same for places in metres."""
+    check_range(path, name, values, MOST_M)
+
+
+def check_radians(path: Path, name: str, values: np.ndarray) -> None:
+    """The same for rotation vectors."""
+    check_range(path, name, values, MOST_RAD)
+
 
 _PERSON, _OBJECT_FIT = "person", "fit01"
 _VERTICES = 6890  # of SMPL and SMPL-H

@@ -1,2 +1,0 @@
-"""Results that another program made, read so that metrics, statistics, viewer and report run on
-them."""
