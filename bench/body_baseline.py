@@ -22,8 +22,8 @@ from torch import Tensor
 
 from intercap_core.body import priors
 from intercap_core.body.keypoints import BODY, FACE, LEFT_HAND, NUM_KEYPOINTS, RIGHT_HAND
+from intercap_core.body.kinematics import vertex_normals
 from intercap_core.body.model import BodyModel
-from intercap_core.body.normals import vertex_normals
 from intercap_core.body.parameters import NUM_POSE, TRANSL
 from intercap_core.body_fit.observations import Observations, PersonCloud
 from intercap_core.evaluation.proximity import Sight

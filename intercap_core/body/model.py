@@ -21,17 +21,23 @@ from intercap_core.body.kinematics import (
     PosedJoints,
     pose_joints,
     rotation_from_axis_angle,
+    skin,
 )
 from intercap_core.body.loading import BodyFile, load_body_file
-from intercap_core.body.maps import MARKER_NAMES, load_maps
+from intercap_core.body.maps import MARKER_NAMES, find_regions, load_maps
 from intercap_core.body.parameters import BodyParameters
-from intercap_core.body.regions import find_regions
 from intercap_core.body.selection import Selection, select
-from intercap_core.body.skinning import skin
+from intercap_core.errors import UserError
 
 _KEPT_SELECTIONS = 8
 _MOUTH_OUTLINE = slice(31, 43)  # landmarks 48 to 59 of dlib's 68
 _FALLBACK_HAND_DEVIATION = 0.35  # rad; for files that do not tell
+_WIDEST_M = 3.0  # arm span and depth
+_SKIN_M2 = (0.3, 6.0)  # clothes, hair and a newborn included
+_FARTHEST_JOINT_M = 0.05  # beyond the box around the skin
+_JOINTS_SPAN = 0.5  # of the skin's width and height
+_MOVE_M = (1e-4, 1.0)  # of the vertex farthest moved by one unit of a shape or expression component
+_HINT = "take the file as published, or none for the open body"
 
 
 @dataclass(frozen=True)
@@ -40,20 +46,6 @@ class BodyOutput:
 
     vertices: Tensor
     joints: Tensor
-
-
-@dataclass(frozen=True)
-class BodyJacobian:
-    """Values and derivatives by the P parameters, in the order of `BodyParameters.vector`.
-
-    vertices (B,V,3), joints (B,55,3), d_vertices (B,V,3,P), d_joints (B,55,3,P); joints and
-    d_joints are None unless asked for.
-    """
-
-    vertices: Tensor
-    d_vertices: Tensor
-    joints: Tensor | None
-    d_joints: Tensor | None
 
 
 class BodyModel:
@@ -201,24 +193,6 @@ class BodyModel:
             points, posed, axis_angle = self._rest(selection, params)
             return linearise(selection, points, posed, axis_angle, self._joint_directions)
 
-    def jacobian(
-        self,
-        params: BodyParameters,
-        *,
-        vertex_ids: Tensor | np.ndarray | None = None,
-        joints: bool = False,
-    ) -> BodyJacobian:
-        """Every derivative as a dense array; for more than a few hundred points use `linearise`."""
-        lin = self.linearise(params, vertex_ids=vertex_ids, joints=joints)
-        full = lin.full()
-        count = lin.selection.num_vertices
-        return BodyJacobian(
-            vertices=lin.vertices,
-            d_vertices=full[:, :count],
-            joints=lin.joints if joints else None,
-            d_joints=full[:, count:] if joints else None,
-        )
-
     def keypoints(self, output: BodyOutput) -> Tensor:
         """(B,135,3) from all vertices, or from those of `keypoint_map.vertex_ids`, and joints."""
         vertices, ids = output.vertices, self.keypoint_map.vertex_ids
@@ -288,3 +262,64 @@ def _regions(file: BodyFile, rest_joints: np.ndarray) -> dict[str, np.ndarray]:
 def with_hand_mean(model: BodyModel, params: BodyParameters) -> BodyParameters:
     """The parameters with both hands in the model's mean pose."""
     return replace(params, left_hand_pose=model.hand_mean[:1], right_hand_pose=model.hand_mean[1:])
+
+
+def check_body(model: BodyModel) -> None:
+    """Raise UserError where no person can be fitted with the model, naming what is off."""
+    template, joints = model.template, model.forward(model.zeros()).joints[0]
+    low, high = template.amin(0), template.amax(0)
+    beyond = torch.maximum(low - joints, joints - high).amax()
+    area = _area(template, model.faces)
+    span = ((joints.amax(0) - joints.amin(0)) / (high - low))[:2].amin()
+    weights = model.skinning_weights
+    lengths = model.hand_components.norm(dim=2)
+    moves = _largest_move(model)
+    problems = (
+        (high - low).amax() > _WIDEST_M,
+        f"a body {float((high - low).amax()):.3g} m wide, expected at most {_WIDEST_M:g} m",
+    ), (
+        not _SKIN_M2[0] < area < _SKIN_M2[1],
+        f"{area:.3g} m2 of skin, expected {_SKIN_M2[0]:g} to {_SKIN_M2[1]:g}",
+    ), (
+        beyond > _FARTHEST_JOINT_M,
+        f"a joint {float(beyond):.3g} m outside of its skin (J_regressor)",
+    ), (
+        not span > _JOINTS_SPAN,
+        f"joints over {float(span):.0%} of its skin's width or height, expected at least "
+        f"{_JOINTS_SPAN:.0%} (J_regressor)",
+    ), (
+        weights.amin() < -1e-3,
+        f"a skinning weight of {float(weights.amin()):.3g}, expected none below 0 (weights)",
+    ), (
+        not _MOVE_M[0] < moves < _MOVE_M[1],
+        f"shape components that move the skin by up to {moves:.3g} m a unit, expected "
+        f"{_MOVE_M[0]:g} to {_MOVE_M[1]:g} m (shapedirs)",
+    ), (
+        lengths.amin() < 0.5 or lengths.amax() > 2,
+        f"hand components of length {float(lengths.amin()):.3g} to {float(lengths.amax()):.3g}, "
+        "expected 1 (hands_components)",
+    ), (
+        model.hand_deviation.amin() <= 0,
+        "a hand component that never varies (hands_deviation or hands_coeffs)",
+    ), (
+        abs(model.keypoint_map.weights.sum(1)[model.keypoint_map.joint < 0] - 1).max() > 0.01,
+        "landmarks whose corners do not add up to 1 (lmk_bary_coords)",
+    )  # fmt: skip
+    for wrong, words in problems:
+        if wrong:
+            raise UserError(f"Body file {model.path} has {words}: {_HINT}.")
+
+
+def _area(points: Tensor, faces: Tensor) -> float:
+    """Square metres of skin."""
+    a, b, c = (points[faces[:, i]] for i in range(3))
+    return 0.5 * float(torch.linalg.cross(b - a, c - a).norm(dim=1).sum())
+
+
+def _largest_move(model: BodyModel) -> float:
+    """Metres by which one unit of any shape or expression component moves a vertex at most."""
+    components = model.num_betas + model.num_expression
+    vector = model.zeros(components).vector()
+    vector[:, -components:] = torch.eye(components, dtype=vector.dtype, device=vector.device)
+    moved = model.forward(model.parameters(vector)).vertices - model.template
+    return float(moved.norm(dim=2).amax())

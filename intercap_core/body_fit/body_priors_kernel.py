@@ -9,9 +9,9 @@ import numpy as np
 import torch
 
 from intercap_core.body import priors
-from intercap_core.body.joint_limits import LIMITS_DEG
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import NUM_POSE
+from intercap_core.body.priors import LIMITS_DEG
 from intercap_core.body_fit import body_priors
 
 _HANDS = (75, 120)  # first column of each hand

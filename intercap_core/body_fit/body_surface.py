@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from intercap_core.body.kinematics import vertex_normals
 from intercap_core.body.model import BodyModel
-from intercap_core.body.normals import vertex_normals
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.body_fit.body_constants import NORMAL_LENGTH_M, SAMPLES_TOGETHER
 from intercap_core.body_fit.body_samples import Samples

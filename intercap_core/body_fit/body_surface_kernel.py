@@ -11,9 +11,8 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from intercap_core.body.jacobian_kernel import _add_point
 from intercap_core.body.parameters import TRANSL
-from intercap_core.body.skeleton_kernel import turned_back
+from intercap_core.body.skeleton_kernel import add_point, turned_back
 
 _SHAPE = TRANSL.stop
 
@@ -117,8 +116,8 @@ def add_self_equations(chain, pairs, frames, place, cost, gradient, hessian, res
                 continue
             row, n = rows[count], pairs.normal[at]
             # d depth / d parameters = -n . (dp - dq)
-            _add_point(row, place, shape, chain, b, pairs.outer[at], one, n, scratch)
-            _add_point(row, place, shape, chain, b, pairs.inner[at], -one, n, scratch)
+            add_point(row, place, shape, chain, b, pairs.outer[at], one, n, scratch)
+            add_point(row, place, shape, chain, b, pairs.inner[at], -one, n, scratch)
             share = square / (depth * depth + square)
             cost[b] += 0.5 * pairs.weight * share * depth * depth
             weight = pairs.weight * share * share

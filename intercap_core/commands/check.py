@@ -47,8 +47,7 @@ def check_bodies(project: Project) -> None:
     if not files and models.vposer is None:
         return  # without importing torch
     from intercap_core.body.artefact import load_pose_prior
-    from intercap_core.body.model import BodyModel
-    from intercap_core.body.plausible import check_body
+    from intercap_core.body.model import BodyModel, check_body
 
     for path in files:
         check_body(BodyModel.load(path))

@@ -15,11 +15,9 @@ import torch
 
 from intercap_core import artefacts
 from intercap_core.body.artefact import file_digest, load_pose_prior
-from intercap_core.body.loading import OPEN_BODY, load_body_file
-from intercap_core.body.model import BodyModel
+from intercap_core.body.loading import OPEN_BODY, ShapePrior, load_body_file
+from intercap_core.body.model import BodyModel, check_body
 from intercap_core.body.parameters import BodyParameters
-from intercap_core.body.plausible import check_body
-from intercap_core.body.shape_prior import ShapePrior
 from intercap_core.body_fit import quality
 from intercap_core.body_fit.bridge import bridge, bridged_sigma, continuous
 from intercap_core.body_fit.constants import (

@@ -8,9 +8,8 @@ import torch
 
 from intercap_core.body.keypoints import FACE, KEYPOINT_NAMES, LEFT_HAND
 from intercap_core.body.loading import OPEN_BODY
-from intercap_core.body.maps import MARKER_NAMES, POINT_NAMES, maps_path, smplx_maps
+from intercap_core.body.maps import MARKER_NAMES, POINT_NAMES, REGION_NAMES, maps_path, smplx_maps
 from intercap_core.body.model import BodyModel
-from intercap_core.body.regions import REGION_NAMES
 
 from .conftest import open_arrays
 

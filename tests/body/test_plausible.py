@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from intercap_core.body.model import BodyModel
-from intercap_core.body.plausible import check_body
+from intercap_core.body.model import BodyModel, check_body
 from intercap_core.errors import UserError
 
 from .conftest import open_arrays, save_body

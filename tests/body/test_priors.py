@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from intercap_core.body import priors
-from intercap_core.body.joint_limits import LIMITS_DEG, REST_SPREAD_DEG
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
+from intercap_core.body.priors import LIMITS_DEG, REST_SPREAD_DEG
 
 from .conftest import random_vector
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from intercap_core.body.loading import BodyFile, load_body_file
-from intercap_core.body.shape_prior import HEIGHT_SIGMA_M, ShapePrior
+from intercap_core.body.loading import HEIGHT_SIGMA_M, BodyFile, ShapePrior, load_body_file
 
 
 @pytest.fixture(scope="module")

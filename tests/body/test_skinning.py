@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from intercap_core.body.kinematics import skin
 from intercap_core.body.model import BodyModel
-from intercap_core.body.skinning import skin
 
 from .conftest import random_vector
 
@@ -43,7 +43,7 @@ def test_the_gradient_is_that_of_finite_differences() -> None:
 def test_pieces_do_not_show(kibibytes: int, monkeypatch: pytest.MonkeyPatch) -> None:
     points, rotations, offsets, weights = _bones(5, 4, 300)
     whole = skin(points, rotations, offsets, weights)
-    monkeypatch.setattr("intercap_core.body.skinning._CACHE_BYTES", kibibytes << 10)
+    monkeypatch.setattr("intercap_core.body.kinematics._CACHE_BYTES", kibibytes << 10)
     assert torch.allclose(skin(points, rotations, offsets, weights), whole, atol=1e-14)
 
 

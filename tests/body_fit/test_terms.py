@@ -10,9 +10,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from intercap_core.body.kinematics import vertex_normals
 from intercap_core.body.loading import load_body_file
 from intercap_core.body.model import BodyModel
-from intercap_core.body.normals import vertex_normals
 from intercap_core.body.vposer import PoseGaussian
 from intercap_core.body_fit import body_cloud, body_keypoints, body_samples, body_self
 from intercap_core.body_fit.problem import BodyProblem

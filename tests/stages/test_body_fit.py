@@ -149,7 +149,7 @@ def test_known_offsets_of_the_exposures_make_a_moving_body_better(model, tmp_pat
 
 
 def _normals(model: BodyModel, vertices: torch.Tensor) -> np.ndarray:
-    from intercap_core.body.normals import vertex_normals
+    from intercap_core.body.kinematics import vertex_normals
 
     return vertex_normals(vertices, model.faces).double().numpy()
 

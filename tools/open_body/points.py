@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core.body.joints import JOINT_INDEX
-from intercap_core.body.maps import MARKER_NAMES, POINT_NAMES
-from intercap_core.body.regions import find_regions
+from intercap_core.body.maps import MARKER_NAMES, POINT_NAMES, find_regions
 
 _X, _Y, _Z = np.eye(3)
 # Left and midline markers: start joint, end joint, share of the way, direction (x to the left).

@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from intercap_core.body.kinematics import vertex_normals
 from intercap_core.body.model import BodyModel
-from intercap_core.body.normals import vertex_normals
 from intercap_core.body_fit import body_cloud as term
 from intercap_core.body_fit.body_samples import COVERINGS, Samples, choose_samples
 from intercap_core.body_fit.body_surface import Surface

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.body.kinematics import vertex_normals
 from intercap_core.body.model import BodyModel
-from intercap_core.body.normals import vertex_normals
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.body_fit import body_self as term
 from intercap_core.body_fit.body_constants import SELF_TOLERANCE_M
