@@ -19,7 +19,6 @@ from intercap_core.artefacts import read
 from intercap_core.body.artefact import load_model, load_pose_prior
 from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.model import BodyModel
-from intercap_core.body_fit.body_samples import choose_samples
 from intercap_core.body_fit.observations import (
     Observations,
     PersonCloud,
@@ -28,7 +27,8 @@ from intercap_core.body_fit.observations import (
 )
 from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.body_fit.schedule import Fitter, Settled
-from intercap_core.body_fit.torch_terms import TorchTerms
+from intercap_core.body_fit.surface import choose_samples
+from intercap_core.body_fit.terms import TorchTerms
 from intercap_core.config import BodyFitSettings, JointSettings, ObjectTrackSettings
 from intercap_core.errors import UserError
 from intercap_core.evaluation import object_pose

@@ -18,8 +18,10 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import NUM_POSE
-from intercap_core.body.skeleton_kernel import _rodrigues
+from intercap_core.body.selection import Selection
+from intercap_core.body.skeleton_kernel import _rodrigues, rest_points
 
 NUM_FEATURES = 486  # nine numbers of each rotation but the root's
 _FIRST = 3  # parameter of the first joint below the root
@@ -27,15 +29,65 @@ _TOGETHER = 16  # points whose table stays in a core's own cache for all bodies
 
 
 class Correctives(NamedTuple):
-    """tables (N,3,486) of a term's points, metres, and ``ids`` (n,) of those that they move."""
+    """Pose blend shapes of N points."""
 
     ids: np.ndarray
+    """(n,) points that they move."""
     tables: np.ndarray
+    """(N, 3, 486) metres."""
 
     @classmethod
     def of(cls, tables: np.ndarray) -> Correctives:
-        """Those of a term's points (N,3,486)."""
         return cls(np.flatnonzero(tables.any((1, 2))), np.ascontiguousarray(tables))
+
+
+class RestPoints(NamedTuple):
+    """N points of b bodies at rest, which pose blend shapes move in place."""
+
+    points: np.ndarray
+    """(b, N, 3) metres."""
+    correctives: Correctives | None
+    """None without pose blend shapes."""
+    gradient: np.ndarray
+    """(b, N, 3) gradient of the energy by these points, filled in by the terms; of no body where
+    it is not needed."""
+
+    @classmethod
+    def of(
+        cls, points: np.ndarray, correctives: Correctives | None, derivatives: bool
+    ) -> RestPoints:
+        needed = derivatives and correctives is not None
+        gradient = np.zeros(points.shape if needed else (0, 0, 3), points.dtype)
+        return cls(points, correctives, gradient)
+
+    @property
+    def tables(self) -> np.ndarray:
+        """(N, 3, 486), or of no point without pose blend shapes."""
+        empty = np.empty((0, 3, NUM_FEATURES), self.points.dtype)
+        return empty if self.correctives is None else self.correctives.tables
+
+    def move(self, feature: np.ndarray, at: slice, used: np.ndarray) -> None:
+        """Move the points of the bodies ``at`` (B) that are ``used`` (B, N) by feature (B, 486)."""
+        move(self.correctives, feature, used, self.points[at])
+
+
+class PointSource(NamedTuple):
+    """Chosen vertices of a body, from which a term makes its points at rest."""
+
+    selection: Selection
+    correctives: Correctives | None
+
+    @classmethod
+    def of(cls, model: BodyModel, vertices: np.ndarray) -> PointSource:
+        selection = model.select(vertices)
+        posedirs = selection.posedirs
+        return cls(selection, None if posedirs is None else Correctives.of(posedirs.numpy()))
+
+    def at_rest(self, shape: np.ndarray, derivatives: bool) -> RestPoints:
+        """Return the points of bodies of shape (b, S)."""
+        template, directions = self.selection.template, self.selection.directions
+        points = rest_points(template.numpy(), directions.numpy(), shape)
+        return RestPoints.of(points, self.correctives, derivatives)
 
 
 @numba.njit(cache=True, nogil=True)

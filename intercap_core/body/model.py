@@ -26,7 +26,7 @@ from intercap_core.body.kinematics import (
 from intercap_core.body.loading import BodyFile, load_body_file
 from intercap_core.body.maps import MARKER_NAMES, find_regions, load_maps
 from intercap_core.body.parameters import BodyParameters
-from intercap_core.body.selection import Selection, select
+from intercap_core.body.selection import Selection, select_points
 from intercap_core.errors import UserError
 
 _KEPT_SELECTIONS = 8
@@ -170,7 +170,7 @@ class BodyModel:
         self, params: BodyParameters, *, vertex_ids: Tensor | np.ndarray | None = None
     ) -> BodyOutput:
         """Posed vertices (B,V,3), or of `vertex_ids` (N,) alone (B,N,3), and joints (B,55,3)."""
-        selection = self._select(vertex_ids, joints=False)
+        selection = self.select(vertex_ids, joints=False)
         points, posed, _ = self._rest(selection, params)
         vertices = skin(points, posed.rotations, posed.offsets, selection.weights)
         return BodyOutput(vertices, posed.joints)
@@ -189,7 +189,7 @@ class BodyModel:
         The points are the vertices (all, or `vertex_ids`), followed by the joints if asked for.
         """
         with torch.no_grad():
-            selection = self._select(vertex_ids, joints=joints)
+            selection = self.select(vertex_ids, joints=joints)
             points, posed, axis_angle = self._rest(selection, params)
             return linearise(selection, points, posed, axis_angle, self._joint_directions)
 
@@ -209,8 +209,9 @@ class BodyModel:
         """(B,135,3), evaluating only the vertices that keypoints use."""
         return self.keypoints(self.forward(params, vertex_ids=self.keypoint_map.vertex_ids))
 
-    def _select(self, vertex_ids: Tensor | np.ndarray | None, *, joints: bool) -> Selection:
-        """The selection for these vertices; the last few are kept."""
+    def select(self, vertex_ids: Tensor | np.ndarray | None, *, joints: bool = False) -> Selection:
+        """Return the rest pose and the bones of these vertices (None = all), followed by the joints
+        if ``joints``. The last few selections are kept."""
         if vertex_ids is None:
             ids, key = None, b"all"
         else:
@@ -219,7 +220,7 @@ class BodyModel:
         key += b"j" if joints else b"v"
         if key not in self._selections:
             at = slice(None) if ids is None else ids
-            self._selections[key] = select(
+            self._selections[key] = select_points(
                 self._template[at],
                 self._directions[at],
                 None if self._posedirs is None else self._posedirs[at],

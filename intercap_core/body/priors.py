@@ -2,7 +2,7 @@
 
 E_theta_b and E_theta_f (:func:`rest_pose`), E_theta_h (:func:`hand_pose`), E_alpha
 (:func:`bending`), E_beta and E_psi (:func:`shape`), and beyond the paper :func:`joint_limits`. They
-are weighed and summed in :mod:`intercap_core.body_fit.body_priors`; VPoser's E_theta_b is in
+are weighed and summed in :mod:`intercap_core.body_fit.prior_term`; VPoser's E_theta_b is in
 :mod:`.vposer`.
 
 Every function takes parameter vectors (B,P) (order of `BodyParameters.vector`) and gives rows that

@@ -94,7 +94,7 @@ def _padded(flags: np.ndarray) -> np.ndarray:
     return np.where(np.take_along_axis(flags, order, 1), order, -1)
 
 
-def select(
+def select_points(
     template: Tensor,
     directions: Tensor,
     posedirs: Tensor | None,

@@ -29,7 +29,7 @@ class RestJoints(NamedTuple):
     @classmethod
     def of(cls, model: BodyModel) -> RestJoints:
         """Those of a body model."""
-        selection = model.linearise(model.zeros(), vertex_ids=np.array([0]), joints=True).selection
+        selection = model.select(np.array([0]), joints=True)
         return cls(selection.template[1:].numpy(), selection.directions[1:].numpy())
 
 
@@ -291,4 +291,18 @@ def add_point(row, place, shape, c, b, i, scale, n, arms):
     direction = c.directions[i]
     for s in shape:
         row[place[_SHAPE + s]] += t0 * direction[0, s] + t1 * direction[1, s] + t2 * direction[2, s]
+    return along
+
+
+@numba.njit(cache=True, nogil=True)
+def project_on_direction(c, b, i, n):
+    """Return n . point i of body b."""
+    x, along = c.rest[b, i], 0.0
+    for k in range(c.bones.shape[1]):
+        w = c.shares[i, k]
+        if w == 0:
+            continue
+        r, o = c.rotations[b, c.bones[i, k]], c.offsets[b, c.bones[i, k]]
+        for d in range(3):
+            along += w * n[d] * (r[d, 0] * x[0] + r[d, 1] * x[1] + r[d, 2] * x[2] + o[d])
     return along

@@ -1,4 +1,4 @@
-"""Frames without a believable fit are filled in between their neighbours."""
+"""Interpolation of frames without a valid fit between their neighbours."""
 
 from __future__ import annotations
 
@@ -8,23 +8,28 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from intercap_core.body.parameters import NUM_POSE
-from intercap_core.body_fit.constants import (
-    FEWEST_BRIDGES,
-    LARGEST_BRIDGED_SIGMA_M,
-    STANDING_SPEED,
-    VELOCITY_WEIGHT,
-    VELOCITY_WEIGHT_UNTIL_S,
-    VELOCITY_WINDOW_S,
-    WALKING_SPEED,
-)
+
+# Standard deviation of a bridged joint: speed along one coordinate if it is unknown (a walk), and
+# its least value (a standing person sways), m/s; the largest deviation is an arm's length, metres.
+_WALKING_SPEED, _STANDING_SPEED = 1.0, 0.1
+_LARGEST_SIGMA_M = 0.5
+# A velocity is measured to the nearest known frame between these times, seconds: nearer frames show
+# the noise of the fit, farther ones another motion. Tuned on the studio.
+_VELOCITY_WINDOW_S = (0.045, 0.15)
+# Weight of this velocity against the mean velocity of the bridge. On gaps of 1 to 15 frames at 15
+# Hz, anything from 0.7 to 1 is best: measured on the studio. It fades for bridges longer than 1 s,
+# which were not measured.
+_VELOCITY_WEIGHT, _VELOCITY_WEIGHT_UNTIL_S = 0.85, 1.0
+_FEWEST_BRIDGES = 5  # over known frames, to estimate the error of a bridge; tuned on the studio
 
 
 def bridge(vectors: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Fill rows of parameter vectors (T,P) that are not ``known`` (T,), by time (T,), seconds.
+    """Interpolate the rows of parameter vectors (T, P) that are not ``known`` (T,).
 
-    Between known neighbours everything goes on a cubic curve with the velocities that it has at its
-    ends (Hermite), rotations in the tangent space of the first neighbour, the shortest way; before
-    the first and after the last known frame the body stands still. At least one frame is known.
+    Between known neighbours parameters follow a cubic Hermite curve with the velocities at its
+    ends, rotations in the tangent space of the first neighbour, by the shortest way. Before the
+    first and after the last known frame the body is at rest. At least one frame is known.
+    ``times`` (T,) seconds.
     """
     result = vectors.copy()
     at = np.flatnonzero(known)
@@ -33,7 +38,7 @@ def bridge(vectors: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.ndar
         if end == start + 1:
             continue
         gap = np.arange(start + 1, end)
-        before, after = _beyond(start, end, known, times)
+        before, after = _velocity_frames(start, end, known, times)
         knots = [start, end, before, after]
         weights = _hermite(times[gap], times[knots])
         rest = slice(NUM_POSE, vectors.shape[1])
@@ -55,25 +60,27 @@ def bridge(vectors: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.ndar
 
 
 def _rotation_vectors(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """(J,3) of the turns from rotations (J,3,3) to others, in the frames of the first."""
+    """Return the turns (J, 3) from rotations (J, 3, 3) to others, in the frames of the first."""
     return np.asarray(Rotation.from_matrix(start.swapaxes(1, 2) @ end).as_rotvec())
 
 
-def _beyond(start: int, end: int, known: np.ndarray, times: np.ndarray) -> tuple[int, int]:
-    """Known frames before ``start`` and after ``end`` that tell the velocities there; these frames
-    themselves where there is none near."""
+def _velocity_frames(start: int, end: int, known: np.ndarray, times: np.ndarray) -> tuple[int, int]:
+    """Return the known frames before ``start`` and after ``end`` that determine the velocities
+    there; ``start`` or ``end`` itself if no frame is near enough."""
     at = np.flatnonzero(known)
     earlier, later = times[start] - times[at], times[at] - times[end]
     found = []
     for frame, seconds in ((start, earlier), (end, later)):
-        near = (seconds >= VELOCITY_WINDOW_S[0]) & (seconds <= VELOCITY_WINDOW_S[1])
+        near = (seconds >= _VELOCITY_WINDOW_S[0]) & (seconds <= _VELOCITY_WINDOW_S[1])
         found.append(int(at[near][seconds[near].argmin()]) if near.any() else frame)
     return found[0], found[1]
 
 
 def _hermite(when: np.ndarray, knots: np.ndarray) -> np.ndarray:
-    """Weights (N,4) at times ``when`` (N,) of values at ``knots`` (4,): start, end of a bridge, and
-    the frames that tell its velocities, which are the start, the end where nothing does."""
+    """Return the weights (N, 4) at times ``when`` (N,) of the values at the times ``knots`` (4,).
+
+    The knots are start and end of a bridge, and the frames of :func:`_velocity_frames`.
+    """
     length = knots[1] - knots[0]
     s = ((when - knots[0]) / length)[:, None]
     mean = np.array([-1.0, 1.0, 0.0, 0.0]) / length
@@ -82,8 +89,8 @@ def _hermite(when: np.ndarray, knots: np.ndarray) -> np.ndarray:
         slopes[0] = np.array([1.0, 0.0, -1.0, 0.0]) / (knots[0] - knots[2])
     if knots[3] > knots[1]:
         slopes[1] = np.array([0.0, -1.0, 0.0, 1.0]) / (knots[3] - knots[1])
-    believed = VELOCITY_WEIGHT * min(1.0, VELOCITY_WEIGHT_UNTIL_S / length)
-    first, last = (mean + believed * (slope - mean) for slope in slopes)
+    weight = _VELOCITY_WEIGHT * min(1.0, _VELOCITY_WEIGHT_UNTIL_S / length)
+    first, last = (mean + weight * (slope - mean) for slope in slopes)
     rise = s**2 * (3 - 2 * s)
     ends = np.concatenate([1 - rise, rise, np.zeros_like(s), np.zeros_like(s)], 1)
     bends = s * (1 - s) ** 2 * first - s**2 * (1 - s) * last
@@ -91,10 +98,11 @@ def _hermite(when: np.ndarray, knots: np.ndarray) -> np.ndarray:
 
 
 def continuous(rotation_vectors: np.ndarray) -> np.ndarray:
-    """Rotation vectors (T,3) of the same turns without jumps of a full turn between frames.
+    """Return rotation vectors (T, 3) of the same turns without jumps of a full turn.
 
-    Each is v or v - 2 pi v / |v|, whichever is nearer to the one before; an upright person seen by
-    a camera whose y is down is always about half a turn from rest, where the two meet.
+    Each is v or v - 2 pi v / |v|, whichever is nearer to the previous one. A person who stands
+    upright in front of a camera whose y points down is half a turn from the rest pose, where both
+    are equally long.
     """
     result = rotation_vectors.copy()
     for t in range(1, len(result)):
@@ -110,12 +118,17 @@ def continuous(rotation_vectors: np.ndarray) -> np.ndarray:
 def bridged_sigma(
     joints: np.ndarray, known: np.ndarray, sigma: np.ndarray, times: np.ndarray
 ) -> np.ndarray:
-    """Stated deviation (T,J), metres, of joints (T,J,3) whose unknown frames were bridged.
+    """Return the standard deviation (T, J) of joints, metres, whose unknown frames were bridged.
 
-    ``sigma`` (T,J) is that of the known frames (T,); ``times`` (T,) seconds. The known frames say
-    how far off such a bridge is: it is built over all their stretches of the same length. Where
-    there are too few of those, a joint is off by what it moves, at the speed it has elsewhere, in
-    the time to the nearest known frame.
+    The error of a bridge is measured on the known frames: bridges of the same length are built over
+    all their stretches. If there are too few, the error is the usual speed of the joint times the
+    time to the nearest known frame.
+
+    Args:
+        joints: (T, J, 3) metres.
+        known: (T,) bool.
+        sigma: (T, J) standard deviation in the known frames, metres.
+        times: (T,) seconds.
     """
     result = sigma.copy()
     at = np.flatnonzero(known)
@@ -126,14 +139,14 @@ def bridged_sigma(
         knots = ends
         weights = np.ones((1, 1))
         if len(ends) == 2:
-            before, after = _beyond(int(ends[0]), int(ends[1]), known, times)
+            before, after = _velocity_frames(int(ends[0]), int(ends[1]), known, times)
             knots = np.array([*ends, before, after])
             weights = _hermite(times[[t]], times[knots])
         steps = knots - t
         tried = np.arange(max(0, -steps.min()), len(known) - max(0, steps.max()))
         tried = tried[known[tried] & np.all([known[tried + step] for step in steps], axis=0)]
-        if len(tried) < FEWEST_BRIDGES:
-            off = np.minimum(speed * seconds[t], LARGEST_BRIDGED_SIGMA_M)
+        if len(tried) < _FEWEST_BRIDGES:
+            off = np.minimum(speed * seconds[t], _LARGEST_SIGMA_M)
         else:
             built = np.tensordot(weights[0], [joints[tried + step] for step in steps], 1)
             off = np.sqrt(((joints[tried] - built) ** 2).mean((0, 2)))
@@ -142,9 +155,9 @@ def bridged_sigma(
 
 
 def _speed(joints: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Usual speed (J,) along one coordinate, m/s, between neighbouring known frames."""
+    """Return the usual speed (J,) along one coordinate, m/s, between adjacent known frames."""
     pairs = np.flatnonzero(known[1:] & known[:-1])
-    if len(pairs) < FEWEST_BRIDGES:
-        return np.full(joints.shape[1], WALKING_SPEED)
+    if len(pairs) < _FEWEST_BRIDGES:
+        return np.full(joints.shape[1], _WALKING_SPEED)
     moved = (joints[pairs + 1] - joints[pairs]) / np.diff(times)[pairs, None, None]
-    return np.maximum(np.sqrt((moved**2).mean((0, 2))), STANDING_SPEED)
+    return np.maximum(np.sqrt((moved**2).mean((0, 2))), _STANDING_SPEED)

@@ -1,6 +1,6 @@
-"""Observations for bodies at their current pose: E_J's pixels and E_D's correspondences.
+"""Observations for bodies at their current pose: pixels of E_J, correspondences of E_D.
 
-Set up anew between rounds of the solver, together with how far each kind of observation is trusted.
+They are updated between rounds of the solver, together with the noise of each kind of observation.
 """
 
 from __future__ import annotations
@@ -13,70 +13,87 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from intercap_core.body.keypoints import BODY, FACE, LEFT_HAND, NUM_KEYPOINTS, RIGHT_HAND
-from intercap_core.body.model import BodyModel
-from intercap_core.body_fit import body_cloud, body_keypoints, body_samples, body_self
-from intercap_core.body_fit.body_cloud import CloudRows
-from intercap_core.body_fit.body_keypoints import KeypointSet
-from intercap_core.body_fit.body_samples import COVERINGS
-from intercap_core.body_fit.body_self import SelfContact
-from intercap_core.body_fit.body_surface import Surface
-from intercap_core.body_fit.constants import (
-    CONFIDENCE_BINS,
-    FEWEST_IN_BIN,
-    FRAMES_KEPT,
-    FRAMES_POSED,
-    HALF_WEIGHT_POINTS,
-    KEYPOINT_SIGMA_M,
-    LARGEST_CONFIDENCE_EXPONENT,
-    LEAST_CONFIDENCE,
-    MAX_SPEED,
-    NOISE_RANGE,
-    PERSISTENCE,
-    SAMPLE_SHARE,
-    SIGMA_RANGE,
-    SMALLEST_SIGMA_PX,
+from intercap_core.body.keypoints import (
+    BODY,
+    CONTOUR,
+    FACE,
+    LEFT_HAND,
+    NUM_KEYPOINTS,
+    RIGHT_HAND,
 )
-from intercap_core.body_fit.matching import Matcher, Skin
+from intercap_core.body.model import BodyModel
+from intercap_core.body_fit import cloud_term, keypoint_term
+from intercap_core.body_fit.matching import Matcher, PosedSkin
 from intercap_core.body_fit.observations import Observations, PersonCloud
 from intercap_core.body_fit.problem import BodyProblem
-from intercap_core.body_fit.terms import Views
+from intercap_core.body_fit.self_contact import SelfContact, find_contacts, join_frames
+from intercap_core.body_fit.surface import COVERINGS, Surface, choose_samples
+from intercap_core.body_fit.term_inputs import CloudRows, KeypointSet, Pairs, Views, keypoint_set
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.solve.robust import SIGMA_PER_MAD
 from intercap_core.geometry.solve.thread_pool import ThreadPool
 from intercap_core.geometry.solve.time_series import limited_velocity
 
+# Standard deviation of a keypoint whose constant offset is known, metres: the start, which is
+# refined from the residuals. Tuned on the studio.
+KEYPOINT_SIGMA_M = (
+    (BODY, 0.02),
+    (LEFT_HAND, 0.01),
+    (RIGHT_HAND, 0.01),
+    (slice(FACE.start, CONTOUR.stop), 0.008),
+)
+_SMALLEST_SIGMA_PX = 1.0  # tuned on the studio
+# Factor of sigma for errors that persist over frames, which residuals hide. Tuned on the studio.
+PERSISTENCE = 1.5
+_LEAST_CONFIDENCE = 0.1  # below it, sigma no longer grows; tuned on the studio
+# Neighbouring samples lie on one fold of cloth: four make one measurement. Tuned on the studio.
+_SAMPLE_SHARE = 0.25
+_HALF_WEIGHT_POINTS = 2.0  # points with which a sample has half its weight; tuned on the studio
+_MAX_SPEED = 6.0  # m/s; hands and feet reach about 5 in everyday tasks; tuned on the studio
+_FRAMES_POSED = 16  # frames whose whole surface is posed at once: memory
+_FRAMES_KEPT = 256  # frames whose surface is kept for the next matching: 250 kB each
 
-def measured_doubt(confidence: Tensor, error: Tensor) -> float:
-    """The power a >= 0 with which errors (M,) grow as confidence (M,) falls: confidence^-a."""
-    bins = torch.tensor_split(confidence.argsort(), CONFIDENCE_BINS)
-    if len(bins[0]) < FEWEST_IN_BIN:
+
+def fit_confidence_exponent(confidence: Tensor, error: Tensor) -> float:
+    """Return the exponent a >= 0 of errors (M,) that grow as confidence^-a.
+
+    It is the slope of the medians in six bins of confidence, 0 with less than 30 errors in a bin,
+    and at most 2. Tuned on the studio.
+    """
+    bins = torch.tensor_split(confidence.argsort(), 6)
+    if len(bins[0]) < 30:
         return 0.0
-    x = torch.stack([confidence[at].median() for at in bins]).clamp_min(LEAST_CONFIDENCE).log()
+    x = torch.stack([confidence[at].median() for at in bins]).clamp_min(_LEAST_CONFIDENCE).log()
     y = torch.stack([error[at].median() for at in bins]).clamp_min(1e-6).log()
     x, y = x - x.mean(), y - y.mean()
     slope = -float((x * y).sum() / (x * x).sum().clamp_min(1e-6))
-    return min(max(slope, 0.0), LARGEST_CONFIDENCE_EXPONENT)
+    return min(max(slope, 0.0), 2.0)
 
 
 class ViewDistances(NamedTuple):
-    """Each camera's points by sample of the skin: their mean distance (N,C,S), metres, and
-    effective number (N,C,S), 0 = none; where the samples were (N,S,3), and their normals."""
+    """Measured points at S samples, by camera, in N frames."""
 
     distance: Tensor
+    """(N, C, S) mean distance, metres."""
     points: Tensor
+    """(N, C, S) effective number of points, 0 = none."""
     where: Tensor
+    """(N, S, 3) position of the samples."""
     normal: Tensor
+    """(N, S, 3) normal of the samples."""
 
 
 class Evidence:
-    """Observations of the N usable frames.
+    """Observations of the N usable frames, and their noise.
 
-    frames (N,) their ids. keypoint_sigma (135,) m and cloud_noise (G,) m start from what is usual
-    and are refined from residuals; the first is of keypoints of usual confidence, others have
-    (confidence / usual)^-keypoint_doubt of it. cloud_residual (N,): median distance of points at
-    the last matching, metres, NaN = none; measured (N,S): which samples had some. by_view: what
-    each camera's points and masks said then, or None.
+    Attributes:
+        frames: (N,) frames of the sequence.
+        keypoint_sigma: (135,) standard deviation of keypoints of usual confidence, metres.
+        keypoint_doubt: (135,) exponent by which sigma grows as confidence falls below the usual.
+        cloud_noise: (G,) noise of the samples of each covering, metres.
+        cloud_residual: (N,) median distance of points at the last matching, metres, NaN = none.
+        measured: (N, S) bool, samples with depth points.
+        by_view: measurements of each camera at the last matching, or None.
     """
 
     def __init__(
@@ -90,21 +107,21 @@ class Evidence:
         self.frames = np.flatnonzero(seen.usable)
         self.clouds = [clouds[t] for t in self.frames]
         self.has_cloud = any(cloud is not None for cloud in self.clouds)
-        self.samples = body_samples.choose_samples(model)
+        self.samples = choose_samples(model)
         self.surface = Surface.around_samples(model, self.samples)
         sample, patch = (
             torch.as_tensor(places, device=model.device)
             for places in (self.surface.sample, self.surface.patch)
         )
         contact = SelfContact.of(model, self.samples)
-        self.self_contact = replace(contact, vertex=sample, patch=patch)  # places in the surface
+        self._self_contact = replace(contact, vertex=sample, patch=patch)  # indices in the surface
         self._matcher = Matcher.of(self.samples, self.surface, model.device)
         self.sample_ids = torch.as_tensor(self.samples.vertex, device=model.device)
         self.group = torch.as_tensor(self.samples.group, device=model.device)
         carrier = model.skinning_weights.argmax(1).cpu().numpy()
         self.sample_joints = carrier[self.samples.vertex]
         self._posed: tuple[Tensor, list[tuple[int, Tensor, Tensor]]] | None = None
-        # frame by frame in compiled code, which threads can share
+        # compiled code runs frame by frame, which threads can share
         self._threads = ThreadPool(torch.get_num_threads() if model.device.type == "cpu" else 1)
         self.cloud_noise = self._tensor(np.array([c.noise for c in COVERINGS]))
         self.cloud_residual = torch.full((len(self.frames),), torch.nan, device=model.device)
@@ -125,13 +142,15 @@ class Evidence:
         return torch.as_tensor(values, dtype=self.model.dtype, device=self.model.device)
 
     def take_cameras(self, rig: Rig, depth_bias: np.ndarray) -> None:
-        """See through other poses of the cameras and depth biases (C,), metres, from now on."""
+        """Use other camera poses and depth biases (C,), metres, from now on."""
         seen = self.seen
         self.clouds = [
             None if cloud is None else cloud.through(rig, depth_bias, seen.rig, seen.depth_bias)
             for cloud in self.clouds
         ]
         self.seen = replace(seen, rig=rig, depth_bias=depth_bias)
+
+    # --- keypoints ---------------------------------------------------------------------------
 
     def observe_keypoints(
         self,
@@ -141,7 +160,7 @@ class Evidence:
         face: bool = False,
         widened: float = 1.0,
     ) -> None:
-        """Set E_J up at the problem's bodies: which keypoints, their sigma in pixels, shifts.
+        """Set up E_J at the problem's bodies: keypoints, their sigma in pixels, shifts.
 
         ``widened`` multiplies sigma, and with it the error from which a keypoint is an outlier.
         """
@@ -156,18 +175,18 @@ class Evidence:
         z = z[..., 0] + pose[:, 2, 3][:, None]
         confidence = self._tensor(seen.confidence[at])
         sigma = widened * self.keypoint_sigma[chosen] * lenses[:, None, 0] / z.clamp_min(0.3)
-        sigma = sigma * self._doubted(confidence, chosen)
+        sigma = sigma * self._sigma_factor(confidence, chosen)
         problem.views = Views(
             self._tensor(seen.keypoints[at]),
             confidence,
-            sigma.clamp_min(SMALLEST_SIGMA_PX),
+            sigma.clamp_min(_SMALLEST_SIGMA_PX),
             lenses,
             pose,
             self._shift(points),
         )
 
     def keypoints(self, *, hands: bool = False, face: bool = False) -> KeypointSet:
-        """Those of the body, and of hands and face where requested.
+        """Return the keypoints of the body, and of hands and face where requested.
 
         The jaw line is left out: its landmarks slide over the cheek with the view.
         """
@@ -176,125 +195,126 @@ class Evidence:
             index += range(LEFT_HAND.start, RIGHT_HAND.stop)
         if face:
             index += range(FACE.start, FACE.stop)
-        return body_keypoints.keypoint_set(self.model, index)
+        return keypoint_set(self.model, index)
 
     def points(self, problem: BodyProblem) -> Tensor:
-        """Current positions (N,K,3) of the problem's keypoints, with offsets."""
-        offsets = torch.zeros(len(problem.keypoints.index), 3).to(problem.base)
-        offsets[: BODY.stop] = problem.offsets
-        return body_keypoints.evaluate(
+        """Return the current positions (N, K, 3) of the problem's keypoints, with offsets."""
+        return keypoint_term.evaluate(
             self.model,
             self.model.parameters(problem.base),
             problem.keypoints,
-            offsets,
+            problem.all_offsets(),
             derivatives=False,
         ).points
 
     def pixel_residuals(self, problem: BodyProblem) -> Tensor:
-        """Projections minus observations (N,C,K,2), px, of the problem's keypoints."""
-        views = problem.views
-        if views is None:
+        """Return projections minus observations (N, C, K, 2), px, of the problem's keypoints."""
+        if problem.views is None:
             raise ValueError("the problem has no views to compare with")
-        return body_keypoints.pixel_residuals(
-            self.points(problem),
-            views.observed,
-            views.lenses,
-            views.colour_from_master,
-            shift=views.shift,
-        )
+        return keypoint_term.pixel_residuals(self.points(problem), problem.views)
 
     def _shift(self, points: Tensor) -> Tensor | None:
-        """Shift (N,C,...,3) of points (N,...,3) from the frame's time to each camera's exposure, or
-        None."""
+        """Return the displacement (N, C, ..., 3) of points (N, ..., 3) until each camera exposes;
+        None if all cameras expose at the time of the frame."""
         offset = self.seen.time_offset
         if not np.any(offset):
             return None
         return self._tensor(offset)[:, None, None] * self.velocity(points)[:, None]
 
     def velocity(self, points: Tensor) -> Tensor:
-        """(N,...,3) m/s of the usable frames' points (N,...,3)."""
+        """Return the velocity (N, ..., 3), m/s, of points (N, ..., 3) of the usable frames."""
         found = limited_velocity(
-            points.double().cpu().numpy(), self.seen.times[self.frames], max_speed=MAX_SPEED
+            points.double().cpu().numpy(), self.seen.times[self.frames], max_speed=_MAX_SPEED
         )
         return self._tensor(found)
 
-    def _doubted(self, confidence: Tensor, index: Tensor) -> Tensor:
-        """Factor (N,C,K) of the sigma of keypoints ``index`` (K,) by their confidence (N,C,K)."""
-        share = confidence.clamp_min(LEAST_CONFIDENCE) / self.usual_confidence[index]
+    def _sigma_factor(self, confidence: Tensor, index: Tensor) -> Tensor:
+        """Return the factor (N, C, K) of sigma for keypoints ``index`` (K,) of this confidence."""
+        share = confidence.clamp_min(_LEAST_CONFIDENCE) / self.usual_confidence[index]
         return share ** -self.keypoint_doubt[index]
 
     def refine_sigma(self, problem: BodyProblem) -> None:
-        """Noise of each group of keypoints from its residuals: 1.48 median absolute deviation."""
+        """Estimate sigma and its dependence on confidence from residuals, for each group of
+        keypoints. Sigma is limited to 0.1 and 4 times its start; tuned on the studio."""
         views = problem.views
         assert views is not None
         index = problem.keypoints.index
         scaled = self.pixel_residuals(problem).abs() / views.sigma[..., None]
         scaled = scaled * self.keypoint_sigma[index, None]
-        scaled = scaled * self._doubted(views.confidence, index)[..., None]
+        scaled = scaled * self._sigma_factor(views.confidence, index)[..., None]
         for part, start in KEYPOINT_SIGMA_M:
             here = (index >= part.start) & (index < part.stop)
             known = views.confidence[:, :, here] > 0
             if bool(known.any()):
                 sure, off = views.confidence[:, :, here][known], scaled[:, :, here][known]
-                self.keypoint_doubt[part] = measured_doubt(sure, off.mean(1))
-                usual = off / self._doubted(views.confidence, index)[:, :, here][known][:, None]
+                self.keypoint_doubt[part] = fit_confidence_exponent(sure, off.mean(1))
+                factor = self._sigma_factor(views.confidence, index)[:, :, here][known]
+                usual = off / factor[:, None]
                 found = SIGMA_PER_MAD * PERSISTENCE * float(usual.median())
-                low, high = (start * factor for factor in SIGMA_RANGE)
-                self.keypoint_sigma[part] = min(max(found, low), high)
+                self.keypoint_sigma[part] = min(max(found, start * 0.1), start * 4.0)
+
+    # --- cloud -------------------------------------------------------------------------------
 
     def refine_cloud_noise(self, problem: BodyProblem) -> None:
-        """The same for each covering's samples, from what is left of their distances."""
+        """Estimate the noise of each covering's samples from residuals, limited to 0.1 and 1.5
+        times its start; tuned on the studio."""
         rows = problem.rows
         assert rows is not None
-        points = self.model.forward(
-            self.model.parameters(problem.base), vertex_ids=self.sample_ids
-        ).vertices
-        residual = body_cloud.residuals(
-            points, rows, problem.thickness_of_group(), self.group
-        ).abs()
+        params = self.model.parameters(problem.base)
+        points = self.model.forward(params, vertex_ids=self.sample_ids).vertices
+        thickness = problem.thickness_of_group()
+        residual = cloud_term.residuals(points, rows, thickness, self.group).abs()
         for g, covering in enumerate(COVERINGS):
             part = self.group == g
             known = rows.weight[:, part] > 0
             if bool(known.any()):
                 found = SIGMA_PER_MAD * float(residual[:, part][known].median())
-                low, high = (covering.noise * factor for factor in NOISE_RANGE)
-                self.cloud_noise[g] = min(max(found, low), high)
+                start = covering.noise
+                self.cloud_noise[g] = min(max(found, start * 0.1), start * 1.5)
 
     def _bodies(self, base: Tensor) -> Iterator[tuple[int, Tensor, Tensor]]:
-        """Some frames of the bodies ``base`` (N,P) at a time: the first one's place, vertices and
-        normals (b,R,3) of the surface. Those of short sequences are kept for the next call."""
+        """Pose the bodies ``base`` (N, P), a few at a time.
+
+        Yields the place of the first one, vertices and normals (b, R, 3) of the surface. Those of
+        short sequences are kept for the next call.
+        """
         if self._posed is not None and torch.equal(self._posed[0], base):
             yield from self._posed[1]
             return
         self._posed, parts = None, []
         params = self.model.parameters(base)
-        for start in range(0, len(base), FRAMES_POSED):
-            part = (start, *self.surface.posed(params.frames(slice(start, start + FRAMES_POSED))))
-            if len(base) <= FRAMES_KEPT:
+        for start in range(0, len(base), _FRAMES_POSED):
+            part = (start, *self.surface.posed(params.frames(slice(start, start + _FRAMES_POSED))))
+            if len(base) <= _FRAMES_KEPT:
                 parts.append(part)
             yield part
         if parts:
             self._posed = (base.clone(), parts)
 
-    def touch(self, problem: BodyProblem) -> body_self.Pairs | None:
-        """Where parts of the problem's bodies are inside each other, or nearly; None = nowhere, or
-        switched off."""
+    def touch(self, problem: BodyProblem) -> Pairs | None:
+        """Find where parts of the problem's bodies penetrate each other; None = nowhere, or the
+        term is switched off."""
         if not problem.self_weight:
             return None
         ids = torch.as_tensor(self.surface.ids, device=self.model.device)
         found = []
         for _, vertices, normals in self._bodies(problem.base):
             found += self._threads.map(
-                lambda one: body_self.find(self.self_contact, *one),
+                lambda posed: find_contacts(self._self_contact, *posed),
                 list(zip(vertices, normals, strict=True)),
             )
-        return body_self.join([(ids[inner], ids[outer], normal) for inner, outer, normal in found])
+        return join_frames([(ids[inner], ids[outer], normal) for inner, outer, normal in found])
 
     def match(
         self, problem: BodyProblem, reach: float, only: np.ndarray | None = None
     ) -> CloudRows:
-        """Correspondences of all frames at the problem's bodies, within ``reach`` metres: of all
-        cameras, or of the one of each frame that ``only`` (N,) names."""
+        """Match the points of all frames to the problem's bodies.
+
+        Args:
+            problem: the bodies.
+            reach: largest valid distance, metres.
+            only: (N,) the one camera of each frame that counts; None = all cameras.
+        """
         count, size, views = len(self.frames), len(self.samples.vertex), len(self.seen.rig)
         params = self.model.parameters(problem.base)
         where = self.model.forward(params, vertex_ids=self.sample_ids).vertices
@@ -304,39 +324,40 @@ class Evidence:
         expected = problem.thickness().repeat(views)
         normal = where.new_zeros(count, size, 3)
         for start, vertices, normals in self._bodies(problem.base):
-            normal[start : start + len(normals)] = normals[:, self.self_contact.vertex]
+            normal[start : start + len(normals)] = normals[:, self._self_contact.vertex]
             seen = [
                 (start + row, *posed)
                 for row, posed in enumerate(zip(vertices, normals, strict=True))
                 if self.clouds[start + row] is not None
             ]
 
-            def matched(one: tuple[int, Tensor, Tensor]) -> None:
-                t, vertices, normals = one
+            def match_frame(posed: tuple[int, Tensor, Tensor]) -> None:
+                t, vertices, normals = posed
                 cloud = self.clouds[t]
                 assert cloud is not None
                 if only is not None:
                     cloud = cloud.of_view(int(only[t]))
                 late = None if shift is None else shift[t]
-                skin = Skin(vertices, normals, where[t], late)
+                skin = PosedSkin(vertices, normals, where[t], late)
                 found = self._matcher.match(
                     cloud, self.seen.rig, self.seen.depth_bias, skin, expected, reach
                 )
                 of_views[t], points[t] = found.distance, found.points
                 self.measured[t], self.cloud_residual[t] = found.measured, found.residual
 
-            self._threads.map(matched, seen)
+            self._threads.map(match_frame, seen)
         self.by_view = ViewDistances(of_views, points, where, normal)
         return self.rows(points)
 
     def rows(self, points: Tensor) -> CloudRows:
-        """What :meth:`match` found, with these numbers of points (N,C,S), 0 = do not count."""
+        """Return the rows of the last :meth:`match` with these numbers of points (N, C, S), 0 = do
+        not count."""
         found = self.by_view
         assert found is not None, "match comes first"
         total = points.sum(1)
         mean = (found.distance * points).sum(1) / total.clamp_min(1e-6)
         noise = self.cloud_noise[self.group]
-        share = self.cloud_weight * SAMPLE_SHARE
-        weight = share * total / (total + HALF_WEIGHT_POINTS) / noise**2
+        share = self.cloud_weight * _SAMPLE_SHARE
+        weight = share * total / (total + _HALF_WEIGHT_POINTS) / noise**2
         target = mean + (found.normal * found.where).sum(2)
         return CloudRows(target, found.normal, weight, mean)

@@ -1,7 +1,7 @@
-"""Where rays first meet a mesh, compiled: for some thousand rays at once, without a tree.
+"""First intersections of a few thousand rays with a mesh, compiled, without a tree.
 
-Triangles are looked at in groups that lie close together; a group is skipped where the ray misses
-its bounding sphere or has hit something nearer. Moeller and Trumbore 1997, double precision.
+Triangles are tested in groups of neighbours. A group is skipped if the ray misses its bounding
+sphere or has a nearer intersection already. Moeller and Trumbore 1997, double precision.
 """
 
 from __future__ import annotations
@@ -9,19 +9,21 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-_GROUP = 48  # triangles
-# Bits of each coordinate along the curve, and those within a cube: 1/32 of the mesh's size.
-_BITS, _CUBE_BITS = 9, 4
-# Triangles reach this much of their size beyond their edges, so that no ray slips between two.
+_GROUP = 48  # triangles: speed
+# Share of their size by which triangles are enlarged, so that no ray passes between two.
 _BEYOND = 1e-9
 
 
 def first_hits(
     points: np.ndarray, faces: np.ndarray, origins: np.ndarray, directions: np.ndarray
 ) -> np.ndarray:
-    """How far (N,) along unit ``directions`` (N,3) from ``origins`` (N,3) rays meet triangles.
+    """Return the distance (N,) to the first intersection of each ray, infinite if there is none.
 
-    Mesh of points (V,3) and faces (F,3), met from either side; infinite where there is nothing.
+    Args:
+        points: (V, 3) vertices.
+        faces: (F, 3) triangles, which count from either side.
+        origins: (N, 3)
+        directions: (N, 3) unit vectors.
     """
     corners = points[faces].astype(np.float64)
     order, starts = _grouped(corners.mean(1))
@@ -29,16 +31,20 @@ def first_hits(
 
 
 def _grouped(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Order (N,) of points (N,3) along Morton's curve, and where in it groups start, and the last
-    ends: where the curve enters another cube, and after so many points."""
+    """Order points (N, 3) along Morton's curve, and group them.
+
+    Returns the order (N,), the start of each group in it, and the end. A group starts where the
+    curve enters another cube of 1/32 of the size of the mesh, and after 48 points.
+    """
+    bits, cube_bits = 9, 4  # of each coordinate: along the curve, and within a cube
     low, size = points.min(0), np.ptp(points, axis=0).max()
-    cell = ((points - low) / max(size, 1e-9) * (2**_BITS - 1)).astype(np.int64)
+    cell = ((points - low) / max(size, 1e-9) * (2**bits - 1)).astype(np.int64)
     place = np.zeros(len(points), np.int64)
-    for bit in range(_BITS):
+    for bit in range(bits):
         for axis in range(3):
             place |= (cell[:, axis] >> bit & 1) << (3 * bit + axis)
     order = np.argsort(place, kind="stable")
-    cube = place[order] >> 3 * _CUBE_BITS
+    cube = place[order] >> 3 * cube_bits
     enters = np.flatnonzero(np.diff(cube)) + 1
     return order, np.union1d(enters, [*range(0, len(order), _GROUP), len(order)])
 
@@ -60,7 +66,7 @@ def _first_hits(corners, starts, origins, directions):
     for r in range(len(origins)):
         ox, oy, oz = origins[r, 0], origins[r, 1], origins[r, 2]
         dx, dy, dz = directions[r, 0], directions[r, 1], directions[r, 2]
-        for g in range(groups):  # apart from what decides, so that several are done at once
+        for g in range(groups):  # separate from the tests below, so that the loop is vectorised
             u, v, w = x[g] - ox, y[g] - oy, z[g] - oz
             along[g] = u * dx + v * dy + w * dz
             aside[g] = u * u + v * v + w * w - along[g] * along[g] - within[g]
@@ -76,7 +82,7 @@ def _first_hits(corners, starts, origins, directions):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _meets(triangle, ox, oy, oz, dx, dy, dz):
-    """How far along the ray it meets a triangle (3,3); -1 = not."""
+    """Return the distance along the ray to a triangle (3,3); -1 = no intersection."""
     ax, ay, az = triangle[0, 0], triangle[0, 1], triangle[0, 2]
     ux, uy, uz = triangle[1, 0] - ax, triangle[1, 1] - ay, triangle[1, 2] - az
     vx, vy, vz = triangle[2, 0] - ax, triangle[2, 1] - ay, triangle[2, 2] - az

@@ -1,40 +1,44 @@
-"""The other direction of E_D (equation 4): from vertices that a camera should see to its depth.
+"""The opposite direction of E_D (equation 4): from visible vertices to the measured depth.
 
-Beyond the paper. A vertex that faces a camera, and past which that camera measured something
-clearly farther away, sticks out of the person. It has to go in along its normal until the measured
-person begins:
+Beyond the paper. A vertex that faces a camera, and behind which that camera measured a surface
+clearly farther away, sticks out of the person. It has to move inward along its normal until the
+measured person begins:
 
-    e = -d - c,    d = the way along -n, in the image, to the first pixel not seen through,
+    e = -d - c,    d = distance along -n, in the image, to the first pixel that is not farther away
 
-c the covering's thickness as in :mod:`intercap_core.body_fit.body_cloud`. The person's mask is not
-used, so one that is too small, or lacks a hand, adds no bias; an occluder is nearer than the
-vertex, and pixels without depth are unknown: neither has a residual.
+with the thickness c of the covering as in :mod:`.cloud_term`. The person's mask is not used, so a
+mask that is too small or lacks a hand adds no bias. An occluder is nearer than the vertex, and
+pixels without depth are unknown: neither has a residual.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 
-from intercap_core.body_fit import free_space_kernel
-from intercap_core.body_fit.constants import (
-    FREE_SPACE_BEHIND_M,
-    FREE_SPACE_FACING,
-    FREE_SPACE_NEAREST_M,
-    FREE_SPACE_REACH_M,
-    FREE_SPACE_STEP_M,
-)
+from intercap_core.geometry.camera.projection_kernels import project_point
 from intercap_core.geometry.camera.rig import Camera
+
+# Metres behind a vertex from which a depth is not the person's surface. Tuned on the studio.
+_BEHIND_M = 0.06
+# Largest cosine of the normal and the viewing direction: about 84 degrees. Tuned on the studio.
+_FACING = 0.1
+_NEAREST_M = 0.3  # depth; the range of the Azure Kinect (NFOV) starts at 0.5 m (data sheet)
+_REACH_M, _STEP_M = 0.05, 0.01  # length and step of the search inward; tuned on the studio
 
 
 @dataclass(frozen=True, eq=False)
 class DepthWindow:
-    """Part of camera ``view``'s depth image: (h,w) uint16 mm, its first pixel's row, column."""
+    """Part of a camera's depth image."""
 
     view: int
+    """Camera index."""
     first: tuple[int, int]
+    """Row and column of the first pixel in the image."""
     depth: np.ndarray
+    """(h, w) uint16, mm."""
 
 
 def seen_through(
@@ -44,15 +48,90 @@ def seen_through(
     points: np.ndarray,
     normals: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Which points (M,) stick out in one view, and how far, metres, M values > 0.
+    """Find points that stick out of the person in one view.
 
-    points, unit normals (N,3), master frame; ``depth_bias`` metres that the camera measures too
-    much. Those for which no person begins within reach are left out.
+    Args:
+        window: depth around the person.
+        camera: the camera.
+        depth_bias: distance that the camera measures too much, metres.
+        points: (N, 3) master frame, metres.
+        normals: (N, 3) unit normals.
+
+    Returns:
+        (M,) index of each point that sticks out, and that the person begins within reach of.
+        (M,) distance by which it sticks out, metres, > 0.
     """
     assert camera.depth is not None
-    return free_space_kernel.seen_through(
+    return _seen_through(
         window.depth, *window.first, tuple(camera.depth.parameters.tolist()),
         camera.depth_from_master, depth_bias, points, normals,
-        FREE_SPACE_BEHIND_M, FREE_SPACE_FACING, FREE_SPACE_NEAREST_M, FREE_SPACE_REACH_M,
-        FREE_SPACE_STEP_M,
+        _BEHIND_M, _FACING, _NEAREST_M, _REACH_M, _STEP_M,
     )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True)
+def _seen_through(
+    depth,
+    top,
+    left,
+    lens,
+    pose,
+    bias,
+    points,
+    normals,
+    behind,
+    facing,
+    nearest,
+    reach,
+    step,
+):
+    """Compiled form of :func:`seen_through`.
+
+    depth (h,w) uint16 mm, whose first pixel is at row ``top`` and column ``left`` of the image;
+    lens: thirteen parameters; pose (4,4): depth_from_master; bias: metres.
+    The other arguments are the constants of this module.
+    """
+    index, away = np.empty(len(points), np.int64), np.empty(len(points))
+    count, steps = 0, int(np.rint(reach / step))
+    for i in range(len(points)):
+        px, py, pz = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
+        if not z > nearest:
+            continue
+        x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]
+        y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]
+        px, py, pz = np.float64(normals[i, 0]), np.float64(normals[i, 1]), np.float64(normals[i, 2])
+        nx = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz
+        ny = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz
+        nz = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz
+        if not nx * x + ny * y + nz * z < facing * np.sqrt(x * x + y * y + z * z):
+            continue
+        if not _past(depth, top, left, lens, x, y, z, bias + behind):
+            continue
+        for s in range(1, steps + 1):
+            way = s * step
+            if _past(
+                depth, top, left, lens, x - way * nx, y - way * ny, z - way * nz, bias + behind
+            ):
+                continue
+            # the nearest step is within the error of the image: counting only the errors outward
+            # would make every person thinner
+            if s > 1:
+                # between the last step that is seen through and the first that is not
+                index[count], away[count] = i, way - step / 2
+                count += 1
+            break
+    return index[:count].copy(), away[:count].copy()
+
+
+@numba.njit(cache=True, nogil=True)
+def _past(depth, top, left, lens, x, y, z, behind):
+    """Return whether the depth at a point, depth camera's frame, is more than ``behind`` metres
+    farther."""
+    u, v = project_point(x, y, z, lens)
+    if not (np.isfinite(u) and np.isfinite(v)):
+        return False
+    column, row = np.rint(u - left), np.rint(v - top)
+    if not (0 <= row < depth.shape[0] and 0 <= column < depth.shape[1]):
+        return False
+    return depth[int(row), int(column)] * 1e-3 > z + behind

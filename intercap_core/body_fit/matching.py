@@ -1,7 +1,9 @@
-"""What one frame's depth and masks say of each sample of the skin, camera by camera: E_D.
+"""Assign one frame's depth points and mask rims to the samples of the skin, camera by camera: E_D.
 
-Points of the person meet the surface (:mod:`intercap_core.body_fit.body_cloud`), vertices that a
-camera looks past stick out (:mod:`.free_space`), and rims of masks touch (:mod:`.outlines`).
+Points of the person are matched to the surface. Vertices in front of a surface that a camera
+measured farther away stick out of the person (:mod:`.free_space`). Rims of masks touch the surface
+(:mod:`.outlines`). The distances at each sample are averaged to one residual of
+:mod:`.cloud_term`.
 """
 
 from __future__ import annotations
@@ -9,84 +11,187 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numba
 import numpy as np
 import torch
 from torch import Tensor
 
-from intercap_core.body_fit import body_cloud
-from intercap_core.body_fit.body_cloud import Matches
-from intercap_core.body_fit.body_samples import Samples
-from intercap_core.body_fit.body_surface import Surface
-from intercap_core.body_fit.constants import CLOUD_HUBER_M, FREE_SPACE_TRUST, OUTLINE_TRUST
 from intercap_core.body_fit.free_space import seen_through
 from intercap_core.body_fit.observations import PersonCloud
 from intercap_core.body_fit.outlines import RimSamples, touching
+from intercap_core.body_fit.surface import MATCH_SIDEWAYS_M, NORMAL_LENGTH_M, Samples, Surface
 from intercap_core.geometry.camera.rig import Rig
 
+MATCH_COSINE = 0.3  # smallest, between the normals of a point and its vertex; tuned on the studio
+# Distance from the covering beyond which a point has less weight, metres. Tuned on the studio.
+CLOUD_HUBER_M = 0.012
 
-class Skin(NamedTuple):
-    """A posed body: vertices and normals (R,3) of the surface, ``where`` (S,3) its samples are, and
-    how far they move until each camera exposes, ``late`` (C,S,3) or None; metres, master frame."""
+
+class Matches(NamedTuple):
+    """M distances of measured points from samples."""
+
+    sample: Tensor
+    """(M,) index of the sample."""
+    distance: Tensor
+    """(M,) signed distance from the surface, outside positive, metres."""
+    valid: Tensor
+    """(M,) bool: the match counts."""
+
+
+def match_points(
+    points: Tensor,
+    normals: Tensor,
+    vertices: Tensor,
+    vertex_normals: Tensor,
+    surface: Surface,
+    reach: float,
+) -> Matches:
+    """Match points to the sample that is nearest in position and orientation.
+
+    A point can only match a surface that faces the same way: the vertices that its camera sees.
+
+    Args:
+        points: (M, 3) measured points, metres.
+        normals: (M, 3) unit normals.
+        vertices: (R, 3) of the posed surface, metres.
+        vertex_normals: (R, 3)
+        surface: samples and patches.
+        reach: largest valid distance along the normal, metres.
+    """
+    if vertices.device.type != "cpu":
+        return match_in_torch(points, normals, vertices, vertex_normals, surface, reach)
+    kind = vertices.dtype
+    found = _match(
+        points.to(kind).numpy(), normals.to(kind).numpy(), vertices.numpy(),
+        vertex_normals.numpy(), surface.sample, surface.patch, surface.order, surface.groups,
+        vertices.numpy().dtype.type(NORMAL_LENGTH_M), reach, MATCH_SIDEWAYS_M, MATCH_COSINE,
+    )  # fmt: skip
+    return Matches(*map(torch.from_numpy, found))
+
+
+def match_in_torch(
+    points: Tensor,
+    normals: Tensor,
+    vertices: Tensor,
+    vertex_normals: Tensor,
+    surface: Surface,
+    reach: float,
+) -> Matches:
+    """The readable form of :func:`match_points`, on any device."""
+    samples, patch = (
+        torch.as_tensor(places, device=vertices.device)
+        for places in (surface.sample, surface.patch)
+    )
+    v, n = vertices[samples], vertex_normals[samples]
+    centre = v.mean(0)
+    ours = torch.cat([v - centre, NORMAL_LENGTH_M * n], 1)
+    theirs = torch.cat([points - centre, NORMAL_LENGTH_M * normals], 1)
+    sample = torch.addmm((ours * ours).sum(1), theirs, ours.T, alpha=-2).argmin(1)
+    near = patch[sample]
+    gap = points[:, None] - vertices[near]
+    best = (gap * gap).sum(2).argmin(1, keepdim=True)
+    at = near.gather(1, best)[:, 0]
+    gap = gap.gather(1, best[..., None].expand(-1, 1, 3))[:, 0]
+    normal = vertex_normals[at]
+    distance = (normal * gap).sum(1)
+    sideways = (gap - distance[:, None] * normal).norm(dim=1)
+    valid = ((normal * normals).sum(1) > MATCH_COSINE) & (distance.abs() < reach)
+    return Matches(sample, distance, valid & (sideways < MATCH_SIDEWAYS_M))
+
+
+def average(
+    found: Matches, trust: Tensor, expected: Tensor, *, huber: float
+) -> tuple[Tensor, Tensor]:
+    """Return the mean distance (N,) at each sample and the effective number of points (N,).
+
+    Args:
+        found: matches of M points.
+        trust: (M,) weight of each point.
+        expected: (N,) thickness of the covering at each sample, metres.
+        huber: distance from ``expected`` beyond which a point has less weight, metres (one
+            iteration of Huber's weight).
+    """
+    excess = (found.distance - expected[found.sample]).abs()
+    weight = trust * found.valid * (huber / excess.clamp_min(huber))
+    total = torch.zeros(len(expected), dtype=trust.dtype, device=trust.device)
+    total = total.index_add(0, found.sample, weight)
+    summed = torch.zeros_like(total).index_add(0, found.sample, weight * found.distance)
+    return summed / total.clamp_min(1e-6), total
+
+
+# --- all measurements of a frame -------------------------------------------------------------
+
+
+class PosedSkin(NamedTuple):
+    """A posed body in the master frame, metres."""
 
     vertices: Tensor
+    """(R, 3) vertices of the surface."""
     normals: Tensor
-    where: Tensor
+    """(R, 3) unit normals; those of samples and patches are correct."""
+    samples: Tensor
+    """(S, 3) positions of the samples."""
     late: Tensor | None
+    """(C, S, 3) displacement of the samples until each camera exposes."""
 
 
 class FrameMatches(NamedTuple):
-    """By camera and sample: mean distance (C,S), metres, and effective number of points (C,S), 0 =
-    none. ``residual``: median distance of the depth's points; measured (S,): who had some."""
+    """Distances at S samples in C cameras."""
 
     distance: Tensor
+    """(C, S) mean distance, metres."""
     points: Tensor
+    """(C, S) effective number of points, 0 = none."""
     residual: Tensor
+    """Median distance of the depth points, metres."""
     measured: Tensor
+    """(S,) bool: the sample has depth points."""
 
 
 @dataclass(frozen=True, eq=False)
 class Matcher:
-    """Of a ``surface`` whose samples are ``sample`` (S,) with patches (S,20), places among its
-    vertices; ``rims``: those that masks tell of."""
+    """Matches the measurements of a frame to the S samples of a surface."""
 
     surface: Surface
     sample: Tensor
-    patch: Tensor
+    """(S,) index of each sample in the surface."""
     rims: RimSamples
+    """Samples that rims of masks can touch."""
 
     @classmethod
     def of(cls, samples: Samples, surface: Surface, device: torch.device) -> Matcher:
-        """For the samples of a surface."""
-        sample, patch = (
-            torch.as_tensor(places, device=device) for places in (surface.sample, surface.patch)
-        )
-        return cls(surface, sample, patch, RimSamples.of(samples, surface))
+        sample = torch.as_tensor(surface.sample, device=device)
+        return cls(surface, sample, RimSamples.of(samples, surface))
 
     def match(
         self,
         cloud: PersonCloud,
         rig: Rig,
         depth_bias: np.ndarray,
-        skin: Skin,
+        skin: PosedSkin,
         expected: Tensor,
         reach: float,
     ) -> FrameMatches:
-        """One frame's ``cloud`` through cameras with ``depth_bias`` (C,), metres.
+        """Match one frame.
 
-        ``expected`` (C*S,) thickness of what is worn; nothing counts beyond ``reach`` metres.
+        Args:
+            cloud: points, depth windows and outlines of the person.
+            rig: cameras.
+            depth_bias: (C,) distance that each camera measures too much, metres.
+            skin: the posed body.
+            expected: (C * S,) thickness of the covering, metres.
+            reach: largest valid distance, metres.
         """
-        points = self._points(cloud, skin, reach)
+        points = self._match_points(cloud, skin, reach)
         parts = [
-            # gathered by camera and sample: those that several cameras see tell their offsets
+            # by camera and sample: samples that several cameras see determine their offsets
             (points._replace(sample=self._row(cloud.view, points.sample)), cloud.trust),
-            self._sticking_out(cloud, rig, depth_bias, skin),
-            self._on_rims(cloud, rig, skin, reach),
+            self._find_protruding(cloud, rig, depth_bias, skin),
+            self._find_on_rims(cloud, rig, skin, reach),
         ]
         every = Matches(*map(torch.cat, zip(*(matches for matches, _ in parts), strict=True)))
         trust = torch.cat([trust for _, trust in parts])
-        distance, number = body_cloud.gather(
-            every, trust, expected, len(expected), huber=CLOUD_HUBER_M
-        )
+        distance, number = average(every, trust, expected, huber=CLOUD_HUBER_M)
         measured = torch.zeros_like(self.sample, dtype=torch.bool)
         measured[points.sample[points.valid]] = True
         return FrameMatches(
@@ -99,42 +204,36 @@ class Matcher:
     def _row(self, view: Tensor | int, sample: Tensor) -> Tensor:
         return view * len(self.sample) + sample
 
-    def _points(self, cloud: PersonCloud, skin: Skin, reach: float) -> Matches:
-        """The depth's points, by sample."""
-        if skin.vertices.device.type == "cpu":
-            found = body_cloud.match_compiled(
-                cloud.points, cloud.normals, skin.vertices, skin.normals, self.surface, reach
-            )
-        else:
-            found = body_cloud.match(
-                cloud.points, cloud.normals, skin.vertices, skin.normals, self.sample, self.patch,
-                reach,
-            )  # fmt: skip
+    def _match_points(self, cloud: PersonCloud, skin: PosedSkin, reach: float) -> Matches:
+        """Match the depth points, by sample."""
+        found = match_points(
+            cloud.points, cloud.normals, skin.vertices, skin.normals, self.surface, reach
+        )
         if skin.late is None:
             return found
         outward = skin.normals[self.sample[found.sample]]
         moved = (skin.late[cloud.view, found.sample] * outward).sum(1)
         return found._replace(distance=found.distance - moved)
 
-    def _sticking_out(
-        self, cloud: PersonCloud, rig: Rig, depth_bias: np.ndarray, skin: Skin
+    def _find_protruding(
+        self, cloud: PersonCloud, rig: Rig, depth_bias: np.ndarray, skin: PosedSkin
     ) -> tuple[Matches, Tensor]:
-        """Samples that a camera looks past, by camera and sample, and their trust."""
+        """Match samples in front of a surface measured farther away, and return their trust."""
         outward = skin.normals[self.sample].cpu().numpy()
         found = []
         for window in cloud.windows:
             view = window.view
-            late = skin.where if skin.late is None else skin.where + skin.late[view]
+            late = skin.samples if skin.late is None else skin.samples + skin.late[view]
             out, inside = seen_through(
                 window, rig[view], float(depth_bias[view]), late.cpu().numpy(), outward
             )
             found.append((view, out, -inside))
-        return self._certain(found, skin, FREE_SPACE_TRUST)
+        return self._join(found, skin)
 
-    def _on_rims(
-        self, cloud: PersonCloud, rig: Rig, skin: Skin, reach: float
+    def _find_on_rims(
+        self, cloud: PersonCloud, rig: Rig, skin: PosedSkin, reach: float
     ) -> tuple[Matches, Tensor]:
-        """Samples that the rims of masks touch, by camera and sample, and their trust."""
+        """Match samples that the rims of masks touch, and return their trust."""
         vertices, normals = skin.vertices.cpu().numpy(), skin.normals.cpu().numpy()
         found = []
         for rim in cloud.outlines:
@@ -142,17 +241,134 @@ class Matcher:
             pose = rig[rim.view].master_from_colour
             at, apart = touching(rim, pose, vertices, normals, self.rims, reach, late)
             found.append((rim.view, at, apart))
-        return self._certain(found, skin, OUTLINE_TRUST)
+        return self._join(found, skin)
 
-    def _certain(
-        self, found: list[tuple[int, np.ndarray, np.ndarray]], skin: Skin, trust: float
+    def _join(
+        self, found: list[tuple[int, np.ndarray, np.ndarray]], skin: PosedSkin
     ) -> tuple[Matches, Tensor]:
-        """Matches of samples (M,) at distances (M,), view by view, each trusted so much."""
-        where = skin.where
+        """Join samples (M,) and distances (M,) of all views, with the trust of one depth point."""
+        where = skin.samples
         sample, distance = [self.sample[:0]], [where[:0, 0]]
         for view, at, apart in found:
             sample.append(self._row(view, torch.as_tensor(at, device=where.device)))
             distance.append(torch.as_tensor(apart, dtype=where.dtype, device=where.device))
         every = torch.cat(sample)
         matches = Matches(every, torch.cat(distance), torch.ones_like(every, dtype=torch.bool))
-        return matches, where.new_full((len(every),), trust)
+        return matches, where.new_ones(len(every))
+
+
+# --- compiled --------------------------------------------------------------------------------
+
+
+@numba.njit(cache=True, nogil=True)
+def _match(
+    points,
+    point_normals,
+    vertices,
+    normals,
+    samples,
+    patch,
+    order,
+    starts,
+    length,
+    reach,
+    aside,
+    turned,
+):
+    """:func:`match_in_torch`, compiled: sample (M,), signed distance (M,), validity (M,).
+
+    points, point_normals (M,3): measured. vertices, normals (R,3): posed surface.
+    samples (S,), patch (S,20): vertices. order (S,), starts (G + 1,): groups of samples; a group
+    whose bounding sphere is farther than the best match so far is skipped.
+    length: metres per radian between normals. reach, aside: largest distances along the normal and
+    from it, metres. turned: smallest cosine between the normals.
+    """
+    groups, kind = len(starts) - 1, vertices.dtype
+    own, centre = np.empty((6, len(order)), kind), np.zeros((6, groups), kind)
+    radius, to_group = np.zeros(groups, kind), np.empty(groups, kind)
+    longest = 0
+    for g in range(groups):
+        first, last = starts[g], starts[g + 1]
+        longest = max(longest, last - first)
+        for at in range(first, last):
+            v = samples[order[at]]
+            for d in range(3):
+                own[d, at] = vertices[v, d]
+                own[3 + d, at] = length * normals[v, d]
+        for d in range(6):
+            centre[d, g] = own[d, first:last].mean()
+        for at in range(first, last):
+            radius[g] = max(radius[g], _square(own, at, centre[:, g]))
+        radius[g] = np.sqrt(radius[g])
+    apart, here = np.empty(longest, kind), np.empty(6, kind)
+    sample = np.empty(len(points), np.int64)
+    distance = np.empty(len(points), kind)
+    valid = np.zeros(len(points), np.bool_)
+    best = 0  # place in the order; the match of one point is the first guess for the next
+    for m in range(len(points)):
+        for d in range(3):
+            here[d] = points[m, d]
+            here[3 + d] = length * point_normals[m, d]
+        least = _square(own, best, here)
+        bound = np.sqrt(least)
+        _squares(centre, 0, groups, here, to_group)
+        for g in range(groups):
+            limit = bound + radius[g]
+            if to_group[g] >= limit * limit:
+                continue
+            first = starts[g]
+            size = starts[g + 1] - first
+            _squares(own, first, size, here, apart)
+            for at in range(size):
+                if apart[at] < least:
+                    least, best = apart[at], first + at
+            bound = np.sqrt(least)
+        sample[m] = order[best]
+        nearest, gx, gy, gz = _nearest_of_patch(points[m], vertices, patch[sample[m]])
+        nx, ny, nz = normals[nearest, 0], normals[nearest, 1], normals[nearest, 2]
+        height = nx * gx + ny * gy + nz * gz
+        distance[m] = height
+        sx, sy, sz = gx - height * nx, gy - height * ny, gz - height * nz
+        valid[m] = (
+            nx * point_normals[m, 0] + ny * point_normals[m, 1] + nz * point_normals[m, 2] > turned
+            and abs(height) < reach
+            and np.sqrt(sx * sx + sy * sy + sz * sz) < aside
+        )
+    return sample, distance, valid
+
+
+@numba.njit(cache=True, nogil=True)
+def _square(values, at, here):
+    """Squared distance of column ``at`` of (6,N) from ``here`` (6,)."""
+    total = here[0] * 0
+    for d in range(6):
+        gap = values[d, at] - here[d]
+        total += gap * gap
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
+def _squares(values, first, count, here, out):
+    """The same of ``count`` columns from ``first`` on, into ``out``."""
+    h0, h1, h2, h3, h4, h5 = here[0], here[1], here[2], here[3], here[4], here[5]
+    last = first + count
+    a, b, c = values[0, first:last], values[1, first:last], values[2, first:last]
+    d, e, f = values[3, first:last], values[4, first:last], values[5, first:last]
+    for at in range(count):
+        x, y, z = a[at] - h0, b[at] - h1, c[at] - h2
+        p, q, r = d[at] - h3, e[at] - h4, f[at] - h5
+        out[at] = x * x + y * y + z * z + p * p + q * q + r * r
+
+
+@numba.njit(cache=True, nogil=True)
+def _nearest_of_patch(point, vertices, patch):
+    """Return the vertex of ``patch`` nearest to a point (3,), and the gap to the point."""
+    px, py, pz = point[0], point[1], point[2]
+    best, gx, gy, gz = patch[0], px * 0, px * 0, px * 0
+    least = px * 0 + np.inf
+    for v in patch:
+        x, y, z = px - vertices[v, 0], py - vertices[v, 1], pz - vertices[v, 2]
+        square = x * x + y * y + z * z
+        if square < least:
+            least, best, gx, gy, gz = square, v, x, y, z
+    return best, gx, gy, gz

@@ -1,4 +1,4 @@
-"""Observations of the person: keypoints of all frames, and each frame's fused cloud."""
+"""Observations of the person: keypoints of all frames, and the fused cloud of each frame."""
 
 from __future__ import annotations
 
@@ -12,18 +12,8 @@ from torch import Tensor
 from intercap_core import artefacts
 from intercap_core.artefacts import unpack_ragged
 from intercap_core.body.keypoints import BODY
-from intercap_core.body_fit.constants import (
-    BEFORE_BACKGROUND_M,
-    DEPTH_EDGE_M,
-    EDGE_TRUST,
-    ENOUGH_KEYPOINTS,
-    EVERY_PIXEL,
-    NEAR_START_S,
-    NORMAL_BASE_PX,
-    OUTLIER_VIEW_TRUST,
-)
 from intercap_core.body_fit.free_space import DepthWindow
-from intercap_core.body_fit.outlines import Outline, outline
+from intercap_core.body_fit.outlines import Outline, trace_outline
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import FROM_DETECTOR
 from intercap_core.formats.recordings.frames import Frames
@@ -34,32 +24,54 @@ from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.solve.thread_pool import ThreadPool
 from intercap_core.schemas import PERSON, SCENE
 
+# Factor of the confidence of a view that disagrees with the triangulated point. Tuned on the
+# studio.
+_OUTLIER_VIEW_TRUST = 0.2
+# A frame without three trunk keypoints can start from a neighbour within this time, seconds, if
+# this many of the 25 body keypoints are triangulated. Tuned on the studio.
+_NEAR_START_S, _ENOUGH_KEYPOINTS = 1.0, 6
+# Distance in front of the background from which a pixel is the person's, metres. Tuned on the
+# studio.
+_BEFORE_BACKGROUND_M = 0.04
+_NORMAL_BASE_PX = 3  # half the base over which a normal is measured; tuned on the studio
+_DEPTH_EDGE_M = 0.04  # a larger step within this base is an edge; tuned on the studio
+# Trust of points at an edge, which may float between person and background. Tuned on the studio.
+_EDGE_TRUST = 0.3
+
+# neck, shoulders, mid hip, hips: keypoints that place the trunk
+TRUNK_KEYPOINTS = (1, 2, 5, 8, 9, 12)
+
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """T frames, C cameras, K = 135 keypoints.
-
-    keypoints (T,C,K,2) px and confidence (T,C,K), 0 = not seen; joints (T,K,3) triangulated, master
-    frame, metres, NaN = unknown; joint_views (T,K); masks: RLE of (T,C), empty = none, who made
-    them, mask_source (T,C), and what else was detected, beside, likewise; image_of (T,C): the set
-    whose image of each camera shows each frame, -1 = none; times (T,) s; time_offset (C,) s: each
-    camera exposes later than the frame's time by this much.
-    """
+    """Observations in T frames and C cameras, with K = 135 keypoints."""
 
     sequence: str
     rig: Rig
     keypoints: np.ndarray
+    """(T, C, K, 2) px."""
     confidence: np.ndarray
+    """(T, C, K), 0 = not detected."""
     joints: np.ndarray
+    """(T, K, 3) triangulated keypoints, master frame, metres, NaN = unknown."""
     joint_views: np.ndarray
+    """(T, K) number of views of each triangulated keypoint."""
     masks: list[bytes]
+    """RLE of the person's mask in each of T * C images, empty = none."""
     mask_source: np.ndarray
+    """(T, C) origin of each mask, as in the person artefact."""
     beside: list[bytes]
+    """RLE of other detected objects in each of T * C images, empty = none."""
     background: list[np.ndarray | None]
+    """Depth of the empty room in each camera, mm."""
     depth_bias: np.ndarray
+    """(C,) distance that each camera measures too much, metres."""
     image_of: np.ndarray
+    """(T, C) frame set whose image of a camera shows each frame, -1 = none."""
     time_offset: np.ndarray
+    """(C,) seconds by which each camera exposes later than the time of the frame."""
     times: np.ndarray
+    """(T,) seconds."""
 
     @property
     def num_frames(self) -> int:
@@ -67,28 +79,26 @@ class Observations:
 
     @property
     def placed(self) -> np.ndarray:
-        """(T,) bool: enough of the trunk is triangulated to place a body."""
+        """(T,) bool: three keypoints of the trunk are triangulated, enough to place a body."""
         trunk = self.joints[:, list(TRUNK_KEYPOINTS)]
         return np.isfinite(trunk).all(2).sum(1) >= 3
 
     @property
     def usable(self) -> np.ndarray:
-        """(T,) bool: a body can be placed, or enough of it is known near a frame in which one can:
-        one view from the side, or over a table, may see no more than one shoulder."""
+        """(T,) bool: a body can be placed, here or in a frame nearby if enough keypoints are known.
+
+        One view from the side, or over a table, may see no more than one shoulder.
+        """
         placed = self.placed
         if not placed.any():
             return placed
         gap = np.abs(self.times[:, None] - self.times[placed][None]).min(1)
         known = np.isfinite(self.joints[:, BODY]).all(2).sum(1)
-        return placed | ((gap <= NEAR_START_S) & (known >= ENOUGH_KEYPOINTS))
-
-
-# neck, shoulders, mid hip, hips, knees: keypoints that a pose can be started from
-TRUNK_KEYPOINTS = (1, 2, 5, 8, 9, 12)
+        return placed | ((gap <= _NEAR_START_S) & (known >= _ENOUGH_KEYPOINTS))
 
 
 def read_observations(scene: Path, person: Path) -> Observations:
-    """Read scene and person; raises UserError for artefacts that do not belong together."""
+    """Read scene and person. Raises UserError if the artefacts do not belong together."""
     with artefacts.read(scene, SCENE) as read:
         rig = Rig.from_artefact(read)
         sequence = str(read.attributes["sequence"])
@@ -117,32 +127,45 @@ def read_observations(scene: Path, person: Path) -> Observations:
             beside = unpack_ragged(read["beside_offsets"], read["beside_rle"])
     confidence = np.clip(np.nan_to_num(keypoints[..., 2]), 0.0, 1.0)
     disputed = (views >= 2)[:, None] & ~inlier
-    confidence = np.where(disputed, OUTLIER_VIEW_TRUST * confidence, confidence)
+    confidence = np.where(disputed, _OUTLIER_VIEW_TRUST * confidence, confidence)
     confidence[~np.isfinite(keypoints[..., :2]).all(-1)] = 0
     return Observations(
-        sequence, rig, np.nan_to_num(keypoints[..., :2]), confidence, joints, views, masks, source,
-        beside, background, depth_bias, image_of, time_offset, times,
-    )  # fmt: skip
+        sequence=sequence,
+        rig=rig,
+        keypoints=np.nan_to_num(keypoints[..., :2]),
+        confidence=confidence,
+        joints=joints,
+        joint_views=views,
+        masks=masks,
+        mask_source=source,
+        beside=beside,
+        background=background,
+        depth_bias=depth_bias,
+        image_of=image_of,
+        time_offset=time_offset,
+        times=times,
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class PersonCloud:
-    """One frame's person points of all views, master frame.
-
-    points, normals (M,3) float32, metres, normals towards the camera; trust (M,) in (0,1]; view
-    (M,) index of the camera; windows: what each camera's depth shows around the person; outlines:
-    the rims of the masks that a detector drew of the person.
-    """
+    """Depth points of the person in one frame, from all views, in the master frame."""
 
     points: Tensor
+    """(M, 3) float32, metres."""
     normals: Tensor
+    """(M, 3) float32, towards the camera."""
     trust: Tensor
+    """(M,) weight in (0, 1]."""
     view: Tensor
+    """(M,) camera index."""
     windows: tuple[DepthWindow, ...] = ()
+    """Depth around the person, by camera."""
     outlines: tuple[Outline, ...] = ()
+    """Rims of the person's masks that a detector drew, by camera."""
 
     def of_view(self, view: int) -> PersonCloud:
-        """What camera ``view`` alone shows."""
+        """Return the part of camera ``view``."""
         mine = self.view == view
         return PersonCloud(
             self.points[mine],
@@ -156,8 +179,7 @@ class PersonCloud:
     def through(
         self, rig: Rig, bias: np.ndarray, before: Rig, bias_before: np.ndarray
     ) -> PersonCloud:
-        """The same pixels through cameras ``rig`` with depth ``bias`` (C,), metres, instead of
-        those ``before``."""
+        """Return the same pixels through other camera poses and depth biases (C,), metres."""
         points, normals = self.points.clone(), self.normals.clone()
         for view in np.unique(self.view.cpu().numpy()):
             mine = self.view == int(view)
@@ -173,15 +195,15 @@ class PersonCloud:
 def person_clouds(
     frames: Path, seen: Observations, count: int, device: torch.device
 ) -> list[PersonCloud | None]:
-    """The cloud of every frame, about ``count`` points each; None = no mask."""
+    """Return the cloud of every frame, of about ``count`` points; None = no mask."""
     with Frames.open(frames) as reader:
         reader = reader.showing(seen.image_of)
         return ThreadPool(torch.get_num_threads()).map(
-            lambda t: _fused(reader, seen, t, count, device), range(seen.num_frames)
+            lambda t: _fuse(reader, seen, t, count, device), range(seen.num_frames)
         )
 
 
-def _fused(
+def _fuse(
     reader: Frames, seen: Observations, t: int, count: int, device: torch.device
 ) -> PersonCloud | None:
     seen_by: list[tuple[int, np.ndarray, np.ndarray]] = []  # camera, depth image, pixels
@@ -192,24 +214,24 @@ def _fused(
         if mask is None:
             continue
         depth = None if camera.depth is None else reader.depth(t, c)
-        # a mask made from colour says where its rim is the person's; where depth is, depth says it
+        # a mask without a detector counts only where there is no depth and other objects are known
         if seen.mask_source[t, c] == FROM_DETECTOR or (depth is None and seen.beside[at]):
-            rim = outline(mask, _runs(seen.beside[at], camera), camera.colour, c)
+            rim = trace_outline(mask, _runs(seen.beside[at], camera), camera.colour, c)
             outlines += [] if rim is None else [rim]
         if depth is None:
             continue
         window = mask_window(depth, camera, mask)
         if window is None:
             continue
-        # what stands before the background is all that can be the person, or cover it
+        # pixels in front of the background are the person or an occluder
         index = mask_pixels(
             depth,
             camera,
             mask,
             window,
             background=seen.background[c],
-            before_m=BEFORE_BACKGROUND_M,
-            every=EVERY_PIXEL,
+            before_m=_BEFORE_BACKGROUND_M,
+            every=2,  # neighbouring rows show the same
         )
         if len(index):
             seen_by.append((c, depth, index))
@@ -225,8 +247,8 @@ def _fused(
     parts: list[tuple[np.ndarray, ...]] = [(none.reshape(0, 3), none.reshape(0, 3), none, none)]
     for (c, depth, index), start in zip(seen_by, first[:-1], strict=True):
         chosen = index[pick[(pick >= start) & (pick < start + len(index))] - start]
-        placed = _placed(depth, seen.rig[c], chosen, seen.depth_bias[c])
-        parts.append((*placed, np.full(len(chosen), c)))
+        in_master = _place_pixels(depth, seen.rig[c], chosen, seen.depth_bias[c])
+        parts.append((*in_master, np.full(len(chosen), c)))
     points, normals, trust, view = (np.concatenate(p) for p in zip(*parts, strict=True))
     return PersonCloud(
         torch.as_tensor(points, dtype=torch.float32, device=device),
@@ -242,22 +264,22 @@ def _runs(rle: bytes, camera: Camera) -> Runs | None:
     return Runs(rle, camera.colour.height, camera.colour.width) if rle else None
 
 
-def _placed(
+def _place_pixels(
     depth: np.ndarray, camera: Camera, index: np.ndarray, depth_bias: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points, normals (M,3), master frame, and trust (M,) of flat depth pixels (M,)."""
-    points, normals, edge = _points_and_normals(depth, camera, index)
+    """Return points and normals (M, 3), master frame, and trust (M,) of flat depth pixels (M,)."""
+    points, normals, edge = _measure_normals(depth, camera, index)
     if depth_bias:
         points = points - depth_bias * points / points[:, 2:]
     master = camera.master_from_depth
     rotation = master[:3, :3].astype(np.float32)
-    return apply(master, points), normals @ rotation.T, np.where(edge, EDGE_TRUST, 1.0)
+    return apply(master, points), normals @ rotation.T, np.where(edge, _EDGE_TRUST, 1.0)
 
 
-def _points_and_normals(
+def _measure_normals(
     depth: np.ndarray, camera: Camera, index: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points and unit normals (M,3), depth camera's frame, and whether a pixel is at an edge."""
+    """Return points and unit normals (M, 3), depth camera's frame, and edge flags (M,)."""
     assert camera.depth is not None
     height, width = depth.shape
     rays = camera.depth.rays
@@ -268,14 +290,14 @@ def _points_and_normals(
         r, c = np.clip(r, 0, height - 1), np.clip(c, 0, width - 1)
         there = depth[r, c].astype(np.float32) * np.float32(1e-3)
         ray = rays[r, c]
-        good = (there > 0) & (np.abs(there - z) < DEPTH_EDGE_M) & np.isfinite(ray[:, 0])
+        good = (there > 0) & (np.abs(there - z) < _DEPTH_EDGE_M) & np.isfinite(ray[:, 0])
         ray = np.where(good[:, None], ray, 0)
         return np.concatenate([ray * there[:, None], there[:, None]], 1), good
 
     ray = np.nan_to_num(rays[row, column])
     here = np.concatenate([ray * z[:, None], z[:, None]], 1)
     spans, smooth = [], np.ones(len(index), bool)
-    for dr, dc in ((0, NORMAL_BASE_PX), (NORMAL_BASE_PX, 0)):
+    for dr, dc in ((0, _NORMAL_BASE_PX), (_NORMAL_BASE_PX, 0)):
         ahead, a = at(row + dr, column + dc)
         back, b = at(row - dr, column - dc)
         # one-sided where the other side is another surface

@@ -1,15 +1,14 @@
-"""What E_D (equation 4) says beside depth, and without it: the rim of the person's mask.
+"""The rim of the person's mask as a measurement of E_D (equation 4), with depth or without.
 
-Beyond the paper. A ray through the rim grazes what the person wears: the plane that this ray and
-the rim's tangent span touches the surface where the normals agree. There the distance is
+Beyond the paper. A ray through the rim grazes the surface of the person's clothes. The plane of
+this ray and the rim's tangent touches the surface where the normals agree. There the distance is
 
     e = N . (o - v) - c,
 
-with the camera's centre o, the plane's outward normal N, the vertex v of the body whose normal and
-place in the image are nearest, and the covering's thickness c as in
-:mod:`intercap_core.body_fit.body_cloud`. A rim at the image's border is not the person's, nor one
-where another detected thing begins, which may be in front. Masks made from the images alone have
-the form that was expected, but for what moved before a known background.
+with the camera centre o, the outward normal N of the plane, the vertex v whose normal and place in
+the image are nearest, and the thickness c of the covering as in :mod:`.cloud_term`. A rim at the
+border of the image is not the person's, nor one where another detected object begins, which may be
+in front.
 """
 
 from __future__ import annotations
@@ -18,53 +17,58 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
+import numba
 import numpy as np
 
-from intercap_core.body_fit import outlines_kernel
-from intercap_core.body_fit.body_constants import MATCH_SIDEWAYS_M, NORMAL_LENGTH_M
-from intercap_core.body_fit.body_samples import Samples
-from intercap_core.body_fit.body_surface import Surface
-from intercap_core.body_fit.constants import (
-    BESIDE_AT_720P,
-    OUTLINE_BLUR_PX,
-    OUTLINE_COSINE,
-    OUTLINE_FACING,
-    OUTLINE_POINTS,
-    SHORTEST_OUTLINE_PX,
-)
+from intercap_core.body_fit.surface import MATCH_SIDEWAYS_M, NORMAL_LENGTH_M, Samples, Surface
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.mask_pixels import drawn
 from intercap_core.geometry.camera.masks import Runs
 
+_POINTS = 400  # of a rim, a third of its pixels where a person fills 720 lines: speed
+_BLUR_PX = 3.0  # over which the direction of the rim is measured; tuned on the studio
+_SHORTEST_PX = 40  # rims of smaller spots and holes are errors of the network; tuned on the studio
+# px outward of a rim at which another object is looked for, in an image of 720 lines: masks of
+# touching objects are some pixels apart. Tuned on the studio.
+_OUTWARD_AT_720P = (1.0, 4.0, 7.0)
 _BORDER_PX = 2  # of the image
+# Largest cosine between the line of sight and the normal of a sample on the rim: two thirds of the
+# spacing of samples on a limb. Tuned on the studio.
+_FACING = 0.6
+_COSINE = (
+    0.8  # smallest, between the normals of the rim's plane and its vertex; tuned on the studio
+)
 
 
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """The rim of the person's mask in camera ``view``: unit rays (M,3) through it, and unit normals
-    (M,3) of the planes that touch the person there, outward; colour camera's frame, float32."""
+    """The rim of the person's mask in one camera."""
 
     view: int
+    """Camera index."""
     rays: np.ndarray
+    """(M, 3) float32 unit rays through the rim, colour camera's frame."""
     normals: np.ndarray
+    """(M, 3) float32 outward unit normals of the planes that touch the person there."""
 
 
-def outline(mask: Runs, beside: Runs | None, lens: Intrinsics, view: int) -> Outline | None:
-    """Some points of the mask's rim, evenly along it; None where there are none.
+def trace_outline(mask: Runs, others: Runs | None, lens: Intrinsics, view: int) -> Outline | None:
+    """Return points evenly along the rim of the mask, or None if there are none.
 
-    Where the rim meets what else was detected, ``beside``, the person may go on behind it.
+    Points next to ``others``, the mask of other detected objects, are left out: the person may
+    continue behind them.
     """
     pixels, outward = _rim(mask)
     inside = (pixels > _BORDER_PX) & (pixels < np.array([mask.width, mask.height]) - 1 - _BORDER_PX)
     own = inside.all(1)
-    if beside is not None:
-        for away in BESIDE_AT_720P:
+    if others is not None:
+        for away in _OUTWARD_AT_720P:
             ahead = np.rint(pixels + away * mask.height / 720 * outward).astype(int)
-            own &= ~beside.sample(*ahead.T)
+            own &= ~others.sample(*ahead.T)
     keep = np.flatnonzero(own)
     if not len(keep):
         return None
-    keep = keep[:: max(1, round(len(keep) / OUTLINE_POINTS))]
+    keep = keep[:: max(1, round(len(keep) / _POINTS))]
     pixels, outward = pixels[keep], outward[keep]
     along = outward[:, ::-1] * (-1, 1)
     rays = lens.unproject(pixels)
@@ -80,17 +84,17 @@ def outline(mask: Runs, beside: Runs | None, lens: Intrinsics, view: int) -> Out
 
 
 def _rim(mask: Runs) -> tuple[np.ndarray, np.ndarray]:
-    """Points (M,2) of the rim, px, in their order along it, and unit directions (M,2) outward."""
+    """Return points (M, 2) along the rim, px, and outward unit directions (M, 2)."""
     x, y, width, height = mask.box
-    pad = round(3 * OUTLINE_BLUR_PX)
+    pad = round(3 * _BLUR_PX)
     window = np.zeros((height + 2 * pad, width + 2 * pad), np.uint8)
     window[pad:-pad, pad:-pad] = np.uint8(255) * drawn(mask.ends, mask.box, mask.height).T
     rims, _ = cv2.findContours(window, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    rims = [rim[:, 0] for rim in rims if len(rim) >= SHORTEST_OUTLINE_PX]
+    rims = [rim[:, 0] for rim in rims if len(rim) >= _SHORTEST_PX]
     if not rims:
         return np.zeros((0, 2)), np.zeros((0, 2))
     at = np.concatenate(rims)
-    soft = cv2.GaussianBlur(window, (0, 0), OUTLINE_BLUR_PX)
+    soft = cv2.GaussianBlur(window, (0, 0), _BLUR_PX)
     column, row = at.T
     left, right = soft[row, column - 1].astype(float), soft[row, column + 1]
     above, below = soft[row - 1, column].astype(float), soft[row + 1, column]
@@ -103,16 +107,17 @@ def _rim(mask: Runs) -> tuple[np.ndarray, np.ndarray]:
 
 
 class RimSamples(NamedTuple):
-    """The samples that masks tell of: their number (S,), vertex (S,) and patch (S,20) in a
-    :class:`.body_surface.Surface`. Masks round off fingers, so hands are left out."""
+    """The S samples that a rim can touch. Masks round off fingers, so hands are left out."""
 
     number: np.ndarray
+    """(S,) index among all samples."""
     vertex: np.ndarray
+    """(S,) index in the surface."""
     patch: np.ndarray
+    """(S, 20) indices in the surface."""
 
     @classmethod
     def of(cls, samples: Samples, surface: Surface) -> RimSamples:
-        """Those of the body."""
         number = np.flatnonzero(~samples.hand)
         return cls(number, surface.sample[number], surface.patch[number])
 
@@ -126,19 +131,104 @@ def touching(
     reach: float,
     late: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Samples (M,) that a rim's planes touch, and the distances (M,), metres, outside positive.
+    """Find the samples that the planes of a rim touch.
 
-    vertices, normals (R,3) of the surface in the master frame; ``late`` (S,3): how much farther the
-    samples have moved when the camera exposes. Planes farther than ``reach`` metres are left out.
+    Args:
+        rim: rays and planes.
+        master_from_colour: (4, 4) pose of the camera.
+        vertices: (R, 3) of the surface, master frame, metres.
+        normals: (R, 3)
+        samples: samples that a rim can touch.
+        reach: largest valid distance, metres.
+        late: (S, 3) displacement of the samples until the camera exposes, or None.
+
+    Returns:
+        (M,) index of each touched sample.
+        (M,) distance, outside positive, metres.
     """
     pose = master_from_colour.astype(vertices.dtype)
     planes, rays = rim.normals @ pose[:3, :3].T, rim.rays @ pose[:3, :3].T
-    at, distance, valid = outlines_kernel.touched(
+    at, distance, valid = _find_touched(
         pose[:3, 3], rays, planes, vertices, normals, samples.vertex, samples.patch,
-        NORMAL_LENGTH_M, OUTLINE_FACING, reach, MATCH_SIDEWAYS_M, OUTLINE_COSINE,
+        NORMAL_LENGTH_M, _FACING, reach, MATCH_SIDEWAYS_M, _COSINE,
     )  # fmt: skip
     sample = samples.number[at]
     if late is not None:
-        # along the sample's normal, as the row that the distance goes to has it
+        # along the normal of the sample, as in the residual of the sample
         distance -= (late[sample] * normals[samples.vertex[at]]).sum(1)
     return sample[valid], distance[valid]
+
+
+@numba.njit(cache=True, nogil=True)
+def _find_touched(
+    centre,
+    rays,
+    planes,
+    vertices,
+    normals,
+    samples,
+    patch,
+    length,
+    facing,
+    reach,
+    aside,
+    turned,
+):
+    """Return sample (M,), signed outward distance (M,) and validity (M,) of rays through a rim.
+
+    centre (3,) of the camera, unit rays (M,3), normals ``planes`` (M,3), vertices and normals
+    (R,3): one frame. samples (S,), patch (S,20): vertices.
+    length: metres per radian between normals. facing: largest cosine between the normal of a
+    sample on the rim and the line of sight. reach, aside: largest distances along the plane's
+    normal and from the ray, metres. turned: smallest cosine between the normals.
+    """
+    kind, where = vertices.dtype, np.empty((6, len(samples)), vertices.dtype)
+    rim = np.empty(len(samples), np.int64)
+    count = 0
+    for s in range(len(samples)):
+        v = samples[s]
+        along = square = vertices[v, 0] * 0
+        for d in range(3):
+            gap = vertices[v, d] - centre[d]
+            along += gap * normals[v, d]
+            square += gap * gap
+        if along * along < facing * facing * square:
+            rim[count] = s
+            for d in range(3):
+                where[d, count] = vertices[v, d] - centre[d]
+                where[3 + d, count] = normals[v, d]
+            count += 1
+    where, apart = where[:, :count].copy(), np.empty(count, kind)
+    sample = np.zeros(len(rays), np.int64)
+    distance = np.zeros(len(rays), kind)
+    valid = np.zeros(len(rays), np.bool_)
+    if count == 0:
+        return sample, distance, valid
+    turn = 2 * length * length  # |n - m|^2 = 2 - 2 n . m of unit vectors
+    for m in range(len(rays)):
+        rx, ry, rz = rays[m, 0], rays[m, 1], rays[m, 2]
+        nx, ny, nz = planes[m, 0], planes[m, 1], planes[m, 2]
+        tx, ty, tz = ry * nz - rz * ny, rz * nx - rx * nz, rx * ny - ry * nx
+        for at in range(count):
+            x, y, z = where[0, at], where[1, at], where[2, at]
+            height, beside = x * nx + y * ny + z * nz, x * tx + y * ty + z * tz
+            cosine = where[3, at] * nx + where[4, at] * ny + where[5, at] * nz
+            apart[at] = height * height + beside * beside - turn * cosine
+        best = rim[np.argmin(apart)]
+        least = vertices[0, 0] * 0 + np.inf
+        for v in patch[best]:
+            x, y, z = (
+                vertices[v, 0] - centre[0],
+                vertices[v, 1] - centre[1],
+                vertices[v, 2] - centre[2],
+            )
+            height, beside = x * nx + y * ny + z * nz, x * tx + y * ty + z * tz
+            cosine = normals[v, 0] * nx + normals[v, 1] * ny + normals[v, 2] * nz
+            # a vertex nearer to the plane is not more on the rim
+            far = beside * beside - turn * cosine
+            if far < least:
+                least = far
+                distance[m] = -height
+                valid[m] = cosine > turned and abs(height) < reach and abs(beside) < aside
+        sample[m] = best
+    return sample, distance, valid

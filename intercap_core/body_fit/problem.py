@@ -1,147 +1,294 @@
-"""The body's energy E_B (equation 2) over all frames, as the solver wants it.
+"""The body's energy E_B (equation 2) over all frames, as the solver expects it.
 
-Which parameters it is a function of is said in :mod:`.layout`, its terms are in
-:mod:`.torch_terms` and :mod:`.compiled_terms`.
+The own parameters of a frame are chosen columns of the body's parameter vector. All frames share,
+in this order: betas (if one shape is fitted), the offsets of the 25 body keypoints, and the
+logarithms u of the thickness of the coverings. The priors of the shared parameters are here: E_beta
+of a shared shape, and beyond the paper Gaussians of offsets and u. The other terms are listed in
+:mod:`.terms`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
+from intercap_core.body.parameters import TRANSL
 from intercap_core.body.vposer import PoseGaussian
-from intercap_core.body_fit import body_self
-from intercap_core.body_fit.body_cloud import CloudRows
-from intercap_core.body_fit.body_keypoints import KeypointSet
-from intercap_core.body_fit.body_samples import COVERINGS, Samples
-from intercap_core.body_fit.compiled_terms import CompiledTerms
 from intercap_core.body_fit.definition import Definition
-from intercap_core.body_fit.layout import Layout, Shared
-from intercap_core.body_fit.terms import Bodies, Observations, Targets, Terms, Views
-from intercap_core.body_fit.torch_terms import TorchTerms
+from intercap_core.body_fit.surface import COVERINGS, Samples
+from intercap_core.body_fit.term_inputs import (
+    Bodies,
+    CloudRows,
+    Columns,
+    KeypointSet,
+    Pairs,
+    Targets,
+    TermInputs,
+    TorchTerm,
+    Views,
+)
+from intercap_core.body_fit.terms import terms_on
 from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
 
+NUM_OFFSETS = 25  # OpenPose's body keypoints
+# Number of times that the prior of a shared parameter counts in every frame: errors of clothing and
+# detector persist over frames, so a recording is worth that many independent measurements fewer.
+# Tuned on the studio.
+_OFFSET_PRIOR_PER_FRAME = 0.3
+_SHAPE_PRIOR_PER_FRAME = 0.3
+_COVERING_PRIOR_PER_FRAME = 0.7
 
-def terms_on(device: torch.device, model: BodyModel, samples: Samples) -> Terms:
-    """The terms' quickest form on a device: compiled on the CPU, else torch."""
-    form = CompiledTerms if device.type == "cpu" else TorchTerms
-    return form(model, samples)
+
+def columns_of(model: BodyModel, *, hands: bool, face: bool, betas: bool) -> Tensor:
+    """Return the own parameters: trunk and limbs, and where requested hands, jaw and expression,
+    betas."""
+    pose = list(range(0, 66))
+    if face:
+        jaw = 3 * JOINT_INDEX["jaw"]
+        pose += list(range(jaw, jaw + 3))
+    if hands:
+        pose += list(range(75, 165))
+    pose += list(range(TRANSL.start, TRANSL.stop))
+    if betas:
+        pose += list(range(TRANSL.stop, TRANSL.stop + model.num_betas))
+    if face:
+        pose += list(range(TRANSL.stop + model.num_betas, model.num_parameters))
+    return torch.tensor(pose, device=model.device)
+
+
+# --- parameters ------------------------------------------------------------------------------
+
+
+class Shared(NamedTuple):
+    """The parameters that all frames share."""
+
+    betas: Tensor | None
+    """(S,), or None if they are not shared."""
+    offsets: Tensor
+    """(25, 3) keypoint offsets, metres."""
+    u: Tensor
+    """(G,) logarithms of the thickness of the coverings over the usual one."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Places of n own and m shared parameters in the solver's vectors, and the shared priors."""
+
+    columns: Tensor
+    """(n,) own parameters."""
+    num_betas: int
+    """Length of the shape."""
+    one_shape: bool
+    """The betas are shared."""
+    fit_shared: bool
+    """Offsets and coverings are shared parameters; else they are fixed."""
+    definition: Definition
+    """Prior of the offsets."""
+
+    @property
+    def shape(self) -> slice:
+        """Columns of the betas in a parameter vector."""
+        return slice(TRANSL.stop, TRANSL.stop + self.num_betas)
+
+    def equations(self) -> Columns:
+        """Return the columns of the normal equations: own, then shared."""
+        parameters = self.columns
+        if self.one_shape:
+            betas = torch.arange(self.shape.start, self.shape.stop, device=parameters.device)
+            parameters = torch.cat([parameters, betas])
+        if not self.fit_shared:
+            return Columns(parameters, 0, 0)
+        return Columns(parameters, NUM_OFFSETS, len(COVERINGS))
+
+    def own(self, base: Tensor) -> Tensor:
+        """Return the own parameters (T, n) of parameter vectors (T, P)."""
+        return base[:, self.columns]
+
+    def shared(self, base: Tensor, offsets: Tensor, u: Tensor) -> Tensor:
+        """Return the shared parameters (m,); the betas are the mean of those of ``base`` (T, P)."""
+        parts = []
+        if self.one_shape:
+            parts.append(base[:, self.shape].mean(0))
+        if self.fit_shared:
+            parts += [offsets.reshape(-1), u]
+        return torch.cat(parts) if parts else base.new_zeros(0)
+
+    def split(self, shared: Tensor, offsets: Tensor, u: Tensor) -> Shared:
+        """Split shared parameters (m,); ``offsets`` and ``u`` are returned if they are fixed."""
+        betas = None
+        if self.one_shape:
+            betas, shared = shared[: self.num_betas], shared[self.num_betas :]
+        if self.fit_shared:
+            offsets = shared[: 3 * NUM_OFFSETS].reshape(NUM_OFFSETS, 3)
+            u = shared[3 * NUM_OFFSETS :]
+        return Shared(betas, offsets, u)
+
+    def vectors(self, base: Tensor, own: Tensor, betas: Tensor | None) -> Tensor:
+        """Return a copy of ``base`` (b, P) with own parameters (b, n) and betas."""
+        vectors = base.clone()
+        vectors[:, self.columns] = own
+        if betas is not None:
+            vectors[:, self.shape] = betas
+        return vectors
+
+    def prior_counts(self, like: Tensor) -> Tensor:
+        """Return how many times the prior of each shared parameter (m,) counts in a frame."""
+        parts = []
+        if self.one_shape:
+            parts.append(like.new_full((self.num_betas,), _SHAPE_PRIOR_PER_FRAME))
+        if self.fit_shared:
+            parts.append(like.new_full((3 * NUM_OFFSETS,), _OFFSET_PRIOR_PER_FRAME))
+            parts.append(like.new_full((len(COVERINGS),), _COVERING_PRIOR_PER_FRAME))
+        return torch.cat(parts) if parts else like.new_zeros(0)
+
+    def prior_cost(self, shared: Tensor) -> Tensor:
+        """Return the cost (scalar) of the shared parameters (m,) in each frame."""
+        if not len(shared):
+            return shared.new_zeros(())
+        return 0.5 * (self._precision(shared) * (shared - self._mean(shared)) ** 2).sum()
+
+    def add_prior(self, shared: Tensor, equations: NormalEquations) -> None:
+        """Add this cost to the normal equations of each frame, whose last columns are shared."""
+        if len(shared):
+            precision, first = self._precision(shared), equations.gradient.shape[1] - len(shared)
+            equations.cost.add_(self.prior_cost(shared))
+            equations.gradient[:, first:] += precision * (shared - self._mean(shared))
+            equations.hessian.diagonal(dim1=1, dim2=2)[:, first:] += precision
+
+    def _precision(self, like: Tensor) -> Tensor:
+        """Return the precision (m,) of the shared parameters in each frame."""
+        spread = []
+        if self.one_shape:
+            spread.append(like.new_ones(self.num_betas))
+        if self.fit_shared:
+            spread.append(torch.as_tensor(self.definition.sigma).to(like).repeat_interleave(3))
+            spread.append(torch.tensor([c.spread for c in COVERINGS]).to(like))
+        return self.prior_counts(like) / torch.cat(spread) ** 2
+
+    def _mean(self, like: Tensor) -> Tensor:
+        """Return the mean (m,) of the prior: zero except for the offsets."""
+        parts = [like.new_zeros(self.num_betas)] if self.one_shape else []
+        if self.fit_shared:
+            parts.append(torch.as_tensor(self.definition.offsets).to(like).reshape(-1))
+            parts.append(like.new_zeros(len(COVERINGS)))
+        return torch.cat(parts)
+
+
+# --- energy ----------------------------------------------------------------------------------
 
 
 @dataclass
 class BodyProblem:
-    """E_B of T frames; see :class:`intercap_core.geometry.solve.levenberg_marquardt.Problem`.
-
-    keypoints: those that take part, the 25 of the body first. base (T,P): parameters that are not
-    fitted keep these values. columns (n,): own parameters. one_shape: betas are shared; else they
-    belong in ``columns`` (or stay). offsets (25,3) and the thickness' logarithms u (G,) are fitted
-    where ``fit_shared`` says so, else fixed. touching: the body's parts that are inside each other,
-    and the weight of that. pose: a learned prior of each frame's pose. hand_share: of an
-    observation that the prior of a hand's pose is in one frame, 1 where frames stand alone.
-    definition: what is expected of the offsets. terms: by default the quickest form on the device
-    of ``base``.
-    """
+    """E_B of T frames; see :class:`intercap_core.geometry.solve.levenberg_marquardt.Problem`."""
 
     model: BodyModel
     keypoints: KeypointSet
+    """K keypoints of E_J, the 25 of the body first."""
     samples: Samples
+    """Samples of the skin for E_D and E_P_self."""
     base: Tensor
+    """(T, P) parameters. Those that are not fitted keep these values."""
     columns: Tensor
+    """(n,) own parameters."""
     one_shape: bool
+    """The betas are shared; else they are among ``columns`` or fixed."""
     offsets: Tensor
+    """(25, 3) keypoint offsets, metres."""
     u: Tensor
+    """(G,) logarithms of the thickness of the coverings over the usual one."""
     views: Views | None = None
+    """Detections for E_J."""
     targets: Targets | None = None
+    """Triangulated keypoints for E_J."""
     rows: CloudRows | None = None
-    touching: body_self.Pairs | None = None
+    """Rows of E_D."""
+    touching: Pairs | None = None
+    """Contacts of E_P_self."""
     self_weight: float = 1.0
+    """Factor of E_P_self."""
     pose: PoseGaussian | None = None
+    """Learned prior of each frame's pose."""
     hand_share: float = 1.0
+    """Factor of E_theta_h in one frame: 1 if the frames are independent."""
     fit_shared: bool = False
+    """Fit offsets and coverings."""
     definition: Definition = field(default_factory=Definition.unknown)
-    terms: Terms | None = None
+    """Prior of the offsets."""
+    terms: TorchTerm | None = None
+    """The terms; None = the fastest form on the device of ``base``."""
 
     def __post_init__(self) -> None:
         device = self.base.device
         self._group = torch.as_tensor(self.samples.group, device=device)
         self._usual_thickness = torch.tensor([c.thickness for c in COVERINGS]).to(self.base)
-        self._terms = self.terms or terms_on(device, self.model, self.samples)
+        self.terms = self._terms = self.terms or terms_on(device, self.model, self.samples)
 
     @property
     def layout(self) -> Layout:
-        """Where the parameters stand now."""
+        """The current places of the parameters."""
         return Layout(
             self.columns, self.model.num_betas, self.one_shape, self.fit_shared, self.definition
         )
 
-    @property
-    def shape_columns(self) -> slice:
-        """Columns of the betas in a parameter vector."""
-        return self.layout.shape
-
     def own_start(self) -> Tensor:
-        """The own parameters (T,n) as they stand."""
+        """Return the current own parameters (T, n)."""
         return self.layout.own(self.base)
 
     def shared_start(self) -> Tensor:
-        """The shared parameters (m,) as they stand."""
+        """Return the current shared parameters (m,)."""
         return self.layout.shared(self.base, self.offsets, self.u)
 
-    def shared_counts(self) -> Tensor:
-        """How often the prior of each shared parameter (m,) counts in a frame."""
-        return self.layout.prior_counts(self.base)
-
     def accept(self, own: Tensor, shared: Tensor) -> None:
-        """Take over a solution: base, offsets and u."""
-        found = self._split(shared)
+        """Set base, offsets and u to a solution."""
+        found = self.layout.split(shared, self.offsets, self.u)
         self.base = self.layout.vectors(self.base, own, found.betas)
         self.offsets, self.u = found.offsets.clone(), found.u.clone()
 
     def thickness(self) -> Tensor:
-        """(N,) of the covering at each sample, metres."""
+        """Return the thickness (N,) of the covering at each sample, metres."""
         return self.thickness_of_group()[self._group]
 
     def thickness_of_group(self) -> Tensor:
-        """(G,) of each covering, metres."""
+        """Return the thickness (G,) of each covering, metres."""
         return self._usual_thickness * self.u.exp()
 
+    def all_offsets(self, offsets: Tensor | None = None) -> Tensor:
+        """Return the offsets (K, 3) of all keypoints: zero beyond the body's 25."""
+        offsets = self.offsets if offsets is None else offsets
+        without = offsets.new_zeros(len(self.keypoints.index) - len(offsets), 3)
+        return torch.cat([offsets, without])
+
     def cost(self, own: Tensor, shared: Tensor, index: Tensor) -> Tensor:
-        """(b,)"""
-        terms = self._terms.cost(self._observations(), self._bodies(own, shared, index))
+        """Return the energy (b,) of the frames ``index`` (b,)."""
+        terms = self._terms.cost(self._inputs(), self._bodies(own, shared, index))
         return terms + self.layout.prior_cost(shared)
 
     def linearise(self, own: Tensor, shared: Tensor, index: Tensor) -> NormalEquations:
-        """Normal equations by own and shared parameters, own first."""
+        """Return the normal equations of the frames by own and shared parameters, own first."""
         layout, count, zeros = self.layout, len(own), self.base.new_zeros
         size = own.shape[1] + len(shared)
         equations = NormalEquations(zeros(count), zeros(count, size), zeros(count, size, size))
-        self._terms.add_equations(
-            self._observations(),
-            self._bodies(own, shared, index),
-            layout.equations(),
-            equations,
-        )
+        bodies = self._bodies(own, shared, index)
+        self._terms.add(self._inputs(), bodies, layout.equations(), equations)
         layout.add_prior(shared, equations)
         return equations
 
-    def _split(self, shared: Tensor) -> Shared:
-        return self.layout.split(shared, self.offsets, self.u)
-
     def _bodies(self, own: Tensor, shared: Tensor, index: Tensor) -> Bodies:
-        betas, offsets, u = self._split(shared)
-        without = offsets.new_zeros(len(self.keypoints.index) - len(offsets), 3)
+        betas, offsets, u = self.layout.split(shared, self.offsets, self.u)
         return Bodies(
             self.layout.vectors(self.base[index], own, betas),
-            torch.cat([offsets, without]),
+            self.all_offsets(offsets),
             self._usual_thickness * u.exp(),
             index,
         )
 
-    def _observations(self) -> Observations:
-        return Observations(
+    def _inputs(self) -> TermInputs:
+        return TermInputs(
             keypoints=self.keypoints,
             views=self.views,
             targets=self.targets,

@@ -1,4 +1,4 @@
-"""Which parts of a fitted body are reliable: determined by observations and in line with them."""
+"""Reliability of the parts of a fitted body: are they determined by consistent observations?"""
 
 from __future__ import annotations
 
@@ -16,20 +16,33 @@ from intercap_core.body.keypoints import (
     LEFT_HAND,
     RIGHT_HAND,
 )
-from intercap_core.body_fit.constants import (
-    DISAGREEING_SHARE,
-    FACE_VISIBLE_SHARE,
-    LARGEST_HAND_SIGMA_M,
-    LARGEST_SIGMA_M,
-    MEASURED_SHARE,
-    MIRRORED_SIGMA_M,
-    UNSEEN_SIGMA_M,
-)
+from intercap_core.body_fit.keypoint_term import KEYPOINT_SCALE
 from intercap_core.schemas import BODY_PARTS
 
-MEDIAN_CHI_3 = 1.5382  # median length of a three-dimensional normal error, in deviations
-_MEDIAN_CHI_2 = 1.1774  # median length of a two-dimensional normal error, in deviations
-_MEAN_CHI_3 = 1.5958  # mean length of a three-dimensional normal error, in deviations
+# Lengths of normal errors, in standard deviations along one coordinate.
+MEDIAN_CHI_3 = 1.5382  # median in three dimensions
+_MEDIAN_CHI_2 = 1.1774  # median in two dimensions
+_MEAN_CHI_3 = 1.5958  # mean in three dimensions
+
+# Standard deviation along one coordinate from which a part is undetermined, metres: half of its
+# joints are more than 40 mm off (MEDIAN_CHI_3), a bad body.
+LARGEST_SIGMA_M = 0.026
+# The same for hands: fingers are 20 mm apart (anatomy), half of the joints then are on a
+# neighbouring finger.
+LARGEST_HAND_SIGMA_M = 0.013
+# A part is wrong if more than this share of its keypoints are outliers.
+_DISAGREEING_SHARE = 0.5
+_FACE_VISIBLE_SHARE = 0.5  # of the landmarks, in some view; tuned on the studio
+# Share of a part's samples with points from which depth determines it: half of the third of a limb
+# that one view sees.
+_MEASURED_SHARE = 0.15
+# A limb seen by one view may lean towards it or away, mirrored. The ends of a forearm are then up
+# to 2 x 0.25 m apart, of a leg's segment 2 x 0.4 m, of a finger 2 x 0.08 m (anatomy). These are the
+# standard deviations along one coordinate, metres; estimated, not measured.
+MIRRORED_SIGMA_M = {"arm": 0.10, "leg": 0.15, "hand": 0.03}
+# A limb that no view supports may be anywhere within its reach, a wrist 0.55 m from the shoulder,
+# an ankle 0.85 m from the hip (anatomy). The linear covariance of prior and fit is smaller.
+UNSEEN_SIGMA_M = {"arm": 0.20, "leg": 0.25}
 
 _LIMBS = {"arm": ("elbow", "wrist"), "leg": ("knee", "ankle", "big_toe", "small_toe", "heel")}
 _JOINTED = ("arm", "leg")
@@ -40,7 +53,7 @@ _TRUNK_JOINTS = ("pelvis", "left_hip", "right_hip", "spine2", "neck", "left_shou
 
 
 def _keypoints_of(part: str) -> np.ndarray:
-    """(K,) indices of the part's keypoints."""
+    """Return the indices (K,) of the keypoints of a part."""
     side, _, limb = part.partition("_")
     if part == "trunk":
         return np.array([KEYPOINT_NAMES.index(name) for name in _TRUNK])
@@ -52,7 +65,7 @@ def _keypoints_of(part: str) -> np.ndarray:
 
 
 def _joints_of(part: str) -> list[int]:
-    """Indices of the part's joints; of the face the head."""
+    """Return the joints of a part; those of the face are head and jaw."""
     side, _, limb = part.partition("_")
     if part == "trunk":
         return [JOINT_INDEX[name] for name in _TRUNK_JOINTS]
@@ -65,7 +78,7 @@ def _joints_of(part: str) -> list[int]:
 
 
 def _carriers_of(part: str) -> list[int]:
-    """Joints whose bones carry the part's skin."""
+    """Return the joints whose bones carry the skin of a part."""
     side, _, limb = part.partition("_")
     if limb == "hand":
         return [JOINT_INDEX[f"{side}_wrist"], *_joints_of(part)]
@@ -76,35 +89,37 @@ def _carriers_of(part: str) -> list[int]:
 
 
 class PartEvidence(NamedTuple):
-    """How the observations of N frames support each of the 8 parts.
-
-    against (N,8): share of a part's observations that are outliers, weighted by confidence, of arms
-    and legs that of their worst point; NaN = nothing of it was seen. distance (N,8): their median
-    distance, metres, NaN likewise. seen (N,8): share of a part's keypoints that some view bears
-    out. views (N,8): how many do, in the median. measured (N,8): share of the part's samples that
-    have points.
-    """
+    """Support of each of the 8 parts by the observations of N frames."""
 
     against: Tensor
+    """(N, 8) share of outliers among the part's observations, weighted by confidence; of arms and
+    legs that of their worst keypoint. NaN = the part is not seen."""
     distance: Tensor
+    """(N, 8) median distance of the observations, metres, NaN = the part is not seen."""
     seen: Tensor
+    """(N, 8) share of the part's keypoints that are inliers in some view."""
     views: Tensor
+    """(N, 8) number of views in which a keypoint is an inlier, median over the keypoints."""
     measured: Tensor
+    """(N, 8) share of the part's samples with depth points."""
 
 
-def compare(
+def compare_parts(
     whitened: Tensor,
     confidence: Tensor,
     index: Tensor,
     sigma: Tensor,
-    scale: float,
     samples: tuple[np.ndarray, Tensor] | None = None,
 ) -> PartEvidence:
-    """Residuals (N,C,K), in sigmas (K,) metres, of the keypoints ``index`` (K,), part by part.
+    """Summarise the residuals of keypoints by part.
 
-    confidence (N,C,K), 0 = not seen; what is more than ``scale`` sigmas off is an outlier.
-    ``samples``: the joint (S,) that each of the cloud's samples hangs on and whether depth measured
-    it (N,S) bool; None without clouds.
+    Args:
+        whitened: (N, C, K) residuals in standard deviations.
+        confidence: (N, C, K), 0 = not detected.
+        index: (K,) index of each keypoint.
+        sigma: (K,) standard deviation of each keypoint, metres.
+        samples: joint (S,) of each sample of the cloud, and whether depth measured it (N, S) bool;
+            None without clouds.
     """
     size = (len(whitened), len(BODY_PARTS))
     unknown, none = whitened.new_full(size, torch.nan), whitened.new_zeros(size)
@@ -114,7 +129,7 @@ def compare(
         at = torch.isin(index, torch.as_tensor(_keypoints_of(part), device=index.device))
         if not bool(at.any()):
             continue
-        weight, good = confidence[:, :, at], whitened[:, :, at] <= scale
+        weight, good = confidence[:, :, at], whitened[:, :, at] <= KEYPOINT_SCALE
         over = (1,) if part.endswith(_JOINTED) else (1, 2)
         share = 1 - (weight * good).sum(over) / weight.sum(over)
         # a correct elbow does not imply a correct wrist
@@ -130,27 +145,27 @@ def compare(
 
 
 def _worst(share: Tensor) -> Tensor:
-    """Largest (N,) of (N,K), NaN left out; NaN where all are."""
+    """Return the largest (N,) of (N, K), ignoring NaN; NaN if all are."""
     largest = share.nan_to_num(nan=-1.0).amax(1)
     return torch.where(largest < 0, torch.nan, largest)
 
 
 def trunk_distance(evidence: PartEvidence) -> np.ndarray:
-    """Median distance (N,) of the trunk's keypoints, metres; NaN = none seen."""
+    """Return the median distance (N,) of the trunk's keypoints, metres; NaN = none seen."""
     return evidence.distance[:, BODY_PARTS.index("trunk")].cpu().numpy()
 
 
-def unmeasured(evidence: PartEvidence) -> np.ndarray:
-    """Limbs and hands (N,8) bool that one view alone bears out, without points of theirs."""
-    found = (evidence.views < 2) & (evidence.measured < MEASURED_SHARE) & (evidence.seen > 0)
+def flag_unmeasured(evidence: PartEvidence) -> np.ndarray:
+    """Flag limbs and hands (N, 8) that one view alone supports, without depth points."""
+    found = (evidence.views < 2) & (evidence.measured < _MEASURED_SHARE) & (evidence.seen > 0)
     result = np.asarray(found.cpu().numpy())
     result[:, [BODY_PARTS.index(part) for part in ("trunk", "face")]] = False
     return result
 
 
-def unmeasured_joints(evidence: PartEvidence) -> np.ndarray:
-    """Joints (N,55) bool of those limbs and hands."""
-    found = unmeasured(evidence)
+def flag_unmeasured_joints(evidence: PartEvidence) -> np.ndarray:
+    """Flag the joints (N, 55) of these limbs and hands."""
+    found = flag_unmeasured(evidence)
     result = np.zeros((len(found), len(JOINT_NAMES)), bool)
     for column, part in enumerate(BODY_PARTS):
         result[:, _joints_of(part)] |= found[:, column, None]
@@ -158,25 +173,25 @@ def unmeasured_joints(evidence: PartEvidence) -> np.ndarray:
 
 
 def _leaning(evidence: PartEvidence) -> np.ndarray:
-    """Standard deviation (N,8), metres, of parts that one view alone supports, whose mirrored pose
-    is as likely, or that no view supports."""
-    known = np.clip(evidence.measured.cpu().numpy() / MEASURED_SHARE, 0, 1)
+    """Return the standard deviation (N, 8), metres, of parts that one view supports, whose mirrored
+    pose is as likely, or that no view supports."""
+    known = np.clip(evidence.measured.cpu().numpy() / _MEASURED_SHARE, 0, 1)
     limbs = [part.partition("_")[2] for part in BODY_PARTS]
     mirrored = np.array([MIRRORED_SIGMA_M.get(limb, 0.0) for limb in limbs])
     unseen = np.array([UNSEEN_SIGMA_M.get(limb, 0.0) for limb in limbs])
-    leaning = np.where(unmeasured(evidence), mirrored * (1 - known) ** 2, 0.0)
+    leaning = np.where(flag_unmeasured(evidence), mirrored * (1 - known) ** 2, 0.0)
     return np.where(evidence.seen.cpu().numpy() == 0, unseen, leaning)
 
 
-def widened_sigma(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
-    """Deviations (N,55), metres, widened for parts whose fit is one of several minima.
+def widen_sigma(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
+    """Return standard deviations (N, 55), metres, widened where a fit is one of several minima.
 
-    Where most observations contradict a part, the truth may be where they are: the deviation that
-    corresponds to their distance, seen in two dimensions, is added in quadrature. A limb that one
-    view alone sees may lean towards it or away, the more the fewer points it has. What is wrong of
-    an arm is wrong of its hand.
+    If most observations contradict a part, the truth may be where they are: the deviation that
+    corresponds to their distance in two dimensions is added in quadrature. A limb that one view
+    alone sees may lean towards it or away, the more so the fewer points it has. An error of an arm
+    is also an error of its hand.
     """
-    disputed = evidence.against.cpu().numpy() > DISAGREEING_SHARE
+    disputed = evidence.against.cpu().numpy() > _DISAGREEING_SHARE
     distance = np.where(disputed, np.nan_to_num(evidence.distance.cpu().numpy()), 0) / _MEDIAN_CHI_2
     distance = np.hypot(distance, _leaning(evidence))
     for side in ("left", "right"):
@@ -189,12 +204,12 @@ def widened_sigma(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
     return result
 
 
-def undetermined(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
-    """Parts (N,8) bool that the observations do not determine, or that most of them contradict.
+def flag_undetermined(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
+    """Flag parts (N, 8) that the observations do not determine, or that most of them contradict.
 
-    sigma (N,55): stated deviation of the joints, metres.
+    sigma (N, 55): standard deviation of the joints, metres.
     """
-    found = evidence.against.cpu().numpy() > DISAGREEING_SHARE
+    found = evidence.against.cpu().numpy() > _DISAGREEING_SHARE
     for column, part in enumerate(BODY_PARTS):
         limit = LARGEST_SIGMA_M
         if part.endswith("hand"):
@@ -202,14 +217,14 @@ def undetermined(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
             found[:, column] |= evidence.seen[:, column].cpu().numpy() == 0
         found[:, column] |= _rms(sigma[:, _joints_of(part)]) > limit
     face = BODY_PARTS.index("face")
-    found[:, face] |= evidence.seen[:, face].cpu().numpy() < FACE_VISIBLE_SHARE
+    found[:, face] |= evidence.seen[:, face].cpu().numpy() < _FACE_VISIBLE_SHARE
     return found
 
 
 def expected_error(sigma: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Mean error (N,) of the surface that ``sigma`` (N,55) makes likely, metres.
+    """Return the expected mean error (N,) of the surface for ``sigma`` (N, 55), metres.
 
-    share (55,) of the surface that hangs on each joint.
+    share (55,): share of the surface that follows each joint.
     """
     return _MEAN_CHI_3 * sigma @ share
 

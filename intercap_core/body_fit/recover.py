@@ -1,8 +1,7 @@
-"""Outliers in time: frames whose body departs from its neighbours' motion are found and refitted,
-starting from an interpolation of the neighbours.
+"""Outliers in time: find frames whose body departs from its neighbours' motion, and refit them.
 
-A fit that starts from a wrong triangulation, or an arm that one view cannot place in depth, ends in
-another minimum of the energy, alone among frames that agree.
+A fit that starts from a wrong triangulation, or an arm whose depth one view cannot determine, ends
+in another minimum of the energy. The refit starts from an interpolation of the neighbours.
 """
 
 from __future__ import annotations
@@ -14,24 +13,29 @@ import torch
 
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body_fit.bridge import bridge
-from intercap_core.body_fit.constants import (
-    JUMP_M,
-    JUMP_WINDOW_S,
-    RECOVER_TRIALS,
-    RECOVERED_COST_FACTOR,
-    RECOVERED_COST_SLACK,
-)
 from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.geometry.solve.levenberg_marquardt import minimise
+
+# Half of the window around a frame, seconds: six frames at 30 Hz.
+JUMP_WINDOW_S = 0.21
+# Largest distance from the median of the window that is no jump, metres: within 0.1 s hands leave
+# the straight path by half of 30 m/s^2 times (0.1 s)^2 = 0.15 m, and fits scatter by less than 0.1.
+JUMP_M = 0.25
+# A new fit is accepted if its cost is below factor * old cost + slack. Tuned on the studio.
+_COST_FACTOR, _COST_SLACK = 1.2, 5.0
 
 _BODY_JOINTS = slice(0, JOINT_INDEX["right_wrist"] + 1)
 
 
 def jumps(joints: np.ndarray, times: np.ndarray, least: np.ndarray | float = JUMP_M) -> np.ndarray:
-    """Distance (N,J) of joints (N,J,3), metres, from their median over the frames around.
+    """Return the distance (N, J) of joints from their median over the frames around, metres.
 
-    ``times`` (N,) seconds. Frames count up to 0.2 s away, as many before as after; 0 where there
-    are none, and where the distance is no more than ``least`` (N,J), by default what people move.
+    It is 0 if it does not exceed ``least``, and in frames without a frame before and after.
+
+    Args:
+        joints: (N, J, 3) metres.
+        times: (N,) seconds.
+        least: (N, J) metres, or one value for all.
     """
     result = np.zeros(joints.shape[:2])
     for t, time in enumerate(times):
@@ -44,10 +48,15 @@ def jumps(joints: np.ndarray, times: np.ndarray, least: np.ndarray | float = JUM
 
 
 def recover(problem: BodyProblem, times: np.ndarray) -> np.ndarray:
-    """Fit the frames that jump again from between the others; which were changed, (N,) bool.
+    """Refit the frames that jump, from an interpolation of the others.
 
-    ``problem`` has views; its base is changed in place, ``times`` (N,) seconds are its frames'.
-    Shared parameters stay.
+    Args:
+        problem: a problem with views, whose ``base`` is changed in place. Shared parameters do not
+            change.
+        times: (N,) seconds.
+
+    Returns:
+        (N,) bool, the frames that were changed.
     """
     model = problem.model
     changed = np.zeros(len(times), bool)
@@ -63,8 +72,8 @@ def recover(problem: BodyProblem, times: np.ndarray) -> np.ndarray:
     everyone = torch.arange(len(at), device=base.device)
     nothing = base.new_zeros(0)
     before = again.cost(problem.base[at][:, again.columns], nothing, everyone)
-    found = minimise(again, again.own_start(), max_trials=RECOVER_TRIALS, cost_tolerance=1e-3)
-    kept = found.cost <= RECOVERED_COST_FACTOR * before + RECOVERED_COST_SLACK
+    found = minimise(again, again.own_start(), max_trials=10, cost_tolerance=1e-3)
+    kept = found.cost <= _COST_FACTOR * before + _COST_SLACK
     rows = problem.base[at].clone()
     again.accept(found.own, nothing)
     rows[kept] = again.base[kept]
@@ -75,28 +84,17 @@ def recover(problem: BodyProblem, times: np.ndarray) -> np.ndarray:
 
 
 def _of_frames(problem: BodyProblem, at: torch.Tensor, base: torch.Tensor) -> BodyProblem:
-    """E_J and priors alone of the frames ``at`` (n,), at bodies ``base`` (n,P), shape fixed."""
-    views, targets = problem.views, problem.targets
-    if views is not None:
-        views = replace(
-            views,
-            observed=views.observed[at],
-            confidence=views.confidence[at],
-            sigma=views.sigma[at],
-            shift=None if views.shift is None else views.shift[at],
-        )
-    if targets is not None:
-        targets = replace(targets, points=targets.points[at], confidence=targets.confidence[at])
-    shape = torch.arange(base.shape[1], device=base.device)[problem.shape_columns]
-    own = problem.columns[~torch.isin(problem.columns, shape)]
+    """Return E_J and the priors of the frames ``at`` (n,), at bodies ``base`` (n, P), shape
+    fixed."""
+    shape = torch.arange(base.shape[1], device=base.device)[problem.layout.shape]
     return replace(
         problem,
         base=base,
-        columns=own,
+        columns=problem.columns[~torch.isin(problem.columns, shape)],
         one_shape=False,
         fit_shared=False,
-        views=views,
-        targets=targets,
+        views=None if problem.views is None else problem.views.frames(at),
+        targets=None if problem.targets is None else problem.targets.frames(at),
         rows=None,
         touching=None,
         pose=None if problem.pose is None else problem.pose.of_frames(at),

@@ -1,21 +1,38 @@
-"""Where the fit of a frame starts: a rigid placement of the trunk, facing both ways."""
+"""Start of the fit: a rigid placement of the trunk, then a fit of 3D keypoints in each frame."""
 
 from __future__ import annotations
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
-from intercap_core.body.parameters import NUM_POSE
+from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.body.keypoints import BODY
+from intercap_core.body.parameters import NUM_POSE, TRANSL
 from intercap_core.body_fit.bridge import bridge
+from intercap_core.body_fit.evidence import Evidence
 from intercap_core.body_fit.observations import TRUNK_KEYPOINTS
+from intercap_core.body_fit.problem import BodyProblem, columns_of
+from intercap_core.body_fit.surface import COVERINGS
+from intercap_core.body_fit.term_inputs import Targets
+from intercap_core.geometry.solve.levenberg_marquardt import Solution, minimise
+
+START_SIGMA_M = 0.04  # of a triangulated keypoint at the start of the fit; tuned on the studio
+# Frames whose cost exceeds the median by this factor are also tried turned around. Tuned on the
+# studio.
+_TURN_WORSE = 1.5
 
 
 def place_trunk(rest: np.ndarray, joints: np.ndarray, pelvis: np.ndarray) -> np.ndarray:
-    """Rotation vectors and translations (T,6) that lay the rest body on triangulated keypoints.
+    """Align the rest body rigidly with triangulated keypoints, by least squares (Kabsch 1976).
 
-    rest (K,3) keypoints of the rest pose, joints (T,K,3) with NaN = unknown, pelvis (3,) the rest
-    pelvis, about which SMPL-X turns. Least squares over the trunk's known keypoints (Kabsch 1976).
-    NaN where fewer than three are known.
+    Args:
+        rest: (K, 3) keypoints of the rest pose.
+        joints: (T, K, 3) triangulated keypoints, NaN = unknown.
+        pelvis: (3,) rest position of the pelvis, about which SMPL-X turns.
+
+    Returns:
+        (T, 6) rotation vectors and translations, NaN if fewer than three trunk keypoints are known.
     """
     trunk = list(TRUNK_KEYPOINTS)
     result = np.full((len(joints), 6), np.nan)
@@ -33,9 +50,9 @@ def place_trunk(rest: np.ndarray, joints: np.ndarray, pelvis: np.ndarray) -> np.
     return result
 
 
-def between(placement: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """The same placements (N,6), at times (N,) s, with the unknown ones (NaN) filled in from those
-    around. At least one is known."""
+def interpolate_unknown(placement: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Return placements (N, 6) at times (N,) with unknown ones (NaN) interpolated. At least one is
+    known."""
     known = np.isfinite(placement).all(1)
     vectors = np.zeros((len(placement), NUM_POSE + 3))
     vectors[:, :3], vectors[:, NUM_POSE:] = placement[:, :3], placement[:, 3:]
@@ -43,10 +60,65 @@ def between(placement: np.ndarray, times: np.ndarray) -> np.ndarray:
     return np.hstack([filled[:, :3], filled[:, NUM_POSE:]])
 
 
-def turned_around(placement: np.ndarray) -> np.ndarray:
-    """The same placements (T,6) with the body facing the other way (half a turn about its y)."""
+def turn_around(placement: np.ndarray) -> np.ndarray:
+    """Return placements (T, 6) with the body turned by half a turn about its y."""
     result = placement.copy()
     known = np.isfinite(placement).all(1)
     turn = Rotation.from_rotvec([0.0, np.pi, 0.0])
     result[known, :3] = (Rotation.from_rotvec(placement[known, :3]) * turn).as_rotvec()
     return result
+
+
+def fit_start(evidence: Evidence, problem: BodyProblem) -> torch.Tensor:
+    """Return parameters (N, P) fitted to the triangulated body keypoints of each frame.
+
+    ``problem`` provides the keypoints, offsets and terms; each frame has its own shape. Frames that
+    fit badly are tried facing the other way.
+    """
+    model = evidence.model
+    rest = model.zeros()
+    keypoints = model.keypoints_of(rest)[0].double().cpu().numpy()
+    pelvis = model.forward(rest, vertex_ids=np.array([0])).joints[0, 0].double().cpu().numpy()
+    joints = evidence.seen.joints[evidence.frames]
+    placed = interpolate_unknown(
+        place_trunk(keypoints, joints, pelvis), evidence.seen.times[evidence.frames]
+    )
+    straight = _fit_triangulated(problem, placed, joints)
+    poor = np.flatnonzero((straight.cost > _TURN_WORSE * straight.cost.median()).cpu().numpy())
+    if len(poor):
+        turned = _fit_triangulated(problem, turn_around(placed[poor]), joints[poor])
+        better = turned.cost < straight.cost[poor]
+        straight.own[poor[better.cpu().numpy()]] = turned.own[better]
+    return straight.own
+
+
+def _fit_triangulated(problem: BodyProblem, placed: np.ndarray, joints: np.ndarray) -> Solution:
+    """Fit bodies placed at (n, 6) to keypoints (n, K, 3); ``own`` of the solution is (n, P)."""
+    model = problem.model
+
+    def tensor(values: np.ndarray) -> torch.Tensor:
+        return torch.as_tensor(values, dtype=model.dtype, device=model.device)
+
+    base = model.zeros(len(placed)).vector().clone()
+    base[:, 75:120], base[:, 120:165] = model.hand_mean[0], model.hand_mean[1]
+    base[:, 0:3], base[:, TRANSL] = tensor(placed[:, :3]), tensor(placed[:, 3:])
+    for name, sign in (("left_shoulder", -1.0), ("right_shoulder", 1.0)):
+        base[:, 3 * JOINT_INDEX[name] + 2] = sign * 0.8  # arms hang
+    joints = joints[:, BODY]
+    known = np.isfinite(joints).all(2)
+    own = BodyProblem(
+        model=model,
+        keypoints=problem.keypoints,
+        samples=problem.samples,
+        base=base,
+        columns=columns_of(model, hands=False, face=False, betas=True),
+        one_shape=False,
+        offsets=problem.offsets,
+        u=base.new_zeros(len(COVERINGS)),
+        targets=Targets(tensor(np.nan_to_num(joints)), tensor(known), START_SIGMA_M),
+        terms=problem.terms,
+    )
+    solution = minimise(own, own.own_start(), max_trials=15, cost_tolerance=1e-2)
+    own.accept(solution.own, solution.shared)
+    solution.own = own.base
+    return solution

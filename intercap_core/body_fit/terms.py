@@ -1,132 +1,182 @@
-"""What the terms of the body's energy E_B (equation 2) are given, and what they must do.
+"""The terms of the body's energy E_B (equation 2 with 3 to 5), summed.
 
-Two forms of every term exist: :mod:`.torch_terms` states each one readably and runs on any device,
-:mod:`.compiled_terms` is what the CPU uses. Both give the same cost, gradient and Gauss-Newton
-matrix, and with them the same steps.
+| term | equation | file | torch form | compiled form |
+| --- | --- | --- | --- | --- |
+| E_J | 3 | keypoint_term.py | KeypointTerm | CompiledKeypoints |
+| E_D | 4 | cloud_term.py | CloudTerm | CompiledCloud |
+| E_P_self | 5 | self_term.py | SelfPenetrationTerm | CompiledSelfPenetration |
+| priors | 2 | prior_term.py | PriorTerm | CompiledPriors |
+
+:class:`TorchTerms` is the readable form and the one that runs on a GPU. :class:`CompiledTerms` has
+the same cost, gradient and Gauss-Newton matrix on the CPU. With a licensed body file, costs and
+gradients contain pose blend shapes in full. The Gauss-Newton matrices of E_J and E_D contain them
+by the joints of a point's own limb, that of E_P_self not at all, since they would make every block
+of the normal equations dense: see :mod:`intercap_core.body.correctives_kernel`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from collections.abc import Callable
+from functools import cache
 
 import numpy as np
+import torch
 from torch import Tensor
 
-from intercap_core.body.vposer import PoseGaussian
-from intercap_core.body_fit.body_cloud import CloudRows
-from intercap_core.body_fit.body_keypoints import KeypointSet
-from intercap_core.body_fit.body_self import Pairs
+from intercap_core.body.correctives_kernel import (
+    NUM_FEATURES,
+    add_gradient,
+    features,
+    gather,
+    rotation_derivatives,
+)
+from intercap_core.body.model import BodyModel
+from intercap_core.body.skeleton_kernel import RestJoints, pose
+from intercap_core.body_fit.cloud_term import CloudTerm, CompiledCloud
+from intercap_core.body_fit.keypoint_term import CompiledKeypoints, KeypointTerm
+from intercap_core.body_fit.prior_term import CompiledPriors, PriorTerm
+from intercap_core.body_fit.self_term import CompiledSelfPenetration, SelfPenetrationTerm
+from intercap_core.body_fit.surface import Samples
+from intercap_core.body_fit.term_inputs import (
+    Batch,
+    BatchEquations,
+    Bodies,
+    Columns,
+    CompiledTerm,
+    PreparedTerm,
+    TermInputs,
+    TorchTerm,
+)
 from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
+from intercap_core.geometry.solve.thread_pool import ThreadPool
+
+_CHUNK = 32  # frames whose dense rows are in memory at once
 
 
-@dataclass
-class Views:
-    """What E_J compares with, for the problem's K keypoints.
-
-    observed (T,C,K,2) px, confidence (T,C,K), sigma (T,C,K) px, lenses (C,13),
-    colour_from_master (C,4,4), shift (T,C,K,3) m or None.
-    """
-
-    observed: Tensor
-    confidence: Tensor
-    sigma: Tensor
-    lenses: Tensor
-    colour_from_master: Tensor
-    shift: Tensor | None = None
+def terms_on(device: torch.device, model: BodyModel, samples: Samples) -> TorchTerm:
+    """Return the fastest form on a device: compiled on the CPU, else torch."""
+    form = CompiledTerms if device.type == "cpu" else TorchTerms
+    return form(model, samples)
 
 
-@dataclass
-class Targets:
-    """Triangulated chosen keypoints (T,K,3) with confidence (T,K) and one sigma in metres."""
+class TorchTerms:
+    """The sum of all terms in torch; see :class:`.term_inputs.TorchTerm`."""
 
-    points: Tensor
-    confidence: Tensor
-    sigma: float
+    def __init__(self, model: BodyModel, samples: Samples) -> None:
+        def tensor(values: object) -> Tensor:
+            return torch.as_tensor(values, device=model.device)
 
+        self.terms: tuple[TorchTerm, ...] = (
+            KeypointTerm(model),
+            CloudTerm(model, tensor(samples.vertex), tensor(samples.group)),
+            SelfPenetrationTerm(model),
+            PriorTerm(model),
+        )
 
-class Observations(NamedTuple):
-    """What the bodies of all T frames are compared with; None = that term is off.
+    def cost(self, inputs: TermInputs, bodies: Bodies) -> Tensor:
+        total = bodies.vectors.new_zeros(len(bodies.frames))
+        for at in _chunks(len(total)):
+            for term in self.terms:
+                total[at] += term.cost(inputs, _part(bodies, at))
+        return total
 
-    views and targets belong to E_J, rows to E_D, and pairs, times self_weight, to E_P_self. pose: a
-    learned prior of each frame's body pose. shape_prior: betas belong to each frame, which then has
-    their prior; else they are shared, or fixed. hand_share: of an observation that E_theta_h is in
-    one frame.
-    """
-
-    keypoints: KeypointSet
-    views: Views | None
-    targets: Targets | None
-    rows: CloudRows | None
-    pairs: Pairs | None
-    self_weight: float
-    pose: PoseGaussian | None
-    shape_prior: bool
-    hand_share: float
-
-
-class Bodies(NamedTuple):
-    """Where the energy is evaluated: ``frames`` (b,) of the observations.
-
-    vectors (b,P) body parameters; offsets (K,3), metres, of the keypoints in the frames of their
-    bones; thickness (G,) of each covering, metres.
-    """
-
-    vectors: Tensor
-    offsets: Tensor
-    thickness: Tensor
-    frames: Tensor
-
-
-class Columns(NamedTuple):
-    """The columns of the normal equations, in their order.
-
-    parameters (n,): the body parameter of each of the first n columns. Then come three columns for
-    the offset of each of the first ``offsets`` keypoints, and ``coverings`` columns for the
-    logarithms u of the coverings' thickness.
-    """
-
-    parameters: Tensor
-    offsets: int
-    coverings: int
-
-    @property
-    def offsets_at(self) -> slice:
-        """The offsets' columns."""
-        first = len(self.parameters)
-        return slice(first, first + 3 * self.offsets)
-
-    @property
-    def coverings_at(self) -> slice:
-        """The coverings' columns."""
-        first = self.offsets_at.stop
-        return slice(first, first + self.coverings)
-
-    def of_parameters(self, count: int) -> np.ndarray:
-        """Column (P,) of each of so many body parameters, -1 = fixed."""
-        columns = np.full(count, -1)
-        columns[self.parameters.cpu().numpy()] = np.arange(len(self.parameters))
-        return columns
-
-    def of_coverings(self, count: int) -> np.ndarray:
-        """Column (G,) of each of so many coverings, -1 = fixed."""
-        at = self.coverings_at
-        return np.arange(at.start, at.stop) if self.coverings else np.full(count, -1)
-
-
-class Terms(Protocol):
-    """E_J + E_D + E_P_self + priors of each frame, without the prior of shared parameters."""
-
-    def cost(self, observed: Observations, bodies: Bodies) -> Tensor:
-        """(b,) of the bodies' frames. Raises ValueError without views and targets."""
-        ...
-
-    def add_equations(
-        self,
-        observed: Observations,
-        bodies: Bodies,
-        columns: Columns,
-        equations: NormalEquations,
+    def add(
+        self, inputs: TermInputs, bodies: Bodies, columns: Columns, equations: NormalEquations
     ) -> None:
-        """Add cost (b,), gradient (b,n) and Gauss-Newton matrix (b,n,n) in place."""
-        ...
+        for at in _chunks(len(bodies.frames)):
+            part = NormalEquations(*(whole[at] for whole in equations))
+            for term in self.terms:
+                term.add(inputs, _part(bodies, at), columns, part)
+
+
+def _part(bodies: Bodies, at: slice) -> Bodies:
+    return bodies._replace(vectors=bodies.vectors[at], frames=bodies.frames[at])
+
+
+def _chunks(count: int) -> list[slice]:
+    return [slice(i, i + _CHUNK) for i in range(0, count, _CHUNK)]
+
+
+class CompiledTerms:
+    """The sum of all terms by compiled kernels, on the CPU; see :class:`.term_inputs.TorchTerm`.
+
+    The skeleton of a frame is posed once for all terms. Frames are divided among as many threads as
+    torch uses. Each frame has its own normal equations, so the result does not depend on the number
+    of threads. Pose blend shapes move the points at rest before the terms use them.
+    """
+
+    def __init__(self, model: BodyModel, samples: Samples) -> None:
+        self._rest_joints = RestJoints.of(model)
+        self._terms: tuple[CompiledTerm, ...] = (
+            CompiledPriors(model),
+            CompiledKeypoints(model),
+            CompiledCloud(model, samples),
+            CompiledSelfPenetration(model),
+        )
+
+    def cost(self, inputs: TermInputs, bodies: Bodies) -> Tensor:
+        terms = self._prepare(inputs, bodies, derivatives=False)
+        total = bodies.vectors.new_zeros(len(bodies.frames))
+
+        def add_frames(at: slice) -> None:
+            batch = self._batch(terms, bodies, at, derivatives=False)
+            for term in terms:
+                term.add_cost(batch, total.numpy()[at])
+
+        _divide_frames(add_frames, len(total))
+        return total
+
+    def add(
+        self, inputs: TermInputs, bodies: Bodies, columns: Columns, equations: NormalEquations
+    ) -> None:
+        terms = self._prepare(inputs, bodies, derivatives=True)
+        moved = [term.rest for term in terms if term.rest and term.rest.correctives]
+        place = columns.of_parameters(bodies.vectors.shape[1])
+        whole = [part.numpy() for part in equations]
+
+        def add_frames(at: slice) -> None:
+            batch = self._batch(terms, bodies, at, derivatives=True)
+            by_pose = rotation_derivatives(batch.vectors if moved else batch.vectors[:0])
+            cost, gradient, hessian = (part[at] for part in whole)
+            own = BatchEquations(columns, place, cost, gradient, hessian, by_pose)
+            for term in terms:
+                term.add(batch, own)
+            if moved:
+                # gradients by the points at rest, through the blend shapes to the pose
+                by_feature = np.zeros((len(by_pose), NUM_FEATURES), by_pose.dtype)
+                for rest in moved:
+                    gather(rest.correctives, rest.gradient[at], by_feature)
+                add_gradient(by_pose, by_feature, place, gradient)
+
+        _divide_frames(add_frames, len(bodies.frames))
+
+    def _prepare(
+        self, inputs: TermInputs, bodies: Bodies, *, derivatives: bool
+    ) -> list[PreparedTerm]:
+        found = [term.prepare(inputs, bodies, derivatives=derivatives) for term in self._terms]
+        return [term for term in found if term is not None]
+
+    def _batch(
+        self, terms: list[PreparedTerm], bodies: Bodies, at: slice, *, derivatives: bool
+    ) -> Batch:
+        """Pose the skeletons of the bodies ``at``, and move their points by the blend shapes."""
+        vectors, frames = bodies.vectors.numpy()[at], bodies.frames.numpy()[at]
+        feature = None
+        for term in terms:
+            if term.rest is not None and term.rest.correctives is not None:
+                feature = features(vectors) if feature is None else feature
+                term.rest.move(feature, at, term.used(frames))
+        skeleton = pose(self._rest_joints, vectors, derivatives=derivatives)
+        return Batch(at, vectors, frames, skeleton)
+
+
+@cache
+def _thread_pool(threads: int) -> ThreadPool:
+    return ThreadPool(threads)
+
+
+def _divide_frames(add_frames: Callable[[slice], None], count: int) -> None:
+    """Call ``add_frames`` on ``count`` frames, in equal parts for each thread."""
+    threads = torch.get_num_threads()
+    step = max(1, -(-count // threads))
+    _thread_pool(threads).map(add_frames, [slice(i, i + step) for i in range(0, count, step)])

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from intercap_core.body_fit.definition import learnt
+from intercap_core.body_fit.definition import average_offsets
 from intercap_core.project import load_project
 
 
@@ -15,7 +15,7 @@ def learn_definition(settings: Path, output: Path) -> str:
     holds. Raises UserError where too few people were recorded with depth."""
     project = load_project(settings)
     fits = [project.artefact(name, "body_fit") for name in project.sequences]
-    found, people = learnt([path for path in fits if path.is_file()])
+    found, people = average_offsets([path for path in fits if path.is_file()])
     found.write(output, f"{project.config.dataset}, {len(people)} people: {', '.join(people)}")
     offset = 1e3 * np.linalg.norm(found.offsets, axis=1)
     return (

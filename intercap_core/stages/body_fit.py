@@ -20,21 +20,20 @@ from intercap_core.body.model import BodyModel, check_body
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.body_fit import quality
 from intercap_core.body_fit.bridge import bridge, bridged_sigma, continuous
-from intercap_core.body_fit.constants import (
-    BAD_BODY_M,
-    JUMP_M,
-    WRONG_TRUNK_M,
-)
 from intercap_core.body_fit.definition import Definition
 from intercap_core.body_fit.observations import person_clouds, read_observations
-from intercap_core.body_fit.recover import jumps
+from intercap_core.body_fit.recover import JUMP_M, jumps
 from intercap_core.body_fit.schedule import Fitter
-from intercap_core.body_fit.uncertainty import deviation, joint_covariance, widened
+from intercap_core.body_fit.uncertainty import deviation, joint_covariance, widen
 from intercap_core.config import BodyFitSettings, BodyModels, SubjectEntry, digest
 from intercap_core.errors import UserError
 from intercap_core.schemas import BODY_FIT, BODY_PARTS
 
 NUM_EXPRESSION = 10
+# Median error of the trunk's keypoints from which the fit is not this person's body, metres. Tuned
+# on the studio.
+WRONG_TRUNK_M = 0.06
+BAD_BODY_M = 0.040  # mean error of the surface that the metrics call a bad body, metres
 
 
 def run(
@@ -98,15 +97,15 @@ def run(
     # an outlier in time may be a wrong minimum: its sigma is widened; a limb that only one view's
     # pixels constrain is widened by any departure from the median
     least = np.full_like(sigma, JUMP_M)
-    least[fit.frames] *= ~quality.unmeasured_joints(fit.parts)
+    least[fit.frames] *= ~quality.flag_unmeasured_joints(fit.parts)
     jumped = np.zeros_like(sigma)
     jumped[fitted] = jumps(joints[fitted].astype(float), seen.times[fitted], least[fitted])
     sigma[fit.frames] = np.hypot(
-        quality.widened_sigma(deviation(stated), fit.parts),
+        quality.widen_sigma(deviation(stated), fit.parts),
         jumped[fit.frames] / quality.MEDIAN_CHI_3,
     )
     undetermined = np.ones((seen.num_frames, len(BODY_PARTS)), bool)
-    undetermined[fit.frames] = quality.undetermined(sigma[fit.frames], fit.parts)
+    undetermined[fit.frames] = quality.flag_undetermined(sigma[fit.frames], fit.parts)
     undetermined[~fitted] = True
     sigma = bridged_sigma(joints.astype(float), fitted, sigma, seen.times)
     covariance = np.zeros((*sigma.shape, 3, 3))
@@ -132,7 +131,7 @@ def run(
         writer.put("keypoint_residual", keypoint_residual)
         writer.put("cloud_residual", cloud_residual)
         writer.put("joint_sigma", sigma)
-        writer.put("joint_covariance", widened(covariance, sigma))
+        writer.put("joint_covariance", widen(covariance, sigma))
         writer.put("keypoint_offsets", fit.settled.offsets.cpu().numpy())
         writer.put("keypoint_sigma", fit.settled.keypoint_sigma.cpu().numpy())
         writer.put("keypoint_doubt", fit.settled.keypoint_doubt.cpu().numpy())

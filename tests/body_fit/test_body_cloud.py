@@ -10,8 +10,7 @@ from torch import Tensor
 from intercap_core.body.kinematics import vertex_normals
 from intercap_core.body.model import BodyModel
 from intercap_core.body_fit import body_cloud as term
-from intercap_core.body_fit.body_samples import COVERINGS, Samples, choose_samples
-from intercap_core.body_fit.body_surface import Surface
+from intercap_core.body_fit.surface import COVERINGS, Samples, Surface, choose_samples
 from tests.helpers.bodies import open_body, random_normal
 
 

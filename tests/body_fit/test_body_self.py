@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from intercap_core.body_fit.body_constants import SELF_TOLERANCE_M
 from torch import Tensor
 
 from intercap_core.body.joints import JOINT_INDEX
@@ -12,12 +13,9 @@ from intercap_core.body.kinematics import vertex_normals
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.body_fit import body_self as term
-from intercap_core.body_fit.body_constants import SELF_TOLERANCE_M
-from intercap_core.body_fit.body_keypoints import keypoint_set
-from intercap_core.body_fit.body_samples import COVERINGS, choose_samples
-from intercap_core.body_fit.problem import BodyProblem
-from intercap_core.body_fit.schedule import columns_of
-from intercap_core.body_fit.terms import Targets
+from intercap_core.body_fit.problem import BodyProblem, columns_of
+from intercap_core.body_fit.surface import COVERINGS, choose_samples
+from intercap_core.body_fit.term_inputs import Targets, keypoint_set
 from intercap_core.geometry.solve.levenberg_marquardt import minimise
 
 

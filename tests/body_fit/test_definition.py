@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-
-from intercap_core.body_fit.constants import OFFSET_SIGMA_M
-from intercap_core.body_fit.definition import POINTS, Definition
 from intercap_core.body_fit.layout import Layout
+
+from intercap_core.body_fit.definition import POINTS, UNKNOWN_SIGMA_M, Definition
 from intercap_core.errors import UserError
 
 
@@ -31,7 +30,7 @@ def test_a_table_is_read_as_it_was_written(tmp_path: Path) -> None:
 
 def test_without_a_table_the_points_are_the_models() -> None:
     found = Definition.read(None)
-    assert not found.offsets.any() and (found.sigma == OFFSET_SIGMA_M).all()
+    assert not found.offsets.any() and (found.sigma == UNKNOWN_SIGMA_M).all()
 
 
 @pytest.mark.parametrize(

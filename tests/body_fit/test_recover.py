@@ -12,10 +12,9 @@ from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
 from intercap_core.body.vposer import PoseGaussian
 from intercap_core.body_fit import body_keypoints, body_samples
-from intercap_core.body_fit.problem import BodyProblem
+from intercap_core.body_fit.problem import BodyProblem, columns_of
 from intercap_core.body_fit.recover import jumps, recover
-from intercap_core.body_fit.schedule import columns_of
-from intercap_core.body_fit.terms import Views
+from intercap_core.body_fit.term_inputs import Views
 from tests.helpers.body_capture import master_from_room, ring
 
 TIMES = np.arange(40) / 15

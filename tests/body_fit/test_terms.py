@@ -15,10 +15,9 @@ from intercap_core.body.loading import load_body_file
 from intercap_core.body.model import BodyModel
 from intercap_core.body.vposer import PoseGaussian
 from intercap_core.body_fit import body_cloud, body_keypoints, body_samples, body_self
-from intercap_core.body_fit.problem import BodyProblem
-from intercap_core.body_fit.schedule import columns_of
-from intercap_core.body_fit.terms import Targets, Views
-from intercap_core.body_fit.torch_terms import TorchTerms
+from intercap_core.body_fit.problem import BodyProblem, columns_of
+from intercap_core.body_fit.term_inputs import Targets, Views
+from intercap_core.body_fit.terms import TorchTerms
 
 FRAMES, CAMERAS, KEYPOINTS = 5, 3, 118
 ROUNDING = 5e-6  # float32; depths of millimetres are differences of positions metres away

@@ -22,7 +22,7 @@ from intercap_core.body.artefact import file_digest
 from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.model import BodyModel, with_hand_mean
 from intercap_core.body.parameters import BodyParameters
-from intercap_core.body_fit.body_samples import COVERINGS
+from intercap_core.body_fit.surface import COVERINGS
 from intercap_core.config import (
     BodyFitSettings,
     BodyModels,

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from intercap_core.body_fit.body_samples import COVERINGS
 from intercap_core.body_fit.observations import person_clouds, read_observations
 from intercap_core.body_fit.schedule import Fitter, Settled
+from intercap_core.body_fit.surface import COVERINGS
 from intercap_core.config import BodyFitSettings
 from intercap_core.joint.cameras import (
     BIAS,

@@ -10,9 +10,9 @@ import torch
 
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
-from intercap_core.body_fit.body_samples import COVERINGS
 from intercap_core.body_fit.observations import person_clouds, read_observations
 from intercap_core.body_fit.schedule import Fitter, Settled
+from intercap_core.body_fit.surface import COVERINGS
 from intercap_core.config import BodyFitSettings
 from intercap_core.joint.time_offsets import (
     OffsetPrior,

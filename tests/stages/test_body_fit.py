@@ -18,13 +18,12 @@ from intercap_core.body.kinematics import rotation_from_axis_angle
 from intercap_core.body.loading import load_body_file
 from intercap_core.body.model import BodyModel
 from intercap_core.body_fit import body_cloud, body_keypoints, body_samples
-from intercap_core.body_fit.body_samples import COVERINGS
-from intercap_core.body_fit.compiled_terms import CompiledTerms
 from intercap_core.body_fit.observations import person_clouds, read_observations
 from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.body_fit.schedule import Fitter, columns_of
-from intercap_core.body_fit.terms import Views
-from intercap_core.body_fit.torch_terms import TorchTerms
+from intercap_core.body_fit.surface import COVERINGS
+from intercap_core.body_fit.term_inputs import Views
+from intercap_core.body_fit.terms import CompiledTerms, TorchTerms
 from intercap_core.config import BodyFitSettings, BodyModels, SubjectEntry
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.transforms import apply

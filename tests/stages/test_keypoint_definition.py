@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from intercap_core import artefacts
-from intercap_core.body_fit.constants import DEFINITION_SIGMA_M
-from intercap_core.body_fit.definition import learnt
+from intercap_core.body_fit.definition import FITTED_SIGMA_M, average_offsets
 from intercap_core.config import BodyFitSettings, BodyModels, SubjectEntry
 from intercap_core.errors import UserError
 from intercap_core.schemas import BODY_FIT
@@ -38,16 +37,16 @@ def people(tmp_path_factory) -> list[Path]:
 
 
 def test_people_with_depth_are_averaged_and_the_others_left_out(people: list[Path]) -> None:
-    found, names = learnt(people)
+    found, names = average_offsets(people)
     assert names == ["p0", "p1", "p2"]
     each = []
     for path in people[:3]:
         with artefacts.read(path, BODY_FIT) as fit:
             each.append(fit["keypoint_offsets"])
     np.testing.assert_allclose(found.offsets, np.mean(each, axis=0), atol=1e-6)
-    assert (found.sigma >= DEFINITION_SIGMA_M).all()
+    assert (found.sigma >= FITTED_SIGMA_M).all()
 
 
 def test_too_few_people_are_named(people: list[Path]) -> None:
     with pytest.raises(UserError, match=r"2 people with depth \(p0, p1\).*without depth"):
-        learnt([*people[:2], people[3]])
+        average_offsets([*people[:2], people[3]])

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from intercap_core.geometry.rigid.normals import vertex_normals
+from intercap_core.geometry.rigid.surfaces import vertex_normals
 
 from . import retopology, shape_space
 from .body_file import SAMPLES, write_npz

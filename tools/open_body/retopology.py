@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.body.joints import JOINT_INDEX, JOINT_NAMES
-from intercap_core.geometry.rigid.normals import vertex_normals
+from intercap_core.geometry.rigid.surfaces import vertex_normals
 
 from .source import Source
 

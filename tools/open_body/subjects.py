@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core.body.joints import JOINT_INDEX
-from intercap_core.geometry.rigid.normals import vertex_normals
+from intercap_core.geometry.rigid.surfaces import vertex_normals
 
 from . import retopology, shape_space
 from .body_file import SAMPLES, write_npz

@@ -26,9 +26,9 @@ import torch
 from intercap_core.artefacts import Artefact
 from intercap_core.body.model import BodyModel
 from intercap_core.body.vposer import VPoser
-from intercap_core.body_fit import body_cloud, body_keypoints
-from intercap_core.body_fit.constants import KEYPOINT_SCALE
+from intercap_core.body_fit import cloud_term, keypoint_term
 from intercap_core.body_fit.evidence import Evidence
+from intercap_core.body_fit.keypoint_term import KEYPOINT_SCALE
 from intercap_core.body_fit.observations import person_clouds, read_observations
 from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.body_fit.schedule import Fitter, Settled
@@ -269,13 +269,11 @@ def _add_keypoints(
     views = problem.views
     if views is None:
         return
-    offsets = problem.offsets.new_zeros(len(problem.keypoints.index), 3)
-    offsets[: len(problem.offsets)] = problem.offsets
-    found = body_keypoints.evaluate(
+    found = keypoint_term.evaluate(
         problem.model,
         problem.model.parameters(problem.base[part]),
         problem.keypoints,
-        offsets,
+        problem.all_offsets(),
         derivatives=True,
         columns=torch.arange(BODY.stop, device=problem.base.device),
     )
@@ -316,8 +314,8 @@ def _add_clouds(evidence: Evidence, problem: BodyProblem, part: np.ndarray, seen
     linear = model.linearise(model.parameters(problem.base[part]), vertex_ids=evidence.sample_ids)
     normal, points = rows.normal[part], linear.vertices
     by_body = -linear.along(normal[:, :, None])[:, :, 0][..., BODY]
-    own = body_cloud.CloudRows(*(values[part] for values in rows))
-    residual = body_cloud.residuals(points, own, problem.thickness_of_group(), evidence.group)
+    own = rows.frames(part)
+    residual = cloud_term.residuals(points, own, problem.thickness_of_group(), evidence.group)
     poses = _poses(evidence).to(points)
     arm = points[:, None] - poses[:, None, :3, 3]  # (b, C, S, 3)
     ray = arm / (arm @ poses[:, :3, 2, None]).clamp_min(0.1)

@@ -2,7 +2,7 @@
 
     E = sum over vertices v of the body inside the object of (depth(v) - tolerance)^2
 
-Equation 6 sums E_P of equation 5, the body's self-penetration (:mod:`.body_self`), over frames, and
+Equation 6 sums E_P of equation 5 (:mod:`intercap_core.body_fit.self_term`), over frames, and
 the text adds "we also penalize the body-object interpenetration, as done in PROX" without a symbol.
 This is that term: beyond the paper's formulas, against the moving object, and by the distance to
 its mesh instead of a voxel grid.

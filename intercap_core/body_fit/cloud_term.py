@@ -1,0 +1,373 @@
+"""Cloud term of the body's energy, E_D: equation 4, a part of equation 2.
+
+    E_D = sum over views v, points p of the person's cloud in v of min over visible vertices |v - p|
+
+Here the distance is measured along the normal of the surface. Beyond the paper: the measured
+surface is clothing and hair, not skin,
+
+    E_D = sum over samples s of weight_s e_s^2 / 2,      e_s = target_s - n_s . v_s - c_g(s),
+    c_g = c0_g exp(u_g),                                 u_g ~ N(0, spread_g^2)
+
+with the sample v_s of the skin, the normal n_s there, and target_s, the mean of n_s . p over the
+points p that were matched to the sample. One thickness c_g > 0 for each covering g (trunk, thighs,
+hair, ...) is shared by all frames; c0_g is that of everyday garments (:mod:`.surface`). Errors of
+neighbouring points come from one fold of cloth, so a sample counts as one measurement however many
+points it has. :mod:`.matching` finds the points of each sample.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor
+
+from intercap_core.body.correctives_kernel import PointSource, RestPoints, add_to_row
+from intercap_core.body.model import BodyModel
+from intercap_core.body.parameters import TRANSL
+from intercap_core.body.selection import Selection
+from intercap_core.body.skeleton_kernel import columns_of_limb, project_on_direction, turned_back
+from intercap_core.body_fit.surface import Samples
+from intercap_core.body_fit.term_inputs import (
+    Batch,
+    BatchEquations,
+    Bodies,
+    CloudRows,
+    Columns,
+    TermInputs,
+    contiguous,
+)
+from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
+
+_SHAPE, _TRANSL = TRANSL.stop, TRANSL.start
+_ROWS_TOGETHER = 4  # rows that are added to a block at once: speed
+
+
+def residuals(points: Tensor, rows: CloudRows, thickness: Tensor, group: Tensor) -> Tensor:
+    """Return e (B, N), metres: positive where the measured surface is outside skin and covering.
+
+    Args:
+        points: (B, N, 3) samples, metres.
+        rows: rows of the B bodies.
+        thickness: (G,) of the coverings, metres.
+        group: (N,) covering of each sample.
+    """
+    return rows.target - (rows.normal * points).sum(2) - thickness[group]
+
+
+@dataclass(frozen=True)
+class CloudTerm:
+    """E_D in torch; see :class:`.term_inputs.TorchTerm`."""
+
+    model: BodyModel
+    sample_ids: Tensor
+    """(N,) vertex ids of the samples."""
+    group: Tensor
+    """(N,) covering of each sample."""
+
+    def cost(self, inputs: TermInputs, bodies: Bodies) -> Tensor:
+        if inputs.rows is None:
+            return bodies.vectors.new_zeros(len(bodies.frames))
+        params = self.model.parameters(bodies.vectors)
+        points = self.model.forward(params, vertex_ids=self.sample_ids).vertices
+        rows = inputs.rows.frames(bodies.frames)
+        e = residuals(points, rows, bodies.thickness, self.group)
+        return 0.5 * (rows.weight * e * e).sum(1)
+
+    def add(
+        self, inputs: TermInputs, bodies: Bodies, columns: Columns, equations: NormalEquations
+    ) -> None:
+        if inputs.rows is None:
+            return
+        params = self.model.parameters(bodies.vectors)
+        linear = self.model.linearise(params, vertex_ids=self.sample_ids)
+        own_limb = linear.with_correctives_of(linear.selection.limbs.moved_by_point())
+        rows = inputs.rows.frames(bodies.frames)
+        # n . d v / d parameters (b, N, n)
+        by, by_own_limb = (
+            each.along(rows.normal[:, :, None])[:, :, 0][..., columns.parameters]
+            for each in (linear, own_limb)
+        )
+        thickness, weight = bodies.thickness, rows.weight
+        e = residuals(linear.vertices, rows, thickness, self.group)
+        weighted = by_own_limb * weight[..., None]
+        n, at = len(columns.parameters), columns.coverings_at
+        cost, gradient, hessian = equations
+        cost += 0.5 * (weight * e * e).sum(1)
+        # de/d theta = -by
+        gradient[:, :n] += -(by * (weight * e)[..., None]).sum(1)
+        hessian[:, :n, :n] += weighted.transpose(1, 2) @ by_own_limb
+        if columns.coverings:
+            # de/du = -c of the sample's covering, since c = c0 exp(u)
+            pick = torch.zeros(len(self.group), len(thickness), dtype=by.dtype, device=by.device)
+            pick[torch.arange(len(self.group)), self.group] = thickness[self.group]
+            cross = weighted.transpose(1, 2) @ pick
+            gradient[:, at] += -(weight * e) @ pick
+            hessian[:, at, at] += torch.einsum("bn,ng,nh->bgh", weight, pick, pick)
+            hessian[:, :n, at] += cross
+            hessian[:, at, :n] += cross.transpose(1, 2)
+
+
+# --- compiled --------------------------------------------------------------------------------
+
+
+class CompiledCloud:
+    """E_D by the kernels below; see :class:`.term_inputs.CompiledTerm`."""
+
+    def __init__(self, model: BodyModel, samples: Samples) -> None:
+        self._source = PointSource.of(model, samples.vertex)
+        self._group = samples.group
+
+    def prepare(
+        self, inputs: TermInputs, bodies: Bodies, *, derivatives: bool
+    ) -> PreparedCloud | None:
+        rows = inputs.rows
+        if rows is None:
+            return None
+        return PreparedCloud(
+            self._source.selection,
+            self._group,
+            self._source.at_rest(contiguous(bodies.vectors[:, _SHAPE:]), derivatives),
+            contiguous(rows.normal),
+            contiguous(rows.weight),
+            contiguous(rows.target),
+            contiguous(bodies.thickness),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedCloud:
+    """See :class:`.term_inputs.PreparedTerm`; fields as in :class:`.term_inputs.CloudRows`."""
+
+    selection: Selection
+    group: np.ndarray
+    rest: RestPoints
+    normal: np.ndarray
+    weight: np.ndarray
+    target: np.ndarray
+    thickness: np.ndarray
+
+    def used(self, frames: np.ndarray) -> np.ndarray:
+        return np.asarray(self.weight[frames] > 0)
+
+    def add_cost(self, batch: Batch, cost: np.ndarray) -> None:
+        chain = batch.skeleton.chain(self.selection, self.rest.points[batch.at])
+        add_cost(
+            chain, self.normal, self.weight, self.target, self.thickness, self.group, batch.frames,
+            cost,
+        )  # fmt: skip
+
+    def add(self, batch: Batch, equations: BatchEquations) -> None:
+        chain = batch.skeleton.chain(self.selection, self.rest.points[batch.at])
+        add_equations(
+            chain, self.selection.limbs, self.normal, self.weight, self.target, self.thickness,
+            self.group, batch.frames, equations.place,
+            equations.columns.of_coverings(len(self.thickness)), equations.cost,
+            equations.gradient, equations.hessian, self.rest.gradient[batch.at], self.rest.tables,
+            equations.by_pose,
+        )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True)
+def add_cost(chain, normal, weight, target, thickness, group, frames, cost):
+    """Add E_D to cost (B,) of the frames (B,).
+
+    normal (T,N,3), weight (T,N), 0 = no row, target (T,N); thickness (G,), group (N,).
+    """
+    for b in range(len(frames)):
+        t, total = frames[b], 0.0
+        for i in range(len(group)):
+            if weight[t, i] > 0:
+                along = project_on_direction(chain, b, i, normal[t, i])
+                e = target[t, i] - along - thickness[group[i]]
+                total += weight[t, i] * e * e / 2
+        cost[b] += total
+
+
+@numba.njit(cache=True, nogil=True)
+def _find_columns(moved_by, place, group, place_u, local, local_u, to):
+    """Write the columns of a limb and return their number.
+
+    local (P,), local_u (G,): the column of each parameter and covering in the limb's rows, -1 =
+    none. ``to``: the column in the normal equations of each column of the rows.
+    """
+    m = columns_of_limb(moved_by, place, local, to)
+    local_u[:] = -1
+    for g in group:
+        if place_u[g] >= 0 and local_u[g] < 0:
+            local_u[g], to[m] = m, place_u[g]
+            m += 1
+    return m
+
+
+@numba.njit(cache=True, nogil=True, fastmath={"contract"})
+def _fill_row(row, local, shape, c, b, i, n, arms, by_shape):
+    """Write n . d point i / d parameters of body b to ``row``, and return n . point.
+
+    local (P,): column of each parameter in the row, -1 = none. shape: fitted shape components.
+    arms (L,3), by_shape (S,): scratch.
+    """
+    x0, x1, x2, along = c.rest[b, i, 0], c.rest[b, i, 1], c.rest[b, i, 2], 0.0
+    n0, n1, n2 = n
+    t0, t1, t2 = n0 * 0, n0 * 0, n0 * 0
+    for q in range(len(row)):
+        row[q] = 0
+    for s in range(len(by_shape)):
+        by_shape[s] = 0
+    for j in range(len(arms)):
+        arms[j, 0] = arms[j, 1] = arms[j, 2] = 0
+    for k in range(c.bones.shape[1]):
+        w, m = c.shares[i, k], c.bones[i, k]
+        if w == 0:
+            continue
+        r00, r01, r02 = c.rotations[b, m, 0, 0], c.rotations[b, m, 0, 1], c.rotations[b, m, 0, 2]
+        r10, r11, r12 = c.rotations[b, m, 1, 0], c.rotations[b, m, 1, 1], c.rotations[b, m, 1, 2]
+        r20, r21, r22 = c.rotations[b, m, 2, 0], c.rotations[b, m, 2, 1], c.rotations[b, m, 2, 2]
+        p0 = r00 * x0 + r01 * x1 + r02 * x2 + c.offsets[b, m, 0]
+        p1 = r10 * x0 + r11 * x1 + r12 * x2 + c.offsets[b, m, 1]
+        p2 = r20 * x0 + r21 * x1 + r22 * x2 + c.offsets[b, m, 2]
+        along += w * (n0 * p0 + n1 * p1 + n2 * p2)
+        for j in range(len(arms)):
+            part, joint = c.below[i, j, k], c.chain[i, j]
+            if part != 0:
+                arms[j, 0] += part * (p0 - c.joints[b, joint, 0])
+                arms[j, 1] += part * (p1 - c.joints[b, joint, 1])
+                arms[j, 2] += part * (p2 - c.joints[b, joint, 2])
+        if len(shape):
+            t0 += w * (r00 * n0 + r10 * n1 + r20 * n2)
+            t1 += w * (r01 * n0 + r11 * n1 + r21 * n2)
+            t2 += w * (r02 * n0 + r12 * n1 + r22 * n2)
+            w0, w1, w2 = w * n0, w * n1, w * n2
+            for s in range(len(by_shape)):
+                by_shape[s] += (
+                    w0 * c.moved[b, m, 0, s] + w1 * c.moved[b, m, 1, s] + w2 * c.moved[b, m, 2, s]
+                )
+    for j in range(len(arms)):
+        a0, a1, a2, joint = arms[j, 0], arms[j, 1], arms[j, 2], c.chain[i, j]
+        if (a0 == 0 and a1 == 0 and a2 == 0) or local[3 * joint] < 0:
+            continue
+        # n . (w x a) = w . (a x n)
+        u0, u1, u2 = a1 * n2 - a2 * n1, a2 * n0 - a0 * n2, a0 * n1 - a1 * n0
+        for d in range(3):
+            if local[3 * joint + d] >= 0:
+                row[local[3 * joint + d]] += (
+                    c.frames[b, joint, 0, d] * u0
+                    + c.frames[b, joint, 1, d] * u1
+                    + c.frames[b, joint, 2, d] * u2
+                )
+    for d in range(3):
+        if local[_TRANSL + d] >= 0:
+            row[local[_TRANSL + d]] = n[d]
+    if len(shape):
+        for s in range(len(by_shape)):
+            by_shape[s] += (
+                t0 * c.directions[i, 0, s] + t1 * c.directions[i, 1, s] + t2 * c.directions[i, 2, s]
+            )
+    for s in shape:
+        row[local[_SHAPE + s]] = by_shape[s]
+    return along
+
+
+@numba.njit(cache=True, nogil=True, fastmath={"contract"})
+def _add_squares(rows, weights, block):
+    """Add the lower triangle of rows^T diag(weights) rows, of four rows (4,m), to block (m,m)."""
+    for p in range(block.shape[0]):
+        a0, a1 = weights[0] * rows[0, p], weights[1] * rows[1, p]
+        a2, a3 = weights[2] * rows[2, p], weights[3] * rows[3, p]
+        for q in range(p + 1):
+            block[p, q] += a0 * rows[0, q] + a1 * rows[1, q] + a2 * rows[2, q] + a3 * rows[3, q]
+
+
+@numba.njit(cache=True, nogil=True)
+def add_equations(
+    chain,
+    limbs,
+    normal,
+    weight,
+    target,
+    thickness,
+    group,
+    frames,
+    place,
+    place_u,
+    cost,
+    gradient,
+    hessian,
+    rest_gradient,
+    tables,
+    by_pose,
+):
+    """Add the normal equations of E_D to those of the frames (B,).
+
+    limbs: :attr:`.Selection.limbs`.
+    normal (T,N,3), weight (T,N), 0 = no row, target (T,N): the rows.
+    thickness (G,), group (N,): coverings.
+    place (P,), place_u (G,): columns of parameters and coverings, -1 = fixed.
+    cost (B,), gradient (B,n), hessian (B,n,n): filled in place.
+    rest_gradient (B,N,3): gradient by the points at rest, filled in place.
+    tables (N,3,486), by_pose (B,54,3,9): see :mod:`intercap_core.body.correctives_kernel`; of no
+    body without pose blend shapes, like rest_gradient.
+    """
+    order, starts, moved_by = limbs
+    dtype = hessian.dtype
+    shape = np.flatnonzero(place[_SHAPE:] >= 0)
+    arms = np.empty((chain.chain.shape[1], 3), dtype)
+    by_shape = np.empty(len(place) - _SHAPE, dtype)
+    weights, weighted = np.empty(_ROWS_TOGETHER, dtype), np.empty(1, dtype)
+    limbs_count, size = len(starts) - 1, len(place) + len(place_u)
+    all_local = np.empty((limbs_count, len(place)), np.int64)
+    all_local_u = np.empty((limbs_count, len(place_u)), np.int64)
+    all_to, width = np.empty((limbs_count, size), np.int64), np.empty(limbs_count, np.int64)
+    for limb in range(limbs_count):
+        width[limb] = _find_columns(
+            moved_by[limb], place, group[order[starts[limb] : starts[limb + 1]]], place_u,
+            all_local[limb], all_local_u[limb], all_to[limb],
+        )  # fmt: skip
+    for b in range(len(frames)):
+        t, total = frames[b], 0.0
+        for limb in range(limbs_count):
+            m, filled = width[limb], 0
+            local, local_u, to = all_local[limb], all_local_u[limb], all_to[limb]
+            rows, block = np.empty((_ROWS_TOGETHER, m), dtype), np.zeros((m, m), dtype)
+            sample_gradient = np.zeros(m, dtype)
+            of_limb = np.flatnonzero(moved_by[limb, 1:]) + 1
+            for at in range(starts[limb], starts[limb + 1]):
+                i = order[at]
+                w, g = weight[t, i], group[i]
+                if not w > 0:
+                    continue
+                row = rows[filled]
+                n = normal[t, i, 0], normal[t, i, 1], normal[t, i, 2]
+                along = _fill_row(row, local, shape, chain, b, i, n, arms, by_shape)
+                if local_u[g] >= 0:
+                    row[local_u[g]] = thickness[g]
+                e = target[t, i] - along - thickness[g]
+                total += w * e * e / 2
+                weighted[0] = w * e
+                for q in range(m):
+                    sample_gradient[q] -= weighted[0] * row[q]
+                if len(rest_gradient):
+                    back = turned_back(chain, b, i, n)
+                    for d in range(3):
+                        rest_gradient[b, i, d] -= weighted[0] * back[d]
+                    add_to_row(row, local, of_limb, back, tables[i], by_pose[b])
+                weights[filled] = w
+                filled += 1
+                if filled == _ROWS_TOGETHER:
+                    _add_squares(rows, weights, block)
+                    filled = 0
+            if filled:
+                for r in range(filled, _ROWS_TOGETHER):
+                    weights[r] = 0
+                    rows[r] = 0
+                _add_squares(rows, weights, block)
+            for p in range(m):
+                gradient[b, to[p]] += sample_gradient[p]
+                for q in range(p):
+                    block[q, p] = block[p, q]
+            for p in range(m):
+                for q in range(m):
+                    hessian[b, to[p], to[q]] += block[p, q]
+        cost[b] += total

@@ -1,0 +1,323 @@
+"""Keypoint term of the body's energy, E_J: equation 3, a part of equation 2.
+
+    E_J = sum over views v, keypoints i of k_i w_i^v rho_J( Pi^v(X_i(theta, beta, gamma)) - J_i^v )
+
+with Geman and McClure's rho_J, the projection Pi^v of view v, the detection J_i^v, the confidence w
+of the detector and the precision k = 1 / sigma^2 of a keypoint. Beyond the paper: X_i is the
+model's keypoint plus an offset o_i that is constant in the frame of the bone that carries it.
+Detectors and body models mean different points by the same name ("hip"), and the difference is the
+same in every frame. o_i is estimated with a Gaussian prior, see :class:`.problem.Layout`. Also
+beyond the paper: triangulated keypoints count in the same way, by their distance in metres.
+
+The residuals of all views depend on the body through the 3D point alone. They are summed into one
+gradient (3,) and one matrix (3, 3) by the point before the derivatives of the body are applied.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from intercap_core.body.correctives_kernel import Correctives, RestPoints
+from intercap_core.body.joints import NUM_JOINTS
+from intercap_core.body.kinematics import pose_joints, rotation_from_axis_angle, skew
+from intercap_core.body.model import BodyModel
+from intercap_core.body.parameters import NUM_POSE, TRANSL, BodyParameters
+from intercap_core.body_fit import keypoint_kernel
+from intercap_core.body_fit.keypoint_kernel import KeypointData, Pieces
+from intercap_core.body_fit.term_inputs import (
+    Batch,
+    BatchEquations,
+    Bodies,
+    Columns,
+    KeypointSet,
+    Targets,
+    TermInputs,
+    Views,
+    contiguous,
+)
+from intercap_core.geometry.camera import projection
+from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
+from intercap_core.geometry.solve.robust import geman_mcclure
+
+# Standard deviations from which a keypoint counts as an outlier: scale of rho_J. Tuned on the
+# studio.
+KEYPOINT_SCALE = 4.0
+
+
+class Keypoints(NamedTuple):
+    """K keypoints of B bodies and their derivatives by n parameters."""
+
+    points: Tensor
+    """(B, K, 3) with offsets, metres."""
+    derivatives: Tensor | None
+    """(B, K, 3, n)"""
+    rotations: Tensor
+    """(B, K, 3, 3) of the bones that carry the offsets."""
+    own_limb: Tensor | None = None
+    """(B, K, 3, n) derivatives for Gauss-Newton matrices: pose blend shapes by the joints of each
+    keypoint's own limb alone."""
+
+
+class PointTerm(NamedTuple):
+    """A cost that depends on the body through points alone."""
+
+    cost: Tensor
+    """(B,)"""
+    gradient: Tensor
+    """(B, K, 3) by the points."""
+    matrix: Tensor
+    """(B, K, 3, 3) Gauss-Newton matrix by the points."""
+
+
+def evaluate(
+    model: BodyModel,
+    params: BodyParameters,
+    chosen: KeypointSet,
+    offsets: Tensor,
+    *,
+    derivatives: bool,
+    columns: Tensor | None = None,
+) -> Keypoints:
+    """Return the chosen keypoints of B bodies.
+
+    Args:
+        model: the body.
+        params: parameters of the B bodies.
+        chosen: the keypoints.
+        offsets: (K, 3) in the frames of the bones, metres.
+        derivatives: compute the derivatives as well.
+        columns: (n,) parameters to differentiate by; None = all.
+    """
+    local = rotation_from_axis_angle(params.full_pose())
+    still = local.new_zeros(local.shape[0], NUM_JOINTS, 3)
+    world = pose_joints(still, local, still[:, 0]).rotations
+    rotations = world[:, chosen.carrier]
+    arms = (rotations @ offsets[..., None])[..., 0]
+    if not derivatives:
+        output = model.forward(params, vertex_ids=chosen.vertices)
+        points = chosen.matrix @ torch.cat([output.vertices, output.joints], 1)
+        return Keypoints(points + arms, None, rotations)
+    if columns is None:
+        columns = torch.arange(model.num_parameters, device=model.device)
+    linear = model.linearise(params, vertex_ids=chosen.vertices, joints=True)
+    full = linear.with_correctives_of(None).full()
+    batch, _, _, size = full.shape
+    by = (chosen.matrix @ full.reshape(batch, full.shape[1], -1)).reshape(batch, -1, 3, size)
+    # a turn w of joint l moves the arm R o by w x R o, for every joint l above the carrier
+    moved = (offsets != 0).any(1).nonzero()[:, 0]
+    turned = -skew(arms[:, moved])[:, :, None] @ linear.frames[:, None]
+    turned = turned * chosen.turned_by[moved][None, :, :, None, None]
+    by[:, moved, :, : 3 * NUM_JOINTS] += turned.transpose(2, 3).reshape(
+        batch, len(moved), 3, 3 * NUM_JOINTS
+    )
+    own_limb = by
+    if linear.correctives is not None:
+        extra = torch.einsum("kn,bnijd->bkijd", chosen.matrix, linear.correctives)
+        flags = torch.as_tensor(chosen.limbs.moved_by_point()[:, 1:], device=model.device)
+        own_limb = by.clone()
+        own_limb[..., 3:NUM_POSE] += (extra * flags[:, None, :, None]).flatten(3)
+        by[..., 3:NUM_POSE] += extra.flatten(3)
+    points = chosen.matrix @ linear.points + arms
+    return Keypoints(points, by[..., columns], rotations, own_limb[..., columns])
+
+
+def reprojection(points: Tensor, views: Views) -> PointTerm:
+    """Return sum w rho(|r / sigma|^2) / 2 of points (B, K, 3), master frame, in the views of the B
+    bodies."""
+    pose, lenses = views.colour_from_master, views.lenses
+    pixels, by_point = projection.project_with_jacobian(
+        _in_cameras(points, pose, views.shift), lenses[:, None]
+    )
+    known = views.confidence > 0
+    sigma = views.sigma[..., None]
+    residual = torch.where(known[..., None], (pixels - views.observed) / sigma, 0)
+    robust = geman_mcclure((residual**2).sum(-1), KEYPOINT_SCALE)
+    by_point = by_point @ pose[:, None, :3, :3] / sigma[..., None]
+    weight = views.confidence * robust.weight
+    weighted = by_point.transpose(-1, -2) * weight[..., None, None]
+    gradient = (weighted @ residual[..., None])[..., 0].sum(1)
+    cost = 0.5 * (views.confidence * robust.rho).sum((1, 2))
+    return PointTerm(cost, gradient, (weighted @ by_point).sum(1))
+
+
+def pixel_residuals(points: Tensor, views: Views) -> Tensor:
+    """Return projection minus observation (B, C, K, 2), px, of points (B, K, 3)."""
+    in_camera = _in_cameras(points, views.colour_from_master, views.shift)
+    return projection.project(in_camera, views.lenses[:, None]) - views.observed
+
+
+def _in_cameras(points: Tensor, pose: Tensor, shift: Tensor | None) -> Tensor:
+    """Return points (B, K, 3) in the frames of C cameras, (B, C, K, 3)."""
+    moved = points[:, None] if shift is None else points[:, None] + shift
+    return moved @ pose[:, :3, :3].transpose(1, 2) + pose[:, None, :3, 3]
+
+
+def triangulated(points: Tensor, targets: Targets) -> PointTerm:
+    """Return sum w rho(|(X - target) / sigma|^2) / 2 of points X (B, K, 3), metres."""
+    known = targets.confidence > 0
+    residual = torch.where(known[..., None], (points - targets.points) / targets.sigma, 0)
+    robust = geman_mcclure((residual**2).sum(-1), KEYPOINT_SCALE)
+    weight = targets.confidence * robust.weight / targets.sigma
+    eye = torch.eye(3, dtype=points.dtype, device=points.device)
+    return PointTerm(
+        0.5 * (targets.confidence * robust.rho).sum(1),
+        weight[..., None] * residual,
+        (weight / targets.sigma)[..., None, None] * eye,
+    )
+
+
+@dataclass(frozen=True)
+class KeypointTerm:
+    """E_J in torch; see :class:`.term_inputs.TorchTerm`."""
+
+    model: BodyModel
+
+    def cost(self, inputs: TermInputs, bodies: Bodies) -> Tensor:
+        return _by_points(inputs, bodies.frames, self._evaluate(inputs, bodies).points).cost
+
+    def add(
+        self, inputs: TermInputs, bodies: Bodies, columns: Columns, equations: NormalEquations
+    ) -> None:
+        keypoints = self._evaluate(inputs, bodies, columns.parameters)
+        term = _by_points(inputs, bodies.frames, keypoints.points)
+        assert keypoints.derivatives is not None and keypoints.own_limb is not None
+        n, batch = len(columns.parameters), len(bodies.frames)
+        cost, gradient, hessian = equations
+        cost += term.cost
+        by = keypoints.derivatives.reshape(batch, -1, n)
+        gradient[:, :n] += (by.transpose(1, 2) @ term.gradient.reshape(batch, -1, 1))[..., 0]
+        weighted = (term.matrix @ keypoints.own_limb).reshape(batch, -1, n)
+        hessian[:, :n, :n] += keypoints.own_limb.reshape(batch, -1, n).transpose(1, 2) @ weighted
+        if columns.offsets:
+            _add_offsets(term, keypoints, columns, equations)
+
+    def _evaluate(
+        self, inputs: TermInputs, bodies: Bodies, columns: Tensor | None = None
+    ) -> Keypoints:
+        return evaluate(
+            self.model,
+            self.model.parameters(bodies.vectors),
+            inputs.keypoints,
+            bodies.offsets,
+            derivatives=columns is not None,
+            columns=columns,
+        )
+
+
+def _by_points(inputs: TermInputs, frames: Tensor, points: Tensor) -> PointTerm:
+    """Sum views and targets of the frames (B,)."""
+    terms = []
+    if inputs.views is not None:
+        terms.append(reprojection(points, inputs.views.frames(frames)))
+    if inputs.targets is not None:
+        terms.append(triangulated(points, inputs.targets.frames(frames)))
+    if not terms:
+        raise ValueError("the problem has neither views nor targets")
+    return PointTerm(*(sum(part[1:], start=part[0]) for part in zip(*terms, strict=True)))
+
+
+def _add_offsets(
+    term: PointTerm, keypoints: Keypoints, columns: Columns, equations: NormalEquations
+) -> None:
+    """Add the blocks of the offsets, and those that they share with the parameters."""
+    count, n, at = columns.offsets, len(columns.parameters), columns.offsets_at
+    assert keypoints.own_limb is not None
+    rotation = keypoints.rotations[:, :count]
+    batch = rotation.shape[0]
+    gradient = (rotation.transpose(2, 3) @ term.gradient[:, :count, :, None])[..., 0]
+    turned = term.matrix[:, :count] @ rotation
+    by = keypoints.own_limb[:, :count]
+    cross = (by.transpose(2, 3) @ turned).permute(0, 2, 1, 3).flatten(2)
+    own = rotation.new_zeros(batch, count, 3, count, 3)
+    each = torch.arange(count, device=rotation.device)
+    own[:, each, :, each, :] = (rotation.transpose(2, 3) @ turned).transpose(0, 1)
+    equations.gradient[:, at] += gradient.reshape(batch, -1)
+    equations.hessian[:, at, at] += own.reshape(batch, 3 * count, 3 * count)
+    equations.hessian[:, :n, at] += cross
+    equations.hessian[:, at, :n] += cross.transpose(1, 2)
+
+
+# --- compiled --------------------------------------------------------------------------------
+
+
+class CompiledKeypoints:
+    """E_J by :mod:`.keypoint_kernel`; see :class:`.term_inputs.CompiledTerm`.
+
+    The pieces of the last set of keypoints are kept between evaluations.
+    """
+
+    def __init__(self, model: BodyModel) -> None:
+        self._model = model
+        self._kept: tuple[KeypointSet, Pieces, Correctives | None] | None = None
+
+    def prepare(
+        self, inputs: TermInputs, bodies: Bodies, *, derivatives: bool
+    ) -> PreparedKeypoints:
+        if self._kept is None or self._kept[0] is not inputs.keypoints:
+            pieces = Pieces.of(self._model, inputs.keypoints)
+            tables = pieces.posedirs
+            correctives = Correctives.of(tables) if tables.shape[2] else None
+            self._kept = inputs.keypoints, pieces, correctives
+        _, pieces, correctives = self._kept
+        at_rest = pieces.at_rest(
+            contiguous(bodies.vectors[:, TRANSL.stop :]), bodies.offsets.numpy()
+        )
+        rest = RestPoints.of(at_rest, correctives, derivatives)
+        return PreparedKeypoints(pieces, rest, _keypoint_data(inputs, bodies.vectors))
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedKeypoints:
+    """See :class:`.term_inputs.PreparedTerm`."""
+
+    pieces: Pieces
+    rest: RestPoints
+    data: KeypointData
+
+    def used(self, frames: np.ndarray) -> np.ndarray:
+        return np.ones((len(frames), self.rest.points.shape[1]), bool)
+
+    def add_cost(self, batch: Batch, cost: np.ndarray) -> None:
+        keypoint_kernel.add_cost(
+            batch.skeleton, self.pieces, self.rest.points[batch.at], self.data, batch.frames, cost
+        )
+
+    def add(self, batch: Batch, equations: BatchEquations) -> None:
+        columns = equations.columns
+        keypoint_kernel.add_equations(
+            batch.skeleton, self.pieces, self.rest.points[batch.at], self.data, batch.frames,
+            equations.place, columns.offsets_at.start, columns.offsets, equations.cost,
+            equations.gradient, equations.hessian, self.rest.gradient[batch.at], equations.by_pose,
+        )  # fmt: skip
+
+
+def _keypoint_data(inputs: TermInputs, like: Tensor) -> KeypointData:
+    """Return the observations in the floating type of ``like``; absent ones have no frame."""
+    if not inputs.has_keypoints:
+        raise ValueError("the problem has neither views nor targets")
+
+    def absent(axes: int) -> Tensor:
+        return like.new_zeros((0,) * axes)
+
+    def array(values: Tensor) -> np.ndarray:
+        return contiguous(values.to(like))
+
+    views = inputs.views or Views(absent(4), absent(3), absent(3), absent(2), absent(3))
+    targets = inputs.targets or Targets(absent(3), absent(2), sigma=1.0)
+    return KeypointData(
+        observed=array(views.observed),
+        confidence=array(views.confidence),
+        sigma=array(views.sigma),
+        lenses=array(views.lenses),
+        colour_from_master=array(views.colour_from_master),
+        shift=array(absent(4) if views.shift is None else views.shift),
+        targets=array(targets.points),
+        targets_confidence=array(targets.confidence),
+        targets_sigma=float(targets.sigma),
+        scale=KEYPOINT_SCALE,
+    )

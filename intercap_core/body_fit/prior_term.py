@@ -1,0 +1,287 @@
+"""Priors of the body (equation 2): E_theta_b, E_theta_h, E_theta_f, E_alpha, E_beta and E_psi.
+
+:mod:`intercap_core.body.priors` has the rows of each prior; here they are weighted and summed. The
+observations are weighted by their noise, so Gaussian priors are in units of their own standard
+deviation and have weight 1, where the paper sets its lambdas empirically. E_theta_b is VPoser if
+the user has it; the open default is a broad Gaussian about standing at ease. E_psi, of the
+expression, is the paper's curly E. E_beta of a shape that all frames share is in
+:class:`.problem.Layout`. Beyond the paper: anatomical limits of the joints, with either pose prior.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor
+
+from intercap_core.body import priors
+from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.body.model import BodyModel
+from intercap_core.body.parameters import NUM_POSE, TRANSL
+from intercap_core.body.vposer import PoseGaussian
+from intercap_core.body_fit.term_inputs import (
+    Batch,
+    BatchEquations,
+    Bodies,
+    Columns,
+    TermInputs,
+    contiguous,
+)
+from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
+
+# 1/rad; ranges of joints are means plus two standard deviations of people, with a soft edge of 4
+# degrees. Tuned on the studio.
+_LIMIT_WEIGHT = 1 / math.radians(4)
+# The penalty exp(sign theta) is 1 at the straight limb, where it should cost little. Tuned on the
+# studio.
+_BENDING_WEIGHT = 1 / 6
+# Smallest standard deviation of a hand component: some hardly vary among grasps. Tuned on the
+# studio.
+_SMALLEST_HAND_DEVIATION = 0.03
+
+_BODY_POSE = slice(3, 66)  # columns of the 21 body joints
+_BODY_START = _BODY_POSE.start
+_HANDS = (75, 120)  # first column of each hand
+
+Rows = priors.DiagonalRows | priors.LinearRows
+
+
+@dataclass(frozen=True)
+class PriorTerm:
+    """All priors in torch; see :class:`.term_inputs.TorchTerm`."""
+
+    model: BodyModel
+
+    def rows(
+        self, vectors: Tensor, *, body_pose: bool = True, hand_share: float = 1.0
+    ) -> list[tuple[Rows, float]]:
+        """Return the rows and weights of all priors but those of shape and expression.
+
+        Args:
+            vectors: (B, P) parameters.
+            body_pose: include the open prior of the 21 body joints.
+            hand_share: factor of E_theta_h in one frame.
+        """
+        model = self.model
+        deviation = model.hand_deviation.clamp_min(_SMALLEST_HAND_DEVIATION)
+        own = (model.hand_mean, model.hand_components, deviation)
+        hands = [(priors.hand_pose(vectors, *own, side=side), hand_share**0.5) for side in (0, 1)]
+        return [
+            (priors.rest_pose(vectors, first=1 if body_pose else JOINT_INDEX["jaw"]), 1.0),
+            (priors.joint_limits(vectors), _LIMIT_WEIGHT),
+            (priors.bending(vectors), _BENDING_WEIGHT),
+            *hands,
+        ]
+
+    def cost(self, inputs: TermInputs, bodies: Bodies) -> Tensor:
+        vectors = bodies.vectors
+        total = 0.5 * (vectors[:, _standard_normal(self.model, inputs.shape_prior)] ** 2).sum(1)
+        if inputs.pose is not None:
+            total = total + inputs.pose.of_frames(bodies.frames).cost(vectors[:, _BODY_POSE])
+        for rows, weight in self._rows(inputs, vectors):
+            total = total + rows.energy(weight)
+        return total
+
+    def add(
+        self, inputs: TermInputs, bodies: Bodies, columns: Columns, equations: NormalEquations
+    ) -> None:
+        vectors = bodies.vectors
+        batch, size = vectors.shape
+        gradient, hessian = torch.zeros_like(vectors), vectors.new_zeros(batch, size, size)
+        if inputs.pose is not None:
+            pose = inputs.pose.of_frames(bodies.frames)
+            difference = vectors[:, _BODY_POSE] - pose.mean
+            gradient[:, _BODY_POSE] += (pose.precision @ difference[..., None])[..., 0]
+            hessian[:, _BODY_POSE, _BODY_POSE] += pose.precision
+        for rows, weight in self._rows(inputs, vectors):
+            rows.add_to(hessian, gradient, weight)
+        at = _standard_normal(self.model, inputs.shape_prior)
+        gradient[:, at] += vectors[:, at]
+        hessian.diagonal(dim1=1, dim2=2)[:, at] += 1
+        chosen, n = columns.parameters, len(columns.parameters)
+        equations.cost.add_(self.cost(inputs, bodies))
+        equations.gradient[:, :n] += gradient[:, chosen]
+        equations.hessian[:, :n, :n] += hessian[:, chosen][:, :, chosen]
+
+    def _rows(self, inputs: TermInputs, vectors: Tensor) -> list[tuple[Rows, float]]:
+        return self.rows(vectors, body_pose=inputs.pose is None, hand_share=inputs.hand_share)
+
+
+def _standard_normal(model: BodyModel, shape: bool) -> slice:
+    """Return the parameters with a standard normal prior: expression, and betas if ``shape``."""
+    return slice(TRANSL.stop + (0 if shape else model.num_betas), None)
+
+
+# --- compiled --------------------------------------------------------------------------------
+
+
+class PriorArrays(NamedTuple):
+    """The priors of P parameters."""
+
+    mean: np.ndarray
+    """(P,)"""
+    own: np.ndarray
+    """(P,) precision of each parameter alone."""
+    hands: np.ndarray
+    """(2, 45, 45) precision of the hands."""
+    ranges: np.ndarray
+    """(165, 2) limits of the pose, rad."""
+    outside: float
+    """Precision outside of the limits."""
+    bends: np.ndarray
+    """(R,) columns of elbows and knees."""
+    sign: np.ndarray
+    """(R,) sign of the wrong direction."""
+    bending: float
+    """Squared weight of bending."""
+    pose: np.ndarray
+    """(T, 63) mean of the learned prior; of no frame without one."""
+    pose_precision: np.ndarray
+    """(T, 63, 63)"""
+
+    @classmethod
+    def of(cls, model: BodyModel, *, shape: bool, body_pose: bool) -> PriorArrays:
+        """Return the priors without a learned one.
+
+        Args:
+            model: the body.
+            shape: include the prior of the betas.
+            body_pose: include the open prior of the 21 body joints.
+        """
+        zero = torch.zeros(1, model.num_parameters, dtype=model.dtype)
+        terms = PriorTerm(model).rows(zero, body_pose=body_pose)
+        alone = [(r, weight) for r, weight in terms if isinstance(r, priors.DiagonalRows)]
+        hands = [r.jacobian for r, _ in terms if isinstance(r, priors.LinearRows)]
+        (rest, _), (_, outside), (_, bending) = alone
+        dtype = zero.numpy().dtype
+        mean, own = np.zeros(zero.shape[1], dtype), np.zeros(zero.shape[1], dtype)
+        at = rest.columns.numpy()
+        mean[at] = (-rest.residuals / rest.slopes)[0].numpy()
+        own[at] = rest.slopes[0].numpy() ** 2
+        own[_standard_normal(model, shape)] = 1
+        for first, hand_mean in zip(_HANDS, model.hand_mean.numpy(), strict=True):
+            mean[first : first + 45] = hand_mean
+        ranges = np.deg2rad(np.array(priors.LIMITS_DEG)).reshape(NUM_POSE, 2).astype(dtype)
+        ranges[:3] = -np.inf, np.inf  # the global orientation has no prior
+        return cls(
+            mean=mean,
+            own=own,
+            hands=np.stack([(jacobian.T @ jacobian).numpy() for jacobian in hands]),
+            ranges=ranges,
+            outside=outside**2,
+            bends=np.array([column for column, _ in priors.BENDING]),
+            sign=np.array([sign for _, sign in priors.BENDING], dtype),
+            bending=bending**2,
+            pose=np.zeros((0, 63), dtype),
+            pose_precision=np.zeros((0, 63, 63), dtype),
+        )
+
+
+class CompiledPriors:
+    """All priors by the kernels below; see :class:`.term_inputs.CompiledTerm`."""
+
+    def __init__(self, model: BodyModel) -> None:
+        self._model = model
+        self._kept: dict[tuple[bool, bool], PriorArrays] = {}
+
+    def prepare(self, inputs: TermInputs, bodies: Bodies, *, derivatives: bool) -> PreparedPriors:
+        which = inputs.shape_prior, inputs.pose is None
+        if which not in self._kept:
+            self._kept[which] = PriorArrays.of(self._model, shape=which[0], body_pose=which[1])
+        arrays = self._kept[which]
+        arrays = arrays._replace(hands=arrays.hands * arrays.hands.dtype.type(inputs.hand_share))
+        return PreparedPriors(_with_learned(arrays, inputs.pose))
+
+
+def _with_learned(arrays: PriorArrays, pose: PoseGaussian | None) -> PriorArrays:
+    if pose is None:
+        return arrays
+    return arrays._replace(pose=contiguous(pose.mean), pose_precision=contiguous(pose.precision))
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedPriors:
+    """See :class:`.term_inputs.PreparedTerm`; priors have no points."""
+
+    arrays: PriorArrays
+    rest: None = None
+
+    def used(self, frames: np.ndarray) -> np.ndarray:
+        return np.zeros((len(frames), 0), bool)
+
+    def add_cost(self, batch: Batch, cost: np.ndarray) -> None:
+        none, fixed = np.zeros((1, 0, 0), cost.dtype), np.full(batch.vectors.shape[1], -1)
+        add_priors(self.arrays, batch.vectors, batch.frames, fixed, False, cost, none[0], none)
+
+    def add(self, batch: Batch, equations: BatchEquations) -> None:
+        add_priors(
+            self.arrays, batch.vectors, batch.frames, equations.place, True, equations.cost,
+            equations.gradient, equations.hessian,
+        )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_block(deviation, precision, first, place, gradient, hessian, derivatives):
+    """Add a Gaussian of adjacent parameters, ``deviation`` (m,) from its mean; return its cost."""
+    total = 0.0
+    for i in range(len(deviation)):
+        derivative = np.float64(0)
+        for j in range(len(deviation)):
+            derivative += precision[i, j] * deviation[j]
+        total += 0.5 * derivative * deviation[i]
+        p = place[first + i]
+        if derivatives and p >= 0:
+            gradient[p] += derivative
+            for j in range(len(deviation)):
+                if place[first + j] >= 0:
+                    hessian[p, place[first + j]] += precision[i, j]
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
+def add_priors(prior, vectors, frames, place, derivatives, cost, gradient, hessian):
+    """Add the priors at vectors (B,P) of the frames (B,) to the cost (B,).
+
+    With ``derivatives``, add to gradient (B,n) and hessian (B,n,n) as well, by the column ``place``
+    (P,) of each parameter, -1 = fixed.
+    """
+    for b in range(len(vectors)):
+        x = vectors[b]
+        g, h = gradient[b if derivatives else 0], hessian[b if derivatives else 0]
+        total = 0.0
+        for p in range(len(place)):
+            deviation = x[p] - prior.mean[p]
+            derivative, curve = prior.own[p] * deviation, prior.own[p]
+            total += 0.5 * derivative * deviation
+            if p < len(prior.ranges):
+                beyond = max(x[p] - prior.ranges[p, 1], 0) + min(x[p] - prior.ranges[p, 0], 0)
+                if beyond != 0:
+                    total += 0.5 * prior.outside * beyond * beyond
+                    derivative += prior.outside * beyond
+                    curve += prior.outside
+            if derivatives and place[p] >= 0:
+                g[place[p]] += derivative
+                h[place[p], place[p]] += curve
+        for r in range(len(prior.bends)):
+            p = place[prior.bends[r]]
+            squared = prior.bending * np.exp(2 * prior.sign[r] * x[prior.bends[r]])
+            total += 0.5 * squared
+            if derivatives and p >= 0:
+                g[p] += prior.sign[r] * squared
+                h[p, p] += squared
+        for side in range(2):
+            first = _HANDS[side]
+            deviation = x[first : first + 45] - prior.mean[first : first + 45]
+            total += _add_block(deviation, prior.hands[side], first, place, g, h, derivatives)
+        if len(prior.pose):
+            t = frames[b]
+            deviation = x[_BODY_START : _BODY_START + 63] - prior.pose[t]
+            total += _add_block(
+                deviation, prior.pose_precision[t], _BODY_START, place, g, h, derivatives
+            )
+        cost[b] += total

@@ -1,0 +1,378 @@
+"""Search for parts of the body that penetrate each other, for E_P_self (equation 5).
+
+A sample of the skin penetrates another part if it lies behind the nearest surface of that part.
+Parts are the trunk, the head, the segments of the limbs, the palms and the fingers. Where two parts
+join, skin meets skin in every pose: samples that are close to each other along the surface,
+relative to the thickness of their parts, never count as touching.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor
+
+from intercap_core.body.joints import JOINT_NAMES
+from intercap_core.body.model import BodyModel
+from intercap_core.body_fit.first_hit import first_hits
+from intercap_core.body_fit.surface import Samples
+from intercap_core.body_fit.term_inputs import Pairs
+from intercap_core.geometry.rigid.surfaces import vertex_normals
+
+# Samples closer along the surface than this times the mean thickness of their parts are joined.
+# Flesh meets flesh where a joint closes, so both sides of a hinge are joined farther. Tuned on the
+# studio.
+_JOINED_THICKNESSES = 1.6
+_JOINED_HINGE_THICKNESSES = 3.2
+# A point deeper than half the thickness of a part is behind its far side (geometry); in metres for
+# the trunk, tuned on the studio.
+_DEEPEST_THICKNESSES, _DEEPEST_M = 0.5, 0.06
+# A sample outside by less than this may penetrate before the next search. Tuned on the studio.
+_WATCHED_M = 0.004
+_NEIGHBOURS = 6  # mean number of a vertex of a triangle mesh (Euler)
+_GEODESIC_ROUNDS = 12  # of the search along the surface, by distance: speed
+_FAR = 1e6  # metres; farther than any distance on a body
+
+_TRUNK = ("pelvis", "spine1", "spine2", "spine3", "left_collar", "right_collar")
+_HAND_PARTS = ("wrist", "thumb", "index", "middle", "ring", "pinky")
+_HEAD = ("neck", "head", "jaw", "left_eye_smplhf", "right_eye_smplhf")
+_HINGES = ("shoulder elbow", "elbow wrist", "wrist thumb", "hip knee", "knee ankle")
+
+
+def _part(joint: str) -> str:
+    if joint in _TRUNK:
+        return "trunk"
+    if joint in _HEAD:
+        return "head"
+    if joint.endswith("_foot"):
+        return joint.replace("foot", "ankle")
+    return joint[:-1] if joint[-1] in "123" else joint
+
+
+_PART_NAMES = tuple(dict.fromkeys(_part(joint) for joint in JOINT_NAMES))
+_PART_OF_JOINT = np.array([_PART_NAMES.index(_part(joint)) for joint in JOINT_NAMES])
+_HAND_OF_PART = np.array(
+    [
+        -1 if not name.endswith(_HAND_PARTS) else int(name.startswith("right"))
+        for name in _PART_NAMES
+    ]
+)
+
+
+def _hinged() -> np.ndarray:
+    """Flag the pairs of parts (parts, parts) that are neighbours along a limb."""
+    table = np.zeros((len(_PART_NAMES), len(_PART_NAMES)), bool)
+    for hinge in _HINGES:
+        for side in ("left", "right"):
+            a, b = (_PART_NAMES.index(f"{side}_{name}") for name in hinge.split())
+            table[a, b] = table[b, a] = True
+    return table
+
+
+# --- which samples may touch -----------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SelfContact:
+    """Which of the N samples of a body may touch each other."""
+
+    vertex: Tensor
+    """(N,) vertex ids, see :class:`.surface.Samples`."""
+    patch: Tensor
+    """(N, 20) vertex ids."""
+    part: Tensor
+    """(N,) part of each sample."""
+    patch_part: Tensor
+    """(N, 20) parts of the vertices of the patch."""
+    hand: Tensor
+    """(N,) 0 left hand, 1 right hand, -1 none."""
+    apart: Tensor
+    """(N, N) bool: the two samples may touch."""
+    deepest: Tensor
+    """(N,) greatest depth behind the surface at which a point counts as inside, metres."""
+    sideways: Tensor
+    """(N,) greatest distance from the normal line at which a point counts as inside, metres."""
+
+    @classmethod
+    def of(cls, model: BodyModel, samples: Samples) -> SelfContact:
+        """Compute from the template, once for a body file."""
+        template = model.template.double().cpu().numpy()
+        faces = model.faces.cpu().numpy()
+        part = _PART_OF_JOINT[model.skinning_weights.argmax(1).cpu().numpy()]
+        thickness = _thickness(template, faces, samples.vertex)
+        own = part[samples.vertex]
+        factor = np.where(
+            _hinged()[own[:, None], own], _JOINED_HINGE_THICKNESSES, _JOINED_THICKNESSES
+        )
+        joined = factor * (thickness[:, None] + thickness) / 2
+        joined[own[:, None] == own] = 0  # parts do not collide with themselves
+        apart = _geodesic_distances(template, faces, part, samples.vertex, joined) > joined
+        apart &= own[:, None] != own
+        around = np.linalg.norm(template[samples.patch] - template[samples.vertex, None], axis=2)
+        spacing = np.sort(around, 1)[:, _NEIGHBOURS]
+
+        def tensor(values: np.ndarray) -> Tensor:
+            return torch.as_tensor(values, device=model.device)
+
+        return cls(
+            vertex=tensor(samples.vertex),
+            patch=tensor(samples.patch),
+            part=tensor(own),
+            patch_part=tensor(part[samples.patch]),
+            hand=tensor(_HAND_OF_PART[own]),
+            apart=tensor(apart),
+            deepest=tensor(np.minimum(_DEEPEST_THICKNESSES * thickness, _DEEPEST_M)).to(
+                model.dtype
+            ),
+            sideways=tensor(spacing).to(model.dtype),
+        )
+
+
+def _thickness(points: np.ndarray, faces: np.ndarray, vertex: np.ndarray) -> np.ndarray:
+    """Return the thickness (N,) of the body at each vertex along its normal, metres."""
+    normals = vertex_normals(points, faces)[vertex]
+    return first_hits(points, faces, points[vertex] - 1e-3 * normals, -normals)
+
+
+def _geodesic_distances(
+    points: np.ndarray, faces: np.ndarray, part: np.ndarray, vertex: np.ndarray, limit: np.ndarray
+) -> np.ndarray:
+    """Return distances (N, N) between vertices along the surface, metres.
+
+    Distances are correct up to ``limit`` (N, N); larger ones only exceed it. They are measured in
+    a graph of the N vertices: two are neighbours if an edge of the mesh connects the regions
+    nearest to them, each on its own part (V,) of the body.
+    """
+    import scipy.sparse.csgraph
+    import scipy.spatial.distance
+
+    nearest = np.full(len(points), -1)
+    for p in np.unique(part[vertex]):
+        here, own = np.flatnonzero(part == p), np.flatnonzero(part[vertex] == p)
+        nearest[here] = own[scipy.spatial.cKDTree(points[vertex[own]]).query(points[here])[1]]
+    edges = nearest[faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)]
+    edges = np.unique(edges[(edges[:, 0] != edges[:, 1]) & (edges >= 0).all(1)], axis=0)
+    length = np.linalg.norm(points[vertex[edges[:, 0]]] - points[vertex[edges[:, 1]]], axis=1)
+    count = len(vertex)
+    graph = scipy.sparse.csr_matrix((length, (edges[:, 0], edges[:, 1])), shape=(count, count))
+    # the geodesic distance is at least the Euclidean one
+    straight = scipy.spatial.distance.cdist(points[vertex], points[vertex])
+    farthest = np.where(straight <= limit, limit, 0).max(1)
+    found = np.full((count, count), np.inf)
+    for some in np.array_split(np.argsort(farthest, kind="stable"), _GEODESIC_ROUNDS):
+        found[some] = scipy.sparse.csgraph.dijkstra(
+            graph, directed=False, indices=some, limit=farthest[some].max()
+        )
+    return found
+
+
+# --- search ----------------------------------------------------------------------------------
+
+Contacts = tuple[Tensor, Tensor, Tensor]
+"""Vertex ids (M,) of penetrating samples, vertex ids (M,) and normals (M, 3) of the surface."""
+
+
+def join_frames(found: list[Contacts]) -> Pairs | None:
+    """Join the contacts of all frames, in order; None if there are none."""
+    counts = torch.tensor([len(inner) for inner, _, _ in found])
+    if not int(counts.sum()):
+        return None
+    inner, outer, normal = (torch.cat(parts) for parts in zip(*found, strict=True))
+    vertices, place = torch.cat([inner, outer]).unique(return_inverse=True)
+    frame = torch.arange(len(found)).repeat_interleave(counts).to(inner.device)
+    return Pairs(frame, place[: len(inner)], place[len(inner) :], normal, vertices)
+
+
+def find_contacts(contact: SelfContact, vertices: Tensor, normals: Tensor) -> Contacts:
+    """Find the samples of one body inside another part, or outside by less than 4 mm.
+
+    vertices (V, 3) metres, unit normals (V, 3). Fingers of one hand are searched separately: the
+    next finger is closer than other parts that a hand may penetrate.
+    """
+    if vertices.device.type != "cpu":
+        return find_in_torch(contact, vertices, normals)
+    given = (getattr(contact, field.name).numpy() for field in fields(contact))
+    found = _find(len(_PART_NAMES), _WATCHED_M, vertices.numpy(), normals.numpy(), *given)
+    inner, outer = map(torch.from_numpy, found)
+    return inner, outer, normals[outer]
+
+
+def find_in_torch(contact: SelfContact, vertices: Tensor, normals: Tensor) -> Contacts:
+    """The readable form of :func:`find_contacts`, on any device."""
+    where = vertices[contact.vertex]
+    near = _near_other_parts(contact, where)
+    distance = torch.cdist(where[near], where)
+    same_hand = contact.hand[near, None] == contact.hand
+    same_hand &= contact.hand >= 0
+    found = []
+    for searched in (contact.apart[near] & ~same_hand, contact.apart[near] & same_hand):
+        nearest_distance, nearest = torch.where(searched, distance, _FAR).min(1)
+        some = nearest_distance < _FAR
+        found.append(_behind(contact, near[some], nearest[some], vertices, normals))
+    # normals agree where two fingers join: no collision
+    facing = (normals[found[1][0]] * normals[found[1][1]]).sum(1) < 0
+    found[1] = (found[1][0][facing], found[1][1][facing])
+    inner, outer = (torch.cat(part) for part in zip(*found, strict=True))
+    return inner, outer, normals[outer]
+
+
+def _behind(
+    contact: SelfContact, sample: Tensor, nearest: Tensor, vertices: Tensor, normals: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Choose the samples (M,) behind the surface around the nearest sample (M,) of another part.
+
+    Returns the vertex ids of the samples and of the vertices that they are behind.
+    """
+    patch = contact.patch[nearest]
+    gap = vertices[contact.vertex[sample], None] - vertices[patch]
+    square = (gap * gap).sum(2)
+    square = square + _FAR * (contact.patch_part[nearest] != contact.part[nearest, None])
+    best = square.argmin(1, keepdim=True)
+    outer = patch.gather(1, best)[:, 0]
+    gap = gap.gather(1, best[..., None].expand(-1, 1, 3))[:, 0]
+    normal = normals[outer]
+    height = (gap * normal).sum(1)
+    sideways = (gap - height[:, None] * normal).norm(dim=1)
+    inside = (height < _WATCHED_M) & (height > -contact.deepest[nearest])
+    inside &= sideways < contact.sideways[nearest]
+    return contact.vertex[sample[inside]], outer[inside]
+
+
+def _near_other_parts(contact: SelfContact, where: Tensor) -> Tensor:
+    """Return the samples (M,) inside the bounding box of another part."""
+    count = len(_PART_NAMES)
+    index = contact.part[:, None].expand(-1, 3)
+    low = where.new_full((count, 3), _FAR).scatter_reduce(0, index, where, "amin")
+    high = where.new_full((count, 3), -_FAR).scatter_reduce(0, index, where, "amax")
+    inside = (where[:, None] > low - _WATCHED_M) & (where[:, None] < high + _WATCHED_M)
+    inside = inside.all(2)
+    inside[torch.arange(len(where)), contact.part] = False
+    return inside.any(1).nonzero()[:, 0]
+
+
+@numba.njit(cache=True, nogil=True)
+def _find(
+    parts,
+    margin,
+    vertices,
+    normals,
+    samples,
+    patch,
+    part,
+    patch_part,
+    hand,
+    apart,
+    deepest,
+    sideways,
+):
+    """:func:`find_in_torch`, compiled: vertex ids (K,) of samples and of surfaces.
+
+    parts: number of parts; margin: metres outside that count as inside; the other arrays are the
+    fields of :class:`SelfContact`.
+    """
+    count, kind = len(samples), vertices.dtype
+    order, starts = _by_part(part, parts)
+    where = np.empty((count, 3), kind)  # in that order
+    low, high = np.full((parts, 3), np.inf, kind), np.full((parts, 3), -np.inf, kind)
+    for at in range(count):
+        i = order[at]
+        for d in range(3):
+            x = vertices[samples[i], d]
+            where[at, d] = x
+            low[part[i], d] = min(low[part[i], d], x)
+            high[part[i], d] = max(high[part[i], d], x)
+    nearest = np.full((2, count), -1)  # by whether it is on the same hand
+    for i in range(count):
+        here = vertices[samples[i]]
+        if not _in_a_box(here, part[i], low, high, margin):
+            continue
+        least = np.full(2, np.inf)
+        for p in range(parts):
+            first, last = starts[p], starts[p + 1]
+            if p == part[i] or first == last:
+                continue
+            same_hand = int(hand[i] >= 0 and hand[order[first]] == hand[i])
+            if _to_box(here, low[p], high[p]) >= least[same_hand]:
+                continue
+            for at in range(first, last):
+                x, y, z = where[at, 0] - here[0], where[at, 1] - here[1], where[at, 2] - here[2]
+                square = x * x + y * y + z * z
+                if square < least[same_hand] and apart[i, order[at]]:
+                    least[same_hand], nearest[same_hand, i] = square, order[at]
+    inner, outer = np.empty(2 * count, np.int64), np.empty(2 * count, np.int64)
+    found = 0
+    for same_hand in range(2):
+        for i in range(count):
+            j = nearest[same_hand, i]
+            if j < 0:
+                continue
+            v, at = samples[i], -1
+            least_gap = vertices[0, 0] * 0 + np.inf
+            for k in range(patch.shape[1]):
+                if patch_part[j, k] == part[j]:
+                    w = patch[j, k]
+                    x, y, z = (
+                        vertices[v, 0] - vertices[w, 0],
+                        vertices[v, 1] - vertices[w, 1],
+                        vertices[v, 2] - vertices[w, 2],
+                    )
+                    square = x * x + y * y + z * z
+                    if square < least_gap:
+                        least_gap, at, gx, gy, gz = square, w, x, y, z
+            if at < 0:
+                continue
+            nx, ny, nz = normals[at, 0], normals[at, 1], normals[at, 2]
+            height = nx * gx + ny * gy + nz * gz
+            sx, sy, sz = gx - height * nx, gy - height * ny, gz - height * nz
+            if not (-deepest[j] < height < margin):
+                continue
+            if not np.sqrt(sx * sx + sy * sy + sz * sz) < sideways[j]:
+                continue
+            # normals agree where two fingers join: no collision
+            if same_hand and (normals[v, 0] * nx + normals[v, 1] * ny + normals[v, 2] * nz >= 0):
+                continue
+            inner[found], outer[found] = v, at
+            found += 1
+    return inner[:found].copy(), outer[:found].copy()
+
+
+@numba.njit(cache=True, nogil=True)
+def _by_part(part, parts):
+    """Return the samples sorted by part, and the start of each part and the end."""
+    order, starts = np.empty(len(part), np.int64), np.zeros(parts + 1, np.int64)
+    for p in part:
+        starts[p + 1] += 1
+    for p in range(parts):
+        starts[p + 1] += starts[p]
+    place = starts.copy()
+    for i in range(len(part)):
+        order[place[part[i]]] = i
+        place[part[i]] += 1
+    return order, starts
+
+
+@numba.njit(cache=True, nogil=True)
+def _in_a_box(here, own, low, high, margin):
+    """Return whether a point (3,) lies in the box (parts,3) of a part other than ``own``."""
+    for p in range(len(low)):
+        if p != own and (
+            here[0] > low[p, 0] - margin and here[0] < high[p, 0] + margin
+            and here[1] > low[p, 1] - margin and here[1] < high[p, 1] + margin
+            and here[2] > low[p, 2] - margin and here[2] < high[p, 2] + margin
+        ):  # fmt: skip
+            return True
+    return False
+
+
+@numba.njit(cache=True, nogil=True)
+def _to_box(here, low, high):
+    """Return the squared distance of a point (3,) from a box, 0 inside."""
+    total = here[0] * 0
+    for d in range(3):
+        gap = max(low[d] - here[d], here[d] - high[d])
+        if gap > 0:
+            total += gap * gap
+    return total

@@ -1,0 +1,280 @@
+"""Self-penetration of the body, E_P = E_P_self: equation 5, a part of equations 2 and 6.
+
+    E_P_self = sum over samples p inside another part of the body of w rho(d - tolerance) / 2,
+    d = -n_q . (p - q)
+
+PROX penalises colliding triangles by the distance fields of Tzionas et al. 2016. Here a sample p of
+the skin that lies behind the surface of another part of the body is pushed out along the normal n_q
+of that surface at its nearest vertex q, and the surface is pushed the other way. w is the weight of
+a sample and rho is Geman and McClure's. Where the observations put one part deep inside another,
+either they are outliers or the body is thinner than its model; a repulsion would correct neither.
+:mod:`.self_contact` finds the pairs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from torch import Tensor
+
+from intercap_core.body.correctives_kernel import PointSource, RestPoints
+from intercap_core.body.jacobian import Linearisation
+from intercap_core.body.model import BodyModel
+from intercap_core.body.parameters import TRANSL
+from intercap_core.body.selection import Selection
+from intercap_core.body.skeleton_kernel import add_point, project_on_direction, turned_back
+from intercap_core.body_fit.term_inputs import (
+    Batch,
+    BatchEquations,
+    Bodies,
+    Columns,
+    Pairs,
+    TermInputs,
+    contiguous,
+)
+from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
+from intercap_core.geometry.solve.robust import geman_mcclure
+
+SELF_TOLERANCE_M = 0.003  # skin yields by some millimetres under pressure; tuned on the studio
+_SIGMA_M = 0.008  # error of the fitted skin on either side: measured on the studio
+_REACH_M = 0.015  # depth at which the penalty levels off: scale of rho; tuned on the studio
+# 1/m^2. Neighbouring samples penetrate together: four make one measurement. Tuned on the studio.
+_WEIGHT = 0.25 / _SIGMA_M**2
+
+_SHAPE = TRANSL.stop
+
+
+@dataclass(frozen=True)
+class SelfPenetrationTerm:
+    """E_P_self in torch; see :class:`.term_inputs.TorchTerm`.
+
+    The gradient contains pose blend shapes, the Gauss-Newton matrix does not.
+    """
+
+    model: BodyModel
+
+    def cost(self, inputs: TermInputs, bodies: Bodies) -> Tensor:
+        total = bodies.vectors.new_zeros(len(bodies.frames))
+        here = None if inputs.pairs is None else inputs.pairs.of_frames(bodies.frames)
+        if here is None:
+            return total
+        pairs, present = here
+        params = self.model.parameters(bodies.vectors).frames(present)
+        points = self.model.forward(params, vertex_ids=pairs.vertices).vertices
+        robust = geman_mcclure(_residuals(points, pairs) ** 2, _REACH_M)
+        inside = total.index_add(0, present[pairs.frame], 0.5 * _WEIGHT * robust.rho)
+        return inputs.self_weight * inside
+
+    def add(
+        self, inputs: TermInputs, bodies: Bodies, columns: Columns, equations: NormalEquations
+    ) -> None:
+        here = None if inputs.pairs is None else inputs.pairs.of_frames(bodies.frames)
+        if here is None:
+            return
+        pairs, present = here
+        params = self.model.parameters(bodies.vectors).frames(present)
+        linear = self.model.linearise(params, vertex_ids=pairs.vertices)
+        residual = _residuals(linear.points, pairs)
+        active = residual > 0
+        if not bool(active.any()):
+            return
+        frame, residual = pairs.frame[active], residual[active]
+        inner, outer, normal = pairs.inner[active], pairs.outer[active], pairs.normal[active]
+
+        def rows_of(linear: Linearisation) -> Tensor:
+            """d residual / d parameters = -n . (dp - dq), (M, n)"""
+            by_point = linear.full()[..., columns.parameters]
+            return -(normal[:, None] @ (by_point[frame, inner] - by_point[frame, outer]))[:, 0]
+
+        rows, rigid_rows = rows_of(linear), rows_of(linear.with_correctives_of(None))
+        robust = geman_mcclure(residual**2, _REACH_M)
+        weight = _WEIGHT * robust.weight
+        count, n, factor = len(present), len(columns.parameters), inputs.self_weight
+        cost = rows.new_zeros(count).index_add(0, frame, 0.5 * _WEIGHT * robust.rho)
+        gradients = (weight * residual)[:, None] * rows
+        gradient = rows.new_zeros(count, n).index_add(0, frame, gradients)
+        hessian = rows.new_zeros(count, n, n)
+        for f in frame.unique().tolist():
+            own = frame == f
+            hessian[f] = rigid_rows[own].T @ (weight[own, None] * rigid_rows[own])
+        equations.cost.index_add_(0, present, factor * cost)
+        equations.gradient[present, :n] += factor * gradient
+        equations.hessian[present, :n, :n] += factor * hessian
+
+
+def _residuals(points: Tensor, pairs: Pairs) -> Tensor:
+    """Return the depth (M,) beyond the tolerance, metres, of points (F, U, 3); 0 = outside."""
+    gap = points[pairs.frame, pairs.inner] - points[pairs.frame, pairs.outer]
+    return (-(pairs.normal * gap).sum(1) - SELF_TOLERANCE_M).clamp_min(0)
+
+
+# --- compiled --------------------------------------------------------------------------------
+
+
+class PairArrays(NamedTuple):
+    """:class:`.term_inputs.Pairs` for the kernels."""
+
+    starts: np.ndarray
+    """(T + 1,) start of the pairs of each frame, and the end."""
+    inner: np.ndarray
+    """(M,)"""
+    outer: np.ndarray
+    """(M,)"""
+    normal: np.ndarray
+    """(M, 3)"""
+    tolerance: float
+    """metres"""
+    reach: float
+    """metres"""
+    weight: float
+    """1/m^2"""
+
+
+class CompiledSelfPenetration:
+    """E_P_self by the kernels below; see :class:`.term_inputs.CompiledTerm`.
+
+    The points of the last pairs are kept between evaluations.
+    """
+
+    def __init__(self, model: BodyModel) -> None:
+        self._model = model
+        self._kept: tuple[Pairs, PointSource] | None = None
+
+    def prepare(
+        self, inputs: TermInputs, bodies: Bodies, *, derivatives: bool
+    ) -> PreparedSelfPenetration | None:
+        pairs = inputs.pairs
+        if pairs is None or not len(bodies.frames):
+            return None
+        if self._kept is None or self._kept[0] is not pairs:
+            self._kept = pairs, PointSource.of(self._model, pairs.vertices.numpy())
+        source = self._kept[1]
+        frames = np.arange(int(bodies.frames.max()) + 2)
+        arrays = PairArrays(
+            starts=np.searchsorted(pairs.frame.numpy(), frames),
+            inner=contiguous(pairs.inner),
+            outer=contiguous(pairs.outer),
+            normal=contiguous(pairs.normal),
+            tolerance=SELF_TOLERANCE_M,
+            reach=_REACH_M,
+            weight=float(inputs.self_weight * _WEIGHT),
+        )
+        rest = source.at_rest(contiguous(bodies.vectors[:, _SHAPE:]), derivatives)
+        return PreparedSelfPenetration(arrays, source.selection, rest)
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedSelfPenetration:
+    """See :class:`.term_inputs.PreparedTerm`."""
+
+    pairs: PairArrays
+    selection: Selection
+    rest: RestPoints
+
+    def used(self, frames: np.ndarray) -> np.ndarray:
+        pairs = self.pairs
+        used = np.zeros((len(frames), self.rest.points.shape[1]), bool)
+        ends = pairs.starts[frames + 1]
+        for row, first, end in zip(used, pairs.starts[frames], ends, strict=True):
+            row[pairs.inner[first:end]] = row[pairs.outer[first:end]] = True
+        return used
+
+    def add_cost(self, batch: Batch, cost: np.ndarray) -> None:
+        chain = batch.skeleton.chain(self.selection, self.rest.points[batch.at])
+        add_cost(chain, self.pairs, batch.frames, cost)
+
+    def add(self, batch: Batch, equations: BatchEquations) -> None:
+        chain = batch.skeleton.chain(self.selection, self.rest.points[batch.at])
+        add_equations(
+            chain, self.pairs, batch.frames, equations.place, equations.cost, equations.gradient,
+            equations.hessian, self.rest.gradient[batch.at],
+        )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True)
+def _depth(chain, pairs, b, at):
+    """Return the depth of pair ``at`` beyond the tolerance, metres; <= 0 = no contact."""
+    n = pairs.normal[at]
+    outer = project_on_direction(chain, b, pairs.outer[at], n)
+    return outer - project_on_direction(chain, b, pairs.inner[at], n) - pairs.tolerance
+
+
+@numba.njit(cache=True, nogil=True)
+def add_cost(chain, pairs, frames, cost):
+    """Add E_P_self to cost (B,) of the frames (B,)."""
+    square = pairs.reach * pairs.reach
+    for b in range(len(frames)):
+        total = 0.0
+        for at in range(pairs.starts[frames[b]], pairs.starts[frames[b] + 1]):
+            depth = _depth(chain, pairs, b, at)
+            if depth > 0:
+                total += depth * depth * square / (depth * depth + square)
+        cost[b] += 0.5 * pairs.weight * total
+
+
+@numba.njit(cache=True, nogil=True)
+def add_equations(chain, pairs, frames, place, cost, gradient, hessian, rest_gradient):
+    """Add the normal equations of E_P_self to those of the frames (B,).
+
+    place (P,): column of each parameter, -1 = fixed.
+    cost (B,), gradient (B,n), hessian (B,n,n): filled in place.
+    rest_gradient (B,N,3): gradient by the points at rest, filled in place; of no body without pose
+    blend shapes.
+    """
+    shape = np.flatnonzero(place[_SHAPE:] >= 0)
+    columns = place[place >= 0]
+    scratch = np.empty((chain.chain.shape[1], 3), hessian.dtype)
+    one = np.ones(1, hessian.dtype)[0]
+    square = pairs.reach * pairs.reach
+    for b in range(len(frames)):
+        first, end = pairs.starts[frames[b]], pairs.starts[frames[b] + 1]
+        rows = np.zeros((end - first, gradient.shape[1]), hessian.dtype)
+        root = np.zeros(end - first, hessian.dtype)
+        count = 0
+        for at in range(first, end):
+            depth = _depth(chain, pairs, b, at)
+            if depth <= 0:
+                continue
+            row, n = rows[count], pairs.normal[at]
+            # d depth / d parameters = -n . (dp - dq)
+            add_point(row, place, shape, chain, b, pairs.outer[at], one, n, scratch)
+            add_point(row, place, shape, chain, b, pairs.inner[at], -one, n, scratch)
+            share = square / (depth * depth + square)
+            cost[b] += 0.5 * pairs.weight * share * depth * depth
+            weight = pairs.weight * share * share
+            for q in columns:
+                gradient[b, q] += weight * depth * row[q]
+            if len(rest_gradient):
+                outer, inner = pairs.outer[at], pairs.inner[at]
+                o, p = turned_back(chain, b, outer, n), turned_back(chain, b, inner, n)
+                for d in range(3):
+                    rest_gradient[b, outer, d] += weight * depth * o[d]
+                    rest_gradient[b, inner, d] -= weight * depth * p[d]
+            root[count] = np.sqrt(weight)
+            count += 1
+        if count == 0:
+            continue
+        used = np.empty(len(columns), np.int64)
+        m = 0
+        for q in columns:
+            if np.any(rows[:count, q]):
+                used[m] = q
+                m += 1
+        dense = np.empty((count, m), hessian.dtype)
+        for r in range(count):
+            for q in range(m):
+                dense[r, q] = root[r] * rows[r, used[q]]
+        # written out: a BLAS product would start its threads for each frame
+        block = np.zeros((m, m), hessian.dtype)
+        for r in range(count):
+            for p in range(m):
+                for q in range(p + 1):
+                    block[p, q] += dense[r, p] * dense[r, q]
+        for p in range(m):
+            for q in range(p):
+                hessian[b, used[p], used[q]] += block[p, q]
+                hessian[b, used[q], used[p]] += block[p, q]
+            hessian[b, used[p], used[p]] += block[p, p]

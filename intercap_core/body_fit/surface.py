@@ -1,0 +1,268 @@
+"""The part of the skin that E_D and E_P_self (equations 4 and 5) use: samples and their patches.
+
+Points of the measured clouds are assigned to a sparse set of skin vertices, the samples. Each
+sample counts as one measurement. Every sample belongs to a covering, a kind of clothing or hair.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor
+
+from intercap_core.body.joints import JOINT_INDEX, JOINT_NAMES
+from intercap_core.body.kinematics import vertex_normals
+from intercap_core.body.model import BodyModel
+from intercap_core.body.parameters import BodyParameters
+from intercap_core.body_fit.first_hit import first_hits
+from intercap_core.geometry.rigid import normals as rigid_normals
+
+# Length in metres that one radian between two normals counts as, in a match. Tuned on the studio.
+NORMAL_LENGTH_M = 0.06
+# Largest distance of a match from the normal line of its vertex, metres. Tuned on the studio.
+MATCH_SIDEWAYS_M = 0.03
+_BODY_SPACING_M = 0.045  # between samples of the skin; tuned on the studio
+_HAND_SPACING_M = 0.015  # between samples of the hands: the width of a finger (anatomy)
+_PATCH_VERTICES = 20  # of the patch around a sample; tuned on the studio
+_SAMPLES_PER_GROUP = 24  # largest group of samples with one bounding sphere: speed
+_SOLE_M = 0.035  # height above the lowest skin at which the upper of a shoe begins (anatomy)
+
+
+@dataclass(frozen=True)
+class Covering:
+    """What lies between the skin and the measured surface."""
+
+    name: str
+    thickness: float
+    """Usual thickness, metres."""
+    spread: float
+    """Standard deviation of the logarithm of the thickness."""
+    noise: float
+    """Standard deviation of a sample's mean distance, metres: folds, and errors of the body
+    model."""
+
+
+# Light indoor clothing is 1-2 mm of fabric that stands off by folds and air: mean air gaps of
+# shirts and trousers are 5-20 mm (Psikuta et al. 2012, "Quantitative evaluation of air gap
+# thickness and contact area between body and garment").
+COVERINGS = (
+    Covering("bare", 0.0005, 0.1, 0.006),
+    Covering("hair", 0.004, 0.6, 0.010),
+    Covering("trunk", 0.010, 0.5, 0.010),
+    Covering("upper_arm", 0.009, 0.5, 0.009),
+    Covering("forearm", 0.004, 0.7, 0.008),
+    Covering("thigh", 0.009, 0.5, 0.010),
+    Covering("lower_leg", 0.007, 0.6, 0.009),
+    Covering("foot", 0.005, 1.0, 0.009),
+    Covering("sole", 0.007, 1.0, 0.009),
+)
+_COVERING_OF_JOINT = {
+    "pelvis": "trunk", "spine1": "trunk", "spine2": "trunk", "spine3": "trunk",
+    "collar": "trunk", "neck": "bare", "head": "hair", "jaw": "bare", "shoulder": "upper_arm",
+    "elbow": "forearm", "wrist": "bare", "hip": "thigh", "knee": "lower_leg", "ankle": "foot",
+    "foot": "foot",
+}  # fmt: skip
+
+
+# --- samples ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Samples:
+    """The sparse set of N skin vertices."""
+
+    vertex: np.ndarray
+    """(N,) vertex ids."""
+    patch: np.ndarray
+    """(N, 20) ids of the nearest outer vertices, the sample itself first."""
+    group: np.ndarray
+    """(N,) index into COVERINGS."""
+    hand: np.ndarray
+    """(N,) bool: the sample is on a hand."""
+
+
+def choose_samples(model: BodyModel) -> Samples:
+    """Spread samples over the outer skin, denser on the hands. The choice is deterministic."""
+    import scipy.spatial
+
+    template = model.template.double().cpu().numpy()
+    faces = model.faces.cpu().numpy()
+    joint = model.skinning_weights.argmax(1).cpu().numpy()
+    hand_joints = [i for i, name in enumerate(JOINT_NAMES) if i >= 25 or name.endswith("wrist")]
+    hand = np.isin(joint, hand_joints)
+    outer = _outer(template, faces, joint)
+    chosen = [
+        _grid(template, np.flatnonzero(outer & part), spacing)
+        for part, spacing in ((~hand, _BODY_SPACING_M), (hand, _HAND_SPACING_M))
+    ]
+    vertex = np.concatenate(chosen)
+    outside = np.flatnonzero(outer)
+    _, near = scipy.spatial.cKDTree(template[outside]).query(template[vertex], _PATCH_VERTICES)
+    names = [c.name for c in COVERINGS]
+    group = np.array([_covering(joint[v], names) for v in vertex])
+    face = _is_face(template, joint, model)[vertex]
+    group[face] = names.index("bare")
+    low = template[vertex, 1] < template[:, 1].min() + _SOLE_M
+    group[low & (group == names.index("foot"))] = names.index("sole")
+    return Samples(vertex, outside[near], group, hand[vertex])
+
+
+def _covering(joint: int, names: list[str]) -> int:
+    name = JOINT_NAMES[joint].removeprefix("left_").removeprefix("right_")
+    return names.index(_COVERING_OF_JOINT.get(name, "bare"))
+
+
+def _is_face(template: np.ndarray, joint: np.ndarray, model: BodyModel) -> np.ndarray:
+    """Flag the front of the head below the brows: the box of the face landmarks, seen from z."""
+    landmarks = template[model.keypoint_map.ids[67:118].reshape(-1)]
+    low, high = landmarks.min(0), landmarks.max(0)
+    inside = (template[:, :2] > low[:2] - 0.01) & (template[:, :2] < high[:2] + 0.01)
+    on_head = np.isin(joint, [JOINT_INDEX["head"], JOINT_INDEX["jaw"]])
+    return inside.all(1) & (template[:, 2] > low[2] - 0.01) & on_head
+
+
+def _grid(points: np.ndarray, ids: np.ndarray, spacing: float) -> np.ndarray:
+    """Choose one id for each occupied cube of a grid: the point nearest to the cube's centre."""
+    cell = np.floor(points[ids] / spacing).astype(np.int64)
+    from_middle = np.abs(points[ids] / spacing - cell - 0.5).max(1)
+    order = np.lexsort((from_middle, cell[:, 2], cell[:, 1], cell[:, 0]))
+    _, first = np.unique(cell[order], axis=0, return_index=True)
+    return np.sort(ids[order[first]])
+
+
+def _outer(points: np.ndarray, faces: np.ndarray, joint: np.ndarray) -> np.ndarray:
+    """Flag the vertices (V,) of the outer skin: no eyes, tongue, mouth cavity or nostrils.
+
+    A vertex of the head is inside if a ray along its normal meets the mesh again.
+    """
+    import scipy.sparse.csgraph
+
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    graph = scipy.sparse.coo_matrix(
+        (np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(points), len(points))
+    )
+    _, part = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    outer = part == np.bincount(part).argmax()
+    head = [JOINT_INDEX[n] for n in ("head", "jaw", "left_eye_smplhf", "right_eye_smplhf")]
+    ids = np.flatnonzero(outer & np.isin(joint, head))
+    normals = rigid_normals.vertex_normals(points, faces)[ids]
+    hits = first_hits(points, faces, points[ids] + 1e-3 * normals, normals)
+    outer[ids[np.isfinite(hits)]] = False
+    return outer
+
+
+# --- posed surface ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """The R vertices of a body whose faces touch a sample's patch, with F faces."""
+
+    model: BodyModel
+    ids: np.ndarray
+    """(R,) vertex ids in the body."""
+    faces: np.ndarray
+    """(F, 3) indices into ``ids``."""
+    sample: np.ndarray
+    """(N,) index of each sample in ``ids``."""
+    patch: np.ndarray
+    """(N, 20) indices of each sample's patch in ``ids``."""
+    around: np.ndarray
+    """Faces at each vertex, vertex by vertex. Vertices outside of all patches have none."""
+    starts: np.ndarray
+    """(R + 1,) start of each vertex's faces in ``around``, and the end."""
+    order: np.ndarray
+    """(N,) samples, ordered by groups of neighbours."""
+    groups: np.ndarray
+    """(G + 1,) start of each group in ``order``, and the end."""
+
+    @classmethod
+    def around_samples(cls, model: BodyModel, samples: Samples) -> Surface:
+        every = model.faces.cpu().numpy()
+        met = np.zeros(model.num_vertices, bool)
+        met[samples.vertex] = met[samples.patch] = True
+        faces = every[met[every].any(1)]
+        ids = np.unique(faces)
+        place = np.full(model.num_vertices, -1)
+        place[ids] = np.arange(len(ids))
+        faces = place[faces]
+        corner = faces.ravel()
+        face = np.repeat(np.arange(len(faces)), 3)[met[ids][corner]]
+        corner = corner[met[ids][corner]]
+        order, groups = _group(model, samples)
+        return cls(
+            model=model,
+            ids=ids,
+            faces=faces,
+            sample=place[samples.vertex],
+            patch=place[samples.patch],
+            around=face[np.argsort(corner, kind="stable")],
+            starts=np.searchsorted(np.sort(corner), np.arange(len(ids) + 1)),
+            order=order,
+            groups=groups,
+        )
+
+    def posed(self, params: BodyParameters) -> tuple[Tensor, Tensor]:
+        """Return vertices and unit normals (B, R, 3), metres. Only the normals of samples and
+        patches are correct."""
+        vertices = self.model.forward(params, vertex_ids=self.ids).vertices
+        if vertices.device.type != "cpu":
+            faces = torch.as_tensor(self.faces).to(vertices.device)
+            return vertices, vertex_normals(vertices, faces)
+        normals = torch.empty_like(vertices)
+        _vertex_normals(vertices.numpy(), self.faces, self.starts, self.around, normals.numpy())
+        return vertices, normals
+
+
+def _group(model: BodyModel, samples: Samples) -> tuple[np.ndarray, np.ndarray]:
+    """Halve the samples by place and normal at rest until the groups are small.
+
+    Returns the order (N,) of the samples, and the start of each group and the end (G + 1,).
+    """
+    template = model.template[None]
+    rest = torch.cat([template, NORMAL_LENGTH_M * vertex_normals(template, model.faces)], 2)[0]
+    at = rest.double().cpu().numpy()[samples.vertex]
+    whole, parts = [np.arange(len(at))], []
+    while whole:
+        part = whole.pop()
+        if len(part) <= _SAMPLES_PER_GROUP:
+            parts.append(part)
+            continue
+        axis = int(np.ptp(at[part], axis=0).argmax())
+        half = np.array_split(part[np.argsort(at[part, axis], kind="stable")], 2)
+        whole += half[::-1]
+    return np.concatenate(parts), np.cumsum([0, *map(len, parts)])
+
+
+@numba.njit(cache=True, nogil=True)
+def _vertex_normals(vertices, faces, starts, around, out):
+    """Write area-weighted unit normals (B,V,3) of vertices (B,V,3) to ``out``.
+
+    ``around`` lists the faces (F,3) at each vertex, those of v from ``starts[v]`` to
+    ``starts[v + 1]``. A vertex without faces gets a zero normal.
+    """
+    cross = np.empty((len(faces), 3), vertices.dtype)
+    for b in range(len(vertices)):
+        posed = vertices[b]
+        for f in range(len(faces)):
+            i, j, k = faces[f]
+            ax, ay, az = posed[i, 0], posed[i, 1], posed[i, 2]
+            ux, uy, uz = posed[j, 0] - ax, posed[j, 1] - ay, posed[j, 2] - az
+            vx, vy, vz = posed[k, 0] - ax, posed[k, 1] - ay, posed[k, 2] - az
+            cross[f, 0] = uy * vz - uz * vy
+            cross[f, 1] = uz * vx - ux * vz
+            cross[f, 2] = ux * vy - uy * vx
+        for v in range(len(starts) - 1):
+            x = y = z = cross[0, 0] * 0
+            for at in range(starts[v], starts[v + 1]):
+                f = around[at]
+                x += cross[f, 0]
+                y += cross[f, 1]
+                z += cross[f, 2]
+            length = np.sqrt(x * x + y * y + z * z)
+            if length > 0:
+                x, y, z = x / length, y / length, z / length
+            out[b, v, 0], out[b, v, 1], out[b, v, 2] = x, y, z

@@ -1,0 +1,357 @@
+"""The interface of the terms of the body's energy E_B (equation 2): inputs, columns, results.
+
+Every term exists in two forms. The torch form is the readable one and runs on any device. The
+compiled form is used on the CPU. Both have the same cost, gradient and Gauss-Newton matrix.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from intercap_core.body.correctives_kernel import RestPoints
+from intercap_core.body.joints import NUM_JOINTS, PARENTS, ancestors
+from intercap_core.body.model import BodyModel
+from intercap_core.body.selection import Limbs
+from intercap_core.body.skeleton_kernel import Skeleton
+from intercap_core.body.vposer import PoseGaussian
+from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
+
+# --- observations ----------------------------------------------------------------------------
+
+
+@dataclass
+class Views:
+    """Detections of K keypoints in C cameras, for T frames."""
+
+    observed: Tensor
+    """(T, C, K, 2) detected keypoints, px."""
+    confidence: Tensor
+    """(T, C, K) confidence, 0 = not detected."""
+    sigma: Tensor
+    """(T, C, K) standard deviation, px."""
+    lenses: Tensor
+    """(C, 13) colour intrinsics."""
+    colour_from_master: Tensor
+    """(C, 4, 4) extrinsics."""
+    shift: Tensor | None = None
+    """(T, C, K, 3) displacement of the keypoints until the camera exposes, metres."""
+
+    def frames(self, index: Tensor) -> Views:
+        """Return the detections of the frames ``index`` (b,)."""
+        return Views(
+            self.observed[index],
+            self.confidence[index],
+            self.sigma[index],
+            self.lenses,
+            self.colour_from_master,
+            None if self.shift is None else self.shift[index],
+        )
+
+
+@dataclass
+class Targets:
+    """Triangulated positions of K keypoints, for T frames."""
+
+    points: Tensor
+    """(T, K, 3) positions in the master frame, metres."""
+    confidence: Tensor
+    """(T, K) confidence, 0 = no target."""
+    sigma: float
+    """Standard deviation, metres."""
+
+    def frames(self, index: Tensor) -> Targets:
+        """Return the targets of the frames ``index`` (b,)."""
+        return Targets(self.points[index], self.confidence[index], self.sigma)
+
+
+class CloudRows(NamedTuple):
+    """Residual rows of E_D: the points of each of N samples, for T frames."""
+
+    target: Tensor
+    """(T, N) mean of normal . point over the matched points, metres."""
+    normal: Tensor
+    """(T, N, 3) normal of the surface at the sample."""
+    weight: Tensor
+    """(T, N) weight, 1/m^2, 0 = no point."""
+    distance: Tensor
+    """(T, N) mean signed distance of the points at the last matching, outside positive, metres."""
+
+    def frames(self, index: Tensor | np.ndarray) -> CloudRows:
+        """Return the rows of the frames ``index`` (b,)."""
+        return CloudRows(*(values[index] for values in self))
+
+
+class Pairs(NamedTuple):
+    """M samples inside or close to another part of the body, until the next search."""
+
+    frame: Tensor
+    """(M,) frame of each pair, ascending."""
+    inner: Tensor
+    """(M,) index of the sample in ``vertices``."""
+    outer: Tensor
+    """(M,) index of the vertex of the other part in ``vertices``."""
+    normal: Tensor
+    """(M, 3) outward normal at that vertex, master frame."""
+    vertices: Tensor
+    """(U,) vertex ids."""
+
+    def of_frames(self, index: Tensor) -> tuple[Pairs, Tensor] | None:
+        """Return the pairs of the frames ``index`` (b,), or None if there are none.
+
+        Returns:
+            The pairs, whose ``frame`` counts the F frames with pairs.
+            (F,) the place of these frames in ``index``.
+        """
+        place = self.frame.new_full((int(max(self.frame.max(), index.max())) + 1,), -1)
+        place[index] = torch.arange(len(index), device=index.device)
+        at = place[self.frame]
+        kept = at >= 0
+        if not bool(kept.any()):
+            return None
+        present, frame = at[kept].unique(return_inverse=True)
+        inner, outer, normal = self.inner[kept], self.outer[kept], self.normal[kept]
+        return Pairs(frame, inner, outer, normal, self.vertices), present
+
+
+# --- keypoints -------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class KeypointSet:
+    """K of the 135 keypoints, as combinations of N vertices and the joints."""
+
+    index: Tensor
+    """(K,) index among the 135 keypoints."""
+    vertices: Tensor
+    """(N,) vertex ids."""
+    matrix: Tensor
+    """(K, N + 55) weights of the vertices and the joints."""
+    carrier: Tensor
+    """(K,) joint whose bone carries the offset of the keypoint."""
+    turned_by: Tensor
+    """(K, 55) 1 for the joints that turn this bone, else 0."""
+    limbs: Limbs
+    """Keypoints on the same chain of joints."""
+
+
+def keypoint_set(model: BodyModel, index: Sequence[int] | range) -> KeypointSet:
+    """Choose keypoints by ``index``.
+
+    A joint is carried by the bone of its parent, a vertex by the bone with the largest weight.
+    """
+    keypoints, rows = model.keypoint_map, np.asarray(index)
+    heaviest = model.skinning_weights.argmax(1).cpu().numpy()
+    carrier = [
+        max(PARENTS[joint], 0) if joint >= 0 else int(heaviest[ids[weights.argmax()]])
+        for joint, ids, weights in zip(
+            keypoints.joint[rows], keypoints.ids[rows], keypoints.weights[rows], strict=True
+        )
+    ]
+    turned = np.zeros((len(rows), NUM_JOINTS))
+    for row, joint in enumerate(carrier):
+        turned[row, list(ancestors(joint))] = 1
+    matrix = keypoints.matrix[rows]
+    count = len(keypoints.vertex_ids)
+    used = np.flatnonzero(matrix[:, :count].any(0))
+    matrix = np.concatenate([matrix[:, used], matrix[:, count:]], 1)
+    device = model.device
+    vertices = keypoints.vertex_ids[used]
+    # a joint follows its parent alone
+    follows = np.zeros((len(vertices) + NUM_JOINTS, NUM_JOINTS), bool)
+    follows[: len(vertices)] = model.skinning_weights[torch.as_tensor(vertices)].cpu().numpy() != 0
+    follows[len(vertices) + np.arange(NUM_JOINTS), [max(parent, 0) for parent in PARENTS]] = True
+    chains = [_chain(np.flatnonzero(bones)) for bones in (matrix != 0) @ follows]
+    return KeypointSet(
+        torch.as_tensor(rows, device=device),
+        torch.as_tensor(vertices, device=device),
+        torch.as_tensor(matrix, dtype=model.dtype, device=device),
+        torch.as_tensor(carrier, device=device),
+        torch.as_tensor(turned, dtype=model.dtype, device=device),
+        _limbs(chains),
+    )
+
+
+def _chain(bones: np.ndarray) -> frozenset[int]:
+    """Return all joints that move any of the bones."""
+    return frozenset().union(*(ancestors(bone) for bone in bones.tolist()))
+
+
+def _limbs(chains: list[frozenset[int]]) -> Limbs:
+    """Group keypoints: each joins the first of the longest chains that contains its own chain."""
+    limbs: list[list[int]] = []
+    for k in sorted(range(len(chains)), key=lambda k: (-len(chains[k]), k)):
+        home = next((limb for limb in limbs if chains[k] <= chains[limb[0]]), None)
+        if home is None:
+            limbs.append([k])
+        else:
+            home.append(k)
+    moved_by = np.zeros((len(limbs), NUM_JOINTS), bool)
+    for flags, limb in zip(moved_by, limbs, strict=True):
+        flags[sorted(chains[limb[0]])] = True
+    return Limbs(np.concatenate(limbs), np.cumsum([0, *map(len, limbs)]), moved_by)
+
+
+# --- one evaluation --------------------------------------------------------------------------
+
+
+class TermInputs(NamedTuple):
+    """What the bodies of T frames are compared with."""
+
+    keypoints: KeypointSet
+    """Keypoints of E_J."""
+    views: Views | None
+    """Detections for E_J; None = not used."""
+    targets: Targets | None
+    """Triangulated keypoints for E_J; None = not used."""
+    rows: CloudRows | None
+    """Rows of E_D; None switches the term off."""
+    pairs: Pairs | None
+    """Contacts of E_P_self; None switches the term off."""
+    self_weight: float
+    """Factor of E_P_self."""
+    pose: PoseGaussian | None
+    """Learned prior of each frame's body pose, in place of the open prior."""
+    shape_prior: bool
+    """Each frame has its own betas, with their prior."""
+    hand_share: float
+    """Factor of E_theta_h in one frame."""
+
+    @property
+    def has_keypoints(self) -> bool:
+        """There is something to compare the keypoints with."""
+        return self.views is not None or self.targets is not None
+
+
+class Bodies(NamedTuple):
+    """The b bodies at which the energy is evaluated."""
+
+    vectors: Tensor
+    """(b, P) parameter vectors."""
+    offsets: Tensor
+    """(K, 3) keypoint offsets in the frames of their bones, metres."""
+    thickness: Tensor
+    """(G,) thickness of the coverings, metres."""
+    frames: Tensor
+    """(b,) frame of each body among the T frames of the inputs."""
+
+
+class Columns(NamedTuple):
+    """Columns of the normal equations: parameters, then keypoint offsets, then coverings."""
+
+    parameters: Tensor
+    """(n,) body parameter of each of the first n columns."""
+    offsets: int
+    """Number of keypoints whose offsets have three columns each."""
+    coverings: int
+    """Number of columns for the logarithms u of the thickness of the coverings."""
+
+    @property
+    def offsets_at(self) -> slice:
+        """Columns of the offsets."""
+        first = len(self.parameters)
+        return slice(first, first + 3 * self.offsets)
+
+    @property
+    def coverings_at(self) -> slice:
+        """Columns of the coverings."""
+        first = self.offsets_at.stop
+        return slice(first, first + self.coverings)
+
+    def of_parameters(self, count: int) -> np.ndarray:
+        """Return the column of each of ``count`` body parameters, -1 = fixed."""
+        columns = np.full(count, -1)
+        columns[self.parameters.cpu().numpy()] = np.arange(len(self.parameters))
+        return columns
+
+    def of_coverings(self, count: int) -> np.ndarray:
+        """Return the column of each of ``count`` coverings, -1 = fixed."""
+        at = self.coverings_at
+        return np.arange(at.start, at.stop) if self.coverings else np.full(count, -1)
+
+
+class TorchTerm(Protocol):
+    """The torch form of a term, or of the sum of all terms."""
+
+    def cost(self, inputs: TermInputs, bodies: Bodies) -> Tensor:
+        """Return the cost (b,) of each body."""
+        ...
+
+    def add(
+        self, inputs: TermInputs, bodies: Bodies, columns: Columns, equations: NormalEquations
+    ) -> None:
+        """Add cost (b,), gradient (b, n) and Gauss-Newton matrix (b, n, n) in place."""
+        ...
+
+
+# --- compiled form ---------------------------------------------------------------------------
+
+
+class Batch(NamedTuple):
+    """Some of the b bodies of an evaluation, which one thread computes."""
+
+    at: slice
+    """Their places among the b bodies."""
+    vectors: np.ndarray
+    """(B, P) parameter vectors."""
+    frames: np.ndarray
+    """(B,) frames."""
+    skeleton: Skeleton
+    """Posed skeletons."""
+
+
+class BatchEquations(NamedTuple):
+    """The normal equations of a batch, filled in place by the kernels."""
+
+    columns: Columns
+    place: np.ndarray
+    """(P,) column of each body parameter, -1 = fixed."""
+    cost: np.ndarray
+    """(B,)"""
+    gradient: np.ndarray
+    """(B, n)"""
+    hessian: np.ndarray
+    """(B, n, n)"""
+    by_pose: np.ndarray
+    """(B, 54, 3, 9) derivatives of the rotations by the pose; empty without pose blend shapes."""
+
+
+class PreparedTerm(Protocol):
+    """The compiled form of a term at the b bodies of one evaluation."""
+
+    @property
+    def rest(self) -> RestPoints | None:
+        """Points of the term at rest, which pose blend shapes move; None = no points."""
+        ...
+
+    def used(self, frames: np.ndarray) -> np.ndarray:
+        """Return which of these N points the frames (B,) use, (B, N) bool."""
+        ...
+
+    def add_cost(self, batch: Batch, cost: np.ndarray) -> None:
+        """Add the cost (B,) in place."""
+        ...
+
+    def add(self, batch: Batch, equations: BatchEquations) -> None:
+        """Add the normal equations in place."""
+        ...
+
+
+class CompiledTerm(Protocol):
+    """The compiled form of a term."""
+
+    def prepare(
+        self, inputs: TermInputs, bodies: Bodies, *, derivatives: bool
+    ) -> PreparedTerm | None:
+        """Return the term at these bodies, or None if it is switched off."""
+        ...
+
+
+def contiguous(values: Tensor) -> np.ndarray:
+    """Return the tensor as an array, as the kernels expect it."""
+    return values.contiguous().numpy()
