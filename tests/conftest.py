@@ -30,7 +30,7 @@ SLOW = (
     "body_fit/test_recover.py",
     "body_fit/test_terms.py",
     "commands",
-    "energy/test_body_self.py",
+    "body_fit/test_self_contact.py",
     "object_track",
     "output/site",
     "geometry/rigid/test_open3d_core.py",

@@ -12,7 +12,7 @@ from intercap_core.body.parameters import NUM_POSE
 # Standard deviation of a bridged joint: speed along one coordinate if it is unknown (a walk), and
 # its least value (a standing person sways), m/s; the largest deviation is an arm's length, metres.
 _WALKING_SPEED, _STANDING_SPEED = 1.0, 0.1
-_LARGEST_SIGMA_M = 0.5
+_BRIDGED_SIGMA_M = 0.5
 # A velocity is measured to the nearest known frame between these times, seconds: nearer frames show
 # the noise of the fit, farther ones another motion. Tuned on the studio.
 _VELOCITY_WINDOW_S = (0.045, 0.15)
@@ -146,7 +146,7 @@ def bridged_sigma(
         tried = np.arange(max(0, -steps.min()), len(known) - max(0, steps.max()))
         tried = tried[known[tried] & np.all([known[tried + step] for step in steps], axis=0)]
         if len(tried) < _FEWEST_BRIDGES:
-            off = np.minimum(speed * seconds[t], _LARGEST_SIGMA_M)
+            off = np.minimum(speed * seconds[t], _BRIDGED_SIGMA_M)
         else:
             built = np.tensordot(weights[0], [joints[tried + step] for step in steps], 1)
             off = np.sqrt(((joints[tried] - built) ** 2).mean((0, 2)))

@@ -63,7 +63,8 @@ class Definition:
         if not rows or tuple(rows[0]) != _COLUMNS:
             raise UserError(
                 f"{path}: columns are {quoted(rows[0]) if rows else 'missing'}, expected "
-                f"{', '.join(_COLUMNS)}, separated by tabs; write it by 'intercap keypoint-definition'"
+                f"{', '.join(_COLUMNS)}, separated by tabs; write it by "
+                "'intercap keypoint-definition'"
             )
         by_point = {row[0]: _numbers(path, row) for row in rows[1:]}
         wrong = sorted(set(POINTS) ^ set(by_point))

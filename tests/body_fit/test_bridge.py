@@ -1,4 +1,4 @@
-"""Frames that were filled in, and how far off they say they are."""
+"""Interpolated frames and their standard deviation."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _as_vectors(points: np.ndarray) -> np.ndarray:
 
 
 def test_a_swing_is_bridged_with_the_velocity_at_both_ends():
-    """Of a turn and a walk to and fro, a third of what a straight bridge gets wrong is left."""
+    """The error is a third of that of a straight bridge."""
     vectors = np.zeros((len(TIMES), NUM_POSE + 3))
     vectors[:, 3:6] = np.outer(np.sin(3 * TIMES), [0.2, 0.9, 0.1])
     vectors[:, NUM_POSE] = 0.5 * np.sin(3 * TIMES)
@@ -47,7 +47,7 @@ def test_a_swing_is_bridged_with_the_velocity_at_both_ends():
     np.testing.assert_array_equal(found[known], vectors[known])
 
 
-def test_who_is_seen_for_one_frame_between_two_gaps_has_no_velocity_there():
+def test_one_frame_between_two_gaps_has_no_velocity():
     vectors = np.zeros((len(TIMES), NUM_POSE + 3))
     vectors[:, NUM_POSE] = TIMES
     vectors[30, NUM_POSE] += 0.2
@@ -56,8 +56,8 @@ def test_who_is_seen_for_one_frame_between_two_gaps_has_no_velocity_there():
 
 
 @pytest.mark.parametrize("gap", [(20,), tuple(range(20, 30)), (0, 1, 2), (57, 58, 59)])
-def test_the_stated_error_of_a_bridge_is_that_of_such_bridges(gap):
-    """Of joints that swing at random phases, error over deviation is about one."""
+def test_stated_error_of_a_bridge_is_the_true_one(gap):
+    """Error over deviation is about one for joints that swing at random phases."""
     random = np.random.default_rng(len(gap))
     phase, speed = random.uniform(0, 2 * np.pi, (40, 3)), random.uniform(2, 4, (40, 3))
     truth = 0.2 * np.sin(TIMES[:, None, None] * speed + phase)
@@ -69,7 +69,7 @@ def test_the_stated_error_of_a_bridge_is_that_of_such_bridges(gap):
     np.testing.assert_allclose(sigma[known], 1e-3)
 
 
-def test_a_gap_longer_than_anything_known_goes_by_the_speed():
+def test_a_gap_longer_than_all_stretches_uses_the_speed():
     known = _unknown(*range(10, 50))
     walking = np.zeros((len(TIMES), 2, 3))
     walking[:, 0] = TIMES[:, None] * 0.5
@@ -78,7 +78,7 @@ def test_a_gap_longer_than_anything_known_goes_by_the_speed():
     assert sigma[30, 1] < sigma[30, 0] <= 0.51
 
 
-def test_one_known_frame_stands_for_all():
+def test_one_known_frame_determines_all():
     known = np.arange(len(TIMES)) == 5
     sigma = bridged_sigma(np.zeros((len(TIMES), 1, 3)), known, np.full((60, 1), 0.01), TIMES)
     assert sigma[5] == 0.01 and sigma[6] > 0.05 and sigma[59] == pytest.approx(0.5, abs=0.001)

@@ -1,4 +1,4 @@
-"""A detector's definition: written, read, and what the fit's prior makes of it."""
+"""A detector's definition: written, read, and as the prior of the offsets."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from intercap_core.body_fit.layout import Layout
 
 from intercap_core.body_fit.definition import POINTS, UNKNOWN_SIGMA_M, Definition
+from intercap_core.body_fit.problem import Layout
 from intercap_core.errors import UserError
 
 
@@ -28,13 +28,13 @@ def test_a_table_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert (tmp_path / "own.tsv").read_text().startswith("# a lab\npoint\tx_mm")
 
 
-def test_without_a_table_the_points_are_the_models() -> None:
+def test_without_a_table_offsets_are_zero() -> None:
     found = Definition.read(None)
     assert not found.offsets.any() and (found.sigma == UNKNOWN_SIGMA_M).all()
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         (lambda text: text.replace("x_mm", "x"), "columns are"),
         (lambda text: text.replace(POINTS[3] + "\t", "shin\t"), "shin"),
@@ -46,22 +46,22 @@ def test_without_a_table_the_points_are_the_models() -> None:
         (lambda text: "", "columns are missing"),
     ],
 )
-def test_bad_tables_are_named(tmp_path: Path, change, told: str) -> None:
+def test_bad_tables_are_reported(tmp_path: Path, change, message: str) -> None:
     path = tmp_path / "own.tsv"
     replace(_some(), offsets=np.full((25, 3), 0.01)).write(path, "a lab")
     path.write_text(change(path.read_text().replace("\t10.0", "\t10.5")))
-    with pytest.raises(UserError, match=told) as error:
+    with pytest.raises(UserError, match=message) as error:
         Definition.read(path)
     assert str(path) in str(error.value) and "keypoint-definition" in str(error.value)
 
 
-def test_a_folder_or_no_file_is_named(tmp_path: Path) -> None:
+def test_a_folder_or_missing_file_is_reported(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / "none.tsv"):
         with pytest.raises(UserError, match="no readable text"):
             Definition.read(path)
 
 
-def test_the_prior_is_about_the_definition_and_its_gradient_is_its_slope() -> None:
+def test_prior_of_offsets_is_centred_on_the_definition() -> None:
     known = _some(1)
     layout = Layout(torch.arange(3), 10, True, True, known)
     at = torch.as_tensor(known.offsets).reshape(-1)
@@ -69,4 +69,4 @@ def test_the_prior_is_about_the_definition_and_its_gradient_is_its_slope() -> No
     assert layout.prior_cost(mean) == 0
     step = torch.as_tensor(np.random.default_rng(2).normal(0, 1e-3, len(mean)))
     wide = Layout(torch.arange(3), 10, True, True, Definition.unknown())
-    assert layout.prior_cost(mean + step) > wide.prior_cost(step)  # known better than unknown
+    assert layout.prior_cost(mean + step) > wide.prior_cost(step)

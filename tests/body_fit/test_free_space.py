@@ -1,4 +1,4 @@
-"""What sticks out of the measured person goes in; what is hidden or unknown does not."""
+"""Points that stick out of the measured person; hidden and unknown ones have no residual."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ BORDER_M = (199.5 - 159.5) / 252 * 2.0
 
 
 @pytest.mark.parametrize("out_m", [0.02, 0.03, 0.045])
-def test_a_point_outside_the_border_is_as_far_out_as_it_is(out_m: float) -> None:
+def test_distance_of_a_point_outside_the_border(out_m: float) -> None:
     points = np.array([[BORDER_M + out_m, 0.0, 2.0]])
     index, away = seen_through(_window(2000, 4000), CAMERA, 0.0, points, np.array([EDGE_ON]))
     assert index.tolist() == [0]
@@ -44,7 +44,7 @@ def test_a_point_outside_the_border_is_as_far_out_as_it_is(out_m: float) -> None
         (2000, 4000, (0.0, 0.0, 1.0), BORDER_M + 0.03),  # looks away
     ],
 )
-def test_what_is_no_evidence_draws_nothing(
+def test_other_points_have_no_residual(
     person_mm: int, background_mm: int, normal: tuple[float, float, float], x: float
 ) -> None:
     window, direction = _window(person_mm, background_mm), np.array([normal], float)
@@ -55,7 +55,7 @@ def test_what_is_no_evidence_draws_nothing(
 def _plain(
     window: DepthWindow, camera: Camera, points: np.ndarray, normals: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The same by arrays: facing, seen through, and the first step inward that is not."""
+    """The same in NumPy: facing, seen through, and the first step inward that is not."""
     assert camera.depth is not None
 
     def past(local: np.ndarray) -> np.ndarray:
@@ -76,7 +76,7 @@ def _plain(
     return index, 0.01 * (through[index].argmin(1) - 0.5)
 
 
-def test_a_distorted_lens_elsewhere_sees_the_same_as_arrays() -> None:
+def test_a_distorted_lens_agrees_with_numpy() -> None:
     generator = np.random.default_rng(0)
     bent = np.array([0.5, -2.6, 1e-3, -5e-4, 1.5, 0.4, -2.4, 1.4])
     lens = Intrinsics(320, 288, 252.0, 252.0, 159.5, 143.5, bent)

@@ -1,4 +1,4 @@
-"""Planes through a mask's rim touch the body where they should, and are as far from it as it is."""
+"""Planes through the rim of a mask touch the body at the right distance."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from intercap_core.body_fit.outlines import Outline, RimSamples, outline, touching
+from intercap_core.body_fit.outlines import Outline, RimSamples, touching, trace_outline
 from intercap_core.geometry.camera import masks
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.transforms import rigid
@@ -40,7 +40,7 @@ def _runs(mask: np.ndarray) -> masks.Runs:
 
 
 def _rim(mask: masks.Runs) -> Outline:
-    found = outline(mask, None, LENS, 0)
+    found = trace_outline(mask, None, LENS, 0)
     assert found is not None
     return found
 
@@ -53,7 +53,7 @@ def _touching(rim: Outline, radius: float, late: float = 0.0) -> tuple[np.ndarra
     return touching(rim, MASTER_FROM_COLOUR, vertices, BALL.vertices @ turn.T, SAMPLES, 0.05, moved)
 
 
-def test_planes_touch_what_the_mask_is_of() -> None:
+def test_planes_touch_the_masked_ball() -> None:
     rim = _rim(_mask(CENTRE, RADIUS))
     apart = (rim.normals * CENTRE).sum(1)  # of the ball's centre: inward
     np.testing.assert_allclose(np.linalg.norm(rim.normals, axis=1), 1, atol=1e-6)
@@ -64,19 +64,18 @@ def test_planes_touch_what_the_mask_is_of() -> None:
 
 
 @pytest.mark.parametrize("smaller_m", [-0.02, 0.0, 0.01, 0.03])
-def test_the_distance_is_what_the_body_lacks(smaller_m: float) -> None:
+def test_distance_is_the_missing_radius(smaller_m: float) -> None:
     rim = _rim(_mask(CENTRE, RADIUS))
     sample, distance = _touching(rim, RADIUS - smaller_m)
     assert len(sample) > 0.9 * len(rim.rays)
     assert distance.mean() == pytest.approx(smaller_m, abs=0.0015)
 
 
-def test_what_is_farther_than_reach_is_left_out() -> None:
+def test_planes_beyond_reach_are_left_out() -> None:
     assert len(_touching(_rim(_mask(CENTRE, RADIUS)), RADIUS - 0.06)[0]) == 0
 
 
-def test_what_has_moved_when_the_camera_exposes_is_looked_for_there() -> None:
-    """On the side that it moves to it lacks less, on the other more."""
+def test_motion_until_the_exposure_is_taken_out() -> None:
     rim = _rim(_mask(CENTRE, RADIUS))
     sample, distance = _touching(rim, RADIUS, late=0.01)
     sideways = BALL.vertices[sample, 0]
@@ -84,7 +83,7 @@ def test_what_has_moved_when_the_camera_exposes_is_looked_for_there() -> None:
     assert distance[sideways < -0.9].mean() == pytest.approx(0.0095, abs=0.002)
 
 
-def test_the_image_border_is_no_rim() -> None:
+def test_image_border_is_no_rim() -> None:
     half = np.zeros((LENS.height, LENS.width), bool)
     half[100:, :300] = True  # leaves the image on the left and below
     normals = _rim(_runs(half)).normals
@@ -103,16 +102,16 @@ def test_a_gap_between_limbs_has_a_rim_and_a_speck_has_none() -> None:
     assert len(rim.rays) != without and inner < 1
     speck = np.zeros_like(whole)
     speck[200:204, 200:204] = True
-    assert outline(_runs(speck), None, LENS, 0) is None
-    assert outline(_runs(np.zeros_like(whole)), None, LENS, 0) is None
+    assert trace_outline(_runs(speck), None, LENS, 0) is None
+    assert trace_outline(_runs(np.zeros_like(whole)), None, LENS, 0) is None
 
 
-def test_where_another_thing_begins_the_person_may_go_on() -> None:
+def test_rim_next_to_another_object_is_left_out() -> None:
     whole = np.zeros((LENS.height, LENS.width), bool)
     whole[100:300, 100:300] = True
     held = np.zeros_like(whole)
     held[150:250, 302:400] = True  # two pixels beside the mask's right border
-    found = outline(_runs(whole), _runs(held), LENS, 0)
+    found = trace_outline(_runs(whole), _runs(held), LENS, 0)
     assert found is not None
     at = LENS.project(found.rays.astype(float))
     on_the_right = at[:, 0] > 298

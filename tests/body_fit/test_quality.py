@@ -1,4 +1,4 @@
-"""Which parts of a body are said to be open."""
+"""Parts of a body that the observations do not determine."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ SIGMA = torch.full((135,), 0.02)
 
 
 def _evidence(whitened: torch.Tensor, confidence: torch.Tensor) -> quality.PartEvidence:
-    return quality.compare(whitened, confidence, ALL, SIGMA, 4.0)
+    return quality.compare_parts(whitened, confidence, ALL, SIGMA)
 
 
-def _open(evidence: quality.PartEvidence, sigma: np.ndarray) -> list[str]:
-    found = quality.undetermined(sigma, evidence)
+def _undetermined(evidence: quality.PartEvidence, sigma: np.ndarray) -> list[str]:
+    found = quality.flag_undetermined(sigma, evidence)
     return [part for part, at in zip(BODY_PARTS, found[0], strict=True) if at]
 
 
@@ -31,98 +31,97 @@ def fine() -> tuple[torch.Tensor, torch.Tensor, np.ndarray]:
     return torch.full((1, 4, 135), 0.7), torch.full((1, 4, 135), 0.8), np.full((1, 55), 0.008)
 
 
-def test_a_good_fit_has_nothing_open(fine):
+def test_a_good_fit_has_no_undetermined_part(fine):
     whitened, confidence, sigma = fine
     evidence = _evidence(whitened, confidence)
-    assert _open(evidence, sigma) == []
+    assert _undetermined(evidence, sigma) == []
     assert torch.equal(evidence.against, torch.zeros(1, 8))
     assert torch.equal(evidence.seen, torch.ones(1, 8))
     assert quality.trunk_distance(evidence) == pytest.approx(0.014)
-    np.testing.assert_array_equal(quality.widened_sigma(sigma, evidence), sigma)
+    np.testing.assert_array_equal(quality.widen_sigma(sigma, evidence), sigma)
 
 
-def test_a_wrist_that_most_views_put_elsewhere(fine):
+def test_a_wrist_that_most_views_contradict(fine):
     """The elbow is right; the wrist is 8 sigmas, 160 mm, off in three of four views."""
     whitened, confidence, sigma = fine
     whitened[:, :3, KEYPOINT_NAMES.index("left_wrist")] = 8.0
     evidence = _evidence(whitened, confidence)
-    assert _open(evidence, sigma) == ["left_arm"]
+    assert _undetermined(evidence, sigma) == ["left_arm"]
     confidence[:, :3, KEYPOINT_NAMES.index("left_wrist")] = 0.2  # less than the fourth alone
-    assert _open(_evidence(whitened, confidence), sigma) == []
+    assert _undetermined(_evidence(whitened, confidence), sigma) == []
 
 
-def test_a_disputed_hand_says_how_far_off_it_may_be(fine):
+def test_a_contradicted_hand_is_widened_by_its_distance(fine):
     whitened, confidence, sigma = fine
     whitened[:, :, 46:67] = 10.0
     evidence = _evidence(whitened, confidence)
-    widened = quality.widened_sigma(sigma, evidence)
+    widened = quality.widen_sigma(sigma, evidence)
     right = JOINT_INDEX["right_index1"]
     assert widened[0, right] == pytest.approx(np.hypot(0.008, 0.2 / 1.1774))
     assert widened[0, JOINT_INDEX["left_index1"]] == 0.008
-    assert _open(evidence, widened) == ["right_hand"]
+    assert _undetermined(evidence, widened) == ["right_hand"]
 
 
-def test_what_nobody_sees_is_open_by_its_deviation(fine):
+def test_unseen_parts_are_undetermined_by_their_deviation(fine):
     whitened, confidence, sigma = fine
     confidence[:, :, 67:] = 0
-    assert _open(_evidence(whitened, confidence), sigma) == ["face"]
+    assert _undetermined(_evidence(whitened, confidence), sigma) == ["face"]
     confidence[:] = 0
     evidence = _evidence(whitened, confidence)
     assert torch.isnan(evidence.against).all() and np.isnan(quality.trunk_distance(evidence)).all()
     sigma[0, [JOINT_INDEX["right_knee"], JOINT_INDEX["right_ankle"]]] = 0.09
-    assert _open(evidence, sigma) == ["right_leg", "left_hand", "right_hand", "face"]
+    assert _undetermined(evidence, sigma) == ["right_leg", "left_hand", "right_hand", "face"]
 
 
-def test_limbs_that_nobody_sees_may_be_anywhere_in_their_reach(fine):
-    """Whatever points lie on them; an arm and two legs make a bad body likely."""
+def test_unseen_limbs_may_be_anywhere_in_their_reach(fine):
+    """With points or without; an arm and two legs make a bad body likely."""
     whitened, confidence, sigma = fine
     share = np.ones(55) / 55
     forearm = [KEYPOINT_NAMES.index(f"left_{name}") for name in ("elbow", "wrist")]
     confidence[:, :, forearm] = 0
-    widened = quality.widened_sigma(sigma, _evidence(whitened, confidence))
+    widened = quality.widen_sigma(sigma, _evidence(whitened, confidence))
     assert widened[0, JOINT_INDEX["left_wrist"]] > 0.2
     assert widened[0, JOINT_INDEX["right_wrist"]] == 0.008
     joints = np.arange(55)
     legs = [k for k, name in enumerate(KEYPOINT_NAMES[:25]) if name.split("_")[-1] in LEG]
     confidence[:, :, legs] = 0
     points = (joints, torch.ones(1, 55, dtype=torch.bool))
-    evidence = quality.compare(whitened, confidence, ALL, SIGMA, 4.0, points)
-    widened = quality.widened_sigma(sigma, evidence)
-    assert set(_open(evidence, widened)) >= {"left_arm", "left_leg", "right_leg"}
+    evidence = quality.compare_parts(whitened, confidence, ALL, SIGMA, points)
+    widened = quality.widen_sigma(sigma, evidence)
+    assert set(_undetermined(evidence, widened)) >= {"left_arm", "left_leg", "right_leg"}
     assert quality.expected_error(widened, share)[0] > 0.04
 
 
-def test_a_limb_that_one_view_sees_needs_points_of_its_own(fine):
+def test_a_limb_that_one_view_sees_needs_depth_points(fine):
     whitened, confidence, sigma = fine
     confidence[:, 1:] = 0
     joints = np.array([JOINT_INDEX["left_elbow"]] * 4 + [JOINT_INDEX["right_elbow"]] * 4)
     measured = torch.tensor([[False] * 6 + [True] * 2])
-    evidence = quality.compare(whitened, confidence, ALL, SIGMA, 4.0, (joints, measured))
-    found = quality.unmeasured(evidence)[0]
+    evidence = quality.compare_parts(whitened, confidence, ALL, SIGMA, (joints, measured))
+    found = quality.flag_unmeasured(evidence)[0]
     at = BODY_PARTS.index
     assert found[at("left_arm")] and not found[at("right_arm")] and not found[at("trunk")]
-    widened = quality.widened_sigma(sigma, evidence)
+    widened = quality.widen_sigma(sigma, evidence)
     assert widened[0, JOINT_INDEX["left_wrist"]] > 0.1
     assert widened[0, JOINT_INDEX["right_wrist"]] == 0.008
 
 
-def test_every_point_on_a_limb_tells_a_little_of_how_it_leans(fine):
-    """From none to as many as decide it, the arm's and its hand's deviation falls to its own."""
+def test_each_depth_point_narrows_a_leaning_limb(fine):
     whitened, confidence, sigma = fine
     confidence[:, 1:] = 0
     joints = np.array([JOINT_INDEX["left_elbow"]] * 100)
     stated = []
     for points in (0, 2, 5, 10, 16):
         measured = torch.arange(100)[None] < points
-        evidence = quality.compare(whitened, confidence, ALL, SIGMA, 4.0, (joints, measured))
-        stated.append(quality.widened_sigma(sigma, evidence)[0, JOINT_INDEX["left_wrist"]])
-        named = quality.unmeasured_joints(evidence)[0]
+        evidence = quality.compare_parts(whitened, confidence, ALL, SIGMA, (joints, measured))
+        stated.append(quality.widen_sigma(sigma, evidence)[0, JOINT_INDEX["left_wrist"]])
+        named = quality.flag_unmeasured_joints(evidence)[0]
         assert named[JOINT_INDEX["left_wrist"]] == (points < 15)
     assert stated[0] > 0.09 and stated[-1] == 0.008
     assert (np.diff(stated) < 0).all()
 
 
-def test_the_expected_error_is_the_mean_of_a_normal_one():
+def test_expected_error_is_the_mean_of_normal_errors():
     random = np.random.default_rng(0)
     errors = np.linalg.norm(random.normal(0, 0.03, (200_000, 3)), axis=1)
     share = np.full(55, 1 / 55)

@@ -1,6 +1,8 @@
-"""Frames that leave the motion of their neighbours."""
+"""Start of the fit, noise of keypoints by confidence, and frames that leave their neighbours."""
 
 from __future__ import annotations
+
+import dataclasses
 
 import numpy as np
 import pytest
@@ -11,13 +13,85 @@ from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
 from intercap_core.body.vposer import PoseGaussian
-from intercap_core.body_fit import body_keypoints, body_samples
+from intercap_core.body_fit.evidence import fit_confidence_exponent
+from intercap_core.body_fit.observations import TRUNK_KEYPOINTS, Observations
 from intercap_core.body_fit.problem import BodyProblem, columns_of
 from intercap_core.body_fit.recover import jumps, recover
-from intercap_core.body_fit.term_inputs import Views
-from tests.helpers.body_capture import master_from_room, ring
+from intercap_core.body_fit.start import interpolate_unknown, place_trunk
+from intercap_core.body_fit.surface import COVERINGS, choose_samples
+from intercap_core.body_fit.term_inputs import keypoint_set
+from tests.helpers.body_capture import exact_views, master_from_room, ring
 
 TIMES = np.arange(40) / 15
+
+
+# --- start ----------------------------------------------------------------------------------------
+
+TURN = Rotation.from_rotvec(np.outer(TIMES[:12], [0, 1.0, 0.5]))
+
+
+def _turning() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rest keypoints (135,3), their pelvis (3,), and keypoints (12,135,3) of a turning person."""
+    rest = np.random.default_rng(0).normal(0, 0.3, (135, 3))
+    pelvis = np.array([0.0, -0.3, 0.0])
+    turned = np.stack([turn.apply(rest - pelvis) for turn in TURN])
+    return rest, pelvis, turned + pelvis + TIMES[:12, None, None] * [1.0, 0, 0]
+
+
+def test_frames_without_a_trunk_start_between_the_others() -> None:
+    rest, pelvis, joints = _turning()
+    joints[4:7, TRUNK_KEYPOINTS[:4]] = np.nan
+    placed = place_trunk(rest, joints, pelvis)
+    assert np.isnan(placed[4:7]).all()
+    found = interpolate_unknown(placed, TIMES[:12])
+    apart = Rotation.from_rotvec(found[:, :3]).inv() * TURN
+    assert apart.magnitude().max() < 1e-6
+    np.testing.assert_allclose(found[:, 3:], TIMES[:12, None] * [1.0, 0, 0], atol=1e-9)
+
+
+def test_frames_near_placed_ones_are_usable_with_enough_keypoints() -> None:
+    _, _, joints = _turning()
+    rig, frames, times = ring(2), 12, TIMES[:12].copy()
+    joints[4, TRUNK_KEYPOINTS[:4]] = np.nan  # seen from the side
+    joints[5, 5:] = np.nan  # only head and one arm
+    joints[11, TRUNK_KEYPOINTS[:4]] = np.nan
+    times[11] += 2.0  # no placed frame nearby
+    seen = Observations(
+        "test", rig, np.zeros((frames, 2, 135, 2)), np.zeros((frames, 2, 135)), joints,
+        np.ones((frames, 135), int), [b""] * 2 * frames, np.zeros((frames, 2)), [b""] * 2 * frames,
+        [None, None], np.zeros(2), np.zeros((frames, 2), int), np.zeros(2), times,
+    )  # fmt: skip
+    assert np.flatnonzero(~seen.placed).tolist() == [4, 5, 11]
+    assert np.flatnonzero(~seen.usable).tolist() == [5, 11]
+    nobody = dataclasses.replace(seen, joints=np.full_like(joints, np.nan))
+    assert not nobody.usable.any()
+
+
+# --- confidence -----------------------------------------------------------------------------------
+
+
+def _errors(power: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Confidences (4000,) and errors that grow with a power of them, 10 % outliers."""
+    random = torch.Generator().manual_seed(0)
+    confidence = 0.2 + 0.75 * torch.rand(4000, generator=random)
+    error = 0.005 * confidence**-power * torch.randn(4000, generator=random).abs()
+    error[::10] = 0.3
+    return confidence, error
+
+
+@pytest.mark.parametrize("power", [0.0, 0.5, 1.0, 1.7])
+def test_confidence_exponent_is_found_among_outliers(power: float) -> None:
+    assert fit_confidence_exponent(*_errors(power)) == pytest.approx(power, abs=0.15)
+
+
+def test_confidence_exponent_is_zero_without_evidence() -> None:
+    confidence, error = _errors(1.0)
+    assert fit_confidence_exponent(torch.full_like(error, 0.9), error) == 0
+    assert fit_confidence_exponent(*(x[:100] for x in _errors(1.0))) == 0
+    assert fit_confidence_exponent(1.2 - confidence, error) == 0  # never falls with confidence
+
+
+# --- jumps ----------------------------------------------------------------------------------------
 
 
 def _swinging() -> np.ndarray:
@@ -28,11 +102,11 @@ def _swinging() -> np.ndarray:
     return joints
 
 
-def test_people_do_not_jump():
+def test_usual_motion_has_no_jumps() -> None:
     assert not jumps(_swinging(), TIMES).any()
 
 
-def test_an_arm_elsewhere_for_three_frames_jumps():
+def test_an_arm_elsewhere_for_three_frames_jumps() -> None:
     joints = _swinging()
     joints[20:23, 0, 2] += 0.4
     found = jumps(joints, TIMES)
@@ -41,50 +115,48 @@ def test_an_arm_elsewhere_for_three_frames_jumps():
     assert not found.any()
 
 
-def test_gaps_and_ends_say_nothing():
+def test_frames_at_gaps_and_ends_have_no_jumps() -> None:
     joints = _swinging()
     joints[[0, -1], 0, 2] += 1.0
     joints[20, 0, 2] += 1.0
     alone = np.r_[TIMES[:20], TIMES[20] + 1, TIMES[21:] + 2]
-    found = jumps(joints, alone)
-    assert not found[[0, 20, -1]].any()
+    assert not jumps(joints, alone)[[0, 20, -1]].any()
 
 
-@pytest.mark.parametrize("learned", [False, True])
-def test_a_body_in_another_minimum_is_fitted_again_from_between_its_neighbours(learned: bool):
-    """An arm stretched backwards in one frame of twenty comes back; the others stay as they are."""
-    model = BodyModel.load(dtype=torch.float64)
-    count, odd = 20, 13
+def test_a_body_in_another_minimum_is_refitted_from_its_neighbours(body64: BodyModel) -> None:
+    """An arm stretched backwards in one frame of nine comes back; the others do not change.
+
+    The learned pose prior knows every frame's own pose: another frame's would show.
+    """
+    model, count, odd = body64, 9, 5
     truth = model.zeros(count).vector().double()
     shoulder = 3 * JOINT_INDEX["right_shoulder"]
-    truth[:, shoulder + 1] = torch.linspace(0.2, 1.2, count)
-    truth[:, TRANSL.start] = torch.linspace(0, 0.6, count)
-    rig = ring(4)
-    pose, lenses = torch.tensor(rig.colour_from_master), torch.tensor(rig.colour_parameters)
+    truth[:, shoulder + 1] = torch.linspace(0.2, 0.6, count)
+    truth[:, TRANSL.start] = torch.linspace(0, 0.27, count)
     room = torch.as_tensor(master_from_room())
     still = model.forward(model.zeros(), vertex_ids=np.array([0])).joints[0, 0]
     upright = Rotation.from_matrix(room[:3, :3].numpy()) * Rotation.from_euler("x", 90, True)
     truth[:, :3] = torch.as_tensor(upright.as_rotvec())
     truth[:, TRANSL] += room[:3, :3] @ torch.tensor([0.0, 0.1, 0.95]).double() + room[:3, 3] - still
     points = model.keypoints_of(model.parameters(truth))
-    shape = (count, 4, 135)
-    seen = body_keypoints.pixel_residuals(points, torch.zeros(*shape, 2).double(), lenses, pose)
     start = truth.clone()
     start[odd, shoulder + 1] -= 2.5
     problem = BodyProblem(
-        model, body_keypoints.keypoint_set(model, range(135)), body_samples.choose_samples(model),
+        model, keypoint_set(model, range(135)), choose_samples(model),
         start, columns_of(model, hands=False, face=False, betas=False), True,
-        offsets=start.new_zeros(25, 3), u=start.new_zeros(len(body_samples.COVERINGS)),
-        views=Views(seen, torch.ones(shape).double(), torch.full(shape, 3.0).double(), lenses,
-                    pose),
+        offsets=start.new_zeros(25, 3), u=start.new_zeros(len(COVERINGS)),
+        views=exact_views(points, ring(4), sigma=3.0),
     )  # fmt: skip
-    if learned:  # sure of every frame's own pose: another frame's would show
-        sure = 1e6 * torch.eye(63).double().expand(count, 63, 63)
-        problem.pose = PoseGaussian(truth[:, 3:66].clone(), sure)
-    changed = recover(problem, np.arange(count) / 15)
-    assert np.flatnonzero(changed).tolist() == [odd]
-    off = (model.keypoints_of(model.parameters(problem.base)) - points).norm(dim=-1).amax(1)
-    assert off[odd] < 0.02  # of 135 points; the arm was 1 m off
-    assert torch.equal(problem.base[torch.arange(count) != odd], truth[torch.arange(count) != odd])
-    if learned:
-        assert (problem.base - truth)[odd, 3:66].abs().max() < 0.01
+    for learned in (False, True):
+        problem.base = start.clone()
+        if learned:
+            sure = 1e6 * torch.eye(63).double().expand(count, 63, 63)
+            problem.pose = PoseGaussian(truth[:, 3:66].clone(), sure)
+        changed = recover(problem, np.arange(count) / 15)
+        assert np.flatnonzero(changed).tolist() == [odd]
+        off = (model.keypoints_of(model.parameters(problem.base)) - points).norm(dim=-1).amax(1)
+        assert off[odd] < 0.02  # of 135 points; the arm was 1 m off
+        others = torch.arange(count) != odd
+        assert torch.equal(problem.base[others], truth[others])
+        if learned:
+            assert (problem.base - truth)[odd, 3:66].abs().max() < 0.01

@@ -1,4 +1,4 @@
-"""The compiled terms of the body's energy against their plain form, and against differences."""
+"""The terms of the body's energy: torch against differences, compiled against torch."""
 
 from __future__ import annotations
 
@@ -10,16 +10,28 @@ import pytest
 import torch
 from torch import Tensor
 
-from intercap_core.body.kinematics import vertex_normals
 from intercap_core.body.loading import load_body_file
 from intercap_core.body.model import BodyModel
 from intercap_core.body.vposer import PoseGaussian
-from intercap_core.body_fit import body_cloud, body_keypoints, body_samples, body_self
+from intercap_core.body_fit import cloud_term, keypoint_term
+from intercap_core.body_fit.prior_term import PriorTerm
 from intercap_core.body_fit.problem import BodyProblem, columns_of
-from intercap_core.body_fit.term_inputs import Targets, Views
+from intercap_core.body_fit.self_contact import SelfContact, find_contacts, join_frames
+from intercap_core.body_fit.surface import COVERINGS, choose_samples
+from intercap_core.body_fit.term_inputs import (
+    Bodies,
+    CloudRows,
+    Targets,
+    TermInputs,
+    TorchTerm,
+    Views,
+    keypoint_set,
+)
 from intercap_core.body_fit.terms import TorchTerms
+from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
+from tests.helpers.bodies import posed_normals
 
-FRAMES, CAMERAS, KEYPOINTS = 5, 3, 118
+FRAMES, CAMERAS, KEYPOINTS = 3, 3, 118
 ROUNDING = 5e-6  # float32; depths of millimetres are differences of positions metres away
 
 
@@ -28,7 +40,7 @@ def _random(*shape: int, seed: int) -> Tensor:
 
 
 def _body(*, blend_shapes: bool) -> BodyModel:
-    """The open body, with pose blend shapes of a millimetre or so if wanted."""
+    """The open body, with pose blend shapes of about a millimetre if requested."""
     file = load_body_file(None, 10, 10)
     if blend_shapes:
         random = np.random.default_rng(13)
@@ -36,28 +48,15 @@ def _body(*, blend_shapes: bool) -> BodyModel:
     return BodyModel(file, torch.device("cpu"), torch.get_default_dtype())
 
 
-@pytest.fixture(scope="module", params=[False, True], ids=["open", "blend shapes"])
-def model(request: pytest.FixtureRequest) -> BodyModel:
-    return _body(blend_shapes=request.param)
-
-
-@pytest.fixture(scope="module")
-def problem(model: BodyModel) -> BodyProblem:
-    return _problem(model)
-
-
 def _problem(model: BodyModel) -> BodyProblem:
-    """Bodies with arms in their sides, seen by lenses whose calibration ends inside the image."""
+    """Bodies with arms inside their sides, in lenses whose calibration ends inside the image."""
     base = 0.15 * _random(FRAMES, model.num_parameters, seed=0)
     base[:, 167] += 2.5
     base[:, [50, 53]] -= torch.tensor([1.0, 1.1])
-    samples = body_samples.choose_samples(model)
-    vertices = model.forward(model.parameters(base)).vertices
-    normals = vertex_normals(vertices, model.faces)
-    contact = body_self.SelfContact.of(model, samples)
-    pairs = body_self.join(
-        [body_self.find(contact, *one) for one in zip(vertices, normals, strict=True)]
-    )
+    samples = choose_samples(model)
+    contact = SelfContact.of(model, samples)
+    posed = zip(*posed_normals(model, model.parameters(base)), strict=True)
+    pairs = join_frames([find_contacts(contact, *each) for each in posed])
     assert pairs is not None
     lenses = torch.zeros(CAMERAS, 13)
     lenses[:, :4] = torch.tensor([900.0, 905.0, 640.0, 360.0])
@@ -70,10 +69,10 @@ def _problem(model: BodyModel) -> BodyProblem:
     confidence[0, 1, 5:20], observed[0, 1, 5:20] = 0, torch.nan
     count = len(samples.vertex)
     return BodyProblem(
-        model, body_keypoints.keypoint_set(model, range(KEYPOINTS)), samples, base,
+        model, keypoint_set(model, range(KEYPOINTS)), samples, base,
         columns_of(model, hands=True, face=True, betas=False), True,
         offsets=0.02 * _random(25, 3, seed=3),
-        u=0.1 * _random(len(body_samples.COVERINGS), seed=4),
+        u=0.1 * _random(len(COVERINGS), seed=4),
         views=Views(
             observed, confidence, torch.full(seen, 40.0), lenses, pose,
             0.01 * _random(*seen, 3, seed=5),
@@ -81,7 +80,7 @@ def _problem(model: BodyModel) -> BodyProblem:
         targets=Targets(
             _random(FRAMES, KEYPOINTS, 3, seed=6), _random(FRAMES, KEYPOINTS, seed=7).relu(), 0.3
         ),
-        rows=body_cloud.CloudRows(
+        rows=CloudRows(
             _random(FRAMES, count, seed=8),
             torch.nn.functional.normalize(_random(FRAMES, count, 3, seed=9), dim=2),
             200 * _random(FRAMES, count, seed=10).clamp_min(0), torch.zeros(FRAMES, count),
@@ -90,17 +89,161 @@ def _problem(model: BodyModel) -> BodyProblem:
     )  # fmt: skip
 
 
-def _variants(problem: BodyProblem) -> dict[str, BodyProblem]:
-    model = problem.model
+@pytest.fixture(scope="module", params=[False, True], ids=["open", "blend shapes"])
+def problem(request: pytest.FixtureRequest) -> BodyProblem:
+    return _problem(_body(blend_shapes=request.param))
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["open", "blend shapes"])
+def exact(request: pytest.FixtureRequest) -> Iterator[BodyProblem]:
+    """The same in double precision."""
+    torch.set_default_dtype(torch.float64)
+    yield _problem(_body(blend_shapes=request.param))
+    torch.set_default_dtype(torch.float32)
+
+
+# --- torch ----------------------------------------------------------------------------------------
+
+
+def _learned(problem: BodyProblem) -> BodyProblem:
+    """The problem with a shape of each frame and a learned pose prior."""
     spread = 0.3 * _random(FRAMES, 63, 63, seed=11)
-    body = columns_of(model, hands=False, face=False, betas=False)
+    columns = columns_of(problem.model, hands=False, face=False, betas=True)
+    return replace(
+        problem, columns=columns, one_shape=False, fit_shared=False, hand_share=0.2,
+        pose=PoseGaussian(0.1 * _random(FRAMES, 63, seed=12), spread @ spread.mT),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("learned", [False, True])
+@pytest.mark.parametrize("number", range(4), ids=["E_J", "E_D", "E_P_self", "priors"])
+def test_gradient_of_each_term_is_the_slope_of_its_cost(
+    number: int, learned: bool, exact: BodyProblem
+) -> None:
+    """By pose, shape, keypoint offsets and thickness of clothing."""
+    problem = _learned(exact) if learned else exact
+    term = TorchTerms(problem.model, problem.samples).terms[number]
+    cost, gradient, hessian, ahead, behind = _along(problem, term, step=1e-6)
+    torch.testing.assert_close(cost, term.cost(*_evaluation(problem)))
+    slope = (ahead - behind) / 2e-6
+    torch.testing.assert_close(gradient, slope, rtol=1e-5, atol=1e-3)
+    torch.testing.assert_close(hessian, hessian.mT)
+    assert torch.linalg.eigvalsh(hessian).min() > -1e-6 * hessian.abs().max()
+
+
+def _evaluation(problem: BodyProblem) -> tuple[TermInputs, Bodies]:
+    own, shared, index = problem.own_start(), problem.shared_start(), torch.arange(FRAMES)
+    return problem._inputs(), problem._bodies(own, shared, index)
+
+
+def _moved(problem: BodyProblem, bodies: Bodies, way: Tensor, step: float) -> Bodies:
+    """The bodies moved along ``way`` (n,) by the columns of the normal equations."""
+    columns = problem.layout.equations()
+    vectors, offsets = bodies.vectors.clone(), bodies.offsets.clone()
+    vectors[:, columns.parameters] += step * way[: len(columns.parameters)]
+    thickness = bodies.thickness
+    if columns.offsets:
+        offsets[:25] += step * way[columns.offsets_at].reshape(25, 3)
+        thickness = thickness * (step * way[columns.coverings_at]).exp()
+    return bodies._replace(vectors=vectors, offsets=offsets, thickness=thickness)
+
+
+def _along(problem: BodyProblem, term: TorchTerm, step: float) -> tuple[Tensor, ...]:
+    """Cost, derivative along a random way, Hessian; costs ahead and behind."""
+    (inputs, bodies), columns = _evaluation(problem), problem.layout.equations()
+    size = columns.coverings_at.stop
+    sums = NormalEquations(*(torch.zeros(FRAMES, *[size] * axes) for axes in (0, 1, 2)))
+    term.add(inputs, bodies, columns, sums)
+    way = _random(size, seed=20)
+    ahead, behind = (
+        term.cost(inputs, _moved(problem, bodies, way, sign * step)) for sign in (1, -1)
+    )
+    return sums.cost, sums.gradient @ way, sums.hessian, ahead, behind
+
+
+@pytest.mark.parametrize("exact", [False], indirect=True)  # else they omit some derivatives
+def test_gauss_newton_matrices_are_products_of_the_residuals_slopes(exact: BodyProblem) -> None:
+    """v^T H v = sum w (dr / dv)^2 along a way v, for E_D and for E_J without blend shapes."""
+    model = exact.model
+    problem = replace(exact, targets=None)
+    keypoints, cloud, *_ = TorchTerms(model, problem.samples).terms
+    (_, bodies), step = _evaluation(problem), 1e-6
+    way = _random(problem.layout.equations().coverings_at.stop, seed=20)
+    moved = [_moved(problem, bodies, way, sign * step) for sign in (1, -1)]
+    ids, group = torch.as_tensor(problem.samples.vertex), torch.as_tensor(problem.samples.group)
+
+    def distances(at: Bodies) -> Tensor:
+        points = model.forward(model.parameters(at.vectors), vertex_ids=ids).vertices
+        return cloud_term.residuals(points, problem.rows, at.thickness, group)
+
+    def pixels(at: Bodies) -> Tensor:
+        params = model.parameters(at.vectors)
+        points = keypoint_term.evaluate(
+            model, params, problem.keypoints, at.offsets, derivatives=False
+        ).points
+        return keypoint_term.pixel_residuals(points, problem.views) / 40.0
+
+    slope = (distances(moved[0]) - distances(moved[1])) / (2 * step)
+    expected = (problem.rows.weight * slope**2).sum(1)
+    _, _, hessian, *_ = _along(problem, cloud, step)
+    torch.testing.assert_close((hessian @ way) @ way, expected, rtol=1e-6, atol=0)
+
+    slope = (pixels(moved[0]) - pixels(moved[1])).nan_to_num() / (2 * step)
+    square = (pixels(bodies).nan_to_num() ** 2).sum(-1)
+    weight = problem.views.confidence * (16 / (square + 16)) ** 2
+    expected = (weight * (slope**2).sum(-1)).sum((1, 2))
+    _, _, hessian, *_ = _along(problem, keypoints, step)
+    torch.testing.assert_close((hessian @ way) @ way, expected, rtol=1e-5, atol=0)
+
+
+def test_keypoints_without_offsets_are_the_models(body64: BodyModel) -> None:
+    params = body64.parameters(0.15 * _random(2, body64.num_parameters, seed=0).double())
+    chosen, offsets = keypoint_set(body64, range(135)), torch.zeros(135, 3).double()
+    found = keypoint_term.evaluate(body64, params, chosen, offsets, derivatives=False)
+    torch.testing.assert_close(found.points, body64.keypoints_of(params))
+
+
+# --- priors ---------------------------------------------------------------------------------------
+
+
+def _prior_cost(model: BodyModel, x: Tensor, **changes: object) -> Tensor:
+    given = {
+        "keypoints": None, "views": None, "targets": None, "rows": None, "pairs": None,
+        "self_weight": 1.0, "pose": None, "shape_prior": True, "hand_share": 1.0,
+    } | changes  # fmt: skip
+    bodies = Bodies(x, torch.zeros(0, 3), torch.zeros(0), torch.arange(len(x)))
+    return PriorTerm(model).cost(TermInputs(**given), bodies)
+
+
+def test_prior_of_shared_betas_is_left_to_the_layout(body64: BodyModel) -> None:
+    x = torch.zeros(2, body64.num_parameters, dtype=torch.float64)
+    x[1, 168:178] = 2.0
+    shared, own = (_prior_cost(body64, x, shape_prior=flag) for flag in (False, True))
+    assert (shared[1] - shared[0]).item() == pytest.approx(0.0)
+    assert (own[1] - own[0]).item() == pytest.approx(0.5 * 10 * 4.0)
+
+
+def test_five_frames_with_a_fifth_of_the_hand_prior_cost_one(body64: BodyModel) -> None:
+    x = torch.zeros(2, body64.num_parameters, dtype=torch.float64)
+    x[:, 75:165] = torch.cat([body64.hand_mean[0], body64.hand_mean[1]])
+    x[1, 75:165] += 0.1 * _random(90, seed=1).double()
+    whole, fifth = (_prior_cost(body64, x, hand_share=share) for share in (1.0, 0.2))
+    torch.testing.assert_close(whole[0], fifth[0])
+    others = sum(rows.energy(weight) for rows, weight in PriorTerm(body64).rows(x)[:3])
+    hands = (whole - others)[1] - (whole - others)[0]
+    assert hands > 1
+    torch.testing.assert_close(5 * ((fifth - others)[1] - (fifth - others)[0]), hands)
+
+
+# --- compiled -------------------------------------------------------------------------------------
+
+
+def _variants(problem: BodyProblem) -> dict[str, BodyProblem]:
+    body = columns_of(problem.model, hands=False, face=False, betas=False)
     alone = {"one_shape": False, "fit_shared": False}
     return {
         "all": problem,
-        "own shape, learned pose": replace(
-            problem, columns=columns_of(model, hands=False, face=False, betas=True), **alone,
-            pose=PoseGaussian(0.1 * _random(FRAMES, 63, seed=12), spread @ spread.mT),
-        ),
+        "own shape, learned pose": _learned(problem),
         "targets alone": replace(
             problem, columns=body, views=None, rows=None, touching=None, **alone
         ),
@@ -110,16 +253,15 @@ def _variants(problem: BodyProblem) -> dict[str, BodyProblem]:
     }  # fmt: skip
 
 
-def _difference(one: Tensor, other: Tensor) -> float:
+def _difference(found: Tensor, expected: Tensor) -> float:
     """Largest difference relative to the largest entry."""
-    return float((one - other).abs().max() / other.abs().max())
+    return float((found - expected).abs().max() / expected.abs().max())
 
 
 @pytest.mark.parametrize("name", ["all", "own shape, learned pose", "targets alone",
                                   "fingers of a standing body"])  # fmt: skip
-@pytest.mark.parametrize("index", [[0, 1, 2, 3, 4], [3, 1]], ids=["every frame", "some"])
-def test_equal_to_the_torch_terms(name: str, index: list[int], problem: BodyProblem) -> None:
-    compiled, at = _variants(problem)[name], torch.tensor(index)
+def test_compiled_terms_equal_torch_in_some_frames(name: str, problem: BodyProblem) -> None:
+    compiled, at = _variants(problem)[name], torch.tensor([2, 1])
     in_torch = replace(compiled, terms=TorchTerms(problem.model, problem.samples))
     own, shared = compiled.own_start()[at], compiled.shared_start()
     found, expected = (each.linearise(own, shared, at) for each in (compiled, in_torch))
@@ -130,51 +272,37 @@ def test_equal_to_the_torch_terms(name: str, index: list[int], problem: BodyProb
         torch.testing.assert_close(cost, expected.cost, rtol=ROUNDING, atol=0)
 
 
-def test_threads_change_nothing(problem: BodyProblem) -> None:
-    own, shared, index = problem.own_start(), problem.shared_start(), torch.arange(FRAMES)
-    before = torch.get_num_threads()
-    try:
-        results = []
-        for threads in (1, 2, 3):
-            torch.set_num_threads(threads)
-            results.append(problem.linearise(own, shared, index))
-    finally:
-        torch.set_num_threads(before)
-    for other in results[1:]:
-        for one, two in zip(results[0], other, strict=True):
-            np.testing.assert_array_equal(one.numpy(), two.numpy())
-
-
-@pytest.fixture
-def in_double() -> Iterator[None]:
-    torch.set_default_dtype(torch.float64)
-    yield
-    torch.set_default_dtype(torch.float32)
-
-
-@pytest.mark.usefixtures("in_double")
-@pytest.mark.parametrize("blend_shapes", [False, True], ids=["open", "blend shapes"])
-def test_the_same_normal_equations_in_double(blend_shapes: bool) -> None:
-    """Compiled and torch terms agree far beyond what float32 could tell: they take the same
-    steps."""
-    model = _body(blend_shapes=blend_shapes)
-    compiled = _problem(model)
-    in_torch = replace(compiled, terms=TorchTerms(model, compiled.samples))
-    own, shared, index = compiled.own_start(), compiled.shared_start(), torch.arange(FRAMES)
-    found, expected = (each.linearise(own, shared, index) for each in (compiled, in_torch))
+def test_compiled_terms_equal_torch_in_double(exact: BodyProblem) -> None:
+    """They agree far beyond float32, so that they take the same steps."""
+    in_torch = replace(exact, terms=TorchTerms(exact.model, exact.samples))
+    own, shared, index = exact.own_start(), exact.shared_start(), torch.arange(FRAMES)
+    found, expected = (each.linearise(own, shared, index) for each in (exact, in_torch))
     for ours, theirs in zip(found, expected, strict=True):
         assert ours.dtype == torch.float64
         assert _difference(ours, theirs) < 1e-12
 
 
-@pytest.mark.usefixtures("in_double")
-def test_gradient_is_the_slope_of_the_cost_with_blend_shapes() -> None:
-    problem = _problem(_body(blend_shapes=True))
-    own, shared, index = problem.own_start()[:1], problem.shared_start(), torch.zeros(1).long()
-    gradient, step = problem.linearise(own, shared, index).gradient[0], 1e-6
-    for seed in range(6):
-        way = _random(len(gradient), seed=20 + seed)
-        by_own, by_shared = step * way[: own.shape[1]], step * way[own.shape[1] :]
-        ahead = problem.cost(own + by_own, shared + by_shared, index)
-        behind = problem.cost(own - by_own, shared - by_shared, index)
-        torch.testing.assert_close((ahead - behind)[0] / (2 * step), gradient @ way)
+def test_gradient_of_the_whole_energy_is_its_slope(exact: BodyProblem) -> None:
+    """All terms and the priors of shared parameters, through the solver's interface."""
+    own, shared, index = exact.own_start(), exact.shared_start(), torch.arange(FRAMES)
+    normal, step = exact.linearise(own, shared, index), 1e-6
+    torch.testing.assert_close(normal.cost, exact.cost(own, shared, index))
+    way = _random(normal.gradient.shape[1], seed=21)
+    by_own, by_shared = step * way[: own.shape[1]], step * way[own.shape[1] :]
+    ahead = exact.cost(own + by_own, shared + by_shared, index)
+    behind = exact.cost(own - by_own, shared - by_shared, index)
+    torch.testing.assert_close((ahead - behind) / (2 * step), normal.gradient @ way)
+
+
+def test_number_of_threads_changes_nothing(problem: BodyProblem) -> None:
+    own, shared, index = problem.own_start(), problem.shared_start(), torch.arange(FRAMES)
+    before = torch.get_num_threads()
+    try:
+        results = []
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            results.append(problem.linearise(own, shared, index))
+    finally:
+        torch.set_num_threads(before)
+    for single, double in zip(*results, strict=True):
+        np.testing.assert_array_equal(single.numpy(), double.numpy())

@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from intercap_core.body.model import BodyModel
+from intercap_core.body_fit.problem import columns_of
 from intercap_core.body_fit.quality import PartEvidence
-from intercap_core.body_fit.schedule import Fit, Settled, columns_of
-from intercap_core.body_fit.uncertainty import deviation, joint_covariance, widened
+from intercap_core.body_fit.schedule import Fit, Settled
+from intercap_core.body_fit.uncertainty import deviation, joint_covariance, widen
 
 SHARED = 10 + 75 + 8
 MODEL_M = 0.001
@@ -48,31 +49,30 @@ def _whole(model: BodyModel, fit: Fit) -> np.ndarray:
 
 
 @pytest.mark.parametrize("frames", [1, 20])
-def test_priors_that_count_once_a_frame_leave_what_one_frame_says(model, frames):
-    """However many frames: what is wrong of what they share is wrong in all of them."""
+def test_frames_whose_priors_count_fully_are_worth_one_frame(model, frames):
     fit = _fit(model, frames, 1.0)
     stated = _sigma(model, fit)
     assert stated.shape == (frames, 55) and stated.min() > 2 * MODEL_M
     np.testing.assert_allclose(stated, _whole(model, fit)[None].repeat(frames, 0), rtol=1e-4)
 
 
-def test_priors_that_count_more_seldom_make_it_more_independent_frames(model):
+def test_priors_that_count_less_make_frames_independent(model):
     once, seldom, never = (_sigma(model, _fit(model, 3, counts)) for counts in (1.0, 0.25, 1e-9))
     np.testing.assert_allclose(
         seldom**2 - never**2, (once**2 - never**2) / 4, rtol=1e-3, atol=1e-10
     )
 
 
-def test_residuals_above_their_noise_widen_what_a_frame_says_alone(model):
+def test_residuals_above_their_noise_widen_a_frame(model):
     one, four = (_sigma(model, _fit(model, 2, 1e-9, e)) for e in (1.0, 4.0))
     np.testing.assert_allclose(four**2 - MODEL_M**2, 4 * (one**2 - MODEL_M**2), rtol=1e-4)
 
 
-def test_what_widens_a_deviation_has_no_direction():
+def test_covariances_are_widened_in_all_directions():
     covariance = np.diag([1e-4, 4e-4, 9e-4])[None].repeat(2, 0)
     sigma = deviation(covariance)
     np.testing.assert_allclose(sigma, np.sqrt(14e-4 / 3))
-    wider = widened(covariance, np.array([sigma[0], 0.05]))
+    wider = widen(covariance, np.array([sigma[0], 0.05]))
     np.testing.assert_allclose(wider[0], covariance[0], atol=1e-12)
     np.testing.assert_allclose(deviation(wider)[1], 0.05)
     np.testing.assert_allclose(wider[1] - covariance[1], np.eye(3) * (0.05**2 - sigma[0] ** 2))

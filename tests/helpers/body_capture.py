@@ -6,9 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from intercap_core import artefacts
 from intercap_core.artefacts import pack_ragged
+from intercap_core.body_fit.keypoint_term import pixel_residuals
+from intercap_core.body_fit.term_inputs import Views
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.masks import encode
 from intercap_core.geometry.camera.rig import Camera, Rig
@@ -196,3 +200,15 @@ def _write_scene(path: Path, rig: Rig, times: np.ndarray, time_offset: np.ndarra
         for name in rig.names:
             background = np.full((DEPTH.height, DEPTH.width), BACKGROUND_MM, np.uint16)
             writer.put(f"cameras/{name}/background", background)
+
+
+def exact_views(points: Tensor, rig: Rig, sigma: float) -> Views:
+    """Projections of keypoints (T,K,3), master frame, in all cameras, with confidence 1."""
+    pose, lenses = torch.tensor(rig.colour_from_master), torch.tensor(rig.colour_parameters)
+    shape = (len(points), len(rig), points.shape[1])
+    views = Views(
+        torch.zeros(*shape, 2).double(), torch.ones(shape).double(),
+        torch.full(shape, sigma).double(), lenses, pose,
+    )  # fmt: skip
+    views.observed = pixel_residuals(points, views)
+    return views

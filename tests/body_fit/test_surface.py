@@ -1,0 +1,132 @@
+"""Samples of the skin, the posed surface around them, and matches of points to it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from intercap_core.body.model import BodyModel
+from intercap_core.body_fit import matching
+from intercap_core.body_fit.first_hit import first_hits
+from intercap_core.body_fit.surface import Samples, Surface, choose_samples
+from intercap_core.geometry.rigid.normals import vertex_normals
+from intercap_core.geometry.rigid.open3d_core import o3d
+from tests.helpers.bodies import posed_normals, random_normal
+
+
+@pytest.fixture(scope="module")
+def samples(body: BodyModel) -> Samples:
+    return choose_samples(body)
+
+
+@pytest.fixture(scope="module")
+def surface(body: BodyModel, samples: Samples) -> Surface:
+    return Surface.around_samples(body, samples)
+
+
+def test_samples_cover_the_outer_skin(body: BodyModel, samples: Samples) -> None:
+    template = body.template.numpy()
+    low = template[samples.vertex].min(0)
+    assert np.allclose(low, template.min(0), atol=0.05)
+    assert len(np.unique(samples.vertex)) == len(samples.vertex)
+    assert (samples.patch[:, 0] == samples.vertex).all()
+    tongue_and_eyes = np.isin(body.skinning_weights.argmax(1).numpy(), (23, 24))
+    assert not tongue_and_eyes[samples.vertex].any()
+
+
+def test_surface_poses_what_samples_need(
+    body: BodyModel, samples: Samples, surface: Surface
+) -> None:
+    x = body.zeros(2).vector().clone()
+    x[:, :165] += 0.3 * random_normal(2, 165).float()
+    found, normals = surface.posed(body.parameters(x))
+    vertices, true = posed_normals(body, body.parameters(x))
+    needed = np.union1d(surface.sample, surface.patch)
+    assert (surface.ids[surface.sample] == samples.vertex).all()
+    assert (surface.ids[surface.patch] == samples.patch).all()
+    torch.testing.assert_close(found, vertices[:, surface.ids])
+    true = true[:, surface.ids]
+    torch.testing.assert_close(normals[:, needed], true[:, needed], rtol=0, atol=2e-6)
+
+
+def test_points_off_the_skin_are_measured(
+    body: BodyModel, surface: Surface, samples: Samples
+) -> None:
+    """Points on normals of outer vertices are matched at their height, from either side."""
+    vertices, normals = (values[0] for values in surface.posed(body.zeros()))
+    ids = torch.as_tensor(surface.sample[~samples.hand])[::3]
+    for height in (0.012, -0.006):
+        points = vertices[ids] + height * normals[ids]
+        found = matching.match_points(points, normals[ids], vertices, normals, surface, 0.05)
+        error = (found.distance - height).abs()
+        assert found.valid.float().mean() > 0.97
+        assert error[found.valid].median() < 1e-6
+        assert error[found.valid].quantile(0.95) < 0.002
+    chest = np.isin(surface.ids, body.regions["chest"][::20])
+    back = matching.match_points(vertices[chest], -normals[chest], vertices, normals, surface, 0.05)
+    assert len(back.valid) > 10 and not bool(back.valid.any())
+
+
+def test_compiled_matches_equal_torch(body: BodyModel, surface: Surface) -> None:
+    x = body.zeros(2).vector().clone()
+    x[:, :165] += 0.3 * random_normal(2, 165).float()
+    generator = torch.Generator().manual_seed(1)
+    for vertices, normals in zip(*surface.posed(body.parameters(x)), strict=True):
+        at = torch.randint(0, len(vertices), (600,), generator=generator)
+        points = vertices[at] + 0.02 * torch.randn(600, 3, generator=generator)
+        looks = normals[at] + 0.3 * torch.randn(600, 3, generator=generator)
+        looks = torch.nn.functional.normalize(looks, dim=1)
+        given = (points, looks, vertices, normals, surface, 0.05)
+        plain, found = matching.match_in_torch(*given), matching.match_points(*given)
+        assert 0.4 < plain.valid.float().mean() < 0.95
+        same = plain.sample == found.sample  # except for two equally near samples
+        assert same.float().mean() > 0.995
+        assert torch.equal(plain.valid[same], found.valid[same])
+        torch.testing.assert_close(plain.distance[same], found.distance[same], rtol=0, atol=1e-6)
+
+
+def test_averages_resist_outliers() -> None:
+    found = matching.Matches(
+        torch.tensor([0, 0, 0, 0, 0, 2]),
+        torch.tensor([0.010, 0.011, 0.009, 0.010, 0.045, 0.004]),
+        torch.tensor([True, True, True, True, True, False]),
+    )
+    mean, total = matching.average(found, torch.ones(6), torch.full((3,), 0.01), huber=0.005)
+    assert mean[0].item() == pytest.approx(0.01, abs=0.005)
+    assert total[0] < 4.5
+    assert total[1] == 0 and total[2] == 0
+
+
+# --- rays -----------------------------------------------------------------------------------------
+
+
+def test_rays_hit_a_body_where_embree_says(body: BodyModel) -> None:
+    points, faces = body.template.double().numpy(), body.faces.numpy()
+    normals = vertex_normals(points, faces)
+    at = np.arange(0, len(points), 17)
+    origins = np.concatenate([points[at] - 1e-3 * normals[at], points[at] + 1e-3 * normals[at]])
+    directions = np.concatenate([-normals[at], normals[at]])
+    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+    scene.add_triangles(
+        o3d.core.Tensor.from_numpy(points.astype(np.float32)),
+        o3d.core.Tensor.from_numpy(faces.astype(np.uint32)),
+    )
+    rays = np.concatenate([origins, directions], 1).astype(np.float32)
+    true = scene.cast_rays(o3d.core.Tensor.from_numpy(rays))["t_hit"].numpy()
+    found = first_hits(points, faces, origins, directions)
+    assert np.isfinite(found).any() and not np.isfinite(found).all()
+    # single precision decides differently for rays along a triangle
+    agree = np.isclose(found, true, rtol=0, atol=2e-6) | ((found == np.inf) & (true == np.inf))
+    assert agree.mean() > 0.998
+
+
+def test_no_ray_passes_between_two_triangles() -> None:
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    step = np.linspace(0.01, 0.99, 50)
+    origins = np.stack([step, step, np.full(50, 2.0)], 1)
+    down = np.tile([0.0, 0, -1], (50, 1))
+    np.testing.assert_allclose(first_hits(corners, faces, origins, down), 2.0)
+    assert np.isinf(first_hits(corners, faces, origins, -down)).all()
+    assert np.isinf(first_hits(corners, faces, np.add(origins, [2.0, 0, 0]), down)).all()
