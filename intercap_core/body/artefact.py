@@ -1,4 +1,4 @@
-"""Bodies as the body_fit and joint artefacts hold them."""
+"""Bodies in the body_fit and joint artefacts."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ _NAMES = (
     "jaw_pose", "leye_pose", "reye_pose", "transl",
 )  # fmt: skip
 
-# Bodies by file and its digest, numbers of coefficients and device, for as long as somebody holds
-# them: a stage that reads several artefacts has one body.
+# Bodies by file, digest, numbers of coefficients and device, as long as they are referenced: a stage
+# that reads several artefacts has one body.
 _LOADED: WeakValueDictionary[tuple[str, int, int, str], BodyModel] = WeakValueDictionary()
 
 
 def file_digest(path: Path) -> str:
-    """What the artefacts of fitted bodies say of the body file."""
+    """Return the digest of a body file that artefacts of fitted bodies contain."""
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 
 
 def load_pose_prior(body_models: BodyModels, model: BodyModel) -> VPoser | None:
-    """The VPoser that the settings name, on the body's device; None = the open prior.
+    """Load the VPoser of the settings on the body's device; None = the open prior.
 
-    Raises UserError for a file that is none, or of another version than named.
+    Raises UserError for an invalid file, or one of another version than the settings name.
     """
     if body_models.vposer is None:
         return None
@@ -44,7 +44,7 @@ def load_pose_prior(body_models: BodyModels, model: BodyModel) -> VPoser | None:
 
 
 def read_parameters(artefact: Artefact) -> BodyParameters:
-    """All T frames of a body_fit or joint artefact; one shape has betas (1, S)."""
+    """Read all T frames of a body_fit or joint artefact; a shared shape has betas (1, S)."""
     values = {
         name: torch.as_tensor(np.atleast_2d(artefact[name]), dtype=torch.float32) for name in _NAMES
     }
@@ -54,9 +54,9 @@ def read_parameters(artefact: Artefact) -> BodyParameters:
 def load_model(
     body_models: BodyModels, gender: str, artefact: Artefact, *, device: torch.device | str = "cpu"
 ) -> BodyModel:
-    """The body that a body_fit or joint artefact was fitted with.
+    """Load the body that a body_fit or joint artefact was fitted with.
 
-    Raises UserError for a broken body file, or another one than was fitted.
+    Raises UserError for a damaged body file, or if the settings name another file.
     """
     path = body_models.of(gender) or OPEN_BODY
     digest = file_digest(path) if path.is_file() else ""
@@ -67,11 +67,11 @@ def load_model(
         _LOADED[key] = model = BodyModel.load(
             path, num_betas=betas, num_expression=expression, device=device
         )
-    told = artefact.attributes
-    if digest != told["body_model"]:
+    attributes = artefact.attributes
+    if digest != attributes["body_model"]:
         raise UserError(
-            f"{artefact.path}: the bodies of sequence {told['sequence']!r} were fitted with "
-            f"another body file than {path}, which the settings give for a {gender} subject; name "
+            f"{artefact.path}: the bodies of sequence {attributes['sequence']!r} were fitted "
+            f"with another body file than {path}, which the settings give for a {gender} subject; name "
             "that file again, or re-run stage 'body_fit' and what follows"
         )
     return model

@@ -1,7 +1,7 @@
-"""Read the tensors of a PyTorch checkpoint without running anything that the file names.
+"""Read the tensors of a PyTorch checkpoint without executing anything that the file names.
 
-Training frameworks store their callbacks and settings beside the weights as objects of their own
-classes, which PyTorch's restricted reader refuses. Here such objects become :class:`_Inert`.
+Training frameworks also store callbacks and settings, as objects of their own classes, which
+PyTorch's restricted reader rejects. Here such objects become :class:`_Inert`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from torch import Tensor
 from intercap_core.inputs.files import MAX_MODEL_BYTES, Unreadable, check_file
 from intercap_core.inputs.safe_pickle import PICKLE_ERRORS, check_program
 
-# What makes tensors out of a file's storages; each only builds values
+# Functions that build tensors from the storages of a file
 _ALLOWED = {
     ("collections", "OrderedDict"),
     ("torch", "Size"),
@@ -30,9 +30,9 @@ _ALLOWED = {
 
 
 class _Inert:
-    """Stands for a class or function that a checkpoint names: whatever is asked, nothing is done.
+    """Placeholder of a class or function that a checkpoint names. It does nothing.
 
-    Methods are those that pickle calls on the objects that it builds.
+    The methods are those that pickle calls on the objects that it builds.
     """
 
     def __new__(cls, *_: object, **__: object) -> _Inert:
@@ -50,7 +50,7 @@ class _Inert:
 
 
 class Unpickler(pickle.Unpickler):
-    """Knows tensors and plain values; every other name means :class:`_Inert`."""
+    """Builds tensors and plain values; all other names become :class:`_Inert`."""
 
     def __init__(self, file: BinaryIO, **arguments: Any) -> None:
         check_program(file)
@@ -61,7 +61,7 @@ class Unpickler(pickle.Unpickler):
 
 
 class _InertPickle:
-    """What `torch.load` wants of a pickle module."""
+    """The part of a pickle module that `torch.load` uses."""
 
     Unpickler = Unpickler
 
@@ -70,25 +70,26 @@ class _InertPickle:
         return Unpickler(file, **arguments).load()
 
 
-# What PyTorch's reader raises for damaged files, beside what unpickling does.
+# Exceptions of PyTorch's reader for damaged files, in addition to those of unpickling
 _ERRORS = (*PICKLE_ERRORS, RuntimeError, OSError, struct.error, zipfile.BadZipFile)
 
 
 def read_tensors(path: Path, *, advice: str) -> dict[str, Tensor]:
-    """The tensors by name that `torch.save` wrote as a dictionary, on the CPU, or in it as its
-    `state_dict`.
+    """Return the tensors by name, on the CPU, of a dictionary or its `state_dict`.
 
-    Raises Unreadable where the file is missing, too large or damaged, or holds no dictionary.
+    Raises Unreadable if the file is missing, too large or damaged, or contains no dictionary.
     """
     check_file(path, MAX_MODEL_BYTES, advice=advice)
     try:
         read = _read(path)
     except _ERRORS as error:
         raise Unreadable(
-            path, f"is damaged or none that torch.save wrote ({type(error).__name__})", advice
+            path, f"is damaged or was not written by torch.save ({type(error).__name__})", advice
         ) from error
     if not isinstance(read, dict):
-        raise Unreadable(path, f"holds a {type(read).__name__}, expected tensors by name", advice)
+        raise Unreadable(
+            path, f"contains a {type(read).__name__}, expected tensors by name", advice
+        )
     state = read.get("state_dict", read)
     if not isinstance(state, dict):
         return {}
@@ -96,9 +97,9 @@ def read_tensors(path: Path, *, advice: str) -> dict[str, Tensor]:
 
 
 def tensor_fault(value: Tensor, shape: tuple[int, ...], largest: float) -> str | None:
-    """What keeps a tensor from being weights of ``shape``, in words that follow its name, or None.
+    """Return why a tensor cannot be weights of ``shape``, to follow its name in a message, or None.
 
-    Shapes come first: a file may state any, and what it states is taken in memory only then.
+    The shape is checked first: a file may state any, and a wrong one may not fit in memory.
     """
     if tuple(value.shape) != shape:
         return f"{tuple(value.shape)}, expected {shape}"
@@ -107,7 +108,7 @@ def tensor_fault(value: Tensor, shape: tuple[int, ...], largest: float) -> str |
     if not value.is_floating_point():
         return f"{value.dtype}, expected floating-point numbers"
     if not bool(value.isfinite().all()):
-        return "values that are no numbers"
+        return "values that are not finite"
     if float(value.abs().max()) > largest:
         return f"weights up to {float(value.abs().max()):.3g}, expected at most {largest:g}"
     return None
@@ -115,7 +116,7 @@ def tensor_fault(value: Tensor, shape: tuple[int, ...], largest: float) -> str |
 
 def _read(path: Path) -> Any:
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what they say of the file is no matter of its user's
+        warnings.simplefilter("ignore")  # they do not concern the user of the file
         try:
             return torch.load(path, map_location="cpu", weights_only=True)
         except pickle.UnpicklingError:

@@ -1,14 +1,15 @@
-"""Pose blend shapes of chosen points, compiled: the points at rest, and the exact gradient.
+"""Pose blend shapes of chosen points, compiled: points at rest, and the exact gradient.
 
-A point at rest moves by P vec(R - I), R the 54 local rotations below the root. Terms take the moved
-points and write their gradient p = dE / dx by each point at rest; then dE/dR = P^T p, and the
-gradient by the parameters follows with dR / d theta_c = skew(J_l e_c) R, J_l the left Jacobian.
+A point at rest moves by P vec(R - I), with the 54 local rotations R below the root. The terms use
+the moved points and write their gradient p = dE / dx by each point at rest. Then dE/dR = P^T p, and
+the gradient by the parameters follows with dR / d theta_c = skew(J_l e_c) R and the left Jacobian
+J_l.
 
-The Gauss-Newton matrices of keypoints and cloud have these derivatives by the joints of a point's
-own limb (:class:`.selection.Limbs`), that of self-penetration none; the torch terms leave out the
-same. In full they would tie every point to every joint, for millimetres a radian, and assembling
-the normal equations would take 2 times as long for the body alone, 3.5 times with hands and face.
-Minima stay where they are, since the gradient is exact.
+The Gauss-Newton matrices of keypoints and cloud contain these derivatives by the joints of a
+point's own limb (:class:`.selection.Limbs`), that of self-penetration does not contain them. In
+full they would couple every point with every joint, for millimetres per radian, and assembling the
+normal equations would take 2 times as long for the body alone, 3.5 times with hands and face. The
+minima do not change, since the gradient is exact.
 """
 
 from __future__ import annotations
@@ -92,7 +93,7 @@ class PointSource(NamedTuple):
 
 @numba.njit(cache=True, nogil=True)
 def features(vectors):
-    """vec(R - I) (B,486) of the parameter vectors (B,P)."""
+    """Return vec(R - I) (B,486) of parameter vectors (B,P)."""
     out = np.empty((len(vectors), NUM_FEATURES), vectors.dtype)
     local, jacobian = np.empty((3, 3)), np.empty((3, 3))
     for b in range(len(vectors)):
@@ -109,9 +110,9 @@ def features(vectors):
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
 def move(correctives, feature, used, rest):
-    """Move the points at rest (B,N,3), those that are ``used`` (B,N), by feature (B,486).
+    """Move the points at rest (B,N,3) that are ``used`` (B,N) by feature (B,486).
 
-    By hand, as :func:`.skeleton_kernel.rest_points`.
+    Written out for the same reason as :func:`.skeleton_kernel.rest_points`.
     """
     ids, tables = correctives
     for first in range(0, len(ids), _TOGETHER):
@@ -133,7 +134,7 @@ def move(correctives, feature, used, rest):
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
 def gather(correctives, rest_gradient, by_feature):
-    """Add to by_feature (B,486) the gradient by the features, from rest_gradient (B,N,3)."""
+    """Add the gradient by the features to by_feature (B,486), from rest_gradient (B,N,3)."""
     ids, tables = correctives
     for first in range(0, len(ids), _TOGETHER):
         for b in range(len(rest_gradient)):
@@ -153,7 +154,7 @@ def gather(correctives, rest_gradient, by_feature):
 
 @numba.njit(cache=True, nogil=True)
 def rotation_derivatives(vectors):
-    """d R / d axis-angle, (B,54,3,9) by axis and number of the rotation, at (B,P) parameters."""
+    """Return d R / d axis-angle (B,54,3,9) at parameters (B,P), by axis and entry of R."""
     out = np.empty((len(vectors), NUM_FEATURES // 9, 3, 9), vectors.dtype)
     local, jacobian = np.empty((3, 3)), np.empty((3, 3))
     for b in range(len(vectors)):
@@ -176,8 +177,8 @@ def rotation_derivatives(vectors):
 def add_gradient(by_pose, by_feature, place, gradient):
     """Add a gradient by the features (B,486) to that by the parameters (B,n).
 
-    by_pose (B,54,3,9) of :func:`rotation_derivatives`; ``place`` (P,): each parameter's column,
-    -1 = fixed.
+    by_pose (B,54,3,9): :func:`rotation_derivatives`. place (P,): column of each parameter, -1 =
+    fixed.
     """
     for b in range(len(by_pose)):
         for joint in range(by_pose.shape[1]):
@@ -190,10 +191,10 @@ def add_gradient(by_pose, by_feature, place, gradient):
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
 def add_to_row(row, local, joints, t, table, by_pose):
-    """Add to a point's row of derivatives what its correctives change by ``joints``.
+    """Add the derivatives of a point's correctives by ``joints`` to its row.
 
-    t (3,): the row's direction turned back to the point at rest; table (3,486); by_pose (54,3,9);
-    ``local`` (P,): each parameter's place in the row, -1 = not there.
+    t (3,): direction of the row, turned back to the point at rest. table (3,486), by_pose
+    (54,3,9). local (P,): column of each parameter in the row, -1 = none.
     """
     for joint in joints:
         first, by = 9 * (joint - 1), by_pose[joint - 1]

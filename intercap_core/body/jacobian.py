@@ -1,10 +1,10 @@
 """Posed points and their exact derivatives with respect to every parameter.
 
-A turn of joint k by the world vector w about the joint moves a point by w x a_k, where
+A rotation of joint k by the world vector w about the joint moves a point by w x a_k, where
 a_k = sum over bones m below k of w_m (R_m x + t_m - p_k): the geometric Jacobian of a manipulator,
-blended. The turn belongs to the axis-angle theta_k through w = R_parent J_l(theta_k) d theta_k with
-the left Jacobian J_l of the rotation group. Shape moves a point by T S_n + sum_k w_k d t_k, T the
-blended rotation; pose blend shapes add T P d R_k / d theta_k.
+blended. A change of the axis-angle theta_k is the rotation w = R_parent J_l(theta_k) d theta_k with
+the left Jacobian J_l of the rotation group. Shape moves a point by T S_n + sum_k w_k d t_k with the
+blended rotation T. Pose blend shapes add T P d R_k / d theta_k.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _CHUNK_BYTES = 64e6  # working set of one step of `normal_equations`
 
 
 def shaped_points(selection: Selection, shape: Tensor, local: Tensor) -> Tensor:
-    """Rest points (B,N,3) after shape (B,S) and the pose blend shapes of local (B,55,3,3)."""
+    """Return rest points (B,N,3) after shape (B,S) and the pose blend shapes of local (B,55,3,3)."""
     batch, count = shape.shape[0], selection.template.shape[0]
     size = selection.directions.shape[-1]
     points = selection.template + (shape @ selection.directions.reshape(-1, size).T).reshape(
@@ -46,7 +46,7 @@ def shaped_points(selection: Selection, shape: Tensor, local: Tensor) -> Tensor:
 
 
 def blend(selection: Selection, posed: PosedJoints) -> tuple[Tensor, Tensor]:
-    """Linear blend skinning's matrix (B,N,3,3) and offset (B,N,3) of every point."""
+    """Return the blended matrix (B,N,3,3) and offset (B,N,3) of every point."""
     batch = posed.rotations.shape[0]
     both = torch.cat([posed.rotations.reshape(batch, NUM_JOINTS, 9), posed.offsets], 2)
     mixed = selection.weights @ both
@@ -55,18 +55,18 @@ def blend(selection: Selection, posed: PosedJoints) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class Linearisation:
-    """N posed points (B,N,3) of B bodies, in metres, and their derivatives.
-
-    turns (B,N,L,3): a_k of each joint in `selection.chain`. frames (B,55,3,3): world turn of a
-    joint for a change of its axis-angle. shape (B,N,3,S): derivatives by betas and expression.
-    correctives (B,N,3,54,3) or None: what the pose blend shapes add.
-    """
+    """N posed points of B bodies and their derivatives."""
 
     points: Tensor
+    """(B, N, 3) metres."""
     turns: Tensor
+    """(B, N, L, 3) a_k of each joint in ``selection.chain``."""
     frames: Tensor
+    """(B, 55, 3, 3) world rotation of a joint for a change of its axis-angle."""
     shape: Tensor
+    """(B, N, 3, S) derivatives by betas and expression."""
     correctives: Tensor | None
+    """(B, N, 3, 54, 3) derivatives of the pose blend shapes."""
     selection: Selection
 
     @property
@@ -80,28 +80,28 @@ class Linearisation:
 
     @property
     def joints(self) -> Tensor:
-        """(B,55,3); empty if the joints were not asked for."""
+        """(B,55,3); empty if the joints were not requested."""
         return self.points[:, self.selection.num_vertices :]
 
     def with_correctives_of(self, joints: np.ndarray | None) -> Linearisation:
-        """The same, with pose blend shapes by the flagged ``joints`` (N,55) of each point alone;
-        None: by no joint."""
+        """Keep the pose blend shapes by the flagged ``joints`` (N,55) of each point; None = by no
+        joint."""
         if self.correctives is None or joints is None:
             return replace(self, correctives=None)
         flags = torch.as_tensor(joints[:, 1:], device=self.points.device)
         return replace(self, correctives=self.correctives * flags[:, None, :, None])
 
     def full(self) -> Tensor:
-        """(B,N,3,P): every derivative, mostly zeros; for few points."""
+        """Return all derivatives (B,N,3,P), mostly zeros; for few points."""
         batch, count = self.points.shape[:2]
         eye = torch.eye(3, dtype=self.points.dtype, device=self.points.device)
         return self.along(eye.expand(batch, count, 3, 3))
 
     def along(self, directions: Tensor) -> Tensor:
-        """Rows n^T d point / d parameters: directions (B,N,R,3) -> (B,N,R,P).
+        """Return n^T d point / d parameters (B,N,R,P) for directions n (B,N,R,3).
 
-        With R = 1 and the surface's normals these are the rows of point-to-plane residuals; with
-        R = 2 and the rows of a projection's derivative, those of a pixel residual.
+        With R = 1 and the normals of the surface these are the rows of point-to-plane residuals.
+        With R = 2 and the derivative of a projection, they are those of pixel residuals.
         """
         batch, count, rows = directions.shape[:3]
         out = directions.new_zeros(batch, count, rows, self.num_parameters)
@@ -126,10 +126,10 @@ class Linearisation:
     def normal_equations(
         self, directions: Tensor, weights: Tensor, residuals: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """J^T W J (B,P,P) and J^T W r (B,P) of the rows that `along` would give.
+        """Return J^T W J (B,P,P) and J^T W r (B,P) with the rows J of :meth:`along`.
 
-        directions (B,N,R,3), weights (B,N,R), residuals (B,N,R). A limb's points touch the columns
-        of few joints, so each limb is one dense product over those.
+        directions (B,N,R,3), weights (B,N,R), residuals (B,N,R). The points of a limb depend on few
+        joints, so each limb is one dense product over their columns.
         """
         batch = self.points.shape[0]
         size = self.num_parameters
@@ -158,7 +158,7 @@ class Linearisation:
         return hessian, gradient
 
     def _rows(self, at: slice, rows: Tensor, active: Tensor, directions: Tensor) -> Tensor:
-        """(b, n*R, 3m + 3 + S): rows of some points over the columns of some joints."""
+        """Return the rows (b, n*R, 3m + 3 + S) of some points, by the columns of some joints."""
         place = torch.zeros(NUM_JOINTS, dtype=torch.long, device=rows.device)
         place[active] = torch.arange(len(active), device=rows.device)
         chain = self.selection.chain[rows]
@@ -179,15 +179,15 @@ class Linearisation:
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:
-    """(...,3) x (...,3), broadcast; in a third of the time of torch.linalg.cross."""
+    """Return (...,3) x (...,3), broadcast, in a third of the time of torch.linalg.cross."""
     a0, a1, a2 = a.unbind(-1)
     b0, b1, b2 = b.unbind(-1)
     return torch.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], -1)
 
 
 def turn_frames(posed: PosedJoints, axis_angle: Tensor) -> tuple[Tensor, Tensor]:
-    """Turn of each joint for a change of its axis-angle, in the world and in its parent's frame:
-    (B,55,3,3) twice."""
+    """Return the rotation of each joint for a change of its axis-angle (B,55,3,3), in the world and
+    in the frame of its parent."""
     parent = torch.tensor([max(p, 0) for p in PARENTS], device=axis_angle.device)
     around = posed.rotations[:, parent].clone()
     around[:, 0] = torch.eye(3, dtype=axis_angle.dtype, device=axis_angle.device)
@@ -202,7 +202,7 @@ def linearise(
     axis_angle: Tensor,
     joint_directions: Tensor,
 ) -> Linearisation:
-    """Pose the rest points (B,N,3) and differentiate; axis_angle (B,55,3), directions (55,3,S)."""
+    """Pose and differentiate rest points (B,N,3); axis_angle (B,55,3), directions (55,3,S)."""
     batch, count = points.shape[:2]
     matrix, offset = blend(selection, posed)
     placed = (matrix @ points[..., None])[..., 0] + offset
@@ -220,7 +220,7 @@ def linearise(
     shape = (selection.weights @ moved_offsets.reshape(batch, NUM_JOINTS, -1)).reshape(
         batch, count, 3, size
     )
-    for axis in range(3):  # matrix @ directions, one dense pass each, not a product for every point
+    for axis in range(3):  # matrix @ directions in dense passes, not a product for every point
         shape = torch.addcmul(
             shape, matrix[..., axis : axis + 1], selection.directions[:, None, axis]
         )

@@ -1,4 +1,4 @@
-"""SMPL-X's 55 joints: names and parents, in the order of every pose and joint array here."""
+"""SMPL-X's 55 joints: names and parents, in the order of all pose and joint arrays."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ JOINT_INDEX: dict[str, int] = {name: i for i, name in enumerate(JOINT_NAMES)}
 
 
 def ancestors(joint: int) -> tuple[int, ...]:
-    """The joint and its ancestors, root first."""
+    """Return the joint and its ancestors, root first."""
     chain = [joint]
     while PARENTS[chain[-1]] >= 0:
         chain.append(PARENTS[chain[-1]])

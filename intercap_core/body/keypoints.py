@@ -1,4 +1,4 @@
-"""The 135 keypoints that detectors give, as fixed linear combinations of vertices and joints.
+"""The 135 keypoints of detectors, as constant linear combinations of vertices and joints.
 
 Order: OpenPose body 25, left hand 21, right hand 21, face 51 (dlib 17 to 67), jaw line 17 (dlib 0
 to 16, of a head seen from the front).
@@ -56,7 +56,7 @@ LIMB_BONES = (*ARM_BONES, *LEG_BONES, *FOOT_BONES)
 
 
 def of_side(side: str, bones: Iterable[tuple[str, str]]) -> tuple[tuple[str, str], ...]:
-    """The bones of one side of the body, "left" or "right", from names without a side."""
+    """Add a side, "left" or "right", to the names of bones."""
     return tuple((f"{side}_{first}", f"{side}_{second}") for first, second in bones)
 
 
@@ -80,18 +80,18 @@ def keypoint_pairs(bones: Iterable[tuple[str, str]]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class KeypointMap:
-    """Keypoint i is joint `joint[i]`, or where that is -1, sum_k weights[i,k] vertex ids[i,k].
-
-    joint (135,), ids (135,3), weights (135,3); rows of joints have weights of zero.
-    vertex_ids (N,) are all ids used, ascending; `matrix` (135, N+55) maps those vertices followed
-    by the 55 joints to the keypoints.
-    """
+    """Keypoint i is joint ``joint[i]``, or if that is -1, sum_k weights[i,k] vertex ids[i,k]."""
 
     joint: np.ndarray
+    """(135,) joint, or -1."""
     ids: np.ndarray
+    """(135, 3) vertex ids."""
     weights: np.ndarray
+    """(135, 3), zero in the rows of joints."""
     vertex_ids: np.ndarray
+    """(N,) all ids used, ascending."""
     matrix: np.ndarray
+    """(135, N + 55) maps these vertices followed by the 55 joints to the keypoints."""
 
 
 def keypoint_map(
@@ -102,7 +102,7 @@ def keypoint_map(
     contour_faces: np.ndarray,
     contour_barycentric: np.ndarray,
 ) -> KeypointMap:
-    """From named vertices and the file's landmarks (51) and frontal jaw line (17)."""
+    """Build the map from named vertices, and the file's landmarks (51) and frontal jaw line (17)."""
     joint = np.full(NUM_KEYPOINTS, -1)
     ids = np.zeros((NUM_KEYPOINTS, 3), int)
     weights = np.zeros((NUM_KEYPOINTS, 3))

@@ -1,4 +1,4 @@
-"""Rotations and the kinematic tree: world transforms of the 55 joints and their derivatives."""
+"""Rotations, the kinematic tree of the 55 joints with derivatives, and linear blend skinning."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from torch.autograd.function import once_differentiable
 from intercap_core.body.joints import NUM_JOINTS, PARENTS
 
 _SMALL_ANGLE_SQUARED = 1e-4  # below this the series' next term is under 1e-10
-_CACHE_BYTES = 2 << 20  # of blended bones held at once, about a core's own cache
+_CACHE_BYTES = 2 << 20  # of blended bones in memory at once: the cache of a core
 
 
 def skew(v: Tensor) -> Tensor:
-    """(...,3) -> (...,3,3) with skew(v) @ x = v x x."""
+    """Return (...,3,3) with skew(v) @ x = v x x, of v (...,3)."""
     zero = torch.zeros_like(v[..., 0])
     x, y, z = v.unbind(-1)
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*v.shape[:-1], 3, 3)
@@ -36,14 +36,14 @@ def _coefficients(theta_squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def rotation_from_axis_angle(axis_angle: Tensor) -> Tensor:
-    """(...,3) -> (...,3,3), Rodrigues' formula."""
+    """Return rotations (...,3,3) of axis-angles (...,3): Rodrigues' formula."""
     a, b, _ = (x[..., None, None] for x in _coefficients((axis_angle**2).sum(-1)))
     k = skew(axis_angle)
     return torch.eye(3, dtype=k.dtype, device=k.device) + a * k + b * (k @ k)
 
 
 def left_jacobian(axis_angle: Tensor) -> Tensor:
-    """(...,3) -> (...,3,3) J with exp(theta + d) = exp(J d) exp(theta) to first order in d.
+    """Return J (...,3,3) with exp(theta + d) = exp(J d) exp(theta) to first order in d.
 
     Chirikjian 2011, "Stochastic Models, Information Theory, and Lie Groups" 2, section 10.8:
     J = I + (1-cos t)/t^2 [theta] + (t - sin t)/t^3 [theta]^2.
@@ -55,11 +55,12 @@ def left_jacobian(axis_angle: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class _Level:
-    """Joints of one depth of the tree, their parents, and the parents' place in level order."""
+    """The joints of one depth of the tree."""
 
     own: Tensor
     parents: Tensor
     parent_place: Tensor
+    """Place of the parents in the order by depth."""
 
 
 def _levels() -> tuple[tuple[_Level, ...], Tensor]:
@@ -82,20 +83,23 @@ _LEVELS, _PLACE = _levels()
 
 @dataclass(frozen=True)
 class PosedJoints:
-    """Rest joints (B,55,3), local and world rotations (B,55,3,3), posed joints (B,55,3) in metres.
-
-    A point x that follows joint k alone goes to rotations[k] @ x + offsets[k].
-    """
+    """The joints of B posed bodies. A point x that follows joint k alone moves to
+    rotations[k] @ x + offsets[k]."""
 
     rest: Tensor
+    """(B, 55, 3) joints at rest, metres."""
     local: Tensor
+    """(B, 55, 3, 3) rotations in the frames of the parents."""
     rotations: Tensor
+    """(B, 55, 3, 3) rotations in the world."""
     joints: Tensor
+    """(B, 55, 3) posed joints, metres."""
     offsets: Tensor
+    """(B, 55, 3) metres."""
 
 
 def pose_joints(rest: Tensor, local: Tensor, transl: Tensor) -> PosedJoints:
-    """rest (B,55,3), local rotations (B,55,3,3), transl (B,3) -> world transforms."""
+    """Pose joints: rest (B,55,3), local rotations (B,55,3,3), transl (B,3)."""
     device = rest.device
     world, posed = local[:, :1], rest[:, :1] + transl[:, None]
     for level in _LEVELS:
@@ -112,7 +116,10 @@ def pose_joints(rest: Tensor, local: Tensor, transl: Tensor) -> PosedJoints:
 
 
 def joint_shape_derivatives(posed: PosedJoints, directions: Tensor) -> tuple[Tensor, Tensor]:
-    """directions (55,3,S) of the rest joints -> d joints and d offsets, each (B,55,3,S)."""
+    """Return the derivatives (B,55,3,S) of joints and offsets by the shape.
+
+    directions (55,3,S): derivatives of the rest joints.
+    """
     device = directions.device
     batch = posed.rotations.shape[0]
     moved = torch.empty(batch, *directions.shape, dtype=posed.rotations.dtype, device=device)
@@ -125,18 +132,22 @@ def joint_shape_derivatives(posed: PosedJoints, directions: Tensor) -> tuple[Ten
 
 
 def skin(points: Tensor, rotations: Tensor, offsets: Tensor, weights: Tensor) -> Tensor:
-    """Posed points (B,N,3), metres.
+    """Return posed points (B,N,3), metres: v_n = sum over bones m of w_nm (R_m x_n + t_m).
 
-    points (B,N,3) at rest; rotations (B,J,3,3) and offsets (B,J,3): a point that follows joint k
-    alone goes to rotations[k] @ x + offsets[k]; weights (N,J), constant. Differentiable once by
-    points, rotations and offsets.
+    points (B,N,3) at rest, rotations (B,J,3,3), offsets (B,J,3), weights (N,J), which are constant.
+    Differentiable once by points, rotations and offsets. Blending the 12 numbers of the bones is
+    one dense product, 12 times as large as the result; a few bodies at a time stay in the cache.
     """
     bones = torch.cat([rotations.permute(0, 2, 3, 1).flatten(1, 2), offsets.transpose(1, 2)], 1)
     return _Skin.apply(points, bones, weights)
 
 
 class _Skin(torch.autograd.Function):
-    """points (B,N,3), bones (B,12,J): rows of the rotation, then the offset; weights (N,J)."""
+    """points (B,N,3), bones (B,12,J): rows of the rotation, then the offset; weights (N,J).
+
+    The pull-back blends again instead of keeping the blended bones M:
+    dE/dx_n = M_n^T dE/dv_n, dE/d(R_m | t_m) = sum over n of w_nm dE/dv_n (x_n | 1)^T.
+    """
 
     @staticmethod
     def forward(ctx: Any, points: Tensor, bones: Tensor, weights: Tensor) -> Tensor:
@@ -171,7 +182,7 @@ def _blended(bones: Tensor, weights: Tensor) -> Tensor:
 
 
 def _pieces(points: Tensor) -> Iterator[slice]:
-    """Bodies that are blended at once; a GPU takes them all."""
+    """Yield the bodies that are blended at once; on a GPU all of them."""
     batch, count = points.shape[:2]
     size = 12 * max(count, 1) * points.element_size()
     step = max(1, _CACHE_BYTES // size) if points.device.type == "cpu" else max(1, batch)
@@ -180,7 +191,7 @@ def _pieces(points: Tensor) -> Iterator[slice]:
 
 
 def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
-    """Area-weighted unit normals (B,V,3) of (B,V,3), (F,3)."""
+    """Return area-weighted unit normals (B,V,3) of vertices (B,V,3) with faces (F,3)."""
     a, b, c = (vertices[:, faces[:, i]] for i in range(3))
     cross = torch.linalg.cross(b - a, c - a)
     normals = torch.zeros_like(vertices)

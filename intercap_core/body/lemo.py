@@ -1,15 +1,14 @@
 """F_S of A.2: the motion encoder of LEMO (Zhang et al. 2021), from the user's own weights.
 
-It sees the steps of 81 markers of the skin (:attr:`BodyModel.markers`) from frame to frame at 30 a
-second as an image: a row for each coordinate (marker by marker; x, y, z), a column for each step.
-Coordinates are those of the first frame's body: x from the left hip to the right, z up; steps are
-divided by the spread of marker coordinates in the data that it was trained on. The image is
-continued by its reflection, one row and eight columns at each side; ten convolutions of 3 x 3, with
-a leaky ReLU after each, keep its size and end in 64 channels. A column is the latent vector of a
-step.
+Its input is an image of the steps of 81 markers of the skin (:attr:`BodyModel.markers`) between
+frames at 30 Hz: one row for each coordinate (marker by marker; x, y, z), one column for each step.
+Coordinates are in the frame of the first body: x from the left hip to the right, z up. Steps are
+divided by the standard deviation of the marker coordinates in the training data. The image is
+padded by reflection, one row and eight columns at each side. Ten convolutions of 3 x 3, each with a
+leaky ReLU, keep its size and end in 64 channels. A column is the latent vector of a step.
 
-All this is as the release (github.com/sanweiliti/LEMO) states it; the code is our own. Only the
-means of the training data are not needed: they cancel in steps.
+All this follows the release (github.com/sanweiliti/LEMO); the code is our own. The means of the
+training data are not needed: they cancel in steps.
 """
 
 from __future__ import annotations
@@ -44,11 +43,12 @@ _HINT = "take the release's file, or leave joint.lemo out for small acceleration
 
 @dataclass(frozen=True)
 class MotionEncoder:
-    """``blocks``: weights and biases of the five pairs of convolutions; ``spread`` (243,) of the
-    coordinates, metres."""
+    """LEMO's motion encoder."""
 
     blocks: tuple[tuple[Tensor, Tensor, Tensor, Tensor], ...]
+    """Weights and biases of the five pairs of convolutions."""
     spread: Tensor
+    """(243,) standard deviation of the coordinates, metres."""
 
     @classmethod
     def load(
@@ -61,7 +61,7 @@ class MotionEncoder:
     ) -> MotionEncoder:
         """Read the encoder's state (`Enc_last_model.pkl`) and the statistics' `Xstd`.
 
-        `UserError` where a file is missing, damaged, or holds something else.
+        Raises UserError if a file is missing, damaged, or contains something else.
         """
         state, spread = _state(weights), _spread(statistics)
         blocks = []
@@ -80,11 +80,11 @@ class MotionEncoder:
         return cls(tuple(blocks), torch.as_tensor(spread, dtype=dtype, device=device))
 
     def latents(self, steps: Tensor) -> Tensor:
-        """Latent vectors (N, 15680) of the steps (N, 243), metres, of N > 8 in a row."""
+        """Return latent vectors (N, 15680) of N > 8 consecutive steps (N, 243), metres."""
         image = (steps / self.spread).T[None, None]
         image = functional.pad(image, (_COLUMNS, _COLUMNS, _ROWS, _ROWS), mode="reflect")
         for block in self.blocks:
-            if image.requires_grad:  # what is between is computed again for the derivative
+            if image.requires_grad:  # activations are computed again for the derivative
                 image = checkpoint(_convolve, image, *block, use_reentrant=False)
             else:
                 image = _convolve(image, *block)
@@ -119,21 +119,21 @@ def _tensor(path: Path, state: dict[str, Tensor], name: str, shape: tuple[int, .
 
 
 def _spread(path: Path) -> np.ndarray:
-    """Spread (243,) of the coordinates."""
+    """Read the standard deviation (243,) of the coordinates."""
     if not path.is_file():
         raise UserError(f"LEMO's statistics {path} do not exist; {_HINT}")
     try:
-        found = read_arrays(path, advice=_HINT)
+        arrays = read_arrays(path, advice=_HINT)
     except Unreadable as error:
         raise UserError(
             f"LEMO's statistics {path} cannot be read ({error.reason}), expected an .npz with "
             f"Xstd; {_HINT}"
         ) from None
-    if "Xstd" not in found:
+    if "Xstd" not in arrays:
         raise UserError(
-            f"LEMO's statistics {path} hold {', '.join(found) or 'nothing'}, expected Xstd; {_HINT}"
+            f"LEMO's statistics {path} contain {', '.join(arrays) or 'nothing'}, expected Xstd; {_HINT}"
         )
-    spread = found["Xstd"]
+    spread = arrays["Xstd"]
     if spread.shape != (COORDINATES,):
         raise UserError(
             f"LEMO's statistics {path}: Xstd has {spread.shape}, expected ({COORDINATES},) for "

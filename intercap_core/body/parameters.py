@@ -1,4 +1,4 @@
-"""The body's parameters and where each stands in the parameter vector."""
+"""The parameters of a body and their order in the parameter vector."""
 
 from __future__ import annotations
 
@@ -22,11 +22,7 @@ TRANSL = slice(NUM_POSE, NUM_POSE + 3)
 
 @dataclass
 class BodyParameters:
-    """SMPL-X parameters of B bodies; rotations are axis-angle in radians, `transl` in metres.
-
-    betas (B,S), expression (B,E), global_orient (B,3), body_pose (B,63), left_hand_pose and
-    right_hand_pose (B,45) full axis-angle with the mean pose already added, jaw_pose, leye_pose,
-    reye_pose, transl (B,3).
+    """SMPL-X parameters of B bodies; rotations are axis-angles in radians.
 
     The parameter vector is global_orient, body_pose, jaw_pose, leye_pose, reye_pose,
     left_hand_pose, right_hand_pose, transl, betas, expression: joint k of the 55 has columns
@@ -34,15 +30,25 @@ class BodyParameters:
     """
 
     betas: Tensor
+    """(B, S)"""
     expression: Tensor
+    """(B, E)"""
     global_orient: Tensor
+    """(B, 3)"""
     body_pose: Tensor
+    """(B, 63)"""
     left_hand_pose: Tensor
+    """(B, 45), the mean pose included."""
     right_hand_pose: Tensor
+    """(B, 45), the mean pose included."""
     jaw_pose: Tensor
+    """(B, 3)"""
     leye_pose: Tensor
+    """(B, 3)"""
     reye_pose: Tensor
+    """(B, 3)"""
     transl: Tensor
+    """(B, 3) metres."""
 
     @classmethod
     def zeros(
@@ -62,7 +68,7 @@ class BodyParameters:
 
     @classmethod
     def from_vector(cls, vector: Tensor, *, num_betas: int = 10) -> BodyParameters:
-        """(B,P) -> parameters; what follows the betas is expression."""
+        """Split vectors (B,P); the columns after the betas are the expression."""
         parts, start = {}, 0
         for name, size in POSE_BLOCKS:
             parts[name] = vector[:, start : start + size]
@@ -76,13 +82,13 @@ class BodyParameters:
         )
 
     def vector(self) -> Tensor:
-        """(B,P) in the order above; betas and expression of one row are spread over the batch."""
+        """Return vectors (B,P); fields of one row are expanded to the batch."""
         batch = self.batch
         names = [*(name for name, _ in POSE_BLOCKS), "transl", "betas", "expression"]
         return torch.cat([getattr(self, n).expand(batch, -1) for n in names], 1)
 
     def full_pose(self) -> Tensor:
-        """(B,55,3) axis-angle in joint order."""
+        """Return the axis-angles (B,55,3) in joint order."""
         batch = self.batch
         return torch.cat(
             [getattr(self, name).expand(batch, -1) for name, _ in POSE_BLOCKS], 1
@@ -93,7 +99,7 @@ class BodyParameters:
         return max(getattr(self, f.name).shape[0] for f in fields(self))
 
     def frames(self, index: slice | Tensor) -> BodyParameters:
-        """The chosen frames; fields of one row are spread over the batch first."""
+        """Return the chosen frames; fields of one row are expanded to the batch first."""
         batch = self.batch
         return replace(
             self,

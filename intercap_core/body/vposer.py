@@ -1,16 +1,16 @@
 """E_theta_b of equation 2 by VPoser (Pavlakos et al. 2019), from the user's own weights.
 
-Version 1 (`TR00_E096.pt`) and version 2 (`V02_05`, a Lightning checkpoint) decode a 32-number code
-to the 21 body rotations by three linear layers; they differ in key names and in the leaky ReLU's
-slope, and their codes are not interchangeable. A code's prior is a standard normal.
+Version 1 (`TR00_E096.pt`) and version 2 (`V02_05`, a Lightning checkpoint) decode a code of 32
+numbers to the 21 body rotations by three linear layers. They differ in key names and in the slope
+of the leaky ReLU, and their codes are not interchangeable. The prior of a code is standard normal.
 
-The fit keeps the pose itself as its parameter: a pose is what a code decodes to, give or take some
-degrees, so that observations can leave what the network rebuilds exactly,
+The parameter of the fit remains the pose, which may differ from the decoded one by some degrees, so
+that observations can determine poses that the network does not reconstruct exactly:
 
     E_theta_b(theta) = min over z of |z|^2 / 2 + |theta - decode(z)|^2 / (2 s^2),
 
-with the code z and the spread s of a decoded pose; the paper's |z|^2, up to its weight, for s = 0.
-Around the best code that is a Gaussian over theta.
+with the code z and the standard deviation s from a decoded pose. For s = 0 this is the paper's
+|z|^2, up to its weight. Around the best code it is a Gaussian over theta.
 """
 
 from __future__ import annotations
@@ -36,36 +36,41 @@ _VERSIONS = {
 }
 _PREFIXES = ("module.", "vp_model.")
 _MATRIX_LOG_EPSILON = 1e-7
-_SPREAD = 0.1  # rad about what a code decodes to: poses of AMASS are rebuilt to some 5 degrees
+_SPREAD = 0.1  # rad; poses of AMASS are reconstructed to about 5 degrees (paper)
 _MAX_HIDDEN = 4096  # units of a hidden layer; the published ones have 512
 _LARGEST_WEIGHT = 1e3  # the published ones' are below 10
 _ADVICE = "expected TR00_E096.pt (version 1) or a V02_05 .ckpt (version 2): take the published file"
 _CODE_STEPS = 12
-_CODE_DAMPING = 0.3  # of a unit code: far from linear, the decoder's steps are held back
+_CODE_DAMPING = 0.3  # at the start, in units of the prior: the decoder is far from linear
 
 
 class PoseGaussian(NamedTuple):
-    """What a pose prior says around B poses: mean (B,63) rad, precision (B,63,63)."""
+    """A pose prior around B poses."""
 
     mean: Tensor
+    """(B, 63) rad."""
     precision: Tensor
+    """(B, 63, 63)"""
 
     def of_frames(self, index: Tensor) -> PoseGaussian:
+        """Return the prior of the frames ``index``."""
         return PoseGaussian(self.mean[index], self.precision[index])
 
     def cost(self, body_pose: Tensor) -> Tensor:
-        """(B,) of poses (B,63)."""
+        """Return the cost (B,) of poses (B,63)."""
         away = body_pose - self.mean
         return 0.5 * (away[:, None] @ self.precision @ away[..., None])[:, 0, 0]
 
 
 @dataclass(frozen=True)
 class VPoser:
-    """layers: weight and bias of the three linear layers; slope of the leaky ReLU between them."""
+    """The decoder of VPoser."""
 
     version: int
     layers: tuple[tuple[Tensor, Tensor], ...]
+    """Weight and bias of the three linear layers."""
     slope: float
+    """Slope of the leaky ReLU between them."""
 
     @classmethod
     def load(
@@ -76,9 +81,9 @@ class VPoser:
         device: torch.device | str = "cpu",
         dtype: torch.dtype = torch.float32,
     ) -> VPoser:
-        """Read the weights; the version is told by their names where it is not given.
+        """Read the weights. Without ``version``, their names determine it.
 
-        `UserError` if the file is missing, holds no decoder, or that of another version than given.
+        Raises UserError if the file is missing, or contains no decoder of this version.
         """
         if not path.is_file():
             raise UserError(
@@ -110,7 +115,7 @@ class VPoser:
         )
 
     def rotations(self, code: Tensor) -> Tensor:
-        """(B,32) -> (B,21,3,3); the 6D output is two columns, made orthonormal."""
+        """Decode codes (B,32) to rotations (B,21,3,3): the 6D output is two columns, orthonormalised."""
         x = code
         for weight, bias in self.layers[:-1]:
             x = functional.leaky_relu(functional.linear(x, weight, bias), self.slope)
@@ -122,11 +127,11 @@ class VPoser:
         return torch.stack([first, second, third], -1)
 
     def decode(self, code: Tensor) -> Tensor:
-        """(B,32) -> body_pose (B,63), axis-angle."""
+        """Decode codes (B,32) to body_pose (B,63), axis-angle."""
         return axis_angle_from_rotation(self.rotations(code)).reshape(*code.shape[:-1], 63)
 
     def around(self, body_pose: Tensor) -> PoseGaussian:
-        """The prior around poses (B,63), at the codes that explain them best (Gauss-Newton)."""
+        """Return the prior around poses (B,63), at their most likely codes (Gauss-Newton)."""
         code = body_pose.new_zeros(len(body_pose), LATENT)
         eye = torch.eye(LATENT, dtype=code.dtype, device=code.device)
         decoded, by_code = self.decode_with_jacobian(code)
@@ -156,13 +161,13 @@ class VPoser:
         return 0.5 * ((code**2).sum(1) + (away**2).sum(1))
 
     def decode_with_jacobian(self, code: Tensor) -> tuple[Tensor, Tensor]:
-        """(B,32) -> body_pose (B,63) and its derivative by the code (B,63,32)."""
+        """Return body_pose (B,63) and its derivative by the code (B,63,32)."""
         jacobian = torch.func.vmap(torch.func.jacfwd(self.decode))(code)
         return self.decode(code), jacobian
 
 
 def axis_angle_from_rotation(rotation: Tensor) -> Tensor:
-    """(...,3,3) -> (...,3); for angles up to just below pi, smooth through zero."""
+    """Return axis-angles (...,3) of rotations (...,3,3) by less than pi, smooth through zero."""
     skewed = torch.stack(
         [
             rotation[..., 2, 1] - rotation[..., 1, 2],
