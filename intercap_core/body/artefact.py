@@ -22,8 +22,8 @@ _NAMES = (
     "jaw_pose", "leye_pose", "reye_pose", "transl",
 )  # fmt: skip
 
-# Bodies by file, digest, numbers of coefficients and device, as long as they are referenced: a stage
-# that reads several artefacts has one body.
+# Bodies by file, digest, numbers of coefficients and device, as long as they are referenced: a
+# stage that reads several artefacts has one body.
 _LOADED: WeakValueDictionary[tuple[str, int, int, str], BodyModel] = WeakValueDictionary()
 
 
@@ -71,7 +71,7 @@ def load_model(
     if digest != attributes["body_model"]:
         raise UserError(
             f"{artefact.path}: the bodies of sequence {attributes['sequence']!r} were fitted "
-            f"with another body file than {path}, which the settings give for a {gender} subject; name "
-            "that file again, or re-run stage 'body_fit' and what follows"
+            f"with another body file than {path}, which the settings give for a {gender} subject; "
+            "name that file again, or re-run stage 'body_fit' and what follows"
         )
     return model

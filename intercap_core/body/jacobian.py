@@ -29,7 +29,8 @@ _CHUNK_BYTES = 64e6  # working set of one step of `normal_equations`
 
 
 def shaped_points(selection: Selection, shape: Tensor, local: Tensor) -> Tensor:
-    """Return rest points (B,N,3) after shape (B,S) and the pose blend shapes of local (B,55,3,3)."""
+    """Return points (B,N,3) at rest, after shape (B,S) and the pose blend shapes of local
+    (B,55,3,3)."""
     batch, count = shape.shape[0], selection.template.shape[0]
     size = selection.directions.shape[-1]
     points = selection.template + (shape @ selection.directions.reshape(-1, size).T).reshape(

@@ -102,7 +102,7 @@ def keypoint_map(
     contour_faces: np.ndarray,
     contour_barycentric: np.ndarray,
 ) -> KeypointMap:
-    """Build the map from named vertices, and the file's landmarks (51) and frontal jaw line (17)."""
+    """Build the map from named vertices and the file's landmarks (51) and frontal jaw line (17)."""
     joint = np.full(NUM_KEYPOINTS, -1)
     ids = np.zeros((NUM_KEYPOINTS, 3), int)
     weights = np.zeros((NUM_KEYPOINTS, 3))

@@ -131,7 +131,8 @@ def _spread(path: Path) -> np.ndarray:
         ) from None
     if "Xstd" not in arrays:
         raise UserError(
-            f"LEMO's statistics {path} contain {', '.join(arrays) or 'nothing'}, expected Xstd; {_HINT}"
+            f"LEMO's statistics {path} contain {', '.join(arrays) or 'nothing'}, expected Xstd; "
+            f"{_HINT}"
         )
     spread = arrays["Xstd"]
     if spread.shape != (COORDINATES,):

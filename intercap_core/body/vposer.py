@@ -115,7 +115,7 @@ class VPoser:
         )
 
     def rotations(self, code: Tensor) -> Tensor:
-        """Decode codes (B,32) to rotations (B,21,3,3): the 6D output is two columns, orthonormalised."""
+        """Decode codes (B,32) to rotations (B,21,3,3), from two orthonormalised columns."""
         x = code
         for weight, bias in self.layers[:-1]:
             x = functional.leaky_relu(functional.linear(x, weight, bias), self.slope)

@@ -12,7 +12,6 @@ from scipy.spatial import cKDTree
 
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
-<<<<<<< HEAD
 from intercap_core.body_fit.surface import choose_samples
 from intercap_core.schemas import CONTACT_REGIONS
 
@@ -83,10 +82,6 @@ def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
         distance = np.minimum(distance, np.square(points - points[chosen[-1]]).sum(axis=1))
         chosen.append(int(distance.argmax()))
     return np.sort(np.array(chosen))
-=======
-from intercap_core.body_fit.surface import choose_samples
-from intercap_core.joint.contact.patches import Patches
->>>>>>> 355fa4d (Body fit: one file per term with its torch and compiled form; constants at their users (tests follow))
 
 
 @dataclass(frozen=True)
