@@ -18,7 +18,7 @@ from intercap_core.body.kinematics import vertex_normals
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.body_fit.first_hit import first_hits
-from intercap_core.geometry.rigid import normals as rigid_normals
+from intercap_core.geometry.rigid import surfaces as rigid_surfaces
 
 # Length in metres that one radian between two normals counts as, in a match. Tuned on the studio.
 NORMAL_LENGTH_M = 0.06
@@ -148,7 +148,7 @@ def _outer(points: np.ndarray, faces: np.ndarray, joint: np.ndarray) -> np.ndarr
     outer = part == np.bincount(part).argmax()
     head = [JOINT_INDEX[n] for n in ("head", "jaw", "left_eye_smplhf", "right_eye_smplhf")]
     ids = np.flatnonzero(outer & np.isin(joint, head))
-    normals = rigid_normals.vertex_normals(points, faces)[ids]
+    normals = rigid_surfaces.vertex_normals(points, faces)[ids]
     hits = first_hits(points, faces, points[ids] + 1e-3 * normals, normals)
     outer[ids[np.isfinite(hits)]] = False
     return outer
