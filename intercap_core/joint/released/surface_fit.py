@@ -21,10 +21,8 @@ from torch import Tensor
 
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import NUM_POSE, TRANSL
-from intercap_core.body_fit import body_cloud
-from intercap_core.body_fit.body_constants import MATCH_COSINE
-from intercap_core.body_fit.body_samples import choose_samples
-from intercap_core.body_fit.body_surface import Surface
+from intercap_core.body_fit.matching import MATCH_COSINE, average, match_points
+from intercap_core.body_fit.surface import Surface, choose_samples
 from intercap_core.formats.released import Skin
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.surfaces import vertex_normals
@@ -186,12 +184,10 @@ class _Surfaces:
         )
         apart = (samples - there).norm(dim=1)
         agrees = ((facing * along).sum(1) > MATCH_COSINE) & (apart < REACH_M)
-        matches = body_cloud.match_compiled(
-            target.points, target.normals, vertices, normals, self.skin, REACH_M
-        )
+        matches = match_points(target.points, target.normals, vertices, normals, self.skin, REACH_M)
         ones = torch.ones(len(target.points), dtype=samples.dtype)
         none = torch.zeros(len(samples), dtype=samples.dtype)
-        mean, count = body_cloud.gather(matches, ones, none, len(samples), huber=FAR_M)
+        mean, count = average(matches, ones, none, huber=FAR_M)
         both = torch.stack([facing, along], 1)
         away = torch.stack([(facing * (samples - there)).sum(1), -mean], 1)
         valid = torch.stack([agrees, count > 0.5], 1)
