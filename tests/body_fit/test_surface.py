@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from intercap_core.geometry.rigid.open3d_core import o3d
 
 from intercap_core.body.model import BodyModel
 from intercap_core.body_fit import matching
 from intercap_core.body_fit.first_hit import first_hits
 from intercap_core.body_fit.surface import Samples, Surface, choose_samples
+from intercap_core.geometry.rigid.distance import o3d
 from intercap_core.geometry.rigid.surfaces import vertex_normals
 from tests.helpers.bodies import posed_normals, random_normal
 
