@@ -25,6 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from bench import annotate_page
 from bench.annotate_hand import Hand, Point
+from bench.command import exit_on_user_error
 from intercap_core import artefacts
 from intercap_core.annotate.questions import answers_path
 from intercap_core.annotate.rerun import targets
@@ -456,12 +457,9 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path("results/evaluation.json"))
     parser.add_argument("--cores", type=int, default=0, help="of runs; 0 = all")
     told = parser.parse_args()
-    try:
+    with exit_on_user_error():
         found = driven(told.settings, told.cores)
         put_figures(told.output, found, instead_of=("annotate.",))
-    except UserError as error:
-        print(error, file=sys.stderr)
-        raise SystemExit(1) from None
     for name, value in found.items():
         print(f"{name}: {value:.4g}")
     if "annotate.clicks" not in found:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,19 @@ from intercap_core.errors import UserError
 
 
 def add_figures(output: Path, area: str, figures: Mapping[str, float]) -> None:
-    """Put ``<area>.<measure>`` into the JSON that is there, in place of the area's older ones."""
+    """Write ``<area>.<measure>`` to the JSON file, in place of the area's older figures."""
     new = {f"{area}.{key}": round(float(value), 4) for key, value in figures.items()}
     commands.add_figures(output, new)
+
+
+@contextmanager
+def exit_on_user_error() -> Iterator[None]:
+    """Print a user's mistake and end the process with status 1."""
+    try:
+        yield
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(1) from None
 
 
 def from_command_line(
@@ -27,22 +38,21 @@ def from_command_line(
 ) -> None:
     """Read the command line and ``measure(settings, output, count)``.
 
-    ``counted`` names the option that sets ``count``; ``settings`` are used where none are named.
+    Args:
+        count: default of the option ``--<counted>``.
+        settings: default of the positional argument.
     """
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("settings", type=Path, nargs="?", default=settings)
     parser.add_argument("--output", type=Path, default=Path("results/bench.json"))
     parser.add_argument(f"--{counted}", type=int, default=count)
     arguments = parser.parse_args()
-    try:
+    with exit_on_user_error():
         measure(arguments.settings, arguments.output, getattr(arguments, counted))
-    except UserError as error:
-        print(error, file=sys.stderr)
-        raise SystemExit(1) from None
 
 
 def figure_class() -> Any:
-    """matplotlib's class of figures; raises UserError where it is not installed."""
+    """Return matplotlib's class of figures; raises UserError if it is not installed."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:

@@ -10,7 +10,6 @@ error of one centimetre and five degrees, in frames in which the stored track is
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from bench.command import add_figures
+from bench.command import add_figures, exit_on_user_error
 from intercap_core import artefacts
 from intercap_core.commands.evaluate.objects import measure
 from intercap_core.config import ObjectPose
@@ -49,12 +48,9 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, default=Path("results/bench.json"))
     arguments = parser.parse_args()
-    try:
+    with exit_on_user_error():
         project = load_project(arguments.settings)
         compare(project, arguments.sequences, arguments.poses, arguments.seed, arguments.output)
-    except UserError as error:
-        print(error, file=sys.stderr)
-        raise SystemExit(1) from None
 
 
 def compare(

@@ -28,7 +28,7 @@ from rich.table import Table
 from bench.clips import JointClip, JointErrors, read_state
 from bench.command import add_figures, from_command_line
 from bench.joint_baseline import STEPS, Energy, refine
-from bench.joint_long import peak_memory_mb
+from bench.stage_resources import peak_memory_mb
 from intercap_core.joint.state import State
 from intercap_core.pipeline.step import run_step
 from intercap_core.project import Project, load_project

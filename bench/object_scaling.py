@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -24,6 +23,7 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
+from bench.command import exit_on_user_error
 from intercap_core.config import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.intrinsics import Intrinsics
@@ -188,11 +188,8 @@ def main() -> None:
     parser.add_argument("--objects", type=Path, default=Path("config/objects.yaml"))
     parser.add_argument("--output", type=Path)
     arguments = parser.parse_args()
-    try:
+    with exit_on_user_error():
         mesh = _load(arguments.objects, arguments.object)
-    except UserError as error:
-        print(error, file=sys.stderr)
-        raise SystemExit(1) from None
     figures = tracking_scaling(mesh)
     for key, value in figures.items():
         print(f"{key:28s} {value:9.3f}")

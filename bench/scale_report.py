@@ -17,7 +17,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from bench.joint_long import lengthen
+from bench.command import exit_on_user_error
+from bench.stage_resources import lengthen
 from intercap_core import artefacts
 from intercap_core.errors import UserError
 from intercap_core.project import Project, load_project
@@ -179,7 +180,7 @@ def _work(what: str, settings: Path, sequence: str, folder: Path) -> None:
         inputs = {stage: folder / f"{stage}.h5" for stage in STAGES[what].reads}
         output = folder / (what if STAGES[what].writes_folder else f"{what}.h5")
         run_step(what, project, sequence, inputs=inputs, output=output)
-    from bench.joint_long import peak_mb
+    from bench.stage_resources import peak_mb
 
     print(json.dumps({"peak_mb": peak_mb()}))
 
@@ -193,14 +194,11 @@ def _main() -> None:
     parser.add_argument("--sequence", default="", help=argparse.SUPPRESS)
     parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
     given = parser.parse_args()
-    try:
+    with exit_on_user_error():
         if given.one:
             _work(given.one, given.settings, given.sequence, given.folder)
         else:
             measure(given.settings, given.output, given.sequences)
-    except UserError as error:
-        print(error, file=sys.stderr)
-        raise SystemExit(1) from None
 
 
 if __name__ == "__main__":

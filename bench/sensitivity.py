@@ -13,13 +13,13 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from bench.changed_constant import Constant, find_constant
+from bench.command import exit_on_user_error
 from bench.replay import STAGES, Outcome, Replays, Run
 from intercap_core.errors import UserError
 
@@ -213,13 +213,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--known", type=Path, default=KNOWN, help="JSON of what is known already")
     parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1))
     told = parser.parse_args(arguments)
-    try:
+    with exit_on_user_error():
         sequences = told.sequences or list(SEQUENCES)
         replays = Replays(told.settings, sequences, told.known, told.jobs)
         table = probe(replays, [_probe_of(name) for name in told.constants or []] or RISKIEST)
-    except UserError as error:
-        print(error, file=sys.stderr)
-        raise SystemExit(1) from None
     print(table)
     if told.output:
         text = page(told.settings, sequences, table)

@@ -35,23 +35,19 @@ def errors_of(settings: Path, sequence: str, folder: Path) -> Any:
     """Errors of one recording's track, computed in ``folder`` by the imported code."""
     from intercap_core.evaluation import object_errors
     from intercap_core.geometry.rigid.mesh import ObjectMesh
+    from intercap_core.pipeline.step import run_step
     from intercap_core.project import load_project
-    from intercap_core.stages import object_track
 
     project = load_project(settings)
     row = project.sequences[sequence]
-    entry = project.objects[row.object]
     track = folder / f"{project.config.dataset}-{sequence}.h5"
-    inputs = ("frames", "scene", "detections", "person")
-    object_track.run(
-        **{stage: project.artefact(sequence, stage) for stage in inputs},
-        output=track,
-        object_=entry,
-        settings=project.config.object_track,
-        initial=project.annotation(sequence).object_pose,
-    )
+    stages = ("frames", "scene", "detections", "person")
+    inputs = {stage: project.artefact(sequence, stage) for stage in stages}
+    run_step("object_track", project, sequence, inputs=inputs, output=track)
     scene = project.artefact(sequence, "scene")
-    return object_errors.measure(scene, track, row.truth, ObjectMesh.load(entry))
+    return object_errors.measure(
+        scene, track, row.truth, ObjectMesh.load(project.objects[row.object])
+    )
 
 
 def measured(settings: list[Path], folder: Path, workers: int) -> dict[str, Any]:

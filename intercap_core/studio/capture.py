@@ -44,7 +44,7 @@ def write_truth(
     capture: StudioCapture,
     recorded: Sequence[CameraRecord],
 ) -> np.ndarray:
-    """Write the truth artefact of the set times' ``moment``; ``recorded`` by each camera.
+    """Write the truth artefact of the moments ``moment`` at the set times.
 
     Returns the true region contact (T, R).
     """
@@ -105,13 +105,13 @@ def write_truth(
 
 
 def _faults(stage: StudioStage, capture: StudioCapture) -> list[str]:
-    """The faults that were asked for, those of one camera with its name."""
+    """Faults of the capture, with the name of the camera if they concern one."""
     names, broken = stage.rig.true.names, stage.failures.broken
     return [f"{kind} {names[broken[kind]]}" if kind in broken else kind for kind in capture.faults]
 
 
 def region_contact(stage: StudioStage, moment: StageState) -> np.ndarray:
-    """(T, R): some point of the region is within ``CONTACT_M`` of the object."""
+    """(T, R): a point of the region is within ``CONTACT_M`` of the object."""
     regions = stage.fitted.regions
     result = np.zeros((len(moment.body), len(CONTACT_REGIONS)), bool)
     if not stage.prop:
@@ -127,7 +127,7 @@ def region_contact(stage: StudioStage, moment: StageState) -> np.ndarray:
 
 
 def support_height(stage: StudioStage, moment: StageState) -> np.ndarray:
-    """(T, 2): the highest surface of the room under each sole, left and right, above the floor."""
+    """(T, 2) height above the floor of the highest surface of the room below each sole."""
     room, regions = stage.room, stage.fitted.regions
     scene = scene_of((room.vertices, room.faces))
     result = np.zeros((len(moment.body), 2))
@@ -142,7 +142,8 @@ def support_height(stage: StudioStage, moment: StageState) -> np.ndarray:
 
 
 def visible(stage: StudioStage, moment: StageState) -> tuple[np.ndarray, np.ndarray]:
-    """Which body vertices (T, V), clothed, and object vertices (T, Vo) some camera truly sees."""
+    """Masks of body vertices (T, V), clothed, and object vertices (T, Vo) that a camera truly
+    sees."""
     prop, faces = stage.prop, stage.subject.faces
     count = moment.clothed.shape[1]
     result = np.zeros((len(moment.clothed), count + len(prop.vertices)), bool)
@@ -176,7 +177,7 @@ def visible(stage: StudioStage, moment: StageState) -> tuple[np.ndarray, np.ndar
 def erring_annotation(
     stage: StudioStage, moment: StageState, contact: np.ndarray
 ) -> dict[str, Any]:
-    """An annotation as a person makes it: off by up to 10 mm, 5 degrees, 5 frames."""
+    """An annotation with a person's errors: up to 10 mm, 5 degrees, 5 frames."""
     rng, scale = stage.noise.rng("annotation"), min(stage.noise.scale, 1.0)
 
     def off(size: float) -> np.ndarray:
@@ -212,8 +213,8 @@ def erring_annotation(
 
 
 def erring_starts(stage: StudioStage, sigma: float) -> dict[str, Any]:
-    """When each camera's first image was taken, as somebody reads it off a clock that counts the
-    hours of a day, wrong by ``sigma`` s."""
+    """Stated time of each camera's first image on a clock of the day, with errors of ``sigma`` s.
+    Stated time of each camera's first image on a clock of the day, with errors of ``sigma`` s."""
     rng = stage.noise.rng("stated starts")
     clock = float(rng.uniform(0, 86_400))
     starts = {}
@@ -239,14 +240,18 @@ def make_capture(
     objects: ObjectEntry | None,
     output: Path,
 ) -> None:
-    """Write the folder of one capture.
+    """Write the folder of one capture; equal arguments give equal bytes.
 
-    Holds the recordings and calibration in the layout of ``capture``,
-    keypoints/<camera>/<image>_keypoints.json, candidates/<camera>.json, truth.h5, annotation.yaml
-    if ``capture.annotate`` or it states starts, and last capture.json, the sorted list of the files
-    with their SHA-256. ``objects`` is the tracked object's entry, None of a person alone. The same
-    arguments give the same bytes. Raises UserError for a subject, interaction, object or fault that
-    the studio does not have, and for an ``output`` that holds something else.
+    Writes recordings and calibration in the layout of ``capture``, keypoints, candidates and
+    truth.h5. Writes annotation.yaml if the capture annotates or states starts, and last
+    capture.json with the SHA-256 of every file.
+
+    Args:
+        objects: entry of the tracked object, None for a person alone.
+
+    Raises:
+        UserError: for a subject, interaction, object or fault that the studio does not have, and if
+            ``output`` holds other files.
     """
     output = Path(output)
     if output.exists():

@@ -5,9 +5,9 @@ Also aligns depth to the colour camera's pixel grid, as the Azure Kinect SDK doe
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import cv2
@@ -24,7 +24,7 @@ STEEPEST = 0.0469
 
 
 class Aligner:
-    """Of one device, by what its own calibration says."""
+    """Aligns depth images of one device by its own calibration."""
 
     def __init__(self, camera: Camera) -> None:
         if camera.depth is None or camera.colour_from_depth is None:
@@ -37,7 +37,11 @@ class Aligner:
         self._usable = np.isfinite(rays[..., 0])
 
     def align(self, depth: np.ndarray) -> np.ndarray:
-        """Depth (H, W) uint16 mm to the colour grid (Hc, Wc) uint16 mm, z of the colour camera."""
+        """Depth (H, W) uint16 mm to the colour grid (Hc, Wc) uint16 mm, z of the colour camera.
+
+        The depth image is treated as a mesh of two triangles between four neighbouring pixels.
+        The nearest surface wins; surfaces that only the colour camera sees stay 0.
+        """
         known = (depth > 0) & self._usable
         points = self._direction[known] * (depth[known] * 1e-3)[:, None] + self._shift
         pixels = np.full((*depth.shape, 2), np.nan, np.float32)
@@ -50,8 +54,12 @@ class Aligner:
 
 @numba.njit(cache=True)
 def _warp(pixels, z, aligned):
-    """Draw the mesh of a depth image: pixels (H, W, 2) in the colour image, z (H, W) metres there,
-    0 = unknown, into ``aligned`` (Hc, Wc)."""
+    """Draw the mesh of a depth image into ``aligned`` (Hc, Wc).
+
+    Args:
+        pixels: (H, W, 2) in the colour image.
+        z: (H, W) metres in the colour camera, 0 = unknown.
+    """
     for v in range(z.shape[0] - 1):
         for u in range(z.shape[1] - 1):
             for second in range(2):
@@ -95,39 +103,42 @@ SWAPPED = (3, 4)  # cameras 4 and 5 of InterCap's release
 
 @dataclass(frozen=True)
 class Device:
-    """One camera of the rig: ``camera`` as it claims to be, always with depth; ``depth`` says
-    whether it records any; ``first_us`` is its first device time; ``sound`` (N,) float32 from its
-    first image on, at :data:`SOUND_RATE`, None = it records none."""
+    """One camera of the rig."""
 
     index: int
     camera: Camera
+    """As calibrated, always with depth."""
     serial: str
     colour_mode: str
     depth_mode: str
     depth: bool
+    """Whether the device records depth."""
     fps: int
     first_us: int
+    """Its first device time."""
     sound: np.ndarray | None = None
+    """(N,) float32 from its first image on at :data:`SOUND_RATE`, None without sound."""
 
 
 @dataclass(frozen=True)
 class DeviceFrame:
-    """What a device delivers of set ``t``: a JPEG, depth (H, W) uint16 mm or None, and inertial
-    samples (acceleration, turning rate, device time)."""
+    """Data of one device for frame set ``t``."""
 
     t: int
     time_us: int
     jpeg: bytes
     depth: np.ndarray | None
+    """(H, W) uint16 mm, or None."""
     inertial: list[tuple[np.ndarray, np.ndarray, int]]
+    """Acceleration (3,), turning rate (3,), device time."""
 
 
 class CameraFiles(ABC):
-    """One camera's files, open; use as a context manager."""
+    """Open files of one camera; a context manager."""
 
     @abstractmethod
-    def write(self, shot: DeviceFrame) -> None:
-        """Add a shot."""
+    def write(self, frame: DeviceFrame) -> None:
+        """Add the data of one frame set."""
 
     def close(self) -> None:  # noqa: B027 (folders have nothing to close)
         """Finish the files."""
@@ -135,17 +146,12 @@ class CameraFiles(ABC):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
 
 class CaptureFolder(ABC):
-    """The files of ``capture`` below ``path``; ``broken``: fault to the camera that has it."""
+    """Files of a capture below ``path``; ``broken`` maps each fault to its camera."""
 
     calibration: str
     """File or folder of the calibration."""
@@ -157,18 +163,19 @@ class CaptureFolder(ABC):
 
     @abstractmethod
     def open(self, device: Device) -> CameraFiles:
-        """Begin one camera's files."""
+        """Open the files of a camera."""
 
     @abstractmethod
     def write_calibration(self, claimed: Rig, fps: int) -> None:
-        """Write the calibration as it is claimed to be."""
+        """Write the erring calibration."""
 
     def image_number(self, t: int, order: int, fps: int) -> int:
-        """What files of keypoints and candidates call the image of set ``t``, the ``order``-th."""
+        """Return the image number that files of detections use for set ``t``, the ``order``-th
+        image."""
         return order
 
     def add_keypoints(self, camera: str, t: int, fps: int, content: str) -> None:  # noqa: B027
-        """Lay a file of keypoints beside the images, where the layout has them there."""
+        """Also write keypoints next to the images, if the layout has them there."""
 
     def add_masks(  # noqa: B027
         self,
@@ -178,10 +185,10 @@ class CaptureFolder(ABC):
         candidates: list[dict[str, Any]],
         label: str,
     ) -> None:
-        """The same for masks of the person and of the object, COCO label ``label``."""
+        """Also write masks of person and object, COCO label ``label``, next to the images."""
 
     def lenses(self, claimed: Rig) -> list[Intrinsics]:
-        """The colour lenses as the calibration has them: wrong where a fault says so."""
+        """Return the colour lenses of the calibration, with the faults of the capture."""
         found = [camera.colour for camera in claimed]
         if "swapped_lenses" in self.capture.faults:
             a, b = SWAPPED
@@ -193,23 +200,28 @@ class CaptureFolder(ABC):
 
 
 class ImageFiles(CameraFiles):
-    """Colour and depth as single files; ``aligner`` where depth lies on the colour grid."""
+    """Colour and depth as single files.
 
-    def __init__(self, aligner: Aligner | None) -> None:
-        self._aligner = aligner
+    Args:
+        paths: returns the files of colour (None: no file) and depth.
+        aligner: maps depth to the colour grid; None keeps it in the depth camera's lens.
+    """
 
-    @abstractmethod
-    def _paths(self, shot: DeviceFrame) -> tuple[Path | None, Path]:
-        """Where colour (None: no file of its own) and depth go."""
+    def __init__(
+        self,
+        paths: Callable[[DeviceFrame], tuple[Path | None, Path]],
+        aligner: Aligner | None = None,
+    ) -> None:
+        self._paths, self._aligner = paths, aligner
 
-    def write(self, shot: DeviceFrame) -> None:
-        colour, depth = self._paths(shot)
+    def write(self, frame: DeviceFrame) -> None:
+        colour, depth = self._paths(frame)
         if colour is not None:
             colour.parent.mkdir(parents=True, exist_ok=True)
-            colour.write_bytes(shot.jpeg)
-        if shot.depth is None:
+            colour.write_bytes(frame.jpeg)
+        if frame.depth is None:
             return
-        image = shot.depth if self._aligner is None else self._aligner.align(shot.depth)
+        image = frame.depth if self._aligner is None else self._aligner.align(frame.depth)
         depth.parent.mkdir(parents=True, exist_ok=True)
         packed = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
         depth.write_bytes(packed.tobytes())

@@ -1,6 +1,6 @@
-"""Curves that a script is made of: ramps, holds, footsteps, small involuntary motion.
+"""Curves of which scripts are made: ramps, plateaus, footsteps, small involuntary motion.
 
-Everything is a function of time in seconds, smooth, and vectorised over moments (N,).
+Everything is a smooth function of time in seconds, vectorised over moments (N,).
 """
 
 from __future__ import annotations
@@ -34,15 +34,14 @@ def plateau(times: np.ndarray, start: float, full: float, wane: float, end: floa
 
 @dataclass(frozen=True)
 class Wander:
-    """Involuntary motion: a sum of slow sines with random phases, ``channels`` of them.
-
-    ``size`` is the RMS of each channel, its unit the caller's. Frequencies in Hz.
-    """
+    """Involuntary motion: a sum of slow sines with random phases."""
 
     channels: int
     size: float
+    """RMS of each channel, in the caller's unit."""
     rng: np.random.Generator
     frequencies: tuple[float, ...] = (0.23, 0.41, 0.67, 1.13)
+    """Hz."""
     _phase: np.ndarray = field(init=False, repr=False)
     _weight: np.ndarray = field(init=False, repr=False)
 
@@ -61,14 +60,16 @@ class Wander:
 
 @dataclass(frozen=True)
 class WristPose:
-    """Where a wrist is wanted: positions (N, 3) and rotations stage_from_rest (N, 3, 3)."""
+    """Target of a wrist over N moments."""
 
     position: np.ndarray
+    """(N, 3)."""
     rotation: np.ndarray
+    """(N, 3, 3) stage_from_rest."""
 
     @classmethod
     def still(cls, transform: np.ndarray, count: int) -> WristPose:
-        """One transform (4, 4) at all of ``count`` moments."""
+        """A constant transform (4, 4) at ``count`` moments."""
         return cls(
             np.broadcast_to(transform[:3, 3], (count, 3)),
             np.broadcast_to(transform[:3, :3], (count, 3, 3)),
@@ -77,7 +78,8 @@ class WristPose:
     def towards(
         self, other: WristPose, share: np.ndarray, arc: np.ndarray | None = None
     ) -> WristPose:
-        """Go to ``other`` by ``share`` (N,), over a detour of ``arc`` (3,) metres in the middle."""
+        """Move to ``other`` by ``share`` (N,), with a detour of ``arc`` (3,) metres in the
+        middle."""
         s = share[:, None]
         position = (1 - s) * self.position + s * other.position
         if arc is not None:
@@ -87,49 +89,50 @@ class WristPose:
 
 @dataclass(frozen=True)
 class Step:
-    """One foot's step: ``foot`` 0 left, 1 right; times in s; to ``place`` (2,), heading rad.
-
-    ``height`` metres above the floor of what it comes to stand on; ``aside`` metres by which it
-    swings out to its own side on the way, past what the other one stands on.
-    """
+    """One step of a foot."""
 
     foot: int
+    """0 left, 1 right."""
     start: float
+    """S."""
     end: float
+    """S."""
     place: tuple[float, float]
+    """Where it ends."""
     heading: float = 0.0
+    """Rad."""
     height: float = 0.0
+    """Of the support above the floor, metres."""
     aside: float = 0.0
+    """Sideways detour, around the support of the other foot, metres."""
 
 
 @dataclass(frozen=True)
 class Guide:
-    """From ``start`` to ``end`` one foot, 0 left, 1 right, comes over to a path of its own.
-
-    ``path`` takes times (N,) to ankle x, y, z in metres, pitch and heading in rad (N, 5); without
-    one the foot comes back to its steps.
-    """
+    """From ``start`` to ``end``, a foot moves to a path of its own."""
 
     foot: int
+    """0 left, 1 right."""
     start: float
     end: float
     path: Callable[[np.ndarray], np.ndarray] | None = None
+    """Times (N,) to ankle x, y, z, pitch, heading (N, 5); None: back to the steps."""
 
 
 @dataclass(frozen=True)
 class Footwork:
-    """Feet that stand without sliding, step, and carry a pelvis along.
-
-    ``start`` (2, 2): where the ankles stand first, left and right; ``heading`` rad;
-    ``ankle_height`` (2,) above the floor, metres; ``guides`` lead feet that leave the floor.
-    """
+    """Feet that stand without sliding, step, and carry a pelvis along."""
 
     start: np.ndarray
+    """(2, 2) first places of the ankles, left and right."""
     heading: float
+    """Rad."""
     steps: Sequence[Step]
     ankle_height: np.ndarray
+    """(2,) above the floor, metres."""
     end_s: float
     guides: Sequence[Guide] = ()
+    """Lead feet that leave the floor."""
     grid_step_s = 0.005  # sampling of the pelvis track
     grid_margin_s = 1.0  # of the track before and after the script
     body_lag_s = 0.11  # the trunk follows the feet, smoothed by this standard deviation
@@ -139,7 +142,7 @@ class Footwork:
     sole_front_m = 0.12  # the ball of the foot, ahead of the ankle, metres
 
     def feet(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Ankles (N, 2, 3), headings (N, 2), pitch (N, 2; positive toes down) at ``times``."""
+        """Ankles (N, 2, 3), headings (N, 2), pitch (N, 2; positive: toes down) at ``times``."""
         count = len(times)
         ankle = np.empty((count, 2, 3))
         ankle[:, :, :2] = self.start
@@ -178,14 +181,14 @@ class Footwork:
 
     @staticmethod
     def _rise(times: np.ndarray, step: Step, before: float) -> np.ndarray:
-        """Metres (N,) by which a step brings a foot up from ``before``: up first, down last."""
+        """Height (N,) that a step adds to ``before``, metres: up first, down last."""
         rise, reach = step.height - before, Footwork.step_up_share * (step.end - step.start)
         if rise > 0:
             return rise * ramp(times, step.start, step.start + reach)
         return rise * ramp(times, step.end - reach, step.end)
 
     def _level(self, times: np.ndarray) -> np.ndarray:
-        """The higher (N,) of what both feet stand on, metres."""
+        """Height (N,) of the higher of both supports, metres."""
         levels, raised = np.zeros((len(times), 2)), [0.0, 0.0]
         for step in self.steps:
             levels[:, step.foot] += self._rise(times, step, raised[step.foot])
@@ -195,8 +198,11 @@ class Footwork:
     def pelvis(self, leg: float, hip_width: float, hip_drop: float, stand: float) -> CubicSpline:
         """Pelvis position and heading (4 channels) over time, low enough for both legs to reach.
 
-        ``leg`` usable length hip to ankle, ``hip_width`` from the midline, ``hip_drop`` the hips
-        below the pelvis, ``stand`` the highest pelvis above what one stands on, all metres.
+        Args:
+            leg: usable length from hip to ankle, metres.
+            hip_width: from the midline to each hip, metres.
+            hip_drop: height of the pelvis above the hips, metres.
+            stand: largest height of the pelvis above the support, metres.
         """
         grid = np.arange(-self.grid_margin_s, self.end_s + self.grid_margin_s, self.grid_step_s)
         ankle, heading, _ = self.feet(grid)

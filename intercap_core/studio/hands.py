@@ -1,8 +1,8 @@
-"""A puppet's hands: finger flexion and grasps closed against the true object's surface.
+"""A puppet's hands: finger flexion, and grasps closed against the true object's surface.
 
-A grasp is found without the contact term and regions of the fit: joint after joint flexes until
-the skin of that finger meets the object, as a robot hand closes (Miller and Allen 2004, "GraspIt!",
-auto-grasp). The hand stands in its rest frame and the object comes to it.
+A grasp does not use the contact term and regions of the fits. Joint after joint flexes until the
+skin of its finger meets the object (Miller and Allen 2004, "GraspIt!", auto-grasp). The hand stays
+in its rest frame; the object is moved relative to it.
 """
 
 from __future__ import annotations
@@ -27,12 +27,14 @@ LIMITS = {"finger": (85.0, 100.0, 65.0), "thumb": (35.0, 50.0, 65.0)}
 
 @dataclass(frozen=True)
 class HandShape:
-    """Angles in degrees. ``flexion`` (5, 3): FINGERS by joint from the knuckle; ``spread`` (5,)
-    away from the middle finger; ``opposition``: the thumb's base turned towards the palm."""
+    """Angles of a hand's joints, degrees."""
 
     flexion: np.ndarray
+    """(5, 3) FINGERS by joint from the knuckle."""
     spread: np.ndarray
+    """(5,) away from the middle finger."""
     opposition: float
+    """Rotation of the thumb's base towards the palm."""
 
     def towards(self, other: HandShape, share: float) -> HandShape:
         """Between this shape and another."""

@@ -1,8 +1,8 @@
-"""2D keypoints that err as a detector of OpenPose's kind does, in its file format.
+"""2D keypoints with the errors of a detector like OpenPose, in its file format.
 
-Errors of one joint: a bias of its own in the body (the detector's idea of a joint is not the
-skeleton's), a bias that depends on the view, jitter that lasts, swaps of left and right, and when
-the joint is hidden a plausible wrong place with a confidence that only partly knows.
+Errors of a joint: a fixed bias in the body (a detector's joints differ from the skeleton's), a bias
+of the view, lasting jitter, exchanges of left and right, and a plausible wrong place when the joint
+is occluded. The confidence depends on the error only partly.
 """
 
 from __future__ import annotations
@@ -30,11 +30,12 @@ _LEGS = np.array(
 
 @dataclass(frozen=True)
 class Detector:
-    """A detector over one recording: fixed biases (135, 3) in metres in each body's own axes."""
+    """A detector over one recording."""
 
     noise: NoiseSource
     frames: int
     body_bias: np.ndarray
+    """(135, 3) fixed biases in the body's own axes, metres."""
     body_bias_m = (0.010, 0.020)  # range of the fixed bias of each body joint, metres
     hand_bias_m = (0.002, 0.005)  # of each hand joint, metres
     face_bias_m = (0.001, 0.004)  # of each face point, metres
@@ -57,8 +58,7 @@ class Detector:
 
     @classmethod
     def build(cls, noise: NoiseSource, frames: int, body_bias: float = 1.0) -> Detector:
-        """Draw the fixed biases, the body's times ``body_bias``; they are the same in all
-        cameras."""
+        """Draw the fixed biases, equal in all cameras; ``body_bias`` scales those of the body."""
         rng = noise.detector_rng("keypoint bias")
         size = np.empty(135)
         size[BODY] = body_bias * rng.uniform(*cls.body_bias_m, 25)
@@ -77,10 +77,13 @@ class Detector:
         hidden: np.ndarray,
         *who: str,
     ) -> np.ndarray:
-        """Keypoints (T, 135, 3) x, y, confidence of the subject, or of ``who``, in one camera.
+        """Keypoints (T, 135, 3) x, y, confidence of one person in one camera.
 
-        ``points`` (T, 135, 3) true points and ``axes`` (T, 3, 3) the pelvis's rotation, both in
-        the master frame; ``hidden`` (T, 135) bool: something is in the way.
+        Args:
+            points: (T, 135, 3) true points, master frame.
+            axes: (T, 3, 3) rotation of the pelvis, master frame.
+            hidden: (T, 135) mask of occluded points.
+            who: name of the person's random stream; none for the subject.
         """
         noise, scale = self.noise, self.noise.scale
         rng = noise.detector_rng("keypoints", camera.name, *who)
@@ -124,7 +127,7 @@ class Detector:
         return np.concatenate([pixels, confidence[..., None]], -1)
 
     def _pixels_per_metre(self, camera: Camera, points: np.ndarray) -> np.ndarray:
-        """(T, 1, 1): how large a metre at the pelvis is in the image."""
+        """Scale (T, 1, 1) of the image at the pelvis."""
         pose = camera.colour_from_master
         depth = points[:, 8] @ pose[2, :3] + pose[2, 3]
         return (camera.colour.fx / np.maximum(depth, 0.3))[:, None, None]
@@ -135,7 +138,7 @@ class Detector:
         error: np.ndarray,
         hidden: np.ndarray,
     ) -> np.ndarray:
-        """(T, 135) in [0, 1]: falls with the error, but knows only part of it."""
+        """Confidence (T, 135) in [0, 1], which decreases with the error."""
         size = np.linalg.norm(error, axis=-1)
         chance = self.noise.process(rng, self.frames, 135, 0.3)
         guess = 0.86 - 0.012 * size - 0.22 * hidden + 0.08 * chance
@@ -150,7 +153,7 @@ class Detector:
         pixels: np.ndarray,
         confidence: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Left and right of the whole body or of the legs, exchanged for a short while."""
+        """Exchange left and right of the whole body or of the legs for short periods."""
         chance = np.full((self.frames, 2), self.swap_probability)
         shared = self.noise.process(rng, self.frames, 1, self.swap_s)[:, 0]
         swapped = self.noise.episodes(rng, self.frames, chance, shared, self.swap_s, 0.0)
@@ -163,8 +166,7 @@ class Detector:
         return pixels, confidence
 
     def people(self, camera: Camera, subject: np.ndarray) -> list[list[np.ndarray]]:
-        """People (135, 3) in each frame's file: the subject mostly, sometimes nobody, sometimes a
-        bystander who is not there, before or after the subject."""
+        """People (135, 3) of each frame's file: the subject, with misses and false persons."""
         noise = self.noise
         rng = noise.detector_rng("people", camera.name)
         one = np.ones((self.frames, 1))
@@ -199,8 +201,7 @@ class Detector:
         passer_by: np.ndarray,
         hidden: np.ndarray,
     ) -> list[list[np.ndarray]]:
-        """The people of each frame's file, and among them, at any place, somebody who walks past:
-        keypoints (T, 135, 3), ``hidden`` (T, 135), where enough of the body is seen."""
+        """Add a second person (T, 135, 3) to each file where enough joints are visible."""
         noise = self.noise
         rng = noise.detector_rng("passer-by", camera.name)
         one, common = np.ones((self.frames, 1)), np.zeros(self.frames)

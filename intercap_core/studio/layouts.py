@@ -1,8 +1,8 @@
-"""What the folder of a capture looks like: Azure Kinect files, the releases of InterCap and BEHAVE,
-or plain images with a calibration in OpenCV's terms.
+"""Layouts of a capture's folder: Azure Kinect files, the releases of InterCap and BEHAVE, plain
+images.
 
-Folders below the capture's own: what the table of sequences calls ``recordings`` is the capture's
-folder, ``calibration`` is :attr:`CaptureFolder.calibration` in it.
+In the table of sequences, ``recordings`` is the capture's folder and ``calibration`` is
+:attr:`CaptureFolder.calibration` in it.
 """
 
 from __future__ import annotations
@@ -48,11 +48,11 @@ class KinectFolder(CaptureFolder):
     own_faults = frozenset({"same_serial", "backwards_clock"})
 
     def open(self, device: Device) -> CameraFiles:
-        """An Azure Kinect recording."""
+        """Open an Azure Kinect recording."""
         return _KinectFile(self.path / f"{device.camera.name}.mkv", device)
 
     def write_calibration(self, claimed: Rig, fps: int) -> None:
-        """The rig file; lenses are in the recordings."""
+        """Write the rig file; the recordings hold the lenses."""
         poses = dict(zip(claimed.names, claimed.master_from_colour, strict=True))
         write_rig_file(self.path / self.calibration, Extrinsics(claimed.names[0], poses))
 
@@ -78,14 +78,14 @@ class _KinectFile(CameraFiles):
         )
         self._last_us = 0
 
-    def write(self, shot: DeviceFrame) -> None:
-        if shot.time_us < self._last_us:
+    def write(self, frame: DeviceFrame) -> None:
+        if frame.time_us < self._last_us:
             self._writer.turn_back()
-        self._last_us = shot.time_us
-        self._writer.write_colour(shot.jpeg, shot.time_us)
-        if shot.depth is not None:
-            self._writer.write_depth(shot.depth, shot.time_us)
-        for sample in shot.inertial:
+        self._last_us = frame.time_us
+        self._writer.write_colour(frame.jpeg, frame.time_us)
+        if frame.depth is not None:
+            self._writer.write_depth(frame.depth, frame.time_us)
+        for sample in frame.inertial:
             self._writer.write_imu(*sample)
 
     def close(self) -> None:
@@ -93,23 +93,30 @@ class _KinectFile(CameraFiles):
 
 
 class ReleaseFolder(CaptureFolder):
-    """InterCap's release: ``Frames_Cam<n>/color/%05d.jpg``, aligned depth beside it, and a folder
-    of ``Color*.json``. There are no times but the numbers of the images."""
+    """InterCap's release: ``Frames_Cam<n>/color/%05d.jpg``, aligned depth, ``Color*.json``.
+
+    Image numbers are the only time stamps.
+    """
 
     calibration = "calibration"
     own_faults = frozenset({"swapped_lenses", "wrong_resolution"})
 
     def open(self, device: Device) -> CameraFiles:
-        """One ``Frames_Cam<n>``."""
-        aligner = Aligner(device.camera) if device.depth else None
-        return _ReleaseFiles(self.path / f"Frames_Cam{device.index + 1}", aligner, device.fps)
+        """Open a folder ``Frames_Cam<n>``."""
+        folder = self.path / f"Frames_Cam{device.index + 1}"
+
+        def paths(frame: DeviceFrame) -> tuple[Path, Path]:
+            name = f"{_release_number(frame.t, device.fps):05d}"
+            return folder / "color" / f"{name}.jpg", folder / "depth" / f"{name}.png"
+
+        return ImageFiles(paths, Aligner(device.camera) if device.depth else None)
 
     def image_number(self, t: int, order: int, fps: int) -> int:
-        """The number in the image's name."""
+        """Return the number in the image's name."""
         return _release_number(t, fps)
 
     def write_calibration(self, claimed: Rig, fps: int) -> None:
-        """``Color.json``, ``Color_2.json``, ...: x_camera = R x_world + T."""
+        """Write ``Color.json``, ``Color_2.json``, ...: x_camera = R x_world + T."""
         folder = self.path / self.calibration
         folder.mkdir()
         for index, (camera, lens) in enumerate(zip(claimed, self.lenses(claimed), strict=True)):
@@ -129,16 +136,6 @@ def _release_number(t: int, fps: int) -> int:
     return t * RELEASE_FPS // fps
 
 
-class _ReleaseFiles(ImageFiles):
-    def __init__(self, folder: Path, aligner: Aligner | None, fps: int) -> None:
-        super().__init__(aligner)
-        self._folder, self._fps = folder, fps
-
-    def _paths(self, shot: DeviceFrame) -> tuple[Path, Path]:
-        name = f"{_release_number(shot.t, self._fps):05d}"
-        return self._folder / "color" / f"{name}.jpg", self._folder / "depth" / f"{name}.png"
-
-
 class BehaveFolder(CaptureFolder):
     """BEHAVE: ``t<seconds>/k<n>.color.jpg`` and ``.depth.png``, aligned; poses and lenses in
     folders of their own. Kinect 1 is the master."""
@@ -147,12 +144,17 @@ class BehaveFolder(CaptureFolder):
     own_faults = frozenset({"wrong_resolution"})
 
     def open(self, device: Device) -> CameraFiles:
-        """Images among those of the other cameras."""
-        aligner = Aligner(device.camera) if device.depth else None
-        return _BehaveFiles(self.path, device.camera.name, aligner, device.fps)
+        """Open a camera; its images share folders with those of the other cameras."""
+        name = device.camera.name
+
+        def paths(frame: DeviceFrame) -> tuple[Path, Path]:
+            folder = _behave_frame(self.path, frame.t, device.fps)
+            return folder / f"{name}.color.jpg", folder / f"{name}.depth.png"
+
+        return ImageFiles(paths, Aligner(device.camera) if device.depth else None)
 
     def write_calibration(self, claimed: Rig, fps: int) -> None:
-        """``<n>/config.json`` (camera to world) and ``intrinsics/<n>/calibration.json``."""
+        """Write ``<n>/config.json`` (camera to world) and ``intrinsics/<n>/calibration.json``."""
         for camera, lens in zip(claimed, self.lenses(claimed), strict=True):
             number, pose = camera.name[1:], camera.master_from_colour
             rotation, shift = pose[:3, :3].ravel().tolist(), pose[:3, 3].tolist()
@@ -167,7 +169,7 @@ class BehaveFolder(CaptureFolder):
             _write_json(self.path / "calibs" / "intrinsics" / number / "calibration.json", content)
 
     def add_keypoints(self, camera: str, t: int, fps: int, content: str) -> None:
-        """``k<n>.color.json``."""
+        """Write ``k<n>.color.json``."""
         (_behave_frame(self.path, t, fps) / f"{camera}.color.json").write_text(content)
 
     def add_masks(
@@ -178,7 +180,8 @@ class BehaveFolder(CaptureFolder):
         candidates: list[dict[str, Any]],
         label: str,
     ) -> None:
-        """``k<n>.person_mask.jpg`` and ``k<n>.obj_rend_mask.jpg``: the first candidate of each."""
+        """Write ``k<n>.person_mask.jpg`` and ``k<n>.obj_rend_mask.jpg``: the first candidate of
+        each."""
         for wanted, kind in (("person", "person_mask"), (label, "obj_rend_mask")):
             found = next((c for c in candidates if c["category"] == wanted), None)
             if found is not None:
@@ -191,31 +194,23 @@ def _behave_frame(folder: Path, t: int, fps: int) -> Path:
     return folder / f"t{t / fps:08.3f}"
 
 
-class _BehaveFiles(ImageFiles):
-    def __init__(self, folder: Path, name: str, aligner: Aligner | None, fps: int) -> None:
-        super().__init__(aligner)
-        self._folder, self._name, self._fps = folder, name, fps
-
-    def _paths(self, shot: DeviceFrame) -> tuple[Path, Path]:
-        folder = _behave_frame(self._folder, shot.t, self._fps)
-        return folder / f"{self._name}.color.jpg", folder / f"{self._name}.depth.png"
-
-
 class PlainFolder(CaptureFolder):
-    """``<camera>/`` with numbered JPEG files, or a video, and timestamps; depth in its own lens;
-    a calibration in OpenCV's terms."""
+    """``<camera>/`` with numbered JPEG files, or a video, and time stamps; OpenCV calibration.
+
+    Depth stays in the depth camera's own lens.
+    """
 
     calibration = "calibration.yaml"
     own_faults = frozenset({"backwards_clock", "wrong_resolution"})
 
     def open(self, device: Device) -> CameraFiles:
-        """The camera's own folder, or its video."""
+        """Open the camera's folder or video."""
         if self.capture.video:
             return _PlainVideo(self.path / device.camera.name, device)
         return _PlainFiles(self.path / device.camera.name)
 
     def write_calibration(self, claimed: Rig, fps: int) -> None:
-        """One file for all cameras: x_camera = R x_world + T."""
+        """Write one file for all cameras: x_camera = R x_world + T."""
         cameras = {}
         for camera, lens in zip(claimed, self.lenses(claimed), strict=True):
             pose = camera.colour_from_master
@@ -237,27 +232,25 @@ class PlainFolder(CaptureFolder):
 
 class _PlainFiles(ImageFiles):
     def __init__(self, folder: Path) -> None:
-        super().__init__(None)
+        super().__init__(
+            lambda frame: (folder / f"{frame.t:06d}.jpg", folder / "depth" / f"{frame.t:06d}.png")
+        )
         self._folder = folder
         self._times: list[str] = []
 
-    def _paths(self, shot: DeviceFrame) -> tuple[Path, Path]:
-        name = f"{shot.t:06d}"
-        return self._folder / f"{name}.jpg", self._folder / "depth" / f"{name}.png"
-
-    def write(self, shot: DeviceFrame) -> None:
-        super().write(shot)
-        self._times.append(f"{shot.t:06d}, {shot.time_us / 1e6:.6f}\n")
+    def write(self, frame: DeviceFrame) -> None:
+        super().write(frame)
+        self._times.append(f"{frame.t:06d}, {frame.time_us / 1e6:.6f}\n")
 
     def close(self) -> None:
         (self._folder / "timestamps.csv").write_text("".join(self._times))
 
 
 class _PlainVideo(ImageFiles):
-    """``<camera>.mp4`` of JPEG packets; depth is numbered as the images of the video are."""
+    """``<camera>.mp4`` of JPEG packets; depth files are numbered as the video's images."""
 
     def __init__(self, folder: Path, device: Device) -> None:
-        super().__init__(None)
+        super().__init__(lambda frame: (None, folder / "depth" / f"{len(self._times):06d}.png"))
         self._folder, self._first_us = folder, device.first_us
         self._times: list[str] = []
         self._container = av.open(str(folder.with_suffix(".mp4")), "w")
@@ -270,19 +263,16 @@ class _PlainVideo(ImageFiles):
         if device.sound is not None:
             self._write_sound(device.sound)
 
-    def _paths(self, shot: DeviceFrame) -> tuple[Path | None, Path]:
-        return None, self._folder / "depth" / f"{len(self._times):06d}.png"
-
-    def write(self, shot: DeviceFrame) -> None:
-        super().write(shot)
-        packet = av.Packet(shot.jpeg)
+    def write(self, frame: DeviceFrame) -> None:
+        super().write(frame)
+        packet = av.Packet(frame.jpeg)
         packet.stream, packet.time_base = self._stream, MICROSECOND
-        packet.pts = packet.dts = shot.time_us - self._first_us
+        packet.pts = packet.dts = frame.time_us - self._first_us
         self._container.mux(packet)
-        self._times.append(f"{shot.time_us / 1e6:.6f}\n")
+        self._times.append(f"{frame.time_us / 1e6:.6f}\n")
 
     def _write_sound(self, samples: np.ndarray) -> None:
-        """As phones do, AAC; the muxer lays it between the images."""
+        """Write AAC sound, as phones do."""
         stream = self._container.add_stream("aac", rate=SOUND_RATE, layout="mono")
         frame = av.AudioFrame.from_ndarray(samples[None], format="fltp", layout="mono")
         frame.sample_rate, frame.pts, frame.time_base = SOUND_RATE, 0, Fraction(1, SOUND_RATE)
@@ -317,7 +307,7 @@ FOLDERS: dict[LayoutName, type[CaptureFolder]] = {
 
 
 def camera_names(layout: LayoutName, count: int) -> list[str]:
-    """Names of the cameras, the master first: k1, k2, ... but k1, k0, k2, ... in BEHAVE."""
+    """Return the names of the cameras, the master first: k1, k2, ...; in BEHAVE k1, k0, k2, ..."""
     if layout == "behave":
         return ["k1", "k0", *(f"k{number}" for number in range(2, count))][:count]
     return [f"k{number}" for number in range(1, count + 1)]

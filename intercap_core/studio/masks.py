@@ -1,8 +1,7 @@
-"""Instance candidates that err as a segmentation network does, in COCO's result format.
+"""Instance candidates with the errors of a segmentation network, in COCO's result format.
 
-What goes wrong lasts for a third of a second to a second and is partly the same in all views:
-borders, labels, misses, blobs of person and object, objects that are not there. Score and order say
-nothing about which candidate is right.
+Errors last for 0.3 to 1 s and partly agree between views: borders, labels, misses, merged person
+and object, false instances. Score and order carry no information.
 """
 
 from __future__ import annotations
@@ -42,20 +41,22 @@ AGREEMENT = 0.5
 
 @dataclass(frozen=True)
 class Labels:
-    """What one camera's image truly shows: ``identity`` (h, w) in a window at (x0, y0) of an image
-    of ``size`` (width, height); ``visible`` share of the object that nothing hides; ``blur_px``
-    how far it moves in the image while it is exposed."""
+    """True labels of one camera's image."""
 
     identity: np.ndarray
+    """(h, w) in a window at (x0, y0) of the image."""
     x0: int
     y0: int
     size: tuple[int, int]
+    """Width and height of the image."""
     visible: float
+    """Share of the object that is not occluded."""
     blur_px: float
+    """Motion of the object during the exposure."""
 
 
 class MaskSimulator:
-    """The network over one recording; every camera's errors partly agree."""
+    """The network over one recording; the errors of its cameras partly agree."""
 
     def __init__(
         self, noise: NoiseSource, frames: int, object_name: str, passer_by: bool = False
@@ -63,19 +64,19 @@ class MaskSimulator:
         self.noise, self.frames, self.passer_by = noise, frames, passer_by
         self.label = LABELS.get(object_name, object_name)
         shared = noise.detector_rng("masks")
-        self._shared = {
+        self.shared = {
             name: noise.process(shared, frames, 1, shared.uniform(*EPISODE_S))[:, 0]
             for name in ("label", "miss", "merge", "split", "person")
         }
 
-    def camera(self, name: str, clutter: np.ndarray | None, size: tuple[int, int]) -> CameraMasks:
-        """The errors of one camera; ``clutter`` (H, W) bool: a object of the room that is of the
-        object's class, or None; ``size`` width and height of its images."""
-        return CameraMasks(self, name, clutter, size)
-
 
 class CameraMasks:
-    """Candidates of one camera, frame by frame in any order."""
+    """Candidates of one camera.
+
+    Args:
+        clutter: (H, W) mask of an object in the room with the object's class, or None.
+        size: width and height of the images.
+    """
 
     border_px = 2.2  # RMS displacement of borders, px at 1080p
     max_border_px = 5.0  # largest displacement, px at 1080p
@@ -107,14 +108,14 @@ class CameraMasks:
         def episodes(kind: str, probability: float) -> np.ndarray:
             seconds = rng.uniform(*EPISODE_S)
             return noise.episodes(
-                rng, frames, one * probability, network._shared[kind], seconds, AGREEMENT
+                rng, frames, one * probability, network.shared[kind], seconds, AGREEMENT
             )[:, 0]
 
         self._wrong_label = episodes("label", self.wrong_label)
         self._merged, self._split = episodes("merge", self.merged), episodes("split", self.split)
         self._person_missed = episodes("person", self.person_missed)
         miss = noise.process(rng, frames, 1, rng.uniform(*EPISODE_S))[:, 0]
-        self._miss = np.sqrt(AGREEMENT) * network._shared["miss"] + np.sqrt(1 - AGREEMENT) * miss
+        self._miss = np.sqrt(AGREEMENT) * network.shared["miss"] + np.sqrt(1 - AGREEMENT) * miss
         self._wrong = rng.integers(0, 1000, frames // 8 + 2)
         # slow waves that move the borders in and out, one set for the object, one for the person
         self._waves = noise.process(rng, frames, 24, rng.uniform(*EPISODE_S)).reshape(-1, 2, 12)
@@ -131,7 +132,7 @@ class CameraMasks:
             self._expect_passer_by(noise.detector_rng("masks", name, "passer-by"))
 
     def _expect_passer_by(self, rng: np.random.Generator) -> None:
-        """Waves, misses and scores of one more person, drawn apart from all else."""
+        """Draw waves, misses and scores of a second person."""
         noise, frames = self.noise, self.network.frames
         waves = noise.process(rng, frames, 12, rng.uniform(*EPISODE_S))[:, None]
         self._waves = np.concatenate([self._waves, waves], 1)
@@ -143,7 +144,7 @@ class CameraMasks:
         self._other_score = noise.process(rng, frames, 1, 0.3)[:, 0]
 
     def _false_instances(self) -> list[tuple[str, dict[str, Any]]]:
-        """False instances of this view that stand still: label and RLE."""
+        """Label and RLE of false instances that do not move."""
         width, height = self.size
         instances = []
         for _ in range(3):
@@ -190,7 +191,7 @@ class CameraMasks:
         return [self._result(*found[i]) for i in order]
 
     def _standing(self, truth: Labels) -> list[tuple[str, dict[str, Any]]]:
-        """What stands about, the object's twin first where nothing moving hides it."""
+        """Static false instances, first the unoccluded part of the object's twin."""
         if self._twin is None:
             return self._clutter
         height, width = truth.identity.shape
@@ -217,7 +218,7 @@ class CameraMasks:
         }
 
     def _bordered(self, truth: Labels, kind: int, t: int) -> np.ndarray | None:
-        """A mask (h + 2m, w + 2m) with its border moved, or None where too little is seen."""
+        """Mask (h + 2m, w + 2m) with its border moved; None if too few pixels are visible."""
         mask = truth.identity == kind
         if mask.sum() < self.min_pixels:
             return None
@@ -252,7 +253,7 @@ class CameraMasks:
         return moved if moved.sum() >= self.min_pixels else None
 
     def _half(self, mask: np.ndarray, t: int) -> np.ndarray:
-        """Part of a mask, as when a network takes one object for two."""
+        """Part of a mask, as if the network took the object for two."""
         rows, columns = np.nonzero(mask)
         angle = self._phases[0, t % 12]
         along = np.cos(angle) * columns + np.sin(angle) * rows
@@ -266,7 +267,7 @@ class CameraMasks:
 
 
 def _encode(mask: np.ndarray, x0: int, y0: int, size: tuple[int, int]) -> dict[str, Any]:
-    """COCO RLE of a window at (x0, y0), which may reach over the image's edge."""
+    """COCO RLE of a window at (x0, y0), which may reach beyond the image."""
     width, height = size
     image = np.zeros((height, width), np.uint8, order="F")
     left, top = max(x0, 0), max(y0, 0)

@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import struct
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Literal
 
 import numpy as np
@@ -115,12 +114,7 @@ class MkvWriter:
     def __enter__(self) -> MkvWriter:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     # --- what goes in -----------------------------------------------------------------------

@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline
 
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.studio.controls import Footwork, WristPose, ramp
-from intercap_core.studio.hands import Hand, HandShape, part_of
+from intercap_core.studio.hands import RELAXED, Hand, HandShape, part_of
 from intercap_core.studio.skeleton import (
     PuppetSkeleton,
     blend,
@@ -59,14 +59,16 @@ def foot_rotations(heading: np.ndarray, pitch: np.ndarray, splay: float = SPLAY)
 
 @dataclass(frozen=True)
 class Trunk:
-    """Pelvis position (N, 3), heading (N,), and bends as rotation vectors (N, 3) in the person's
-    axes (x left, y up, z forward: positive x bends forward, positive z to the right, positive y
-    turns left) of the trunk and, against the heading, of the head."""
+    """Pose of pelvis, trunk and head over N moments."""
 
     pelvis: np.ndarray
+    """(N, 3)."""
     heading: np.ndarray
+    """(N,)."""
     bend: np.ndarray
+    """(N, 3) rotation vectors of the trunk in the person's axes (x left, y up, z forward)."""
     head: np.ndarray
+    """(N, 3) rotation vectors of the head relative to the heading."""
 
 
 def _sole_depth(subject: Subject, side: int) -> float:
@@ -92,7 +94,7 @@ def _thigh_height(subject: Subject, side: int) -> float:
 
 
 class Puppet:
-    """One subject that can be posed."""
+    """A subject that can be posed."""
 
     arm_reach = 0.960  # share of the arm's length beyond which the trunk helps
     assist_steps = 8  # iterations in which the trunk bends to help an arm
@@ -155,7 +157,7 @@ class Puppet:
         return footwork.pelvis(self.leg_reach * self.leg, width, self.hip_drop, self.stand)
 
     def settled(self, trunk: Trunk, ankle: np.ndarray) -> Trunk:
-        """The same trunk, lower where a leg could not reach its ankle (N, 2, 3)."""
+        """The same trunk, lower where a leg cannot reach its ankle (N, 2, 3)."""
         rotation = self.trunk(trunk)[:, 0]
         excess = np.full(len(trunk.pelvis), -np.inf)
         for side, name in enumerate(SIDES):
@@ -242,9 +244,9 @@ class Puppet:
         return carry(hand.out, hand.palm, fingers, palm)
 
     def assist(self, trunk: Trunk, targets: dict[int, tuple[WristPose, np.ndarray]]) -> Trunk:
-        """Bend the trunk a little more where an arm could not reach.
+        """Bend the trunk where an arm cannot reach its target.
 
-        ``targets``: side to (wrist target, weight (N,) in [0, 1]).
+        ``targets``: wrist target and weight (N,) in [0, 1] for each side.
         """
         bend = trunk.bend.copy()
         for _ in range(self.assist_steps):
@@ -293,6 +295,25 @@ class Puppet:
         world[:, _J[names[2]]] = wrist.rotation
         world[:, hand.first : hand.first + 15] = wrist.rotation[:, None]
 
+    def swing_arm(
+        self,
+        world: np.ndarray,
+        pelvis: np.ndarray,
+        side: int,
+        swing: np.ndarray,
+        *offsets: np.ndarray,
+    ) -> None:
+        """Set a hanging arm with relaxed fingers, in place.
+
+        Args:
+            swing: (N,) metres forward.
+            offsets: (N, 3) of the wrist, metres.
+        """
+        wrist = self.idle_wrist(world, pelvis, side, swing)
+        position = sum(offsets, wrist.position)
+        self.arm_to(world, pelvis, side, WristPose(position, wrist.rotation))
+        self.fingers(world, side, self.finger_track(side, RELAXED, []))
+
     def fingers(self, world: np.ndarray, side: int, vectors: np.ndarray) -> None:
         """Set the fingers' rotation vectors (N, 15, 3) relative to their parents, in place."""
         hand = self.hands[side]
@@ -321,7 +342,7 @@ class Puppet:
 
 
 class Foot:
-    """One foot of a puppet; ``side`` 0 left, 1 right. Places are ankle x, y, z, pitch, heading."""
+    """One foot of a puppet; places (5,) are ankle x, y, z, pitch, heading."""
 
     def __init__(self, puppet: Puppet, side: int) -> None:
         self.side, self.subject = side, puppet.subject

@@ -17,14 +17,16 @@ _QUANTILES = ndtri((np.arange(1 << 16) + 0.5) / (1 << 16)).astype(np.float32)
 
 
 def gaussian(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    """Standard normal values in float32 for whole images: one of 65536 quantiles each, a quarter
-    of the time of the generator's own."""
+    """Standard normal values in float32 for images: one of 65536 quantiles each.
+
+    Takes a quarter of the time of the generator's own method.
+    """
     return _QUANTILES[rng.integers(0, 1 << 16, shape, np.uint16)]
 
 
 @dataclass(frozen=True)
 class NoiseSource:
-    """Makes processes from a seed, a scale and a family; each name its own stream."""
+    """Random processes with a seed, scale and family; each name has its own stream."""
 
     seed: int
     scale: float
@@ -33,11 +35,11 @@ class NoiseSource:
     redrawn: int = 0
 
     def rng(self, *name: object) -> np.random.Generator:
-        """A generator of its own for what ``name`` says."""
+        """Generator of the stream ``name``."""
         return np.random.default_rng([self.seed, zlib.crc32(repr(name).encode())])
 
     def detector_rng(self, *name: object) -> np.random.Generator:
-        """The same for the errors of detectors, which ``redrawn`` draws anew."""
+        """Generator of a detector's stream; ``redrawn`` selects another stream."""
         return self.rng(*name, self.redrawn) if self.redrawn else self.rng(*name)
 
     def process(
@@ -77,7 +79,7 @@ class NoiseSource:
         return path
 
     def tails(self, gaussian: np.ndarray) -> np.ndarray:
-        """Family "b": the same ranks, Laplace-distributed with unit variance."""
+        """In family "b", map Gaussian values to Laplace values of unit variance."""
         if self.family != "b":
             return gaussian
         rank = np.clip(ndtr(gaussian), 1e-6, 1 - 1e-6) - 0.5
@@ -92,10 +94,12 @@ class NoiseSource:
         correlation_s: float,
         agreement: float,
     ) -> np.ndarray:
-        """(frames, n) on/off episodes that last about ``correlation_s`` and are partly shared.
+        """(frames, n) on/off episodes of about ``correlation_s`` that views partly share.
 
-        ``probability`` (frames, n) of being on; ``shared`` (frames,) a process that all views have
-        in common, ``agreement`` its share of the variance.
+        Args:
+            probability: (frames, n) of being on.
+            shared: (frames,) process common to all views.
+            agreement: share of the variance that ``shared`` explains.
         """
         own = self.process(rng, frames, probability.shape[1], correlation_s)
         mixed = np.sqrt(agreement) * shared[:, None] + np.sqrt(1 - agreement) * own

@@ -34,16 +34,19 @@ PRINT_RADIUS = (0.15, 0.45)  # of a spot, in parts of the object's radius
 
 @dataclass(frozen=True)
 class TrueObject:
-    """The object as it truly is: its frame, metres; ``colours`` (V, 3) uint8 RGB."""
+    """The object as it truly is, object frame, metres."""
 
     name: str
     vertices: np.ndarray
+    """(V, 3)."""
     faces: np.ndarray
+    """(F, 3)."""
     colours: np.ndarray
+    """(V, 3) RGB."""
 
     @classmethod
     def nothing(cls) -> TrueObject:
-        """What a person alone handles: a mesh without a face."""
+        """Return a mesh without faces, for a person alone."""
         vertices, faces = np.zeros((0, 3)), np.zeros((0, 3), np.int32)
         return cls("", vertices, faces, vertices)
 
@@ -63,12 +66,14 @@ class TrueObject:
 
 
 def true_mesh(entry: ObjectEntry, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The object as it truly is in one capture.
+    """Mesh of the true object in one capture.
 
-    Returns vertices (V, 3) in metres, faces (F, 3) int32 facing outward and colours (V, 3) uint8,
-    in the object frame of ``entry``'s mesh: the rigid part of the displacement is taken out, so a
-    true pose is also the best pose of the tracked mesh. Four times the faces of the tracked mesh,
-    every edge split at a random place. The same entry and seed give the same mesh.
+    Rigid motion is removed from the displacement, so that a true pose is also the best pose of the
+    tracked mesh. Each face of the tracked mesh is split into four, at random places of its edges.
+
+    Returns:
+        vertices (V, 3) metres, faces (F, 3) int32 facing outward, colours (V, 3) uint8, in the
+        frame of the mesh of ``entry``; equal for equal entry and seed.
     """
     source = load_mesh(Path(entry.mesh))
     rng = np.random.default_rng([seed, zlib.crc32(entry.name.encode())])
@@ -148,8 +153,10 @@ def press_out(
 ) -> np.ndarray:
     """Move points (N, 3) of the stage that are inside the object to its surface.
 
-    ``bounds`` (2, 3) is the object's box in its own frame. The displacement is as deep as the
-    point was, so it fades to nothing where the skin leaves the object.
+    The displacement equals the depth of the point: it fades out where the skin leaves the object.
+
+    Args:
+        bounds: (2, 3) bounding box of the object in its own frame.
     """
     rotation, translation = stage_from_object[:3, :3], stage_from_object[:3, 3]
     local = (points - translation) @ rotation
@@ -175,8 +182,12 @@ def press_out(
 def object_colours(
     look: str, vertices: np.ndarray, colours: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
-    """Colours (V, 3) RGB in [0, 1] of a true object whose mesh has ``colours`` (V, 3): those
-    ('mesh'), one for all ('plain') or one with spots of others that no scan knows ('printed')."""
+    """Colours (V, 3) RGB in [0, 1] of a true object.
+
+    Args:
+        look: "mesh" keeps ``colours`` (V, 3), "plain" has a single colour, "printed" has spots of
+            other colours.
+    """
     if look == "mesh":
         return colours
     first, *others = np.array(PAINTS)[rng.permutation(len(PAINTS))]

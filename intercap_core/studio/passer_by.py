@@ -1,8 +1,7 @@
-"""Another person in the room, who touches nothing: walks straight past the subject, or stands by.
+"""A second person in the room, who walks past the subject or stands near the subject.
 
-The way, or the place, is drawn until one fits: 0.8 to 1.6 m from the subject where the two are
-nearest, clear of the object, of furniture and of the cameras. Walls have no doors: where one is in
-the way, the person comes out of it.
+The path is drawn until it fits: 0.8 to 1.6 m from the subject at the nearest point, clear of the
+object, furniture and cameras. Walls have no doors: the person walks through them.
 """
 
 from __future__ import annotations
@@ -13,52 +12,59 @@ import numpy as np
 
 from intercap_core.errors import UserError
 from intercap_core.studio.controls import Footwork, Step, Wander
-from intercap_core.studio.hands import RELAXED
 from intercap_core.studio.motion import Puppet, Trunk
 from intercap_core.studio.noise import NoiseSource
 from intercap_core.studio.room import FLOOR_HALF_M, Room
 from intercap_core.studio.subjects import Subject, body_colours, subject_names
 
 CELL_M = 0.05  # of the floor plan
-FLOOR_UP_M, WALLS_BEYOND_M = 0.03, 2.8  # what of the room is a object that one walks around
+FLOOR_UP_M, WALLS_BEYOND_M = 0.03, 2.8  # what of the room is an object that one walks around
 OTHER_COLOURS = 0.25  # at least this far from the subject's, mean of the clothed surface, RGB
 _CORNERS = np.array([[a, b, 4 - a - b] for a in range(5) for b in range(5 - a)]) / 4
 
 
 @dataclass(frozen=True)
 class Passing:
-    """N moments: ``present`` (N,) bool, and where it is, in the stage, metres: ``body`` and
-    ``clothed`` (N, V, 3), ``joints`` (N, 55, 3), ``pelvis`` (N, 3, 3) stage_from_rest."""
+    """State of the second person at N moments, stage frame, metres."""
 
     present: np.ndarray
+    """(N,) bool."""
     body: np.ndarray
+    """(N, V, 3)."""
     clothed: np.ndarray
+    """(N, V, 3)."""
     joints: np.ndarray
+    """(N, 55, 3)."""
     pelvis: np.ndarray
+    """(N, 3, 3) stage_from_rest."""
 
 
 @dataclass(frozen=True)
 class Way:
-    """A straight way, ``heading`` rad; at ``when`` s of the recording one is at ``place`` (2,).
-
-    Of somebody who stands, it is where and towards what.
-    """
+    """A straight path, or the place of a person who stands."""
 
     place: np.ndarray
+    """(2,) at time ``when``."""
     heading: float
+    """Rad."""
     when: float
+    """Recording time, s."""
 
     def at(self, times: np.ndarray, speed: float) -> np.ndarray:
-        """Places (N, 2) at recording times (N,), where one walks with ``speed`` m/s."""
+        """Places (N, 2) at recording times (N,) for a walking speed, m/s."""
         ahead = np.array([np.cos(self.heading), np.sin(self.heading)])
         return self.place + speed * (times - self.when)[:, None] * ahead
 
 
 class PasserBy:
-    """The other person of one recording, who ``stands`` or walks.
+    """The second person of a recording.
 
-    ``times`` (N,) s over the recording, at which ``pelvis`` (N, 2) and ``prop`` (N, 2) are the
-    places of subject and object on the floor, in the stage; ``eyes`` (C, 2) those of the cameras.
+    Args:
+        eyes: (C, 2) places of the cameras on the floor plan.
+        times: (N,) recording times, s.
+        pelvis: (N, 2) places of the subject at ``times``.
+        prop: (N, 2) places of the object.
+        stands: whether the person stands; else walks.
     """
 
     passes_m = (0.8, 1.6)  # range of the least distance from the subject's pelvis, metres
@@ -112,7 +118,7 @@ class PasserBy:
         pelvis: np.ndarray,
         prop: np.ndarray,
     ) -> Way:
-        """A way that fits; raises UserError where none does."""
+        """Draw a path that fits; raises UserError if none does."""
         fine = np.linspace(times[0], times[-1], 1 + int(np.ptp(times) / self.place_s))
         for _ in range(self.tries):
             heading, far = rng.uniform(0, 2 * np.pi), rng.uniform(*self.passes_m)
@@ -135,8 +141,10 @@ class PasserBy:
         )
 
     def _walk(self, stride: float) -> None:
-        """Footsteps along x of the person's own frame, from x = 0 at the time 0; none, with the
-        feet side by side, of somebody who stands."""
+        """Plan footsteps along x of the person's own frame, from x = 0 at time 0.
+
+        A standing person has no steps and the feet side by side.
+        """
         puppet, across = self.puppet, 0.7 * self.puppet.hip_width
         count = 0 if self.stands else int(np.ceil(2 * (FLOOR_HALF_M + 1) / stride))
         apart = 0.0 if self.stands else 0.5 * stride
@@ -151,7 +159,7 @@ class PasserBy:
         self.track = puppet.pelvis_track(self.footwork, across)
 
     def at(self, times: np.ndarray) -> Passing:
-        """The person at recording times (N,); present while on the floor of the room."""
+        """State at recording times (N,); present while inside the room."""
         count, points = len(times), len(self.subject.rest)
         present = (np.abs(self.way.at(times, self.speed)) < FLOOR_HALF_M - 0.3).all(1)
         body, clothed = np.zeros((2, count, points, 3))
@@ -184,10 +192,7 @@ class PasserBy:
         # an arm is ahead while the foot of its side is behind
         for side, sign in enumerate((1.0, -1.0)):
             swing = sign * walks * self.arm_swing_m * np.cos(phase)
-            puppet.arm_to(
-                world, trunk.pelvis, side, puppet.idle_wrist(world, trunk.pelvis, side, swing)
-            )
-            puppet.fingers(world, side, puppet.finger_track(side, RELAXED, []))
+            puppet.swing_arm(world, trunk.pelvis, side, swing)
         middle = self.speed * self.seconds / 2
         cos, sin = np.cos(self.way.heading), np.sin(self.way.heading)
         turned = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
@@ -196,7 +201,7 @@ class PasserBy:
 
 
 def _obstacles(room: Room) -> np.ndarray:
-    """Points (N, 2) of what stands about, on the floor plan."""
+    """Floor points (N, 2) of furniture, on a grid."""
     corners = room.vertices[room.faces]
     points = np.einsum("sk,fkc->fsc", _CORNERS, corners).reshape(-1, 3)
     standing = points[:, 2] > FLOOR_UP_M
@@ -206,14 +211,14 @@ def _obstacles(room: Room) -> np.ndarray:
 
 
 def _gap(path: np.ndarray, obstacles: np.ndarray) -> float:
-    """How near a path (N, 2) comes to objects (M, 2), metres."""
+    """Least distance of a path (N, 2) from obstacles (M, 2), metres."""
     if not len(obstacles):
         return np.inf
     return float(np.linalg.norm(path[:, None] - obstacles, axis=2).min())
 
 
 def _other_colours(noise: NoiseSource, passer_by: Subject, subject: Subject) -> np.ndarray:
-    """Colours (V, 3) of somebody whose clothes are not the subject's."""
+    """Colours (V, 3) with clothes that differ from the subject's."""
     worn = body_colours(subject, noise.rng("looks"))[subject.clothing > 0.001].mean(0)
     rng = noise.rng("passer-by looks")
     dressed = passer_by.clothing > 0.001

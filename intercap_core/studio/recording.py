@@ -1,4 +1,4 @@
-"""What one Kinect records of the stage, and what detectors make of its images."""
+"""Recording of one Kinect, and the detections on its images."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from intercap_core.geometry.camera.transforms import invert
 from intercap_core.studio.calibration import ACCELEROMETER_FROM_DEPTH
 from intercap_core.studio.capture_folder import CaptureFolder, Device, DeviceFrame
 from intercap_core.studio.keypoints import Detector, to_json
-from intercap_core.studio.masks import Labels, MaskSimulator
+from intercap_core.studio.masks import CameraMasks, Labels, MaskSimulator
 from intercap_core.studio.passer_by import Passing
 from intercap_core.studio.render import (
     BODY,
@@ -36,16 +36,18 @@ COVER_M = {"body": 0.13, "hand": 0.03, "face": 0.02}
 
 @dataclass(frozen=True)
 class CameraRecord:
-    """What one camera has of every set: ``object_pixels`` (T,) of the object that are seen,
-    ``object_whole`` (T,) that it would cover if nothing hid it; ``colour`` and ``depth`` (T,) bool:
-    there is an image whose device time is the set's, and depth that is not empty. ``depth_bias``:
-    what its depth is too far by, metres."""
+    """Contents of one camera's recording, by set."""
 
     object_pixels: np.ndarray
+    """(T,) visible pixels of the object."""
     object_whole: np.ndarray
+    """(T,) pixels that the object would cover if nothing occluded it."""
     colour: np.ndarray
+    """(T,) bool: there is an image whose device time is the set's."""
     depth: np.ndarray
+    """(T,) bool: there is depth that is not empty."""
     depth_bias: float
+    """Constant error of its depth, metres."""
 
 
 class Kinect:
@@ -83,7 +85,7 @@ class Kinect:
         return "backwards_clock" in self.broken and t >= self.stage.frames // 2
 
     def device_time_us(self, t: int) -> int:
-        """What the device says about the image of set ``t``."""
+        """Device time of the image of set ``t``."""
         stagger = round(STAGGER_S * 1e6) * self.index
         jitter = round(self.stage.failures.jitter_s[t, self.index] * 1e6)
         if self.fallen_back(t):
@@ -110,7 +112,7 @@ class Kinect:
         if stage.room.distractor < 0:
             clutter = None
         size = (self.true.colour.width, self.true.colour.height)
-        masks = segmenter.camera(name, clutter, size)
+        masks = CameraMasks(segmenter, name, clutter, size)
         colours = body_colours(stage.subject, stage.noise.rng("looks"))
 
         passing = stage.passer_by.at(self.exposures) if stage.passer_by else None
@@ -167,7 +169,7 @@ class Kinect:
         return CameraRecord(seen, whole, colour, colour & has_depth & ~empty, sensor.bias)
 
     def _sound(self) -> np.ndarray:
-        """What the device hears from its first image to its last."""
+        """Sound from the first image to the last."""
         first, last = min(self.sets), max(self.sets)
         late = self.stage.rig.late_s[self.index]
         length = (last + 1 - first) / self.stage.fps
@@ -179,8 +181,10 @@ class Kinect:
         rng: np.random.Generator,
         stage_from_depth: np.ndarray,
     ) -> list[tuple[np.ndarray, np.ndarray, int]]:
-        """Acceleration, turning rate and device time over one period of a device that stands
-        still: its accelerometer feels the ground push up."""
+        """Acceleration, turning rate and device time of the samples of set ``t``.
+
+        The device does not move: its accelerometer measures the reaction to gravity.
+        """
         up = ACCELEROMETER_FROM_DEPTH @ stage_from_depth[:3, :3].T @ (0, 0, self.gravity)
         first, period = self.device_time_us(t), 1_000_000 // self.stage.fps
         return [
@@ -226,7 +230,7 @@ def surfaces_at(
     colours: np.ndarray,
     passing: Passing | None = None,
 ) -> list[MovingSurface]:
-    """The clothed body, the object and a passer-by, those that are there at one moment."""
+    """Clothed body, object and second person at moment ``t``, if present."""
     prop, subject = stage.prop, stage.subject
     faces = subject.faces.astype(np.int32)
 
@@ -246,7 +250,7 @@ def surfaces_at(
 
 
 def _blur_px(view: RoomView, times: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """How far (T,) points (T, 3) seen at ``times`` (T,) move in the image while it is exposed."""
+    """Motion (T,) of points (T, 3) in the image during the exposure, px."""
     at = points @ view.camera_from_stage[:3, :3].T + view.camera_from_stage[:3, 3]
     shift = np.linalg.norm(np.gradient(view.lens.project(at), axis=0), axis=1)
     # a camera that slips may show one moment twice
@@ -254,7 +258,7 @@ def _blur_px(view: RoomView, times: np.ndarray, points: np.ndarray) -> np.ndarra
 
 
 def _hidden(cast: Cast, view: RoomView, points: np.ndarray) -> np.ndarray:
-    """Which keypoints (135,) of those in the image something stands before."""
+    """Mask (135,) of keypoints that another surface occludes."""
     cover = np.full(135, COVER_M["body"])
     cover[25:67], cover[67:] = COVER_M["hand"], COVER_M["face"]
     cover[[0, 15, 16, 17, 18]] = COVER_M["face"] * 2

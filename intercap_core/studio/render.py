@@ -1,8 +1,9 @@
-"""Images of the stage: the static room by ray casting, once a camera; moving objects every frame.
+"""Images of the stage: the room is ray cast once for each camera, moving surfaces are drawn over
+it.
 
-Rays are not normalised (z = 1 in the camera's frame), so a hit's parameter is its depth z. Moving
-objects are drawn by a z-buffer over the same rays: half the cost of building a tree for a body that
-is another one in every image.
+Rays are not normalised (z = 1 in the camera frame), so that the parameter of a hit is its depth z.
+Moving surfaces are drawn by a z-buffer over the same rays, which costs half of building a tree for
+a body that changes in every image.
 """
 
 from __future__ import annotations
@@ -32,33 +33,38 @@ CAMERA_GAMMA = 2.2  # light adds up, grey levels are its power 1 / 2.2, as sRGB'
 
 @dataclass(frozen=True)
 class MovingSurface:
-    """A closed moving mesh, BODY, OBJECT or PASSER_BY, in its own frame: vertices (V, 3), faces
-    (F, 3), unit normals (V, 3), colours (V, 3) RGB in [0, 1], and where it is, stage_from_mesh."""
+    """A closed moving mesh."""
 
     kind: int
+    """BODY, OBJECT or PASSER_BY."""
     vertices: np.ndarray
+    """(V, 3) own frame."""
     faces: np.ndarray
+    """(F, 3)."""
     normals: np.ndarray
+    """(V, 3) unit."""
     colours: np.ndarray
+    """(V, 3) RGB in [0, 1]."""
     stage_from_mesh: np.ndarray
+    """(4, 4)."""
 
 
 @dataclass(frozen=True)
 class Cast:
-    """What moving objects look like in a window whose first pixel is (x0, y0).
-
-    ``identity`` (h, w) uint8 BODY, OBJECT, PASSER_BY or 0 where the room is nearer. Of the n pixels
-    that are not 0: ``pixels`` (n,) flat index in the window, ``depth`` (n,) z in metres, ``normal``
-    (n, 3) stage frame and ``colour`` (n, 3), float32.
-    """
+    """Drawn moving surfaces in a window whose first pixel is (``x0``, ``y0``)."""
 
     x0: int
     y0: int
     identity: np.ndarray
+    """(h, w) uint8: BODY, OBJECT, PASSER_BY, or 0 where the room is nearer."""
     pixels: np.ndarray
+    """(n,) flat indices in the window of the pixels that are not 0."""
     depth: np.ndarray
+    """(n,) z, metres."""
     normal: np.ndarray
+    """(n, 3) stage frame."""
     colour: np.ndarray
+    """(n, 3) float32."""
 
     @property
     def window(self) -> tuple[slice, slice]:
@@ -74,7 +80,7 @@ class Cast:
 
 
 def scene_of(*meshes: tuple[np.ndarray, np.ndarray]) -> o3d.t.geometry.RaycastingScene:
-    """A scene of meshes (V, 3), (F, 3); built by one thread, so that it is always the same."""
+    """Scene of meshes (V, 3), (F, 3); built by one thread, so that it is deterministic."""
     scene = o3d.t.geometry.RaycastingScene(nthreads=1)
     for vertices, faces in meshes:
         scene.add_triangles(
@@ -94,7 +100,7 @@ def shade(normals: np.ndarray) -> np.ndarray:
 
 
 class RoomView:
-    """One lens of one camera: its rays and what it sees of the empty room."""
+    """Rays of one lens, and its image of the empty room."""
 
     def __init__(
         self,
@@ -133,8 +139,10 @@ class RoomView:
                 self.colour[rows].reshape(-1, 3)[seen] = colours
 
     def directions(self, rows: slice = slice(None)) -> np.ndarray:
-        """Rays (h, W, 3) float32 of image rows in the stage, z = 1 in the camera; zero beyond the
-        lens's radius, so that they hit nothing."""
+        """Rays (h, W, 3) float32 of image rows in the stage, z = 1 in the camera.
+
+        Rays beyond the lens's radius are zero and hit nothing.
+        """
         xy = self.lens.rays[rows]
         directions = xy @ self.rotation[:, :2].T + self.rotation[:, 2]
         directions[np.isnan(xy[..., 0])] = 0
@@ -173,7 +181,7 @@ class RoomView:
         return Cast(drawn.x0, drawn.y0, identity, pixels, depth, normal, colour)
 
     def count(self, surface: MovingSurface) -> int:
-        """Pixels that a surface would cover if nothing hid it."""
+        """Number of pixels that an unoccluded surface covers."""
         return int(render_scene([self._drawable(surface)], self.lens).mask.sum())
 
 
@@ -259,8 +267,7 @@ def _room_colours(
 
 
 class Photographer:
-    """Turns casts of one colour view into JPEG images; ``gain`` (3,) of linear RGB is its white
-    balance."""
+    """Turns casts into JPEG images; ``gain`` (3,) on linear RGB is the white balance."""
 
     sensor_noise = 2.0  # standard deviation, grey levels
     edge_blur_px = 0.55  # blur of the edges of moving surfaces

@@ -33,23 +33,22 @@ DEPTH_TILT_DEG = 5.6  # the depth camera looks down against the colour camera
 
 @dataclass(frozen=True)
 class StudioRig:
-    """Cameras as they are and as they claim to be, in the master's colour frame.
-
-    ``true`` and ``claimed`` share names and order; ``claimed`` holds the erring lenses of the
-    recordings and the erring poses of the rig file. ``master_from_stage`` (4, 4). ``offset_s``
-    (C,): how much later than its device time (without the stagger) each camera exposes.
-    ``missing``: for each camera the set indices that it did not record. ``slip`` (T, C): whole
-    frames by which an image is older than its device time says. ``late_s`` (C,): what all along of
-    that and of ``offset_s`` is because the camera was started apart.
-    """
+    """Cameras as they are and as they claim to be, in the master's colour frame."""
 
     true: Rig
+    """True lenses and poses."""
     claimed: Rig
+    """Erring lenses of the recordings and erring poses of the rig file."""
     master_from_stage: np.ndarray
+    """(4, 4)."""
     offset_s: np.ndarray
+    """(C,) exposure after the device time, without the stagger."""
     missing: tuple[frozenset[int], ...]
+    """Sets that each camera did not record."""
     slip: np.ndarray
+    """(T, C) whole frames by which an image is older than its device time says."""
     late_s: np.ndarray
+    """(C,) part of slip and offset that comes from starting the cameras apart."""
 
 
 def build_rig(
@@ -64,11 +63,14 @@ def build_rig(
     overlap: bool = True,
     names: Sequence[str] | None = None,
 ) -> StudioRig:
-    """Make a rig around the stage's origin; ``noise`` scales every error.
+    """Make a rig around the stage's origin.
 
-    ``slips``: "missing" frames in two cameras, or "silent": their images are one to four frames
-    late for a while or from then on, and the device times do not tell. Without ``overlap`` all
-    cameras but the master look away. ``names`` of the cameras, the master first; k1, k2, ...
+    Args:
+        noise: scale of every error.
+        slips: "missing": two cameras lose frames; "silent": their images are 1 to 4 frames late
+            for a while or to the end, and the device times do not show it.
+        overlap: False: all cameras but the master look away.
+        names: of the cameras, the master first; by default k1, k2, ...
     """
     names = names or [f"k{number}" for number in range(1, cameras + 1)]
     stage_from_camera = _ring(rng, cameras)
@@ -120,8 +122,11 @@ def build_rig(
 def started_apart(
     rig: StudioRig, rng: np.random.Generator, seconds: float, fps: float
 ) -> StudioRig:
-    """The same rig whose cameras were started by hand: each but the master's images are older or
-    newer by up to ``seconds`` than their times say, one of them by nearly as much."""
+    """The same rig with cameras that were started by hand.
+
+    The images of each camera but the master are older or newer than their times say, by up to
+    ``seconds``; at least one nearly by as much.
+    """
     late = rng.uniform(-seconds, seconds, len(rig.true))
     if len(late) > 1:
         most = 1 + int(rng.integers(len(late) - 1))
@@ -152,7 +157,7 @@ def _ring(rng: np.random.Generator, cameras: int) -> list[np.ndarray]:
 
 
 def _about_centre(master_from_colour: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """Turn a camera about its own place and move it: the error of an ill-measured mount."""
+    """Rotate a camera about its centre and move it: the error of an ill-measured mount."""
     moved = master_from_colour.copy()
     moved[:3, :3] = error[:3, :3] @ moved[:3, :3]
     moved[:3, 3] += error[:3, 3]
@@ -193,7 +198,7 @@ def _depth_lens(rng: np.random.Generator, mode: str) -> Intrinsics:
 
 
 def _in_mode(lens: Intrinsics, mode: Mode, other: Mode) -> Intrinsics:
-    """The same glass and sensor read out in another mode."""
+    """The same lens and sensor in another mode."""
     scale = other.binned[0] / mode.binned[0]
     cx, cy = (np.array([lens.cx, lens.cy]) + mode.crop + 0.5) * scale - other.crop - 0.5
     width, height = other.size
@@ -208,7 +213,7 @@ def _colour_from_depth(rng: np.random.Generator) -> np.ndarray:
 
 
 def _recalibrated(lens: Intrinsics, rng: np.random.Generator, noise: float) -> Intrinsics:
-    """What the device's own calibration says of a lens."""
+    """The lens with the errors of the device's own calibration."""
     focal = 1 + rng.normal(0, FOCAL_ERROR) * noise
     centre = rng.normal(0, CENTRE_ERROR_PX, 2) * noise * lens.width / 1920
     return replace(
@@ -223,8 +228,10 @@ def _slips(
     kind: str,
     noise: float,
 ) -> tuple[tuple[frozenset[int], ...], np.ndarray]:
-    """Frames that are missing, or silent slips (T, C), in two subordinate cameras where there are
-    two; a camera starts late and one ends early."""
+    """Missing frames, or silent slips (T, C), in two subordinate cameras.
+
+    One camera starts late and one ends early.
+    """
     missing: list[set[int]] = [set() for _ in range(cameras)]
     slip = np.zeros((frames, cameras), np.int32)
     others = np.arange(1, cameras)
@@ -256,17 +263,16 @@ ONE_CAMERA_EACH = (
 
 @dataclass(frozen=True)
 class Failures:
-    """Of every camera of one capture.
-
-    ``jitter_s`` (T, C): what device times are off from an even beat; ``depth_empty`` and
-    ``depth_away`` (T, C) bool: the depth image holds nothing, or there is none; ``broken``: fault
-    to the camera's index (:data:`ONE_CAMERA_EACH`).
-    """
+    """Failures of every camera of a capture."""
 
     jitter_s: np.ndarray
+    """(T, C) deviation of device times from an even beat."""
     depth_empty: np.ndarray
+    """(T, C) the depth image holds nothing."""
     depth_away: np.ndarray
+    """(T, C) there is no depth image."""
     broken: dict[str, int] = field(default_factory=dict)
+    """Camera index of each fault of :data:`ONE_CAMERA_EACH`."""
 
     @classmethod
     def draw(
@@ -278,7 +284,7 @@ class Failures:
         faults: Sequence[str] = (),
         depth: bool = True,
     ) -> Failures:
-        """Decide what fails; the master's clock is the one that the sets go by."""
+        """Draw the failures; the master's clock defines the times of the sets."""
         jitter = np.zeros((frames, cameras))
         empty, away = np.zeros((2, frames, cameras), bool)
         rng = noise.rng("clocks")
@@ -302,7 +308,7 @@ class Failures:
 
 
 def _assigned(noise: NoiseSource, cameras: int, faults: Sequence[str]) -> dict[str, int]:
-    """A subordinate camera for each fault of one camera, different ones while there are enough."""
+    """A subordinate camera for each fault; different cameras while there are enough."""
     order = 1 + noise.rng("faults").permutation(max(cameras - 1, 1))
     named = [fault for fault in ONE_CAMERA_EACH if fault in faults]
     return {fault: int(order[i % len(order)]) for i, fault in enumerate(named)}

@@ -25,16 +25,19 @@ PILLARS_MAX = 3
 
 @dataclass(frozen=True)
 class Box:
-    """A piece of static furniture: upright box, ``low`` and ``high`` corners (3,), heading rad
-    about its middle; ``material`` names its looks."""
+    """A piece of static furniture: an upright box."""
 
     low: tuple[float, float, float]
+    """Corner."""
     high: tuple[float, float, float]
+    """Corner."""
     heading: float = 0.0
+    """Rad about the middle."""
     material: str = "wood"
+    """Names its look."""
 
     def moved(self, transform: np.ndarray) -> Box:
-        """The box turned about the vertical and shifted by a transform (4, 4)."""
+        """The box rotated about the vertical and shifted by a transform (4, 4)."""
         middle = (np.array(self.low) + self.high) / 2
         shift = transform[:3, :3] @ middle + transform[:3, 3] - middle
         low, high = np.array(self.low) + shift, np.array(self.high) + shift
@@ -43,8 +46,7 @@ class Box:
 
 
 class Twin(NamedTuple):
-    """What another object of the object's class looks like: vertices (V, 3) standing, z up, and
-    faces (F, 3)."""
+    """Another object of the object's class."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -55,14 +57,18 @@ Furnishing = Literal["furnished", "sparse", "bare"]
 
 @dataclass(frozen=True)
 class Room:
-    """Static surfaces in the stage frame: vertices (V, 3), faces (F, 3), material (F,) as an index
-    of ``materials``: functions of points (N, 3) and normals (N, 3) to colours (N, 3)."""
+    """Static surfaces in the stage frame."""
 
     vertices: np.ndarray
+    """(V, 3)."""
     faces: np.ndarray
+    """(F, 3)."""
     material: np.ndarray
+    """(F,) index of ``materials``."""
     materials: tuple[Callable[[np.ndarray, np.ndarray], np.ndarray], ...]
-    distractor: int  # index of the material of a object that detectors take for the object
+    """Functions of points (N, 3) and normals (N, 3) to colours (N, 3)."""
+    distractor: int
+    """Material of an object that detectors take for the tracked one, or -1."""
 
 
 def build_room(
@@ -74,11 +80,14 @@ def build_room(
     twin: Twin | None = None,
     hidden: np.ndarray | None = None,
 ) -> Room:
-    """Make a room around the stage with the script's ``furniture``; a bare one has nothing else
-    but a floor, a sparse one two low pieces beside it.
+    """Make a room around the stage with the script's ``furniture``.
 
-    ``eyes`` (C, 2): where the cameras stand; their view of the middle stays free but for a few
-    pillars between them and the place ``hidden`` (2,), where given. ``twin`` stands about as well.
+    Args:
+        eyes: (C, 2) places of the cameras; their view of the middle stays free.
+        furnishing: "bare" adds only a floor, "sparse" also two low pieces, "furnished" walls,
+            posters and five pieces.
+        twin: another object of the class that stands in the room.
+        hidden: (2,) place that a few pillars hide from some cameras.
     """
     boxes = list(furniture)
     twins: list[Twin] = []
@@ -159,14 +168,14 @@ def _pieces(rng: np.random.Generator, eyes: np.ndarray) -> list[Box]:
 
 
 def _between(eyes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Azimuths (C,) in the middle between neighbouring cameras, and how wide each gap is."""
+    """Azimuths (C,) in the middle between neighbouring cameras, and the width of each gap."""
     azimuths = np.sort(np.arctan2(eyes[:, 1], eyes[:, 0]))
     gaps = np.diff(np.append(azimuths, azimuths[0] + 2 * np.pi))
     return azimuths + gaps / 2, gaps
 
 
 def _twin(rng: np.random.Generator, eyes: np.ndarray, twin: Twin) -> tuple[list[Box], Twin]:
-    """Another object of the object's class, of another size, and what it stands on."""
+    """The twin at another scale, and the box on which it stands."""
     between, gaps = _between(eyes)
     gap = int(rng.integers(len(between)))
     angle = between[gap] + gaps[gap] * rng.uniform(-0.2, 0.2)
@@ -186,7 +195,7 @@ def _twin(rng: np.random.Generator, eyes: np.ndarray, twin: Twin) -> tuple[list[
 
 
 def _pillars(rng: np.random.Generator, eyes: np.ndarray, place: np.ndarray) -> list[Box]:
-    """Pillars before some of the cameras that hide what is at ``place`` (2,) from them."""
+    """Pillars that hide ``place`` (2,) from some of the cameras."""
     count = min(int(rng.integers(1, PILLARS_MAX + 1)), len(eyes) // 2)
     pillars = []
     for eye in eyes[rng.permutation(len(eyes))[:count]]:

@@ -20,25 +20,27 @@ from intercap_core.studio.stage import StudioStage
 
 
 @dataclass(frozen=True)
-class ModeLimits:
-    """Of one depth mode: nearest and farthest distance that is measured, somewhat beyond what the
-    data sheet warrants, and its noise against the narrow unbinned mode's."""
+class DepthMode:
+    """Limits of a depth mode, slightly beyond the data sheet's."""
 
     near_m: float
+    """Nearest measured distance."""
     far_m: float
+    """Farthest measured distance."""
     noise: float
+    """Noise relative to the narrow unbinned mode."""
 
 
 LIMITS = {
-    "NFOV_UNBINNED": ModeLimits(0.45, 4.3, 1.0),
-    "NFOV_2X2BINNED": ModeLimits(0.45, 6.0, 0.7),
-    "WFOV_2X2BINNED": ModeLimits(0.23, 3.2, 1.2),
-    "WFOV_UNBINNED": ModeLimits(0.23, 2.5, 2.0),
+    "NFOV_UNBINNED": DepthMode(0.45, 4.3, 1.0),
+    "NFOV_2X2BINNED": DepthMode(0.45, 6.0, 0.7),
+    "WFOV_2X2BINNED": DepthMode(0.23, 3.2, 1.2),
+    "WFOV_UNBINNED": DepthMode(0.23, 2.5, 2.0),
 }
 
 
 class DepthSensor:
-    """One depth camera looking at the room through ``view``; errors from ``noise``."""
+    """One depth camera that looks at the room through ``view``."""
 
     noise_m = 0.0006  # standard deviation of depth at distance 0, metres
     noise_per_m2 = 0.00058  # growth of the standard deviation with squared distance
@@ -77,14 +79,14 @@ class DepthSensor:
         self._static_holes = blotches < np.where(np.isfinite(risk), risk, 1)
 
     def _risk(self, depth: np.ndarray, cosine: np.ndarray, albedo: np.ndarray) -> np.ndarray:
-        """Share (...) of holes on surfaces at grazing angles and on dark ones."""
+        """Probability (...) of holes on surfaces at grazing angles and on dark surfaces."""
         scale = self._noise.scale
         risk = 0.9 * np.clip(1 - np.abs(cosine) / (self.grazing_cosine * (0.5 + 0.5 * scale)), 0, 1)
         risk += np.clip(1 - albedo / self.dark, 0, 1) * np.clip(depth / 4 - 0.2, 0, 0.7)
         return risk * min(scale, 1.5)
 
     def image(self, cast: Cast) -> np.ndarray:
-        """Depth (H, W) uint16 in millimetres, 0 = invalid, of the room with moving objects."""
+        """Depth (H, W) uint16 mm, 0 = invalid, of the room with moving surfaces."""
         rng, scale = self._rng, np.float32(self._noise.scale)
         depth, invalid = self._room.copy(), ~self._finite | ~self._in_field | self._static_holes
         if len(cast.pixels):
@@ -117,7 +119,7 @@ class DepthSensor:
         return np.rint(error * 1000).astype(np.uint16)
 
     def _edges(self, depth: np.ndarray, invalid: np.ndarray, scale: np.float32) -> None:
-        """Mix depths across steps, or lose them, in place."""
+        """Mix or invalidate depths across steps, in place."""
         kernel = np.ones((3, 3), np.uint8)
         near, far = cv2.erode(depth, kernel).ravel(), cv2.dilate(depth, kernel).ravel()
         at = np.flatnonzero((far - near > self.edge_m) & (near > 0))
@@ -138,14 +140,14 @@ def _blotches(
     size: float,
     contrast: float,
 ) -> np.ndarray:
-    """Values in [0, 1] (H, W) that change over ``size`` pixels."""
+    """Smooth random values in [0, 1] (H, W) that change over ``size`` pixels."""
     smooth = cv2.GaussianBlur(gaussian(rng, shape), (0, 0), size)
     return 0.5 + 0.5 * np.tanh(smooth / contrast / 1.2)
 
 
 def _field(lens: Intrinsics, mode: str) -> np.ndarray:
-    """Pixels (H, W) that the infrared light reaches: a hexagon in the narrow modes, a disc in the
-    wide ones."""
+    """Mask (H, W) of pixels that the infrared light reaches: hexagonal in narrow modes, else a
+    disc."""
     v, u = np.mgrid[: lens.height, : lens.width]
     x, y = u / (lens.width - 1) * 2 - 1, v / (lens.height - 1) * 2 - 1
     lit = abs(x) + 0.55 * abs(y) < 1.42 if mode.startswith("NFOV") else np.hypot(x, y) < 1
@@ -173,8 +175,12 @@ class _Event:
 
 
 def heard(stage: StudioStage, index: int, first_s: float, seconds: float) -> np.ndarray:
-    """Samples (N,) float32 at :data:`.SOUND_RATE` of camera ``index``, ``seconds`` long from the
-    true time ``first_s`` on, as the device lays them beside its images."""
+    """Samples (N,) float32 at :data:`.SOUND_RATE` of camera ``index``, as its file carries them.
+
+    Args:
+        first_s: true time of the first sample.
+        seconds: duration.
+    """
     rng = stage.noise.rng("microphone", stage.rig.true.names[index])
     eye = (invert(stage.rig.master_from_stage) @ stage.rig.true[index].master_from_colour)[:3, 3]
     latency = rng.uniform(-MAX_LATENCY_S, MAX_LATENCY_S) * min(1.0, stage.noise.scale)
@@ -195,7 +201,7 @@ def heard(stage: StudioStage, index: int, first_s: float, seconds: float) -> np.
 
 
 def _room(stage: StudioStage, rng: np.random.Generator) -> np.ndarray:
-    """The room's answer to a click, between this device and somebody in the middle."""
+    """Impulse response of the room between this device and a person in the middle."""
     fall = stage.noise.rng("reverberation").uniform(*REVERBERATION_S)
     times = np.arange(round(fall * RATE)) / RATE
     tail = rng.normal(size=len(times)) * 10 ** (-3 * times / fall)
@@ -206,7 +212,8 @@ def _room(stage: StudioStage, rng: np.random.Generator) -> np.ndarray:
 
 
 def _events(stage: StudioStage) -> list[_Event]:
-    """The same for every camera: steps on the floor below the person, syllables at the mouth."""
+    """Sounds of the capture, equal for all cameras: steps below the person, syllables at the
+    mouth."""
     rng = stage.noise.rng("sound")
     played = stage.interaction.perform(
         stage.interaction.script_times(stage.set_times, stage.duration)

@@ -40,8 +40,8 @@ def blend(a: np.ndarray, b: np.ndarray, share: np.ndarray) -> np.ndarray:
 
 
 def frame(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Rotations (..., 3, 3) whose columns are ``first``, the part of ``second`` across it, both
-    (..., 3), and their cross product."""
+    """Rotations (..., 3, 3) with columns ``first``, the part of ``second`` across it, their
+    product."""
     x = unit(first)
     y = unit(second - x * (x * second).sum(-1, keepdims=True))
     return np.stack([x, y, np.cross(x, y)], -1)
@@ -64,7 +64,7 @@ class PuppetSkeleton:
     rest: np.ndarray
 
     def bone(self, parent: str, child: str) -> np.ndarray:
-        """From one joint to another in the T-pose (3,)."""
+        """Vector (3,) from one joint to another in the T-pose."""
         return self.rest[JOINT_INDEX[child]] - self.rest[JOINT_INDEX[parent]]
 
     def length(self, *names: str) -> float:

@@ -1,4 +1,4 @@
-"""The stage of one capture: who, what and where, and how it all is at any moment."""
+"""The stage of one capture: subject, object, room and cameras, and their state at any moment."""
 
 from __future__ import annotations
 
@@ -37,20 +37,24 @@ ANY_LAYOUT = frozenset({"dead_half", "no_depth", "zero_depth", "no_overlap"})
 
 @dataclass(frozen=True)
 class StageState:
-    """N moments in the stage frame, metres: ``body`` and ``clothed`` (N, V, 3), ``joints``
-    (N, 55, 3), ``tips`` (N, 10, 3) thumb to little finger, left then right, ``pelvis`` (N, 3, 3)
-    stage_from_rest rotations, ``stage_from_object`` (N, 4, 4), NaN where there is no object."""
+    """N moments in the stage frame, metres; poses are NaN without an object."""
 
     body: np.ndarray
+    """(N, V, 3)."""
     clothed: np.ndarray
+    """(N, V, 3)."""
     joints: np.ndarray
+    """(N, 55, 3)."""
     tips: np.ndarray
+    """(N, 10, 3) thumb to little finger, left then right."""
     pelvis: np.ndarray
+    """(N, 3, 3) stage_from_rest."""
     stage_from_object: np.ndarray
+    """(N, 4, 4)."""
 
 
 class StudioStage:
-    """Everything that is true about one capture.
+    """The true state of a capture.
 
     Raises UserError for a subject, interaction or object that does not fit.
     """
@@ -157,7 +161,7 @@ class StudioStage:
         )
 
     def _highlight(self) -> np.ndarray:
-        """Where the object is on the floor plan (2,) when most happens to it."""
+        """Place (2,) of the object on the floor plan at the highlight."""
         played = self.interaction.perform(np.array([self.interaction.highlight]))
         return (self.stage_from_script @ played.stage_from_object[0])[:2, 3]
 
@@ -177,7 +181,7 @@ class StudioStage:
         return BodyModel.load()
 
     def at(self, times: np.ndarray) -> StageState:
-        """Everything at recording times (N,), seconds since the first set."""
+        """State at recording times (N,), seconds since the first set."""
         script = self.interaction.script_times(times, self.duration)
         played = self.interaction.perform(script)
         place = self.stage_from_script
@@ -203,7 +207,7 @@ class StudioStage:
         )
 
     def keypoints(self, moment: StageState | Passing) -> np.ndarray:
-        """The 135 true keypoints (N, 135, 3) in the stage; all people share one mesh."""
+        """True keypoints (N, 135, 3) in the stage; all people share one mesh."""
         chart = self.fitted.keypoint_map
         corners = self.subject.faces[self.subject.fitted_face[chart.vertex_ids]]
         weights = self.subject.fitted_bary[chart.vertex_ids]
@@ -219,7 +223,7 @@ class StudioStage:
 def check_capture(
     capture: StudioCapture, settings: StudioSettings, object_name: str | None
 ) -> None:
-    """Raise UserError for a subject, interaction, object or fault that the studio cannot play."""
+    """Raise UserError for a capture that the studio cannot play."""
     kind = interaction_named(capture.interaction)
     if (object_name or "") != kind.object_class:
         needed = f"object {kind.object_class!r}" if kind.object_class else "no object"
@@ -261,7 +265,7 @@ def check_capture(
 
 
 def _check_rates(capture: StudioCapture, settings: StudioSettings) -> None:
-    """Raise UserError where a camera cannot record every n-th frame set."""
+    """Raise UserError if a camera cannot record every n-th frame set."""
     names = camera_names(capture.layout, settings.cameras)
     for name, every in capture.every.items():
         if name not in names:
@@ -284,7 +288,7 @@ def _check_rates(capture: StudioCapture, settings: StudioSettings) -> None:
 
 
 def check_faults(faults: Sequence[str], *, layout: LayoutName, cameras: int, frames: int) -> None:
-    """Raise UserError where a capture asks for faults that it cannot have."""
+    """Raise UserError for faults that a capture cannot have."""
     strange = set(faults) - ANY_LAYOUT - FOLDERS[layout].own_faults
     if strange:
         raise UserError(

@@ -36,44 +36,49 @@ _LARGEST_BULGE = 1.6  # times the displacement at 90 degrees
 
 @dataclass(frozen=True)
 class PosedSubject:
-    """B poses, metres: body skin (B,V,3), clothed surface (B,V,3), joints (B,55,3), tips (B,10,3).
-
-    Tips: left index, middle, pinky, ring, thumb, then right.
-    """
+    """B poses, metres. Tips are left index, middle, pinky, ring, thumb, then right."""
 
     vertices: np.ndarray
+    """(B,V,3) skin."""
     clothed: np.ndarray
+    """(B,V,3) surface of the clothes."""
     joints: np.ndarray
+    """(B,55,3)."""
     tips: np.ndarray
+    """(B,10,3)."""
 
 
 @dataclass(frozen=True)
 class Subject:
-    """One person in the T-pose.
-
-    rest (V,3), faces (F,3), rest_joints (55,3), rest_tips (10,3) in metres, weights (V,55), bulges
-    (8,V,3) metres at a right angle, clothing (V,) metres, height_m; fitted_face (N,) and
-    fitted_bary (N,3): where on this mesh the vertices of the open body are; sole_m: how far soles
-    of shoes are below the lowest skin.
-    """
+    """One person in the T-pose, metres."""
 
     name: str
     gender: str
     height_m: float
     rest: np.ndarray
+    """(V,3)."""
     faces: np.ndarray
+    """(F,3)."""
     rest_joints: np.ndarray
+    """(55,3)."""
     rest_tips: np.ndarray
+    """(10,3)."""
     weights: csr_matrix
+    """(V,55)."""
     bulges: np.ndarray
+    """(8,V,3) at a right angle of each driver."""
     clothing: np.ndarray
+    """(V,) thickness."""
     fitted_face: np.ndarray
+    """(N,) face of this mesh below each vertex of the open body."""
     fitted_bary: np.ndarray
+    """(N,3) barycentric coordinates in it."""
     sole_m: float = 0.0
+    """How far soles of shoes are below the lowest skin."""
 
     @classmethod
     def load(cls, name: str) -> Subject:
-        """One of `subject_names()` or `build_names()`; another name raises KeyError."""
+        """Load a person of `subject_names()` or `build_names()`; another name raises KeyError."""
         names = (*subject_names(), *build_names())
         if name not in names:
             raise KeyError(f"no subject {name!r}; there are {', '.join(names)}")
@@ -100,8 +105,9 @@ class Subject:
     def skin(self, pose: np.ndarray, transl: np.ndarray) -> PosedSubject:
         """Pose the person.
 
-        pose: local rotations (B,55,3,3), or axis-angle (B,165) or (B,55,3) in SMPL-X's order;
-        transl (B,3) metres, added to the rest position as in SMPL-X.
+        Args:
+            pose: local rotations (B,55,3,3), or axis-angle (B,165) or (B,55,3), in SMPL-X's order.
+            transl: (B,3) metres, added to the rest position as in SMPL-X.
         """
         local = _matrices(pose)
         world, joints = self._chain(local, np.asarray(transl, np.float64))
@@ -115,12 +121,12 @@ class Subject:
         return PosedSubject(vertices, clothed, joints, tips)
 
     def on_fitted_topology(self, vertices: np.ndarray) -> np.ndarray:
-        """(B,V,3) on this mesh -> (B,N,3): the surface's points at the open body's vertices."""
+        """(B,V,3) on this mesh -> (B,N,3) points at the open body's vertices."""
         corners = vertices[:, self.faces[self.fitted_face]]
         return np.einsum("nk,bnkc->bnc", self.fitted_bary, corners)
 
     def normals(self, vertices: np.ndarray) -> np.ndarray:
-        """(B,V,3) -> unit normals (B,V,3), each face counted by its area."""
+        """(B,V,3) -> unit normals (B,V,3), weighted by area."""
         return _normals(np.asarray(vertices, np.float64), self.faces)
 
     @property
@@ -159,12 +165,12 @@ class Subject:
 
 
 def subject_names() -> tuple[str, ...]:
-    """The usual people, in a fixed order."""
+    """Names of the twelve standard people, in a fixed order."""
     return tuple(_file(SUBJECTS_FILE)["names"].tolist())
 
 
 def build_names() -> tuple[str, ...]:
-    """The people of other builds: small and tall, slight and strong."""
+    """Names of the people of other builds: small and tall, slight and strong."""
     return tuple(_file(BUILDS_FILE)["names"].tolist())
 
 
@@ -199,7 +205,7 @@ def _normals(vertices, faces):
 
 @numba.njit(cache=True)
 def _face_parents(quaternions, parents):
-    """q and -q are one rotation: bring (B,55,4) to their parents' side, in place."""
+    """Flip quaternions (B,55,4) to their parents' hemisphere, in place."""
     for b in range(len(quaternions)):
         for k in range(1, quaternions.shape[1]):
             if (quaternions[b, k] * quaternions[b, parents[k]]).sum() < 0:
@@ -256,13 +262,16 @@ FEET = ((7, 10), (8, 11))  # joints: ankle and ball of the left foot, of the rig
 
 
 def shoe_area(subject: Subject) -> np.ndarray:
-    """Which vertices (V,) are in the shoes."""
+    """Mask (V,) of the vertices inside the shoes."""
     share = np.asarray(subject.weights[:, [joint for foot in FEET for joint in foot]].sum(1))
     return (share.ravel() > 0.5) & (subject.rest[:, 1] < _top(subject))
 
 
 def in_heavy_shoes(subject: Subject, rng: np.random.Generator) -> Subject:
-    """The same person in heavy shoes, which are part of the clothing; ``rng`` draws the leather."""
+    """The same person in heavy shoes, which are part of the clothing.
+
+    The bare feet stay the true body; the soles stand on the floor. ``rng`` draws the leather.
+    """
     leather = rng.uniform(*LEATHER_M)
     down = -subject.normals(subject.rest[None])[0, :, 1]
     clothing, height = subject.clothing.copy(), subject.rest[:, 1]

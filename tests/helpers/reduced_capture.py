@@ -29,6 +29,15 @@ _OF_DEPTH_LENS = {
     "depth_metric_radius": np.nan,
     "colour_from_depth": np.nan,
 }
+# Value of an image that was taken away, and the field of Reduction that says which cameras keep it
+_EMPTY = {
+    "depth_index": (-1, "depth"),
+    "colour_index": (-1, ""),
+    "image_of": (-1, ""),
+    "candidate": (-1, "candidates"),
+    "keypoints_found": (False, "keypoints"),
+    "candidates_found": (False, "candidates"),
+}
 _RAGGED = (
     ("people_offsets", ("people",)),
     ("candidate_offsets", ("candidate_labels", "candidate_scores", "candidate_boxes")),
@@ -37,16 +46,14 @@ _RAGGED = (
 
 @dataclass(frozen=True)
 class Reduction:
-    """What is left of a capture; None = everything, camera names otherwise.
-
-    ``sets``: the first so many. ``depth``: cameras that keep theirs. ``images_until``: the set from
-    which a camera has no more images. ``keypoints``, ``candidates``: cameras with detections.
-    """
+    """The part of a capture that is kept; None keeps everything, else cameras are named."""
 
     cameras: Collection[str] | None = None
     sets: int | None = None
+    """Number of frame sets, from the first."""
     depth: Collection[str] | None = None
     images_until: Mapping[str, int] | None = None
+    """Set from which a camera has no more images."""
     keypoints: Collection[str] | None = None
     candidates: Collection[str] | None = None
 
@@ -88,21 +95,12 @@ class Reduction:
         for c, name in enumerate(names):
             if key in _OF_DEPTH_LENS and not _has(self.depth, name):
                 values[c] = _OF_DEPTH_LENS[key]
-            if key == "depth_index" and not _has(self.depth, name):
-                values[:, c] = -1
-            until = (self.images_until or {}).get(name)
-            if until is not None and key in ("depth_index", "colour_index", "image_of"):
-                values[until:, c] = -1
-            if until is not None and key in ("keypoints_found", "candidates_found"):
-                values[until:, c] = False
-            if key == "candidate" and not _has(self.candidates, name):
-                values[:, c] = -1
-            if until is not None and key == "candidate":
-                values[until:, c] = -1
-            if key == "keypoints_found" and not _has(self.keypoints, name):
-                values[:, c] = False
-            if key == "candidates_found" and not _has(self.candidates, name):
-                values[:, c] = False
+            if key in _EMPTY:
+                empty, needs = _EMPTY[key]
+                if needs and not _has(getattr(self, needs), name):
+                    values[:, c] = empty
+                if name in (self.images_until or {}):
+                    values[self.images_until[name] :, c] = empty
         for axis, dim in enumerate(dims):
             if dim == "T" and self.sets is not None:
                 values = values.take(np.arange(min(self.sets, values.shape[axis])), axis)
@@ -134,21 +132,22 @@ class Reduction:
             part = key.rsplit("/", 1)[1]
             if part in ("depth", "depth_time", "background") and not _has(self.depth, name):
                 continue
+            if part == "background":
+                new.put(key, old[key])
+                continue
+            index = "depth_index" if part.startswith("depth") else "colour_index"
+            count = self._num_images(old, name, index)
             if part == "depth":
                 rows = new.stream(key, old.describe(key)[0][1:])
-                for row in range(self._num_images(old, name, "depth_index")):
+                for row in range(count):
                     rows.append(old.rows(key, slice(row, row + 1)))
-            elif part == "depth_time":
-                new.put(key, old[key][: self._num_images(old, name, "depth_index")])
             elif part == "colour":
-                end = old[f"{group}/colour_offsets"][self._num_images(old, name, "colour_index")]
+                end = old[f"{group}/colour_offsets"][count]
                 new.put(key, old.rows(key, slice(0, int(end))))
-            elif part == "colour_offsets":
-                new.put(key, old[key][: self._num_images(old, name, "colour_index") + 1])
-            elif part == "colour_time":
-                new.put(key, old[key][: self._num_images(old, name, "colour_index")])
+            elif part in ("depth_time", "colour_time"):
+                new.put(key, old[key][:count])
             else:
-                new.put(key, old[key])
+                new.put(key, old[key][: count + 1])  # colour_offsets
 
     def _num_images(self, old: Artefact, name: str, index: str) -> int:
         """Images of a camera that the kept sets need."""

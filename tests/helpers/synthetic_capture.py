@@ -5,16 +5,17 @@ Nothing of the studio: rays are cast on boxes and planes analytically.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from intercap_core import artefacts
+from intercap_core.artefacts import Writer, pack_ragged
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import apply, invert, rigid
-from intercap_core.schemas import FRAMES
+from intercap_core.schemas import FRAMES, PERSON, SCENE
 
 COLOUR = Intrinsics(
     1920, 1080, 918.0, 917.0, 959.2, 549.4,
@@ -190,10 +191,14 @@ def write_frames(
     colour_times: bool = False,
     sound: Mapping[str, np.ndarray] | None = None,
 ) -> Path:
-    """Write a frames artefact without colour; ``depths`` has (T, H, W) uint16 for each camera,
-    ``stated`` what is stated of the calibration's world, by dataset; ``colour_times``: with the
-    device times of colour images, which begin at 7 s; ``sound`` when it says cameras started, by
-    dataset."""
+    """Write a frames artefact without colour images.
+
+    Args:
+        depths: (T, H, W) uint16 mm for each camera.
+        stated: datasets of what the calibration states about its world.
+        colour_times: also write the device times of colour images, which begin at 7 s.
+        sound: datasets of the start times found in the sound.
+    """
     count = len(rig)
     sets = np.repeat(np.arange(num_sets)[:, None], count, 1)
     none = np.full((num_sets, count), -1)
@@ -215,4 +220,81 @@ def write_frames(
             if colour_times:
                 times = 7_000_000 + np.rint(np.arange(num_sets) * 1e6 / 15).astype(np.int64)
                 writer.put(f"cameras/{name}/colour_time", times)
+    return path
+
+
+def fill(writer: Writer, schema: artefacts.Schema, **dims: int) -> None:
+    """Write zeros of sizes ``dims`` for the datasets of the schema that are still missing."""
+    for key, declared in schema.fields.items():
+        if declared.optional or "{camera}" in key or key in writer._file:
+            continue
+        shape = [int(d) if d.isdigit() else dims.get(d, 1) for d in declared.dims]
+        empty = np.full(shape, "") if declared.dtype == "str" else np.zeros(shape, declared.dtype)
+        writer.put(key, empty)
+    for name in schema.attributes:
+        writer.attributes.setdefault(name, "")
+
+
+def write_scene(
+    path: Path,
+    rig: Rig,
+    times: np.ndarray,
+    backgrounds: Sequence[np.ndarray],
+    *,
+    zup_from_master: np.ndarray | None = None,
+    **values: np.ndarray,
+) -> Path:
+    """Write a scene artefact whose extrinsics were not refined.
+
+    Args:
+        backgrounds: depth (H, W) of the empty room for each camera.
+        zup_from_master: (4, 4), None if no floor was found.
+        values: datasets that differ from their neutral values.
+    """
+    sets, count, known = len(times), len(rig), zup_from_master is not None
+    floor = invert(zup_from_master) if known else np.full((4, 4), np.nan)
+    written = {
+        **rig.datasets(),
+        "master_from_colour": rig.master_from_colour,
+        "master_from_colour_start": rig.master_from_colour,
+        "present": np.ones(count, bool),
+        "times": times,
+        "time_offset_sigma": np.full(count, np.nan),
+        "image_of": np.arange(sets)[:, None].repeat(count, 1),
+        "ground_point": floor[:3, 3],
+        "ground_normal": floor[:3, 2],
+        "zup_from_master": zup_from_master if known else np.full((4, 4), np.nan),
+        **values,
+    }
+    with artefacts.write(
+        path, SCENE, sequence="test", master="k1", fps=15.0, extrinsics_refined=False,
+        extrinsics_converged=False, verdict="", ground_found=known,
+        ground_source="fitted" if known else "none", ground_rms=0.0 if known else np.nan,
+        ground_inliers=100 if known else 0,
+    ) as writer:  # fmt: skip
+        for key, value in written.items():
+            writer.put(key, value)
+        fill(writer, SCENE, T=sets, C=count, P=0)
+        for name, background in zip(rig.names, backgrounds, strict=True):
+            writer.put(f"cameras/{name}/background", background)
+    return path
+
+
+def write_person(path: Path, rig: Rig, masks: Sequence[bytes], **values: np.ndarray) -> Path:
+    """Write a person artefact.
+
+    Args:
+        masks: RLE of each set and camera, sets first.
+        values: datasets that differ from zero.
+    """
+    sets, count = len(masks) // len(rig), len(rig)
+    offsets, runs = pack_ragged(masks)
+    with artefacts.write(
+        path, PERSON, sequence="test", images_alone=False, chosen_by="alone", doubts=""
+    ) as writer:
+        known = {"camera_names": rig.names, "mask_offsets": offsets, "mask_rle": runs,
+                 "mask_source": np.ones((sets, count), np.int8)}  # fmt: skip
+        for key, value in {**known, **values}.items():
+            writer.put(key, value)
+        fill(writer, PERSON, T=sets, C=count)
     return path

@@ -10,7 +10,7 @@ from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.places import Places, Standing
 from intercap_core.object_track.tracker import Tracker
 from tests.geometry.rigid.conftest import catalogue
-from tests.helpers.harsh_capture import FPS, HarshCapture
+from tests.helpers.object_capture import FPS, HarshCapture
 
 HANDLED, APART = np.array([0.0, 0.0, 2.0]), np.array([1.2, 0.0, 2.5])
 

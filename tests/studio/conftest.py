@@ -3,22 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
+from functools import cache
 
 import pytest
-import yaml
 
-from intercap_core.config import ObjectEntry
+from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
+from intercap_core.studio.interactions import INTERACTIONS
+from intercap_core.studio.stage import StudioStage
+from tests.helpers.fitted_capture import object_entry as catalogue_entry
 
-CONFIG = Path(__file__).resolve().parents[2] / "config"
+MakeStage = Callable[..., StudioStage]
 
 
 @pytest.fixture(scope="session")
 def object_entry() -> Callable[[str], ObjectEntry]:
     """Entries of config/objects.yaml by name."""
+    return catalogue_entry
 
-    def entry(name: str) -> ObjectEntry:
-        found = yaml.safe_load((CONFIG / "objects.yaml").read_text())[name]
-        return ObjectEntry(name=name, mesh=CONFIG / found["mesh"], labels=found["labels"])
 
-    return entry
+@pytest.fixture(scope="session")
+def make_stage() -> MakeStage:
+    """Stage of one camera for an interaction, subject and seed; made once in a process."""
+
+    @cache
+    def make(interaction: str, subject: str, seed: int, frames: int = 45) -> StudioStage:
+        capture = StudioCapture(interaction=interaction, subject=subject, seed=seed, frames=frames)
+        name = INTERACTIONS[interaction].object_class
+        entry = catalogue_entry(name) if name else None
+        return StudioStage(capture, StudioSettings(captures={}, cameras=1), entry)
+
+    return make

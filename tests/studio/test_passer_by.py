@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import open3d as o3d
 import pytest
 
-from intercap_core import artefacts
 from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
 from intercap_core.geometry.camera.transforms import invert
-from intercap_core.schemas import TRUTH
-from intercap_core.studio.capture import make_capture
 from intercap_core.studio.keypoints import Detector
 from intercap_core.studio.noise import NoiseSource
 from intercap_core.studio.passer_by import PasserBy
@@ -94,12 +89,12 @@ def test_nothing_else_of_the_recording_changes(stage: StudioStage, object_entry:
 
 def test_each_hides_what_is_behind(stage: StudioStage, walker: PasserBy) -> None:
     """Against rays that are cast through all surfaces at once."""
-    times = np.array([0.0, walker.way.when, 1.8])
+    times = np.array([0.0, walker.way.when])
     moment, passing = stage.at(times), walker.at(times)
     colours = body_colours(stage.subject, stage.noise.rng("looks"))
     stage_from_master = invert(stage.rig.master_from_stage)
     drawn_of_walker = 0
-    for camera in stage.rig.true:
+    for camera in stage.rig.true[:2]:
         pose = stage_from_master @ camera.master_from_colour
         view = RoomView(camera.colour.scaled(0.2), pose, stage.room, coloured=True)
         for t in range(len(times)):
@@ -119,22 +114,6 @@ def test_each_hides_what_is_behind(stage: StudioStage, walker: PasserBy) -> None
                 assert ((hit == number) != (drawn == kind)).mean() < 1e-4
             drawn_of_walker += int((drawn == PASSER_BY).sum())
     assert drawn_of_walker > 1000
-
-
-def test_detectors_find_both_people_in_any_order(tmp_path: Path, object_entry: Entry) -> None:
-    folder = tmp_path / "passed"
-    make_capture(CAPTURE, SETTINGS, sequence="passed", objects=object_entry("stool"), output=folder)
-    with artefacts.read(folder / "truth.h5", TRUTH) as truth:
-        assert truth.attributes["passer_by"] != truth.attributes["subject"]
-        names = truth.text("camera_names")
-    several, persons = 0, 0
-    for name in names:
-        for path in sorted((folder / "keypoints" / name).iterdir()):
-            several += len(json.loads(path.read_text())["people"]) > 1
-        found = json.loads((folder / "candidates" / f"{name}.json").read_text())
-        images = [c["image_id"] for c in found if c["category"] == "person"]
-        persons += sum(images.count(image) > 1 for image in set(images))
-    assert several > CAPTURE.frames and persons > CAPTURE.frames
 
 
 def test_a_walker_is_anywhere_in_a_file_and_only_where_seen(stage: StudioStage) -> None:

@@ -81,14 +81,10 @@ class BeamWalk(Interaction):
         puppet.legs(world, pelvis, *feet)
         swing = self.arm_swing(times)
         for side, sign in ((LEFT, 1.0), (RIGHT, -1.0)):
-            wrist = puppet.idle_wrist(world, pelvis, side, swing[:, side])
             outward = sign * world[:, 9, :, 0] * (1, 1, 0)
             out = balance[:, None] * (0.26 * outward + (0, 0, 0.16))
             unsteady = 4 * balance[:, None] * swing[:, [side]] * (0, 0, 1)
-            puppet.arm_to(
-                world, pelvis, side, WristPose(wrist.position + out + unsteady, wrist.rotation)
-            )
-            puppet.fingers(world, side, puppet.finger_track(side, RELAXED, []))
+            puppet.swing_arm(world, pelvis, side, swing[:, side], out, unsteady)
         return Performance(world, pelvis, np.full((len(times), 4, 4), np.nan))
 
 
@@ -123,14 +119,12 @@ class WalkAndWave(Interaction):
         self.walk(start, steps)
 
     def _trunk(self, times: np.ndarray) -> Trunk:
-        track, sway = self.pelvis_track(times), self.sway(times)
-        pelvis = track[:, :3] + self.weight_shift(times)
-        pelvis[:, 2] -= 0.01
-        bend, head = 0.6 * sway[:, :3], 1.3 * sway[:, 3:]
-        bend[:, 0] += 0.03
-        head[:, 0] += 0.05
-        head[:, 1] += 0.3 * np.sign(self.turned) * plateau(times, 0.5, 0.9, 1.4, 1.8)
-        return Trunk(pelvis, track[:, 3], bend, head)
+        trunk = self.standing(times)
+        trunk.pelvis[:, 2] -= 0.01
+        trunk.bend[:, 0] += 0.03
+        trunk.head[:, 0] += 0.05
+        trunk.head[:, 1] += 0.3 * np.sign(self.turned) * plateau(times, 0.5, 0.9, 1.4, 1.8)
+        return trunk
 
     def _waving(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> WristPose:
         """The raised wrist (N), the palm ahead."""

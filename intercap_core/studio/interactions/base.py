@@ -1,4 +1,4 @@
-"""What every scripted interaction has: a puppet, the true object, furniture, and times."""
+"""Base class of all scripts: puppet, true object, furniture and times."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from intercap_core.geometry.camera.transforms import invert
 from intercap_core.studio.controls import Footwork, Guide, Step, Wander
-from intercap_core.studio.motion import Puppet
+from intercap_core.studio.motion import Puppet, Trunk
 from intercap_core.studio.objects import TrueObject
 from intercap_core.studio.room import Box
 
@@ -19,22 +19,21 @@ SCRIPT_S = 3.0  # a script's own length; longer recordings play it slower
 
 @dataclass(frozen=True)
 class Performance:
-    """N moments: joint rotations (N, 55, 3, 3), pelvis (N, 3), stage_from_object (N, 4, 4), NaN
-    where there is no object."""
+    """N moments of a script; poses are NaN without an object."""
 
     world: np.ndarray
+    """(N, 55, 3, 3) joint rotations."""
     pelvis: np.ndarray
+    """(N, 3)."""
     stage_from_object: np.ndarray
+    """(N, 4, 4)."""
 
 
 @dataclass
 class Interaction(ABC):
-    """One script for one person and one object, or none where ``object_class`` is "".
+    """Script for one person and one object; ``object_class`` is "" without an object.
 
-    Script time runs from 0 to ``SCRIPT_S``. ``centre`` is the middle of the action on the floor,
-    in the script's frame: z up, the floor at z = 0. ``highlight`` is the script time around which a
-    recording shorter than the script is taken. ``feet_meet_object``: feet touch it on
-    purpose. ``leaves_floor``: feet stand on furniture.
+    Script time runs from 0 to ``SCRIPT_S``. The script's frame has z up and the floor at z = 0.
     """
 
     puppet: Puppet
@@ -42,10 +41,10 @@ class Interaction(ABC):
     rng: np.random.Generator
     furniture: list[Box] = field(default_factory=list)
     object_class = ""
-    feet_meet_object = False
-    leaves_floor = False
-    highlight = SCRIPT_S / 2
-    centre = (0.0, 0.0)
+    feet_meet_object = False  # soles or insteps touch the object
+    leaves_floor = False  # the feet stand on furniture
+    highlight = SCRIPT_S / 2  # short recordings show the script around this time
+    centre = (0.0, 0.0)  # middle of the action on the floor, script frame
 
     def __post_init__(self) -> None:
         self.sway = Wander(6, 0.010, self.rng)  # rad, trunk and head
@@ -55,11 +54,11 @@ class Interaction(ABC):
 
     @abstractmethod
     def plan(self) -> None:
-        """Decide on places, times and grasps."""
+        """Choose places, times and grasps."""
 
     @abstractmethod
     def perform(self, times: np.ndarray) -> Performance:
-        """Play the script at script times (N,), any order."""
+        """Play the script at script times (N,), in any order."""
 
     def walk(
         self,
@@ -72,6 +71,12 @@ class Interaction(ABC):
         """Stand at ``start`` (2, 2), left and right, with ``heading`` rad, then take the steps."""
         self.footwork = Footwork(start, heading, steps, self.puppet.ankle_height, SCRIPT_S, guides)
         self.pelvis_track = self.puppet.pelvis_track(self.footwork)
+
+    def standing(self, times: np.ndarray, *, bend: float = 0.6, head: float = 1.3) -> Trunk:
+        """Trunk over the feet that shifts its weight and sways, scaled by ``bend`` and ``head``."""
+        track, sway = self.pelvis_track(times), self.sway(times)
+        pelvis = track[:, :3] + self.weight_shift(times)
+        return Trunk(pelvis, track[:, 3], bend * sway[:, :3], head * sway[:, 3:])
 
     def script_times(self, times: np.ndarray, duration: float) -> np.ndarray:
         """Script times of recording times (N,), seconds from its first set.
@@ -104,7 +109,7 @@ def held_object(
     side: int,
     object_from_wrist: np.ndarray,
 ) -> np.ndarray:
-    """stage_from_object (N, 4, 4) of what a hand holds: the posed wrist's own place decides."""
+    """stage_from_object (N, 4, 4) of an object in the hand, from the posed wrist."""
     wrist = np.broadcast_to(np.eye(4), (len(world), 4, 4)).copy()
     index = puppet.hands[side].wrist
     wrist[:, :3, :3] = world[:, index]

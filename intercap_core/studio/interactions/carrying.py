@@ -24,7 +24,7 @@ class HandleCarry(Interaction):
 
     highlight = 1.5
     centre = (0.22, -0.15)
-    # What a object asks for: half the thickness of the handle's bar, the room between hip and the
+    # What an object asks for: half the thickness of the handle's bar, the room between hip and the
     # object's middle, where the knuckles are tried beside and below the bar, the height above the
     # grip from which the hand goes down to it, all in metres
     bar_half: float
@@ -109,24 +109,21 @@ class HandleCarry(Interaction):
         )
 
     def _trunk(self, times: np.ndarray) -> Trunk:
-        track = self.pelvis_track(times)
-        sway, shift = self.sway(times), self.weight_shift(times)
+        trunk = self.standing(times, head=1.5)
+        pelvis, bend, head = trunk.pelvis, trunk.bend, trunk.head
         stoop = plateau(times, self.stoop_from, 1.02, 1.10, self.lifted_s - 0.05)
         stoop = stoop + plateau(times, self.lower_s, 2.40, 2.54, 3.30)
         carry = plateau(times, 1.15, 1.6, 1.85, 2.3)
-        pelvis = track[:, :3] + shift
         pelvis[:, 2] -= self.stoop_down * self.puppet.leg * stoop
         pelvis[:, 0] -= self.stoop_back * stoop
-        bend = 0.6 * sway[:, :3]
         bend[:, 0] += 0.04 + self.stoop_bend * stoop
         bend[:, 2] += 0.10 * stoop - 0.10 * carry
         bend[:, 1] -= 0.10 * stoop
-        head = 1.5 * sway[:, 3:]
         head[:, 0] += 0.12 + 0.45 * stoop
         head[:, 1] -= 0.35 * plateau(times, 0.2, 0.7, 1.2, 1.6) + 0.25 * plateau(
             times, 1.8, 2.2, 2.5, 2.9
         )
-        return Trunk(pelvis, track[:, 3], bend, head)
+        return trunk
 
     def _right_wrist(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> WristPose:
         count = len(times)

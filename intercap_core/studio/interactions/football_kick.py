@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.studio.controls import Guide, Step, WristPose, bump, plateau, ramp
-from intercap_core.studio.hands import RELAXED
+from intercap_core.studio.controls import Guide, Step, bump, plateau, ramp
 from intercap_core.studio.interactions.base import SCRIPT_S, Interaction, Performance
 from intercap_core.studio.motion import LEFT, RIGHT, Foot, Trunk, moved, still
 from intercap_core.studio.skeleton import turn, unit
@@ -151,21 +150,18 @@ class FootballKick(Interaction):
     # --- the script --------------------------------------------------------------------------
 
     def _trunk(self, times: np.ndarray) -> Trunk:
-        track = self.pelvis_track(times)
-        sway, shift = self.sway(times), self.weight_shift(times)
+        trunk = self.standing(times)
+        pelvis, bend, head = trunk.pelvis, trunk.bend, trunk.head
         back = bump(times, 1.05, 1.62)
         kick = plateau(times, 1.40, 1.75, 1.85, 2.40)
-        pelvis = track[:, :3] + shift
         pelvis[:, 0] += 0.05 * back
         pelvis[:, 1] += 0.03 * plateau(times, 0.30, 0.60, 2.10, 2.50)
         pelvis[:, 2] -= 0.015 + 0.02 * (back + kick)
-        bend = 0.6 * sway[:, :3]
         bend[:, 0] += 0.04 + 0.16 * back - 0.05 * kick
         bend[:, 1] += -0.20 * back + 0.18 * kick
         bend[:, 2] -= 0.05 * plateau(times, 0.30, 0.60, 2.10, 2.50)
-        head = 1.3 * sway[:, 3:]
         head[:, 0] += 0.48 - 0.22 * ramp(times, 1.80, 2.60)
-        return Trunk(pelvis, track[:, 3], bend, head)
+        return trunk
 
     def perform(self, times: np.ndarray) -> Performance:
         puppet, feet = self.puppet, self.footwork.feet(times)
@@ -177,11 +173,7 @@ class FootballKick(Interaction):
         balance = plateau(times, 0.30, 0.70, 2.00, 2.60)
         for side, sign in ((LEFT, 1.0), (RIGHT, -1.0)):
             swing = sign * (0.16 * back - 0.20 * kick) + self.arm_swing(times)[:, side]
-            wrist = puppet.idle_wrist(world, trunk.pelvis, side, swing)
             out = (0.10 * balance)[:, None] * np.array([0, sign, 0])
             out[:, 2] += 0.05 * balance
-            puppet.arm_to(
-                world, trunk.pelvis, side, WristPose(wrist.position + out, wrist.rotation)
-            )
-            puppet.fingers(world, side, puppet.finger_track(side, RELAXED, []))
+            puppet.swing_arm(world, trunk.pelvis, side, swing, out)
         return Performance(world, trunk.pelvis, self._ball(times))

@@ -34,13 +34,15 @@ WRAP_LIMITS = {"finger": (75.0, 95.0, 60.0), "thumb": (40.0, 50.0, 60.0)}
 
 @dataclass(frozen=True)
 class Grip:
-    """A planned grasp: the hand's shape before and in it, where the wrist is, ``object_from_wrist``
-    (4, 4), and the fingers' least signed distances ``gaps`` (5,), metres."""
+    """A planned grasp."""
 
     open: HandShape
+    """Shape before the grasp."""
     closed: HandShape
     object_from_wrist: np.ndarray
+    """(4, 4)"""
     gaps: np.ndarray
+    """Least signed distance (5,) of each finger, metres."""
 
 
 def backed_off(
@@ -101,14 +103,18 @@ class Hollow:
 
 @dataclass(frozen=True)
 class Approach:
-    """How a palm comes to a object: to the point ``at`` (3,) of the stage along ``palm`` (3,), with
-    ``fingers`` (3,) ahead, ``along`` metres beyond the palm's middle, above ``floor`` metres."""
+    """Straight approach of a palm to an object, stage frame."""
 
     at: np.ndarray
+    """Goal (3,) of the palm."""
     fingers: np.ndarray
+    """Direction (3,) of the fingers."""
     palm: np.ndarray
+    """Direction (3,) in which the palm faces and moves."""
     along: float = ALONG_FINGERS_M
+    """The goal lies this far from the palm's middle towards the fingers, metres."""
     floor: float = -np.inf
+    """The hand stays above this height, metres."""
 
     def wrist(
         self,

@@ -1,4 +1,4 @@
-"""Base of the scripts in which hands take an object, move it and put it down."""
+"""Base class of scripts in which hands pick up an object, move it and put it down."""
 
 from __future__ import annotations
 
@@ -62,23 +62,25 @@ class HandlingScript(Interaction):
         """The trunk (N), before it helps arms that are too short."""
 
     def needs(self, times: np.ndarray) -> dict[int, np.ndarray]:
-        """How much the trunk helps each hand (N,): from shortly before to after it holds."""
+        """Weight (N,) with which the trunk helps each hand, from before to after it holds."""
         return {
             side: ramp(times, on - 0.65, on - 0.20) - ramp(times, off + 0.20, off + 0.60)
             for side, (on, off) in self.hold_s.items()
         }
 
     def slide(self, times: np.ndarray) -> np.ndarray:
-        """How the leading hand has moved along the object since it took it (N, 4, 4), the object's
-        frame: what is held slips, turns in the fingers or is taken anew."""
+        """Motion (N, 4, 4) of the leading hand along the object since the grasp, object frame.
+
+        Scripts override it for objects that slip, turn in the fingers or are grasped again.
+        """
         return np.broadcast_to(np.eye(4), (len(times), 4, 4))
 
     def raised(self, times: np.ndarray, side: int) -> np.ndarray:
-        """How far an elbow is lifted outward (N,), as `Puppet.arm_to` takes it."""
+        """Outward lift of an elbow (N,), as `Puppet.arm_to` takes it."""
         return np.zeros(len(times))
 
     def object_from_wrist(self, side: int, times: np.ndarray) -> np.ndarray:
-        """Where a hand's wrist is on the object (N, 4, 4) at script times."""
+        """Wrist poses (N, 4, 4) relative to the object at script times."""
         grip = self.grips[side].object_from_wrist
         if side == self.lead:
             return self.slide(times) @ grip
@@ -99,9 +101,13 @@ class HandlingScript(Interaction):
         self.furniture.append(Box(low, high, heading, "wood"))
 
     def set_out(self, top_of_height: float, aside: float, further: Sequence[Step] = ()) -> None:
-        """A plinth ahead and ``aside`` (metres to the left), its top at a share of the person's
-        height; the object on it, its x axis about to the left; two steps up to it and ``further``
-        ones."""
+        """Place a plinth with the object on it, and plan the steps to it.
+
+        Args:
+            top_of_height: height of the plinth's top, share of the person's height.
+            aside: the plinth's middle, metres to the left.
+            further: steps after the two that lead to the plinth.
+        """
         rng, puppet = self.rng, self.puppet
         self.top = top_of_height * puppet.subject.height_m + rng.uniform(-0.03, 0.03)
         self.table(
@@ -122,16 +128,13 @@ class HandlingScript(Interaction):
         self.walk(np.array([[-0.24, w], [-0.22, -w]]), [*steps, *further])
 
     def leaning(self, times: np.ndarray, reach: np.ndarray, look: np.ndarray) -> Trunk:
-        """The trunk over the feet, swaying, bent by ``reach`` (N,) from 0 to 1, the head pitched
-        down by ``look`` (N,) rad."""
-        track = self.pelvis_track(times)
-        sway = self.sway(times)
-        pelvis = track[:, :3] + self.weight_shift(times)
-        pelvis[:, 2] -= 0.01
-        bend, head = 0.6 * sway[:, :3], 1.3 * sway[:, 3:]
-        bend[:, 0] += 0.03 + 0.16 * reach
-        head[:, 0] += 0.10 + look
-        return Trunk(pelvis, track[:, 3], bend, head)
+        """Trunk over the feet, bent by ``reach`` (N,) in [0, 1], head pitched by ``look`` (N,)
+        rad."""
+        trunk = self.standing(times)
+        trunk.pelvis[:, 2] -= 0.01
+        trunk.bend[:, 0] += 0.03 + 0.16 * reach
+        trunk.head[:, 0] += 0.10 + look
+        return trunk
 
     def before_chest(
         self,
@@ -140,8 +143,12 @@ class HandlingScript(Interaction):
         offset: np.ndarray,
         about: np.ndarray,
     ) -> WristPose:
-        """The object (N) held before the person: ``offset`` (3,) metres to the left, up and ahead
-        of ``origin`` (N, 3), turned by ``about`` (N, 3) from how it was taken."""
+        """Poses (N) of the object held in front of the person.
+
+        Args:
+            offset: (3,) metres to the left, up and ahead of ``origin`` (N, 3).
+            about: (N, 3) rotation vectors relative to the pick-up pose.
+        """
         person = facing(np.arctan2(world[:, 9, 1, 2], world[:, 9, 0, 2]))
         heading = person @ facing(np.zeros(1))[0].T
         return WristPose(origin + person @ offset, heading @ turn(about) @ self.pick_pose[:3, :3])
@@ -156,7 +163,7 @@ class HandlingScript(Interaction):
         times: np.ndarray,
         prop: np.ndarray,
     ) -> WristPose:
-        """The wrist (N) of a hand: to the ``prop`` (N, 4, 4), with it, away from it."""
+        """Wrist poses (N) of a hand: to the object ``prop`` (N, 4, 4), with it, away from it."""
         swing = self.arm_swing(times)[:, SIDES.index(side)]
         idle = self.puppet.idle_wrist(world, pelvis, side, swing)
         if side not in self.grips:
@@ -178,7 +185,7 @@ class HandlingScript(Interaction):
         return wrist.towards(idle, ramp(times, off + 0.30 * q, off + 0.80 * q))
 
     def finger_keys(self, side: int, times: np.ndarray) -> list[tuple[np.ndarray, HandShape]]:
-        """The shapes a hand goes through, as `Puppet.finger_track` takes them."""
+        """Hand shapes over time, as `Puppet.finger_track` takes them."""
         if side not in self.grips:
             return []
         (on, off), grip = self.hold_s[side], self.grips[side]
@@ -218,7 +225,7 @@ class HandlingScript(Interaction):
         return Performance(world, pelvis, prop)
 
     def _held(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """The object (N, 4, 4): at rest, as the leading hand has it, at rest."""
+        """Poses (N, 4, 4) of the object: at rest, in the leading hand, at rest."""
         joints = self.puppet.skeleton.forward(world, pelvis)
         index = self.puppet.hands[self.lead].wrist
         wrist = _matrices(WristPose(joints[:, index], world[:, index]))
@@ -236,11 +243,11 @@ def _matrices(pose: WristPose) -> np.ndarray:
     return result
 
 
-PALMS_BELOW_M = 0.01  # the middle of a object held between palms
+PALMS_BELOW_M = 0.01  # the middle of an object held between palms
 
 
 def between_palms(script: HandlingScript) -> dict[int, Grip]:
-    """A palm on either side of the object, fingers ahead and a little down."""
+    """Grip with a palm on either side of the object, fingers ahead and slightly down."""
     grips = {}
     for side in SIDES:
         inward = (-1.0, 1.0)[side]
@@ -253,14 +260,16 @@ def between_palms(script: HandlingScript) -> dict[int, Grip]:
 
 
 def by_the_wall(script: HandlingScript, height: float) -> Grip:
-    """The right hand around an upright wall, ``height`` metres above the object's origin or as low
-    as the plinth lets it."""
+    """Grip of the right hand around an upright wall.
+
+    ``height``: of the palm above the object's origin, metres; more if the plinth is in the way.
+    """
     at = script.pick_pose[:3, 3] + (0, 0, height)
     return wrapped(script.puppet, RIGHT, WRAP_OPEN, script.prop.surface, script.pick_pose,
                    around_wall(at, script.top + HandlingScript.fingers_rest_m))  # fmt: skip
 
 
 def palm_below(script: HandlingScript) -> Grip:
-    """The object's bottom on the left palm, fingers ahead and to the right."""
+    """Grip with the object's bottom on the left palm, fingers ahead and to the right."""
     below = Approach(script.pick_pose[:3, 3], np.array([0.75, -0.65, -0.05]), np.array([0, 0, 1.0]))
     return laid_on(script.puppet, LEFT, script.prop.surface, script.pick_pose, below)

@@ -17,7 +17,7 @@ from intercap_core.studio.motion import LEFT, RIGHT, Trunk
 
 
 class Checking(HandlingScript):
-    """What the two ways of checking share: the path and the trunk."""
+    """Pick up an object, turn it before the eyes, put it back."""
 
     highlight = 1.75
     centre = (0.20, 0.0)
@@ -97,7 +97,7 @@ class CheckingByTheWall(Checking):
     grip_height_m = 0.0
 
     def grasp(self) -> None:
-        """The wall as one drinks, then the bottom on the left palm."""
+        """Right hand around the wall, the bottom on the left palm."""
         self.grips = {RIGHT: by_the_wall(self, self.grip_height_m), LEFT: palm_below(self)}
         self.hold_s = {RIGHT: (self.attach_s, self.release_s), LEFT: (self.join_s, self.part_s)}
         self.haste[LEFT] = 0.6
@@ -113,14 +113,14 @@ class BottleCheck(CheckingByTheWall):
 
 
 class CupCheck(CheckingByTheWall):
-    """The cup by its wall, its bottom on the other palm; one looks into it."""
+    """The cup by its wall, its bottom on the other palm; the person looks into it."""
 
     object_class = "cup"
     tip_deg = 38.0
 
 
 class Passing(HandlingScript):
-    """What the ways of passing share; the second plinth is to the left of the first."""
+    """Carry an object from one plinth to a second one on the left, and hold it out meanwhile."""
 
     highlight = 1.85
     centre = (0.15, 0.40)
@@ -202,19 +202,19 @@ class PassingByTheWall(Passing):
     grip_height_m = 0.0
 
     def grasp(self) -> None:
-        """The wall as one drinks."""
+        """Right hand around the wall."""
         self.grips = {RIGHT: by_the_wall(self, self.grip_height_m)}
         self.hold_s = {RIGHT: (self.attach_s, self.release_s)}
 
 
 class CupPass(PassingByTheWall):
-    """The cup, in one hand."""
+    """The cup in one hand."""
 
     object_class = "cup"
 
 
 class BottlePass(PassingByTheWall):
-    """The bottle, in one hand."""
+    """The bottle in one hand."""
 
     object_class = "bottle"
     grip_height_m = 0.01

@@ -6,8 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from intercap_core.studio.controls import Guide, Step, WristPose, plateau, ramp
-from intercap_core.studio.hands import RELAXED
+from intercap_core.studio.controls import Guide, Step, plateau, ramp
 from intercap_core.studio.interactions.base import Interaction, Performance, upright
 from intercap_core.studio.motion import LEFT, RIGHT, Foot, Trunk, moved, still
 
@@ -112,23 +111,20 @@ class SkateboardRide(Interaction):
         return lambda times: place + (self.way * self._rolled(times))[:, None] * np.eye(5)[0]
 
     def _trunk(self, times: np.ndarray, ankle: np.ndarray) -> Trunk:
-        track = self.pelvis_track(times)
-        sway, shift = self.sway(times), self.weight_shift(times)
+        trunk = self.standing(times, bend=0.8)
+        pelvis, bend, head = trunk.pelvis, trunk.bend, trunk.head
         ride = plateau(times, 0.70, 1.20, 2.00, 2.60)
         on_front = plateau(times, 0.72, 0.95, 1.08, 1.34) + plateau(times, 2.02, 2.25, 2.45, 2.68)
         on_back = plateau(times, 0.0, 0.12, 0.36, 0.62) + plateau(times, 2.46, 2.66, 2.84, 3.06)
         middle = ankle.mean(1)
         front, back = ankle[:, self.front], ankle[:, 1 - self.front]
         lean = on_front[:, None] * (front - middle) + on_back[:, None] * (back - middle)
-        pelvis = track[:, :3] + shift
         pelvis[:, :2] += 0.6 * lean[:, :2]
         pelvis[:, 2] -= 0.01 + 0.05 * ride
-        bend = 0.8 * sway[:, :3]
         bend[:, 0] += 0.06 + 0.14 * ride
-        head = 1.3 * sway[:, 3:]
         head[:, 0] += 0.40 - 0.22 * ride
         head[:, 1] -= 0.45 * self.way * ride
-        return Trunk(pelvis, track[:, 3], bend, head)
+        return trunk
 
     def perform(self, times: np.ndarray) -> Performance:
         puppet, feet = self.puppet, self.footwork.feet(times)
@@ -137,13 +133,9 @@ class SkateboardRide(Interaction):
         puppet.legs(world, trunk.pelvis, *feet)
         balance = 0.3 * ramp(times, 0.1, 0.5) + 0.7 * plateau(times, 0.7, 1.1, 2.2, 2.9)
         for side, sign in ((LEFT, 1.0), (RIGHT, -1.0)):
-            wrist = puppet.idle_wrist(world, trunk.pelvis, side, self.arm_swing(times)[:, side])
             outward = sign * world[:, 9, :, 0] * (1, 1, 0)
             out = balance[:, None] * (0.20 * outward + (0, 0, 0.12))
-            puppet.arm_to(
-                world, trunk.pelvis, side, WristPose(wrist.position + out, wrist.rotation)
-            )
-            puppet.fingers(world, side, puppet.finger_track(side, RELAXED, []))
+            puppet.swing_arm(world, trunk.pelvis, side, self.arm_swing(times)[:, side], out)
         pose = np.broadcast_to(self.board, (len(times), 4, 4)).copy()
         pose[:, 0, 3] += self.way * self._rolled(times)
         return Performance(world, trunk.pelvis, pose)

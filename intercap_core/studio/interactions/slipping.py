@@ -1,6 +1,6 @@
-"""Scripts in which what is held truly moves in the hand: a glide, a turn, a re-grasp.
+"""Scripts in which the held object moves in the hand: glide, turn, re-grasp.
 
-Only ``slide`` says how fast skin and object pass each other; truth follows from it.
+``slide`` states the motion between hand and object; true contact and slip follow from it.
 """
 
 from __future__ import annotations
@@ -17,8 +17,10 @@ from intercap_core.studio.skeleton import turn
 
 
 def along_and_about(along: np.ndarray, about: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """Transforms (N, 4, 4): ``along`` (N,) metres along z and ``about`` (N,) rad about the line
-    parallel to z through ``axis`` (2,) metres."""
+    """Transforms (N, 4, 4): ``along`` (N,) metres along z, ``about`` (N,) rad around z.
+
+    The rotation axis goes through ``axis`` (2,), metres.
+    """
     result = np.broadcast_to(np.eye(4), (len(along), 4, 4)).copy()
     vectors = np.zeros((len(along), 3))
     vectors[:, 2] = about
@@ -58,8 +60,10 @@ class UmbrellaTurn(UmbrellaSwing):
 
 
 class BottleRegrasp(BottleCheck):
-    """The bottle is taken, let go and taken anew higher up and farther round before it is lifted:
-    the plinth keeps it. One hand turns it before the eyes."""
+    """The hand lets go of the bottle and grasps it higher up and turned, then lifts it.
+
+    The bottle stands on the plinth meanwhile. The right hand alone turns it before the eyes.
+    """
 
     regrasp_s = (1.04, 1.12, 1.26, 1.36)  # opens from, is open, closes from, is closed
     rests_until_s = 1.36
@@ -73,7 +77,7 @@ class BottleRegrasp(BottleCheck):
         self.hold_s = {RIGHT: (self.attach_s, self.release_s)}
 
     def raised(self, times: np.ndarray, side: int) -> np.ndarray:
-        """No arm helps."""
+        """Zeros: no arm helps."""
         return np.zeros(len(times))
 
     def slide(self, times: np.ndarray) -> np.ndarray:
@@ -89,13 +93,13 @@ class BottleRegrasp(BottleCheck):
         return moved
 
     def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> WristPose:
-        """Before the eyes and back, but that it rests until it is held anew."""
+        """As in the base script, but the bottle rests until the second grasp."""
         way = super().path(world, pelvis, times)
         still = WristPose.still(self.pick_pose, len(times))
         return still.towards(way, ramp(times, self.rests_until_s, 1.80))
 
     def finger_keys(self, side: int, times: np.ndarray) -> list[tuple[np.ndarray, HandShape]]:
-        """The hand opens and closes once more in between."""
+        """The hand opens and closes a second time."""
         keys = super().finger_keys(side, times)
         if side != RIGHT:
             return keys

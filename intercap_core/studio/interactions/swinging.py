@@ -20,15 +20,18 @@ from intercap_core.studio.skeleton import unit
 
 @dataclass(frozen=True)
 class Key:
-    """Where the swinging hand is at one moment: ``wrist`` (3,) from the shoulder's rest place, in
-    arm lengths ahead, to the left and up; where fingers and thumb point; from when to when it
-    goes there, script times."""
+    """Goal of the swinging hand."""
 
     wrist: tuple[float, float, float]
+    """From the shoulder's rest place, in arm lengths ahead, to the left and up."""
     fingers: tuple[float, float, float]
+    """Direction of the fingers."""
     thumb: tuple[float, float, float]
+    """Direction of the thumb."""
     start: float
+    """Start of the motion to this goal, script time."""
     end: float
+    """Its end."""
 
 
 class Swinging(HandlingScript):

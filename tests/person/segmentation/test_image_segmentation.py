@@ -16,7 +16,7 @@ from intercap_core.person.segmentation.image_segmentation import segment_images
 from intercap_core.schemas import PERSON as PERSON_SCHEMA
 from intercap_core.schemas import SCENE
 from intercap_core.stages import person
-from tests.helpers.foreground_capture import BOX, BOX_M, PERSON, SCENERY, STOOL, Carrying
+from tests.helpers.body_capture import BOX, BOX_M, PERSON, SCENERY, STOOL, Carrying
 from tests.helpers.synthetic_people import seen_by, write_detections
 
 STEP = 4

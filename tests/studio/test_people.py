@@ -1,11 +1,26 @@
+"""People, their shoes, and the colours of objects."""
+
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from intercap_core.body.model import BodyModel
-from intercap_core.studio.subjects import Subject, build_names, subject_names
+from intercap_core.config import StudioCapture, StudioSettings
+from intercap_core.studio.objects import object_colours
+from intercap_core.studio.stage import StudioStage
+from intercap_core.studio.subjects import (
+    FEET,
+    LEATHER_M,
+    SOLE_M,
+    Subject,
+    build_names,
+    in_heavy_shoes,
+    shoe_area,
+    subject_names,
+)
 
 
 @pytest.fixture(scope="module")
@@ -98,8 +113,6 @@ def test_a_pose_means_the_same_as_on_the_fitted_body(person: Subject, body: Body
 
 
 def test_rotations_and_axis_angle_are_the_same_pose(person: Subject) -> None:
-    from scipy.spatial.transform import Rotation
-
     pose = _random_pose(2)
     matrices = Rotation.from_rotvec(pose.reshape(-1, 3)).as_matrix().reshape(2, 55, 3, 3)
     a, b = (person.skin(p, np.zeros((2, 3))).vertices for p in (pose, matrices))
@@ -154,3 +167,61 @@ def test_a_bent_elbow_bulges_by_millimetres(person: Subject) -> None:
     change = np.linalg.norm(bent - flat.skin(pose, np.zeros((1, 3))).vertices[0], axis=1)
     assert 0.003 < change.max() < 0.02
     assert (change > 1e-3).mean() < 0.1
+
+
+@pytest.mark.parametrize("name", subject_names()[::3])
+def test_soles_are_flat_and_leather_is_as_thick_as_stated(name: str) -> None:
+    bare = Subject.load(name)
+    shod = in_heavy_shoes(bare, np.random.default_rng(3))
+    np.testing.assert_array_equal(shod.rest, bare.rest)
+    away = ~shoe_area(bare)
+    np.testing.assert_array_equal(shod.clothing[away], bare.clothing[away])
+    normals = bare.normals(bare.rest[None])[0]
+    for foot in FEET:
+        own = shoe_area(bare) & (np.asarray(bare.weights[:, foot].sum(1)).ravel() > 0.5)
+        ground = bare.rest[own, 1].min() - SOLE_M
+        assert shod.rest_clothed[own, 1].min() == pytest.approx(ground, abs=1e-4)
+        under = own & (normals[:, 1] < -0.9)
+        assert np.percentile(shod.rest_clothed[under, 1] - ground, 90) < 0.001
+        level = own & (np.abs(normals[:, 1]) < 0.2) & (bare.rest[:, 1] < ground + SOLE_M + 0.03)
+        thick = shod.clothing[level]
+        assert LEATHER_M[0] <= thick.min() and thick.max() <= LEATHER_M[1]
+
+
+def test_a_person_stands_on_the_soles() -> None:
+    """Bare feet are at the height of the sole, soles on the floor."""
+    settings = StudioSettings(captures={}, cameras=1)
+    for shoes, height in (("plain", 0.0), ("heavy", SOLE_M)):
+        capture = StudioCapture(
+            interaction="walk_and_wave", subject="s06", seed=11, frames=20, shoes=shoes
+        )
+        stage = StudioStage(capture, settings, None)
+        state = stage.at(stage.set_times[::4])
+        lowest, soles = (part[..., 2].min(1) for part in (state.body, state.clothed))
+        assert np.abs(soles).max() < 0.001 and np.abs(lowest - height).max() < 0.001
+
+
+@pytest.fixture
+def ball() -> np.ndarray:
+    points = np.random.default_rng(0).normal(size=(2000, 3))
+    return 0.1 * points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
+def test_a_plain_object_has_one_colour_and_a_printed_one_sides(ball):
+    of_mesh = np.full((len(ball), 3), 0.5)
+    for seed in range(4):
+        plain, printed = (
+            object_colours(look, ball, of_mesh, np.random.default_rng(seed))
+            for look in ("plain", "printed")
+        )
+        assert len(np.unique(plain, axis=0)) == 1
+        assert 2 <= len(np.unique(printed, axis=0)) <= 7
+        common = (printed == plain[0]).all(1)
+        assert 0.02 < common.mean() < 0.98, "spots leave some of the first colour"
+        turned = printed[np.argsort(np.arctan2(ball[:, 1], ball[:, 0]))]
+        assert not np.allclose(turned, np.roll(turned, len(ball) // 2, axis=0))
+
+
+def test_an_object_may_look_like_its_mesh(ball):
+    of_mesh = np.random.default_rng(1).random((len(ball), 3))
+    assert object_colours("mesh", ball, of_mesh, np.random.default_rng(0)) is of_mesh

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.joint_long import _nearest_sets, lengthen, there_and_back
+from bench.stage_resources import _nearest_sets, lengthen, there_and_back
 from intercap_core import artefacts
 from intercap_core.artefacts import pack_ragged, unpack_ragged
 from intercap_core.errors import UserError

@@ -1,0 +1,76 @@
+"""Limbs, hands and grasps of a puppet."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from intercap_core.geometry.rigid.distance import DistanceField
+from intercap_core.studio.hands import OPEN, Hand, shape
+from intercap_core.studio.interactions.grasps import Hollow
+from intercap_core.studio.interactions.handling import HandlingScript
+from intercap_core.studio.motion import RIGHT
+from intercap_core.studio.skeleton import REACH_FREE, PuppetSkeleton, turn
+from intercap_core.studio.subjects import Subject
+from tests.studio.conftest import MakeStage
+
+
+def test_limb_reaches_its_target_and_bends_to_the_pole() -> None:
+    skeleton = PuppetSkeleton(Subject.load("s03").rest_joints)
+    rng = np.random.default_rng(0)
+    names = ("left_hip", "left_knee", "left_ankle")
+    root, direction, pole = rng.normal(size=(3, 50, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    length = rng.uniform(0.4, REACH_FREE, (50, 1)) * skeleton.length(*names)
+    target = root + direction * length
+    upper, lower = skeleton.limb(names, root, target, pole, np.array([1.0, 0, 0]))
+    knee = root + upper @ skeleton.bone(*names[:2])
+    end = knee + lower @ skeleton.bone(*names[1:])
+    np.testing.assert_allclose(end, target, atol=1e-9)
+    across = pole - direction * (pole * direction).sum(1, keepdims=True)
+    assert (((knee - root) * across).sum(1) > 0).all()
+    np.testing.assert_allclose(np.linalg.det(upper), 1, atol=1e-9)
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_fingers_flex_towards_the_palm(side: int) -> None:
+    hand = Hand(Subject.load("s04"), side)
+    fist = shape((60, 70, 40), (20, 20, 20), 40)
+    open_tips, fist_tips = (
+        hand.skin(hand.local(h)[None])[0][hand.moved[1][2]].mean(0) for h in (OPEN, fist)
+    )
+    assert (fist_tips - open_tips) @ hand.palm > 0.01
+    assert (fist_tips - open_tips) @ hand.out < -0.02
+
+
+def test_turn_is_a_rotation_about_its_vector() -> None:
+    vector = np.array([0.3, -0.2, 0.9])
+    np.testing.assert_allclose(turn(vector) @ vector, vector, atol=1e-12)
+
+
+def test_half_of_all_directions_meet_a_wide_wall_and_all_a_shell() -> None:
+    wall = trimesh.creation.box((20.0, 20.0, 0.02))
+    share = Hollow(DistanceField(wall.vertices, wall.faces)).share(np.array([[0, 0, 0.02]]))
+    assert share[0] == pytest.approx(0.5, abs=2 / Hollow.directions)
+    shell = trimesh.creation.icosphere(subdivisions=2, radius=0.1)
+    inside = Hollow(DistanceField(shell.vertices, shell.faces)).share(np.zeros((1, 3)))
+    assert inside[0] == 1
+
+
+@pytest.mark.parametrize("subject", ["s03", pytest.param("s06", marks=pytest.mark.full)])
+def test_no_finger_is_in_the_cup(subject: str, make_stage: MakeStage) -> None:
+    stage = make_stage("cup_drink", subject, 911, 3)
+    script = stage.interaction
+    assert isinstance(script, HandlingScript)
+    low, high = stage.bounds[:, 2]
+    hollow = Hollow(stage.prop.surface)
+    assert hollow.holds(np.array([[0.0, 0.0, (low + high) / 2]]))
+    assert not hollow.holds(np.array([[0.0, 0.0, high + 0.02]]))
+    hand, grip = stage.puppet.hands[RIGHT], script.grips[RIGHT]
+    skin = hand.skin(hand.local(grip.closed)[None])[0]
+    at = skin @ grip.object_from_wrist[:3, :3].T + grip.object_from_wrist[:3, 3]
+    # by the cup's own shape: within the wall's middle line and below the rim
+    in_cup = (np.hypot(at[:, 0], at[:, 1]) < 0.034) & (at[:, 2] < high - 0.005)
+    assert not in_cup.any()
+    assert grip.gaps.max() < 0.003
