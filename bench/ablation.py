@@ -304,7 +304,7 @@ def ablate(
     strange = [name for name in variants if name not in VARIANTS]
     if strange:
         raise UserError(f"there is no variant {strange[0]!r}; known are {', '.join(VARIANTS)}")
-    projects = {  # all of them first: settings that cannot be used are told before any is computed
+    projects = {  # all before the first is computed, so that invalid settings fail at once
         variant: load_project(settings, {"joint": VARIANTS[variant]}) for variant in variants
     }
     paths: Paths = {}
@@ -395,12 +395,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--output", type=Path, default=Path("results/ablation.json"))
     parser.add_argument("--folder", type=Path, default=Path("results/ablation"))
-    told = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     with exit_on_user_error():
-        names = told.sequences or list(load_project(told.settings).sequences)
-        variants = told.variants or list(VARIANTS)
-        paths, figures = ablate(told.settings, names, variants, told.folder)
-        pictures = draw_pictures(load_project(told.settings), paths, told.folder)
+        names = options.sequences or list(load_project(options.settings).sequences)
+        variants = options.variants or list(VARIANTS)
+        paths, figures = ablate(options.settings, names, variants, options.folder)
+        pictures = draw_pictures(load_project(options.settings), paths, options.folder)
     variant = Column("variant", no_wrap=True)
     table = Table(variant, *(measure.title for measure in MEASURES), box=None)
     for row in rows(figures):
@@ -408,16 +408,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     console = Console()
     console.width = max(console.width, 170)
     console.print(table)
-    section = told.folder / "RESULTS.md"
-    section.write_text(markdown(figures, told.settings, names), encoding="utf-8")
+    section = options.folder / "RESULTS.md"
+    section.write_text(markdown(figures, options.settings, names), encoding="utf-8")
     flat = {
         f"{slug(variant)}.{key}": round(value, 4)
         for variant, found in figures.items()
         for key, value in found.items()
     }
-    told.output.parent.mkdir(parents=True, exist_ok=True)
-    told.output.write_text(json.dumps(flat, indent=1) + "\n", encoding="utf-8")
-    for path in (told.output, section, *pictures):
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    options.output.write_text(json.dumps(flat, indent=1) + "\n", encoding="utf-8")
+    for path in (options.output, section, *pictures):
         print(path)
 
 

@@ -62,8 +62,8 @@ def _content(stage: str, project: Project, sequence: str, paths: Mapping[str, Pa
     state.update(repr(project.annotation(sequence)).encode())
     row = project.sequences[sequence]
     entry = project.objects[row.object]
-    for told in (entry, project.subjects[row.subject]):
-        state.update(told.model_dump_json().encode())
+    for described in (entry, project.subjects[row.subject]):
+        state.update(described.model_dump_json().encode())
     files = [paths[name] for name in STAGES[stage].reads]
     models, gender = project.config.body_models, project.subjects[row.subject].gender
     files += [entry.mesh, entry.contact_vertices, models.of(gender), models.vposer]

@@ -99,8 +99,8 @@ class Placing:
 
     def __init__(self, hand: Hand, eye: Eye) -> None:
         self.hand, self.eye = hand, eye
-        told = hand.see("window.annotate.told.cameras")
-        self.cameras = {one["name"]: one for one in told if one["pose"] is not None}
+        cameras = hand.see("window.annotate.told.cameras")
+        self.cameras = {one["name"]: one for one in cameras if one["pose"] is not None}
         self.poses = {name: np.array(one["pose"]) for name, one in self.cameras.items()}
 
     def place(self, frame: int) -> float:
@@ -359,12 +359,12 @@ def _edited(hand: Hand, part: str, wanted: list[Interval]) -> bool:
 
 def _bars(hand: Hand, part: str) -> list[Interval]:
     """The part's intervals on the timeline."""
-    told = hand.see(
+    labels = hand.see(
         "(part) => [...document.querySelectorAll(`[data-part='${part}'] .bar`)]"
         ".map((bar) => bar.dataset.interval)",
         part,
     )
-    ends = [str(one).split(":")[1:] for one in told]
+    ends = [str(one).split(":")[1:] for one in labels]
     return sorted((int(start), int(end)) for start, end in ends)
 
 
@@ -456,10 +456,10 @@ def main() -> None:
     parser.add_argument("settings", type=Path, nargs="?", default=settings)
     parser.add_argument("--output", type=Path, default=Path("results/evaluation.json"))
     parser.add_argument("--cores", type=int, default=0, help="of runs; 0 = all")
-    told = parser.parse_args()
+    options = parser.parse_args()
     with exit_on_user_error():
-        found = driven(told.settings, told.cores)
-        put_figures(told.output, found, instead_of=("annotate.",))
+        found = driven(options.settings, options.cores)
+        put_figures(options.output, found, instead_of=("annotate.",))
     for name, value in found.items():
         print(f"{name}: {value:.4g}")
     if "annotate.clicks" not in found:

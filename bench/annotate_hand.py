@@ -52,14 +52,14 @@ class Hand:
         """Seconds in the browser, without the runs."""
         return time.monotonic() - self.started - self.waited
 
-    def see(self, expression: str, told: Any = None) -> Any:
+    def see(self, expression: str, argument: Any = None) -> Any:
         """Value of a JavaScript expression on the page."""
-        return self.visit.page.evaluate(expression, told)
+        return self.visit.page.evaluate(expression, argument)
 
     def views(self, points: dict[str, list[np.ndarray]]) -> list[dict[str, Any]]:
         """The large views, with the image positions of ``points`` by camera."""
-        told = {name: [p.tolist() for p in those] for name, those in points.items()}
-        return list(self.see(_VIEWS, told))
+        positions = {name: [p.tolist() for p in those] for name, those in points.items()}
+        return list(self.see(_VIEWS, positions))
 
     def key(self, name: str, times: int = 1) -> None:
         for _ in range(times):

@@ -146,14 +146,14 @@ def main() -> None:
     parser.add_argument("--sequence", default="cup_drink_s02")
     parser.add_argument("--steps", type=int, default=30)
     parser.add_argument("--output", type=Path, default=Path("results/bench.json"))
-    told = parser.parse_args()
+    options = parser.parse_args()
     try:
-        found = measure(told.settings, told.sequence, told.steps)
+        found = measure(options.settings, options.sequence, options.steps)
     except UserError as error:
         raise SystemExit(str(error)) from None
     for name, value in found.items():
         print(f"{name}: {value}")
-    put_figures(told.output, found, instead_of=("annotate.page_",))
+    put_figures(options.output, found, instead_of=("annotate.page_",))
 
 
 if __name__ == "__main__":

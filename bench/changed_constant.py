@@ -145,11 +145,11 @@ def import_changed(constant: Constant, change: Callable[[Any], Any]) -> tuple[An
         raise UserError(f"{constant.module} is imported already; change it in a fresh process")
     spec = importlib.util.find_spec(constant.module)
     assert spec is not None and spec.origin is not None
-    told: list[tuple[Any, Any]] = []
+    replaced: list[tuple[Any, Any]] = []
 
     def changed(value: Any) -> Any:
-        told.append((value, change(value)))
-        return told[-1][1]
+        replaced.append((value, change(value)))
+        return replaced[-1][1]
 
     tree = ast.parse(Path(spec.origin).read_bytes(), spec.origin)
     for statement in tree.body:
@@ -162,9 +162,9 @@ def import_changed(constant: Constant, change: Callable[[Any], Any]) -> tuple[An
     exec(compile(ast.fix_missing_locations(tree), spec.origin, "exec"), module.__dict__)
     parent, _, last = constant.module.rpartition(".")
     setattr(sys.modules[parent], last, module)
-    if not told:
+    if not replaced:
         raise UserError(f"{constant.module} binds no {constant.name} at its top level")
-    return told[-1]
+    return replaced[-1]
 
 
 def _wrap(statement: ast.stmt, value: ast.expr) -> None:

@@ -359,16 +359,16 @@ def joint_figures(found: Found) -> Figures:
     over_all = by_variant(found)
     floors = {key: over_all.get(TRUE_MESH, {}).get(measure) for key, measure in FLOORS.items()}
     floors["extrinsics_floor_mm"] = over_all.get(FREE, {}).get("extrinsics_mm")
-    told = {key: value for key, value in floors.items() if value is not None}
+    bounds = {key: value for key, value in floors.items() if value is not None}
     for what, measure in RATIOS.items():
         closed, opened = (_of_each(found.get(name, {}), measure) for name in (AS_IT_IS, OPEN))
         both = [name for name in closed if name in opened and closed[name] > 0]
         if both:
             whole = sum(closed[name] for name in both)
-            told[f"open_mesh_{what}ratio"] = sum(opened[name] for name in both) / whole
+            bounds[f"open_mesh_{what}ratio"] = sum(opened[name] for name in both) / whole
         if both and not what:
-            told["open_mesh_worst_ratio"] = max(opened[name] / closed[name] for name in both)
-    return told
+            bounds["open_mesh_worst_ratio"] = max(opened[name] / closed[name] for name in both)
+    return bounds
 
 
 def _of_each(sequences: Mapping[str, SequenceMetrics], measure: str) -> Figures:
@@ -401,17 +401,17 @@ def print_tables(found: Found) -> None:
             cells = (number(some.get(key), 2) for key in MEASURES.values())
             table.add_row(variant, *cells)
         console.print(table)
-    told, given = joint_figures(found), by_variant(found).get(AS_IT_IS, {})
-    if {"extrinsics_mm", "extrinsics_scene_mm"} <= set(given) and "extrinsics_floor_mm" in told:
+    bounds, given = joint_figures(found), by_variant(found).get(AS_IT_IS, {})
+    if {"extrinsics_mm", "extrinsics_scene_mm"} <= set(given) and "extrinsics_floor_mm" in bounds:
         scene, joint, floor = (
-            given["extrinsics_scene_mm"], given["extrinsics_mm"], told["extrinsics_floor_mm"],
+            given["extrinsics_scene_mm"], given["extrinsics_mm"], bounds["extrinsics_floor_mm"],
         )  # fmt: skip
         way = f": {(scene - joint) / (scene - floor):.0%} of the way" if scene > floor else ""
         console.print(
             f"cameras: {scene:.2f} mm after scene, {joint:.2f} after joint, floor {floor:.2f}{way}",
             highlight=False,
         )
-    for key, value in told.items():
+    for key, value in bounds.items():
         console.print(f"joint.{key} {value:.3f}", highlight=False)
 
 
@@ -428,19 +428,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--cores", type=int, default=0, help="sequences at a time; 0: all cores")
     parser.add_argument("--output", type=Path, default=Path("results/oracle.json"))
     parser.add_argument("--folder", type=Path, default=Path("results/oracle"))
-    told = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     with exit_on_user_error():
-        cores = told.cores or len(os.sched_getaffinity(0))
+        cores = options.cores or len(os.sched_getaffinity(0))
         found = consult(
-            told.settings,
-            told.sequences or (),
-            told.folder,
-            variants=told.variants or tuple(VARIANTS),
+            options.settings,
+            options.sequences or (),
+            options.folder,
+            variants=options.variants or tuple(VARIANTS),
             cores=cores,
         )
         print_tables(found)
-        put_figures(told.output, flat(found), instead_of=_OWN)
-    print(told.output)
+        put_figures(options.output, flat(found), instead_of=_OWN)
+    print(options.output)
 
 
 if __name__ == "__main__":

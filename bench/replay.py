@@ -209,8 +209,8 @@ def _text(value: Any) -> str:
 
 def main(task: str, output: str) -> None:
     """Replay one run and write its outcome."""
-    told = json.loads(task)
-    outcome = replay(Path(told["settings"]), told["sequences"], run_from(told["run"]))
+    request = json.loads(task)
+    outcome = replay(Path(request["settings"]), request["sequences"], run_from(request["run"]))
     Path(output).write_text(json.dumps(asdict(outcome)), encoding="utf-8")
 
 

@@ -79,7 +79,7 @@ def _repeated(source: Project, name: str, here: Path, count: int) -> Project:
         rows.append("\t".join((other, row.subject, row.object or "", *map(str, [folder, *paths]))))
     (here / "sequences.tsv").write_text("\n".join(rows) + "\n", encoding="utf-8")
     shutil.copy(source.path.parent / source.config.subjects, here / "subjects.tsv")
-    told = {
+    settings = {
         **source.config.model_dump(mode="json", exclude_defaults=True, exclude={"studio"}),
         "dataset": "scale",
         "sequences": "sequences.tsv",
@@ -87,7 +87,7 @@ def _repeated(source: Project, name: str, here: Path, count: int) -> Project:
         "objects": str((source.path.parent / source.config.objects).resolve()),
         "results": "results",
     }
-    (here / "config.yaml").write_text(yaml.safe_dump(told), encoding="utf-8")
+    (here / "config.yaml").write_text(yaml.safe_dump(settings), encoding="utf-8")
     before = Path.cwd()
     os.chdir(here)
     try:

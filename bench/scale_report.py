@@ -77,11 +77,11 @@ def load_seconds(folder: Path) -> float | None:
     program = shutil.which("chromium") or shutil.which("chromium-browser")
     if program is None:
         return None
-    told: list[float] = []
+    answers: list[float] = []
 
     class Answer(http.server.BaseHTTPRequestHandler):
         def do_GET(self) -> None:
-            told.append(float(self.path.rpartition("=")[2]) / 1000)
+            answers.append(float(self.path.rpartition("=")[2]) / 1000)
             self.send_response(204)
             self.end_headers()
 
@@ -116,7 +116,7 @@ def load_seconds(folder: Path) -> float | None:
             browser.terminate()
             browser.wait()
             server.server_close()
-    return told[0] if told else float("nan")
+    return answers[0] if answers else float("nan")
 
 
 def _lengthen(project: Project, name: str, folder: Path) -> None:

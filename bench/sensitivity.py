@@ -148,13 +148,13 @@ def markdown(usual: Mapping[str, Outcome], rows: Sequence[_Row]) -> str:
     """Table of the unchanged figures, and table of the constants, most sensitive first."""
     lines = ["| room | figures as the code is | flagged | s |", "|---|---|---|---|"]
     for room, outcome in usual.items():
-        told = ", ".join(
+        text = ", ".join(
             f"{name} {_number(value)}"
             for name, value in outcome.figures.items()
             if name != "flagged"
         )
         lines.append(
-            f"| {room} | {told or outcome.failure} | {outcome.figures.get('flagged', 0):.0f} "
+            f"| {room} | {text or outcome.failure} | {outcome.figures.get('flagged', 0):.0f} "
             f"| {outcome.seconds:.0f} |"
         )
     lines += [
@@ -167,7 +167,7 @@ def markdown(usual: Mapping[str, Outcome], rows: Sequence[_Row]) -> str:
         cells = [f"`{row.constant.label}`", row.probe.decides, row.half.value]
         for outcome in (row.half, row.double):
             cells += [
-                _told(row.usual, outcome),
+                _changes_text(row.usual, outcome),
                 _flags(row.usual, outcome),
                 f"{outcome.seconds:.0f}",
             ]
@@ -175,13 +175,13 @@ def markdown(usual: Mapping[str, Outcome], rows: Sequence[_Row]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _told(usual: Outcome, outcome: Outcome) -> str:
+def _changes_text(usual: Outcome, outcome: Outcome) -> str:
     if outcome.failure:
         return f"{outcome.changed}: fails, {outcome.failure}"
     found = changes(usual, outcome)
-    told = ", ".join(f"{name} {_number(a)} → {_number(b)}" for name, (a, b, _) in found.items())
-    if told:
-        return f"{outcome.changed}: {told}"
+    text = ", ".join(f"{name} {_number(a)} → {_number(b)}" for name, (a, b, _) in found.items())
+    if text:
+        return f"{outcome.changed}: {text}"
     same = {k: v for k, v in outcome.figures.items()} == dict(usual.figures)
     return f"{outcome.changed}: {'the same' if same else 'less than 2 %'}"
 
@@ -212,15 +212,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--output", type=Path, help="Markdown file for the tables")
     parser.add_argument("--known", type=Path, default=KNOWN, help="JSON of what is known already")
     parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1))
-    told = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     with exit_on_user_error():
-        sequences = told.sequences or list(SEQUENCES)
-        replays = Replays(told.settings, sequences, told.known, told.jobs)
-        table = probe(replays, [_probe_of(name) for name in told.constants or []] or RISKIEST)
+        sequences = options.sequences or list(SEQUENCES)
+        replays = Replays(options.settings, sequences, options.known, options.jobs)
+        table = probe(replays, [_probe_of(name) for name in options.constants or []] or RISKIEST)
     print(table)
-    if told.output:
-        text = page(told.settings, sequences, table)
-        told.output.write_text(text, encoding="utf-8")
+    if options.output:
+        text = page(options.settings, sequences, table)
+        options.output.write_text(text, encoding="utf-8")
 
 
 def _probe_of(name: str) -> Probe:

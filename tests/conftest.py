@@ -38,6 +38,7 @@ SLOW = (
     "slurm",
     "stages",
     "studio/test_capture.py",
+    "studio/test_devices.py",
     "studio/test_interactions.py",
     "studio/test_layouts.py",
     "test_kernel_cache.py",

@@ -229,7 +229,7 @@ def erring_starts(stage: StudioStage, sigma: float) -> dict[str, Any]:
 log = logging.getLogger(__name__)
 
 MANIFEST = "capture.json"
-MARK = ".virtual"  # there from the first file on: the studio may delete what lies beside it
+MARK = ".virtual"  # marks a folder that the studio may delete
 
 
 def make_capture(

@@ -156,7 +156,7 @@ class CaptureFolder(ABC):
     calibration: str
     """File or folder of the calibration."""
     own_faults: frozenset[StudioFault]
-    """Faults that recordings of this layout can have, beside those that any can."""
+    """Faults that only recordings of this layout can have."""
 
     def __init__(self, path: Path, capture: StudioCapture, broken: dict[str, int]) -> None:
         self.path, self.capture, self.broken = path, capture, broken

@@ -228,7 +228,7 @@ class Puppet:
         left, up, forward = base[..., 0], base[..., 1], base[..., 2]
         shoulder = self.arm_root(world, pelvis, side)
         reach = 0.955 * self.arms[side]
-        # beside the hips, however broad they are
+        # clear of the hips
         beside = self.girth + self.hand_half_m - sign * ((shoulder - pelvis) * left).sum(1)
         out = np.clip(beside, 0.085, 0.6 * reach)
         down = np.sqrt((0.97 * reach) ** 2 - out**2)

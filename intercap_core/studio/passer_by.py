@@ -18,7 +18,7 @@ from intercap_core.studio.room import FLOOR_HALF_M, Room
 from intercap_core.studio.subjects import Subject, body_colours, subject_names
 
 CELL_M = 0.05  # of the floor plan
-FLOOR_UP_M, WALLS_BEYOND_M = 0.03, 2.8  # what of the room is an object that one walks around
+FLOOR_UP_M, WALLS_BEYOND_M = 0.03, 2.8  # floor and walls are no obstacles
 OTHER_COLOURS = 0.25  # at least this far from the subject's, mean of the clothed surface, RGB
 _CORNERS = np.array([[a, b, 4 - a - b] for a in range(5) for b in range(5 - a)]) / 4
 
@@ -136,7 +136,7 @@ class PasserBy:
             ):
                 return way
         raise UserError(
-            "studio: nobody finds a place beside the subject in this room; set passer_by: nobody, "
+            "studio: this room has no free path near the subject; set passer_by: nobody, "
             "another seed or room: bare"
         )
 

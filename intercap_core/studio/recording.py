@@ -253,7 +253,7 @@ def _blur_px(view: RoomView, times: np.ndarray, points: np.ndarray) -> np.ndarra
     """Motion (T,) of points (T, 3) in the image during the exposure, px."""
     at = points @ view.camera_from_stage[:3, :3].T + view.camera_from_stage[:3, 3]
     shift = np.linalg.norm(np.gradient(view.lens.project(at), axis=0), axis=1)
-    # a camera that slips may show one moment twice
+    # a camera that slips may show a moment twice
     return shift / np.maximum(np.abs(np.gradient(times)), EXPOSURE_S) * EXPOSURE_S
 
 

@@ -278,7 +278,7 @@ class Photographer:
         self.gain = (gain ** (1 / CAMERA_GAMMA)).astype(np.float32)
         room = np.clip(view.colour * self.gain * 255, 0, 255)
         self._room = np.ascontiguousarray(room[..., ::-1].astype(np.uint8))
-        # sensor noise: one tile, taken at another place in each image
+        # sensor noise: a tile that is shifted at random in each image
         size = (view.lens.height + 64, view.lens.width + 64, 3)
         tile = gaussian(rng, size) * np.float32(self.sensor_noise)
         tile = np.rint(cv2.GaussianBlur(tile, (0, 0), 0.6) * np.float32(1.6))

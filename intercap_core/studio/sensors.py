@@ -161,7 +161,7 @@ SYLLABLE_EVERY_S, SYLLABLE_S = (0.15, 0.6), (0.08, 0.25)
 VOICE_HZ = (250.0, 3000.0)
 MOUTH_M = 0.6  # above the pelvis
 REVERBERATION_S = (0.25, 0.6)  # until it has fallen by 60 dB; of a room with furniture, or bare
-ROOM_LEVEL = (0.5, 1.2)  # of the reverberation's energy beside the direct sound's
+ROOM_LEVEL = (0.5, 1.2)  # of the reverberation's energy, relative to the direct sound's
 NOISE_DB = (5.0, 20.0)  # of the sound over the device's own noise
 MAX_LATENCY_S = 0.04  # of a device's sound against its images, to either side
 LOUDEST = 0.5
@@ -185,7 +185,7 @@ def heard(stage: StudioStage, index: int, first_s: float, seconds: float) -> np.
     eye = (invert(stage.rig.master_from_stage) @ stage.rig.true[index].master_from_colour)[:3, 3]
     latency = rng.uniform(-MAX_LATENCY_S, MAX_LATENCY_S) * min(1.0, stage.noise.scale)
     count = round(seconds * RATE)
-    lead = round(max(REVERBERATION_S) * RATE)  # what was said before still sounds
+    lead = round(max(REVERBERATION_S) * RATE)  # reverberation of earlier sounds
     direct = np.zeros(lead + count)
     for event in _events(stage):
         far = max(0.3, float(np.linalg.norm(event.place - eye)))

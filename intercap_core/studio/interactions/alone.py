@@ -70,7 +70,7 @@ class BeamWalk(Interaction):
         unsteady = 1 + 2.5 * balance[:, None]
         bend, head = 0.6 * unsteady * sway[:, :3], 1.3 * sway[:, 3:]
         bend[:, 0] += 0.04
-        head[:, 0] += 0.12 + 0.22 * balance  # one looks where one steps
+        head[:, 0] += 0.12 + 0.22 * balance  # the person looks down
         return Trunk(pelvis, track[:, 3], bend, head)
 
     def perform(self, times: np.ndarray) -> Performance:

@@ -24,23 +24,28 @@ class HandleCarry(Interaction):
 
     highlight = 1.5
     centre = (0.22, -0.15)
-    # What an object asks for: half the thickness of the handle's bar, the room between hip and the
-    # object's middle, where the knuckles are tried beside and below the bar, the height above the
-    # grip from which the hand goes down to it, all in metres
     bar_half: float
+    """Half the thickness of the handle's bar, metres."""
     beside: float
+    """From the hip to the object's middle, metres."""
     knuckles_aside: tuple[float, ...] = (0.020, 0.025, 0.030)
+    """Places of the knuckles next to the bar that are tried, metres."""
     knuckles_below: tuple[float, ...] = (0.020, 0.024, 0.028, 0.032)
+    """Places below the bar, metres."""
     above: float
-    # until when it is lifted, from when it goes down, s
+    """Height above the grip from which the hand goes down to it, metres."""
     lifted_s: float
+    """End of the lift, script time."""
     lower_s: float
-    # the stoop: from when, s; how far down the pelvis goes, in lengths of a leg, and how far back,
-    # metres; how much more the trunk bends, rad
+    """Start of putting it down, script time."""
     stoop_from: float
+    """Start of the stoop, script time."""
     stoop_down: float
+    """How far the pelvis goes down, in leg lengths."""
     stoop_back: float
+    """How far the pelvis goes back, metres."""
     stoop_bend: float
+    """Additional bend of the trunk, rad."""
     attach_s = 1.08  # grasp, script time
     release_s = 2.46  # release, script time
     knuckles_deg = (36, 44, 52, 60)  # knuckle flexions of the hands that are tried

@@ -1,7 +1,7 @@
-"""Grasps planned on the true object's surface: a hand comes near until its skin is pressed in, then
-its fingers close; of several tries the one whose fingers come nearest is kept.
+"""Grasps planned on the true object's surface, without the contact term and regions of the fits.
 
-No contact term and no contact regions of the fit are used.
+A hand approaches until its skin is pressed in, then its fingers close. The try with the smallest
+gaps between fingers and object is kept.
 """
 
 from __future__ import annotations
@@ -202,5 +202,5 @@ def wrapped(
         if best is not None and best[0] > -THUMB_NEAR_M:
             break
     if best is None:
-        raise ValueError("no approach leaves the thumb room outside the thing")
+        raise ValueError("no approach leaves the thumb room outside the object")
     return best[1]

@@ -196,7 +196,7 @@ class Sitting(Interaction):
         aside[:3, 3] += (0.0, -0.05, 0.11)
         wrist = idle.towards(WristPose.still(aside, count), ramp(times, 0.54, 1.00))
         wrist = wrist.towards(WristPose.still(place, count), ramp(times, 0.86, 1.12))
-        # out of the way of the hips that come down beside it
+        # out of the way of the hips
         off = aside.copy()
         off[1, 3] -= 0.10
         wrist = wrist.towards(WristPose.still(off, count), ramp(times, 1.12, 1.34))
@@ -248,7 +248,7 @@ class Sitting(Interaction):
 
 
 class StoolSit(Sitting):
-    """A round seat without a back; the left hand hangs beside its rim."""
+    """A round seat without a back; the left hand hangs near its rim."""
 
     object_class = "stool"
     palm_at = (-0.02, -0.16)
@@ -263,7 +263,7 @@ class StoolSit(Sitting):
         return self.rng.uniform(0, np.pi / 2)
 
     def _beside_seat(self, hover: float) -> np.ndarray:
-        """The left hand hanging beside the seat's rim, ``hover`` metres away."""
+        """The left hand hanging near the seat's rim, ``hover`` metres away."""
         hand = self.puppet.hands[LEFT]
         fingers, palm = unit(np.array([0.15, 0.10, -1.0])), np.array([0.0, -1.0, -0.1])
         rotation = self.puppet.wrist_rotation(LEFT, fingers, palm)
