@@ -22,9 +22,8 @@ from intercap_core.config import (
 )
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.class_names import read_label_map
-from intercap_core.inputs.files import MAX_TABLE_BYTES, Unreadable, read_text
-from intercap_core.inputs.quotes import printable, quoted
-from intercap_core.inputs.yaml_files import read_yaml
+from intercap_core.inputs.documents import read_yaml
+from intercap_core.inputs.files import MAX_TABLE_BYTES, Unreadable, printable, quoted, read_text
 from intercap_core.schemas import FRAMES
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 

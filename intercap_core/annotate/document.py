@@ -26,8 +26,8 @@ from intercap_core.annotate.yaml_entries import same
 from intercap_core.annotate.yaml_sections import NoLayout, with_section
 from intercap_core.config import STATED_EMPTY, Annotation
 from intercap_core.errors import UserError
+from intercap_core.inputs.documents import parse_yaml, yaml_fault
 from intercap_core.inputs.files import MAX_SETTINGS_BYTES, read_bytes
-from intercap_core.inputs.yaml_files import parse_yaml, told
 
 NO_FILE = "none"  # the digest where there is no file
 _BOM = b"\xef\xbb\xbf"
@@ -80,7 +80,7 @@ def read(path: Path) -> Document:
         return Document(path, text, digest, {}, words, note)
     except (UnicodeError, yaml.YAMLError, ValueError) as error:
         shown = data.decode("utf-8", "replace")
-        words = f"{path}: not valid YAML{told(error)}; correct it in an editor"
+        words = f"{path}: not valid YAML{yaml_fault(error)}; correct it in an editor"
         return Document(path, shown, digest, {}, words, note)
     return Document(path, text, digest, sections, note=note, marked=data.startswith(_BOM))
 

@@ -24,7 +24,7 @@ from intercap_core.annotate.yaml_entries import (
     same,
     split,
 )
-from intercap_core.inputs.yaml_files import parse_yaml
+from intercap_core.inputs.documents import parse_yaml
 
 _WIDTH = 10_000  # characters of a line, before one is broken: what a user wrote in one stays so
 _FLOW_ITEMS = {  # lists with one short entry a line

@@ -11,13 +11,13 @@ import struct
 import warnings
 import zipfile
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from intercap_core.inputs.arrays import PICKLE_ERRORS
 from intercap_core.inputs.files import MAX_MODEL_BYTES, Unreadable, check_file
-from intercap_core.inputs.safe_pickle import PICKLE_ERRORS, check_program
 
 # Functions that build tensors from the storages of a file
 _ALLOWED = {
@@ -51,10 +51,6 @@ class _Inert:
 
 class Unpickler(pickle.Unpickler):
     """Builds tensors and plain values; all other names become :class:`_Inert`."""
-
-    def __init__(self, file: BinaryIO, **arguments: Any) -> None:
-        check_program(file)
-        super().__init__(file, **arguments)
 
     def find_class(self, module: str, name: str) -> Any:
         return super().find_class(module, name) if (module, name) in _ALLOWED else _Inert

@@ -14,8 +14,8 @@ import numpy as np
 from intercap_core.body.joints import JOINT_INDEX, JOINT_NAMES
 from intercap_core.errors import UserError
 from intercap_core.geometry.rigid.surfaces import vertex_normals
-from intercap_core.inputs.json_files import read_json
-from intercap_core.inputs.quotes import quoted
+from intercap_core.inputs.documents import read_json
+from intercap_core.inputs.files import quoted
 
 SMPLX_VERTICES = 10_475
 

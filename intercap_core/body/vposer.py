@@ -25,8 +25,7 @@ from torch.nn import functional
 
 from intercap_core.body.checkpoint import read_tensors, tensor_fault
 from intercap_core.errors import UserError
-from intercap_core.inputs.files import Unreadable
-from intercap_core.inputs.quotes import quoted
+from intercap_core.inputs.files import Unreadable, quoted
 
 LATENT = 32
 _JOINTS = 21

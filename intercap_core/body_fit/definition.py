@@ -16,8 +16,7 @@ import numpy as np
 from intercap_core import artefacts
 from intercap_core.body.keypoints import BODY, KEYPOINT_NAMES
 from intercap_core.errors import UserError
-from intercap_core.inputs.files import MAX_SETTINGS_BYTES, Unreadable, read_text
-from intercap_core.inputs.quotes import quoted
+from intercap_core.inputs.files import MAX_SETTINGS_BYTES, Unreadable, quoted, read_text
 from intercap_core.schemas import BODY_FIT
 
 POINTS = tuple(KEYPOINT_NAMES[BODY])

@@ -21,8 +21,7 @@ import numpy as np
 from intercap_core.config import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.behave import FRAME_FOLDER
-from intercap_core.inputs import safe_pickle
-from intercap_core.inputs.arrays import read_arrays
+from intercap_core.inputs.arrays import read_arrays, read_pickle
 
 MOST_M = 100.0  # a place beyond this is in other units
 MOST_RAD = 100.0  # as is a rotation vector
@@ -243,7 +242,7 @@ def _as_smplx(poses: np.ndarray, path: Path) -> np.ndarray:
 
 
 def _named(path: Path) -> Mapping[str, Any]:
-    values = safe_pickle.load(path)
+    values = read_pickle(path)
     if not isinstance(values, dict):
         raise UserError(f"{path}: holds {type(values).__name__}, expected numbers by name")
     return values

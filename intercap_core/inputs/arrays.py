@@ -1,94 +1,56 @@
-"""Arrays of .npz archives: plain numbers, whose stated sizes are compared before memory is taken.
+"""Arrays of .npz archives and of pickles, without executing what a file names.
 
-``np.load`` takes the memory that an array's head asks for, and an archive of some megabytes unpacks
-to gigabytes.
+The stated size of an array is compared with the size of its content before memory is allocated.
 """
 
 from __future__ import annotations
 
 import io
 import math
-import re
-import sys
+import pickle
 import tokenize
 import zipfile
 import zlib
 from collections.abc import Collection
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from intercap_core.inputs.files import MAX_ARRAYS_BYTES, Unreadable, read_bytes
-from intercap_core.inputs.quotes import printable
+from intercap_core.inputs.files import (
+    MAX_ARRAYS_BYTES,
+    MAX_PICKLE_BYTES,
+    Unreadable,
+    printable,
+    read_bytes,
+)
 
-MAX_ARRAYS = 10_000  # of one archive
-_ADDRESS = re.compile(r" object at 0x[0-9a-f]+")
-_SUFFIX, _ARRAY = ".npy", b"\x93NUMPY"
 _HEADS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
 }
-# What zipfile and zlib raise for damaged, encrypted or foreign archives.
-_ZIP_ERRORS = (
+# What zipfile, zlib and numpy's parser of heads raise for damaged archives.
+_ARCHIVE_ERRORS = (
     zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OSError,
-    ValueError, OverflowError,
+    ValueError, OverflowError, TypeError, SyntaxError, tokenize.TokenError, KeyError,
 )  # fmt: skip
-_HEAD_ERRORS = (
-    ValueError,
-    TypeError,
-    SyntaxError,
-    tokenize.TokenError,
-    RecursionError,
-    OverflowError,
-    KeyError,
-)  # fmt: skip  (of the parser of heads)
-
-
-class Archive:
-    """The arrays of an .npz by name; each is read when it is asked for."""
-
-    def __init__(self, path: Path, limit: int = MAX_ARRAYS_BYTES, *, advice: str) -> None:
-        """Raises Unreadable for what is no archive, or unpacks to more than ``limit`` bytes."""
-        self._path, self._advice = path, advice
-        content = read_bytes(path, limit, advice=advice)
-        try:
-            self._zip = zipfile.ZipFile(io.BytesIO(content))
-        except _ZIP_ERRORS as error:
-            told = "it is a single array" if content.startswith(_ARRAY) else error
-            raise self._refused(f"is not a readable .npz archive ({told})") from None
-        entries = self._zip.infolist()
-        unpacked = sum(entry.file_size for entry in entries)
-        if unpacked > limit:
-            raise self._refused(
-                f"unpacks to {unpacked / 1e6:.0f} MB, at most {limit / 1e6:.0f} are read"
-            )
-        if len(entries) > MAX_ARRAYS:
-            raise self._refused(f"holds {len(entries)} arrays, at most {MAX_ARRAYS} are read")
-        self._entries = {entry.filename.removesuffix(_SUFFIX): entry for entry in entries}
-
-    @property
-    def names(self) -> list[str]:
-        """The arrays' names, in the archive's order."""
-        return list(self._entries)
-
-    def read(self, name: str) -> np.ndarray:
-        """One array; raises Unreadable where it is damaged, or not of numbers or text."""
-        try:
-            content = self._zip.read(self._entries[name])
-        except _ZIP_ERRORS as error:
-            raise self._refused(f"is damaged at {name!r:.60} ({_told(error)})") from None
-        try:
-            return _array(content)
-        except _HEAD_ERRORS as error:
-            raise self._refused(f"has no readable array {name!r:.60} ({_told(error)})") from None
-
-    def _refused(self, reason: str) -> Unreadable:
-        return Unreadable(self._path, reason, self._advice)
-
-
-def _told(error: Exception) -> str:
-    words = _ADDRESS.sub("", printable(str(error)))  # of an object of Python's, which says nothing
-    return " ".join(words.split())[:200] or type(error).__name__
+# What unpickling raises for damaged files.
+PICKLE_ERRORS = (
+    pickle.UnpicklingError, ValueError, TypeError, KeyError, IndexError, AttributeError, EOFError,
+    OverflowError, RecursionError, ImportError, AssertionError, SystemError,
+    MemoryError,  # a damaged index of the unpickler's memo asks for any amount of memory
+)  # fmt: skip
+# What pickles of numpy arrays and plain values name. numpy 2.0 moved its own from core to _core.
+_PICKLE_NAMES = {
+    *((f"numpy.{core}.multiarray", name) for core in ("core", "_core")
+      for name in ("_reconstruct", "scalar")),
+    *((f"numpy.{core}.numeric", "_frombuffer") for core in ("core", "_core")),
+    ("numpy", "ndarray"), ("numpy", "dtype"),
+    ("_codecs", "encode"),  # of bytes in protocol 2
+    ("collections", "OrderedDict"),
+    *((module, name) for module in ("builtins", "__builtin__")
+      for name in ("set", "frozenset", "bytes")),
+}  # fmt: skip
 
 
 def read_arrays(
@@ -98,21 +60,38 @@ def read_arrays(
     limit: int = MAX_ARRAYS_BYTES,
     advice: str = "save it again",
 ) -> dict[str, np.ndarray]:
-    """The arrays of an .npz, or those of them that are wanted; raises Unreadable."""
-    archive = Archive(path, limit, advice=advice)
-    return {name: archive.read(name) for name in archive.names if wanted is None or name in wanted}
+    """Return the arrays of an .npz by name, all or those in ``wanted``.
 
-
-def check_text(values: np.ndarray) -> None:
-    """Raise ValueError for text of numbers that are no characters: Python believes numpy's."""
-    if values.dtype.kind == "U" and values.size:
-        order = "<u4" if values.dtype.isnative == (sys.byteorder == "little") else ">u4"
-        if np.ascontiguousarray(values).reshape(-1).view(order).max() > sys.maxunicode:
-            raise ValueError("it holds text that is none")
+    Raises Unreadable if it is no archive, unpacks to more than ``limit`` bytes, or if a wanted
+    array is damaged or holds neither numbers nor text.
+    """
+    content = read_bytes(path, limit, advice=advice)
+    if content.startswith(b"\x93NUMPY"):
+        raise Unreadable(path, "is not a readable .npz archive (it is a single array)", advice)
+    try:
+        archive = zipfile.ZipFile(io.BytesIO(content))
+    except _ARCHIVE_ERRORS as error:
+        raise Unreadable(path, f"is not a readable .npz archive ({error})", advice) from None
+    unpacked = sum(entry.file_size for entry in archive.infolist())
+    if unpacked > limit:
+        words = f"unpacks to {unpacked / 1e6:.0f} MB, at most {limit / 1e6:.0f} are read"
+        raise Unreadable(path, words, advice)
+    arrays = {}
+    for entry in archive.infolist():
+        name = entry.filename.removesuffix(".npy")
+        if wanted is not None and name not in wanted:
+            continue
+        try:
+            arrays[name] = _array(archive.read(entry))
+        except _ARCHIVE_ERRORS as error:
+            reason = " ".join(printable(str(error)).split())[:200] or type(error).__name__
+            words = f"has no readable array {name!r:.60} ({reason})"
+            raise Unreadable(path, words, advice) from None
+    return arrays
 
 
 def _array(content: bytes) -> np.ndarray:
-    """The array of an .npy file's content; raises ``_HEAD_ERRORS`` where it is none of numbers."""
+    """Return the array of an .npy file's content."""
     file = io.BytesIO(content)
     version = np.lib.format.read_magic(file)
     if version not in _HEADS:
@@ -128,5 +107,29 @@ def _array(content: bytes) -> np.ndarray:
     if not size:
         return np.zeros(shape, dtype)
     values = np.frombuffer(content, dtype, offset=file.tell())
-    check_text(values)
     return values.reshape(shape, order="F" if fortran else "C").copy(order="K")
+
+
+class _Unpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) not in _PICKLE_NAMES:
+            raise pickle.UnpicklingError(f"it asks for {module:.40}.{name:.40}")
+        return super().find_class(module, name)
+
+
+def read_pickle(path: Path) -> Any:
+    """Load a pickle of numpy arrays and plain Python values, such as results of InterCap.
+
+    Python 2 pickles are read as latin-1, as numpy advises. Raises Unreadable if the file is
+    missing, damaged or names anything else.
+    """
+    content = read_bytes(Path(path), MAX_PICKLE_BYTES)
+    try:
+        return _Unpickler(io.BytesIO(content), encoding="latin1").load()
+    except PICKLE_ERRORS as error:
+        reason = printable(str(error))[:200] or type(error).__name__
+        raise Unreadable(
+            Path(path),
+            f"not a pickle of numpy arrays and plain values ({reason})",
+            "convert it to .npz or .json, or get the file again",
+        ) from None

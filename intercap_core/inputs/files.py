@@ -1,15 +1,18 @@
-"""Bytes and text of the files that a user supplies: regular files, up to a size, strict UTF-8."""
+"""Bytes and text of files that a user supplies, and values of such files quoted in messages."""
 
 from __future__ import annotations
 
 import os
+import reprlib
 import stat
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from intercap_core.errors import UserError
-from intercap_core.inputs.quotes import printable
 
-# Bytes, by kind of file. Each is several times what the largest real file of its kind has.
+# Size limits in bytes by kind of file, several times the size of the largest real file of the kind.
 MAX_SETTINGS_BYTES = 1 << 20  # written by hand; YAML is parsed at about a megabyte a second
 MAX_TABLE_BYTES = 1 << 24  # a line for each of 100,000 recordings
 MAX_CALIBRATION_BYTES = 1 << 24  # JSON, YAML or TOML of a hundred cameras
@@ -17,17 +20,25 @@ MAX_MODEL_BYTES = 1 << 29  # COLMAP's images and their points; a mesh; network w
 MAX_IMAGE_BYTES = 1 << 28  # one image file
 MAX_PICKLE_BYTES = 1 << 28  # results of an hour at 30 frames a second
 MAX_ARRAYS_BYTES = 1 << 30  # arrays of an .npz unpacked; SMPL-X's have 350 MB
-_NO_FILE = {
+
+_FILE_TYPES = {
     stat.S_ISDIR: "a folder",
     stat.S_ISCHR: "a device",
     stat.S_ISBLK: "a device",
     stat.S_ISFIFO: "a pipe",
     stat.S_ISSOCK: "a socket",
 }
+_REPR = reprlib.Repr()
+_REPR.maxlevel = 3
+_REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = _REPR.maxset = _REPR.maxfrozenset = 6
+_REPR.maxstring = _REPR.maxother = 80
 
 
 class Unreadable(UserError):
-    """A file that cannot be used. ``reason`` says why, in words that fit after its name."""
+    """A file that cannot be used.
+
+    ``reason`` fits after the file's name, for readers that continue without the file.
+    """
 
     def __init__(self, path: Path, reason: str, advice: str = "check the path") -> None:
         super().__init__(f"{printable(str(path))}: {reason}; {advice}")
@@ -37,52 +48,48 @@ class Unreadable(UserError):
 def read_bytes(
     path: Path, limit: int, *, advice: str = "check the path", head: int | None = None
 ) -> bytes:
-    """The content of a regular file of at most ``limit`` bytes, or its first ``head`` bytes.
+    """Return the content of a regular file of at most ``limit`` bytes, or its first ``head`` bytes.
 
-    Raises :class:`Unreadable` for anything else, also where the path leads to a device or a pipe,
-    which is never waited for.
+    Raises :class:`Unreadable` for other files, without waiting for pipes or devices.
     """
+    check_file(path, limit, advice=advice)
     try:
-        handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        with open(path, "rb") as file:
+            content = file.read(limit + 1 if head is None else min(head, limit))
     except OSError as error:
         raise Unreadable(path, f"cannot be read ({error.strerror})", advice) from None
-    except ValueError:  # a NUL, or text that no file system has
-        raise Unreadable(path, "is no name that a file can have", advice) from None
-    try:
-        _check(path, os.fstat(handle), limit, advice)
-    except Unreadable:
-        os.close(handle)
-        raise
-    with os.fdopen(handle, "rb") as file:
-        try:
-            content = file.read(limit + 1 if head is None else min(head, limit))
-        except OSError as error:
-            raise Unreadable(path, f"cannot be read ({error.strerror})", advice) from None
-    if len(content) > limit:
+    if len(content) > limit:  # the file grew while it was read
         raise Unreadable(path, _too_large(len(content), limit), advice)
     return content
 
 
 def check_file(path: Path, limit: int | None, *, advice: str = "check the path") -> int:
-    """The size of a regular file that a library will open by its path; raises
-    :class:`Unreadable` where it is none, or larger than ``limit`` bytes (None = of any size)."""
+    """Return the size of a file that a library will open by its path.
+
+    Raises :class:`Unreadable` if it is no regular file or larger than ``limit`` bytes (None = of
+    any size).
+    """
     try:
-        found = os.stat(path)
+        status = os.stat(path)
     except OSError as error:
         raise Unreadable(path, f"cannot be read ({error.strerror})", advice) from None
-    except ValueError:
+    except ValueError:  # a NUL, or characters that no file system has
         raise Unreadable(path, "is no name that a file can have", advice) from None
-    _check(path, found, limit, advice)
-    return found.st_size
+    if not stat.S_ISREG(status.st_mode):
+        kind = next((name for test, name in _FILE_TYPES.items() if test(status.st_mode)), "no file")
+        raise Unreadable(path, f"cannot be read (it is {kind}, no file)", advice)
+    if limit is not None and status.st_size > limit:
+        raise Unreadable(path, _too_large(status.st_size, limit), advice)
+    return status.st_size
 
 
 def read_text(path: Path, limit: int, *, advice: str = "check the path") -> str:
-    """The text of a regular file, UTF-8 with or without its mark; raises :class:`Unreadable`."""
-    return decoded(path, read_bytes(path, limit, advice=advice))
+    """Return the text of a regular file, UTF-8 with or without a byte order mark."""
+    return decode_text(path, read_bytes(path, limit, advice=advice))
 
 
-def decoded(path: Path, content: bytes) -> str:
-    """Content as text; raises :class:`Unreadable` naming the byte that is no UTF-8."""
+def decode_text(path: Path, content: bytes) -> str:
+    """Decode UTF-8; raises :class:`Unreadable` with the line and byte that are not UTF-8."""
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -93,7 +100,7 @@ def decoded(path: Path, content: bytes) -> str:
 
 
 def path_fault(path: Path) -> str | None:
-    """Why no file system has this path, None = it may."""
+    """Return why no file system can have this path, or None."""
     try:
         parts = [os.fsencode(part) for part in path.parts]
         str(path).encode("utf-8")
@@ -106,12 +113,31 @@ def path_fault(path: Path) -> str | None:
     return None
 
 
-def _check(path: Path, found: os.stat_result, limit: int | None, advice: str) -> None:
-    if not stat.S_ISREG(found.st_mode):
-        kind = next((name for test, name in _NO_FILE.items() if test(found.st_mode)), "no file")
-        raise Unreadable(path, f"cannot be read (it is {kind}, no file)", advice)
-    if limit is not None and found.st_size > limit:
-        raise Unreadable(path, _too_large(found.st_size, limit), advice)
+def quoted(value: Any, most: int = 80) -> str:
+    """Format a value for a message, in about ``most`` printable characters."""
+    if isinstance(value, int) and not isinstance(value, bool) and value.bit_length() > 64:
+        return f"a whole number of {value.bit_length()} bits"
+    if isinstance(value, dict):
+        keys = ", ".join(printable(str(key)[:40]) for key in list(value)[:5])
+        return f"an object with {keys}" if keys else "an empty object"
+    text = printable(_REPR.repr(value))
+    return text if len(text) <= most else f"{text[: most - 3]}..."
+
+
+def printable(text: str) -> str:
+    """Replace what UTF-8 cannot encode, such as bytes of file names, by ``?``."""
+    return text.encode("utf-8", "replace").decode("utf-8", "replace")
+
+
+def numbers_of(value: Any, where: str, field: str) -> np.ndarray:
+    """Convert to an array of finite numbers; raises UserError that begins with ``where``."""
+    try:
+        numbers = np.array(value, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        numbers = np.full(1, np.nan)
+    if not np.isfinite(numbers).all():
+        raise UserError(f"{where}: {field} is {quoted(value)}, expected finite numbers; correct it")
+    return numbers
 
 
 def _too_large(size: int, limit: int) -> str:

@@ -9,8 +9,8 @@ from typing import Any
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.behave import frame_folders
 from intercap_core.formats.released import PERSON_MESH
+from intercap_core.inputs.documents import read_json
 from intercap_core.inputs.files import Unreadable
-from intercap_core.inputs.json_files import read_json
 from intercap_core.tables.project_files import Draft, Row
 
 SEQUENCE = re.compile(r"(Date\d{1,4})_(Sub\d{1,4})_([A-Za-z0-9]+)(?:_[A-Za-z0-9_-]+)?")

@@ -13,7 +13,7 @@ import numpy as np
 from intercap_core.config import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.intercap import camera_folders, numbered_images
-from intercap_core.inputs.yaml_files import read_yaml
+from intercap_core.inputs.documents import read_yaml
 from intercap_core.tables.intercap_annotations import Key, annotation_folders, convert
 from intercap_core.tables.project_files import Draft, Row
 

@@ -17,8 +17,8 @@ import yaml
 from pydantic import ValidationError
 
 from intercap_core.config import ANY_REGION, Annotation
+from intercap_core.inputs.documents import parse_integer
 from intercap_core.inputs.files import MAX_SETTINGS_BYTES, Unreadable, read_text
-from intercap_core.inputs.json_files import whole
 
 FOLDER = re.compile(
     r"subject(\d{1,2})_(?:motion|object)(\d{1,2})_seg_?(\d{1,2})([A-Za-z0-9_-]*)", re.IGNORECASE
@@ -89,7 +89,7 @@ def _contact(
     if not path.is_file():
         return None
     try:
-        values = [whole(word) for word in read_text(path, MAX_SETTINGS_BYTES).split()]
+        values = [parse_integer(word) for word in read_text(path, MAX_SETTINGS_BYTES).split()]
     except (Unreadable, ValueError):
         faults.append("contact.txt is not a list of frame numbers")
         return None
@@ -121,7 +121,7 @@ def _object_pose(path: Path, numbers: np.ndarray, faults: list[str]) -> dict[str
             [float(word) for word in parser[section][key].split()]
             for section, key in (("init_trans", "trans"), ("init_rot", "rot"))
         )
-        frame = whole(parser["init_frame_id"]["id"])
+        frame = parse_integer(parser["init_frame_id"]["id"])
         if len(translation) != 3 or len(rotation) != 3:
             raise ValueError
     except (Unreadable, ValueError, KeyError, configparser.Error):

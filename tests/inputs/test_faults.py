@@ -123,9 +123,6 @@ REFUSED = {
     "matrix of 401 digits": (
         ("opencv-storage", text("left.yml", "data: [ 901.5", f"data: [ {HUGE}")), "camera_matrix",
     ),
-    "an aliased list": (
-        ("opencv-yaml", text("rig.yaml", "fps: 30.0", "fps: &a [*a]")), "holds itself",
-    ),
     "a field of a megabyte": (
         ("sequences", text("sequences.tsv", "rec/one", "y" * (1 << 20))),
         "line 2.*255 bytes a name",

@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 from intercap_core.errors import UserError
-from intercap_core.inputs import safe_pickle
+from intercap_core.inputs.arrays import read_pickle
 from intercap_core.pipeline.code_digest import code_digest
 from intercap_core.project import Project, load_project
 
@@ -157,7 +157,7 @@ def measure_cached(part: EvaluationPart[Errors], project: Project, sequence: str
     folder = project.results / sequence / "evaluation"
     path = folder / f"{part.name}-{state.hexdigest()[:24]}.pickle"
     if path.is_file():
-        return _dataclass_of(part.kept, safe_pickle.load(path))
+        return _dataclass_of(part.kept, read_pickle(path))
     errors = part.measure(project, sequence)
     folder.mkdir(parents=True, exist_ok=True)
     for old in folder.glob(f"{part.name}-*.pickle"):

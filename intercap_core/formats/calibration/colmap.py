@@ -24,9 +24,15 @@ from intercap_core.formats.calibration.files import (
 from intercap_core.formats.calibration.opencv import MAX_SIDE, Calibration, opencv_lens
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.transforms import rigid
-from intercap_core.inputs.files import MAX_MODEL_BYTES, decoded, read_bytes, read_text
-from intercap_core.inputs.json_files import whole
-from intercap_core.inputs.quotes import printable, quoted
+from intercap_core.inputs.documents import parse_integer
+from intercap_core.inputs.files import (
+    MAX_MODEL_BYTES,
+    decode_text,
+    printable,
+    quoted,
+    read_bytes,
+    read_text,
+)
 
 
 class LensModel(NamedTuple):
@@ -151,7 +157,7 @@ def _text_lenses(path: Path) -> Iterator[tuple[int, Intrinsics]]:
         where = f"{path}, line {number}"
         try:
             identity, model, width, height, *rest = line.split()
-            camera, size = whole(identity), (whole(width), whole(height))
+            camera, size = parse_integer(identity), (parse_integer(width), parse_integer(height))
             values = [float(word) for word in rest]
         except ValueError:
             raise UserError(
@@ -171,7 +177,7 @@ def _text_images(path: Path) -> Iterator[_Image]:
         try:
             _, *numbers, camera, name = line.split(maxsplit=9)
             values = [float(word) for word in numbers]
-            identity = whole(camera)
+            identity = parse_integer(camera)
         except ValueError:
             values = []
         if len(values) != 7:
@@ -202,7 +208,7 @@ class _Bytes:
         end = self._content.find(b"\0", self._at, self._at + 4096)  # longer than any path
         if end < 0:
             raise UserError(f"{self._path}: an image has no name; copy or export it again")
-        name = decoded(self._path, self._content[self._at : end])
+        name = decode_text(self._path, self._content[self._at : end])
         self._at = end + 1
         return name
 

@@ -27,7 +27,7 @@ from intercap_core.formats.calibration.opencv import (
     opencv_pose,
     parse_image_size,
 )
-from intercap_core.inputs.quotes import quoted
+from intercap_core.inputs.files import quoted
 
 INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
 

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.transforms import invert, is_rigid, rigid
-from intercap_core.inputs.json_files import read_object
-from intercap_core.inputs.quotes import printable, quoted
+from intercap_core.inputs.documents import read_object
+from intercap_core.inputs.files import printable, quoted
 
 MAX_DISTANCE_M = 100.0  # of a camera from the file's origin; beyond it, the file is in millimetres
 MAX_TO_MASTER_M = 30.0  # a sports hall; beyond it, the file is in centimetres

@@ -22,8 +22,8 @@ from intercap_core.formats.calibration.opencv import (
 from intercap_core.geometry.camera.intrinsics import DEFAULT_METRIC_RADIUS, Intrinsics
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import invert, is_rigid, rigid
-from intercap_core.inputs.json_files import parse_json
-from intercap_core.inputs.quotes import quoted
+from intercap_core.inputs.documents import parse_json
+from intercap_core.inputs.files import quoted
 
 # Names in the JSON.
 DEPTH_LOCATION = "CALIBRATION_CameraLocationD0"

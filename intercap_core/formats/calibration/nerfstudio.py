@@ -29,10 +29,8 @@ from intercap_core.formats.calibration.opencv import (
 )
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.transforms import invert, is_rigid
-from intercap_core.inputs.files import Unreadable
-from intercap_core.inputs.json_files import read_json, read_object
-from intercap_core.inputs.numbers import numbers_of
-from intercap_core.inputs.quotes import quoted
+from intercap_core.inputs.documents import read_json, read_object
+from intercap_core.inputs.files import Unreadable, numbers_of, quoted
 
 TRANSFORMS = "transforms.json"
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")

@@ -28,10 +28,8 @@ from intercap_core.geometry.camera.intrinsics import DEFAULT_METRIC_RADIUS, Intr
 from intercap_core.geometry.camera.projection import radial_fraction
 from intercap_core.geometry.camera.transforms import invert, is_rigid, rigid
 from intercap_core.inputs import yaml_files
-from intercap_core.inputs.files import MAX_CALIBRATION_BYTES, Unreadable
-from intercap_core.inputs.json_files import read_json
-from intercap_core.inputs.numbers import numbers_of
-from intercap_core.inputs.quotes import quoted
+from intercap_core.inputs.documents import read_json
+from intercap_core.inputs.files import MAX_CALIBRATION_BYTES, Unreadable, numbers_of, quoted
 
 # Focal lengths in units of the longer side of the image. 0.2 sees 136 degrees across, about the
 # limit of a pinhole with distortion (the wide depth mode of the Azure Kinect has 0.49). 20 sees 3

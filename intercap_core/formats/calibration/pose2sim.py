@@ -25,8 +25,8 @@ from intercap_core.formats.calibration.opencv import (
     opencv_pose,
     parse_image_size,
 )
-from intercap_core.inputs.json_files import read_toml
-from intercap_core.inputs.quotes import quoted
+from intercap_core.inputs.documents import read_toml
+from intercap_core.inputs.files import quoted
 
 FIELDS = ("size", "matrix", "distortions", "rotation", "translation")
 

@@ -29,7 +29,7 @@ from intercap_core.formats.detections.mask_files import (
     read_masks,
     release_masks,
 )
-from intercap_core.inputs.quotes import printable
+from intercap_core.inputs.files import printable
 
 Result = TypeVar("Result")
 

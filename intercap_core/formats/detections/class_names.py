@@ -9,10 +9,8 @@ from typing import Any
 import yaml
 
 from intercap_core.errors import UserError
-from intercap_core.inputs.files import read_text
-from intercap_core.inputs.json_files import parse_json
-from intercap_core.inputs.quotes import quoted
-from intercap_core.inputs.yaml_files import parse_yaml
+from intercap_core.inputs.documents import parse_json, parse_yaml
+from intercap_core.inputs.files import quoted, read_text
 
 MAX_LABEL = 200  # characters; the artefact stores all labels at the length of the longest
 MAX_LABELS_BYTES = (

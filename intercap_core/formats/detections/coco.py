@@ -18,9 +18,8 @@ from typing import Any, NamedTuple
 from intercap_core.formats.detections.class_names import label_text, names_of
 from intercap_core.formats.detections.instance import Instance, to_rle
 from intercap_core.geometry.camera import masks
-from intercap_core.inputs.files import Unreadable, read_bytes
-from intercap_core.inputs.json_files import decoder, parse_json
-from intercap_core.inputs.quotes import quoted
+from intercap_core.inputs.documents import json_decoder, parse_json
+from intercap_core.inputs.files import Unreadable, quoted, read_bytes
 
 MAX_JSON_BYTES = 1 << 29  # parsed JSON takes about six times its file size in memory
 HEAD_BYTES = 1 << 18  # of a long file, parsed for a preview
@@ -133,7 +132,7 @@ def read_head(path: Path) -> Any:
     text = content.decode("utf-8", errors="ignore").lstrip()
     if not text.startswith("["):
         return None
-    reader, at = decoder(text), 1
+    reader, at = json_decoder(text), 1
     entries: list[Any] = []
     while True:
         while text[at : at + 1] in (",", " ", "\t", "\r", "\n"):

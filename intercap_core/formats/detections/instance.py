@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from intercap_core.geometry.camera import masks
-from intercap_core.inputs.quotes import quoted
+from intercap_core.inputs.files import quoted
 
 MAX_PIXELS = 1 << 27  # of a mask that is scaled; a full-frame camera has a fifth of this
 MAX_REDUCTION = 32.0  # largest ratio of an image's side to the mask's side

@@ -28,7 +28,7 @@ from intercap_core.formats.detections.converters import openpose
 from intercap_core.formats.detections.converters.coco_people import people_of
 from intercap_core.formats.detections.converters.openpose import as_openpose
 from intercap_core.formats.detections.image_numbers import CameraImages
-from intercap_core.inputs.quotes import printable
+from intercap_core.inputs.files import printable
 
 EDGE_PX = 0.5  # the centres of pixels have integer coordinates
 # px. A person whose points all lie below this has normalised coordinates (0 to 1, some beyond the

@@ -22,8 +22,7 @@ from intercap_core.formats.detections.instance import (
 )
 from intercap_core.formats.recordings.behave import frame_folders
 from intercap_core.formats.recordings.image_files import encoded_size
-from intercap_core.inputs.files import MAX_IMAGE_BYTES, Unreadable, read_bytes
-from intercap_core.inputs.quotes import printable
+from intercap_core.inputs.files import MAX_IMAGE_BYTES, Unreadable, printable, read_bytes
 
 BEHAVE_PERSON = ("person_mask",)
 BEHAVE_OBJECT = ("obj_rend_mask", "obj_mask")  # the second where the first is not there

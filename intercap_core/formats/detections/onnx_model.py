@@ -16,8 +16,7 @@ import cv2
 import numpy as np
 
 from intercap_core.errors import UserError
-from intercap_core.inputs.files import check_file
-from intercap_core.inputs.quotes import printable
+from intercap_core.inputs.files import check_file, printable
 
 MAX_NETWORK_BYTES = 1 << 31  # limit of the ONNX format; larger models store weights in other files
 MAX_INPUT_SIDE = 8192  # px; detectors use 640 to 1333

@@ -36,7 +36,7 @@ from intercap_core.formats.detections.onnx_model import (
     parse_names,
 )
 from intercap_core.geometry.camera import masks
-from intercap_core.inputs.quotes import quoted
+from intercap_core.inputs.files import quoted
 
 NMS_IOU = 0.7  # default of ultralytics' predictors
 MAX_BOXES = 3000  # of one image, that enter non-maximum suppression

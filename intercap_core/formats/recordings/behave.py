@@ -26,8 +26,8 @@ from intercap_core.formats.recordings.image_files import AlignedRecording, Image
 from intercap_core.formats.recordings.source import RecordingLayout
 from intercap_core.geometry.camera.intrinsics import DEFAULT_METRIC_RADIUS, Intrinsics
 from intercap_core.geometry.camera.transforms import is_rigid, rigid
+from intercap_core.inputs.documents import read_json, read_object
 from intercap_core.inputs.files import Unreadable
-from intercap_core.inputs.json_files import read_json, read_object
 
 MASTER = "k1"
 FRAME_FOLDER = re.compile(r"t(\d{1,6}(?:\.\d{1,6})?)")

@@ -14,7 +14,7 @@ from intercap_core.errors import UserError
 from intercap_core.formats.recordings.image_files import encoded_size
 from intercap_core.formats.recordings.source import CameraRecording, Image, RecordingLayout, Sound
 from intercap_core.geometry.camera.rig import Camera
-from intercap_core.inputs.quotes import printable
+from intercap_core.inputs.files import printable
 from intercap_core.progress import Progress
 
 log = logging.getLogger(__name__)

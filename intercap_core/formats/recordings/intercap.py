@@ -21,8 +21,8 @@ from intercap_core.formats.calibration.opencv import check_lens
 from intercap_core.formats.recordings.image_files import AlignedRecording, ImagePair, common_size
 from intercap_core.formats.recordings.source import RecordingLayout
 from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.inputs.documents import read_json
 from intercap_core.inputs.files import Unreadable
-from intercap_core.inputs.json_files import read_json
 
 FPS = 30.0
 CAMERA_FOLDER = re.compile(r"frames_cam(\d{1,2})", re.IGNORECASE)

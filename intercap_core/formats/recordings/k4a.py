@@ -56,8 +56,7 @@ from intercap_core.formats.recordings.video import (
     segment_end,
 )
 from intercap_core.geometry.camera.rig import Camera
-from intercap_core.inputs.files import read_bytes
-from intercap_core.inputs.quotes import quoted
+from intercap_core.inputs.files import quoted, read_bytes
 
 TRACKS = {"COLOR": "K4A_COLOR_TRACK", "DEPTH": "K4A_DEPTH_TRACK", "IMU": "K4A_IMU_TRACK"}
 CALIBRATION_NAME, CALIBRATION_TAG = "calibration.json", "K4A_CALIBRATION_FILE"

@@ -10,8 +10,7 @@ import numpy as np
 
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.image_files import ImagePair
-from intercap_core.inputs.files import MAX_TABLE_BYTES, Unreadable, read_text
-from intercap_core.inputs.quotes import quoted
+from intercap_core.inputs.files import MAX_TABLE_BYTES, Unreadable, quoted, read_text
 
 SUFFIXES = (".csv", ".txt")
 LATEST_S = 1e11  # beyond all clocks that count seconds, and within 64 bits in microseconds

@@ -15,11 +15,9 @@ from typing import Any
 import numpy as np
 
 from intercap_core.errors import UserError
-from intercap_core.inputs import safe_pickle
-from intercap_core.inputs.arrays import Archive
-from intercap_core.inputs.files import Unreadable
-from intercap_core.inputs.json_files import read_json
-from intercap_core.inputs.quotes import printable, quoted
+from intercap_core.inputs.arrays import read_arrays, read_pickle
+from intercap_core.inputs.documents import read_json
+from intercap_core.inputs.files import Unreadable, printable, quoted
 
 _IDS, _COUNT, _DIGEST = "contact_vertices", "mesh_vertices", "mesh_digest"
 
@@ -92,7 +90,7 @@ def _read(path: Path) -> Any:
             "objects.yaml or leave it out"
         )
     if path.suffix == ".pkl":
-        return safe_pickle.load(path)
+        return read_pickle(path)
     if path.suffix == ".npz":
         return _from_npz(path)
     try:
@@ -104,9 +102,7 @@ def _read(path: Path) -> Any:
 
 
 def _from_npz(path: Path) -> Any:
-    archive = Archive(path, advice="save the .npz of vertex ids again")
-    names = archive.names
-    if not names:
+    arrays = read_arrays(path, advice="save the .npz of vertex ids again")
+    if not arrays:
         raise UserError(f"{path}: not a readable .npz of vertex ids (it is empty); save it again")
-    found = {name: archive.read(name) for name in (_COUNT, _DIGEST) if name in names}
-    return {**found, _IDS: archive.read(_IDS if _IDS in names else names[0])}
+    return arrays if _IDS in arrays else {**arrays, _IDS: next(iter(arrays.values()))}

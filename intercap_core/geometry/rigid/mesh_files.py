@@ -17,8 +17,13 @@ import trimesh
 from PIL import Image
 
 from intercap_core.errors import UserError
-from intercap_core.inputs.files import MAX_IMAGE_BYTES, MAX_MODEL_BYTES, Unreadable, read_bytes
-from intercap_core.inputs.quotes import printable
+from intercap_core.inputs.files import (
+    MAX_IMAGE_BYTES,
+    MAX_MODEL_BYTES,
+    Unreadable,
+    printable,
+    read_bytes,
+)
 
 SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb")
 # What trimesh and numpy raise for broken files, and Pillow for broken textures.

@@ -17,8 +17,7 @@ from intercap_core.formats.released import (
     check_radians,
     intercap_file,
 )
-from intercap_core.inputs import safe_pickle
-from intercap_core.inputs.arrays import read_arrays
+from intercap_core.inputs.arrays import read_arrays, read_pickle
 
 _HANDS = 45  # numbers of a hand's full pose; fewer are components
 _TURNS = {"global_orient": 3, "body_pose": 63, "jaw_pose": 3, "leye_pose": 3, "reye_pose": 3}
@@ -58,7 +57,7 @@ def read_results(path: Path) -> Results:
 
 
 def _load(path: Path) -> Any:
-    return read_arrays(path) if path.suffix == ".npz" else safe_pickle.load(path)
+    return read_arrays(path) if path.suffix == ".npz" else read_pickle(path)
 
 
 def _stacked(loaded: Any, path: Path) -> dict[str, Any]:

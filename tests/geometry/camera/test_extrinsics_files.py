@@ -37,7 +37,6 @@ def test_a_byte_order_mark_is_skipped(tmp_path: Path) -> None:
         ("", "not valid JSON"),
         (b"\xff\xfe{}", "not valid JSON"),
         ("[" * 100000, "not valid JSON"),
-        ('{"master": ' + "1" * 5000 + "}", "not valid JSON"),
         ("[]", "found list"),
         ("{}", "expected 'master'"),
         ('{"master": "k9", "cameras": {"k1": {}}}', "'k9' is none of the cameras"),

@@ -3,7 +3,6 @@
 import io
 import json
 import logging
-import os
 import pickle
 from pathlib import Path
 
@@ -16,7 +15,6 @@ from intercap_core.errors import UserError
 from intercap_core.geometry.rigid.contact_vertices import contact_list
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.inputs import safe_pickle
 
 
 def _entry(path, **values):
@@ -328,56 +326,3 @@ def test_impossible_symmetry_names_the_object(tmp_path):
     flat = tuple(np.diag([2.0, 1, 1, 1]).ravel())
     with pytest.raises(UserError, match="object 'thing': symmetry"):
         ObjectMesh.load(_entry(mesh, symmetry=Symmetry(discrete=(flat,))))
-
-
-class _Attack:
-    def __reduce__(self):
-        return os.system, ("touch should_not_exist",)
-
-
-class _Huge:
-    def __reduce__(self):
-        return np.ndarray, ((1 << 33,),)
-
-
-class _Evaluate:
-    def __reduce__(self):
-        return eval, ("1 + 1",)
-
-
-@pytest.mark.parametrize(
-    "value",
-    [_Attack(), [np.arange(3), _Evaluate()], {"a": Path("x")}, range(3), slice(3), 1j, _Huge()],
-)
-@pytest.mark.parametrize("protocol", [0, 2, 4, 5])
-def test_pickles_that_call_anything_are_refused(tmp_path, monkeypatch, value, protocol):
-    monkeypatch.chdir(tmp_path)
-    path = tmp_path / "evil.pkl"
-    path.write_bytes(pickle.dumps(value, protocol=protocol))
-    with pytest.raises(UserError, match=r"evil\.pkl: not a pickle of numpy arrays"):
-        safe_pickle.load(path)
-    assert not (tmp_path / "should_not_exist").exists()
-
-
-@pytest.mark.parametrize("protocol", [0, 1, 2, 3, 4, 5])
-def test_pickles_of_plain_values_load(tmp_path, protocol):
-    value = {
-        "ob_pose": [np.arange(3.0), np.ones((2, 2), np.float32)],
-        "names": ("a", b"b", None, True, 3, 2.5),
-        "scalar": np.float32(1.5),
-        "ids": {1, 2},
-    }
-    path = tmp_path / "plain.pkl"
-    path.write_bytes(pickle.dumps(value, protocol=protocol))
-    loaded = safe_pickle.load(path)
-    np.testing.assert_array_equal(loaded["ob_pose"][1], value["ob_pose"][1])
-    assert loaded["names"] == value["names"] and loaded["ids"] == value["ids"]
-    assert loaded["scalar"] == np.float32(1.5)
-
-
-@pytest.mark.parametrize("data", [b"", b"not a pickle", pickle.dumps([1] * 50)[:-5]])
-def test_damaged_pickles_are_refused(tmp_path, data):
-    path = tmp_path / "damaged.pkl"
-    path.write_bytes(data)
-    with pytest.raises(UserError, match="damaged"):
-        safe_pickle.load(path)

@@ -19,7 +19,7 @@ from intercap_core.body.artefact import file_digest
 from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.model import BodyModel
 from intercap_core.geometry.camera.transforms import apply
-from intercap_core.inputs import safe_pickle
+from intercap_core.inputs.arrays import read_pickle
 from intercap_core.output.export import body_files
 from intercap_core.output.export.about import BodyFile
 from intercap_core.schemas import JOINT
@@ -81,7 +81,7 @@ def test_amass_parameters_move_the_exported_body_as_the_joint_result_does(
 def test_intercap_parameters_move_the_exported_body_as_the_joint_result_does(
     hands: str, folder: Path, expected: np.ndarray
 ) -> None:
-    told = safe_pickle.load(folder / "intercap" / "res.pkl")
+    told = read_pickle(folder / "intercap" / "res.pkl")
     total = len(told["transl"])
     by_components = hands.startswith("components")
     if by_components:
@@ -108,7 +108,7 @@ def test_intercap_parameters_move_the_exported_body_as_the_joint_result_does(
 def test_object_poses_of_both_formats_are_the_same_object(
     lively: fitted.Capture, folder: Path, zup_from_master: np.ndarray
 ) -> None:
-    told = safe_pickle.load(folder / "intercap" / "res.pkl")
+    told = read_pickle(folder / "intercap" / "res.pkl")
     with np.load(folder / "amass" / "object.npz") as amass:
         for t, (turn, at) in enumerate(zip(told["ob_pose"], told["ob_trans"], strict=True)):
             placed = lively.mesh.vertices @ Rotation.from_rotvec(turn).as_matrix().T + at

@@ -11,7 +11,7 @@ import pygltflib
 import pytest
 from scipy.spatial.transform import Rotation
 
-from intercap_core.inputs import safe_pickle
+from intercap_core.inputs.arrays import read_pickle
 from intercap_core.output.export.motion import Coordinates
 from tests.helpers import exported
 from tests.helpers import fitted_capture as fitted
@@ -29,7 +29,7 @@ def _said(folder: Path) -> dict[str, dict[str, Any]]:
     return {
         "amass": _npz(folder / "amass" / "body.npz"),
         "amass/object": _npz(folder / "amass" / "object.npz"),
-        "intercap": safe_pickle.load(folder / "intercap" / "res.pkl")["about"],
+        "intercap": read_pickle(folder / "intercap" / "res.pkl")["about"],
         "intercap/npz": _npz(folder / "intercap" / "res.npz"),
         "bop": json.loads((folder / "bop" / "about.json").read_text()),
         "coco": coco["info"],

@@ -30,7 +30,7 @@ from intercap_core.errors import UserError
 from intercap_core.formats.recordings.synchronise import images_of_moments
 from intercap_core.geometry.camera.masks import decode
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
-from intercap_core.inputs import safe_pickle
+from intercap_core.inputs.arrays import read_pickle
 from intercap_core.output.export import bop, coco
 from intercap_core.output.export.about import About, BodyFile, Verdict
 from intercap_core.output.export.motion import read_motion
@@ -124,7 +124,7 @@ def test_intercap_result_is_a_plain_pickle_for_every_numpy(
     capture: fitted.Capture, folder: Path
 ) -> None:
     path = folder / "intercap" / "res.pkl"
-    result = safe_pickle.load(path)
+    result = read_pickle(path)
     total = len(capture.vertices)
     assert result["body_pose"].shape == (1, 63 * total)
     assert result["left_hand_pose"].shape == (total, 12)
@@ -209,7 +209,7 @@ def test_no_file_claims_smplx_for_another_mesh(capture: fitted.Capture, folder: 
     digest = hashlib.sha256(OPEN_BODY.read_bytes()).hexdigest()[:16]
     told = [
         json.loads((folder / "export.json").read_text())["body"],
-        safe_pickle.load(folder / "intercap" / "res.pkl")["about"]["body"],
+        read_pickle(folder / "intercap" / "res.pkl")["about"]["body"],
         json.loads((folder / "bop" / "about.json").read_text())["body"],
         json.loads((folder / "coco" / "annotations.json").read_text())["info"]["body"],
         _Gltf((folder / "glb" / "cap.glb").read_bytes()).json["asset"]["extras"]["body"],

@@ -15,7 +15,7 @@ import trimesh
 
 from intercap_core import artefacts
 from intercap_core.errors import UserError
-from intercap_core.inputs import safe_pickle
+from intercap_core.inputs.arrays import read_pickle
 from intercap_core.schemas import BODY_FIT, JOINT, METRICS, OBJECT_TRACK
 from tests.helpers import exported
 from tests.helpers import fitted_capture as fitted
@@ -68,7 +68,7 @@ def _told(folder: Path) -> dict[str, Any]:
     for name in ("amass/body.npz", "amass/object.npz", "intercap/res.npz"):
         with np.load(folder / name) as file:
             found[name] = {key: file[key] for key in file.files}
-    found["res.pkl"] = safe_pickle.load(folder / "intercap" / "res.pkl")["about"]["by_frame"]
+    found["res.pkl"] = read_pickle(folder / "intercap" / "res.pkl")["about"]["by_frame"]
     for name in ("bop/about.json", "meshes/about.json"):
         found[name] = json.loads((folder / name).read_text())["by_frame"]
     coco = json.loads((folder / "coco" / "annotations.json").read_text())

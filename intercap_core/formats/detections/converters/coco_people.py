@@ -36,7 +36,7 @@ from intercap_core.formats.detections.keypoint_layouts import (
     LAYOUTS,
     to_shared,
 )
-from intercap_core.inputs.quotes import quoted
+from intercap_core.inputs.files import quoted
 
 # Lists beside COCO's 17 points, and how COCO-WholeBody orders their points.
 _PARTS = {
