@@ -27,8 +27,7 @@ from intercap_core.formats.calibration.extrinsics import (
 from intercap_core.geometry.camera.intrinsics import DEFAULT_METRIC_RADIUS, Intrinsics
 from intercap_core.geometry.camera.projection import radial_fraction
 from intercap_core.geometry.camera.transforms import invert, is_rigid, rigid
-from intercap_core.inputs import yaml_files
-from intercap_core.inputs.documents import read_json
+from intercap_core.inputs.documents import YamlLoader, read_json, read_yaml
 from intercap_core.inputs.files import MAX_CALIBRATION_BYTES, Unreadable, numbers_of, quoted
 
 # Focal lengths in units of the longer side of the image. 0.2 sees 136 degrees across, about the
@@ -359,12 +358,8 @@ def _rate(entry: dict[str, Any], where: str) -> float | None:
     return fps
 
 
-class _Loader(yaml_files.Loader):
+class _Loader(YamlLoader):
     """The safe loader, extended by OpenCV's matrices."""
-
-    kinds = yaml_files.KINDS | dict.fromkeys(
-        [f"tag:yaml.org,2002:{name}" for name in _MATRIX_TYPES], yaml.MappingNode
-    )
 
 
 def _matrix(entry: dict[Any, Any]) -> Any:
@@ -397,7 +392,7 @@ def load_opencv(path: Path) -> dict[str, Any]:
         if path.suffix.lower() == ".json":
             content = read_json(path, entry=_json_object)
         else:  # OpenCV's first line, %YAML:1.0, is not YAML
-            content = yaml_files.read_yaml(
+            content = read_yaml(
                 path,
                 MAX_CALIBRATION_BYTES,
                 loader=_Loader,
