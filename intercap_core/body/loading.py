@@ -1,7 +1,14 @@
-"""Read an SMPL-X-format npz and say in one sentence what is wrong with another file."""
+"""Read and check an SMPL-X-format npz, and the prior of a subject's shape, E_beta.
+
+The open body is of both genders. Its file ``open_body_genders.npz`` has the mean and covariance of
+the shape among women and among men. A licensed file is of its own gender: its betas are standard
+normal by definition. A height is one linear measurement of the betas, between the vertices at the
+crown and at the soles of the rest pose, and narrows the Gaussian (Kalman's update).
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -17,9 +24,10 @@ from intercap_core.inputs.files import Unreadable
 
 OPEN_BODY = Path(__file__).parent / "data" / "open_body.npz"
 GENDERS_FILE = OPEN_BODY.with_name("open_body_genders.npz")
-# m. Stated heights exceed measured ones by 1 to 2 cm with a spread of 2 to 3 (Gorber et al. 2007,
-# "A comparison of direct vs. self-report measures for assessing height, weight and body mass
-# index", Obesity Reviews 8), and people fall by 1 to 2 cm over a day.
+# Standard deviation of a stated height, metres. Stated heights exceed measured ones by 1 to 2 cm,
+# with a standard deviation of 2 to 3 (Gorber et al. 2007, "A comparison of direct vs. self-report
+# measures for assessing height, weight and body mass index", Obesity Reviews 8). People lose 1 to 2
+# cm over a day.
 HEIGHT_SIGMA_M = 0.02
 _REQUIRED = (
     "v_template", "f", "shapedirs", "J_regressor", "kintree_table", "weights", "hands_meanl",
@@ -35,27 +43,37 @@ _HINT = "name an SMPLX_NEUTRAL/MALE/FEMALE.npz as body model, or none for the op
 
 @dataclass(frozen=True)
 class BodyFile:
-    """The arrays of the file in float64; posedirs is None if the file has no pose blend shapes.
-
-    hand_mean (2,45), hand_components (2,H,45) and hand_deviation (2,H), None = not told, are those
-    asked for.
-    """
+    """The arrays of a file in float64."""
 
     path: Path
     template: np.ndarray
+    """(V, 3) metres."""
     faces: np.ndarray
+    """(F, 3)"""
     shape_directions: np.ndarray
+    """(V, 3, S)"""
     expression_directions: np.ndarray
+    """(V, 3, E)"""
     posedirs: np.ndarray | None
+    """(V, 3, 486); None without pose blend shapes."""
     joint_regressor: np.ndarray
+    """(55, V)"""
     weights: np.ndarray
+    """(V, 55), rows sum to one."""
     hand_mean: np.ndarray
+    """(2, 45)"""
     hand_components: np.ndarray
+    """(2, H, 45)"""
     hand_deviation: np.ndarray | None
+    """(2, H) standard deviations of the components; None = unknown."""
     landmark_faces: np.ndarray
+    """(51,)"""
     landmark_barycentric: np.ndarray
+    """(51, 3)"""
     contour_faces: np.ndarray
+    """(79, 17)"""
     contour_barycentric: np.ndarray
+    """(79, 17, 3)"""
 
 
 def load_body_file(
@@ -66,10 +84,10 @@ def load_body_file(
     num_hand_components: int = 45,
     flat_hand_mean: bool = False,
 ) -> BodyFile:
-    """Read and check; `UserError` for anything but a complete SMPL-X file.
+    """Read and check a file. Raises UserError unless it is a complete SMPL-X file.
 
-    The first ``num_hand_components`` of each hand are kept; with ``flat_hand_mean`` they count from
-    the flat hand (mean of zero).
+    The first ``num_hand_components`` of each hand are kept. With ``flat_hand_mean`` they are
+    relative to the flat hand (mean of zero).
     """
     path = OPEN_BODY if path is None else Path(path)
     arrays = _read(path)
@@ -113,35 +131,37 @@ def _read(path: Path) -> dict[str, np.ndarray]:
         return read_arrays(path, wanted)
     except Unreadable as error:
         raise UserError(
-            f"Body file {path} is no readable npz ({error.reason}): {_HINT}."
+            f"Body file {path} is not a readable npz ({error.reason}): {_HINT}."
         ) from error
 
 
 def _check(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Raise UserError for the first fault."""
+    for faults in (_find_wrong_shapes(arrays), _find_wrong_values(arrays)):
+        for fault in faults:
+            raise UserError(f"Body file {path} {fault}: {_HINT}.")
+
+
+def _find_wrong_shapes(arrays: dict[str, np.ndarray]) -> Iterator[str]:
+    """Yield faults of types and shapes, to follow the name of the file."""
     for name, values in arrays.items():
         if values.dtype.kind not in "iuf":
-            raise UserError(
-                f"Body file {path} has {name} of type {values.dtype}; expected numbers: {_HINT}."
-            )
+            yield f"has {name} of type {values.dtype}; expected numbers"
     tree = arrays.get("kintree_table")
-    joints = tree.shape[-1] if tree is not None and tree.ndim == 2 else None
+    joints = tree.shape[-1] if tree is not None and tree.ndim == 2 else NUM_JOINTS
     if joints in _OTHER_MODELS:
-        raise UserError(
-            f"Body file {path} is a {_OTHER_MODELS[joints]} model with {joints} joints; expected "
-            f"SMPL-X with {NUM_JOINTS}: {_HINT}."
+        yield (
+            f"is a {_OTHER_MODELS[joints]} model with {joints} joints; expected SMPL-X with "
+            f"{NUM_JOINTS}"
         )
-    if joints is not None and joints != NUM_JOINTS:
-        raise UserError(
-            f"Body file {path} has {joints} joints; expected SMPL-X's {NUM_JOINTS}: {_HINT}."
-        )
+    if joints != NUM_JOINTS:
+        yield f"has {joints} joints; expected SMPL-X's {NUM_JOINTS}"
     missing = [name for name in _REQUIRED if name not in arrays]
     if missing:
-        what = "the hands (" if missing[0].startswith("hands") else "("
-        raise UserError(
-            f"Body file {path} lacks {what}{', '.join(missing)}): expected a complete SMPL-X file; "
-            f"{_HINT}."
-        )
+        hands = "the hands " if missing[0].startswith("hands") else ""
+        yield f"lacks {hands}({', '.join(missing)}); expected a complete SMPL-X file"
     vertices = len(arrays["v_template"]) if arrays["v_template"].ndim else 0
+    posedirs = arrays.get("posedirs")
     shapes = {
         "v_template": (vertices, 3),
         "f": (None, 3),
@@ -155,41 +175,28 @@ def _check(path: Path, arrays: dict[str, np.ndarray]) -> None:
         "lmk_bary_coords": (51, 3),
         "dynamic_lmk_faces_idx": (79, 17),
         "dynamic_lmk_bary_coords": (79, 17, 3),
+        **({"posedirs": (vertices, 3, 486)} if posedirs is not None and posedirs.size else {}),
     }
     for name, shape in shapes.items():
         found = arrays[name].shape
         if len(found) != len(shape) or any(
             want is not None and want != have for want, have in zip(shape, found, strict=True)
         ):
-            raise UserError(
-                f"Body file {path} has {name} of shape {found}; expected "
-                f"{tuple('any' if s is None else s for s in shape)}: {_HINT}."
-            )
-    posedirs = arrays.get("posedirs")
-    if posedirs is not None and posedirs.size and posedirs.shape != (vertices, 3, 486):
-        raise UserError(
-            f"Body file {path} has posedirs of shape {posedirs.shape}; expected "
-            f"({vertices}, 3, 486): {_HINT}."
-        )
+            expected = tuple("any" if size is None else size for size in shape)
+            yield f"has {name} of shape {found}; expected {expected}"
+
+
+def _find_wrong_values(arrays: dict[str, np.ndarray]) -> Iterator[str]:
+    """Yield faults of values: indices outside their tables, weights, metres."""
     for name, values in arrays.items():
         if not np.isfinite(values).all():
-            raise UserError(f"Body file {path} has values in {name} that are not finite: {_HINT}.")
-    # The root's parent is stored as -1, or as the same bits unsigned
-    if tuple(int(p) for p in tree[0, 1:]) != PARENTS[1:]:  # type: ignore[index]
-        raise UserError(
-            f"Body file {path} has another joint tree than SMPL-X: its joints are in another "
-            f"order; {_HINT}."
-        )
-    _check_values(path, arrays)
-
-
-def _check_values(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """What shapes do not tell: indices within their tables, weights that add up, metres."""
+            yield f"has values in {name} that are not finite"
+    # the parent of the root is stored as -1, or as the same bits unsigned
+    if tuple(int(p) for p in arrays["kintree_table"][0, 1:]) != PARENTS[1:]:
+        yield "has another joint tree than SMPL-X: its joints are in another order"
     vertices, faces = len(arrays["v_template"]), len(arrays["f"])
     if not vertices or not faces:
-        raise UserError(
-            f"Body file {path} has {vertices} vertices and {faces} faces; expected a body: {_HINT}."
-        )
+        yield f"has {vertices} vertices and {faces} faces; expected a body"
     for name, count, what in (
         ("f", vertices, "vertices"),
         ("lmk_faces_idx", faces, "faces"),
@@ -197,33 +204,30 @@ def _check_values(path: Path, arrays: dict[str, np.ndarray]) -> None:
     ):
         lowest, highest = arrays[name].min(), arrays[name].max()
         if lowest < 0 or highest >= count:
-            raise UserError(
-                f"Body file {path} names number {int(lowest if lowest < 0 else highest)} in "
-                f"{name}; expected 0 to {count - 1}, as it has {count} {what}: {_HINT}."
+            yield (
+                f"names number {int(lowest if lowest < 0 else highest)} in {name}; expected 0 to "
+                f"{count - 1}, as it has {count} {what}"
             )
     if arrays["weights"].sum(1, dtype=np.float64).min() <= 0:
-        raise UserError(
-            f"Body file {path} has a vertex whose weights are zero or negative; expected a sum "
-            f"of 1: {_HINT}."
-        )
+        yield "has a vertex whose weights are zero or negative; expected a sum of 1"
     height = float(np.ptp(arrays["v_template"][:, 1].astype(np.float64)))
     if not _HEIGHT_M[0] <= height <= _HEIGHT_M[1]:
-        raise UserError(
-            f"Body file {path} has a body {height:.4g} m tall; expected {_HEIGHT_M[0]} to "
-            f"{_HEIGHT_M[1]} m with y up (is it in millimetres?): {_HINT}."
+        yield (
+            f"has a body {height:.4g} m tall; expected {_HEIGHT_M[0]} to {_HEIGHT_M[1]} m with y "
+            "up (is it in millimetres?)"
         )
 
 
 def _directions(
     path: Path, table: np.ndarray, num_betas: int, num_expression: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Columns 0.. and 300.. of a full file, or the two halves of a 20-column one."""
+    """Return columns 0.. and 300.. of a full file, or the two halves of one with 20 columns."""
     columns = table.shape[2]
     start = _SMPLX_SHAPE_COLUMNS if columns > _SMPLX_SHAPE_COLUMNS else columns // 2
     if num_betas > start or num_expression > columns - start:
         raise UserError(
             f"Body file {path} has {start} shape and {columns - start} expression components; "
-            f"{num_betas} and {num_expression} were asked for: ask for fewer."
+            f"{num_betas} and {num_expression} were requested: request fewer."
         )
     return table[:, :, :num_betas], table[:, :, start : start + num_expression]
 
@@ -231,12 +235,12 @@ def _directions(
 def _hands(
     path: Path, arrays: dict[str, np.ndarray], count: int, flat: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Mean (2,45), first components (2,count,45) and their usual size (2,count) about that mean."""
+    """Return mean (2,45), first components (2,count,45) and their deviations (2,count)."""
     fewest, most = _HAND_COMPONENTS
     if not fewest <= count <= most:
         raise UserError(
-            f"Body file {path}: {count} hand components were asked for; expected {fewest} to "
-            f"{most}: ask for as many."
+            f"Body file {path}: {count} hand components were requested; expected {fewest} to "
+            f"{most}."
         )
     mean = np.stack([arrays["hands_meanl"], arrays["hands_meanr"]]).astype(np.float64)
     components = np.stack([arrays["hands_componentsl"], arrays["hands_componentsr"]])
@@ -245,16 +249,15 @@ def _hands(
     if deviation is not None:
         deviation = deviation[:, :count]
     if flat:
-        if deviation is not None:  # about zero, the mean is part of what is usual
+        if deviation is not None:  # about zero, the mean adds to the deviation
             deviation = np.hypot(deviation, np.einsum("skj,sj->sk", components, mean))
         mean = np.zeros_like(mean)
     return mean, components, deviation
 
 
 def _hand_deviation(arrays: dict[str, np.ndarray]) -> np.ndarray | None:
-    """(2,45) standard deviations of the hand components: stored, or of the registered hands.
-
-    SMPL-X files carry the coefficients of the scans that the hand space was learnt from.
+    """Return the standard deviations (2,45) of the hand components: stored, or of the registered
+    hands. SMPL-X files contain the coefficients of the scans that the hand space was learnt from.
     """
     stored = [arrays.get(f"hands_deviation{s}") for s in "lr"]
     if all(x is not None and x.shape == (45,) for x in stored):
@@ -267,14 +270,16 @@ def _hand_deviation(arrays: dict[str, np.ndarray]) -> np.ndarray | None:
 
 @dataclass(frozen=True, eq=False)
 class ShapePrior:
-    """betas = mean (S,) + root (S,S) z, with z standard normal."""
+    """betas = mean + root z, with z standard normal."""
 
     mean: np.ndarray
+    """(S,)"""
     root: np.ndarray
+    """(S, S)"""
 
     @classmethod
     def of(cls, file: BodyFile, gender: str, height_m: float | None = None) -> ShapePrior:
-        """Of a subject of this gender, and height where it is known, for a body file."""
+        """Return the prior of a subject of this gender and height, if it is known."""
         count = file.shape_directions.shape[2]
         mean, covariance = np.zeros(count), np.eye(count)
         if file.path == OPEN_BODY and gender in _genders():
@@ -290,20 +295,20 @@ class ShapePrior:
         return cls(mean, np.linalg.cholesky((covariance + covariance.T) / 2))
 
     def centred(self, file: BodyFile) -> BodyFile:
-        """The same bodies with z in place of betas: shapes in units of this prior."""
+        """Return the body with z in place of betas: shapes in units of this prior."""
         directions = file.shape_directions
         template = file.template + directions @ self.mean
         return replace(file, template=template, shape_directions=directions @ self.root)
 
     def betas(self, z: Tensor) -> Tensor:
-        """The file's own betas (...,S) of shapes (...,S) in units of this prior."""
+        """Return the file's betas (...,S) of shapes (...,S) in units of this prior."""
         mean, root = (torch.as_tensor(values).to(z) for values in (self.mean, self.root))
         return mean + z @ root.T
 
 
 @cache
 def _genders() -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Mean (30,) and covariance (30,30) of the open body's betas, by gender."""
+    """Return mean (30,) and covariance (30,30) of the open body's betas, by gender."""
     with np.load(GENDERS_FILE, allow_pickle=False) as file:
         names, mean, covariance = (file[name] for name in ("genders", "mean", "covariance"))
     return {

@@ -1,7 +1,9 @@
 """Named points of a body mesh: keypoint vertices, motion-capture markers, contact regions.
 
-The open body's are in data/open_body_maps.json. SMPL-X's own 10,475-vertex mesh is known by its
-published vertex ids.
+Those of the open body are in data/open_body_maps.json. SMPL-X's mesh of 10,475 vertices has
+published vertex ids. Its contact regions are found on the T-posed template by rules that fit every
+mesh in SMPL-X's format: skinning weights determine the limb of a vertex, normals its side. Lengths
+scale with the bones of the body.
 """
 
 from __future__ import annotations
@@ -57,31 +59,34 @@ REGION_NAMES: tuple[str, ...] = (
 
 @dataclass(frozen=True)
 class BodyMaps:
-    """points: vertex id by name (`POINT_NAMES`); markers (81,) in `MARKER_NAMES`' order; regions:
-    vertex ids by name, or None to find them on the template.
-    """
+    """Named points of a mesh."""
 
     points: dict[str, int]
+    """Vertex id of each of `POINT_NAMES`."""
     markers: np.ndarray
+    """(81,) vertex ids in the order of `MARKER_NAMES`."""
     regions: dict[str, np.ndarray] | None
+    """Vertex ids by region; None = find them on the template."""
 
 
 def smplx_maps() -> BodyMaps:
+    """Return the published ids of SMPL-X's mesh."""
     return BodyMaps(_SMPLX_POINTS, np.array(list(_SMPLX_MARKERS.values())), None)
 
 
 def maps_path(body_path: Path) -> Path:
+    """Return the path of the maps of a body file."""
     return body_path.with_name(body_path.stem + "_maps.json")
 
 
 def _vertex(value: object) -> int:
     if type(value) is not int:
-        raise ValueError(f"{quoted(value, 40)} is no vertex")
+        raise ValueError(f"{quoted(value, 40)} is not a vertex id")
     return value
 
 
 def load_maps(body_path: Path, num_vertices: int) -> BodyMaps:
-    """The `<body>_maps.json` beside the body file, or SMPL-X's published ids."""
+    """Read `<body>_maps.json` next to the body file, or return the published ids of SMPL-X."""
     path = maps_path(body_path)
     if path.exists():
         read = read_json(path)
@@ -108,12 +113,12 @@ def load_maps(body_path: Path, num_vertices: int) -> BodyMaps:
         return smplx_maps()
     raise UserError(
         f"Body file {body_path} has {num_vertices} vertices, not SMPL-X's {SMPLX_VERTICES}, and no "
-        f"{path.name} beside it: add that map, or use an SMPLX_*.npz file."
+        f"{path.name} next to it: add that map, or use an SMPLX_*.npz file."
     )
 
 
 def _inside_polygon(points: np.ndarray, polygon: np.ndarray) -> np.ndarray:
-    """(N,2) inside the closed (M,2) polygon, by crossing number."""
+    """Flag points (N,2) inside the closed polygon (M,2), by crossing number."""
     a, b = polygon, np.roll(polygon, -1, axis=0)
     x, y = points[:, :1], points[:, 1:]
     spans = (a[:, 1] > y) != (b[:, 1] > y)
@@ -129,10 +134,14 @@ def find_regions(
     joints: np.ndarray,
     mouth_outline: np.ndarray,
 ) -> dict[str, np.ndarray]:
-    """Vertex ids of each region, ascending; a vertex is in one region at most.
+    """Return the vertex ids of each region, ascending; regions are disjoint.
 
-    vertices (V,3), faces (F,3), weights (V,55), joints (55,3) of the T-posed template (y up, facing
-    +z, metres); mouth_outline (12,3): the outer lip landmarks in order.
+    Args:
+        vertices: (V, 3) of the T-posed template, y up, facing +z, metres.
+        faces: (F, 3)
+        weights: (V, 55)
+        joints: (55, 3)
+        mouth_outline: (12, 3) outer lip landmarks in order.
     """
     normals = vertex_normals(vertices, faces)
     at = {name: joints[i] for name, i in JOINT_INDEX.items()}
@@ -167,7 +176,7 @@ def find_regions(
         past_wrist = out * (vertices[:, 0] - at[f"{side}_wrist"][0]) > 0
         thumb = share(*(n for n in fingers if "thumb" in n)) > 0.5
         down = np.array([0.0, -1, 0])
-        # The thumb's pad looks across the palm: to the little finger and down
+        # The pad of the thumb faces the little finger and down
         across = np.array([0.0, -0.55, -0.83])
         pad = np.where(thumb[:, None], across, down)
         claim(f"{side}_hand", hand & past_wrist & ((normals * pad).sum(1) > 0.15))

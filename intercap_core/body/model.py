@@ -1,4 +1,4 @@
-"""The body: any file in SMPL-X's format, posed, with exact derivatives.
+"""The body: a file in SMPL-X's format, posed, with exact derivatives.
 
 Loper et al. 2015 (SMPL) and Pavlakos et al. 2019 (SMPL-X):
 v = W(T + S [betas, expression] + P vec(R(theta) - I), J(T + S [betas, expression]), theta).
@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from intercap_core.body.jacobian import Linearisation, linearise, shaped_points
-from intercap_core.body.joints import PARENTS
 from intercap_core.body.keypoints import KeypointMap, keypoint_map
 from intercap_core.body.kinematics import (
     PosedJoints,
@@ -24,14 +23,14 @@ from intercap_core.body.kinematics import (
     skin,
 )
 from intercap_core.body.loading import BodyFile, load_body_file
-from intercap_core.body.maps import MARKER_NAMES, find_regions, load_maps
+from intercap_core.body.maps import find_regions, load_maps
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.body.selection import Selection, select_points
 from intercap_core.errors import UserError
 
 _KEPT_SELECTIONS = 8
 _MOUTH_OUTLINE = slice(31, 43)  # landmarks 48 to 59 of dlib's 68
-_FALLBACK_HAND_DEVIATION = 0.35  # rad; for files that do not tell
+_FALLBACK_HAND_DEVIATION = 0.35  # rad; for files without deviations of the hand components
 _WIDEST_M = 3.0  # arm span and depth
 _SKIN_M2 = (0.3, 6.0)  # clothes, hair and a newborn included
 _FARTHEST_JOINT_M = 0.05  # beyond the box around the skin
@@ -42,22 +41,26 @@ _HINT = "take the file as published, or none for the open body"
 
 @dataclass(frozen=True)
 class BodyOutput:
-    """vertices (B,V,3), or those asked for, and joints (B,55,3), metres."""
+    """Posed bodies, metres."""
 
     vertices: Tensor
+    """(B, V, 3), or of the requested vertices."""
     joints: Tensor
+    """(B, 55, 3)"""
 
 
 class BodyModel:
     """A body of V vertices and 55 joints in SMPL-X's conventions (y up, facing +z, metres).
 
-    faces (F,3) int64. parents: of each joint, -1 for the pelvis. hand_mean (2,45) and
-    hand_components (2,H,45), left then right: axis-angle = mean + coefficients @ components;
-    hand_deviation (2,H): usual size of each coefficient. keypoint_map, regions (name to vertex
-    ids), markers (81,) LEMO's marker vertices by `marker_names`.
+    Attributes:
+        faces: (F, 3) int64.
+        hand_mean: (2, 45), left then right: axis-angle = mean + coefficients @ components.
+        hand_components: (2, H, 45)
+        hand_deviation: (2, H) standard deviation of each coefficient.
+        keypoint_map: the 135 keypoints.
+        regions: vertex ids of each contact region.
+        markers: (81,) vertices of LEMO's markers, in the order of `maps.MARKER_NAMES`.
     """
-
-    marker_names = MARKER_NAMES
 
     def __init__(self, file: BodyFile, device: torch.device, dtype: torch.dtype) -> None:
         def tensor(array: np.ndarray) -> Tensor:
@@ -68,7 +71,6 @@ class BodyModel:
         self.num_betas = file.shape_directions.shape[2]
         self.num_expression = file.expression_directions.shape[2]
         self.faces = torch.as_tensor(file.faces, device=device)
-        self.parents = PARENTS
         directions = np.concatenate([file.shape_directions, file.expression_directions], 2)
         rest_joints = file.joint_regressor @ file.template
         self._template = tensor(file.template)
@@ -114,10 +116,18 @@ class BodyModel:
     ) -> BodyModel:
         """Load an SMPL-X npz (300+100 or 10+10 shape columns), or the open body without a path.
 
-        ``num_hand_components``, 6 to 45, are kept of each hand's pose space (fits of the whole pose
-        want all); ``flat_hand_mean``: coefficients count from the flat hand, not from the mean
-        one. Raises `UserError` for a file that is missing, is SMPL or SMPL-H, or is incomplete, or
-        where more components are asked for than it has.
+        Raises UserError for a file that is missing, incomplete or of another model, or that has
+        fewer components.
+
+        Args:
+            path: body file; None = the open body.
+            num_betas: number of shape components.
+            num_expression: number of expression components.
+            num_hand_components: 6 to 45 components of each hand's pose space. A fit of the whole
+                pose needs all.
+            flat_hand_mean: coefficients are relative to the flat hand, not to the mean hand.
+            device: device of the model.
+            dtype: floating type of the model.
         """
         file = load_body_file(
             path,
@@ -147,7 +157,7 @@ class BodyModel:
         return self._weights
 
     def zeros(self, batch: int = 1) -> BodyParameters:
-        """T-posed mean bodies with flat hands."""
+        """Return T-posed mean bodies with flat hands."""
         return BodyParameters.zeros(
             batch,
             num_betas=self.num_betas,
@@ -157,19 +167,19 @@ class BodyModel:
         )
 
     def parameters(self, vector: Tensor) -> BodyParameters:
-        """(B,P) parameter vector -> parameters."""
+        """Split parameter vectors (B,P)."""
         return BodyParameters.from_vector(vector, num_betas=self.num_betas)
 
     def hand_pose(self, coefficients: Tensor, side: int) -> Tensor:
-        """(B,n) coefficients of the first n of the H components -> (B,45) axis-angle; side 0 left,
-        1 right."""
+        """Return the axis-angle (B,45) of coefficients (B,n) of the first n components; side 0 is
+        the left hand."""
         count = coefficients.shape[-1]
         return self.hand_mean[side] + coefficients @ self.hand_components[side, :count]
 
     def forward(
         self, params: BodyParameters, *, vertex_ids: Tensor | np.ndarray | None = None
     ) -> BodyOutput:
-        """Posed vertices (B,V,3), or of `vertex_ids` (N,) alone (B,N,3), and joints (B,55,3)."""
+        """Pose all vertices, or ``vertex_ids`` (N,) alone, and the joints."""
         selection = self.select(vertex_ids, joints=False)
         points, posed, _ = self._rest(selection, params)
         vertices = skin(points, posed.rotations, posed.offsets, selection.weights)
@@ -184,9 +194,9 @@ class BodyModel:
         vertex_ids: Tensor | np.ndarray | None = None,
         joints: bool = False,
     ) -> Linearisation:
-        """Posed points with what their derivatives are made of; see `Linearisation`.
+        """Pose points and prepare their derivatives; see `Linearisation`.
 
-        The points are the vertices (all, or `vertex_ids`), followed by the joints if asked for.
+        The points are the vertices (all, or ``vertex_ids``), followed by the joints if ``joints``.
         """
         with torch.no_grad():
             selection = self.select(vertex_ids, joints=joints)
@@ -194,7 +204,7 @@ class BodyModel:
             return linearise(selection, points, posed, axis_angle, self._joint_directions)
 
     def keypoints(self, output: BodyOutput) -> Tensor:
-        """(B,135,3) from all vertices, or from those of `keypoint_map.vertex_ids`, and joints."""
+        """Return keypoints (B,135,3) from all vertices, or those of `keypoint_map.vertex_ids`."""
         vertices, ids = output.vertices, self.keypoint_map.vertex_ids
         if vertices.shape[1] == self.num_vertices:
             vertices = vertices[:, torch.as_tensor(ids, device=vertices.device)]
@@ -206,7 +216,7 @@ class BodyModel:
         return self._keypoint_matrix @ torch.cat([vertices, output.joints], 1)
 
     def keypoints_of(self, params: BodyParameters) -> Tensor:
-        """(B,135,3), evaluating only the vertices that keypoints use."""
+        """Return keypoints (B,135,3), evaluating only the vertices that they use."""
         return self.keypoints(self.forward(params, vertex_ids=self.keypoint_map.vertex_ids))
 
     def select(self, vertex_ids: Tensor | np.ndarray | None, *, joints: bool = False) -> Selection:
@@ -235,7 +245,7 @@ class BodyModel:
     def _rest(
         self, selection: Selection, params: BodyParameters
     ) -> tuple[Tensor, PosedJoints, Tensor]:
-        """Rest points (B,N,3), posed joints, axis-angle (B,55,3)."""
+        """Return points at rest (B,N,3), posed joints, axis-angles (B,55,3)."""
         batch = params.batch
         axis_angle = params.full_pose()
         shape = torch.cat([params.betas.expand(batch, -1), params.expression.expand(batch, -1)], 1)
@@ -261,12 +271,12 @@ def _regions(file: BodyFile, rest_joints: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def with_hand_mean(model: BodyModel, params: BodyParameters) -> BodyParameters:
-    """The parameters with both hands in the model's mean pose."""
+    """Return the parameters with both hands in the mean pose of the model."""
     return replace(params, left_hand_pose=model.hand_mean[:1], right_hand_pose=model.hand_mean[1:])
 
 
 def check_body(model: BodyModel) -> None:
-    """Raise UserError where no person can be fitted with the model, naming what is off."""
+    """Raise UserError if the numbers of a body file cannot be those of a person."""
     template, joints = model.template, model.forward(model.zeros()).joints[0]
     low, high = template.amin(0), template.amax(0)
     beyond = torch.maximum(low - joints, joints - high).amax()
@@ -312,13 +322,13 @@ def check_body(model: BodyModel) -> None:
 
 
 def _area(points: Tensor, faces: Tensor) -> float:
-    """Square metres of skin."""
+    """Return the area of the skin, square metres."""
     a, b, c = (points[faces[:, i]] for i in range(3))
     return 0.5 * float(torch.linalg.cross(b - a, c - a).norm(dim=1).sum())
 
 
 def _largest_move(model: BodyModel) -> float:
-    """Metres by which one unit of any shape or expression component moves a vertex at most."""
+    """Return the largest motion of a vertex by one unit of a shape or expression component."""
     components = model.num_betas + model.num_expression
     vector = model.zeros(components).vector()
     vector[:, -components:] = torch.eye(components, dtype=vector.dtype, device=vector.device)

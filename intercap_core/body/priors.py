@@ -1,12 +1,28 @@
-"""Priors of equation 2, what is known about a body before it is seen, with analytic Jacobians.
+"""Priors of equation 2 with analytic Jacobians, and the ranges of motion of the 55 joints.
 
 E_theta_b and E_theta_f (:func:`rest_pose`), E_theta_h (:func:`hand_pose`), E_alpha
-(:func:`bending`), E_beta and E_psi (:func:`shape`), and beyond the paper :func:`joint_limits`. They
-are weighed and summed in :mod:`intercap_core.body_fit.prior_term`; VPoser's E_theta_b is in
-:mod:`.vposer`.
+(:func:`bending`), and beyond the paper :func:`joint_limits`. E_beta and E_psi are standard normal.
+All are weighted and summed in :mod:`intercap_core.body_fit.prior_term`; VPoser's E_theta_b is in
+:mod:`.vposer`. The functions take parameter vectors (B,P) in the order of `BodyParameters.vector`
+and return rows that add themselves to normal equations. Weights enter squared, as in SMPLify-X.
 
-Every function takes parameter vectors (B,P) (order of `BodyParameters.vector`) and gives rows that
-add themselves to normal equations. Weights enter squared, as in SMPLify-X.
+Ranges of motion are components of the axis-angle from the T-pose. They are the means plus about two
+standard deviations of
+- Soucie et al. 2011, "Range of motion measurements: reference values and a database for comparison
+  studies", Haemophilia 17 (hip, knee, ankle, shoulder, elbow, adults);
+- American Academy of Orthopaedic Surgeons 1965, "Joint Motion: Method of Measuring and Recording"
+  (forearm, wrist, fingers, thumb, toes, neck);
+- White and Panjabi 1990, "Clinical Biomechanics of the Spine" (thorax and lumbar spine, divided
+  among the three spine joints).
+Under the weight of a crouching person an ankle bends farther than in Soucie's passive measurement
+(Rabin et al. 2015, "Weight-bearing ankle dorsiflexion range of motion", Journal of Athletic
+Training): its range is 20 degrees larger. The components of a rotation vector are clinical angles
+only for turns about one axis, so ball joints have 10 to 20 degrees more. Pronation is divided
+between elbow and wrist.
+
+Axes in the T-pose (x left, y up, z forward): about +x the trunk bends forward, the leg swings back,
+the knee closes, the toes go down; about +z the left leg and the left arm go up to the side; about
+-y the left arm swings forward and the left elbow closes; about -z the left fingers close.
 """
 
 from __future__ import annotations
@@ -52,7 +68,7 @@ _TABLE: dict[str, tuple[_Range, _Range, _Range]] = {
     "thumb3": ((-50, 50), (-30, 85), (-85, 40)),
 }  # fmt: skip
 
-# Mean and spread in degrees of the 25 joints that are no fingers: arms hang (SMPL-X rests in a T)
+# Mean and standard deviation in degrees of the 25 joints that are not fingers: the arms hang
 _REST: dict[str, tuple[tuple[float, float], tuple[float, float], tuple[float, float]]] = {
     "shoulder": ((10, 40), (-20, 45), (-55, 40)),
     "elbow": ((0, 30), (-40, 45), (0, 12)),
@@ -72,7 +88,7 @@ _REST: dict[str, tuple[tuple[float, float], tuple[float, float], tuple[float, fl
 
 
 def _kind(joint: str) -> tuple[str, bool]:
-    """The table's name for a joint, and whether it is on the right."""
+    """Return the name of a joint in the tables, and whether it is on the right."""
     side, _, rest = joint.partition("_")
     if side not in ("left", "right"):
         return joint, False
@@ -104,16 +120,19 @@ def _rest(joint: str) -> tuple[_Range, _Range, _Range]:
 LIMITS_DEG = tuple(_limits(joint) for joint in JOINT_NAMES)
 """(55, 3 axes, lower and upper)"""
 REST_SPREAD_DEG = tuple(_rest(joint) for joint in JOINT_NAMES)
-"""(55, 3 axes, mean and spread)"""
+"""(55, 3 axes, mean and standard deviation)"""
 
 
 @dataclass(frozen=True)
 class DiagonalRows:
-    """One parameter a residual: residuals (B,R), their slopes (B,R), parameter columns (R,)."""
+    """Residuals of one parameter each."""
 
     residuals: Tensor
+    """(B, R)"""
     slopes: Tensor
+    """(B, R) derivatives by the parameter."""
     columns: Tensor
+    """(R,) columns of the parameters."""
 
     def add_to(self, hessian: Tensor, gradient: Tensor, weight: float) -> None:
         """Add weight^2 J^T J to (B,P,P) and weight^2 J^T r to (B,P), in place."""
@@ -122,17 +141,20 @@ class DiagonalRows:
         gradient[:, self.columns] += weight**2 * self.slopes * self.residuals
 
     def energy(self, weight: float) -> Tensor:
-        """(B,) half the weighted sum of squares."""
+        """Return half the weighted sum of squares (B,)."""
         return 0.5 * weight**2 * (self.residuals**2).sum(1)
 
 
 @dataclass(frozen=True)
 class LinearRows:
-    """residuals (B,R) with one Jacobian (R,C) for all bodies over the parameters columns (C,)."""
+    """Residuals with one Jacobian for all bodies."""
 
     residuals: Tensor
+    """(B, R)"""
     jacobian: Tensor
+    """(R, C)"""
     columns: Tensor
+    """(C,) columns of the parameters."""
 
     def add_to(self, hessian: Tensor, gradient: Tensor, weight: float) -> None:
         """Add weight^2 J^T J to (B,P,P) and weight^2 J^T r to (B,P), in place."""
@@ -141,15 +163,14 @@ class LinearRows:
         gradient[:, self.columns] += weight**2 * self.residuals @ self.jacobian
 
     def energy(self, weight: float) -> Tensor:
-        """(B,) half the weighted sum of squares."""
+        """Return half the weighted sum of squares (B,)."""
         return 0.5 * weight**2 * (self.residuals**2).sum(1)
 
 
 def joint_limits(vector: Tensor) -> DiagonalRows:
-    """How far each axis-angle component is outside its anatomical range, rad (beyond the paper).
+    """Distance of each axis-angle component from its anatomical range, rad (beyond the paper).
 
-    r = max(theta - upper, 0) + min(theta - lower, 0): zero inside, so it costs a healthy pose
-    nothing. Ranges and their sources: `joint_limits.LIMITS_DEG`.
+    r = max(theta - upper, 0) + min(theta - lower, 0), zero inside the range `LIMITS_DEG`.
     """
     table = torch.deg2rad(torch.tensor(LIMITS_DEG, dtype=vector.dtype, device=vector.device))
     pose = vector[:, 3:NUM_POSE]
@@ -169,10 +190,10 @@ def bending(vector: Tensor) -> DiagonalRows:
 
 def rest_pose(vector: Tensor, *, first: int = 1) -> DiagonalRows:
     """E_theta_b (21 body joints) and E_theta_f (jaw, eyes), from joint ``first`` on: a weak pull to
-    standing at ease, r = (theta - mean) / spread.
+    standing at ease, r = (theta - mean) / sigma.
 
-    Means and spreads are broad guesses of everyday poses (`joint_limits.REST_SPREAD_DEG`): they
-    only hold what nothing has seen.
+    Means and standard deviations (`REST_SPREAD_DEG`) are broad estimates of everyday poses: they
+    only determine parts without observations.
     """
     columns = torch.arange(3 * first, 75, device=vector.device)
     table = torch.deg2rad(torch.tensor(REST_SPREAD_DEG, dtype=vector.dtype, device=vector.device))[
@@ -194,16 +215,9 @@ def hand_pose(
     """E_theta_h: Gaussian over one hand's pose components, r = C (theta - mean) / deviation.
 
     mean (2,45), components (2,45,45) orthonormal rows, deviation (2,45) of the model; side 0 is the
-    left hand; the first `count` components count.
+    left hand; the first `count` components are used.
     """
     at = _HAND_COLUMNS[side]
     jacobian = components[side, :count] / deviation[side, :count, None]
     residuals = (vector[:, at] - mean[side]) @ jacobian.T
     return LinearRows(residuals, jacobian, torch.arange(at.start, at.stop, device=vector.device))
-
-
-def shape(vector: Tensor) -> DiagonalRows:
-    """E_beta and E_psi: betas and expression are standard normal, r = value."""
-    columns = torch.arange(NUM_POSE + 3, vector.shape[1], device=vector.device)
-    residuals = vector[:, NUM_POSE + 3 :]
-    return DiagonalRows(residuals, torch.ones_like(residuals), columns)

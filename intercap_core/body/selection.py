@@ -1,6 +1,6 @@
-"""The points of a body that are evaluated: some or all vertices, and joints if asked.
+"""The points of a body that are evaluated: some or all vertices, and the joints if requested.
 
-A joint is a point that follows its parent alone, so one code path poses both.
+A joint is a point that follows its parent alone, so the same code poses both.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from torch import Tensor
 
 from intercap_core.body.joints import NUM_JOINTS, PARENTS, ancestors
 
-# Points that hang on nearly the same joints share one dense block of the normal equations.
-# A block is named by the joint that moves its points most.
+# Points that follow nearly the same joints share one dense block of the normal equations. This is
+# the block of a point by its heaviest joint.
 _BLOCK_OF_JOINT: tuple[int, ...] = (
     0, 1, 2, 0, 4, 5, 0, 4, 5, 9, 4, 5, 12, 9, 9, 12, 16, 17, 16, 17, 20, 21, 12, 12, 12,
     *(25 + 3 * (i // 3) for i in range(30)),
@@ -33,18 +33,17 @@ class Block:
 
 
 class Limbs(NamedTuple):
-    """N points by limb: those that hang on nearly the same joints.
-
-    order (N,): points, limb by limb; starts (L+1,): where each limb starts in it, and the end;
-    moved_by (L,55) bool: the joints that move any point of a limb.
-    """
+    """N points grouped into L limbs, which follow nearly the same joints."""
 
     order: np.ndarray
+    """(N,) points, limb by limb."""
     starts: np.ndarray
+    """(L + 1,) start of each limb in the order, and the end."""
     moved_by: np.ndarray
+    """(L, 55) bool, the joints that move a point of the limb."""
 
     def moved_by_point(self) -> np.ndarray:
-        """(N,55) bool: the joints of each point's own limb."""
+        """Flag the joints (N, 55) of each point's own limb."""
         flags = np.zeros((len(self.order), NUM_JOINTS), bool)
         flags[self.order] = self.moved_by.repeat(np.diff(self.starts), 0)
         return flags
@@ -52,25 +51,27 @@ class Limbs(NamedTuple):
 
 @dataclass(frozen=True)
 class Selection:
-    """N points in the rest pose and what moves them.
-
-    template (N,3), directions (N,3,S), posedirs (N,3,486) or None, weights (N,55).
-    bones (N,K) and bone_weights (N,K): the joints with weight, padded with weight zero.
-    chain (N,L): every joint whose rotation moves the point, padded with 0; below (N,L,K): bone
-    weight of bones[n,k] if it hangs below chain[n,l], else 0. num_vertices: the first so many
-    points are vertices, the rest are the 55 joints.
-    """
+    """N points in the rest pose and their dependence on joints and shape."""
 
     template: Tensor
+    """(N, 3) metres."""
     directions: Tensor
+    """(N, 3, S) by shape and expression."""
     posedirs: Tensor | None
+    """(N, 3, 486) pose blend shapes."""
     weights: Tensor
+    """(N, 55) skinning weights."""
     bones: Tensor
+    """(N, K) joints with weight."""
     bone_weights: Tensor
+    """(N, K) their weights, padded with zero."""
     chain: Tensor
+    """(N, L) all joints whose rotation moves the point, padded with 0."""
     below: Tensor
+    """(N, L, K) weight of bones[n, k] if it is chain[n, l] or a descendant, else 0."""
     blocks: tuple[Block, ...]
     num_vertices: int
+    """Number of vertices; the other points are the 55 joints."""
 
     @cached_property
     def limbs(self) -> Limbs:
@@ -88,7 +89,7 @@ for _joint in range(NUM_JOINTS):
 
 
 def _padded(flags: np.ndarray) -> np.ndarray:
-    """(N,55) bool -> (N,K) column ids of the set flags, ascending, padded with -1."""
+    """Return the columns (N,K) of the set flags of (N,55), ascending, padded with -1."""
     width = max(1, int(flags.sum(1).max()))
     order = np.argsort(~flags, axis=1, kind="stable")[:, :width]
     return np.where(np.take_along_axis(flags, order, 1), order, -1)
@@ -101,7 +102,7 @@ def select_points(
     weights: Tensor,
     joints: tuple[Tensor, Tensor] | None,
 ) -> Selection:
-    """Vertices (N,...) as given, then the joints' rest (55,3) and directions (55,3,S) if given."""
+    """Join vertices (N,...), and the joints' rest (55,3) and directions (55,3,S) if given."""
     count = template.shape[0]
     if joints is not None:
         rest, moves = joints
@@ -141,6 +142,6 @@ def select_points(
 
 
 def _block_rows(weights: np.ndarray) -> Sequence[np.ndarray]:
-    """Row ids of each block, in the order of the joints that name them."""
+    """Return the rows of each block, in the order of their joints."""
     block = np.array(_BLOCK_OF_JOINT)[weights.argmax(1)]
     return [np.flatnonzero(block == name) for name in np.unique(block)]

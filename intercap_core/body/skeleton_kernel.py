@@ -1,6 +1,9 @@
-"""The 55 joints of many bodies posed, with their derivatives, compiled: once for all terms.
+"""Posed skeletons and the derivatives of single points, compiled.
 
-The same as :mod:`intercap_core.body.kinematics`, joint by joint instead of level by level.
+The skeleton is posed once for all terms, as :mod:`intercap_core.body.kinematics` does, joint by
+joint. Rows of derivatives are n^T d point / d parameters, equal to
+:class:`.jacobian.Linearisation` to rounding for bodies without pose blend shapes. ``place`` (P,) is
+the column of a parameter in a row, -1 = none. All arrays have one floating type.
 """
 
 from __future__ import annotations
@@ -21,29 +24,25 @@ _PARENTS = np.array(PARENTS)
 
 
 class RestJoints(NamedTuple):
-    """joints (55,3) of the mean shape, metres, and their directions (55,3,S) by the shape."""
+    """The joints of the mean shape."""
 
     joints: np.ndarray
+    """(55, 3) metres."""
     directions: np.ndarray
+    """(55, 3, S) derivatives by the shape."""
 
     @classmethod
     def of(cls, model: BodyModel) -> RestJoints:
-        """Those of a body model."""
         selection = model.select(np.array([0]), joints=True)
         return cls(selection.template[1:].numpy(), selection.directions[1:].numpy())
 
 
 class Chain(NamedTuple):
-    """B posed bodies and N of their points.
-
-    rest (B,N,3) points; rotations (B,55,3,3) and offsets (B,55,3): a point that follows joint k
-    alone goes to rotations[k] @ x + offsets[k]; joints (B,55,3) posed; frames (B,55,3,3): world
-    turn of a joint for a change of its axis-angle; moved (B,55,3,S): derivatives of the offsets by
-    the shape. Of each point directions (N,3,S), and bones, shares, chain and below as
-    ``bones``, ``bone_weights``, ``chain`` and ``below`` of :class:`.selection.Selection`.
-    """
+    """B posed bodies and N of their points, for kernels: :class:`Skeleton` and
+    :class:`.selection.Selection` as arrays."""
 
     rest: np.ndarray
+    """(B, N, 3) points at rest."""
     rotations: np.ndarray
     offsets: np.ndarray
     joints: np.ndarray
@@ -52,25 +51,29 @@ class Chain(NamedTuple):
     directions: np.ndarray
     bones: np.ndarray
     shares: np.ndarray
+    """(N, K) ``bone_weights`` of the selection."""
     chain: np.ndarray
     below: np.ndarray
 
 
 class Skeleton(NamedTuple):
-    """B posed skeletons: rotations (B,55,3,3), offsets (B,55,3), joints (B,55,3), frames
-    (B,55,3,3) and moved (B,55,3,S) as in :class:`Chain`.
-
-    Posed without derivatives, frames and moved are of no body.
-    """
+    """B posed skeletons. A point x that follows joint k alone moves to
+    rotations[k] @ x + offsets[k]."""
 
     rotations: np.ndarray
+    """(B, 55, 3, 3)"""
     offsets: np.ndarray
+    """(B, 55, 3) metres."""
     joints: np.ndarray
+    """(B, 55, 3) metres."""
     frames: np.ndarray
+    """(B, 55, 3, 3) world rotation of a joint for a change of its axis-angle; of no body without
+    derivatives."""
     moved: np.ndarray
+    """(B, 55, 3, S) derivatives of the offsets by the shape; of no body without derivatives."""
 
     def chain(self, selection: Selection, rest: np.ndarray) -> Chain:
-        """What kernels take, for points of a selection; rest (B,N,3)."""
+        """Return the arrays of a selection's points; rest (B,N,3)."""
         return Chain(
             rest, *self, selection.directions.numpy(), selection.bones.numpy(),
             selection.bone_weights.numpy(), selection.chain.numpy(), selection.below.numpy(),
@@ -79,9 +82,10 @@ class Skeleton(NamedTuple):
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
 def rest_points(template, directions, shape):
-    """Points (B,N,3) of bodies of shape (B,S); template (N,3), directions (N,3,S).
+    """Return points (B,N,3) of bodies of shape (B,S); template (N,3), directions (N,3,S).
 
-    By hand: a library's product would wake its threads, and round by the number of bodies.
+    Written out: the product of a library would start its threads, and its rounding would depend on
+    the number of bodies.
     """
     points = np.empty((len(shape), *template.shape), template.dtype)
     for b in range(len(shape)):
@@ -96,11 +100,12 @@ def rest_points(template, directions, shape):
 
 @numba.njit(cache=True, nogil=True)
 def columns_of_limb(moved_by, place, local, to):
-    """A limb's columns: writes where each parameter's is in its rows, ``local`` (P,), -1 = not
-    there, and where it stands in the normal equations, ``to``; how many there are.
+    """Write the columns of a limb and return their number.
 
-    ``moved_by`` (55,) bool: the joints that turn the limb; ``place`` (P,): each parameter's column
-    in the normal equations, -1 = fixed.
+    moved_by (55,) bool: the joints that move the limb.
+    place (P,): column of each parameter in the normal equations, -1 = fixed.
+    local (P,): filled with its column in the limb's rows, -1 = none.
+    to: filled with the column in the normal equations of each column of the rows.
     """
     local[:] = -1
     m = 0
@@ -113,7 +118,7 @@ def columns_of_limb(moved_by, place, local, to):
 
 @numba.njit(cache=True, nogil=True)
 def turned_back(chain, b, i, n):
-    """A vector n on point i of body b as it acts on the point at rest: the blended R^T n."""
+    """Return the blended R^T n: a vector n at point i of body b, turned back to rest."""
     t0 = t1 = t2 = n[0] * np.float32(0)  # of the same type
     for k in range(chain.bones.shape[1]):
         w = chain.shares[i, k]
@@ -127,7 +132,7 @@ def turned_back(chain, b, i, n):
 
 
 def pose(rest: RestJoints, vectors: np.ndarray, *, derivatives: bool) -> Skeleton:
-    """Skeletons of the parameter vectors (B,P)."""
+    """Pose the skeletons of parameter vectors (B,P)."""
     count, size = len(vectors), rest.directions.shape[2]
     also = count if derivatives else 0
     skeleton = Skeleton(
@@ -143,7 +148,7 @@ def pose(rest: RestJoints, vectors: np.ndarray, *, derivatives: bool) -> Skeleto
 
 @numba.njit(cache=True, nogil=True)
 def _rodrigues(x, y, z, local, jacobian):
-    """Rotation and left Jacobian (3,3) of the axis-angle x, y, z; see :mod:`.kinematics`."""
+    """Write rotation and left Jacobian (3,3) of the axis-angle x, y, z; see :mod:`.kinematics`."""
     t2 = x * x + y * y + z * z
     if t2 < _SMALL_ANGLE_SQUARED:
         a = 1 - t2 / 6 + t2 * t2 / 120
@@ -165,13 +170,13 @@ def _rodrigues(x, y, z, local, jacobian):
 
 @numba.njit(cache=True, nogil=True)
 def _product(a, b, i, c):
-    """Element (i, c) of a b, both (3,3)."""
+    """Return element (i, c) of a b, both (3,3)."""
     return a[i, 0] * b[0, c] + a[i, 1] * b[1, c] + a[i, 2] * b[2, c]
 
 
 @numba.njit(cache=True, nogil=True)
 def _pose(rest, directions, parents, vectors, rotations, offsets, joints, frames, moved):
-    """Fill in what :class:`Skeleton` holds; sums along the tree are in float64."""
+    """Fill the arrays of :class:`Skeleton`; sums along the tree are in float64."""
     size = directions.shape[2]
     local, jacobian = np.empty((3, 3)), np.empty((3, 3))
     world = np.empty((len(parents), 3, 3))
@@ -236,7 +241,7 @@ def _pose(rest, directions, parents, vectors, rotations, offsets, joints, frames
 
 @numba.njit(cache=True, nogil=True)
 def _add_turn(row, place, joint, frame, scale, a, n):
-    """Add scale n^T (w x a) for the turns w of one joint; a, n (3,)."""
+    """Add scale n^T (w x a) for the rotations w of one joint; a, n (3,)."""
     t0 = scale * (a[1] * n[2] - a[2] * n[1])
     t1 = scale * (a[2] * n[0] - a[0] * n[2])
     t2 = scale * (a[0] * n[1] - a[1] * n[0])
@@ -248,9 +253,9 @@ def _add_turn(row, place, joint, frame, scale, a, n):
 
 @numba.njit(cache=True, nogil=True)
 def add_point(row, place, shape, c, b, i, scale, n, arms):
-    """Add scale n^T d point i / d parameters of body b to the row; returns scale n^T point.
+    """Add scale n^T d point i / d parameters of body b to the row; return scale n^T point.
 
-    ``shape``: the shape's columns that are asked for, from 0. ``arms`` (L,3) is scratch.
+    shape: fitted shape components. arms (L,3): scratch.
     """
     arms[:] = 0
     x = c.rest[b, i]

@@ -298,7 +298,7 @@ class PreparedKeypoints:
 
 def _keypoint_data(inputs: TermInputs, like: Tensor) -> KeypointData:
     """Return the observations in the floating type of ``like``; absent ones have no frame."""
-    if not inputs.has_keypoints:
+    if inputs.views is None and inputs.targets is None:
         raise ValueError("the problem has neither views nor targets")
 
     def absent(axes: int) -> Tensor:

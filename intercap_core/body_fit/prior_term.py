@@ -80,7 +80,7 @@ class PriorTerm:
 
     def cost(self, inputs: TermInputs, bodies: Bodies) -> Tensor:
         vectors = bodies.vectors
-        total = 0.5 * (vectors[:, _standard_normal(self.model, inputs.shape_prior)] ** 2).sum(1)
+        total = 0.5 * (vectors[:, _standard_normal(self.model, not inputs.one_shape)] ** 2).sum(1)
         if inputs.pose is not None:
             total = total + inputs.pose.of_frames(bodies.frames).cost(vectors[:, _BODY_POSE])
         for rows, weight in self._rows(inputs, vectors):
@@ -100,7 +100,7 @@ class PriorTerm:
             hessian[:, _BODY_POSE, _BODY_POSE] += pose.precision
         for rows, weight in self._rows(inputs, vectors):
             rows.add_to(hessian, gradient, weight)
-        at = _standard_normal(self.model, inputs.shape_prior)
+        at = _standard_normal(self.model, not inputs.one_shape)
         gradient[:, at] += vectors[:, at]
         hessian.diagonal(dim1=1, dim2=2)[:, at] += 1
         chosen, n = columns.parameters, len(columns.parameters)
@@ -190,7 +190,7 @@ class CompiledPriors:
         self._kept: dict[tuple[bool, bool], PriorArrays] = {}
 
     def prepare(self, inputs: TermInputs, bodies: Bodies, *, derivatives: bool) -> PreparedPriors:
-        which = inputs.shape_prior, inputs.pose is None
+        which = not inputs.one_shape, inputs.pose is None
         if which not in self._kept:
             self._kept[which] = PriorArrays.of(self._model, shape=which[0], body_pose=which[1])
         arrays = self._kept[which]

@@ -18,19 +18,13 @@ from torch import Tensor
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
-from intercap_core.body.vposer import PoseGaussian
 from intercap_core.body_fit.definition import Definition
 from intercap_core.body_fit.surface import COVERINGS, Samples
 from intercap_core.body_fit.term_inputs import (
     Bodies,
-    CloudRows,
     Columns,
-    KeypointSet,
-    Pairs,
-    Targets,
     TermInputs,
     TorchTerm,
-    Views,
 )
 from intercap_core.body_fit.terms import terms_on
 from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
@@ -182,39 +176,21 @@ class Layout:
 # --- energy ----------------------------------------------------------------------------------
 
 
-@dataclass
-class BodyProblem:
+@dataclass(kw_only=True)
+class BodyProblem(TermInputs):
     """E_B of T frames; see :class:`intercap_core.geometry.solve.levenberg_marquardt.Problem`."""
 
     model: BodyModel
-    keypoints: KeypointSet
-    """K keypoints of E_J, the 25 of the body first."""
     samples: Samples
     """Samples of the skin for E_D and E_P_self."""
     base: Tensor
     """(T, P) parameters. Those that are not fitted keep these values."""
     columns: Tensor
     """(n,) own parameters."""
-    one_shape: bool
-    """The betas are shared; else they are among ``columns`` or fixed."""
     offsets: Tensor
     """(25, 3) keypoint offsets, metres."""
     u: Tensor
     """(G,) logarithms of the thickness of the coverings over the usual one."""
-    views: Views | None = None
-    """Detections for E_J."""
-    targets: Targets | None = None
-    """Triangulated keypoints for E_J."""
-    rows: CloudRows | None = None
-    """Rows of E_D."""
-    touching: Pairs | None = None
-    """Contacts of E_P_self."""
-    self_weight: float = 1.0
-    """Factor of E_P_self."""
-    pose: PoseGaussian | None = None
-    """Learned prior of each frame's pose."""
-    hand_share: float = 1.0
-    """Factor of E_theta_h in one frame: 1 if the frames are independent."""
     fit_shared: bool = False
     """Fit offsets and coverings."""
     definition: Definition = field(default_factory=Definition.unknown)
@@ -265,7 +241,7 @@ class BodyProblem:
 
     def cost(self, own: Tensor, shared: Tensor, index: Tensor) -> Tensor:
         """Return the energy (b,) of the frames ``index`` (b,)."""
-        terms = self._terms.cost(self._inputs(), self._bodies(own, shared, index))
+        terms = self._terms.cost(self, self._bodies(own, shared, index))
         return terms + self.layout.prior_cost(shared)
 
     def linearise(self, own: Tensor, shared: Tensor, index: Tensor) -> NormalEquations:
@@ -274,7 +250,7 @@ class BodyProblem:
         size = own.shape[1] + len(shared)
         equations = NormalEquations(zeros(count), zeros(count, size), zeros(count, size, size))
         bodies = self._bodies(own, shared, index)
-        self._terms.add(self._inputs(), bodies, layout.equations(), equations)
+        self._terms.add(self, bodies, layout.equations(), equations)
         layout.add_prior(shared, equations)
         return equations
 
@@ -285,17 +261,4 @@ class BodyProblem:
             self.all_offsets(offsets),
             self._usual_thickness * u.exp(),
             index,
-        )
-
-    def _inputs(self) -> TermInputs:
-        return TermInputs(
-            keypoints=self.keypoints,
-            views=self.views,
-            targets=self.targets,
-            rows=self.rows,
-            pairs=self.touching,
-            self_weight=self.self_weight,
-            pose=self.pose,
-            shape_prior=not self.one_shape,
-            hand_share=self.hand_share,
         )

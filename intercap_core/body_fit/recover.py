@@ -96,6 +96,6 @@ def _of_frames(problem: BodyProblem, at: torch.Tensor, base: torch.Tensor) -> Bo
         views=None if problem.views is None else problem.views.frames(at),
         targets=None if problem.targets is None else problem.targets.frames(at),
         rows=None,
-        touching=None,
+        pairs=None,
         pose=None if problem.pose is None else problem.pose.of_frames(at),
     )

@@ -150,7 +150,7 @@ class Fitter:
         for last in (False, True):
             if evidence.has_cloud:
                 problem.rows = evidence.match(problem, _CLOUD_REACH_M[-1])
-            problem.touching = evidence.touch(problem)
+            problem.pairs = evidence.touch(problem)
             evidence.refine_sigma(problem)
             evidence.observe_keypoints(problem, hands=hands, face=face)
             solution = self._minimise(problem, 4, keep_normal=last)
@@ -175,7 +175,7 @@ class Fitter:
         """Update correspondences, contacts, the pose prior and sigmas at the problem's bodies."""
         if self.evidence.has_cloud:
             problem.rows = self.evidence.match(problem, _CLOUD_REACH_M[-1])
-        problem.touching = self.evidence.touch(problem)
+        problem.pairs = self.evidence.touch(problem)
         self._linearise_pose_prior(problem)
         self.evidence.observe_keypoints(problem, hands=self.settings.hands, face=self.settings.face)
 

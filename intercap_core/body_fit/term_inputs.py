@@ -200,32 +200,28 @@ def _limbs(chains: list[frozenset[int]]) -> Limbs:
 # --- one evaluation --------------------------------------------------------------------------
 
 
-class TermInputs(NamedTuple):
+@dataclass(kw_only=True)
+class TermInputs:
     """What the bodies of T frames are compared with."""
 
     keypoints: KeypointSet
-    """Keypoints of E_J."""
-    views: Views | None
-    """Detections for E_J; None = not used."""
-    targets: Targets | None
-    """Triangulated keypoints for E_J; None = not used."""
-    rows: CloudRows | None
+    """Keypoints of E_J, the 25 of the body first."""
+    views: Views | None = None
+    """Detections for E_J."""
+    targets: Targets | None = None
+    """Triangulated keypoints for E_J."""
+    rows: CloudRows | None = None
     """Rows of E_D; None switches the term off."""
-    pairs: Pairs | None
+    pairs: Pairs | None = None
     """Contacts of E_P_self; None switches the term off."""
-    self_weight: float
+    self_weight: float = 1.0
     """Factor of E_P_self."""
-    pose: PoseGaussian | None
+    pose: PoseGaussian | None = None
     """Learned prior of each frame's body pose, in place of the open prior."""
-    shape_prior: bool
-    """Each frame has its own betas, with their prior."""
-    hand_share: float
-    """Factor of E_theta_h in one frame."""
-
-    @property
-    def has_keypoints(self) -> bool:
-        """There is something to compare the keypoints with."""
-        return self.views is not None or self.targets is not None
+    one_shape: bool
+    """All frames share the betas; else each frame has its own betas, with their prior."""
+    hand_share: float = 1.0
+    """Factor of E_theta_h in one frame: 1 if the frames are independent."""
 
 
 class Bodies(NamedTuple):

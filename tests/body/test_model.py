@@ -180,7 +180,7 @@ def test_flat_hands_are_the_mean_of_coefficients_that_count_from_them(body64: Bo
 @pytest.mark.parametrize("count", [5, 46])
 def test_too_few_or_too_many_hand_components_are_named(count: int) -> None:
     with pytest.raises(
-        UserError, match=f"{count} hand components were asked for; expected 6 to 45"
+        UserError, match=f"{count} hand components were requested; expected 6 to 45"
     ):
         BodyModel.load(num_hand_components=count)
 
@@ -265,7 +265,7 @@ BAD_FILES: dict[str, tuple[Callable[[dict], dict], str]] = {
     ),
     "no faces": (lambda a: a | {"f": a["f"][:0]}, "0 faces"),
     "text": (lambda a: a | {"weights": np.full(a["weights"].shape, "a")}, "weights of type"),
-    "objects": (lambda a: a | {"weights": np.array([None])}, "no readable npz"),
+    "objects": (lambda a: a | {"weights": np.array([None])}, "not a readable npz"),
     "scalar tree": (lambda a: a | {"kintree_table": np.array(3)}, "kintree_table of shape"),
     "face": (lambda a: a | {"f": a["f"] + np.uint32(1)}, "names number 13492 in f"),
     "negative face": (lambda a: a | {"f": a["f"].astype(np.int64) - 1}, "names number -1 in f"),
@@ -293,7 +293,7 @@ def test_files_that_are_no_npz_are_named(tmp_path: Path) -> None:
     broken.write_bytes(b"PK\x03\x04 not a zip")
     pickle = tmp_path / "SMPLX_MALE.pkl"
     pickle.write_bytes(b"\x80\x04.")
-    for path, words in ((tmp_path / "none.npz", "does not exist"), (broken, "no readable npz"),
+    for path, words in ((tmp_path / "none.npz", "does not exist"), (broken, "not a readable npz"),
                         (pickle, "pickle")):  # fmt: skip
         with pytest.raises(UserError, match=words):
             BodyModel.load(path)

@@ -30,7 +30,6 @@ def test_rows_differentiate_their_energy(name: str, body64: BodyModel) -> None:
         "limits": priors.joint_limits,
         "bending": priors.bending,
         "rest": priors.rest_pose,
-        "shape": priors.shape,
         "left": _hand(body64, 0, 45),
         "right": _hand(body64, 1, 12),
     }

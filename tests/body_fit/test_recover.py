@@ -142,8 +142,8 @@ def test_a_body_in_another_minimum_is_refitted_from_its_neighbours(body64: BodyM
     start = truth.clone()
     start[odd, shoulder + 1] -= 2.5
     problem = BodyProblem(
-        model, keypoint_set(model, range(135)), choose_samples(model),
-        start, columns_of(model, hands=False, face=False, betas=False), True,
+        model=model, keypoints=keypoint_set(model, range(135)), samples=choose_samples(model),
+        base=start, columns=columns_of(model, hands=False, face=False, betas=False), one_shape=True,
         offsets=start.new_zeros(25, 3), u=start.new_zeros(len(COVERINGS)),
         views=exact_views(points, ring(4), sigma=3.0),
     )  # fmt: skip

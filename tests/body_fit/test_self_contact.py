@@ -129,14 +129,15 @@ def test_a_fit_to_keypoints_of_penetrating_limbs_separates_them(
     params = _pose(body64, **CASES[name])
     truth = body64.keypoints_of(params)[:, :67]
     problem = BodyProblem(
-        body64, keypoint_set(body64, range(67)), samples, params.vector().clone(),
-        columns_of(body64, hands=True, face=False, betas=False), False,
+        model=body64, keypoints=keypoint_set(body64, range(67)), samples=samples,
+        base=params.vector().clone(),
+        columns=columns_of(body64, hands=True, face=False, betas=False), one_shape=False,
         offsets=torch.zeros(25, 3).double(), u=torch.zeros(len(COVERINGS)).double(),
         targets=Targets(truth, torch.ones(1, 67).double(), 0.02),
     )  # fmt: skip
     before = _depth(body64, params, _find(body64, contact, params))
     for _ in range(3):
-        problem.touching = _find(body64, contact, body64.parameters(problem.base))
+        problem.pairs = _find(body64, contact, body64.parameters(problem.base))
         solution = minimise(problem, problem.own_start(), max_trials=10)
         problem.accept(solution.own, solution.shared)
     here = body64.parameters(problem.base)

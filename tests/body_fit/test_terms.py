@@ -69,8 +69,8 @@ def _problem(model: BodyModel) -> BodyProblem:
     confidence[0, 1, 5:20], observed[0, 1, 5:20] = 0, torch.nan
     count = len(samples.vertex)
     return BodyProblem(
-        model, keypoint_set(model, range(KEYPOINTS)), samples, base,
-        columns_of(model, hands=True, face=True, betas=False), True,
+        model=model, keypoints=keypoint_set(model, range(KEYPOINTS)), samples=samples, base=base,
+        columns=columns_of(model, hands=True, face=True, betas=False), one_shape=True,
         offsets=0.02 * _random(25, 3, seed=3),
         u=0.1 * _random(len(COVERINGS), seed=4),
         views=Views(
@@ -85,7 +85,7 @@ def _problem(model: BodyModel) -> BodyProblem:
             torch.nn.functional.normalize(_random(FRAMES, count, 3, seed=9), dim=2),
             200 * _random(FRAMES, count, seed=10).clamp_min(0), torch.zeros(FRAMES, count),
         ),
-        touching=pairs, self_weight=1.0, fit_shared=True,
+        pairs=pairs, self_weight=1.0, fit_shared=True,
     )  # fmt: skip
 
 
@@ -133,7 +133,7 @@ def test_gradient_of_each_term_is_the_slope_of_its_cost(
 
 def _evaluation(problem: BodyProblem) -> tuple[TermInputs, Bodies]:
     own, shared, index = problem.own_start(), problem.shared_start(), torch.arange(FRAMES)
-    return problem._inputs(), problem._bodies(own, shared, index)
+    return problem, problem._bodies(own, shared, index)
 
 
 def _moved(problem: BodyProblem, bodies: Bodies, way: Tensor, step: float) -> Bodies:
@@ -207,10 +207,7 @@ def test_keypoints_without_offsets_are_the_models(body64: BodyModel) -> None:
 
 
 def _prior_cost(model: BodyModel, x: Tensor, **changes: object) -> Tensor:
-    given = {
-        "keypoints": None, "views": None, "targets": None, "rows": None, "pairs": None,
-        "self_weight": 1.0, "pose": None, "shape_prior": True, "hand_share": 1.0,
-    } | changes  # fmt: skip
+    given = {"keypoints": keypoint_set(model, [0]), "one_shape": False} | changes
     bodies = Bodies(x, torch.zeros(0, 3), torch.zeros(0), torch.arange(len(x)))
     return PriorTerm(model).cost(TermInputs(**given), bodies)
 
@@ -218,7 +215,7 @@ def _prior_cost(model: BodyModel, x: Tensor, **changes: object) -> Tensor:
 def test_prior_of_shared_betas_is_left_to_the_layout(body64: BodyModel) -> None:
     x = torch.zeros(2, body64.num_parameters, dtype=torch.float64)
     x[1, 168:178] = 2.0
-    shared, own = (_prior_cost(body64, x, shape_prior=flag) for flag in (False, True))
+    shared, own = (_prior_cost(body64, x, one_shape=flag) for flag in (True, False))
     assert (shared[1] - shared[0]).item() == pytest.approx(0.0)
     assert (own[1] - own[0]).item() == pytest.approx(0.5 * 10 * 4.0)
 
@@ -245,7 +242,7 @@ def _variants(problem: BodyProblem) -> dict[str, BodyProblem]:
         "all": problem,
         "own shape, learned pose": _learned(problem),
         "targets alone": replace(
-            problem, columns=body, views=None, rows=None, touching=None, **alone
+            problem, columns=body, views=None, rows=None, pairs=None, **alone
         ),
         "fingers of a standing body": replace(
             problem, columns=torch.arange(75, 165), targets=None, rows=None, hand_share=0.2, **alone

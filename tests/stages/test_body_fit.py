@@ -166,8 +166,8 @@ def test_exact_keypoints_alone_give_the_parameters_back() -> None:
     start[:, 69:75] = truth[:, 69:75] = 0
     views = exact_views(points, ring(4), sigma=30.0)
     problem = BodyProblem(
-        model, keypoint_set(model, range(135)), choose_samples(model), start,
-        columns_of(model, hands=True, face=True, betas=False), True,
+        model=model, keypoints=keypoint_set(model, range(135)), samples=choose_samples(model),
+        base=start, columns=columns_of(model, hands=True, face=True, betas=False), one_shape=True,
         offsets=start.new_zeros(25, 3), u=start.new_zeros(len(COVERINGS)), views=views,
     )  # fmt: skip
     # far from the minimum every residual would count as an outlier: widen, then narrow
