@@ -46,11 +46,11 @@ def test_equals_autograd(pose_blend_shapes: bool, body64: BodyModel, full_file: 
 
 # Both types are measured against autograd in float64 at the same parameters
 @pytest.mark.parametrize("dtype, bound", [(torch.float64, 1e-12), (torch.float32, 5e-6)])
-def test_full_file_by_all_parameters(dtype: torch.dtype, bound: float, gendered_file: Path) -> None:
+def test_full_file_by_all_parameters(dtype: torch.dtype, bound: float, full_file: Path) -> None:
     """165 pose, 3 translation, 300 shape and 100 expression parameters."""
     options = {"num_betas": 300, "num_expression": 100}
-    model = BodyModel.load(gendered_file, dtype=dtype, **options)
-    exact = BodyModel.load(gendered_file, dtype=torch.float64, **options)
+    model = BodyModel.load(full_file, dtype=dtype, **options)
+    exact = BodyModel.load(full_file, dtype=torch.float64, **options)
     vector = random_vector(1, model.num_parameters, 11, dtype)
     vector[:, 168:] *= 0.2
     ours = _by_formula(model, vector, ALL_OVER)

@@ -1,4 +1,4 @@
-"""What gender and height say of the shape, and shapes in units of it."""
+"""The prior of the shape by gender and height, and shapes in its units."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_the_neutral_prior_is_the_files_own(file: BodyFile) -> None:
     np.testing.assert_array_equal(prior.centred(file).template, file.template)
 
 
-def test_women_and_men_are_as_tall_as_they_are(file: BodyFile) -> None:
+def test_heights_of_women_and_men_are_those_of_adults(file: BodyFile) -> None:
     """About 1.64 +- 0.08 m and 1.76 +- 0.08 m."""
     women, men = (_heights(ShapePrior.of(file, who), file) for who in ("female", "male"))
     assert women.mean() == pytest.approx(1.63, abs=0.02)
@@ -43,14 +43,12 @@ def test_women_and_men_are_as_tall_as_they_are(file: BodyFile) -> None:
 
 @pytest.mark.parametrize("gender", ["female", "male", "neutral"])
 @pytest.mark.parametrize("height", [1.52, 1.90])
-def test_a_height_is_met_and_leaves_the_rest_open(
-    file: BodyFile, gender: str, height: float
-) -> None:
+def test_a_stated_height_narrows_one_direction(file: BodyFile, gender: str, height: float) -> None:
     before, after = ShapePrior.of(file, gender), ShapePrior.of(file, gender, height)
     heights = _heights(after, file)
     assert heights.mean() == pytest.approx(height, abs=0.02)
     assert heights.std() < HEIGHT_SIGMA_M
-    # one direction is told, nine are as open as before
+    # nine directions are as wide as before
     narrower = np.linalg.eigvals(
         np.linalg.solve(before.root @ before.root.T, after.root @ after.root.T)
     )
@@ -66,6 +64,6 @@ def test_shapes_in_units_of_the_prior_are_the_same_bodies(file: BodyFile) -> Non
     np.testing.assert_allclose(ours, file.template + file.shape_directions @ betas, atol=1e-9)
 
 
-def test_a_licensed_file_is_of_its_own_gender(file: BodyFile) -> None:
+def test_a_licensed_file_has_its_own_gender(file: BodyFile) -> None:
     other = replace(file, path=Path("SMPLX_MALE.npz"))
     np.testing.assert_array_equal(ShapePrior.of(other, "male").mean, 0)

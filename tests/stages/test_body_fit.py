@@ -358,7 +358,7 @@ def test_compiled_and_torch_fits_agree_with_blend_shapes(tmp_path):
     samples = choose_samples(model)
     for terms in (CompiledTerms(model, samples), TorchTerms(model, samples)):
         clouds = person_clouds(capture.inputs.frames, seen, 800, model.device)
-        vectors = Fitter(model, seen, clouds, BODY_ALONE, terms=terms).run().vectors
+        vectors = Fitter(model, seen, clouds, SETTINGS, terms=terms).run().vectors
         found.append(model.forward(model.parameters(vectors)).joints.numpy())
     assert 1000 * np.linalg.norm(found[0] - found[1], axis=2).max() < 0.3
     assert 1000 * np.linalg.norm(found[0] - capture.joints, axis=2)[:, :22].mean() < 6
