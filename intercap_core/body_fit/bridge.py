@@ -9,17 +9,13 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core.body.parameters import NUM_POSE
 
-# Standard deviation of a bridged joint: speed along one coordinate if it is unknown (a walk), and
-# its least value (a standing person sways), m/s; the largest deviation is an arm's length, metres.
-_WALKING_SPEED, _STANDING_SPEED = 1.0, 0.1
-_BRIDGED_SIGMA_M = 0.5
 # A velocity is measured to the nearest known frame between these times, seconds: nearer frames show
 # the noise of the fit, farther ones another motion. Tuned on the studio.
 _VELOCITY_WINDOW_S = (0.045, 0.15)
 # Weight of this velocity against the mean velocity of the bridge. On gaps of 1 to 15 frames at 15
 # Hz, anything from 0.7 to 1 is best: measured on the studio. It fades for bridges longer than 1 s,
 # which were not measured.
-_VELOCITY_WEIGHT, _VELOCITY_WEIGHT_UNTIL_S = 0.85, 1.0
+_VELOCITY_WEIGHT = 0.85
 _FEWEST_BRIDGES = 5  # over known frames, to estimate the error of a bridge; tuned on the studio
 
 
@@ -89,7 +85,7 @@ def _hermite(when: np.ndarray, knots: np.ndarray) -> np.ndarray:
         slopes[0] = np.array([1.0, 0.0, -1.0, 0.0]) / (knots[0] - knots[2])
     if knots[3] > knots[1]:
         slopes[1] = np.array([0.0, -1.0, 0.0, 1.0]) / (knots[3] - knots[1])
-    weight = _VELOCITY_WEIGHT * min(1.0, _VELOCITY_WEIGHT_UNTIL_S / length)
+    weight = _VELOCITY_WEIGHT * min(1.0, 1.0 / length)
     first, last = (mean + weight * (slope - mean) for slope in slopes)
     rise = s**2 * (3 - 2 * s)
     ends = np.concatenate([1 - rise, rise, np.zeros_like(s), np.zeros_like(s)], 1)
@@ -146,7 +142,7 @@ def bridged_sigma(
         tried = np.arange(max(0, -steps.min()), len(known) - max(0, steps.max()))
         tried = tried[known[tried] & np.all([known[tried + step] for step in steps], axis=0)]
         if len(tried) < _FEWEST_BRIDGES:
-            off = np.minimum(speed * seconds[t], _BRIDGED_SIGMA_M)
+            off = np.minimum(speed * seconds[t], 0.5)  # an arm's length
         else:
             built = np.tensordot(weights[0], [joints[tried + step] for step in steps], 1)
             off = np.sqrt(((joints[tried] - built) ** 2).mean((0, 2)))
@@ -158,6 +154,6 @@ def _speed(joints: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.ndarr
     """Return the usual speed (J,) along one coordinate, m/s, between adjacent known frames."""
     pairs = np.flatnonzero(known[1:] & known[:-1])
     if len(pairs) < _FEWEST_BRIDGES:
-        return np.full(joints.shape[1], _WALKING_SPEED)
+        return np.full(joints.shape[1], 1.0)  # a walk
     moved = (joints[pairs + 1] - joints[pairs]) / np.diff(times)[pairs, None, None]
-    return np.maximum(np.sqrt((moved**2).mean((0, 2))), _STANDING_SPEED)
+    return np.maximum(np.sqrt((moved**2).mean((0, 2))), 0.1)  # a standing person sways

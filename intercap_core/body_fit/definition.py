@@ -21,11 +21,9 @@ from intercap_core.schemas import BODY_FIT
 
 POINTS = tuple(KEYPOINT_NAMES[BODY])
 _COLUMNS = ("point", "x_mm", "y_mm", "z_mm", "sigma_mm")
-_LEAST_SIGMA_MM = 0.01  # :meth:`Definition.write` has one decimal
 _LARGEST_M = 0.1  # a larger offset means another joint
 UNKNOWN_SIGMA_M = 0.010  # of an offset without a definition; tuned on the studio
 FITTED_SIGMA_M = 0.003  # least value with a definition: offsets are fitted to 3 mm, measured
-_FEWEST_PEOPLE = 3  # of whom a standard deviation can be estimated
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +90,7 @@ def _numbers(path: Path, row: Sequence[str]) -> list[float]:
     except ValueError:
         values = []
     size = np.abs(values).max() if len(values) == 4 else np.nan
-    if not size <= 1e3 * _LARGEST_M or not values[3] > _LEAST_SIGMA_MM:
+    if not size <= 1e3 * _LARGEST_M or not values[3] > 0.01:
         raise UserError(
             f"{path}: point {quoted(row[0])} has {quoted(row[1:])}, expected three offsets and a "
             f"deviation above 0 in mm, at most {1e3 * _LARGEST_M:.0f}; write it again by "
@@ -119,11 +117,11 @@ def average_offsets(fits: Sequence[Path]) -> tuple[Definition, list[str]]:
             else:
                 no_depth.append(str(fit.attributes["sequence"]))
     people = sorted(of_person)
-    if len(people) < _FEWEST_PEOPLE:
+    if len(people) < 3:
         without = f"; without depth: {', '.join(no_depth)}" if no_depth else ""
         raise UserError(
             f"{len(people)} people with depth ({', '.join(people) or 'none'}), expected at least "
-            f"{_FEWEST_PEOPLE}, since a definition cannot be separated from one person's "
+            "3, since a definition cannot be separated from one person's "
             f"shape{without}; run stage 'body_fit' of recordings of more people with depth"
         )
     means = np.stack([np.mean(of_person[name], axis=0) for name in people])

@@ -42,7 +42,6 @@ KEYPOINT_SIGMA_M = (
     (RIGHT_HAND, 0.01),
     (slice(FACE.start, CONTOUR.stop), 0.008),
 )
-_SMALLEST_SIGMA_PX = 1.0  # tuned on the studio
 # Factor of sigma for errors that persist over frames, which residuals hide. Tuned on the studio.
 PERSISTENCE = 1.5
 _LEAST_CONFIDENCE = 0.1  # below it, sigma no longer grows; tuned on the studio
@@ -179,7 +178,7 @@ class Evidence:
         problem.views = Views(
             self._tensor(seen.keypoints[at]),
             confidence,
-            sigma.clamp_min(_SMALLEST_SIGMA_PX),
+            sigma.clamp_min(1.0),
             lenses,
             pose,
             self._shift(points),

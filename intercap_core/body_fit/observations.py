@@ -27,16 +27,11 @@ from intercap_core.schemas import PERSON, SCENE
 # Factor of the confidence of a view that disagrees with the triangulated point. Tuned on the
 # studio.
 _OUTLIER_VIEW_TRUST = 0.2
-# A frame without three trunk keypoints can start from a neighbour within this time, seconds, if
-# this many of the 25 body keypoints are triangulated. Tuned on the studio.
-_NEAR_START_S, _ENOUGH_KEYPOINTS = 1.0, 6
 # Distance in front of the background from which a pixel is the person's, metres. Tuned on the
 # studio.
 _BEFORE_BACKGROUND_M = 0.04
 _NORMAL_BASE_PX = 3  # half the base over which a normal is measured; tuned on the studio
 _DEPTH_EDGE_M = 0.04  # a larger step within this base is an edge; tuned on the studio
-# Trust of points at an edge, which may float between person and background. Tuned on the studio.
-_EDGE_TRUST = 0.3
 
 # neck, shoulders, mid hip, hips: keypoints that place the trunk
 TRUNK_KEYPOINTS = (1, 2, 5, 8, 9, 12)
@@ -85,16 +80,17 @@ class Observations:
 
     @property
     def usable(self) -> np.ndarray:
-        """(T,) bool: a body can be placed, here or in a frame nearby if enough keypoints are known.
+        """(T,) bool: a body can be placed, or six keypoints are known within 1 s of such a frame.
 
-        One view from the side, or over a table, may see no more than one shoulder.
+        One view from the side, or over a table, may see no more than one shoulder. Tuned on the
+        studio.
         """
         placed = self.placed
         if not placed.any():
             return placed
         gap = np.abs(self.times[:, None] - self.times[placed][None]).min(1)
         known = np.isfinite(self.joints[:, BODY]).all(2).sum(1)
-        return placed | ((gap <= _NEAR_START_S) & (known >= _ENOUGH_KEYPOINTS))
+        return placed | ((gap <= 1.0) & (known >= 6))
 
 
 def read_observations(scene: Path, person: Path) -> Observations:
@@ -273,7 +269,7 @@ def _place_pixels(
         points = points - depth_bias * points / points[:, 2:]
     master = camera.master_from_depth
     rotation = master[:3, :3].astype(np.float32)
-    return apply(master, points), normals @ rotation.T, np.where(edge, _EDGE_TRUST, 1.0)
+    return apply(master, points), normals @ rotation.T, np.where(edge, 0.3, 1.0)
 
 
 def _measure_normals(

@@ -25,13 +25,11 @@ from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.mask_pixels import drawn
 from intercap_core.geometry.camera.masks import Runs
 
-_POINTS = 400  # of a rim, a third of its pixels where a person fills 720 lines: speed
 _BLUR_PX = 3.0  # over which the direction of the rim is measured; tuned on the studio
 _SHORTEST_PX = 40  # rims of smaller spots and holes are errors of the network; tuned on the studio
 # px outward of a rim at which another object is looked for, in an image of 720 lines: masks of
 # touching objects are some pixels apart. Tuned on the studio.
 _OUTWARD_AT_720P = (1.0, 4.0, 7.0)
-_BORDER_PX = 2  # of the image
 # Largest cosine between the line of sight and the normal of a sample on the rim: two thirds of the
 # spacing of samples on a limb. Tuned on the studio.
 _FACING = 0.6
@@ -59,7 +57,7 @@ def trace_outline(mask: Runs, others: Runs | None, lens: Intrinsics, view: int) 
     continue behind them.
     """
     pixels, outward = _rim(mask)
-    inside = (pixels > _BORDER_PX) & (pixels < np.array([mask.width, mask.height]) - 1 - _BORDER_PX)
+    inside = (pixels > 2) & (pixels < np.array([mask.width, mask.height]) - 3)
     own = inside.all(1)
     if others is not None:
         for away in _OUTWARD_AT_720P:
@@ -68,7 +66,8 @@ def trace_outline(mask: Runs, others: Runs | None, lens: Intrinsics, view: int) 
     keep = np.flatnonzero(own)
     if not len(keep):
         return None
-    keep = keep[:: max(1, round(len(keep) / _POINTS))]
+    # about 400 points, a third of the pixels of a person who fills 720 lines: speed
+    keep = keep[:: max(1, round(len(keep) / 400))]
     pixels, outward = pixels[keep], outward[keep]
     along = outward[:, ::-1] * (-1, 1)
     rays = lens.unproject(pixels)

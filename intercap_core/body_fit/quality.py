@@ -19,10 +19,8 @@ from intercap_core.body.keypoints import (
 from intercap_core.body_fit.keypoint_term import KEYPOINT_SCALE
 from intercap_core.schemas import BODY_PARTS
 
-# Lengths of normal errors, in standard deviations along one coordinate.
-MEDIAN_CHI_3 = 1.5382  # median in three dimensions
-_MEDIAN_CHI_2 = 1.1774  # median in two dimensions
-_MEAN_CHI_3 = 1.5958  # mean in three dimensions
+# Median length of a normal error in three dimensions, in standard deviations along one coordinate.
+MEDIAN_CHI_3 = 1.5382
 
 # Standard deviation along one coordinate from which a part is undetermined, metres: half of its
 # joints are more than 40 mm off (MEDIAN_CHI_3), a bad body.
@@ -191,8 +189,9 @@ def widen_sigma(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
     alone sees may lean towards it or away, the more so the fewer points it has. An error of an arm
     is also an error of its hand.
     """
+    # the median length of a normal error in two dimensions is 1.1774 standard deviations
     disputed = evidence.against.cpu().numpy() > _DISAGREEING_SHARE
-    distance = np.where(disputed, np.nan_to_num(evidence.distance.cpu().numpy()), 0) / _MEDIAN_CHI_2
+    distance = np.where(disputed, np.nan_to_num(evidence.distance.cpu().numpy()), 0) / 1.1774
     distance = np.hypot(distance, _leaning(evidence))
     for side in ("left", "right"):
         arm, hand = BODY_PARTS.index(f"{side}_arm"), BODY_PARTS.index(f"{side}_hand")
@@ -226,7 +225,8 @@ def expected_error(sigma: np.ndarray, share: np.ndarray) -> np.ndarray:
 
     share (55,): share of the surface that follows each joint.
     """
-    return _MEAN_CHI_3 * sigma @ share
+    # the mean length of a normal error in three dimensions
+    return 1.5958 * sigma @ share
 
 
 def _rms(values: np.ndarray) -> np.ndarray:

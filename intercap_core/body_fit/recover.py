@@ -21,8 +21,6 @@ JUMP_WINDOW_S = 0.21
 # Largest distance from the median of the window that is no jump, metres: within 0.1 s hands leave
 # the straight path by half of 30 m/s^2 times (0.1 s)^2 = 0.15 m, and fits scatter by less than 0.1.
 JUMP_M = 0.25
-# A new fit is accepted if its cost is below factor * old cost + slack. Tuned on the studio.
-_COST_FACTOR, _COST_SLACK = 1.2, 5.0
 
 _BODY_JOINTS = slice(0, JOINT_INDEX["right_wrist"] + 1)
 
@@ -73,7 +71,7 @@ def recover(problem: BodyProblem, times: np.ndarray) -> np.ndarray:
     nothing = base.new_zeros(0)
     before = again.cost(problem.base[at][:, again.columns], nothing, everyone)
     found = minimise(again, again.own_start(), max_trials=10, cost_tolerance=1e-3)
-    kept = found.cost <= _COST_FACTOR * before + _COST_SLACK
+    kept = found.cost <= 1.2 * before + 5.0  # tuned on the studio
     rows = problem.base[at].clone()
     again.accept(found.own, nothing)
     rows[kept] = again.base[kept]

@@ -22,18 +22,8 @@ from intercap_core.body_fit.surface import Samples
 from intercap_core.body_fit.term_inputs import Pairs
 from intercap_core.geometry.rigid.surfaces import vertex_normals
 
-# Samples closer along the surface than this times the mean thickness of their parts are joined.
-# Flesh meets flesh where a joint closes, so both sides of a hinge are joined farther. Tuned on the
-# studio.
-_JOINED_THICKNESSES = 1.6
-_JOINED_HINGE_THICKNESSES = 3.2
-# A point deeper than half the thickness of a part is behind its far side (geometry); in metres for
-# the trunk, tuned on the studio.
-_DEEPEST_THICKNESSES, _DEEPEST_M = 0.5, 0.06
 # A sample outside by less than this may penetrate before the next search. Tuned on the studio.
 _WATCHED_M = 0.004
-_NEIGHBOURS = 6  # mean number of a vertex of a triangle mesh (Euler)
-_GEODESIC_ROUNDS = 12  # of the search along the surface, by distance: speed
 _FAR = 1e6  # metres; farther than any distance on a body
 
 _TRUNK = ("pelvis", "spine1", "spine2", "spine3", "left_collar", "right_collar")
@@ -104,15 +94,15 @@ class SelfContact:
         part = _PART_OF_JOINT[model.skinning_weights.argmax(1).cpu().numpy()]
         thickness = _thickness(template, faces, samples.vertex)
         own = part[samples.vertex]
-        factor = np.where(
-            _hinged()[own[:, None], own], _JOINED_HINGE_THICKNESSES, _JOINED_THICKNESSES
-        )
+        # samples closer along the surface than this times the mean thickness of their parts are
+        # joined; flesh meets flesh where a hinge closes; tuned on the studio
+        factor = np.where(_hinged()[own[:, None], own], 3.2, 1.6)
         joined = factor * (thickness[:, None] + thickness) / 2
         joined[own[:, None] == own] = 0  # parts do not collide with themselves
         apart = _geodesic_distances(template, faces, part, samples.vertex, joined) > joined
         apart &= own[:, None] != own
         around = np.linalg.norm(template[samples.patch] - template[samples.vertex, None], axis=2)
-        spacing = np.sort(around, 1)[:, _NEIGHBOURS]
+        spacing = np.sort(around, 1)[:, 6]  # a vertex has six neighbours (Euler)
 
         def tensor(values: np.ndarray) -> Tensor:
             return torch.as_tensor(values, device=model.device)
@@ -124,9 +114,8 @@ class SelfContact:
             patch_part=tensor(part[samples.patch]),
             hand=tensor(_HAND_OF_PART[own]),
             apart=tensor(apart),
-            deepest=tensor(np.minimum(_DEEPEST_THICKNESSES * thickness, _DEEPEST_M)).to(
-                model.dtype
-            ),
+            # a deeper point is behind the far side (geometry), in the trunk tuned on the studio
+            deepest=tensor(np.minimum(0.5 * thickness, 0.06)).to(model.dtype),
             sideways=tensor(spacing).to(model.dtype),
         )
 
@@ -162,7 +151,7 @@ def _geodesic_distances(
     straight = scipy.spatial.distance.cdist(points[vertex], points[vertex])
     farthest = np.where(straight <= limit, limit, 0).max(1)
     found = np.full((count, count), np.inf)
-    for some in np.array_split(np.argsort(farthest, kind="stable"), _GEODESIC_ROUNDS):
+    for some in np.array_split(np.argsort(farthest, kind="stable"), 12):
         found[some] = scipy.sparse.csgraph.dijkstra(
             graph, directed=False, indices=some, limit=farthest[some].max()
         )

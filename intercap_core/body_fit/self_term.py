@@ -39,10 +39,10 @@ from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
 from intercap_core.geometry.solve.robust import geman_mcclure
 
 SELF_TOLERANCE_M = 0.003  # skin yields by some millimetres under pressure; tuned on the studio
-_SIGMA_M = 0.008  # error of the fitted skin on either side: measured on the studio
 _REACH_M = 0.015  # depth at which the penalty levels off: scale of rho; tuned on the studio
-# 1/m^2. Neighbouring samples penetrate together: four make one measurement. Tuned on the studio.
-_WEIGHT = 0.25 / _SIGMA_M**2
+# 1/m^2. The skin is fitted to 8 mm on either side (measured on the studio). Neighbouring samples
+# penetrate together: four make one measurement (tuned on the studio).
+_WEIGHT = 0.25 / 0.008**2
 
 _SHAPE = TRANSL.stop
 

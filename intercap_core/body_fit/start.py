@@ -18,9 +18,6 @@ from intercap_core.body_fit.term_inputs import Targets
 from intercap_core.geometry.solve.levenberg_marquardt import Solution, minimise
 
 START_SIGMA_M = 0.04  # of a triangulated keypoint at the start of the fit; tuned on the studio
-# Frames whose cost exceeds the median by this factor are also tried turned around. Tuned on the
-# studio.
-_TURN_WORSE = 1.5
 
 
 def place_trunk(rest: np.ndarray, joints: np.ndarray, pelvis: np.ndarray) -> np.ndarray:
@@ -73,7 +70,7 @@ def fit_start(evidence: Evidence, problem: BodyProblem) -> torch.Tensor:
     """Return parameters (N, P) fitted to the triangulated body keypoints of each frame.
 
     ``problem`` provides the keypoints, offsets and terms; each frame has its own shape. Frames that
-    fit badly are tried facing the other way.
+    cost 1.5 times the median (tuned on the studio) are also tried facing the other way.
     """
     model = evidence.model
     rest = model.zeros()
@@ -84,7 +81,7 @@ def fit_start(evidence: Evidence, problem: BodyProblem) -> torch.Tensor:
         place_trunk(keypoints, joints, pelvis), evidence.seen.times[evidence.frames]
     )
     straight = _fit_triangulated(problem, placed, joints)
-    poor = np.flatnonzero((straight.cost > _TURN_WORSE * straight.cost.median()).cpu().numpy())
+    poor = np.flatnonzero((straight.cost > 1.5 * straight.cost.median()).cpu().numpy())
     if len(poor):
         turned = _fit_triangulated(problem, turn_around(placed[poor]), joints[poor])
         better = turned.cost < straight.cost[poor]

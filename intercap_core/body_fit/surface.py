@@ -24,11 +24,6 @@ from intercap_core.geometry.rigid import surfaces as rigid_surfaces
 NORMAL_LENGTH_M = 0.06
 # Largest distance of a match from the normal line of its vertex, metres. Tuned on the studio.
 MATCH_SIDEWAYS_M = 0.03
-_BODY_SPACING_M = 0.045  # between samples of the skin; tuned on the studio
-_HAND_SPACING_M = 0.015  # between samples of the hands: the width of a finger (anatomy)
-_PATCH_VERTICES = 20  # of the patch around a sample; tuned on the studio
-_SAMPLES_PER_GROUP = 24  # largest group of samples with one bounding sphere: speed
-_SOLE_M = 0.035  # height above the lowest skin at which the upper of a shoe begins (anatomy)
 
 
 @dataclass(frozen=True)
@@ -94,18 +89,20 @@ def choose_samples(model: BodyModel) -> Samples:
     hand_joints = [i for i, name in enumerate(JOINT_NAMES) if i >= 25 or name.endswith("wrist")]
     hand = np.isin(joint, hand_joints)
     outer = _outer(template, faces, joint)
+    # metres; that of hands is the width of a finger (anatomy), the other is tuned on the studio
     chosen = [
         _grid(template, np.flatnonzero(outer & part), spacing)
-        for part, spacing in ((~hand, _BODY_SPACING_M), (hand, _HAND_SPACING_M))
+        for part, spacing in ((~hand, 0.045), (hand, 0.015))
     ]
     vertex = np.concatenate(chosen)
     outside = np.flatnonzero(outer)
-    _, near = scipy.spatial.cKDTree(template[outside]).query(template[vertex], _PATCH_VERTICES)
+    _, near = scipy.spatial.cKDTree(template[outside]).query(template[vertex], 20)
     names = [c.name for c in COVERINGS]
     group = np.array([_covering(joint[v], names) for v in vertex])
     face = _is_face(template, joint, model)[vertex]
     group[face] = names.index("bare")
-    low = template[vertex, 1] < template[:, 1].min() + _SOLE_M
+    # the upper of a shoe begins 35 mm above the lowest skin (anatomy)
+    low = template[vertex, 1] < template[:, 1].min() + 0.035
     group[low & (group == names.index("foot"))] = names.index("sole")
     return Samples(vertex, outside[near], group, hand[vertex])
 
@@ -228,7 +225,7 @@ def _group(model: BodyModel, samples: Samples) -> tuple[np.ndarray, np.ndarray]:
     whole, parts = [np.arange(len(at))], []
     while whole:
         part = whole.pop()
-        if len(part) <= _SAMPLES_PER_GROUP:
+        if len(part) <= 24:
             parts.append(part)
             continue
         axis = int(np.ptp(at[part], axis=0).argmax())

@@ -50,8 +50,6 @@ from intercap_core.body_fit.term_inputs import (
 from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
 from intercap_core.geometry.solve.thread_pool import ThreadPool
 
-_CHUNK = 32  # frames whose dense rows are in memory at once
-
 
 def terms_on(device: torch.device, model: BodyModel, samples: Samples) -> TorchTerm:
     """Return the fastest form on a device: compiled on the CPU, else torch."""
@@ -94,7 +92,8 @@ def _part(bodies: Bodies, at: slice) -> Bodies:
 
 
 def _chunks(count: int) -> list[slice]:
-    return [slice(i, i + _CHUNK) for i in range(0, count, _CHUNK)]
+    """Divide frames so that the dense rows of 32 are in memory at once."""
+    return [slice(i, i + 32) for i in range(0, count, 32)]
 
 
 class CompiledTerms:

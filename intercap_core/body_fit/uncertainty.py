@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from intercap_core.body.joints import NUM_JOINTS
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
 from intercap_core.body_fit.schedule import Fit
@@ -13,8 +14,6 @@ from intercap_core.body_fit.schedule import Fit
 # Error of a joint that ten shape components leave, metres along one coordinate: 1.3 mm in the mean
 # over adults that the open body was not made from, measured (docs/body.md).
 _MODEL_SIGMA_M = 0.001
-_CHUNK = 16  # frames whose derivatives are in memory at once
-_NUM_JOINTS = 55
 
 
 def joint_covariance(model: BodyModel, fit: Fit) -> Tensor:
@@ -38,7 +37,7 @@ def joint_covariance(model: BodyModel, fit: Fit) -> Tensor:
     information = information / (counts[:, None] * counts[None]).sqrt()
     shared_factor = torch.linalg.cholesky(information)
     model_error = _MODEL_SIGMA_M**2 * torch.eye(3).to(information)
-    result = information.new_zeros(len(fit.vectors), _NUM_JOINTS, 3, 3)
+    result = information.new_zeros(len(fit.vectors), NUM_JOINTS, 3, 3)
     for at, (factor, answer, _) in zip(_chunks(len(fit.vectors)), at_rest, strict=True):
         lin = model.linearise(
             model.parameters(fit.vectors[at]), vertex_ids=np.array([0]), joints=True
@@ -83,9 +82,10 @@ def _covariance(factor: Tensor, by: Tensor) -> Tensor:
     factor (B, n, n) or (n, n): Cholesky factor of the information.
     """
     half = torch.linalg.solve_triangular(factor, by.transpose(1, 2), upper=False)
-    half = half.reshape(len(by), -1, _NUM_JOINTS, 3).transpose(1, 2)
+    half = half.reshape(len(by), -1, NUM_JOINTS, 3).transpose(1, 2)
     return half.transpose(2, 3) @ half
 
 
 def _chunks(count: int) -> list[slice]:
-    return [slice(start, start + _CHUNK) for start in range(0, count, _CHUNK)]
+    """Divide frames so that the derivatives of 16 are in memory at once."""
+    return [slice(start, start + 16) for start in range(0, count, 16)]

@@ -1,8 +1,7 @@
 """Stage ``body_fit``: SMPL-X parameters in every frame (equation 2).
 
-All frames are fitted at once by second-order steps. There is no term between frames: each stands
-on what its own views show, apart from one shape, the clothing's thickness and the detector's fixed
-offsets, which all frames share.
+All frames are fitted at once by second-order steps. No term couples frames; they only share the
+shape, the thickness of the clothing and the offsets of the detector's keypoints.
 """
 
 from __future__ import annotations
@@ -29,7 +28,6 @@ from intercap_core.config import BodyFitSettings, BodyModels, SubjectEntry, dige
 from intercap_core.errors import UserError
 from intercap_core.schemas import BODY_FIT, BODY_PARTS
 
-NUM_EXPRESSION = 10
 # Median error of the trunk's keypoints from which the fit is not this person's body, metres. Tuned
 # on the studio.
 WRONG_TRUNK_M = 0.06
@@ -49,15 +47,15 @@ def run(
 ) -> None:
     """Fit the subject's body in all frames and write body_fit.h5.
 
-    Frames in which too little of the person is placed, whose fit ends far from the keypoints, or
-    that one view sees without points of the person, are ``failed`` and ``bridged``: filled in
-    between their neighbours. Raises UserError where no frame at all can be fitted, the body file
-    cannot be used, or the artefacts do not belong together.
+    Frames with too few keypoints, frames whose fit is far from the keypoints, and frames with one
+    view and no points of the person are ``failed`` and ``bridged``: interpolated between their
+    neighbours. Raises UserError if no frame can be fitted, the body file cannot be used, or the
+    artefacts do not belong together.
     """
     path = body_models.of(subject.gender) or OPEN_BODY
-    file = load_body_file(path, settings.betas, NUM_EXPRESSION)
+    file = load_body_file(path, settings.betas, num_expression=10)
     shapes = ShapePrior.of(file, subject.gender, subject.height)
-    # the fit's shapes are in units of the subject's prior
+    # the shapes of the fit are in units of the subject's prior
     model = BodyModel(shapes.centred(file), torch.device(device), torch.float32)
     check_body(model)
     pose_prior = load_pose_prior(body_models, model)
@@ -74,10 +72,10 @@ def run(
 
     fitted = np.zeros(seen.num_frames, bool)
     # limbs may be occluded: only the trunk decides whether this is the subject's body
-    believed = quality.trunk_distance(fit.parts) < WRONG_TRUNK_M
-    # one view's keypoints leave the body's depth free, its depth points fix it
-    placed = (~fit.pixel_residual.isnan()).sum(1) + (~fit.cloud_residual.isnan()) >= 2
-    fitted[fit.frames[believed & placed.cpu().numpy()]] = True
+    on_trunk = quality.trunk_distance(fit.parts) < WRONG_TRUNK_M
+    # the keypoints of one view do not determine the body's distance, its depth points do
+    determined = (~fit.pixel_residual.isnan()).sum(1) + (~fit.cloud_residual.isnan()) >= 2
+    fitted[fit.frames[on_trunk & determined.cpu().numpy()]] = True
     if not fitted.any():
         raise UserError(
             f"{person}: sequence {seen.sequence}: in every frame the fitted trunk is more than "
@@ -94,8 +92,8 @@ def run(
     joints = model.forward(params, vertex_ids=np.array([0])).joints.cpu().numpy()
     sigma = np.zeros((seen.num_frames, 55))
     stated = joint_covariance(model, fit).cpu().numpy()
-    # an outlier in time may be a wrong minimum: its sigma is widened; a limb that only one view's
-    # pixels constrain is widened by any departure from the median
+    # a jump may be a wrong minimum and widens sigma; a limb that only the pixels of one view
+    # constrain is widened by any distance from the median
     least = np.full_like(sigma, JUMP_M)
     least[fit.frames] *= ~quality.flag_unmeasured_joints(fit.parts)
     jumped = np.zeros_like(sigma)
