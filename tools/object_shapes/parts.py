@@ -182,7 +182,7 @@ def union(parts: Sequence[Part], edge_length: float) -> Built:
     """All parts as one solid, edges no longer than ``edge_length`` metres.
 
     Every triangle remembers the part that it came from; a vertex takes the part that comes last
-    in the list among its triangles' parts, so details are listed after what carries them.
+    in the list among its triangles' parts, so details are listed after the parts that carry them.
     """
     originals = [part.solid.as_original() for part in parts]
     ids = [solid.original_id() for solid in originals]

@@ -1,4 +1,5 @@
-"""Write the open body as an SMPL-X-format npz, and measure it on adults it has not seen."""
+"""Write the open body as an SMPL-X-format npz, measure it on other adults, and write the mean and
+covariance of its shape among women and among men."""
 
 from __future__ import annotations
 
@@ -17,10 +18,12 @@ SAMPLES = 1500
 SEED = 20
 _TIP_PARENTS = [*range(27, 40, 3), *range(42, 55, 3)]
 _EPOCH = (1980, 1, 1, 0, 0, 0)
+_ADULTS = 3000  # of whom the shapes of women and men are measured, half of each gender
+_GENDERS = ("female", "male")
 
 
 def write_npz(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """A compressed npz without time stamps, so that the same arrays give the same bytes."""
+    """Write a compressed npz without time stamps: the same arrays give the same bytes."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
         for name, array in sorted(arrays.items()):
@@ -31,7 +34,7 @@ def write_npz(path: Path, arrays: dict[str, np.ndarray]) -> None:
 
 
 def _held_out(source: Source) -> dict[str, np.ndarray]:
-    """Ten adults that the bake has not seen: some skin vertices and the rig's own joints."""
+    """Return some skin vertices and the joints of ten adults outside the training set."""
     others = shape_space.sample_adults(10, np.random.default_rng(SEED + 2))
     vertices, joints, _ = shape_space.t_posed(source, source.coefficients(others))
     ids = np.arange(0, len(source.template), 31)
@@ -43,7 +46,7 @@ def _held_out(source: Source) -> dict[str, np.ndarray]:
 
 
 def bake(source: Source, folder: Path, held_out: Path) -> None:
-    """Write open_body.npz and its maps to `folder`, and a few unseen adults for the tests."""
+    """Write open_body.npz and its maps to ``folder``, and a few other adults for the tests."""
     space = shape_space.build(source, SAMPLES, SEED)
     directions = space.directions.astype(np.float16)
     template = space.template.astype(np.float32)
@@ -83,7 +86,7 @@ def bake(source: Source, folder: Path, held_out: Path) -> None:
 
 
 def report(source: Source, space: shape_space.ShapeSpace, regressor: np.ndarray) -> None:
-    """Print how well ten and all components meet 300 other adults: skin and joints, mm."""
+    """Print the errors of ten and of all components for 300 other adults: skin and joints, mm."""
     others = shape_space.sample_adults(300, np.random.default_rng(SEED + 1))
     vertices, joints, _ = shape_space.t_posed(source, source.coefficients(others))
     area = np.repeat(shape_space.vertex_areas(space.template, source.faces), 3)
@@ -104,6 +107,34 @@ def report(source: Source, space: shape_space.ShapeSpace, regressor: np.ndarray)
               f"worst {gap:.4f} mm")  # fmt: skip
     print("joints of held-out adults, mm: name; mean, p95, worst of ten components; of all")
     for joint, name in enumerate(JOINT_NAMES):
-        told = (f"{e.mean():6.2f} {np.percentile(e, 95):5.2f} {e.max():5.2f}"
+        texts = (f"{e.mean():6.2f} {np.percentile(e, 95):5.2f} {e.max():5.2f}"
                 for e in (found[:, joint] for found in errors))  # fmt: skip
-        print(f"  {name:18s} {' '.join(told)}")
+        print(f"  {name:18s} {' '.join(texts)}")
+
+
+def bake_genders(source: Source, body: Path, path: Path) -> None:
+    """Write mean and covariance of the shapes of adults by gender, for the file ``body``.
+
+    The adults are drawn as those of whom the directions were made.
+    """
+    with np.load(body) as file:
+        directions = file["shapedirs"].astype(float)[:, :, : shape_space.NUM_SHAPE]
+        template = file["v_template"].astype(float)
+    area = np.repeat(shape_space.vertex_areas(template, source.faces), 3)
+    basis = directions.reshape(-1, shape_space.NUM_SHAPE)
+    weighted = (basis * area[:, None]).T
+    drawn = shape_space.sample_adults(_ADULTS, np.random.default_rng(SEED + 3))
+    vertices, _, _ = shape_space.t_posed(source, source.coefficients(drawn))
+    offset = (vertices - template).reshape(_ADULTS, -1)
+    betas = np.linalg.solve(weighted @ basis, weighted @ offset.T).T
+    female = drawn["gender"] > 0.5
+    height = np.ptp(vertices[:, :, 1], axis=1)
+    groups = [betas[female], betas[~female]]
+    for name, some, tall in zip(_GENDERS, groups, (height[female], height[~female]), strict=True):
+        first, spread = some.mean(0)[:4].round(2), some.std(0)[:4].round(2)
+        print(f"{name}: {tall.mean():.3f} +- {tall.std():.3f} m; components {first} +- {spread}")
+    write_npz(path, {
+        "genders": np.array(_GENDERS),
+        "mean": np.stack([some.mean(0) for some in groups]).astype(np.float32),
+        "covariance": np.stack([np.cov(some.T) for some in groups]).astype(np.float32),
+    })  # fmt: skip

@@ -1,7 +1,7 @@
-"""Six more subjects of builds that the dozen has not: 1.50 to 1.95 m, slight and strong.
+"""Six more subjects of other builds than the twelve: 1.50 to 1.95 m, slight and strong.
 
-They stand on the dozen's mesh, found again on the source by the way back that its file holds, so
-that the dozen's file stays as it is and the new one holds only what differs between people.
+They have the mesh of the twelve. Its place on the source is derived from subjects.npz, so that this
+file does not change and builds.npz only contains the differences between people.
 """
 
 from __future__ import annotations
@@ -24,14 +24,16 @@ ROUNDS = 3  # of stature and local changes in turn
 
 
 class Build(NamedTuple):
-    """``height_m``; anny's ``muscle`` and ``weight`` in [0, 1]; RMS distance ``outside_mm`` from
-    the fitted model's shape space; whether sleeves are long."""
+    """The build of a subject."""
 
     female: bool
     height_m: float
     muscle: float
+    """In [0, 1], as anny defines it."""
     weight: float
+    """In [0, 1], as anny defines it."""
     outside_mm: float
+    """RMS distance from the fitted model's shape space."""
     long_sleeves: bool
 
 
@@ -86,10 +88,10 @@ def _on_source(
     faces: np.ndarray,
     weights: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where the dozen's vertices are on the source: its (face (V,), barycentric (V,3)).
+    """Return the places of the mesh's vertices on the source: face (V,), barycentric (V, 3).
 
-    The file holds where the source's vertices are on the dozen's mesh; laid there, the source's
-    triangles are next to the vertices that once came from them.
+    The file contains the places of the source's vertices on the mesh. With the source's vertices
+    there, its triangles are next to the vertices of the mesh that were made from them.
     """
     bary = mesh["fitted_bary"].astype(float)
     back = mesh["fitted_face"].astype(int), bary / bary.sum(1, keepdims=True)
@@ -106,7 +108,7 @@ def _person(
     build: Build,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """T-posed vertices, joints, tips of somebody of a build; the rest of the looks is drawn."""
+    """Return T-posed vertices, joints and tips of a person of this build, otherwise random."""
     race = rng.dirichlet(np.ones(3) * 0.5)
     person = {
         "gender": 0.95 if build.female else 0.05, "age": rng.uniform(0.64, 0.83),

