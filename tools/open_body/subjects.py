@@ -119,7 +119,7 @@ def _neighbour_mean(faces: np.ndarray, count: int):
 
 
 def _smoothed_weights(weights: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return smoother weights than the fitted model's: diffused on the surface, at most six bones."""
+    """Return weights smoothed by diffusion over the surface, with at most six bones."""
     mean = _neighbour_mean(faces, len(weights))
     rigid = weights[:, [22, 23, 24]].sum(1) > 0.02
     hand = weights[:, [20, 21, *range(25, 55)]].sum(1) > 0.5  # small triangles: fewer steps
