@@ -45,28 +45,31 @@ class KeypointData(NamedTuple):
 
 
 class Pieces(NamedTuple):
-    """What K keypoints are made of: E pieces, keypoint k of those from starts[k] to starts[k+1].
-
-    A piece lies at R x + share t, with R and t of its bone and x, at rest, from template (E,3) and
-    directions (E,3,S). carrier (K,): the piece on the bone that carries the keypoint's offset.
-    limb_starts (L+1,) and order (K,): the keypoints of each limb; moved_by (L,55) bool: the joints
-    that turn a limb. posedirs (E,3,486), or (E,3,0) where there are no pose blend shapes.
-    """
+    """E pieces of K keypoints. A piece is at R x + share t, with R and t of its bone and x at rest."""
 
     starts: np.ndarray
+    """(K + 1,) start of the pieces of each keypoint, and the end."""
     bone: np.ndarray
+    """(E,) joint that moves the piece."""
     share: np.ndarray
+    """(E,) weight of the bone."""
     template: np.ndarray
+    """(E, 3) x of the mean shape, times the share, metres."""
     directions: np.ndarray
+    """(E, 3, S) derivatives of x by the shape."""
     carrier: np.ndarray
+    """(K,) piece on the bone that carries the offset of the keypoint."""
     limb_starts: np.ndarray
+    """(L + 1,) start of each limb in the order, and the end."""
     order: np.ndarray
+    """(K,) keypoints, limb by limb."""
     moved_by: np.ndarray
+    """(L, 55) bool, the joints that move the limb."""
     posedirs: np.ndarray
+    """(E, 3, 486) pose blend shapes, or (E, 3, 0)."""
 
     @classmethod
     def of(cls, model: BodyModel, chosen: KeypointSet) -> Pieces:
-        """The pieces of a set of keypoints."""
         points = model.select(chosen.vertices, joints=True)
         weights = points.weights.double().numpy()
         dtype = points.template.numpy().dtype
@@ -87,7 +90,7 @@ class Pieces(NamedTuple):
         )  # fmt: skip
 
     def at_rest(self, shape: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-        """Pieces (B,E,3) of bodies of shape (B,S), with the keypoints' offsets (K,3)."""
+        """Return the pieces (B,E,3) at rest of bodies of shape (B,S), with offsets (K,3)."""
         rest = rest_points(self.template, self.directions, shape)
         rest[:, self.carrier] += offsets
         return rest
@@ -95,7 +98,7 @@ class Pieces(NamedTuple):
 
 @numba.njit(cache=True, nogil=True)
 def _project(px, py, pz, lens):
-    """:func:`.projection_kernels.project_point_with_jacobian`, by the inverse depth."""
+    """Project as :func:`.projection_kernels.project_point_with_jacobian`, by the inverse depth."""
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     free = pz > MIN_DEPTH_M
     inverse = 1 / pz if free else 1 / MIN_DEPTH_M
@@ -109,8 +112,10 @@ def _project(px, py, pz, lens):
 
 @numba.njit(cache=True, nogil=True)
 def evaluate_keypoint(given, t, k, p, derivatives, gradient, matrix):
-    """E_J of keypoint k of frame t at point p (3,), metres, master frame: returns its cost and,
-    with ``derivatives``, writes gradient (3,) and Gauss-Newton matrix (3,3) by the point."""
+    """Return the cost of keypoint k of frame t at point p (3,), master frame, metres.
+
+    With ``derivatives``, write gradient (3,) and Gauss-Newton matrix (3,3) by the point.
+    """
     cost = 0.0
     gradient[:] = 0
     matrix[:] = 0
@@ -168,7 +173,7 @@ def evaluate_keypoint(given, t, k, p, derivatives, gradient, matrix):
 
 @numba.njit(cache=True, nogil=True)
 def _piece(skeleton, pieces, rest, b, e):
-    """Where piece e (3,) of body b is, times its share, metres."""
+    """Return the position (3,) of piece e of body b, times its share, metres."""
     m, w = pieces.bone[e], pieces.share[e]
     x, y, z = rest[b, e, 0], rest[b, e, 1], rest[b, e, 2]
     turn, offset = skeleton.rotations, skeleton.offsets
@@ -180,7 +185,7 @@ def _piece(skeleton, pieces, rest, b, e):
 
 @numba.njit(cache=True, nogil=True)
 def _point(skeleton, pieces, rest, b, k):
-    """Keypoint k (3,) of body b, metres."""
+    """Return the position (3,) of keypoint k of body b, metres."""
     p0, p1, p2 = 0.0, 0.0, 0.0
     for e in range(pieces.starts[k], pieces.starts[k + 1]):
         q0, q1, q2 = _piece(skeleton, pieces, rest, b, e)
@@ -190,7 +195,7 @@ def _point(skeleton, pieces, rest, b, k):
 
 @numba.njit(cache=True, nogil=True)
 def add_cost(skeleton, pieces, rest, observed, frames, cost):
-    """Add E_J to cost (B,) of the frames (B,), whose pieces at rest are (B,E,3)."""
+    """Add E_J to cost (B,) of the frames (B,); rest (B,E,3): pieces at rest."""
     gradient, matrix = np.empty(3), np.empty((3, 3))
     for b in range(len(frames)):
         total = 0.0
@@ -202,8 +207,11 @@ def add_cost(skeleton, pieces, rest, observed, frames, cost):
 
 @numba.njit(cache=True, nogil=True)
 def _fill_rows(skeleton, pieces, rest, b, k, local, shape, rows, moved):
-    """Write the derivatives (3,m) of keypoint k by the columns that ``local`` (P,) places, those of
-    the shape from ``shape`` on. ``moved`` (3,S) is scratch."""
+    """Write the derivatives (3,m) of keypoint k to ``rows``.
+
+    local (P,): column of each parameter in the rows, -1 = none. shape: fitted shape components.
+    moved (3,S): scratch.
+    """
     rows[:] = 0
     moved[:] = 0
     for e in range(pieces.starts[k], pieces.starts[k + 1]):
@@ -248,8 +256,9 @@ def _fill_rows(skeleton, pieces, rest, b, k, local, shape, rows, moved):
 def _add_correctives(
     skeleton, pieces, b, k, by_keypoint, rest_gradient, rows, local, joints, by_pose
 ):
-    """Add the gradient by the pieces of keypoint k at rest, and to its rows (3,m) what ``joints``
-    change by pose blend shapes; by_keypoint (3,): the cost's gradient by the keypoint."""
+    """Add the gradient by the pieces of keypoint k at rest, and the derivatives of its pose blend
+    shapes by ``joints`` to its rows (3,m). by_keypoint (3,): gradient of the cost by the keypoint.
+    """
     for e in range(pieces.starts[k], pieces.starts[k + 1]):
         turn = skeleton.rotations[b, pieces.bone[e]]
         for i in range(3):
@@ -278,8 +287,10 @@ def _add_product(rows, weighted, block):
 
 @numba.njit(cache=True, nogil=True)
 def _add_offset(turn, by_keypoint, matrix, weighted, to, first, gradient, hessian):
-    """Add the part of a keypoint's offset, whose three columns start at ``first``; turn (3,3) of
-    the bone that carries it."""
+    """Add the blocks of a keypoint's offset, whose three columns start at ``first``.
+
+    turn (3,3): rotation of the bone that carries the offset.
+    """
     for d in range(3):
         r0, r1, r2 = turn[0, d], turn[1, d], turn[2, d]
         gradient[first + d] += r0 * by_keypoint[0] + r1 * by_keypoint[1] + r2 * by_keypoint[2]
@@ -310,13 +321,15 @@ def add_equations(
     rest_gradient,
     by_pose,
 ):
-    """Add the normal equations of E_J to those of the frames (B,), whose pieces at rest are
-    (B,E,3).
+    """Add the normal equations of E_J to those of the frames (B,).
 
-    ``place`` (P,) says where a parameter's column is, -1 = fixed; the offsets of the first
-    ``offsets`` keypoints, three columns each, start at ``first_offset``. cost (B,), gradient (B,n),
-    hessian (B,n,n). rest_gradient (B,E,3): that of the pieces at rest, filled in, and by_pose
-    (B,54,3,9): see :mod:`.correctives_kernel`; of no body without pose blend shapes.
+    rest (B,E,3): pieces at rest.
+    place (P,): column of each parameter, -1 = fixed.
+    first_offset, offsets: first column and number of keypoint offsets, three columns each.
+    cost (B,), gradient (B,n), hessian (B,n,n): filled in place.
+    rest_gradient (B,E,3): gradient by the pieces at rest, filled in place.
+    by_pose (B,54,3,9): see :mod:`intercap_core.body.correctives_kernel`; of no body without pose
+    blend shapes, like rest_gradient.
     """
     dtype = hessian.dtype
     shape = np.flatnonzero(place[_SHAPE:] >= 0)

@@ -339,7 +339,7 @@ def _match(
 
 @numba.njit(cache=True, nogil=True)
 def _square(values, at, here):
-    """Squared distance of column ``at`` of (6,N) from ``here`` (6,)."""
+    """Return the squared distance of column ``at`` of (6,N) from ``here`` (6,)."""
     total = here[0] * 0
     for d in range(6):
         gap = values[d, at] - here[d]
@@ -349,7 +349,7 @@ def _square(values, at, here):
 
 @numba.njit(cache=True, nogil=True)
 def _squares(values, first, count, here, out):
-    """The same of ``count`` columns from ``first`` on, into ``out``."""
+    """Write the squared distances of ``count`` columns from ``first`` on to ``out``."""
     h0, h1, h2, h3, h4, h5 = here[0], here[1], here[2], here[3], here[4], here[5]
     last = first + count
     a, b, c = values[0, first:last], values[1, first:last], values[2, first:last]

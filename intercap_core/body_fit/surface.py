@@ -28,7 +28,7 @@ MATCH_SIDEWAYS_M = 0.03
 
 @dataclass(frozen=True)
 class Covering:
-    """What lies between the skin and the measured surface."""
+    """The layer between the skin and the measured surface."""
 
     name: str
     thickness: float

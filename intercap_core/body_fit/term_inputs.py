@@ -202,7 +202,7 @@ def _limbs(chains: list[frozenset[int]]) -> Limbs:
 
 @dataclass(kw_only=True)
 class TermInputs:
-    """What the bodies of T frames are compared with."""
+    """Observations of T frames and settings of the terms."""
 
     keypoints: KeypointSet
     """Keypoints of E_J, the 25 of the body first."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -22,7 +23,7 @@ from intercap_core.body_fit.bridge import bridge, bridged_sigma, continuous
 from intercap_core.body_fit.definition import Definition
 from intercap_core.body_fit.observations import person_clouds, read_observations
 from intercap_core.body_fit.recover import JUMP_M, jumps
-from intercap_core.body_fit.schedule import Fitter
+from intercap_core.body_fit.schedule import Fit, Fitter
 from intercap_core.body_fit.uncertainty import deviation, joint_covariance, widen
 from intercap_core.config import BodyFitSettings, BodyModels, SubjectEntry, digest
 from intercap_core.errors import UserError
@@ -90,28 +91,7 @@ def run(
 
     params = model.parameters(torch.as_tensor(vectors, dtype=model.dtype, device=model.device))
     joints = model.forward(params, vertex_ids=np.array([0])).joints.cpu().numpy()
-    sigma = np.zeros((seen.num_frames, 55))
-    stated = joint_covariance(model, fit).cpu().numpy()
-    # a jump may be a wrong minimum and widens sigma; a limb that only the pixels of one view
-    # constrain is widened by any distance from the median
-    least = np.full_like(sigma, JUMP_M)
-    least[fit.frames] *= ~quality.flag_unmeasured_joints(fit.parts)
-    jumped = np.zeros_like(sigma)
-    jumped[fitted] = jumps(joints[fitted].astype(float), seen.times[fitted], least[fitted])
-    sigma[fit.frames] = np.hypot(
-        quality.widen_sigma(deviation(stated), fit.parts),
-        jumped[fit.frames] / quality.MEDIAN_CHI_3,
-    )
-    undetermined = np.ones((seen.num_frames, len(BODY_PARTS)), bool)
-    undetermined[fit.frames] = quality.flag_undetermined(sigma[fit.frames], fit.parts)
-    undetermined[~fitted] = True
-    sigma = bridged_sigma(joints.astype(float), fitted, sigma, seen.times)
-    covariance = np.zeros((*sigma.shape, 3, 3))
-    covariance[fit.frames] = stated
-    covariance[~fitted] = 0
-    share = model.skinning_weights.double().mean(0).cpu().numpy()
-    uncertain = fitted & (quality.expected_error(sigma, share) > BAD_BODY_M)
-
+    stated = _state_uncertainty(model, fit, seen.times, fitted, joints)
     keypoint_residual = np.full((seen.num_frames, len(seen.rig)), np.nan)
     keypoint_residual[fit.frames] = fit.pixel_residual.cpu().numpy()
     cloud_residual = np.full(seen.num_frames, np.nan)
@@ -128,8 +108,8 @@ def run(
         _put_bodies(writer, replace(params, betas=shapes.betas(params.betas)), joints)
         writer.put("keypoint_residual", keypoint_residual)
         writer.put("cloud_residual", cloud_residual)
-        writer.put("joint_sigma", sigma)
-        writer.put("joint_covariance", widen(covariance, sigma))
+        writer.put("joint_sigma", stated.sigma)
+        writer.put("joint_covariance", stated.covariance)
         writer.put("keypoint_offsets", fit.settled.offsets.cpu().numpy())
         writer.put("keypoint_sigma", fit.settled.keypoint_sigma.cpu().numpy())
         writer.put("keypoint_doubt", fit.settled.keypoint_doubt.cpu().numpy())
@@ -137,9 +117,9 @@ def run(
         writer.put("covering_noise", fit.settled.cloud_noise.cpu().numpy())
         writer.put("failed", ~fitted)
         writer.put("bridged", ~fitted)
-        writer.put("uncertain", uncertain)
+        writer.put("uncertain", stated.uncertain)
         writer.put("part_names", list(BODY_PARTS))
-        writer.put("undetermined", undetermined)
+        writer.put("undetermined", stated.undetermined)
 
 
 def _put_bodies(writer: artefacts.Writer, params: BodyParameters, joints: np.ndarray) -> None:
@@ -149,3 +129,48 @@ def _put_bodies(writer: artefacts.Writer, params: BodyParameters, joints: np.nda
     ):  # fmt: skip
         writer.put(name, getattr(params, name).cpu().numpy())
     writer.put("joints", joints)
+
+
+class _Uncertainty(NamedTuple):
+    """Uncertainty of the joints in T frames."""
+
+    sigma: np.ndarray
+    """(T, 55) standard deviation along one coordinate, metres."""
+    covariance: np.ndarray
+    """(T, 55, 3, 3) square metres."""
+    undetermined: np.ndarray
+    """(T, 8) bool, parts of the body."""
+    uncertain: np.ndarray
+    """(T,) bool, the expected error is that of a bad body."""
+
+
+def _state_uncertainty(
+    model: BodyModel, fit: Fit, times: np.ndarray, fitted: np.ndarray, joints: np.ndarray
+) -> _Uncertainty:
+    """Return the uncertainty of the ``fitted`` frames (T,) and of the bridged ones.
+
+    times (T,) seconds, joints (T, 55, 3) metres.
+    """
+    count = len(times)
+    sigma = np.zeros((count, 55))
+    stated = joint_covariance(model, fit).cpu().numpy()
+    # a jump may be a wrong minimum and widens sigma; a limb that only the pixels of one view
+    # constrain is widened by any distance from the median
+    least = np.full_like(sigma, JUMP_M)
+    least[fit.frames] *= ~quality.flag_unmeasured_joints(fit.parts)
+    jumped = np.zeros_like(sigma)
+    jumped[fitted] = jumps(joints[fitted].astype(float), times[fitted], least[fitted])
+    sigma[fit.frames] = np.hypot(
+        quality.widen_sigma(deviation(stated), fit.parts),
+        jumped[fit.frames] / quality.MEDIAN_CHI_3,
+    )
+    undetermined = np.ones((count, len(BODY_PARTS)), bool)
+    undetermined[fit.frames] = quality.flag_undetermined(sigma[fit.frames], fit.parts)
+    undetermined[~fitted] = True
+    sigma = bridged_sigma(joints.astype(float), fitted, sigma, times)
+    covariance = np.zeros((*sigma.shape, 3, 3))
+    covariance[fit.frames] = stated
+    covariance[~fitted] = 0
+    share = model.skinning_weights.double().mean(0).cpu().numpy()
+    uncertain = fitted & (quality.expected_error(sigma, share) > BAD_BODY_M)
+    return _Uncertainty(sigma, widen(covariance, sigma), undetermined, uncertain)
