@@ -45,7 +45,7 @@ class KeypointData(NamedTuple):
 
 
 class Pieces(NamedTuple):
-    """E pieces of K keypoints. A piece is at R x + share t, with R and t of its bone and x at rest."""
+    """E pieces of K keypoints, at R x + share t with R and t of the bone and x at rest."""
 
     starts: np.ndarray
     """(K + 1,) start of the pieces of each keypoint, and the end."""
