@@ -177,7 +177,7 @@ def tables(
         Path, typer.Option(help="intercap without meshes: the objects.yaml to use.")
     ] = Path("config/objects.yaml"),
     keypoints: Annotated[
-        Path | None, typer.Option(help="intercap: OpenPose files, a folder for each sequence.")
+        Path | None, typer.Option(help="intercap: keypoint files, a folder for each sequence.")
     ] = None,
     candidates: Annotated[
         Path | None, typer.Option(help="intercap: segmentations, a folder for each sequence.")

@@ -222,14 +222,14 @@ def _notes_of_keypoints(
     cameras: list[str],
 ) -> list[str]:
     """Notes on layout, position and confidence of the first people of each camera."""
-    from intercap_core.formats.detections.keypoint_files import look_at_keypoints
+    from intercap_core.formats.detections.keypoint_files import preview_keypoints
 
     notes: list[str] = []
     for name in cameras:
         size = _colour_size(layout, name)
         if size is not None:
             full = settings.keypoint_full_confidence
-            notes += look_at_keypoints(folder, name, size=size, full_confidence=full)
+            notes += preview_keypoints(folder, name, size=size, full_confidence=full)
     return notes
 
 
@@ -249,7 +249,7 @@ def _notes_of_candidates(
     cameras: list[str],
 ) -> list[str]:
     """Notes on format, size and labels of the first candidates of each camera."""
-    from intercap_core.formats.detections.candidate_files import look_at_candidates
+    from intercap_core.formats.detections.candidate_files import preview_candidates
     from intercap_core.formats.detections.class_names import class_names
 
     assert row.candidates is not None
@@ -260,7 +260,7 @@ def _notes_of_candidates(
         size = _colour_size(layout, name)
         if size is None:
             continue
-        seen = look_at_candidates(
+        seen = preview_candidates(
             row.candidates, name, size=size, names=class_names(settings.category_names)
         )
         notes += seen.notes

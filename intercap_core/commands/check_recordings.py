@@ -153,10 +153,7 @@ def _check_recording(
 def _check_detections(row: SequenceEntry, name: str, images: int | None) -> list[str]:
     """Notes on keypoints or candidates whose number of images differs from the recording's."""
     counted = {
-        "keypoints": row.keypoints and _count(
-            keypoint_files.camera_file(row.keypoints, name),
-            keypoint_files.image_files(row.keypoints / name),
-        ),
+        "keypoints": row.keypoints and _count(*keypoint_files.keypoint_paths(row.keypoints, name)),
         "candidates": row.candidates and _count(
             candidate_files.camera_file(row.candidates, name),
             candidate_files.image_files(row.candidates, name),

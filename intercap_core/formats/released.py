@@ -1,4 +1,6 @@
-"""Files of BEHAVE's results: registrations in the folders of frames, and the 30 fps parameters.
+"""Released results: their common form, and the files of BEHAVE.
+
+BEHAVE has registrations in the folders of frames, and parameters at 30 fps.
 
 A frame's folder ``t0003.000`` holds ``person/fit02/person_fit.ply`` (6,890 vertices, SMPL-H's) and
 ``.pkl`` (``pose``: 156 numbers of SMPL-H's 52 joints, or 72 of SMPL's 24), and of the object
@@ -23,24 +25,25 @@ from intercap_core.errors import UserError
 from intercap_core.formats.recordings.behave import FRAME_FOLDER
 from intercap_core.inputs.arrays import read_arrays, read_pickle
 
-MOST_M = 100.0  # a place beyond this is in other units
-MOST_RAD = 100.0  # as is a rotation vector
-PERSON_EXTENT_M = (0.5, 3.0)  # largest side of a person's box, crouched to with an arm up
-INTERCAP = ("res.pkl", "res.npz", "res_2.pkl", "res_1.pkl")  # the newest first
+MOST_M = 100.0  # larger coordinates are not in metres
+MOST_RAD = 100.0  # longer rotation vectors are not in radians
+# Largest side of a person's bounding box: from crouching to an arm raised.
+MIN_PERSON_M, MAX_PERSON_M = 0.5, 3.0
+INTERCAP = ("res.pkl", "res.npz", "res_2.pkl", "res_1.pkl")  # names of result files, newest first
 BEHAVE_PERSON, BEHAVE_OBJECT = "smpl_fit_all.npz", "object_fit_all.npz"  # parameters at 30 fps
 PERSON_MESH = Path("person", "fit02", "person_fit.ply")  # in the folder of a frame of BEHAVE
 
 
 def intercap_file(path: Path) -> Path:
-    """The file of results in a folder, the folder itself where it has none; a file as it is."""
+    """The file of results in a folder; a file, or a folder without such a file, as it is."""
     return next((path / name for name in INTERCAP if (path / name).is_file()), path)
 
 
 def files_of(path: Path) -> list[Path]:
-    """What the workflow watches of results: a file, or BEHAVE's folder and what it holds itself.
+    """Paths of results that the workflow watches: a file, or BEHAVE's folder and the files in it.
 
-    The folder stands for the thousands of files in its folders of frames: its time changes when a
-    frame comes or goes, and looking at all of them would keep a run that has nothing to do busy.
+    Files in its folders of frames are not watched: there are thousands. The folder's time changes
+    if a frame is added or removed.
     """
     own = intercap_file(path)
     inside = (path / name for name in (BEHAVE_PERSON, BEHAVE_OBJECT))
@@ -49,51 +52,54 @@ def files_of(path: Path) -> list[Path]:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """The sequence that results are asked for.
-
-    ``times`` (T,): of its frame sets, seconds on the clock of the recordings themselves (not from
-    the first on). ``object_``: None = a person alone. ``body``: the body file whose surface is
-    fitted where results are of another body, with ``betas`` numbers of the shape.
-    """
+    """The sequence whose results are read."""
 
     sequence: str
+    """Its name."""
     times: np.ndarray
+    """(T,) times of its frame sets on the recordings' own clock, seconds."""
     object_: ObjectEntry | None
+    """Its object; None for a person alone."""
     body: Path
+    """Body file whose surface is fitted to results of another body model."""
     betas: int
+    """Number of shape parameters of that fit."""
 
 
 @dataclass(frozen=True, eq=False)
 class Results:
-    """T frames, master camera's frame, metres and radians.
-
-    ``turns``: rotation vectors by SMPL-X's names, (T, 3) or (T, 63); ``hands``: left and right,
-    (T, 45) full poses, or (T, n) components over the hand's mean pose; ``transl`` (T, 3), ``betas``
-    and ``expression`` (T, n). ``rotation`` (T, 3, 3) and ``translation`` (T, 3) are
-    master_from_object, NaN throughout where there is no object. ``source``: what they are, in
-    words. ``reasons`` (T,): why a frame has no result, or should not be trusted; empty = neither is
-    told. ``surface_distance`` (T, 2): mean and 95th percentile of how far a body that was converted
-    is from the surface that the results have; None where nothing was converted.
-    """
+    """Results of another program for T frames; master camera's frame, metres and radians."""
 
     path: Path
+    """File or folder of the results."""
     turns: Mapping[str, np.ndarray]
+    """Rotation vectors by SMPL-X's names, (T, 3) or (T, 63)."""
     hands: tuple[np.ndarray, np.ndarray]
+    """Left and right: full poses (T, 45), or components (T, n) over the hand's mean pose."""
     transl: np.ndarray
+    """(T, 3)."""
     betas: np.ndarray
+    """(T, n)."""
     expression: np.ndarray
+    """(T, n)."""
     rotation: np.ndarray
+    """(T, 3, 3) of master_from_object; NaN without an object."""
     translation: np.ndarray
+    """(T, 3) of master_from_object; NaN without an object."""
     source: str
+    """Description of the results, for the user."""
     reasons: Sequence[str] = ()
+    """(T,) why a frame has no result or is not trusted, "" = no reason; () = no frame has one."""
     surface_distance: np.ndarray | None = None
+    """(T, 2) mean and 95th percentile of the distance between the converted and the released body
+    surface; None if the body was not converted."""
 
     def __len__(self) -> int:
         return len(self.transl)
 
     @property
     def known(self) -> np.ndarray:
-        """Frames (T,) whose every number is finite; of the object where there is one."""
+        """(T,) bool: all numbers of the frame are finite, including those of an object."""
         body = [*self.turns.values(), *self.hands, self.transl, self.betas, self.expression]
         parts = [np.isfinite(part).all(axis=1) for part in body]
         if np.isfinite(self.translation).any():
@@ -102,19 +108,19 @@ class Results:
 
 
 def check_range(path: Path, name: str, values: np.ndarray, most: float) -> None:
-    """Raise UserError where finite ``values`` are so large that their unit is another one."""
+    """Raise UserError if finite ``values`` are too large for metres or radians."""
     finite = np.abs(values[np.isfinite(values)])
     if (finite > most).any():
         raise UserError(f"{path}: {name} reaches {finite.max():.0f}; expected metres and radians")
 
 
 def check_metres(path: Path, name: str, values: np.ndarray) -> None:
-    """The same for places in metres."""
+    """Raise UserError if coordinates are too large for metres."""
     check_range(path, name, values, MOST_M)
 
 
 def check_radians(path: Path, name: str, values: np.ndarray) -> None:
-    """The same for rotation vectors."""
+    """Raise UserError if rotation vectors are too long for radians."""
     check_range(path, name, values, MOST_RAD)
 
 
@@ -143,8 +149,7 @@ class ObjectPoses:
 
 
 def read_skin(path: Path) -> Skin:
-    """A ``person_fit.ply``; raises UserError naming it where it is no mesh of 6,890 vertices of a
-    person in metres."""
+    """Read a ``person_fit.ply``; raises UserError unless it has 6,890 vertices of a person."""
     from intercap_core.geometry.rigid.mesh import read_mesh
 
     mesh = read_mesh(path)
@@ -156,7 +161,8 @@ def read_skin(path: Path) -> Skin:
         )
     if not np.isfinite(vertices).all():
         raise UserError(f"{path}: has a vertex that is no number; get BEHAVE's file again")
-    extent, (low, high) = float(np.ptp(vertices, axis=0).max()), PERSON_EXTENT_M
+    extent = float(np.ptp(vertices, axis=0).max())
+    low, high = MIN_PERSON_M, MAX_PERSON_M
     if not low <= extent <= high:
         raise UserError(
             f"{path}: is {extent:.4g} m large, expected a person of {low:g} to {high:g} m; write "
@@ -167,12 +173,12 @@ def read_skin(path: Path) -> Skin:
 
 
 def read_person_pose(path: Path) -> np.ndarray:
-    """Rotation vectors (55, 3) in SMPL-X's order of a ``person_fit.pkl``."""
+    """Read rotation vectors (55, 3), in SMPL-X's order, from a ``person_fit.pkl``."""
     return _as_smplx(_numbers(_named(path), "pose", path).reshape(1, -1), path)[0]
 
 
 def read_object_pose(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation vector (3,) and translation (3,) of an ``<object>_fit.pkl``."""
+    """Read rotation vector (3,) and translation (3,) from an ``<object>_fit.pkl``."""
     values = _named(path)
     angle, trans = (_numbers(values, name, path).ravel() for name in ("angle", "trans"))
     for name, found in (("angle", angle), ("trans", trans)):
@@ -184,7 +190,7 @@ def read_object_pose(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def object_fits(frame: Path) -> list[Path]:
-    """Files ``<name>/fit01/<name>_fit.pkl`` of a frame's folder, whatever the object's name."""
+    """Files ``<name>/fit01/<name>_fit.pkl`` of a frame's folder, for any name of the object."""
     return [
         path
         for folder in sorted(frame.iterdir())
@@ -202,7 +208,7 @@ def person_poses_at_30_fps(folder: Path) -> dict[int, np.ndarray]:
     poses = _as_smplx(_numbers(values, "poses", path), path)
     if "frame_times" not in values and (folder / BEHAVE_OBJECT).is_file():  # as first released
         values["frame_times"] = _arrays(folder / BEHAVE_OBJECT).get("frame_times", np.zeros(0))
-    # Some sequences have more poses than times: those whose object failed were taken off the end.
+    # Some sequences have more poses than times: frames without an object were removed at the end.
     return dict(zip(_times(values, path, len(poses)), poses, strict=False))
 
 
@@ -223,8 +229,10 @@ def object_poses_at_30_fps(folder: Path) -> dict[int, tuple[np.ndarray, np.ndarr
 
 
 def _as_smplx(poses: np.ndarray, path: Path) -> np.ndarray:
-    """Poses (T, 156) or (T, 72) as rotation vectors (T, 55, 3); jaw and eyes, and the fingers that
-    SMPL does not have, are at rest."""
+    """Convert poses (T, 156) or (T, 72) to rotation vectors (T, 55, 3) in SMPL-X's order.
+
+    Jaw and eyes are at rest, and so are fingers in SMPL's poses.
+    """
     if poses.ndim != 2 or poses.shape[1] not in _JOINTS:
         size = poses.shape[-1] if poses.ndim else 1
         raise UserError(
@@ -262,7 +270,7 @@ def _numbers(values: Mapping[str, Any], name: str, path: Path) -> np.ndarray:
 
 
 def _times(values: Mapping[str, np.ndarray], path: Path, most: int) -> list[int]:
-    """Microseconds of ``frame_times``, at most as many as there are poses."""
+    """Times of ``frame_times``, microseconds, at most as many as there are poses."""
     texts = np.atleast_1d(values.get("frame_times", np.zeros(0)))
     found = [FRAME_FOLDER.fullmatch(str(text)) for text in texts]
     if not found or not all(found) or len(found) > most:

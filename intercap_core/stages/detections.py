@@ -1,4 +1,4 @@
-"""Stage ``detections``: keypoints and segmentation candidates to one artefact in image space."""
+"""Stage ``detections``: keypoints and segmentation candidates of every image, in one artefact."""
 
 from __future__ import annotations
 
@@ -14,30 +14,38 @@ from intercap_core import artefacts
 from intercap_core.config import DetectionsSettings, SequenceEntry, digest
 from intercap_core.errors import UserError
 from intercap_core.formats.detections import candidate_files, keypoint_files
-from intercap_core.formats.detections.candidate_files import Candidates
+from intercap_core.formats.detections.candidate_files import CandidatesByImage
 from intercap_core.formats.detections.class_names import class_names
 from intercap_core.formats.detections.image_numbers import CameraImages, camera_images
 from intercap_core.formats.detections.instance import Instance, boxes_of
-from intercap_core.formats.detections.keypoint_files import NOBODY, People, Values
+from intercap_core.formats.detections.keypoint_files import (
+    NOBODY,
+    KeypointCleaner,
+    PeopleByImage,
+)
 from intercap_core.formats.detections.mask_files import BehaveFiles
 from intercap_core.progress import Progress
 from intercap_core.schemas import DETECTIONS, FRAMES
 
 log = logging.getLogger(__name__)
 
-
 Image = tuple[int, int]  # frame set and camera
 
 
 @dataclass
 class CameraDetections:
-    """What is known about one camera; lists have one entry a frame set."""
+    """Detections of one camera; the lists have one entry for each of the T frame sets."""
 
     people: list[np.ndarray]
+    """Keypoints (P, 135, 3) of the people: x, y (px), confidence."""
     instances: list[list[Instance]]
+    """Candidates."""
     keypoints_found: np.ndarray
+    """(T,) bool: a detector looked for people."""
     candidates_found: np.ndarray
+    """(T,) bool: a detector looked for instances."""
     notes: list[str] = field(default_factory=list)
+    """What was left out, for the user."""
 
 
 def run(
@@ -49,22 +57,20 @@ def run(
 ) -> None:
     """Read the sequence's files of keypoints and candidates and write the detections artefact.
 
-    A file belongs to the colour image of its number: in the camera's own recording, or in the
-    image file's name where the layout is the InterCap release's. Of a plain folder of images,
-    damaged ones count too, and files may be named after the images. BEHAVE's keypoints and masks
-    lie beside its images and are read from there unless the row names others. A segmentation model
-    sees the images of which no file of candidates says anything, then a model of keypoints those of
-    which no file of keypoints does. Missing or broken files, entries that cannot be used and
-    missing cameras are noted, not fatal. Raises UserError where neither keypoints nor candidates
-    are found for any image, or none of a camera's keypoints can be used.
+    Files are matched to colour images by number or name (:mod:`.image_numbers`). BEHAVE's keypoints
+    and masks lie in the folders of its images and are read from there unless the row names others.
+    Models look at the images for which there is no file: first the segmentation model, then the
+    keypoint model. Missing or broken files, unusable entries and missing cameras are noted. Raises
+    UserError if there are neither keypoints nor candidates for any image, or if none of a camera's
+    keypoints can be used.
     """
     with artefacts.read(frames, FRAMES) as source:
         images = camera_images(source, sequence)
     cameras = [camera.name for camera in images]
-    beside = None
+    behave = None
     if sequence.layout == "behave":
-        beside = BehaveFiles(sequence.recordings, sequence.object)
-    found = [_read_camera(sequence, camera, beside, settings) for camera in images]
+        behave = BehaveFiles(sequence.recordings, sequence.object)
+    found = [_read_camera(sequence, camera, behave, settings) for camera in images]
     attributes = {}
     if settings.segmentation_model is not None:
         _segment(frames, images, found, settings)
@@ -132,7 +138,7 @@ def _offsets(per_set: list[np.ndarray] | list[list[Instance]]) -> np.ndarray:
 def _read_camera(
     sequence: SequenceEntry,
     images: CameraImages,
-    beside: BehaveFiles | None,
+    behave: BehaveFiles | None,
     settings: DetectionsSettings,
 ) -> CameraDetections:
     count, name = len(images.number), images.name
@@ -149,8 +155,8 @@ def _read_camera(
     if sequence.keypoints is not None:
         people = keypoint_files.read_camera(sequence.keypoints, images, full_confidence=full)
         _add_people(result, people, images)
-    elif beside is not None:
-        paths = {int(images.number[t]): beside.keypoints(time, name) for t, time in times.items()}
+    elif behave is not None:
+        paths = {int(images.number[t]): behave.keypoints(time, name) for t, time in times.items()}
         people = keypoint_files.read_files(sequence.recordings, paths, images, full_confidence=full)
         _add_people(result, people, images)
     if sequence.candidates is not None:
@@ -162,15 +168,15 @@ def _read_camera(
             names=class_names(settings.category_names),
         )
         _add_candidates(result, candidates, images)
-    elif beside is not None:
-        candidates = Candidates()
-        files = {int(images.number[t]): beside.masks(time, name) for t, time in times.items()}
+    elif behave is not None:
+        candidates = CandidatesByImage()
+        files = {int(images.number[t]): behave.masks(time, name) for t, time in times.items()}
         candidate_files.add_masks(candidates, files, images.size)
         _add_candidates(result, candidates, images)
     return result
 
 
-def _add_people(result: CameraDetections, people: People, images: CameraImages) -> None:
+def _add_people(result: CameraDetections, people: PeopleByImage, images: CameraImages) -> None:
     """Give each frame set the people of its image."""
     for t in images.sets:
         found = people.by_image.get(int(images.number[t]))
@@ -180,8 +186,10 @@ def _add_people(result: CameraDetections, people: People, images: CameraImages) 
     result.notes += people.notes
 
 
-def _add_candidates(result: CameraDetections, candidates: Candidates, images: CameraImages) -> None:
-    """Give each frame set what is known of its image."""
+def _add_candidates(
+    result: CameraDetections, candidates: CandidatesByImage, images: CameraImages
+) -> None:
+    """Give each frame set the candidates of its image."""
     for t in images.sets:
         instances = candidates.by_image.get(int(images.number[t]))
         if instances is not None:
@@ -196,7 +204,7 @@ def _segment(
     found: list[CameraDetections],
     settings: DetectionsSettings,
 ) -> None:
-    """Let the model find instances in the images of which no file says anything."""
+    """Let the model find instances in the images without candidates from files."""
     from intercap_core.formats.detections.onnx_segmentation import Segmenter
 
     wanted = _unknown(images, [d.candidates_found for d in found])
@@ -221,7 +229,7 @@ def _find_people(
     found: list[CameraDetections],
     settings: DetectionsSettings,
 ) -> None:
-    """Let the model find keypoints in the images of which no file says anything."""
+    """Let the model find people in the images without keypoints from files."""
     from intercap_core.formats.detections.onnx_pose import PoseModel
 
     wanted = _unknown(images, [d.keypoints_found for d in found])
@@ -229,20 +237,22 @@ def _find_people(
         return
     model = PoseModel.load(settings)
     damaged = [0] * len(images)
-    values = [Values(camera.size, settings.keypoint_full_confidence) for camera in images]
+    cleaners = [
+        KeypointCleaner(camera.size, settings.keypoint_full_confidence) for camera in images
+    ]
     progress = Progress(log, "found people in", len(wanted), "images")
     for (t, c), picture in _pictures(frames, wanted, damaged):
-        found[c].people[t] = values[c].clean(model.find(picture, found[c].instances[t]))
+        found[c].people[t] = cleaners[c].clean(model.find(picture, found[c].instances[t]))
         found[c].keypoints_found[t] = True
         progress.step()
-    for detections, count, counted in zip(found, damaged, values, strict=True):
-        detections.notes += counted.notes()
+    for detections, count, cleaner in zip(found, damaged, cleaners, strict=True):
+        detections.notes += cleaner.notes()
         if count:
             detections.notes.append(f"{count} damaged images not looked at for keypoints")
 
 
 def _unknown(images: list[CameraImages], known: list[np.ndarray]) -> list[Image]:
-    """The images of which nothing is ``known`` (T,), by camera."""
+    """The images that no detector looked at; ``known`` (T,) of each camera."""
     return [
         (t, c)
         for c, (camera, found) in enumerate(zip(images, known, strict=True))
@@ -254,7 +264,7 @@ def _unknown(images: list[CameraImages], known: list[np.ndarray]) -> list[Image]
 def _pictures(
     frames: Path, wanted: list[Image], damaged: list[int]
 ) -> Iterator[tuple[Image, np.ndarray]]:
-    """The wanted images (H, W, 3); ``damaged`` counts for each camera those that do not decode."""
+    """Yield the wanted images (H, W, 3); count those that do not decode in ``damaged`` (C,)."""
     from intercap_core.formats.recordings.frames import Frames
 
     with Frames.open(frames) as recording:

@@ -1,7 +1,7 @@
 """Stage ``frames``: recordings to synchronised frame sets.
 
-Colour packets are copied as recorded, depth is kept without loss; nothing is decoded. Memory does
-not grow with the length of the recordings, apart from 8 bytes an image for its time.
+Colour packets are copied as recorded and depth is lossless. Memory does not grow with the length of
+the recordings, except by 8 bytes for the time of each image.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.schemas import FRAMES
 
-MIN_DRIFT_US = 1000.0  # less than the exposure of one image
-# By how much a camera's images are usually off from where they are beside their sets on the whole:
-# less is a device's unsteady clock, more moves a walking person by some millimetres.
+MIN_DRIFT_US = 1000.0  # less than the exposure time of an image
+# Median deviation of a camera's skews from their median, beyond which it is noted. Smaller ones are
+# jitter of the clock; in 2 ms a walking person moves by some millimetres.
 MIN_UNEVEN_US = 2000.0
-OTHER_RATE = 1.5  # times as many images a second: half way to double
+OTHER_RATE = 1.5  # ratio of frame rates: half way between equal and double
 
 
 def run(
@@ -50,12 +50,10 @@ def run(
 ) -> None:
     """Write the frames artefact of one sequence.
 
-    Reads the sequence's recordings in the layout that its row names. A camera without a usable
-    recording or without a pose, or that the settings leave out, is kept with ``present`` = False
-    and a note; what else is degraded is noted too. The frame of the poses stays that of the
-    calibration's master, also where the master's own recording is missing. Sets listed in
-    ``frames_to_drop`` get no image. Raises UserError where no camera can be used, for an unreadable
-    calibration, and where a set to drop or a camera to use is not there.
+    A camera without a usable recording or a pose, or that the settings exclude, is kept with
+    ``present`` = False and a note. Poses are in the frame of the calibration's master, even if its
+    recording is missing. Sets in ``frames_to_drop`` get no image. Raises UserError if no camera can
+    be used, if the calibration is unreadable, and if a set to drop or a camera to use is missing.
     """
     layout = open_layout(sequence)
     extrinsics = layout.extrinsics
@@ -74,9 +72,9 @@ def run(
         master = names.index(extrinsics.master)
         _straighten_clocks(views, master)
         clock = _clock_of(views, master)
-        _set_aside_other_clocks(views, clock)
+        _exclude_other_clocks(views, clock)
         table, depth_index = _frame_sets(views, clock, settings)
-        _note_shortcomings(views, table, clock)
+        _note_defects(views, table, clock)
         dropped = _dropped(len(table.times_us), frames_to_drop, sequence)
         colour_index, depth_index = (
             np.where(dropped[:, None], -1, index) for index in (table.index, depth_index)
@@ -108,31 +106,32 @@ def run(
 
 
 def _stated_world(sequence: SequenceEntry, extrinsics: Extrinsics) -> dict[str, np.ndarray]:
-    """What the sequence's row states of the calibration's world: (3,) each, master's frame."""
+    """Up direction and floor point (3,) that the sequence's row states, master's frame."""
     axis = sequence.calibration_up
     if axis is None:
         return {}
     up = np.array([float(axis[-1] == name) for name in "xyz"]) * (-1 if axis[0] == "-" else 1)
-    turn, shift = extrinsics.master_from_world[:3, :3], extrinsics.master_from_world[:3, 3]
-    stated = {"stated_up": turn @ up}
+    rotation = extrinsics.master_from_world[:3, :3]
+    translation = extrinsics.master_from_world[:3, 3]
+    stated = {"stated_up": rotation @ up}
     if sequence.calibration_floor is not None:
-        stated["stated_floor"] = turn @ (sequence.calibration_floor * up) + shift
+        stated["stated_floor"] = rotation @ (sequence.calibration_floor * up) + translation
     return stated
 
 
 def _used(names: Sequence[str], settings: FramesSettings, sequence: SequenceEntry) -> set[str]:
-    """The cameras that the settings do not leave out."""
-    strange = [name for name in settings.cameras if name not in names]
-    if strange:
+    """The cameras that the settings include."""
+    unknown = [name for name in settings.cameras if name not in names]
+    if unknown:
         raise UserError(
-            f"settings: frames.cameras names {strange[0]!r}, the cameras of sequence "
+            f"settings: frames.cameras names {unknown[0]!r}, the cameras of sequence "
             f"{sequence.sequence!r} are {', '.join(names)}; correct the settings"
         )
     return set(settings.cameras or names)
 
 
 def _note_same_devices(views: list[ExtractedCamera]) -> None:
-    """Say where two recordings are of one device; set the second aside where they are one."""
+    """Note recordings of one device; of two with the same images, exclude the second."""
     for first, second in combinations([view for view in views if view.present], 2):
         if first.source is None or second.source is None or first.serial != second.serial:
             continue
@@ -164,34 +163,34 @@ def _require_usable(views: list[ExtractedCamera], sequence: SequenceEntry) -> No
 
 
 def _straighten_clocks(views: list[ExtractedCamera], master: int) -> None:
-    """Where a device's clock was reset, keep the stretch of its images in the others' time."""
+    """If a device's clock was reset, keep the epoch of its images in the others' time."""
     present = [view for view in views if view.present]
-    stretches = {view.name: split_into_epochs(view.colour_times) for view in present}
-    straight = [view for view in present if stretches[view.name].max() == 0]
+    epochs = {view.name: split_into_epochs(view.colour_times) for view in present}
+    straight = [view for view in present if epochs[view.name].max() == 0]
     if not straight:
         first = views[master] if views[master].present else present[0]
-        _keep_one_stretch(first, stretches[first.name], np.zeros(0))
+        _keep_one_epoch(first, epochs[first.name], np.zeros(0))
         straight = [first]
         present.remove(first)
     reference = np.concatenate([view.usable_times for view in straight])
     for view in present:
-        _keep_one_stretch(view, stretches[view.name], reference)
+        _keep_one_epoch(view, epochs[view.name], reference)
 
 
-def _keep_one_stretch(view: ExtractedCamera, stretch: np.ndarray, reference_us: np.ndarray) -> None:
+def _keep_one_epoch(view: ExtractedCamera, epoch: np.ndarray, reference_us: np.ndarray) -> None:
     period_us = 1e6 / view.fps
-    kept = choose_epoch(view.colour_times, stretch, np.sort(reference_us), period_us)
-    resets = int(stretch.max())
-    wrong = int((stretch == OUTLIER).sum())
+    kept = choose_epoch(view.colour_times, epoch, np.sort(reference_us), period_us)
+    resets = int(epoch.max())
+    wrong = int((epoch == OUTLIER).sum())
     if wrong:
         view.notes.append(f"{wrong} images with device times out of order left out")
     if resets:
-        others = int(((stretch != kept) & (stretch != OUTLIER)).sum())
+        others = int(((epoch != kept) & (epoch != OUTLIER)).sum())
         view.notes.append(
             f"its device times jump back {resets} times: {others} images outside the stretch of "
-            f"{int((stretch == kept).sum())} in the other cameras' time left out"
+            f"{int((epoch == kept).sum())} in the other cameras' time left out"
         )
-    view.colour_usable &= stretch == kept
+    view.colour_usable &= epoch == kept
     if not len(view.depth_times):
         return
     depth = split_into_epochs(view.depth_times)
@@ -208,20 +207,20 @@ def _overlap(view: ExtractedCamera, other: ExtractedCamera) -> bool:
 
 
 def _clock_of(views: list[ExtractedCamera], master: int) -> int:
-    """The camera whose images define the sets: the one with which the most overlap in time.
+    """The camera whose images define the sets: that which overlaps most others in time.
 
-    Of equals the master, or the first that is there.
+    Of equal ones it is the master, or the first that is present.
     """
     present = [index for index, view in enumerate(views) if view.present]
-    company = {i: sum(_overlap(views[i], views[other]) for other in present) for i in present}
-    clock = max(present, key=lambda index: (company[index], index == master))
+    overlaps = {i: sum(_overlap(views[i], views[other]) for other in present) for i in present}
+    clock = max(present, key=lambda index: (overlaps[index], index == master))
     if clock != master:
         views[master].notes.append(f"frame sets follow {views[clock].name}")
     return clock
 
 
-def _set_aside_other_clocks(views: list[ExtractedCamera], clock: int) -> None:
-    """A device that ran without the sync cable counts from its own start: of no use here."""
+def _exclude_other_clocks(views: list[ExtractedCamera], clock: int) -> None:
+    """Exclude devices without the sync cable, whose clocks count from their own start."""
     for view in [view for view in views if view.present]:
         if _overlap(views[clock], view):
             continue
@@ -239,7 +238,7 @@ def _set_aside_other_clocks(views: list[ExtractedCamera], clock: int) -> None:
 def _frame_sets(
     views: list[ExtractedCamera], clock: int, settings: FramesSettings
 ) -> tuple[SetTable, np.ndarray]:
-    """Return the table of colour images and the index (T, C) of the depth images beside them."""
+    """Return the table of colour images and the index (T, C) of the depth images."""
     max_skew_us = settings.max_skew_ms * 1000
     period_us = 1e6 / views[clock].fps
     if max_skew_us >= period_us / 2:
@@ -263,7 +262,7 @@ def _frame_sets(
     return table, depth_index
 
 
-def _note_shortcomings(views: list[ExtractedCamera], table: SetTable, clock: int) -> None:
+def _note_defects(views: list[ExtractedCamera], table: SetTable, clock: int) -> None:
     period_us = 1e6 / views[clock].fps
     sets_per_s = frame_rate(table.times_us) or views[clock].fps
     gaps = table.gaps(period_us)
@@ -302,23 +301,23 @@ def _note_shortcomings(views: list[ExtractedCamera], table: SetTable, clock: int
         uneven = float(np.median(np.abs(off - np.median(off))))
         if uneven > MIN_UNEVEN_US:
             view.notes.append(
-                f"its images are unevenly beside their sets, usually {uneven / 1e3:.1f} ms off: "
-                "fits take all of them to be as late as they are on the whole"
+                f"the skew of its images varies by {uneven / 1e3:.1f} ms (median): fits use one "
+                "time offset for all of them"
             )
         holes = int(seen[-1] - seen[0] + 1 - len(seen))
         early = len(table.times_us) - 1 - int(seen[-1])
         if holes:
             view.notes.append(f"no image in {holes} frame sets between its first and last")
-        alike = max(1.0, 1 / ratio)  # sets before the first image, or after the last, at its rate
-        if seen[0] >= alike:
+        tolerated = max(1.0, 1 / ratio)  # sets before the first image, or after the last one
+        if seen[0] >= tolerated:
             view.notes.append(f"begins {seen[0]} frame sets late")
-        if early >= alike:
+        if early >= tolerated:
             view.truncated = True
             view.notes.append(f"ends {early} frame sets early")
 
 
 def _other_rate(own: float, sets: float, unmatched: int) -> str:
-    """What is to be said of a camera with ``own`` images a second, which the sets do not have."""
+    """Note for a camera with ``own`` images a second, if that is not the rate of the sets."""
     text = f"it has {own:.3g} images a second beside {sets:.3g} frame sets"
     if own > sets:
         return (
@@ -348,10 +347,10 @@ def _dropped(count: int, frames_to_drop: Sequence[int], sequence: SequenceEntry)
 def _camera_or_placeholder(
     view: ExtractedCamera, views: list[ExtractedCamera], extrinsics: Extrinsics
 ) -> Camera:
-    """The camera, or for one that is absent a stand-in without depth that keeps the C axis whole.
+    """The camera, or for an absent one a placeholder without depth that keeps its place in C.
 
-    The stand-in has the image size of a camera that is there and a plain lens; ``present`` says
-    that nothing of it may be used but its pose.
+    The placeholder has the image size of a present camera and a lens without distortion. Only its
+    pose may be used.
     """
     if view.present and view.camera is not None:
         return view.camera

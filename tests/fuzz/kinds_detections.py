@@ -12,12 +12,12 @@ import numpy as np
 
 from intercap_core.config import DetectionsSettings
 from intercap_core.formats.detections import candidate_files, keypoint_files
-from intercap_core.formats.detections.candidate_files import look_at_candidates
+from intercap_core.formats.detections.candidate_files import preview_candidates
 from intercap_core.formats.detections.class_names import COCO_NAMES, read_label_map
 from intercap_core.formats.detections.image_numbers import CameraImages
 from intercap_core.formats.detections.instance import Instance
-from intercap_core.formats.detections.keypoint_files import look_at_keypoints
-from intercap_core.formats.detections.keypoint_layouts import WHOLE_BODY
+from intercap_core.formats.detections.keypoint_files import preview_keypoints
+from intercap_core.formats.detections.keypoints.coco import WHOLE_BODY
 from intercap_core.formats.detections.onnx_pose import PoseModel
 from intercap_core.formats.detections.onnx_segmentation import Segmenter
 from intercap_core.geometry.camera import masks
@@ -51,7 +51,7 @@ def _read_candidates(folder: Path) -> list[str]:
     )
     for instances in found.by_image.values():
         check_instances(instances)
-    look = look_at_candidates(folder, "k1", size=SIZE, names=COCO_NAMES)
+    look = preview_candidates(folder, "k1", size=SIZE, names=COCO_NAMES)
     for label in look.labels:
         label.encode()
     notes = [*found.notes, *look.notes]
@@ -64,7 +64,7 @@ def _read_keypoints(folder: Path) -> list[str]:
         finite(people=people)
         within(0, 1, confidence=people[..., 2])
         within(-1, max(SIZE), place=people[..., :2])
-    notes = [*found.notes, *look_at_keypoints(folder, "k1", size=SIZE, full_confidence=1.0)]
+    notes = [*found.notes, *preview_keypoints(folder, "k1", size=SIZE, full_confidence=1.0)]
     return [f"camera k1: {note}" for note in notes]
 
 

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from onnx import TensorProto
 
-from intercap_core.formats.detections.keypoint_layouts import WHOLE_BODY
+from intercap_core.formats.detections.keypoints.coco import WHOLE_BODY
 from tests.helpers.tiny_onnx import Graph
 
 MEAN = np.array([123.675, 116.28, 103.53])

@@ -1,4 +1,4 @@
-"""Names of classes by number: COCO's numberings, and lists of classes in parsed files."""
+"""Names of classes by number: COCO's numberings and files of class names."""
 
 from __future__ import annotations
 
@@ -13,10 +13,8 @@ from intercap_core.inputs.documents import parse_json, parse_yaml
 from intercap_core.inputs.files import quoted, read_text
 
 MAX_LABEL = 200  # characters; the artefact stores all labels at the length of the longest
-MAX_LABELS_BYTES = (
-    1 << 26
-)  # a list of classes has some kB; annotations of a data set are not needed
-# COCO's 80 classes, and their published ids, which have gaps.
+MAX_LABELS_BYTES = 1 << 26  # a list of classes has some kB; the annotations are not needed
+# COCO's 80 classes. Their published ids, from 1 to 90, have gaps.
 _CLASSES = (
     "person", "bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck", "boat",
     "traffic light", "fire hydrant", "stop sign", "parking meter", "bench", "bird", "cat", "dog",
@@ -38,10 +36,7 @@ COCO_NAMES_FROM_1: dict[int, str] = dict(enumerate(_CLASSES, start=1))
 
 
 def names_of(content: Any) -> dict[int, str]:
-    """Class names by number of parsed JSON or YAML.
-
-    Raises ValueError, in words that fit after a file's name.
-    """
+    """Class names by number of parsed JSON or YAML; raises ValueError if there are none."""
     if isinstance(content, dict):
         for key in ("categories", "names"):
             if isinstance(content.get(key), list | dict):
@@ -71,7 +66,7 @@ def _unique(pairs: Sequence[tuple[Any, Any]]) -> dict[int, str]:
 
 
 def label_text(name: str) -> str:
-    """The name as it is; raises ValueError where it is no text or longer than ``MAX_LABEL``."""
+    """Return the name; raises ValueError if it is no valid text or longer than ``MAX_LABEL``."""
     try:
         name.encode("utf-8")
     except UnicodeEncodeError:

@@ -1,10 +1,10 @@
-"""Instance segmentations as JSON: COCO's result format and what other detectors make of it.
+"""Instance segmentations as JSON: COCO's result format and the variants that detectors write.
 
 A file is a list of results or a data set (``images``, ``annotations``, ``categories``). A result
-says which image it belongs to (``image_id``, a number or a name, or ``file_name``) unless the file
-holds one image alone, its class by number or by name, a score, and a segmentation in any form that
-:func:`intercap_core.formats.detections.instance.to_rle` knows. Keys are those of detectron2,
-torchvision users, ultralytics, Segment Anything and Grounded SAM.
+states its image (``image_id``, a number or a name, or ``file_name``) unless the file holds one
+image, its class by number or by name, a score, and a segmentation in any form that
+:func:`intercap_core.formats.detections.instance.to_rle` reads. Keys are those of detectron2,
+torchvision, ultralytics, Segment Anything and Grounded SAM.
 """
 
 from __future__ import annotations
@@ -26,17 +26,14 @@ HEAD_BYTES = 1 << 18  # of a long file, parsed for a preview
 # Scores are probabilities. The overlaps that Segment Anything predicts slightly exceed 1.
 MIN_SCORE, MAX_SCORE = -0.01, 1.2
 _LARGEST_ID = 2**31 - 1
-_NAME_KEYS = ("category_name", "category", "class_name", "class", "label", "name")
-_NUMBER_KEYS = ("category_id", "class", "class_id", "label")
-_SCORE_KEYS = ("score", "confidence", "predicted_iou")
 
 
-class UnreadableCandidates(Exception):
-    """The file as a whole is of no use; says why, in words that fit after its name."""
+class UnreadableDetections(Exception):
+    """A file of detections cannot be used; the message follows the file's name."""
 
 
 class ImageKey(NamedTuple):
-    """How a file calls an image: by number, by name, or both."""
+    """How a file refers to an image: by number, by name, or by both."""
 
     number: int | None
     name: str | None
@@ -44,56 +41,71 @@ class ImageKey(NamedTuple):
 
 @dataclass
 class CandidateFile:
-    """The results of one file.
-
-    ``results`` are pairs of image and instance in the file's order. ``images`` are the images that
-    the file speaks about, or None where it does not say: then an image without results has none.
-    ``faults`` say which entries are left out and why, ``faulty`` their images; ``entries`` counts
-    all that have at least the wanted score. ``scaled`` counts masks of another resolution.
-    """
+    """The results of one file."""
 
     results: list[tuple[ImageKey, Instance]] = field(default_factory=list)
+    """Image and instance of each result, in the file's order."""
     images: list[ImageKey] | None = None
+    """Images that the file lists. None = it lists none; then an image without results has none."""
     faults: list[str] = field(default_factory=list)
+    """Entries that are left out, with the reason."""
     faulty: list[ImageKey] = field(default_factory=list)
+    """Images of these entries."""
     entries: int = 0
+    """Number of entries with at least the least score."""
     scaled: int = 0
+    """Number of masks of another resolution than the images."""
 
 
 @dataclass(frozen=True)
-class _Stated:
-    """What a file says about all of its entries."""
+class CandidateForm:
+    """Facts that are needed to read candidates of one camera."""
 
-    names: Mapping[int, str]  # of classes, by number
-    files: Mapping[int, str]  # of images, by id
-    sizes: Mapping[int, tuple[int, int]]  # of images, by id
-    size: tuple[int, int] | None  # of all images
-    corners: bool  # boxes are x, y of two corners
+    size: tuple[int, int]
+    """Width and height of its images."""
+    names: Mapping[int, str]
+    """Classes by number, for files that do not list them."""
+    min_score: float
+    """Results with a lower score are left out."""
 
 
-def candidates_of(
-    content: Any,
-    *,
-    width: int,
-    height: int,
-    min_score: float,
-    names: Mapping[int, str],
-    one_image: bool = False,
+@dataclass(frozen=True)
+class _FileHead:
+    """What a data set states about all of its entries."""
+
+    names: Mapping[int, str]
+    """Classes by number."""
+    files: Mapping[int, str]
+    """Names of images by id."""
+    sizes: Mapping[int, tuple[int, int]]
+    """Sizes of images by id."""
+    size: tuple[int, int] | None
+    """Size of all images."""
+    corners: bool
+    """Boxes are x, y of two corners."""
+
+
+def parse_candidates(
+    content: Any, form: CandidateForm, *, one_image: bool = False
 ) -> CandidateFile:
-    """The results in parsed JSON (:func:`read_json`), in order: images of ``width`` x ``height``.
+    """The results in parsed JSON (:func:`read_json`), in order.
 
-    ``names`` are the classes by number, where the file does not list them. ``one_image``: entries
-    need not say their image. Results under ``min_score`` are left out; so are those that cannot be
-    used, which the result tells. Raises :class:`UnreadableCandidates` where nothing can be used.
+    Results that cannot be used are left out and reported as faults. Raises
+    :class:`UnreadableDetections` if nothing can be used.
+
+    Args:
+        content: the parsed JSON.
+        form: images, classes and the least score.
+        one_image: entries need not state their image.
     """
     entries = content
     images: list[ImageKey] | None = None
-    stated = _Stated(names, {}, {}, None, False)
+    head = _FileHead(form.names, {}, {}, None, False)
     if isinstance(content, dict):
         entries = content.get("annotations")
-        stated, images = _stated(content, names)
+        head, images = _read_file_head(content, form.names)
     if not isinstance(entries, list):
-        raise UnreadableCandidates(
+        raise UnreadableDetections(
             f"holds {quoted(content)}, expected a list of results, or 'annotations' with one"
         )
     found = CandidateFile(images=images)
@@ -102,16 +114,15 @@ def candidates_of(
         try:
             if not isinstance(entry, dict):
                 raise ValueError(f"expected a result, found {quoted(entry)}")
-            image = image_of(entry, stated.files, one_image)
+            image = image_of(entry, head.files, one_image)
             score = _score(entry)
-            if score < min_score:
+            if score < form.min_score:
                 continue
-            instance, scaled = _instance(entry, score, image, stated, (width, height))
+            instance, scaled = _instance(entry, score, image, head, form.size)
         except ValueError as error:
-            told = image.name if image.name is not None else image.number
-            found.faults.append(
-                f"entry {index}{f' (image {told})' if told is not None else ''}: {error}"
-            )
+            name = image.name if image.name is not None else image.number
+            where = f"entry {index}{f' (image {name})' if name is not None else ''}"
+            found.faults.append(f"{where}: {error}")
             found.faulty.append(image)
         else:
             found.results.append((image, instance))
@@ -123,8 +134,8 @@ def candidates_of(
 def read_head(path: Path) -> Any:
     """Parse a small file, or the first results of a long list of them.
 
-    A look before a run: None where a large file does not begin with results. Raises
-    :class:`UnreadableCandidates` as :func:`read_json` does.
+    Returns None if a large file does not begin with results. Raises :class:`UnreadableDetections`
+    as :func:`read_json` does.
     """
     content = _bytes(path, HEAD_BYTES)
     if len(content) < HEAD_BYTES:
@@ -145,12 +156,12 @@ def read_head(path: Path) -> Any:
 
 
 def read_json(path: Path) -> Any:
-    """Parse a file; raises :class:`UnreadableCandidates` where it is no JSON or too large."""
+    """Parse a file; raises :class:`UnreadableDetections` if it is no JSON or too large."""
     content = _bytes(path)
     try:
         return parse_json(content.decode("utf-8-sig"))
     except ValueError as error:
-        raise UnreadableCandidates(f"is not valid JSON ({error}); write it again") from None
+        raise UnreadableDetections(f"is not valid JSON ({error}); write it again") from None
 
 
 def _bytes(path: Path, head: int | None = None) -> bytes:
@@ -158,55 +169,55 @@ def _bytes(path: Path, head: int | None = None) -> bytes:
         return read_bytes(path, MAX_JSON_BYTES, head=head)
     except Unreadable as error:
         smaller = "; write masks as compressed RLE, or one file an image"
-        large = " MB, at most" in error.reason
-        raise UnreadableCandidates(error.reason + (smaller if large else "")) from None
+        is_large = " MB, at most" in error.reason
+        raise UnreadableDetections(error.reason + (smaller if is_large else "")) from None
 
 
-def _stated(
+def _read_file_head(
     content: dict[str, Any], names: Mapping[int, str]
-) -> tuple[_Stated, list[ImageKey] | None]:
+) -> tuple[_FileHead, list[ImageKey] | None]:
     own: dict[int, str] = {}
     if content.get("categories"):
         try:
             own = names_of(content["categories"])
         except ValueError as error:
-            raise UnreadableCandidates(
+            raise UnreadableDetections(
                 f"'categories' must list objects with id and name ({error})"
             ) from None
     size = _size(content.get("img_width"), content.get("img_height"))
     corners = content.get("box_format") == "xyxy"
     listed = listed_images(content)
     if listed is None:
-        return _Stated({**names, **own}, {}, {}, size, corners), None
+        return _FileHead({**names, **own}, {}, {}, size, corners), None
     sizes = {
         value["id"]: own_size
         for value in content["images"]
         if (own_size := _size(value.get("width"), value.get("height"))) is not None
     }
-    return _Stated({**names, **own}, files_of(listed), sizes, size, corners), listed
+    return _FileHead({**names, **own}, files_of(listed), sizes, size, corners), listed
 
 
 def listed_images(content: dict[str, Any]) -> list[ImageKey] | None:
-    """The images that a data set lists, None = it lists none.
+    """The images that a data set lists; None if it lists none.
 
-    Raises :class:`UnreadableCandidates` where they are no objects with an id.
+    Raises :class:`UnreadableDetections` if they are not objects with an id.
     """
     if "images" not in content:
         return None
     values, images = content["images"], []
     if not isinstance(values, list):
-        raise UnreadableCandidates("'images' must be a list of objects with id")
+        raise UnreadableDetections("'images' must be a list of objects with id")
     for value in values:
         number = value.get("id") if isinstance(value, dict) else None
         if type(number) is not int or not 0 <= number <= _LARGEST_ID:
-            raise UnreadableCandidates(f"'images' must list objects with id, found {quoted(value)}")
+            raise UnreadableDetections(f"'images' must list objects with id, found {quoted(value)}")
         name = value.get("file_name")
         images.append(ImageKey(number, name if isinstance(name, str) else None))
     return images
 
 
 def files_of(images: list[ImageKey]) -> dict[int, str]:
-    """Names of images by id, where they have one."""
+    """Names of images by id, for those that have one."""
     return {i.number: i.name for i in images if i.number is not None and i.name is not None}
 
 
@@ -217,9 +228,14 @@ def _size(width: Any, height: Any) -> tuple[int, int] | None:
 
 
 def image_of(entry: dict[str, Any], files: Mapping[int, str], one_image: bool) -> ImageKey:
-    """What an entry calls its image; ``files`` are the names of images by id.
+    """The image of an entry.
 
-    ``one_image``: it need not. Raises ValueError where it must and does not.
+    Raises ValueError if the entry must state its image and does not.
+
+    Args:
+        entry: the entry.
+        files: names of images by id.
+        one_image: the entry need not state its image.
     """
     value, name = entry.get("image_id"), entry.get("file_name", entry.get("image_path"))
     if isinstance(value, str):
@@ -237,10 +253,11 @@ def image_of(entry: dict[str, Any], files: Mapping[int, str], one_image: bool) -
 
 
 def _instance(
-    entry: dict[str, Any], score: float, image: ImageKey, stated: _Stated, size: tuple[int, int]
+    entry: dict[str, Any], score: float, image: ImageKey, head: _FileHead, size: tuple[int, int]
 ) -> tuple[Instance, bool]:
-    label = _label(entry, stated.names)
-    own_size = stated.sizes.get(-1 if image.number is None else image.number, stated.size)
+    """The instance of an entry, and whether its mask was scaled."""
+    label = _label(entry, head.names)
+    own_size = head.sizes.get(-1 if image.number is None else image.number, head.size)
     segmentation = entry.get("segmentation", entry.get("segments"))
     rle, (x_scale, y_scale) = to_rle(segmentation, size, own_size)
     scaled = (x_scale, y_scale) != (1.0, 1.0)
@@ -248,7 +265,7 @@ def _instance(
     if box is None or scaled:
         box = masks.Runs(rle, size[1], size[0]).box
         return Instance(label, score, (*map(float, box),), rle), scaled  # type: ignore[arg-type]
-    corners = stated.corners
+    corners = head.corners
     if isinstance(box, dict):
         box, corners = [box.get(key) for key in ("x1", "y1", "x2", "y2")], True
     try:
@@ -259,21 +276,19 @@ def _instance(
         raise ValueError(f"bbox is {quoted(box)}, expected finite numbers")
     if corners:
         w, h = w - x, h - y
-    if not (w >= 0 and h >= 0 and _near(x, x + w, size[0]) and _near(y, y + h, size[1])):
+    # A box may exceed the image by the image's size.
+    near = x >= -size[0] and x + w <= 2 * size[0] and y >= -size[1] and y + h <= 2 * size[1]
+    if not (w >= 0 and h >= 0 and near):
         raise ValueError(
             f"bbox is {quoted(box)}, expected pixels of the image of {size[0]}x{size[1]}"
         )
-    masks.Runs(rle, size[1], size[0])  # raises where the string is no mask of the image
+    masks.Runs(rle, size[1], size[0])  # raises ValueError if the string is no mask of the image
     return Instance(label, score, (x, y, w, h), rle), scaled
 
 
-def _near(low: float, high: float, side: int) -> bool:
-    """Whether an extent lies within a side of the image, or as much beyond it."""
-    return low >= -side and high <= 2 * side
-
-
 def _score(entry: dict[str, Any]) -> float:
-    value = next((entry[key] for key in _SCORE_KEYS if key in entry), 1.0)
+    keys = ("score", "confidence", "predicted_iou")
+    value = next((entry[key] for key in keys if key in entry), 1.0)
     if isinstance(value, list) and len(value) == 1:
         value = value[0]
     try:
@@ -286,11 +301,11 @@ def _score(entry: dict[str, Any]) -> float:
 
 
 def _label(entry: dict[str, Any], names: Mapping[int, str]) -> str:
-    """The class's name; "" where the detector knows no classes."""
-    for key in _NAME_KEYS:
+    """The class's name; "" if the detector knows no classes."""
+    for key in ("category_name", "category", "class_name", "class", "label", "name"):
         if isinstance(entry.get(key), str):
             return label_text(entry[key])
-    present = [key for key in _NUMBER_KEYS if key in entry]
+    present = [key for key in ("category_id", "class", "class_id", "label") if key in entry]
     if not present:
         return ""
     for key in present:

@@ -1,41 +1,48 @@
-"""What detectors' files call the colour images that a frames artefact holds."""
+"""Which colour image of a camera a file, or an entry of a file, is about."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
+from typing import TypeVar
 
 import numpy as np
 
 from intercap_core import artefacts
 from intercap_core.config import SequenceEntry
 from intercap_core.errors import UserError
+from intercap_core.formats.detections.coco import ImageKey
 from intercap_core.formats.recordings.image_files import FilesRecording
 from intercap_core.formats.recordings.intercap import numbers_of
 from intercap_core.formats.recordings.plain import PlainLayout
+from intercap_core.inputs.files import printable
 
+Result = TypeVar("Result")
+
+FILES_NAMED = 3  # broken files or entries that a note names; the others are only counted
 _SUFFIX = re.compile(r"\.(jpe?g|png|bmp|tiff?|webp|json)$", re.IGNORECASE)
-_LAST_NUMBER = re.compile(r"(?:.*\D)?(\d{1,9})")
+_LAST_NUMBER = re.compile(r"(?:.*\D)?0*(\d{1,9})")
 
 
 @dataclass(frozen=True)
 class CameraImages:
-    """The colour images that the T frame sets hold of one camera.
-
-    ``number`` (T,) is what files of keypoints and candidates call the image, -1 = no image;
-    ``time_us`` (T,) its device time. ``recorded`` are the numbers of all its images, also of those
-    in no set. ``stems`` are the names of its image files without suffix, in the order that
-    ``number`` counts, where files may be named after them.
-    """
+    """The colour images of one camera, by frame set."""
 
     name: str
+    """Name of the camera."""
     size: tuple[int, int]
+    """Width and height."""
     number: np.ndarray
+    """(T,) number by which files call the image of each set; -1 = no image."""
     time_us: np.ndarray
+    """(T,) device time of the image."""
     recorded: frozenset[int] = frozenset()
+    """Numbers of all images of the camera, including those in no set."""
     stems: tuple[str, ...] = ()
+    """Names of the image files without suffix, in the order of their numbers; () if files cannot
+    be named after images."""
 
     @property
     def sets(self) -> list[int]:
@@ -43,10 +50,11 @@ class CameraImages:
         return np.flatnonzero(self.number >= 0).tolist()
 
     def numbers_of_names(self, names: Iterable[str]) -> dict[str, int]:
-        """The images that file names mean, as far as they mean any.
+        """Numbers of the images that names of files refer to; other names are left out.
 
-        Where any is named after an image file, that counts. Else the number at a name's end does
-        (``frame_0012.jpg`` is image 12), as long as no two names end in the same.
+        If any name is that of an image file, only such names count. Otherwise the number at the
+        end of a name counts (``frame_0012.jpg`` is image 12), provided that no two names end in the
+        same number.
         """
         stems = {name: stem_of(name) for name in sorted(set(names))}
         places = {stem: place for place, stem in enumerate(self.stems)}
@@ -59,14 +67,24 @@ class CameraImages:
 
 
 def stem_of(name: str) -> str:
-    """A file's name without folders (of either system) and without an image's suffix."""
+    """A file's name without folders (of any system) and without the suffix of an image."""
     return _SUFFIX.sub("", PurePosixPath(name.replace("\\", "/")).name)
+
+
+def repeated_number(names: Iterable[str]) -> list[str]:
+    """Names that end in the same number; [] if there are no two such names."""
+    by_number: dict[int, list[str]] = {}
+    for name in names:
+        match = _LAST_NUMBER.fullmatch(stem_of(name))
+        if match:
+            by_number.setdefault(int(match.group(1)), []).append(name)
+    return next((found for found in by_number.values() if len(found) > 1), [])
 
 
 def camera_images(source: artefacts.Artefact, sequence: SequenceEntry) -> list[CameraImages]:
     """The images of every camera of an open frames artefact, in its order of cameras.
 
-    Raises UserError where a plain recording's files no longer are those of the artefact.
+    Raises UserError if the files of a plain recording are no longer those of the artefact.
     """
     indices = np.where(source["dropped"][:, None], -1, source["colour_index"])
     plain = PlainLayout(sequence) if sequence.layout == "plain" else None
@@ -92,7 +110,7 @@ def camera_images(source: artefacts.Artefact, sequence: SequenceEntry) -> list[C
 
 
 def _count(source: artefacts.Artefact, name: str, index: np.ndarray) -> int:
-    """How many colour images of a camera the artefact holds."""
+    """Number of colour images of a camera in the artefact."""
     key = f"cameras/{name}/colour_offsets"
     if key in source:
         return len(source[key]) - 1
@@ -102,25 +120,107 @@ def _count(source: artefacts.Artefact, name: str, index: np.ndarray) -> int:
 def _plain_numbers(
     layout: PlainLayout, name: str, index: np.ndarray, times_us: np.ndarray
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Places (T,) among all image files of a camera, -1 = no image, and the files' stems.
+    """Positions (T,) among all image files of a camera, -1 = no image, and the files' stems.
 
-    ``index`` counts only the images that could be copied, so that a damaged file would move all
-    keypoints after it to another image. Of a video it is the place.
+    ``index`` counts only the images that could be copied: a damaged file would otherwise move the
+    keypoints of all later images. For a video, the position is ``index``.
     """
     with layout.open(name) as recording:
         if not isinstance(recording, FilesRecording):
             return index, ()
         files = recording.colour_files
     places = {time_us: place for place, (time_us, _) in reversed(list(enumerate(files)))}
-    held = times_us[index >= 0].tolist()
-    lost = [time_us for time_us in held if time_us not in places]
-    if lost:
+    used_times = times_us[index >= 0].tolist()
+    missing = [time_us for time_us in used_times if time_us not in places]
+    if missing:
         raise UserError(
             f"sequence {layout.sequence.sequence!r}: none of the {len(files)} images of camera "
-            f"{name} in {recording.source} was taken at {lost[0] / 1e6:.6f} s as the frames "
+            f"{name} in {recording.source} was taken at {missing[0] / 1e6:.6f} s as the frames "
             "artefact says; images, timestamps or calibration have changed, so run the frames "
             "stage again"
         )
     number = np.full(len(index), -1)
-    number[index >= 0] = [places[time_us] for time_us in held]
+    number[index >= 0] = [places[time_us] for time_us in used_times]
     return number, tuple(path.stem for _, path in files)
+
+
+def json_files(folder: Path) -> list[Path]:
+    """The JSON files in a folder; [] without the folder."""
+    paths = folder.iterdir() if folder.is_dir() else ()
+    return sorted(p for p in paths if p.suffix.lower() == ".json" and not p.name.startswith("."))
+
+
+def sort_by_image(
+    results: list[tuple[ImageKey, Result]],
+    listed: list[ImageKey] | None,
+    faulty: list[ImageKey],
+    images: CameraImages,
+    *,
+    useless: bool,
+) -> tuple[dict[int, list[Result]], list[str]]:
+    """Sort a file's results by image number.
+
+    Returns the results by number, and the names of images that were not recorded. An image that
+    the detector looked at has a list, which may be empty.
+
+    Args:
+        results: image and result of each entry.
+        listed: images that the file lists; None = it lists none, so it is about all images.
+        faulty: images of entries that could not be used. They have a list only with results.
+        images: the recorded images.
+        useless: no entry could be used. Then the file says nothing about images it does not list.
+    """
+    keys = [*(key for key, _ in results), *faulty, *(listed or ())]
+    by_name = images.numbers_of_names(key.name for key in keys if key.name is not None)
+    ids = {key.number for key in keys if key.number is not None}
+    if len(images.recorded & ids) > len(images.recorded.intersection(by_name.values())):
+        by_name = {}  # the numbers in the names are something else, such as times
+
+    def number(key: ImageKey) -> int | None:
+        if key.name is not None and (by_name or key.number is None):
+            return by_name.get(key.name)
+        return key.number
+
+    if useless and listed is None:
+        known: set[int] = set()
+    elif listed is None:
+        known = set(images.recorded)
+    else:
+        known = {n for n in map(number, listed) if n is not None}
+    known -= {n for n in map(number, faulty) if n is not None}
+    by_image: dict[int, list[Result]] = {n: [] for n in sorted(known & images.recorded)}
+    absent = []
+    for key, result in results:
+        place = number(key)
+        if place is not None and place in images.recorded:
+            by_image.setdefault(place, []).append(result)
+        else:
+            absent.append(key.name if key.name is not None else str(key.number))
+    return by_image, absent
+
+
+def note_absent(notes: list[str], names: list[str], images: CameraImages, where: str) -> None:
+    """Note results of images that were not recorded."""
+    if not names:
+        return
+    has = f"images {min(images.recorded)} to {max(images.recorded)}" if images.recorded else "none"
+    if images.stems:
+        has += printable(f", {images.stems[0]} to {images.stems[-1]}")
+    off_by_one = {str(max(images.recorded, default=-1) + 1)} == set(names)
+    hint = "; image numbers count from 0" if off_by_one else ""
+    notes.append(
+        f"{len(names)} results in {where} are of images that the recording does not have (first: "
+        f"{printable(names[0][:80])}; it has {has}){hint}"
+    )
+
+
+def short_name(path: Path) -> str:
+    """The file's name with that of its folder, which is a camera or a moment."""
+    return printable(f"{path.parent.name}/{path.name}")
+
+
+def note_broken(notes: list[str], what: str, broken: list[str]) -> None:
+    """Note files that cannot be read, the first ones by name."""
+    if broken:
+        more = f" and {len(broken) - FILES_NAMED} more" if len(broken) > FILES_NAMED else ""
+        notes.append(f"{what} not readable: {', '.join(broken[:FILES_NAMED])}{more}")

@@ -1,7 +1,7 @@
-"""One segmented instance, whichever detector found it, and any way to write its mask.
+"""One segmented instance, and every form in which detectors write its mask.
 
-Masks end as compressed COCO RLE at the size of the colour image. A mask of the same picture at
-another resolution is scaled; one of another shape belongs to another image and is refused.
+Masks become compressed COCO RLE at the size of the colour image. A mask of the same picture at
+another resolution is scaled. A mask of another aspect ratio is refused: it is of another image.
 """
 
 from __future__ import annotations
@@ -16,29 +16,33 @@ from intercap_core.geometry.camera import masks
 from intercap_core.inputs.files import quoted
 
 MAX_PIXELS = 1 << 27  # of a mask that is scaled; a full-frame camera has a fifth of this
-MAX_REDUCTION = 32.0  # largest ratio of an image's side to the mask's side
+MAX_REDUCTION = 32.0  # of the side of an image to that of its mask; networks reduce by 4 to 32
 SAME_SHAPE_PX = 1.0  # rounding error of one side of a reduced image
 MASK_THRESHOLD = 128  # grey level of 8 bits; JPEG blurs the two values of a mask
-PERSON_LABEL = "person"  # what every detector's list of classes calls people
+PERSON_LABEL = "person"  # name of the class of people in COCO and all lists that follow it
 
 
 @dataclass(frozen=True)
 class Instance:
-    """One result: label ("" = unknown), score, box (x, y, width, height, px), compressed RLE."""
+    """One segmented instance."""
 
     label: str
+    """Name of its class; "" = unknown."""
     score: float
+    """From 0 to 1."""
     box: tuple[float, float, float, float]
+    """x, y, width, height, px."""
     rle: bytes
+    """Mask as compressed COCO RLE."""
 
 
 def boxes_of(instances: list[Instance]) -> np.ndarray:
-    """(N, 4) float32."""
+    """Boxes (N, 4) float32: x, y, width, height, px."""
     return np.array([i.box for i in instances], np.float32).reshape(-1, 4)
 
 
 def instance_of(label: str, score: float, mask: np.ndarray) -> Instance | None:
-    """The instance of a mask (H, W) of the colour image's size; None where it is empty."""
+    """The instance of a mask (H, W) of the colour image's size; None if the mask is empty."""
     rle = masks.encode(mask)
     x, y, width, height = masks.Runs(rle, *mask.shape).box
     if not width:
@@ -47,9 +51,9 @@ def instance_of(label: str, score: float, mask: np.ndarray) -> Instance | None:
 
 
 def scale_to(found: tuple[int, int], size: tuple[int, int]) -> tuple[float, float]:
-    """Factors (x, y) from an image of ``found`` (width, height) to one of ``size``.
+    """Factors (x, y) from a mask of size ``found`` (width, height) to an image of ``size``.
 
-    Raises ValueError where one is no reduced copy of the other.
+    Raises ValueError if the mask is no reduced copy of the image.
     """
     if found == size:
         return 1.0, 1.0
@@ -63,7 +67,7 @@ def scale_to(found: tuple[int, int], size: tuple[int, int]) -> tuple[float, floa
 
 
 def resized(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """A mask (h, w) at ``size`` (width, height): (H, W) bool, edges midway between pixels."""
+    """Resize a mask (h, w) to ``size`` (width, height): (H, W) bool."""
     grey = np.where(mask, np.uint8(255), np.uint8(0))
     return cv2.resize(grey, size, interpolation=cv2.INTER_LINEAR) >= MASK_THRESHOLD
 
@@ -71,12 +75,15 @@ def resized(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 def to_rle(
     segmentation: Any, size: tuple[int, int], stated: tuple[int, int] | None = None
 ) -> tuple[bytes, tuple[float, float]]:
-    """Compressed RLE at ``size`` (width, height) of a segmentation in any of the known forms.
+    """Compressed RLE of a segmentation, and the factors (x, y) by which the mask was scaled.
 
-    An RLE with size and counts (compressed, also as bytes written as text; or a list of lengths),
-    polygons, one flat polygon, or lists ``x`` and ``y`` of its corners. ``stated`` is the image's
-    size as the file has it, for forms that do not say their own. Also returns the factors (x, y)
-    by which the mask was scaled. Raises ValueError, in words that fit after the entry's name.
+    Raises ValueError, in words that follow the entry's name.
+
+    Args:
+        segmentation: an RLE with size and counts (compressed, also as the text of Python's bytes;
+            or a list of lengths), polygons, one flat polygon, or lists ``x`` and ``y`` of corners.
+        size: width and height of the result.
+        stated: size of the image according to the file, for forms that do not state their own.
     """
     if isinstance(segmentation, dict) and "counts" in segmentation:
         return _from_rle(segmentation, size)
@@ -117,7 +124,7 @@ def _compressed(counts: Any, height: int, width: int) -> bytes:
     if isinstance(counts, bytes):
         return counts
     if isinstance(counts, str):
-        if counts[:2] in ("b'", 'b"') and counts[-1:] == counts[1]:  # bytes through str()
+        if counts[:2] in ("b'", 'b"') and counts[-1:] == counts[1]:  # str() of bytes
             counts = counts[2:-1].replace("\\\\", "\\")
         try:
             return counts.encode("ascii")
@@ -134,7 +141,7 @@ def _compressed(counts: Any, height: int, width: int) -> bytes:
 
 
 def _polygons(value: Any) -> list[list[Any]] | None:
-    """Polygons as flat lists; None where it is none of their forms."""
+    """Polygons as flat lists; None if the value holds none."""
     if isinstance(value, dict) and isinstance(value.get("x"), list):
         x, y = value["x"], value.get("y")
         if not isinstance(y, list) or len(x) != len(y):

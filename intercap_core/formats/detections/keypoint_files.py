@@ -1,8 +1,8 @@
-"""Which files of a folder of keypoints speak of one camera, and of which of its images.
+"""Files of keypoints of one camera, sorted by image.
 
-``<camera>.json`` (or as mmpose and AlphaPose name it) holds all images; else ``<camera>/`` holds a
-file an image, ``<image>_keypoints.json`` as OpenPose writes it or ``<image>.json``. What a file
-holds says whose it is. What cannot be used is left out and told, and the rest counts.
+A file of the camera (``<camera>.json``) holds all images; otherwise its folder ``<camera>/`` holds
+a file for each image. :mod:`.keypoints` knows the names of the files and reads them. Entries and
+files that cannot be used are noted.
 """
 
 from __future__ import annotations
@@ -10,52 +10,53 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.errors import UserError
-from intercap_core.formats.detections.candidate_files import (
+from intercap_core.formats.detections.coco import UnreadableDetections, read_head, read_json
+from intercap_core.formats.detections.image_numbers import (
     FILES_NAMED,
+    CameraImages,
     note_absent,
     note_broken,
-    short,
-    sorted_by_image,
+    repeated_number,
+    short_name,
+    sort_by_image,
 )
-from intercap_core.formats.detections.coco import UnreadableCandidates, read_head, read_json
-from intercap_core.formats.detections.converters import openpose
-from intercap_core.formats.detections.converters.coco_people import people_of
-from intercap_core.formats.detections.converters.openpose import as_openpose
-from intercap_core.formats.detections.image_numbers import CameraImages
+from intercap_core.formats.detections.keypoints import KeypointReader, read_people, readers
 from intercap_core.inputs.files import printable
 
 EDGE_PX = 0.5  # the centres of pixels have integer coordinates
-# px. A person whose points all lie below this has normalised coordinates (0 to 1, some beyond the
-# image), not pixels.
+# A person whose points all have smaller coordinates, px, has normalised ones: 0 to 1, and somewhat
+# more outside the image.
 MAX_NORMALISED_PX = 2.0
 NOBODY = np.zeros((0, NUM_KEYPOINTS, 3), np.float32)
 
 
 @dataclass
-class Values:
-    """Cleans the people of one camera's images of ``size`` (width, height), and counts.
-
-    ``full_confidence`` is what counts as 1.
-    """
+class KeypointCleaner:
+    """Removes impossible keypoints of one camera's images and counts them."""
 
     size: tuple[int, int]
+    """Width and height of the images."""
     full_confidence: float = 1.0
+    """Confidence that counts as 1."""
     seen: int = 0
+    """Number of points that are stated as seen."""
     outside: int = 0
+    """Number of points outside the image."""
     beyond: int = 0
-    shares: int = 0
+    """Number of points with more than the full confidence."""
+    normalised: int = 0
+    """Number of people with normalised coordinates."""
 
     def clean(self, people: np.ndarray) -> np.ndarray:
-        """People (P, 135, 3) without those of whom nothing is seen, the rest as float32.
+        """Return the people (P, 135, 3) of whom anything is seen, as float32.
 
-        A point that is not finite, lies outside the image or in its very corner (0, 0), or has no
-        confidence becomes zeros; confidence beyond the full one is cut to 1.
+        A point becomes zeros if it is not finite, lies outside the image or exactly at (0, 0), or
+        has no confidence. Confidence beyond the full one is clipped to 1.
         """
         x, y, confidence = np.moveaxis(np.asarray(people, np.float64), -1, 0)
         with np.errstate(invalid="ignore"):
@@ -70,26 +71,27 @@ class Values:
         share = np.minimum(np.where(known, confidence, 0) / self.full_confidence, 1)
         result = np.where(known[..., None], np.stack([x, y, share], -1), 0).astype(np.float32)
         present = known.any(-1)
-        shares = present & (result[..., :2].max((1, 2), initial=0) <= MAX_NORMALISED_PX)
-        self.shares += int(shares.sum())
-        return result[present & ~shares]
+        largest = result[..., :2].max((1, 2), initial=0)
+        normalised = present & (largest <= MAX_NORMALISED_PX)
+        self.normalised += int(normalised.sum())
+        return result[present & ~normalised]
 
     def notes(self) -> list[str]:
-        """What was changed, in words."""
+        """What was changed, for the user."""
         notes = []
         width, height = self.size
         if self.outside:
-            wrong = 2 * self.outside > self.seen
-            hint = "; are they of images of another size, or of another camera?" if wrong else ""
+            most = 2 * self.outside > self.seen
+            hint = "; are they of images of another size, or of another camera?" if most else ""
             notes.append(
                 f"{self.outside} of {self.seen} keypoints lie outside the image of "
                 f"{width}x{height} pixels and count as not seen{hint}"
             )
-        if self.shares:
+        if self.normalised:
             notes.append(
-                f"{self.shares} people left out whose points all lie within {MAX_NORMALISED_PX:g} "
-                "pixels of the upper left corner: coordinates must be pixels, not shares of the "
-                "image"
+                f"{self.normalised} people left out whose points all lie within "
+                f"{MAX_NORMALISED_PX:g} pixels of the upper left corner: coordinates must be "
+                "pixels, not shares of the image"
             )
         if self.beyond:
             notes.append(
@@ -99,30 +101,31 @@ class Values:
         return notes
 
 
-RESULTS = "results_"  # what mmpose's demo puts before the name of an image or a video
-ALPHAPOSE = "alphapose-results.json"
-
-
 @dataclass
-class People:
-    """What is known of one camera: people (P, 135, 3) by image number, also none, and notes."""
+class PeopleByImage:
+    """People of one camera."""
 
     by_image: dict[int, np.ndarray] = field(default_factory=dict)
+    """People (P, 135, 3) by image number; P = 0 if the detector found nobody in the image."""
     notes: list[str] = field(default_factory=list)
+    """What was left out, for the user."""
 
 
 @dataclass
 class _Reading:
-    """One camera's files while they are read."""
+    """State while one camera's files are read."""
 
-    values: Values
-    people: People = field(default_factory=People)
-    broken: list[str] = field(default_factory=list)  # cut or empty files
-    faults: list[str] = field(default_factory=list)  # people or files of another layout
-    used: bool = False  # anything could be read
+    cleaner: KeypointCleaner
+    people: PeopleByImage = field(default_factory=PeopleByImage)
+    broken: list[str] = field(default_factory=list)
+    """Files that cannot be loaded."""
+    faults: list[str] = field(default_factory=list)
+    """People or files that cannot be used."""
+    used: bool = False
+    """Whether anything could be used."""
 
-    def finished(self, folder: Path, camera: str) -> People:
-        """The people, with notes; raises UserError where all that was found is of no use."""
+    def finish(self, folder: Path, camera: str) -> PeopleByImage:
+        """The people, with notes; raises UserError if there are files and none can be used."""
         notes = self.people.notes
         note_broken(notes, "keypoint files", self.broken)
         if self.faults and not self.used:
@@ -132,45 +135,63 @@ class _Reading:
         if self.faults:
             first = "; ".join(self.faults[:FILES_NAMED])
             notes.append(f"{len(self.faults)} people or files of keypoints left out: {first}")
-        notes += self.values.notes()
+        notes += self.cleaner.notes()
         return self.people
 
 
-def camera_file(folder: Path, camera: str) -> Path | None:
-    """The file that holds the keypoints of all images of a camera, if there is one."""
-    names = (f"{camera}.json", f"{RESULTS}{camera}.json", f"{camera}/{ALPHAPOSE}")
-    return next((folder / name for name in names if (folder / name).is_file()), None)
+def find_camera_file(folder: Path, camera: str) -> tuple[Path, KeypointReader] | None:
+    """The file that holds the keypoints of all images of a camera, and the reader of its form."""
+    for reader in readers():
+        for name in reader.camera_files:
+            path = folder / name.replace("{camera}", camera)
+            if path.is_file():
+                return path, reader
+    return None
 
 
-def image_files(folder: Path) -> list[Path]:
-    """The JSON files in a camera's folder, one an image."""
-    if not folder.is_dir():
-        return []
-    paths = (path for path in folder.iterdir() if not path.name.startswith("."))
-    return sorted(path for path in paths if path.suffix.lower() == ".json")
+def find_image_files(folder: Path) -> tuple[dict[str, Path], KeypointReader] | None:
+    """Files of single images in a camera's folder by the image's name, and their reader."""
+    visible = [path for path in folder.iterdir() if not path.name.startswith(".")]
+    for reader in readers():
+        matched = reader.match_images(sorted(visible))
+        if matched:
+            return matched, reader
+    return None
+
+
+def keypoint_paths(folder: Path, camera: str) -> tuple[Path | None, list[Path]]:
+    """The file of all images of a camera, if there is one, and the files of single images."""
+    whole = find_camera_file(folder, camera)
+    single = find_image_files(folder / camera) if (folder / camera).is_dir() else None
+    return whole[0] if whole else None, sorted(single[0].values()) if single else []
 
 
 def has_keypoints(folder: Path, camera: str) -> bool:
-    """Whether any file, or a folder for files, speaks of the camera."""
-    return camera_file(folder, camera) is not None or (folder / camera).is_dir()
+    """Whether there is a file or a folder for the camera."""
+    return find_camera_file(folder, camera) is not None or (folder / camera).is_dir()
 
 
-def read_camera(folder: Path, images: CameraImages, *, full_confidence: float) -> People:
-    """Read all that ``folder`` holds of one camera; ``full_confidence`` counts as 1.
+def read_camera(folder: Path, images: CameraImages, *, full_confidence: float) -> PeopleByImage:
+    """Read all keypoints of one camera.
 
-    Raises UserError where there are keypoints and none can be used, or two of one image.
+    Raises UserError if there are keypoints and none can be used, or two files of one image.
+
+    Args:
+        folder: folder of keypoints of the sequence.
+        images: the camera's images.
+        full_confidence: confidence that counts as 1.
     """
-    reading = _Reading(Values(images.size, full_confidence))
-    path = camera_file(folder, images.name)
-    if path is not None:
-        _add_camera_file(reading, images, path)
+    reading = _Reading(KeypointCleaner(images.size, full_confidence))
+    whole = find_camera_file(folder, images.name)
+    if whole is not None:
+        _add_camera_file(reading, images, *whole)
     elif (folder / images.name).is_dir():
         _add_image_files(reading, folder / images.name, images)
     else:
         reading.people.notes.append(
             f"no keypoints {folder.name}/{images.name}/ or {folder.name}/{images.name}.json"
         )
-    return reading.finished(folder, images.name)
+    return reading.finish(folder, images.name)
 
 
 def read_files(
@@ -179,137 +200,121 @@ def read_files(
     images: CameraImages,
     *,
     full_confidence: float,
-) -> People:
-    """Read the file of each image, None = there is none, somewhere below ``folder``; fails as
-    :func:`read_camera` does."""
-    reading = _Reading(Values(images.size, full_confidence))
-    _add_files(reading, files)
-    return reading.finished(folder, images.name)
+) -> PeopleByImage:
+    """Read the JSON file of each image number, None = there is none; raises as read_camera."""
+    reading = _Reading(KeypointCleaner(images.size, full_confidence))
+    reader = next(reader for reader in readers() if reader.load is read_json)
+    _add_files(reading, files, reader)
+    return reading.finish(folder, images.name)
 
 
-def _add_camera_file(reading: _Reading, images: CameraImages, path: Path) -> None:
+def _add_camera_file(
+    reading: _Reading, images: CameraImages, path: Path, reader: KeypointReader
+) -> None:
     """Read one file of all images and sort its people by image."""
     try:
-        parsed = read_json(path)
-    except UnreadableCandidates as error:
-        reading.people.notes.append(f"{short(path)} {error}")
+        loaded = reader.load(path)
+    except UnreadableDetections as error:
+        reading.people.notes.append(f"{short_name(path)} {error}")
         return
     try:
-        content = people_of(parsed)
-    except UnreadableCandidates as error:
-        reading.faults.append(f"{short(path)} {error}")
+        content = read_people(loaded, reader.load, one_image=False)
+    except UnreadableDetections as error:
+        reading.faults.append(f"{short_name(path)} {error}")
         return
     useless = bool(content.entries) and len(content.faults) == content.entries
-    by_image, absent = sorted_by_image(
+    by_image, absent = sort_by_image(
         content.results, content.images, content.faulty, images, useless=useless
     )
     for number, found in by_image.items():
         people = np.stack(found) if found else NOBODY
-        reading.people.by_image[number] = reading.values.clean(people)
+        reading.people.by_image[number] = reading.cleaner.clean(people)
     reading.used |= not useless
-    reading.faults += [f"{short(path)}, {fault}" for fault in content.faults]
-    note_absent(reading.people.notes, absent, images, short(path))
+    reading.faults += [f"{short_name(path)}, {fault}" for fault in content.faults]
+    note_absent(reading.people.notes, absent, images, short_name(path))
 
 
 def _add_image_files(reading: _Reading, folder: Path, images: CameraImages) -> None:
-    """Read the files of a camera's folder: by the image's name where any is so named, else by
-    number."""
+    """Read the files of a camera's folder."""
+    by_name, reader = find_image_files(folder) or ({}, readers()[0])
+    places = images.numbers_of_names(by_name)
+    repeated = [] if places else repeated_number(by_name)
+    if repeated:
+        first, second = (by_name[name].name for name in repeated[:2])
+        reading.faults.append(f"one image has two keypoint files, {first} and {second}; keep one")
+    by_number = {place: by_name[name] for name, place in places.items()}
     numbers = [int(images.number[t]) for t in images.sets]
-    named = openpose.named_keypoint_files(folder, images.stems)
-    numbered = {} if named else openpose.keypoint_files(folder)
-    if named:
-        _add_files(reading, {n: named.get(images.stems[n]) for n in numbers})
-        return
-    if numbered:
-        _add_files(reading, {n: numbered.get(n) for n in numbers})
-        return
-    paths = {path.name.removeprefix(RESULTS): path for path in image_files(folder)}
-    places = images.numbers_of_names(paths)
-    by_number = {place: paths[name] for name, place in places.items()}
-    absent = [name for name in paths if places.get(name) not in images.recorded]
-    _add_files(reading, {n: by_number.get(n) for n in numbers})
+    _add_files(reading, {n: by_number.get(n) for n in numbers}, reader)
+    absent = [name for name in by_name if places.get(name) not in images.recorded]
     if absent:
         reading.people.notes.append(
             f"{len(absent)} keypoint files belong to no image (first: {printable(absent[0][:80])})"
         )
 
 
-def _add_files(reading: _Reading, files: Mapping[int, Path | None]) -> None:
+def _add_files(reading: _Reading, files: Mapping[int, Path | None], reader: KeypointReader) -> None:
+    """Read the file of each image number."""
     missing = 0
     for number, path in files.items():
         if path is None:
             missing += 1
             continue
         try:
-            content = read_json(path)
-        except UnreadableCandidates:
-            reading.broken.append(short(path))
+            loaded = reader.load(path)
+        except UnreadableDetections:
+            reading.broken.append(short_name(path))
             continue
         try:
-            people = _people_of_image(reading, content, path)
-        except UserError as error:
-            reading.faults.append(str(error))
+            content = read_people(loaded, reader.load, one_image=True)
+        except UnreadableDetections as error:
+            reading.faults.append(f"{short_name(path)} {error}")
             continue
-        except UnreadableCandidates as error:
-            reading.faults.append(f"{short(path)} {error}")
-            continue
-        if people is not None:
-            reading.people.by_image[number] = reading.values.clean(people)
+        reading.faults += [f"{short_name(path)}, {fault}" for fault in content.faults]
+        if content.results or not content.faults:
+            people = np.stack([p for _, p in content.results]) if content.results else NOBODY
+            reading.people.by_image[number] = reading.cleaner.clean(people)
             reading.used = True
     if missing:
         reading.people.notes.append(f"no keypoint file for {missing} images")
 
 
-def _people_of_image(reading: _Reading, content: Any, path: Path) -> np.ndarray | None:
-    """People (P, 135, 3) of a file of one image, None = all of them are of no use."""
-    content = as_openpose(content)
-    if openpose.is_openpose(content):
-        return openpose.people_of(content, short(path))
-    found = people_of(content, one_image=True)
-    reading.faults += [f"{short(path)}, {fault}" for fault in found.faults]
-    if found.faults and not found.results:
-        return None
-    return np.stack([one for _, one in found.results]) if found.results else NOBODY
-
-
-def look_at_keypoints(
+def preview_keypoints(
     folder: Path, camera: str, *, size: tuple[int, int], full_confidence: float
 ) -> list[str]:
     """What is wrong with the beginning of one camera's file, or its first file of one image.
 
-    ``size`` (width, height) of the colour images; ``full_confidence`` counts as 1.
+    Args:
+        folder: folder of keypoints of the sequence.
+        camera: name of the camera.
+        size: width and height of its colour images.
+        full_confidence: confidence that counts as 1.
     """
-    whole = camera_file(folder, camera)
-    path = whole if whole is not None else next(iter(image_files(folder / camera)), None)
-    if path is None:
+    whole = find_camera_file(folder, camera)
+    single = find_image_files(folder / camera) if (folder / camera).is_dir() else None
+    if whole is not None:
+        path, reader = whole
+    elif single is not None:
+        path, reader = min(single[0].values()), single[1]
+    else:
         return []
-    notes, values = [], Values(size, full_confidence)
     try:
-        content = read_head(path)
-        if content is None:
+        loaded = read_head(path) if reader.load is read_json else reader.load(path)
+        if loaded is None:
             return []
-        if whole is None:
-            content = as_openpose(content)
-        if whole is None and openpose.is_openpose(content):
-            people = openpose.people_of(content, str(path))
-        else:
-            found = people_of(content, one_image=whole is None)
-            if found.faults:
-                notes.append(
-                    f"{path}: {len(found.faults)} of its first {found.entries} people cannot be "
-                    f"used (first: {found.faults[0]})"
-                )
-            people = np.array([person for _, person in found.results]).reshape(
-                -1, *NOBODY.shape[1:]
-            )
-    except UnreadableCandidates as error:
+        found = read_people(loaded, reader.load, one_image=whole is None)
+    except UnreadableDetections as error:
         return [f"{path} {error}"]
-    except UserError as error:
-        return [str(error)]
-    values.clean(people)
-    if len(people) and not values.seen:
+    notes, cleaner = [], KeypointCleaner(size, full_confidence)
+    if found.faults:
         notes.append(
-            f"{path}: none of its first {len(people)} people has a point with numbers and a "
-            "confidence above 0; write the keypoints again"
+            f"{path}: {len(found.faults)} of its first {found.entries} people cannot be used "
+            f"(first: {found.faults[0]})"
         )
-    return notes + [f"{path}: {note}" for note in values.notes()]
+    if found.results:
+        cleaner.clean(np.stack([person for _, person in found.results]))
+        if not cleaner.seen:
+            notes.append(
+                f"{path}: none of its first {len(found.results)} people has a point with numbers "
+                "and a confidence above 0; write the keypoints again"
+            )
+    return notes + [f"{path}: {note}" for note in cleaner.notes()]

@@ -1,4 +1,4 @@
-"""Masks that detectors keep as image files: an instance a file, or several numbered in one."""
+"""Masks as image files: one instance a file, or several that are numbered in one file."""
 
 from __future__ import annotations
 
@@ -25,36 +25,32 @@ from intercap_core.formats.recordings.image_files import encoded_size
 from intercap_core.inputs.files import MAX_IMAGE_BYTES, Unreadable, printable, read_bytes
 
 BEHAVE_PERSON = ("person_mask",)
-BEHAVE_OBJECT = ("obj_rend_mask", "obj_mask")  # the second where the first is not there
-SUFFIXES = ("png", "jpg")  # without loss first
-_NUMBERED = re.compile(r"\D*(\d{1,9})\.(?:png|jpe?g)", re.IGNORECASE)
+BEHAVE_OBJECT = ("obj_rend_mask", "obj_mask")  # the second is used if the first is missing
 MAX_MASK_VALUES = 1000  # instances in one mask image; an image with more is not a mask
-WHITE = 255
-BETWEEN = "__"  # an image's name, a label and a number in the name of a mask
-_AROUND_LABEL = "0123456789_-. "
 
 
 class UnreadableMask(Exception):
-    """The file is no mask of the image; says why, in words that fit after its name."""
+    """The file is no mask of the image; the message follows the file's name."""
 
 
 class MaskFile(NamedTuple):
-    """One file of masks of one image.
-
-    ``inverted``: dark pixels are the instance. ``numbered``: where no pixel is white, each value
-    but 0 is an instance of its own.
-    """
+    """One file of masks of one image."""
 
     path: Path
+    """The file."""
     label: str
+    """Label of its instances; "" = unknown."""
     inverted: bool = False
+    """Dark pixels are the instance."""
     numbered: bool = False
+    """If no pixel is white, each value except 0 is an instance."""
 
 
 def read_masks(file: MaskFile, size: tuple[int, int]) -> list[Instance]:
-    """Read the masks of an image of ``size`` (width, height), score 1; empty ones are none.
+    """Read the masks of an image of ``size`` (width, height) as instances of score 1.
 
-    A mask of the whole picture at another resolution is scaled. Raises :class:`UnreadableMask`.
+    Empty masks are left out. A mask of the whole picture at another resolution is scaled. Raises
+    :class:`UnreadableMask`.
     """
     try:
         content = read_bytes(file.path, MAX_IMAGE_BYTES)
@@ -66,7 +62,7 @@ def read_masks(file: MaskFile, size: tuple[int, int]) -> list[Instance]:
     kind = cv2.IMREAD_UNCHANGED if file.numbered else cv2.IMREAD_GRAYSCALE
     try:
         image = cv2.imdecode(np.frombuffer(content, np.uint8), kind)
-    except cv2.error:  # of an image that takes more memory than OpenCV allows
+    except cv2.error:  # the image takes more memory than OpenCV allows
         image = None
     if image is None:
         raise UnreadableMask("is no image")
@@ -88,10 +84,10 @@ def read_masks(file: MaskFile, size: tuple[int, int]) -> list[Instance]:
 
 
 def _split(image: np.ndarray, file: MaskFile) -> Iterator[np.ndarray]:
-    """The masks (H, W) bool that a grey image holds."""
+    """The masks (H, W) bool of a grey image."""
     if file.inverted:
         yield image < MASK_THRESHOLD
-    elif not file.numbered or (image.dtype == np.uint8 and image.max() == WHITE):
+    elif not file.numbered or (image.dtype == np.uint8 and image.max() == 255):
         yield image >= MASK_THRESHOLD
     else:
         values = np.unique(image)
@@ -105,10 +101,11 @@ def _split(image: np.ndarray, file: MaskFile) -> Iterator[np.ndarray]:
 
 
 def instance_masks(folder: Path) -> dict[str, list[MaskFile]]:
-    """Masks of one camera by the name of their image.
+    """Mask files of one camera by the name of their image.
 
-    ``<image>.png`` without a label, ``<image>__<label>.png``, ``<image>__<label>__<n>.png``, or
-    files in a folder ``<image>/`` whose names hold the label between digits: ``3_cup.png``.
+    Names are ``<image>.png`` without a label, ``<image>__<label>.png``,
+    ``<image>__<label>__<n>.png``, or in a folder ``<image>/`` the label between digits:
+    ``3_cup.png``.
     """
     found: dict[str, list[MaskFile]] = {}
     for path in sorted(folder.iterdir()):
@@ -117,11 +114,11 @@ def instance_masks(folder: Path) -> dict[str, list[MaskFile]]:
         if path.is_dir():
             for inner in sorted(path.iterdir()):
                 if _is_png(inner):
-                    label = printable(inner.stem).strip(_AROUND_LABEL)[:MAX_LABEL]
+                    label = printable(inner.stem).strip("0123456789_-. ")[:MAX_LABEL]
                     found.setdefault(path.name, []).append(MaskFile(inner, label, numbered=True))
         elif _is_png(path):
-            image, _, rest = path.stem.partition(BETWEEN)
-            label = printable(rest.partition(BETWEEN)[0])[:MAX_LABEL]
+            image, _, rest = path.stem.partition("__")
+            label = printable(rest.partition("__")[0])[:MAX_LABEL]
             found.setdefault(image, []).append(MaskFile(path, label, numbered=True))
     return found
 
@@ -131,26 +128,27 @@ def _is_png(path: Path) -> bool:
 
 
 def release_masks(candidates: Path, camera: str) -> dict[int, MaskFile] | None:
-    """Person masks of one camera as the InterCap release's tools keep them, by image number.
+    """Person masks of one camera as the InterCap release's tools store them, by image number.
 
-    ``<camera>/<number>.png`` or ``BodyIndexColor_<n>/<number>.png``, without ``_<n>`` for camera 1,
-    with 0 for the person and 255 for the background; None where there is no such folder.
+    Names are ``<camera>/<number>.png`` or ``BodyIndexColor_<n>/<number>.png`` (for camera 1 without
+    ``_<n>``). The person is 0 and the background 255. None without such a folder.
     """
     number = camera[1:]
     names = [camera, f"BodyIndexColor_{number}", *(["BodyIndexColor"] if number == "1" else [])]
     for name in names:
         folder = candidates / name
         if folder.is_dir():
-            matches = ((path, _NUMBERED.fullmatch(path.name)) for path in sorted(folder.iterdir()))
+            form = re.compile(r"\D*(\d{1,9})\.(?:png|jpe?g)", re.IGNORECASE)
+            matches = ((path, form.fullmatch(path.name)) for path in sorted(folder.iterdir()))
             return {int(m.group(1)): MaskFile(path, PERSON_LABEL, True) for path, m in matches if m}
     return None
 
 
 class BehaveFiles:
-    """Keypoints and masks beside BEHAVE's images, by the time of the image, microseconds.
+    """Keypoints and masks in the folders of BEHAVE's images, by the image's time, microseconds.
 
-    The masks are of one person and of the sequence's object, which is given ``object_label``; None
-    leaves them out.
+    Masks are of one person and of the sequence's object, whose instances get ``object_label``.
+    Without a label they are left out.
     """
 
     def __init__(self, recordings: Path, object_label: str | None) -> None:
@@ -160,7 +158,7 @@ class BehaveFiles:
             self._labels[BEHAVE_OBJECT] = object_label
 
     def keypoints(self, time_us: int, camera: str) -> Path | None:
-        """The keypoint file of one image, None = there is none."""
+        """The keypoint file of one image; None if there is none."""
         return self._existing(time_us, f"{camera}.color.json")
 
     def masks(self, time_us: int, camera: str) -> list[MaskFile]:
@@ -170,7 +168,7 @@ class BehaveFiles:
             paths = (
                 self._existing(time_us, f"{camera}.{kind}.{suffix}")
                 for kind in kinds
-                for suffix in SUFFIXES
+                for suffix in ("png", "jpg")  # the lossless file first
             )
             path = next((path for path in paths if path is not None), None)
             if path is not None:

@@ -1,7 +1,6 @@
-"""A user's ONNX model of images: its session, what it takes, and images made to fit it.
+"""A user's ONNX model: its session, its input, and images that are fitted to the input.
 
-What a model does with the image is its caller's matter: segmentation here, keypoints elsewhere.
-Nothing that a model file says is run as code; custom operators are not loaded.
+Nothing in a model file is run as code except its graph; custom operators are not loaded.
 """
 
 from __future__ import annotations
@@ -40,36 +39,44 @@ _LISTED = re.compile(rf"\s*({_TEXT})\s*(?:,|$)", re.DOTALL)
 class Fit:
     """Where an image lies in the model's input: input = image * scale + (left, top).
 
-    ``scale`` (x, y) and the shift count pixel edges, so that a pixel's middle is at 0.5.
+    Coordinates are of pixel edges: the middle of the first pixel is at 0.5.
     """
 
     scale: tuple[float, float]
+    """Factors of x and y."""
     left: int
+    """Shift of x, px."""
     top: int
-    size: tuple[int, int]  # of the image: width, height
+    """Shift of y, px."""
+    size: tuple[int, int]
+    """Width and height of the image."""
 
     def to_image(self, boxes: np.ndarray) -> np.ndarray:
-        """Boxes (N, 4) of two corners from the input to the image, within it."""
+        """Map boxes (N, 4) of two corners from the input to the image and clip them to it."""
         shift, scale = (self.left, self.top) * 2, self.scale * 2
         corners = (boxes - np.array(shift, np.float32)) / np.array(scale, np.float32)
         return np.clip(corners, 0, np.array(self.size * 2, np.float32))
 
 
 class OnnxModel:
-    """An open session with one image as input. Obtained from :meth:`load`.
+    """An open session with one image as input; obtained from :meth:`load`."""
 
-    ``size`` (width, height) that the model insists on, None = any; ``batch`` likewise.
-    ``outputs`` are names, declared shapes (numbers, or names of free lengths) and types.
-    ``metadata`` is what the exporter wrote into the file.
-    """
+    size: tuple[int, int] | None
+    """Width and height of the input; None = any."""
+    batch: int | None
+    """Number of images in one input; None = any."""
+    outputs: list[tuple[str, tuple[Any, ...], str]]
+    """Name, declared shape (numbers, or names of free lengths) and type of each output."""
+    metadata: dict[str, str]
+    """Entries that the exporter wrote into the file."""
 
     def __init__(self, path: Path, session: Any) -> None:
         self.path, self._session = path, session
         inputs = session.get_inputs()
         if len(inputs) != 1 or len(inputs[0].shape) not in (3, 4) or inputs[0].type not in _TYPES:
-            told = printable(", ".join(f"{i.name} {i.type} {i.shape}" for i in inputs)[:300])
+            found = printable(", ".join(f"{i.name} {i.type} {i.shape}" for i in inputs)[:300])
             raise UserError(
-                f"{path}: takes {told}; expected one image, (batch,) 3, height, width; export the "
+                f"{path}: takes {found}; expected one image, (batch,) 3, height, width; export the "
                 "model for images alone"
             )
         self._name, self._dtype = inputs[0].name, _TYPES[inputs[0].type]
@@ -85,15 +92,15 @@ class OnnxModel:
                 f"{height or 'any'} pixels, expected at most {MAX_BATCH} of {MAX_INPUT_SIDE} a "
                 "side; export it at the size that it was trained with"
             )
-        self.metadata: dict[str, str] = dict(session.get_modelmeta().custom_metadata_map)
+        self.metadata = dict(session.get_modelmeta().custom_metadata_map)
         self.outputs = [(o.name, tuple(o.shape), o.type) for o in session.get_outputs()]
 
     @classmethod
     def load(cls, path: Path, device: str = "cpu") -> OnnxModel:
         """Open a model file on ``device`` (cpu or cuda).
 
-        Raises UserError where onnxruntime or the device is not there, or the file is no model that
-        takes one image.
+        Raises UserError if onnxruntime or the device is missing, or if the file is no model of one
+        image.
         """
         try:
             import onnxruntime
@@ -104,7 +111,7 @@ class OnnxModel:
             ) from None
         wanted = _PROVIDERS[device]
         options = onnxruntime.SessionOptions()
-        options.log_severity_level = 3  # errors alone
+        options.log_severity_level = 3  # only errors
         options.inter_op_num_threads = 1
         options.intra_op_num_threads = _threads()
         if wanted not in onnxruntime.get_available_providers():
@@ -116,15 +123,12 @@ class OnnxModel:
             raise UserError(
                 f"{path}: is no ONNX model that can be run ({_first_line(error)}); export it again"
             ) from None
-        if wanted not in session.get_providers():  # it falls back to the CPU without a word
+        if wanted not in session.get_providers():  # onnxruntime falls back to the CPU silently
             raise _no_device(path, device, onnxruntime)
         return cls(path, session)
 
     def run(self, images: np.ndarray) -> list[np.ndarray]:
-        """Outputs for images (B, 3, H, W) as :func:`fitted` makes them.
-
-        Raises UserError where the model fails on them.
-        """
+        """Outputs for images (B, 3, H, W); raises UserError if the model fails on them."""
         values = images.transpose(0, 2, 3, 1) if self._channels_last else images
         values = values if self.batched else values[0]
         try:
@@ -142,9 +146,9 @@ class OnnxModel:
     def fitted(
         self, picture: np.ndarray, fit: Fit, size: tuple[int, int], values: PixelValues, pad: int
     ) -> np.ndarray:
-        """A BGR picture (H, W, 3) uint8 as the model takes it: (3, h, w) of input ``size``.
+        """Fit a BGR picture (H, W, 3) uint8 into the input: (3, h, w) of ``size`` (width, height).
 
-        ``pad`` is the grey around it, 0 to 255. A model that takes bytes gets them unscaled.
+        ``pad`` is the grey level, 0 to 255, around the picture.
         """
         width = round(fit.size[0] * fit.scale[0])
         height = round(fit.size[1] * fit.scale[1])
@@ -156,7 +160,10 @@ class OnnxModel:
         return self.prepared(canvas, values)
 
     def prepared(self, canvas: np.ndarray, values: PixelValues) -> np.ndarray:
-        """A BGR picture (h, w, 3) uint8 of the input's size as the model takes it: (3, h, w)."""
+        """Convert a BGR picture (h, w, 3) uint8 of the input's size to its values (3, h, w).
+
+        A model whose input is of bytes gets bytes.
+        """
         if values in ("rgb", "imagenet"):
             canvas = canvas[..., ::-1]
         if self._dtype == np.uint8:
@@ -172,22 +179,22 @@ class OnnxModel:
 
 
 def fit_within(picture: tuple[int, int], size: tuple[int, int], *, centred: bool) -> Fit:
-    """Place a picture (width, height), its shape kept, in an input of ``size``.
+    """Place a picture (width, height) in an input of ``size`` without changing its aspect ratio.
 
-    In the middle, or at the upper left.
+    The picture is in the middle if ``centred``, otherwise at the upper left.
     """
     ratio = min(size[0] / picture[0], size[1] / picture[1])
     width, height = (max(1, round(n * ratio)) for n in picture)
-    # Where the rest is odd, the upper left has the smaller part, as in YOLO's own letterboxing.
+    # An odd rest is larger at the lower right, as in YOLO's letterboxing.
     left, top = ((size[0] - width) // 2, (size[1] - height) // 2) if centred else (0, 0)
     return Fit((width / picture[0], height / picture[1]), left, top, picture)
 
 
 def parse_names(text: str) -> dict[int, str]:
-    """Class names by number from a model's metadata: a mapping or a list, as text.
+    """Class names by number from a model's metadata: the text of a mapping or a list.
 
-    Exporters write Python's or JSON's notation; it is read, never evaluated. Empty where it is
-    neither.
+    Exporters write the notation of Python or JSON. The text is parsed, never evaluated. Returns {}
+    for any other text.
     """
     text = text.strip()
     if len(text) < 2 or text[0] + text[-1] not in ("{}", "[]"):
@@ -205,7 +212,7 @@ def parse_names(text: str) -> dict[int, str]:
 
 
 def _runtime_errors() -> tuple[type[Exception], ...]:
-    """What onnxruntime raises: a class for each status, and pybind11's own for what it is given."""
+    """Exceptions of onnxruntime: a class for each status, and pybind11's for wrong arguments."""
     from onnxruntime.capi import onnxruntime_pybind11_state as state
 
     of_status = [
@@ -215,7 +222,7 @@ def _runtime_errors() -> tuple[type[Exception], ...]:
 
 
 def _threads() -> int:
-    """Threads that the job may use, 0 = all; the runtime does not ask OpenMP."""
+    """Threads that the job may use, 0 = all; onnxruntime does not read OpenMP's variable."""
     text = os.environ.get("OMP_NUM_THREADS", "")
     return int(text) if text.isdecimal() else 0
 

@@ -1,9 +1,9 @@
 """Whole-body keypoints by a user's ONNX model: RTMPose, DWPose, HRNet or ViTPose exports, top down.
 
-Such a model sees one person at a time, cut out around a box, and says for every point how likely it
-is in each column and each row, in bins finer than pixels (SimCC), or in each cell of a map that is
-coarser than the input. Cutting out and reading follow mmpose: the box is widened by a quarter and
-to the input's shape, pixels are RGB less ImageNet's mean.
+The input of such a model is one person, cut out around a box. The output for every point is its
+likelihood in each column and each row, in bins finer than pixels (SimCC), or in each cell of a map
+that is coarser than the input (heatmap). Cropping and decoding follow mmpose: the box is enlarged
+by a quarter and widened to the input's aspect ratio, pixels are RGB minus ImageNet's mean.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from intercap_core.body.keypoints import BODY
 from intercap_core.config import DetectionsSettings
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.instance import PERSON_LABEL, Instance
-from intercap_core.formats.detections.keypoint_layouts import KNOWN_COUNTS, LAYOUTS, to_shared
+from intercap_core.formats.detections.keypoints import LAYOUT_KEY, find_layout, to_shared
 from intercap_core.formats.detections.onnx_model import OnnxModel
 
 HeatmapGrid = Literal["msra", "udp"]
 
-_EDGE = 2  # cells from the border within which no second difference is there
-_TINY = 1e-10  # a response whose logarithm is taken, at least
+_EDGE = 2  # cells at the border, where there is no second difference
+_TINY = 1e-10  # least response whose logarithm is taken
 BOX_PADDING = 1.25  # factor on a person's box, as in mmpose's training and tests
 MIN_BOX_SCORE = 0.3  # of a detected person; mmpose's default
 # Ratio of the blur's width to the heatmap's width: mmpose has 11 cells of 48, 17 of 72.
@@ -47,32 +47,34 @@ _FLOATS = ("tensor(float)", "tensor(float16)")
 
 @dataclass(frozen=True)
 class Crop:
-    """A piece of an image as the model sees it: input = (image - corner) * scale, pixels."""
+    """Part of an image that is the model's input: input = (image - corner) * scale, pixels."""
 
     corner: tuple[float, float]
+    """x, y of the input's upper left corner in the image, px."""
     scale: float
+    """Pixels of the input for one of the image."""
 
     @classmethod
     def around(cls, box: np.ndarray, size: tuple[int, int], padding: float) -> Crop:
-        """Around a box (x, y, width, height), widened to the shape of an input of ``size``."""
+        """Make the crop around a box (x, y, width, height) for an input of ``size``."""
         x, y, width, height = (float(v) for v in box)
         scale = min(size[0] / max(width, 1), size[1] / max(height, 1)) / padding
         middle = (x + width / 2, y + height / 2)
         return cls((middle[0] - size[0] / (2 * scale), middle[1] - size[1] / (2 * scale)), scale)
 
     def cut(self, picture: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-        """The piece of a picture (H, W, 3), black beyond its edge."""
+        """Cut the crop out of a picture (H, W, 3); it is black beyond the picture's edge."""
         shift = -self.scale * np.array(self.corner)
         matrix = np.array([[self.scale, 0, shift[0]], [0, self.scale, shift[1]]])
         return cv2.warpAffine(picture, matrix, size, flags=cv2.INTER_LINEAR)
 
-    def to_image(self, places: np.ndarray) -> np.ndarray:
-        """Places (..., 2) in the input, to the image."""
-        return places / self.scale + np.array(self.corner)
+    def to_image(self, points: np.ndarray) -> np.ndarray:
+        """Map points (..., 2) from the input to the image."""
+        return points / self.scale + np.array(self.corner)
 
 
 class PoseModel:
-    """A model of people's keypoints. Obtained from :meth:`load`."""
+    """A model of people's keypoints; obtained from :meth:`load`."""
 
     def __init__(
         self,
@@ -81,17 +83,14 @@ class PoseModel:
         full_confidence: float,
         grid: HeatmapGrid,
     ) -> None:
-        """``outputs``: the numbers of columns and rows, or of the heatmaps alone."""
+        """``outputs``: positions of the model's columns and rows, or of its heatmaps."""
         assert model.size is not None
         self._model, self._outputs, self._size = model, outputs, model.size
         self._full_confidence, self._grid = full_confidence, grid
 
     @classmethod
     def load(cls, settings: DetectionsSettings) -> PoseModel:
-        """Open the model that the settings name.
-
-        Raises UserError where it cannot be run or is none of these.
-        """
+        """Open the model that the settings name; raises UserError if it is no pose model."""
         assert settings.keypoint_model is not None
         model = OnnxModel.load(settings.keypoint_model, settings.keypoint_device)
         outputs = _simcc_outputs(model) or _heatmap_output(model)
@@ -103,33 +102,32 @@ class PoseModel:
                 "size, such as 288x384, and any number of people"
             )
         count = model.outputs[outputs[0]][1][1]
-        if isinstance(count, int) and count not in LAYOUTS:
-            raise _other_points(model, count)
+        if isinstance(count, int):
+            _point_names(model, count)
         return cls(
             model, outputs, settings.keypoint_full_confidence, settings.keypoint_heatmap_grid
         )
 
     def find(self, picture: np.ndarray, instances: list[Instance]) -> np.ndarray:
-        """People (P, 135, 3) in a picture (H, W, 3) uint8 BGR, confidence as the model's.
+        """Find people (P, 135, 3) in a picture (H, W, 3) uint8 BGR, with the model's confidence.
 
-        Looks at the people among ``instances``, best first; where there are none, through the whole
-        image, and again around whom it finds.
+        The model looks at the people among ``instances``, best first. Without any, it looks at
+        tiles of the whole image and then at the people found in them.
         """
         size = (picture.shape[1], picture.shape[0])
         boxes = person_boxes(instances)
         if len(boxes):
-            return self._look(picture, boxes, BOX_PADDING)
-        people, boxes = self._found(self._look(picture, tiles(size, self._size), 1.0))
+            return self._people_in(picture, boxes, BOX_PADDING)
+        people, boxes = self._distinct(self._people_in(picture, tiles(size, self._size), 1.0))
         if len(boxes):
-            people, _ = self._found(self._look(picture, boxes, BOX_PADDING))
+            people, _ = self._distinct(self._people_in(picture, boxes, BOX_PADDING))
         return people
 
-    def _found(self, people: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Those of the people (P, 135, 3) who are there, each once, best first, and their boxes
-        (N, 4)."""
+    def _distinct(self, people: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Confident people among (P, 135, 3), each once, best first, and their boxes (N, 4)."""
         sure = people[..., 2] >= FOUND_CONFIDENCE * self._full_confidence
-        there = sure[:, BODY].sum(1) >= FOUND_POINTS
-        people, sure = people[there], sure[there]
+        accepted = sure[:, BODY].sum(1) >= FOUND_POINTS
+        people, sure = people[accepted], sure[accepted]
         if not len(people):
             return people, np.zeros((0, 4))
         low = np.where(sure[..., None], people[..., :2], np.inf).min(1)
@@ -138,19 +136,19 @@ class PoseModel:
         kept: list[int] = []
         for i in best_first.tolist():
             near = SAME_POINT_SHARE * np.linalg.norm(high[i] - low[i])
-            apart = np.linalg.norm(people[kept, :, :2] - people[i, :, :2], axis=-1)
-            taken = ((apart < near) & sure[kept]).any(0)
-            if taken[sure[i]].mean() < SAME_PERSON_SHARE:
+            distance = np.linalg.norm(people[kept, :, :2] - people[i, :, :2], axis=-1)
+            shared = ((distance < near) & sure[kept]).any(0)
+            if shared[sure[i]].mean() < SAME_PERSON_SHARE:
                 kept.append(i)
         return people[kept][:MAX_PEOPLE], np.concatenate([low, high - low], 1)[kept][:MAX_PEOPLE]
 
-    def _look(self, picture: np.ndarray, boxes: np.ndarray, padding: float) -> np.ndarray:
-        """People (N, 135, 3) in boxes (N, 4) of x, y, width, height; confidence as the model's."""
+    def _people_in(self, picture: np.ndarray, boxes: np.ndarray, padding: float) -> np.ndarray:
+        """One person (N, 135, 3) in each of the boxes (N, 4) of x, y, width, height."""
         crops = [Crop.around(box, self._size, padding) for box in boxes]
         found = [points for batch in self._batches(picture, crops) for points in batch]
         for crop, points in zip(crops, found, strict=True):
             points[:, :2] = crop.to_image(points[:, :2])
-        return to_shared(np.stack(found), self._layout(found[0]))
+        return to_shared(np.stack(found), _point_names(self._model, len(found[0])))
 
     def _batches(self, picture: np.ndarray, crops: list[Crop]) -> Iterator[np.ndarray]:
         """Points (B, K, 3) in the input's pixels."""
@@ -161,7 +159,7 @@ class PoseModel:
                 [self._model.prepared(crop.cut(picture, self._size), "imagenet") for crop in part]
             )
             missing = (self._model.batch or 0) - len(images)
-            if missing > 0:  # the model insists on its number
+            if missing > 0:  # the model has a fixed batch size
                 images = np.concatenate([images, np.repeat(images[-1:], missing, 0)])
             outputs = self._model.run(images)
             yield self._points([outputs[i] for i in self._outputs], len(part))[: len(part)]
@@ -177,11 +175,6 @@ class PoseModel:
             return heatmap_points(responses[0], self._size, self._grid)
         raise _unknown(self._model, [str(list(shape)) for shape in shapes])
 
-    def _layout(self, points: np.ndarray) -> tuple[str, ...]:
-        if len(points) not in LAYOUTS:
-            raise _other_points(self._model, len(points))
-        return LAYOUTS[len(points)]
-
 
 def person_boxes(instances: list[Instance]) -> np.ndarray:
     """Boxes (N, 4) of x, y, width, height of the people among instances, best first."""
@@ -191,10 +184,10 @@ def person_boxes(instances: list[Instance]) -> np.ndarray:
 
 
 def tiles(size: tuple[int, int], shape: tuple[int, int]) -> np.ndarray:
-    """Boxes (N, 4) of an input's ``shape`` that cover an image of ``size`` (width, height).
+    """Boxes (N, 4) with the aspect ratio of an input's ``shape`` that cover an image of ``size``.
 
-    As high as the image, or as wide where it is narrower, each half over the next, so that
-    somebody who is less than half as wide is whole in one.
+    They are as high or as wide as the image. Each overlaps the next by half, so that a person who
+    is less than half as wide lies entirely within one box.
     """
     scale = min(size[0] / shape[0], size[1] / shape[1])
     tile = (shape[0] * scale, shape[1] * scale)
@@ -208,7 +201,7 @@ def tiles(size: tuple[int, int], shape: tuple[int, int]) -> np.ndarray:
 
 
 def _simcc_outputs(model: OnnxModel) -> tuple[int, int] | None:
-    """Which outputs are columns and rows: by name, else by their order."""
+    """Positions of columns and rows among the outputs, by their names or else by their order."""
     if len(model.outputs) != 2:
         return None
     if any(len(shape) != 3 or kind not in _FLOATS for _, shape, kind in model.outputs):
@@ -218,7 +211,7 @@ def _simcc_outputs(model: OnnxModel) -> tuple[int, int] | None:
 
 
 def _heatmap_output(model: OnnxModel) -> tuple[int] | None:
-    """The number of the only output, where that is maps coarser than the input."""
+    """Position of the heatmaps: the only output, coarser than the input."""
     if len(model.outputs) != 1:
         return None
     _, shape, kind = model.outputs[0]
@@ -231,7 +224,7 @@ def _heatmap_output(model: OnnxModel) -> tuple[int] | None:
 
 
 def _same_bins(shapes: list[tuple[int, ...]], size: tuple[int, int]) -> bool:
-    """Whether columns and rows are of the same people and points in bins of the same width."""
+    """Whether columns and rows have the same people, points and width of bins."""
     columns, rows = shapes
     if len(columns) != 3 or columns[:2] != rows[:2]:
         return False
@@ -239,8 +232,8 @@ def _same_bins(shapes: list[tuple[int, ...]], size: tuple[int, int]) -> bool:
 
 
 def _coarser(cells: tuple[int, ...], size: tuple[int, int]) -> bool:
-    """Whether maps of ``cells`` (height, width) are of an input of ``size`` (width, height), whose
-    cells are squares of several pixels."""
+    """Whether the cells of a map (height, width) are squares of several pixels of an input of
+    ``size`` (width, height)."""
     if len(cells) != 2 or min(cells) < 1:
         return False
     stride = size[0] / cells[1]
@@ -256,17 +249,21 @@ def _unknown(model: OnnxModel, found: list[str]) -> UserError:
     )
 
 
-def _other_points(model: OnnxModel, count: int) -> UserError:
-    return UserError(
-        f"{Path(model.path)}: finds {count} points, expected one of {KNOWN_COUNTS} (133 = "
-        "COCO-WholeBody); name a whole-body model"
-    )
+def _point_names(model: OnnxModel, count: int) -> tuple[str, ...]:
+    """Names of the points of a model with ``count`` points."""
+    try:
+        return find_layout(count, model.metadata.get(LAYOUT_KEY)).points
+    except ValueError as error:
+        raise UserError(f"{Path(model.path)}: {error}") from None
 
 
 def simcc_points(columns: np.ndarray, rows: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Points (B, K, 3) of x, y in an input of ``size`` (width, height) and confidence.
+    """Decode SimCC responses: (B, K, 3) of x, y (px of the input) and confidence.
 
-    columns (B, K, X) and rows (B, K, Y) are responses; the confidence is the smaller of the two.
+    Args:
+        columns: (B, K, X) responses of the bins along x.
+        rows: (B, K, Y) responses of the bins along y. The confidence is the smaller maximum.
+        size: width and height of the input.
     """
     x = columns.argmax(-1) * size[0] / columns.shape[-1]
     y = rows.argmax(-1) * size[1] / rows.shape[-1]
@@ -275,12 +272,14 @@ def simcc_points(columns: np.ndarray, rows: np.ndarray, size: tuple[int, int]) -
 
 
 def heatmap_points(maps: np.ndarray, size: tuple[int, int], grid: HeatmapGrid) -> np.ndarray:
-    """Points (B, K, 3) of x, y in an input of ``size`` (width, height) and confidence.
+    """Decode heatmaps: (B, K, 3) of x, y (px of the input) and confidence.
 
-    maps (B, K, h, w). Cell i of w stands for pixel i W/w with the grid "msra" (mmpose's
-    MSRAHeatmap), for i (W-1)/(w-1) with "udp" (Huang et al. 2020, "The Devil is in the Details:
-    Delving into Unbiased Data Processing for Human Pose Estimation"). The confidence is the
-    highest response.
+    Args:
+        maps: (B, K, h, w). The confidence is the highest response.
+        size: width and height of the input, W and H.
+        grid: "msra": cell i is at pixel i W/w (mmpose's MSRAHeatmap). "udp": at i (W-1)/(w-1)
+            (Huang et al. 2020, "The Devil is in the Details: Delving into Unbiased Data Processing
+            for Human Pose Estimation").
     """
     batch, count, height, width = maps.shape
     flat = maps.reshape(batch * count, height, width).astype(np.float64)
@@ -292,9 +291,10 @@ def heatmap_points(maps: np.ndarray, size: tuple[int, int], grid: HeatmapGrid) -
 
 
 def peaks(maps: np.ndarray) -> np.ndarray:
-    """Places (N, 2) of x, y in cells of the peaks of maps (N, h, w), finer than cells.
+    """Peaks (N, 2) of x, y in cells of maps (N, h, w), finer than cells (DARK, Zhang et al. 2020).
 
-    Where the expansion is none of a peak within a cell, or at the border, it is the highest cell.
+    The result is the highest cell at the border, and if the second-order expansion of the logarithm
+    has no maximum within one cell.
     """
     number, height, width = maps.shape
     row, column = np.divmod(maps.reshape(number, -1).argmax(1), width)
@@ -320,9 +320,10 @@ def peaks(maps: np.ndarray) -> np.ndarray:
 
 
 def _smooth_around(maps: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-    """(N, 5, 5) around a cell of each of the maps (N, h, w) after a Gaussian blur.
+    """Blur maps (N, h, w) and return (N, 5, 5) around a cell of each.
 
-    The blur makes one hill of what noise made several; zero beyond the border, as mmpose has it.
+    The blur joins the several maxima that noise causes. Maps are zero beyond the border, as in
+    mmpose.
     """
     reach = max(1, round(HEATMAP_BLUR * min(maps.shape[1:]) / 2 - 0.5))
     kernel = cv2.getGaussianKernel(2 * reach + 1, 0)[:, 0]  # OpenCV's own deviation for the width

@@ -1,9 +1,12 @@
-"""Instance segmentation by a user's ONNX model: what kind of model it is, and images through it.
+"""Instance segmentation by a user's ONNX model: YOLO-seg, Mask R-CNN or PointRend.
 
-Two kinds are told apart by their outputs. YOLO-seg (ultralytics) has two: rows of boxes, class
-scores and coefficients (B, 4 + classes + M, N), and M prototypes of masks (B, M, h, w). Mask R-CNN
-and PointRend have boxes (N, 4), classes (N,), scores (N,) and masks, over the box (N, 1, 28, 28) or
-over the image (N, 1, H, W); detectron2's also have the image's size.
+The kind of a model is recognised by its outputs. YOLO-seg (ultralytics) has two: rows of boxes,
+class scores and coefficients (B, 4 + classes + M, N), and M prototypes of masks (B, M, h, w). Mask
+R-CNN and PointRend have boxes (N, 4), classes (N,), scores (N,) and masks, over the box (N, 1, 28,
+28) or over the image (N, 1, H, W); those of detectron2 also have the image's size.
+
+Boxes are two corners in the model's input. Masks are sampled where the image's pixels lie in the
+model's grid, and only within the box.
 """
 
 from __future__ import annotations
@@ -39,8 +42,8 @@ from intercap_core.geometry.camera import masks
 from intercap_core.inputs.files import quoted
 
 NMS_IOU = 0.7  # default of ultralytics' predictors
-MAX_BOXES = 3000  # of one image, that enter non-maximum suppression
-MAX_INSTANCES = 100  # of one image, the best; as in COCO's evaluation
+MAX_BOXES = 3000  # of one image that enter non-maximum suppression; 30 times MAX_INSTANCES
+MAX_INSTANCES = 100  # of one image, as in COCO's evaluation
 MASK_PROBABILITY = 0.5  # at the edge of a mask
 
 
@@ -55,10 +58,10 @@ def yolo_instances(
 ) -> list[Instance]:
     """Instances of a YOLO-seg export.
 
-    ``rows`` (4 + classes + M, N) of box (middle, width, height), class scores and M coefficients,
-    or (N, 6 + M) of corners, score, class and coefficients where the model suppresses overlaps
-    itself. ``prototypes`` (M, h, w) over the whole input. Raises ValueError where the rows have
-    neither shape.
+    ``rows`` are (4 + classes + M, N) of box (middle, width, height), class scores and M
+    coefficients; or (N, 6 + M) of corners, score, class and coefficients, if the model itself
+    suppresses overlaps. ``prototypes`` (M, h, w) cover the whole input. Raises ValueError if the
+    rows have neither shape.
     """
     count = len(prototypes)
     ends_itself = rows.shape[1] == 6 + count
@@ -104,10 +107,10 @@ def rcnn_instances(
     min_score: float,
     names: Mapping[int, str],
 ) -> list[Instance]:
-    """Instances of a Mask R-CNN or PointRend export.
+    """Instances of a Mask R-CNN or PointRend export; see :func:`yolo_instances`.
 
-    ``corners`` (N, 4), ``classes`` (N,), ``scores`` (N,); ``probabilities`` (N, h, w) of the mask
-    over the whole input where they have its size, else over the box.
+    ``corners`` (N, 4), ``classes`` (N,) and ``scores`` (N,). The masks' ``probabilities`` (N, h, w)
+    are over the whole input if they have its size, else over the box.
     """
     kept = np.flatnonzero(scores >= min_score)
     kept = kept[np.argsort(-scores[kept], kind="stable")][:MAX_INSTANCES]
@@ -147,10 +150,10 @@ def _instance(
     size: tuple[int, int],
     threshold: float,
 ) -> Instance | None:
-    """The pixels of ``box`` (x0, y0, x1, y1) at which ``grid`` (h, w) is above the threshold.
+    """The instance of the pixels in ``box`` (x0, y0, x1, y1) where ``grid`` (h, w) > threshold.
 
     ``across`` and ``down`` are scale and shift from the image's to the grid's pixel edges. The
-    instance's box is the mask's own; None where no pixel is set.
+    box of the result is that of its mask. None if no pixel is set.
     """
     if not np.isfinite(box).all():
         return None
@@ -158,7 +161,7 @@ def _instance(
     x1, y1 = min(int(np.ceil(box[2])), size[0]), min(int(np.ceil(box[3])), size[1])
     if x1 <= x0 or y1 <= y0:
         return None
-    # Pixel u of the window has its middle at x0 + u + 0.5; the grid's pixel v at v + 0.5.
+    # The middle of pixel u of the window is at x0 + u + 0.5, that of the grid's pixel v at v + 0.5.
     inverse = np.array(
         [
             [across[0], 0, across[0] * (x0 + 0.5) + across[1] - 0.5],
@@ -180,9 +183,9 @@ def _instance(
 
 
 def suppressed(corners: np.ndarray, scores: np.ndarray, classes: np.ndarray) -> np.ndarray:
-    """Indices (K,) of the boxes (N, 4) that stay, best first: greedy non-maximum suppression.
+    """Indices (K,) of the boxes (N, 4) that greedy non-maximum suppression keeps, best first.
 
-    A box goes where a better one of its own class overlaps it by more than ``NMS_IOU``.
+    A box is removed if a better one of its class overlaps it by more than ``NMS_IOU``.
     """
     order = np.argsort(-scores, kind="stable")[:MAX_BOXES]
     boxes, kinds = corners[order], classes[order]
@@ -217,16 +220,20 @@ _FLOATS = ("tensor(float)", "tensor(float16)")
 
 @dataclass(frozen=True)
 class _Kind:
-    """How a model is to be fed and understood."""
+    """Kind of a model."""
 
     values: PixelValues
+    """Pixel values of its input."""
     names: Mapping[int, str]
-    outputs: dict[str, int]  # which output is what
+    """Classes by number."""
+    outputs: dict[str, int]
+    """Position of each output by its meaning."""
     yolo: bool
+    """Whether it is a YOLO-seg."""
 
 
 class Segmenter:
-    """A model with its class names. Obtained from :meth:`load`."""
+    """A model with its class names; obtained from :meth:`load`."""
 
     def __init__(self, model: OnnxModel, kind: _Kind, min_score: float) -> None:
         self._model, self._kind, self._min_score = model, kind, min_score
@@ -234,10 +241,7 @@ class Segmenter:
 
     @classmethod
     def load(cls, settings: DetectionsSettings) -> Segmenter:
-        """Open the model that the settings name.
-
-        Raises UserError where it cannot be run or is of no kind that is known.
-        """
+        """Open the model that the settings name; raises UserError if its kind is unknown."""
         assert settings.segmentation_model is not None
         model = OnnxModel.load(settings.segmentation_model, settings.segmentation_device)
         task = model.metadata.get("task", "segment")
@@ -262,7 +266,7 @@ class Segmenter:
 
     @property
     def classes(self) -> list[str]:
-        """What the model can find, in the order of its numbers."""
+        """Classes of the model, in the order of their numbers."""
         return [self._kind.names[number] for number in sorted(self._kind.names)]
 
     def segment(
@@ -300,7 +304,7 @@ class Segmenter:
     ) -> Iterator[tuple[Key, list[Instance]]]:
         images = np.stack([values for _, _, values in waiting])
         missing = (self._model.batch or 0) - len(images)
-        if missing > 0:  # the model insists on its number
+        if missing > 0:  # the model has a fixed batch size
             images = np.concatenate([images, np.repeat(images[-1:], missing, 0)])
         outputs = self._model.run(images)
         size = (images.shape[3], images.shape[2])
@@ -315,14 +319,10 @@ class Segmenter:
         if not shaped or not _is_grid(prototypes.shape[2:]) or not prototypes.shape[1]:
             raise _unknown(self._model, [str(list(v.shape)) for v in outputs])
         self._check_numbers(rows[index], prototypes[index])
+        score, names = self._min_score, self._kind.names
         try:
             found = yolo_instances(
-                rows[index],
-                prototypes[index],
-                fit,
-                size,
-                min_score=self._min_score,
-                names=self._kind.names,
+                rows[index], prototypes[index], fit, size, min_score=score, names=names
             )
         except ValueError:
             raise _unknown(self._model, [str(list(v.shape)) for v in outputs]) from None
@@ -342,15 +342,9 @@ class Segmenter:
         if not shaped or soft.ndim != 3 or (len(soft) and not _is_grid(soft.shape[1:])):
             raise _unknown(self._model, [str(list(v.shape)) for v in outputs])
         self._check_numbers(boxes, classes, scores)
+        score, names = self._min_score, self._kind.names
         found = rcnn_instances(
-            boxes,
-            classes,
-            scores,
-            soft,
-            fit,
-            size,
-            min_score=self._min_score,
-            names=self._kind.names,
+            boxes, classes, scores, soft, fit, size, min_score=score, names=names
         )
         return self._plausible(found)
 
@@ -363,7 +357,7 @@ class Segmenter:
                 )
 
     def _plausible(self, found: list[Instance]) -> list[Instance]:
-        """The instances; raises UserError where their scores are none."""
+        """Return the instances; raises UserError if their scores are no probabilities."""
         most = max((instance.score for instance in found), default=0.0)
         if most > MAX_SCORE:
             raise UserError(
@@ -374,7 +368,7 @@ class Segmenter:
 
 
 def _is_grid(shape: tuple[int, ...]) -> bool:
-    """Whether masks of this height and width can be laid over an image."""
+    """Whether masks of this height and width can be sampled."""
     return min(shape) >= 1 and max(shape) <= MAX_GRID_SIDE
 
 
@@ -388,7 +382,7 @@ def _yolo_outputs(model: OnnxModel) -> dict[str, int] | None:
 
 
 def _rcnn_outputs(model: OnnxModel) -> dict[str, int] | None:
-    """Which output is what, by name where all four are named, else by rank and type."""
+    """Position of each output, by the names if they name all four, else by rank and type."""
     found: dict[str, int] = {}
     for what, words in (
         ("boxes", "box"), ("classes", "label|class"), ("scores", "score"), ("masks", "mask"),
@@ -402,7 +396,7 @@ def _rcnn_outputs(model: OnnxModel) -> dict[str, int] | None:
     for i, (_, shape, kind) in enumerate(model.outputs):
         if len(shape) == 2 and kind in _FLOATS:
             found.setdefault("boxes", i)
-        elif len(shape) == 1:  # the image's size, of whole numbers too, comes last
+        elif len(shape) == 1:  # the image's size, also of whole numbers, comes last
             found.setdefault("scores" if kind in _FLOATS else "classes", i)
         elif len(shape) in (3, 4):
             found.setdefault("masks", i)
@@ -410,7 +404,7 @@ def _rcnn_outputs(model: OnnxModel) -> dict[str, int] | None:
 
 
 def _auto_values(model: OnnxModel, found: dict[str, int]) -> PixelValues:
-    """Whose export it is: torchvision's masks cover the image, detectron2 also gives its size."""
+    """Pixel values by exporter: torchvision's masks cover the image, detectron2 adds its size."""
     if len(model.outputs) > 4:
         return "bgr255"
     lengths = model.outputs[found["masks"]][1][-2:]
@@ -420,7 +414,7 @@ def _auto_values(model: OnnxModel, found: dict[str, int]) -> PixelValues:
 
 
 def _coco_names(yolo: bool, values: str) -> Mapping[int, str]:
-    """COCO's numbering of the family that is fed this way."""
+    """COCO's numbering in models with these pixel values."""
     if yolo or values == "bgr255":
         return COCO_NAMES_FROM_0
     return COCO_NAMES if values == "rgb" else COCO_NAMES_FROM_1
@@ -432,7 +426,7 @@ def _own_names(model: OnnxModel) -> dict[int, str]:
 
 
 def _longest_side(metadata: Mapping[str, str]) -> int:
-    """The longest side at which a YOLO of free size was trained."""
+    """The longest side at which a YOLO without a fixed input size was trained."""
     sides = [int(n) for n in re.findall(r"\d{1,5}", metadata.get("imgsz", ""))]
     return max(sides) if sides and min(sides) > 0 else YOLO_SIDE
 

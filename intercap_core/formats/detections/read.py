@@ -21,20 +21,22 @@ NOBODY_LOOKED, FROM_DETECTOR, FROM_IMAGES = 0, 1, 2  # who segmented an image
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """One segmented instance of one image.
-
-    ``index`` counts within the image, ``box`` (4,) is x, y, width, height, pixels. The mask is
-    parsed when first asked for. ``extent_m`` is the size of the thing where it was measured, NaN
-    where not.
-    """
+    """One segmented instance of one image."""
 
     index: int
+    """Counts within the image."""
     label: str
+    """Name of the class; "" = unknown."""
     score: float
+    """From 0 to 1."""
     box: np.ndarray
+    """(4,) x, y, width, height, px."""
     rle: bytes
-    image_size: tuple[int, int]  # width, height
+    """Mask as compressed COCO RLE; parsed on first use."""
+    image_size: tuple[int, int]
+    """Width and height of the image."""
     extent_m: float = float("nan")
+    """Measured size of the instance, metres; NaN = not measured."""
 
     @cached_property
     def runs(self) -> Runs:
@@ -48,7 +50,7 @@ class Candidate:
 
 
 class PeopleOfImages(Protocol):
-    """The people of a recording's images, wherever they come from."""
+    """The people of a recording's images, from any source."""
 
     @property
     def num_sets(self) -> int:
@@ -73,12 +75,21 @@ class _CameraTable:
 
 
 class Detections:
-    """Detections of all images; T frame sets, C cameras in the order of ``camera_names``.
+    """Detections of all images; obtained from :meth:`load`.
 
-    Everything is read at once: keypoints and RLE strings are a few MB a hundred sets.
-    ``keypoints_found`` and ``candidates_found`` are (T, C) bool, ``image_sizes`` (C, 2) width and
-    height. Obtained from :meth:`load`.
+    Everything is read at once: keypoints and RLE strings are a few MB for a hundred frame sets.
     """
+
+    camera_names: tuple[str, ...]
+    """Names of the C cameras."""
+    image_sizes: np.ndarray
+    """(C, 2) width and height of the colour images."""
+    keypoints_found: np.ndarray
+    """(T, C) bool: a detector looked for people."""
+    candidates_found: np.ndarray
+    """(T, C) bool: a detector looked for instances."""
+    notes: tuple[str, ...]
+    """What was left out, by camera."""
 
     def __init__(self, artefact: artefacts.Artefact) -> None:
         self.path = artefact.path
@@ -99,10 +110,13 @@ class Detections:
             return cls(artefact)
 
     def showing(self, image_of: np.ndarray) -> Detections:
-        """The same detections by the moment that their images show: ``t`` is then a moment.
+        """Return the detections indexed by moment instead of frame set.
 
-        ``image_of`` (T, C) of the scene artefact: the set whose image of each camera shows each
-        moment, -1 = none. Raises UserError where it is of another recording.
+        Raises UserError if ``image_of`` is of another recording.
+
+        Args:
+            image_of: (T, C) of the scene artefact: the frame set whose image of each camera shows
+                each moment, -1 = none.
         """
         if image_of.shape != self.keypoints_found.shape:
             sets, cameras = self.keypoints_found.shape
@@ -119,11 +133,11 @@ class Detections:
         return moments
 
     def with_candidates_of(self, person: Path) -> Detections:
-        """The same with the candidates that stage ``person`` found in the images alone.
+        """Return the detections with the candidates that stage ``person`` found in the images.
 
-        They follow a detector's, or replace them where the stage was to use the images alone; only
-        of detections read by the moment (:meth:`showing`). Raises UserError where the artefact
-        cannot be read or is of another recording.
+        They are appended to a detector's, or replace them if the stage was told to use the images
+        alone. Call this for detections by moment (:meth:`showing`). Raises UserError if the
+        artefact cannot be read or is of another recording.
         """
         with artefacts.read(person, PERSON) as artefact:
             source = artefact["mask_source"]
@@ -149,7 +163,7 @@ class Detections:
             image = t * source.shape[1] + c
             first, last = int(offsets[image]), int(offsets[image + 1])
             named = [] if alone else self.candidates(t, c)
-            # that nothing stands before the background does not say that the object is not there
+            # An image without foreground may still show the object, so it stays "not found".
             both.candidates_found[t, c] |= last > first
             width, height = (int(n) for n in self.image_sizes[c])
             both._from_images[t, c] = named + [
@@ -182,7 +196,7 @@ class Detections:
         return table.people[table.people_offsets[image] : table.people_offsets[image + 1]]
 
     def candidates(self, t: int, c: int) -> list[Candidate]:
-        """The image's segmentation candidates, in the order that the artefact holds them."""
+        """The image's segmentation candidates, in the order of the artefact."""
         if (t, c) in self._from_images:
             return self._from_images[t, c]
         table, image = self._tables[c], self._image(t, c)

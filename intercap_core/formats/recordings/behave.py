@@ -1,4 +1,4 @@
-"""RecordingLayout ``behave``: the folders of the BEHAVE data set.
+"""Layout ``behave``: the folders of the BEHAVE data set.
 
 ``recordings`` is a sequence's folder of frame folders ``t<seconds>`` that hold
 ``k<n>.color.jpg`` and ``k<n>.depth.png`` (16 bits, millimetres, on the colour image's grid) of the
@@ -33,8 +33,9 @@ MASTER = "k1"
 FRAME_FOLDER = re.compile(r"t(\d{1,6}(?:\.\d{1,6})?)")
 IMAGE_FILE = re.compile(r"k(\d{1,2})\.(color\.(?:jpe?g|png)|depth\.png)", re.IGNORECASE)
 KINECT_FOLDER = re.compile(r"k?(\d{1,2})")
-NOMINAL_FPS = (30.0, 15.0, 5.0)  # of an Azure Kinect; names round the times to milliseconds
-FPS_TOLERANCE = 0.05
+# Frame rates of Azure Kinects. Names of folders round times to milliseconds, 3 % of a period.
+NOMINAL_FPS = (30.0, 15.0, 5.0)
+FPS_TOLERANCE = 0.05  # relative
 
 
 class BehaveLayout(RecordingLayout):
@@ -56,7 +57,7 @@ class BehaveLayout(RecordingLayout):
         )
 
     def open(self, name: str) -> AlignedRecording:
-        """Find the camera's files; raises UserError without colour images or a fitting lens."""
+        """Find the camera's files; raises UserError without colour images or a matching lens."""
         shots = [
             ImagePair(time_us, images.get((name, "color")), images.get((name, "depth")))
             for time_us, images in self._images.items()
@@ -83,7 +84,7 @@ class BehaveLayout(RecordingLayout):
 def frame_folders(recordings: Path) -> dict[int, Path]:
     """Folders of frames by time, microseconds, in order of time.
 
-    Raises UserError where two have one time.
+    Raises UserError if two have the same time.
     """
     found: dict[int, Path] = {}
     for path in sorted(recordings.iterdir()):
@@ -100,7 +101,7 @@ def frame_folders(recordings: Path) -> dict[int, Path]:
 
 
 def frame_rate(times_us: list[int]) -> float:
-    """Nominal frames a second of increasing times; 1 of a single one."""
+    """Nominal frame rate of increasing times; 1 for a single time."""
     if len(times_us) < 2:
         return 1.0
     fps = 1e6 / float(np.median(np.diff(times_us)))
@@ -108,7 +109,7 @@ def frame_rate(times_us: list[int]) -> float:
 
 
 def _images(folder: Path) -> dict[tuple[str, str], Path]:
-    """The frame's images by camera name and kind, "color" or "depth"."""
+    """A frame's images by camera and kind, "color" or "depth"."""
     found = {}
     for path in sorted(folder.iterdir()):
         match = IMAGE_FILE.fullmatch(path.name)
@@ -121,8 +122,8 @@ def read_poses(folder: Path) -> Extrinsics:
     """Read ``<n>/config.json`` of every Kinect: poses relative to Kinect 1's colour camera.
 
     ``rotation`` (9 numbers, row by row) and ``translation`` (metres) map a colour camera's points
-    to the world, x_world = R x + t. Raises UserError naming the file where one is broken, or where
-    there is none of Kinect 1.
+    to the world, x_world = R x + t. Raises UserError naming the file if one is broken, and if there
+    is none of Kinect 1.
     """
     world_from_colour = {}
     for number, path in _kinect_folders(folder).items():
@@ -158,18 +159,17 @@ def read_poses(folder: Path) -> Extrinsics:
 
 
 def find_intrinsics_folder(calibration: Path) -> Path | None:
-    """The folder ``intrinsics`` in ``calibration`` (``calibs/<date>/config``), or up to two folders
-    above; None where there is none."""
+    """The folder ``intrinsics`` in ``calibration`` (``calibs/<date>/config``) or up to two folders
+    above it; None if there is none."""
     above = calibration.resolve()
     places = [above / "intrinsics", above.parent / "intrinsics", above.parents[1] / "intrinsics"]
     return next((place for place in places if place.is_dir()), None)
 
 
 def read_lens(calibration: Path, number: int) -> Intrinsics:
-    """Read the colour lens of one Kinect from the folder ``intrinsics`` beside the dates.
+    """Read the colour lens of one Kinect from the folder of :func:`find_intrinsics_folder`.
 
-    The folder is looked for in ``calibration`` (``calibs/<date>/config``) and up to two folders
-    above. The file's ``color`` states ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy`` and
+    The file's ``color`` states ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy`` and
     ``opencv``: those four again, then OpenCV's distortion. Raises UserError naming the file.
     """
     place = find_intrinsics_folder(calibration)

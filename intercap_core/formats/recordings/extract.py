@@ -1,4 +1,4 @@
-"""Copies one camera's images into the frames artefact, as recorded, and notes their defects."""
+"""Copies one camera's images into the frames artefact and notes what is degraded."""
 
 from __future__ import annotations
 
@@ -20,33 +20,44 @@ from intercap_core.progress import Progress
 log = logging.getLogger(__name__)
 
 COLOUR_BUFFER_BYTES = 4 << 20
-FINGERPRINT_BYTES = 256  # of each image's end: entropy-coded, so that no two images share them
+# End of each image that enters the fingerprint: entropy-coded data, which no two images share.
+FINGERPRINT_BYTES = 256
 
 
 @dataclass
 class ExtractedCamera:
-    """One camera: its lenses, the times of its images, and their defects.
-
-    ``colour_times`` and ``depth_times`` are device times, microseconds, in the order of the
-    artefact's images; ``depth_delay_us`` is not taken off. Images that no frame set may use are
-    False in ``colour_usable`` and ``depth_usable``. ``sound`` where the recording has any.
-    """
+    """One camera whose images were copied."""
 
     name: str
+    """Name of the camera."""
     source: Path | None = None
+    """Its recording; None without one."""
     camera: Camera | None = None
+    """Lenses and pose; None if the camera cannot be used."""
     fps: float = 0.0
+    """Nominal images a second."""
     serial: str = ""
+    """Serial number of the device; "" = unknown."""
     depth_delay_us: int = 0
+    """Device time of a depth image minus that of its colour image, by design."""
     fingerprint: int = 0
+    """Checksum over the ends of all colour images."""
     gravity: np.ndarray = field(default_factory=lambda: np.full(3, np.nan))
+    """(3,) direction down, unit, colour camera's frame; NaN = unknown."""
     truncated: bool = False
+    """The recording was cut off."""
     notes: list[str] = field(default_factory=list)
+    """What is degraded, for the user."""
     colour_times: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    """(N,) device times, microseconds, in the order of the artefact's images."""
     depth_times: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    """(M,) the same of depth, including its delay."""
     colour_usable: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
+    """(N,) frame sets may use the image."""
     depth_usable: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
+    """(M,) frame sets may use the image."""
     sound: Sound | None = None
+    """Sound track of the recording."""
 
     @property
     def present(self) -> bool:
@@ -62,9 +73,9 @@ class ExtractedCamera:
 def extract(
     name: str, layout: RecordingLayout, writer: artefacts.Writer, *, depth: bool = True
 ) -> ExtractedCamera:
-    """Copy one camera's images into the artefact; whatever is wrong becomes a note of the view.
+    """Copy one camera's images into the artefact; faults become notes of the result.
 
-    Without ``depth`` its colour alone.
+    Without ``depth``, only colour is copied.
     """
     view = ExtractedCamera(name)
     if name not in layout.extrinsics.master_from_colour:
@@ -89,7 +100,7 @@ def extract(
 
 
 def _without_folders(text: str, layout: RecordingLayout) -> str:
-    """An artefact holds no path of a machine: files by what is below the sequence's folders."""
+    """Shorten paths to what is below the sequence's folders: artefacts hold no absolute paths."""
     recordings, calibration = layout.sequence.recordings, layout.sequence.calibration
     for folder in (recordings, calibration.parent):
         text = text.replace(f"{folder}/", "")
@@ -97,7 +108,7 @@ def _without_folders(text: str, layout: RecordingLayout) -> str:
 
 
 class _Copy:
-    """The copying of one recording."""
+    """Copies one recording."""
 
     def __init__(
         self,
@@ -119,13 +130,13 @@ class _Copy:
         self.colour_times: list[int] = []
         self.depth_times: list[int] = []
         self.offsets, self.buffer = [0], bytearray()
-        self.measured = False  # some depth image holds a distance
+        self.measured = False  # whether any depth image holds a distance
         self.damaged = self.other_size = 0
 
     def run(self) -> None:
-        """Copy all images, then write their times and say what is degraded.
+        """Copy all images, write their times and note what is degraded.
 
-        Raises UserError where no image at all has the size that the calibration is for.
+        Raises UserError if the first image has another size than the calibration.
         """
         view, recording = self.view, self.recording
         progress = Progress(log, f"{view.name}: read", None, "images")
@@ -177,7 +188,7 @@ class _Copy:
     def _refuse(
         self, kind: str, found: tuple[int, ...], expected: tuple[int, ...], first: bool
     ) -> None:
-        """Count one image of another size; the first image speaks for the whole recording."""
+        """Count an image of another size; raise UserError if it is the first of the recording."""
         if first:
             raise UserError(
                 f"{self.recording.source}: {kind} images are {found[0]}x{found[1]}, the "

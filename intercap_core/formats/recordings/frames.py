@@ -24,7 +24,7 @@ _DECODED = {
 
 
 class Frames:
-    """An open frames artefact. ``t`` is a set (0 <= t < T), ``c`` a camera's index in the rig."""
+    """An open frames artefact. ``t`` is a frame set (0 <= t < T), ``c`` a camera of the rig."""
 
     def __init__(self, artefact: artefacts.Artefact, image_of: np.ndarray | None = None) -> None:
         self._artefact = artefact
@@ -39,10 +39,13 @@ class Frames:
             yield cls(artefact)
 
     def showing(self, image_of: np.ndarray) -> Frames:
-        """The same images by the moment that they show: ``t`` is then a moment, not a set.
+        """Return the images indexed by moment instead of frame set.
 
-        ``image_of`` (T, C) of the scene artefact: the set whose image of each camera shows each
-        moment, -1 = none. Raises UserError where it is of another recording.
+        Raises UserError if ``image_of`` is of another recording.
+
+        Args:
+            image_of: (T, C) of the scene artefact: the frame set whose image of each camera shows
+                each moment, -1 = none.
         """
         if image_of.shape != self._colour_index.shape:
             sets, cameras = self._colour_index.shape
@@ -55,7 +58,7 @@ class Frames:
 
     @cached_property
     def rig(self) -> Rig:
-        """Lenses and extrinsics as given (unrefined)."""
+        """Lenses and extrinsics of the calibration (unrefined)."""
         return Rig.from_artefact(self._artefact)
 
     @property
@@ -114,7 +117,7 @@ class Frames:
 
     @property
     def available(self) -> np.ndarray:
-        """(T, C) bool: the set holds some image of this camera; False for dropped sets."""
+        """(T, C) bool: the set holds any image of this camera; False for dropped sets."""
         return self.colour_available | self.depth_available
 
     @cached_property
@@ -124,7 +127,7 @@ class Frames:
 
     @cached_property
     def first_set_s(self) -> float:
-        """When the first set was, by the recordings' own clock, seconds; NaN without images."""
+        """Time of the first set on the recordings' own clock, seconds; NaN without images."""
         index, skew = self._artefact["colour_index"], self._artefact["skew"].astype(float)
         for c, name in enumerate(self.rig.names):
             seen = np.flatnonzero(index[:, c] >= 0)
@@ -136,8 +139,10 @@ class Frames:
 
     @cached_property
     def first_image_s(self) -> np.ndarray:
-        """(C,) when each camera's first image was taken by its own times, seconds since the first
-        set, NaN = it has no image in any set."""
+        """(C,) time of each camera's first image by its own times, seconds since the first set.
+
+        NaN = no image in any set.
+        """
         result = np.full(len(self.present), np.nan)
         index, skew = self._artefact["colour_index"], self._artefact["skew"].astype(float)
         for c, name in enumerate(self.rig.names):
@@ -151,41 +156,44 @@ class Frames:
 
     @property
     def sound_starts(self) -> dict[str, tuple[float, float]]:
-        """When cameras took their first images by the sound, seconds on a clock of any zero, and
-        its standard deviation, by name; without those that share no sound."""
+        """Starts of cameras by the sound, and their standard deviations, seconds, by name.
+
+        A start is the time of the first image on a clock of any zero. Cameras that share no sound
+        are left out.
+        """
         if "sound_start" not in self._artefact:
             return {}
         pairs = zip(self._artefact["sound_start"], self._artefact["sound_start_sigma"], strict=True)
-        told = dict(zip(self.rig.names, pairs, strict=True))
-        return {n: (float(s), float(d)) for n, (s, d) in told.items() if np.isfinite(s)}
+        starts = dict(zip(self.rig.names, pairs, strict=True))
+        return {n: (float(s), float(d)) for n, (s, d) in starts.items() if np.isfinite(s)}
 
     @cached_property
     def gravity(self) -> np.ndarray:
-        """(C, 3): the direction down, unit, in each colour camera's frame; NaN = not known."""
+        """(C, 3) direction down, unit, in each colour camera's frame; NaN = unknown."""
         return self._artefact["gravity"]
 
     @cached_property
     def stated_up(self) -> np.ndarray:
-        """(3,) unit, up as the user states it, master's frame; NaN = not stated."""
+        """(3,) unit, direction up that the user states, master's frame; NaN = not stated."""
         return self._stated("stated_up")
 
     @cached_property
     def stated_floor(self) -> np.ndarray:
-        """(3,) a point of the floor as the user states it, master's frame; NaN = not stated."""
+        """(3,) point of the floor that the user states, master's frame; NaN = not stated."""
         return self._stated("stated_floor")
 
     def _stated(self, key: str) -> np.ndarray:
         return self._artefact[key] if key in self._artefact else np.full(3, np.nan)
 
     def depth(self, t: int, c: int) -> np.ndarray | None:
-        """Return the depth image (H, W) uint16, millimetres, 0 = invalid; None if there is none."""
+        """The depth image (H, W) uint16, millimetres, 0 = invalid; None if there is none."""
         index = int(self._depth_index[t, c])
         if index < 0:
             return None
         return self._artefact.rows(f"cameras/{self.rig.names[c]}/depth", index)
 
     def colour_jpeg(self, t: int, c: int) -> bytes | None:
-        """Return the JPEG (or PNG) file as recorded; None if there is none."""
+        """The JPEG (or PNG) file as recorded; None if there is none."""
         index = int(self._colour_index[t, c])
         if index < 0:
             return None
@@ -196,10 +204,10 @@ class Frames:
         return self._artefact.rows(f"{group}/colour", slice(int(start), int(end))).tobytes()
 
     def colour(self, t: int, c: int, reduction: Literal[1, 2, 4] = 1) -> np.ndarray | None:
-        """Return the colour image (H, W, 3) uint8, BGR; None if there is none.
+        """The colour image (H, W, 3) uint8, BGR; None if there is none.
 
-        With a ``reduction`` each pixel is the mean of so many by as many, in a fraction of the
-        time. Raises UserError where the recorded image cannot be decoded.
+        With a ``reduction`` of n, each pixel is the mean of n by n pixels, which is faster. Raises
+        UserError if the recorded image cannot be decoded.
         """
         jpeg = self.colour_jpeg(t, c)
         if jpeg is None:

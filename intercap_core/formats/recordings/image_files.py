@@ -1,6 +1,6 @@
-"""Image files of a released data set: their heads, their pixels, a camera made of many of them.
+"""Image files: encodings of single images, and recordings that consist of many files.
 
-Depth here lies on the colour image's pixel grid, so that both have one lens.
+JPEG: ITU-T T.81, annex B; PNG: RFC 2083; Exif: CIPA DC-008, 4.6.
 """
 
 from __future__ import annotations
@@ -22,22 +22,20 @@ from intercap_core.inputs.files import MAX_IMAGE_BYTES, Unreadable, read_bytes
 
 JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
 PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
-JPEG_QUALITY = 97  # of colour that was not recorded as JPEG; about 1 grey level of error
+JPEG_QUALITY = 97  # of colour that was not recorded as JPEG; an error of about 1 grey level
 RAW_FORMATS = {"NV12": 1.5, "YUY2": 2.0, "BGRA": 4.0}  # bytes a pixel
-_SCAN = 0xDA
-_NO_FRAME_HEADERS = (0xC4, 0xC8, 0xCC)  # among C0..CF: tables, reserved, arithmetic conditioning
 
 
 def encoded_size(content: bytes) -> tuple[int, int] | None:
-    """Return width and height of a JPEG or PNG file; None for what is no whole file of these.
+    """Width and height of a JPEG or PNG file; None if the content is no complete file.
 
-    They are those of the image as OpenCV decodes it: turned as a JPEG's Exif orientation says. The
-    end must be there (zero bytes may follow a JPEG's), and in a JPEG a scan; its pixels are not
-    looked at.
+    The size is that of the image as OpenCV decodes it: rotated by a JPEG's Exif orientation. The
+    file's end must be there (zero bytes may follow a JPEG's), and in a JPEG a scan. Pixels are not
+    decoded.
     """
     if content.startswith(PNG_START):
-        whole = content.endswith(PNG_END) and len(content) >= 33
-        return struct.unpack(">II", content[16:24]) if whole else None
+        complete = content.endswith(PNG_END) and len(content) >= 33
+        return struct.unpack(">II", content[16:24]) if complete else None
     if not content.startswith(JPEG_START):
         return None
     if not content.endswith(JPEG_END) and not content.rstrip(b"\0").endswith(JPEG_END):
@@ -46,28 +44,29 @@ def encoded_size(content: bytes) -> tuple[int, int] | None:
 
 
 def _jpeg_size(content: bytes) -> tuple[int, int] | None:
-    """Walk the segments up to the first scan; the frame header before it holds the size."""
-    at, lying = 2, False
+    """Parse the segments up to the first scan; the frame header before it holds the size."""
+    at, rotated = 2, False
     size: tuple[int, int] | None = None
     while at + 9 <= len(content) and content[at] == 0xFF:
         marker = content[at + 1]
         if marker == 0xFF:  # a fill byte
             at += 1
             continue
-        if 0xC0 <= marker <= 0xCF and marker not in _NO_FRAME_HEADERS:
+        # Frame headers are C0 to CF except tables, reserved and arithmetic conditioning.
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
             height, width = struct.unpack(">HH", content[at + 5 : at + 9])
-            size = (height, width) if lying else (width, height)
+            size = (height, width) if rotated else (width, height)
         end = at + 2 + int.from_bytes(content[at + 2 : at + 4], "big")
         if marker == 0xE1 and content[at + 4 : at + 10] == b"Exif\0\0":
-            lying = _orientation(content[at + 10 : end]) >= 5  # by a quarter turn
-        if marker == _SCAN:
+            rotated = _orientation(content[at + 10 : end]) >= 5  # by a quarter turn
+        if marker == 0xDA:  # a scan
             return size if end + 2 < len(content.rstrip(b"\0")) else None
         at = end
     return None
 
 
 def _orientation(tiff: bytes) -> int:
-    """The Exif orientation, 1 to 8; 1 (as stored) where there is none."""
+    """The Exif orientation, 1 to 8; 1 (as stored) without an entry."""
     order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
     if order is None or len(tiff) < 10:
         return 1
@@ -81,7 +80,7 @@ def _orientation(tiff: bytes) -> int:
 
 
 def encode_jpeg(image: np.ndarray) -> bytes:
-    """Encode (H, W, 3) uint8 BGR, for recordings whose colour cannot be copied."""
+    """Encode (H, W, 3) uint8 BGR as JPEG of :data:`JPEG_QUALITY`."""
     import cv2
 
     done, content = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
@@ -91,10 +90,10 @@ def encode_jpeg(image: np.ndarray) -> bytes:
 
 
 def decode_raw(content: bytes, pixel_format: str, size: tuple[int, int]) -> np.ndarray:
-    """Return (H, W, 3) uint8 BGR of a raw image of ``size`` (width, height).
+    """Decode a raw image of ``size`` (width, height) to (H, W, 3) uint8 BGR.
 
-    ``pixel_format`` is one of :data:`RAW_FORMATS`; YUV is BT.601 with limited range, as the Azure
-    Kinect's own viewer takes it. Raises ValueError for another number of bytes.
+    ``pixel_format`` is one of :data:`RAW_FORMATS`. YUV is BT.601 with limited range, as in the
+    viewer of the Azure Kinect. Raises ValueError for another number of bytes.
     """
     import cv2
 
@@ -107,24 +106,24 @@ def decode_raw(content: bytes, pixel_format: str, size: tuple[int, int]) -> np.n
     return cv2.cvtColor(np.frombuffer(content, np.uint8).reshape(shape), code)
 
 
-LOOKED_AT = 5  # files of each kind that a preview opens, spread over the recording
-GREY_TYPE = 0  # PNG colour type of one channel
+PREVIEWED_FILES = 5  # of each kind, evenly over the recording
 
 
 class DamagedImage(Exception):
-    """The file is no image that can be used; says why, in words that fit after its name."""
+    """The file is no usable image; the message follows its name."""
 
 
 class ImagePair(NamedTuple):
-    """What one camera recorded at one moment; None = no file."""
+    """Colour and depth file of one camera at one moment; None = no file."""
 
     time_us: int
+    """Device time, microseconds."""
     colour: Path | None
     depth: Path | None
 
 
 def read_colour(path: Path) -> bytes:
-    """Return a whole JPEG or PNG file as it is; raises :class:`DamagedImage` for anything else."""
+    """Content of a complete JPEG or PNG file; raises :class:`DamagedImage` for anything else."""
     content = _read(path)
     if encoded_size(content) is None:
         raise DamagedImage("is no whole JPEG or PNG")
@@ -132,9 +131,9 @@ def read_colour(path: Path) -> bytes:
 
 
 def read_depth(path: Path, size: tuple[int, int]) -> np.ndarray:
-    """Decode a 16-bit PNG of one channel and of ``size``: (H, W) uint16, millimetres.
+    """Decode a 16-bit PNG of one channel to (H, W) uint16, millimetres.
 
-    Raises :class:`DamagedImage` for anything else.
+    Raises :class:`DamagedImage` for anything else, and for another ``size`` (width, height).
     """
     content = _read(path)
     _check_depth_head(content, size)
@@ -150,16 +149,10 @@ def _check_depth_head(content: bytes, size: tuple[int, int]) -> None:
     if not content.startswith(PNG_START) or len(content) < 26:
         raise DamagedImage("is no PNG")
     width, height, bits, colour_type = struct.unpack_from(">IIBB", content, 16)
-    if bits != 16 or colour_type != GREY_TYPE:
+    if bits != 16 or colour_type != 0:
         raise DamagedImage(f"is no 16-bit grey PNG ({bits} bits, colour type {colour_type})")
-    _check_size((width, height), size)
-
-
-def _check_size(found: tuple[int, int], expected: tuple[int, int]) -> None:
-    if found != expected:
-        raise DamagedImage(
-            f"has {found[0]}x{found[1]} pixels, the colour images {expected[0]}x{expected[1]}"
-        )
+    if (width, height) != size:
+        raise DamagedImage(f"has {width}x{height} pixels, the colour images {size[0]}x{size[1]}")
 
 
 def _read(path: Path, length: int | None = None) -> bytes:
@@ -170,7 +163,7 @@ def _read(path: Path, length: int | None = None) -> bytes:
 
 
 def common_size(paths: Iterable[Path]) -> tuple[int, int] | None:
-    """Return width and height of the first whole image; None where none does."""
+    """Width and height of the first complete image; None if there is none."""
     for path in paths:
         with contextlib.suppress(DamagedImage):
             size = encoded_size(_read(path))
@@ -180,9 +173,9 @@ def common_size(paths: Iterable[Path]) -> tuple[int, int] | None:
 
 
 class FilesRecording(CameraRecording):
-    """One camera's image files: colour files as they are, depth decoded.
+    """One camera's image files: colour files are copied, depth is decoded.
 
-    Depth images have the size of the camera's depth lens; without one they are not read.
+    Depth images have the size of the camera's depth lens. Without a depth lens they are not read.
     """
 
     def __init__(self, source: Path, camera: Camera, shots: list[ImagePair], fps: float) -> None:
@@ -191,11 +184,11 @@ class FilesRecording(CameraRecording):
 
     @property
     def colour_files(self) -> list[tuple[int, Path]]:
-        """Device time, microseconds, and path of every colour file, also of damaged ones."""
+        """Device time, microseconds, and path of all colour files, including damaged ones."""
         return [(shot.time_us, shot.colour) for shot in self._shots if shot.colour is not None]
 
     def preview(self) -> RecordingPreview:
-        """The sizes of all files, and some of the images."""
+        """Inspect the sizes of all files, and some of the images."""
         files, size = self.colour_files, None
         for _, path in files:
             with contextlib.suppress(DamagedImage):
@@ -207,14 +200,14 @@ class FilesRecording(CameraRecording):
         return RecordingPreview(size, len(files), seconds, faults=tuple(faults))
 
     def images(self) -> Iterator[Image]:
-        """Images in the order of the shots; damaged ones are left out and counted."""
+        """Yield images in the order of the shots; damaged ones are left out and counted."""
         return read_pairs(self, self._shots)
 
 
 def faults_of_files(shots: list[ImagePair], lens: Intrinsics | None) -> list[str]:
-    """What is wrong with a camera's image files, by their sizes and a look into some of them.
+    """Faults of a camera's image files: empty files, and damaged ones among a few.
 
-    ``lens`` of the depth camera, None = its depth is not used.
+    ``lens`` is that of the depth camera; None = depth is not used.
     """
     faults = []
     for kind, paths in (
@@ -223,10 +216,11 @@ def faults_of_files(shots: list[ImagePair], lens: Intrinsics | None) -> list[str
     ):
         empty = [path for path in paths if path.stat().st_size == 0]
         if empty:
-            told = f"{len(empty)} of {len(paths)} {kind} files are empty (first: {empty[0].name})"
-            faults.append(told)
+            faults.append(
+                f"{len(empty)} of {len(paths)} {kind} files are empty (first: {empty[0].name})"
+            )
         bad = []
-        looked = np.unique(np.linspace(0, len(paths) - 1, LOOKED_AT).round().astype(int))
+        looked = np.unique(np.linspace(0, len(paths) - 1, PREVIEWED_FILES).round().astype(int))
         looked = looked[: len(paths)].tolist()
         for index in looked:
             try:
@@ -238,13 +232,14 @@ def faults_of_files(shots: list[ImagePair], lens: Intrinsics | None) -> list[str
                 if paths[index] not in empty:
                     bad.append(f"{paths[index].name} {error}")
         if bad:
-            told = f"{len(bad)} of {len(looked)} {kind} files looked at are damaged"
-            faults.append(f"{told} (first: {bad[0]})")
+            faults.append(
+                f"{len(bad)} of {len(looked)} {kind} files looked at are damaged (first: {bad[0]})"
+            )
     return faults
 
 
 def read_pairs(recording: CameraRecording, shots: list[ImagePair]) -> Iterator[Image]:
-    """Yield the images of ``shots``; what is damaged is noted at the recording, by first name."""
+    """Yield the images of ``shots``; damaged ones are noted at the recording."""
     lens = recording.camera.depth
     damaged: list[str] = []
     for time_us, colour, depth in shots:
@@ -266,11 +261,11 @@ def read_pairs(recording: CameraRecording, shots: list[ImagePair]) -> Iterator[I
 
 
 class AlignedRecording(FilesRecording):
-    """One camera's image files, with depth on the colour image's grid.
+    """One camera's image files with depth on the colour image's pixel grid: both have one lens.
 
-    ``shots`` are in order of time. A camera none of whose depth files is a 16-bit PNG of the
-    colour image's size is one without depth, with a note. Raises UserError, naming ``source``,
-    where there is no colour file at all.
+    ``shots`` are in order of time. If no depth file is a 16-bit PNG of the colour image's size, the
+    camera counts as without depth, with a note. Raises UserError, naming ``source``, if there is no
+    colour file.
     """
 
     def __init__(
@@ -294,7 +289,7 @@ class AlignedRecording(FilesRecording):
             raise UserError(f"{source}: holds no colour image; copy this camera's images again")
 
     def _fault_of_depth(self) -> str:
-        """What is wrong with all depth files; empty where some file's head is as it must be."""
+        """Why no depth file can be used; "" if the head of any of them is right."""
         fault = ""
         for path in (shot.depth for shot in self._shots if shot.depth is not None):
             try:
@@ -305,9 +300,9 @@ class AlignedRecording(FilesRecording):
         return fault
 
     def sample_depth(self, count: int) -> list[np.ndarray]:
-        """Up to ``count`` depth images (H, W) uint16 mm, spread over the recording.
+        """Up to ``count`` depth images (H, W) uint16, mm, evenly over the recording.
 
-        Raises UserError where none can be read.
+        Raises UserError if none can be read.
         """
         paths = [shot.depth for shot in self._shots if shot.depth is not None]
         chosen = np.unique(np.linspace(0, len(paths) - 1, count).round().astype(int))

@@ -1,7 +1,7 @@
-"""RecordingLayout ``intercap``: the folders of the InterCap release.
+"""Layout ``intercap``: the folders of the InterCap release.
 
-``recordings`` is ``RGBD_Images/<subject>/<object>/Seg_<k>`` with ``Frames_Cam<n>/color/%05d.jpg``
-and a folder of depth beside each ``color``: 16-bit PNG, millimetres, on the colour image's grid.
+``recordings`` is ``RGBD_Images/<subject>/<object>/Seg_<k>``. It holds ``Frames_Cam<n>`` with
+``color/%05d.jpg`` and a folder of depth: 16-bit PNG, millimetres, on the colour image's grid.
 ``calibration`` is a folder of ``Color.json``, ``Color_2.json``, ... Cameras are named k1, k2, ...
 The release states no times: the number in a file's name is its place at 30 images a second.
 """
@@ -24,13 +24,13 @@ from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.inputs.documents import read_json
 from intercap_core.inputs.files import Unreadable
 
-FPS = 30.0
+FPS = 30.0  # of the release
 CAMERA_FOLDER = re.compile(r"frames_cam(\d{1,2})", re.IGNORECASE)
 COLOUR_FOLDER = re.compile(r"colou?r", re.IGNORECASE)
 DEPTH_FOLDER = re.compile(r"depth.*", re.IGNORECASE)
 NUMBERED = re.compile(r"(?!\.)\D*(\d{1,9})\.(?:jpe?g|png)", re.IGNORECASE)
-# A principal point farther than this share of the image's width or height from its middle is that
-# of another resolution: the release's lie within 3 %.
+# Share of the image by which a principal point lies off its middle, beyond which it belongs to
+# another resolution. Those of the release lie within 3 %.
 FARTHEST_CENTRE = 0.15
 
 
@@ -40,7 +40,7 @@ def time_of(number: int) -> int:
 
 
 def numbers_of(times_us: np.ndarray) -> np.ndarray:
-    """The numbers in the names of the images with these device times, inverse of the above."""
+    """Numbers in the names of the images with these device times; inverse of :func:`time_of`."""
     return np.rint(np.asarray(times_us) * (FPS / 1e6)).astype(np.int64)
 
 
@@ -60,7 +60,7 @@ class InterCapLayout(RecordingLayout):
         self.names = list(self._folders)
 
     def open(self, name: str) -> AlignedRecording:
-        """Find the camera's files; raises UserError without colour images or a fitting lens."""
+        """Find the camera's files; raises UserError without colour images or a matching lens."""
         folder = self._folders[name]
         colour, depth = numbered_images(folder)
         size = common_size(colour.values())
@@ -82,7 +82,7 @@ class InterCapLayout(RecordingLayout):
 
 
 def frame_rate(numbers: list[int]) -> float:
-    """Images a second of increasing numbers: fewer than the release's where every n-th was kept."""
+    """Images a second of increasing numbers; less than 30 if only every n-th image was kept."""
     steps = np.diff(numbers)
     return FPS / max(1.0, float(np.median(steps))) if len(steps) else FPS
 
@@ -100,8 +100,8 @@ def camera_folders(recordings: Path) -> dict[str, Path]:
 def numbered_images(folder: Path) -> tuple[dict[int, Path], dict[int, Path]]:
     """Colour and depth files of a camera's folder by the number in their names.
 
-    Of several folders of depth one that says "align" is taken, else the first by name. Raises
-    UserError where two files have one number.
+    Of several folders of depth, the first whose name contains "align" is used, else the first by
+    name. Raises UserError if two files have the same number.
     """
     below = sorted(path for path in folder.iterdir() if path.is_dir())
     colour = next((path for path in below if COLOUR_FOLDER.fullmatch(path.name)), None)

@@ -1,8 +1,7 @@
-"""Reader of Azure Kinect MKV recordings, without the Azure Kinect SDK.
+"""Layout ``k4a``: MKV recordings of Azure Kinects, read without the Azure Kinect SDK.
 
-Images come out as recorded: colour as JPEG packets (or raw, in the modes that record so), depth
-as the packets' own big-endian bytes.
-Device time = block time + ``K4A_START_OFFSET_NS``, whole microseconds. Sources for the tags and
+Colour packets are JPEG files, or raw images in some modes; depth packets are big-endian numbers.
+Device time is block time + ``K4A_START_OFFSET_NS``, in whole microseconds. Sources of the tags and
 tracks: https://learn.microsoft.com/azure/kinect-dk/record-file-format and the SDK's reader (MIT).
 """
 
@@ -14,7 +13,6 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal, NamedTuple
 
 import av
@@ -45,6 +43,7 @@ from intercap_core.formats.recordings.image_files import (
 )
 from intercap_core.formats.recordings.source import (
     CameraRecording,
+    ClosedOnExit,
     Image,
     RecordingLayout,
     RecordingPreview,
@@ -61,9 +60,7 @@ from intercap_core.inputs.files import quoted, read_bytes
 TRACKS = {"COLOR": "K4A_COLOR_TRACK", "DEPTH": "K4A_DEPTH_TRACK", "IMU": "K4A_IMU_TRACK"}
 CALIBRATION_NAME, CALIBRATION_TAG = "calibration.json", "K4A_CALIBRATION_FILE"
 IMU_SAMPLE = struct.Struct("<Q3fQ3f")  # time ns, m/s^2, time ns, rad/s
-LONGEST_DELAY_US = 1_000_000  # of depth or of a subordinate: the SDK allows one frame's period
-PASSIVE_INFRARED = "PASSIVE_IR"  # the depth camera as an infrared one: it measures no depth
-_EBML_MAGIC = b"\x1a\x45\xdf\xa3"
+LONGEST_DELAY_US = 1_000_000  # of depth or of a subordinate; the SDK allows one frame's period
 
 Kind = Literal["colour", "depth", "imu"]
 _KINDS: dict[str, Kind] = {"COLOR": "colour", "DEPTH": "depth", "IMU": "imu"}
@@ -74,35 +71,44 @@ class Packet(NamedTuple):
 
     kind: Kind
     device_time_us: int
+    """Device time, microseconds."""
     content: bytes
 
 
 @dataclass(frozen=True)
 class KinectFileInfo:
-    """What the head of a recording says. ``depth_mode`` is None where no depth was recorded.
-
-    ``colour_format`` is MJPG or one of :data:`RAW_FORMATS`.
-    """
+    """The head of a recording."""
 
     colour_mode: str
+    """Key of ``COLOUR_MODES``."""
     colour_format: str
+    """MJPG or one of :data:`RAW_FORMATS`."""
     depth_mode: str | None
+    """Key of ``DEPTH_MODES``; None without depth."""
     fps: float
+    """Images a second."""
     serial: str
+    """Serial number of the device; "" = not stated."""
     start_offset_us: int
+    """Device time of the file's time 0, microseconds."""
     depth_delay_us: int
+    """Device time of a depth image minus that of its colour image, microseconds."""
     subordinate_delay_us: int
+    """Delay of this device against the master of the sync cable, microseconds."""
     wired_sync_mode: str
+    """STANDALONE, MASTER or SUBORDINATE."""
     calibration: bytes
+    """The device's calibration JSON."""
     truncated: bool
+    """The file is shorter than its head states."""
 
 
-class KinectFile:
+class KinectFile(ClosedOnExit):
     """One open recording; use as a context manager.
 
-    Raises UserError, naming the file, for a file that is missing, empty or no Matroska file, and
-    for one without a colour track, a calibration, or with a mode that the SDK does not know. A file
-    that was cut off opens as long as its head is whole: ``info.truncated`` then says so.
+    Raises UserError, naming the file, if the file is missing, empty or no Matroska file, if it has
+    no colour track or no calibration, and if the SDK does not know its mode. A file that was cut
+    off can be opened if its head is complete; ``info.truncated`` is then True.
     """
 
     def __init__(self, path: Path) -> None:
@@ -110,7 +116,7 @@ class KinectFile:
         self.broken_packets = 0
         truncated = _is_truncated(self.path)
         try:
-            # the tracks' headers are complete; probing would only buffer packets
+            # Headers of the tracks are complete, so that probing would only buffer packets.
             self._container = open_container(self.path, probesize="32768")
         except (av.error.FFmpegError, OSError) as error:
             raise UserError(
@@ -125,29 +131,17 @@ class KinectFile:
             raise
         for stream in self._container.streams:
             if stream.index not in self._streams:
-                stream.discard = Discard.all  # infrared is half of the bytes; never read it
-
-    def __enter__(self) -> KinectFile:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
+                stream.discard = Discard.all  # infrared is half of the bytes and is not used
 
     def close(self) -> None:
         """Close the file."""
         self._container.close()
 
     def packets(self) -> Iterator[Packet]:
-        """Yield every packet in the file's order, one at a time: memory does not grow.
+        """Yield all packets in the file's order, one at a time; call once.
 
-        A packet that cannot be an image (a JPEG without its start or end, raw of another size) is
-        left out and counted in ``broken_packets``. A file that was cut off ends early, without an
-        error. Call once.
+        A packet that is no image (a JPEG without start or end, raw data of another size) is left
+        out and counted in ``broken_packets``. A file that was cut off ends early without an error.
         """
         streams = [self._container.streams[index] for index in self._streams]
         demuxed = self._container.demux(streams)
@@ -160,10 +154,10 @@ class KinectFile:
                 self.broken_packets += 1
                 return
             if not packet.size or packet.pts is None or packet.time_base is None:
-                continue  # the mark at the end of each track
+                continue  # the end mark of a track
             kind = self._streams[packet.stream_index]
             content = bytes(packet)
-            if not self._is_whole(kind, content):
+            if not self._is_complete(kind, content):
                 self.broken_packets += 1
                 continue
             time_us = round(packet.pts * packet.time_base * 1_000_000) + self.info.start_offset_us
@@ -172,7 +166,7 @@ class KinectFile:
                 continue
             yield Packet(kind, time_us, content)
 
-    def _is_whole(self, kind: Kind, content: bytes) -> bool:
+    def _is_complete(self, kind: Kind, content: bytes) -> bool:
         if kind == "colour" and self.info.colour_format == "MJPG":
             return encoded_size(content) is not None
         if kind == "colour":
@@ -184,7 +178,7 @@ class KinectFile:
         return kind == "imu"
 
     def preview(self) -> RecordingPreview:
-        """A look at the colour track, without reading the others."""
+        """Inspect the colour track without reading the others."""
         index = next(index for index, kind in self._streams.items() if kind == "colour")
         seen = preview_video(self.path, index, self.info.fps)
         if self.info.colour_format != "MJPG":
@@ -192,16 +186,16 @@ class KinectFile:
         return seen
 
     def depth_image(self, content: bytes) -> np.ndarray:
-        """Turn a depth packet into (H, W) uint16, millimetres, 0 = invalid, lossless."""
+        """Convert a depth packet to (H, W) uint16, millimetres, 0 = invalid."""
         if self.info.depth_mode is None:
             raise ValueError(f"{self.path} has no depth")
         width, height = DEPTH_MODES[self.info.depth_mode].size
         return np.frombuffer(content, ">u2").reshape(height, width).astype(np.uint16)
 
     def camera(self, name: str, master_from_colour: np.ndarray | None = None) -> Camera:
-        """Return this device's lenses under ``name``, at the pose (4, 4) or the identity.
+        """The device's lenses as a camera of a name and pose (4, 4); None = the identity.
 
-        Raises UserError where the calibration is broken.
+        Raises UserError if the calibration is broken.
         """
         return read_calibration(
             self.info.calibration,
@@ -213,13 +207,13 @@ class KinectFile:
         )
 
     def colour_from_accelerometer(self) -> np.ndarray | None:
-        """Return the rotation (3, 3) from accelerometer to colour axes; None if not calibrated."""
+        """Rotation (3, 3) from accelerometer to colour axes; None if not calibrated."""
         return colour_from_accelerometer(self.info.calibration, source=str(self.path))
 
     # --- the head of the file ---------------------------------------------------------------
 
     def _find_tracks(self) -> dict[int, Kind]:
-        """Map stream index to kind: by tag (only the tagged track carries it), else by name."""
+        """Kind of each track by its index: by its tag, else by its name."""
         found: dict[int, Kind] = {}
         candidates = [s for s in self._container.streams if s.type != "attachment"]
         for name, tag in TRACKS.items():
@@ -271,13 +265,13 @@ class KinectFile:
         if (
             depth is None
             or depth.codec_context is None
-            or depth.metadata.get("K4A_DEPTH_MODE") == PASSIVE_INFRARED
+            or depth.metadata.get("K4A_DEPTH_MODE") == "PASSIVE_IR"  # infrared alone, no depth
         ):
             return None
         return self._mode("depth", depth, "K4A_DEPTH_MODE", DEPTH_MODES)
 
     def _mode(self, kind: str, stream: Any, tag: str, known: dict[str, Any]) -> str:
-        """The mode's name: the one whose image has the track's size (no two modes share it)."""
+        """The mode whose images have the track's size; no two modes share a size."""
         size = (stream.codec_context.width, stream.codec_context.height)
         name = next((mode for mode, entry in known.items() if entry.size == size), None)
         if name is None:
@@ -309,16 +303,16 @@ class KinectFile:
 
 
 def imu_samples(content: bytes) -> np.ndarray:
-    """Return accelerations and turning rates (n, 6) of one packet, m/s^2 and rad/s."""
-    whole = len(content) // IMU_SAMPLE.size * IMU_SAMPLE.size
-    samples = [(*s[1:4], *s[5:8]) for s in IMU_SAMPLE.iter_unpack(content[:whole])]
+    """Accelerations and angular rates (n, 6) of one packet, m/s^2 and rad/s."""
+    length = len(content) // IMU_SAMPLE.size * IMU_SAMPLE.size
+    samples = [(*s[1:4], *s[5:8]) for s in IMU_SAMPLE.iter_unpack(content[:length])]
     return np.array(samples).reshape(-1, 6)
 
 
 def _is_truncated(path: Path) -> bool:
-    """Tell whether the file is shorter than its Segment says, or was never finished.
+    """Whether the file is shorter than its Segment states, or was never finished.
 
-    Raises UserError for a file that is missing, empty or not Matroska.
+    Raises UserError if the file is missing, empty or no Matroska file.
     """
     try:
         size = os.path.getsize(path)
@@ -327,7 +321,7 @@ def _is_truncated(path: Path) -> bool:
     head = read_bytes(path, max(size, 4096), head=4096)
     if not head:
         raise UserError(f"{path}: is empty (0 bytes); copy or record it again")
-    if not head.startswith(_EBML_MAGIC):
+    if not head.startswith(b"\x1a\x45\xdf\xa3"):
         raise UserError(
             f"{path}: is not a Matroska file (it starts with {head[:4]!r}); give the .mkv that "
             "k4arecorder wrote"
@@ -337,8 +331,10 @@ def _is_truncated(path: Path) -> bool:
 
 
 class KinectLayout(RecordingLayout):
-    """``<camera>.mkv`` files, and camera poses as :func:`read_extrinsics` reads them, or those of
-    another tool's calibration, whose lenses are left aside."""
+    """Files ``<camera>.mkv``; poses of :func:`read_extrinsics` or of another tool's calibration.
+
+    Lenses are those in the recordings.
+    """
 
     def __init__(self, sequence: SequenceEntry) -> None:
         super().__init__(sequence)
@@ -356,7 +352,7 @@ class KinectLayout(RecordingLayout):
 
 
 class KinectRecording(CameraRecording):
-    """One Azure Kinect recording; lenses are those of the calibration that it holds."""
+    """One Azure Kinect recording, with the lenses of the calibration in it."""
 
     def __init__(self, path: Path, name: str, pose: np.ndarray) -> None:
         self._recording = KinectFile(path)
@@ -376,13 +372,13 @@ class KinectRecording(CameraRecording):
         self._recording.close()
 
     def preview(self) -> RecordingPreview:
-        """The head, the first image and the file's length."""
+        """Inspect the head, the first image and the file's length."""
         return self._recording.preview()
 
     def images(self) -> Iterator[Image]:
-        """Colour packets as recorded, depth without loss; gravity from the accelerometer.
+        """Yield colour packets as recorded and lossless depth; find gravity from the accelerometer.
 
-        Raw colour is stored as JPEG, with a note: as recorded it would be ten times the bytes.
+        Raw colour is stored as JPEG, with a note; raw it would be ten times as large.
         """
         info = self._recording.info
         counts = {"colour": 0, "depth": 0}
@@ -415,5 +411,5 @@ class KinectRecording(CameraRecording):
             self.notes.append(f"{self._recording.broken_packets} damaged packets left out")
         rotation = self._recording.colour_from_accelerometer()
         if samples and rotation is not None and np.linalg.norm(acceleration) > 0:
-            # At rest the sensor feels the floor's push, which is up.
+            # At rest the accelerometer measures the floor's reaction, which is up.
             self.gravity = rotation @ (-acceleration / np.linalg.norm(acceleration))

@@ -9,23 +9,21 @@ from intercap_core.errors import UserError
 from intercap_core.formats.calibration.files import refuse_scale
 from intercap_core.formats.recordings.source import RecordingLayout
 
-# What the workflow watches, below the folder of recordings ("" = the folder itself). Folders stand
-# for what is in them: their times change when an image comes or goes, and watching each of a
-# sequence's thousands of images would keep a run that has nothing to do busy for minutes.
+# Patterns of the files and folders that the workflow watches, below the folder of recordings ("" =
+# that folder). A folder's time changes if an image is added or removed; watching each of the
+# thousands of images would delay every run by minutes.
 INPUTS: dict[LayoutName, tuple[str, ...]] = {
     "k4a": ("*.mkv",),
     "intercap": ("Frames_Cam*/*",),
     "behave": ("",),
     "plain": ("*", "*/colour", "*/depth"),
 }
-
-
-# Of what lies beside recordings: never a recording itself, and a truth least of all.
+# Suffixes of other files in such a folder, such as the studio's truth.
 _NO_RECORDINGS = {".h5", ".json", ".yaml", ".yml", ".toml", ".txt", ".tsv", ".part"}
 
 
 def input_files(sequence: SequenceEntry) -> list[Path]:
-    """The files and folders whose change asks for the frames anew; empty without recordings."""
+    """Files and folders whose change makes the frames stale; [] without recordings."""
     folder = sequence.recordings
     if not folder.is_dir():
         return []
@@ -41,9 +39,9 @@ def input_files(sequence: SequenceEntry) -> list[Path]:
 
 
 def open_layout(sequence: SequenceEntry) -> RecordingLayout:
-    """Open the recordings of one sequence in the layout that its row names.
+    """Open the recordings of one sequence in the layout of its row.
 
-    Raises UserError where there is no such folder, and as the layout does.
+    Raises UserError if the folder does not exist, and as the layout does.
     """
     if not sequence.recordings.is_dir():
         raise UserError(
@@ -52,7 +50,7 @@ def open_layout(sequence: SequenceEntry) -> RecordingLayout:
         )
     if sequence.layout in ("intercap", "behave"):
         refuse_scale(sequence.calibration, sequence.calibration_scale)
-    # Imports inside, one a layout: the workflow sees what the stage reaches, each loads its own.
+    # Imported here, so that each process loads only the libraries of its layout.
     match sequence.layout:
         case "k4a":
             from intercap_core.formats.recordings.k4a import KinectLayout

@@ -1,8 +1,8 @@
-"""RecordingLayout ``plain``: a folder of images or a video for each camera, and a calibration file.
+"""Layout ``plain``: a folder of images or a video for each camera, and a calibration file.
 
-``recordings`` holds ``<camera>/`` with JPEG or PNG files (or ``<camera>/colour/``), or
-``<camera>.mp4`` and its like; ``<camera>/depth/`` holds 16-bit PNG files, millimetres, where the
-camera has depth. ``calibration`` is as :mod:`intercap_core.formats.calibration.files` says.
+``recordings`` holds ``<camera>/`` with JPEG or PNG files (or ``<camera>/colour/``), or a video
+``<camera>.mp4``. ``<camera>/depth/`` holds the depth, if any: 16-bit PNG files, millimetres.
+``calibration`` is any form of :mod:`intercap_core.formats.calibration.files`.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class PlainLayout(RecordingLayout):
         self._known, self.extrinsics = calibration.cameras, calibration.extrinsics
 
     def _size_of(self, name: str) -> tuple[int, int] | None:
-        """Width and height of the camera's first image; None where there is none to be read."""
+        """Width and height of the camera's first image; None if none can be read."""
         folder = self._folders.get(name)
         files = _colour(folder) if folder else []
         if files:
@@ -60,7 +60,7 @@ class PlainLayout(RecordingLayout):
     def open(self, name: str) -> CameraRecording:
         """Open the camera's video or folder.
 
-        Raises UserError where it has neither or several, or where nothing says the times.
+        Raises UserError if it has neither or several, and if the times of images are unknown.
         """
         known, folder = self._known[name], self._folders.get(name)
         colour, depth = (_colour(folder), _depth(folder)) if folder else ([], [])
@@ -126,7 +126,7 @@ def _images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
 
 
 def _colour(folder: Path) -> list[Path]:
-    """The camera's colour files, below its folder or in a folder of their own."""
+    """The camera's colour files, in its folder or in a folder of their own."""
     own = [found for name in COLOUR_FOLDERS if (found := _images(folder / name, IMAGE_SUFFIXES))]
     return own[0] if own else _images(folder, IMAGE_SUFFIXES)
 

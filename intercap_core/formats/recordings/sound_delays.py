@@ -1,10 +1,10 @@
-"""When cameras started, from the sound that they share: generalised cross-correlation.
+"""Starts of cameras from the sound that they share: generalised cross-correlation (GCC-PHAT).
 
 Knapp and Carter, IEEE Trans. ASSP 24(4), 1976: the cross-spectrum of two tracks is divided by its
-size (phase transform), so that a broad-band sound gives one sharp peak at its delay, in spite of
-reverberation. Windows of one track are each sought in the whole of the other; only where several
-find the same delay, each by a peak far above chance and clearly the best, is anything said.
-Silence, unrelated sounds and music that repeats itself say nothing.
+magnitude (phase transform), so that a broad-band sound gives one sharp peak at its delay in spite
+of reverberation. Windows of one track are each searched for in the whole other track. There is a
+result only if several windows agree on a delay, each by a peak that is far above chance and clearly
+the highest. Silence, unrelated sounds and repetitive music give no result.
 """
 
 from __future__ import annotations
@@ -18,38 +18,47 @@ from scipy import fft
 
 from intercap_core.formats.recordings.source import SOUND_RATE, Sound
 
-BAND_HZ = (150.0, 3500.0)  # above hum and handling, below the resampler's edge
+LOWEST_HZ = 150.0  # above hum and handling noise
+HIGHEST_HZ = 3500.0  # below the edge of the resampler's filter
 WINDOWS = 8  # of a track, evenly over it
-WINDOW_S = (1.0, 10.0)  # least and most; a quarter of the track between
-FEWEST_WINDOWS = 3
-# Power of the correlation is summed over a millisecond: clocks of 100 ppm drift by as much in 10 s.
-SMOOTHED_S = 0.001
-# Above the mean power: of unrelated noise the sum over eight samples (chi square) exceeds it by
+# A window is a quarter of the track within these limits. At least a second holds several steps or
+# words; within 10 s clocks drift by at most SMOOTHED_S.
+MIN_WINDOW_S = 1.0
+MAX_WINDOW_S = 10.0
+FEWEST_WINDOWS = 3  # that must agree; two may agree by chance
+SMOOTHED_S = 0.001  # over which power is averaged: clocks of 100 ppm drift by as much in 10 s
+# Times the mean power. The sum over eight samples of unrelated noise (chi square) exceeds it by
 # chance once in 1e10 delays.
 LEAST_PEAK = 8.0
-CLEAR_PEAK = 1.5  # times the next best power that is not near; tuned on the studio's rooms
-NEAR_S = 0.03  # a room's first echoes: 10 m of detour
-AGREE_S, DRIFT = 0.01, 1e-4  # windows agree within this, and two clocks' drift over the track
-LOOP_S = 0.02  # by which the delays of three cameras may not add up
-# Of one camera's sound against its images, one standard deviation. EBU R37 allows a programme's
-# sound to lead by 40 ms and to lag by 60 (an even spread's deviation is 29 ms); recorders are made
-# to such bounds, and none says more. Sound itself takes 3 ms a metre, some 5 ms within a ring.
+CLEAR_PEAK = 1.5  # times the next highest power that is not near; tuned on the studio
+NEAR_S = 0.03  # first echoes of a room: 10 m of detour
+AGREE_S = 0.01  # difference up to which windows agree, plus the drift of two clocks
+DRIFT = 1e-4  # relative, of two clocks
+LOOP_S = 0.02  # error of closure of the delays of three cameras; tuned on the studio
+# Standard deviation of one camera's sound against its images. EBU R37 allows the sound of a
+# programme to lead by 40 ms and to lag by 60 ms; the deviation of a uniform distribution over this
+# range is 29 ms. Sound itself takes 3 ms a metre, about 5 ms within a ring of cameras.
 SOUND_SIGMA_S = 0.03
 
 
 @dataclass(frozen=True)
 class Delay:
-    """A sound is heard ``seconds`` later in the second track than in the first, each counted from
-    its first image; ``spread`` s, a standard deviation, over the ``windows`` that agree."""
+    """Delay of a sound in the second track against the first."""
 
     seconds: float
+    """Delay; times count from the first image of each track."""
     spread: float
+    """Standard deviation over the windows, seconds."""
     windows: int
+    """Number of windows that agree."""
 
 
 def sound_starts(sounds: Sequence[Sound | None]) -> tuple[np.ndarray, np.ndarray]:
-    """When cameras took their first images, seconds on one clock, and the standard deviations (C,),
-    NaN where the sound says nothing: of the largest group of cameras that share sounds."""
+    """Starts (C,) of the cameras and their standard deviations (C,), from pairwise delays.
+
+    A start is the time of the first image, seconds on one clock. It is NaN for cameras outside the
+    largest group that shares sounds.
+    """
     views = len(sounds)
     delays: dict[tuple[int, int], Delay] = {}
     for a, b in combinations(range(views), 2):
@@ -76,12 +85,12 @@ def sound_starts(sounds: Sequence[Sound | None]) -> tuple[np.ndarray, np.ndarray
 
 
 def delay_between(first: Sound, second: Sound) -> Delay | None:
-    """The delay of two tracks; None where they do not surely share sounds."""
+    """The delay of two tracks; None if it is not certain that they share sounds."""
     short, long = sorted((first, second), key=lambda sound: len(sound.samples))
-    least, most = (round(s * SOUND_RATE) for s in WINDOW_S)
+    least, most = (round(s * SOUND_RATE) for s in (MIN_WINDOW_S, MAX_WINDOW_S))
     size = min(max(len(short.samples) // 4, least), most)
     last = len(short.samples) - size
-    if last < size:  # less than two windows: nothing could disagree
+    if last < size:  # fewer than two separate windows cannot disagree
         return None
     places = np.unique(np.linspace(0, last, WINDOWS).astype(int))
     nfft = fft.next_fast_len(len(long.samples) + size, real=True)
@@ -102,19 +111,21 @@ def delay_between(first: Sound, second: Sound) -> Delay | None:
 
 
 def _lag(window: np.ndarray, whole: np.ndarray, nfft: int, count: int) -> int | None:
-    """Samples by which a window (n,) is best shifted to lie on a track of ``count`` samples with
-    the spectrum ``whole``; None where no shift is far above chance and clearly the best."""
+    """Shift, samples, of a window (n,) in a track of ``count`` samples with spectrum ``whole``.
+
+    None if no shift has a peak that is far above chance and clearly the highest.
+    """
     cross = whole * np.conj(fft.rfft(window * np.hanning(len(window)), nfft))
     size = np.abs(cross)
     hz = fft.rfftfreq(nfft, 1 / SOUND_RATE)
-    heard = (hz > BAND_HZ[0]) & (hz < BAND_HZ[1]) & (size > 0)
+    heard = (hz > LOWEST_HZ) & (hz < HIGHEST_HZ) & (size > 0)
     if not heard.any():
         return None
     white = np.zeros_like(cross)
     white[heard] = cross[heard] / size[heard]
     power = fft.irfft(white, nfft) ** 2
     smooth = round(SMOOTHED_S * SOUND_RATE)
-    # lags at which the window is not wholly within the other track are tried as well
+    # Also lags at which the window lies only partly within the other track.
     power = np.roll(power, len(window) - 1)[: count + len(window) - 1]
     power = np.convolve(power, np.ones(smooth) / smooth, mode="same")
     best = int(power.argmax())
@@ -128,7 +139,7 @@ def _lag(window: np.ndarray, whole: np.ndarray, nfft: int, count: int) -> int | 
 
 
 def _agreeing(delays: np.ndarray, seconds: float) -> np.ndarray:
-    """The most of ``delays`` (N,) s that are near one of them, in a track of so many seconds."""
+    """The largest subset of ``delays`` (N,) that agree; ``seconds`` is the track's length."""
     if not len(delays):
         return delays
     near = np.abs(delays[:, None] - delays) <= AGREE_S + DRIFT * seconds
@@ -136,9 +147,9 @@ def _agreeing(delays: np.ndarray, seconds: float) -> np.ndarray:
 
 
 def _largest_group(delays: dict[tuple[int, int], Delay], views: int) -> list[int]:
-    """The most cameras that delays join; of equals those of the first camera."""
+    """The largest group of cameras that delays connect; of equal ones that of the first camera."""
     group = list(range(views))
-    for _ in range(views):  # the least number travels along the pairs
+    for _ in range(views):  # the smallest number spreads along the pairs
         for a, b in delays:
             group[a] = group[b] = min(group[a], group[b])
     most = max(group, key=lambda g: (group.count(g), -g))
@@ -146,8 +157,10 @@ def _largest_group(delays: dict[tuple[int, int], Delay], views: int) -> list[int
 
 
 def _solved(delays: dict[tuple[int, int], Delay], group: list[int]) -> dict[int, float]:
-    """Starts of a ``group``'s cameras by least squares, the first one's 0: the sound of a camera
-    that starts later comes earlier in its track."""
+    """Starts of a ``group``'s cameras by least squares; that of the first is 0.
+
+    A sound comes earlier in the track of a camera that starts later.
+    """
     place = {c: i for i, c in enumerate(group)}
     rows = np.zeros((len(delays) + 1, len(group)))
     values = np.zeros(len(delays) + 1)

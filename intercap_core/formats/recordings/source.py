@@ -1,9 +1,7 @@
-"""What every layout of recordings gives: the cameras, their poses, their images one at a time.
+"""Interface of all layouts of recordings: cameras, their poses, and their images one at a time.
 
-A layout is one class, :class:`RecordingLayout`, made for one sequence; it opens one
-:class:`CameraRecording`
-for each camera. The frames stage knows nothing else of where images come from. To add a layout:
-derive from both, name it in ``config.LayoutName`` and in
+A :class:`RecordingLayout` is made for one sequence and opens a :class:`CameraRecording` for each
+camera. To add a layout, derive from both and name it in ``config.LayoutName`` and in
 :mod:`intercap_core.formats.recordings.layouts`.
 """
 
@@ -11,10 +9,10 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Literal, NamedTuple, Self
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -22,53 +20,63 @@ from intercap_core.config import SequenceEntry
 from intercap_core.formats.calibration.extrinsics import Extrinsics
 from intercap_core.geometry.camera.rig import Camera
 
-SOUND_RATE = 8000  # samples a second: telephony's, steps and voices are within 4 kHz
+SOUND_RATE = 8000  # samples a second, that of telephony: steps and voices are within 4 kHz
 
 
 class RecordingPreview(NamedTuple):
-    """What a look at a recording shows without reading all of it.
-
-    ``size`` (width, height) of the first colour image, None = none can be read. ``images`` counts
-    the colour images that are there (one by one where ``counted``, else by duration and rate),
-    ``seconds`` lasts from the first to the last; None = nothing says. ``share`` of what the head
-    states is in the file. ``faults`` are what else is wrong, in words that follow its name.
-    """
+    """Properties of a recording that are known without reading all of it."""
 
     size: tuple[int, int] | None
+    """Width and height of the first colour image; None if none can be read."""
     images: int | None
+    """Number of colour images in the file; None = unknown."""
     seconds: float | None
+    """Duration from the first image to the last; None = unknown."""
     share: float = 1.0
+    """Share of the stated content that the file holds."""
     faults: tuple[str, ...] = ()
+    """Other faults; each follows the camera's name in a message."""
     counted: bool = True
+    """Whether images were counted; otherwise they follow from duration and rate."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sound:
-    """``samples`` (N,) float32 at :data:`SOUND_RATE`; the first one was recorded ``first_s``
-    seconds after the first image, by the file's own clock."""
+    """The sound track of a recording."""
 
     samples: np.ndarray
+    """(N,) float32 at :data:`SOUND_RATE`."""
     first_s: float
+    """Time of the first sample minus that of the first image on the file's clock, seconds."""
 
 
 class Image(NamedTuple):
-    """One image as recorded.
-
-    ``content`` of a colour image is a whole JPEG or PNG file; of a depth image (H, W) uint16,
-    millimetres, 0 = invalid, in the size of the camera's depth lens. ``time_us`` is the camera's
-    device time, whole microseconds; depth that is late by design keeps its own time.
-    """
+    """One image as recorded."""
 
     kind: Literal["colour", "depth"]
+    """Kind of the image."""
     time_us: int
+    """Device time of the camera, microseconds. Depth that is late by design keeps its own time."""
     content: bytes | np.ndarray
+    """Colour: a whole JPEG or PNG file. Depth: (H, W) uint16 in the size of the depth lens, mm,
+    0 = invalid."""
 
 
-class CameraRecording(ABC):
-    """One camera's recording, open; use as a context manager.
+class ClosedOnExit(AbstractContextManager[Any]):
+    """A context manager that calls ``close`` at the end of the ``with`` block."""
 
-    The constructor reads what the head says and raises UserError, naming the file, for a recording
-    of which nothing can be used. Attributes that :meth:`images` completes are final after it.
+    def close(self) -> None:
+        """Release the files."""
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+
+class CameraRecording(ClosedOnExit, ABC):
+    """One camera's open recording; use as a context manager.
+
+    The constructor reads the head of the file and raises UserError, naming the file, if nothing of
+    the recording can be used.
     """
 
     source: Path
@@ -82,11 +90,11 @@ class CameraRecording(ABC):
     depth_delay_us: int
     """Device time of a depth image minus that of its colour image, by design."""
     truncated: bool
-    """The recording was cut off. Completed by :meth:`images`."""
+    """The recording was cut off. Final after :meth:`images`."""
     notes: list[str]
-    """What is degraded, in words for the user. Completed by :meth:`images`."""
+    """What is degraded, for the user. Final after :meth:`images`."""
     gravity: np.ndarray
-    """(3,) direction down, unit, colour camera's frame; NaN = not known. By :meth:`images`."""
+    """(3,) direction down, unit, colour camera's frame; NaN = unknown. Set by :meth:`images`."""
 
     def __init__(
         self, source: Path, camera: Camera, *, fps: float, serial: str = "", depth_delay_us: int = 0
@@ -99,46 +107,32 @@ class CameraRecording(ABC):
 
     @abstractmethod
     def images(self) -> Iterator[Image]:
-        """Yield every image one at a time, so that memory does not grow; call once.
+        """Yield all images one at a time, so that memory does not grow; call once.
 
-        Images that are damaged are left out and counted in a note. No depth image is given where
+        Damaged images are left out and counted in a note. There are no depth images if
         ``camera.depth`` is None.
         """
 
     def sound(self) -> Sound | None:
-        """The recording's sound, after :meth:`images`; None = it has none."""
+        """The recording's sound, after :meth:`images`; None without sound."""
         return None
 
     @abstractmethod
     def preview(self) -> RecordingPreview:
-        """Look at what can be told without reading all images, in milliseconds."""
-
-    def close(self) -> None:  # noqa: B027 (a folder has nothing to close)
-        """Release the file."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
+        """Inspect the recording without reading all images, in milliseconds."""
 
 
 class RecordingLayout(ABC):
     """The recordings of one sequence.
 
-    The constructor finds the cameras and reads their poses; it raises UserError where the folder
-    or the calibration cannot be used at all. ``sequence.recordings`` is a folder that exists.
+    The constructor finds the cameras and reads their poses. It raises UserError if the folder or
+    the calibration cannot be used. ``sequence.recordings`` is an existing folder.
     """
 
     extrinsics: Extrinsics
-    """Poses of the cameras; its order is that of every C axis."""
+    """Poses of the cameras, in the order of every C axis."""
     names: list[str]
-    """Cameras that have a recording, also those without a pose."""
+    """Cameras with a recording, including those without a pose."""
 
     def __init__(self, sequence: SequenceEntry) -> None:
         self.sequence = sequence
@@ -147,5 +141,5 @@ class RecordingLayout(ABC):
     def open(self, name: str) -> CameraRecording:
         """Open the recording of a camera that has a recording and a pose.
 
-        Raises UserError where it cannot be used: the camera is then set aside with that reason.
+        Raises UserError if it cannot be used; the camera is then absent, with this reason.
         """

@@ -1,4 +1,4 @@
-"""Sets of images taken at one moment by several cameras, found by device time alone."""
+"""Frame sets: images that several cameras took at one moment, by device time."""
 
 from __future__ import annotations
 
@@ -7,25 +7,26 @@ from dataclasses import dataclass
 
 import numpy as np
 
-NEW_SET_GAP = 0.6  # of a period: an image this far from every set starts one of its own
+# Of a period: an image that is farther from every set starts a new one. More than half, so that an
+# image never starts a set between two regular ones.
+NEW_SET_GAP = 0.6
 
 
 @dataclass(frozen=True)
 class SetTable:
-    """Which image of each camera belongs to each of T sets.
-
-    ``times_us`` (T,) int64 increasing, the master's device time or, where it has no image, that of
-    the others; ``index`` (T, C) int32 into each camera's images, -1 = none; ``skew_us`` (T, C)
-    float64, image time minus set time, NaN = none; ``unmatched`` (C,) images in no set.
-    """
+    """The images of T frame sets of C cameras."""
 
     times_us: np.ndarray
+    """(T,) int64, increasing: device time of the master, or of others if it has no image."""
     index: np.ndarray
+    """(T, C) int32: position among each camera's images; -1 = none."""
     skew_us: np.ndarray
+    """(T, C) float64: time of the image minus that of the set; NaN = no image."""
     unmatched: np.ndarray
+    """(C,) number of images in no set."""
 
     def gaps(self, period_us: float) -> list[tuple[int, int]]:
-        """Where time runs on without any image: (set before the gap, number of sets missing)."""
+        """Gaps without any image: (set before the gap, number of missing sets)."""
         steps = np.rint(np.diff(self.times_us) / period_us).astype(int)
         return [(int(at), int(steps[at]) - 1) for at in np.flatnonzero(steps > 1)]
 
@@ -35,11 +36,16 @@ def synchronise(
 ) -> SetTable:
     """Group the images of C cameras into sets.
 
-    ``times_us``: for each camera the device times (N_c,) int64 of its images, microseconds of one
-    common clock, in any order, empty for a missing camera. The master's images each make a set;
-    where it has none (more than ``NEW_SET_GAP`` periods to the next set) the other cameras' do.
-    An image joins the nearest set if it is within ``max_skew_us`` and no image of its camera is
-    nearer. Raises ValueError unless 0 <= master < C and max_skew_us < period_us / 2.
+    Each image of the master makes a set. Where the next of these is more than ``NEW_SET_GAP``
+    periods away, the other cameras' images do. An image joins the nearest set if it is within
+    ``max_skew_us`` and no other image of its camera is nearer.
+
+    Args:
+        times_us: device times (N_c,) int64 of each camera's images, microseconds of one clock, in
+            any order; empty for a missing camera.
+        period_us: time between images.
+        max_skew_us: less than half a period, otherwise ValueError is raised.
+        master: index of the master.
     """
     if not 0 <= master < len(times_us):
         raise ValueError(f"master {master} is none of {len(times_us)} cameras")
@@ -65,10 +71,10 @@ def synchronise(
 
 
 def nearest_images(sets_us: np.ndarray, times_us: np.ndarray, max_skew_us: float) -> np.ndarray:
-    """Return for each set (T,) the position of its image among ``times_us`` (N,), -1 = none.
+    """Position (T,) of each set's image among ``times_us`` (N,); -1 = none.
 
     Image and set are each other's nearest and at most ``max_skew_us`` apart, so that no image is
-    used twice. ``sets_us`` is increasing.
+    used twice. ``sets_us`` (T,) is increasing.
     """
     index = np.full(len(sets_us), -1, np.int32)
     if not len(sets_us) or not len(times_us):
@@ -82,11 +88,13 @@ def nearest_images(sets_us: np.ndarray, times_us: np.ndarray, max_skew_us: float
 
 
 def images_of_moments(slip: np.ndarray, available: np.ndarray) -> np.ndarray:
-    """Return the set (T, C) int32 whose image of each camera shows the moment of each set.
+    """The set (T, C) int32 whose image of each camera shows the moment of each set; -1 = none.
 
-    ``slip`` (T, C): the image of set t shows the moment of set t - slip; ``available`` (T, C): the
-    set holds an image of the camera. Where two images show one moment, the one that slipped less
-    is taken; -1 = none does.
+    Of two images that show one moment, the result is the one that slipped less.
+
+    Args:
+        slip: (T, C) int: the image of set t shows the moment of set t - slip.
+        available: (T, C) bool: the set holds an image of the camera.
     """
     shown = np.full(slip.shape, -1, np.int32)
     sets = len(slip)
@@ -94,23 +102,23 @@ def images_of_moments(slip: np.ndarray, available: np.ndarray) -> np.ndarray:
         images = np.flatnonzero(available[:, camera])
         late = slip[images, camera]
         moments = images - late
-        order = np.argsort(-np.abs(late), kind="stable")  # what slipped least is written last
+        order = np.argsort(-np.abs(late), kind="stable")  # the least slip is written last
         order = order[(moments[order] >= 0) & (moments[order] < sets)]
         shown[moments[order], camera] = images[order]
     return shown
 
 
 def usual_steps(available: np.ndarray) -> np.ndarray:
-    """Sets (C,) from one image of a camera to its next, usually; 1 for a camera with fewer than 2.
+    """Median number of sets (C,) from one image of a camera to its next; 1 for fewer than 2 images.
 
-    ``available`` (T, C): the set holds an image of the camera.
+    ``available`` (T, C) bool: the set holds an image of the camera.
     """
     steps = [np.diff(np.flatnonzero(camera)) for camera in available.T]
     return np.array([float(np.median(step)) if len(step) else 1.0 for step in steps])
 
 
 def _nearest(values: np.ndarray, sorted_targets: np.ndarray) -> np.ndarray:
-    """Return the position of the target nearest to each value; of two equally near the first."""
+    """Position of the target nearest to each value; of two equally near ones the first."""
     right = np.clip(np.searchsorted(sorted_targets, values), 1, max(1, len(sorted_targets) - 1))
     if len(sorted_targets) == 1:
         return np.zeros(len(values), np.int64)
@@ -120,14 +128,14 @@ def _nearest(values: np.ndarray, sorted_targets: np.ndarray) -> np.ndarray:
 
 
 def distance_to(values: np.ndarray, sorted_targets: np.ndarray) -> np.ndarray:
-    """Return how far each value (N,) is from the nearest target; inf where there is none."""
+    """Distance (N,) of each value to the nearest target; inf without targets."""
     if not len(sorted_targets):
         return np.full(len(values), np.inf)
     return np.abs(values - sorted_targets[_nearest(values, sorted_targets)])
 
 
 def _distinct(sorted_times: np.ndarray, gap: float) -> np.ndarray:
-    """Drop times that follow a kept one by less than ``gap``: repeats of one image."""
+    """Drop repeats: times that follow a kept one by less than ``gap``."""
     kept: list[int] = []
     for time in sorted_times.tolist():
         if not kept or time - kept[-1] >= gap:
@@ -135,60 +143,66 @@ def _distinct(sorted_times: np.ndarray, gap: float) -> np.ndarray:
     return np.array(kept, np.int64)
 
 
-OUTLIER = -1
-EARLIER_IS_ENOUGH = 0.5  # of the images of the fullest stretch
+OUTLIER = -1  # epoch of a single wrong time
 
 
 def split_into_epochs(times_us: np.ndarray) -> np.ndarray:
-    """Return for each image (N,) the stretch of running time that it belongs to, from 0.
+    """Epoch (N,) of each image, from 0: a new one begins where the device's clock was reset.
 
-    ``times_us`` (N,) int64 are device times in the order of recording. Where time jumps back, a
-    stretch ends and the next begins (the device's clock was reset). A single time that its
-    neighbours on both sides contradict is ``OUTLIER`` and ends nothing.
+    ``times_us`` (N,) int64 are device times in the order of recording. An epoch ends where time
+    jumps back. A single time that contradicts its neighbours on both sides is an ``OUTLIER`` and
+    ends no epoch.
     """
-    stretch = np.zeros(len(times_us), np.int64)
+    epoch = np.zeros(len(times_us), np.int64)
     times = times_us.tolist()
-    kept: list[int] = []  # of the current stretch
+    kept: list[int] = []  # images of the current epoch
     number = 0
     for at, time in enumerate(times):
         if kept and time <= times[kept[-1]]:
             later = times[at + 1] if at + 1 < len(times) else None
             if later is not None and later > times[kept[-1]]:
-                stretch[at] = OUTLIER
+                epoch[at] = OUTLIER
                 continue
             if len(kept) > 1 and time > times[kept[-2]]:
-                stretch[kept.pop()] = OUTLIER
+                epoch[kept.pop()] = OUTLIER
             else:
                 number += 1
                 kept = []
         kept.append(at)
-        stretch[at] = number
-    return stretch
+        epoch[at] = number
+    return epoch
 
 
 def choose_epoch(
-    times_us: np.ndarray, stretch: np.ndarray, reference_us: np.ndarray, within_us: float
+    times_us: np.ndarray, epoch: np.ndarray, reference_us: np.ndarray, within_us: float
 ) -> int:
-    """Return the stretch that overlaps the others' times; the longest where none does.
+    """The epoch that overlaps the other cameras' times; the longest one if none does.
 
-    ``stretch`` (N,) is what :func:`split_into_epochs` says of ``times_us`` (N,); ``reference_us``
-    (M,) are
-    increasing times of the others. A reset takes a clock out of step with them, so that of several
-    stretches among their times the earlier is right: the first one with at least half as many
-    images near a reference time as any other.
+    A reset takes a clock out of step with the others, so that the first of several overlapping
+    epochs is right: the first with at least half as many images near a reference time as any other.
+
+    Args:
+        times_us: (N,) device times.
+        epoch: (N,) result of :func:`split_into_epochs`.
+        reference_us: (M,) increasing times of the other cameras.
+        within_us: distance up to which an image is near a reference time.
     """
-    near = (distance_to(times_us, reference_us) <= within_us) & (stretch >= 0)
+    near = (distance_to(times_us, reference_us) <= within_us) & (epoch >= 0)
     if not near.any():
-        return int(np.argmax(np.bincount(stretch[stretch >= 0])))
-    counts = np.bincount(stretch[near])
-    return int(np.argmax(counts >= counts.max() * EARLIER_IS_ENOUGH))
+        return int(np.argmax(np.bincount(epoch[epoch >= 0])))
+    counts = np.bincount(epoch[near])
+    return int(np.argmax(counts >= counts.max() * 0.5))
 
 
 def clock_drift_us(times_us: np.ndarray, skew_us: np.ndarray) -> float:
-    """Return by how much a clock ran away from the sets' over the recording, microseconds.
+    """Drift of a camera's clock against the sets' over the recording, microseconds.
 
-    ``skew_us`` (T,) is device time minus the set's at ``times_us`` (T,), NaN = no image; the
-    difference between the medians of the last and the first quarter, stretched to the whole.
+    It is the difference between the median skews of the last and the first quarter, extrapolated
+    to the whole recording.
+
+    Args:
+        times_us: (T,) times of the sets.
+        skew_us: (T,) device time minus that of the set; NaN = no image.
     """
     has = np.flatnonzero(np.isfinite(skew_us))
     quarter = len(has) // 4

@@ -1,4 +1,4 @@
-"""When the image files of a folder were taken: by a file of timestamps, or by their numbers."""
+"""Times of the image files of a folder: from a file of timestamps, or from their numbers."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from intercap_core.formats.recordings.image_files import ImagePair
 from intercap_core.inputs.files import MAX_TABLE_BYTES, Unreadable, quoted, read_text
 
 SUFFIXES = (".csv", ".txt")
-LATEST_S = 1e11  # beyond all clocks that count seconds, and within 64 bits in microseconds
-LONGEST_STEP_S = 5.0  # a usual step above this is no second
+LATEST_S = 1e11  # beyond all clocks that count seconds; in microseconds it fits into 64 bits
+LONGEST_STEP_S = 5.0  # median step beyond which the unit is not the second
 NUMBER = re.compile(r"\d+(?=\D*$)")  # the last number of a name
-Timestamps = Mapping[str | int, float]  # seconds by name, or by place where lines have no names
+Timestamps = Mapping[str | int, float]  # seconds by name, or by position if lines have no names
 _WHOLE = re.compile(r"[0-9]{1,18}")
 _SPLIT = re.compile(r"[,;\s]+")
 
 
 def find_timestamps(stem: Path) -> Path | None:
-    """Return ``<stem>.csv`` or ``<stem>.txt``, where there is one."""
+    """Return ``<stem>.csv`` or ``<stem>.txt``; None if neither exists."""
     files = [stem.with_name(stem.name + suffix) for suffix in SUFFIXES]
     return next((file for file in files if file.is_file()), None)
 
 
 def read_timestamps(path: Path) -> Timestamps:
-    """Read times in seconds, one a line: ``seconds`` or ``name, seconds``; a header may be first.
+    """Read a time from each line, ``seconds`` or ``name, seconds``; there may be a header.
 
-    Returns them by name, or by 0, 1, ... where the lines have no names. Raises UserError naming
-    file and line for what is no number, for a name given twice, and for milliseconds.
+    Returns the times by name, or by 0, 1, ... if the lines have no names. Raises UserError naming
+    file and line for text that is no number, for a repeated name, and for milliseconds.
     """
     try:
         lines = read_text(path, MAX_TABLE_BYTES).splitlines()
@@ -71,7 +71,7 @@ def read_timestamps(path: Path) -> Timestamps:
 
 
 def frame_rate(times_us: np.ndarray) -> float | None:
-    """Return images a second by the usual step of device times (N,); None for fewer than 2."""
+    """Images a second, from the median step of device times (N,); None for fewer than 2."""
     steps = np.abs(np.diff(np.asarray(times_us, np.float64)))
     steps = steps[steps > 0]
     return float(1e6 / np.median(steps)) if len(steps) else None
@@ -86,13 +86,19 @@ def pair_images(
     times: Timestamps | None,
     source: Path,
 ) -> list[ImagePair]:
-    """Bring colour and depth files of one camera together, each with its time.
+    """Pair colour and depth files of one camera, with their times.
 
-    The files' numbers (the last one in each name) say which belong together and, divided by
-    ``fps``, when they were taken; where some names have no number of their own, their order does.
-    ``times`` as :func:`read_timestamps` gives it overrides that: by name, by name without suffix,
-    by number, or one for each colour image in order. Raises UserError, naming ``source``, where
-    neither says the times or where times are missing.
+    Files are paired by the last number in their names, or by order if any name has no number of its
+    own. Raises UserError, naming ``source``, if times are unknown or missing.
+
+    Args:
+        colour: colour files.
+        depth: depth files.
+        fps: images a second; the number in a name divided by it is the time. None = unknown.
+        offset_s: seconds that are added to all times.
+        times: times of :func:`read_timestamps`, which go before ``fps``: by name, by name without
+            suffix, by number, or one for each colour image in order.
+        source: folder or video, for messages.
     """
     found = _by_key(colour, depth, source)
     keys = sorted(found)
@@ -122,11 +128,11 @@ def _by_key(
     colour: list[Path], depth: list[Path], source: Path
 ) -> dict[int, tuple[Path | None, Path | None]]:
     by_number = [{_number(path): path for path in paths} for paths in (colour, depth)]
-    whole = all(
-        len(one) == len(paths) and None not in one
-        for one, paths in zip(by_number, (colour, depth), strict=True)
+    are_numbered = all(
+        len(numbers) == len(paths) and None not in numbers
+        for numbers, paths in zip(by_number, (colour, depth), strict=True)
     )
-    if not whole:
+    if not are_numbered:
         order = {path.stem: index for index, path in enumerate(colour)}
         strays = [path.name for path in depth if path.stem not in order]
         if strays and colour:
@@ -138,7 +144,7 @@ def _by_key(
             dict(enumerate(colour)),
             {order.get(path.stem, index): path for index, path in enumerate(depth)},
         ]
-    keys = {key for one in by_number for key in one if key is not None}
+    keys = {key for numbers in by_number for key in numbers if key is not None}
     return {key: (by_number[0].get(key), by_number[1].get(key)) for key in keys}
 
 
@@ -150,7 +156,7 @@ def _number(path: Path) -> int | None:
 def _stated(
     found: Mapping[int, tuple[Path | None, Path | None]], times: Timestamps, source: Path
 ) -> dict[int, float]:
-    """The stated time of each key; depth alone, beside a video, goes by its place in the list."""
+    """The stated time of each key. The depth files of a video go by position in the list."""
     coloured = [key for key in sorted(found) if found[key][0] is not None]
     if all(isinstance(name, int) for name in times):
         if not coloured:

@@ -1,7 +1,7 @@
-"""Video files: packets are copied where each is a JPEG, else images are decoded and stored as such.
+"""Video files: their preview, sound track and images.
 
-The packets of other codecs are no images by themselves: most hold only what changed, so that one
-image cannot be read without those before it.
+JPEG packets are copied. Packets of other codecs mostly hold differences to earlier images, so that
+their images are decoded and stored as JPEG.
 """
 
 from __future__ import annotations
@@ -34,15 +34,18 @@ from intercap_core.formats.recordings.timestamps import Timestamps, pair_images
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.inputs.files import Unreadable, check_file
 
-# By content a file may also be a list of other files or addresses, which FFmpeg would follow.
+# FFmpeg would also follow lists of other files or addresses.
 FORMATS = "matroska,webm,mov,mp4,m4a,3gp,3g2,mj2,avi,mpeg,mpegts,mpegvideo"
-LATEST_US = 10**15  # of a device's clock: some thirty years; later ones are damage
+LATEST_US = 10**15  # of a device's clock: thirty years; later times are damage
 MAX_SIDE = 16_384  # px of an image that is decoded
 
 
 def open_container(path: Path, **options: str) -> Any:
-    """Open a regular file; raises Unreadable where it is none, and what PyAV raises where it is no
-    container of :data:`FORMATS`."""
+    """Open a regular file with PyAV.
+
+    Raises Unreadable if it is no regular file, and PyAV's errors if it is no container of
+    :data:`FORMATS`.
+    """
     check_file(path, None)
     return av.open(
         f"file:{path}",
@@ -51,16 +54,20 @@ def open_container(path: Path, **options: str) -> Any:
     )
 
 
-FIRST_PACKETS = 60  # within these some image must decode: two seconds
+FIRST_PACKETS = 60  # two seconds, within which an image must decode
 _MATROSKA = "matroska"
 _SEGMENT_ID = b"\x18\x53\x80\x67"
 
 
 def preview_video(path: Path, stream_index: int, fps: float) -> RecordingPreview:
-    """Look at one track of a video file that opens."""
+    """Inspect one track of a video file that opens.
+
+    This takes milliseconds for files with an index (mp4, mov, avi) and for Matroska, which states
+    its length. Other files are read from the last image to which FFmpeg can seek.
+    """
     with open_container(path) as container:
         stream: Any = container.streams[stream_index]
-        # read here: a stream of a closed container is freed memory
+        # The stream of a closed container is freed memory.
         stated, frames = float(container.duration or 0) / av.time_base, int(stream.frames)
         length = os.path.getsize(path)
         entries = getattr(stream, "index_entries", None) or ()
@@ -68,8 +75,7 @@ def preview_video(path: Path, stream_index: int, fps: float) -> RecordingPreview
             share = _share_of_segment(path, length)
             seconds = stated * share if stated else None
         elif frames and len(entries) == frames:
-            there = sum(entry.pos + entry.size <= length for entry in entries)
-            share = there / frames
+            share = sum(entry.pos + entry.size <= length for entry in entries) / frames
             seconds = float(stream.duration * stream.time_base) * share if stream.duration else None
         else:
             seconds = _last_time(container, stream)
@@ -86,7 +92,7 @@ def preview_video(path: Path, stream_index: int, fps: float) -> RecordingPreview
 
 
 def _first_size(container: Any, stream: Any) -> tuple[int, int] | None:
-    """Size of the first image that decodes, turned as its file says."""
+    """Size of the first image that decodes, rotated as the file states."""
     try:
         for number, packet in enumerate(container.demux(stream)):
             if number > FIRST_PACKETS:
@@ -105,7 +111,7 @@ def _first_size(container: Any, stream: Any) -> tuple[int, int] | None:
 
 
 def _last_time(container: Any, stream: Any) -> float | None:
-    """Seconds from the first image to the last that can be read; None where there is none."""
+    """Seconds from the first to the last readable image; None without images."""
     times: list[float] = []
     try:
         if container.duration:
@@ -120,14 +126,14 @@ def _last_time(container: Any, stream: Any) -> float | None:
 
 
 def _share_of_segment(path: Path, length: int) -> float:
-    """Which share of the bytes that a Matroska file's Segment states is there; 1 = it does not."""
+    """Share of the bytes of a Matroska file's Segment that the file holds; 1 = not stated."""
     with open(path, "rb") as file:
         end = segment_end(file.read(4096))
     return 1.0 if end is None else min(1.0, length / end)
 
 
 def segment_end(head: bytes) -> int | None:
-    """Where the Segment of a Matroska file ends, bytes; None where it was never finished.
+    """Offset of the end of a Matroska file's Segment, bytes; None if it was never finished.
 
     ``head`` is the file's beginning. Source: RFC 8794, section 6; RFC 9559, section 5.1.
     """
@@ -140,15 +146,15 @@ def segment_end(head: bytes) -> int | None:
     return None if stated == (1 << 7 * width) - 1 else at + 4 + width + stated
 
 
-MAX_SOUND_S = 600.0  # that are read: 19 MB a camera
-JUMP_S = 0.05  # by which a packet's time differs from the samples before it: a gap
+MAX_SOUND_S = 600.0  # of a track that are read: 19 MB
+JUMP_S = 0.05  # between a packet's time and that of the samples before it, beyond which it is a gap
 
 
 def read_sound(path: Path, first_image_s: float) -> Sound | None:
-    """Read a video's first sound track; None where it has none that can be decoded.
+    """Read a video's first sound track; None if there is none that can be decoded.
 
-    ``first_image_s`` is the time of the first image on the file's clock. Damaged packets are left
-    out, as gaps.
+    ``first_image_s`` is the time of the first image on the file's clock, seconds. Damaged packets
+    become gaps.
     """
     parts: list[np.ndarray] = []
     start: float | None = None
@@ -172,7 +178,7 @@ def read_sound(path: Path, first_image_s: float) -> Sound | None:
 
 
 def _pieces(path: Path) -> Iterator[tuple[float, np.ndarray]]:
-    """Times on the file's clock and samples (n,), as they are decoded."""
+    """Yield times on the file's clock, seconds, and decoded samples (n,)."""
     try:
         container = open_container(path)
     except (Unreadable, av.error.FFmpegError, OSError):
@@ -208,11 +214,11 @@ def _frames(container: Any, stream: Any) -> Iterator[Any]:
             continue
 
 
-FEW_IMAGES = 0.02  # by which a count from duration and rate may be wrong
+FEW_IMAGES = 0.02  # relative error of a number of images that follows from duration and rate
 
 
 def video_size(path: Path) -> tuple[int, int] | None:
-    """Width and height of a video's images; None where it cannot be opened."""
+    """Width and height of a video's images; None if it cannot be opened."""
     try:
         with open_container(path) as container:
             context = container.streams.video[0].codec_context
@@ -222,11 +228,9 @@ def video_size(path: Path) -> tuple[int, int] | None:
 
 
 class VideoRecording(CameraRecording):
-    """One video file, and perhaps a folder of depth files.
+    """One video file, with or without a folder of depth files.
 
-    The file's own clock, from its first image on, gives the times; ``times`` as
-    :func:`.timestamps.read_timestamps` reads them override it, one for each image in order.
-    ``offset_s`` is added. Raises UserError, naming the file, where it is no video.
+    Raises UserError, naming the file, if it is no video.
     """
 
     def __init__(
@@ -239,6 +243,17 @@ class VideoRecording(CameraRecording):
         offset_s: float,
         times: Timestamps | None,
     ) -> None:
+        """Open the file.
+
+        Args:
+            path: the video.
+            camera: lenses and pose.
+            depth: depth files, in order.
+            fps: images a second; None = as the file states.
+            offset_s: seconds that are added to all times.
+            times: times of :func:`.timestamps.read_timestamps`, one for each image in order; None =
+                the file's clock from its first image on.
+        """
         try:
             self._container = open_container(path)
         except Unreadable as error:
@@ -275,14 +290,14 @@ class VideoRecording(CameraRecording):
             [], depth, fps=rate, offset_s=offset_s, times=times, source=path.with_suffix("")
         )
         self._damaged = 0
-        self._first_s: float | None = None  # of the first image, on the file's clock
+        self._first_s: float | None = None  # time of the first image on the file's clock
 
     def close(self) -> None:
         """Close the file."""
         self._container.close()
 
     def preview(self) -> RecordingPreview:
-        """The head, the first image, the index or the last image; beside it the depth files."""
+        """Inspect the head, the first image, the index or the last image, and the depth files."""
         seen = preview_video(self.source, self._stream.index, self.fps)
         faults = faults_of_files(self._shots, self.camera.depth)
         if self._times is not None and seen.images is not None:
@@ -292,7 +307,7 @@ class VideoRecording(CameraRecording):
         return seen._replace(faults=tuple(faults))
 
     def images(self) -> Iterator[Image]:
-        """Images in the order in which they are shown, then depth."""
+        """Yield images in the order in which they are shown, then depth."""
         copied = self._stream.codec_context.name == "mjpeg"
         count = 0
         first: float | None = None
@@ -356,6 +371,6 @@ class VideoRecording(CameraRecording):
                     self._damaged += 1
                     continue
                 image = frame.to_ndarray(format="bgr24")
-                # A phone held upright records lying images and says so; viewers turn them.
+                # An upright phone records rotated images and states the rotation.
                 image = np.rot90(image, round((getattr(frame, "rotation", 0) or 0) / 90))
                 yield frame.time, encode_jpeg(np.ascontiguousarray(image))

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from intercap_core.formats.detections import coco
 from intercap_core.formats.detections.class_names import COCO_NAMES, COCO_NAMES_FROM_0
 from intercap_core.formats.detections.coco import (
+    CandidateForm,
     ImageKey,
-    UnreadableCandidates,
-    candidates_of,
+    UnreadableDetections,
+    parse_candidates,
     read_json,
 )
 from intercap_core.geometry.camera import masks
@@ -37,8 +37,10 @@ ENTRY = {
 def read(tmp_path, content, **options):
     path = tmp_path / "k1.json"
     path.write_text(content if isinstance(content, str) else json.dumps(content))
-    options = {"names": COCO_NAMES, "min_score": 0.05} | options
-    return candidates_of(read_json(path), width=WIDTH, height=HEIGHT, **options)
+    names, score = options.pop("names", COCO_NAMES), options.pop("min_score", 0.05)
+    return parse_candidates(
+        read_json(path), CandidateForm((WIDTH, HEIGHT), names, score), **options
+    )
 
 
 def instances(found, number):
@@ -157,13 +159,13 @@ def test_wrong_entries_are_left_out_and_named(tmp_path, change, words):
     ],
 )
 def test_wrong_files_are_told(tmp_path, content):
-    with pytest.raises(UnreadableCandidates):
+    with pytest.raises(UnreadableDetections):
         read(tmp_path, content)
 
 
 def test_huge_files_are_not_read(tmp_path, monkeypatch):
-    monkeypatch.setattr(coco, "MAX_JSON_BYTES", 100)
-    with pytest.raises(UnreadableCandidates, match="one file an image"):
+    monkeypatch.setattr("intercap_core.formats.detections.coco.MAX_JSON_BYTES", 100)
+    with pytest.raises(UnreadableDetections, match="one file an image"):
         read(tmp_path, [ENTRY])
 
 
@@ -266,10 +268,10 @@ KEYS = ("image_id", "category_id", "category_name", "score", "bbox", "box", "seg
 )
 def test_any_json_is_read_or_told(changes, whole, segmentation):
     entries = [ENTRY | changes, ENTRY | {"segmentation": segmentation}, changes]
-    options = {"width": WIDTH, "height": HEIGHT, "min_score": 0.0, "names": COCO_NAMES}
+    form = CandidateForm((WIDTH, HEIGHT), COCO_NAMES, 0.0)
     try:
-        found = coco.candidates_of({"annotations": [*entries, ENTRY]} | whole, **options)
-    except UnreadableCandidates:
+        found = parse_candidates({"annotations": [*entries, ENTRY]} | whole, form)
+    except UnreadableDetections:
         return
     assert len(found.results) + len(found.faults) == found.entries
     for _, instance in found.results:

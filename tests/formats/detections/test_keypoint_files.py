@@ -13,12 +13,12 @@ from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.image_numbers import CameraImages
 from intercap_core.formats.detections.keypoint_files import (
-    Values,
+    KeypointCleaner,
     has_keypoints,
-    look_at_keypoints,
+    preview_keypoints,
     read_camera,
 )
-from intercap_core.formats.detections.keypoint_layouts import WHOLE_BODY
+from intercap_core.formats.detections.keypoints.coco import WHOLE_BODY
 
 SIZE = (1920, 1080)
 COUNT = 4
@@ -76,7 +76,7 @@ def test_files_named_after_the_images_follow_them(tmp_path):
         write(tmp_path / "k1" / f"results_shot_{n}.json", [whole(n)])
     found = read(tmp_path, images(stems))
     assert noses(found) == {n: [n + 1.0] for n in range(COUNT)}
-    assert found.notes == ["1 keypoint files belong to no image (first: shot_5.json)"]
+    assert found.notes == ["1 keypoint files belong to no image (first: shot_5)"]
     named = [whole(n, image_id=f"shot_{n}.jpg") for n in (2, 4, 9)]
     found = read(write(tmp_path / "k1.json", named).parent, images(stems))
     assert noses(found) == {0: [], 1: [2], 2: [], 3: [4]}
@@ -107,7 +107,7 @@ def test_cut_files_and_other_layouts_are_left_out(tmp_path):
     broken, layouts = found.notes
     assert "k1/1_keypoints.json" in broken
     assert layouts.startswith("2 people or files of keypoints left out")
-    assert "2_keypoints.json: people[0].pose_keypoints_2d has 54 numbers, expected 75" in layouts
+    assert "2_keypoints.json has 54 numbers in people[0].pose_keypoints_2d, expected 75" in layouts
     assert "expected OpenPose's 'people'" in layouts
     assert str(tmp_path) not in " ".join(found.notes), "artefacts know no absolute paths"
 
@@ -130,8 +130,8 @@ def test_people_of_another_length_are_left_out_of_a_file(tmp_path):
     ("name", "content", "words"),
     [
         ("k1.json", [{"image_id": 0, "keypoints": [1.0] * 150}], "has 50 keypoints"),
-        ("k1.json", {"bodies": []}, "expected OpenPose's 'people'"),
-        ("k1.json", openpose(3), "expected OpenPose's 'people'"),
+        ("k1.json", {"bodies": []}, "expected a list of people"),
+        ("k1.json", openpose(3), "expected a list of people"),
         ("k1/0_keypoints.json", {"people": [{"pose_keypoints_2d": [1.0] * 54}]}, "54 numbers"),
         ("k1/0.json", [{"keypoints": [1.0] * 150}], "has 50 keypoints"),
     ],
@@ -147,8 +147,16 @@ def test_keypoints_none_of_which_can_be_used_are_refused(tmp_path, name, content
 def test_two_files_of_one_image_are_refused(tmp_path):
     for name in ("1_keypoints.json", "a_01_keypoints.json"):
         write(tmp_path / "k1" / name, openpose(3))
-    with pytest.raises(UserError, match="image 1 has two"):
+    with pytest.raises(UserError, match=r"two keypoint files, 1_keypoints\.json and a_01_"):
         read(tmp_path)
+
+
+def test_openpose_files_are_matched_by_number_and_hidden_files_ignored(tmp_path):
+    write(tmp_path / "k1" / "k1_000000000002_keypoints.json", openpose(10))
+    write(tmp_path / "k1" / "00003_keypoints.json", openpose(20))
+    write(tmp_path / "k1" / "._00001_keypoints.json", "no JSON")
+    write(tmp_path / "k1" / "notes.txt", "")
+    assert noses(read(tmp_path)) == {2: [10], 3: [20]}
 
 
 def changed(**points) -> np.ndarray:
@@ -167,31 +175,31 @@ def changed(**points) -> np.ndarray:
     ],
 )  # fmt: skip
 def test_points_that_cannot_be_true_are_not_seen(values):
-    (person,) = Values(SIZE).clean(changed(nose=values))
+    (person,) = KeypointCleaner(SIZE).clean(changed(nose=values))
     assert (person[0] == 0).all() and (person[1:, 2] == 0.5).all() and person.dtype == np.float32
 
 
 def test_points_on_the_edge_stay_and_those_beyond_are_counted():
     kept = changed(nose=(-0.5, 1079.4, 0.9), neck=(1919.4, 0, 0.9), mid_hip=(2000, 5, 0.9))
-    values = Values(SIZE)
+    values = KeypointCleaner(SIZE)
     (person,) = values.clean(kept)
     assert person[AT("nose"), 2] > 0 and person[AT("neck"), 2] > 0 and person[8, 2] == 0
     (note,) = values.notes()
     assert note.startswith("1 of 135 keypoints lie outside the image of 1920x1080")
     assert "another size" not in note
-    values = Values((160, 90))
+    values = KeypointCleaner((160, 90))
     values.clean(changed() * (2, 1, 1))
     assert "are they of images of another size" in values.notes()[0]
 
 
 def test_confidence_is_cut_and_scaled():
     person = changed(nose=(5, 5, 1.3), neck=(5, 5, 4.0))
-    values = Values(SIZE)
+    values = KeypointCleaner(SIZE)
     (cut,) = values.clean(person)
     assert cut[[0, 1], 2].tolist() == [1, 1] and cut[2, 2] == 0.5
     assert "2 of 135 confidences are beyond 1" in values.notes()[0]
     assert "keypoint_full_confidence" in values.notes()[0]
-    values = Values(SIZE, full_confidence=4.0)
+    values = KeypointCleaner(SIZE, full_confidence=4.0)
     (scaled,) = values.clean(person)
     np.testing.assert_allclose(scaled[[0, 1, 2], 2], [0.325, 1, 0.125])
     assert values.notes() == []
@@ -200,7 +208,7 @@ def test_confidence_is_cut_and_scaled():
 @pytest.mark.parametrize("value", [0.0, None])
 def test_a_look_before_a_run_tells_of_people_without_points(tmp_path, value):
     empty = whole(image_id=0) | {"keypoints": [value] * 399}
-    look = partial(look_at_keypoints, tmp_path, "k1", size=SIZE, full_confidence=1.0)
+    look = partial(preview_keypoints, tmp_path, "k1", size=SIZE, full_confidence=1.0)
     write(tmp_path / "k1.json", [empty, empty])
     (note,) = look()
     assert "k1.json: none of its first 2 people has a point" in note
@@ -211,12 +219,12 @@ def test_a_look_before_a_run_tells_of_people_without_points(tmp_path, value):
 
 
 def test_people_of_zeros_or_of_shares_are_nobody():
-    values = Values(SIZE)
+    values = KeypointCleaner(SIZE)
     assert len(values.clean(np.zeros((2, 135, 3)))) == 0 and values.notes() == []
     shares = changed() * (1 / 250, 1 / 250, 1)
     assert len(values.clean(np.concatenate([shares, changed()]))) == 1
     assert "coordinates must be pixels" in values.notes()[0]
-    assert Values(SIZE).clean(np.zeros((0, 135, 3))).shape == (0, 135, 3)
+    assert KeypointCleaner(SIZE).clean(np.zeros((0, 135, 3))).shape == (0, 135, 3)
 
 
 def test_what_is_changed_is_told_with_the_camera(tmp_path):

@@ -21,8 +21,7 @@ sys.path.insert(0, str(ROOT / "tools"))
 import mediapipe_keypoints as tool  # noqa: E402
 
 from intercap_core.body.keypoints import KEYPOINT_NAMES  # noqa: E402
-from intercap_core.formats.detections import keypoint_layouts  # noqa: E402
-from intercap_core.formats.detections.converters.coco_people import people_of  # noqa: E402
+from intercap_core.formats.detections.keypoints import coco, read_people  # noqa: E402
 
 AT = KEYPOINT_NAMES.index
 SIZE = (1000, 500)
@@ -39,7 +38,7 @@ FACE = [(i / 1000, 0.4, 0.0) for i in range(478)]
 
 def read(person: dict) -> np.ndarray:
     content = {"images": [{"id": 0}], "annotations": [person | {"image_id": 0}]}
-    found = people_of(content)
+    found = read_people(content, one_image=False)
     assert not found.faults
     return found.results[0][1]
 
@@ -49,8 +48,8 @@ def seen(share: float, length: int) -> float:
 
 
 def test_its_names_are_the_pipelines():
-    assert tool.COCO_BODY == keypoint_layouts.COCO_BODY
-    assert tool.COCO_FEET == keypoint_layouts.COCO_FEET
+    assert tool.COCO_BODY == coco.BODY
+    assert tool.COCO_FEET == coco.FEET
     assert set(tool.FEET) == set(tool.COCO_FEET) - {"left_small_toe", "right_small_toe"}
     assert len(tool.FACE) == len(set(tool.FACE)) == 68 and max(tool.FACE) < 468
 
@@ -75,7 +74,7 @@ def test_points_arrive_by_name():
 
 def test_what_was_not_found_is_not_seen():
     person = read(tool.person(BODY, (None, HAND), None, SIZE))
-    left, right = keypoint_layouts.HANDS[:21], keypoint_layouts.HANDS[21:]
+    left, right = coco.LEFT, coco.RIGHT
     assert (person[[AT(name) for name in left]] == 0).all()
     assert (person[[AT(name) for name in right], 2] > 0).all()
     assert (person[67:] == 0).all()
@@ -112,7 +111,7 @@ def test_mediapipe_itself_calls_the_points_so(python):
     for name in names["hand"][1:]:
         finger, _, joint = name.replace("_finger", "").partition("_")
         told.append(finger + (parts if finger == "thumb" else fingers)[joint])
-    assert [f"left_{name}" for name in told] == list(keypoint_layouts.HANDS[:21])
+    assert [f"left_{name}" for name in told] == list(coco.LEFT)
     for points, contour in (
         (tool.JAW, "FACE_OVAL"), (tool.RIGHT_BROW, "RIGHT_EYEBROW"), (tool.LEFT_EYE, "LEFT_EYE"),
         (tool.LEFT_BROW, "LEFT_EYEBROW"), (tool.RIGHT_EYE, "RIGHT_EYE"), (tool.OUTER_LIPS, "LIPS"),

@@ -12,7 +12,8 @@ from intercap_core.body.keypoints import KEYPOINT_NAMES  # noqa: E402
 from intercap_core.config import DetectionsSettings  # noqa: E402
 from intercap_core.errors import UserError  # noqa: E402
 from intercap_core.formats.detections.instance import Instance  # noqa: E402
-from intercap_core.formats.detections.keypoint_layouts import LAYOUTS  # noqa: E402
+from intercap_core.formats.detections.keypoints import KeypointLayout, layouts  # noqa: E402
+from intercap_core.formats.detections.keypoints.coco import BODY  # noqa: E402
 from intercap_core.formats.detections.onnx_pose import Crop, PoseModel, person_boxes, tiles  # noqa: E402
 from tests.helpers import tiny_onnx  # noqa: E402
 
@@ -168,18 +169,16 @@ def test_the_best_people_of_a_crowd_are_looked_at():
 
 def test_body_models_are_taken_and_others_refused(tmp_path):
     image = tiny_pose.picture(SIZE, [LEFT])
-    (body,) = model(tmp_path, layout=LAYOUTS[17]).find(image, [around(LEFT)])
+    (body,) = model(tmp_path, layout=BODY).find(image, [around(LEFT)])
     assert body[KEYPOINT_NAMES.index("left_knee"), 2] > 0.5 and (body[25:, 2] == 0).all()
-    with pytest.raises(UserError, match="finds 21 points, expected one of 17, 23, 26, 133, 134"):
+    with pytest.raises(UserError, match="has 21 keypoints, expected one of 17, 23, 26, 133, 134"):
         model(tmp_path, layout=tuple(tiny_pose.NAMES[:21]))
 
 
 def test_heatmaps_of_other_points_or_shapes_are_told(tmp_path):
-    (body,) = map_model(tmp_path, layout=LAYOUTS[17]).find(
-        tiny_pose.picture(SIZE, [LEFT]), [around(LEFT)]
-    )
+    (body,) = map_model(tmp_path, layout=BODY).find(tiny_pose.picture(SIZE, [LEFT]), [around(LEFT)])
     assert body[KEYPOINT_NAMES.index("left_knee"), 2] > 0.5 and (body[25:, 2] == 0).all()
-    with pytest.raises(UserError, match="finds 21 points, expected one of 17, 23, 26, 133, 134"):
+    with pytest.raises(UserError, match="has 21 keypoints, expected one of 17, 23, 26, 133, 134"):
         map_model(tmp_path, layout=tuple(tiny_pose.NAMES[:21]))
     with pytest.raises(UserError, match=r"\['batch', 133, 32, 48\].* not those of a pose"):
         map_model(tmp_path, stride=(4, 8))
@@ -205,3 +204,13 @@ def test_bins_that_differ_are_told(tmp_path):
     pose = model(tmp_path, split=(2, 3))
     with pytest.raises(UserError, match=r"\[1, 133, 384\]; \[1, 133, 768\].* not those of a pose"):
         pose.find(tiny_pose.picture(SIZE, []), [around(LEFT)])
+
+
+def test_a_layout_in_the_models_metadata_is_used(tmp_path, monkeypatch):
+    monkeypatch.setitem(layouts(), "mirrored", KeypointLayout("mirrored", BODY[::-1]))
+    image, mirrored = tiny_pose.picture(SIZE, [LEFT]), model(tmp_path, layout=BODY)
+    (body,) = mirrored.find(image, [around(LEFT)])
+    mirrored._model.metadata["keypoint_layout"] = "mirrored"
+    (other,) = mirrored.find(image, [around(LEFT)])
+    at = [KEYPOINT_NAMES.index(name) for name in BODY]
+    np.testing.assert_array_equal(other[at], body[at[::-1]])

@@ -2,20 +2,12 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from intercap_core.body.keypoints import KEYPOINT_NAMES
-from intercap_core.errors import UserError
-from intercap_core.formats.detections.converters.openpose import (
-    as_openpose,
-    is_openpose,
-    keypoint_files,
-    people_of,
-)
+from intercap_core.formats.detections.coco import UnreadableDetections
+from intercap_core.formats.detections.keypoints.openpose import READER
 
 COUNTS = {
     "pose_keypoints_2d": 25,
@@ -35,15 +27,10 @@ def person(base: float = 0.0) -> dict[str, list[float]]:
     return lists
 
 
-def write(tmp_path, content) -> Path:
-    path = tmp_path / "000000000000_keypoints.json"
-    path.write_text(json.dumps(content))
-    return path
-
-
 def read_people(content) -> np.ndarray:
-    assert is_openpose(content)
-    return people_of(content, "a_keypoints.json")
+    assert READER.recognises(content)
+    people = [points for _, points in READER.read(content, True).results]
+    return np.array(people).reshape(-1, 135, 3)
 
 
 def test_lists_land_in_the_shared_order():
@@ -69,9 +56,7 @@ def test_nobody_and_parts_that_were_not_looked_for():
 def test_behaves_lists_are_one_person():
     names = ("body_joints", "left_hand_joints", "right_hand_joints", "face_joints")
     content = dict(zip(names, person().values(), strict=True))
-    people = read_people(as_openpose(content))
-    np.testing.assert_array_equal(people, read_people({"people": [person()]}))
-    assert as_openpose({"people": []}) == {"people": []}
+    np.testing.assert_array_equal(read_people(content), read_people({"people": [person()]}))
 
 
 @pytest.mark.parametrize(
@@ -79,7 +64,10 @@ def test_behaves_lists_are_one_person():
     [
         ({"people": {}}, "no list 'people'"),
         ({"people": [[1, 2]]}, r"people\[0\]"),
-        ({"people": [person() | {"pose_keypoints_2d": [0.0] * 54}]}, "54 numbers, expected 75"),
+        (
+            {"people": [person() | {"pose_keypoints_2d": [0.0] * 54}]},
+            r"54 numbers in people\[0\].* 75",
+        ),
         ({"people": [person() | {"pose_keypoints_2d": ["x"] * 75}]}, "not a number"),
         ({"people": [person() | {"pose_keypoints_2d": [10**400] * 75}]}, "not a number"),
         ({"people": [person() | {"pose_keypoints_2d": [{}] * 75}]}, "not a number"),
@@ -88,20 +76,5 @@ def test_behaves_lists_are_one_person():
     ],
 )
 def test_other_layouts_are_named(content, words):
-    with pytest.raises(UserError, match=f"a_keypoints.json: .*{words}"):
+    with pytest.raises(UnreadableDetections, match=words):
         read_people(content)
-
-
-def test_files_are_found_by_their_number(tmp_path):
-    for name in ("k1_000000000012_keypoints.json", "00003_keypoints.json", "notes.txt"):
-        (tmp_path / name).write_text("{}")
-    assert sorted(keypoint_files(tmp_path)) == [3, 12]
-    (tmp_path / "3_keypoints.json").write_text("{}")
-    with pytest.raises(UserError, match="image 3 has two"):
-        keypoint_files(tmp_path)
-
-
-def test_hidden_files_of_other_systems_are_passed_over(tmp_path):
-    path = write(tmp_path, {"people": []})
-    (tmp_path / f"._{path.name}").write_bytes(b"\0\5\x16\7")
-    assert keypoint_files(tmp_path) == {0: path}

@@ -6,9 +6,16 @@ import numpy as np
 import pytest
 
 from intercap_core.body.keypoints import KEYPOINT_NAMES
-from intercap_core.formats.detections.coco import ImageKey, UnreadableCandidates
-from intercap_core.formats.detections.converters.coco_people import people_of
-from intercap_core.formats.detections.keypoint_layouts import LAYOUTS, WHOLE_BODY, to_shared
+from intercap_core.formats.detections.coco import ImageKey, UnreadableDetections
+from intercap_core.formats.detections.keypoints import (
+    KeypointLayout,
+    PeopleFile,
+    find_layout,
+    layouts,
+    read_people,
+    to_shared,
+)
+from intercap_core.formats.detections.keypoints.coco import WHOLE_BODY
 
 AT = KEYPOINT_NAMES.index
 # Numbers of COCO-WholeBody's points as its paper's figure and mmpose's data set file count them.
@@ -46,6 +53,10 @@ MMPOSE = {
 }
 
 
+def people_of(content, *, one_image: bool = False) -> PeopleFile:
+    return read_people(content, one_image=one_image)
+
+
 def only(content, **options) -> np.ndarray:
     found = people_of(content, **options)
     assert not found.faults
@@ -54,10 +65,17 @@ def only(content, **options) -> np.ndarray:
 
 
 def test_every_layout_names_known_points_once():
-    for count, names in LAYOUTS.items():
-        assert len(names) == len(set(names)) == count
-        assert set(names) - set(KEYPOINT_NAMES) <= {"head", "middle_of_shoulders"}
-    assert sorted(LAYOUTS) == [17, 23, 26, 133, 134, 136]
+    for layout in layouts().values():
+        assert len(layout.points) == len(set(layout.points))
+        assert set(layout.points) - set(KEYPOINT_NAMES) <= {"head", "middle_of_shoulders"}
+    assert sorted(len(layout.points) for layout in layouts().values()) == [
+        17,
+        23,
+        26,
+        133,
+        134,
+        136,
+    ]
     assert set(KEYPOINT_NAMES) - set(WHOLE_BODY) == {"neck", "mid_hip"}
 
 
@@ -125,8 +143,39 @@ def test_dwposes_own_order_is_the_same_person():
     np.testing.assert_allclose(only([WHOLE | {"keypoints": flat(sorted_)}]), only([WHOLE]))
 
 
+@pytest.mark.parametrize(
+    "content",
+    [
+        [MMPOSE | {"image_id": 3, "keypoint_layout": "other"}],
+        {"keypoint_layout": "other", "annotations": [MMPOSE | {"image_id": 3}]},
+        {"meta_info": {"dataset_name": "other"},
+         "instance_info": [{"frame_id": 4, "instances": [MMPOSE]}]},
+    ],
+    ids=["person", "file", "mmpose"],
+)  # fmt: skip
+def test_a_stated_layout_is_used_among_two_of_one_length(monkeypatch, content):
+    other = KeypointLayout("other", WHOLE_BODY[::-1])
+    monkeypatch.setitem(layouts(), "other", other)
+    np.testing.assert_allclose(only(content), to_shared(points(), other.points))
+    np.testing.assert_allclose(only([WHOLE]), to_shared(points(), WHOLE_BODY))
+
+
+def test_a_layout_that_does_not_fit_is_refused(monkeypatch):
+    for layout, count, words in (
+        ("unknown", 133, "expected one of coco, "),
+        ("coco", 133, "expected the 17 of layout coco"),
+        (None, 50, "expected one of 17, 23, 26, 133, 134, 136"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            find_layout(count, layout)
+    for name in ("a", "b"):
+        monkeypatch.setitem(layouts(), name, KeypointLayout(name, WHOLE_BODY[:50]))
+    with pytest.raises(ValueError, match="as have layouts a, b; state 'keypoint_layout'"):
+        find_layout(50)
+
+
 def test_body_models_leave_hands_and_face_unseen():
-    person = to_shared(points(17), LAYOUTS[17])
+    person = to_shared(points(17), find_layout(17).points)
     assert (person[:, 2] > 0).sum() == 17 and (person[25:] == 0).all()
 
 
@@ -144,7 +193,7 @@ def test_nan_and_none_stay_what_they_are():
         ({"image_id": 1, "pose": []}, "has no 'keypoints' but an object with image_id, pose"),
         ({"image_id": 1, "keypoints": flat(points(50))}, "50 keypoints, expected one of 17, 23"),
         ({"image_id": 1, "keypoints": flat(points())[:-1]}, r"has the shape \[398\]"),
-        ({"image_id": 1, "keypoints": points()[:, :2].tolist()}, "'keypoint_scores' beside"),
+        ({"image_id": 1, "keypoints": points()[:, :2].tolist()}, "x, y and 'keypoint_scores'"),
         ({"image_id": 1, "keypoints": "none"}, "keypoints is 'none', expected lists of numbers"),
         ({"image_id": 1, "keypoints": [["a", "b", 1]]}, "expected lists of numbers"),
         ({"image_id": 1, "keypoints": [[1, 2, 3], [4]]}, "expected lists of numbers"),
@@ -170,5 +219,5 @@ def test_people_that_cannot_be_used_are_told_and_the_rest_counts(entry, words):
      [{"frame_id": "a", "instances": []}], [{"frame_id": 0, "instances": 3}]],
 )  # fmt: skip
 def test_files_of_another_layout_are_told(content):
-    with pytest.raises(UnreadableCandidates):
+    with pytest.raises(UnreadableDetections):
         people_of(content)

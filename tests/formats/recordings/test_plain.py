@@ -247,8 +247,8 @@ def test_uneven_images_are_in_the_sets_of_their_times_and_told(capture):
     with Frames.open(output) as frames:
         assert frames.colour_available.all()
         np.testing.assert_allclose(frames.skew_s[:, 1], np.tile([0.0, 0.006], 4), atol=1e-6)
-    assert "unevenly beside their sets, usually 3.0 ms off" in notes_of(output)["right"]
-    assert "unevenly" not in notes_of(output)["left"]
+    assert "the skew of its images varies by 3.0 ms" in notes_of(output)["right"]
+    assert "varies" not in notes_of(output)["left"]
 
 
 def test_a_video_beside_a_folder_of_depth(capture):

@@ -1,0 +1,184 @@
+"""Keypoints of detectors: the layouts of their points and the readers of their files.
+
+A module of this package adds layouts by ``LAYOUTS``, a tuple of :class:`KeypointLayout`, or a form
+of file by ``READER``, a :class:`KeypointReader`. docs/extending.md has an example of each.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from intercap_core.body.keypoints import KEYPOINT_NAMES, NUM_KEYPOINTS
+from intercap_core.formats.detections.coco import ImageKey, UnreadableDetections, read_json
+from intercap_core.inputs.files import quoted
+from intercap_core.plugins import modules_of
+
+# Key by which a file, a person in it or an ONNX model's metadata may name its layout.
+LAYOUT_KEY = "keypoint_layout"
+
+
+@dataclass(frozen=True)
+class KeypointLayout:
+    """Points that a detector gives for a person."""
+
+    name: str
+    """Name by which a file may state the layout."""
+    points: tuple[str, ...]
+    """Name of each point in the detector's order. Points are matched by name; names that
+    ``body.keypoints.KEYPOINT_NAMES`` does not have are left out."""
+    is_default: bool = False
+    """Whether people with this number of points have this layout if their file names none. Needed
+    only if another layout has the same number of points."""
+
+
+@dataclass
+class PeopleFile:
+    """The people of one file."""
+
+    results: list[tuple[ImageKey, np.ndarray]] = field(default_factory=list)
+    """Image and keypoints (135, 3) of each person: x, y (px) and confidence as written."""
+    images: list[ImageKey] | None = None
+    """Images that the detector looked at; None if the file does not list them."""
+    faults: list[str] = field(default_factory=list)
+    """Entries that are left out, with the reason."""
+    faulty: list[ImageKey] = field(default_factory=list)
+    """Images of these entries."""
+    entries: int = 0
+    """Number of all entries."""
+
+
+@dataclass(frozen=True)
+class KeypointReader:
+    """Reader of one form of keypoint files."""
+
+    tool: str
+    """Name of the detector."""
+    expects: str
+    """Content of the files, for messages."""
+    recognises: Callable[[Any], bool]
+    """Whether loaded content is of this form."""
+    read: Callable[[Any, bool], PeopleFile]
+    """Reads loaded content. The second argument is True for a file of one image, whose people need
+    not state their image. Raises :class:`UnreadableDetections` if nothing can be used."""
+    camera_files: tuple[str, ...] = ()
+    """Names of files for all images of a camera, such as ``{camera}.json``; () = there are none."""
+    image_files: tuple[str, ...] = ()
+    """Names of files for one image in the camera's folder, such as ``{image}.json``."""
+    load: Callable[[Path], Any] = read_json
+    """Loads a file. Readers with the same function share the files that their names match."""
+    rank: int = 1
+    """Readers are asked in this order: a lower rank first."""
+
+    def match_images(self, paths: Iterable[Path]) -> dict[str, Path]:
+        """Files that may hold one image, by the image's name."""
+        matched = {}
+        for path in paths:
+            for name in self.image_files:
+                before, after = name.split("{image}")
+                match = re.fullmatch(f"{re.escape(before)}(.+){re.escape(after)}", path.name)
+                if match:
+                    matched[match[1]] = path
+                    break
+        return matched
+
+
+@cache
+def layouts() -> dict[str, KeypointLayout]:
+    """All layouts by name."""
+    modules = modules_of("intercap_core.formats.detections.keypoints")
+    return {layout.name: layout for module in modules for layout in getattr(module, "LAYOUTS", ())}
+
+
+@cache
+def readers() -> tuple[KeypointReader, ...]:
+    """All readers in the order in which they are asked."""
+    modules = modules_of("intercap_core.formats.detections.keypoints")
+    found = [module.READER for module in modules if hasattr(module, "READER")]
+    return tuple(sorted(found, key=lambda reader: (reader.rank, reader.tool)))
+
+
+def known_counts() -> str:
+    """Numbers of points of all layouts, for messages."""
+    return ", ".join(map(str, sorted({len(layout.points) for layout in layouts().values()})))
+
+
+def find_layout(count: int, name: str | None = None) -> KeypointLayout:
+    """The layout of a person with ``count`` points.
+
+    Raises ValueError, in words that follow the person's or the model's name, if there is none.
+
+    Args:
+        count: number of points.
+        name: name of the layout if the file states it.
+    """
+    if name is not None and name not in layouts():
+        raise ValueError(
+            f"states {LAYOUT_KEY} {quoted(name)}, expected one of {', '.join(sorted(layouts()))}"
+        )
+    if name is not None and len(layouts()[name].points) != count:
+        expected = len(layouts()[name].points)
+        raise ValueError(f"has {count} keypoints, expected the {expected} of layout {name}")
+    if name is not None:
+        return layouts()[name]
+    found = [layout for layout in layouts().values() if len(layout.points) == count]
+    found = [layout for layout in found if layout.is_default] or found
+    if not found:
+        raise ValueError(
+            f"has {count} keypoints, expected one of {known_counts()} (133 = COCO-WholeBody); "
+            "run a whole-body model"
+        )
+    if len(found) > 1:
+        raise ValueError(
+            f"has {count} keypoints, as have layouts {', '.join(one.name for one in found)}; state "
+            f"'{LAYOUT_KEY}'"
+        )
+    return found[0]
+
+
+def to_shared(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
+    """Order points of a detector as the 135 keypoints of ``body.keypoints``.
+
+    Returns (..., 135, 3). Points that the detector does not give have confidence 0. Those include
+    COCO's neck and middle of the hips, which are estimated in space later
+    (:func:`intercap_core.person.middles.fill_middles`).
+
+    Args:
+        points: (..., K, 3) of x, y, confidence.
+        names: name of each of the K points.
+    """
+    index = {name: at for at, name in enumerate(KEYPOINT_NAMES)}
+    result = np.zeros((*points.shape[:-2], NUM_KEYPOINTS, 3))
+    kept = [at for at, name in enumerate(names) if name in index]
+    result[..., [index[names[at]] for at in kept], :] = points[..., kept, :]
+    return result
+
+
+def read_people(
+    content: Any, load: Callable[[Path], Any] = read_json, *, one_image: bool
+) -> PeopleFile:
+    """Read loaded content by the reader that recognises it.
+
+    Raises :class:`UnreadableDetections` if there is none, or as the reader does.
+
+    Args:
+        content: content as ``load`` returns it.
+        load: function that loaded the file.
+        one_image: the file is of one image.
+    """
+    possible = [
+        reader
+        for reader in readers()
+        if reader.load is load and (reader.image_files if one_image else reader.camera_files)
+    ]
+    for reader in possible:
+        if reader.recognises(content):
+            return reader.read(content, one_image)
+    expected = ", ".join(reader.expects for reader in possible)
+    raise UnreadableDetections(f"holds {quoted(content)}, expected {expected}")

@@ -1,0 +1,89 @@
+"""OpenPose's JSON files: body, hands and face of every person in one image.
+
+Body 25, hands 21 each and face 70 points become 135: body, left hand, right hand, the inner face
+(dlib 17 to 67), the jaw line (dlib 0 to 16). OpenPose's two pupils (68, 69) are left out. BEHAVE
+keeps OpenPose's lists of one person at the top of the file, under names of its own.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from intercap_core.body.keypoints import (
+    BODY,
+    CONTOUR,
+    FACE,
+    LEFT_HAND,
+    NUM_KEYPOINTS,
+    RIGHT_HAND,
+)
+from intercap_core.formats.detections.coco import ImageKey, UnreadableDetections
+from intercap_core.formats.detections.keypoints import KeypointReader, PeopleFile
+
+# Key, BEHAVE's key, number of points.
+_LISTS = (
+    ("pose_keypoints_2d", "body_joints", 25),
+    ("hand_left_keypoints_2d", "left_hand_joints", 21),
+    ("hand_right_keypoints_2d", "right_hand_joints", 21),
+    ("face_keypoints_2d", "face_joints", 70),
+)
+
+
+def _recognises(content: Any) -> bool:
+    return isinstance(content, dict) and ("people" in content or "body_joints" in content)
+
+
+def _read(content: dict[str, Any], one_image: bool) -> PeopleFile:
+    """Read the people of one image. A part that OpenPose did not look for has confidence 0."""
+    if "people" not in content:
+        content = {"people": [{key: content.get(theirs, []) for key, theirs, _ in _LISTS}]}
+    people = content["people"]
+    if not isinstance(people, list):
+        raise UnreadableDetections("has no list 'people'; expected a file as OpenPose writes it")
+    result = PeopleFile(entries=len(people))
+    for index, person in enumerate(people):
+        if not isinstance(person, dict):
+            raise UnreadableDetections(
+                f"has people[{index}] that is not an object with keypoint lists"
+            )
+        body, left, right, face = (
+            _points(person.get(key, []), count, f"people[{index}].{key}")
+            for key, _, count in _LISTS
+        )
+        points = np.zeros((NUM_KEYPOINTS, 3))
+        points[BODY], points[LEFT_HAND], points[RIGHT_HAND] = body, left, right
+        points[FACE], points[CONTOUR] = face[17:68], face[:17]
+        result.results.append((ImageKey(None, None), points))
+    return result
+
+
+READER = KeypointReader(
+    tool="OpenPose",
+    expects="OpenPose's 'people'",
+    recognises=_recognises,
+    read=_read,
+    image_files=("{image}_keypoints.json",),
+    rank=0,
+)
+
+
+def _points(values: Any, count: int, where: str) -> np.ndarray:
+    """Points (count, 3) of one list."""
+    if not isinstance(values, list) or len(values) not in (0, 3 * count):
+        found = len(values) if isinstance(values, list) else type(values).__name__
+        raise UnreadableDetections(
+            f"has {found} numbers in {where}, expected {3 * count} (x, y, confidence of {count} "
+            "points); run OpenPose with its BODY_25 model, hands and face"
+        )
+    if not values:
+        return np.zeros((count, 3))
+    try:
+        # None stands for NaN in JSON of libraries that avoid NaN.
+        points = np.array([np.nan if v is None else v for v in values], np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise UnreadableDetections(f"has a value in {where} that is not a number") from None
+    if points.ndim != 1:
+        raise UnreadableDetections(f"has lists in {where}, expected one flat list of numbers")
+    return points.reshape(count, 3)
