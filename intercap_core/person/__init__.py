@@ -2,18 +2,12 @@
 
 In the order of a run:
 
-- ``groups``: people of one set matched over views by geometry; ``tracks``: followed over time;
-  ``people``: known again after an absence, by place and build; ``subject``: who of them it is, by
-  the points that ``named`` reads, by who touches the object (``touching``), or by who is seen most
-- ``lifting``: keypoints of a single view placed by the depth beside them
-- ``swaps``: sides exchanged by the detector: steadied over time in each view, then triangulated and
-  corrected; ``agreement`` decides set by set which views disagree, ``facing`` which of two mirrored
-  bodies is the true one, by the body's build and its motion
-- ``sides``: which keypoints are left and right of each other
-- ``exposure``: keypoints moved from each camera's exposure to the set's time
-- ``middles``: neck and middle of the hips from shoulders and hips
-- ``masks``: the detector's candidate that is the subject
-- ``constants``: all numbers, by kind
-
-Images that no detector segmented are segmented by the room ``segmentation``.
+1. ``groups`` matches the people of one set over views by geometry, ``tracks`` follows them over
+   time and recognises them after an absence. ``subject`` chooses the subject among them, with the
+   help of ``subject_hints``: points named by the user, and contact with the object.
+2. ``lifting`` places keypoints of a single view by its depth.
+3. ``subject_joints`` triangulates the subject. ``left_right`` makes left and right consistent over
+   views and time; ``sides`` has the index tables, and sides stated by the user.
+4. ``masks`` chooses the detector's candidate that is the subject. Images without a detector's
+   candidates are segmented by ``segmentation``.
 """

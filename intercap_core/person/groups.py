@@ -1,7 +1,7 @@
 """The people of one frame set, matched over its views by geometry.
 
-The order of people in a detector's file says nothing: detections whose rays meet are one person. In
-a set where no rays meet, depth tells where the people of each single view are.
+The order of people in a detector's file carries no information: detections whose rays meet are one
+person. In a set without intersecting rays, depth locates the people of each single view.
 """
 
 from __future__ import annotations
@@ -21,13 +21,11 @@ from intercap_core.geometry.camera.triangulation import (
 )
 from intercap_core.person.sides import BODY_POINTS, PARTNER
 
-MIN_COMMON_POINTS = 5  # body points; fewer do not tell two people apart; tuned on the studio
-# Median distance within which a view shows the same person, px: detectors' biases and calibration
-# stay well under it, another person half a metre away (160 px at 2.6 m) is well over it.
+MIN_COMMON_POINTS = 5  # body points that two detections must share; tuned on the studio
+# Median distance within which a view shows the same person, px. Detector biases and calibration
+# errors are much smaller; half a metre is 160 px at 2.6 m. Tuned on the studio.
 SAME_PERSON_PX_AT_1080P = 60.0
 SAME_PERSON_GAP_M = 0.12  # median distance of two views' rays; tuned on the studio
-SAME_PERSON_M = 0.3  # between centres, of people who share a detection; nobody stands nearer
-LIFTED_SUPPORT = 0.5  # of a point that one view lifts by depth; triangulated, it counts about two
 
 
 NOBODY = -1
@@ -41,18 +39,20 @@ set t, by its depth alone: called with t, c and the people."""
 
 @dataclass(frozen=True, eq=False)
 class PersonGroup:
-    """One person in one frame set: ``members`` (C,) index of the view's person or -1, ``points``
-    (25, 3) metres, NaN = not known, ``support``, the number of points seen, over views, and
-    ``errors`` (C,), how far the points are from each member's, share of what is allowed."""
+    """One person in one frame set."""
 
     members: np.ndarray
+    """(C,) index of the person in each view; -1 = not seen."""
     points: np.ndarray
+    """(25, 3) body points, metres; NaN = unknown."""
     support: float
+    """Weighted number of points seen, over all views."""
     errors: np.ndarray
+    """(C,) distance of the points from each detection, as a share of the limit."""
 
     @property
     def views(self) -> int:
-        """How many views see the person."""
+        """Number of views that see the person."""
         return int((self.members != NOBODY).sum())
 
     @cached_property
@@ -61,7 +61,7 @@ class PersonGroup:
         return np.nanmedian(self.points, 0)
 
     def without(self, views: np.ndarray) -> PersonGroup:
-        """The same person, not seen by some ``views`` (C,) bool."""
+        """The same person without the detections of ``views`` (C,) bool."""
         return replace(self, members=np.where(views, NOBODY, self.members))
 
 
@@ -91,15 +91,17 @@ def group_set(people: list[np.ndarray], rig: Rig, min_confidence: float) -> list
 
 
 def _with_another(groups: list[PersonGroup], group: PersonGroup) -> list[PersonGroup]:
-    """Add a person whom two views or more see as nobody else; a detection that two people could be
-    is that one's whom it fits better."""
+    """Add a person with at least two detections of their own.
+
+    A detection shared by two people is assigned to the one it fits better.
+    """
     shared = [(group.members == g.members) & (group.members != NOBODY) for g in groups]
     if group.views - int(np.any(shared, axis=0).sum() if shared else 0) < 2:
         return groups
     result = []
     for other, both in zip(groups, shared, strict=True):
-        if both.any() and np.linalg.norm(group.centre - other.centre) < SAME_PERSON_M:
-            return groups
+        if both.any() and np.linalg.norm(group.centre - other.centre) < 0.3:
+            return groups  # nobody stands closer to another person than 0.3 m
         worse = group.errors >= other.errors
         group = group.without(both & worse)
         result.append(other.without(both & ~worse))
@@ -115,17 +117,16 @@ def lifted_groups(t: int, people: list[np.ndarray], lift: Lift) -> list[PersonGr
             if count >= MIN_COMMON_POINTS:
                 members = np.full(len(people), NOBODY, np.int32)
                 members[c] = i
-                result.append(
-                    PersonGroup(members, points, LIFTED_SUPPORT * count, np.zeros(len(people)))
-                )
+                support = 0.5 * count  # a triangulated point counts about two
+                result.append(PersonGroup(members, points, support, np.zeros(len(people))))
     return sorted(result, key=lambda group: -group.support)
 
 
 def _pair_proposals(
     pairs: list[tuple[int, int]], rays: list[np.ndarray], seen: list[np.ndarray], rig: Rig
 ) -> list[_Proposal]:
-    """Two views' people whose rays meet: the median gap, metres, points (25, 3) and (view, person)
-    of both."""
+    """Pairs of people of two views whose rays meet: median gap, metres, points (25, 3), and
+    (view, person) of both."""
     centres = rig.master_from_colour[:, :3, 3]
     result = []
     for a, b in pairs:
@@ -161,7 +162,7 @@ def _grow(
     seen: list[np.ndarray],
     rig: Rig,
 ) -> PersonGroup | None:
-    """Add to a proposal the person of every view that it reprojects onto."""
+    """Add to a proposal the person of each view that it reprojects onto."""
     members = np.full(len(rig), NOBODY, np.int32)
     members[first[0]], members[second[0]] = first[1], second[1]
     pixels = reproject(np.nan_to_num(points), rig)

@@ -3,17 +3,15 @@
 A detector that mistakes a back for a front exchanges left and right in a whole view, often in
 several views at once; points triangulated from inconsistent views are wrong.
 
-:func:`make_views_agree` tries, for each limb, all 2^(C-1) assignments of sides to views and takes
-the one of
-least cost: truncated squared gaps between the rays of every pair of views, plus a cost for each
-exchanged view. Which of the two mirrored bodies is the true one remains open.
+:func:`make_views_agree` tries, for each limb, all 2^(C-1) assignments of sides to views and chooses
+the one of least cost: truncated squared gaps between the rays of every pair of views, plus a cost
+for each exchanged view. Which of the two mirrored bodies is the true one remains open.
 
 :func:`find_mirrored` decides it for arms, legs and head of all sets together, by the Viterbi
-algorithm
-over the eight ways of exchanging them. Unary costs: knees and ankles bend one way, the nose is in
-front of the ears and of the chest, shoulders and hips face the same way, detectors are mostly
-right. Pairwise costs: motion from set to set, and a change of sides. A hand belongs to the arm
-whose wrist is nearer.
+algorithm over the eight ways of exchanging them. Unary costs: knees and ankles bend one way, the
+nose is in front of the ears and of the chest, shoulders and hips face the same way, detectors are
+mostly right. Pairwise costs: motion from set to set, and a change of sides. A hand belongs to the
+arm whose wrist is nearer.
 """
 
 from __future__ import annotations
@@ -36,41 +34,36 @@ from intercap_core.person.sides import (
     exchange_points,
 )
 
-SHORT_BONE_M = 0.03  # vectors shorter than this have no reliable direction; tuned on the studio
-HAND_ROOT_APART_M = 0.08  # body's and hand's wrist of one arm are nearer together; tuned
-MOTION_MEMORY_S = 0.5  # motion is judged over gaps of at most this; tuned on the studio
-STEP_M = 0.04  # motion from set to set that costs 1 (negative log likelihood); tuned on the studio
-LARGEST_STEP_M = 0.3  # motion from set to set counts as this at most; tuned on the studio
-MAX_AGREEING_VIEWS = 10  # all 2^(C-1) assignments of sides are tried over so many views
-# Gap between rays of one point beyond which a pair of views says nothing more, metres; arms, legs,
-# head, hands. Rays of one point pass each other by a few centimetres (detectors' biases,
-# calibration), those of a left and a right point by up to a body's breadth, or a face's.
+MOTION_MEMORY_S = 0.5  # longest gap over which motion is evaluated; tuned on the studio
+STEP_M = 0.04  # motion from set to set with a negative log likelihood of 1; tuned on the studio
+LARGEST_STEP_M = 0.3  # truncation of that motion; tuned on the studio
+# Truncation of the gap between two rays, metres, for arms, legs, head and hands. Rays of one point
+# miss each other by a few centimetres (detector bias, calibration), those of a left and a right
+# point by up to the breadth of the body, or of the face. Tuned on the studio.
 SIDE_GAPS_M = (0.12, 0.12, 0.05, 0.12)
-UNKNOWN_SIDE_COST = 0.25  # squared share of that gap, where there is nothing to compare; tuned
-# Cost of each view exchanged: more than noise alone gains on a small limb; tuned on the studio.
-EXCHANGED_VIEW_COST = 0.5
-# The body's build is certain, a turned head and a twisted back (each up to some 80 degrees) less
-# so; detectors exchange the sides in most views of about one set in twenty.
-HINGE_COST, HEAD_COST, TWIST_COST, NOSE_COST = 8.0, 6.0, 6.0, 3.0
-DETECTED_COST = 3.0  # of contradicting the detector in all views: -log(1/20)
-CHANGE_COST = 1.0  # of a limb's sides changing from set to set
-CROSSED_HANDS_RATIO = 0.5  # hands are exchanged where the other arm is nearer by this factor
-
-
-_LIKE_ARMS = 2  # first of the limbs that are named as the arms are
+UNKNOWN_SIDE_COST = 0.25  # squared share of that gap, assumed without a comparison; tuned
+EXCHANGED_VIEW_COST = 0.5  # of each exchanged view, above the gain by noise; tuned on the studio
+# Negative log likelihoods of an impossible build, tuned on the studio. Knees and ankles are
+# certain, a turned head and a twisted back (each up to some 80 degrees) less so.
+HINGE_COST = 8.0
+HEAD_COST = 6.0
+TWIST_COST = 6.0
+NOSE_COST = 3.0
+DETECTED_COST = 3.0  # of contradicting the detector in all views: -log(1/20); tuned on the studio
+CHANGE_COST = 1.0  # of a limb's sides changing from set to set; tuned on the studio
 
 
 def make_views_agree(keypoints: np.ndarray, rig: Rig, *, min_confidence: float) -> np.ndarray:
     """Exchange limbs of ``keypoints`` (T, C, 135, 3 or more) in place, set by set.
 
-    Of two mirrored ways the one that exchanges fewer views is taken (of head and hands, where
-    it is nearer: the one that exchanges those whose arms are). Returns which limbs were
-    exchanged, (T, C, 4) bool in the order of LIMBS.
+    Of two mirrored solutions the one that exchanges fewer views is chosen; for head and hands, if
+    that is closer, the one that exchanges the same views as the arms. Returns the exchanged limbs,
+    (T, C, 4) bool in the order of LIMBS.
     """
     sets, views = keypoints.shape[:2]
     exchanged = np.zeros((sets, views, len(LIMBS)), bool)
     weight = np.where(keypoints[..., 2] >= min_confidence, keypoints[..., 2], 0)
-    seeing = np.argsort(-(weight > 0).sum((0, 2)), kind="stable")[:MAX_AGREEING_VIEWS]
+    seeing = np.argsort(-(weight > 0).sum((0, 2)), kind="stable")[:10]  # of 2^9 ways
     order = np.sort(seeing[(weight[:, seeing] > 0).any((0, 2))])
     if len(order) < 2:
         return exchanged
@@ -99,8 +92,8 @@ def make_views_agree(keypoints: np.ndarray, rig: Rig, *, min_confidence: float) 
         count = seen.sum(1)[:, None]
         plain = seen.astype(int) @ ways.T
         unusual, opposite = plain, count - plain
-        if number >= _LIKE_ARMS:
-            # what takes a back for a front names head and hands as it does the arms
+        if number >= 2:  # head and hands
+            # a detector that mistakes a back for a front exchanges them together with the arms
             arms = exchanged[:, order, 0]
             unlike = ((ways[None] ^ arms[:, None]) & seen[:, None]).sum(2)
             unusual = np.minimum(unusual, unlike)
@@ -124,7 +117,7 @@ def _cost(
     from_second: np.ndarray,
     limit: float,
 ) -> np.ndarray:
-    """How badly rays (T, n, 3) of two views meet, (T,), summed over points by weights (T, n)."""
+    """Truncated squared gaps (T,) of rays (T, n, 3) of two views, weighted by both (T, n)."""
     _, gap = midpoints(first, second, from_first, from_second)
     square = np.minimum(np.nan_to_num(gap, nan=limit) / limit, 1.0) ** 2
     weight = first_weight * second_weight
@@ -137,10 +130,12 @@ _STATES = np.array(list(product((False, True), repeat=len(_LIMBS))))
 
 
 def find_mirrored(points: np.ndarray, share: np.ndarray, times: np.ndarray | None) -> np.ndarray:
-    """Which limbs of triangulated points (T, 135, 3), NaN = not known, have left for right.
+    """Limbs of triangulated points with exchanged sides, (T, 4) bool in the order of LIMBS.
 
-    ``share`` (T, 3): of the views that see arms, legs and head, how many had them exchanged so far;
-    ``times`` (T,) seconds, None = each set stands alone. Returns (T, 4) bool, by LIMBS.
+    Args:
+        points: (T, 135, 3), NaN = unknown.
+        share: (T, 3) share of the views of arms, legs and head in which they are already exchanged.
+        times: (T,) seconds; None = each set by itself.
     """
     result = np.zeros((len(points), len(LIMBS)), bool)
     if not len(points):
@@ -156,9 +151,8 @@ def find_mirrored(points: np.ndarray, share: np.ndarray, times: np.ndarray | Non
 
 
 def excess_build_cost(points: np.ndarray) -> np.ndarray:
-    """By how much (T,) another way of exchanging arms, legs and head suits the body's build better
-    than triangulated points (T, 135, 3) as they are; negative log likelihood, 0 = none does.
-    """
+    """Negative log likelihood (T,) of triangulated points (T, 135, 3), by the body's build, above
+    that of the best exchange of arms, legs and head."""
     cost = _build(points)
     return np.asarray(cost[:, 0] - cost.min(1))
 
@@ -180,7 +174,7 @@ def _build(points: np.ndarray) -> np.ndarray:
     ears = between("right_ear", "left_ear")
     up = between("mid_hip", "neck")
     nose = points[:, _AT["nose"]] - points[:, [_AT["left_ear"], _AT["right_ear"]]].mean(1)
-    # whichever way a leg is stretched, its knee and its ankle turn about the line of the hips
+    # knee and ankle turn about the line of the hips
     hinges = np.zeros(len(points))
     for side in ("left", "right"):
         thigh, shin = (
@@ -203,7 +197,7 @@ def _build(points: np.ndarray) -> np.ndarray:
 
 
 def _steps(points: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Cost (T - 1, 8, 8) of going from one state of the sides to the next: change and motion."""
+    """Cost (T - 1, 8, 8) of transitions between states of the sides: change and motion."""
     steps = np.empty((len(points) - 1, len(_STATES), len(_STATES)))
     steps[:] = CHANGE_COST * (_STATES[:, None] != _STATES[None]).sum(2)
     last, when = points[0].copy(), np.full(points.shape[1], times[0])
@@ -220,14 +214,14 @@ def _steps(points: np.ndarray, times: np.ndarray) -> np.ndarray:
 
 
 def _motion(before: np.ndarray, now: np.ndarray) -> float:
-    """Cost of moving points (n, 3) so far; 0 where fewer than two are known."""
+    """Cost of the motion of points (n, 3); 0 if fewer than two are known."""
     step = np.linalg.norm(now - before, axis=1)
     step = step[np.isfinite(step)]
     return float(np.minimum(step, LARGEST_STEP_M).mean() / STEP_M) if len(step) > 1 else 0.0
 
 
 def _other_hands(points: np.ndarray) -> np.ndarray:
-    """Whether the hands (T,) begin where the other side's arm ends."""
+    """Mask (T,) of sets whose hands are at the wrists of the other side."""
     wrists = points[:, [_AT["left_wrist"], _AT["right_wrist"]]]
     roots = points[:, [_AT["left_hand_wrist"], _AT["right_hand_wrist"]]]
     own = np.linalg.norm(wrists - roots, axis=2)
@@ -235,13 +229,14 @@ def _other_hands(points: np.ndarray) -> np.ndarray:
     both = np.isfinite(own) & np.isfinite(other)
     count = np.maximum(both.sum(1), 1)
     own, other = (np.where(both, d, 0).sum(1) / count for d in (own, other))
-    return both.any(1) & (own > HAND_ROOT_APART_M) & (other < CROSSED_HANDS_RATIO * own)
+    # wrists of body and hand of one arm differ by less than 8 cm
+    return both.any(1) & (own > 0.08) & (other < 0.5 * own)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
-    """Directions (..., 3), NaN for what is too short to have one."""
+    """Directions (..., 3); NaN for vectors below 3 cm, which have no reliable direction."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.where(length > SHORT_BONE_M, vectors / np.maximum(length, SHORT_BONE_M), np.nan)
+    return np.where(length > 0.03, vectors / np.maximum(length, 0.03), np.nan)
 
 
 def _hinge(first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -1,9 +1,9 @@
 """Keypoints of one view lifted to 3D by the depth beside them, where no second view sees them.
 
 Depth measures the skin, a keypoint is a joint inside the body: the point lies deeper on the pixel's
-ray by an inset of its own. The depth at an occluded joint is of another surface: pixels of the
-scene's background are skipped, and where a side view shows both shoulders or hips in one place, the
-one that the detector trusts less is occluded and left out with its limb.
+ray by an inset that depends on the joint. The depth at an occluded joint is of another surface:
+pixels of the scene's background are skipped, and if a side view shows both shoulders or hips in one
+place, the one with less confidence is occluded and left out with its limb.
 """
 
 from __future__ import annotations
@@ -24,15 +24,12 @@ from intercap_core.geometry.camera.triangulation import Triangulation
 from intercap_core.person.groups import NOBODY
 from intercap_core.person.sides import ARMS, BODY_POINTS, LEGS
 
-KEYPOINT_REACH_M = 0.03  # half side, across the ray, of where depth is read; tuned
+KEYPOINT_REACH_M = 0.03  # half side of the window for depth samples, across the ray; tuned
 MIN_DEPTH_SAMPLES = 4  # depth pixels; tuned on the studio
-# Quantile of the samples that counts as nearest: nearer ones may float between body and background.
-NEAREST_QUANTILE = 0.2  # tuned on the studio
-SURFACE_M = 0.05  # samples this far behind the nearest are another surface; tuned on the studio
-AT_BACKGROUND_MM = 40  # within this of the scene's background a pixel shows it; tuned on the studio
-DEPTH_STRIDE = 2  # pixels and rows; a quarter of the depth image is enough around a joint
-# How deep a keypoint lies under the skin, metres: measured on the open body (`body.loading`),
-# standing, the median over all horizontal directions. What is not named lies on the skin.
+SURFACE_M = 0.05  # samples farther behind the nearest are another surface; tuned on the studio
+AT_BACKGROUND_MM = 40  # distance to the background within which a pixel shows it; tuned
+# Depth of a keypoint below the skin, metres: measured on the open body, standing, as the median
+# over all horizontal directions. Keypoints without an entry lie on the skin.
 INSET_M = {
     "neck": 0.065,
     "shoulder": 0.060,
@@ -43,22 +40,17 @@ INSET_M = {
     "knee": 0.059,
     "ankle": 0.040,
 }
-HAND_INSET_M = 0.008  # half a finger's thickness
-# Between shoulders, between hips, metres, half of an adult's breadth: nearer, one occludes the
-# other.
+# Distance of shoulders, and of hips, metres, below which one occludes the other: half of an adult's
+# breadth (anatomy).
 OCCLUDED_BREADTH_M = (0.18, 0.09)
-BODY_DEPTH_M = 0.25  # from the body's middle, along the ray, an unmoving part may lie; tuned
-ENOUGH_TRIANGULATED = 8  # body points; a set with so many needs no lifting; tuned on the studio
-MIN_MOVING_POINTS = (
-    6  # points before the background; with fewer, the person is taken for part of it
-)
+BODY_DEPTH_M = 0.25  # largest distance of a static part from the body along the ray; tuned
 
 
 def _insets() -> np.ndarray:
     """(135,) metres."""
     parts = [name.removeprefix("left_").removeprefix("right_") for name in KEYPOINT_NAMES]
     inset = np.array([INSET_M.get(part, 0.0) for part in parts])
-    inset[LEFT_HAND] = inset[RIGHT_HAND] = HAND_INSET_M
+    inset[LEFT_HAND] = inset[RIGHT_HAND] = 0.008  # half a finger
     return inset
 
 
@@ -67,27 +59,30 @@ INSETS_M = _insets()
 
 @dataclass(frozen=True, eq=False)
 class DepthRelief:
-    """What a depth image shows, as the colour camera sees it.
-
-    ``pixels`` (N, 2) of the colour image and ``distance`` (N,) along the ray, metres; ``room`` (N,)
-    bool where the scene's background is seen.
-    """
+    """Depth pixels projected into the colour image."""
 
     camera: Camera
+    """The camera."""
     pixels: np.ndarray
+    """(N, 2) in the colour image."""
     distance: np.ndarray
+    """(N,) along the ray, metres."""
     room: np.ndarray
+    """(N,) bool: shows the scene's background."""
 
     @classmethod
     def of(
         cls, depth: np.ndarray, camera: Camera, bias_m: float, background: np.ndarray | None
     ) -> DepthRelief:
-        """Every second pixel of every second row of ``depth`` (H, W) uint16 mm.
+        """Project every second pixel of every second row of a depth image.
 
-        ``bias_m`` is subtracted from the depth. ``background`` (H, W) of the scene, None = unknown.
+        Args:
+            depth: (H, W) uint16 mm.
+            bias_m: subtracted from the depth.
+            background: (H, W) uint16 mm of the scene; None = unknown.
         """
         thinned = np.zeros_like(depth)
-        some = np.s_[::DEPTH_STRIDE, ::DEPTH_STRIDE]
+        some = np.s_[::2, ::2]
         thinned[some] = depth[some]
         points, index = depth_points(thinned, camera)
         room = np.zeros(len(index), bool)
@@ -104,11 +99,14 @@ class DepthRelief:
         return cls(camera, camera.colour.project(points), distance, room[inside])
 
     def lift(self, pixels: np.ndarray, seen: np.ndarray, inset_m: np.ndarray) -> np.ndarray:
-        """Points (K, 3), master frame, of keypoints at ``pixels`` (K, 2) where ``seen`` (K,).
+        """Points (K, 3), master frame, of keypoints at ``pixels`` (K, 2); NaN = unknown.
 
-        ``inset_m`` (K,): how deep each lies. NaN where nothing is measured, or only the room; but
-        who stands still for long is part of the room: that counts where it is as far away as the
-        rest of the body, or where there is hardly any rest.
+        A person who stands still for long is part of the background. Background samples are used
+        if they are at the distance of the rest of the body, or if there is hardly any rest.
+
+        Args:
+            seen: (K,) bool, keypoints to lift.
+            inset_m: (K,) depth of each below the skin.
         """
         result, of_room = np.full((len(pixels), 3), np.nan), np.zeros(len(pixels), bool)
         rays = self.camera.colour.unproject(pixels)
@@ -126,12 +124,12 @@ class DepthRelief:
             found = self.distance[around_it if of_room[k] else before]
             if len(found) < MIN_DEPTH_SAMPLES:
                 continue
-            nearest = np.quantile(found, NEAREST_QUANTILE)
+            nearest = np.quantile(found, 0.2)  # closer samples may be flying pixels
             surface = np.median(found[found < nearest + SURFACE_M])
             result[k] = rays[k] * (surface + inset_m[k])
         away = np.linalg.norm(result, axis=1)
         body = np.isfinite(away) & ~of_room
-        if body.sum() >= MIN_MOVING_POINTS:
+        if body.sum() >= 6:
             apart = np.abs(away - np.median(away[body]))
             result[of_room & ~(apart < BODY_DEPTH_M)] = np.nan
         return apply(self.camera.master_from_colour, result)
@@ -142,10 +140,7 @@ class DepthRelief:
 
 
 class Lifter:
-    """Lifts keypoints of a recording's single views.
-
-    ``frames`` read by the moment that their images show, ``scene`` the scene artefact.
-    """
+    """Lifts keypoints of single views, by frames read by moment and the scene artefact."""
 
     def __init__(self, frames: Frames, scene: Artefact, *, min_confidence: float) -> None:
         self._frames, self._min_confidence = frames, min_confidence
@@ -176,18 +171,24 @@ class Lifter:
         )
 
     def fill(self, person: np.ndarray, keypoints: np.ndarray, found: Triangulation) -> np.ndarray:
-        """Lift, in place, what ``found`` (T * 135 points) lacks where few points are triangulated.
+        """Lift missing points of sets with few triangulated ones, in place.
 
-        ``person`` (T, C) and ``keypoints`` (T, C, 135, 3) are the subject's. A set takes its points
-        from the view that gives most of them; that view counts as the one that agrees. Returns the
-        sets (T,) bool that were lifted.
+        Each set uses the view that gives most points, which becomes their only inlier.
+
+        Args:
+            person: (T, C) the subject's detections.
+            keypoints: (T, C, 135, 3) of the subject.
+            found: triangulation of T * 135 points.
+
+        Returns:
+            (T,) bool, sets with lifted points.
         """
         sets, views = person.shape
         points = found.points.reshape(sets, -1, 3)
         inlier = found.inlier.reshape(sets, -1, views)
         triangulated = np.isfinite(points[:, BODY_POINTS, 0]).sum(1)
         lifted = np.zeros(sets, bool)
-        for t in np.flatnonzero(triangulated < ENOUGH_TRIANGULATED):
+        for t in np.flatnonzero(triangulated < 8):
             best, best_view = np.full(points.shape[1:], np.nan), -1
             for c in np.flatnonzero(person[t] != NOBODY):
                 relief = self._relief(int(t), int(c))
@@ -205,9 +206,9 @@ class Lifter:
 
 
 def _hidden_side(points: np.ndarray, confidence: np.ndarray) -> np.ndarray:
-    """Keypoints (135,) bool that the body itself must hide, of lifted ``points`` (135, 3).
+    """Mask (135,) of lifted ``points`` (135, 3) that the body itself must occlude.
 
-    Of a shoulder or hip that coincides with the other one, the limb that the detector trusts less.
+    If both shoulders or hips coincide, the limb with less confidence is occluded.
     """
     hidden = np.zeros(len(points), bool)
     for limb, breadth in zip((ARMS, LEGS), OCCLUDED_BREADTH_M, strict=True):

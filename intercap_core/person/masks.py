@@ -11,13 +11,11 @@ from intercap_core.formats.detections.instance import PERSON_LABEL
 from intercap_core.formats.detections.read import Candidate
 from intercap_core.geometry.camera.masks import Runs
 
-SAME_PERSON_SHARE = 0.5  # of a candidate's mask within the subject's: the same person; judged
-OUTSIDE_GRID = 64  # steps along the longer side of a mask on whose grid its outside is counted
-MIN_INSIDE_SHARE = 0.5  # of the subject's points inside the mask
-LABEL_BONUS = 0.15  # share of points; labels are mostly right, one that fits much better still wins
-OUTSIDE_COST = 0.5  # share of points, for a mask that lies wholly outside the subject's box
-BOX_MARGIN = 0.25  # share of the box of the points, for what has none: hair, soles, clothes
-MIN_MASK_POINTS = 4  # points and middles of bones
+SAME_PERSON_SHARE = 0.5  # of a candidate's mask within the subject's: the same person; untuned
+MIN_INSIDE_SHARE = 0.5  # of the subject's points inside the mask; untuned
+LABEL_BONUS = 0.15  # share of points by which a mask with another label must fit better; untuned
+OUTSIDE_COST = 0.5  # share of points, for a mask entirely outside the subject's box; untuned
+BOX_MARGIN = 0.25  # share of the points' box, for hair, soles and clothes; untuned
 
 
 # Points between joints: wrists and ankles lie on a mask's rim, the middle of a limb does not.
@@ -27,13 +25,17 @@ BONES = keypoint_pairs(SKELETON)  # (14, 2) of the 25 body points
 def choose_mask(
     candidates: list[Candidate], points: np.ndarray, seen: np.ndarray, where: str
 ) -> bytes:
-    """The RLE of the subject's candidate in one image; empty where none fits.
+    """RLE of the subject's candidate in one image; empty if none fits.
 
-    ``points`` (25, 2) pixels of the body and ``seen`` (25,) bool. Raises UserError, naming
-    ``where``, for a candidate whose RLE does not decode.
+    Raises UserError for a candidate whose RLE does not decode.
+
+    Args:
+        points: (25, 2) pixels of the body.
+        seen: (25,) bool, usable points.
+        where: name of the image, for messages.
     """
     samples = _samples(points, seen)
-    if len(samples) < MIN_MASK_POINTS:
+    if len(samples) < 4:
         return b""
     x, y = np.rint(samples).astype(np.int64).T
     best, best_score = b"", 0.0
@@ -56,9 +58,11 @@ def choose_mask(
 
 
 def merge_other_candidates(candidates: list[Candidate], person: bytes) -> bytes:
-    """The RLE of all other candidates together, those left out that lie mostly within the
-    ``person``'s mask: the same person again, or a part; empty where there are none. Their RLEs
-    have been parsed, as :func:`choose_mask` does."""
+    """RLE of the union of all other candidates; empty if there are none.
+
+    Candidates mostly within the ``person``'s mask are the same person or a part, and left out.
+    Their RLEs must be valid, see :func:`choose_mask`.
+    """
     if not person or not candidates:
         return b""
     width, height = candidates[0].image_size
@@ -90,7 +94,7 @@ def _share_outside(runs: Runs, samples: np.ndarray) -> float:
     x0, y0, width, height = runs.box
     if not width or not height:
         return 1.0
-    step = max(1, int(max(width, height) / OUTSIDE_GRID))
+    step = max(1, int(max(width, height) / 64))
     y, x = np.mgrid[y0 : y0 + height : step, x0 : x0 + width : step]
     inside = runs.sample(x, y)
     grid = np.stack([x, y], -1)

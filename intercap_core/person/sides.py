@@ -68,10 +68,13 @@ def exchange_limb(keypoints: np.ndarray, t: np.ndarray, c: np.ndarray, limb: np.
 def images_with_stated_sides(
     stated: Sequence[ExchangedSides], names: Sequence[str], image_of: np.ndarray, sequence: str
 ) -> np.ndarray:
-    """The moments' images (T, C) bool in which left and right are stated to be exchanged.
+    """Mask (T, C) of the images in which the user states that left and right are exchanged.
 
-    ``names`` of the cameras, ``image_of`` (T, C) of the scene artefact: the frame whose image shows
-    each moment. Raises UserError, naming the entry, for an unknown camera.
+    Raises UserError for an unknown camera.
+
+    Args:
+        names: camera names.
+        image_of: (T, C) frame whose image shows each moment.
     """
     found = np.zeros(image_of.shape, bool)
     for number, sides in enumerate(stated):
@@ -93,11 +96,16 @@ def exchange_stated(keypoints: np.ndarray, stated: np.ndarray) -> np.ndarray:
 def hold_sides(
     keypoints: np.ndarray, points: Triangulation, given: np.ndarray, stated: np.ndarray
 ) -> tuple[np.ndarray, Triangulation]:
-    """The subject with the sides of the images ``stated`` (T, C): in sets in which most of these
-    had a limb exchanged, it is exchanged again in all views.
+    """Apply the sides stated by the user to the result.
 
-    ``keypoints`` (T, C, 135, 3) and the triangulation of T * 135 ``points`` as they were found from
-    the keypoints ``given`` (T, C, 135, 3).
+    In sets in which a limb was exchanged in most of the stated images, it is exchanged again in all
+    views.
+
+    Args:
+        keypoints: (T, C, 135, 3) result.
+        points: triangulation of T * 135 points.
+        given: (T, C, 135, 3) keypoints with the stated sides.
+        stated: (T, C) bool, images with stated sides.
     """
     count = len(keypoints)
     wrong = np.zeros((count, len(LIMBS)), bool)

@@ -1,8 +1,8 @@
-"""The subject among the people of a recording: named by the user, or chosen by what they do.
+"""The subject among the people of a recording: named by the user, or chosen by their actions.
 
-People are matched over views (:mod:`groups`), followed over time (:mod:`tracks`), and known again
-after an absence (:mod:`people`). The subject is the one who is named; else the one whom most views
-and sets see, near the middle of the ring, and who touches the object.
+People are matched over views (:mod:`.groups`), followed over time and recognised after an absence
+(:mod:`.tracks`). The subject is the named person; else the one with most support by views and sets,
+near the centre of the ring, who touches the object.
 """
 
 from __future__ import annotations
@@ -34,42 +34,43 @@ from intercap_core.person.tracks import (
     link_groups,
 )
 
-MOVED_PX_FACTOR = 2.0  # that limit is this much wider where the subject has moved since
-CENTRE_RANGE_M = 1.5  # support counts half so far from the ring's middle; tuned on the studio
-# Support of who touches the object most counts so much more, others' by how much they touch it;
-# where nobody touches it in this share of the images that show both, nothing is said; judged.
-HANDLING_WEIGHT, LEAST_HANDLING = 4.0, 0.05
-# Support of another person, seen at the same time, over the subject's, from which it is said that
-# it might be the one; judged.
-RIVAL_SHARE = 0.5
+CENTRE_RANGE_M = 1.5  # distance from the ring's centre at which support is halved; tuned
+HANDLING_WEIGHT = 4.0  # additional support of the person who touches the object most; untuned
+LEAST_HANDLING = 0.05  # share of the images with contact, from which it is evidence; untuned
+RIVAL_SHARE = 0.5  # of the subject's support, from which another person is reported; untuned
 
 
 Touches = Callable[[int, int, int], bool | None]
-"""Whether person i of the image of view c in set t touches the object there, None = the object is
-not seen: called with t, c and i."""
+"""Whether person i of view c in set t touches the object, called with t, c and i; None = the object
+is not seen."""
 
 
 @dataclass(frozen=True)
 class NamedDetection:
-    """A detection that the user says is the subject: person ``index`` of camera ``c`` in set ``t``;
-    ``words`` name the entry that says so."""
+    """A detection that the user names as the subject."""
 
     t: int
+    """Frame set."""
     c: int
+    """Camera index."""
     index: int
+    """Person in the image."""
     words: str
+    """Name of the entry, for messages."""
 
 
 @dataclass(frozen=True, eq=False)
 class SubjectDetections:
-    """``people`` (T, C) int32: index of the subject's detection in every image, -1 = not seen;
-    ``others`` (T,) int32: how many more people were placed; ``chosen_by``: "alone", "named",
-    "handling" or "middle"; ``doubts``: what speaks against the choice, in words."""
+    """The subject in all images."""
 
     people: np.ndarray
+    """(T, C) int32: index of the subject's detection; -1 = not seen."""
     others: np.ndarray
+    """(T,) int32: number of other located people."""
     chosen_by: str
+    """"alone", "named", "handling" or "middle"."""
     doubts: tuple[str, ...]
+    """Evidence against the choice."""
 
 
 def find_subject(
@@ -82,10 +83,15 @@ def find_subject(
     touches: Touches | None = None,
     named: Sequence[NamedDetection] = (),
 ) -> SubjectDetections:
-    """Find the subject in every image; nobody where nobody can be placed in any set.
+    """Find the subject in every image; nobody if nobody can be located in any set.
 
-    ``times`` (T,) seconds. ``lift`` places the people of single views in sets where no two views
-    agree on anybody. Raises UserError where the user names two people who are seen at once.
+    Raises UserError if the user names two people who are seen at the same time.
+
+    Args:
+        times: (T,) seconds.
+        lift: locates people of single views in sets in which no two views agree on anybody.
+        touches: contact with the object.
+        named: detections named by the user.
     """
     groups = []
     for t in range(detections.num_sets):
@@ -113,7 +119,7 @@ def _chosen(
     touches: Touches | None,
     named: Sequence[NamedDetection],
 ) -> tuple[PersonTrack, str, list[str]]:
-    """The subject's groups as one track, how it was chosen, and doubts."""
+    """The subject's track, how it was chosen, and doubts."""
     first, doubts = _of_named(tracks, named, times)
     people = join_tracks(tracks, times, first)
     if first:
@@ -143,37 +149,37 @@ def _chosen(
 def _of_named(
     tracks: list[PersonTrack], named: Sequence[NamedDetection], times: np.ndarray
 ) -> tuple[list[PersonTrack], list[str]]:
-    """The tracks that hold the named detections, and what was not found.
+    """Tracks of the named detections, and a message for those without a track.
 
-    Raises UserError where two of them are seen at once.
+    Raises UserError if two of them are seen at the same time.
     """
     found: dict[int, tuple[PersonTrack, NamedDetection]] = {}
     lost = []
-    for one in named:
-        track = next((k for k in tracks if _holds(k, one)), None)
+    for detection in named:
+        track = next((k for k in tracks if _has(k, detection)), None)
         if track is None:
-            lost.append(one)
+            lost.append(detection)
             continue
         for other, before in found.values():
             if other is not track and Person((other,)).meets(Person((track,))):
                 t = max(other.sets[0], track.sets[0])
                 raise UserError(
-                    f"{before.words} and {one.words} name two people: both are seen at frame {t} "
-                    f"({times[t] - times[0]:.2f} s); keep the points that lie on one person"
+                    f"{before.words} and {detection.words} name two people: both are seen at frame "
+                    f"{t} ({times[t] - times[0]:.2f} s); keep the points that lie on one person"
                 )
-        found.setdefault(id(track), (track, one))
+        found.setdefault(id(track), (track, detection))
     return [track for track, _ in found.values()], [_not_followed(lost)] if lost else []
 
 
 def _not_followed(named: Sequence[NamedDetection]) -> str:
-    words = ", ".join(one.words for one in named)
+    words = ", ".join(detection.words for detection in named)
     return (
         f"who is named by {words} is placed by no two views there and could not be followed; name "
         "the person in a frame in which more cameras see it"
     )
 
 
-def _holds(track: PersonTrack, named: NamedDetection) -> bool:
+def _has(track: PersonTrack, named: NamedDetection) -> bool:
     place = np.searchsorted(track.sets, named.t)
     if place == len(track.sets) or track.sets[place] != named.t:
         return False
@@ -189,13 +195,13 @@ def _score(track: PersonTrack, middle: np.ndarray) -> float:
 
 
 def _handling(track: PersonTrack, touches: Touches) -> float:
-    """Share of the images of somebody in which they touch the object, of those that show it."""
-    told = [
+    """Share of the images of a person and the object in which they touch."""
+    contacts = [
         touches(t, c, int(group.members[c]))
         for t, group in zip(track.sets, track.groups, strict=True)
         for c in np.flatnonzero(group.members != NOBODY).tolist()
     ]
-    known = [touch for touch in told if touch is not None]
+    known = [touch for touch in contacts if touch is not None]
     return sum(known) / len(known) if known else 0.0
 
 
@@ -217,8 +223,10 @@ def _add_single_views(
     times: np.ndarray,
     min_confidence: float,
 ) -> None:
-    """Where only one view sees the subject, take the person nearest to the last known points, but
-    nobody who is placed elsewhere by the views that agree."""
+    """Add the detection closest to the last known points where a single view sees the subject.
+
+    People whom agreeing views locate elsewhere are excluded.
+    """
     if not chosen.sets:
         return
     known = np.array(chosen.sets)
@@ -230,7 +238,7 @@ def _add_single_views(
         points = chosen.groups[place].points
         pixels = reproject(np.nan_to_num(points), rig)
         for c in range(len(rig)):
-            best = MOVED_PX_FACTOR * limits[c]  # the subject has moved since
+            best = 2.0 * limits[c]  # the subject has moved since
             placed = {int(group.members[c]) for group in groups[t] if group.views > 1}
             for i, person in enumerate(detections.people(t, c)):
                 if i in placed:
@@ -243,6 +251,6 @@ def _add_single_views(
 
 
 def _add_named(people: np.ndarray, named: Sequence[NamedDetection]) -> None:
-    """What the user says of an image holds, whatever the views agree on."""
-    for one in named:
-        people[one.t, one.c] = one.index
+    """Named detections take precedence over the views' agreement."""
+    for detection in named:
+        people[detection.t, detection.c] = detection.index

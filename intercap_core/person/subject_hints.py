@@ -14,8 +14,8 @@ from intercap_core.formats.detections.read import Detections
 from intercap_core.person.sides import BODY_POINTS
 from intercap_core.person.subject import NamedDetection, Touches
 
-TOUCH_REACH = 0.03  # of a person's height in an image, beyond the keypoints: a hand's breadth
-NAMED_REACH = 0.15  # of a person's height in an image, from bones to the point that names it
+TOUCH_REACH = 0.03  # reach beyond keypoints, share of a person's height: a hand's breadth (anatomy)
+NAMED_REACH = 0.15  # from bones to a point that names the person, share of the height; untuned
 
 
 _BONES = keypoint_pairs(SKELETON)
@@ -28,11 +28,14 @@ def named_people(
     *,
     min_confidence: float,
 ) -> list[NamedDetection]:
-    """Who is at each point: the person whose bones are nearest, for their size in the image.
+    """Find the person at each point: the one with the closest bones, relative to their size.
 
-    ``detections`` by moment, ``image_of`` (T, C) of the scene artefact: the frame whose image shows
-    each. Raises UserError, naming the entry, for an unknown camera, a frame without an image, a
-    point outside of it, and where nobody was detected.
+    Raises UserError for an unknown camera, a frame without an image, a point outside of it, and if
+    nobody was detected there.
+
+    Args:
+        detections: by moment.
+        image_of: (T, C) frame whose image shows each moment.
     """
     return [
         _named(f"subject[{k}]", point, detections, image_of, min_confidence)
@@ -51,15 +54,15 @@ def _named(
     sizes = {
         name: (int(w), int(h)) for name, (w, h) in zip(names, detections.image_sizes, strict=True)
     }
-    told = f"sequence {detections.sequence}: the annotation's {entry}"
+    words = f"sequence {detections.sequence}: the annotation's {entry}"
     if fault := point.fault(sizes):
-        raise UserError(f"{told} {fault}")
+        raise UserError(f"{words} {fault}")
     c = names.index(point.camera)
     where = f"camera {point.camera}, frame {point.frame}"
     shows = np.flatnonzero(image_of[:, c] == point.frame)
     if not len(shows):
         raise UserError(
-            f"{told} names {where}, which has no image, or one that is not in step; name the "
+            f"{words} names {where}, which has no image, or one that is not in step; name the "
             "person in another frame or camera"
         )
     t, at = int(shows[0]), np.array([point.x, point.y])
@@ -72,14 +75,14 @@ def _named(
             f"({x:.0f}, {y:.0f})" for x, y in (np.median(body, 0) for body in seen if len(body))
         )
         raise UserError(
-            f"{told} is at x {point.x:g}, y {point.y:g} of {where}, where nobody was detected; "
+            f"{words} is at x {point.x:g}, y {point.y:g} of {where}, where nobody was detected; "
             f"there are people at {places or 'no place of it'}"
         )
     return NamedDetection(t, c, nearest, entry)
 
 
 def _distance(person: np.ndarray, point: np.ndarray, min_confidence: float) -> float:
-    """Distance of a point (2,) from the bones of a person (25, 3), share of its size."""
+    """Distance of a point (2,) from the bones of a person (25, 3), relative to the size."""
     seen = person[:, 2] >= min_confidence
     bones = _BONES[seen[_BONES].all(1)]
     if not len(bones):
@@ -99,24 +102,24 @@ _AROUND = np.array([(0, 0), *((np.cos(a), np.sin(a)) for a in np.arange(8) * np.
 def touch_test(
     detections: Detections, labels: tuple[str, ...], *, min_confidence: float
 ) -> Touches:
-    """Who touches a candidate that has one of the object's ``labels``; none = any but a person's.
+    """Test for contact with a candidate with one of the object's ``labels``; none = any but people.
 
-    Somebody touches it whose keypoints, or places a hand's breadth beside them, lie in its mask. In
-    a view from behind that is so by chance; most views tell.
+    A person touches it if keypoints, or pixels a hand's breadth around them, lie in its mask. One
+    view may show this by occlusion, most views do not.
     """
 
     def touches(t: int, c: int, person: int) -> bool | None:
-        things = [
+        objects = [
             candidate
             for candidate in detections.candidates(t, c)
             if candidate.label != PERSON_LABEL and (candidate.label in labels or not labels)
         ]
         points = detections.people(t, c)[person][_POINTS]
         points = points[points[:, 2] >= min_confidence, :2]
-        if not things or not len(points):
+        if not objects or not len(points):
             return None
         reach = TOUCH_REACH * float(np.ptp(points, axis=0).max())
         x, y = np.rint(points[:, None] + reach * _AROUND).astype(np.int64).reshape(-1, 2).T
-        return any(bool(thing.runs.sample(x, y).any()) for thing in things)
+        return any(bool(candidate.runs.sample(x, y).any()) for candidate in objects)
 
     return touches

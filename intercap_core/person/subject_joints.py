@@ -25,23 +25,16 @@ from intercap_core.geometry.solve.time_series import cheapest_sequence, limited_
 from intercap_core.person.left_right import find_mirrored, make_views_agree
 from intercap_core.person.sides import LIMBS, PARTNER, exchange_limb, exchange_points
 
-# Hands reach some 5 m/s in everyday tasks and people stand two metres from a capture ring's
-# cameras: what moves faster in an image is another detection. Radians a second.
+# Hands reach 5 m/s in everyday tasks, and people stand two metres from the cameras of a ring:
+# faster motion in an image is another detection. Radians per second.
 MAX_IMAGE_SPEED_RAD_S = 2.5
-EXCHANGE_ROUNDS = 2  # of exchanging limbs and triangulating again
 MUCH_BETTER = 0.5  # cost exchanged over cost as detected, at most; tuned on the studio
-# Mean truncated squared error, in units of the inlier limit, from which a limb may be exchanged:
-# half of its points are off by the limit or more.
-MIN_LIMB_COST = 0.25
-# In units of the inlier limit; well beyond it, so that an exchange differs from another mistake.
-TRUNCATED_AT = 4.0
-MIN_LIMB_POINTS = 2  # of a limb that is compared
-FEW_VIEWS = 4  # with at most so many, limbs that jump between the sides are steadied; tuned
-EXCHANGED_PX_AT_1080P = 3.0  # cost of a set exchanged: detectors are mostly right; tuned
-# Cost of an exchange with which the recording begins or ends: it shows one jump alone, as a fast
-# turn does. Tuned on the studio.
+FEW_VIEWS = 4  # largest number of views for which jumps between sides are corrected; tuned
+EXCHANGED_PX_AT_1080P = 3.0  # cost of an exchanged set: detectors are mostly right; tuned
+# Cost of an exchange at the start or end of the recording: it has only one jump, as a fast turn.
+# Tuned on the studio.
 OPEN_EXCHANGE_PX_AT_1080P = 100.0
-JUMP_PX_AT_1080P = 120.0  # motion from set to set counts as this at most; tuned on the studio
+JUMP_PX_AT_1080P = 120.0  # truncation of the motion from set to set; tuned on the studio
 
 
 def at_set_times(
@@ -52,10 +45,10 @@ def at_set_times(
     *,
     min_confidence: float,
 ) -> np.ndarray:
-    """Keypoints (T, C, K, 3) as they would be had every camera exposed at ``times`` (T,).
+    """Move keypoints (T, C, K, 3) from each camera's exposure to ``times`` (T,).
 
-    ``keypoints`` (T, C, K, 3) x, y, confidence as exposed, ``time_offset`` (C,) seconds later.
-    Moved by the velocity in the image, from neighbouring sets and limited where one of them jumps.
+    Uses the velocity in the image, from neighbouring sets and limited at jumps. ``time_offset``:
+    (C,) seconds by which cameras expose late.
     """
     result = keypoints.copy()
     known = keypoints[..., 2] >= min_confidence
@@ -76,11 +69,10 @@ _MIDDLES = tuple(
 
 
 def fill_middles(points: np.ndarray) -> None:
-    """Fill in place what is NaN in ``points`` (..., 135, 3) from shoulders and hips, if known.
+    """Fill a missing neck and mid hip of ``points`` (..., 135, 3), in place, by shoulders and hips.
 
-    Only in space, not in the images: the body's initial pose and its volume use them, while the
-    fit, whose evidence is the keypoints in images, does not count the shoulders' and hips' errors
-    twice.
+    Only in space: the initial pose and the volume of the body use these points. The fit uses
+    keypoints in images, where they would count the errors of shoulders and hips twice.
     """
     for middle, ends in _MIDDLES:
         at = points[..., middle, :]
@@ -119,7 +111,7 @@ def triangulate_people(
                 for part in (found.points, found.inlier, found.error, found.view_error)
             )
         )
-    for _ in range(EXCHANGE_ROUNDS):
+    for _ in range(2):
         exchanged = exchange(
             keypoints,
             found.points.reshape(len(keypoints), -1, 3),
@@ -192,7 +184,8 @@ def exchange(
         other = _cost(
             pixels[:, :, limb], keypoints[:, :, partner, :2], own & seen[:, :, partner], limit
         )
-        wrong = (as_found > MIN_LIMB_COST) & (other < MUCH_BETTER * as_found)
+        # half of the limb's points are off by the limit or more
+        wrong = (as_found > 0.25) & (other < MUCH_BETTER * as_found)
         t, c = np.nonzero(wrong)
         exchange_limb(keypoints, t, c, limb)
         count += len(t)
@@ -202,11 +195,14 @@ def exchange(
 def _cost(
     expected: np.ndarray, found: np.ndarray, valid: np.ndarray, limit: np.ndarray
 ) -> np.ndarray:
-    """Mean truncated squared error (T, C) in units of the limit; NaN with too few points."""
+    """Mean truncated squared error (T, C) in units of the limit; NaN with fewer than two points.
+
+    Truncated well beyond the limit, so that exchanged sides differ from other errors.
+    """
     error = np.linalg.norm(expected - found, axis=-1) / limit
-    square = np.where(valid, np.minimum(error, TRUNCATED_AT) ** 2, 0).sum(-1)
+    square = np.where(valid, np.minimum(error, 4.0) ** 2, 0).sum(-1)
     count = valid.sum(-1)
-    return np.where(count >= MIN_LIMB_POINTS, square / np.maximum(count, 1), np.nan)
+    return np.where(count >= 2, square / np.maximum(count, 1), np.nan)
 
 
 def _triangulate(

@@ -17,23 +17,20 @@ import numpy as np
 from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.person.groups import PersonGroup
 
-# How far adults' thighs, shanks, upper arms, forearms, shoulders (from joint to joint) and trunks
-# are spread, metres: standard deviations over the open body's shapes.
+# Standard deviations of thigh, shank, upper arm, forearm, shoulder width and trunk among adults,
+# metres, measured over the shapes of the open body.
 BUILD_SPREADS_M = (0.034, 0.027, 0.015, 0.023, 0.033, 0.025)
-# A median length errs by as much however many sets tell: detectors' biases by pose; tuned
-BUILD_FLOOR_M = 0.012
-MIN_BUILD_SETS = 5  # that know a bone; also so many neighbouring sets err alike; tuned
+BUILD_FLOOR_M = 0.012  # error of a median length with many sets: detector bias by pose; tuned
 MAX_BODY_SPEED_M_S = 4.0  # of a body's centre; people run slower indoors
-# Over at most this a person is followed by place alone; longer gaps are a matter of build, too.
-FOLLOWED_GAP_S = 0.4  # tuned on the studio
-# Over at most this a single view takes somebody for who was last known there, and a joined track
-# is not in doubt; tuned on the studio.
+FOLLOWED_GAP_S = 0.4  # longest gap over which position alone suffices; tuned on the studio
+# Longest gap over which a single view identifies a person by position, and after which a joined
+# track is not doubted; tuned on the studio.
 MAX_LINK_GAP_S = 2.0
-WALKING_SPEED_M_S = 1.2  # of who is not seen for a while
-LINK_SLACK_M = 0.25  # scatter of a person's centre between sets; tuned on the studio
-# Logarithms of how much more likely two tracks are of one person than of two, by build: below the
-# first they are not joined, below the second, after a gap, it is said.
-OTHER_BUILD, SURE_BUILD = -3.0, 1.0
+WALKING_SPEED_M_S = 1.2  # usual speed during a gap
+LINK_SLACK_M = 0.25  # noise of a person's centre between sets; tuned on the studio
+# Log likelihood ratios, by build, of one person against two.
+OTHER_BUILD = -3.0  # below, tracks are not joined; tuned on the studio
+SURE_BUILD = 1.0  # below, a join after a gap is reported; tuned on the studio
 
 
 _PLACE = {name: index for index, name in enumerate(KEYPOINT_NAMES)}
@@ -56,31 +53,32 @@ _BONES: tuple[tuple[tuple[int, int], ...], ...] = (
 
 @dataclass(eq=False)
 class PersonTrack:
-    """One person from set to set: ``sets`` (N,), rising, and the ``groups`` of them."""
+    """One person from set to set."""
 
     sets: list[int] = field(default_factory=list)
+    """Frame sets, ascending."""
     groups: list[PersonGroup] = field(default_factory=list)
+    """The person in each of them."""
 
     @cached_property
     def build(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lengths (B,) of the bones, metres, medians over time, and their variance; infinite where
-        too few sets tell."""
+        """Median lengths (B,) of bones, metres, and their variances; infinite with few sets."""
         points = np.stack([group.points for group in self.groups])
         lengths = np.stack([_lengths(points, bone) for bone in _BONES], axis=1)  # (N, B)
         count = np.isfinite(lengths).sum(0)
-        enough = count >= MIN_BUILD_SETS
+        enough = count >= 5
         length, variance = np.zeros(len(_BONES)), np.full(len(_BONES), np.inf)
         known = lengths[:, enough]
         length[enough] = np.nanmedian(known, axis=0)
         scatter = 1.48 * np.nanmedian(np.abs(known - length[enough]), axis=0)
-        # a median's variance; errors of neighbouring sets are alike
-        independent = np.maximum(count[enough] / MIN_BUILD_SETS, 1)
+        # variance of a median; errors of five neighbouring sets are correlated
+        independent = np.maximum(count[enough] / 5, 1)
         variance[enough] = BUILD_FLOOR_M**2 + np.pi / 2 * scatter**2 / independent
         return length, variance
 
 
 def _lengths(points: np.ndarray, bone: tuple[tuple[int, int], ...]) -> np.ndarray:
-    """Lengths (N,) of a bone in points (N, 25, 3), the mean of the sides that are known."""
+    """Lengths (N,) of a bone in points (N, 25, 3), averaged over the known sides."""
     sides = np.stack([np.linalg.norm(points[:, a] - points[:, b], axis=1) for a, b in bone])
     known = np.isfinite(sides)
     total = np.where(known, sides, 0.0).sum(0)
@@ -115,8 +113,10 @@ def link_groups(groups: Sequence[Sequence[PersonGroup]], times: np.ndarray) -> l
 
 
 def same_build(one: PersonTrack, other: PersonTrack) -> float:
-    """How much more likely the two tracks' bones are of one person than of two: the logarithm of
-    the ratio, 0 = nothing is known. Normal errors of the tracks, normal spreads among people."""
+    """Log likelihood ratio, by the lengths of bones, of one person against two; 0 = unknown.
+
+    Errors of the tracks and spreads among people are normal.
+    """
     (a, own), (b, theirs) = one.build, other.build
     known = np.isfinite(own + theirs)
     apart = (a - b)[known] ** 2
@@ -130,11 +130,12 @@ NEVER = -np.inf
 
 @dataclass(frozen=True, eq=False)
 class Person:
-    """``parts``: tracks that do not overlap, in order of time; ``doubts``: what speaks against that
-    they are of one person, in words."""
+    """Tracks of one person."""
 
     parts: tuple[PersonTrack, ...]
-    doubts: tuple[str, ...] = field(default=())
+    """Tracks that do not overlap, in order of time."""
+    doubts: tuple[str, ...] = ()
+    """Evidence against their being one person."""
 
     @cached_property
     def whole(self) -> PersonTrack:
@@ -146,7 +147,7 @@ class Person:
         return whole
 
     def meets(self, other: Person) -> bool:
-        """Whether two people are surely two: parts of them overlap in time."""
+        """Whether parts of two people overlap in time, so that they are two."""
         return any(
             a.sets[0] <= b.sets[-1] and b.sets[0] <= a.sets[-1]
             for a in self.parts
@@ -157,8 +158,13 @@ class Person:
 def join_tracks(
     tracks: Sequence[PersonTrack], times: np.ndarray, together: Sequence[PersonTrack] = ()
 ) -> list[Person]:
-    """The people of a recording; ``times`` (T,) s. Those ``together``, some of the ``tracks`` that
-    do not overlap, are one person whatever speaks against it, and that person is the first."""
+    """Join the tracks of a recording to people.
+
+    Args:
+        times: (T,) seconds.
+        together: tracks that do not overlap and are one person regardless of the evidence; this
+            person is the first of the result.
+    """
     rest = [track for track in tracks if track not in together]
     people = [Person(_ordered(together))] if together else []
     people += [Person((track,)) for track in rest]
@@ -184,30 +190,32 @@ def _ordered(parts: Sequence[PersonTrack]) -> tuple[PersonTrack, ...]:
 
 
 def _likelihood(one: Person, other: Person, times: np.ndarray) -> float:
-    """Logarithm of how much more likely one person than two are, by build and by the ways between;
-    :data:`NEVER` where it cannot be one."""
+    """Log likelihood ratio of one person against two, by build and motion.
+
+    :data:`NEVER` if they are certainly two.
+    """
     if one.meets(other):
         return NEVER
-    found = 0.0
+    result = 0.0
     for before, after in _seams(one, other):
         apart = float(np.linalg.norm(after.groups[0].centre - before.groups[-1].centre))
         gap = float(times[after.sets[0]] - times[before.sets[-1]])
         if apart > LINK_SLACK_M + MAX_BODY_SPEED_M_S * gap:
             return NEVER
-        found -= 0.5 * (apart / (LINK_SLACK_M + WALKING_SPEED_M_S * gap)) ** 2
+        result -= 0.5 * (apart / (LINK_SLACK_M + WALKING_SPEED_M_S * gap)) ** 2
     alike = same_build(one.whole, other.whole)
-    return found + alike if alike > OTHER_BUILD else NEVER
+    return result + alike if alike > OTHER_BUILD else NEVER
 
 
 def _seams(one: Person, other: Person) -> list[tuple[PersonTrack, PersonTrack]]:
-    """Where, in order of time, a part of one person follows a part of the other."""
+    """Pairs of successive parts, in order of time, that belong to different people."""
     own = set(map(id, one.parts))
     parts = _ordered((*one.parts, *other.parts))
     return [(a, b) for a, b in pairwise(parts) if (id(a) in own) != (id(b) in own)]
 
 
 def _doubt(one: Person, other: Person, times: np.ndarray) -> tuple[str, ...]:
-    """What is said of joining two after a gap over which nobody can be followed."""
+    """Message on joining two people after a long gap, if their build does not decide."""
     gap, start = min(
         (float(times[b.sets[0]] - times[a.sets[-1]]), b.sets[0]) for a, b in _seams(one, other)
     )

@@ -1,10 +1,10 @@
 """Static background depth of each depth camera.
 
-Moving things are nearer than the static scene, so the background of a pixel is the *farthest* depth
-that it measures repeatedly, not the median: a person who stands still for most of the recording
-does not become background. Pixels near the triangulated keypoints are ignored, so a person who
-never leaves does not become background either. An object that never moves cannot be told from
-furniture and is part of the background.
+Moving surfaces are nearer than the static scene, so the background of a pixel is the *farthest*
+depth that it measures repeatedly, not the median: a person who stands still for most of the
+recording does not become background. Pixels near the triangulated keypoints are ignored, so a
+person who never leaves does not become background either. An object that never moves cannot be
+distinguished from furniture and is part of the background.
 """
 
 from __future__ import annotations
@@ -23,19 +23,15 @@ from intercap_core.geometry.camera.transforms import apply
 # about 1 mm + 0.1 % of depth, more at 4 m (Toelgyessy et al., Sensors 21(2):413, 2021, NFOV).
 BACKGROUND_AGREE_MM = 8.0
 BACKGROUND_AGREE_PER_DEPTH = 0.004  # of depth
-MAX_SAMPLES = 25  # sets of the background; bounds memory: this many depth images of one camera
-PERSON_MASK_REDUCTION = 8  # the person's mask is worked out on every eighth pixel
 STEADY_SHARE = 0.2  # of a pixel's samples that must agree; tuned on the studio
-# A pixel that often measures nothing looks past the scene: what it holds now and then, however
-# steadily, may have come by. There nearly all of it must agree. Tuned on the studio.
+# A pixel with fewer valid samples looks past the scene, and a surface that it measures repeatedly
+# may be a passing one: VALID_AGREE of them must agree. Tuned on the studio.
 OFTEN_VALID = 0.75
 VALID_AGREE = 0.8  # of such a pixel's valid samples
-STATIC_SHARE = 0.5  # above this the pixel shows background most of the time
-# How far from a bone skin, clothing and hair reach, metres: wider than the body's own radii
-# (`segmentation.constants`), since what is left out of the background only has to hold the person.
-# Of the limbs, in the order of LIMB_BONES; tuned on the studio.
+# Distance from a bone to skin, clothing and hair, metres, in the order of LIMB_BONES. Wider than
+# the radii of the segmentation: the region only has to contain the person. Tuned on the studio.
 LIMB_REACH_M = (0.16, 0.14, 0.18, 0.15, 0.14, 0.14)
-# Of trunk and head, which have no bones of their own in the skeleton; hands reach past the wrist.
+# The same for trunk and head, which have no bones of their own; hands reach past the wrist.
 TRUNK_REACH_M: dict[tuple[str, str], float] = {
     ("neck", "mid_hip"): 0.26,
     ("right_shoulder", "right_hip"): 0.20,
@@ -55,10 +51,10 @@ _REACH = np.array([*TRUNK_REACH_M.values(), *LIMB_REACH_M, *LIMB_REACH_M])
 def mask_person(
     depth: np.ndarray, lens: Intrinsics, depth_from_master: np.ndarray, joints: np.ndarray
 ) -> np.ndarray:
-    """Tell for a depth image (H, W) uint16 mm which pixels (H, W) lie within a bone's reach.
+    """Mask (H, W) of the pixels of a depth image (H, W), uint16 mm, that lie near a bone.
 
-    ``joints`` (K, 3): the keypoints of the 135-point order, at least the body's 25, master frame,
-    metres, NaN = not known.
+    ``joints``: (K, 3) keypoints in the 135-point order, at least the body's 25, master frame,
+    metres; NaN = unknown.
     """
     ends = [apply(depth_from_master, joints[index]) for index in (_FIRST, _SECOND)]
     known = np.isfinite(ends[0]).all(1) & np.isfinite(ends[1]).all(1)
@@ -66,10 +62,7 @@ def mask_person(
     if not known.any():
         return result
     start, along, reach = ends[0][known], (ends[1] - ends[0])[known], _REACH[known]
-    small = np.s_[
-        PERSON_MASK_REDUCTION // 2 :: PERSON_MASK_REDUCTION,
-        PERSON_MASK_REDUCTION // 2 :: PERSON_MASK_REDUCTION,
-    ]
+    small = np.s_[4::8, 4::8]  # every eighth pixel is enough for so coarse a mask
     z = depth[small].astype(np.float64) * 1e-3
     points = np.dstack([lens.rays[small] * z[..., None], z])
     low = np.minimum(start, start + along).min(0) - reach.max()
@@ -86,58 +79,65 @@ def mask_person(
 
 @dataclass(frozen=True, eq=False)
 class Background:
-    """``depth`` (H, W) uint16 mm, 0 = unknown; ``static`` (H, W) bool: seen in most samples."""
+    """Static scene of one depth camera."""
 
     depth: np.ndarray
+    """(H, W) uint16 mm; 0 = unknown."""
     static: np.ndarray
+    """(H, W) bool: most samples show the background."""
 
 
-def sample_sets(available: np.ndarray) -> np.ndarray:
-    """At most :data:`MAX_SAMPLES` sets, evenly among those where ``available`` (T,)."""
+def sample_sets(available: np.ndarray, most: int = 25) -> np.ndarray:
+    """Choose at most ``most`` sets, evenly among those where ``available`` (T,).
+
+    The default bounds the memory for the depth images of one camera.
+    """
     sets = np.flatnonzero(available)
-    if len(sets) <= MAX_SAMPLES:
+    if len(sets) <= most:
         return sets
-    return sets[np.linspace(0, len(sets) - 1, MAX_SAMPLES).round().astype(int)]
+    return sets[np.linspace(0, len(sets) - 1, most).round().astype(int)]
 
 
 def camera_background(
     frames: Frames, c: int, joints: np.ndarray | None = None
 ) -> Background | None:
-    """The background of camera ``c``; None where it has no depth image.
+    """Background of camera ``c``; None if it has no depth image.
 
-    ``joints`` (T, 135, 3): the subject's keypoints at the moment that the camera's image of each
-    set shows, master frame, metres, NaN = not known; what is near them is not background.
+    ``joints``: (T, 135, 3) the subject's keypoints at the moment that the camera's image of each
+    set shows, master frame, metres; NaN = unknown. Pixels near them are not background.
     """
     camera = frames.rig[c]
     sets = sample_sets(frames.depth_available[:, c])
     if not len(sets) or camera.depth is None:
         return None
     images = np.stack([image for t in sets if (image := frames.depth(int(t), c)) is not None])
-    somebody = np.zeros(images.shape, bool)
+    person = np.zeros(images.shape, bool)
     if joints is not None:
-        for image, near, t in zip(images, somebody, sets, strict=True):
+        for image, near, t in zip(images, person, sets, strict=True):
             near[:] = mask_person(image, camera.depth, camera.depth_from_master, joints[t])
-    return steady_background(images, somebody)
+    return steady_background(images, person)
 
 
-def steady_background(images: np.ndarray, somebody: np.ndarray | None = None) -> Background:
-    """The background of depth images (S, H, W) uint16 mm of one camera; ``somebody`` (S, H, W)
-    bool: a person may be there, so that the sample is no evidence of the background."""
+def steady_background(images: np.ndarray, person: np.ndarray | None = None) -> Background:
+    """Background of one camera's depth images (S, H, W), uint16 mm.
+
+    ``person``: (S, H, W) bool, samples that may show a person and are ignored.
+    """
     samples, height, width = images.shape
-    told = np.full(height * width, samples)
-    if somebody is not None:
-        told -= somebody.reshape(samples, -1).sum(0)
-        images = np.where(somebody, 0, images)
+    usable = np.full(height * width, samples)
+    if person is not None:
+        usable -= person.reshape(samples, -1).sum(0)
+        images = np.where(person, 0, images)
     ordered = np.sort(images.reshape(samples, -1).T, axis=1)  # (pixels, S), invalid zeros first
     valid = samples - (ordered == 0).sum(1)
-    share = np.where(valid >= OFTEN_VALID * told, STEADY_SHARE, VALID_AGREE)
+    share = np.where(valid >= OFTEN_VALID * usable, STEADY_SHARE, VALID_AGREE)
     needed = np.maximum(np.ceil(share * valid), min(2, samples)).astype(int)
     depth = np.zeros(len(ordered), np.uint16)
     support = np.zeros(len(ordered))
     for count in np.unique(needed[valid >= needed]):
         rows = np.flatnonzero((needed == count) & (valid >= needed))
         depth[rows], support[rows] = _farthest_cluster(ordered[rows], int(count))
-    static = (depth > 0) & (support > STATIC_SHARE * np.maximum(valid, told / 2))
+    static = (depth > 0) & (support > 0.5 * np.maximum(valid, usable / 2))
     return Background(depth.reshape(height, width), static.reshape(height, width))
 
 

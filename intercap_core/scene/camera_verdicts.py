@@ -1,9 +1,9 @@
-"""Each camera's own verdict: does its refined pose explain what did not take part better?
+"""Decides for each camera whether its refined pose explains held-out data better than the given.
 
-Every camera in turn gets its given pose back while the others stay refined; where that is not far
-worse, the others are refined to suit it, too. What says which of the two is better: the held-out
-points of each pair that it is in (background and moving surfaces apart), and keypoints of the half
-of the time that a second refinement did not see.
+Each camera in turn gets its given pose back while the others stay refined. If that is not far
+worse, the others are also refined with this camera fixed. The two are compared on the held-out
+points of each pair with this camera (background and moving surfaces separately), and on keypoints
+of the half of the recording that a second refinement did not use.
 """
 
 from __future__ import annotations
@@ -23,33 +23,33 @@ from intercap_core.scene.registration import (
 )
 
 MUST_IMPROVE = 0.98  # of the start's held-out cost, in one group at least; tuned on the studio
-# By how many standard deviations a camera's refined pose has to be better than its given one; the
-# least spread, of log ratios, that errors of units are taken to have. Tuned on the studio.
-CHANCE_SIGMA, LEAST_UNIT_SPREAD = 2.0, 0.25
+CHANCE_SIGMA = (
+    2.0  # standard deviations by which a refined pose must be better; tuned on the studio
+)
+LEAST_UNIT_SPREAD = 0.25  # of log ratios, assumed for few units; tuned on the studio
 DOUBTFUL_RATIO = 0.5  # of refined over given errors: above it a camera gets a second look
-WEAK_CAMERA_M = 0.010  # a camera that may slide by more is told
 
 
 _KINDS = (("background", STATIC), ("moving surfaces", MOVING))
-_LEAST = 1e-6  # of an error
-_LEVEL, _STEEP, _ALONG = 0.5, 0.8, 0.8  # cosines by which a direction is named
 
 
 @dataclass(frozen=True)
 class PoseEvidence:
-    """Of one ``kind`` for one camera: log ratios (N,) of errors, refined over given, of units that
-    err independently: pairs of cameras, or a joint for half a second."""
+    """Held-out errors of one camera, refined against given pose."""
 
     kind: str
+    """Name of the kind of data."""
     log_ratio: np.ndarray
+    """(N,) log of refined over given error, by independent unit: a pair of cameras, or a joint for
+    half a second."""
 
     @classmethod
     def of(
         cls, kind: str, given: Mapping[Hashable, float], refined: Mapping[Hashable, float]
     ) -> PoseEvidence:
-        """Of errors by unit, those units that both have."""
+        """Compare errors by unit, over the units that both have."""
         both = [
-            np.log(max(error, _LEAST) / max(given[unit], _LEAST))
+            np.log(max(error, 1e-6) / max(given[unit], 1e-6))
             for unit, error in refined.items()
             if unit in given
         ]
@@ -62,7 +62,7 @@ class PoseEvidence:
 
     @property
     def sigma(self) -> float:
-        """Its standard deviation; few units are taken to spread by a usual amount."""
+        """Standard deviation of the mean; of few units at least the usual one."""
         spread = max(float(self.log_ratio.std()), LEAST_UNIT_SPREAD)
         return spread / np.sqrt(len(self.log_ratio))
 
@@ -73,10 +73,12 @@ class PoseEvidence:
 
 @dataclass(frozen=True)
 class PoseVerdict:
-    """Whether a camera's refined pose is better beyond chance, and what says so."""
+    """Whether a camera's refined pose is significantly better."""
 
     refined: bool
+    """The refined pose is kept."""
     evidence: tuple[PoseEvidence, ...]
+    """Comparison by kind of data."""
 
     @property
     def in_doubt(self) -> bool:
@@ -88,7 +90,7 @@ class PoseVerdict:
 
     @classmethod
     def of(cls, evidence: Sequence[PoseEvidence]) -> PoseVerdict:
-        """Every kind counts the same, however many units it has."""
+        """Decide from the evidence; every kind has the same weight."""
         if not evidence:  # the rig as a whole is better refined
             return cls(True, ())
         mean = np.mean([e.mean for e in evidence])
@@ -99,13 +101,12 @@ class PoseVerdict:
     def __str__(self) -> str:
         if not self.evidence:
             return "refined with the rig: nothing that was held out shows this camera by itself"
-        said = "refined" if self.refined else "as given, refined it is not better beyond chance"
-        return f"{said} (held-out errors, {', '.join(map(str, self.evidence))})"
+        pose = "refined" if self.refined else "as given, refined it is not better beyond chance"
+        return f"{pose} (held-out errors, {', '.join(map(str, self.evidence))})"
 
 
 class PoseJudge:
-    """Judges single cameras of a rig that was ``refined`` as a whole from ``held``, the given poses
-    with the biases and offsets that suit them."""
+    """Judges single cameras of a rig that was refined as a whole."""
 
     def __init__(
         self,
@@ -115,7 +116,13 @@ class PoseJudge:
         held: RigEstimate,
         refined: RigEstimate,
     ) -> None:
-        """``refine`` (keypoints, None = all; which cameras (C,) may move) gives an estimate."""
+        """
+        Args:
+            refine: estimates the rig from keypoints (None = all) and free cameras (C,).
+            views: keypoints of the subject; None = too few.
+            held: given poses, with biases and offsets estimated for them.
+            refined: all poses refined.
+        """
         self._registration, self._refine = registration, refine
         self._held, self._refined = held, refined
         self._seen = self._halved = self._held_out = None
@@ -127,25 +134,30 @@ class PoseJudge:
                 self._held_out = BodyConstraint(unseen, registration.rig)
 
     def verdicts(self, cameras: Sequence[int]) -> dict[int, PoseVerdict]:
-        """Of each of the ``cameras``; those in doubt get a second look, the others of the rig
-        refined to suit their given poses."""
-        found = {}
+        """Verdict of each of the ``cameras``.
+
+        Doubtful cameras are judged again, with the rest of the rig refined for their given poses.
+        """
+        verdicts = {}
         for c in cameras:
             apart = _with_camera_of(self._refined, self._held, c)
             halved = None if self._halved is None else _with_camera_of(self._halved, self._held, c)
-            found[c] = self._compare(c, apart, halved)
-        doubtful = [c for c, verdict in found.items() if verdict.in_doubt]
+            verdicts[c] = self._compare(c, apart, halved)
+        doubtful = [c for c, verdict in verdicts.items() if verdict.in_doubt]
         if doubtful:
             free = np.ones(len(self._held.poses), bool)
             free[doubtful] = False
             apart = self._refine(None, free)
             halved = None if self._halved is None else self._refine(self._seen, free)
-            found |= {c: self._compare(c, apart, halved) for c in doubtful}
-        return found
+            verdicts |= {c: self._compare(c, apart, halved) for c in doubtful}
+        return verdicts
 
     def _compare(self, camera: int, apart: RigEstimate, halved: RigEstimate | None) -> PoseVerdict:
-        """``apart`` and ``halved``: the estimate with this camera as given, and that without the
-        held-out keypoints."""
+        """Compare one camera's poses.
+
+        ``apart``: estimate with this camera as given. ``halved``: the same without the held-out
+        keypoints.
+        """
         evidence = []
         for name, kind in _KINDS:
             medians = (
@@ -178,8 +190,16 @@ def _with_camera_of(at: RigEstimate, other: RigEstimate, camera: int) -> RigEsti
 def weakest_motion(
     covariance: np.ndarray, pose: np.ndarray, centre: np.ndarray
 ) -> tuple[float, np.ndarray]:
-    """Standard deviation, metres, and unit direction (3,) in which the stated ``covariance``
-    (7, 7) of a camera at ``pose`` (4, 4) lets the rig's ``centre`` (3,) slide most."""
+    """Largest standard deviation of the rig's centre due to one camera's pose, and its direction.
+
+    Args:
+        covariance: (7, 7) of the camera.
+        pose: (4, 4) master from camera.
+        centre: (3,) of the rig.
+
+    Returns:
+        Standard deviation, metres, and unit direction (3,).
+    """
     across = np.cross(np.eye(3), centre - pose[:3, 3])  # row i: the shift by a turn about axis i
     by_pose = np.concatenate([across.T, np.eye(3)], axis=1)
     values, vectors = np.linalg.eigh(by_pose @ covariance[:6, :6] @ by_pose.T)
@@ -189,15 +209,15 @@ def weakest_motion(
 def describe_direction(direction: np.ndarray, pose: np.ndarray, up: np.ndarray) -> str:
     """Name a unit ``direction`` (3,) as seen by a camera at ``pose`` (4, 4), ``up`` (3,) unit."""
     steep = abs(float(direction @ up))
-    if steep > _STEEP:
+    if steep > 0.8:  # cosine
         return "up and down"
     ahead = pose[:3, 2] - (pose[:3, 2] @ up) * up
     ahead /= max(float(np.linalg.norm(ahead)), 1e-9)
     level = direction - (direction @ up) * up
     along = abs(float(level @ ahead)) / np.linalg.norm(level)
     way = "aslant to its view"
-    if along > _ALONG:
+    if along > 0.8:
         way = "along its view"
-    elif along < np.sqrt(1 - _ALONG**2):
+    elif along < np.sqrt(1 - 0.8**2):
         way = "across its view"
-    return f"along the floor, {way}" if steep < _LEVEL else f"aslant to the floor, {way}"
+    return f"along the floor, {way}" if steep < 0.5 else f"aslant to the floor, {way}"

@@ -27,55 +27,45 @@ from intercap_core.scene.subject_views import SubjectViews
 from intercap_core.scene.surfaces import DepthSurface
 
 FLOOR_SIGMA_M = 0.005  # floors are not flat and depth is biased; tuned on the studio
-KEYPOINT_SIGMA_FLOOR_PX = 3.0  # of reprojection with each joint's bias in; tuned on the studio
+KEYPOINT_SIGMA_FLOOR_PX = 3.0  # of reprojection, including joint biases; tuned on the studio
 ROBUST_SIGMA = 3.0  # scale of Geman and McClure's function, standard deviations; tuned
 KEYPOINT_ERROR_TIME_S = 0.5  # how long an error at one joint lasts; tuned on the studio
-POINT_STEPS = 2  # Gauss-Newton steps of keypoints' points before each of the cameras'
-MAX_FLOOR_POINTS = 1000  # of a camera, in the common floor's constraint
 MIN_BODY_POINTS = 50  # fewer do not constrain a rig; tuned on the studio
-# Two views of a larger rig say little of their own relative pose; of a rig of two they are all that
-# there is: five of its six freedoms, the prior holds the distance.
-MIN_BODY_VIEWS = 3
 NEAR_FLOOR_M = 0.06  # of the floor at poses that are not yet refined; tuned on the studio
-MIN_FLOOR_POINTS = 200  # of a camera's 3 cm cells: a fifth of a square metre
-FLOOR_EFFECTIVE_POINTS = 10.0  # of one camera: its errors are those of its lens and bias
+FLOOR_EFFECTIVE_POINTS = 10.0  # independent points of a camera: lens and bias errors are shared
 
 
 @dataclass(frozen=True, eq=False)
 class BodyViews:
-    """The subject as all views see it: ``pixels`` (N, C, 2) and ``weights`` (N, C) of N points,
-    ``points`` (N, 3) triangulated at the start, and ``velocity`` (N, 3) m/s, 0 where unknown.
-    ``unit`` (N,): points of one joint within the time that a detector's error lasts share one."""
+    """Keypoints of the subject in all views: N points of all sets."""
 
     pixels: np.ndarray
+    """(N, C, 2) detected pixels."""
     weights: np.ndarray
+    """(N, C) weight of each detection; 0 = not seen."""
     points: np.ndarray
+    """(N, 3) points triangulated at the given poses, metres."""
     velocity: np.ndarray
+    """(N, 3) m/s; 0 = unknown."""
     unit: np.ndarray
-
-    def subset(self, rows: np.ndarray) -> BodyViews:
-        """The points chosen."""
-        return BodyViews(
-            self.pixels[rows],
-            self.weights[rows],
-            self.points[rows],
-            self.velocity[rows],
-            self.unit[rows],
-        )
+    """(N,) number shared by the points of one joint for as long as a detector's error lasts."""
 
     def halves(self) -> tuple[BodyViews, BodyViews]:
         """The points of every second span of time, and the others."""
         odd = self.unit // NUM_KEYPOINTS % 2 == 1
-        return self.subset(~odd), self.subset(odd)
+        fields = (self.pixels, self.weights, self.points, self.velocity, self.unit)
+        return BodyViews(*(f[~odd] for f in fields)), BodyViews(*(f[odd] for f in fields))
 
 
 def body_views(subject: SubjectViews, times: np.ndarray) -> BodyViews:
-    """The body's keypoints that enough views agree on, at ``times`` (T,) seconds."""
+    """Keypoints of the body on which enough views agree. ``times``: (T,) seconds."""
     views = subject.keypoints.shape[1]
     by_point = np.swapaxes(subject.keypoints[:, :, BODY_POINTS], 1, 2).reshape(-1, views, 3)
     inlier = np.swapaxes(subject.inlier[:, :, BODY_POINTS], 1, 2).reshape(-1, views)
     points = subject.joints[:, BODY_POINTS].reshape(-1, 3)
-    enough = min(MIN_BODY_VIEWS, views)
+    # Two views of a larger rig hardly constrain their relative pose. In a rig of two they determine
+    # five of its six parameters, and the prior holds the distance.
+    enough = min(3, views)
     good = (subject.views[:, BODY_POINTS].ravel() >= enough) & np.isfinite(points[:, 0])
     gap = float(np.median(np.diff(times))) if len(times) > 1 else KEYPOINT_ERROR_TIME_S
     weights = by_point[..., 2] * inlier * min(1.0, gap / KEYPOINT_ERROR_TIME_S)
@@ -87,8 +77,10 @@ def body_views(subject: SubjectViews, times: np.ndarray) -> BodyViews:
 
 
 def velocities(points: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Central differences (T, K, 3), m/s, of points (T, K, 3) at ``times`` (T,); NaN at both ends
-    and beside what is not known."""
+    """Central differences (T, K, 3), m/s, of points (T, K, 3) at ``times`` (T,) seconds.
+
+    NaN at both ends and next to unknown points.
+    """
     result = np.full(points.shape, np.nan)
     if len(times) > 2:
         result[1:-1] = (points[2:] - points[:-2]) / (times[2:] - times[:-2])[:, None, None]
@@ -107,7 +99,7 @@ class BodyConstraint:
         """Matrix (C, 6, C, 6) and gradient (C, 6) at ``poses`` (C, 4, 4) of cameras that expose
         ``offset`` (C,) s after the set's time: rotation about the camera's centre, applied on the
         left, and translation of ``master_from_colour``."""
-        for _ in range(POINT_STEPS):
+        for _ in range(2):  # Gauss-Newton steps of the points at fixed poses
             residual, by_point, weight, _ = self._linearised(poses, offset)
             normal, slope = _normal_of_points(residual, by_point, weight)
             self._points -= np.linalg.solve(normal, slope[..., None])[..., 0]
@@ -128,8 +120,10 @@ class BodyConstraint:
     def unit_errors(
         self, poses: np.ndarray, offset: np.ndarray, camera: int
     ) -> dict[Hashable, float]:
-        """By unit of the points that ``camera`` sees, after they have settled: the mean
-        reprojection error in all views, px."""
+        """Mean reprojection error in all views, px, by unit of the points that ``camera`` sees.
+
+        The points are first adapted to the poses.
+        """
         self(poses, offset)
         residual, _, _, _ = self._linearised(poses, offset)
         known = self._views.weights > 0
@@ -142,7 +136,7 @@ class BodyConstraint:
         return result
 
     def median_error(self, poses: np.ndarray, offset: np.ndarray) -> float:
-        """Median reprojection error, px, after the points have settled."""
+        """Median reprojection error, px, with the points adapted to the poses."""
         self(poses, offset)
         residual, _, weight, _ = self._linearised(poses, offset)
         return float(np.median(np.linalg.norm(residual, axis=-1)[weight > 0]))
@@ -154,7 +148,7 @@ class BodyConstraint:
         (N, C, 2, 6), and weights (N, C)."""
         colour_from_master = invert(poses)
         velocity = self._views.velocity[:, None]
-        seen = self._points[:, None] + offset[:, None] * velocity  # (N, C, 3), where it then was
+        seen = self._points[:, None] + offset[:, None] * velocity  # (N, C, 3), at the exposure
         in_camera = np.einsum("cij,ncj->nci", colour_from_master[:, :3, :3], seen)
         in_camera += colour_from_master[:, :3, 3]
         pixels, by_camera = projection.project_with_jacobian(in_camera, self._lenses)
@@ -217,13 +211,13 @@ class FloorConstraint:
             height = (apply(pose, surface.points) - ground.point) @ ground.normal
             facing = surface.normals @ pose[:3, :3].T @ ground.normal
             rows = np.flatnonzero((np.abs(height) < NEAR_FLOOR_M) & (facing > FLOOR_COSINE))
-            if len(rows) >= MIN_FLOOR_POINTS:
-                rows = np.random.default_rng(0).permutation(rows)[:MAX_FLOOR_POINTS]
+            if len(rows) >= 200:  # cells of 3 cm: a fifth of a square metre
+                rows = np.random.default_rng(0).permutation(rows)[:1000]
                 points[c] = surface.points[rows]
         return cls(rig, points, ground.normal) if len(points) >= 2 else None
 
     def __call__(self, poses: np.ndarray, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Matrix (C, 6, C, 6) and gradient (C, 6) at ``poses`` (C, 4, 4); ``offset`` has no say.
+        """Matrix (C, 6, C, 6) and gradient (C, 6) at ``poses`` (C, 4, 4); ``offset`` is unused.
 
         Raises ValueError for poses of another rig.
         """

@@ -16,7 +16,8 @@ from intercap_core.scene.constraints import (
     FloorConstraint,
     body_views,
 )
-from intercap_core.scene.keypoint_timing import TIMING_INFLATION, TimeOffsets
+from intercap_core.scene.keypoint_timing import TIMING_INFLATION
+from intercap_core.scene.moments import Moments
 from intercap_core.scene.registration import (
     MOVING,
     OFFSET,
@@ -31,53 +32,59 @@ from intercap_core.scene.registration import (
     RigSolution,
     SurfaceLayer,
 )
-from intercap_core.scene.starts import StartTimes
-from intercap_core.scene.subject_views import SubjectViews
 from intercap_core.scene.surfaces import DepthSurface
 
 # Variance of refined poses and biases over that of the normal equations: the points of a surface
 # share errors of its lens and its material. Tuned on the studio.
 COVARIANCE_INFLATION = 3.0
-CONVERGED_M = 0.001  # the last step's motion of what a camera looks at
-MAY_WORSEN = 1.02  # in any group
-WEAK_POINTS = 120  # held-out correspondences of a pair, background and moving together
-WEAK_RESIDUAL = 2.0  # times the median pair's
-KNOWN_OFFSET_SIGMA_S = 0.008  # less certain than what devices are off by: not known
+MAY_WORSEN = 1.02  # of the start's held-out cost, in any group; tuned on the studio
+KNOWN_OFFSET_SIGMA_S = 0.008  # above this the offset of a synchronised device is unknown; tuned
 
 
 @dataclass(frozen=True, eq=False)
 class PairTable:
-    """Held-out residuals by pair: ``pairs`` (P, 2) camera indices; for the background and for what
-    moves, ``points`` (P, 2) and medians ``before`` and ``after`` (P, 2), metres, NaN = no overlap;
-    ``weak`` (P,): few points, or residuals that stay large."""
+    """Held-out residuals by pair of cameras, each for background and moving surfaces."""
 
     pairs: np.ndarray
+    """(P, 2) camera indices."""
     points: np.ndarray
+    """(P, 2) correspondences."""
     before: np.ndarray
+    """(P, 2) median residual at the given poses, metres; NaN = no overlap."""
     after: np.ndarray
+    """(P, 2) the same at the refined poses."""
     weak: np.ndarray
+    """(P,) bool: few points, or residuals that remain large."""
 
 
 @dataclass(frozen=True, eq=False)
 class Refinement:
-    """``poses`` (C, 4, 4) master_from_colour, ``bias`` (C,) metres to subtract from depth,
-    ``offset`` and ``offset_sigma`` (C,) seconds, NaN sigma = not known; ``improved``: the poses are
-    better than the start's on held-out points; the pairs and the verdict; which cameras (C,) were
-    ``refined``, each one's own verdict, and its note, in words. ``covariance`` (C, 7, C, 7) of each
-    camera's rotation about its centre, rad, translation and depth bias, m, given the master's."""
+    """Poses, depth biases and time offsets of a rig."""
 
     poses: np.ndarray
+    """(C, 4, 4) master_from_colour."""
     bias: np.ndarray
+    """(C,) metres to subtract from depth."""
     covariance: np.ndarray
+    """(C, 7, C, 7) of rotation about the camera's centre, rad, translation and depth bias, m."""
     offset: np.ndarray
+    """(C,) seconds by which each camera exposes after the set's time."""
     offset_sigma: np.ndarray
+    """(C,) standard deviation of ``offset``, seconds; NaN = unknown."""
     improved: bool
+    """At least one pose is refined."""
     converged: bool
+    """The last step moved no viewed point by more than a millimetre."""
     pairs: PairTable
+    """Held-out residuals."""
     verdict: str
+    """Summary for the whole rig."""
     refined: np.ndarray
+    """(C,) bool: the camera's pose is refined."""
     verdicts: tuple[str, ...]
+    """Reason for each camera's pose."""
     notes: tuple[str, ...]
+    """What weakly connected cameras rest on; "" = nothing to report."""
 
 
 def refine(
@@ -85,26 +92,29 @@ def refine(
     master: int,
     static: dict[int, DepthSurface],
     moving: Sequence[dict[int, DepthSurface]],
-    subject: SubjectViews,
+    moments: Moments,
     times: np.ndarray,
-    timing: TimeOffsets,
-    starts: StartTimes,
     *,
     floor: FloorConstraint | None,
     free_poses: bool,
 ) -> Refinement:
-    """Refine all cameras' poses but the ``master``'s, their depth bias and time offsets.
+    """Refine the poses of all cameras but the ``master``, depth biases and time offsets.
 
-    ``static`` and ``moving`` are surfaces as :func:`.surface.background_surfaces` and
-    :func:`.moving.moving_surfaces` give; ``subject`` is by moment; ``timing`` is what its keypoints
-    say of the offsets beside those of ``starts``; ``floor`` ties cameras that share no surface
-    with the others. The start's poses are kept where held-out points and keypoints together do not
-    get better, and where not ``free_poses``.
+    The given poses are kept if held-out points and keypoints together do not improve.
+
+    Args:
+        static: background surfaces by camera.
+        moving: moving surfaces by camera, of several sets.
+        moments: images by moment, time offsets of the keypoints, and the subject.
+        times: (T,) seconds of the sets.
+        floor: connects cameras that share no surface with the others.
+        free_poses: False keeps all given poses.
     """
+    starts, timing = moments.starts, moments.timing
     layers = [SurfaceLayer(static, STATIC), *(SurfaceLayer(at_once, MOVING) for at_once in moving)]
     registration = Registration(rig, layers, master, starts.offset_sigma)
     given = RigEstimate.start(rig, starts.offset)
-    views = body_views(subject, times)
+    views = body_views(moments.subject, times)
     body = BodyConstraint(views, rig) if len(views.points) >= MIN_BODY_POINTS else None
     known = OffsetInformation(
         timing.information / TIMING_INFLATION**2, timing.vector / TIMING_INFLATION**2
@@ -113,18 +123,18 @@ def refine(
     linked = _linked(np.concatenate(overlapping), master)
     constraints: list[Constraint] = [body] if body else []
     if floor is not None and len(linked) < len(rig):
-        constraints.append(floor)  # where cameras overlap, their surfaces tell more
+        constraints.append(floor)  # overlapping surfaces constrain more
     held = registration.solve(given, (), known, free_poses=False)
-    found, improved, ratios = held, False, []
+    result, ratios, covariance = held, [], held.covariance
     verdicts: dict[int, PoseVerdict] = {}
-    covariance = held.covariance
+    own = np.zeros(len(rig), bool)
     if free_poses and len(rig) > 1:
 
         def solve(some: BodyViews | None, free: np.ndarray) -> RigSolution:
-            own = constraints
+            used = constraints
             if some is not None:
-                own = [BodyConstraint(some, rig), *(one for one in constraints if one is not body)]
-            return registration.solve(given, own, known, free_poses=free)
+                used = [BodyConstraint(some, rig), *(c for c in constraints if c is not body)]
+            return registration.solve(given, used, known, free_poses=free)
 
         freed = solve(None, np.ones(len(rig), bool))
         ratios = _ratios(registration, body, held.estimate, freed.estimate)
@@ -138,61 +148,48 @@ def refine(
             )
             verdicts = judge.verdicts([c for c in range(len(rig)) if c != master])
             own = np.array([c in verdicts and verdicts[c].refined for c in range(len(rig))])
-            improved = bool(own.any())
-            if improved:
-                all_of_them = own.sum() == len(verdicts)
-                found = freed if all_of_them else solve(None, own)
-                covariance = (
-                    freed.covariance
-                )  # what is kept is as well known as it would be refined
-    pairs = _pair_table(registration, held.estimate, found.estimate)
-    sigma = np.sqrt(np.diagonal(found.covariance[:, OFFSET, :, OFFSET]))
-    unknown = (sigma > KNOWN_OFFSET_SIGMA_S) & np.isnan(starts.sigma)  # a stated time is known
+            if own.any():
+                result = freed if own.sum() == len(verdicts) else solve(None, own)
+                covariance = freed.covariance  # given poses are as certain as they would be refined
+    improved = bool(own.any())
+    pairs = _pair_table(registration, held.estimate, result.estimate)
+    sigma = np.sqrt(np.diagonal(result.covariance[:, OFFSET, :, OFFSET]))
+    unknown = (sigma > KNOWN_OFFSET_SIGMA_S) & np.isnan(starts.sigma)  # stated times are known
     sigma = np.where(unknown, np.nan, sigma)
     sigma[master] = 0.0
-    converged = found.last_step_m < CONVERGED_M
-    verdict = _verdict(rig, pairs, ratios, improved, converged, free_poses)
-    refined, words = _verdicts(rig, master, verdicts, verdict)
+    converged = result.last_step_m < 0.001
+    verdict = _verdict(rig, pairs, ratios, improved=improved, converged=converged, free=free_poses)
+    on_floor = floor.cameras if floor is not None and floor in constraints else ()
     return Refinement(
-        found.estimate.poses,
-        found.estimate.bias,
-        _stated_covariance(covariance, master),
-        np.where(unknown, given.offset, found.estimate.offset),
-        sigma,
-        improved,
-        converged,
-        pairs,
-        verdict,
-        refined,
-        words,
-        _notes(
-            rig,
-            master,
-            pairs,
-            views.weights,
-            refined,
-            floor.cameras if floor is not None and floor in constraints else (),
-        ),
+        poses=result.estimate.poses,
+        bias=result.estimate.bias,
+        covariance=_stated_covariance(covariance, master),
+        offset=np.where(unknown, given.offset, result.estimate.offset),
+        offset_sigma=sigma,
+        improved=improved,
+        converged=converged,
+        pairs=pairs,
+        verdict=verdict,
+        refined=own,
+        verdicts=_verdicts(rig, master, verdicts, verdict),
+        notes=_notes(rig, master, pairs, views.weights, own, on_floor),
     )
 
 
-def _verdicts(
-    rig: Rig, master: int, own: dict[int, PoseVerdict], said: str
-) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Which cameras (C,) were refined, and why, in words; of the rig as a whole where no camera was
-    judged by itself."""
-    refined = np.array([c in own and own[c].refined for c in range(len(rig))])
-    whole = "as given: " + said.removesuffix(": poses as given")
-    words = [str(own[c]) if c in own else whole for c in range(len(rig))]
+def _verdicts(rig: Rig, master: int, own: dict[int, PoseVerdict], of_rig: str) -> tuple[str, ...]:
+    """Reason for each camera's pose: its own verdict, or that of the rig."""
+    kept = "as given: " + of_rig.removesuffix(": poses as given")
+    words = [str(own[c]) if c in own else kept for c in range(len(rig))]
     words[master] = "the master, which the others are placed by"
-    return refined, tuple(words)
+    return tuple(words)
 
 
-def _stated_covariance(found: np.ndarray, master: int) -> np.ndarray:
-    """Covariance (C, 7, C, 7) of poses and depth bias from that ``found`` (C, 8, C, 8): residuals
-    of many points say little of errors that they share. Poses that were held are as uncertain as
-    given ones."""
-    stated = COVARIANCE_INFLATION * found[:, :OFFSET, :, :OFFSET]
+def _stated_covariance(solved: np.ndarray, master: int) -> np.ndarray:
+    """Covariance (C, 7, C, 7) of poses and depth bias from the solver's (C, 8, C, 8).
+
+    Fixed poses get the covariance of the prior.
+    """
+    stated = COVARIANCE_INFLATION * solved[:, :OFFSET, :, :OFFSET]
     given = np.repeat([PRIOR_ROTATION_RAD, PRIOR_TRANSLATION_M], 3) ** 2
     for c in range(len(stated)):
         if c != master and not stated[c, :6, c, :6].any():
@@ -203,9 +200,9 @@ def _stated_covariance(found: np.ndarray, master: int) -> np.ndarray:
 def _ratios(
     registration: Registration, body: BodyConstraint | None, start: RigEstimate, found: RigEstimate
 ) -> list[float]:
-    """Held-out costs over the start's: background, what moves, and keypoints, where there are any.
+    """Held-out costs over those of the start: background, moving surfaces and keypoints, if any.
 
-    The start has the depth bias and the time offsets that suit it best: poses alone are judged.
+    The start has the depth biases and time offsets that fit it best, so only poses are compared.
     """
     ratios = []
     for kind in (STATIC, MOVING):
@@ -244,8 +241,8 @@ def _pair_table(registration: Registration, start: RigEstimate, found: RigEstima
             points[rows, k] = residuals.count
     after = medians[1]
     usual = np.array([np.nanmedian(a) if np.isfinite(a).any() else np.nan for a in after.T])
-    large = (after > WEAK_RESIDUAL * usual).any(1)
-    weak = large | (points.sum(1) < WEAK_POINTS)
+    large = (after > 2.0 * usual).any(1)
+    weak = large | (points.sum(1) < 120)
     return PairTable(np.array(pairs, np.int32).reshape(-1, 2), points, medians[0], after, weak)
 
 
@@ -253,25 +250,27 @@ def _verdict(
     rig: Rig,
     pairs: PairTable,
     ratios: list[float],
+    *,
     improved: bool,
     converged: bool,
-    free_poses: bool,
+    free: bool,
 ) -> str:
+    """Summarise the refinement of the rig."""
     if len(rig) == 1:
         return "one camera: nothing to refine"
-    if not free_poses:
+    if not free:
         return "refinement is switched off: poses as given"
     if not ratios:
         return "too little is seen by several cameras at once: poses as given"
     if not improved:
         return "held-out points do not get better: poses as given"
-    said = "refined" if converged else "refined, not fully converged"
+    words = "refined" if converged else "refined, not fully converged"
     for k, kind in enumerate(("background", "moving surfaces")):
         if np.isfinite(pairs.after[:, k]).any():
             before, after = (1e3 * float(np.nanmean(x[:, k])) for x in (pairs.before, pairs.after))
-            said += f"; {kind} {before:.1f} to {after:.1f} mm"
+            words += f"; {kind} {before:.1f} to {after:.1f} mm"
     names = [f"{rig.names[a]}-{rig.names[b]}" for a, b in pairs.pairs[pairs.weak]]
-    return f"{said}; weak pairs: {', '.join(names)}" if names else said
+    return f"{words}; weak pairs: {', '.join(names)}" if names else words
 
 
 def _notes(
@@ -282,8 +281,10 @@ def _notes(
     improved: np.ndarray,
     on_floor: Collection[int],
 ) -> tuple[str, ...]:
-    """What each camera's pose rests on, where that is less than the others': ``improved`` (C,)
-    were refined, those ``on_floor`` are tied to the common floor."""
+    """Describe what the pose of each weakly connected camera rests on; "" = connected.
+
+    ``improved``: (C,) refined cameras. ``on_floor``: cameras with the common floor's constraint.
+    """
     linked = _linked(pairs.pairs, master)
     notes = []
     for c in range(len(rig)):
@@ -303,7 +304,7 @@ def _notes(
 
 
 def _linked(pairs: np.ndarray, master: int) -> set[int]:
-    """The cameras that a chain of ``pairs`` (P, 2) joins to the master, itself included."""
+    """Cameras that a chain of ``pairs`` (P, 2) connects to the master, which is included."""
     linked = {master}
     while True:
         touching = [{int(c) for c in pair} for pair in pairs if linked & {int(c) for c in pair}]

@@ -1,5 +1,4 @@
-"""The floor plane: fitted to depth, annotated, stated by the user, or derived from standing
-feet."""
+"""The floor plane: fitted to depth, annotated, stated by the user, or derived from feet."""
 
 from __future__ import annotations
 
@@ -15,38 +14,30 @@ from intercap_core.scene.up import UpDirection, degrees_between
 FOOT_HEIGHT_M = 0.014  # of the lowest of heel and toe keypoints: the open body's, standing
 FOOT_TOLERANCE_M = 0.05  # feet that differ by more do not stand on one floor; tuned on the studio
 MIN_FOOT_SPREAD_M = 0.15  # standard deviation, of feet that show a tilt; tuned on the studio
-FLOOR_HYPOTHESES = 400
-FLOOR_HYPOTHESIS_POINTS = 6000  # on which they are judged
-FLOOR_REFINE_STEPS = 8
 FLOOR_COSINE = 0.94  # 20 degrees: of a floor point's normal with the plane's; tuned on the studio
-FLOOR_FIRST_GATE_M = 0.06  # of the plane's refinement, closing to the setting's tolerance
 FLOOR_HYPOTHESIS_TOLERANCE_M = 0.03  # inliers of a hypothesis of the floor; tuned on the studio
 BELOW_FLOOR_M = 0.10  # a point this far under the plane speaks against it; tuned on the studio
 BELOW_FLOOR_COST = 3.0  # how many inliers such a point outweighs; tuned on the studio
 MIN_FLOOR_AREA_M2 = 0.5  # tuned on the studio
-LOWER_FLOOR_DEG = 3.0  # of a lower floor from a platform: both are level
-COVER_CELL_M = 0.15  # in which a surface above another one hides it
-MAX_COVERED_SHARE = (
-    0.5  # of a lower floor: with more it is the upper one, seen by a misplaced camera
-)
-LEVEL_SHARE = 0.15  # of the sets: feet that make a level of their own; a bound, not tuned
-MAX_SLOPE_DEG = 15.0  # of one tilted plane under all feet; treads of 12 by 40 cm climb by 17
-FEET_TILT_DEG = 6.0  # twice what feet that have been apart tell a tilt to
 MIN_FOOT_SETS = 5  # sets with feet seen, for a floor; tuned on the studio
 
 
 @dataclass(frozen=True, eq=False)
 class GroundPlane:
-    """``point`` (3,) and unit ``normal`` (3,), up, master frame; ``rms`` metres over the
-    ``inliers`` points, or sets in which someone stands, within the tolerance; NaN and 0 where
-    there is no floor. ``note``: what is odd about it, in words, "" = nothing."""
+    """Floor plane in the master's frame."""
 
     point: np.ndarray
+    """(3,) metres; NaN = no floor."""
     normal: np.ndarray
+    """(3,) unit, upwards; NaN = no floor."""
     rms: float
+    """Root mean square distance of the inliers, metres; NaN = none."""
     inliers: int
+    """Number of points, or of sets with a standing foot, within the tolerance."""
     source: str
+    """"fitted", "annotated", "stated", "feet" or "none"."""
     note: str = ""
+    """What is unusual about the floor; "" = nothing."""
 
     @property
     def found(self) -> bool:
@@ -66,12 +57,12 @@ def fit_ground(
     tolerance_m: float,
     cell_m: float,
 ) -> GroundPlane:
-    """Fit the floor to background points (N, 3) with normals (N, 3), master frame, spaced by
-    ``cell_m``: the lowest large plane that faces up, below the cameras, with little under it.
+    """Fit the floor to background points (N, 3) with normals (N, 3), master frame.
 
-    Every point with its normal is a hypothesis (so one point gives a plane); the best is refined
-    by iterated weighted least squares. A platform may be larger than the floor that is seen
-    around it: the lowest plane parallel to it that is large enough is the floor.
+    The floor is the lowest large plane that faces up, below the cameras, with few points under it.
+    Each point with its normal is a hypothesis; the best is refined by iterated weighted least
+    squares. A platform may be larger than the visible floor around it: the lowest plane parallel
+    to it that is large enough is the floor. ``cell_m``: spacing of the points, metres.
     """
     cone = up.cone_deg
     facing = normals @ up.direction >= np.cos(np.radians(cone) + np.arccos(FLOOR_COSINE))
@@ -80,9 +71,9 @@ def fit_ground(
     if not len(candidates):
         return NO_GROUND
     rng = np.random.default_rng(0)
-    judging = min(len(points), FLOOR_HYPOTHESIS_POINTS)
+    judging = min(len(points), 6000)
     sample = points[rng.choice(len(points), judging, replace=False)]
-    tried = rng.choice(candidates, min(len(candidates), FLOOR_HYPOTHESES), replace=False)
+    tried = rng.choice(candidates, min(len(candidates), 400), replace=False)
     near_up = normals[tried] @ up.direction >= np.cos(np.radians(cone))
     tried = tried[near_up]
     if not len(tried):
@@ -116,12 +107,12 @@ def _lowest(
         first = int(np.argmax(count))
         start = points[order[first : first + count[first]]].mean(0)
         lower = _refined(points, normals, start, ground.normal, tolerance_m)
-        parallel = degrees_between(lower.normal, ground.normal) <= LOWER_FLOOR_DEG
+        parallel = degrees_between(lower.normal, ground.normal) <= 3.0  # both are level
         deep = (lower.point - ground.point) @ ground.normal < -BELOW_FLOOR_M
         if lower.inliers * cell_m**2 < MIN_FLOOR_AREA_M2 or not (parallel and deep):
             break
-        if _covered(points, lower, ground, tolerance_m) > MAX_COVERED_SHARE:
-            break
+        if _covered(points, lower, ground, tolerance_m) > 0.5:
+            break  # the upper surface, seen by a misplaced camera
         ground = lower
     if ground is upper:
         return ground
@@ -133,13 +124,15 @@ def _lowest(
 def _covered(
     points: np.ndarray, lower: GroundPlane, upper: GroundPlane, tolerance_m: float
 ) -> float:
-    """Share of the lower plane, by cells, over which the upper one was seen: no camera looks
-    through a platform, but one that is misplaced shows the same floor a second time."""
+    """Share of the lower plane, by cells of 15 cm, above which the upper one was measured.
+
+    No camera looks through a platform, but a misplaced camera shows the same floor a second time.
+    """
     across = np.linalg.svd(upper.normal[None])[2][1:]
 
     def cells(plane: GroundPlane) -> set[tuple[int, ...]]:
         on = np.abs((points - plane.point) @ plane.normal) < tolerance_m
-        flat = np.floor(points[on] @ across.T / COVER_CELL_M).astype(int)
+        flat = np.floor(points[on] @ across.T / 0.15).astype(int)
         return set(map(tuple, flat.tolist()))
 
     below = cells(lower)
@@ -153,9 +146,8 @@ def _refined(
     normal: np.ndarray,
     tolerance_m: float,
 ) -> GroundPlane:
-    """Weighted total least squares, the gate closing from 6 cm to the tolerance."""
-    gates = np.geomspace(max(FLOOR_FIRST_GATE_M, tolerance_m), tolerance_m, FLOOR_REFINE_STEPS)
-    for gate in gates:
+    """Weighted total least squares, with a gate that narrows from 6 cm to the tolerance."""
+    for gate in np.geomspace(max(0.06, tolerance_m), tolerance_m, 8):
         distance = (points - point) @ normal
         weight = np.maximum(0, 1 - (distance / gate) ** 2) ** 2
         weight *= normals @ normal >= FLOOR_COSINE
@@ -174,10 +166,10 @@ def _refined(
 def annotated_ground(
     floor: np.ndarray, points: np.ndarray, up: UpDirection, *, tolerance_m: float
 ) -> GroundPlane:
-    """The plane through annotated floor points (M, 3), M >= 3, master frame; ``points`` (N, 3) of
-    the background are only counted.
+    """Plane through annotated floor points (M, 3), M >= 3, master frame.
 
-    Raises UserError, to be prefixed with the sequence, where the points lie on one line.
+    Background ``points`` (N, 3) are only counted. Raises UserError, to be prefixed with the
+    sequence, if the annotated points lie on one line.
     """
     point = floor.mean(0)
     axes = np.linalg.svd(floor - point, full_matrices=False)[2]
@@ -194,13 +186,16 @@ def annotated_ground(
 
 
 def stated_ground(up: np.ndarray, floor: np.ndarray) -> GroundPlane:
-    """The floor as the user states it: ``up`` (3,) unit, and a point of it, master frame."""
+    """Floor stated by the user: ``up`` (3,) unit, and a point ``floor`` (3,), master frame."""
     return GroundPlane(floor, up, float("nan"), 0, "stated")
 
 
 def zup_from_master(ground: GroundPlane, rig: Rig, up_hint: UpDirection) -> np.ndarray:
-    """Transform (4, 4) to z up with the floor at z = 0 under the ring's middle; y is where the
-    master looks. Without a floor: up by ``up_hint``, and z = 0 at the master camera."""
+    """Transform (4, 4) to z up, with the origin on the floor under the ring's centre.
+
+    y is the horizontal viewing direction of the master. Without a floor, up is ``up_hint`` and the
+    origin is the master camera.
+    """
     up, point = ground.normal, ground.point
     if not ground.found:
         up, point = up_hint.direction, np.zeros(3)
@@ -217,14 +212,13 @@ def zup_from_master(ground: GroundPlane, rig: Rig, up_hint: UpDirection) -> np.n
 
 
 def fit_ground_to_feet(feet: np.ndarray, up: UpDirection) -> GroundPlane:
-    """The floor that someone stands on: from heels and toes (T, F, 3), NaN = not known.
+    """Floor under standing feet, for scenes whose floor no camera measures.
 
-    In each set the lowest of the feet stands, in most of them on the floor; where they stand on
-    several levels (a beam, stairs) the lowest that is well supported is the floor. Measured gravity
-    or a stated up gives the normal; without them the feet do, as far as they have been apart: who
-    walks along a line shows the tilt along it, and across it the cameras' own up stands. For
-    scenes whose floor no camera measures; its height is as good as the keypoints, a centimetre or
-    two.
+    ``feet``: (T, F, 3) heels and toes, NaN = unknown. The lowest foot point of each set stands. If
+    feet stand on several levels (a beam, stairs), the lowest well supported level is the floor.
+    The normal is measured gravity or a stated up, else it is fitted to the feet, where they are
+    spread enough: a walk along a line shows the tilt along it. The height is as accurate as the
+    keypoints, one to two centimetres.
     """
     standing = _standing(feet, up.direction)
     if len(standing) < MIN_FOOT_SETS:
@@ -242,7 +236,7 @@ def fit_ground_to_feet(feet: np.ndarray, up: UpDirection) -> GroundPlane:
         point, normal = standing.mean(0), own
     elif up.source == "stated" and slope is not None:
         off = degrees_between(slope, normal)
-        if off > FEET_TILT_DEG:
+        if off > 6.0:  # twice the accuracy of a tilt by feet
             odd = f"the plane of the standing feet is {off:.0f} degrees from the stated up"
             note = f"{note}; {odd}" if note else odd
     distance = (standing - point) @ normal
@@ -252,8 +246,7 @@ def fit_ground_to_feet(feet: np.ndarray, up: UpDirection) -> GroundPlane:
 
 
 def describe_raised_feet(feet: np.ndarray, ground: GroundPlane) -> str:
-    """Say, "" = nothing, where the lower of the feet (T, F, 3) often stands above ``ground``, or
-    below it."""
+    """Report if the lower of the feet (T, F, 3) often stands above or below ``ground``; "" = no."""
     standing = _standing(feet, ground.normal)
     if len(standing) < MIN_FOOT_SETS:
         return ""
@@ -267,16 +260,16 @@ def describe_raised_feet(feet: np.ndarray, ground: GroundPlane) -> str:
 
 
 def _standing(feet: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """(S, 3): the lowest foot point of each set in which three or more are known."""
+    """Lowest foot point (S, 3) of each set with three or more known points."""
     known = np.isfinite(feet[..., 0]).sum(1) >= 3
     height = np.where(np.isfinite(feet[..., 0]), feet @ up, np.inf)[known]
     return feet[known][np.arange(known.sum()), height.argmin(1)]
 
 
 def _one_level(standing: np.ndarray, up: np.ndarray, *, sloping: bool) -> tuple[np.ndarray, str]:
-    """Which of the standing feet (S, 3) are on one level, the floor: (S,) bool, and a note.
+    """Mask (S,) of the standing feet (S, 3) on the floor's level, and a note on other levels.
 
-    ``sloping``: one plane holds them all, be ``up`` tilted or the floor.
+    ``sloping``: one tilted plane explains them all, so there are no levels.
     """
     height = standing @ up
     middle = np.median(height)
@@ -293,8 +286,10 @@ def _one_level(standing: np.ndarray, up: np.ndarray, *, sloping: bool) -> tuple[
 
 
 def _lowest_level(height: np.ndarray, need: int) -> float:
-    """The lowest of the heights (S,) about which ``need`` of them lie and above which few do; their
-    median where there is none such: noise about one level has no gap below it."""
+    """Lowest height around which ``need`` of the heights (S,) lie, with a gap above it.
+
+    The median if there is no gap: noise about a single level has none.
+    """
     order, middle = np.sort(height), float(np.median(height))
     ends = np.searchsorted(order, order + 2 * FOOT_TOLERANCE_M, side="right")
     first = int(np.argmax(ends - np.arange(len(order)) >= need))
@@ -313,16 +308,18 @@ def _levels(off: np.ndarray, height: np.ndarray, side: str) -> str:
 
 
 def _supporting(count: int) -> int:
-    return max(MIN_FOOT_SETS, int(np.ceil(LEVEL_SHARE * count)))
+    """Least number of ``count`` sets in which feet form a level of their own."""
+    return max(MIN_FOOT_SETS, int(np.ceil(0.15 * count)))
 
 
 def _one_slope(standing: np.ndarray, up: np.ndarray) -> np.ndarray | None:
-    """Normal (3,) of the one plane, little tilted, that explains nearly all of the standing feet
-    (S, 3); None where there is no such plane."""
+    """Normal (3,) of a slightly tilted plane that explains nearly all standing feet (S, 3), or
+    None."""
     kept = np.ones(len(standing), bool)
     for _ in range(5):
         normal = _normal_of(standing[kept], up)
-        if normal is None or degrees_between(normal, up) > MAX_SLOPE_DEG:
+        # treads of 12 by 40 cm rise by 17 degrees
+        if normal is None or degrees_between(normal, up) > 15.0:
             return None
         distance = (standing - standing[kept].mean(0)) @ normal
         kept = np.abs(distance - np.median(distance[kept])) < FOOT_TOLERANCE_M
@@ -332,8 +329,10 @@ def _one_slope(standing: np.ndarray, up: np.ndarray) -> np.ndarray | None:
 
 
 def _normal_of(standing: np.ndarray, up: np.ndarray) -> np.ndarray | None:
-    """Unit normal (3,) of the plane through points (S, 3), across a line that of ``up``; None
-    where they are all in one place."""
+    """Unit normal (3,) of the plane through points (S, 3); None if they are all in one place.
+
+    Across points on a line, the normal is that of ``up``.
+    """
     _, spread, axes = np.linalg.svd(standing - standing.mean(0), full_matrices=False)
     along, across = spread[:2] / np.sqrt(len(standing))
     if along < MIN_FOOT_SPREAD_M:

@@ -25,34 +25,34 @@ from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.camera.triangulation import pixel_scale, triangulate
 
-MAX_PATH_GAP_S = 0.35  # over which a path is carried on without sight; tuned on the studio
-MIN_CONFIDENCE = 0.3  # below, keypoints are left out; tuned on the studio
-SLIPPED_PX_AT_1080P = 60.0  # as above, of slipped views of moving limbs; tuned on the studio
+MAX_PATH_GAP_S = 0.35  # a path bridges at most this time without samples; tuned on the studio
+MIN_CONFIDENCE = 0.3  # keypoints below are ignored; tuned on the studio
 MOTION_SIGMA_FLOOR_PX = 1.0  # at 1080p, with the bias taken off; tuned on the studio
 OUTLIER_SIGMA = 4.0  # beyond, a residual is an outlier; tuned on the studio
-MOTION_ROUNDS = 3  # of smoothing and refitting the keypoints' paths
 STIFFNESS = 10.0 ** np.arange(-3, 4)  # of third differences between sets, tried by likelihood
-# Likelihood takes errors that last for motion; this much more stiffness is closest to no bias of
-# the speeds, to either side. Tuned on the studio.
+# Likelihood mistakes lasting errors for motion; this factor removes the bias of the speeds. Tuned
+# on the studio.
 STIFFER = 4.0
-MIN_PATH_SAMPLES = 6  # of a path through third differences, and a few to spare
-
-
-ORDER = 3
+MIN_PATH_SAMPLES = 6  # more than third differences need
+ORDER = 3  # of the differences
 
 
 @dataclass(frozen=True, eq=False)
 class SmoothPaths:
-    """K smooth paths through T sets at ``times`` (T,) s: ``points`` (T, K, 3) m and ``velocity``
-    (T, K, 3) m/s, NaN = not known."""
+    """K smooth paths through T sets."""
 
     times: np.ndarray
+    """(T,) seconds."""
     points: np.ndarray
+    """(T, K, 3) metres; NaN = unknown."""
     velocity: np.ndarray
+    """(T, K, 3) m/s; NaN = unknown."""
 
     def at(self, wanted: np.ndarray) -> np.ndarray:
-        """Points (N, K, 3) at times ``wanted`` (N,): cubic between neighbours, NaN outside the
-        paths and over long gaps."""
+        """Points (N, K, 3) at times ``wanted`` (N,), by cubic interpolation.
+
+        NaN outside the paths and in long gaps.
+        """
         times, last = self.times, len(self.times) - 1
         left = np.clip(np.searchsorted(times, wanted, side="right") - 1, 0, max(last - 1, 0))
         right = np.minimum(left + 1, last)
@@ -67,7 +67,7 @@ class SmoothPaths:
 
 
 def smooth_paths(times: np.ndarray, points: np.ndarray) -> SmoothPaths:
-    """Smooth ``points`` (T, K, 3), NaN = not known, at increasing ``times`` (T,) s."""
+    """Smooth ``points`` (T, K, 3), NaN = unknown, at increasing ``times`` (T,) seconds."""
     sets = len(points)
     known = np.isfinite(points[..., 0])
     smooth = np.full(points.shape, np.nan)
@@ -85,7 +85,7 @@ def smooth_paths(times: np.ndarray, points: np.ndarray) -> SmoothPaths:
 
 
 def _penalty(times: np.ndarray) -> np.ndarray:
-    """D'D in upper banded form (4, T), D third divided differences in units of the usual gap."""
+    """D'D in upper banded form (4, T); D: third divided differences in units of the median gap."""
     gap = float(np.median(np.diff(times)))
     scaled = (times - times[0]) / gap
     rows = len(times) - ORDER
@@ -103,7 +103,7 @@ def _penalty(times: np.ndarray) -> np.ndarray:
 
 
 def _smoothed(points: np.ndarray, known: np.ndarray, penalty: np.ndarray) -> np.ndarray:
-    """One path (T, 3), :data:`STIFFER` than the one of greatest restricted likelihood."""
+    """Smooth one path (T, 3), :data:`STIFFER` than by restricted maximum likelihood."""
     right = points * known[:, None]
     samples, sets = int(known.sum()), len(points)
     costs = []
@@ -125,7 +125,7 @@ def _factor(stiffness: float, known: np.ndarray, penalty: np.ndarray) -> np.ndar
 
 
 def _near_known(times: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Whether (T, K) a path is known at a set, or was shortly before and is shortly after."""
+    """Mask (T, K) of sets at which a path is known, or known shortly before and shortly after."""
     before = np.full(known.shape, -np.inf)
     after = np.full(known.shape, np.inf)
     before[known] = np.broadcast_to(times[:, None], known.shape)[known]
@@ -135,35 +135,40 @@ def _near_known(times: np.ndarray, known: np.ndarray) -> np.ndarray:
     return after - before <= MAX_PATH_GAP_S
 
 
-# Body; of each hand the wrist, knuckles and finger tips; corners of brows, eyes, nose and mouth.
-# Points beyond these move with them and cost as much again.
-_HAND = np.array([0, 4, 5, 8, 9, 13, 17, 20])
-_FACE = np.array([0, 9, 10, 13, 19, 28, 31, 37])
-POINTS = np.r_[
-    np.arange(BODY.start, BODY.stop),
-    LEFT_HAND.start + _HAND,
-    RIGHT_HAND.start + _HAND,
-    FACE.start + _FACE,
-]
+def _chosen_points() -> np.ndarray:
+    """Body; of each hand the wrist, knuckles and finger tips; corners of brows, eyes, nose, mouth.
+
+    The other keypoints move with these and would double the cost.
+    """
+    hand = np.array([0, 4, 5, 8, 9, 13, 17, 20])
+    face = FACE.start + np.array([0, 9, 10, 13, 19, 28, 31, 37])
+    body = np.arange(BODY.start, BODY.stop)
+    return np.r_[body, LEFT_HAND.start + hand, RIGHT_HAND.start + hand, face]
+
+
+POINTS = _chosen_points()
 
 
 @dataclass(frozen=True, eq=False)
 class KeypointMotion:
-    """K keypoints in T sets of C views.
-
-    ``paths`` in the master frame; ``residual`` (T, C, K, 2) px, found less expected, 0 where not
-    ``seen``; ``seen`` and ``valid`` (T, C, K) bool: has a residual, and one that is no outlier;
-    ``sigma`` (C, K) px, what the residuals scatter by; ``bias`` (C, K, 2) px was taken off.
-    """
+    """Paths and residuals of K keypoints in T sets of C views."""
 
     rig: Rig
+    """Cameras."""
     times: np.ndarray
+    """(T,) seconds."""
     paths: SmoothPaths
+    """In the master's frame."""
     residual: np.ndarray
+    """(T, C, K, 2) detected less expected pixels, without bias; 0 where not ``seen``."""
     seen: np.ndarray
+    """(T, C, K) bool: has a residual."""
     valid: np.ndarray
+    """(T, C, K) bool: has a residual that is no outlier."""
     sigma: np.ndarray
+    """(C, K) standard deviation of the residuals, px."""
     bias: np.ndarray
+    """(C, K, 2) median residual, px, which is subtracted."""
 
     @cached_property
     def by_point(self) -> np.ndarray:
@@ -177,23 +182,25 @@ class KeypointMotion:
 
     @cached_property
     def speed_px(self) -> np.ndarray:
-        """Pixel velocities (T, C, K, 2), px/s, 0 where not known."""
+        """Pixel velocities (T, C, K, 2), px/s; 0 = unknown."""
         return np.nan_to_num(np.einsum("tckij,tkj->tcki", self.by_point, self.paths.velocity))
 
     def at_offsets(self, offset: np.ndarray) -> KeypointMotion:
-        """The motion as seen by cameras that expose ``offset`` (C,) s late."""
+        """The same motion seen by cameras that expose ``offset`` (C,) seconds late."""
         along = np.where(self.seen[..., None], self.speed_px * offset[:, None, None], 0.0)
         return replace(self, residual=self.residual - along)
 
     def shifted(self, seconds: float) -> np.ndarray:
-        """How far (T, C, K, 2), px, the points would be seen from where they are expected by
-        images that are ``seconds`` older; NaN where the path is not known."""
+        """Displacement (T, C, K, 2), px, of the points in images that are ``seconds`` older.
+
+        NaN where the path is unknown.
+        """
         points = self.paths.at(self.times - seconds)
         return _pixels_of(points, self.rig) - self.expected
 
     @cached_property
     def projector(self) -> np.ndarray:
-        """(T, K, 2C, 2C): makes weighted residuals free of where the point is, to first order.
+        """(T, K, 2C, 2C) projector that removes the point's position from weighted residuals.
 
         With A = W^(1/2) J it is (I - A (A'A)^-1 A') W^(1/2), W the inverse variances.
         """
@@ -214,7 +221,7 @@ class KeypointMotion:
         return np.einsum("tkef,tkf->tke", self.projector, flat)
 
     def projected_of(self, camera: int, values: np.ndarray) -> np.ndarray:
-        """The same of one camera's values (T, K, 2), all others 0."""
+        """The same for one camera's values (T, K, 2), with 0 for all others."""
         columns = self.projector[..., 2 * camera : 2 * camera + 2]
         return np.einsum("tkef,tkf->tke", columns, np.nan_to_num(values))
 
@@ -222,18 +229,18 @@ class KeypointMotion:
 def build_motion(
     keypoints: np.ndarray, rig: Rig, times: np.ndarray, start: np.ndarray | None = None
 ) -> KeypointMotion:
-    """Fit moving points to ``keypoints`` (T, C, 135, 3) x, y, confidence, 0 = not seen.
+    """Fit moving points to ``keypoints`` (T, C, 135, 3): x, y, confidence; 0 = not seen.
 
-    ``start`` (T, K, 3): points of nearly the same keypoints, NaN = not known.
+    ``start``: (T, K, 3) points of nearly the same keypoints, NaN = unknown.
     """
     pixels, seen = _chosen(keypoints)
     scale = pixel_scale(rig)[:, None]
     if start is None:
         points, valid = _triangulated(pixels, seen, rig)
         sigma = np.broadcast_to(4.0 * scale, seen.shape[1:])
-        rounds = MOTION_ROUNDS
+        rounds = 3
     else:
-        points, valid, rounds = start, seen, MOTION_ROUNDS - 1
+        points, valid, rounds = start, seen, 2
     for _ in range(rounds):
         smooth = smooth_paths(times, points).points
         expected, by_point = _project(smooth, rig)
@@ -250,7 +257,7 @@ def build_motion(
 
 
 def with_keypoints(motion: KeypointMotion, keypoints: np.ndarray) -> KeypointMotion:
-    """Other ``keypoints`` (T, C, 135, 3) of the same motion."""
+    """The same motion with other ``keypoints`` (T, C, 135, 3)."""
     pixels, seen = _chosen(keypoints)
     return _seeing(pixels, seen, motion.rig, motion.paths, motion.sigma, motion.bias)
 
@@ -271,19 +278,19 @@ def _seeing(
 
 
 def _chosen(keypoints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (T, C, K, 2) and whether they are seen (T, C, K), of :data:`POINTS`."""
+    """Pixels (T, C, K, 2) and visibility (T, C, K) of :data:`POINTS`."""
     chosen = keypoints[:, :, POINTS]
     return chosen[..., :2], chosen[..., 2] >= MIN_CONFIDENCE
 
 
 def _triangulated(pixels: np.ndarray, seen: np.ndarray, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
-    """Points (T, K, 3) of each set on its own, and who agrees with them (T, C, K)."""
+    """Points (T, K, 3) of each set by itself, and the views that agree with them (T, C, K)."""
     sets, views, count = seen.shape
     found = triangulate(
         np.swapaxes(pixels, 1, 2).reshape(-1, views, 2),
         np.swapaxes(seen, 1, 2).reshape(-1, views).astype(float),
         rig,
-        max_error_px=SLIPPED_PX_AT_1080P,
+        max_error_px=60.0,  # at 1080p: moving limbs in views that are frames late
     )
     inlier = np.swapaxes(found.inlier.reshape(sets, count, views), 1, 2)
     return found.points.reshape(sets, count, 3), inlier
@@ -321,7 +328,7 @@ def _refitted(
     valid: np.ndarray,
     sigma: np.ndarray,
 ) -> np.ndarray:
-    """One robust Gauss-Newton step of each point of each set; NaN where two views do not see it."""
+    """One robust Gauss-Newton step of each point; NaN if fewer than two views see it."""
     size = np.linalg.norm(np.nan_to_num(residual), axis=-1)
     weight = np.where(valid, 1 / (sigma**2 * (1 + (size / (2 * sigma)) ** 2)), 0.0)
     rows = np.nan_to_num(by_point)
@@ -335,8 +342,10 @@ def _refitted(
 
 
 def _scatter(size: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Robust standard deviation (C, K) a coordinate of residuals of length ``size`` (T, C, K);
-    few samples count little against the view's others."""
+    """Robust standard deviation (C, K) per coordinate of residuals of length ``size`` (T, C, K).
+
+    Keypoints with few samples are shrunk to the median of their view.
+    """
     of_point = known_median(np.where(known, size, np.nan)) / 1.177  # of a Rayleigh median
     number = known.sum(0)
     of_view = known_median(np.where(number > 0, of_point, np.nan).T)[:, None]
@@ -347,7 +356,7 @@ def _scatter(size: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 def known_median(values: np.ndarray) -> np.ndarray:
-    """Median over the first axis, 0 where there is none."""
+    """Median of the finite values over the first axis; 0 where there are none."""
     order = np.sort(values, 0)  # NaN last
     count = np.isfinite(values).sum(0)
     low = np.take_along_axis(order, np.maximum(count - 1, 0)[None] // 2, 0)[0]

@@ -22,42 +22,41 @@ from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.solve.time_series import filled_linearly
 from intercap_core.scene.keypoint_motion import KeypointMotion, build_motion
 
-# Of the poses as they are given, beside the offsets in the keypoints' equations: rotation, rad, and
-# translation, m. Tuned on the studio.
-POSE_SIGMA = np.r_[np.full(3, np.radians(1.0)), np.full(3, 0.02)]
-OFFSET_SIGMA_S = 0.05  # prior of an offset, told by keypoints alone; tuned on the studio
-# The noise over time is chosen from these by likelihood; a short list tuned on the studio.
+OFFSET_SIGMA_S = 0.05  # prior of an offset; tuned on the studio
+# Correlation times, seconds, from which the likelihood chooses; tuned on the studio.
 ERROR_LENGTHS_S = {"rough": (0.2, 0.5, 1.0), "smooth": (0.15, 0.3, 0.6)}
-FAST_SHARES = (0.03, 0.1, 0.25, 0.6)  # of the variance that is new in each image
-CONSTANT_VARIANCE = 100.0  # of a series' constant part, of its own scatter: free in effect
-MISSING_VARIANCE = 1e6  # of a sample that is not there: no weight in effect
+CONSTANT_VARIANCE = 100.0  # of a series' constant, over its other variance: nearly unconstrained
 TIMING_INFLATION = 2.0  # of sigmas: keypoints of one person err together; tuned on the studio
-SPEED_ERROR = 0.08  # of an offset: paths are smoothed too much or too little; tuned on the studio
+SPEED_ERROR = 0.08  # relative error of an offset due to smoothing; tuned on the studio
 WINDOW_SETS = 96  # covariances over time are dense within a window, none reaches beyond it
-MIN_TIMING_SETS = 8  # fewer tell no time
-KEYPOINT_OFFSET_KNOWN_S = 0.02  # sigma, from keypoints alone: less certain is not known
-MIN_VALID_SHARE = 0.9  # of a series that helps to choose the noise
+MIN_TIMING_SETS = 8  # fewer give no estimate
+KEYPOINT_OFFSET_KNOWN_S = 0.02  # standard deviation above which an offset is unknown; tuned
 
 
 @dataclass(frozen=True)
 class TimeNoise:
-    """``kind`` "rough" exp(-|d| / length) or "smooth" exp(-d^2 / (2 length^2)); ``length`` s;
-    ``fast`` share of the variance that is new in each image; ``scale``: standard deviation;
-    ``constant``: variance of what never changes, of the rest's."""
+    """Covariance of a residual over time."""
 
     kind: str
+    """"rough", exp(-|d| / length), or "smooth", exp(-d^2 / (2 length^2))."""
     length: float
+    """Correlation time, seconds."""
     fast: float
+    """Share of the variance that is independent in each image."""
     scale: float
+    """Standard deviation."""
     constant: float = CONSTANT_VARIANCE
+    """Variance of the constant part, relative to the rest."""
 
     def covariance(self, times: np.ndarray) -> np.ndarray:
-        """(T, T), of unit ``scale``, with the constant part."""
+        """(T, T) covariance of unit ``scale``, with the constant part."""
         return _covariance(times, self.kind, self.length, self.fast) + self.constant
 
     def precision(self, times: np.ndarray, variance: np.ndarray) -> np.ndarray:
-        """Inverse covariances (N, T, T) of N series, in units of ``scale``; ``variance`` (N, T) is
-        added to each sample: :data:`MISSING_VARIANCE` where there is none."""
+        """Inverse covariances (N, T, T) of N series, in units of ``scale``.
+
+        ``variance``: (N, T) is added to each sample; very large if the sample is missing.
+        """
         unique, of_series = np.unique(variance, axis=0, return_inverse=True)
         whole = np.broadcast_to(self.covariance(times), (*unique.shape, len(times))).copy()
         rows = np.arange(len(times))
@@ -67,7 +66,7 @@ class TimeNoise:
 
 def fit_noise(times: np.ndarray, series: np.ndarray, valid: np.ndarray) -> TimeNoise:
     """Choose the noise model for ``series`` (N, T) of unit variance, from those with few gaps."""
-    whole = np.flatnonzero(valid.mean(1) >= MIN_VALID_SHARE)
+    whole = np.flatnonzero(valid.mean(1) >= 0.9)
     if len(whole) < 10 or len(times) < 8:
         return TimeNoise("rough", 0.5, 0.25, 1.0)
     rows = np.where(valid[whole], series[whole], np.nan)
@@ -76,7 +75,7 @@ def fit_noise(times: np.ndarray, series: np.ndarray, valid: np.ndarray) -> TimeN
     best, chosen = -np.inf, TimeNoise("rough", 0.5, 0.25, 1.0)
     for kind, lengths in ERROR_LENGTHS_S.items():
         for length in lengths:
-            for fast in FAST_SHARES:
+            for fast in (0.03, 0.1, 0.25, 0.6):
                 covariance = _covariance(times, kind, length, fast) + CONSTANT_VARIANCE
                 low = np.linalg.cholesky(covariance)
                 energy = (np.linalg.solve(low, rows.T) ** 2).sum(0)
@@ -100,14 +99,19 @@ CLUSTER = np.r_[np.arange(25), np.repeat([25, 26, 27], 8)]
 
 @dataclass(frozen=True, eq=False)
 class TimeOffsets:
-    """``offset`` (C,) s and ``sigma`` (C,) s, NaN = too little evidence; ``information`` (C, C)
-    1/s^2 and ``vector`` (C,) 1/s: the normal equations ``information @ offset = vector`` of all
-    cameras' offsets, before the master's is set to 0 and without any prior on them."""
+    """Time offsets, and their normal equations ``information`` @ offset = ``vector``.
+
+    The equations have no prior, and the master's offset is not set to 0.
+    """
 
     offset: np.ndarray
+    """(C,) seconds."""
     sigma: np.ndarray
+    """(C,) standard deviation, seconds; NaN = too little evidence."""
     information: np.ndarray
+    """(C, C) 1/s^2."""
     vector: np.ndarray
+    """(C,) 1/s."""
 
 
 def find_offsets(
@@ -121,9 +125,11 @@ def find_offsets(
 ) -> TimeOffsets:
     """Estimate when each camera exposes, seconds after the master.
 
-    ``keypoints`` (T, C, 135, 3) x, y, confidence of the subject by image, 0 = not seen; ``slip``
-    (T, C) whole sets by which an image is older than its set; ``times`` (T,) s; ``start`` (C,) s,
-    about when they do, where that is not nearly together.
+    Args:
+        keypoints: (T, C, 135, 3) x, y, confidence of the subject by image; 0 = not seen.
+        slip: (T, C) whole sets by which an image is older than its set.
+        times: (T,) seconds.
+        start: (C,) seconds, approximate offsets; None = nearly 0.
     """
     shown = keypoints_by_moment(keypoints, slip)
     views = len(rig)
@@ -145,7 +151,9 @@ def estimate_offsets(motion: KeypointMotion, master: int) -> TimeOffsets:
     """The time offsets that explain a motion's residuals."""
     views = len(motion.rig)
     matrices, vectors = keypoint_equations(motion, motion.residual, _columns(motion))
-    prior = np.r_[np.full(views, OFFSET_SIGMA_S**-2.0), np.tile(POSE_SIGMA**-2.0, views)]
+    # given poses are uncertain by a degree and 2 cm; tuned on the studio
+    pose_sigma = np.repeat([np.radians(1.0), 0.02], 3)
+    prior = np.r_[np.full(views, OFFSET_SIGMA_S**-2.0), np.tile(pose_sigma**-2.0, views)]
     free = np.flatnonzero(np.arange(7 * views) != master)
     matrix, vector = matrices.sum(0), vectors.sum(0)
     covariance = np.linalg.inv((matrix + np.diag(prior))[np.ix_(free, free)])
@@ -195,7 +203,7 @@ def _inflation(
 
 
 def keypoints_by_moment(keypoints: np.ndarray, slip: np.ndarray) -> np.ndarray:
-    """Keypoints (T, C, 135, 3) of the images that show each set's moment; 0 where none does."""
+    """Keypoints (T, C, 135, 3) of the images that show each set's moment; 0 = no such image."""
     image_of = images_of_moments(slip, np.asarray(keypoints[..., 2].any(-1)))
     shown = keypoints[np.maximum(image_of, 0), np.arange(image_of.shape[1])]
     shown[image_of < 0] = 0
@@ -225,7 +233,7 @@ def estimate_noise(motion: KeypointMotion) -> TimeNoise:
 def precisions(motion: KeypointMotion, noise: TimeNoise, part: slice) -> np.ndarray:
     """Inverse covariances (K, C, W, W) over time of one window, the same for x and y."""
     valid = np.moveaxis(motion.valid[part], 0, 2)  # (C, K, W)
-    variance = np.where(valid, 0.0, MISSING_VARIANCE)
+    variance = np.where(valid, 0.0, 1e6)  # practically no weight if missing
     views, count, size = variance.shape
     found = noise.precision(motion.times[part], variance.reshape(-1, size))
     return np.swapaxes(found.reshape(views, count, size, size), 0, 1)
@@ -239,15 +247,17 @@ def keypoint_equations(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Each keypoint's normal matrix (K, n, n) and vector (K, n).
 
-    ``columns`` (n, T, K, 2C) are projected residuals' derivatives by the unknowns, ``residual`` (T,
-    C, K, 2) px; ``constant``: see :class:`TimeNoise`.
+    Args:
+        residual: (T, C, K, 2) px.
+        columns: (n, T, K, 2C) derivatives of the projected residuals by the unknowns.
+        constant: see :class:`TimeNoise`.
     """
     noise = replace(estimate_noise(motion), constant=constant)
     series = as_series(motion.projected(residual))
     size, _, count, _ = columns.shape
     matrices, vectors = np.zeros((count, size, size)), np.zeros((count, size))
     parts = windows(len(motion.times))
-    # A constant that is not free lasts beyond a window: windows do not add up.
+    # A constrained constant is common to all windows, so their information does not add up.
     share = 1.0 if constant >= CONSTANT_VARIANCE else 1 / len(parts)
     for part in parts:
         precision = precisions(motion, noise, part) * share
@@ -262,15 +272,14 @@ def keypoint_equations(
 
 
 def _columns(motion: KeypointMotion) -> np.ndarray:
-    """How the projected residuals (T, K, 2C) change with each camera's offset, then with each
-    camera's six pose errors: (7C, T, K, 2C)."""
+    """Derivatives (7C, T, K, 2C) of the projected residuals by offsets, then by pose errors."""
     offsets = [motion.projected_of(c, motion.speed_px[:, c]) for c in range(len(motion.rig))]
     return np.concatenate([np.stack(offsets), pose_columns(motion)])
 
 
 def pose_columns(motion: KeypointMotion) -> np.ndarray:
-    """How the projected residuals change with each camera's turn about its centre, rad, and its
-    move, m, in the master's axes: (6C, T, K, 2C)."""
+    """Derivatives (6C, T, K, 2C) of the projected residuals by each camera's rotation about its
+    centre, rad, and translation, m, in the master's axes."""
     poses = []
     for c, camera in enumerate(motion.rig):
         arm = np.nan_to_num(motion.paths.points - camera.master_from_colour[:3, 3])

@@ -15,18 +15,22 @@ Devices that bring their own intrinsics are not tested.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 
 from intercap_core.geometry.camera import projection
-from intercap_core.geometry.camera.intrinsics import Intrinsics
-from intercap_core.geometry.camera.rig import Camera, Rig
+from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.scene.background import Background
-from intercap_core.scene.constraints import MIN_BODY_POINTS, BodyConstraint, body_views
+from intercap_core.scene.constraints import (
+    MIN_BODY_POINTS,
+    BodyConstraint,
+    BodyViews,
+    body_views,
+)
 from intercap_core.scene.keypoint_motion import KeypointMotion, build_motion
 from intercap_core.scene.keypoint_timing import (
     CLUSTER,
@@ -38,28 +42,24 @@ from intercap_core.scene.registration import STATIC, Registration, RigEstimate, 
 from intercap_core.scene.subject_views import SubjectViews
 from intercap_core.scene.surfaces import background_surfaces
 
-# Poses by a rig's own calibration, without what happened to the tripods since: for cameras whose
-# lenses keypoints alone can judge. Tuned on the studio.
-CALIBRATION_ROTATION_SIGMA = np.radians(0.3)
-CALIBRATION_TRANSLATION_SIGMA_M = 0.006
-VIEW_BIAS_VARIANCE = 2.0  # of a joint's constant error in a view, over its scatter's; tuned
+VIEW_BIAS_VARIANCE = 2.0  # of a joint's constant error in a view, over that of its noise; tuned
 MIN_LENS_GAIN = 15.0  # log likelihood; chance brings up to 9 on the studio
-LENS_FIT_RANGE = (0.5, 1.5)  # how much of the exchange's pattern must be there; 1 is all of it
-SUSPICIOUS = 1.3  # a camera's residuals over usual ones, else nothing is tried; tuned on the studio
-MAX_SUSPECTS = 4  # every pair of them is tried
-MUCH_BETTER = 0.8  # of the residuals with the lenses as given; tuned on the studio
+SUSPICIOUS = 1.3  # residuals over usual ones from which a camera is tested; tuned on the studio
+MUCH_BETTER = 0.8  # residuals with exchanged over those with given lenses; tuned on the studio
 
 
 @dataclass(frozen=True)
 class LensPair:
-    """Cameras ``first`` and ``second`` have each other's lenses; ``gain`` in log likelihood, less
-    where the keypoints disagree by more than their noise; ``share`` of the exchange's pattern that
-    the residuals hold."""
+    """Hypothesis that two cameras have each other's lenses."""
 
     first: int
+    """Camera index."""
     second: int
+    """Camera index."""
     gain: float
+    """Log likelihood ratio, reduced if keypoints disagree by more than their noise."""
     share: float
+    """Share of the expected pattern that the residuals contain; 1 = all of it."""
 
 
 def lenses_by_keypoints(
@@ -70,11 +70,13 @@ def lenses_by_keypoints(
     rotation_sigma: float,
     translation_sigma: float,
 ) -> list[LensPair]:
-    """The pairs whose colour lenses should be exchanged; each camera at most once.
+    """Find pairs of cameras whose colour lenses are exchanged; each camera at most once.
 
-    ``keypoints`` (T, C, 135, 3) x, y, confidence of the subject by moment, slips put right;
-    ``times`` (T,) s; ``rotation_sigma`` rad and ``translation_sigma`` m about each axis: how well
-    the poses are known.
+    Args:
+        keypoints: (T, C, 135, 3) x, y, confidence of the subject by moment.
+        times: (T,) seconds.
+        rotation_sigma: standard deviation of the poses about each axis, rad.
+        translation_sigma: standard deviation of the poses along each axis, metres.
     """
     pairs = lens_gains(
         keypoints, rig, times, rotation_sigma=rotation_sigma, translation_sigma=translation_sigma
@@ -82,7 +84,7 @@ def lenses_by_keypoints(
     chosen: list[LensPair] = []
     for pair in sorted(pairs, key=lambda p: -p.gain):
         used = {c for other in chosen for c in (other.first, other.second)}
-        good = pair.gain >= MIN_LENS_GAIN and LENS_FIT_RANGE[0] <= pair.share <= LENS_FIT_RANGE[1]
+        good = pair.gain >= MIN_LENS_GAIN and 0.5 <= pair.share <= 1.5
         if good and not used & {pair.first, pair.second}:
             chosen.append(pair)
     return chosen
@@ -96,7 +98,7 @@ def lens_gains(
     rotation_sigma: float,
     translation_sigma: float,
 ) -> list[LensPair]:
-    """What each exchange of two unlike lenses for images of one size would gain."""
+    """Test each exchange of two different lenses for images of one size."""
     size = [(camera.colour.width, camera.colour.height) for camera in rig]
     lenses = rig.colour_parameters
     orders = [
@@ -123,7 +125,7 @@ def lens_gains(
             continue
         pattern = np.zeros(len(matrix))
         pattern[[place[a, b], place[b, a]]] = 1.0
-        # The part of the pattern that no poses explain, and the poses beside a share of it.
+        # The part of the pattern that no poses explain.
         pattern[number:] = -poses @ (matrix @ pattern)[number:]
         energy = float(pattern @ matrix @ pattern + prior @ pattern[number:] ** 2) + 1e-12
         linear = float(pattern @ vector)
@@ -137,7 +139,7 @@ def lens_gains(
 
 
 def _lens_shift(motion: KeypointMotion, camera: int, other: int) -> np.ndarray:
-    """By how much (T, K, 2) px the points move in a ``camera`` with the ``other``'s lens."""
+    """Displacement (T, K, 2), px, of the points in ``camera`` if it had the lens of ``other``."""
     in_camera = apply(motion.rig[camera].colour_from_master, np.nan_to_num(motion.paths.points))
     lenses = motion.rig.colour_parameters
     moved = projection.project(in_camera, lenses[other]) - projection.project(
@@ -148,15 +150,19 @@ def _lens_shift(motion: KeypointMotion, camera: int, other: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class LensExchange:
-    """Cameras ``first`` and ``second`` got each other's lens (``whole``) or all of it but the
-    distortion; ``before`` and ``after``: median distance of their backgrounds to the other
-    cameras', metres, NaN where keypoints decided."""
+    """Two cameras that were given each other's intrinsics."""
 
     first: int
+    """Camera index."""
     second: int
+    """Camera index."""
     whole: bool
+    """The distortion is exchanged as well."""
     before: float
+    """Median distance of both backgrounds to those of the other cameras, as given, metres; NaN if
+    the keypoints decided."""
     after: float
+    """The same once corrected."""
 
 
 def exchange_lenses(
@@ -166,126 +172,104 @@ def exchange_lenses(
     times: np.ndarray,
     master: int,
 ) -> tuple[Rig, list[LensExchange]]:
-    """Return the rig with exchanged lenses put right, and what was exchanged.
+    """Return the rig with exchanged lenses corrected, and the exchanges.
 
-    ``backgrounds`` of the C cameras; ``subject`` by moment; ``times`` (T,) s.
+    Args:
+        backgrounds: of the C cameras.
+        subject: by moment.
+        times: (T,) seconds.
+        master: camera whose pose is fixed.
     """
-    found = _by_background(rig, backgrounds, subject, times, master)
+    exchanges = _BackgroundTest(backgrounds, body_views(subject, times), master).exchanges(rig)
     blind = [c for c, camera in enumerate(rig) if camera.depth is None]
     if len(blind) >= 2:
+        # Poses as calibrated, before anybody touched the tripods; tuned on the studio.
         for pair in lenses_by_keypoints(
             subject.keypoints,
             rig,
             times,
-            rotation_sigma=CALIBRATION_ROTATION_SIGMA,
-            translation_sigma=CALIBRATION_TRANSLATION_SIGMA_M,
+            rotation_sigma=np.radians(0.3),
+            translation_sigma=0.006,
         ):
             if pair.first in blind and pair.second in blind:
-                found.append(LensExchange(pair.first, pair.second, True, np.nan, np.nan))
-    for one in found:
-        rig = swap_lenses(rig, one.first, one.second, whole=one.whole)
-    return rig, found
+                exchanges.append(LensExchange(pair.first, pair.second, True, np.nan, np.nan))
+    for exchange in exchanges:
+        rig = swap_lenses(rig, exchange.first, exchange.second, whole=exchange.whole)
+    return rig, exchanges
 
 
 def swap_lenses(rig: Rig, first: int, second: int, *, whole: bool) -> Rig:
-    """The rig with the lenses of two cameras exchanged, without the distortion unless ``whole``;
-    depth on the colour grid goes with it."""
+    """Exchange the lenses of two cameras, without the distortion unless ``whole``.
+
+    Depth on the colour grid is exchanged with them.
+    """
     cameras = list(rig.cameras)
     for own, other in ((first, second), (second, first)):
-        cameras[own] = _with_lens(rig[own], _lens(rig[own].colour, rig[other].colour, whole))
+        camera, lens = rig[own], rig[other].colour
+        if not whole:
+            lens = replace(camera.colour, fx=lens.fx, fy=lens.fy, cx=lens.cx, cy=lens.cy)
+        depth = lens if camera.aligned else camera.depth
+        cameras[own] = replace(camera, colour=lens, depth=depth)
     return Rig(tuple(cameras))
 
 
-def _lens(own: Intrinsics, other: Intrinsics, whole: bool) -> Intrinsics:
-    if whole:
-        return other
-    return replace(own, fx=other.fx, fy=other.fy, cx=other.cx, cy=other.cy)
+@dataclass(frozen=True, eq=False)
+class _BackgroundTest:
+    """Tests exchanges by the distances between the backgrounds of all cameras."""
 
+    backgrounds: Sequence[Background | None]
+    """Of the C cameras."""
+    views: BodyViews
+    """Keypoints of the subject, which also constrain the poses."""
+    master: int
+    """Camera whose pose is fixed."""
 
-def _with_lens(camera: Camera, lens: Intrinsics) -> Camera:
-    depth = lens if camera.aligned else camera.depth
-    return replace(camera, colour=lens, depth=depth)
+    def exchanges(self, rig: Rig) -> list[LensExchange]:
+        """Exchanges among cameras with depth on the colour grid; each camera at most once."""
+        free = [c for c, cam in enumerate(rig) if cam.aligned and self.backgrounds[c] is not None]
+        exchanges: list[LensExchange] = []
+        while len(free) >= 2 and (best := self._best(rig, free)) is not None:
+            exchanges.append(best)
+            free = [c for c in free if c not in (best.first, best.second)]
+            rig = swap_lenses(rig, best.first, best.second, whole=best.whole)
+        return exchanges
 
-
-def _by_background(
-    rig: Rig,
-    backgrounds: Sequence[Background | None],
-    subject: SubjectViews,
-    times: np.ndarray,
-    master: int,
-) -> list[LensExchange]:
-    aligned = [c for c, camera in enumerate(rig) if camera.aligned and backgrounds[c] is not None]
-    if len(aligned) < 2:
-        return []
-    found: list[LensExchange] = []
-    while True:
-        free = [c for c in aligned if all(c not in (one.first, one.second) for one in found)]
-        best = _best_exchange(rig, free, backgrounds, subject, times, master)
-        if best is None:
-            return found
-        found.append(best)
-        rig = swap_lenses(rig, best.first, best.second, whole=best.whole)
-
-
-def _best_exchange(
-    rig: Rig,
-    cameras: list[int],
-    backgrounds: Sequence[Background | None],
-    subject: SubjectViews,
-    times: np.ndarray,
-    master: int,
-) -> LensExchange | None:
-    """The exchange that brings two of ``cameras`` nearest to the others; None where none does."""
-    given = _residuals(rig, backgrounds, subject, times, master)
-    if not given:
-        return None
-    # a wrong lens biases its neighbours' poses, too: the lowest quartile is the usual residual.
-    usual = np.quantile(list(given.values()), 0.25)
-    suspects = [c for c in cameras if _of(given, c) > SUSPICIOUS * usual]
-    suspects = sorted(sorted(suspects, key=lambda c: -_of(given, c))[:MAX_SUSPECTS])
-    found = []
-    for a, b in combinations(suspects, 2):
-        if not _interchangeable(rig[a].colour, rig[b].colour):
-            continue
-        before = _of(given, a, b)
-        for whole, candidate in _variants(rig, a, b):
-            after = _of(_residuals(candidate, backgrounds, subject, times, master), a, b)
+    def _best(self, rig: Rig, cameras: list[int]) -> LensExchange | None:
+        """The exchange that brings two of ``cameras`` closest to the others, if any does."""
+        given = self._residuals(rig)
+        if not given:
+            return None
+        # A wrong lens also biases the poses of its neighbours: the lowest quartile is usual.
+        usual = np.quantile(list(given.values()), 0.25)
+        suspects = [c for c in cameras if _mean_of(given, c) > SUSPICIOUS * usual]
+        suspects = sorted(sorted(suspects, key=lambda c: -_mean_of(given, c))[:4])
+        better = []
+        for (a, b), whole in product(combinations(suspects, 2), (True, False)):
+            own, other = rig[a].colour, rig[b].colour
+            same_size = (own.width, own.height) == (other.width, other.height)
+            if not same_size or np.array_equal(own.parameters, other.parameters):
+                continue
+            before = _mean_of(given, a, b)
+            after = _mean_of(self._residuals(swap_lenses(rig, a, b, whole=whole)), a, b)
             if after < MUCH_BETTER * before:
-                found.append(LensExchange(a, b, whole, before, after))
-    return min(found, key=lambda one: one.after, default=None)
+                better.append(LensExchange(a, b, whole, before, after))
+        return min(better, key=lambda exchange: exchange.after, default=None)
+
+    def _residuals(self, rig: Rig) -> dict[tuple[int, int], float]:
+        """Held-out residual by pair, metres, with poses refined on the background."""
+        surfaces = background_surfaces(rig, self.backgrounds)
+        registration = Registration(rig, [SurfaceLayer(surfaces, STATIC)], self.master)
+        enough = len(self.views.points) >= MIN_BODY_POINTS
+        body = [BodyConstraint(self.views, rig)] if enough else []
+        refined = registration.solve(RigEstimate.start(rig), body).estimate
+        residuals = registration.residuals(refined, STATIC)
+        return {
+            (int(a), int(b)): float(median)
+            for (a, b), median in zip(residuals.pairs, residuals.median, strict=True)
+        }
 
 
-def _variants(rig: Rig, a: int, b: int) -> Iterator[tuple[bool, Rig]]:
-    for whole in (True, False):
-        yield whole, swap_lenses(rig, a, b, whole=whole)
-
-
-def _interchangeable(one: Intrinsics, other: Intrinsics) -> bool:
-    same_image = (one.width, one.height) == (other.width, other.height)
-    return same_image and not np.array_equal(one.parameters, other.parameters)
-
-
-def _residuals(
-    rig: Rig,
-    backgrounds: Sequence[Background | None],
-    subject: SubjectViews,
-    times: np.ndarray,
-    master: int,
-) -> dict[tuple[int, int], float]:
-    """Held-out residual by pair, metres, after the poses were refined on the background."""
-    surfaces = background_surfaces(rig, backgrounds)
-    registration = Registration(rig, [SurfaceLayer(surfaces, STATIC)], master)
-    views = body_views(subject, times)
-    body = [BodyConstraint(views, rig)] if len(views.points) >= MIN_BODY_POINTS else []
-    refined = registration.solve(RigEstimate.start(rig), body).estimate
-    residuals = registration.residuals(refined, STATIC)
-    return {
-        (int(a), int(b)): float(median)
-        for (a, b), median in zip(residuals.pairs, residuals.median, strict=True)
-    }
-
-
-def _of(residuals: dict[tuple[int, int], float], *cameras: int) -> float:
-    """Mean over the pairs that one of the cameras is in; NaN where there is none."""
+def _mean_of(residuals: dict[tuple[int, int], float], *cameras: int) -> float:
+    """Mean over the pairs with one of the cameras; NaN if there are none."""
     own = [value for pair, value in residuals.items() if set(pair) & set(cameras)]
     return float(np.mean(own)) if own else float("nan")

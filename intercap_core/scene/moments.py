@@ -21,16 +21,13 @@ from intercap_core.scene.starts import (
 )
 from intercap_core.scene.subject_views import SubjectViews, find_subject_views
 
-LITTLE_ADDED = 0.5  # of a stated deviation that is left: the start rests on what was stated
-
 
 def check_stated_starts(
     starts: StartTimes, stated: StatedStarts, slips: Slips, timing: TimeOffsets
 ) -> StartTimes:
-    """The starts once slips and offsets are known: without what was stated of cameras whose
-    keypoints say otherwise.
+    """Reject stated starts that slips and time offsets contradict.
 
-    ``slips`` were found with the cameras in step, ``timing`` beside both.
+    ``slips`` are relative to ``starts``, ``timing`` to both.
     """
     late, sigma = starts.late.copy(), starts.sigma.copy()
     denied, step = starts.denied.copy(), starts.step_s
@@ -62,8 +59,10 @@ def describe_stated_start(
     offset: float,
     offset_sigma: float,
 ) -> str:
-    """What became of a stated start, in words; "" where there is nothing to tell. ``offset`` s,
-    with its standard deviation, is what is left beside whole sets."""
+    """Describe how a stated start was used; "" if there is nothing to report.
+
+    ``offset`` and ``offset_sigma``: seconds by which the start differs from whole sets.
+    """
     if not stated.known[camera]:
         return ""
     source, late = stated.source[camera], float(stated.late[camera])
@@ -74,7 +73,7 @@ def describe_stated_start(
             f"{source} has it start {describe_start(late)}; the keypoints deny that and were "
             f"followed: {describe_start(found)}"
         )
-    if not offset_sigma < LITTLE_ADDED * stated.sigma[camera]:
+    if not offset_sigma < 0.5 * stated.sigma[camera]:  # the keypoints add little
         return (
             f"its start rests on {source}: {describe_start(found)}, known to {offset_sigma:.3f} s; "
             "the keypoints tell too little"
@@ -89,16 +88,20 @@ def describe_stated_start(
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """``slip`` (T, C) whole sets by which images are older than their set says, by ``starts`` and
-    ``slips`` together; ``image_of`` (T, C) the set whose image shows each set's moment, -1 = none;
-    what the keypoints say of the cameras' ``timing``; the ``subject`` by moment."""
+    """Assignment of images to the moments that they show."""
 
     starts: StartTimes
+    """Start of each camera."""
     slips: Slips
+    """Late images, relative to ``starts``."""
     slip: np.ndarray
+    """(T, C) whole sets by which images are older than their set, by starts and slips together."""
     image_of: np.ndarray
+    """(T, C) set whose image shows each set's moment; -1 = none."""
     timing: TimeOffsets
+    """Time offsets from the keypoints."""
     subject: SubjectViews
+    """The subject by moment."""
 
 
 def find_moments(
@@ -111,10 +114,14 @@ def find_moments(
     master: int,
     stated: StatedStarts | None = None,
 ) -> Moments:
-    """Bring the views into step: whole recordings first, then images, then parts of a frame.
+    """Synchronise the views: starts of recordings, then late images, then sub-frame offsets.
 
-    ``times`` (T,) s of the sets; ``available`` (T, C): the set has an image of the camera. A camera
-    whose start cannot be told shows no moment. ``stated``: when they started, beside the keypoints.
+    A camera with an undetermined start shows no moment.
+
+    Args:
+        times: (T,) seconds of the sets.
+        available: (T, C) bool, the set has an image of the camera.
+        stated: starts from other sources than the keypoints.
     """
     stated = stated or StatedStarts.nothing(len(rig))
     starts = find_starts(detections, rig, times, available, master=master, stated=stated)

@@ -24,44 +24,33 @@ from intercap_core.scene.starts import PRIOR_OFFSET_S
 from intercap_core.scene.surfaces import DepthSurface
 
 SURFACE_SIGMA_FLOOR_M = 0.003  # of point-to-plane residuals; tuned on the studio
-# Prior on the start of the registration: errors of a careful calibration; tuned on the studio.
-PRIOR_TRANSLATION_M = 0.01
-PRIOR_ROTATION_RAD = np.radians(0.5)
+PRIOR_TRANSLATION_M = 0.01  # error of a careful calibration; tuned on the studio
+PRIOR_ROTATION_RAD = np.radians(0.5)  # the same
 PRIOR_BIAS_M = 0.003  # systematic depth error is at most 11 mm + 0.1 % (Azure Kinect DK data sheet)
-LEVER_M = 2.5  # from a camera to what it looks at, in a ring: turns a rotation into metres
-PAIR_QUERIES = 2500  # points of one camera that are sought in another, over all moments
-HELD_OUT_EVERY = 4  # of each surface's cells, one judges instead of taking part
-MOMENTS_APART_M = 10.0  # in the search tree's fourth axis: farther than any search
+HELD_OUT_EVERY = 4  # one of so many cells of a surface is held out
 SURFACE_SEARCH_M = 0.12  # distance to the nearest cell, beyond the widest gate
 # Gates on the distance to the plane, one an iteration, annealed; tuned on the studio.
 GATES_M = (0.08, 0.05, 0.03, 0.02, 0.015, 0.015, 0.015)
-HELD_GATES_M = (0.08, 0.04, 0.04)  # where the poses are held
+HELD_GATES_M = (0.08, 0.04, 0.04)  # the same if the poses are fixed
 MIN_NORMALS_COSINE = 0.85  # 32 degrees: one surface's normals in two views; tuned on the studio
-# Of the weight that two cameras' background has in the registration, one direction of normals has
-# at most this share; others gain at most this factor. Normals within 20 degrees are one direction.
-# Tuned on the studio.
-MAX_DIRECTION_SHARE, MAX_DIRECTION_GAIN, DIRECTION_COSINE = 0.8, 3.0, 0.94
+MAX_DIRECTION_SHARE = 0.8  # of a pair's weight, for one direction of normals; tuned on the studio
+MAX_DIRECTION_GAIN = (
+    3.0  # factor by which the weight of other directions grows; tuned on the studio
+)
 MIN_PAIR_POINTS = 60  # fewer correspondences are chance; tuned on the studio
-# Neighbouring residuals err together (lens, multipath, bias): a pair of cameras counts as at most
-# this many independent measurements each way. Tuned on the studio.
-STATIC_EFFECTIVE_POINTS = 10.0
-MOVING_EFFECTIVE_POINTS = 50.0  # over many moments and places
-
-
-_STEPS = 3  # until the mean of a direction that holds most of the weight stays
 
 
 def balance_directions(weight: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Weights (N,) of points with unit normals (N, 3), their sum unchanged, in which one direction
-    has at most ``MAX_DIRECTION_SHARE`` of it.
+    """Rescale weights (N,) of points with unit normals (N, 3) so that no direction dominates.
 
-    The others gain at most ``MAX_DIRECTION_GAIN`` times: specks of a bare floor's edge are no wall.
+    One direction keeps at most ``MAX_DIRECTION_SHARE`` of the total, which is unchanged. The others
+    grow at most by ``MAX_DIRECTION_GAIN``: specks at the edge of a bare floor are no wall.
     """
     total = weight.sum()
     inside = np.ones(len(weight), bool)
-    for _ in range(_STEPS):
+    for _ in range(3):  # until the mean of the dominant direction is stable
         mean = weight[inside] @ normals[inside]
-        inside = normals @ mean >= DIRECTION_COSINE * np.linalg.norm(mean)
+        inside = normals @ mean >= 0.94 * np.linalg.norm(mean)  # 20 degrees
     share = weight[inside].sum() / max(total, 1e-9)
     if share <= MAX_DIRECTION_SHARE or share >= 1:
         return weight
@@ -69,8 +58,10 @@ def balance_directions(weight: np.ndarray, normals: np.ndarray) -> np.ndarray:
     return weight * np.where(inside, (1 - (1 - share) * gain) / share, gain)
 
 
-ROTATION, TRANSLATION, BIAS, OFFSET = slice(0, 3), slice(3, 6), 6, 7
-FREEDOMS = 8  # of a camera
+# Unknowns of a camera: rotation 0:3, translation 3:6, depth bias, time offset
+BIAS = 6
+OFFSET = 7
+FREEDOMS = 8
 
 # Adds a group's normal equations: (poses (C, 4, 4), offset (C,)) -> matrix (C, 6, C, 6), gradient
 # (C, 6) of rotation and translation
@@ -79,41 +70,42 @@ Constraint = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 @dataclass(frozen=True)
 class SurfaceKind:
-    """How surfaces of one kind, background or foreground, enter the registration.
-
-    ``effective_points``: neighbouring residuals are correlated (lens, multipath, bias), so the
-    information of a pair of cameras is limited to that of so many independent measurements each
-    way. ``queries``: how many points of one camera are matched with another's, over all moments.
-    ``rounded``: two cameras see different flanks of such a surface, so the points of one lie off
-    the tangent planes of the other by a constant which is no misalignment: each pair's weighted
-    mean residual is subtracted.
-    """
+    """How surfaces of one kind, background or foreground, enter the registration."""
 
     effective_points: float
-    queries: int
+    """Independent measurements of a pair of cameras, each way, at most. Neighbouring residuals are
+    correlated (lens, multipath, bias)."""
     rounded: bool
+    """Two cameras see different flanks of such a surface. The points of one lie off the tangent
+    planes of the other by a constant which is no misalignment, so each pair's weighted mean
+    residual is subtracted."""
 
 
-STATIC = SurfaceKind(STATIC_EFFECTIVE_POINTS, PAIR_QUERIES, rounded=False)
-MOVING = SurfaceKind(MOVING_EFFECTIVE_POINTS, PAIR_QUERIES, rounded=True)
+# Numbers of points tuned on the studio; moving surfaces are seen at many moments and places.
+STATIC = SurfaceKind(effective_points=10.0, rounded=False)
+MOVING = SurfaceKind(effective_points=50.0, rounded=True)
 
 
 @dataclass(frozen=True)
 class SurfaceLayer:
-    """Surfaces seen at one moment: surfaces by camera index, depth camera's frame."""
+    """Surfaces seen at one moment."""
 
     surfaces: dict[int, DepthSurface]
+    """By camera index, in the depth camera's frame."""
     kind: SurfaceKind
+    """Background or foreground."""
 
 
 @dataclass
 class RigEstimate:
-    """Poses ``master_from_colour`` (C, 4, 4), depth bias (C,), metres to subtract, and time offset
-    (C,), seconds by which each camera exposes after the set's time."""
+    """Unknowns of the registration."""
 
     poses: np.ndarray
+    """(C, 4, 4) master_from_colour."""
     bias: np.ndarray
+    """(C,) metres to subtract from depth."""
     offset: np.ndarray
+    """(C,) seconds by which each camera exposes after the set's time."""
 
     @classmethod
     def start(cls, rig: Rig, offset: np.ndarray | None = None) -> RigEstimate:
@@ -125,48 +117,59 @@ class RigEstimate:
 
 @dataclass(frozen=True)
 class RigSolution:
-    """An estimate, its covariance (C, 8, C, 8) of rotation about the camera's centre, translation,
-    bias and offset (0 for what was held), and how far the last step moved a point, metres."""
+    """Result of the registration."""
 
     estimate: RigEstimate
+    """Poses, biases and offsets."""
     covariance: np.ndarray
+    """(C, 8, C, 8) of rotation about the camera's centre, translation, bias, offset; 0 = fixed."""
     last_step_m: float
+    """Displacement of a viewed point by the last step, metres."""
 
 
 @dataclass(frozen=True)
 class OffsetInformation:
-    """What is known of the offsets: ``information`` (C, C) 1/s^2 times them = ``vector`` (C,)."""
+    """Normal equations of the time offsets: ``information`` @ offset = ``vector``."""
 
     information: np.ndarray
+    """(C, C) 1/s^2."""
     vector: np.ndarray
+    """(C,) 1/s."""
 
 
 @dataclass
 class PairResiduals:
-    """``pairs`` (P, 2); ``count`` (P,) held-out correspondences; ``median`` (P,) metres."""
+    """Held-out point-to-plane residuals by pair of cameras."""
 
     pairs: np.ndarray
+    """(P, 2) camera indices."""
     count: np.ndarray
+    """(P,) correspondences."""
     median: np.ndarray
+    """(P,) median absolute residual, metres."""
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """All of one kind that one camera sees, of all moments: ``moment`` (N,) sets moments apart in
-    the search tree; ``queries`` and ``held_out`` are the rows that are sought in other cameras."""
+    """Surfaces of one kind of one camera at all moments, with a search tree."""
 
     surface: DepthSurface
+    """All points."""
     moment: np.ndarray
+    """(N,) fourth coordinate in the search tree, which separates the moments."""
     tree: cKDTree
+    """Of points and moments."""
     queries: np.ndarray
+    """Rows that are matched with other cameras."""
     held_out: np.ndarray
+    """Rows that are matched for evaluation only."""
 
     @classmethod
-    def of(cls, surfaces: Sequence[tuple[int, DepthSurface]], queries: int) -> _Seen:
+    def of(cls, surfaces: Sequence[tuple[int, DepthSurface]], queries: int = 2500) -> _Seen:
+        """Join ``surfaces`` by moment; at most ``queries`` points are matched."""
         surface = DepthSurface.joined([surface for _, surface in surfaces])
-        moment = np.repeat(
-            [MOMENTS_APART_M * at for at, _ in surfaces], [len(s) for _, s in surfaces]
-        )
+        # 10 m: beyond any search radius
+        moment = np.repeat([10.0 * at for at, _ in surfaces], [len(s) for _, s in surfaces])
         tree = cKDTree(np.column_stack([surface.points, moment]), balanced_tree=False)
         order = np.random.default_rng(0).permutation(len(surface))
         return cls(
@@ -180,22 +183,24 @@ class _Seen:
 
 @dataclass(frozen=True)
 class _Match:
-    """Correspondences of ``source`` with ``target``: distances (n,) to the planes, points and
-    normals (n, 3), both depth directions (n, 3), master frame, and the speed (n,)."""
+    """Correspondences of one camera's points with another's surface, master frame."""
 
     residual: np.ndarray
+    """(n,) distance to the plane, metres."""
     points: np.ndarray
+    """(n, 3) metres."""
     normals: np.ndarray
+    """(n, 3) unit."""
     own_ray: np.ndarray
+    """(n, 3) displacement of the point per metre of its own depth."""
     other_ray: np.ndarray
+    """(n, 3) the same for the target."""
     speed: np.ndarray
+    """(n,) m/s along the normal."""
 
 
 class Registration:
-    """Holds the surfaces and their search trees; estimates a rig from them.
-
-    ``master`` is the camera that stays, in place and in time.
-    """
+    """Estimates a rig from surfaces; the pose and time of the master are fixed."""
 
     def __init__(
         self,
@@ -204,8 +209,14 @@ class Registration:
         master: int,
         offset_sigma: np.ndarray | None = None,
     ) -> None:
-        """``offset_sigma`` (C,) s is what the start's offsets are off by, None = what synchronised
-        devices are."""
+        """
+        Args:
+            rig: cameras as given.
+            layers: surfaces by moment and kind.
+            master: index of the master.
+            offset_sigma: (C,) prior standard deviation of the given offsets, seconds; None = that
+                of synchronised devices.
+        """
         self.rig = rig
         self._offset_sigma = (
             np.full(len(rig), PRIOR_OFFSET_S) if offset_sigma is None else offset_sigma
@@ -218,9 +229,7 @@ class Registration:
                 for camera, surface in layer.surfaces.items():
                     if layer.kind == kind and len(surface):
                         by_camera.setdefault(camera, []).append((moment, surface))
-            self._seen[kind] = {
-                c: _Seen.of(surfaces, kind.queries) for c, surfaces in sorted(by_camera.items())
-            }
+            self._seen[kind] = {c: _Seen.of(surfaces) for c, surfaces in sorted(by_camera.items())}
 
     def solve(
         self,
@@ -230,11 +239,13 @@ class Registration:
         *,
         free_poses: bool | np.ndarray = True,
     ) -> RigSolution:
-        """Refine ``start``; ``constraints`` add normal equations of the poses, ``timing`` those of
-        the offsets.
+        """Refine ``start``.
 
-        Without ``free_poses``, of all or by camera (C,), the bias and the offsets alone are
-        estimated.
+        Args:
+            start: first estimate, and mean of the prior.
+            constraints: further normal equations of the poses.
+            timing: normal equations of the offsets from the keypoints.
+            free_poses: whether poses are estimated, for all cameras or by camera (C,).
         """
         current = RigEstimate(start.poses.copy(), start.bias.copy(), start.offset.copy())
         count = len(self.rig)
@@ -258,7 +269,8 @@ class Registration:
         covariance = np.zeros((count * FREEDOMS, count * FREEDOMS))
         covariance[np.ix_(rows, rows)] = np.linalg.inv(system)
         last = np.abs(step.reshape(count, FREEDOMS))
-        moved = LEVER_M * last[:, ROTATION].max(1) + last[:, TRANSLATION].max(1)
+        # In a ring, a camera is about 2.5 m from the scene.
+        moved = 2.5 * last[:, :3].max(1) + last[:, 3:6].max(1)
         return RigSolution(
             current, covariance.reshape(count, FREEDOMS, count, FREEDOMS), float(moved.max())
         )
@@ -266,8 +278,7 @@ class Registration:
     def residuals(
         self, at: RigEstimate, kind: SurfaceKind, camera: int | None = None
     ) -> PairResiduals:
-        """Median |point to plane| of every pair of cameras, or those of one ``camera``, over the
-        held-out points."""
+        """Median |point to plane| of held-out points of all pairs, or those with one ``camera``."""
         values = {}
         for a, b in combinations(self._seen.get(kind, {}), 2):
             if camera is not None and camera not in (a, b):
@@ -397,7 +408,7 @@ class Registration:
 
 
 def _derivatives(m: _Match, at: RigEstimate, a: int, b: int) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives (n, 8) of r = n . (p - q) - (offset_a - offset_b) speed by the cameras' freedoms.
+    """Derivatives (n, 8) of r = n . (p - q) - (offset_a - offset_b) speed by the cameras' unknowns.
 
     Turning the target about its centre moves n and q: together that is minus the source's
     derivative, taken at p with the target's centre.
@@ -413,6 +424,6 @@ def _derivatives(m: _Match, at: RigEstimate, a: int, b: int) -> tuple[np.ndarray
 
 def _stepped(at: RigEstimate, step: np.ndarray) -> RigEstimate:
     poses = at.poses.copy()
-    poses[:, :3, :3] = Rotation.from_rotvec(step[:, ROTATION]).as_matrix() @ poses[:, :3, :3]
-    poses[:, :3, 3] += step[:, TRANSLATION]
+    poses[:, :3, :3] = Rotation.from_rotvec(step[:, :3]).as_matrix() @ poses[:, :3, :3]
+    poses[:, :3, 3] += step[:, 3:6]
     return RigEstimate(poses, at.bias + step[:, BIAS], at.offset + step[:, OFFSET])

@@ -31,54 +31,58 @@ from intercap_core.scene.keypoint_timing import (
     windows,
 )
 
-# By how much an image is late. What holds it back is a queue, of some images, or a computer that is
-# busy, for some time: slips of 1 to 4 images at 30 a second occur in InterCap's recordings, and the
-# greater of the two counts at other rates.
-MAX_SLIP_FRAMES, MAX_SLIP_S = 4, 4 / 30
-SLIP_ROUNDS = 12  # at most: each takes the best intervals and looks again
-# Log likelihood without the keypoints that gain most: limbs that a detector confuses fit a slip by
-# chance, but never all over the body. Chance finds are short: what is beyond doubt depends on how
-# many sets say it. Tuned on the studio.
+# Gains are log likelihood ratios, tuned on the studio. False detections are short, so the required
+# gain is MIN_SLIP_GAIN + MIN_SLIP_GAIN_OF_SET / (number of sets).
 MIN_SLIP_GAIN = 15.0
-MIN_SLIP_GAIN_OF_SET = 60.0  # over the number of sets
-SLIP_LEFT_OUT = 4  # keypoints
-SLIP_GAIN_PER_SET = 1.0  # a set must bring this much to belong to an interval
-CLEAR_SLIP_GAIN = 10.0  # of an interval over the whole recording's being late
-SLIP_WORTH = 0.2  # of the best interval's gain makes another worth taking at once
-SLIPS_APART_S = 1.0  # nearer in time, one slip may have brought about another
-MANY_VIEWS = 4  # suffice for the body's motion without those that slip
+MIN_SLIP_GAIN_OF_SET = 60.0
+SLIP_GAIN_PER_SET = 1.0  # least gain of a set within an interval; tuned on the studio
+CLEAR_SLIP_GAIN = 10.0  # of an interval over a delay of the whole recording; tuned on the studio
+SLIP_WORTH = (
+    0.2  # of the best gain, for an interval accepted in the same round; tuned on the studio
+)
+SLIPS_APART_S = 1.0  # closer in time, one slip may cause the evidence for another; tuned
 
 
 @dataclass(frozen=True)
 class SlipInterval:
-    """Camera ``camera`` shows in sets ``first`` to ``last``, inclusive, what was to be seen
-    ``slip`` frames before; ``gain`` in log likelihood, ``sure`` without the best keypoints."""
+    """Run of late images of one camera."""
 
     camera: int
+    """Camera index."""
     first: int
+    """First set."""
     last: int
+    """Last set, inclusive."""
     slip: int
+    """Frames by which the images are late."""
     gain: float
+    """Log likelihood ratio."""
     sure: float
+    """The same without the keypoints that gain most."""
 
     @property
     def beyond_doubt(self) -> bool:
-        """Whether its gain is significant: above what chance produces."""
+        """Whether the gain is significant."""
         return self.sure >= MIN_SLIP_GAIN + MIN_SLIP_GAIN_OF_SET / (self.last - self.first + 1)
 
 
 @dataclass(frozen=True, eq=False)
 class Slips:
-    """``slip`` (T, C) int32: whole frames by which each image is older than its set says, and the
-    intervals that were found, in the order of their gain."""
+    """Late images of a recording."""
 
     slip: np.ndarray
+    """(T, C) int32: whole frames by which each image is older than its set."""
     intervals: tuple[SlipInterval, ...]
+    """By decreasing gain."""
 
 
 def longest_slip(fps: float) -> int:
-    """By how many frames, ``fps`` a second, an image may be late."""
-    return max(MAX_SLIP_FRAMES, round(MAX_SLIP_S * fps))
+    """Largest number of frames by which an image may be late at ``fps`` frames per second.
+
+    InterCap's recordings have slips of up to 4 frames at 30 per second. The cause is a queue of
+    images or a busy computer, so the larger of 4 frames and 4/30 s applies at other rates.
+    """
+    return max(4, round(4 / 30 * fps))
 
 
 def find_slips(
@@ -89,10 +93,13 @@ def find_slips(
     *,
     master: int = 0,
 ) -> Slips:
-    """Find slips of up to :func:`longest_slip` frames in any camera, for a while or always.
+    """Find slips of up to :func:`longest_slip` frames, temporary or constant.
 
-    ``keypoints`` (T, C, 135, 3) x, y, confidence of the subject by image, 0 = not seen; ``times``
-    (T,) s. A delay of all images of a camera is relative to the ``master``'s.
+    A constant delay of a camera is relative to the ``master``.
+
+    Args:
+        keypoints: (T, C, 135, 3) x, y, confidence of the subject by image; 0 = not seen.
+        times: (T,) seconds.
     """
     slip = np.zeros(keypoints.shape[:2], np.int32)
     if len(times) < MIN_TIMING_SETS or len(rig) < 2:
@@ -102,7 +109,7 @@ def find_slips(
     motion = build_motion(keypoints, rig, times)
     offset: np.ndarray | None = None
     always: list[SlipInterval] = []
-    for _ in range(SLIP_ROUNDS):
+    for _ in range(12):
         seen = motion if offset is None else motion.at_offsets(offset)
         evidence = _Evidence(seen, steps, fps)
         best = [i for c in range(len(rig)) if (i := evidence.best(c)) is not None]
@@ -115,13 +122,13 @@ def find_slips(
                 keypoints_by_moment(keypoints, slip), rig, times, motion.paths.points
             )
         elif offset is None:
-            # Slips are large against offsets, but weak ones hide behind them: look once more.
+            # Offsets hide weak slips: search again without them.
             offset = estimate_offsets(motion, master).offset
         else:
             break
     if slip.any():
         undisturbed = keypoints.copy()
-        if len(rig) >= MANY_VIEWS:
+        if len(rig) >= 4:  # enough other views determine the motion
             undisturbed[slip != constant_slip(slip)] = 0
         motion = build_motion(
             keypoints_by_moment(undisturbed, slip), rig, times, motion.paths.points
@@ -138,22 +145,22 @@ def _whole(interval: SlipInterval, sets: int) -> bool:
 
 
 def constant_slip(slip: np.ndarray) -> np.ndarray:
-    """The delay common to all images of each camera (C,), in frames."""
+    """Delay common to all images of each camera (C,), in frames."""
     return np.where((slip != 0).all(0), np.median(slip, 0), 0).astype(np.int32)
 
 
 def _apply(slip: np.ndarray, interval: SlipInterval) -> None:
-    """Add to ``slip`` (T, C), in place, for the images that so far show the interval's moments."""
+    """Add an interval to ``slip`` (T, C), in place, for the images that show its moments so far."""
     moment = np.arange(len(slip)) - slip[:, interval.camera]
     late = (moment >= interval.first) & (moment <= interval.last)
     slip[late | _whole(interval, len(slip)), interval.camera] += interval.slip
 
 
 def _apart(intervals: list[SlipInterval], times: np.ndarray) -> list[SlipInterval]:
-    """The best interval and those that it cannot have caused.
+    """The best interval and those whose evidence it cannot have caused.
 
-    An unsynchronised camera makes others look so: much weaker intervals, and those near it in time,
-    are left to the next round.
+    A late camera makes others look late. Much weaker intervals, and those close in time, are left
+    to the next round.
     """
     ordered = sorted(intervals, key=lambda i: -i.gain)
     taken: list[SlipInterval] = []
@@ -167,7 +174,7 @@ def _apart(intervals: list[SlipInterval], times: np.ndarray) -> list[SlipInterva
 
 
 def _runs(chosen: np.ndarray) -> list[np.ndarray]:
-    """The places of each unbroken run of True."""
+    """Indices of each unbroken run of True."""
     places = np.flatnonzero(chosen)
     return np.split(places, np.flatnonzero(np.diff(places) > 1) + 1) if len(places) else []
 
@@ -180,7 +187,7 @@ def _polished(
     steps: list[int],
     fps: float,
 ) -> tuple[np.ndarray, list[SlipInterval]]:
-    """Find each interval once more, against the motion that no slip disturbs any longer."""
+    """Estimate each interval again, from the motion without the late images."""
     result, intervals = slip.copy(), []
     for c in range(slip.shape[1]):
         constant = constant_slip(slip)[c]
@@ -197,8 +204,10 @@ def _polished(
 
 
 def _tolerant(motion: KeypointMotion, moved: np.ndarray) -> KeypointMotion:
-    """The motion, where residuals that a slip would explain count as valid, too; ``moved`` (S, T,
-    C, K, 2) px."""
+    """The motion with residuals that a slip explains counted as valid.
+
+    ``moved``: (S, T, C, K, 2) displacements by slips, px.
+    """
     size = np.linalg.norm(motion.residual, axis=-1)
     for late in moved:
         size = np.minimum(size, np.linalg.norm(motion.residual - late, axis=-1))
@@ -206,8 +215,11 @@ def _tolerant(motion: KeypointMotion, moved: np.ndarray) -> KeypointMotion:
 
 
 def _sure(gains: np.ndarray) -> float:
-    """The sum of the keypoints' gains (K,) without the best few."""
-    return float(np.sort(gains)[:-SLIP_LEFT_OUT].sum())
+    """Sum of the keypoints' gains (K,) without the best four.
+
+    Limbs that a detector confuses fit a slip by chance, but never all over the body.
+    """
+    return float(np.sort(gains)[:-4].sum())
 
 
 class _Evidence:
@@ -273,8 +285,10 @@ def _best_of_window(cases: dict[int, _Slipped]) -> SlipInterval | None:
 
 
 def _own_series(motion: KeypointMotion, camera: int) -> tuple[np.ndarray, np.ndarray]:
-    """One camera's residuals given all other views': ``root`` (T, K, 2, 2) makes its pixels of unit
-    variance, ``series`` (T, K, 2) are the residuals so.
+    """One camera's residuals given all other views.
+
+    Returns the matrices ``root`` (T, K, 2, 2) that whiten its pixels, and the whitened residuals
+    (T, K, 2).
 
     With the projector N = (I - P) W^(1/2), the information on the camera's own pixels is
     w (I - P)_cc w; its symmetric root is ``root``.
@@ -293,12 +307,14 @@ def _own_series(motion: KeypointMotion, camera: int) -> tuple[np.ndarray, np.nda
 
 @dataclass(frozen=True, eq=False)
 class _Window:
-    """W sets: ``root`` (W, K, 2, 2) and ``series`` (W, K, 2) as :func:`_own_series` gives;
-    ``precision`` (K, W, W) over time."""
+    """One camera's residuals in W sets."""
 
     root: np.ndarray
+    """(W, K, 2, 2), see :func:`_own_series`."""
     series: np.ndarray
+    """(W, K, 2), see :func:`_own_series`."""
     precision: np.ndarray
+    """(K, W, W) inverse covariance over time."""
 
     def slipped(self, late: np.ndarray) -> _Slipped:
         """The hypothesis that keypoints are displaced by ``late`` (W, K, 2) px."""
@@ -310,13 +326,16 @@ class _Window:
 
 @dataclass(frozen=True, eq=False)
 class _Slipped:
-    """Residuals ``series`` (K, W, 2), their ``change`` (K, W, 2) by the slip, and ``linear`` (K, W)
-    the product of the two, whitened over time by ``precision`` (K, W, W)."""
+    """One camera's residuals under the hypothesis of a slip."""
 
     series: np.ndarray
+    """(K, W, 2) whitened residuals."""
     change: np.ndarray
+    """(K, W, 2) their change by the slip."""
     linear: np.ndarray
+    """(K, W) product of the two, whitened over time."""
     precision: np.ndarray
+    """(K, W, W) inverse covariance over time."""
 
     def gains(self, first: int, end: int) -> np.ndarray:
         """The keypoints' gains (K,) if the sets from ``first`` to before ``end`` are late."""
@@ -326,8 +345,10 @@ class _Slipped:
         return self.linear[:, part].sum(1) - energy / 2
 
     def misfit(self, first: int, end: int) -> float:
-        """Truncated squares of what the slip leaves. Not whitened over time: that would count the
-        errors of the paths themselves, which change fast, as much as the motion."""
+        """Truncated squares of the remaining residuals.
+
+        Not whitened over time, which would weight the fast errors of the paths as much as motion.
+        """
         left = self.series[:, first:end] - self.change[:, first:end]
         return float(np.minimum((left**2).sum(-1), OUTLIER_SIGMA**2).sum())
 
@@ -341,8 +362,10 @@ class _Slipped:
 
 
 def interval_gains(linear: np.ndarray, quadratic: np.ndarray) -> np.ndarray:
-    """Gains (W + 1, W + 1) of intervals [first, end): the sum of ``linear`` (W,) less half the sum
-    of ``quadratic`` (W, W) over them; -inf where they hold nothing."""
+    """Gains (W + 1, W + 1) of all intervals [first, end); -inf for empty ones.
+
+    A gain is the sum of ``linear`` (W,) less half that of ``quadratic`` (W, W) over the interval.
+    """
     size = len(linear)
     sums = np.r_[0.0, np.cumsum(linear)]
     table = np.zeros((size + 1, size + 1))

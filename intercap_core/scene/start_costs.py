@@ -23,12 +23,9 @@ from intercap_core.person.subject_joints import MAX_IMAGE_SPEED_RAD_S
 from intercap_core.person.tracks import MAX_LINK_GAP_S
 from intercap_core.scene.keypoint_motion import MIN_CONFIDENCE, known_median
 
-MAX_PEOPLE = 3  # of an image, the surest
-LINK_SLACK_RAD = 0.05  # scatter of a person's middles between images; a detector's few pixels
-EPIPOLAR_PX_AT_1080P = (
-    6.0  # what two views of one moment disagree by, over time; tuned on the studio
-)
-SLOWER_SETS = 1.5  # usual sets from one of a camera's images to the next: half way to half the rate
+MAX_PEOPLE = 3  # of an image, the most confident
+LINK_SLACK_RAD = 0.05  # noise of a person's middles between images: a few pixels of the detector
+EPIPOLAR_PX_AT_1080P = 6.0  # scatter of epipolar distances over time at equal times; tuned
 
 
 _PLACE = {name: index for index, name in enumerate(KEYPOINT_NAMES)}
@@ -41,8 +38,10 @@ MIDDLES = len(_ALONE) + len(_SIDES)
 
 
 def body_middles(person: np.ndarray) -> np.ndarray:
-    """Pixels (K, 2) that do not depend on which side is called left, of keypoints (135, 3); NaN
-    where one of the two is not seen."""
+    """Pixels (K, 2) of keypoints (135, 3) that do not depend on left and right.
+
+    NaN if one of the two points of a middle is not seen.
+    """
     known = np.where(person[:, 2:] >= MIN_CONFIDENCE, person[:, :2], np.nan)
     between = [(known[left] + known[right]) / 2 for left, right in _SIDES]
     return np.concatenate([known[_ALONE], between])
@@ -53,9 +52,12 @@ def follow_rays(
 ) -> np.ndarray:
     """Rays (T, C, P, K, 2), x and y at z = 1, of the middles of people; NaN = not seen.
 
-    Each of the P places holds one person of a camera's images for as long as it can be followed;
-    places of two cameras have nothing to do with each other. ``times`` (T,) s of the sets,
-    ``available`` (T, C): the set has an image of the camera.
+    Each of the P places holds one person of a camera's images for as long as they can be followed.
+    Places of different cameras are unrelated.
+
+    Args:
+        times: (T,) seconds of the sets.
+        available: (T, C) bool, the set has an image of the camera.
     """
     rays = np.full((*available.shape, MAX_PEOPLE, MIDDLES, 2), np.nan)
     for c, usual in enumerate(usual_steps(available)):
@@ -67,14 +69,16 @@ def follow_rays(
                 continue
             pixels = np.stack([body_middles(people[i]) for i in surest])
             _place(rays[:, c], t, rig[c].colour.unproject(pixels)[..., :2], times)
-        if usual >= SLOWER_SETS:
+        if usual >= 1.5:  # half way to half the rate
             _carry_on(rays[:, c], images, usual)
     return rays
 
 
 def _place(rays: np.ndarray, t: int, people: np.ndarray, times: np.ndarray) -> None:
-    """Put an image's ``people`` (N, K, 2) into the places of ``rays`` (T, P, K, 2), in place: each
-    where somebody was last seen near by, else into one that was free for longest."""
+    """Assign an image's ``people`` (N, K, 2) to the places of ``rays`` (T, P, K, 2), in place.
+
+    Each is assigned to the place whose person was last seen nearby, else to the longest unused one.
+    """
     count = rays.shape[1]
     last = [_last_seen(rays[:t, place]) for place in range(count)]
     options = sorted(
@@ -98,38 +102,40 @@ def _place(rays: np.ndarray, t: int, people: np.ndarray, times: np.ndarray) -> N
 
 
 def _last_seen(rays: np.ndarray) -> int:
-    """The last set of rays (T, K, 2) that has any, -1 = none."""
+    """Last set with rays (T, K, 2); -1 = none."""
     seen = np.flatnonzero(np.isfinite(rays[..., 0]).any(1))
     return int(seen[-1]) if len(seen) else -1
 
 
 def _carry_on(rays: np.ndarray, images: np.ndarray, usual: float) -> None:
-    """Fill the ``rays`` (T, P, K, 2) of a camera of fewer images a second than sets, in place, in
-    the sets between two of its ``images`` (N,), usually ``usual`` sets apart: people move evenly
-    over so short a time. Else one lag is judged by other pairs and moments than the next."""
+    """Interpolate the ``rays`` (T, P, K, 2) of a camera with a lower frame rate, in place.
+
+    Otherwise adjacent lags would be compared by different sets. ``images``: (N,) sets with an
+    image, usually ``usual`` sets apart.
+    """
     for first, last in pairwise(images.tolist()):
         if last - first > 2 * usual:
-            continue  # lost images: nothing is made up
+            continue  # lost images are not interpolated
         for t in range(first + 1, last):
             share = (t - first) / (last - first)
             rays[t] = (1 - share) * rays[first] + share * rays[last]
 
 
-_NO_MOTION_RAD = 1e-6
-
-
 @dataclass(frozen=True, eq=False)
 class PairCosts:
-    """How badly two cameras a < b agree, 0 to 1, if b's image of set t + lag shows what a's of set
-    t does: ``cost[a, b]`` (4 reach + 1, T), lags from - 2 reach, NaN = not known."""
+    """Disagreement of pairs of cameras, by lag and set."""
 
     cost: dict[tuple[int, int], np.ndarray]
+    """(4 reach + 1, T) by cameras a < b: cost, 0 to 1, of b's image of set t + lag showing the same
+    moment as a's image of set t. Lags begin at -2 reach; NaN = unknown."""
     views: int
+    """Number of cameras."""
     reach: int
+    """Largest delay of a camera, sets."""
 
     @classmethod
     def of(cls, rays: np.ndarray, rig: Rig, reach: int, fewest: float) -> PairCosts:
-        """From ``rays`` (T, C, P, K, 2); lags at which fewer than ``fewest`` sets tell stay NaN."""
+        """Compute costs of ``rays`` (T, C, P, K, 2); NaN at lags with fewer than ``fewest``."""
         lags = range(-2 * reach, 2 * reach + 1)
         occupied = np.isfinite(rays[..., 0]).any((0, 3))  # (C, P)
         people = [rays[:, c, places] for c, places in enumerate(occupied)]
@@ -142,9 +148,11 @@ class PairCosts:
         return cls(cost, len(rig), reach)
 
     def series(self, camera: int, late: int, others: Sequence[int], sets: np.ndarray) -> np.ndarray:
-        """The cost (T + 2 reach,) of a camera's pairs with ``others`` by moment, if it is late by
-        ``late`` sets and they by ``sets`` (C,)."""
-        found = []
+        """Mean cost (T + 2 reach,) of a camera's pairs with ``others``, by moment.
+
+        ``late``: delay of the camera, sets. ``sets``: (C,) delays of the others.
+        """
+        rows = []
         for other in others:
             a, b = sorted((camera, other))
             own, theirs = (late, int(sets[other]))
@@ -153,14 +161,13 @@ class PairCosts:
             series = np.full(len(row) + 2 * self.reach, np.nan)
             start = self.reach - (theirs if a == other else own)  # a's set t shows moment t - late
             series[start : start + len(row)] = row
-            found.append(series)
-        return known_mean(np.array(found))
+            rows.append(series)
+        return known_mean(np.array(rows))
 
     def profile(
         self, camera: int, others: Sequence[int], sets: np.ndarray, bound: int | None = None
     ) -> np.ndarray:
-        """Mean cost (2 reach + 1,) by how late a camera is, NaN where no pair tells, and beyond
-        ``bound`` sets."""
+        """Mean cost (2 reach + 1,) by a camera's delay; NaN if unknown or beyond ``bound`` sets."""
         tried = range(-self.reach, self.reach + 1)
         cost = known_mean(np.array([self.series(camera, k, others, sets) for k in tried]).T)
         if bound is not None:
@@ -171,10 +178,12 @@ class PairCosts:
 def _cost(
     rays_a: np.ndarray, rays_b: np.ndarray, epipolar: _PairEpipolar, lag: int, fewest: float
 ) -> np.ndarray:
-    """One lag's costs (T,) of :class:`PairCosts`: of each person whom camera a follows, and the
-    one of
-    camera b who agrees best all along, how far the distances to each other's epipolar lines are
-    from their medians over time; the mean over people by how much they move."""
+    """Costs (T,) of one lag, see :class:`PairCosts`.
+
+    Each person of camera a is compared with the person of camera b who agrees best over the whole
+    recording. The cost is the deviation of their epipolar distances from the median over time,
+    averaged over people with their amount of motion as weight.
+    """
     sets = len(rays_a)
     found = np.full(sets, np.nan)
     at = slice(max(0, -lag), min(sets, sets - lag))
@@ -183,7 +192,7 @@ def _cost(
     first = rays_a[at]
     distance = epipolar.distances(first, rays_b[at.start + lag : at.stop + lag])
     seen = np.isfinite(distance).sum(0, keepdims=True)
-    distance = np.where(seen >= fewest, distance, np.nan)  # of people who are seen for long enough
+    distance = np.where(seen >= fewest, distance, np.nan)
     known = np.isfinite(distance).any(-1)  # (T, P, Q)
     size = known_mean(known_mean(np.moveaxis(np.abs(distance), -1, 0)))
     size[known.sum(0) < fewest] = np.nan
@@ -199,9 +208,11 @@ def _cost(
 
 
 def _moves(rays: np.ndarray) -> float:
-    """How far, rad, somebody's rays (T, K, 2) are from their mean: who stands still is in step with
-    anything, and says nothing. Never 0."""
-    return _NO_MOTION_RAD + float(np.nanmean(np.sqrt(np.nanvar(rays, axis=0).sum(-1))))
+    """Mean deviation, rad, of a person's rays (T, K, 2) from their mean; never 0.
+
+    A person who stands still agrees at any lag and carries no information.
+    """
+    return 1e-6 + float(np.nanmean(np.sqrt(np.nanvar(rays, axis=0).sum(-1))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,7 +242,7 @@ class _PairEpipolar:
 
 
 def known_mean(values: np.ndarray) -> np.ndarray:
-    """Mean over the first axis of what is known; NaN where nothing is."""
+    """Mean of the finite values over the first axis; NaN if there are none."""
     known = np.isfinite(values)
     count = known.sum(0)
     total = np.where(known, values, 0.0).sum(0)

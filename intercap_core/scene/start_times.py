@@ -30,13 +30,15 @@ from intercap_core.scene.starts import (
 )
 
 MAX_START_S = 1.5  # cameras are started by hand or by one command that reaches them in turn
-MAX_START_SHARE = 0.4  # of the recording: less in common tells little; tuned on the studio
-# A camera started apart if views agree better so than as they are, and than at any time that is not
-# near: in most blocks of time, by so many standard errors of their mean, and by a share of how much
-# they disagree anyway. Tuned on the studio.
-START_BLOCK_S, START_BLOCKS_SHARE, START_SIGMAS, START_WORSE = 0.3, 0.7, 3.0, 0.2
-CLEAR_SIGMAS, START_PEAK_S, FEWEST_BLOCKS = 1.0, 0.15, 4
-START_ROUNDS = 5
+MAX_START_SHARE = 0.4  # of the recording, for the largest delay; tuned on the studio
+# A delay is certain if the cost at the alternative is higher in most blocks of time, by a number of
+# standard errors of the mean, and by a share of the usual cost.
+START_BLOCK_S = 0.3  # length of a block, seconds; tuned on the studio
+START_BLOCKS_SHARE = 0.7  # of the blocks; tuned on the studio
+START_SIGMAS = 3.0  # standard errors; tuned on the studio
+START_WORSE = 0.2  # of the usual cost; tuned on the studio
+START_PEAK_S = 0.15  # delays closer than this belong to one minimum of the cost; tuned
+FEWEST_BLOCKS = 4  # fewer do not decide; tuned on the studio
 
 
 def find_starts(
@@ -48,14 +50,16 @@ def find_starts(
     master: int = 0,
     stated: StatedStarts | None = None,
 ) -> StartTimes:
-    """When the cameras started, from all people that they show, and from what is ``stated``.
+    """Estimate when the cameras started, from all visible people and ``stated`` starts.
 
-    ``times`` (T,) s of the sets; ``available`` (T, C): the set has an image of the camera.
+    Args:
+        times: (T,) seconds of the sets.
+        available: (T, C) bool, the set has an image of the camera.
     """
     views, sets = len(rig), len(times)
     step = float(np.median(np.diff(times))) if sets > 1 else 0.0
-    told = stated or StatedStarts.nothing(views)
-    as_stated = StartTimes.as_stated(told, step)
+    known = stated or StatedStarts.nothing(views)
+    as_stated = StartTimes.as_stated(known, step)
     if sets < 2 or views < 2:
         return as_stated
     reach = min(round(MAX_START_S / step), int(MAX_START_SHARE * sets))
@@ -64,60 +68,69 @@ def find_starts(
         return as_stated
     rays = shift_images(follow_rays(detections, rig, times, available), as_stated.sets, np.nan)
     search = _Search(
-        PairCosts.of(rays, rig, reach, fewest), master, step, told.bounds(step, reach), told.known
+        PairCosts.of(rays, rig, reach, fewest), master, step, known.bounds(step, reach), known.known
     )
     late, denied = search.agreed()
     others = [c for c in range(views) if c != master]
-    sure = {c: bool(denied[c]) or search.is_apart(late, c) for c in others}
-    # that one camera surely started apart says that nobody started them together
-    found = replace(as_stated, apart=any(sure.values()) or told.says_apart(step), denied=denied)
+    certain = {c: bool(denied[c]) or search.is_apart(late, c) for c in others}
+    # if one camera certainly started apart, the cameras were not started together
+    result = replace(
+        as_stated, apart=any(certain.values()) or known.says_apart(step), denied=denied
+    )
     shown = search.shown(late)
     for c in others:
-        if told.known[c] and not denied[c] and not shown[c]:
+        if known.known[c] and not denied[c] and not shown[c]:
             continue
-        if not told.known[c] and not found.apart:
+        if not known.known[c] and not result.apart:
             continue
-        if not told.known[c]:
-            # that somebody moves at all is not known where only what is stated says "apart"
-            moves = any(sure.values()) or abs(late[c]) < FEWEST_SETS_APART
+        if not known.known[c]:
+            # if only a statement says "apart", it is unknown whether anybody moves
+            moves = any(certain.values()) or abs(late[c]) < FEWEST_SETS_APART
             if not moves or not search.is_clear(late, c):
-                found.in_doubt[c] = True
+                result.in_doubt[c] = True
                 continue
-        found.late[c] = (found.sets[c] + late[c] + search.between(late, c)) * step
-        found.sets[c] += late[c]
+        result.late[c] = (result.sets[c] + late[c] + search.between(late, c)) * step
+        result.sets[c] += late[c]
         if denied[c]:
-            found.sigma[c] = np.nan
-        elif told.known[c] and told.sigma[c] > step / 2:
-            found.sigma[c] = step / 2  # the views tell more; slips are sought from the best place
-        elif told.known[c]:
-            found.late[c], found.sigma[c] = combine_estimates(
-                (found.late[c], step / 2), (told.late[c], told.sigma[c])
+            result.sigma[c] = np.nan
+        elif known.known[c] and known.sigma[c] > step / 2:
+            result.sigma[c] = step / 2  # the views are more accurate
+        elif known.known[c]:
+            result.late[c], result.sigma[c] = combine_estimates(
+                (result.late[c], step / 2), (known.late[c], known.sigma[c])
             )
-            found.sets[c] = round(found.late[c] / step)
-    return found
+            result.sets[c] = round(result.late[c] / step)
+    return result
 
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """How late cameras are beside what is stated, whole sets: ``bounds`` (C,) within which they do
-    not deny it, of cameras of which something is ``stated`` (C,)."""
+    """Search for the delays of cameras relative to stated starts, in whole sets."""
 
     pairs: PairCosts
+    """Costs by lag."""
     master: int
+    """Camera whose delay is 0."""
     step: float
+    """Seconds per set."""
     bounds: np.ndarray
+    """(C,) largest delays that do not contradict a stated start."""
     stated: np.ndarray
+    """(C,) bool: the start is stated."""
 
     def agreed(self) -> tuple[np.ndarray, np.ndarray]:
-        """Sets (C,) where the views agree best, and which cameras (C,) deny what is stated: they do
-        one after another, the surest first, since a wrong one disturbs the rest."""
+        """Delays (C,) at which the views agree best, and the cameras (C,) with rejected statements.
+
+        Statements are rejected one after another, the clearest first, because a wrong one disturbs
+        the others.
+        """
         denied = np.zeros(len(self.bounds), bool)
         bounds = self.bounds.copy()
         while True:
             late = self._descended(bounds)
             doubtful = self.stated & ~denied & (late != 0)
             doubtful &= ~self.shown(late)
-            if doubtful.any():  # nothing sure leads away from what is stated
+            if doubtful.any():  # no certain evidence against the statement
                 bounds[doubtful] = 0
                 continue
             denials = {
@@ -131,7 +144,7 @@ class _Search:
             bounds = np.where(denied, self.pairs.reach, self.bounds)
 
     def _denial(self, late: np.ndarray, camera: int) -> float:
-        """By how much the views agree better with a camera out of its bounds, 0 = not surely."""
+        """Decrease of the cost if a camera leaves its bounds; 0 = not significant."""
         profile = self.pairs.profile(camera, self._others(camera), late)
         tried = np.arange(-self.pairs.reach, self.pairs.reach + 1)
         if not np.isfinite(profile).any():
@@ -146,14 +159,16 @@ class _Search:
         return float(self._worse(there, camera, int(late[camera])).mean())
 
     def _descended(self, bounds: np.ndarray) -> np.ndarray:
-        """How late (C,), in sets, cameras are where all pairs agree best, within ``bounds`` (C,):
-        they join one after another, the clearest first, then each is moved until none moves."""
+        """Delays (C,), in sets, that minimise the cost of all pairs within ``bounds`` (C,).
+
+        Cameras are added one after another, the clearest first. Then coordinate descent.
+        """
         pairs, master = self.pairs, self.master
         sets, joined = np.zeros(pairs.views, int), [master]
         waiting = [c for c in range(pairs.views) if c != master]
         while waiting:
             profiles = {c: pairs.profile(c, joined, sets, int(bounds[c])) for c in waiting}
-            # what is stated needs no motion to be told
+            # a stated start needs no motion
             least = np.where(self.stated, np.finfo(float).tiny, 0.0)
             gains = {
                 c: max(_gain(profile), least[c]) if np.isfinite(profile).any() else 0.0
@@ -164,7 +179,7 @@ class _Search:
                 sets[c] = np.nanargmin(profiles[c]) - pairs.reach
                 joined.append(c)
             waiting.remove(c)
-        for _ in range(START_ROUNDS):
+        for _ in range(5):
             before = sets.copy()
             for c in joined[1:]:
                 profile = pairs.profile(c, [o for o in joined if o != c], sets, int(bounds[c]))
@@ -175,15 +190,13 @@ class _Search:
         return sets
 
     def is_apart(self, sets: np.ndarray, camera: int, instead: int = 0) -> bool:
-        """Whether a camera is in no doubt not at ``instead``: by more than what slips and offsets
-        explain, and the views disagree with it again and again over the recording."""
+        """Whether a camera's delay certainly differs from ``instead``, beyond slips and offsets."""
         if abs(sets[camera] - instead) < FEWEST_SETS_APART:
             return False
-        worse = self._worse(sets, camera, instead)
-        return self._surely(worse, sets, camera)
+        return self._significant(self._worse(sets, camera, instead), sets, camera)
 
-    def _surely(self, worse: np.ndarray, sets: np.ndarray, camera: int) -> bool:
-        """Whether views agree ``worse`` (N,) than at a camera's time in no doubt."""
+    def _significant(self, worse: np.ndarray, sets: np.ndarray, camera: int) -> bool:
+        """Whether the cost increases ``worse`` (N,), by block, are significant."""
         if len(worse) < FEWEST_BLOCKS:
             return False
         series = self.pairs.series(camera, int(sets[camera]), self._others(camera), sets)
@@ -192,25 +205,27 @@ class _Search:
         return bool((worse > 0).mean() >= START_BLOCKS_SHARE and worse.mean() > least)
 
     def shown(self, sets: np.ndarray) -> np.ndarray:
-        """Of which cameras (C,) the motion shows that they are near these times: where it does of
-        one in no doubt, somebody moves, and of others it has to be clear."""
+        """Mask (C,) of the cameras whose delays the motion confirms.
+
+        If it is certain for one camera, somebody moves, and a clear minimum suffices for others.
+        """
         views = range(len(sets))
-        surely = np.array([c != self.master and self._is_shown(sets, c) for c in views])
-        if not surely.any():
-            return surely
-        return surely | [c != self.master and self.is_clear(sets, c, if_few=False) for c in views]
+        certain = np.array([c != self.master and self._is_shown(sets, c) for c in views])
+        if not certain.any():
+            return certain
+        return certain | [c != self.master and self.is_clear(sets, c, if_few=False) for c in views]
 
     def _is_shown(self, sets: np.ndarray, camera: int) -> bool:
-        """Whether a camera's time is in no doubt near this one, or at least not what is stated."""
+        """Whether a camera's delay is certain, or at least certainly differs from the statement."""
         if self.is_apart(sets, camera):
             return True
         next_best = self._next_best(sets, camera)
-        return next_best is not None and self._surely(
+        return next_best is not None and self._significant(
             self._worse(sets, camera, next_best), sets, camera
         )
 
     def _next_best(self, sets: np.ndarray, camera: int) -> int | None:
-        """The best time of a camera that is not near its own; None where either is not known."""
+        """Best delay of a camera outside the minimum of its own; None if either is unknown."""
         pairs = self.pairs
         profile = pairs.profile(camera, self._others(camera), sets)
         tried = np.arange(-pairs.reach, pairs.reach + 1)
@@ -220,19 +235,20 @@ class _Search:
         return int(tried[far][profile[far].argmin()])
 
     def is_clear(self, sets: np.ndarray, camera: int, *, if_few: bool = True) -> bool:
-        """Whether the views agree better at a camera's time than at any that is not near;
-        ``if_few`` where hardly anything was seen at the same time."""
+        """Whether the cost has a clear minimum at a camera's delay.
+
+        ``if_few``: the answer if there are too few blocks.
+        """
         next_best = self._next_best(sets, camera)
         if next_best is None:
             return False
         worse = self._worse(sets, camera, next_best)
         if len(worse) < FEWEST_BLOCKS:
             return if_few
-        return bool(worse.mean() > CLEAR_SIGMAS * worse.std(ddof=1) / np.sqrt(len(worse)))
+        return bool(worse.mean() > worse.std(ddof=1) / np.sqrt(len(worse)))
 
     def _worse(self, sets: np.ndarray, camera: int, late: int) -> np.ndarray:
-        """By how much (N,) a camera's views agree worse if it is ``late`` by so many sets than at
-        its own time, mean of each block of time in which both are known."""
+        """Increase (N,) of the cost, by block, from a camera's own delay to ``late`` sets."""
         others = self._others(camera)
         own = self.pairs.series(camera, int(sets[camera]), others, sets)
         change = self.pairs.series(camera, late, others, sets) - own
@@ -241,8 +257,7 @@ class _Search:
         return known_mean(whole[np.isfinite(whole).sum(1) * 2 >= size].T)
 
     def between(self, sets: np.ndarray, camera: int) -> float:
-        """How far from its whole number of sets, in sets, a parabola of a camera's cost is
-        lowest."""
+        """Sub-set part of a camera's delay, in sets, by a parabola through the cost."""
         place = sets[camera] + self.pairs.reach
         profile = self.pairs.profile(camera, self._others(camera), sets)
         profile = profile[max(place - 1, 0) : place + 2]
@@ -258,6 +273,6 @@ class _Search:
 
 
 def _gain(profile: np.ndarray) -> float:
-    """How much better the best of a profile is than usual; 0 where nothing is known."""
+    """Depth of a profile's minimum below its median; 0 if nothing is known."""
     known = profile[np.isfinite(profile)]
     return float(np.median(known) - known.min()) if len(known) else 0.0

@@ -22,9 +22,9 @@ from intercap_core.person.subject_joints import fill_middles, triangulate_people
 from intercap_core.scene.keypoint_motion import MIN_CONFIDENCE
 from intercap_core.scene.slips import longest_slip
 
-LOOSE_PX_AT_1080P = 40.0  # agreement of views whose poses are a centimetre off; tuned on the studio
-# Median over the body of somebody seen a while ago: biases of joints, poses not yet refined, half
-# a frame of motion; tuned on the studio.
+LOOSE_PX_AT_1080P = 40.0  # reprojection error at poses that are a centimetre off; tuned
+# Median distance to a body seen shortly before: joint biases, unrefined poses, half a frame of
+# motion; tuned on the studio.
 SAME_PERSON_PX_AT_1080P = 45.0
 
 
@@ -38,11 +38,12 @@ def add_late_views(
     fps: float,
     min_confidence: float,
 ) -> np.ndarray:
-    """Add to the subject's ``index`` (T, C), -1 = not seen, people who are where it was shortly
-    before.
+    """Add detections that are where the subject was shortly before, as far back as slips reach.
 
-    ``joints`` (T, 135, 3) m, triangulated from the views that do see it, NaN = not known; ``times``
-    (T,) s. Looks back as far as slips are sought.
+    Args:
+        index: (T, C) the subject's detection in each image; -1 = not seen.
+        joints: (T, 135, 3) triangulated from the views with a detection, metres; NaN = unknown.
+        times: (T,) seconds.
     """
     reach_s = longest_slip(fps) / fps
     result = index.copy()
@@ -63,7 +64,7 @@ def add_late_views(
 
 
 def _sets_before(times: np.ndarray, t: int, reach_s: float) -> np.ndarray:
-    """Sets up to ``reach_s`` before set ``t``, itself included."""
+    """Sets from ``reach_s`` before set ``t`` to ``t``."""
     first = np.searchsorted(times, times[t] - reach_s - 1e-3)
     return np.arange(first, t + 1)
 
@@ -71,8 +72,8 @@ def _sets_before(times: np.ndarray, t: int, reach_s: float) -> np.ndarray:
 def _distance(
     person: np.ndarray, expected: np.ndarray, known: np.ndarray, min_confidence: float
 ) -> float:
-    """The least median distance, px, of a person (135, 3) to any of N bodies (N, 25, 2); either as
-    found or with the sides exchanged."""
+    """Least median distance, px, of a person (135, 3) to N bodies (N, 25, 2), with either order of
+    sides."""
     best = np.inf
     for body in (person[BODY_POINTS], swap_sides(person)[BODY_POINTS]):
         common = known & (body[:, 2] >= min_confidence)
@@ -85,25 +86,26 @@ def _distance(
 
 @dataclass(frozen=True, eq=False)
 class SubjectViews:
-    """``keypoints`` (T, C, 135, 3) x, y, confidence of the subject, 0 = not seen, sides put right;
-    ``inlier`` (T, C, 135): the view agrees with the others; ``joints`` (T, 135, 3) triangulated
-    from the body's 25 keypoints, master frame, metres, NaN = not known (hands and face always);
-    ``views`` (T, 135): how many agree, 0 for a neck or mid hip between shoulders or hips."""
+    """Keypoints of the subject in all views, and its joints."""
 
     keypoints: np.ndarray
+    """(T, C, 135, 3) x, y, confidence with corrected sides; 0 = not seen."""
     inlier: np.ndarray
+    """(T, C, 135) bool: the view agrees with the others."""
     joints: np.ndarray
+    """(T, 135, 3) triangulated body, master frame, metres; NaN = unknown, as are hands and face."""
     views: np.ndarray
+    """(T, 135) number of agreeing views; 0 for a neck or mid hip filled in between other joints."""
 
     def showing(self, image_of: np.ndarray, rig: Rig) -> SubjectViews:
-        """The same by moment: set t holds the image of camera c that ``image_of`` (T, C) says."""
+        """The same by moment. ``image_of``: (T, C) set whose image shows each moment."""
         shown = self.keypoints[np.maximum(image_of, 0), np.arange(image_of.shape[1])]
         shown[image_of < 0] = 0
         return triangulate_views(shown, rig)
 
 
 def find_subject_views(detections: PeopleOfImages, rig: Rig, times: np.ndarray) -> SubjectViews:
-    """Find the subject at the start's poses; all 0 and NaN where no two views agree on anybody."""
+    """Find the subject at the given poses; all 0 and NaN if no two views agree on anybody."""
     index = find_subject(detections, rig, times, min_confidence=MIN_CONFIDENCE).people
     found = triangulate_views(_keypoints_of(detections, index), rig)
     if len(times) < 2:
@@ -130,7 +132,7 @@ def _keypoints_of(detections: PeopleOfImages, index: np.ndarray) -> np.ndarray:
 
 
 def triangulate_views(keypoints: np.ndarray, rig: Rig) -> SubjectViews:
-    """Triangulate the body of ``keypoints`` (T, C, 135, 3), sides exchanged where views say so."""
+    """Triangulate the body of ``keypoints`` (T, C, 135, 3), with sides made consistent."""
     sets, views = keypoints.shape[:2]
     body = np.zeros_like(keypoints)
     body[:, :, BODY_POINTS] = keypoints[:, :, BODY_POINTS]

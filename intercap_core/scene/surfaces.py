@@ -22,43 +22,42 @@ from intercap_core.scene.background import Background
 # 11 mm + 0.1 % of depth (Azure Kinect DK data sheet) and its noise; margin tuned on the studio.
 BEFORE_BACKGROUND_MM = 40.0
 BEFORE_BACKGROUND_SHARE = 0.012  # of depth
-BACKGROUND_MAX_DEPTH_M = 5.0  # beyond, the depth's error is past a centimetre
-MOVING_MAX_DEPTH_M = 4.0  # beyond, the depth's error is past what a body moves between sets
-# Base line of a normal, one way: 4 px of the unbinned narrow depth camera (f = 504 px); tuned on
-# the studio: shorter is noise, longer crosses edges.
+BACKGROUND_MAX_DEPTH_M = 5.0  # beyond, the error of the depth exceeds a centimetre
+MOVING_MAX_DEPTH_M = 4.0  # beyond, the error exceeds the motion of a body between sets
+# Baseline of a normal, one way: 4 px of the unbinned narrow depth camera (f = 504 px). Shorter is
+# noise, longer crosses edges; tuned on the studio.
 NORMAL_STEP_RAD = 0.008
-MAX_KINK_M_PER_M = 0.008  # per depth, off the neighbours' mean: an edge; tuned on the studio
+MAX_KINK_M_PER_M = 0.008  # deviation from the neighbours' mean, per depth; tuned on the studio
 MIN_VIEW_COSINE = 0.26  # 75 degrees: time-of-flight degrades at grazing angles; tuned on the studio
 MOVING_SEARCH_M = 0.15  # from one set to the next: 2 m/s at 15 sets a second
 BACKGROUND_CELL_M = 0.03  # of thinned surfaces
 MOVING_CELL_M = 0.02  # of thinned moving surfaces; tuned on the studio
-MOVING_MOMENTS = 16  # frame sets looked at, each with the one before and the one after
-MOVING_SEARCHES = 3  # nearest neighbours until the displacement along the normal settles
-NEIGHBOUR_PIXEL_STEP = 2  # every second pixel of the neighbouring sets, both ways, is enough
 
 
 @dataclass(frozen=True, eq=False)
 class DepthSurface:
-    """``points`` (N, 3) metres, ``normals`` (N, 3) unit, towards the camera, ``rays`` (N, 3) what a
-    point moves by for one metre of depth: all in one camera's depth frame, float64. ``speed``
-    (N,) m/s along the normal, 0 of what stands still."""
+    """Oriented points in one camera's depth frame, float64."""
 
     points: np.ndarray
+    """(N, 3) metres."""
     normals: np.ndarray
+    """(N, 3) unit, towards the camera."""
     rays: np.ndarray
+    """(N, 3) displacement of a point per metre of depth."""
     speed: np.ndarray
+    """(N,) m/s along the normal; 0 for static surfaces."""
 
     def __len__(self) -> int:
         return len(self.points)
 
     @classmethod
     def joined(cls, parts: Sequence[DepthSurface]) -> DepthSurface:
-        """All parts (one or more), end to end."""
+        """Concatenate one or more surfaces."""
         names = ("points", "normals", "rays", "speed")
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
     def subset(self, rows: np.ndarray) -> DepthSurface:
-        """The rows chosen."""
+        """The points of some rows."""
         return DepthSurface(
             self.points[rows], self.normals[rows], self.rays[rows], self.speed[rows]
         )
@@ -73,10 +72,14 @@ def surface_from_depth(
     cell_m: float,
     max_depth_m: float,
 ) -> DepthSurface:
-    """Thin a depth image (H, W) uint16 mm to one mean point and normal a cell of ``cell_m``.
+    """Thin a depth image (H, W), uint16 mm, to one mean point and normal per cell.
 
-    ``keep`` (H, W) bool says which pixels take part, ``window`` (rows, columns) which part of the
-    image is looked at. Edges, grazing views and what is farther than ``max_depth_m`` are left out.
+    Edges, grazing views and points beyond ``max_depth_m`` are left out.
+
+    Args:
+        keep: (H, W) bool, pixels that take part; None = all.
+        window: rows and columns that are processed.
+        cell_m: side of a cell, metres.
     """
     depth, table = depth[window], lens.rays[window]
     usable = (depth > 0) & (depth <= max_depth_m * 1000)
@@ -132,7 +135,7 @@ def thin_surface(surface: DepthSurface, cell_m: float) -> DepthSurface:
 def background_surfaces(
     rig: Rig, backgrounds: Sequence[Background | None]
 ) -> dict[int, DepthSurface]:
-    """The static surface that each camera sees, in its depth camera's frame, by camera index."""
+    """Static surface of each camera, in its depth camera's frame, by camera index."""
     surfaces = {}
     for c, background in enumerate(backgrounds):
         lens = rig[c].depth
@@ -148,9 +151,13 @@ def background_surfaces(
 
 
 def moving_surfaces(
-    frames: Frames, rig: Rig, image_of: np.ndarray, backgrounds: list[Background | None]
+    frames: Frames,
+    rig: Rig,
+    image_of: np.ndarray,
+    backgrounds: list[Background | None],
+    most: int = 16,
 ) -> list[dict[int, DepthSurface]]:
-    """Return the moving surfaces of up to :data:`MOVING_MOMENTS` frame sets, by camera index.
+    """Return the moving surfaces of up to ``most`` frame sets, by camera index.
 
     Points are in the depth camera's frame. Surfaces without a neighbouring set on both sides are
     omitted, because their speed is unknown.
@@ -163,9 +170,9 @@ def moving_surfaces(
     whole = np.zeros(depth_image.shape, bool)  # (T, C) with the sets before and after
     whole[1:-1] = (depth_image[:-2] >= 0) & (depth_image[1:-1] >= 0) & (depth_image[2:] >= 0)
     usable = np.flatnonzero(whole.sum(1) >= 2)
-    if len(usable) > MOVING_MOMENTS:
-        usable = usable[np.linspace(0, len(usable) - 1, MOVING_MOMENTS).round().astype(int)]
-    found = []
+    if len(usable) > most:
+        usable = usable[np.linspace(0, len(usable) - 1, most).round().astype(int)]
+    result = []
     for t in usable:
         at_once = {}
         for c in np.flatnonzero(whole[t]):
@@ -178,8 +185,8 @@ def moving_surfaces(
             if len(surface):
                 at_once[int(c)] = surface
         if len(at_once) >= 2:
-            found.append(at_once)
-    return found
+            result.append(at_once)
+    return result
 
 
 def _with_depth(frames: Frames, image_of: np.ndarray) -> np.ndarray:
@@ -221,7 +228,7 @@ def _box(image: np.ndarray) -> tuple[slice, slice]:
 
 
 def _points(image: np.ndarray, lens: Intrinsics) -> np.ndarray:
-    thin = np.s_[::NEIGHBOUR_PIXEL_STEP, ::NEIGHBOUR_PIXEL_STEP]
+    thin = np.s_[::2, ::2]  # every second pixel is enough
     z = image[thin].astype(np.float64) * 1e-3
     keep = (z > 0) & (z < MOVING_MAX_DEPTH_M + 0.3)
     points = np.column_stack([lens.rays[thin][keep] * z[keep, None], z[keep]])
@@ -229,16 +236,16 @@ def _points(image: np.ndarray, lens: Intrinsics) -> np.ndarray:
 
 
 def _along_normals(surface: DepthSurface, points: np.ndarray) -> np.ndarray:
-    """How far along its normal each point's surface has gone (N,), metres; NaN = not found.
+    """Displacement (N,) of the surface along each point's normal, metres; NaN = not found.
 
-    The nearest point is nearer than the one on the normal: it is sought again from where the last
-    one puts the surface.
+    The nearest point is closer than the surface along the normal, so the search is repeated from
+    the displaced point.
     """
     away, lost = np.zeros(len(surface)), np.zeros(len(surface), bool)
     if not len(points):
         return np.full(len(surface), np.nan)
     tree = cKDTree(points, balanced_tree=False)
-    for _ in range(MOVING_SEARCHES):
+    for _ in range(3):
         sought = surface.points + away[:, None] * surface.normals
         distance, nearest = tree.query(sought, distance_upper_bound=MOVING_SEARCH_M)
         lost |= ~np.isfinite(distance)

@@ -7,38 +7,42 @@ from typing import Literal
 
 import numpy as np
 
+from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.rig import Rig
 
-GRAVITY_CONE_DEG = 10.0  # of an accelerometer and its mounting, on a tripod; a bound, no data sheet
-STATED_UP_CONE_DEG = 10.0  # of a calibration's axis from the floor's normal: a board laid on it
-CAMERA_UP_CONE_DEG = 40.0  # of the mean of the cameras' own up directions; tuned on the studio
-# How far a measured floor may be from what is stated of the calibration's world before it is said:
-# a board is laid by hand and is a few centimetres thick, feet tell a tilt to about 3 degrees.
+GRAVITY_CONE_DEG = 10.0  # error of an accelerometer on a tripod, or of a board laid on the floor
+CAMERA_UP_CONE_DEG = 40.0  # error of the cameras' mean up direction; tuned on the studio
+# Deviations of the floor from the stated one that are reported: a board is laid by hand and is a
+# few centimetres thick, and feet show a tilt to about 3 degrees.
 STATED_UP_DEG = 4.0
 STATED_FLOOR_M = 0.06
-WRONG_UP_DEG = 60.0  # another axis is 90 degrees away; who bends for long leans by less
-MIN_TRUNK_SETS = 5  # that show neck and hips
+WRONG_UP_DEG = 60.0  # another axis is 90 degrees away; a person who bends leans by less
 
 
-NECK, MID_HIP = 1, 8  # among the body's keypoints
+_NECK, _MID_HIP = (KEYPOINT_NAMES.index(name) for name in ("neck", "mid_hip"))
 
 
 @dataclass(frozen=True, eq=False)
 class UpDirection:
-    """``direction`` (3,), unit, master frame; up is within ``cone_deg`` of it."""
+    """Approximate direction up, master frame."""
 
     direction: np.ndarray
+    """(3,) unit."""
     cone_deg: float
+    """Largest angle to the true direction, degrees."""
     source: Literal["gravity", "stated", "cameras"]
+    """Origin of the direction."""
 
 
 def rough_up(rig: Rig, gravity: np.ndarray, stated: np.ndarray | None = None) -> UpDirection:
-    """Roughly up.
+    """Approximate direction up: measured, else stated, else by the cameras.
 
-    ``gravity`` (C, 3) points down in each colour camera, NaN where not known; where no sensor
-    measured it, ``stated`` (3,), master frame, None or NaN = not stated; else the images' upward
-    directions, whose tilts cancel around a ring.
+    The upward directions of the images are averaged, because tilts cancel around a ring.
+
+    Args:
+        gravity: (C, 3) down in each colour camera; NaN = not measured.
+        stated: (3,) up in the master's frame; None or NaN = not stated.
     """
     measured = np.isfinite(gravity).all(1)
     rotations = rig.master_from_colour[:, :3, :3]
@@ -47,19 +51,19 @@ def rough_up(rig: Rig, gravity: np.ndarray, stated: np.ndarray | None = None) ->
         up = -np.median(down, axis=0)
         return UpDirection(up / np.linalg.norm(up), GRAVITY_CONE_DEG, "gravity")
     if stated is not None and np.isfinite(stated).all():
-        return UpDirection(stated, STATED_UP_CONE_DEG, "stated")
+        return UpDirection(stated, GRAVITY_CONE_DEG, "stated")
     up = -rotations[:, :, 1].mean(0)
     return UpDirection(up / np.linalg.norm(up), CAMERA_UP_CONE_DEG, "cameras")
 
 
 def trunk_direction(joints: np.ndarray) -> np.ndarray:
-    """From the middle of the hips to the neck, (3,) unit: the median over joints (T, K, 3).
+    """Median direction (3,) from the middle of the hips to the neck, over joints (T, K, 3).
 
-    NaN where fewer than ``MIN_TRUNK_SETS`` sets show it.
+    NaN if fewer than five sets show both.
     """
-    trunk = joints[:, NECK] - joints[:, MID_HIP]
+    trunk = joints[:, _NECK] - joints[:, _MID_HIP]
     trunk = trunk[np.isfinite(trunk).all(1)]
-    if len(trunk) < MIN_TRUNK_SETS:
+    if len(trunk) < 5:
         return np.full(3, np.nan)
     middle = np.median(trunk / np.linalg.norm(trunk, axis=1, keepdims=True), axis=0)
     return middle / np.linalg.norm(middle)
@@ -68,19 +72,19 @@ def trunk_direction(joints: np.ndarray) -> np.ndarray:
 def check_stated_up(
     stated: np.ndarray, rig: Rig, gravity: np.ndarray, trunk: np.ndarray
 ) -> list[str]:
-    """Say where the ``stated`` up (3,) is not that of the sensors, or of the cameras and a person.
+    """Report where the ``stated`` up (3,) contradicts the sensors, or the cameras and a person.
 
-    ``trunk`` (3,) is :func:`trunk_direction`. Raises UserError, to be prefixed with the sequence,
-    where nothing measured gravity and both the cameras and the person deny it: whatever lies flat
-    that way would be taken for the floor.
+    ``trunk``: see :func:`trunk_direction`. Raises UserError, to be prefixed with the sequence, if
+    gravity was not measured and both the cameras and the person contradict the statement: any
+    surface perpendicular to it could be mistaken for the floor.
     """
     if not np.isfinite(stated).all():
         return []
     without = rough_up(rig, gravity)
     off = degrees_between(stated, without.direction)
     if without.source == "gravity":
-        said = f"the stated up (calibration_up) is {off:.0f} degrees from the gravity sensors'"
-        return [f"{said}, which were believed"] * (off > GRAVITY_CONE_DEG)
+        note = f"the stated up (calibration_up) is {off:.0f} degrees from the gravity sensors'"
+        return [f"{note}, which were believed"] * (off > GRAVITY_CONE_DEG)
     leans = degrees_between(stated, trunk)
     if off > WRONG_UP_DEG and leans > WRONG_UP_DEG:
         raise UserError(
@@ -100,10 +104,14 @@ def check_stated_up(
 def compare_with_stated(
     point: np.ndarray, normal: np.ndarray, up: np.ndarray, floor: np.ndarray, middle: np.ndarray
 ) -> list[str]:
-    """Say where a floor, its ``point`` and ``normal`` (3,), is not the one that is stated.
+    """Report where a floor deviates from the stated one; all in the master's frame.
 
-    ``up`` and a point of the stated ``floor`` (3,), NaN = not stated; heights are compared at
-    ``middle`` (3,). All in the master's frame.
+    Args:
+        point: (3,) of the floor.
+        normal: (3,) of the floor.
+        up: (3,) stated up; NaN = not stated.
+        floor: (3,) point of the stated floor; NaN = not stated.
+        middle: (3,) where heights are compared.
     """
     notes = []
     off = degrees_between(up, normal)
@@ -117,5 +125,5 @@ def compare_with_stated(
 
 
 def degrees_between(a: np.ndarray, b: np.ndarray) -> float:
-    """The angle of two unit vectors (3,); NaN where one is."""
+    """Angle between two unit vectors (3,), degrees; NaN if one of them is."""
     return float(np.degrees(np.arccos(np.clip(a @ b, -1.0, 1.0))))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig, ring_centre
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.scene.background import Background, camera_background
-from intercap_core.scene.camera_verdicts import WEAK_CAMERA_M, describe_direction, weakest_motion
+from intercap_core.scene.camera_verdicts import describe_direction, weakest_motion
 from intercap_core.scene.constraints import FloorConstraint
 from intercap_core.scene.extrinsics import Refinement, refine
 from intercap_core.scene.ground import (
@@ -47,7 +48,32 @@ from intercap_core.scene.up import (
 from intercap_core.schemas import SCENE
 
 FEET = slice(19, 25)  # toes and heels among the body's keypoints
+WEAK_CAMERA_M = 0.010  # a larger standard deviation of a camera's pose is reported
 Floor = Sequence[tuple[float, float, float]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Scene:
+    """Contents of the scene artefact."""
+
+    rig: Rig
+    """Refined cameras."""
+    backgrounds: list[Background | None]
+    """Static depth by camera."""
+    moments: Moments
+    """Images by moment."""
+    refined: Refinement
+    """Poses, biases and offsets."""
+    ground: GroundPlane
+    """The floor."""
+    ground_notes: list[str]
+    """What is unusual about the floor or the stated up."""
+    notes: list[list[str]]
+    """Notes by camera."""
+    slides: np.ndarray
+    """(C, 3) weakest motion of each camera, see :func:`_slides`."""
+    known_to: list[str]
+    """The same in words, "" = fixed."""
 
 
 def run(
@@ -61,10 +87,12 @@ def run(
 ) -> None:
     """Write the scene artefact of one sequence.
 
-    ``floor`` are annotated floor points, master frame, metres, which override the fit; ``starts``
-    annotated times of cameras' first images and their standard deviations, seconds. Raises
-    UserError where the recording has no image at all, the two artefacts are of different
-    recordings, the annotated points give no plane, or the annotated starts nothing in common.
+    Raises UserError if the recording has no image, the two artefacts are of different recordings,
+    the annotated floor points span no plane, or the annotated starts leave no common time.
+
+    Args:
+        floor: annotated floor points, master frame, metres; they replace the fit.
+        starts: annotated time of the first image and its standard deviation, seconds, by camera.
     """
     with Frames.open(frames) as source:
         if not source.available.any():
@@ -85,57 +113,40 @@ def run(
             people, rig, source.time_s, source.fps, source.available, master=master, stated=stated
         )
         subject, image_of = moments.subject, moments.image_of
-        oddities = _check_stated_up(source, subject)
+        ground_notes = _check_stated_up(source, subject)
         backgrounds = _backgrounds(source, subject, moments.slip)
         rig, exchanges = exchange_lenses(rig, backgrounds, subject, source.time_s, master)
         surfaces = background_surfaces(rig, backgrounds)
+        given_ground = _ground(source, rig, surfaces, np.zeros(len(rig)), settings, floor)
         refined = refine(
             rig,
             master,
             surfaces,
             moving_surfaces(source, rig, image_of, backgrounds),
-            subject,
+            moments,
             source.time_s,
-            moments.timing,
-            moments.starts,
-            floor=FloorConstraint.of(
-                rig, surfaces, _ground(source, rig, surfaces, np.zeros(len(rig)), settings, floor)
-            ),
+            floor=FloorConstraint.of(rig, surfaces, given_ground),
             free_poses=settings.refine_extrinsics,
         )
         rig = rig.moved(refined.poses)
         ground = _ground(source, rig, surfaces, refined.bias, settings, floor)
-        ground, odd = _with_feet(source, rig, ground, subject)
-        oddities += odd
+        ground, more_notes = _with_feet(source, rig, ground, subject)
         slides, known_to = _slides(source, rig, refined, ground)
         notes = _notes(source, refined, moments, stated, exchanges)
-        for note, odd_start, slide, words in zip(notes, disagree, slides, known_to, strict=True):
-            note += [odd_start] if odd_start else []
+        for note, disagreement, slide, words in zip(notes, disagree, slides, known_to, strict=True):
+            note += [disagreement] if disagreement else []
             note += [words] if np.linalg.norm(slide) > WEAK_CAMERA_M else []
-        _write(
-            output,
-            source,
-            rig,
-            backgrounds,
-            moments.slip,
-            image_of,
-            refined,
-            ground,
-            oddities,
-            ["; ".join(lines) for lines in notes],
-            slides,
-            [
-                "; ".join(filter(None, both))
-                for both in zip(refined.verdicts, known_to, strict=True)
-            ],
-            settings,
+        ground_notes += more_notes
+        scene = _Scene(
+            rig, backgrounds, moments, refined, ground, ground_notes, notes, slides, known_to
         )
+        _write(output, source, scene, settings)
 
 
 def _stated_starts(
     source: Frames, starts: Mapping[str, tuple[float, float]], master: int
 ) -> tuple[StatedStarts, list[str]]:
-    """What the annotation and the sound say, and of each camera where they disagree, in words."""
+    """Starts by annotation and sound combined, and a message (C,) for each disagreement."""
     names, heard = source.rig.names, source.sound_starts
     if not starts and not heard:
         return StatedStarts.nothing(len(names)), [""] * len(names)
@@ -152,7 +163,7 @@ def _stated_starts(
 def _backgrounds(
     source: Frames, subject: SubjectViews, slip: np.ndarray
 ) -> list[Background | None]:
-    """Each camera's background; the person is sought where it was when the image was taken."""
+    """Background of each camera; the person is masked where they were at the exposure."""
     last = source.num_sets - 1
     moment = np.clip(np.arange(source.num_sets)[:, None] - slip, 0, last)
     return [
@@ -176,9 +187,9 @@ def _check_stated_up(source: Frames, subject: SubjectViews) -> list[str]:
 def _with_feet(
     source: Frames, rig: Rig, ground: GroundPlane, subject: SubjectViews
 ) -> tuple[GroundPlane, list[str]]:
-    """The floor, and what is odd about it, in words.
+    """The floor, and notes about it.
 
-    Without a measured one it is that which is stated where feet do not deny it, else that of feet.
+    If none was measured, the stated floor is used unless feet contradict it, else that of the feet.
     """
     stated = source.stated_up, source.stated_floor
     middle = ring_centre(rig)
@@ -190,13 +201,13 @@ def _with_feet(
                 ground.point, ground.normal, *stated, middle
             )
             ground = ground if denied else stated_ground(*stated)
-    odd = [ground.note] if ground.note else []
+    notes = [ground.note] if ground.note else []
     if ground.found and ground.source != "feet":
         above = describe_raised_feet(subject.joints[:, FEET], ground)
-        odd += [above] if above else []
+        notes += [above] if above else []
     if ground.found:
-        odd += compare_with_stated(ground.point, ground.normal, *stated, middle)
-    return ground, odd
+        notes += compare_with_stated(ground.point, ground.normal, *stated, middle)
+    return ground, notes
 
 
 def _ground(
@@ -207,6 +218,7 @@ def _ground(
     settings: SceneSettings,
     floor: Floor | None,
 ) -> GroundPlane:
+    """Fit the floor to the background, or to the annotated points."""
     points, normals = [np.zeros((0, 3))], [np.zeros((0, 3))]
     for c, surface in surfaces.items():
         pose = rig[c].master_from_depth
@@ -227,28 +239,18 @@ def _ground(
         rig,
         _up(source, rig),
         tolerance_m=tolerance,
-        # Every camera may see the same floor: count the area as if all of them did.
+        # Cameras may see the same floor: count the area as if all of them did.
         cell_m=BACKGROUND_CELL_M / np.sqrt(max(1, len(surfaces))),
     )
 
 
-def _write(
-    output: Path,
-    source: Frames,
-    rig: Rig,
-    backgrounds: list[Background | None],
-    slip: np.ndarray,
-    image_of: np.ndarray,
-    refined: Refinement,
-    ground: GroundPlane,
-    oddities: list[str],
-    notes: list[str],
-    slides: np.ndarray,
-    verdicts: list[str],
-    settings: SceneSettings,
-) -> None:
+def _write(output: Path, source: Frames, scene: _Scene, settings: SceneSettings) -> None:
+    rig, refined, ground = scene.rig, scene.refined, scene.ground
     pairs = refined.pairs
     up = _up(source, rig)
+    verdicts = [
+        "; ".join(filter(None, both)) for both in zip(refined.verdicts, scene.known_to, strict=True)
+    ]
     with artefacts.write(
         output,
         SCENE,
@@ -264,8 +266,8 @@ def _write(
         ground_rms=ground.rms,
         ground_inliers=ground.inliers,
     ) as writer:
-        if oddities:
-            writer.attributes["ground_note"] = "; ".join(oddities)
+        if scene.ground_notes:
+            writer.attributes["ground_note"] = "; ".join(scene.ground_notes)
         if not ground.found:
             writer.attributes["up_source"] = up.source
         for key, values in rig.datasets().items():
@@ -278,8 +280,8 @@ def _write(
         writer.put("camera_covariance", refined.covariance)
         writer.put("camera_refined", refined.refined)
         writer.put("camera_verdict", verdicts)
-        writer.put("camera_slide", slides)
-        writer.put("note", notes)
+        writer.put("camera_slide", scene.slides)
+        writer.put("note", ["; ".join(lines) for lines in scene.notes])
         writer.put("pairs", pairs.pairs)
         for k, kind in enumerate(("pair", "pair_moving")):
             residual = "pair_residual" if k == 0 else kind
@@ -289,12 +291,12 @@ def _write(
         writer.put("pair_weak", pairs.weak)
         writer.put("time_offset", refined.offset)
         writer.put("time_offset_sigma", refined.offset_sigma)
-        writer.put("slip", slip)
-        writer.put("image_of", image_of)
+        writer.put("slip", scene.moments.slip)
+        writer.put("image_of", scene.moments.image_of)
         writer.put("ground_point", ground.point)
         writer.put("ground_normal", ground.normal)
         writer.put("zup_from_master", zup_from_master(ground, rig, up))
-        for camera, background in zip(rig, backgrounds, strict=True):
+        for camera, background in zip(rig, scene.backgrounds, strict=True):
             if background is not None:
                 writer.put(f"cameras/{camera.name}/background", background.depth)
 
@@ -306,17 +308,17 @@ def _notes(
     stated: StatedStarts,
     exchanges: Sequence[LensExchange],
 ) -> list[list[str]]:
-    """What each camera's lens, pose and time rest on, and where it slips."""
+    """Notes (C,) on the lens, pose, time and slips of each camera."""
     notes = [[note] if note else [] for note in refined.notes]
-    for one in exchanges:
-        what = "its lens" if one.whole else "its focal length and principal point"
-        shown = "by the keypoints"
-        if np.isfinite(one.before):
-            shown = f"background {1e3 * one.before:.1f} to {1e3 * one.after:.1f} mm"
-        for own, other in ((one.first, one.second), (one.second, one.first)):
+    for swap in exchanges:
+        part = "its lens" if swap.whole else "its focal length and principal point"
+        evidence = "by the keypoints"
+        if np.isfinite(swap.before):
+            evidence = f"background {1e3 * swap.before:.1f} to {1e3 * swap.after:.1f} mm"
+        for own, other in ((swap.first, swap.second), (swap.second, swap.first)):
             notes[own].append(
-                f"{what} and those of {source.rig.names[other]} are exchanged in the calibration "
-                f"and were put right ({shown})"
+                f"{part} and those of {source.rig.names[other]} are exchanged in the calibration "
+                f"and were put right ({evidence})"
             )
     starts = moments.starts
     for c in np.flatnonzero(source.present & ~stated.known & (starts.sets != 0)).tolist():
@@ -345,8 +347,8 @@ def _notes(
 def _slides(
     source: Frames, rig: Rig, refined: Refinement, ground: GroundPlane
 ) -> tuple[np.ndarray, list[str]]:
-    """By which each camera may let the rig's middle slide (C, 3), one standard deviation, metres,
-    and the same in words, "" = not at all."""
+    """Weakest motion of each camera: displacement (C, 3) of the rig's centre by one standard
+    deviation, metres, and a description, "" = fixed."""
     up = ground.normal if ground.found else _up(source, rig).direction
     slides, words = np.zeros((len(rig), 3)), [""] * len(rig)
     for c, pose in enumerate(rig.master_from_colour):

@@ -11,54 +11,57 @@ import numpy as np
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import apply
 
-# Behind the nearest point of its cell by more, a point is occluded, metres: more than a surface's
-# slope within a cell. Tuned on the studio.
+# Distance behind the nearest point of its cell from which a point is occluded, metres: above the
+# slope of a surface within a cell. Tuned on the studio.
 OCCLUDED_BEHIND_M = 0.03
 
 
 @dataclass(frozen=True)
 class ImageCandidate:
-    """A thing in one view: COCO RLE, how likely it is one (0 to 1), its size in space.
-
-    ``component`` is the same in all views that show the same thing.
-    """
+    """A possible object in one view."""
 
     rle: bytes
+    """Mask, COCO RLE."""
     score: float
+    """Probability that it is an object, 0 to 1."""
     extent_m: float
+    """Size in space, metres."""
     component: int
+    """Number of the component, common to all views that show it."""
 
 
 @dataclass(frozen=True)
 class ViewSegments:
-    """The person's RLE, empty = not seen, and candidates of one view. ``beside``: the RLE of where
-    a border of the person's says nothing, empty = it says nothing anywhere."""
+    """Segmentation of one view."""
 
     person: bytes
+    """RLE of the person; empty = not seen."""
     candidates: list[ImageCandidate]
+    """Possible objects."""
     beside: bytes = b""
-
-
-_CLOSING = np.ones((3, 3), np.uint8)
+    """RLE of the pixels in which a border of the person is no evidence; empty = nowhere."""
 
 
 @dataclass(frozen=True, eq=False)
 class ColourCells:
-    """Where points (N,) lie in a colour image of (height, width) cells of ``scale`` pixels.
-
-    ``cell`` (N,) flat, -1 outside the image; ``z`` (N,) depth in the colour camera, metres.
-    """
+    """Cells of the colour image in which points lie."""
 
     cell: np.ndarray
+    """(N,) flat index; -1 = outside the image."""
     z: np.ndarray
+    """(N,) depth in the colour camera, metres."""
     height: int
+    """Rows of cells."""
     width: int
+    """Columns of cells."""
     scale: int
+    """Side of a cell, pixels."""
     colour_size: tuple[int, int]
+    """Width and height of the image, pixels."""
 
     @classmethod
     def of(cls, points: np.ndarray, camera: Camera) -> ColourCells:
-        """Of ``points`` (N, 3) float32 in the depth camera's frame."""
+        """Project ``points`` (N, 3) float32 in the depth camera's frame."""
         colour, depth = camera.colour, camera.depth
         assert depth is not None and camera.colour_from_depth is not None
         scale = max(1, round(colour.fx / depth.fx))
@@ -77,37 +80,34 @@ class ColourCells:
 
     @classmethod
     def joined(cls, parts: list[ColourCells]) -> ColourCells:
-        """All points of one image, end to end."""
+        """Concatenate points of one image."""
         cell, z = (np.concatenate([getattr(part, key) for part in parts]) for key in ("cell", "z"))
         return replace(parts[0], cell=cell, z=z)
 
 
 @dataclass(frozen=True, eq=False)
 class ProjectedCells:
-    """Depth pixels on cells of the colour image.
-
-    ``cell`` (N,) flat cell of each pixel, -1 where a nearer pixel or the image's edge hides it;
-    the grid is (height, width) cells of ``scale`` x ``scale`` colour pixels.
-    """
+    """Cells of the colour image in which depth pixels are visible."""
 
     cell: np.ndarray
-    height: int
+    """(N,) flat index; -1 = occluded by a nearer pixel, or outside the image."""
     width: int
+    """Columns of cells."""
     scale: int
-    colour_size: tuple[int, int]  # width, height
+    """Side of a cell, pixels."""
+    colour_size: tuple[int, int]
+    """Width and height of the image, pixels."""
 
     @classmethod
     def of(cls, cells: ColourCells) -> ProjectedCells:
-        """The pixels of ``cells``; each hides what is clearly behind it."""
+        """Remove the pixels of ``cells`` that are clearly behind others."""
         hidden = _hidden(cells.cell, cells.z, cells.height * cells.width)
-        cell = np.where(hidden, -1, cells.cell)
-        return cls(cell, cells.height, cells.width, cells.scale, cells.colour_size)
+        return cls(np.where(hidden, -1, cells.cell), cells.width, cells.scale, cells.colour_size)
 
     def rle(self, chosen: np.ndarray, others: np.ndarray) -> bytes:
-        """The mask of the pixels ``chosen`` (N,) bool as COCO RLE.
+        """Mask of the pixels ``chosen`` (N,) bool as COCO RLE; empty bytes if none is visible.
 
-        Holes of the projection are closed, but not over cells of ``others`` (N,) bool. Empty
-        bytes where nothing is left.
+        Holes of the projection are closed, but not over cells of ``others`` (N,) bool.
         """
         cells = self.cell[chosen & (self.cell >= 0)]
         if not len(cells):
@@ -117,7 +117,7 @@ class ProjectedCells:
         bottom, right = int(row.max()) + 3, int(column.max()) + 3
         drawn = np.zeros((bottom - top, right - left), np.uint8)
         drawn[row - top, column - left] = 1
-        mask = cv2.morphologyEx(drawn, cv2.MORPH_CLOSE, _CLOSING)
+        mask = cv2.morphologyEx(drawn, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
         taken_row, taken_column = np.divmod(self.cell[others & (self.cell >= 0)], self.width)
         near = (taken_row >= top) & (taken_row < bottom)
         near &= (taken_column >= left) & (taken_column < right)
@@ -130,10 +130,10 @@ class ProjectedCells:
 def encode_window(
     mask: np.ndarray, left: int, top: int, scale: int, width: int, height: int
 ) -> bytes:
-    """COCO compressed RLE of an image (height, width) that is set where a window of cells is.
+    """COCO compressed RLE of an image (height, width) that is set in a window of cells.
 
-    ``mask`` (h, w) uint8; cell (0, 0) covers the ``scale`` x ``scale`` pixels from (left, top) *
-    ``scale`` on. What lies outside the image is cut off.
+    ``mask``: (h, w) uint8. Cell (0, 0) covers the ``scale`` x ``scale`` pixels from (left, top) *
+    ``scale`` on. Pixels outside the image are cut off.
     """
     columns = min(mask.shape[1] * scale, width - left * scale)
     rows = min(mask.shape[0] * scale, height - top * scale)

@@ -1,8 +1,8 @@
 """The person's mask and candidates of the object from colour images, where a camera has no depth.
 
 Background subtraction: a pixel that differs in colour from the recording's median is foreground.
-Foreground around the projected keypoints is the person. Without depth, a thing that occludes the
-person in the image counts as the person, and a thing that rests for most of a recording is part of
+Foreground around the projected keypoints is the person. Without depth, an object that occludes the
+person in the image counts as the person, and an object at rest for most of a recording is part of
 the background.
 """
 
@@ -24,43 +24,42 @@ from intercap_core.person.segmentation.candidate_masks import (
 from intercap_core.person.segmentation.person_volume import MovingPerson
 
 # Horprasert, Harwood and Davis (1999): a pixel is split into brightness along the background's
-# colour and what is off it. A shadow is darker, of the same colour. Grey levels, share, share; the
-# values are tuned on the studio.
-OFF_COLOUR, SHADOW, HIGHLIGHT = 14.0, 0.5, 1.4
-DARK = 40.0  # grey levels; darker colours of the background have no direction; tuned on the studio
-DARK_CHANGE = 30.0  # grey levels by which a pixel of such a background differs; tuned on the studio
-SATURATED = 250  # grey level from which a pixel tells nothing of the exposure
-# The person's volume, this many margins larger, in the colour image: left out of the background,
-# holds the mask, holds no thing. Tuned on the studio.
-SAMPLE_MARGINS, MASK_MARGINS, THING_MARGINS = 5.0, 2.0, 1.0
-COLOUR_SCALE = 2  # images are decoded at half their size, which JPEG does in a quarter of the time
-UNSURE_CELLS = 4  # around the volume where nothing moved, in which a border is the volume's; judged
-MAX_COLOUR_SAMPLES = 15  # images of which the background is the median
-MIN_COLOUR_SAMPLES = 3  # of a pixel without the person: fewer tell no background
-GAIN_STRIDE = 16  # pixels; exposures are compared at every so many
-MAX_COLOUR_CANDIDATES = 5  # of one image
-MIN_COLOUR_CELLS = 60  # of a candidate in colour, at the reduced size; tuned on the studio
-COLOUR_SCORE = 0.5
+# colour and a deviation from it. A shadow is darker and of the same colour.
+OFF_COLOUR = 14.0  # deviation, grey levels; tuned on the studio
+SHADOW = 0.5  # least brightness, share; tuned on the studio
+HIGHLIGHT = 1.4  # largest brightness, share; tuned on the studio
+DARK = 40.0  # grey levels below which a background has no colour direction; tuned on the studio
+DARK_CHANGE = 30.0  # change of such a background, grey levels; tuned on the studio
+# Margins by which the person's volume is enlarged in the colour image, tuned on the studio:
+SAMPLE_MARGINS = 5.0  # excluded from the background
+MASK_MARGINS = 2.0  # contains the person's mask
+THING_MARGINS = 1.0  # contains no object
+COLOUR_SCALE = 2  # images are decoded at half size, which takes a quarter of the time for JPEG
+UNSURE_CELLS = 4  # around a volume without motion, whose border is no outline; untuned
+MIN_COLOUR_SAMPLES = 3  # least number of samples of a pixel without the person
+MIN_COLOUR_CELLS = 60  # of a candidate, at the reduced size; tuned on the studio
 
 
 class ColourSegmenter:
-    """Segments the views of a recording that have colour alone.
-
-    ``frames`` read by the moment that their images show, ``scene`` the scene artefact, ``joints``
-    (T, 135, 3) the subject's keypoints, master frame, metres, NaN = not known, ``sigma`` (T, 135)
-    what they are off by.
-    """
+    """Segments the views of a recording without depth."""
 
     def __init__(
         self, frames: Frames, scene: Artefact, joints: np.ndarray, sigma: np.ndarray
     ) -> None:
+        """
+        Args:
+            frames: read by the moment that their images show.
+            scene: the scene artefact.
+            joints: (T, 135, 3) the subject's keypoints, master frame, metres; NaN = unknown.
+            sigma: (T, 135) their standard deviations, metres.
+        """
         self._frames = frames
         self._rig = Rig.from_artefact(scene)
         self._person = MovingPerson(joints, sigma, scene)
         self._backgrounds: dict[int, tuple[np.ndarray, np.ndarray] | None] = {}
 
     def segment(self, t: int, c: int) -> ViewSegments | None:
-        """One image; None where it does not decode, or its background or the person is unknown."""
+        """Segment one image; None if it does not decode, or background or person are unknown."""
         if c not in self._backgrounds:
             self._backgrounds[c] = self._background(c)
         background = self._backgrounds[c]
@@ -70,23 +69,21 @@ class ColourSegmenter:
             return None
         camera = self._rig[c]
         moved = find_foreground(image, *background)
-        # clothes of the wall's colour, or a place that the person never left: take the body's
-        # volume
+        # the volume fills in clothes of the wall's colour, and places that the person never left
         body = draw_volume(bones, camera, moved.shape, 0)
         person = body | (moved & draw_volume(bones, camera, moved.shape, MASK_MARGINS))
-        # the volume's own border, what was cut off, and what has no background are no outline
+        # borders of the volume, of the cut, and of unknown background are no outline
         block = np.ones((2 * UNSURE_CELLS + 1,) * 2, np.uint8)
         assumed = cv2.dilate((body & ~moved).view(np.uint8), block) > 0
         unsure = assumed | (moved & ~person) | ~background[1]
-        things = moved & ~draw_volume(bones, camera, moved.shape, THING_MARGINS)
+        objects = moved & ~draw_volume(bones, camera, moved.shape, THING_MARGINS)
         block = np.ones((3, 3), np.uint8)
-        rest = cv2.morphologyEx(things.view(np.uint8), cv2.MORPH_OPEN, block)
+        rest = cv2.morphologyEx(objects.view(np.uint8), cv2.MORPH_OPEN, block)
         _, label, stats, _ = cv2.connectedComponentsWithStats(rest, connectivity=8)
         areas = stats[:, cv2.CC_STAT_AREA]
         large = [k for k in np.argsort(-areas, kind="stable") if k and areas[k] >= MIN_COLOUR_CELLS]
         candidates = [
-            ImageCandidate(self._rle(label == k, camera), COLOUR_SCORE, float("nan"), -1)
-            for k in large[:MAX_COLOUR_CANDIDATES]
+            ImageCandidate(self._rle(label == k, camera), 0.5, float("nan"), -1) for k in large[:5]
         ]
         if not person.any():
             return ViewSegments(b"", candidates)
@@ -104,8 +101,8 @@ class ColourSegmenter:
 
     def _background(self, c: int) -> tuple[np.ndarray, np.ndarray] | None:
         sets = np.flatnonzero(self._frames.colour_available[:, c])
-        if len(sets) > MAX_COLOUR_SAMPLES:
-            sets = sets[np.linspace(0, len(sets) - 1, MAX_COLOUR_SAMPLES).round().astype(int)]
+        if len(sets) > 15:
+            sets = sets[np.linspace(0, len(sets) - 1, 15).round().astype(int)]
         images, people = [], []
         for t in sets:
             image, bones = self._image(int(t), c), self._person.bones(int(t), c)
@@ -125,10 +122,13 @@ class ColourSegmenter:
 
 
 def median_background(images: np.ndarray, people: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Median colour (H, W, 3) float32 of images (S, H, W, 3) uint8 where nobody is, and whether it
-    is known (H, W) bool; ``people`` (S, H, W) bool.
+    """Median colour (H, W, 3) float32 without the person, and where it is known, (H, W) bool.
 
-    Exposures are brought to that of the first image before.
+    Exposures are first matched to that of the first image.
+
+    Args:
+        images: (S, H, W, 3) uint8.
+        people: (S, H, W) bool, pixels of the person.
     """
     gains = np.stack([_gain(image, images[0]) for image in images])
     seen = len(images) - people.sum(0)
@@ -160,8 +160,13 @@ def _median(images: np.ndarray, people: np.ndarray, gains: np.ndarray) -> np.nda
 
 
 def find_foreground(image: np.ndarray, background: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Pixels (H, W) bool of an image (H, W, 3) uint8 that differ from the ``background`` (H, W, 3)
-    float32 by more than a shadow does, holes closed; False where that is not ``known`` (H, W)."""
+    """Pixels (H, W) bool that differ from the background by more than a shadow, holes closed.
+
+    Args:
+        image: (H, W, 3) uint8.
+        background: (H, W, 3) float32.
+        known: (H, W) bool, pixels with a background; others are no foreground.
+    """
     changed = _changed(image, background, _gain(image, background)) & known
     block = np.ones((3, 3), np.uint8)
     opened = cv2.morphologyEx(changed.view(np.uint8), cv2.MORPH_OPEN, block)
@@ -194,10 +199,10 @@ def _changed(image: np.ndarray, background: np.ndarray, gain: np.ndarray) -> np.
 
 
 def _gain(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Factors (3,) float32 that bring an image's exposure to the reference's."""
-    few = np.s_[::GAIN_STRIDE, ::GAIN_STRIDE]
+    """Factors (3,) float32 that match an image's exposure to the reference."""
+    few = np.s_[::16, ::16]
     a, b = image[few].astype(np.float32), reference[few].astype(np.float32)
-    good = (a > DARK / 2) & (a < SATURATED) & (b > DARK / 2) & (b < SATURATED)
+    good = (a > DARK / 2) & (a < 250) & (b > DARK / 2) & (b < 250)  # neither dark nor saturated
     gains = np.ones(3, np.float32)
     for channel in range(3):
         use = good[..., channel]
@@ -209,9 +214,9 @@ def _gain(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
 def draw_volume(
     bones: np.ndarray, camera: Camera, shape: tuple[int, ...], margins: float
 ) -> np.ndarray:
-    """Where the person's volume, ``margins`` larger, is in the reduced colour image: (H, W) bool.
+    """Mask (H, W) of the person's volume, enlarged by ``margins``, in the reduced colour image.
 
-    ``bones`` (B, 9), master frame, of :func:`.person_volume.bones_of`.
+    ``bones``: (B, 9), master frame, of :func:`.person_volume.build_bones`.
     """
     mask = np.zeros(shape[:2], np.uint8)
     if not len(bones):

@@ -3,14 +3,14 @@
 Background subtraction: depth before the static background is foreground. Foreground within a body
 of average build around the triangulated keypoints is the person, the rest belongs to objects. Their
 points of all views are clustered in space into connected components, and each component is a
-candidate in every view that shows it. Four kinds of component are proposed, the object's track
-chooses:
+candidate in every view that shows it. Four kinds of component are proposed; the object's tracker
+chooses among them:
 
 - moving: foreground away from the person, cut off the body at two distances (``NEAR_CUT``,
-  ``FAR_CUT``), since where hand ends and thing begins is uncertain;
-- merged: neighbouring moving components, for a thing whose middle the hand occludes;
-- static: components of the background near the person's path, for a thing that does not move now;
-- partly moved: a static component with foreground beside it, for a thing that moved by less than
+  ``FAR_CUT``), because the border between hand and object is uncertain;
+- merged: neighbouring moving components, for an object whose middle the hand occludes;
+- static: components of the background near the person's path, for an object at rest;
+- partly moved: a static component with adjacent foreground, for an object that moved by less than
   its size, so that part of it still coincides with the background.
 """
 
@@ -44,58 +44,50 @@ from intercap_core.person.segmentation.static_objects import (
     find_static_objects,
 )
 
-PERSON_MARGINS = 1.5  # outside the usual build by less is the person; tuned on the studio
-# Margins outside the person at which a thing may begin, both are tried; tuned on the studio.
-NEAR_CUT, FAR_CUT = 1.0, 2.5
-CLOTHING_MARGINS = 2.2  # a component that reaches no farther is clothing; tuned on the studio
-# Around the person's path, above the highest keypoint: where things are looked for, metres; tuned
-# on the studio.
-AROUND_PATH_M, ABOVE_HEAD_M = 1.5, 0.7
-PERSON_SAMPLES = 12  # moments at which the person's own traces in the background are sought
-MAX_COMPONENTS = 6  # of one kind
+# Distances from a person of usual build are in margins, see :mod:`.person_volume`.
+PERSON_MARGINS = 1.5  # below, foreground is the person; tuned on the studio
+NEAR_CUT = 1.0  # first distance from which an object may begin; tuned on the studio
+FAR_CUT = 2.5  # second distance, tried as well; tuned on the studio
+CLOTHING_MARGINS = 2.2  # a component within is clothing; tuned on the studio
+AROUND_PATH_M = 1.5  # searched distance from the person's path; tuned on the studio
+ABOVE_HEAD_M = 0.7  # searched height above the highest keypoint; tuned on the studio
+MAX_COMPONENTS = 6  # of one kind, in one frame set
 CELL_M = 0.02  # points of one surface 4 m away are 8 mm apart
-NEARBY_CELL_M = 0.07  # components with less between them may be one held thing: a hand's breadth
-FLOOR_M = 0.025  # what is lower may be the floor; tuned on the studio
+NEARBY_CELL_M = 0.07  # gap of components that may be one held object: a hand's breadth (anatomy)
+FLOOR_M = 0.025  # lower points may be the floor; tuned on the studio
 MIN_POINTS = 40  # of a component, over all views; tuned on the studio
-MIN_VIEW_POINTS = 12  # of it in a view that has it as a candidate; tuned on the studio
-SAME_SHARE = 0.9  # of a component's points: the farther cut shows nothing new; tuned
-# Prior that a component is a handled thing, whatever its size: of moving components, by how far
-# they reach from the person; low for all of the static scene. The scores are shaped by the studio:
-# no recording was annotated to calibrate them.
-ON_TOP_SCORE, STATIC_SCORE, PARTLY_MOVED_SCORE, TWO_ENDS_SCORE = 0.3, 0.2, 0.4, 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class _ViewPoints:
-    """Foreground and static things of one view: points (N, 3), z up, and their colour ``cells``.
-
-    ``outside`` (N,) margins outside the person; ``moving`` (N,) bool: before the static scene;
-    ``of_thing``: indices of the points of every static thing.
-    """
+    """Foreground and static objects of one view."""
 
     points: np.ndarray
+    """(N, 3) metres, z up."""
     cells: ColourCells
+    """Their cells in the colour image."""
     outside: np.ndarray
+    """(N,) distance outside the person, margins."""
     moving: np.ndarray
-    of_thing: list[np.ndarray]
+    """(N,) bool: foreground."""
+    of_static: list[np.ndarray]
+    """Indices of the points of each static object."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Component:
-    """A connected component: indices of its points in each view, score (0 to 1), size."""
+    """A connected component of points of all views."""
 
     members: list[np.ndarray]
+    """Indices of its points in each view."""
     score: float
+    """Prior probability that it is a handled object. Shaped by the studio, not calibrated."""
     extent_m: float
+    """Size, metres."""
 
 
 class DepthSegmenter:
-    """Segments the views of a recording that have depth.
-
-    ``frames`` read by the moment that their images show, ``scene`` the scene artefact, ``joints``
-    (T, 135, 3) the subject's keypoints in the master frame and ``sigma`` (T, 135) what they are off
-    by, metres, ``cameras`` which of them to look at.
-    """
+    """Segments the views of a recording with depth."""
 
     def __init__(
         self,
@@ -105,6 +97,14 @@ class DepthSegmenter:
         sigma: np.ndarray,
         cameras: list[int],
     ) -> None:
+        """
+        Args:
+            frames: read by the moment that their images show.
+            scene: the scene artefact.
+            joints: (T, 135, 3) the subject's keypoints, master frame, metres; NaN = unknown.
+            sigma: (T, 135) their standard deviations, metres.
+            cameras: indices of the cameras to segment.
+        """
         self._frames = frames
         rig = Rig.from_artefact(scene)
         zup = scene["zup_from_master"]
@@ -139,14 +139,14 @@ class DepthSegmenter:
             for c in self.cameras
         ]
         backgrounds = without_free_space(views, backgrounds, self._low, self._high)
-        some = range(0, len(joints), max(1, len(joints) // PERSON_SAMPLES))
+        some = range(0, len(joints), max(1, len(joints) // 12))
         bodies = [self._person.bones_at(t) for t in some]
         backgrounds = [
             without_person_traces(view, background, bodies)
             for view, background in zip(views, backgrounds, strict=True)
         ]
         self._background = dict(zip(self.cameras, backgrounds, strict=True))
-        # without the floor removed, the whole scene is one component
+        # with the floor, the whole scene would be one component
         bottom = self._low if grounded else self._high
         self._static = find_static_objects(views, backgrounds, bottom, self._high, everywhere)
         self._fixed = {c: self._static_points(number, c) for number, c in enumerate(self.cameras)}
@@ -154,16 +154,16 @@ class DepthSegmenter:
     def _static_points(
         self, number: int, c: int
     ) -> list[tuple[np.ndarray, np.ndarray, ColourCells]]:
-        """Flat pixels, points and cells of every static thing in one camera."""
+        """Flat pixels, points and cells of each static object in one camera."""
         view, found = self._views[c], []
-        for thing in self._static.things:
-            pixels = thing.pixels[number]
+        for item in self._static.objects:
+            pixels = item.pixels[number]
             points, local = view.points(self._background[c].depth, pixels)
             found.append((pixels, points, ColourCells.of(local, view.camera)))
         return found
 
     def segment(self, t: int, wanted: list[int]) -> dict[int, ViewSegments]:
-        """The views ``wanted`` of moment ``t``, those that have no depth image left out."""
+        """Segment the views ``wanted`` of moment ``t``, except those without a depth image."""
         images = {
             c: image
             for c in wanted
@@ -180,7 +180,7 @@ class DepthSegmenter:
             *self._partly_moved(seen),
         ]
         return {
-            c: _masks(view, [(one, one.members[number]) for one in proposed])
+            c: _masks(view, number, proposed)
             for number, (c, view) in enumerate(zip(images, seen, strict=True))
         }
 
@@ -192,22 +192,22 @@ class DepthSegmenter:
         points, local, index = points[inside], local[inside], index[inside]
         bones = self._person.bones(t, c)
         away = distance_outside(points, bones)
-        # background unknown to this view may be known to another one
+        # background that is unknown in this view may be known in another one
         rest = np.flatnonzero((away > NEAR_CUT) & (background.depth.ravel()[index] == 0))
         scene = rest[self._static.surface.holds(points[rest])]
         moving = np.ones(len(points), bool)
         moving[scene] = False
         shown = background.shows(image).ravel()
-        parts, cells, of_thing = [points], [ColourCells.of(local, view.camera)], []
+        parts, cells, of_static = [points], [ColourCells.of(local, view.camera)], []
         count = len(points)
-        for thing, (pixels, fixed, fixed_cells) in zip(
-            self._static.things, self._fixed[c], strict=True
+        for item, (pixels, fixed, fixed_cells) in zip(
+            self._static.objects, self._fixed[c], strict=True
         ):
             here = shown[pixels]
             parts.append(fixed[here])
             cells.append(fixed_cells[here])
-            own = scene[thing.cells.holds(points[scene])]
-            of_thing.append(np.concatenate([own, count + np.arange(here.sum())]))
+            own = scene[item.cells.holds(points[scene])]
+            of_static.append(np.concatenate([own, count + np.arange(here.sum())]))
             count += int(here.sum())
         more = count - len(points)
         return _ViewPoints(
@@ -215,34 +215,32 @@ class DepthSegmenter:
             ColourCells.joined(cells),
             np.concatenate([away, np.full(more, FAR, np.float32)]),
             np.concatenate([moving, np.zeros(more, bool)]),
-            of_thing,
+            of_static,
         )
 
     def _static_components(self, seen: list[_ViewPoints]) -> list[_Component]:
         return [
             _Component(
-                [view.of_thing[k] for view in seen],
-                ON_TOP_SCORE if thing.on_top else STATIC_SCORE,
-                thing.extent_m,
+                [view.of_static[k] for view in seen], 0.3 if item.on_top else 0.2, item.extent_m
             )
-            for k, thing in enumerate(self._static.things)
+            for k, item in enumerate(self._static.objects)
         ]
 
     def _partly_moved(self, seen: list[_ViewPoints]) -> list[_Component]:
-        """Components of static things together with foreground that touches them.
+        """Components of static objects together with foreground that touches them.
 
-        For a thing that moved by less than its size, such as a chair that was pushed: part of it
-        coincides with its place in the background, the rest is foreground.
+        For an object that moved by less than its size, such as a pushed chair: part of it coincides
+        with its place in the background, the rest is foreground.
         """
         chosen = []
         touched = False
         for view in seen:
             moving = np.flatnonzero(view.moving & (view.outside > NEAR_CUT))
             parts = [moving]
-            for k, thing in enumerate(self._static.things):
-                if not thing.carries:
-                    parts.append(view.of_thing[k])
-                    touched |= bool(thing.cells.holds(view.points[moving]).any())
+            for k, item in enumerate(self._static.objects):
+                if not item.carries:
+                    parts.append(view.of_static[k])
+                    touched |= bool(item.cells.holds(view.points[moving]).any())
             chosen.append(np.unique(np.concatenate(parts)))
         if not touched:
             return []
@@ -250,14 +248,14 @@ class DepthSegmenter:
         for members, points in _connected(seen, chosen):
             moves = [v.moving[m].sum() for v, m in zip(seen, members, strict=True)]
             if MIN_POINTS < sum(moves) < len(points) - MIN_POINTS:
-                found.append(_Component(members, PARTLY_MOVED_SCORE, box_diagonal(points)))
+                found.append(_Component(members, 0.4, box_diagonal(points)))
         return found[:MAX_COMPONENTS]
 
 
 def _connected(
     seen: list[_ViewPoints], chosen: list[np.ndarray], cell_m: float = CELL_M
 ) -> Iterator[tuple[list[np.ndarray], np.ndarray]]:
-    """Components of the points ``chosen`` in each view: their indices by view, and points."""
+    """Yield the components of the points ``chosen`` in each view: indices by view, and points."""
     ends = np.cumsum([0, *map(len, chosen)])
     points = np.concatenate([view.points[own] for view, own in zip(seen, chosen, strict=True)])
     for group in components(points, cell_m, MIN_POINTS):
@@ -267,7 +265,7 @@ def _connected(
 
 
 def _moving_components(seen: list[_ViewPoints]) -> list[_Component]:
-    """Components of the foreground farther from the person than either cut; clothing left out."""
+    """Components of the foreground beyond either cut from the person, without clothing."""
     proposed: list[_Component] = []
     for cut in (NEAR_CUT, FAR_CUT):
         kept = 0
@@ -291,40 +289,39 @@ def _moving_components(seen: list[_ViewPoints]) -> list[_Component]:
 def _merged_neighbours(seen: list[_ViewPoints], proposed: list[_Component]) -> list[_Component]:
     """Unions of components less than a hand's breadth apart.
 
-    For a thing that a hand holds in its middle: both ends are components of their own.
+    For an object held in its middle, whose ends are separate components.
     """
     if len(proposed) < 2:
         return []
-    chosen = [
-        np.unique(np.concatenate([one.members[v] for one in proposed])) for v in range(len(seen))
-    ]
+    chosen = [np.unique(np.concatenate([c.members[v] for c in proposed])) for v in range(len(seen))]
     found: list[_Component] = []
     for members, points in _connected(seen, chosen, NEARBY_CELL_M):
         parts = components(points, CELL_M, MIN_POINTS)
         if len(parts) > 1 and len(found) < MAX_COMPONENTS:
-            found.append(_Component(members, TWO_ENDS_SCORE, box_diagonal(points)))
+            found.append(_Component(members, 0.5, box_diagonal(points)))
     return found
 
 
 def _is_same(own: list[np.ndarray], other: list[np.ndarray]) -> bool:
-    """Whether ``own``, a subset of ``other``, holds nearly all of its points."""
+    """Whether ``own``, a subset of ``other``, contains at least 90 % of its points."""
     size = sum(map(len, other))
-    return sum(map(len, own)) > SAME_SHARE * size and any(
+    return sum(map(len, own)) > 0.9 * size and any(
         len(a) and len(b) and a[0] in b for a, b in zip(own, other, strict=True)
     )
 
 
-def _masks(seen: _ViewPoints, proposed: list[tuple[_Component, np.ndarray]]) -> ViewSegments:
+def _masks(seen: _ViewPoints, number: int, proposed: list[_Component]) -> ViewSegments:
+    """Masks of the person and of the components in one view, the ``number``-th of those seen."""
     projected = ProjectedCells.of(seen.cells)
     person = seen.moving & (seen.outside < PERSON_MARGINS)
-    things = ~person
     candidates = []
-    for component, (one, members) in enumerate(proposed):
-        if len(members) < MIN_VIEW_POINTS:
+    for index, component in enumerate(proposed):
+        members = component.members[number]
+        if len(members) < 12:
             continue
         chosen = np.zeros(len(person), bool)
         chosen[members] = True
         rle = projected.rle(chosen, person & ~chosen)
         if rle:
-            candidates.append(ImageCandidate(rle, one.score, one.extent_m, component))
-    return ViewSegments(projected.rle(person, things), candidates)
+            candidates.append(ImageCandidate(rle, component.score, component.extent_m, index))
+    return ViewSegments(projected.rle(person, ~person), candidates)

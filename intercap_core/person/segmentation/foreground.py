@@ -23,47 +23,42 @@ from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.person.segmentation.person_volume import distance_outside
 
-# Nearer than the background by this stands before it: five standard deviations of the sensor's
-# random error and its bias between images (Toelgyessy et al., Sensors 21(2):413, 2021).
-BEFORE_MM, BEFORE_PER_DEPTH = 15.0, 0.005
-FLOATING_MM = (
-    30.0  # a pixel so far from nearer and from farther neighbours is a flying pixel; tuned
-)
-EDGE_PX = 5  # background that is lost in narrower strips is an edge that measures badly; tuned
-GONE_SHARE = 0.08  # of images in which a pixel shows something else: it is not background; tuned
-# The other camera's background is farther by this: calibration and the slope of grazing surfaces.
-BEHIND_M, BEHIND_PER_DEPTH = 0.05, 0.01  # metres, share of depth; tuned on the studio
-BEHIND_AROUND_PX = 5  # pixels all of which must be so far: edges of the background are uncertain
-MIN_HOLE_PX = 5  # across, of what is taken out of a background; tuned on the studio
-MIN_SURFACE_PX = 400  # smooth surfaces of at least so many pixels are no traces of a person; tuned
+# Distance from the background to the foreground: five standard deviations of the sensor's random
+# error and its bias between images (Toelgyessy et al., Sensors 21(2):413, 2021).
+BEFORE_MM = 15.0
+BEFORE_PER_DEPTH = 0.005  # of depth, added to BEFORE_MM; same source
+FLOATING_MM = 30.0  # distance of a flying pixel from nearer and farther neighbours; tuned
+GONE_SHARE = 0.08  # of images without the background, from which a pixel is no background; tuned
+# Distance to the other camera's background, for calibration errors and grazing surfaces.
+BEHIND_M = 0.05  # tuned on the studio
+BEHIND_PER_DEPTH = 0.01  # of depth, added to BEHIND_M; tuned on the studio
+MIN_SURFACE_PX = 400  # size of a smooth surface that is no trace of a person; tuned on the studio
 SMOOTH_MM = 100.0  # range of depth in 3 x 3 pixels of a smooth surface; tuned on the studio
-TRACE_MARGINS, TRACE_SHARE = 1.0, 0.4  # within the person, at this share of moments: a trace; tuned
-MAX_DEPTH_SAMPLES = 25  # images looked at for what leaves its place
-
-
-_NO_DEPTH = np.float32(65535)
+TRACE_MARGINS = 1.0  # distance outside the person within which a patch may be a trace; tuned
+TRACE_SHARE = 0.4  # of moments at which a trace is within the person; tuned on the studio
 
 
 @dataclass(frozen=True, eq=False)
 class DepthBackground:
-    """The static scene of one depth camera.
-
-    ``depth`` (H, W) uint16 mm of the background, 0 = unknown; ``reach`` (H, W) uint16 mm, the
-    farthest that is of interest; ``limit`` (H, W) uint16 mm: what is measured nearer stands before
-    the background.
-    """
+    """Static scene of one depth camera, (H, W) uint16 mm."""
 
     depth: np.ndarray
+    """Depth of the background; 0 = unknown."""
     reach: np.ndarray
+    """Largest depth of interest."""
     limit: np.ndarray
+    """Depth below which a measurement is foreground."""
 
     @classmethod
     def of(
         cls, background: np.ndarray, images: list[np.ndarray], reach_mm: np.ndarray
     ) -> DepthBackground:
-        """From the scene's ``background`` (H, W) uint16 mm and samples of the recording.
+        """Remove pixels from the scene's background that are not static.
 
-        ``reach_mm`` (H, W): nothing farther is of interest.
+        Args:
+            background: (H, W) uint16 mm.
+            images: samples of the recording, (H, W) uint16 mm.
+            reach_mm: (H, W) largest depth of interest.
         """
         tolerance = (BEFORE_MM + BEFORE_PER_DEPTH * background).astype(np.uint16)
         behind = background + tolerance
@@ -72,17 +67,17 @@ class DepthBackground:
             absent = ((image == 0) | (image > behind)).view(np.uint8)
             gone += cv2.medianBlur(absent, 5)  # single pixels fail now and then
         often = (gone >= max(2, GONE_SHARE * len(images))).view(np.uint8)
-        # along the edges of furniture, pixels fail for most of a recording
-        not_static = cv2.morphologyEx(often, cv2.MORPH_OPEN, np.ones((EDGE_PX, EDGE_PX), np.uint8))
+        # narrow strips are edges of furniture, where pixels often fail
+        not_static = cv2.morphologyEx(often, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
         depth = np.where(not_static > 0, 0, background).astype(np.uint16)
         near = np.maximum(depth - (BEFORE_MM + BEFORE_PER_DEPTH * depth), 0)
         limit = np.where(depth > 0, near, reach_mm)
         return cls(depth, reach_mm, np.minimum(limit, reach_mm).astype(np.uint16))
 
     def before(self, image: np.ndarray) -> np.ndarray:
-        """Flat pixels (N,) of a depth image (H, W) uint16 mm that stand before the background.
+        """Flat indices (N,) of the foreground pixels of a depth image (H, W), uint16 mm.
 
-        Also those whose background nobody knows. Pixels that float at an edge are left out.
+        Includes pixels with an unknown background. Flying pixels at edges are left out.
         """
         found = (image > 0) & (image < self.limit)
         index = np.flatnonzero(found)
@@ -96,7 +91,7 @@ class DepthBackground:
         return index[~floats.ravel()[index]]
 
     def shows(self, image: np.ndarray) -> np.ndarray:
-        """Pixels (H, W) bool in which the image (H, W) uint16 mm shows the background."""
+        """Mask (H, W) of the pixels of an image (H, W), uint16 mm, that show the background."""
         away = cv2.absdiff(image, self.depth)
         return (self.depth > 0) & (away <= BEFORE_MM + BEFORE_PER_DEPTH * self.depth)
 
@@ -105,42 +100,44 @@ def _floating(image: np.ndarray) -> np.ndarray:
     block = np.ones((3, 3), np.uint8)
     values = image.astype(np.float32)
     farthest = cv2.dilate(values, block)
-    nearest = cv2.erode(np.where(image == 0, _NO_DEPTH, values), block)
+    nearest = cv2.erode(np.where(image == 0, np.float32(65535), values), block)
     return (values - nearest > FLOATING_MM) & (farthest - values > FLOATING_MM)
 
 
-def sampled_images(frames: Frames, c: int) -> list[np.ndarray]:
-    """Evenly spread depth images (H, W) uint16 mm of camera ``c``, at most MAX_DEPTH_SAMPLES."""
+def sampled_images(frames: Frames, c: int, most: int = 25) -> list[np.ndarray]:
+    """Evenly spread depth images (H, W) uint16 mm of camera ``c``, at most ``most``."""
     sets = np.flatnonzero(frames.depth_available[:, c])
-    if len(sets) > MAX_DEPTH_SAMPLES:
-        sets = sets[np.linspace(0, len(sets) - 1, MAX_DEPTH_SAMPLES).round().astype(int)]
+    if len(sets) > most:
+        sets = sets[np.linspace(0, len(sets) - 1, most).round().astype(int)]
     images = (frames.depth(int(t), c) for t in sets)
     return [image for image in images if image is not None]
 
 
 @dataclass(frozen=True, eq=False)
 class DepthView:
-    """A depth camera's pixels as points of a given frame.
-
-    ``camera``; ``bias_m`` is subtracted from its depth; ``target_from_depth`` (4, 4).
-    """
+    """Converts a depth camera's pixels to points of a target frame."""
 
     camera: Camera
+    """The camera."""
     bias_m: float
+    """Subtracted from its depth, metres."""
     target_from_depth: np.ndarray
+    """(4, 4)."""
 
     def points(self, image: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Points (N, 3) float32 of flat pixels: in the target frame, and in the depth camera's.
+        """Points (N, 3) float32 of flat pixels, in the target frame and in the depth camera's.
 
-        NaN where the lens' calibration does not hold.
+        NaN outside the range of the lens calibration.
         """
         z = image.ravel()[index] * np.float32(1e-3) - np.float32(self.bias_m)
         local = self._rays[index] * z[:, None]
         return local @ self._rotation.T + self.target_from_depth[:3, 3].astype(np.float32), local
 
     def reach_mm(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Depth (H, W) uint16 at which each pixel's ray leaves a box of the target frame, 0 = it
-        misses the box; ``low``, ``high`` (3,) metres."""
+        """Depth (H, W) uint16 mm at which each pixel's ray leaves a box; 0 = misses it.
+
+        ``low``, ``high``: (3,) corners of the box in the target frame, metres.
+        """
         lens = self.camera.depth
         assert lens is not None
         along = self._rays @ self._rotation.T
@@ -168,24 +165,18 @@ class DepthView:
         return np.concatenate([rays, np.ones((len(rays), 1), np.float32)], 1)
 
 
-_UNKNOWN = np.uint16(0)
-
-
 def without_free_space(
     views: list[DepthView],
     backgrounds: list[DepthBackground],
     low: np.ndarray,
     high: np.ndarray,
 ) -> list[DepthBackground]:
-    """The backgrounds without pixels whose points lie in free space of another camera.
+    """Remove pixels from the backgrounds whose points lie in free space of another camera.
 
-    Only points in the box ``low`` to ``high`` (3,), metres, z up, are tested. A pixel becomes
-    unknown where the point lies clearly before the other background, in patches of several pixels.
+    A pixel becomes unknown if its point lies clearly before the other background, in patches of
+    several pixels. Only points in the box ``low`` to ``high`` (3,), metres, z up, are tested.
     """
-    nearest = [
-        cv2.erode(background.depth, np.ones((BEHIND_AROUND_PX, BEHIND_AROUND_PX), np.uint8))
-        for background in backgrounds
-    ]
+    nearest = [cv2.erode(background.depth, np.ones((5, 5), np.uint8)) for background in backgrounds]
     result = []
     for number, (view, background) in enumerate(zip(views, backgrounds, strict=True)):
         index = np.flatnonzero(background.depth)
@@ -196,7 +187,7 @@ def without_free_space(
         for other, far in enumerate(nearest):
             if other != number:
                 gone.ravel()[index[_occludes_background(views[other], far, points)]] = 1
-        block = np.ones((MIN_HOLE_PX, MIN_HOLE_PX), np.uint8)
+        block = np.ones((5, 5), np.uint8)
         closed = cv2.morphologyEx(gone, cv2.MORPH_CLOSE, block)
         whole = cv2.morphologyEx(closed, cv2.MORPH_OPEN, block)
         result.append(_with_unknown(background, whole > 0))
@@ -206,9 +197,10 @@ def without_free_space(
 def without_person_traces(
     view: DepthView, background: DepthBackground, bodies: list[np.ndarray]
 ) -> DepthBackground:
-    """The background without small patches that lay inside the person for much of the time.
+    """Remove small patches that are inside the person for much of the recording.
 
-    ``bodies``: bones (B, 9) of :func:`.person_volume.bones_of` at some moments, view's frame.
+    ``bodies``: bones (B, 9) of :func:`.person_volume.build_bones` at some moments, in the view's
+    frame.
     """
     depth = background.depth
     block = np.ones((3, 3), np.uint8)
@@ -231,14 +223,13 @@ def without_person_traces(
 
 def _with_unknown(background: DepthBackground, gone: np.ndarray) -> DepthBackground:
     taken = gone & (background.depth > 0)
-    depth = np.where(taken, _UNKNOWN, background.depth)
+    depth = np.where(taken, np.uint16(0), background.depth)
     limit = np.where(taken, background.reach, background.limit)
     return replace(background, depth=depth, limit=limit)
 
 
 def _occludes_background(view: DepthView, nearest: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Whether points (N, 3) lie clearly nearer than the background ``nearest`` (H, W) mm of a view:
-    (N,) bool."""
+    """Mask (N,) of points (N, 3) clearly nearer than a view's background ``nearest`` (H, W), mm."""
     lens = view.camera.depth
     assert lens is not None
     local = apply(invert(view.target_from_depth), points)

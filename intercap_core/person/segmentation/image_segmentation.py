@@ -23,11 +23,14 @@ def segment_images(
     wanted: np.ndarray,
     sigma: np.ndarray | None = None,
 ) -> dict[tuple[int, int], ViewSegments]:
-    """Segment the images ``wanted`` (T, C) bool; by moment and camera, those that can be.
+    """Segment images; returns the result by moment and camera, for those that can be segmented.
 
-    ``frames`` are read by the moment that their images show, ``scene`` is the scene artefact,
-    ``joints`` (T, 135, 3) the subject's keypoints, master frame, metres, NaN = not known,
-    ``sigma`` (T, 135) what they are off by, metres, None = nothing.
+    Args:
+        frames: read by the moment that their images show.
+        scene: the scene artefact.
+        joints: (T, 135, 3) the subject's keypoints, master frame, metres; NaN = unknown.
+        wanted: (T, C) bool, images to segment.
+        sigma: (T, 135) standard deviations of the keypoints, metres; None = 0.
     """
     sigma = np.zeros(joints.shape[:2]) if sigma is None else sigma
     posed = np.isfinite(scene["master_from_colour"]).all((1, 2)) & scene["present"]

@@ -17,9 +17,9 @@ from intercap_core.body.keypoints import KEYPOINT_NAMES, LIMB_BONES, of_side
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.solve.time_series import limited_velocity
 
-# Half breadths and girths over 2 pi of NASA-STD-3000, section 3.3; the last of each row, how
-# uncertain the surface is (one margin: clothing and build), is tuned on the studio. Radii at the
-# first and at the second keypoint. "middle_ear" is half way between the ears.
+# Radii at the first and at the second keypoint, and the uncertainty of the surface (one margin:
+# clothing and build), metres. Radii are half breadths, and girths over 2 pi, of NASA-STD-3000,
+# section 3.3; margins are tuned on the studio. "middle_ear" is half way between the ears.
 TRUNK_RADII_M: dict[tuple[str, str], tuple[float, float, float]] = {
     ("neck", "mid_hip"): (0.130, 0.130, 0.035),
     ("left_shoulder", "left_hip"): (0.100, 0.110, 0.035),
@@ -30,7 +30,7 @@ TRUNK_RADII_M: dict[tuple[str, str], tuple[float, float, float]] = {
     ("middle_ear", "middle_ear"): (0.125, 0.125, 0.025),
     ("nose", "middle_ear"): (0.045, 0.105, 0.025),
 }
-# Of the bones of `body.keypoints.LIMB_BONES`, and of the soles.
+# The same for the bones of `body.keypoints.LIMB_BONES`, and for the soles.
 LIMB_RADII_M: dict[tuple[str, str], tuple[float, float, float]] = {
     ("shoulder", "elbow"): (0.065, 0.048, 0.025),
     ("elbow", "wrist"): (0.048, 0.034, 0.018),
@@ -46,34 +46,37 @@ SOLE_RADII_M: dict[tuple[str, str], tuple[float, float, float]] = {
 FINGER_RADII_M = (0.012, 0.010, 0.009)  # at the knuckle, middle, tip
 PALM_RADII_M = (0.024, 0.016)  # at the wrist, at the knuckles
 HAND_MARGIN_M = 0.012  # fingers are located within millimetres; tuned on the studio
-# A hand whose fingers nobody saw goes on from the wrist along the forearm: length, radius, margin.
-BLIND_HAND_LENGTH_M, BLIND_HAND_RADIUS_M, BLIND_HAND_MARGIN_M = 0.15, 0.045, 0.02
-MIN_FINGERS = 3  # whose roots must be known for the hand's own bones; tuned on the studio
-USUAL_TRUNK_M = 0.50  # neck to middle of the hips, of the people whose radii these are
-SMALLEST_BUILD, LARGEST_BUILD = 0.6, 1.25  # of that: children to the tallest
-MAX_HAND_SPEED_M_S = 8.0  # above what hands reach in everyday tasks (some 5 m/s)
-UNKNOWN_OFFSET_S = 0.01  # deviation of an undetermined time offset: the spread over scenes
-MAX_KEYPOINT_GAP_S = 0.5  # a keypoint lost for less is where it lies between; tuned on the studio
-BONES_PER_GROUP = 5  # bones that are passed over together where a point is far from all of them
-FAR = 20.0  # margins: the distance that is given to whatever is farther than this
+# A hand without visible fingers extends from the wrist along the forearm (anatomy).
+BLIND_HAND_LENGTH_M = 0.15
+BLIND_HAND_RADIUS_M = 0.045
+BLIND_HAND_MARGIN_M = 0.02  # tuned on the studio
+USUAL_TRUNK_M = 0.50  # neck to middle of the hips of a person with these radii (anatomy)
+MAX_HAND_SPEED_M_S = 8.0  # hands reach 5 m/s in everyday tasks
+UNKNOWN_OFFSET_S = 0.01  # standard deviation of an undetermined time offset: spread over scenes
+MAX_KEYPOINT_GAP_S = 0.5  # longest gap of a keypoint that is interpolated; tuned on the studio
+BONES_PER_GROUP = 5  # bones that are skipped together if a point is far from all of them
+FAR = 20.0  # largest distance that is computed, margins
 
-
-# Name -> radii at both ends and margin, metres: trunk and head, limbs and soles of either side.
+# By name, for each side.
 _SIDE_RADII_M = {bone: LIMB_RADII_M[bone] for bone in LIMB_BONES} | SOLE_RADII_M
 
 
 def build_bones(joints: np.ndarray, sigma: np.ndarray | None = None) -> np.ndarray:
-    """Bones (B, 9) float32 of one moment: both ends, both radii, margin; metres; hands last.
+    """Bones (B, 9) float32 of one moment: both ends, both radii, margin, metres; hands last.
 
-    ``joints`` (135, 3), NaN = not known; a bone without one of its ends is left out. A margin is
-    that of the surface and, where ``sigma`` (135,) is given, metres, that of the bone's ends.
+    Bones with an unknown end are left out.
+
+    Args:
+        joints: (135, 3) metres; NaN = unknown.
+        sigma: (135,) standard deviations, metres, that are added to the margins of the surface.
     """
     off = np.zeros(len(joints)) if sigma is None else sigma
     points = np.column_stack([joints, off])  # (135, 4)
     at = {name: points[i] for i, name in enumerate(KEYPOINT_NAMES[:67])}
     at["middle_ear"] = _middle(at["left_ear"], at["right_ear"])
     size = float(np.linalg.norm((at["neck"] - at["mid_hip"])[:3])) / USUAL_TRUNK_M
-    size = float(np.clip(size, SMALLEST_BUILD, LARGEST_BUILD)) if np.isfinite(size) else 1.0
+    # from children to the tallest adults
+    size = float(np.clip(size, 0.6, 1.25)) if np.isfinite(size) else 1.0
     radii = list(TRUNK_RADII_M.items())
     for side in ("left", "right"):
         bones = of_side(side, _SIDE_RADII_M)
@@ -105,7 +108,7 @@ def _hand(
         rows.append((wrist, chain[0], *PALM_RADII_M, HAND_MARGIN_M))
         radii = (PALM_RADII_M[1], *FINGER_RADII_M)
         rows += [(chain[i], chain[i + 1], radii[i], radii[i + 1], HAND_MARGIN_M) for i in range(3)]
-    if known >= MIN_FINGERS:
+    if known >= 3:
         return rows
     along = wrist - at[f"{side}_elbow"]
     along[3] = 0.0  # as uncertain as the wrist
@@ -120,12 +123,12 @@ def _middle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def distance_outside(points: np.ndarray, bones: np.ndarray) -> np.ndarray:
-    """How far points (N, 3) float32 lie outside the person, in margins, (N,) float32.
+    """Signed distance (N,) float32 of points (N, 3) float32 from the person, in margins.
 
-    Negative inside, at most ``FAR``; ``bones`` (B, 9) of :func:`build_bones`.
+    Negative inside, at most ``FAR``. ``bones``: (B, 9), see :func:`build_bones`.
     """
     groups = range(0, len(bones), BONES_PER_GROUP)
-    balls = np.zeros((len(groups), 5), np.float32)  # around every group of bones, largest margin
+    balls = np.zeros((len(groups), 5), np.float32)  # bounding balls of groups, largest margin
     for row, first in zip(balls, groups, strict=True):
         some = bones[first : first + BONES_PER_GROUP]
         ends = some[:, :6].reshape(-1, 3)
@@ -169,7 +172,7 @@ def _outside(points: np.ndarray, bones: np.ndarray, balls: np.ndarray) -> np.nda
 
 
 class MovingPerson:
-    """Keypoints over time; ``joints`` (T, K, 3), metres, short gaps filled, NaN = not known."""
+    """Keypoints over time; ``joints`` (T, K, 3), metres, short gaps filled, NaN = unknown."""
 
     def __init__(
         self,
@@ -178,10 +181,12 @@ class MovingPerson:
         scene: Artefact,
         frame_from_master: np.ndarray | None = None,
     ) -> None:
-        """Of ``joints`` (T, K, 3), master frame, at the times of the ``scene`` artefact.
-
-        ``sigma`` (T, K) metres, what each is off by; in another frame where ``frame_from_master``
-        (4, 4) is given.
+        """
+        Args:
+            joints: (T, K, 3) master frame, metres; NaN = unknown.
+            sigma: (T, K) standard deviations, metres.
+            scene: scene artefact, for times and time offsets.
+            frame_from_master: (4, 4) to the frame of the result; None = the master's.
         """
         times = scene["times"]
         if frame_from_master is not None:
@@ -195,21 +200,21 @@ class MovingPerson:
         self._late_sigma = np.nan_to_num(scene["time_offset_sigma"], nan=UNKNOWN_OFFSET_S)
 
     def bones(self, t: int, c: int) -> np.ndarray:
-        """Bones (B, 9) of :func:`build_bones` when camera c exposes the image of moment t."""
+        """Bones (B, 9) at the exposure of camera ``c`` at moment ``t``, see :func:`build_bones`."""
         off = self._late_sigma[c] * np.linalg.norm(self._velocity[t], axis=-1)
         joints = self.joints[t] + self._late[c] * self._velocity[t]
         return build_bones(joints, np.hypot(self._sigma[t], off))
 
     def bones_at(self, t: int) -> np.ndarray:
-        """The same at the moment itself."""
+        """Bones at the time of moment ``t``."""
         return build_bones(self.joints[t], self._sigma[t])
 
 
 def fill_short_gaps(joints: np.ndarray, times: np.ndarray, *, max_gap_s: float) -> np.ndarray:
-    """Keypoints (T, K, 3), NaN = not known, with short gaps filled by linear interpolation.
+    """Fill short gaps of keypoints (T, K, 3), NaN = unknown, by linear interpolation.
 
-    A gap is filled up to ``max_gap_s`` from its nearest known time of ``times`` (T,) seconds; at
-    the beginning and the end the nearest known place is held.
+    Sets within ``max_gap_s`` of a known time are filled; before the first and after the last known
+    set the nearest position is repeated. ``times``: (T,) seconds.
     """
     result = joints.copy()
     for k in range(joints.shape[1]):

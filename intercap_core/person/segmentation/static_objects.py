@@ -1,8 +1,8 @@
 """Objects that never move: components of the static scene above the floor, near the person's path.
 
-A chair that is sat on or a mug left on its table cannot be told from furniture, so every connected
-component of the background that the person comes near is a candidate. What stands on a level
-surface (a table) is segmented from it by height. Components are found on a voxel grid.
+A chair in use or a mug on its table cannot be distinguished from furniture, so each connected
+component of the background near the person is a candidate. Objects on a level surface (a table)
+are segmented from it by height. Components are computed on a voxel grid.
 """
 
 from __future__ import annotations
@@ -14,27 +14,23 @@ import numpy as np
 
 from intercap_core.person.segmentation.foreground import DepthBackground, DepthView
 
-WITHIN_REACH_M = 0.35  # of a keypoint of the person at some time; tuned on the studio
-MAX_STATIC_THINGS = 8
-MAX_DISTANCE_POINTS = 2000  # of a thing, from which its distance to the person is taken
-VISITED_CELL_M = 0.10  # cells that stand for the places of the person's keypoints
-STATIC_CELL_M = 0.025  # the same in the background; tuned on the studio
-SURFACE_CELL_M, SURFACE_POINTS = 0.02, 2  # cells with so many points hold a surface; tuned
+WITHIN_REACH_M = 0.35  # distance to a keypoint of the person at any time; tuned on the studio
+STATIC_CELL_M = 0.025  # side of the cells of components; tuned on the studio
+SURFACE_CELL_M = 0.02  # side of the cells of a surface; tuned on the studio
+SURFACE_POINTS = 2  # least number of points of a surface in a cell; tuned on the studio
 MIN_STATIC_POINTS = 60  # of a static component, over all views; tuned on the studio
-LARGEST_M = 2.2  # anything larger is no thing that one person handles; tuned
-# A level surface: this share of a component's points within a layer; what stands on it is at least
-# so high above. Metres, share, metres; tuned on the studio.
-LAYER_M, LEVEL_SHARE, ABOVE_M = 0.02, 0.12, 0.012
-
-
-_BITS = 21  # of a cell's coordinate in its key
+LARGEST_M = 2.2  # largest object that one person handles; tuned on the studio
+LAYER_M = 0.02  # thickness of a level surface; tuned on the studio
+LEVEL_SHARE = 0.12  # of a component's points in a level surface; tuned on the studio
+ABOVE_M = 0.012  # height of an object's points above the surface under it; tuned on the studio
+_BITS = 21  # of a coordinate in the key of a cell
 
 
 def label_components(points: np.ndarray, cell_m: float) -> tuple[np.ndarray, int]:
-    """The component of each point (N,) int32 and how many there are.
+    """Component of each point, (N,) int32, and the number of components.
 
-    Points (N, 3), metres, of cells that touch, if only at a corner, are one component. Components
-    are numbered by size, the one with most cells first.
+    Points (N, 3), metres, of adjacent cells (26-neighbourhood) are one component. Components are
+    numbered by decreasing number of cells.
     """
     if not len(points):
         return np.zeros(0, np.int32), 0
@@ -48,9 +44,9 @@ def label_components(points: np.ndarray, cell_m: float) -> tuple[np.ndarray, int
 
 
 def components(points: np.ndarray, cell_m: float, min_points: int) -> list[np.ndarray]:
-    """Indices of the points (N, 3) of each component of at least so many, ascending.
+    """Ascending indices of the points (N, 3) of each component with at least ``min_points``.
 
-    The component with most cells comes first.
+    Components are in the order of decreasing number of cells.
     """
     label, count = label_components(points, cell_m)
     if not count:
@@ -63,7 +59,7 @@ def components(points: np.ndarray, cell_m: float, min_points: int) -> list[np.nd
 
 
 class OccupiedCells:
-    """The cells that points (N, 3) of a surface lie in, and those that share a face with them."""
+    """Cells with points (N, 3) of a surface, and cells that share a face with them."""
 
     def __init__(self, points: np.ndarray, cell_m: float, min_points: int) -> None:
         self._cell_m = cell_m
@@ -73,7 +69,7 @@ class OccupiedCells:
         self._keys = np.unique(np.concatenate([keys, *(keys + step for step in steps)]))
 
     def holds(self, points: np.ndarray) -> np.ndarray:
-        """Whether each of the points (M, 3) lies in one of the cells: (M,) bool."""
+        """Mask (M,) of the points (M, 3) in these cells."""
         if not len(self._keys):
             return np.zeros(len(points), bool)
         keys = _keys(points, self._cell_m)
@@ -82,7 +78,7 @@ class OccupiedCells:
 
 
 def _keys(points: np.ndarray, cell_m: float) -> np.ndarray:
-    """One number (N,) int64 a cell; the same step of it leads to the same neighbour everywhere."""
+    """Key (N,) int64 of each point's cell; neighbours differ by a constant step."""
     cells = np.floor(points * np.float32(1 / cell_m)).astype(np.int64) + (1 << (_BITS - 1))
     return (cells[:, 0] << (2 * _BITS)) | (cells[:, 1] << _BITS) | cells[:, 2]
 
@@ -91,7 +87,7 @@ def _keys(points: np.ndarray, cell_m: float) -> np.ndarray:
 def _roots(keys: np.ndarray) -> np.ndarray:
     """Index (M,) of the first cell of each cell's component; ``keys`` (M,) ascending."""
     parent = np.arange(len(keys))
-    # of the 26 neighbours those that come before: the rest find this cell from their side
+    # only the neighbours with a smaller key: adjacency is symmetric
     for dx in range(-1, 1):
         for dy in range(-1, 2):
             for dz in range(-1, 2):
@@ -125,27 +121,30 @@ def _roots(keys: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class StaticObject:
-    """A component of the static scene.
-
-    ``extent_m`` its size, ``away_m`` from the nearest place of the person; ``on_top``: it was taken
-    off another one; ``carries``: it is one off which something was taken. ``pixels`` are the flat
-    depth pixels of each view's background that show it, ``cells`` where it is.
-    """
+    """A component of the static scene."""
 
     extent_m: float
+    """Size, metres."""
     away_m: float
+    """Smallest distance to the person's path, metres."""
     on_top: bool
+    """Stands on another component."""
     carries: bool
+    """Has another component on it."""
     pixels: list[np.ndarray]
+    """Flat depth pixels that show it in each view's background."""
     cells: OccupiedCells
+    """Cells with its points."""
 
 
 @dataclass(frozen=True, eq=False)
 class StaticScene:
-    """The things, and ``surface``: where the scene is known to be, whichever view tells."""
+    """Components of the static scene."""
 
-    things: list[StaticObject]
+    objects: list[StaticObject]
+    """Possible objects, the closest to the person first."""
     surface: OccupiedCells
+    """Cells in which any view measures the scene."""
 
 
 def find_static_objects(
@@ -155,9 +154,9 @@ def find_static_objects(
     high: np.ndarray,
     joints: np.ndarray,
 ) -> StaticScene:
-    """Components of the solid background in the box ``low`` to ``high`` (3,), z up, metres.
+    """Find components of the background in the box ``low`` to ``high`` (3,), z up, metres.
 
-    ``joints`` (N, 3) are places of the person's keypoints at any time, same frame.
+    ``joints``: (N, 3) keypoints of the person at all times, same frame.
     """
     parts, owner, index = [], [], []
     for number, (view, background) in enumerate(zip(views, backgrounds, strict=True)):
@@ -170,9 +169,9 @@ def find_static_objects(
     points = np.concatenate(parts) if parts else np.zeros((0, 3), np.float32)
     pixel = np.concatenate(index) if index else np.zeros(0, np.int64)
     view_of = np.concatenate(owner) if owner else np.zeros(0, np.int32)
-    walked = np.unique(np.round(joints / VISITED_CELL_M), axis=0) * VISITED_CELL_M
+    walked = np.unique(np.round(joints / 0.10), axis=0) * 0.10
     surface = OccupiedCells(points, SURFACE_CELL_M, SURFACE_POINTS)
-    things: list[StaticObject] = []
+    objects: list[StaticObject] = []
 
     def add(members: np.ndarray, on_top: bool, carries: bool) -> None:
         own = points[members]
@@ -180,7 +179,7 @@ def find_static_objects(
         if size < LARGEST_M and away < WITHIN_REACH_M:
             pixels = [pixel[members[view_of[members] == v]] for v in range(len(views))]
             cells = OccupiedCells(own, SURFACE_CELL_M, SURFACE_POINTS)
-            things.append(StaticObject(size, away, on_top, carries, pixels, cells))
+            objects.append(StaticObject(size, away, on_top, carries, pixels, cells))
 
     for members in components(points, STATIC_CELL_M, MIN_STATIC_POINTS):
         top = _above_level(points, members)
@@ -188,20 +187,20 @@ def find_static_objects(
         add(members, False, bool(above))
         for standing in above:
             add(standing, True, False)
-    things.sort(key=lambda thing: thing.away_m)
-    return StaticScene(things[:MAX_STATIC_THINGS], surface)
+    objects.sort(key=lambda item: item.away_m)
+    return StaticScene(objects[:8], surface)
 
 
 def _away(points: np.ndarray, places: np.ndarray) -> float:
     """Smallest distance, metres, of points (N, 3) from places (M, 3)."""
     from scipy.spatial import cKDTree
 
-    sample = points[:: max(1, len(points) // MAX_DISTANCE_POINTS)]
+    sample = points[:: max(1, len(points) // 2000)]
     return float(cKDTree(places).query(sample)[0].min()) if len(places) else np.inf
 
 
 def _above_level(points: np.ndarray, members: np.ndarray) -> np.ndarray:
-    """Members of a component above its highest large level surface; none without one."""
+    """Members of a component above its highest large level surface; none without such a surface."""
     height = points[members, 2]
     bottom = float(height.min())
     counts = np.bincount(((height - bottom) / LAYER_M).astype(int))
@@ -214,6 +213,6 @@ def _above_level(points: np.ndarray, members: np.ndarray) -> np.ndarray:
 
 
 def box_diagonal(points: np.ndarray) -> float:
-    """Length of the diagonal of the points' box (N, 3), the outermost two per cent left out."""
+    """Diagonal of the bounding box of points (N, 3), without the outermost two per cent."""
     low, high = np.percentile(points, (2, 98), axis=0)
     return float(np.linalg.norm(high - low))

@@ -125,19 +125,19 @@ def test_points_and_reach_of_a_view():
 
 def test_a_thing_that_gives_way_is_no_background():
     steady = np.full((40, 60), 3000, np.uint16)
-    thing = steady.copy()
-    thing[10:30, 20:40] = 2000
+    item = steady.copy()
+    item[10:30, 20:40] = 2000
     empty = steady.copy()
     empty[10:30, 20:40] = 0
     reach = np.full(steady.shape, 5000, np.uint16)
-    background = DepthBackground.of(thing, [thing] * 20 + [empty] * 4, reach)
+    background = DepthBackground.of(item, [item] * 20 + [empty] * 4, reach)
     assert (background.depth[12:28, 22:38] == 0).all() and background.depth[0, 0] == 3000
     foreground = np.zeros(steady.shape, bool)
-    foreground.ravel()[background.before(thing)] = True
+    foreground.ravel()[background.before(item)] = True
     assert foreground[12:28, 22:38].all() and foreground.sum() <= 400
-    assert background.shows(thing)[:8].all() and not background.shows(thing)[12:28, 22:38].any()
-    kept = DepthBackground.of(thing, [thing] * 24, reach)
-    assert (kept.depth == thing).all() and not len(kept.before(thing))
+    assert background.shows(item)[:8].all() and not background.shows(item)[12:28, 22:38].any()
+    kept = DepthBackground.of(item, [item] * 24, reach)
+    assert (kept.depth == item).all() and not len(kept.before(item))
 
 
 def test_pixels_that_float_at_an_edge_are_left_out():
@@ -186,14 +186,14 @@ def test_static_things_near_the_person_and_on_a_table():
         backgrounds.append(DepthBackground.of(image, [image], view.reach_mm(LOW, HIGH)))
     person = stick_person() + np.array([0.0, 0.55, 0.0])
     scene = find_static_objects(views, backgrounds, LOW, HIGH, person)
-    sizes = [thing.extent_m for thing in scene.things]
-    assert len(scene.things) == 3
+    sizes = [item.extent_m for item in scene.objects]
+    assert len(scene.objects) == 3
     for box, on_top, carries in ((table, False, True), (mug, True, False), (stool, False, False)):
         size = np.linalg.norm(box[1] - box[0])
-        thing = scene.things[int(np.argmin(np.abs(np.array(sizes) - size)))]
-        assert abs(thing.extent_m - size) < 0.12 * size + 0.05
-        assert (thing.on_top, thing.carries) == (on_top, carries)
-        assert sum(len(pixels) > 0 for pixels in thing.pixels) >= 4
+        item = scene.objects[int(np.argmin(np.abs(np.array(sizes) - size)))]
+        assert abs(item.extent_m - size) < 0.12 * size + 0.05
+        assert (item.on_top, item.carries) == (on_top, carries)
+        assert sum(len(pixels) > 0 for pixels in item.pixels) >= 4
     assert scene.surface.holds(np.array([[0.0, 0.3, 0.35]]))[0]
     assert not scene.surface.holds(np.array([[0.0, 0.0, 1.5]]))[0]
 
