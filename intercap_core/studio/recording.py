@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from pathlib import Path
+from functools import cached_property
 
 import numpy as np
 
@@ -98,19 +98,13 @@ class Kinect:
         """Write the recording, keypoints/<camera>/ and candidates/<camera>.json."""
         stage, name = self.stage, self.true.name
         moment = stage.at(self.exposures)
-        stage_from_master = invert(stage.rig.master_from_stage)
-        colour_pose = stage_from_master @ self.true.master_from_colour
-        depth_pose = stage_from_master @ self.true.master_from_depth
-        assert self.true.depth is not None
-        colour_view = RoomView(self.true.colour, colour_pose, stage.room, coloured=True)
-        depth_view = RoomView(self.true.depth, depth_pose, stage.room, coloured=False)
+        colour_view, depth_view = self._views()
         sensor = DepthSensor(depth_view, stage.noise, name, stage.depth_mode)
         rng = stage.noise.rng("photo", name)
         gain = rng.uniform(0.92, 1.06) * rng.uniform(0.97, 1.03, 3)
         photographer = Photographer(colour_view, gain, rng)
-        clutter = colour_view.material == stage.room.distractor
-        if stage.room.distractor < 0:
-            clutter = None
+        distractor = stage.room.distractor
+        clutter = colour_view.material == distractor if distractor >= 0 else None
         size = (self.true.colour.width, self.true.colour.height)
         masks = CameraMasks(segmenter, name, clutter, size)
         colours = body_colours(stage.subject, stage.noise.rng("looks"))
@@ -134,7 +128,7 @@ class Kinect:
             for order, t in enumerate(self.sets):
                 surfaces = surfaces_at(stage, moment, t, colours, passing)
                 cast = colour_view.cast(surfaces)
-                inertial = self._inertial(t, rng, depth_pose)
+                inertial = self._inertial(t, rng)
                 jpeg = photographer.jpeg(photographer.photograph(cast))
                 depth = sensor.image(depth_view.cast(surfaces))
                 if empty[t]:
@@ -157,7 +151,9 @@ class Kinect:
                 folder.add_masks(name, t, stage.fps, found, segmenter.label)
                 image = folder.image_number(t, order, stage.fps)
                 candidates += [{"image_id": image, **result} for result in found]
-        self._write_candidates(folder.path, candidates)
+        path = folder.path / "candidates" / f"{name}.json"
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(json.dumps(candidates, separators=(",", ":")) + "\n")
         shown = self._detected(detector, moment, points, hidden)
         people = detector.people(self.true, shown)
         if passing:
@@ -168,6 +164,20 @@ class Kinect:
         colour[[t for t in self.sets if not self.fallen_back(t)]] = True
         return CameraRecord(seen, whole, colour, colour & has_depth & ~empty, sensor.bias)
 
+    @cached_property
+    def _depth_pose(self) -> np.ndarray:
+        """stage_from_depth (4, 4)."""
+        return invert(self.stage.rig.master_from_stage) @ self.true.master_from_depth
+
+    def _views(self) -> tuple[RoomView, RoomView]:
+        """Views of the room through the colour and through the depth lens."""
+        assert self.true.depth is not None
+        colour_pose = invert(self.stage.rig.master_from_stage) @ self.true.master_from_colour
+        return (
+            RoomView(self.true.colour, colour_pose, self.stage.room, coloured=True),
+            RoomView(self.true.depth, self._depth_pose, self.stage.room, coloured=False),
+        )
+
     def _sound(self) -> np.ndarray:
         """Sound from the first image to the last."""
         first, last = min(self.sets), max(self.sets)
@@ -176,16 +186,13 @@ class Kinect:
         return heard(self.stage, self.index, self.stage.set_times[first] - late, length)
 
     def _inertial(
-        self,
-        t: int,
-        rng: np.random.Generator,
-        stage_from_depth: np.ndarray,
+        self, t: int, rng: np.random.Generator
     ) -> list[tuple[np.ndarray, np.ndarray, int]]:
         """Acceleration, turning rate and device time of the samples of set ``t``.
 
         The device does not move: its accelerometer measures the reaction to gravity.
         """
-        up = ACCELEROMETER_FROM_DEPTH @ stage_from_depth[:3, :3].T @ (0, 0, self.gravity)
+        up = ACCELEROMETER_FROM_DEPTH @ self._depth_pose[:3, :3].T @ (0, 0, self.gravity)
         first, period = self.device_time_us(t), 1_000_000 // self.stage.fps
         return [
             (
@@ -195,11 +202,6 @@ class Kinect:
             )
             for k in range(self.imu_per_frame)
         ]
-
-    def _write_candidates(self, folder: Path, candidates: list[dict[str, object]]) -> None:
-        path = folder / "candidates" / f"{self.true.name}.json"
-        path.parent.mkdir(exist_ok=True)
-        path.write_text(json.dumps(candidates, separators=(",", ":")) + "\n")
 
     def _detected(
         self,

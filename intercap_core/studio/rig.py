@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from intercap_core.config import StudioCapture, StudioSettings
 from intercap_core.formats.calibration.k4a import COLOUR_MODES, DEPTH_MODES, Mode
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera, Rig
@@ -53,28 +54,19 @@ class StudioRig:
 
 def build_rig(
     rng: np.random.Generator,
-    *,
-    cameras: int,
-    frames: int,
-    colour_mode: str,
-    depth_mode: str = "NFOV_UNBINNED",
-    noise: float,
-    slips: str = "missing",
-    overlap: bool = True,
+    capture: StudioCapture,
+    settings: StudioSettings,
     names: Sequence[str] | None = None,
 ) -> StudioRig:
-    """Make a rig around the stage's origin.
+    """Make a rig around the stage's origin; ``settings.noise`` scales every error.
 
-    Args:
-        noise: scale of every error.
-        slips: "missing": two cameras lose frames; "silent": their images are 1 to 4 frames late
-            for a while or to the end, and the device times do not show it.
-        overlap: False: all cameras but the master look away.
-        names: of the cameras, the master first; by default k1, k2, ...
+    With the fault "no_overlap", all cameras but the master look away. ``names``: of the cameras,
+    the master first; by default k1, k2, ...
     """
+    cameras, noise = settings.cameras, settings.noise
     names = names or [f"k{number}" for number in range(1, cameras + 1)]
     stage_from_camera = _ring(rng, cameras)
-    if not overlap:
+    if "no_overlap" in capture.faults:
         for pose in stage_from_camera[1:]:
             pose[:3, :3] = turn(np.array([0, 0, np.pi])) @ pose[:3, :3]
     true, claimed = [], []
@@ -82,8 +74,8 @@ def build_rig(
     for index in range(cameras):
         camera = Camera(
             names[index],
-            _colour_lens(rng, colour_mode),
-            _depth_lens(rng, depth_mode),
+            _colour_lens(rng, settings.colour_mode),
+            _depth_lens(rng, settings.depth_mode),
             _colour_from_depth(rng),
             master_from_stage @ stage_from_camera[index],
         )
@@ -107,7 +99,7 @@ def build_rig(
     offset = np.clip(offset, -2 * MAX_OFFSET_S, 2 * MAX_OFFSET_S)
     offset -= offset[0]  # the sets' times are the master's
     offset = np.clip(offset, -MAX_OFFSET_S * noise, MAX_OFFSET_S * noise)
-    missing, slip = _slips(rng, cameras, frames, slips, noise)
+    missing, slip = _slips(rng, capture.frames, settings)
     return StudioRig(
         Rig(tuple(true)),
         Rig(tuple(claimed)),
@@ -222,26 +214,23 @@ def _recalibrated(lens: Intrinsics, rng: np.random.Generator, noise: float) -> I
 
 
 def _slips(
-    rng: np.random.Generator,
-    cameras: int,
-    frames: int,
-    kind: str,
-    noise: float,
+    rng: np.random.Generator, frames: int, settings: StudioSettings
 ) -> tuple[tuple[frozenset[int], ...], np.ndarray]:
     """Missing frames, or silent slips (T, C), in two subordinate cameras.
 
     One camera starts late and one ends early.
     """
+    cameras = settings.cameras
     missing: list[set[int]] = [set() for _ in range(cameras)]
     slip = np.zeros((frames, cameras), np.int32)
     others = np.arange(1, cameras)
-    if len(others) == 0 or frames < 8 or noise == 0:
+    if len(others) == 0 or frames < 8 or settings.noise == 0:
         return tuple(frozenset(m) for m in missing), slip
     for camera in rng.permutation(others)[:SLIPPING_CAMERAS]:
         length = int(rng.integers(SLIPPED_FRAMES[0], SLIPPED_FRAMES[1] + 1))
         first = max(2, length)  # nothing is shown that was before the recording
         start = int(rng.integers(first, max(first + 1, frames - length - 2)))
-        if kind == "silent":
+        if settings.slips == "silent":
             end = start + int(rng.integers(*SLIP_LASTS))
             slip[start : frames if rng.random() < SLIP_STAYS else end, camera] = length
         else:
@@ -275,16 +264,9 @@ class Failures:
     """Camera index of each fault of :data:`ONE_CAMERA_EACH`."""
 
     @classmethod
-    def draw(
-        cls,
-        noise: NoiseSource,
-        *,
-        frames: int,
-        cameras: int,
-        faults: Sequence[str] = (),
-        depth: bool = True,
-    ) -> Failures:
+    def draw(cls, noise: NoiseSource, capture: StudioCapture, cameras: int) -> Failures:
         """Draw the failures; the master's clock defines the times of the sets."""
+        frames = capture.frames
         jitter = np.zeros((frames, cameras))
         empty, away = np.zeros((2, frames, cameras), bool)
         rng = noise.rng("clocks")
@@ -298,8 +280,8 @@ class Failures:
                 length = int(rng.integers(DEPTH_GAP_FRAMES[0], DEPTH_GAP_FRAMES[1] + 1))
                 which = empty if rng.random() < 0.5 else away
                 which[start : start + length, camera] = True
-        away |= not depth
-        broken = _assigned(noise, cameras, faults)
+        away |= not capture.depth
+        broken = _assigned(noise, cameras, capture.faults)
         if "no_depth" in broken:
             away[:, broken["no_depth"]] = True
         if "zero_depth" in broken:

@@ -89,27 +89,13 @@ class StudioStage:
         rng = self.noise.rng("room")
         self.stage_from_script = _placed(rng, self.interaction.centre)
         self.rig: StudioRig = build_rig(
-            self.noise.rng("rig"),
-            cameras=settings.cameras,
-            frames=capture.frames,
-            colour_mode=settings.colour_mode,
-            depth_mode=settings.depth_mode,
-            noise=settings.noise,
-            slips=settings.slips,
-            overlap="no_overlap" not in capture.faults,
-            names=camera_names(capture.layout, settings.cameras),
+            self.noise.rng("rig"), capture, settings, camera_names(capture.layout, settings.cameras)
         )
         if capture.starts_apart:
             apart = self.noise.rng("starts")
             self.rig = started_apart(self.rig, apart, capture.starts_apart, settings.fps)
         self.every = [capture.every.get(name, 1) for name in self.rig.true.names]
-        self.failures = Failures.draw(
-            self.noise,
-            frames=capture.frames,
-            cameras=settings.cameras,
-            faults=capture.faults,
-            depth=capture.depth,
-        )
+        self.failures = Failures.draw(self.noise, capture, settings.cameras)
         furniture = [box.moved(self.stage_from_script) for box in self.interaction.furniture]
         is_bare = bool(rng.random() < BARE_ROOM_SHARE)
         by_chance: Furnishing = "bare" if is_bare else "furnished"

@@ -26,9 +26,14 @@ from intercap_core.studio.stage import check_capture, check_faults
 FRAMES, FPS = 8, 5
 
 
-def rig_of(seed: int, **options: object) -> StudioRig:
-    settings = dict(cameras=6, frames=45, colour_mode="720P", noise=1.0) | options
-    return build_rig(np.random.default_rng(seed), **settings)  # type: ignore[arg-type]
+def capture_of(frames: int = 45, **options: object) -> StudioCapture:
+    values = dict(interaction="stool_sit", subject="s02", seed=78, frames=frames) | options
+    return StudioCapture.model_validate(values)
+
+
+def rig_of(seed: int, *faults: str, **options: object) -> StudioRig:
+    settings = StudioSettings.model_validate(dict(captures={}, colour_mode="720P") | options)
+    return build_rig(np.random.default_rng(seed), capture_of(faults=faults), settings)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -82,18 +87,18 @@ def test_a_depth_mode_reads_out_the_same_glass(mode: str) -> None:
 
 def test_clocks_are_unsteady_but_the_masters() -> None:
     noise = NoiseSource(5, 1.0, "a", 30.0)
-    failures = Failures.draw(noise, frames=400, cameras=4, faults=())
+    failures = Failures.draw(noise, capture_of(400), 4)
     assert not failures.jitter_s[:, 0].any()
     assert 80e-6 < failures.jitter_s[:, 1:].std() < 120e-6
     assert np.abs(failures.jitter_s).max() < 301e-6
     lost = failures.depth_away | failures.depth_empty
     assert lost.any(0).sum() == 1 and 1 <= lost.sum() <= 9 and not lost[:, 0].any()
-    still = Failures.draw(NoiseSource(5, 0.0, "a", 30.0), frames=400, cameras=4, faults=())
+    still = Failures.draw(NoiseSource(5, 0.0, "a", 30.0), capture_of(400), 4)
     assert not still.jitter_s.any() and not still.depth_away.any()
 
 
 def test_no_overlap_leaves_the_middle_to_the_master() -> None:
-    rig = rig_of(2, overlap=False)
+    rig = rig_of(2, "no_overlap")
     middle = rig.master_from_stage[:3, 3] + rig.master_from_stage[:3, 2] * 0.85
     for index, camera in enumerate(rig.true):
         at = camera.colour_from_master[:3, :3] @ middle + camera.colour_from_master[:3, 3]
@@ -107,10 +112,8 @@ def broken_capture(
     """Five frames a second, three cameras: one stops, one clock jumps back; a second person."""
     folder = tmp_path_factory.mktemp("studio") / "broken"
     make_capture(
-        StudioCapture(
-            interaction="stool_sit", subject="s02", seed=78, frames=FRAMES, room="bare",
-            passer_by="stands",
-            faults=("backwards_clock", "dead_half"),
+        capture_of(
+            FRAMES, room="bare", passer_by="stands", faults=("backwards_clock", "dead_half")
         ),
         StudioSettings(
             captures={}, cameras=3, colour_mode="720P", depth_mode="WFOV_2X2BINNED", fps=FPS

@@ -34,10 +34,10 @@ LAYOUTS = get_args(LayoutName)
 
 
 def rig_of(layout: LayoutName, cameras: int = 3) -> StudioRig:
-    return build_rig(
-        np.random.default_rng(4), cameras=cameras, frames=6, colour_mode="720P", noise=1.0,
-        names=camera_names(layout, cameras),
-    )  # fmt: skip
+    capture = StudioCapture(interaction="stool_sit", subject="s01", seed=1, frames=6)
+    settings = StudioSettings(captures={}, cameras=cameras, colour_mode="720P")
+    names = camera_names(layout, cameras)
+    return build_rig(np.random.default_rng(4), capture, settings, names)
 
 
 def write(folder: Path, layout: LayoutName, faults: tuple[str, ...] = (),

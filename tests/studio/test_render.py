@@ -7,6 +7,7 @@ import open3d as o3d
 import pytest
 import trimesh
 
+from intercap_core.config import StudioCapture, StudioSettings
 from intercap_core.geometry.camera.transforms import apply, invert, rigid
 from intercap_core.studio.render import (
     BODY,
@@ -46,7 +47,9 @@ def surfaces() -> tuple[MovingSurface, MovingSurface]:
 def test_moving_things_are_drawn_where_rays_hit_them(
     surfaces: tuple[MovingSurface, MovingSurface], index: int
 ) -> None:
-    rig = build_rig(np.random.default_rng(1), cameras=2, frames=9, colour_mode="720P", noise=1.0)
+    capture = StudioCapture(interaction="stool_sit", subject="s01", seed=1, frames=9)
+    settings = StudioSettings(captures={}, cameras=2, colour_mode="720P")
+    rig = build_rig(np.random.default_rng(1), capture, settings)
     camera = rig.true[index]
     assert camera.depth is not None
     pose = invert(rig.master_from_stage) @ camera.master_from_depth
