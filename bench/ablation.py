@@ -110,11 +110,13 @@ class _Track:
 
 @dataclass(frozen=True, eq=False)
 class _Known:
-    """One sequence: tracks by variant (and "truth"), ``fps`` and the body's ``regions``."""
+    """Tracks of one sequence by variant, and "truth"."""
 
     tracks: Mapping[str, _Track]
+    """By variant."""
     truth: Truth
     regions: Mapping[str, np.ndarray]
+    """Vertices of the body by region."""
     fps: float
 
 
@@ -141,8 +143,10 @@ def _read(project: Project, paths: Paths, sequence: str, versions: Mapping[str, 
 
 
 def _accelerations(project: Project, paths: Paths, output: Path, figure: Any) -> Path | None:
-    """Acceleration over time, in each sequence, of the skin vertex whose acceleration smoothing
-    changes most, for better or worse; the legend has the mean errors against truth."""
+    """Plot the acceleration of the skin vertex that smoothing changes most, for each sequence.
+
+    The legend has the mean errors against the truth.
+    """
     if not {EVERYTHING, WITHOUT_SMOOTHNESS} <= set(paths):
         return None
     versions = {"without smoothness": WITHOUT_SMOOTHNESS, "joint": EVERYTHING}
@@ -174,8 +178,10 @@ def _accelerations(project: Project, paths: Paths, output: Path, figure: Any) ->
 
 
 def _contact_paths(project: Project, paths: Paths, output: Path, figure: Any) -> Path | None:
-    """Where the vertex that truly touches longest goes in the object's frame while it does, from
-    the middle of the true path; a large dot is its begin."""
+    """Plot the path of the vertex with the longest true contact, in the object's frame.
+
+    The origin is the middle of the true path; a large dot marks its start.
+    """
     if not {EVERYTHING, WITHOUT_STICK} <= set(paths):
         return None
     versions = {"sequential": "", "without stick": WITHOUT_STICK, "joint": EVERYTHING}
@@ -213,8 +219,7 @@ def _contact_paths(project: Project, paths: Paths, output: Path, figure: Any) ->
 def _held(
     project: Project, paths: Paths, versions: Mapping[str, str]
 ) -> dict[str, tuple[_Known, int, np.ndarray]]:
-    """By sequence in which a hand truly holds the object: what is known, the skin vertex of the
-    hands that truly touches it longest, and the frames in which it does."""
+    """Vertex with the longest true contact, and the frames of it, by sequence with a hold."""
     found = {}
     for name in paths[EVERYTHING]:
         known = _read(project, paths, name, versions)
@@ -263,10 +268,10 @@ VARIANTS: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Measure:
-    """A column: its title, the figure's name, and the areas that have it of the joint fit and of
-    the sequential fits, "" where these have none."""
+    """Column of the table."""
 
     title: str
+    """Of the column."""
     name: str
     joint: str = "joint"
     sequential: str = "body_fit"

@@ -54,13 +54,16 @@ Interval = tuple[int, int]
 
 @dataclass
 class Eye:
-    """What a person sees in the images: the true object, ``rotation`` (T, 3, 3) and ``translation``
-    (T, 3), ``views`` (T,) that see it, and the true cameras ``colour_from_master`` by name."""
+    """Truth that stands for what a person sees in the images."""
 
     rotation: np.ndarray
+    """(T, 3, 3) of the true object."""
     translation: np.ndarray
+    """(T, 3)."""
     views: np.ndarray
+    """(T,) number of cameras that see the object."""
     colour_from_master: dict[str, np.ndarray]
+    """True cameras by name."""
     mesh: ObjectMesh
 
     @classmethod

@@ -1,6 +1,7 @@
-"""Operate the annotation page as a person: keys, clicks and drags, counted and timed.
+"""Operates the annotation page as a person does, by keys, clicks and drags, which are counted and
+timed.
 
-Nothing here calls the page's own functions to do the work.
+No function of the page is called to change anything.
 """
 
 from __future__ import annotations
@@ -40,11 +41,13 @@ _VIEWS = """(points) => {
 
 @dataclass
 class Hand:
-    """``actions``: all keys, clicks and drags so far; ``waited``: seconds of runs among all."""
+    """A person's hand on the page."""
 
     visit: Visit
     actions: int = 0
+    """Keys, clicks and drags so far."""
     waited: float = 0.0
+    """Seconds of runs."""
     started: float = field(default_factory=time.monotonic)
 
     @property
@@ -101,9 +104,9 @@ class Hand:
         self.visit.wait(f"window.annotate.frame === {frame}")
 
     def save_and_run(self) -> float:
-        """By Ctrl+S and the dialog; seconds until the new result is drawn.
+        """Save by Ctrl+S and the dialog; returns the seconds until the new result is drawn.
 
-        Raises UserError where it is not saved, or the run fails.
+        Raises UserError if the page does not save, or the run fails.
         """
         self.key("Control+s")
         self.visit.wait("document.getElementById('dialog').open")

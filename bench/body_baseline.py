@@ -1,12 +1,12 @@
 """The paper's body fit, as a baseline: equation 2 minimised by L-BFGS in stages.
 
-One frame after another, each from the one before. The stages, their weights, the robust functions
-and the solver are those of SMPLify-X and PROX-D, on which the paper builds; derivatives are
-autograd's, through this project's body model, and the views are one batch. Where the recipe needs
-licensed weights (VPoser) the pose prior is the open one of this project's own fit, in units of its
-spread like VPoser's code. E_D is measured to the vertices that each view sees and back, with
-correspondences taken anew in every evaluation and visibility in every stage. Self-penetration is
-left out, which only makes the baseline faster.
+Each frame starts from the frame before it. The stages, their weights, the robust functions and the
+solver are those of SMPLify-X and PROX-D, on which the paper builds; derivatives are autograd's,
+through this project's body model, and the views are one batch. The pose prior is this project's
+open prior, in units of its spread as in VPoser's code, because VPoser's weights are licensed. E_D
+is measured to the vertices that each view sees, and back; correspondences are updated in every
+evaluation, visibility in every stage. Self-penetration is left out, which makes the baseline
+faster.
 """
 
 from __future__ import annotations

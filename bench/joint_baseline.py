@@ -1,22 +1,23 @@
-"""The paper's joint refinement as it is published, for comparison: equation 6 by L-BFGS.
+"""The paper's joint refinement, as a baseline: equation 6 minimised by L-BFGS.
 
-All frames at once, from the sequential fits, in one run of L-BFGS with strong Wolfe line searches;
-derivatives are autograd's. The paper says neither steps nor solver; its authors' public code makes
-100 and then 600 L-BFGS steps (its conf.yaml: ``lbfgsls``, step 1), the first with the shape free.
-Here the shape stays the mean, as the paper has it, for all 700.
+All frames are refined at once from the sequential fits, in one run of L-BFGS with strong Wolfe line
+searches; derivatives are autograd's. The paper states neither steps nor solver. Its authors' public
+code makes 100 and then 600 L-BFGS steps (its conf.yaml: ``lbfgsls``, step 1), the first with the
+shape free. Here the shape stays the mean, as in the paper, for all 700.
 
-The terms, all of whose frames and views are one batch:
+Terms, with all frames and views in one batch:
 
-- E_B: our own data terms and priors, in plain torch. Those of :mod:`bench.body_baseline` know
-  neither clothing nor what a detector means by a joint, which both fits have been given here.
+- E_B: our own data terms and priors, in plain torch. The terms of :mod:`bench.body_baseline` model
+  neither clothing nor the detector's definition of joints.
 - E_O: equation 1 as in :mod:`bench.object_baseline`, in units of the track's covariance.
-- Q_t E_C: Chamfer distance of the touching regions' vertices to the object; Q_t is binary and, as
-  nobody has annotated it, what our stage detects at the start. Robust as in the public code.
-- body in object, E_G, E_G', E_S and E_A are the same equations as ours with the same weights. E_S
-  is that of joints since LEMO's weights are not free.
+- Q_t E_C: Chamfer distance of the touching regions' vertices to the object. Q_t is binary: the
+  contact that our stage detects at the start, as there are no annotations. Robust as in the public
+  code.
+- Body in object, E_G, E_G', E_S and E_A are our equations with our weights. E_S is that of joints,
+  because LEMO's weights are not free.
 
-No stick, planted feet, drift or time offsets, which go beyond the paper. Correspondences of the
-clouds, pixel sigmas and standing vertices are taken anew every ``ROUND`` steps.
+Stick, planted feet, drift and time offsets go beyond the paper and are left out. Correspondences of
+the clouds, pixel sigmas and standing vertices are updated every ``ROUND`` steps.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ class Energy:
         self._contact = contact_weights(clip.geometry, clip.touching)
 
     def observe(self, x: Tensor) -> None:
-        """Take anew at x what is held while L-BFGS steps."""
+        """Update at x what is fixed during a round of L-BFGS."""
         clip, posed = self._clip, self.geometry.at(x.detach())
         problem = clip.body.problem
         problem.base = problem.base.clone()
@@ -110,19 +111,25 @@ class Energy:
 
 @dataclass(frozen=True, eq=False)
 class Posed:
-    """body (T, 168), skin (T, N, 3), joints (T, 55, 3), moments (T, 6, 3) and object_vertices
-    (T, V, 3); rotation (T, 3, 3), translation (T, 3); metres, master frame."""
+    """Body and object, metres, master frame."""
 
     geometry: Geometry
     body: Tensor
+    """(T, 168)."""
     skin: Tensor
+    """(T, N, 3)."""
     joints: Tensor
+    """(T, 55, 3)."""
     rotation: Tensor
+    """(T, 3, 3)."""
     translation: Tensor
+    """(T, 3)."""
 
     def distance(self) -> Tensor:
-        """Signed distances (T, N) of the skin to the object: the closest point and the direction
-        are held, which leaves value and gradient exact."""
+        """Signed distances (T, N) of the skin to the object.
+
+        The closest point and the direction are constants, which leaves value and gradient exact.
+        """
         points, rotation, translation = (
             part.detach().double().numpy() for part in (self.skin, self.rotation, self.translation)
         )
@@ -133,7 +140,7 @@ class Posed:
         return (torch.as_tensor(near.normals).to(self.skin) * apart).sum(-1)
 
     def of_object(self, points: np.ndarray) -> Tensor:
-        """Points (N, 3) or (T, N, 3) of the object where it is (T, N, 3)."""
+        """Points (N, 3) or (T, N, 3) of the object in the master frame (T, N, 3)."""
         local = torch.as_tensor(points).to(self.skin)
         return local @ self.rotation.mT + self.translation[:, None]
 
@@ -219,7 +226,7 @@ class ObjectImages:
 
 
 def contact_weights(geometry: Geometry, touching: np.ndarray) -> Tensor:
-    """Weights (T, M) of the patches' vertices in E_C: a region's sum to one where it touches."""
+    """Weights (T, M) of the patches' vertices in E_C; those of a touching region sum to 1."""
     region = geometry.patches.region
     share = 1 / np.bincount(region, minlength=touching.shape[1])[region]
     return torch.as_tensor((touching[:, region] * share).astype(np.float32))
@@ -240,14 +247,14 @@ def penetration(distance: Tensor, geometry: Geometry) -> Tensor:
 
 
 def standing(object_vertices: Tensor, clip: JointClip) -> Tensor:
-    """On how many vertices the object stands (T, 1)."""
+    """Number (T, 1) of vertices on which the object stands."""
     return (
         (_height(object_vertices, clip) < 0).sum(1, keepdim=True).clamp_min(MIN_STANDING_VERTICES)
     )
 
 
 def ground(posed: Posed, clip: JointClip, stands_on: Tensor) -> Tensor:
-    """E_G and E_G', whose vertices count by how many of them stand (T, 1)."""
+    """E_G and E_G'; object vertices are weighted by the number that stand (T, 1)."""
     share = torch.as_tensor(clip.geometry.skin.share).to(posed.skin) / VERTICES_PER_MEASUREMENT
     body = (share * _height(posed.skin, clip) ** 2).sum()
     object_ = (_height(posed.object_vertices, clip) ** 2 / stands_on).sum()
@@ -255,7 +262,7 @@ def ground(posed: Posed, clip: JointClip, stands_on: Tensor) -> Tensor:
 
 
 def _height(points: Tensor, clip: JointClip) -> Tensor:
-    """Heights (T, N) of points (T, N, 3) over the floor where negative, else 0."""
+    """Heights (T, N) of points (T, N, 3) above the floor, 0 where positive."""
     if clip.floor is None:
         return points.new_zeros(points.shape[:2])
     point, normal = (torch.as_tensor(a).to(points) for a in (clip.floor.point, clip.floor.normal))
@@ -282,17 +289,19 @@ def _accelerations(points: Tensor, sigma: Tensor, fps: float) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """States after every round, the start first, with seconds (R,), energy (R,) there before the
-    clouds are looked at again, and steps (R,) taken."""
+    """Results after every round, the start first."""
 
     states: list[State]
     seconds: np.ndarray
+    """(R,)."""
     energy: np.ndarray
+    """(R,) before the clouds are observed again."""
     steps: np.ndarray
+    """(R,) L-BFGS steps so far."""
 
 
 def refine(energy: Energy, frames: int, steps: int = STEPS) -> Refined:
-    """At most ``steps`` L-BFGS steps from the sequential fits of ``frames``."""
+    """Take at most ``steps`` L-BFGS steps from the sequential fits of ``frames``."""
     begin = time.perf_counter()
     x = torch.zeros((frames, OBJECT_SHIFT.stop), requires_grad=True)
     optimiser = _lbfgs(x)

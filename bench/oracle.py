@@ -185,13 +185,16 @@ AS_IT_IS, TRUE_MESH, FREE, OPEN = "as it is", "true mesh", "starts at the truth"
 
 @dataclass(frozen=True)
 class Variant:
-    """What is put in: true poses of the ``cameras``, true depth ``biases``, and a ``mesh``, "true"
-    or "open". ``held``: cameras and biases that are put in stay as they are."""
+    """Inputs that are replaced by the truth."""
 
     cameras: bool = False
+    """True camera poses."""
     biases: bool = False
+    """True depth biases."""
     mesh: str = ""
+    """"true" or "open"; empty: the run's mesh."""
     held: bool = True
+    """Cameras and biases are fixed at these inputs."""
 
 
 VARIANTS = {

@@ -1,8 +1,8 @@
-"""`make test-slurm`: the workflow on a real Slurm of this machine's own, and what goes wrong there.
+"""`make test-slurm`: the workflow on a real Slurm on this machine, with faults.
 
-Runs the tests of ``tests/slurm`` in full and adds to results/bench.json ``slurm.faults_tried`` and
-``slurm.faults_survived``, and ``slurm.overhead_s_per_job``: seconds of a job beside its stage's
-own, from its submission to the moment when its end is known.
+Runs all tests of ``tests/slurm`` and adds to results/bench.json ``slurm.faults_tried``,
+``slurm.faults_survived`` and ``slurm.overhead_s_per_job``: the seconds of a job from its submission
+until its end is known, without those of its stage.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ OUTPUT = Path("results/bench.json")
 
 
 def figures(report: Path) -> dict[str, float]:
-    """From what pytest wrote about each test: its outcome, and what it recorded."""
+    """Figures from pytest's report: outcomes and recorded properties of the tests."""
     tried, survived, overhead = 0, 0, {}
     for case in ElementTree.parse(report).iter("testcase"):
         recorded = {one.get("name"): one.get("value") for one in case.iter("property")}
@@ -35,7 +35,7 @@ def figures(report: Path) -> dict[str, float]:
 
 
 def main() -> int:
-    """Run the tests; returns their exit status, 1 where there is no Slurm to run them on."""
+    """Run the tests; returns their exit status, 1 without Slurm."""
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "report.xml"
         command = [sys.executable, "-m", "pytest", "-n0", "-rs", "tests/slurm"]

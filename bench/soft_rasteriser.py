@@ -23,21 +23,25 @@ OVERDRAW_PX = 1.0  # width of DEODR's blended edge
 
 @dataclass(frozen=True, eq=False)
 class Pixels:
-    """The pixels that are wanted in V tiles of one size each.
-
-    ``view`` (P,) the tile, ``x``, ``y`` (P,) int64 within it; ``sizes`` (V, 2) width, height.
-    """
+    """Pixels to draw in V tiles."""
 
     view: np.ndarray
+    """(P,) tile."""
     x: np.ndarray
+    """(P,) int64 in the tile."""
     y: np.ndarray
+    """(P,) int64 in the tile."""
     sizes: np.ndarray
+    """(V, 2) width and height."""
 
 
 class Rasteriser(Protocol):
-    """``__call__(corners (V, N, 2) px of each tile, depth (V, N) m)`` gives coverage (P,), 0 to 1,
-    and depth (P,), metres, of the wanted pixels, both differentiable; depth means nothing where
-    coverage is small."""
+    """Differentiable drawing of corners (V, N, 2), px in each tile, with depth (V, N), metres.
+
+    Returns coverage (P,) in [0, 1] and depth (P,), metres, of the pixels. Depth is meaningless
+    where
+    coverage is small.
+    """
 
     def __call__(
         self, corners: torch.Tensor, depth: torch.Tensor
@@ -124,9 +128,11 @@ def _to_edge(at: torch.Tensor, start: torch.Tensor, end: torch.Tensor) -> torch.
 
 
 class OverdrawRasteriser:
-    """DEODR on one image that holds all tiles one below the other, coverage and depth as colours.
+    """DEODR on one image that holds all tiles one below the other.
 
-    Depth is interpolated linearly in the image. The mesh must be closed, its faces outward.
+    Coverage and depth are drawn as colours; depth is interpolated linearly in the image. The mesh
+    must
+    be closed, with outward faces.
     """
 
     def __init__(self, faces: np.ndarray, vertices: int, pixels: Pixels) -> None:

@@ -37,20 +37,22 @@ LEAST_SHIFT = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Of N sequences of one part: ``features`` (N, F) and the ``true`` errors (N,), metres, and the
-    ``kind`` (N,) of each recording."""
+    """N sequences of one part."""
 
     features: np.ndarray
+    """(N, F)."""
     true: np.ndarray
+    """(N,) true errors, metres."""
     kind: np.ndarray
+    """(N,) kind of each recording."""
 
     def chosen(self, rows: np.ndarray) -> Samples:
-        """The sequences ``rows`` (N,) bool alone."""
+        """The sequences of the mask ``rows`` (N,)."""
         return Samples(self.features[rows], self.true[rows], self.kind[rows])
 
 
 def read(paths: Sequence[Path]) -> dict[JudgedPart, Samples]:
-    """The samples of each part; raises UserError where a file has no verdict, or no truth."""
+    """Samples of each part; raises UserError for a file without verdict or truth."""
     rows: dict[JudgedPart, list[tuple[np.ndarray, float, str]]] = {part: [] for part in JudgedPart}
     for path in paths:
         sequence = SequenceMetrics.read(path)
@@ -73,7 +75,7 @@ def read(paths: Sequence[Path]) -> dict[JudgedPart, Samples]:
 
 
 def fit(samples: Samples) -> Factors:
-    """Factors whose stated errors' logarithms are nearest to the true ones', robustly."""
+    """Robust fit of factors to the logarithms of the true errors."""
     log_true = np.log(samples.true)
 
     def apart(factors: np.ndarray) -> np.ndarray:
@@ -87,7 +89,7 @@ def fit(samples: Samples) -> Factors:
 
 
 def left_out(samples: Samples) -> np.ndarray:
-    """Stated errors (N,), each from factors that were fitted to recordings of other kinds."""
+    """Stated errors (N,) by factors that were fitted to recordings of other kinds."""
     stated = np.empty(len(samples.true))
     for kind in np.unique(samples.kind):
         own = samples.kind == kind
@@ -101,7 +103,7 @@ def _stated(features: np.ndarray, factors: np.ndarray) -> np.ndarray:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print factors and how well they do."""
+    """Print the factors and their cross-validated errors."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("metrics", nargs="+", type=Path, help="metrics.h5 of sequences with truth")
     options = parser.parse_args(arguments)
