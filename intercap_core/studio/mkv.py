@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import struct
 from pathlib import Path
-from typing import IO, Literal
+from typing import IO, Literal, Required, TypedDict, Unpack
 
 import numpy as np
 
@@ -56,42 +56,49 @@ def _text(number: int, value: str) -> bytes:
     return _element(number, value.encode())
 
 
+class MkvOptions(TypedDict, total=False):
+    """Options of a recording."""
+
+    calibration_json: Required[bytes | None]
+    """The device's calibration; None leaves the attachment out."""
+    colour_mode: Required[str]
+    """Key of ``COLOUR_MODES``."""
+    depth_mode: Required[str | None]
+    """Key of ``DEPTH_MODES``; None leaves the depth track out."""
+    fps: Required[int]
+    serial: Required[str]
+    start_offset_ns: int
+    """Device time at which the file's clock starts; default 0."""
+    depth_delay_ns: int
+    wired_sync_mode: WiredSyncMode
+    subordinate_delay_ns: int
+    with_ir: bool
+    with_imu: bool
+    colour_format: ColourFormat
+    """Default MJPG."""
+
+
 class MkvWriter:
     """Writes one camera's recording, in order of time, with memory for one cluster only.
 
-    Use as a context manager; on leaving, the index and the sizes are filled in. Times are the
-    device's microseconds; the file's clock starts at ``start_offset_ns``. ``colour_mode`` and
-    ``depth_mode`` are keys of ``COLOUR_MODES`` and ``DEPTH_MODES``; ``depth_mode`` None leaves the
-    depth track out. The same calls write the same bytes. Raises ValueError for unknown modes, for
+    A context manager: on leaving, the index and the sizes are filled in. Times are the device's
+    microseconds. The same calls write the same bytes. Raises ValueError for unknown modes, for
     images of another size and for times before the start or more than a cluster back.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        calibration_json: bytes | None,
-        colour_mode: str,
-        depth_mode: str | None,
-        fps: int,
-        serial: str,
-        start_offset_ns: int = 0,
-        depth_delay_ns: int = 0,
-        wired_sync_mode: WiredSyncMode = "STANDALONE",
-        subordinate_delay_ns: int = 0,
-        with_ir: bool = False,
-        with_imu: bool = False,
-        colour_format: ColourFormat = "MJPG",
-    ) -> None:
+    def __init__(self, path: Path, **options: Unpack[MkvOptions]) -> None:
+        colour_mode, depth_mode = options["colour_mode"], options["depth_mode"]
+        fps, start_offset_ns = options["fps"], options.get("start_offset_ns", 0)
+        with_ir, with_imu = options.get("with_ir", False), options.get("with_imu", False)
         if fps not in KINECT_RATES:
             raise ValueError(f"fps is {fps}, the device records at 5, 15 or 30")
         if start_offset_ns % TIMECODE_SCALE_NS:
             raise ValueError(f"start_offset_ns {start_offset_ns} is not a whole microsecond")
-        self._colour_format = colour_format
+        self._colour_format = options.get("colour_format", "MJPG")
         self._colour_size = COLOUR_MODES[colour_mode].size
         self._depth_size = DEPTH_MODES[depth_mode].size if depth_mode else None
         self._start_us = start_offset_ns // TIMECODE_SCALE_NS
-        self._serial = serial
+        self._serial = options["serial"]
         names = ["COLOR"] + ["DEPTH"] * bool(depth_mode) + ["IR"] * with_ir + ["IMU"] * with_imu
         self._tracks = {name: number for number, name in enumerate(names, start=1)}
         self._cluster_us: int | None = None
@@ -100,16 +107,18 @@ class MkvWriter:
         self._cues: list[bytes] = []
         self._last_us = 0
 
-        tags = self._tags(colour_mode, depth_mode, calibration_json is not None)
-        tags["K4A_DEPTH_DELAY_NS"] = (str(depth_delay_ns), "")
-        tags["K4A_WIRED_SYNC_MODE"] = (wired_sync_mode, "")
-        if wired_sync_mode == "SUBORDINATE":
-            tags["K4A_SUBORDINATE_DELAY_NS"] = (str(subordinate_delay_ns), "")
-        tags["K4A_DEVICE_SERIAL_NUMBER"] = (serial, "")
+        calibration = options["calibration_json"]
+        sync = options.get("wired_sync_mode", "STANDALONE")
+        tags = self._tags(colour_mode, depth_mode, calibration is not None)
+        tags["K4A_DEPTH_DELAY_NS"] = (str(options.get("depth_delay_ns", 0)), "")
+        tags["K4A_WIRED_SYNC_MODE"] = (sync, "")
+        if sync == "SUBORDINATE":
+            tags["K4A_SUBORDINATE_DELAY_NS"] = (str(options.get("subordinate_delay_ns", 0)), "")
+        tags["K4A_DEVICE_SERIAL_NUMBER"] = (self._serial, "")
         tags["K4A_START_OFFSET_NS"] = (str(start_offset_ns), "")
 
         self._file: IO[bytes] = open(path, "wb")  # noqa: SIM115 - closed by close()
-        self._write_head(fps, calibration_json, tags)
+        self._write_head(fps, calibration, tags)
 
     def __enter__(self) -> MkvWriter:
         return self
