@@ -29,12 +29,14 @@ from rich.table import Column, Table
 from bench.again import artefacts_of, check_run, compute_once
 from bench.command import exit_on_user_error, figure_class
 from intercap_core import artefacts
+from intercap_core.config import JointSettings
 from intercap_core.errors import UserError
 from intercap_core.evaluation.contact import CONTACT_M
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.proximity import PosedObject
 from intercap_core.evaluation.tracks import read_body, read_object
 from intercap_core.evaluation.truth import Truth
+from intercap_core.joint.problem import TERMS
 from intercap_core.joint.terms.stick import local_points
 from intercap_core.output.site.closeups import SIDES, closeup, holds, read_handling
 from intercap_core.project import Project, load_project
@@ -263,6 +265,14 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "without cameras": {"refine_cameras": False},
     "without renewed images": {"look_again": False, "refine_cameras": False},
     "contact to annotated vertices": {"contact_to": "annotated"},
+}
+# Terms whose weight is in none of these variants.
+VARIANTS |= {
+    f"without {term.equation.symbol}": {name: 0.0}
+    for term in TERMS
+    for name in term.equation.settings
+    if isinstance(JointSettings.model_fields[name].default, float)
+    and not any(name in settings for settings in VARIANTS.values())
 }
 
 

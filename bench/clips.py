@@ -40,7 +40,7 @@ from intercap_core.geometry.camera.transforms import apply_step, rigid
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.joint.contact.detect import contact_probability, region_motion
-from intercap_core.joint.floor import Ground
+from intercap_core.joint.floor import FloorPlane
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.sequential import SequentialFits
 from intercap_core.joint.skin import contact_patches
@@ -287,7 +287,7 @@ class JointClip:
     labels: tuple[str, ...]  # detector labels of the object
     object_settings: ObjectTrackSettings
     touching: np.ndarray  # (T, R) regions in contact at the start, by the stage's detection
-    floor: Ground | None
+    floor: FloorPlane | None
     fps: float
     settings: JointSettings
     truth: Truth
@@ -316,7 +316,7 @@ class JointClip:
             settled = Settled(*(torch.from_numpy(fitted[name]) for name in _SETTLED))
             failed = fitted["failed"]
             found = bool(scene.attributes["ground_found"])
-            floor = Ground(scene["ground_point"], scene["ground_normal"]) if found else None
+            floor = FloorPlane(scene["ground_point"], scene["ground_normal"]) if found else None
             fps = float(scene.attributes["fps"])
         seen = read_observations(paths["scene"], paths["person"])
         clouds = person_clouds(paths["frames"], seen, settings.points_per_frame, model.device)

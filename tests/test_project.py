@@ -403,7 +403,7 @@ def test_the_example_annotation_is_valid() -> None:
     Annotation.model_validate(values)
 
 
-GENERATED = contents()
+GENERATED = contents(ROOT)
 
 
 @pytest.mark.parametrize("relative", sorted(GENERATED))

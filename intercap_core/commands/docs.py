@@ -27,12 +27,14 @@ ENTRIES: dict[str, tuple[type[BaseModel], str, str]] = {
 # The default settings name a dataset; the studio's section belongs to virtual recordings alone.
 STARTING_DATASET = "my_dataset"
 LEFT_OUT_OF_DEFAULTS = ("studio",)
+# Lines of docs/equations.md between which the table of the joint terms is generated.
+TERMS_BEGIN, TERMS_END = "<!-- joint terms -->\n", "<!-- end of joint terms -->\n"
 
 
 def generate(root: Path, *, write: bool) -> list[Path]:
     """Bring the generated files under ``root`` up to date; returns those that were not."""
     stale = []
-    for relative, text in contents().items():
+    for relative, text in contents(root).items():
         path = root / relative
         if not path.is_file() or path.read_text(encoding="utf-8") != text:
             stale.append(path)
@@ -42,12 +44,13 @@ def generate(root: Path, *, write: bool) -> list[Path]:
     return stale
 
 
-def contents() -> dict[str, str]:
+def contents(root: Path) -> dict[str, str]:
     """Every generated file's text, by its path below the project's root."""
     files = {
         "config/config.yaml": default_settings(),
         "config/README.md": settings_page(),
         "docs/artefacts.md": artefacts_page(),
+        "docs/equations.md": equations_page((root / "docs/equations.md").read_text("utf-8")),
     }
     for name, (model, _, _) in ENTRIES.items():
         text = json.dumps(model.model_json_schema(), indent=2) + "\n"
@@ -90,6 +93,15 @@ def _inline(value: Any) -> str:
     return (
         yaml.safe_dump(value, default_flow_style=True, width=1000).removesuffix("\n...\n").strip()
     )
+
+
+def equations_page(page: str) -> str:
+    """docs/equations.md with the table of the joint terms."""
+    from intercap_core.joint.problem import equation_table  # imports torch
+
+    head, _, rest = page.partition(TERMS_BEGIN)
+    _, _, tail = rest.partition(TERMS_END)
+    return head + TERMS_BEGIN + "\n".join(equation_table()) + "\n" + TERMS_END + tail
 
 
 def settings_page() -> str:

@@ -1,4 +1,4 @@
-"""Normal equations of all frames: block-banded, since accelerations tie three frames together."""
+"""Normal equations of all frames: block-banded, since accelerations couple three frames."""
 
 from __future__ import annotations
 
@@ -11,49 +11,55 @@ from intercap_core.geometry.solve.banded import BandedSystem
 from intercap_core.geometry.solve.thread_pool import ThreadPool
 from intercap_core.joint.state import ALL
 
-ACCELERATION = (1.0, -2.0, 1.0)  # of frames t-1, t, t+1
-RATE = (-1.0, 1.0)  # of frames t, t+1
-# Derivatives (F, K, R, m) of K of a term's N values, R numbers each, in the F frames of a slice.
+ACCELERATION = (1.0, -2.0, 1.0)  # stencil over frames t, t+1, t+2
+RATE = (-1.0, 1.0)  # stencil over frames t, t+1
+
 Rows = Callable[[slice, np.ndarray], np.ndarray]
-# Rows are made for so many frames at a time: few enough that they stay in the cache.
-_FRAMES_TOGETHER = 8
-# Values of less weight than this share of their term's largest change nothing: the tail of a
+"""Derivatives (F, K, R, m) of K of a term's N values, R numbers each, in F frames (a slice)."""
+
+# Values whose weight is a smaller share of their term's largest change nothing: the tail of a
 # Gaussian over a contact patch would have a row of each of its vertices.
-_NEGLIGIBLE = 1e-7
+NEGLIGIBLE_WEIGHT = 1e-7
+
+_CHUNK = 8  # frames whose rows are computed at a time: few enough to stay in the cache
 
 
-class NormalEquations:
-    """Sums weighted J^T J and J^T r of terms.
+class BandedEquations:
+    """Sums of weighted J^T J and J^T r of all terms.
 
-    ``bands`` (w+1, T, n, n) as in :class:`BandedSystem`, w = 2 or fewer for short recordings,
-    ``gradient`` (T, n) and ``energies`` (T,) of each term, one half of the weighted sum of squares;
-    a difference over frames is shared by them.
-    ``damped`` (T, n) is the diagonal without its stiff parts: damping by their large values would
-    freeze an object that has to move as one over many frames.
+    Attributes:
+        bands: (w+1, T, n, n) as in :class:`BandedSystem`, w = 2 or less for short recordings.
+        damped: (T, n) diagonal without the stiff rows: damping by their large values would freeze
+            an object that has to move as one over many frames.
+        gradient: (T, n).
+        energies: (T,) of each term, one half of the weighted sum of squares; the energy of a
+            difference between frames is divided among them.
     """
 
     def __init__(self, frames: int, threads: ThreadPool | None = None) -> None:
-        """``threads`` make rows, of a few frames each; None is one."""
+        """Start with zeros. ``threads`` compute rows, a few frames each; None for one thread."""
         self._threads = threads or ThreadPool()
         self.bands = np.zeros((min(3, frames), frames, ALL.stop, ALL.stop))
         self.damped = np.zeros((frames, ALL.stop))
         self.gradient = np.zeros((frames, ALL.stop))
         self.energies: dict[str, np.ndarray] = {}
 
-    def copy(self, bands: np.ndarray | None = None) -> NormalEquations:
-        """The same sums, to which more can be added; in the memory of ``bands``, of the same shape,
-        where that is given: half of the time goes into new memory."""
-        made = NormalEquations(0, self._threads)
+    def copy(self, bands: np.ndarray | None = None) -> BandedEquations:
+        """A copy, to which more can be added.
+
+        ``bands`` is memory of the same shape to use again: allocation takes half of the time.
+        """
+        made = BandedEquations(0, self._threads)
         made.bands = np.empty_like(self.bands) if bands is None else bands
         made.bands[...], made.damped = self.bands, self.damped.copy()
         made.gradient, made.energies = self.gradient.copy(), dict(self.energies)
         return made
 
     def step(self, damping: np.ndarray) -> np.ndarray | None:
-        """The Gauss-Newton step (T, n), damped by ``damping`` (T,) of each frame, or None where the
-        matrix is not definite.
+        """The Gauss-Newton step (T, n), or None if the matrix is not positive definite.
 
-        It spends ``bands``, most of a long recording's memory: another step needs new equations.
+        ``damping`` (T,) is a share of the diagonal. The step consumes ``bands``, most of the memory
+        of a long recording: another step needs new equations.
         """
         matrix, self.bands = torch.from_numpy(self.bands), np.zeros((0, 0, 0, 0))
         damped = torch.from_numpy(damping[:, None] * self.damped)
@@ -65,7 +71,7 @@ class NormalEquations:
 
     @property
     def energy(self) -> dict[str, float]:
-        """Of each term, over all frames."""
+        """Energy of each term, over all frames."""
         return {term: float(values.sum()) for term, values in self.energies.items()}
 
     @property
@@ -79,7 +85,7 @@ class NormalEquations:
         return np.sum(list(self.energies.values()), axis=0)
 
     def hold(self, columns: slice) -> None:
-        """Keep ``columns``, of which no term knows anything, where they are."""
+        """Keep ``columns``, which no term constrains, where they are."""
         own = self.bands[0][:, columns, columns]
         own += np.eye(own.shape[-1])
 
@@ -91,8 +97,7 @@ class NormalEquations:
         gradient: np.ndarray,
         energy: np.ndarray,
     ) -> None:
-        """Add ready J^T W J (T, m, m), J^T W r (T, m) and energy (T,) over ``columns`` of every
-        frame."""
+        """Add J^T W J (T, m, m), J^T W r (T, m) and energy (T,) over ``columns`` of each frame."""
         self.bands[0][:, columns, columns] += hessian
         self.damped[:, columns] += hessian.diagonal(axis1=1, axis2=2)
         self.gradient[:, columns] += gradient
@@ -110,11 +115,17 @@ class NormalEquations:
         stencil: tuple[float, ...] = (1.0,),
         stiff: bool = False,
     ) -> None:
-        """Add values, or their differences over neighbouring frames; ``stiff``: not damped.
+        """Add values of each frame, or differences of values over neighbouring frames.
 
-        ``rows`` derive the values by ``columns``, ``stencil`` (w+1,) are the factors of frames
-        t .. t+w; ``weights`` (T-w, N) and ``residuals`` (T-w, N, R) are those of the differences.
-        ``energy`` (T-w,) is that of a robust term, None for plain least squares.
+        Args:
+            term: name of the energy.
+            columns: unknowns on which the values depend.
+            rows: derivatives of the values by these unknowns.
+            weights: (T-w, N) of the differences.
+            residuals: (T-w, N, R) of the differences.
+            energy: (T-w,) of a robust term; None for plain least squares.
+            stencil: (w+1,) factors of the frames t .. t+w.
+            stiff: leave these rows out of the damping.
         """
         frames, ahead = len(self.gradient), len(stencil) - 1
         if energy is None:
@@ -131,10 +142,10 @@ class NormalEquations:
             _over_stencil([f * g for f, g in zip(stencil, stencil[d:], strict=False)], weights)
             for d in range(ahead + 1)
         ]
-        counts = couplings[0] > _NEGLIGIBLE * couplings[0].max(initial=0.0)
+        counts = couplings[0] > NEGLIGIBLE_WEIGHT * couplings[0].max(initial=0.0)
 
         def add_chunk(start: int) -> None:
-            stop = min(start + _FRAMES_TOGETHER, frames)
+            stop = min(start + _CHUNK, frames)
             last = min(stop + ahead, frames)
             used = np.flatnonzero(counts[start:last].any(axis=0))
             if not len(used):
@@ -152,14 +163,14 @@ class NormalEquations:
                     ahead_of = (jacobian[d : d + count] * weight).transpose(0, 2, 1)
                     self.bands[d, here, columns, columns] += ahead_of @ jacobian[:count]
                     continue
-                # of a matrix with itself half of the products are enough, which numpy knows
+                # numpy computes half of the product of a matrix with its own transpose
                 scaled = jacobian[:count] * np.sqrt(weight)
                 block = scaled.transpose(0, 2, 1) @ scaled
                 self.bands[0, here, columns, columns] += block
                 if not stiff:
                     self.damped[here, columns] += block.diagonal(axis1=1, axis2=2)
 
-        self._threads.map(add_chunk, range(0, frames, _FRAMES_TOGETHER))
+        self._threads.map(add_chunk, range(0, frames, _CHUNK))
 
 
 def _over_stencil(factors: Sequence[float] | np.ndarray, values: np.ndarray) -> np.ndarray:

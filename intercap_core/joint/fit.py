@@ -1,6 +1,4 @@
-"""The joint fit: alternates between estimating contact and minimising the energy, until neither
-changes.
-"""
+"""The joint fit: alternates between estimating contact and minimising the energy of equation 6."""
 
 from __future__ import annotations
 
@@ -11,113 +9,100 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.config import ContactInterval, JointSettings
-from intercap_core.geometry.solve.thread_pool import ThreadPool
 from intercap_core.joint.cameras import CameraFit
 from intercap_core.joint.contact.estimate import ContactEstimate, ContactEstimator
-from intercap_core.joint.floor import Ground, contradiction
-from intercap_core.joint.geometry import Geometry
+from intercap_core.joint.floor import FloorPlane, contradiction
 from intercap_core.joint.inputs import JointInputs
 from intercap_core.joint.minimise import limited, minimise
-from intercap_core.joint.problem import Problem, joint_terms
-from intercap_core.joint.result import CARRIED, CONTRADICTED
-from intercap_core.joint.sequential import Flags
+from intercap_core.joint.problem import JointProblem, build_terms
+from intercap_core.joint.result import CARRIED, CONTRADICTED, Convergence, JointFit
 from intercap_core.joint.state import State
-from intercap_core.joint.terms.body_data import BodyData, Residuals
+from intercap_core.joint.terms.body_data import BodyData
 from intercap_core.joint.terms.contact import Contact
 from intercap_core.joint.terms.object_data import NoObject, ObjectData
 from intercap_core.joint.terms.object_images import ObjectImagesData
-from intercap_core.joint.time_offsets import OffsetPrior, TimeOffsets
+from intercap_core.joint.terms.term import TermContext
 
-# Errors of masks and keypoints last about so long, seconds: what the frames of that time say of the
-# cameras is one observation. Tuned on the studio.
-ERROR_LASTING_S = 0.3
-# What the body says of the cameras beside that: a detector's errors follow view and pose, and
-# clothing is of unknown thickness. Tuned on the studio.
-BODY_SHARE = 0.05
-# Changes of offsets above this call for another round, seconds: 3 mm of that hand's motion.
-OFFSET_CHANGED_S = 0.001
-# Corrections of cameras below this are not worth another round, metres.
-CAMERAS_CHANGED_M = 0.0005
-# Most accepted steps of each round; contact is estimated anew between rounds, and the first moves
-# the most. Tuned on the studio.
+# Largest number of accepted steps of each round: the first round moves most. Contact is estimated
+# between rounds. Tuned on the studio.
 ROUND_STEPS = (6, 4, 3)
-# Largest change of a contact probability after which another round has nothing new to work with.
-# Tuned on the studio.
+# Duration of errors of masks and keypoints, seconds: the frames of that time are one observation of
+# the cameras. Tuned on the studio.
+ERROR_LASTING_S = 0.3
+# Weight of the body's evidence of the cameras: a detector's errors follow view and pose, and
+# clothing has an unknown thickness. Tuned on the studio.
+BODY_SHARE = 0.05
+# Changes after which another round has nothing to improve: of a contact probability (tuned on the
+# studio), of time offsets, seconds (3 mm of a hand at 3 m/s), and of cameras, metres.
 CONTACT_CONVERGED = 0.1
-# A frame with skin deeper than this inside the object, or the other way round, is flagged, metres:
-# far beyond what skin yields, so one of the two poses is wrong. Tuned on the studio.
+OFFSET_CHANGED_S = 0.001
+CAMERAS_CHANGED_M = 0.0005
+# Depth of skin in the object, or of the object in the body, that flags a frame, metres: far beyond
+# what skin yields, so one of the two poses is wrong. Tuned on the studio.
 FLAGGED_DEPTH = 0.03
 
 log = logging.getLogger(__name__)
-ObjectTerm = ObjectData | ObjectImagesData | NoObject  # what stands for E_O
 
-
-@dataclass(frozen=True)
-class JointFit:
-    """The refined state, with contact, time offsets and residuals there, the energy by term before
-    and after, the numbers of ``steps`` and of ``refused`` ones, whether it ``converged``, and the
-    reasons (T,) not to trust a frame, "" = none; whether the ``cameras`` were corrected."""
-
-    state: State
-    contact: ContactEstimate
-    time_offsets: TimeOffsets
-    residuals: Residuals
-    energy_before: dict[str, float]
-    energy_after: dict[str, float]
-    steps: int
-    refused: int
-    converged: bool
-    flag_reasons: list[str]
-    cameras: bool
+ObjectTerm = ObjectData | ObjectImagesData | NoObject
+"""The term that stands for E_O."""
 
 
 @dataclass(frozen=True, eq=False)
 class Assembly:
-    """The ``problem`` of equation 6, with those of its terms that are told what to hold fixed;
-    ``against_floor`` says why the floor was left out, "" = it was not."""
+    """The energy of a recording, and those of its terms that the fit updates between rounds."""
 
-    problem: Problem
+    problem: JointProblem
+    """All terms."""
     body: BodyData
+    """E_B."""
     object_: ObjectTerm
+    """E_O."""
     contact: Contact | None
-    floor: Ground | None
+    """E_C; None without an object."""
+    floor: FloorPlane | None
+    """The floor that the terms use."""
     against_floor: str
+    """Why the scene's floor is not used; "" if it is, or if there is none."""
     share: float
+    """Share of an independent observation of the cameras that a frame is."""
 
 
 def assemble(inputs: JointInputs, settings: JointSettings) -> Assembly:
-    """All terms over ``inputs``. Without images the object's track stands for them; without an
-    object only the body's terms are left. A floor that the sequential fits contradict is left
-    out."""
+    """Build all terms.
+
+    Without images the object's track stands for E_O; without an object the body's terms remain. A
+    floor that the sequential fits contradict is left out.
+    """
     sequential, floor = inputs.sequential, inputs.floor
     against_floor = contradiction(inputs.geometry, sequential, floor) if floor else ""
-    if against_floor:
-        floor = None
+    context = TermContext(
+        geometry=inputs.geometry,
+        settings=settings,
+        start=sequential.state,
+        trust=sequential.trust,
+        fps=inputs.fps,
+        floor=None if against_floor else floor,
+        encoder=inputs.encoder,
+        up=floor.normal if floor else None,
+    )
     share = min(1.0, 1 / (inputs.fps * ERROR_LASTING_S))
     object_data: ObjectTerm = NoObject()
-    contact = None
     if sequential.tracked is not None:
-        contact = Contact(inputs.geometry, settings.contact_weight)
         object_data = (
             ObjectImagesData(sequential.tracked, inputs.images, share)
             if inputs.images
             else ObjectData(sequential.tracked)
         )
-    problem = Problem(
-        joint_terms(
-            inputs.geometry,
-            settings,
-            sequential.state,
-            data=(inputs.body_data, object_data),
-            contact=contact,
-            floor=floor,
-            fps=inputs.fps,
-            trust=sequential.trust,
-            motion=inputs.motion,
-        ),
-        inputs.threads,
+    terms = build_terms(context, (inputs.body_data, object_data))
+    return Assembly(
+        problem=JointProblem(terms, inputs.threads),
+        body=inputs.body_data,
+        object_=object_data,
+        contact=context.find(Contact) if inputs.geometry.has_object else None,
+        floor=context.floor,
+        against_floor=against_floor,
+        share=share,
     )
-    return Assembly(problem, inputs.body_data, object_data, contact, floor, against_floor, share)
 
 
 def fit(
@@ -125,168 +110,173 @@ def fit(
 ) -> JointFit:
     """Minimise equation 6 from the sequential fits.
 
-    ``intervals`` are the annotated contacts, None where contact is to be detected. A floor that
-    the sequential fits contradict flags every frame.
+    ``intervals`` are the annotated contacts; None to detect contact. A floor that the sequential
+    fits contradict flags every frame.
     """
-    geometry, sequential, body_data = inputs.geometry, inputs.sequential, inputs.body_data
-    state = sequential.state
-    alone = not geometry.has_object
+    alone = not inputs.geometry.has_object
     if settings.refine_cameras and not (settings.look_again or alone):
         log.warning("refine_cameras needs look_again: the cameras stay as the scene has them")
     assembly = assemble(inputs, settings)
-    problem, object_data, contact = assembly.problem, assembly.object_, assembly.contact
-    floor, against_floor, share = assembly.floor, assembly.against_floor, assembly.share
-    if against_floor:
-        log.warning("%s: every frame is flagged; look at the scene's ground", against_floor)
+    if assembly.against_floor:
+        log.warning(
+            "%s: every frame is flagged; look at the scene's ground", assembly.against_floor
+        )
     cameras = inputs.cameras if (inputs.images or alone) and settings.refine_cameras else None
-    fps, prior = inputs.fps, inputs.prior
-    estimator = ContactEstimator(geometry, sequential, floor, fps, settings, intervals)
-    rounds = _Rounds(problem, body_data, object_data, contact, estimator, prior, state)
+    estimator = ContactEstimator(
+        inputs.geometry, inputs.sequential, assembly.floor, inputs.fps, settings, intervals
+    )
+    rounds = _Rounds(inputs, assembly, estimator)
     for number, max_steps in enumerate(ROUND_STEPS, 1):
         rounds.minimise(max_steps)
         if number == len(ROUND_STEPS):
             break
-        if cameras is not None and not cameras.refused and not isinstance(object_data, ObjectData):
-            rounds.settle(cameras, object_data, share)
-        if rounds.settled:
+        if cameras is not None and not cameras.refused:
+            rounds.correct_cameras(cameras)
+        if rounds.convergence == Convergence.CONVERGED:
             break
-    state, steps, refused = rounds.state, rounds.steps, rounds.refused
-    stuck = steps == 0 and refused > 0 and not rounds.settled
-    against_images = np.zeros(len(state), bool)
-    if isinstance(object_data, ObjectImagesData):
-        against_images = object_data.contradicted(state)
+    state, convergence = rounds.state, rounds.convergence
+    stalled = rounds.stalled | (convergence == Convergence.STALLED)
     log.log(
-        logging.WARNING if stuck else logging.INFO,
-        "%d steps taken, %d refused, %d frames held, %s",
-        steps,
-        refused,
-        rounds.held.sum(),
-        "settled" if rounds.settled else "ended before it settled",
+        logging.WARNING if convergence == Convergence.STALLED else logging.INFO,
+        "%s: %d steps accepted, %d refused, %d frames stalled",
+        convergence.value,
+        rounds.steps,
+        rounds.refused,
+        rounds.stalled.sum(),
     )
-    body_data.refresh(state)
-    residuals = body_data.residuals()
+    body, images = assembly.body, assembly.object_
+    against_images = np.zeros(len(state), bool)
+    if isinstance(images, ObjectImagesData):
+        against_images = images.contradicted(state)
+    body.refresh(state)
     return JointFit(
         state=state,
         contact=rounds.estimate,
-        time_offsets=body_data.estimate_offsets(prior),
-        residuals=residuals,
+        time_offsets=body.estimate_offsets(inputs.prior),
+        residuals=body.residuals(),
         energy_before=rounds.energy_before,
         energy_after=rounds.energy_after,
-        steps=steps,
-        refused=refused,
-        converged=rounds.settled,
+        steps=rounds.steps,
+        refused=rounds.refused,
+        convergence=convergence,
         flag_reasons=_flag_reasons(
-            geometry,
-            state,
-            sequential.flags,
-            rounds.estimate,
-            rounds.held | stuck,
-            against_floor,
-            against_images,
-            problem.threads,
+            inputs, state, rounds.estimate, stalled, against_images, assembly.against_floor
         ),
-        cameras=cameras is not None and not cameras.refused,
+        cameras_corrected=cameras is not None and not cameras.refused,
     )
 
 
 class _Rounds:
-    """What the alternation has come to: the ``state`` with contact's ``estimate`` there, the energy
-    by term before and after, the numbers of ``steps`` and of ``refused`` ones, and the frames (T,)
-    that were ``held`` in every round."""
+    """The alternation between minimisation and estimates of contact, time offsets and cameras.
+
+    Attributes:
+        state: present state.
+        estimate: contact at this state.
+        steps: number of accepted steps of all rounds.
+        refused: number of refused steps of all rounds.
+        stalled: (T,) frames that no round moved, since each step raised the energy there.
+        energy_before: energy by term at the start.
+        energy_after: energy by term at the end of the last round.
+    """
 
     def __init__(
-        self,
-        problem: Problem,
-        body_data: BodyData,
-        object_data: ObjectTerm,
-        contact: Contact | None,
-        estimator: ContactEstimator,
-        prior: OffsetPrior,
-        state: State,
+        self, inputs: JointInputs, assembly: Assembly, estimator: ContactEstimator
     ) -> None:
-        self._problem, self._body, self._object = problem, body_data, object_data
-        self._contact, self._estimator, self._prior = contact, estimator, prior
-        self.state, self.estimate = state, estimator.at(state)
+        self._assembly, self._estimator, self._prior = assembly, estimator, inputs.prior
+        self.state = inputs.sequential.state
+        self.estimate = estimator.at(self.state)
         self.steps = self.refused = 0
-        self.held = np.ones(len(state), bool)
+        self.stalled = np.ones(len(self.state), bool)
         self.energy_before: dict[str, float] = {}
         self.energy_after: dict[str, float] = {}
-        self._still = False  # neither state, contact nor time offsets change any more
-        self._camera_change = 0.0
+        self._unchanged = False  # the last round hardly changed state, contact and time offsets
+        self._camera_shift = 0.0  # of the last correction, metres
 
     @property
-    def settled(self) -> bool:
-        """Whether another round would change nothing."""
-        return self._still and self._camera_change < CAMERAS_CHANGED_M
+    def convergence(self) -> Convergence:
+        """Outcome so far."""
+        if self._unchanged and self._camera_shift < CAMERAS_CHANGED_M:
+            return Convergence.CONVERGED
+        if self.steps == 0 and self.refused > 0:
+            return Convergence.STALLED
+        return Convergence.ITERATION_LIMIT
 
     def minimise(self, max_steps: int) -> None:
-        """One round: time offsets and images at the state, at most so many steps, contact anew."""
-        if self._contact is not None:
-            self._contact.take_contact(self.estimate.probability, self.estimate.labels)
-        self._body.refresh(self.state)
-        offsets = self._body.estimate_offsets(self._prior).offset
-        offset_change = self._body.take_offsets(offsets)
-        self._object.take_offsets(self._body.time_offset)
-        self._problem.refresh(self.state, but=self._body)
-        minimum = minimise(self._problem.equations, self.state, max_steps=max_steps)
+        """Do one round.
+
+        Update time offsets and correspondences at the state, take at most ``max_steps`` steps, and
+        estimate contact again.
+        """
+        assembly, body = self._assembly, self._assembly.body
+        if assembly.contact is not None:
+            assembly.contact.take_contact(self.estimate.probability, self.estimate.labels)
+        body.refresh(self.state)
+        offset_change = body.take_offsets(body.estimate_offsets(self._prior).offset)
+        assembly.object_.take_offsets(body.time_offset)
+        assembly.problem.refresh(self.state, but=body)
+        minimum = minimise(assembly.problem.equations, self.state, max_steps=max_steps)
         self.state = minimum.state
         self.steps, self.refused = self.steps + minimum.steps, self.refused + minimum.refused
         self.energy_before = self.energy_before or minimum.energy_before
         self.energy_after = minimum.equations.energy
-        self.held &= minimum.held
+        self.stalled &= minimum.stalled
         log.info("%d steps, energy %.4g", self.steps, minimum.equations.total)
         converged = minimum.converged
         del minimum  # its equations are most of the memory
         previous, self.estimate = self.estimate, self._estimator.at(self.state)
         contact_change = self.estimate.change(previous)
-        self._still = bool(
+        self._unchanged = bool(
             converged and contact_change < CONTACT_CONVERGED and offset_change < OFFSET_CHANGED_S
         )
 
-    def settle(self, cameras: CameraFit, images: ObjectImagesData | NoObject, share: float) -> None:
-        """Correct the ``cameras`` by body and, where there is an object, ``images``; a frame is so
-        large a ``share`` of an independent observation."""
-        shown = [self._body.sights(self.state, BODY_SHARE * share)]
+    def correct_cameras(self, cameras: CameraFit) -> None:
+        """Correct ``cameras`` by the evidence of the body and, if there are images of it, the
+        object."""
+        body, images = self._assembly.body, self._assembly.object_
+        evidence = [body.camera_evidence(self.state, BODY_SHARE * self._assembly.share)]
         if isinstance(images, ObjectImagesData):
-            shown.append(images.sights(self.state))
-        found = cameras.settle(shown)
-        if cameras.take(found):
-            self._camera_change = found.shift
-            log.info("cameras corrected by up to %.1f mm", 1e3 * found.shift)
-            self.state = self.state.moved(limited(found.along))
-        self._body.take_cameras(cameras.now)
+            evidence.append(images.camera_evidence(self.state))
+        correction = cameras.solve(evidence)
+        if cameras.take(correction):
+            self._camera_shift = correction.shift
+            log.info("cameras corrected by up to %.1f mm", 1e3 * correction.shift)
+            self.state = self.state.moved(limited(correction.along))
+        body.take_cameras(cameras.now)
         if isinstance(images, ObjectImagesData):
             images.take_cameras(cameras.now)
         if cameras.refused:
-            # what the cameras were until now was fitted to: at least one more round
-            self._camera_change, self._still = 0.0, False
+            # the state was fitted to the cameras before: at least one more round
+            self._camera_shift, self._unchanged = 0.0, False
             log.warning(
                 "body and object would move a camera by %.0f mm, far beyond what the scene "
                 "leaves open: all cameras stay as the scene has them; look at their poses, the "
                 "body and the object",
-                1e3 * found.shift,
+                1e3 * correction.shift,
             )
 
 
 def _flag_reasons(
-    geometry: Geometry,
+    inputs: JointInputs,
     state: State,
-    flags: Flags,
     estimate: ContactEstimate,
-    stuck: np.ndarray,
-    against_floor: str,
+    stalled: np.ndarray,
     against_images: np.ndarray,
-    threads: ThreadPool,
+    against_floor: str,
 ) -> list[str]:
-    """Why each frame (T,) should not be trusted; "" where it can be. ``stuck`` (T,): no step
-    lowered its energy; ``against_images`` (T,): they contradict the object's final pose."""
-    nowhere = np.zeros(len(state), bool)
-    deep = sunk = nowhere
+    """Reasons (T,) not to trust a frame; "" if there is none.
+
+    Args:
+        stalled: (T,) frames that no step moved.
+        against_images: (T,) frames whose images contradict the object's final pose.
+        against_floor: why the floor is not used.
+    """
+    flags = inputs.sequential.flags
+    deep = sunk = np.zeros(len(state), bool)
     lost = "object found in no frame"
-    if geometry.has_object:
-        posed = geometry.at(state)
+    if inputs.geometry.has_object:
+        posed = inputs.geometry.at(state)
         deep = posed.proximity.distance.min(axis=1) < -FLAGGED_DEPTH
-        sunk = posed.object_depth(threads) > FLAGGED_DEPTH
+        sunk = posed.object_depth(inputs.threads) > FLAGGED_DEPTH
         lost = "object lost, filled in"
     causes = (
         (flags.filled, "body not seen well enough, filled in"),
@@ -297,7 +287,7 @@ def _flag_reasons(
         (deep, "body deep inside the object"),
         (sunk, "object deep inside the body"),
         *estimate.distrust(),
-        (stuck, "no step of the joint fit lowered its energy"),
+        (stalled, "no step of the joint fit lowered its energy"),
         (against_images, CONTRADICTED),
         (np.full(len(state), bool(against_floor)), against_floor),
     )

@@ -1,7 +1,8 @@
-"""Whether the floor that the scene gives is one on which the tracked body can be.
+"""The floor plane, and a test whether the sequential fits contradict it.
 
-A floor decides how high a body stands, by several terms at once: where it is wrong by decimetres,
-they would carry the body there. The sequential fits know nothing of it, so they can contradict it.
+Several terms at once push body and object onto the floor, so that a floor that is wrong by
+decimetres would displace the whole body. The sequential fits do not use the floor: they can
+contradict it.
 """
 
 from __future__ import annotations
@@ -14,34 +15,36 @@ from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.sequential import SequentialFits
 from intercap_core.schemas import CONTACT_REGIONS
 
-# Feet so far below the floor, or feet and object so far above it, contradict it, metres: several
-# times what sequential fits err there (at most 0.03). Tuned on the studio.
-FLOOR_CONTRADICTED = 0.10
-# Share of the frames in which feet or object should reach the floor: a jump ends, and so does a
-# walk with the object in the air. Tuned on the studio.
-REACHED_SHARE = 0.1
+# Distance between feet and floor that contradicts the floor, metres: three times the largest error
+# of the sequential fits on the studio.
+CONTRADICTION_M = 0.10
+# Quantile over the frames of the height of the lowest of feet and object: a jump ends, and so does
+# a walk with the object in the air. Tuned on the studio.
+REACHED_QUANTILE = 0.1
 
 _FEET = tuple(CONTACT_REGIONS.index(f"{side}_foot") for side in ("left", "right"))
 
 
 @dataclass(frozen=True)
-class Ground:
-    """A floor: ``point`` (3,) and upward unit ``normal`` (3,), master frame, metres."""
+class FloorPlane:
+    """The floor, in the master frame."""
 
     point: np.ndarray
+    """(3,) any point of the plane, metres."""
     normal: np.ndarray
+    """(3,) upward unit vector."""
 
     def heights(self, points: np.ndarray) -> np.ndarray:
         """Heights (..., N) of points (..., N, 3) above the floor, metres; negative below it."""
         return (points - self.point) @ self.normal
 
 
-def contradiction(geometry: Geometry, sequential: SequentialFits, floor: Ground) -> str:
-    """What the sequential fits say against ``floor``, in words; "" = nothing.
+def contradiction(geometry: Geometry, sequential: SequentialFits, floor: FloorPlane) -> str:
+    """Describe how the sequential fits contradict ``floor``; "" if they do not.
 
-    The lower foot is below it in most frames, or neither feet nor object ever come near it: feet
-    may hang from a chair or stand on a board, but then these reach it. Frames in which the body was
-    filled in or the object is lost have no say.
+    A floor is contradicted if the lower foot is below it in most frames, or if neither feet nor
+    object come near it in any part of the recording. Frames with an interpolated body do not
+    count, and neither does the object in frames in which it is lost.
     """
     posed = geometry.at(sequential.state)
     feet = geometry.skin.patch[np.isin(geometry.patches.region, _FEET)]
@@ -50,14 +53,13 @@ def contradiction(geometry: Geometry, sequential: SequentialFits, floor: Ground)
     if not known.any():
         return ""
     sunk = float(np.median(lowest[known]))
-    if sunk < -FLOOR_CONTRADICTED:
+    if sunk < -CONTRADICTION_M:
         return f"floor {-sunk:.2f} m above the feet, not used"
     reach = lowest
     if geometry.has_object:
         objects = floor.heights(posed.object_vertices).min(axis=1)
         reach = np.where(sequential.flags.lost, lowest, np.minimum(lowest, objects))
-    reach = reach[known]
-    nearest = float(np.quantile(reach, REACHED_SHARE))
-    if nearest > FLOOR_CONTRADICTED:
+    nearest = float(np.quantile(reach[known], REACHED_QUANTILE))
+    if nearest > CONTRADICTION_M:
         return f"floor {nearest:.2f} m below feet and object, not used"
     return ""

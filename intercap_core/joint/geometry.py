@@ -1,4 +1,4 @@
-"""What several terms need of one state, computed once: the body's skin, joints, the object."""
+"""Geometry that several terms need at one state, computed once: skin, joints, the object."""
 
 from __future__ import annotations
 
@@ -14,21 +14,22 @@ from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.surfaces import sample_surface
 from intercap_core.geometry.solve.thread_pool import ThreadPool
-from intercap_core.joint.proximity import Proximity, Surface, proximity
-from intercap_core.joint.skin import Patches, Skin
+from intercap_core.joint.proximity import Proximity, SearchableSurface, proximity
+from intercap_core.joint.skin import Patches, SkinSamples
 from intercap_core.joint.state import BODY, State
 
-# Turns are as smooth as those of a thing of this radius, metres: hands turn what they hold with
-# 20 rad/s^2 where they move it with 6 m/s^2. Tuned on the studio.
+# Least distance of the six points to the object's centre, metres: hands turn an object with
+# 20 rad/s^2 if they move it with 6 m/s^2, and a thin object's own points would leave its spin free.
+# Tuned on the studio.
 OBJECT_ARM = 0.3
-# Points of the object's surface that are held against the body for that.
+# Points of the object's surface that are searched inside the body.
 DEPTH_POINTS = 400
 
-_FRAMES_TOGETHER = 32  # frames whose derivatives are made at a time
+_CHUNK = 32  # frames whose derivatives are computed at a time, to bound the memory
 
 
 class Geometry:
-    """The meshes, and what they are at one state; terms share one instance."""
+    """The meshes of body and object. Terms share one instance."""
 
     def __init__(
         self,
@@ -36,23 +37,28 @@ class Geometry:
         mesh: ObjectMesh | None,
         field: DistanceField | None,
         patches: Patches,
-        touched: Surface | None = None,
+        touched: SearchableSurface | None = None,
     ) -> None:
-        """``mesh`` and its ``field`` are None where there is no object; ``touched`` is what contact
-        draws skin to, None = the whole surface."""
+        """Choose samples of the skin.
+
+        Args:
+            mesh: the object; None without an object.
+            field: distances to the object; None without an object.
+            touched: part of the object that contact draws skin to; None for all of it.
+        """
         self.model, self._mesh, self._field, self.patches = model, mesh, field, patches
         self.touched = touched
-        self.skin = Skin.select(model, patches)
+        self.skin = SkinSamples.select(model, patches)
         self._last: PosedGeometry | None = None
 
     @property
     def has_object(self) -> bool:
-        """Whether there is an object; what else is asked of it needs one."""
+        """Whether there is an object; the properties below that concern it need one."""
         return self._mesh is not None
 
     @property
     def mesh(self) -> ObjectMesh:
-        """The object's."""
+        """The object's mesh."""
         assert self._mesh is not None, "there is no object"
         return self._mesh
 
@@ -64,13 +70,13 @@ class Geometry:
 
     @cached_property
     def moments(self) -> np.ndarray:
-        """Points (6, 3) with the object's moments, its frame."""
+        """Points (6, 3) with the object's moments, object frame."""
         return moment_points(self.mesh.vertices, OBJECT_ARM)
 
     def at(self, state: State) -> PosedGeometry:
-        """The geometry at ``state``; the last state's is kept, since all terms ask for the same.
+        """The geometry at ``state``. The result for the last state is kept: all terms ask for it.
 
-        A state is never changed in place, so it is known by its identity.
+        A state is never changed in place, so its identity is the key.
         """
         if self._last is None or self._last.state is not state:
             self._last = PosedGeometry(self, state)
@@ -78,7 +84,7 @@ class Geometry:
 
 
 class PosedGeometry:
-    """Points, distances and derivatives at one state, each computed when first asked for.
+    """Points, distances and derivatives at one state, each computed on first use.
 
     Master frame, metres.
     """
@@ -92,64 +98,73 @@ class PosedGeometry:
 
     @cached_property
     def skin(self) -> np.ndarray:
-        """(T, N, 3) the skin's vertices."""
+        """Skin samples (T, N, 3)."""
         return self.posed(self._geometry.skin.vertices)
 
     def posed(self, vertices: np.ndarray) -> np.ndarray:
-        """(T, K, 3) the body's ``vertices`` (K,)."""
+        """Positions (T, K, 3) of the body's vertices with these ids (K,)."""
         with torch.no_grad():
             body = self._geometry.model(self._parameters, vertex_ids=vertices)
         return body.vertices.double().cpu().numpy()
 
     def object_depth(self, threads: ThreadPool) -> np.ndarray:
-        """(T,) how deep the object's surface is inside the body at most, metres, 0 = not at all: by
-        points spread over it, against all of the posed body."""
+        """Largest depth (T,) of the object's surface inside the body, metres; 0 without overlap.
+
+        Points spread over the object are compared with the whole posed body.
+        """
         g, state = self._geometry, self.state
         mesh, faces = g.mesh, g.model.faces.cpu().numpy()
         points = sample_surface(mesh.vertices, mesh.faces, DEPTH_POINTS).of(
             mesh.vertices, mesh.faces
         )
         vector, depth = self._parameters.vector(), np.zeros(len(state))
-        for start in range(0, len(state), _FRAMES_TOGETHER):
+        for start in range(0, len(state), _CHUNK):
             with torch.no_grad():
-                bodies = g.model(g.model.parameters(vector[start : start + _FRAMES_TOGETHER]))
+                bodies = g.model(g.model.parameters(vector[start : start + _CHUNK]))
             posed = bodies.vertices.cpu().numpy()
 
-            def deepest(t: int, vertices: np.ndarray) -> float:
+            def deepest(frame: tuple[int, np.ndarray]) -> float:
+                t, vertices = frame
                 placed = points @ state.rotation[t].T + state.translation[t]
-                beside = (placed > vertices.min(axis=0)) & (placed < vertices.max(axis=0))
-                near = placed[beside.all(axis=1)]
+                in_box = (placed > vertices.min(axis=0)) & (placed < vertices.max(axis=0))
+                near = placed[in_box.all(axis=1)]
                 if not len(near):
                     return 0.0
                 body = DistanceField(vertices, faces, threads=1)
                 return max(0.0, -float(body.signed_distance(near).min()))
 
-            some = list(enumerate(posed, start))
-            depth[start : start + len(posed)] = threads.map(lambda one: deepest(*one), some)
+            depth[start : start + len(posed)] = threads.map(deepest, list(enumerate(posed, start)))
         return depth
 
     @cached_property
     def proximity(self) -> Proximity:
-        """Distance of the N skin vertices to the object."""
+        """Distances of the skin samples to the object."""
         state = self.state
         return proximity(self._geometry.field, self.skin, state.rotation, state.translation)
 
     @cached_property
     def touching(self) -> Proximity:
-        """Distance of the N skin vertices to what contact draws them to."""
+        """Distances of the skin samples to the part of the object that contact draws them to."""
         touched, state = self._geometry.touched, self.state
         if touched is None:
             return self.proximity
         return proximity(touched, self.skin, state.rotation, state.translation)
 
     def skin_by_body(self, frames: slice, index: np.ndarray, axes: np.ndarray) -> np.ndarray:
-        """Derivative (F, K, R, 168) by the body in ``frames``, of the skin vertices ``index`` (K,)
-        along ``axes`` (F, K, R, 3)."""
+        """Derivative (F, K, R, 168) of skin samples by the body, along axes.
+
+        Args:
+            frames: F of the frames.
+            index: (K,) of the samples.
+            axes: (F, K, R, 3) directions along which the points are measured.
+        """
         return self.vertices_by_body(frames, self._geometry.skin.vertices[index], axes)
 
     def vertices_by_body(self, frames: slice, ids: np.ndarray, axes: np.ndarray) -> np.ndarray:
-        """Derivative (F, K, R, 168) by the body in ``frames``, of its vertices ``ids`` (K,) along
-        ``axes`` (F, K, R, 3)."""
+        """Derivative (F, K, R, 168) of the body's vertices ``ids`` (K,) by the body, along axes.
+
+        ``axes`` (F, K, R, 3) are the directions along which the points are measured.
+        """
         model = self._geometry.model
         parameters = model.parameters(self._parameters.vector()[frames])
         lin = model.linearise(parameters, vertex_ids=ids)
@@ -160,14 +175,13 @@ class PosedGeometry:
 
     @cached_property
     def joints(self) -> tuple[np.ndarray, np.ndarray]:
-        """The body's joints (T, 55, 3) and their derivative (T, 55, 3, 168) by the body, in
-        single precision."""
+        """Joints (T, 55, 3) and their derivative (T, 55, 3, 168) by the body, single precision."""
         g = self._geometry
         vector = self._parameters.vector()
         points = np.empty((len(vector), NUM_JOINTS, 3))
         jacobian = np.empty((*points.shape, BODY.stop), np.float32)
-        for start in range(0, len(vector), _FRAMES_TOGETHER):
-            at = slice(start, start + _FRAMES_TOGETHER)
+        for start in range(0, len(vector), _CHUNK):
+            at = slice(start, start + _CHUNK)
             lin = g.model.linearise(
                 g.model.parameters(vector[at]), vertex_ids=np.zeros(0, np.int64), joints=True
             )
@@ -177,13 +191,13 @@ class PosedGeometry:
 
     @cached_property
     def moments(self) -> tuple[np.ndarray, np.ndarray]:
-        """Points (T, 6, 3) with the object's moments and their derivative (T, 6, 3, 6) by it."""
+        """Points (T, 6, 3) with the object's moments, and their derivative (T, 6, 3, 6) by it."""
         state = self.state
         return points_by_object(self._geometry.moments, state.rotation, state.translation)
 
     @cached_property
     def object_vertices(self) -> np.ndarray:
-        """(T, V, 3) the object's vertices."""
+        """Vertices (T, V, 3) of the object."""
         turned = self._geometry.mesh.vertices @ self.state.rotation.transpose(0, 2, 1)
         return turned + self.state.translation[:, None]
 
@@ -191,9 +205,9 @@ class PosedGeometry:
 def moment_points(vertices: np.ndarray, least: float = 0.0) -> np.ndarray:
     """Six points (6, 3) with the mean and covariance of ``vertices`` (V, 3).
 
-    Mean + and - sqrt(3 lambda_i) e_i along the principal axes: any sum of squares of an affine map
-    over the vertices is V / 6 times the same sum over these points. None is nearer to the mean than
-    ``least``, metres: a thin thing's own points would leave its spin free.
+    They are mean + and - sqrt(3 lambda_i) e_i along the principal axes. A sum of squares of an
+    affine map over the vertices is V / 6 times the same sum over these points. None is nearer to
+    the mean than ``least``, metres.
     """
     mean = vertices.mean(axis=0)
     covariance = np.cov((vertices - mean).T, bias=True)
@@ -207,8 +221,10 @@ def points_by_object(
     rotation: np.ndarray,
     translation: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Object points (N, 3) moved to all frames (T, N, 3), and their derivative (T, N, 3, 6) by
-    (w, d) for the motion X' = exp(w)(X - t) + t + d."""
+    """Object points (N, 3) in all frames (T, N, 3), and their derivative (T, N, 3, 6).
+
+    The derivative is by (w, d) of the motion X' = exp(w)(X - t) + t + d.
+    """
     arm = np.einsum("tij,nj->tni", rotation, points)
     jacobian = np.zeros((*arm.shape, 6))
     jacobian[..., 0, 1], jacobian[..., 0, 2] = arm[..., 2], -arm[..., 1]

@@ -1,4 +1,4 @@
-"""What the joint fit works on, read from the artefacts of the stages before it."""
+"""Inputs of the joint fit, read from the artefacts of earlier stages."""
 
 from __future__ import annotations
 
@@ -24,47 +24,52 @@ from intercap_core.geometry.rigid.distance import DistanceField, SurfacePart
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.solve.thread_pool import ThreadPool
 from intercap_core.joint.cameras import BIAS, CameraFit, Cameras
-from intercap_core.joint.floor import Ground
+from intercap_core.joint.floor import FloorPlane
 from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.sequential import SequentialFits
 from intercap_core.joint.skin import contact_patches
 from intercap_core.joint.terms.body_data import BodyData
-from intercap_core.joint.terms.motion import LearnedMotion
 from intercap_core.joint.terms.object_images import ObjectImages
 from intercap_core.joint.time_offsets import OffsetPrior
 from intercap_core.object_track.recording import ObjectRecording
 from intercap_core.schemas import BODY_FIT, OBJECT_TRACK, SCENE
 from intercap_core.sequence_inputs import FitSettings, SequenceModels, SequencePaths
 
-# A recording whose rate differs by more than this share from that of a learned prior shows it other
-# motion: AMASS, on which LEMO's was trained, holds walks that differ by more among themselves.
+# Relative difference between the frame rate of a recording and that of LEMO's encoder beyond which
+# its steps are other motion: walks in AMASS, its training data, differ by more among themselves.
 MAX_RATE_ERROR = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class JointInputs:
-    """The sequential fits with what they were fitted to.
-
-    ``images`` is None where the settings do not look again or there is no object, ``floor`` where
-    none was seen, ``motion`` without a learned E_S. ``cameras`` are the scene's, with what is known
-    of them. ``attributes``: sequence, gender and body model of the body's fit.
-    """
+    """The sequential fits of a recording, and the data that they were fitted to."""
 
     geometry: Geometry
+    """Meshes of body and object."""
     sequential: SequentialFits
+    """Body fit and object track."""
     body_data: BodyData
+    """E_B over keypoints and clouds."""
     images: ObjectImages | None
-    floor: Ground | None
+    """Images of the object; None without an object, or if ``look_again`` is off."""
+    floor: FloorPlane | None
+    """The scene's floor, if it has one."""
     prior: OffsetPrior
+    """The scene's time offsets."""
     cameras: CameraFit
-    motion: LearnedMotion | None
+    """The scene's cameras and their covariance."""
+    encoder: MotionEncoder | None
+    """LEMO's motion encoder, if the settings name its weights."""
     fps: float
+    """Frames per second."""
     threads: ThreadPool
+    """Threads that compute rows and compare images."""
     attributes: dict[str, object]
+    """Sequence, gender and body model of the body fit."""
 
     @property
     def model(self) -> BodyModel:
-        """The body."""
+        """The body model."""
         return self.geometry.model
 
 
@@ -85,36 +90,29 @@ def open_inputs(
     with (
         artefacts.read(paths.body_fit, BODY_FIT) as body,
         artefacts.read(paths.object_track, OBJECT_TRACK) as track,
-        artefacts.read(paths.scene, SCENE) as source,
+        artefacts.read(paths.scene, SCENE) as scene,
     ):
         model = load_model(body_models, str(body.attributes["gender"]), body, device=device)
-        encoder = _motion_encoder(settings, source, model)
-        sequential = SequentialFits.read(body, track, source)
+        encoder = _motion_encoder(settings, scene, model)
+        sequential = SequentialFits.read(body, track, scene)
         attributes = {name: body.attributes[name] for name in ("sequence", "gender", "body_model")}
-        fps = float(source.attributes["fps"])
+        fps = float(scene.attributes["fps"])
         body_data = BodyData.load(
-            frames=paths.frames,
-            scene=paths.scene,
-            person=paths.person,
-            body_fit=body,
+            paths,
+            body,
             model=model,
             state=sequential.state,
             settings=fit_settings.body_fit,
             fps=fps,
             pose_prior=load_pose_prior(body_models, model),
         )
-        floor, prior = _floor(source), _offset_prior(source)
-        cameras = read_cameras(source)
-        up = source["ground_normal"]
+        floor, prior, cameras = _floor(scene), _offset_prior(scene), read_cameras(scene)
     if sequential.tracked is None:
         mesh = None
     geometry = _geometry(model, mesh, settings)
-    motion = None
-    if encoder is not None:
-        motion = LearnedMotion(geometry, encoder, up, settings.body_smoothness)
     threads = ThreadPool(torch.get_num_threads() if model.device.type == "cpu" else 1)
-    # numpy divides its products among threads too; small ones gain nothing by that, and those of
-    # two threads would wait for each other
+    # numpy would divide its products among threads too: small ones gain nothing, and products of
+    # two of our threads would wait for each other
     with Frames.open(paths.frames) as recording, threadpool_limits(1, user_api="blas"):
         images = None
         if settings.look_again and object_ is not None and mesh is not None:
@@ -127,22 +125,22 @@ def open_inputs(
             )
             images = ObjectImages(seen, mesh, fit_settings.object_track, object_.labels, threads)
         yield JointInputs(
-            geometry,
-            sequential,
-            body_data,
-            images,
-            floor,
-            prior,
-            cameras,
-            motion,
-            fps,
-            threads,
-            attributes,
+            geometry=geometry,
+            sequential=sequential,
+            body_data=body_data,
+            images=images,
+            floor=floor,
+            prior=prior,
+            cameras=cameras,
+            encoder=encoder,
+            fps=fps,
+            threads=threads,
+            attributes=attributes,
         )
 
 
 def _mesh(entry: ObjectEntry | None, settings: JointSettings) -> ObjectMesh | None:
-    """The object's, None for a person alone; raises UserError where it cannot be used."""
+    """The object's mesh; None for a person alone. Raises UserError if it cannot be used."""
     if entry is None:
         return None
     problem = settings.check_object(entry)
@@ -162,9 +160,9 @@ def _geometry(model: BodyModel, mesh: ObjectMesh | None, settings: JointSettings
 def _motion_encoder(
     settings: JointSettings, scene: Artefact, model: BodyModel
 ) -> MotionEncoder | None:
-    """The learned E_S that the settings name; None = small accelerations of the joints.
+    """The encoder of the learned E_S, if the settings name its weights.
 
-    Raises UserError for files that hold none and for recordings that it is not for.
+    Raises UserError for unusable files and for recordings that the encoder was not trained for.
     """
     if settings.lemo_files is None:
         return None
@@ -185,22 +183,22 @@ def _motion_encoder(
             "joint.lemo out for small accelerations of the joints"
         )
     weights, statistics = settings.lemo_files
-    # in double precision: E_S is a small difference of large latents, which a GPU's convolutions
-    # round to ten bits otherwise
+    # Double precision: E_S is a small difference of large latents, and convolutions on a GPU may
+    # round to ten bits.
     return MotionEncoder.load(weights, statistics, device=model.device, dtype=torch.float64)
 
 
 def _touched(mesh: ObjectMesh, field: DistanceField, settings: JointSettings) -> SurfacePart | None:
-    """What contact draws skin to; None = any point of the object."""
+    """The part of the object that contact draws skin to; None for all of it."""
     if settings.contact_to == "any":
         return None
     return SurfacePart(field, mesh.vertices, mesh.faces, mesh.contact_vertices)
 
 
-def _floor(scene: Artefact) -> Ground | None:
+def _floor(scene: Artefact) -> FloorPlane | None:
     if not scene.attributes["ground_found"]:
         return None
-    return Ground(scene["ground_point"], scene["ground_normal"])
+    return FloorPlane(scene["ground_point"], scene["ground_normal"])
 
 
 def _offset_prior(scene: Artefact) -> OffsetPrior:
@@ -209,7 +207,7 @@ def _offset_prior(scene: Artefact) -> OffsetPrior:
 
 
 def read_cameras(scene: Artefact) -> CameraFit:
-    """The scene's cameras and what is known of them."""
+    """The scene's cameras with their covariance."""
     start = Cameras(Rig.from_artefact(scene), scene["depth_bias"])
     covariance = scene["camera_covariance"]
     usable = scene["present"] & np.isfinite(start.rig.master_from_colour).all((1, 2))

@@ -3,11 +3,9 @@
     E = E_B + E_O + lambda_Q Q_t E_C + stick + body in object + object in body
         + lambda_G E_G + plant + lambda_S E_S + drift + lambda_A E_A + drift + lambda_G E_G'
 
-The paper's E_P (equation 5) is part of E_B; body in object and object in body, stick, plant and
-drift go beyond the paper. To read a term, open its file; to leave one out or add one, change
-:func:`joint_terms`. Every residual is divided by the standard deviation that its source leaves
-unexplained, so that a term's weight in the settings is 1 where it is as strong as its evidence. The
-table of all equations is in docs/equations.md.
+The paper's E_P (equation 5) is part of E_B. Body in object, object in body, stick, plant and drift
+go beyond the paper. ``TERMS`` lists all terms except E_B and E_O, in the order in which their
+equations are added; docs/extending.md shows how to add one.
 """
 
 from __future__ import annotations
@@ -15,85 +13,78 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from intercap_core.config import JointSettings
 from intercap_core.geometry.solve.thread_pool import ThreadPool
-from intercap_core.joint.equations import NormalEquations
-from intercap_core.joint.floor import Ground
-from intercap_core.joint.geometry import Geometry
-from intercap_core.joint.sequential import Trust
+from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.state import State
+from intercap_core.joint.terms.body_data import BodyData
 from intercap_core.joint.terms.contact import Contact
 from intercap_core.joint.terms.drift import BodyDrift, ObjectDrift
 from intercap_core.joint.terms.ground import BodyGround, ObjectGround
-from intercap_core.joint.terms.motion import BodyMotion, ObjectMotion
+from intercap_core.joint.terms.motion import BodyMotion, LearnedMotion, ObjectMotion
+from intercap_core.joint.terms.object_data import NoObject, ObjectData
+from intercap_core.joint.terms.object_images import ObjectImagesData
 from intercap_core.joint.terms.penetration import ObjectInBody, Penetration
 from intercap_core.joint.terms.plant import Plant
 from intercap_core.joint.terms.stick import Stick
-from intercap_core.joint.terms.term import Term
+from intercap_core.joint.terms.term import JointTerm, TermContext
+
+DATA_TERMS: tuple[type[JointTerm], ...] = (BodyData, ObjectImagesData, ObjectData, NoObject)
+"""Terms of the recording's data, which :func:`intercap_core.joint.fit.assemble` builds."""
+TERMS: tuple[type[JointTerm], ...] = (
+    Contact,
+    Stick,
+    Penetration,
+    ObjectInBody,
+    BodyGround,
+    Plant,
+    BodyMotion,
+    LearnedMotion,
+    BodyDrift,
+    ObjectMotion,
+    ObjectDrift,
+    ObjectGround,
+)
+"""All other terms. A term of which data are missing is left out."""
 
 
-def joint_terms(
-    geometry: Geometry,
-    settings: JointSettings,
-    sequential: State,
-    *,
-    data: Sequence[Term],
-    contact: Contact | None,
-    floor: Ground | None,
-    fps: float,
-    trust: Trust,
-    motion: Term | None = None,
-) -> tuple[Term, ...]:
-    """All terms of equation 6 and what goes beyond it, in the order in which they are added.
-
-    ``sequential`` is the state of the sequential fits; ``data`` are E_B and E_O; ``floor`` is None
-    where none was seen: then nothing keeps body or object above it. ``motion`` takes the place of
-    the joints' small accelerations. Without ``contact`` there is no object: the body's own terms.
-    """
-    handling: tuple[Term, ...] = ()
-    of_object: tuple[Term, ...] = ()
-    if contact is not None:
-        handling = (
-            contact,
-            Stick(geometry, contact, fps, settings.stick_weight),
-            Penetration(geometry, settings.penetration_weight),
-            ObjectInBody(geometry, settings.penetration_weight),
-        )
-        of_object = (
-            ObjectMotion(geometry, fps, settings.object_smoothness),
-            ObjectDrift(
-                geometry, sequential, fps, trust.object_, trust.still, settings.drift_weight
-            ),
-            *((ObjectGround(geometry, floor, settings.ground_weight),) if floor else ()),
-        )
-    return (
-        *data,
-        *handling,
-        *((BodyGround(geometry, floor, settings.ground_weight),) if floor else ()),
-        Plant(geometry, floor, fps, settings.plant_weight),
-        motion or BodyMotion(geometry, fps, settings.body_smoothness),
-        BodyDrift(geometry, sequential, fps, trust.body, settings.drift_weight),
-        *of_object,
-    )
+def build_terms(context: TermContext, data: Sequence[JointTerm]) -> tuple[JointTerm, ...]:
+    """All terms of a recording: E_B and E_O, which are ``data``, then those of ``TERMS``."""
+    for kind in TERMS:
+        if kind.applies(context):
+            context.terms.append(kind(context))
+    return (*data, *context.terms)
 
 
 @dataclass(frozen=True)
-class Problem:
-    """The sum of ``terms``, whose rows ``threads`` make."""
+class JointProblem:
+    """The sum of ``terms``, whose rows ``threads`` compute."""
 
-    terms: tuple[Term, ...]
+    terms: tuple[JointTerm, ...]
     threads: ThreadPool = field(default_factory=ThreadPool)
 
-    def equations(self, state: State) -> NormalEquations:
+    def equations(self, state: State) -> BandedEquations:
         """Linearise every term at ``state``."""
-        equations = NormalEquations(len(state), self.threads)
+        equations = BandedEquations(len(state), self.threads)
         for term in self.terms:
             term.add(state, equations)
         return equations
 
-    def refresh(self, state: State, but: Term | None = None) -> None:
-        """Take anew at ``state`` what terms, all ``but`` one, hold fixed during a round of
-        minimisation."""
+    def refresh(self, state: State, but: JointTerm | None = None) -> None:
+        """Compute at ``state`` what all terms except ``but`` keep fixed during a round."""
         for term in self.terms:
             if term is not but:
                 term.refresh(state)
+
+
+def equation_table() -> list[str]:
+    """Rows of the generated table in docs/equations.md, in Markdown."""
+    lines = ["| term | formula here | paper | file | setting |", "|---|---|---|---|---|"]
+    for term in (*DATA_TERMS, *TERMS):
+        row = term.equation
+        file = term.__module__.removeprefix("intercap_core.").replace(".", "/") + ".py"
+        settings = ", ".join(f"`joint.{name}`" for name in row.settings) or "-"
+        lines.append(
+            f"| {row.symbol} | {row.formula} | {row.source} | `{file}` {term.__name__} "
+            f"| {settings} |"
+        )
+    return lines

@@ -1,11 +1,11 @@
 """Signed distances of body points to the moving object, with derivatives.
 
-Shared by E_C of equation 6 (A.4) and the term of body in object, which goes beyond it. E_C may ask
-for those to the part of the surface that is annotated as likely touched.
+Both E_C of equation 6 (A.4) and the term body in object are functions of this distance. E_C may
+measure it to the annotated part of the surface.
 
 d = n . (x - q), with q the point of the object's surface closest to x and n the outward direction
-from q to x. Both terms are functions of this one distance. Far from the object, where neither says
-anything, q is the nearest point of its box: the most costly searches of the surface are those.
+from q to x. Far from the object, where no term asks for d, q is the nearest point of the object's
+box: searches of the surface are the most expensive there.
 """
 
 from __future__ import annotations
@@ -17,74 +17,83 @@ import numpy as np
 
 from intercap_core.geometry.rigid.distance import Closest
 
-# Farther from the object's box than this, metres, the box stands for the surface: many times what
-# any term or contact asks about.
+# Distance to the object's box beyond which the box replaces the surface, metres: many times the
+# range of any term.
 FAR_FROM_BOX = 0.25
-# Nearer to the surface than this, metres, the direction to the closest point is noise: the face's
-# normal is used. Tuned on the studio.
+# Distance below which the direction to the closest point is noise and the face's normal replaces
+# it, metres. Tuned on the studio.
 ON_SURFACE = 1e-4
 
-_FRAMES_TOGETHER = 32  # what is between the points and the result is kept of so many at a time
+_CHUNK = 32  # frames that are computed at a time, to bound the memory
 
 
-class Surface(Protocol):
-    """An object's surface, or a part of it; ``box`` (2, 3) holds it."""
+class SearchableSurface(Protocol):
+    """An object's surface, or a part of it."""
 
     box: np.ndarray
+    """(2, 3) corners of a box that holds the surface."""
 
     def boundary(self, points: np.ndarray) -> tuple[np.ndarray, Closest]:
-        """Which of points (N, 3) of its frame are inside, and its closest points."""
+        """Mask of the points (N, 3) that are inside, and their closest points; object frame."""
 
 
 @dataclass(frozen=True)
 class Proximity:
-    """Distances of N points in T frames to the object's surface, master frame, metres.
+    """Signed distances of N points in T frames to the object's surface; master frame, metres.
 
-    ``distance`` (T, N), negative inside; ``normals`` (T, N, 3) d distance / d point. By the object
-    its derivative is minus that of a point at the same place that moves with it
-    (:func:`along_by_object`): x - q is parallel to n, and turning n changes nothing to first order.
+    The derivative by the object is minus that of a point at the same place that moves with it
+    (:func:`along_by_object`): x - q is parallel to n, so that turning n changes nothing to first
+    order.
     """
 
     distance: np.ndarray
+    """(T, N), negative inside."""
     normals: np.ndarray
+    """(T, N, 3) derivative of the distance by the point."""
 
     def at(self, index: np.ndarray) -> Proximity:
-        """The same for the points ``index`` (M,) alone."""
+        """The distances of the points ``index`` (M,)."""
         return Proximity(self.distance[:, index], self.normals[:, index])
 
 
 def along_by_object(points: np.ndarray, along: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    """d (a . x) / d (w, d) (T, N, 6) of points x (T, N, 3) that move with the object,
-    X' = exp(w)(X - t) + t + d; ``along`` (T, N, 3) are the directions a, ``translation`` (T, 3)
-    is t."""
+    """Derivative (T, N, 6) of a . x by a turn w and a shift d of the object.
+
+    Args:
+        points: (T, N, 3) points x that move with the object, X' = exp(w)(X - t) + t + d.
+        along: (T, N, 3) directions a.
+        translation: (T, 3) the object's translation t.
+    """
     return np.concatenate([np.cross(points - translation[:, None], along), along], axis=2)
 
 
 def proximity(
-    surface: Surface,
+    surface: SearchableSurface,
     points: np.ndarray,
     rotation: np.ndarray,
     translation: np.ndarray,
 ) -> Proximity:
-    """Distances of ``points`` (T, N, 3) to the object at ``rotation`` (T, 3, 3) and
-    ``translation`` (T, 3), all in the master frame, with exact first derivatives."""
+    """Measure distances of ``points`` (T, N, 3) to the object.
+
+    ``rotation`` (T, 3, 3) and ``translation`` (T, 3) are master_from_object.
+    """
     shape = points.shape[:2]
-    found = Proximity(np.empty(shape), np.empty((*shape, 3)))
-    for start in range(0, len(points), _FRAMES_TOGETHER):
-        at = slice(start, start + _FRAMES_TOGETHER)
-        found.distance[at], found.normals[at] = _proximity(
+    near = Proximity(np.empty(shape), np.empty((*shape, 3)))
+    for start in range(0, len(points), _CHUNK):
+        at = slice(start, start + _CHUNK)
+        near.distance[at], near.normals[at] = _measure(
             surface, points[at], rotation[at], translation[at]
         )
-    return found
+    return near
 
 
-def _proximity(
-    surface: Surface,
+def _measure(
+    surface: SearchableSurface,
     points: np.ndarray,
     rotation: np.ndarray,
     translation: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Distance and normals of a few frames."""
+    """Distances (T, N) and normals (T, N, 3)."""
     frames, count = points.shape[:2]
     local = (points - translation[:, None]) @ rotation
     flat = local.reshape(-1, 3)

@@ -1,8 +1,9 @@
-"""What the joint fit has found, read back from its artefact."""
+"""Result of the joint fit: as it is computed, and as its artefact states it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
 
 import numpy as np
@@ -11,34 +12,79 @@ from intercap_core import artefacts
 from intercap_core.artefacts import Artefact
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.joint.cameras import Cameras
+from intercap_core.joint.contact.estimate import ContactEstimate
 from intercap_core.joint.sequential import pose_vector
 from intercap_core.joint.state import State
+from intercap_core.joint.terms.body_data import BodyResiduals
+from intercap_core.joint.time_offsets import OffsetEstimate
 from intercap_core.schemas import JOINT
 
-# Among the reasons of a flag.
+# Reasons of a flag that later stages search for.
 CONTRADICTED = "the images contradict the object's pose"
 CARRIED = "object not seen, carried from annotated poses"
 
 
-@dataclass(frozen=True, eq=False)
-class JointResult:
-    """The ``state``, ``probability`` (T, R) of contact and what is ``annotated`` (T, R) of it, 1
-    touching, the ``cameras`` with their ``time_offset`` (C,), seconds, the frames (T,) that are
-    ``flagged``, and those among them in which the images have ``contradicted`` the object's pose.
-    """
+class Convergence(Enum):
+    """Outcome of the rounds of minimisation."""
+
+    CONVERGED = "converged"
+    """Another round would change nothing."""
+    ITERATION_LIMIT = "reached the iteration limit before converging"
+    """The last round still changed state, contact, time offsets or cameras."""
+    STALLED = "stalled"
+    """No step lowered the energy: every frame is flagged."""
+
+
+@dataclass(frozen=True)
+class JointFit:
+    """Result of the joint fit of T frames."""
 
     state: State
+    """Refined body and object."""
+    contact: ContactEstimate
+    """Contact at this state."""
+    time_offsets: OffsetEstimate
+    """Time offsets of the cameras."""
+    residuals: BodyResiduals
+    """Distances of the body to the images."""
+    energy_before: dict[str, float]
+    """Energy by term at the start."""
+    energy_after: dict[str, float]
+    """Energy by term at this state."""
+    steps: int
+    """Number of accepted steps."""
+    refused: int
+    """Number of refused steps."""
+    convergence: Convergence
+    """Outcome of the rounds."""
+    flag_reasons: list[str]
+    """(T,) reasons not to trust a frame; "" if there is none."""
+    cameras_corrected: bool
+    """Whether the cameras were corrected."""
+
+
+@dataclass(frozen=True, eq=False)
+class JointResult:
+    """The joint artefact of T frames, R contact regions and C cameras."""
+
+    state: State
+    """Body and object."""
     probability: np.ndarray
+    """(T, R) probability of contact."""
     annotated: np.ndarray
+    """(T, R) annotation: 1 touching, 0 free, -1 no label."""
     cameras: Cameras
+    """Corrected cameras."""
     time_offset: np.ndarray
+    """(C,) time offsets of the cameras, seconds."""
     flagged: np.ndarray
+    """(T,) frames not to be trusted."""
     contradicted: np.ndarray
+    """(T,) frames whose images contradict the object's pose."""
 
     @classmethod
     def read(cls, path: Path, scene: Artefact) -> JointResult:
-        """Read joint.h5, of cameras whose lenses are in scene.h5; raises UserError as reading
-        does."""
+        """Read joint.h5; the cameras' lenses are in scene.h5. Raises UserError as reading does."""
         with artefacts.read(path, JOINT) as joint:
             state = State(
                 pose_vector(joint),

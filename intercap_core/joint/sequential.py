@@ -1,4 +1,4 @@
-"""Where the joint fit starts: what the two sequential stages, body and object, have found."""
+"""Results of the two sequential fits, body and object, at which the joint fit starts."""
 
 from __future__ import annotations
 
@@ -13,24 +13,19 @@ from intercap_core.geometry.camera.transforms import apply_step, rigid
 from intercap_core.geometry.solve.time_series import rigid_velocity
 from intercap_core.joint.state import State
 
-# A tracked pose is never surer than this, rad and metres: the meshes differ from the things
-# themselves. Tuned on the studio.
-TRACK_FLOOR_TURN = radians(0.05)
-TRACK_FLOOR_SHIFT = 0.0005
-# What is added where different poses explain a frame equally well, rad and metres: it is nearly
-# always the rotation (on which side the handle is). Tuned on the studio.
-AMBIGUOUS_TURN = radians(10.0)
-AMBIGUOUS_SHIFT = 0.002
-BRIDGED_OBJECT_TURN = 0.5  # rad; tuned on the studio
-BRIDGED_OBJECT_SHIFT = 0.15  # metres; tuned on the studio
-# Standard deviation of the object's position where the track is lost, metres: contact detection
-# then learns nothing from the distance. Tuned on the studio.
+# Standard deviations of the object's pose, six numbers each: rad for turns, metres for shifts. All
+# are tuned on the studio.
+# Smallest one of a tracked pose: the mesh differs from the object.
+_FLOOR = np.repeat([radians(0.05), 0.0005], 3)
+# In a frame without a measurement, about the interpolated pose.
+_INTERPOLATED = np.repeat([0.5, 0.15], 3)
+# Added if different poses explain a frame equally well. Nearly always the rotation is ambiguous: on
+# which side the handle is.
+_AMBIGUOUS = np.repeat([radians(10.0), 0.002], 3)
+# Standard deviation of the object's position if the track is lost, metres: contact detection then
+# learns nothing from the distance. Tuned on the studio.
 UNTRACKED_SIGMA = 0.5
 
-# Standard deviations (6,) of turn and shift, rad and metres.
-_FLOOR = np.repeat([TRACK_FLOOR_TURN, TRACK_FLOOR_SHIFT], 3)
-_BRIDGED = np.repeat([BRIDGED_OBJECT_TURN, BRIDGED_OBJECT_SHIFT], 3)
-_AMBIGUOUS = np.repeat([AMBIGUOUS_TURN, AMBIGUOUS_SHIFT], 3)
 # In the order of `BodyParameters`.
 _POSE = (
     "global_orient",
@@ -45,73 +40,93 @@ _POSE = (
 
 
 @dataclass(frozen=True)
-class TrackedPoses:
-    """``rotation`` (T, 3, 3), ``translation`` (T, 3) and ``information`` (T, 6, 6), the inverse
-    covariance of (turn on the left, shift).
+class TrackMarks:
+    """Masks (T,) of frames of the object track."""
 
-    ``twist`` (T, 6) is the motion in a second, ``share`` (T, C) each camera's part in the evidence
-    for a pose and ``time_offset`` (C,) what the tracker took the cameras' to be, seconds. Frames
-    (T,) that are ``seen`` and in which it is ``resting``, their ``times``, seconds; ``spread``
-    (T, 6) the variance of a pose, beside what the images of a frame leave open.
-    """
+    lost: np.ndarray
+    """The object is lost; its pose is interpolated."""
+    ambiguous: np.ndarray
+    """Different poses explain the frame equally well."""
+    carried: np.ndarray
+    """The images show nothing: the pose follows from annotated poses alone."""
+    resting: np.ndarray
+    """The object rests."""
+
+
+@dataclass(frozen=True)
+class TrackedPoses:
+    """The object track as Gaussians, one per frame."""
 
     rotation: np.ndarray
+    """(T, 3, 3) of master_from_object."""
     translation: np.ndarray
+    """(T, 3) of master_from_object, metres."""
     information: np.ndarray
+    """(T, 6, 6) inverse covariance of turn (left) and shift."""
     twist: np.ndarray
+    """(T, 6) motion per second; 0 at rest."""
     share: np.ndarray
+    """(T, C) share of each camera in the evidence for a pose."""
     time_offset: np.ndarray
+    """(C,) time offsets of the cameras that the tracker assumed, seconds."""
     seen: np.ndarray
+    """(T,) frames whose images determine the pose."""
     resting: np.ndarray
+    """(T,) frames in which the object rests."""
     times: np.ndarray
+    """(T,) seconds."""
     spread: np.ndarray
+    """(T, 6) variance of the pose beyond what the images of its frame leave open."""
 
     @classmethod
     def from_track(
         cls,
-        rotation: np.ndarray,
-        translation: np.ndarray,
+        poses: np.ndarray,
         covariance: np.ndarray,
-        lost: np.ndarray,
-        ambiguous: np.ndarray,
-        resting: np.ndarray,
+        marks: TrackMarks,
         *,
-        carried: np.ndarray,
         visible: np.ndarray,
         times: np.ndarray,
         time_offset: np.ndarray,
     ) -> TrackedPoses:
-        """Take over an object track whose lost frames are interpolated.
+        """Build from the arrays of an object track.
 
-        ``covariance`` (T, 6, 6) around these poses alone; ``lost``, ``ambiguous``, ``resting`` and
-        ``carried`` (T,), of which the images show nothing; ``visible`` (T, C) the views that show
-        the object; ``times`` (T,) and ``time_offset`` (C,) seconds.
+        Args:
+            poses: (T, 4, 4) master_from_object.
+            covariance: (T, 6, 6) around these poses, without the spread between several poses.
+            marks: lost frames and others.
+            visible: (T, C) views that show the object.
+            times: (T,) seconds.
+            time_offset: (C,) seconds.
         """
-        tracked = ~lost & np.isfinite(covariance).all(axis=(1, 2))
+        tracked = ~marks.lost & np.isfinite(covariance).all(axis=(1, 2))
         total = np.where(tracked[:, None, None], covariance, 0.0)
-        other = (ambiguous & ~carried)[:, None]  # of what is carried, the covariance says it
-        floor = np.where(other, np.hypot(_FLOOR, _AMBIGUOUS), _FLOOR)
-        spread = np.where(tracked[:, None], floor, _BRIDGED) ** 2
+        # the covariance of a carried pose contains its ambiguity
+        ambiguous = (marks.ambiguous & ~marks.carried)[:, None]
+        smallest = np.where(ambiguous, np.hypot(_FLOOR, _AMBIGUOUS), _FLOOR)
+        spread = np.where(tracked[:, None], smallest, _INTERPOLATED) ** 2
         total += np.eye(6) * spread[:, None, :]
-        twist = rigid_velocity(rigid(rotation, translation), ~lost, times)
-        twist[resting] = 0
+        twist = rigid_velocity(poses, ~marks.lost, times)
+        twist[marks.resting] = 0
         share = visible / np.maximum(visible.sum(axis=1, keepdims=True), 1)
         return cls(
-            rotation,
-            translation,
+            poses[:, :3, :3].copy(),
+            poses[:, :3, 3].copy(),
             np.linalg.inv(total),
             twist,
             share,
             time_offset,
-            tracked & ~carried,
-            resting,
+            tracked & ~marks.carried,
+            marks.resting,
             times,
             spread,
         )
 
     def at(self, time_offset: np.ndarray) -> TrackedPoses:
-        """The poses if the cameras had these offsets (C,), seconds: earlier by the mean change of
-        the views that show the object."""
+        """The poses if the cameras had these time offsets (C,), seconds.
+
+        A pose is earlier by the mean change of the offsets of the views that show the object.
+        """
         late = self.share @ (time_offset - self.time_offset)
         poses = apply_step(rigid(self.rotation, self.translation), -late[:, None] * self.twist)
         return replace(
@@ -121,49 +136,48 @@ class TrackedPoses:
 
 @dataclass(frozen=True)
 class Trust:
-    """Frames in which the sequential fits are trusted.
-
-    ``body`` and ``object_`` (T,) flags, ``still`` (T-1,) the steps over which the object rests.
-    """
+    """Frames and steps in which the sequential fits are trusted."""
 
     body: np.ndarray
+    """(T,) frames with a fit of the body."""
     object_: np.ndarray
+    """(T,) frames in which the object is tracked."""
     still: np.ndarray
+    """(T - 1,) steps over which the object rests."""
 
 
 @dataclass(frozen=True)
-class Flags:
-    """Frames (T,) that a sequential fit has flagged.
-
-    ``filled``: the body was not seen well enough; ``uncertain``: the body is not determined by what
-    was seen; ``lost``, ``ambiguous`` and ``carried``: the object track's, where an object is named.
-    ``hands`` (T, 2), left and right: the hand is not determined by what was seen, or not fitted at
-    all; no reason to flag the frame.
-    """
+class SequentialFlags:
+    """Frames that a sequential fit has flagged."""
 
     filled: np.ndarray
+    """(T,) the body was not seen well enough and is interpolated."""
     uncertain: np.ndarray
+    """(T,) the body is not determined by the images."""
     lost: np.ndarray
+    """(T,) the sequence has an object and its track is lost."""
     ambiguous: np.ndarray
+    """(T,) different poses of the object explain the frame."""
     carried: np.ndarray
+    """(T,) the object's pose follows from annotated poses alone."""
     hands: np.ndarray
+    """(T, 2) left or right hand is not determined by the images; does not flag the frame."""
 
 
 @dataclass(frozen=True)
 class SequentialFits:
-    """One state of body and object, and how far it is to be trusted.
-
-    ``state`` has the mean shape. ``tracked`` is None where there is no object: the track is lost in
-    every frame, and the state's poses of the object are NaN. ``joint_sigma`` (T, 55) and
-    ``object_sigma`` (T,) are stated standard deviations of positions, metres.
-    """
+    """Body fit and object track as one state, and how far they are trusted."""
 
     state: State
+    """Both fits with the mean shape. Without an object its poses are NaN."""
     tracked: TrackedPoses | None
+    """The object track; None if it is lost in all frames."""
     trust: Trust
-    flags: Flags
+    flags: SequentialFlags
     joint_sigma: np.ndarray
+    """(T, 55) stated standard deviations of the joints' positions, metres."""
     object_sigma: np.ndarray
+    """(T,) stated standard deviation of the object's position, metres."""
 
     @classmethod
     def read(cls, body: Artefact, track: Artefact, scene: Artefact) -> SequentialFits:
@@ -172,27 +186,24 @@ class SequentialFits:
         failed, lost = body["failed"], track["lost"]
         named = bool(track.attributes["object"])
         filled = failed | body["bridged"]
-        flags = Flags(
+        carried = np.asarray(track["carried"] if "carried" in track else np.zeros_like(lost))
+        marks = TrackMarks(lost, track["ambiguous"], carried, track["resting"])
+        flags = SequentialFlags(
             filled=filled,
             uncertain=body["uncertain"],
             lost=lost & named,
-            ambiguous=track["ambiguous"],
-            carried=_carried(track),
+            ambiguous=marks.ambiguous,
+            carried=carried,
             hands=_undetermined_hands(body) | filled[:, None],
         )
-        resting = track["resting"]
         tracked = None
         if lost.all():
             state = state.without_object()
         else:
             tracked = TrackedPoses.from_track(
-                state.rotation,
-                state.translation,
+                rigid(state.rotation, state.translation),
                 track["covariance"] - track["spread"],
-                lost,
-                flags.ambiguous,
-                resting,
-                carried=flags.carried,
+                marks,
                 visible=(track["candidate"] >= 0) | np.isfinite(track["depth_residual"]),
                 times=scene["times"],
                 time_offset=scene["time_offset"],
@@ -201,20 +212,15 @@ class SequentialFits:
         return cls(
             state=state,
             tracked=tracked,
-            trust=Trust(~failed, ~lost, resting[1:] & resting[:-1]),
+            trust=Trust(~failed, ~lost, marks.resting[1:] & marks.resting[:-1]),
             flags=flags,
             joint_sigma=body["joint_sigma"].astype(float),
             object_sigma=np.where(lost | ~np.isfinite(sigma), UNTRACKED_SIGMA, sigma),
         )
 
 
-def _carried(track: Artefact) -> np.ndarray:
-    """Frames (T,) bool whose pose of the object follows from annotated ones alone."""
-    return np.asarray(track["carried"] if "carried" in track else np.zeros_like(track["lost"]))
-
-
 def _undetermined_hands(body: Artefact) -> np.ndarray:
-    """Left and right hands (T, 2) bool that the body fit says nothing determines."""
+    """Mask (T, 2) of left and right hands that the body fit marks as undetermined."""
     parts = body.text("part_names")
     hands = [parts.index(f"{side}_hand") for side in ("left", "right")]
     return np.asarray(body["undetermined"][:, hands])

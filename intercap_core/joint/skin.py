@@ -1,6 +1,6 @@
-"""The body's likely-contact vertices (H of E_C, A.4), subsampled and cut into patches.
+"""Vertices of the body that are compared with object and floor: dense contact patches, and samples.
 
-The body's vertices that are compared with object and floor: patches dense, the rest sparse.
+The contact patches are H of E_C (A.4): the body's likely-contact vertices.
 """
 
 from __future__ import annotations
@@ -15,34 +15,38 @@ from intercap_core.body.model import BodyModel
 from intercap_core.body_fit.surface import choose_samples
 from intercap_core.schemas import CONTACT_REGIONS
 
+# Vertices kept of each region: fingers are thin and wrap around objects, and a large region that
+# sits on an edge touches it with few vertices. Tuned on the studio.
+REGION_VERTICES = 240
 # Vertices of the body's mesh, inside the object or below the floor, that are one measurement:
 # neighbours err together. Tuned on the studio.
 VERTICES_PER_MEASUREMENT = 10.0
-# Vertices kept of each region: fingers are thin and wrap around things, and what sits on an edge
-# touches it with little of a large region. Tuned on the studio.
-REGION_VERTICES = 240
 
-# Joints from here on are the fingers', three a finger, first of the left hand.
+# Joints from here on are the fingers', three per finger, first of the left hand.
 _FIRST_FINGER_JOINT = JOINT_INDEX["left_index1"]
 _PALM = -1
 
 
 @dataclass(frozen=True)
 class Patches:
-    """``vertices`` (N,) ids on the body; ``region`` (N,) and ``patch`` (N,) of each;
-    ``region_of_patch`` (P,); ``joint`` (N,) the joint that moves the vertex most; ``share`` (N,)
-    how many vertices of its region it stands for."""
+    """Vertices of the contact regions, cut into patches."""
 
     vertices: np.ndarray
+    """(M,) ids on the body."""
     region: np.ndarray
+    """(M,) index into ``CONTACT_REGIONS``."""
     patch: np.ndarray
+    """(M,) patch of each vertex."""
     region_of_patch: np.ndarray
+    """(P,) region of each patch."""
     joint: np.ndarray
+    """(M,) joint with the largest skinning weight."""
     share: np.ndarray
+    """(M,) number of vertices of the region that each stands for."""
 
 
 def contact_patches(model: BodyModel) -> Patches:
-    """Cut every region of ``CONTACT_REGIONS``: hands into palm and fingers, others are whole."""
+    """Cut hands into palm and fingers; each of the other regions is one patch."""
     template = model.template.cpu().numpy()
     joint_of = model.skinning_weights.cpu().numpy().argmax(axis=1)
     region_of_patch: list[int] = []
@@ -73,7 +77,7 @@ def contact_patches(model: BodyModel) -> Patches:
 
 
 def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
-    """Indices of ``count`` points spread evenly over points (N, 3); all where there are fewer."""
+    """Indices of ``count`` points spread evenly over points (N, 3); all if there are fewer."""
     if len(points) <= count:
         return np.arange(len(points))
     chosen = [int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmax())]
@@ -85,17 +89,19 @@ def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Skin:
-    """``vertices`` (N,) ids, ascending; ``share`` (N,) how many vertices of the mesh each stands
-    for; ``patch`` (M,) the contact patches' places among them."""
+class SkinSamples:
+    """All contact patches and an even sample of the outer skin."""
 
     vertices: np.ndarray
+    """(N,) ids on the body, ascending."""
     share: np.ndarray
+    """(N,) number of vertices of the mesh that each stands for."""
     patch: np.ndarray
+    """(M,) indices of the contact patches' vertices among the samples."""
 
     @classmethod
-    def select(cls, model: BodyModel, patches: Patches) -> Skin:
-        """All contact patches and an even sample of the outer skin."""
+    def select(cls, model: BodyModel, patches: Patches) -> SkinSamples:
+        """Choose the samples."""
         vertices = np.union1d(patches.vertices, choose_samples(model).vertex)
         template = model.template.double().cpu().numpy()
         _, nearest = cKDTree(template[vertices]).query(template)

@@ -22,26 +22,29 @@ ALL = slice(0, OBJECT.stop)
 
 @dataclass(frozen=True)
 class State:
-    """``body`` (T, 168) pose and translation in ``BodyParameters``' order; ``betas`` (S,) and
-    ``expression`` (T, X), which stay as they are; ``rotation`` (T, 3, 3) and ``translation``
-    (T, 3), master_from_object, all NaN where there is no object."""
+    """Body and object in T frames. A state is never changed in place."""
 
     body: np.ndarray
+    """(T, 168) pose and translation in the order of ``BodyParameters``."""
     betas: np.ndarray
+    """(S,) shape, not an unknown."""
     expression: np.ndarray
+    """(T, X) expression, not an unknown."""
     rotation: np.ndarray
+    """(T, 3, 3) of master_from_object; NaN without an object."""
     translation: np.ndarray
+    """(T, 3) of master_from_object, metres; NaN without an object."""
 
     def __len__(self) -> int:
         return len(self.body)
 
     def without_object(self) -> State:
-        """The body alone."""
+        """The same state with NaN poses of the object."""
         nowhere = np.full_like(self.rotation, np.nan), np.full_like(self.translation, np.nan)
         return State(self.body, self.betas, self.expression, *nowhere)
 
     def parameters(self, model: BodyModel) -> BodyParameters:
-        """The body as the model takes it."""
+        """The body's parameters on the device and in the precision of ``model``."""
         vector = np.concatenate(
             [self.body, np.tile(self.betas, (len(self), 1)), self.expression], axis=1
         )

@@ -1,20 +1,18 @@
 """Each camera's time offset from the residuals of a fit of the moving body (beyond the paper).
 
-Where camera c exposes tau_c later than the fit assumes, it sees every point farther along its path.
-With r = prediction minus observation of a point that a view sees, u the prediction's velocity in
+A camera c that exposes tau_c later than the fit assumes sees every point farther along its path.
+With r the prediction minus the observation of a point in a view, u the prediction's velocity in
 that view and J its derivative by the point's position,
 
     r_c = - u_c tau_c + J_c e + b_c + noise,
 
-e is the fit's own error at that point and moment, which all views share, and b_c a camera's
-constant bias at the point (the detector's definition of a joint, calibration, clothing). e is
-eliminated for each point and moment, b by subtracting the mean over time. Both errors and noise
-last over many frames: r and u are replaced by the innovations of a first-order autoregression whose
-coefficient is that of the residuals themselves. The remaining residuals are weighted by their own
-scale and robustly (Geman-McClure), and solved for all cameras at once with a prior on their
-offsets; the master's is zero, since the frame sets' times are the master's.
-
-Residuals of keypoints and clouds by camera, as the estimate of time offsets takes them.
+e is the fit's error of that point in that frame, which all views share, and b_c a camera's constant
+bias at the point (the detector's definition of a joint, calibration, clothing). e is eliminated for
+each point and frame, b by subtracting the mean over time. Errors and noise last over many frames: r
+and u are replaced by the innovations of a first-order autoregression with the correlation of the
+residuals. The innovations are weighted by their scale and robustly (Geman-McClure), and solved for
+all cameras at once with a prior of their offsets. The master's offset is zero, since the times of
+the frame sets are the master's.
 """
 
 from __future__ import annotations
@@ -32,77 +30,82 @@ from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.geometry.camera import projection
 from intercap_core.geometry.solve.robust import SIGMA_PER_MAD, geman_mcclure_weight
 
-# Standard deviation of an offset that nothing is known of, seconds: beyond it the frame sets would
-# have been matched differently (a third of the time between frames at 30 fps).
+# Standard deviation of an offset without a prior, seconds: a third of the time between frames at
+# 30 fps. Beyond it frame sets would have been matched differently.
 LOOSE_OFFSET_SIGMA_S = 0.010
-# The prior comes from the same keypoints: it is not taken as surer than this, seconds. Tuned on
-# the studio.
+# Smallest standard deviation of the prior, seconds: it comes from the same keypoints. Tuned on the
+# studio.
 MIN_PRIOR_SIGMA_S = 0.0005
-# A fitted point's own error, metres; loose, so that only disagreement between views counts. Tuned
-# on the studio.
+# Standard deviation of the fit's error of a point, metres; large, so that only disagreement between
+# views counts. Tuned on the studio.
 POINT_SIGMA_M = 0.03
-MAX_CORRELATION = 0.98  # of successive residuals; tuned on the studio
-# Standard deviations at which an innovation starts to count as an outlier. Tuned on the studio.
+# Largest correlation of successive residuals. Tuned on the studio.
+MAX_CORRELATION = 0.98
+# Standard deviations at which an innovation counts a quarter. Tuned on the studio.
 INNOVATION_OUTLIER = 3.0
-# Points of one part of the body count as at most so many: their errors are correlated. Tuned on
+# Largest total weight of the points of one part of the body: their errors are correlated. Tuned on
 # the studio.
 POINTS_PER_PART = 4.0
-# Number of a camera's depth points on a sample with which the sample has half its full weight.
-# Tuned on the studio.
+# Number of a camera's depth points at a sample of the skin that gives half its full weight. Tuned
+# on the studio.
 HALF_WEIGHT_POINTS = 2.0
-# Rows farther apart than this share of the median time step are no neighbours: one frame missing
-# makes a step of 2.
+# Largest time step between successive frames, relative to the median: a missing frame doubles it.
 MAX_STEP_RATIO = 1.5
-MIN_INNOVATIONS = 50  # fewer seen points of successive frames give no estimate; tuned on the studio
-OFFSET_ITERATIONS = 4  # reweightings of the offsets' normal equations; tuned on the studio
+# Number of points in successive frames below which there is no estimate. Tuned on the studio.
+MIN_INNOVATIONS = 50
+# Iterations of the robust weights. Tuned on the studio.
+OFFSET_ITERATIONS = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Sightings:
-    """Observations by C cameras of K points in T frames, D numbers each (pixels, or a distance).
-
-    residual (T,C,K,D) prediction minus observation; velocity (T,C,K,D) of the prediction, a second;
-    by_point (T,C,K,D,P) derivative of the prediction by P coordinates of the point's position,
-    metres; weight (T,C,K) relative confidence, 0 = not seen; part (K,): errors within a part are
-    correlated.
-    """
+class PointObservations:
+    """Observations by C cameras of K points in T frames, D numbers each (pixels, or a distance)."""
 
     residual: np.ndarray
+    """(T, C, K, D) prediction minus observation."""
     velocity: np.ndarray
+    """(T, C, K, D) change of the prediction per second."""
     by_point: np.ndarray
+    """(T, C, K, D, P) derivative of the prediction by P coordinates of the point, per metre."""
     weight: np.ndarray
+    """(T, C, K) relative confidence; 0 if not seen."""
     part: np.ndarray
+    """(K,) part of the body; errors within a part are correlated."""
 
 
 @dataclass(frozen=True)
 class OffsetPrior:
-    """Prior of the offsets: ``offset`` (C,) and ``sigma`` (C,), seconds. Sigma is NaN where nothing
-    is known (then ``LOOSE_OFFSET_SIGMA_S`` about zero); the camera ``master`` has offset zero."""
+    """Prior of the time offsets of C cameras."""
 
     offset: np.ndarray
+    """(C,) seconds."""
     sigma: np.ndarray
+    """(C,) standard deviations, seconds; NaN for a broad prior about zero."""
     master: int
+    """Index of the camera whose offset is zero."""
 
 
 @dataclass(frozen=True)
-class TimeOffsets:
-    """``offset`` (C,) seconds later than the sets' times and ``sigma`` (C,) its stated standard
-    deviation, both 0 for the master."""
+class OffsetEstimate:
+    """Time offsets of C cameras; zero for the master."""
 
     offset: np.ndarray
+    """(C,) exposure after the times of the frame sets, seconds."""
     sigma: np.ndarray
+    """(C,) standard deviations, seconds."""
 
 
 def estimate_offsets(
-    sightings: Sequence[Sightings],
+    observations: Sequence[PointObservations],
     times: np.ndarray,
     current: np.ndarray,
     prior: OffsetPrior,
-) -> TimeOffsets:
-    """Estimate all offsets (C,), seconds.
+) -> OffsetEstimate:
+    """Estimate the time offsets of all cameras.
 
-    ``current`` (C,) are the offsets with which the predictions were made; ``times`` (T,) of the
-    frames.
+    Args:
+        times: (T,) of the frames, seconds.
+        current: (C,) offsets with which the predictions were made, seconds.
     """
     count = len(current)
     has_prior = np.isfinite(prior.sigma)
@@ -110,39 +113,45 @@ def estimate_offsets(
     sigma = np.maximum(np.where(has_prior, prior.sigma, LOOSE_OFFSET_SIGMA_S), MIN_PRIOR_SIGMA_S)
     precision = np.diag(sigma**-2.0)
     free = np.arange(count) != prior.master
-    all_innovations = [found for s in sightings if (found := _Innovations.of(s, times)) is not None]
+    all_innovations = [
+        innovations
+        for points in observations
+        if (innovations := _Innovations.of(points, times)) is not None
+    ]
     change = np.zeros(count)
     for _ in range(OFFSET_ITERATIONS):
         hessian, gradient = precision.copy(), precision @ (expected - change)
-        for found in all_innovations:
-            h, g = found.normal_equations(change)
+        for innovations in all_innovations:
+            h, g = innovations.normal_equations(change)
             hessian, gradient = hessian + h, gradient + g
         change[free] += np.linalg.solve(hessian[np.ix_(free, free)], gradient[free])
-    spread = precision + sum(found.spread(change) for found in all_innovations)
+    spread = precision + sum(innovations.spread(change) for innovations in all_innovations)
     inverse = np.linalg.inv(hessian[np.ix_(free, free)])
     sigma = np.zeros(count)
     sigma[free] = np.sqrt(np.diag(inverse @ spread[np.ix_(free, free)] @ inverse))
-    return TimeOffsets(np.where(free, current + change, 0.0), sigma)
+    return OffsetEstimate(np.where(free, current + change, 0.0), sigma)
 
 
 @dataclass(eq=False)
 class _Innovations:
-    """Sightings as innovations over time, means subtracted, in units of their own standard
-    deviation: the N that any view saw of T - 1 frames' points.
-
-    residual, velocity (N,C,D), by_point (N,C,D,P), weight (N,C), part and frame (N,) of each.
-    """
+    """Innovations over time of the N points that any view saw, in units of their deviation."""
 
     residual: np.ndarray
+    """(N, C, D) less its mean over time."""
     velocity: np.ndarray
+    """(N, C, D) less its mean over time."""
     by_point: np.ndarray
+    """(N, C, D, P)."""
     weight: np.ndarray
+    """(N, C)."""
     part: np.ndarray
+    """(N,) part of the body."""
     frame: np.ndarray
+    """(N,) frame."""
 
     @classmethod
-    def of(cls, seen: Sightings, times: np.ndarray) -> _Innovations | None:
-        """None where too few rows are of successive frames."""
+    def of(cls, seen: PointObservations, times: np.ndarray) -> _Innovations | None:
+        """Innovations of observations; None if too few are in successive frames."""
         step = np.diff(times)
         if not len(step):
             return None
@@ -172,8 +181,11 @@ class _Innovations:
         )
 
     def _remaining(self, change: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Residuals (N,C,D) after offsets ``change`` (C,) and the best point errors, robust
-        weights (N,C), and the points' inverse matrices (N,P,P)."""
+        """Residuals at offsets ``change`` (C,) and the best errors of the points.
+
+        Returns residuals (N, C, D), robust weights (N, C), and the inverse matrices (N, P, P) of
+        the points.
+        """
         residual = self.residual + self.velocity * change[:, None]
         weight = self._robust(residual)
         remaining, inverse = self._without_point_errors(residual, weight)
@@ -200,7 +212,7 @@ class _Innovations:
         return residual - (by_point @ (inverse @ gradient)).reshape(residual.shape), inverse
 
     def normal_equations(self, change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """H (C,C) and g (C,) of the offsets' next correction H^-1 g, point errors eliminated."""
+        """H (C, C) and g (C,) of the next correction H^-1 g, with the points' errors eliminated."""
         remaining, weight, inverse = self._remaining(change)
         along = self.velocity * weight[..., None]
         own = (along * self.velocity).sum((0, 2))
@@ -209,24 +221,28 @@ class _Innovations:
         return np.diag(own) - shared, -(along * remaining).sum((0, 2))
 
     def spread(self, change: np.ndarray) -> np.ndarray:
-        """Covariance (C,C) of g, from its scatter over body parts (errors that last) and over
-        frames (errors of a moment)."""
+        """Covariance (C, C) of g from its scatter over body parts and over frames.
+
+        The former contains lasting errors, the latter errors of single frames.
+        """
         remaining, weight, _ = self._remaining(change)
         gradient = (self.velocity * weight[..., None] * remaining).sum(2)  # (N, C)
-        groups = [gradient[by == one].sum(0) for by in (self.part, self.frame) for one in set(by)]
+        groups = [gradient[by == key].sum(0) for by in (self.part, self.frame) for key in set(by)]
         return np.transpose(groups) @ np.array(groups)
 
 
 def _centred(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """``values`` (T,C,K,D) less their mean over time of each camera and point; 0 where unseen."""
+    """Values (T, C, K, D) less the mean over time of each camera and point; 0 if not seen."""
     total = np.maximum(weight.sum(0), 1e-12)[..., None]
     mean = (values * weight[..., None]).sum(0) / total
     return np.where(weight[..., None] > 0, values - mean, 0.0)
 
 
 def _correlation(residual: np.ndarray, both: np.ndarray) -> float:
-    """Correlation of successive residuals (T,C,K,D) where ``both`` (T-1,C,K) are seen, outliers
-    clipped."""
+    """Correlation of successive residuals (T, C, K, D) that are ``both`` (T-1, C, K) seen.
+
+    Outliers are clipped.
+    """
     now, before = residual[1:][both], residual[:-1][both]
     limit = INNOVATION_OUTLIER * SIGMA_PER_MAD * np.median(np.abs(now))
     now, before = (np.clip(x, -limit, limit) for x in (now, before))
@@ -234,8 +250,8 @@ def _correlation(residual: np.ndarray, both: np.ndarray) -> float:
     return float(np.clip((now * before).sum() / max(power, 1e-30), 0.0, MAX_CORRELATION))
 
 
-def keypoint_sightings(evidence: Evidence, problem: BodyProblem) -> Sightings:
-    """The problem's keypoints in every colour image, in units of their sigma."""
+def observe_keypoints(evidence: Evidence, problem: BodyProblem) -> PointObservations:
+    """Keypoints in all colour images, in units of their standard deviation."""
     views = problem.views
     if views is None:
         raise ValueError("the problem has no views to compare with")
@@ -246,7 +262,7 @@ def keypoint_sightings(evidence: Evidence, problem: BodyProblem) -> Sightings:
     pixels, by_camera = projection.project_with_jacobian(in_camera, views.lenses[:, None])
     by_point = by_camera @ rotation[:, None] / views.sigma[..., None, None]
     velocity = by_point @ evidence.velocity(points)[:, None, :, :, None]
-    return Sightings(
+    return PointObservations(
         _array((pixels - views.observed) / views.sigma[..., None]),
         _array(velocity[..., 0]),
         _array(by_point),
@@ -255,8 +271,8 @@ def keypoint_sightings(evidence: Evidence, problem: BodyProblem) -> Sightings:
     )
 
 
-def cloud_sightings(evidence: Evidence, problem: BodyProblem) -> Sightings | None:
-    """The person's points at every sample of the skin, along its normal; None without depth."""
+def observe_clouds(evidence: Evidence, problem: BodyProblem) -> PointObservations | None:
+    """Depth points at the samples of the skin, along its normal; None without depth."""
     found = evidence.by_view
     if found is None:
         return None
@@ -265,7 +281,7 @@ def cloud_sightings(evidence: Evidence, problem: BodyProblem) -> Sightings | Non
     along = (evidence.velocity(where) * found.normal).sum(-1)
     joint = evidence.model.skinning_weights.argmax(1)[evidence.sample_ids]
     shape = (*found.distance.shape, 1)
-    return Sightings(
+    return PointObservations(
         -_array(found.distance)[..., None],
         np.broadcast_to(_array(along)[:, None, :, None], shape),
         np.ones((*shape, 1)),
@@ -275,7 +291,7 @@ def cloud_sightings(evidence: Evidence, problem: BodyProblem) -> Sightings | Non
 
 
 def _part_of_keypoint(index: np.ndarray) -> np.ndarray:
-    """Each body keypoint is a part of its own; all of a hand are one, and all of the face."""
+    """Part (K,) of keypoints: each body keypoint, each hand and the face are one part."""
     starts = (LEFT_HAND.start, RIGHT_HAND.start, FACE.start)
     hand_or_face = BODY.stop - 1 + np.searchsorted(starts, index, side="right")
     return np.where(index < BODY.stop, index, hand_or_face)

@@ -17,17 +17,18 @@ from intercap_core.body.keypoints import LEFT_HAND, RIGHT_HAND
 from intercap_core.body.model import BodyModel
 from intercap_core.config import ContactInterval, digest
 from intercap_core.joint.cameras import CameraFit
-from intercap_core.joint.fit import JointFit, fit
+from intercap_core.joint.fit import fit
 from intercap_core.joint.inputs import open_inputs
 from intercap_core.joint.released.artefact import import_joint
+from intercap_core.joint.result import Convergence, JointFit
 from intercap_core.joint.state import State
 from intercap_core.schemas import CONTACT_REGIONS, JOINT, PERSON
 from intercap_core.sequence_inputs import FitSettings, SequenceModels, SequencePaths
 
 log = logging.getLogger(__name__)
 
-# A hand whose keypoints are mostly seen in so many views or fewer is undetermined: what hides it
-# from the others hides fingers from these.
+# Number of views of a hand's median keypoint up to which the hand is undetermined: what occludes it
+# in the other views occludes fingers in these.
 FEW_HAND_VIEWS = 2
 
 _BODY_PARAMETERS = (
@@ -75,14 +76,14 @@ def run(
         return
     with open_inputs(paths, models, fit_settings, device) as inputs:
         fitted = fit(inputs, settings, contact)
-    for odd in fitted.contact.oddities:
-        first, last = odd.frames.start, max(odd.frames.start, odd.frames.stop - 1)
+    for issue in fitted.contact.issues:
+        first, last = issue.frames.start, max(issue.frames.start, issue.frames.stop - 1)
         log.warning(
             "sequence %s, frames %d to %d: %s",
             inputs.attributes["sequence"],
             first,
             last,
-            odd.text,
+            issue.text,
         )
     with artefacts.write(
         output,
@@ -92,8 +93,8 @@ def run(
         object=models.object_.name if models.object_ else "",
         iterations=fitted.steps,
         refused=fitted.refused,
-        converged=fitted.converged,
-        cameras_corrected=fitted.cameras,
+        converged=fitted.convergence == Convergence.CONVERGED,
+        cameras_corrected=fitted.cameras_corrected,
         **inputs.attributes,
     ) as writer:
         _put_body(writer, inputs.model, fitted.state)

@@ -7,18 +7,32 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from intercap_core.body.lemo import MotionEncoder
 from intercap_core.config import JointSettings
 
 CHANNELS = (1, 32, 64, 64, 64, 64)
+THIN = (1, 4, 4, 4, 4, 4)
 COORDINATES = 243  # of 81 markers
 
 
-def random_state(seed: int = 0, *, bias: float = 0.1) -> dict[str, torch.Tensor]:
+def random_encoder(
+    *, bias: float = 0.1, channels: tuple[int, ...] = THIN, spread: float = 0.6
+) -> MotionEncoder:
+    """An encoder in double precision; with few channels it takes little time."""
+    state = random_state(bias=bias, channels=channels)
+    weights = [values.double() for values in state.values()]
+    blocks = [tuple(weights[k : k + 4]) for k in range(0, len(weights), 4)]
+    return MotionEncoder(tuple(blocks), torch.full((COORDINATES,), spread, dtype=torch.float64))
+
+
+def random_state(
+    seed: int = 0, *, bias: float = 0.1, channels: tuple[int, ...] = CHANNELS
+) -> dict[str, torch.Tensor]:
     """An encoder's state: ten convolutions of 3 x 3, biases up to ``bias``."""
     generator = torch.Generator().manual_seed(seed)
     state = {}
     for block in range(5):
-        sizes = CHANNELS[block], CHANNELS[block + 1]
+        sizes = channels[block], channels[block + 1]
         for layer, inner in zip((0, 2), sizes, strict=True):
             name = f"enc_blc{block + 1}.main.{layer}"
             shape = (sizes[1], inner, 3, 3)

@@ -17,10 +17,10 @@ from intercap_core.joint.cameras import (
     FREEDOMS,
     SHIFT,
     TURN,
+    CameraEvidence,
     CameraFit,
     Cameras,
     CameraStep,
-    Sights,
 )
 from intercap_core.joint.state import BODY, OBJECT
 from intercap_core.joint.terms.body_data import add_by_cameras
@@ -71,9 +71,9 @@ def _problem(fitter: Fitter):
     return problem
 
 
-def _seen_from(fitter: Fitter, problem, held: float) -> Sights:
+def _seen_from(fitter: Fitter, problem, held: float) -> CameraEvidence:
     size = FREEDOMS * CAMERAS
-    seen = Sights(
+    seen = CameraEvidence(
         BODY,
         np.tile(held * np.eye(BODY.stop), (FRAMES, 1, 1)),
         np.zeros((FRAMES, BODY.stop)),
@@ -99,7 +99,7 @@ def test_beside_known_bodies_a_wrong_camera_is_put_right(fitter: Fitter, only: s
             problem.rows = None
         else:
             problem.views = None
-        cameras.take(cameras.settle([_seen_from(fitter, problem, held=1e9)]))
+        cameras.take(cameras.solve([_seen_from(fitter, problem, held=1e9)]))
         evidence.take_cameras(cameras.now.rig, cameras.now.depth_bias)
     found, true = cameras.now.rig[WRONG], ring(CAMERAS)[WRONG]
     apart = found.master_from_colour @ np.linalg.inv(true.master_from_colour)
@@ -153,10 +153,10 @@ def test_poses_go_along_and_the_prior_holds() -> None:
     jacobian[3:, SHIFT] = -np.eye(3)  # the residual is x - d
     weight = precision**2
 
-    def sights(known: float) -> Sights:
+    def sights(known: float) -> CameraEvidence:
         """The pose is also known from elsewhere to be ``off`` from what the camera says."""
         own = np.concatenate([np.zeros(3), np.full(3, off)])
-        return Sights(
+        return CameraEvidence(
             OBJECT,
             np.tile((weight + known) * np.eye(6), (frames, 1, 1)),
             np.tile(weight * own, (frames, 1)),
@@ -166,13 +166,13 @@ def test_poses_go_along_and_the_prior_holds() -> None:
             1.0,
         )
 
-    nothing = cameras.settle([sights(known=0.0)])  # any camera explains a pose that is free
+    nothing = cameras.solve([sights(known=0.0)])  # any camera explains a pose that is free
     np.testing.assert_allclose(nothing.step, 0, atol=1e-9)
-    found = cameras.settle([sights(known=1e6 * weight)])
+    found = cameras.solve([sights(known=1e6 * weight)])
     expected = off * frames * weight / (frames * weight + prior**-2)
     np.testing.assert_allclose(found.step[0, SHIFT], expected, rtol=1e-3)
     np.testing.assert_allclose(found.step[0, TURN], 0)
-    free = cameras.settle([replace(sights(known=0.0), pull=frames * np.ones(FREEDOMS))])
+    free = cameras.solve([replace(sights(known=0.0), pull=frames * np.ones(FREEDOMS))])
     np.testing.assert_allclose(free.along[:, OBJECT][:, 3:], np.tile(free.step[0, SHIFT], (5, 1)))
 
 

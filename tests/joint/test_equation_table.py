@@ -1,4 +1,4 @@
-"""The table of equations names what is in the code, and all of it."""
+"""The tables of docs/equations.md name what is in the code, and all of it."""
 
 from __future__ import annotations
 
@@ -9,10 +9,13 @@ from typing import NamedTuple
 import pytest
 
 import intercap_core
-from intercap_core.config import Config
+from intercap_core.config import Config, JointSettings
+from intercap_core.joint.problem import DATA_TERMS, TERMS
+from intercap_core.joint.terms.term import JointTerm
 
 PACKAGE = Path(intercap_core.__file__).resolve().parent
-PAGE = PACKAGE.parent / "docs" / "equations.md"
+PAGE = (PACKAGE.parent / "docs" / "equations.md").read_text(encoding="utf-8")
+JOINT_TERMS = (*DATA_TERMS, *TERMS)
 
 
 class Row(NamedTuple):
@@ -29,19 +32,14 @@ def _rows(text: str) -> list[Row]:
     return [Row(*row) for row in cells if len(row) == 5][2:]
 
 
-PAGE_TEXT = PAGE.read_text(encoding="utf-8")
-ROWS = _rows(PAGE_TEXT[PAGE_TEXT.index("## Table") :])
-
-
-def _tree(file: str) -> ast.Module:
-    return ast.parse((PACKAGE / file).read_text())
+ROWS = _rows(PAGE[PAGE.index("## Table") :])
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.term} {row.file}")
-def test_what_a_row_names_exists(row: Row) -> None:
+def test_row_names_code_and_setting_that_exist(row: Row) -> None:
     defined = [
         node.name
-        for node in _tree(row.file).body
+        for node in ast.parse((PACKAGE / row.file).read_text()).body
         if isinstance(node, ast.FunctionDef | ast.ClassDef)
     ]
     assert row.name in defined
@@ -51,32 +49,33 @@ def test_what_a_row_names_exists(row: Row) -> None:
         assert field in getattr(annotation, "model_fields", {})
 
 
-def test_every_equation_has_a_row() -> None:
-    numbers = {number.strip() for row in ROWS for number in row.paper.split(",")}
+def test_every_equation_of_the_paper_has_a_row() -> None:
+    sources = [row.paper for row in ROWS] + [term.equation.source for term in JOINT_TERMS]
+    numbers = {number.strip() for source in sources for number in source.split(",")}
     assert numbers - {"beyond"} == {*"123456", "A.1", "A.2", "A.3", "A.4", "A.5", "A.6"}
 
 
-def test_every_term_of_the_joint_energy_has_a_row() -> None:
-    folder = PACKAGE / "joint" / "terms"
-    terms = {
-        (f"joint/terms/{path.name}", node.name)
-        for path in folder.glob("*.py")
-        for node in ast.parse(path.read_text()).body
-        if isinstance(node, ast.ClassDef)
-        and any(isinstance(base, ast.Name) and base.id == "Term" for base in node.bases)
+def test_every_term_is_listed_and_every_setting_has_a_row() -> None:
+    files = {path.stem for path in (PACKAGE / "joint" / "terms").glob("[a-z]*.py")} - {"term"}
+    assert files == {term.__module__.rpartition(".")[2] for term in JOINT_TERMS}
+    kinds, waiting = set(), [JointTerm]
+    while waiting:
+        kind = waiting.pop()
+        waiting += kind.__subclasses__()
+        if kind.__module__.startswith("intercap_core") and "equation" in vars(kind):
+            kinds.add(kind)
+    assert kinds == set(JOINT_TERMS)
+    settings = {f"joint.{name}" for term in JOINT_TERMS for name in term.equation.settings}
+    assert {f"joint.{name}" for name in JointSettings.model_fields} == settings | {
+        row.setting for row in ROWS if row.setting.startswith("joint.")
     }
-    assert len(terms) == 16
-    assert terms <= {(row.file, row.name) for row in ROWS}
 
 
-def test_every_weight_of_the_joint_energy_has_a_row() -> None:
-    annotation = Config.model_fields["joint"].annotation
-    weights = {f"joint.{name}" for name in getattr(annotation, "model_fields", {})}
-    assert weights <= {row.setting for row in ROWS}
-
-
-@pytest.mark.parametrize("row", [row for row in ROWS if row.paper.startswith("6")], ids=str)
-def test_files_of_equation_6_name_it(row: Row) -> None:
-    described = ast.get_docstring(_tree(row.file)) or ""
-    assert "equation 6" in described
-    assert row.term.split(":")[0].split(",")[0].split(" with")[0] in described
+def test_terms_of_equation_6_are_named_in_their_file() -> None:
+    for term in JOINT_TERMS:
+        if term.equation.source.startswith("6"):
+            described = ast.get_docstring(
+                ast.parse((PACKAGE.parent / f"{term.__module__.replace('.', '/')}.py").read_text())
+            )
+            assert described and "equation 6" in described
+            assert term.equation.symbol.split(" ")[0] in described

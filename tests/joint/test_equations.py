@@ -7,13 +7,13 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from intercap_core.joint.equations import NormalEquations
+from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.state import ALL, OBJECT
 
 POINTS = 4
 
 
-def _dense(equations: NormalEquations) -> np.ndarray:
+def _dense(equations: BandedEquations) -> np.ndarray:
     width, frames, size, _ = equations.bands.shape
     full = np.zeros((frames, size, frames, size))
     for k in range(width):
@@ -24,7 +24,7 @@ def _dense(equations: NormalEquations) -> np.ndarray:
 
 
 @pytest.mark.parametrize("stencil", [(1.0,), (-1.0, 1.0), (1.0, -2.0, 1.0)])
-@pytest.mark.parametrize("frames", [1, 2, 5, 40])
+@pytest.mark.parametrize("frames", [1, 2, 5, 12])
 def test_differences_over_frames_are_those_of_one_dense_jacobian(frames, stencil) -> None:
     """Some points have weight in a few frames alone."""
     rng = np.random.default_rng(frames)
@@ -32,7 +32,7 @@ def test_differences_over_frames_are_those_of_one_dense_jacobian(frames, stencil
     values = rng.normal(size=(frames, POINTS, 3, 6))
     weights = rng.random((steps, POINTS)) * (rng.random((steps, POINTS)) > 0.5)
     residuals = rng.normal(size=(steps, POINTS, 3))
-    equations = NormalEquations(frames)
+    equations = BandedEquations(frames)
     equations.add_rows(
         "term", columns, lambda at, some: values[at, some], weights, residuals, stencil=stencil
     )
@@ -51,7 +51,7 @@ def test_differences_over_frames_are_those_of_one_dense_jacobian(frames, stencil
 
 def test_what_is_stiff_is_not_damped() -> None:
     """Two frames tied together move on as one, however strong the damping is."""
-    equations = NormalEquations(2)
+    equations = BandedEquations(2)
     values = np.broadcast_to(np.eye(ALL.stop), (2, 1, ALL.stop, ALL.stop))
     for stiff, stencil, weight in ((False, (1.0,), 1.0), (True, (-1.0, 1.0), 1e8)):
         count = 3 - len(stencil)
@@ -75,7 +75,7 @@ def test_equations_take_the_memory_of_their_bands() -> None:
     used = {}
     for frames in (50, 100):
         tracemalloc.start()
-        equations = NormalEquations(frames)
+        equations = BandedEquations(frames)
         equations.add_rows(
             "term",
             ALL,
@@ -100,6 +100,6 @@ def test_rows_are_made_for_what_has_weight_alone() -> None:
 
     weights = np.full((40, POINTS), 1e-15)
     weights[20, 2] = 1.0
-    NormalEquations(40).add_rows("term", OBJECT, rows, weights, np.ones((40, POINTS, 1)))
+    BandedEquations(40).add_rows("term", OBJECT, rows, weights, np.ones((40, POINTS, 1)))
     assert len(asked) == 1 and asked[0][1] == [2]
     assert asked[0][0].start <= 20 < asked[0][0].stop

@@ -16,9 +16,9 @@ from intercap_core.body_fit.surface import COVERINGS
 from intercap_core.config import BodyFitSettings
 from intercap_core.joint.time_offsets import (
     OffsetPrior,
-    cloud_sightings,
     estimate_offsets,
-    keypoint_sightings,
+    observe_clouds,
+    observe_keypoints,
 )
 from tests.helpers.bodies import open_body
 from tests.helpers.body_capture import master_from_room, ring, write_capture
@@ -75,10 +75,10 @@ def test_velocities_are_what_a_later_exposure_changes(fitted):
     fitter, problem = fitted
     evidence, step = fitter.evidence, 0.002
     given = evidence.seen
-    before = keypoint_sightings(evidence, problem), cloud_sightings(evidence, problem)
+    before = observe_keypoints(evidence, problem), observe_clouds(evidence, problem)
     evidence.seen = replace(given, time_offset=np.full(CAMERAS, step))
     fitter.observe(problem)
-    after = keypoint_sightings(evidence, problem), cloud_sightings(evidence, problem)
+    after = observe_keypoints(evidence, problem), observe_clouds(evidence, problem)
     evidence.seen = given
     fitter.observe(problem)
     for a, b, tolerance in zip(before, after, (0.02, 0.05), strict=True):
@@ -88,7 +88,7 @@ def test_velocities_are_what_a_later_exposure_changes(fitted):
         assert np.abs(change - expected).mean() < tolerance * np.abs(expected).mean()
 
 
-@pytest.mark.parametrize("kind", [keypoint_sightings, cloud_sightings])
+@pytest.mark.parametrize("kind", [observe_keypoints, observe_clouds])
 def test_the_true_offsets_are_found_beside_the_true_bodies(fitted, kind):
     fitter, problem = fitted
     evidence = fitter.evidence

@@ -8,7 +8,7 @@ import pytest
 from intercap_core.joint.time_offsets import (
     LOOSE_OFFSET_SIGMA_S,
     OffsetPrior,
-    Sightings,
+    PointObservations,
     estimate_offsets,
 )
 
@@ -45,7 +45,7 @@ def _sightings(seed: int = 0, *, late: np.ndarray = TRUE, lasting_px=4.0, noise_
     residual += noise_px * rng.normal(size=(T, C, K, 2))
     by_point = np.broadcast_to(views[None, :, None], (T, C, K, 2, 3))
     weight = (rng.uniform(size=(T, C, K)) < 0.8).astype(float)
-    return Sightings(residual, velocity, by_point, weight, np.arange(K))
+    return PointObservations(residual, velocity, by_point, weight, np.arange(K))
 
 
 def _within(found, most: float) -> bool:
@@ -90,7 +90,9 @@ def test_outliers_and_swaps_are_left_out():
 
 def test_without_motion_the_prior_stays():
     seen = _sightings(late=np.zeros(C))
-    still = Sightings(seen.residual, 0 * seen.velocity, seen.by_point, seen.weight, seen.part)
+    still = PointObservations(
+        seen.residual, 0 * seen.velocity, seen.by_point, seen.weight, seen.part
+    )
     given = OffsetPrior(TRUE, np.array([0, 1, 1, np.nan, 2]) * 1e-3, 0)
     found = estimate_offsets([still], TIMES, np.zeros(C), given)
     assert found.offset == pytest.approx([0, TRUE[1], TRUE[2], 0, TRUE[4]])
@@ -117,6 +119,8 @@ def test_distances_along_a_normal_tell_too():
     residual = -velocity * TRUE[:, None, None] + error[:, None, :, None]
     residual += 0.005 * rng.normal(size=(1, C, 200, 1)) + 0.004 * rng.normal(size=residual.shape)
     weight = (rng.uniform(size=(T, C, 200)) < 0.4).astype(float)
-    seen = Sightings(residual, velocity, np.ones((*residual.shape, 1)), weight, np.arange(200) // 8)
+    seen = PointObservations(
+        residual, velocity, np.ones((*residual.shape, 1)), weight, np.arange(200) // 8
+    )
     found = estimate_offsets([seen], TIMES, np.zeros(C), NOTHING)
     assert _within(found, 1.5e-3)

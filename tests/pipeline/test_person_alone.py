@@ -18,6 +18,9 @@ from intercap_core.commands.evaluate.part import Measured
 from intercap_core.commands.inspect import print_summary
 from intercap_core.commands.release import check_release, write_release
 from intercap_core.errors import UserError
+from intercap_core.joint.problem import TERMS
+from intercap_core.joint.terms.body_data import BodyData
+from intercap_core.joint.terms.term import Data
 from intercap_core.output.release.manifest import KINDS
 from intercap_core.pipeline.outcome import line, notes
 from intercap_core.pipeline.step import run_dataset, run_step, run_studio
@@ -82,7 +85,8 @@ def test_no_stage_says_anything_of_an_object(project: Project) -> None:
 def test_the_body_is_fitted_with_its_own_terms(project: Project) -> None:
     with _open(project, "joint") as joint:
         terms = {name.decode() for name in joint["energy_names"]}
-        assert terms == {"body_data", "body_drift", "body_motion", "ground", "plant"}
+        alone = {term.name for term in TERMS if Data.OBJECT not in term.needs}
+        assert terms == {BodyData.name} | alone
         before, after = (joint[f"energy_{when}"][()].sum() for when in ("before", "after"))
         assert joint.attrs["iterations"] > 0 and after < before
         assert not joint["flagged"][()].all()

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from intercap_core.config import JointSettings
-from intercap_core.joint.equations import NormalEquations
+from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.fit import Assembly, assemble
 from intercap_core.joint.inputs import JointInputs
 from intercap_core.joint.minimise import MIN_DAMPING, limited
@@ -55,7 +55,7 @@ class Refits:
         ]
         if not isinstance(assembly.object_, NoObject):
             self._seen.append((OBJECT, assembly.object_))
-        self._rest = NormalEquations(len(state), assembly.problem.threads)
+        self._rest = BandedEquations(len(state), assembly.problem.threads)
         for term in assembly.problem.terms:
             if not any(term is seen for _, seen in self._seen):
                 term.add(state, self._rest)

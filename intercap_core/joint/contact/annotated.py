@@ -1,4 +1,4 @@
-"""Q_t given by annotation, of equation 6: what intervals say of each frame, and what is odd."""
+"""Q_t of equation 6 from annotated intervals: evidence by frame, and implausible intervals."""
 
 from __future__ import annotations
 
@@ -18,13 +18,15 @@ FAR_CONTACT = 0.15
 
 
 @dataclass(frozen=True)
-class Oddity:
-    """What is odd about an annotated interval in ``frames``, in words; ``distrusted`` where these
-    frames should not be trusted for it."""
+class AnnotationIssue:
+    """An implausible annotated interval."""
 
     frames: range
+    """Frames concerned."""
     text: str
+    """Description."""
     distrusted: bool = False
+    """Whether the frames are flagged."""
 
 
 def annotation_evidence(
@@ -33,13 +35,14 @@ def annotation_evidence(
     frames: int,
     uncertainty: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Log odds (T, R) that annotated intervals add, and the labels (T, R) int8 they state.
+    """Log odds (T, R) of contact from annotated intervals, and their labels (T, R) int8.
 
-    Regions that no interval names are annotated as free throughout: a sequence's contact is
-    annotated as a whole. While some unnamed part touches (``any``), regions have no label (-1) and
-    no evidence unless they are named as well. Annotators err by up to ``uncertainty`` frames at an
-    end, wherever within them it is: so near to one the annotation says nothing, and what is seen
-    decides. The middle between two ends is certain, however near they are.
+    Labels are 1 (touching), 0 (free) and -1 (no label). Contact is annotated for a sequence as a
+    whole: regions that no interval names are free in all frames. During an interval of an unnamed
+    part (``any``) regions that are not named have no label and no evidence.
+
+    The evidence is 0 within ``uncertainty`` frames of an end of an interval, where annotators err
+    and the geometry decides. The middle between two ends always has evidence.
     """
     labels = np.zeros((frames, len(regions)), np.int8)
     for interval in sorted(intervals, key=lambda interval: interval.part != ANY_REGION):
@@ -61,49 +64,54 @@ def annotation_evidence(
     return sign * certain * ANNOTATED_LOGIT, labels
 
 
-def oddities(
+def find_issues(
     intervals: Sequence[ContactInterval],
     regions: Sequence[str],
     distance: np.ndarray,
     unseen: np.ndarray,
-) -> list[Oddity]:
-    """What is odd about annotated ``intervals``, by what the fit found.
+) -> list[AnnotationIssue]:
+    """Find implausible annotated intervals.
 
-    ``distance`` (T, R) of each region to the object, metres; ``unseen`` (T,) frames in which body
-    or object was not seen, so that nothing can be held against the annotation.
+    Args:
+        distance: (T, R) of each region to the object in the fit, metres.
+        unseen: (T,) frames in which body or object was not seen.
     """
-    found = [
-        Oddity(range(i.start, i.end), f"contact of {i.part} annotated for no frame at {i.start}")
+    issues = [
+        AnnotationIssue(
+            range(i.start, i.end), f"contact of {i.part} annotated for no frame at {i.start}"
+        )
         for i in intervals
         if i.end <= i.start
     ]
     filled = [interval for interval in intervals if interval.end > interval.start]
-    found += _overlaps(filled)
+    issues += _overlaps(filled)
     for interval in filled:
-        found += _unseen_ends(interval, unseen)
-        found += _far_away(interval, regions, distance, unseen)
-    return found
+        issues += _unseen_ends(interval, unseen)
+        issues += _far_away(interval, regions, distance, unseen)
+    return issues
 
 
-def _overlaps(intervals: Sequence[ContactInterval]) -> list[Oddity]:
-    """Intervals of one part that name the same frames: they count once."""
+def _overlaps(intervals: Sequence[ContactInterval]) -> list[AnnotationIssue]:
+    """Overlapping intervals of one part, which count once."""
     by_part = sorted(intervals, key=lambda i: (i.part, i.start, i.end))
-    found = []
+    issues = []
     for part, group in groupby(by_part, key=lambda i: i.part):
         reached = 0
         for interval in group:
             if interval.start < reached:
                 both = range(interval.start, min(reached, interval.end))
-                found.append(Oddity(both, f"contact of {part} annotated twice"))
+                issues.append(AnnotationIssue(both, f"contact of {part} annotated twice"))
             reached = max(reached, interval.end)
-    return found
+    return issues
 
 
-def _unseen_ends(interval: ContactInterval, unseen: np.ndarray) -> list[Oddity]:
-    """Ends at frames that were not seen: only the annotation says when the contact changes."""
+def _unseen_ends(interval: ContactInterval, unseen: np.ndarray) -> list[AnnotationIssue]:
+    """Ends in unseen frames: the annotation alone determines when the contact changes."""
     ends = {"begins": interval.start, "ends": interval.end}
     return [
-        Oddity(range(at - 1, at + 1), f"annotated contact of {interval.part} {what} unseen")
+        AnnotationIssue(
+            range(at - 1, at + 1), f"annotated contact of {interval.part} {what} unseen"
+        )
         for what, at in ends.items()
         if 0 < at < len(unseen) and unseen[at - 1 : at + 1].any()
     ]
@@ -114,8 +122,8 @@ def _far_away(
     regions: Sequence[str],
     distance: np.ndarray,
     unseen: np.ndarray,
-) -> list[Oddity]:
-    """Runs of frames in which the annotated part is far from the object."""
+) -> list[AnnotationIssue]:
+    """Frames in which the annotated part is far from the object."""
     of_part = (
         distance.min(axis=1)
         if interval.part == ANY_REGION
@@ -123,10 +131,10 @@ def _far_away(
     )
     during = slice(interval.start, interval.end)
     far = np.flatnonzero((of_part[during] > FAR_CONTACT) & ~unseen[during]) + interval.start
-    found = []
+    issues = []
     for run in np.split(far, np.flatnonzero(np.diff(far) > 1) + 1):
         if len(run):
             metres = of_part[run].min()
             text = f"contact of {interval.part} annotated {metres:.2f} m from the object or more"
-            found.append(Oddity(range(run[0], run[-1] + 1), text, distrusted=True))
-    return found
+            issues.append(AnnotationIssue(range(run[0], run[-1] + 1), text, distrusted=True))
+    return issues

@@ -1,4 +1,4 @@
-"""On and off over time: a semi-Markov chain with stays of different lengths, made of states."""
+"""An on/off process over time: a semi-Markov chain whose dwell times are a mixture."""
 
 from __future__ import annotations
 
@@ -8,37 +8,42 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class Chain:
-    """Off, or on in one of K kinds of stay.
+class DwellChain:
+    """A hidden chain with one state "off" and one state "on" for each of K kinds of dwell.
 
-    ``begins`` is how often a second what is off goes on; ``durations`` (K,) are the stays' means,
-    seconds, and ``shares`` (K,) how many of the stays are of each kind. With several kinds, short
-    stays cost little and long ones are not forgotten where nothing is seen.
+    With several kinds, short dwells are not suppressed and long ones last through frames without
+    evidence.
     """
 
     begins: float
+    """Rate at which "off" turns to "on", 1/s."""
     durations: tuple[float, ...]
+    """(K,) mean dwell time of each kind, seconds."""
     shares: tuple[float, ...]
+    """(K,) share of each kind among the dwells."""
 
     def start(self) -> np.ndarray:
-        """Probability (1 + K,) of off and of each kind before anything is seen."""
+        """Stationary probability (1 + K,) of "off" and of each kind."""
         weights = np.array(
             [1.0, *(self.begins * s * d for s, d in zip(self.shares, self.durations, strict=True))]
         )
         return weights / weights.sum()
 
     def transition(self, fps: float) -> np.ndarray:
-        """(1 + K, 1 + K) from one frame's state to the next one's, at ``fps`` frames a second."""
+        """Transition matrix (1 + K, 1 + K) between consecutive frames."""
         kinds = len(self.durations)
-        found = np.zeros((1 + kinds, 1 + kinds))
-        found[0, 1:] = min(0.5, self.begins / fps) * np.array(self.shares)
-        found[1:, 0] = np.minimum(0.5, 1 / (fps * np.array(self.durations)))
-        found[np.diag_indices(1 + kinds)] = 1 - found.sum(axis=1)
-        return found
+        matrix = np.zeros((1 + kinds, 1 + kinds))
+        matrix[0, 1:] = min(0.5, self.begins / fps) * np.array(self.shares)
+        matrix[1:, 0] = np.minimum(0.5, 1 / (fps * np.array(self.durations)))
+        matrix[np.diag_indices(1 + kinds)] = 1 - matrix.sum(axis=1)
+        return matrix
 
     def posterior(self, evidence: np.ndarray, fps: float) -> np.ndarray:
-        """Probability (T, R) of on, of R chains, given log odds ``evidence`` (T, R) by frame."""
-        with np.errstate(divide="ignore"):  # one kind of stay never turns into another
+        """Probability (T, R) of "on" for R independent chains (forward-backward algorithm).
+
+        ``evidence`` (T, R) are log-likelihood ratios of on against off.
+        """
+        with np.errstate(divide="ignore"):  # kinds of dwell never turn into each other
             transition, start = np.log(self.transition(fps)), np.log(self.start())
         on = np.arange(len(start)) > 0
         emission = evidence[:, :, None] * on

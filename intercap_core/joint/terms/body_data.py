@@ -1,24 +1,22 @@
-"""Body data: E_B of equation 6, which is equation 2 as the body fit left it.
+"""Body data: E_B of equation 6, which is equation 2 with the constants of the body fit.
 
-Shape, thickness of clothing and keypoint offsets stay as the body fit found them. E_B's own terms
-and weights are those of :mod:`intercap_core.body_fit.problem`; no setting of the joint fit weighs
-them. E_theta_h alone counts less: a hand's pose lasts, so that over many frames its prior is seen
-again and again where keypoints bring something new; with full weight in every frame fingers stay
-tens of millimetres short of what several views agree on. A frame without a fit stays near the pose
-interpolated there.
+Shape, thickness of clothing and keypoint offsets are those of the body fit. The terms of E_B and
+their weights are those of :mod:`intercap_core.body_fit.problem`; no setting of the joint fit weighs
+them. E_theta_h alone has less weight: a hand's pose lasts, so that its prior in successive frames
+is one observation, whereas keypoints of each frame are new. With full weight in every frame fingers
+stay tens of millimetres short of the pose on which several views agree. A frame without a fit stays
+near its interpolated pose.
 
-How E_J and E_D (equations 3 and 4) change with small corrections of the cameras.
-
-A camera that is turned by w about its centre s, shifted by v and whose depth bias grows by b moves
-what it measured at p by w x (p - s) + v - b r, r the ray to p for a metre of depth. To keypoints it
-is as if the body had moved the other way. The weights are those that E_B has at the last look.
+E_J and E_D (equations 3 and 4) also depend on the cameras. A camera that is turned by w about its
+centre s, shifted by v and whose depth bias grows by b displaces a point measured at p by
+w x (p - s) + v - b r, with r the ray to p for a metre of depth. For keypoints it is as if the body
+had moved the other way. The weights are those of the last comparison with the images.
 """
 
 from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -35,70 +33,76 @@ from intercap_core.body_fit.schedule import Fitter, Settled
 from intercap_core.config import BodyFitSettings
 from intercap_core.geometry.camera import projection
 from intercap_core.geometry.solve.robust import geman_mcclure_weight
-from intercap_core.joint.cameras import BIAS, FREEDOMS, SHIFT, TURN, Cameras, Sights
-from intercap_core.joint.equations import NormalEquations
+from intercap_core.joint.cameras import BIAS, FREEDOMS, SHIFT, TURN, CameraEvidence, Cameras
+from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.state import BODY, BODY_SHIFT, State
-from intercap_core.joint.terms.term import Term
+from intercap_core.joint.terms.term import Equation, JointTerm
 from intercap_core.joint.time_offsets import (
+    OffsetEstimate,
     OffsetPrior,
-    TimeOffsets,
-    cloud_sightings,
     estimate_offsets,
-    keypoint_sightings,
+    observe_clouds,
+    observe_keypoints,
 )
+from intercap_core.sequence_inputs import SequencePaths
 
-# A hand's pose lasts about so long, seconds: what the prior of poses says in the frames of that
-# time is one observation, where the body fit's frames stand alone. A grasp lasts longer, fingers
-# on their way shorter. Tuned on the studio: 0.3 to 1 are alike.
+# Duration of a hand's pose, seconds: its prior in the frames of that time is one observation. Tuned
+# on the studio: 0.3 to 1 are alike.
 HAND_LASTING_S = 0.5
-BRIDGED_BODY_TURN = 0.3  # rad, of each joint; tuned on the studio
-BRIDGED_BODY_SHIFT = 0.1  # metres; tuned on the studio
-# Changes of offsets below this are not followed, seconds: a hand at 3 m/s moves a millimetre
-# meanwhile.
+# Standard deviations about an interpolated pose: of each joint, rad, and of the translation,
+# metres. Tuned on the studio.
+INTERPOLATED_TURN = 0.3
+INTERPOLATED_SHIFT = 0.1
+# Change of time offsets that is ignored, seconds: a hand at 3 m/s moves a millimetre.
 OFFSET_UNCHANGED_S = 0.0003
 
 log = logging.getLogger(__name__)
-_FRAMES_TOGETHER = 64  # frames whose equations are held in single precision at a time
-_CHUNK = 32  # frames whose derivatives are held at once
+_CHUNK = 64  # frames whose equations are computed at a time, to bound the memory
+_CAMERA_CHUNK = 32  # frames whose derivatives by the cameras are computed at a time
 
 
 @dataclass(frozen=True)
-class Residuals:
-    """``keypoint_px`` (T, C) median reprojection error and ``cloud_m`` (T,) median distance of the
-    cloud beyond the coverings; NaN = nothing seen."""
+class BodyResiduals:
+    """Distances of the body to the images; NaN without an observation."""
 
     keypoint_px: np.ndarray
+    """(T, C) median reprojection error, pixels."""
     cloud_m: np.ndarray
+    """(T,) median distance of the clouds beyond the clothing, metres."""
 
 
-class BodyData(Term):
-    """E_B of the frames whose fit is ``trusted`` (T,): keypoints, clouds and priors."""
+class BodyData(JointTerm):
+    """E_B: keypoints, clouds and priors of the body."""
 
     name = "body_data"
+    equation = Equation(
+        symbol="E_B",
+        source="6",
+        formula="equation 2; shape, thickness of clothing and keypoint offsets stay as fitted; "
+        "E_theta_h counts once in the half second that a hand's pose lasts",
+    )
 
     def __init__(self, fitter: Fitter, problem: BodyProblem, trusted: np.ndarray) -> None:
         self._fitter, self._problem = fitter, problem
         self._trusted = trusted[fitter.frames]
         self._index = torch.arange(len(fitter.frames), device=fitter.model.device)
-        self._bridged: np.ndarray | None = None
+        self._interpolated: np.ndarray | None = None
 
     @classmethod
     def load(
         cls,
-        *,
-        frames: Path,
-        scene: Path,
-        person: Path,
+        paths: SequencePaths,
         body_fit: Artefact,
+        *,
         model: BodyModel,
         state: State,
         settings: BodyFitSettings,
         fps: float,
         pose_prior: VPoser | None = None,
     ) -> BodyData:
-        """Read the observations and what the body fit found to be constant."""
-        observations = read_observations(scene, person)
-        clouds = person_clouds(frames, observations, settings.points_per_frame, model.device)
+        """Read the observations, and the constants of the body fit."""
+        observations = read_observations(paths.scene, paths.person)
+        clouds = person_clouds(paths.frames, observations, settings.points_per_frame, model.device)
         fitter = Fitter(model, observations, clouds, settings, pose_prior)
         settled = Settled(
             *(
@@ -119,26 +123,30 @@ class BodyData(Term):
         return cls(fitter, problem, ~body_fit["failed"])
 
     def refresh(self, state: State) -> None:
-        """Take correspondences and visibility anew at ``state``."""
+        """Find correspondences and visibility at ``state``."""
         self._place(state)
         self._fitter.observe(self._problem)
-        if self._bridged is None:
-            self._bridged = state.body.copy()
+        if self._interpolated is None:
+            self._interpolated = state.body.copy()
 
     def compare(self, state: State, camera: np.ndarray) -> None:
-        """Have :meth:`residuals` and :meth:`person_by_view` tell of ``state``, of the one
-        ``camera`` (T,) of each frame alone: others show nothing of the person's points. Before
-        equations are made again, :meth:`refresh`."""
+        """Compare ``state`` with one view per frame, for the errors in views that were held out.
+
+        Afterwards :meth:`residuals` and :meth:`person_by_view` refer to ``state`` and to the camera
+        ``camera`` (T,) of each frame. :meth:`refresh` comes before further equations.
+        """
         self._place(state)
         self._fitter.observe_only(self._problem, camera[self._fitter.frames])
 
-    def add(self, state: State, equations: NormalEquations) -> None:
+    def add(self, state: State, equations: BandedEquations) -> None:
         """Add E_B at ``state`` with the correspondences of the last :meth:`refresh`."""
         equations.add_blocks(self.name, BODY, *self._equations(state))
 
     def of_views(self, used: np.ndarray, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """E_B's matrix (T, 168, 168), gradient (T, 168) and energy (T,) at ``state``, of the last
-        :meth:`refresh`, by the cameras ``used`` (T, C) alone."""
+        """E_B's matrix (T, 168, 168), gradient (T, 168) and energy (T,) at ``state`` of some views.
+
+        ``used`` (T, C) masks the views; correspondences are those of the last :meth:`refresh`.
+        """
         problem, evidence = self._problem, self._fitter.evidence
         counted = torch.as_tensor(used[self._fitter.frames], device=problem.base.device)[..., None]
         views, rows = problem.views, problem.rows
@@ -153,64 +161,70 @@ class BodyData(Term):
 
     def _equations(self, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """E_B's matrix (T, 168, 168), gradient (T, 168) and energy (T,)."""
-        assert self._bridged is not None, "refresh comes first"
+        assert self._interpolated is not None, "refresh comes first"
         pose = torch.as_tensor(state.body[self._fitter.frames]).to(self._problem.base)
-        shared = pose.new_zeros(0)  # nothing that all frames share is free here
+        shared = pose.new_zeros(0)  # no parameters are shared by all frames
         hessian = np.zeros((len(state), BODY.stop, BODY.stop))
         gradient = np.zeros((len(state), BODY.stop))
         energy = np.zeros(len(state))
-        for some in self._index.split(_FRAMES_TOGETHER):
+        for some in self._index.split(_CHUNK):
             normal = self._problem.linearise(pose[some], shared, some)
-            places = some.cpu().numpy()  # a tensor of one place would be taken for a number
+            places = some.cpu().numpy()  # a tensor with one element would index like a scalar
             trusted = self._trusted[places]
             at = self._fitter.frames[places][trusted]
             hessian[at] = normal.hessian.cpu().numpy()[trusted]
             gradient[at] = normal.gradient.cpu().numpy()[trusted]
             energy[at] = normal.cost.double().cpu().numpy()[trusted]
         frames = self._fitter.frames[self._trusted]
-        bridged = np.setdiff1d(np.arange(len(state)), frames)
-        precision = np.full(BODY.stop, BRIDGED_BODY_TURN**-2)
-        precision[BODY_SHIFT] = BRIDGED_BODY_SHIFT**-2
-        offset = state.body[bridged] - self._bridged[bridged]
-        hessian[bridged] = np.diag(precision)
-        gradient[bridged] = precision * offset
-        energy[bridged] = 0.5 * (precision * offset**2).sum(axis=1)
+        filled = np.setdiff1d(np.arange(len(state)), frames)
+        precision = np.full(BODY.stop, INTERPOLATED_TURN**-2)
+        precision[BODY_SHIFT] = INTERPOLATED_SHIFT**-2
+        offset = state.body[filled] - self._interpolated[filled]
+        hessian[filled] = np.diag(precision)
+        gradient[filled] = precision * offset
+        energy[filled] = 0.5 * (precision * offset**2).sum(axis=1)
         return hessian, gradient, energy
 
     def take_cameras(self, cameras: Cameras, time_offset: np.ndarray | None = None) -> None:
-        """See through these cameras, that expose so late (C,), seconds, from the next
-        :meth:`refresh` on; None leaves the offsets as they are."""
+        """Use these cameras from the next :meth:`refresh` on.
+
+        ``time_offset`` (C,) are their time offsets, seconds; None keeps the present ones.
+        """
         evidence = self._fitter.evidence
         evidence.take_cameras(cameras.rig, cameras.depth_bias)
         if time_offset is not None:
             evidence.seen = replace(evidence.seen, time_offset=time_offset)
 
-    def sights(self, state: State, share: float) -> Sights:
-        """What keypoints and clouds of the trusted frames say of poses and cameras, at
-        ``state``."""
+    def camera_evidence(self, state: State, share: float) -> CameraEvidence:
+        """Evidence of keypoints and clouds about the cameras at ``state``.
+
+        ``share`` is the share of an independent observation that a frame is.
+        """
         self._place(state)
         count = FREEDOMS * len(self._fitter.evidence.seen.rig)
         hessian, gradient, _ = self._equations(state)
         cross = np.zeros((len(state), BODY.stop, count))
-        seen = Sights(
+        seen = CameraEvidence(
             BODY, hessian, gradient, cross, np.zeros((count, count)), np.zeros(count), share
         )
         add_by_cameras(self._fitter.evidence, self._problem, self._trusted, seen)
         return seen
 
-    def residuals(self) -> Residuals:
-        """How far the images are from the state of the last :meth:`refresh`."""
+    def residuals(self) -> BodyResiduals:
+        """Distances of the body to the images at the last :meth:`refresh`."""
         pixels, metres = self._fitter.residuals(self._problem)
         total = len(self._fitter.evidence.seen.times)
         keypoint = np.full((total, pixels.shape[1]), np.nan)
         cloud = np.full(total, np.nan)
         keypoint[self._fitter.frames] = pixels.cpu().numpy()
         cloud[self._fitter.frames] = metres.cpu().numpy()
-        return Residuals(keypoint, cloud)
+        return BodyResiduals(keypoint, cloud)
 
     def person_by_view(self) -> np.ndarray:
-        """Median distance (T, C) of the person's points from the skin beyond the coverings, metres,
-        in every camera, at the last :meth:`refresh`; NaN = nothing seen."""
+        """Median distance (T, C) of the person's points beyond the clothing, metres, in each view.
+
+        At the last :meth:`refresh`; NaN without points.
+        """
         seen = self._fitter.evidence.seen
         person = np.full((len(seen.times), len(seen.rig)), np.nan)
         found = self._fitter.evidence.by_view
@@ -222,24 +236,24 @@ class BodyData(Term):
 
     @property
     def time_offset(self) -> np.ndarray:
-        """(C,) seconds by which each camera is predicted to expose late."""
+        """(C,) time offset of each camera in the predictions, seconds."""
         return self._fitter.evidence.seen.time_offset
 
-    def estimate_offsets(self, prior: OffsetPrior) -> TimeOffsets:
+    def estimate_offsets(self, prior: OffsetPrior) -> OffsetEstimate:
         """Estimate the cameras' time offsets at the state of the last :meth:`refresh`."""
         evidence, problem = self._fitter.evidence, self._problem
-        sightings = [
-            replace(found, weight=found.weight * self._trusted[:, None, None])
-            for found in (keypoint_sightings(evidence, problem), cloud_sightings(evidence, problem))
-            if found is not None
+        observations = [
+            replace(points, weight=points.weight * self._trusted[:, None, None])
+            for points in (observe_keypoints(evidence, problem), observe_clouds(evidence, problem))
+            if points is not None
         ]
         times = evidence.seen.times[evidence.frames]
-        offsets = estimate_offsets(sightings, times, self.time_offset, prior)
+        offsets = estimate_offsets(observations, times, self.time_offset, prior)
         log.info("time offsets, ms: %s", np.round(1e3 * offsets.offset, 2))
         return offsets
 
     def take_offsets(self, offset: np.ndarray) -> float:
-        """Predict with offsets (C,) from now on; returns the largest change, seconds."""
+        """Use these time offsets (C,), seconds; returns the largest change."""
         evidence = self._fitter.evidence
         change = float(np.abs(offset - self.time_offset).max())
         if change > OFFSET_UNCHANGED_S:
@@ -253,18 +267,18 @@ class BodyData(Term):
 
 
 def add_by_cameras(
-    evidence: Evidence, problem: BodyProblem, trusted: np.ndarray, seen: Sights
+    evidence: Evidence, problem: BodyProblem, trusted: np.ndarray, seen: CameraEvidence
 ) -> None:
-    """Add the ``trusted`` (N,) of the evidence's N frames at the problem's bodies."""
+    """Add the evidence of the ``trusted`` (N,) frames at the problem's bodies to ``seen``."""
     frames = np.flatnonzero(trusted)
-    for part in np.array_split(frames, max(1, -(-len(frames) // _CHUNK))):
+    for part in np.array_split(frames, max(1, -(-len(frames) // _CAMERA_CHUNK))):
         if len(part):
             _add_keypoints(evidence, problem, part, seen)
             _add_clouds(evidence, problem, part, seen)
 
 
 def _add_keypoints(
-    evidence: Evidence, problem: BodyProblem, part: np.ndarray, seen: Sights
+    evidence: Evidence, problem: BodyProblem, part: np.ndarray, seen: CameraEvidence
 ) -> None:
     views = problem.views
     if views is None:
@@ -306,7 +320,9 @@ def _add_keypoints(
     seen.cross[evidence.frames[part], BODY] += _array(cross).reshape(*cross.shape[:2], -1)
 
 
-def _add_clouds(evidence: Evidence, problem: BodyProblem, part: np.ndarray, seen: Sights) -> None:
+def _add_clouds(
+    evidence: Evidence, problem: BodyProblem, part: np.ndarray, seen: CameraEvidence
+) -> None:
     rows, by_view = problem.rows, evidence.by_view
     if rows is None or by_view is None:
         return
@@ -333,7 +349,7 @@ def _add_clouds(evidence: Evidence, problem: BodyProblem, part: np.ndarray, seen
 
 
 def _poses(evidence: Evidence) -> torch.Tensor:
-    """(C, 4, 4) of the cameras; zeros for one without, which shows nothing."""
+    """Poses (C, 4, 4) of the cameras; zeros for a camera without a pose, which has no evidence."""
     return torch.as_tensor(np.nan_to_num(evidence.seen.rig.master_from_colour))
 
 

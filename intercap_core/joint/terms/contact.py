@@ -1,27 +1,20 @@
-"""Contact term E_C of equation 6 (A.4): body areas that touch are drawn to the object.
+"""Contact Q_t E_C of equation 6 (A.4): body areas that touch are drawn to the object.
 
     E_C = CD( H(W(body)), H'(W'(object)) )
 
 CD is the Chamfer distance between H, the body's likely-contact vertices, and H', their closest
-points on the object: the signed distances of :mod:`.proximity`. By the appendix these are of the
-whole object, by the paper's text of the vertices labelled as likely touched: the setting
-``joint.contact_to``, where the latter are the faces between them, as vertices of a mesh may be
-centimetres apart. Equation 6 weighs it by the binary Q_t (here the probability that a region
-touches) times lambda_Q, and adds an E_C without Q_t, which is left out: a body that does not touch
-is not drawn to the object.
+points on the object: the signed distances of :mod:`intercap_core.joint.proximity`. In the paper's
+appendix H' is the whole object, in its text the vertices labelled as likely touched; the setting
+``contact_to`` selects either. Labelled vertices stand for the faces between them, as vertices of a
+mesh may be centimetres apart.
+
+Equation 6 weighs E_C by the binary Q_t times lambda_Q (setting ``contact_weight``); here Q_t is the
+probability that a region touches. Equation 6 also has an E_C without Q_t, which is left out: a body
+that does not touch is not drawn to the object.
 
 Beyond the paper each region is cut into patches (a palm, each finger, a sole). The nearest patches
 carry the weight, within a patch the nearest vertices, and a patch that is far is an outlier
-(Geman-McClure), so that a hand holding a handle with three fingers does not drag the other two
-along.
-
-Contact: Q_t E_C of equation 6 (A.4), weighed by lambda_Q (setting ``contact_weight``).
-
-The residuals, and what differs from the paper, are in
-:mod:`intercap_core.joint.terms.contact_residual`. The
-paper's binary Q_t is the probability that each region touches, annotated or detected; what somebody
-saw touching draws more while it stands apart. The setting ``contact_to`` says what skin is drawn
-to: any point of the object, or its annotated part.
+(Geman-McClure): a hand that holds a handle with three fingers does not pull the other two along.
 """
 
 from __future__ import annotations
@@ -31,47 +24,52 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.geometry.solve.robust import geman_mcclure_weight
-from intercap_core.joint.equations import NormalEquations
-from intercap_core.joint.geometry import Geometry
+from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.state import State
-from intercap_core.joint.terms.term import Term, add_distances
+from intercap_core.joint.terms.term import Data, Equation, JointTerm, TermContext
 
-# Distance of a patch that truly touches, after errors of skin, mesh and calibration, metres.
-# Tuned on the studio.
+# Distance of a patch that touches, after errors of skin, mesh and calibration, metres. Tuned on the
+# studio.
 CONTACT_SIGMA = 0.004
-# What an annotated contact weighs over a detected one, half its deviation: somebody saw it, while
-# lasting errors of head and object hold them apart. Chosen on one recording of the studio (a bottle
-# at the mouth, noise 2, three cameras): with 1 the mouth stays 10 mm off, with 16 the hand suffers.
-# What touches is drawn no more than by detection: at a handle fingers were pulled askew.
+# Weight of an annotated contact relative to a detected one: half the deviation. It applies only
+# while the region stands apart; with it, an annotated mouth reaches the bottle in spite of lasting
+# errors of head and object. Tuned on the studio: with 1 the mouth stays 10 mm off, with 16 the hand
+# is displaced.
 ANNOTATED_CONTACT_WEIGHT = 4.0
-# A vertex counts in its patch, and a patch in its region, by how much farther it is than the
-# nearest, metres: skin yields and meshes are some millimetres wrong, so contact is an area of this
-# depth. Tuned on the studio.
+# Excess distance, metres, at which a vertex counts exp(-1/2) in its patch, and a patch in its
+# region: skin yields and meshes err by millimetres, so contact is an area of this depth. Tuned on
+# the studio.
 CONTACT_SOFTNESS = 0.006
-# Distance at which a patch starts to count as an outlier, metres: the accuracy that keypoints and
-# depth leave to a hand. Tuned on the studio.
+# Distance at which a patch counts a quarter, metres: the accuracy that keypoints and depth leave to
+# a hand. Tuned on the studio.
 CONTACT_OUTLIER = 0.02
-# Nearer than this is contact and costs nothing, metres: half the distance (4.5 mm) at which
-# ``contact_mm`` of the settings calls it contact, rounded down. Tuned on the studio.
+# Distance that costs nothing, metres: half the default of the setting ``metrics.contact_mm``,
+# rounded down. Tuned on the studio.
 CONTACT_TOLERANCE = 0.002
 
 
 @dataclass(frozen=True)
-class Shares:
-    """How contact is spread over a body: ``area`` (T, N) weights that sum to one in each patch, and
-    ``gate`` (T, P) how much each patch takes part in its region's contact."""
+class ContactShares:
+    """How contact is spread over the body."""
 
     area: np.ndarray
+    """(T, M) weights of the patches' vertices; they sum to one in each patch."""
     gate: np.ndarray
+    """(T, P) participation of each patch in its region's contact, 0 to 1."""
 
 
 def spread_contact(
     distance: np.ndarray, patch_of: np.ndarray, region_of_patch: np.ndarray
-) -> Shares:
-    """Spread contact at signed distances ``distance`` (T, N) to the object, metres.
+) -> ContactShares:
+    """Spread contact over the nearest vertices of each patch and the nearest patches of a region.
 
-    ``patch_of`` (N,) patch of each vertex, ``region_of_patch`` (P,). Taken once in a round and then
-    held, so that the energy below has the derivative that its weights state.
+    The result stays fixed during a round, so that the weights of :func:`evaluate_contact` are the
+    exact derivative of its energy.
+
+    Args:
+        distance: (T, M) signed distances of the patches' vertices to the object, metres.
+        patch_of: (M,) patch of each vertex.
+        region_of_patch: (P,) region of each patch.
     """
     area = np.zeros_like(distance)
     nearest = np.empty((len(distance), len(region_of_patch)))
@@ -84,71 +82,88 @@ def spread_contact(
     of_region = np.stack(
         [nearest[:, region_of_patch == region].min(axis=1) for region in region_of_patch], axis=1
     )
-    return Shares(area, _closeness(nearest - of_region))
+    return ContactShares(area, _closeness(nearest - of_region))
 
 
 def evaluate_contact(
     distance: np.ndarray,
     patch_of: np.ndarray,
-    spread: Shares,
+    shares: ContactShares,
     probability: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Residuals (T, N) in metres, weights (T, N) and energies (T,) (m^2) of all contact vertices.
+    """Residuals (T, M) in metres, weights (T, M) and energies (T,) in m^2.
 
-    ``distance`` (T, N) signed distances to the object, metres; ``probability`` (T, P) that each
-    patch's region touches. One patch in one frame has the energy q rho(s) / 2, with q probability
-    times gate, s the mean square residual over the patch's area and Geman-McClure's
-    rho(s) = R^2 s / (R^2 + s), R = ``CONTACT_OUTLIER``; its weights are q rho'(s) spread over that
-    area.
+    One patch in one frame has the energy q rho(s) / 2. q is probability times gate, s the mean
+    square residual over the patch's area, and rho(s) = R^2 s / (R^2 + s) Geman-McClure's function
+    with R = ``CONTACT_OUTLIER``. The weights are q rho'(s) spread over that area.
+
+    Args:
+        distance: (T, M) signed distances of the patches' vertices to the object, metres.
+        patch_of: (M,) patch of each vertex.
+        shares: result of :func:`spread_contact`.
+        probability: (T, P) that each patch's region touches.
     """
     residual = np.sign(distance) * np.maximum(np.abs(distance) - CONTACT_TOLERANCE, 0.0)
     square = np.zeros_like(probability)
-    contribution = spread.area * np.square(residual)
+    contribution = shares.area * np.square(residual)
     for patch in range(probability.shape[1]):
         square[:, patch] = contribution[:, patch_of == patch].sum(axis=1)
-    gate = probability * spread.gate
-    weight = spread.area * (gate * geman_mcclure_weight(square, CONTACT_OUTLIER))[:, patch_of]
-    rho = CONTACT_OUTLIER**2 / (CONTACT_OUTLIER**2 + square)  # over the square
+    gate = probability * shares.gate
+    weight = shares.area * (gate * geman_mcclure_weight(square, CONTACT_OUTLIER))[:, patch_of]
+    rho = CONTACT_OUTLIER**2 / (CONTACT_OUTLIER**2 + square)  # divided by the square
     return residual, weight, 0.5 * (gate * square * rho).sum(axis=1)
 
 
-def _closeness(farther: np.ndarray) -> np.ndarray:
-    """1 at the nearest, falling off with metres ``farther`` over ``CONTACT_SOFTNESS``."""
-    return np.exp(-np.square(farther / CONTACT_SOFTNESS) / 2)
+def _closeness(excess: np.ndarray) -> np.ndarray:
+    """Weight of points by their ``excess`` distance over the nearest one, metres."""
+    return np.exp(-np.square(excess / CONTACT_SOFTNESS) / 2)
 
 
-class Contact(Term):
-    """Q_t E_C; Q (T, R), the probability that each region touches, is set between rounds."""
+class Contact(JointTerm):
+    """Q_t E_C. The probability Q is set between rounds by :meth:`take_contact`."""
 
     name = "contact"
+    equation = Equation(
+        symbol="E_C",
+        source="6, A.4",
+        formula="Q_t CD(H(W), H'(W')): likely-contact vertices H of the body to their closest "
+        "points H' on the object, by patches, robust",
+        settings=("contact_weight", "contact_to"),
+    )
+    needs = frozenset({Data.OBJECT})
 
-    def __init__(self, geometry: Geometry, weight: float) -> None:
-        self._geometry, self._scale = geometry, weight / CONTACT_SIGMA**2
-        self._probability: np.ndarray | None = None
-        self._annotated: np.ndarray | None = None
-        self._draws: np.ndarray | None = None
-        self._shares: Shares | None = None
+    def __init__(self, context: TermContext) -> None:
+        super().__init__(context)
+        self._scale = context.settings.contact_weight / CONTACT_SIGMA**2
+        self._probability: np.ndarray | None = None  # (T, R)
+        self._annotated: np.ndarray | None = None  # (T, R)
+        self._draws: np.ndarray | None = None  # (T, R) probability times annotated weight
+        self._shares: ContactShares | None = None
 
-    def take_contact(self, probability: np.ndarray, annotated: np.ndarray) -> None:
-        """Use this probability (T, R) that each region touches from now on; ``annotated`` (T, R) is
-        1 where somebody states that it does."""
-        self._probability, self._annotated = probability, annotated == 1
+    def take_contact(self, probability: np.ndarray, labels: np.ndarray) -> None:
+        """Set the probability (T, R) that each region touches.
+
+        ``labels`` (T, R) is 1 where an annotation states that the region touches.
+        """
+        self._probability, self._annotated = probability, labels == 1
 
     def holding(self) -> np.ndarray:
-        """How surely each of the patches' vertices holds the object (T, M), times its share of its
-        patch's area, as of the last :meth:`refresh`."""
+        """Probability (T, M) that each patch vertex holds the object, times its share of the patch.
+
+        As of the last :meth:`refresh`.
+        """
         assert self._shares is not None, "refresh comes first"
         assert self._probability is not None, "take_contact comes first"
-        patches = self._geometry.patches
+        patches = self.geometry.patches
         gate = self._probability[:, patches.region_of_patch] * self._shares.gate
         return self._shares.area * gate[:, patches.patch]
 
     def refresh(self, state: State) -> None:
-        """Take anew which vertices carry the contact, and how much each region draws."""
+        """Choose the vertices that carry the contact, and the weight of each region."""
         assert self._probability is not None, "take_contact comes first"
         assert self._annotated is not None, "take_contact comes first"
-        patches = self._geometry.patches
-        distance = self._geometry.at(state).touching.distance[:, self._geometry.skin.patch]
+        patches = self.geometry.patches
+        distance = self.geometry.at(state).touching.distance[:, self.geometry.skin.patch]
         self._shares = spread_contact(distance, patches.patch, patches.region_of_patch)
         more = np.zeros_like(self._probability)
         for region in np.flatnonzero(self._annotated.any(0)).tolist():
@@ -157,12 +172,12 @@ class Contact(Term):
             more[:, region] = self._annotated[:, region] * apart
         self._draws = (1.0 + (ANNOTATED_CONTACT_WEIGHT - 1.0) * more) * self._probability
 
-    def add(self, state: State, equations: NormalEquations) -> None:
-        """Add Q_t E_C at ``state`` with the vertices' shares of the last :meth:`refresh`."""
+    def add(self, state: State, equations: BandedEquations) -> None:
+        """Add Q_t E_C at ``state`` with the shares of the last :meth:`refresh`."""
         assert self._shares is not None, "refresh comes first"
         assert self._draws is not None, "refresh comes first"
-        patches, at_patch = self._geometry.patches, self._geometry.skin.patch
-        posed = self._geometry.at(state)
+        patches, at_patch = self.geometry.patches, self.geometry.skin.patch
+        posed = self.geometry.at(state)
         near = posed.touching
         distance = near.distance
         touch, weight, energy = evaluate_contact(
@@ -173,4 +188,4 @@ class Contact(Term):
         )
         residual, weights = np.zeros_like(distance), np.zeros_like(distance)
         residual[:, at_patch], weights[:, at_patch] = touch, weight * self._scale
-        add_distances(self.name, posed, near, residual, weights, energy * self._scale, equations)
+        self.add_distances(posed, near, residual, weights, equations, energy * self._scale)

@@ -3,55 +3,64 @@
     E_G = sum over vertices W of the body of || RL(n . (p - W)) ||^2
     E_G' = sum over vertices W' of the object of || RL(n . (p - W')) ||^2
 
-with p a point of the floor, n its upward unit normal and RL the rectifier max(0, x).
-
-Ground support: E_G (body, A.5) and E_G' (object, A.6) of equation 6.
-
-Weighed by lambda_G (setting ``ground_weight``); residuals in
-:mod:`intercap_core.joint.terms.ground_residual`.
+with p a point of the floor, n its upward unit normal and RL the rectifier max(0, x). Both are
+weighed by lambda_G (setting ``ground_weight``).
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.joint.equations import NormalEquations
-from intercap_core.joint.floor import Ground
-from intercap_core.joint.geometry import Geometry
+from intercap_core.joint.equations import BandedEquations
+from intercap_core.joint.floor import FloorPlane
 from intercap_core.joint.proximity import along_by_object
 from intercap_core.joint.skin import VERTICES_PER_MEASUREMENT
 from intercap_core.joint.state import BODY, OBJECT, State
-from intercap_core.joint.terms.term import Term
+from intercap_core.joint.terms.term import Data, Equation, JointTerm, TermContext
 
-# Depth of a vertex below the floor, metres: the ground plane's own error. Tuned on the studio.
+# Standard deviation of the floor's height, metres. Tuned on the studio.
 GROUND_SIGMA = 0.005
-# Vertices of the object on which it stands at least: fewer would each count as a measurement of
-# their own when an edge just touches the floor. Tuned on the studio.
+# The object's vertices below the floor count as one measurement, and as less if they are fewer than
+# this: an edge that just touches the floor. Tuned on the studio.
 MIN_STANDING_VERTICES = 4
 
 
-def depth_below(points: np.ndarray, floor: Ground) -> np.ndarray:
-    """Height (..., N) of points (..., N, 3) over the floor where negative, else 0; metres.
+def depth_below(points: np.ndarray, floor: FloorPlane) -> np.ndarray:
+    """Height (..., N) of points (..., N, 3) over the floor if negative, else 0; metres.
 
-    Its derivative by a point is the normal where the residual is negative and 0 elsewhere.
+    Its derivative by a point is the floor's normal where it is negative, and 0 elsewhere.
     """
     return np.minimum(floor.heights(points), 0.0)
 
 
-class BodyGround(Term):
-    """E_G: the body does not sink into the floor."""
+class _Ground(JointTerm):
+    """A term that needs a floor."""
 
     name = "ground"
 
-    def __init__(self, geometry: Geometry, floor: Ground, weight: float) -> None:
-        self._geometry, self._floor = geometry, floor
-        self._scale = weight / GROUND_SIGMA**2 / VERTICES_PER_MEASUREMENT
+    def __init__(self, context: TermContext) -> None:
+        super().__init__(context)
+        assert context.floor is not None, "the term needs a floor"
+        self._floor, self._weight = context.floor, context.settings.ground_weight
 
-    def add(self, state: State, equations: NormalEquations) -> None:
+
+class BodyGround(_Ground):
+    """E_G: the body does not sink into the floor."""
+
+    equation = Equation(
+        symbol="E_G",
+        source="6, A.5",
+        formula="\\|\\|RL(n . (p - W))\\|\\|^2 over the body's vertices W",
+        settings=("ground_weight",),
+    )
+    needs = frozenset({Data.FLOOR})
+
+    def add(self, state: State, equations: BandedEquations) -> None:
         """Add E_G at ``state``."""
-        posed = self._geometry.at(state)
+        posed = self.geometry.at(state)
         height = depth_below(posed.skin, self._floor)
-        weight = np.where(height < 0, self._geometry.skin.share, 0.0) * self._scale
+        scale = self._weight / GROUND_SIGMA**2 / VERTICES_PER_MEASUREMENT
+        weight = np.where(height < 0, self.geometry.skin.share, 0.0) * scale
 
         def rows(frames: slice, index: np.ndarray) -> np.ndarray:
             shape = (*height[frames, index].shape, 1, 3)
@@ -60,30 +69,36 @@ class BodyGround(Term):
         equations.add_rows(self.name, BODY, rows, weight, height[..., None])
 
 
-class ObjectGround(Term):
+class ObjectGround(_Ground):
     """E_G': the object does not sink into the floor.
 
     An object stands on few vertices: together they count as one measurement.
     """
 
-    name = "ground"
+    equation = Equation(
+        symbol="E_G'",
+        source="6, A.6",
+        formula="\\|\\|RL(n . (p - W'))\\|\\|^2 over the object's vertices W'",
+        settings=("ground_weight",),
+    )
+    needs = frozenset({Data.OBJECT, Data.FLOOR})
 
-    def __init__(self, geometry: Geometry, floor: Ground, weight: float) -> None:
-        self._geometry, self._floor, self._weight = geometry, floor, weight
-        self._standing: np.ndarray | None = None
+    def __init__(self, context: TermContext) -> None:
+        super().__init__(context)
+        self._standing: np.ndarray | None = None  # (T, 1) vertices below the floor
 
     def refresh(self, state: State) -> None:
-        """Take anew on how many vertices the object stands."""
+        """Count the vertices on which the object stands."""
         below = self._height(state) < 0
         self._standing = np.maximum(below.sum(axis=1, keepdims=True), MIN_STANDING_VERTICES)
 
-    def add(self, state: State, equations: NormalEquations) -> None:
+    def add(self, state: State, equations: BandedEquations) -> None:
         """Add E_G' at ``state`` with the number of vertices of the last :meth:`refresh`."""
         assert self._standing is not None, "refresh comes first"
         height = self._height(state)
         weight = (height < 0) / self._standing
         weight = weight * self._weight / GROUND_SIGMA**2
-        vertices = self._geometry.at(state).object_vertices
+        vertices = self.geometry.at(state).object_vertices
 
         def rows(frames: slice, index: np.ndarray) -> np.ndarray:
             points, origin = vertices[frames, index], state.translation[frames]
@@ -93,5 +108,4 @@ class ObjectGround(Term):
         equations.add_rows(self.name, OBJECT, rows, weight, height[..., None])
 
     def _height(self, state: State) -> np.ndarray:
-        vertices = self._geometry.at(state).object_vertices
-        return depth_below(vertices, self._floor)
+        return depth_below(self.geometry.at(state).object_vertices, self._floor)

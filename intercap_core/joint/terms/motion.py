@@ -1,27 +1,16 @@
 """Smooth motion: E_S (body, A.1) and E_A (object, A.3) of equation 6.
 
-Weighed by lambda_S and lambda_A (settings ``body_smoothness`` and ``object_smoothness``); what
-differs from the paper is in :mod:`intercap_core.joint.smoothness`. Recordings of fewer than three
-frames have no acceleration.
+    E_A = 1 / (T - 2) sum over t of || W'_(t-1) + W'_(t+1) - 2 W'_t ||^2  over object vertices W'
+    E_S = 1 / (Q (T - 2)) sum over t of || z_(t+1) - z_t ||^2  over latents z of LEMO's network
 
-E_S of equation 6 in LEMO's learned marker space (A.1, A.2), where the user has its weights.
+with T frames, A.2's latent vectors z and Q, the number of LEMO's virtual markers (not Q_t). E_S is
+:class:`LearnedMotion` if the user supplies LEMO's weights; otherwise :class:`BodyMotion`, which has
+E_A's form over the body's joints. For a rigid body E_A depends on the vertices only through their
+mean and covariance, so that six points with the same moments give the same energy.
 
-    E_S = k / 2 sum over t of || z(t+1) - z(t) ||^2,  Z = F_S(steps of the markers)
-
-F_S is :class:`intercap_core.body.lemo.MotionEncoder`. It takes the place of the joints' small
-accelerations (:class:`.motion.BodyMotion`) and is weighed by the same lambda_S
-(``body_smoothness``). k, which stands for 1 / Q(T - 2), makes them equally strong: a body that
-moves as one, with everyday accelerations that change at random, costs as much here as there before
-it is robust. That follows from the user's weights and ``BODY_ACCELERATION`` alone.
-
-Energy and gradient are exact: by automatic differentiation as far as the markers, then by the
-body's Jacobian. Its curvature ties 22 frames together, three fit into the equations' bands. To
-a shift in time the encoder is blind but for which side of zero its leaky ReLUs are on: with K its
-derivative, z(t+1) - z(t) changes by K of the change of the steps' difference, the markers'
-acceleration a. So k |K|^2 |da|^2 / 2, with the spectral norm, bounds it, and ties three frames. K
-is that of the everyday motion above; where the ReLUs differ from its, or between frames, it is no
-bound: a step that raises the energy is refused, as everywhere here, and damped. It is steeper than
-the energy along most directions, so that steps are shorter than those of the other terms.
+Beyond the paper E_A and :class:`BodyMotion` are robust, since a start, a stop or an impact is an
+outlier of smooth motion. They are weighed by lambda_S and lambda_A (settings ``body_smoothness``
+and ``object_smoothness``). Recordings of fewer than three frames have no acceleration.
 """
 
 from __future__ import annotations
@@ -33,22 +22,22 @@ from torch import Tensor
 from intercap_core.body import lemo
 from intercap_core.body.joints import JOINT_INDEX, NUM_JOINTS
 from intercap_core.body.lemo import MotionEncoder
-from intercap_core.joint.equations import ACCELERATION, NormalEquations
-from intercap_core.joint.geometry import Geometry
+from intercap_core.joint.equations import ACCELERATION, BandedEquations
 from intercap_core.joint.state import BODY, OBJECT, State
-from intercap_core.joint.terms.term import Term
+from intercap_core.joint.terms.term import Data, Equation, JointTerm, TermContext
 
-# Standard deviation of accelerations in everyday motion, m/s^2: trunk and limbs stay below some
-# of them outside impacts, hands reach ten, carried objects are in between. Tuned on the studio.
+# Standard deviations of accelerations in everyday motion, m/s^2: trunk and limbs, fingers, carried
+# objects. Tuned on the studio.
 BODY_ACCELERATION = 6.0
 FINGER_ACCELERATION = 10.0
 OBJECT_ACCELERATION = 6.0
-# Steps of the motion that says how strong and how steep a learned prior of it is, and iterations in
-# which the steepest direction is found.
-PROBE_STEPS, SPECTRAL_ITERATIONS = 16, 5
-# Accelerations beyond so many standard deviations count as a start, a stop or an impact. Tuned on
+# Standard deviations beyond which an acceleration counts as a start, a stop or an impact. Tuned on
 # the studio.
 ACCELERATION_OUTLIER = 2.0
+# Steps of the motion that calibrates weight and curvature of the learned E_S, and power iterations
+# for the curvature.
+PROBE_STEPS = 16
+SPECTRAL_ITERATIONS = 5
 
 _FIRST_FINGER = JOINT_INDEX["left_index1"]  # joints from here on are the fingers'
 _HIPS = [JOINT_INDEX["left_hip"], JOINT_INDEX["right_hip"]]
@@ -60,27 +49,41 @@ def accelerations(points: np.ndarray, fps: float) -> np.ndarray:
 
 
 def pseudo_huber(acceleration: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pseudo-Huber weights (T-2, N) and energies (T-2,) of accelerations (T-2, N, 3): quadratic
-    below ``scale``, linear above."""
+    """Weights (T-2, N) and energies (T-2,) of accelerations (T-2, N, 3).
+
+    The energy is quadratic below ``scale`` and linear above.
+    """
     root = np.sqrt(1.0 + np.square(acceleration / scale).sum(axis=2))
     return 1.0 / root, scale**2 * (root - 1.0).sum(axis=1)
 
 
-class BodyMotion(Term):
-    """E_S: small accelerations of the 55 joints."""
+class BodyMotion(JointTerm):
+    """E_S without LEMO: small accelerations of the 55 joints."""
 
     name = "body_motion"
+    equation = Equation(
+        symbol="E_S",
+        source="6, A.1",
+        formula="robust squared accelerations of the joints",
+        settings=("body_smoothness",),
+    )
 
-    def __init__(self, geometry: Geometry, fps: float, weight: float) -> None:
-        self._geometry, self._fps, self._weight = geometry, fps, weight
+    def __init__(self, context: TermContext) -> None:
+        super().__init__(context)
+        self._fps, self._weight = context.fps, context.settings.body_smoothness
         fingers = np.arange(NUM_JOINTS) >= _FIRST_FINGER
         self._sigma = np.where(fingers, FINGER_ACCELERATION, BODY_ACCELERATION)
 
-    def add(self, state: State, equations: NormalEquations) -> None:
+    @classmethod
+    def applies(cls, context: TermContext) -> bool:
+        """Whether the settings name no learned E_S."""
+        return context.encoder is None
+
+    def add(self, state: State, equations: BandedEquations) -> None:
         """Add E_S at ``state``."""
         if len(state) < 3:
             return
-        joints, jacobian = self._geometry.at(state).joints
+        joints, jacobian = self.geometry.at(state).joints
         acceleration = accelerations(joints, self._fps) / self._sigma[:, None]
         weight, energy = pseudo_huber(acceleration, ACCELERATION_OUTLIER)
         unit = self._fps**2 / self._sigma
@@ -95,19 +98,27 @@ class BodyMotion(Term):
         )
 
 
-class ObjectMotion(Term):
+class ObjectMotion(JointTerm):
     """E_A: small accelerations of the object's points."""
 
     name = "object_motion"
+    equation = Equation(
+        symbol="E_A",
+        source="6, A.3",
+        formula="robust \\|\\|W'(t-1) + W'(t+1) - 2 W'(t)\\|\\|^2",
+        settings=("object_smoothness",),
+    )
+    needs = frozenset({Data.OBJECT})
 
-    def __init__(self, geometry: Geometry, fps: float, weight: float) -> None:
-        self._geometry, self._fps, self._weight = geometry, fps, weight
+    def __init__(self, context: TermContext) -> None:
+        super().__init__(context)
+        self._fps, self._weight = context.fps, context.settings.object_smoothness
 
-    def add(self, state: State, equations: NormalEquations) -> None:
+    def add(self, state: State, equations: BandedEquations) -> None:
         """Add E_A at ``state``."""
         if len(state) < 3:
             return
-        points, jacobian = self._geometry.at(state).moments
+        points, jacobian = self.geometry.at(state).moments
         acceleration = accelerations(points, self._fps) / OBJECT_ACCELERATION
         weight, energy = pseudo_huber(acceleration, ACCELERATION_OUTLIER)
         unit = self._fps**2 / OBJECT_ACCELERATION
@@ -122,39 +133,66 @@ class ObjectMotion(Term):
         )
 
 
-class LearnedMotion(Term):
-    """E_S by the ``encoder``; ``up`` (3,) is the master frame's unit vector against gravity.
+class LearnedMotion(JointTerm):
+    """E_S in the latent space of LEMO's marker encoder (A.1, A.2).
 
-    For recordings of ``lemo.FEWEST_FRAMES`` or more at ``lemo.FRAMES_PER_SECOND``.
+        E_S = k / 2 sum over t of || z(t+1) - z(t) ||^2,  Z = F_S(steps of the markers)
+
+    F_S is :class:`intercap_core.body.lemo.MotionEncoder`. k, which stands for 1 / Q(T - 2), makes
+    the term as strong as :class:`BodyMotion` before that is robust: a body that translates with
+    random everyday accelerations costs as much in both. k follows from the user's weights and
+    ``BODY_ACCELERATION``.
+
+    Energy and gradient are exact: automatic differentiation up to the markers, then the body's
+    Jacobian. The exact curvature couples 22 frames, of which three fit into the bands of the
+    equations. Except for the signs at its leaky ReLUs the encoder commutes with a shift in time:
+    with K its derivative, z(t+1) - z(t) changes by K times the change of the markers' acceleration
+    a. So k |K|^2 |da|^2 / 2, with the spectral norm, bounds the curvature and couples three frames.
+    K is taken at the everyday motion above. Where the ReLUs differ from it, the bound does not
+    hold; a step that raises the energy is then refused and damped. The bound is steeper than the
+    energy in most directions, so that steps are shorter than those of the other terms.
     """
 
     name = "body_motion"
+    equation = Equation(
+        symbol="E_S with LEMO's encoder",
+        source="6, A.1, A.2",
+        formula="k \\|\\|z(t+1) - z(t)\\|\\|^2 of the encoder's latents z",
+        settings=("body_smoothness", "lemo"),
+    )
 
-    def __init__(
-        self, geometry: Geometry, encoder: MotionEncoder, up: np.ndarray, weight: float
-    ) -> None:
-        self._geometry, self._encoder, self._up = geometry, encoder, up
+    def __init__(self, context: TermContext) -> None:
+        super().__init__(context)
+        encoder = context.encoder
+        assert encoder is not None and context.up is not None, "the term needs encoder and floor"
+        self._encoder, self._up = encoder, context.up
         everyday = _everyday(encoder)
         with torch.no_grad():
             jumps = torch.diff(encoder.latents(everyday), dim=0).double()
-        self._scale = weight * 3 * NUM_JOINTS / (lemo.LATENT * float(jumps.square().mean()))
+        weight, size = context.settings.body_smoothness, jumps.shape[1]
+        self._scale = weight * 3 * NUM_JOINTS / (size * float(jumps.square().mean()))
         self._curvature = self._scale * _squared_norm(encoder, everyday)
         self._axes = np.eye(3)
 
+    @classmethod
+    def applies(cls, context: TermContext) -> bool:
+        """Whether the settings name LEMO's weights."""
+        return context.encoder is not None
+
     def refresh(self, state: State) -> None:
-        """Take anew where the first frame's body faces."""
-        left, right = self._geometry.at(state).joints[0][0, _HIPS]
+        """Set the encoder's axes to the heading of the body in the first frame."""
+        left, right = self.geometry.at(state).joints[0][0, _HIPS]
         across = right - left - self._up * (self._up @ (right - left))
         across /= np.linalg.norm(across)
         self._axes = np.stack([across, np.cross(self._up, across), self._up])
 
-    def add(self, state: State, equations: NormalEquations) -> None:
+    def add(self, state: State, equations: BandedEquations) -> None:
         """Add E_S at ``state`` with the heading of the last :meth:`refresh`."""
         markers = self._markers(state).requires_grad_()
         jumps = torch.diff(self._encoder.latents(self._steps(markers)), dim=0)
         energy = 0.5 * self._scale * jumps.double().square().sum(dim=1)
         (force,) = torch.autograd.grad(energy.sum(), markers)
-        posed, ids = self._geometry.at(state), self._geometry.model.markers
+        posed, ids = self.geometry.at(state), self.geometry.model.markers
         every = slice(0, len(state))
         along = posed.vertices_by_body(every, ids, force.double().cpu().numpy()[:, :, None])
         columns = BODY.stop - BODY.start
@@ -180,21 +218,20 @@ class LearnedMotion(Term):
         )
 
     def _markers(self, state: State) -> Tensor:
-        """(T, 81, 3), master frame, metres."""
-        model = self._geometry.model
+        """Markers (T, 81, 3), master frame, metres."""
+        model = self.geometry.model
         with torch.no_grad():
-            found = model(state.parameters(model), vertex_ids=model.markers).vertices
-        return found.to(self._encoder.spread)
+            vertices = model(state.parameters(model), vertex_ids=model.markers).vertices
+        return vertices.to(self._encoder.spread)
 
     def _steps(self, markers: Tensor) -> Tensor:
-        """Steps (T - 1, 243) of the markers, in the first frame's body's frame, metres."""
+        """Steps (T - 1, 243) of the markers along the axes of the first body, metres."""
         axes = torch.as_tensor(self._axes).to(markers)
         return torch.diff(markers @ axes.T, dim=0).flatten(1)
 
 
 def _everyday(encoder: MotionEncoder) -> Tensor:
-    """Steps (N, 243), metres, of a body that moves as one with random accelerations of
-    ``BODY_ACCELERATION``, the same at every call."""
+    """Steps (N, 243), metres, of a body that translates with random accelerations (seeded)."""
     generator = torch.Generator().manual_seed(0)
     change = torch.randn(PROBE_STEPS, 3, dtype=torch.float64, generator=generator)
     steps = torch.cumsum(change * BODY_ACCELERATION / lemo.FRAMES_PER_SECOND**2, dim=0)
@@ -202,8 +239,10 @@ def _everyday(encoder: MotionEncoder) -> Tensor:
 
 
 def _squared_norm(encoder: MotionEncoder, steps: Tensor) -> float:
-    """Largest eigenvalue of K^T K, estimated from below, K the derivative of the latents by steps
-    (N, 243) over their spread; by power iteration from a body that moves as one."""
+    """Largest eigenvalue of K^T K by power iteration, an estimate from below.
+
+    K is the derivative of the latents by ``steps`` (N, 243) over their spread.
+    """
     along = torch.ones_like(steps) / steps.numel() ** 0.5
     largest = 0.0
     for _ in range(SPECTRAL_ITERATIONS):

@@ -1,19 +1,14 @@
-"""Object data: E_O of equation 6, the images' evidence on the object's pose in every frame.
+"""Object data: E_O of equation 6 from the object track, and no object in place of E_O.
 
-The tracker ends at the minimum of equation 1, and its covariance gives the energy's curvature
-there. E_O is taken as the quadratic form of the two,
+The tracker ends at the minimum of equation 1, and its covariance is the energy's curvature there.
+E_O is the quadratic form of the two,
 
     E_O = d^T C^-1 d / 2,    d = offset (turn, shift) from the tracked pose, C its covariance,
 
-so the joint fit need not compare images again. What other possible poses add to a covariance is
-left out: between two of them the images support nothing. A frame in which the object is lost has a
-wide C: it stays near the interpolated pose unless contact or its neighbours move it; one whose pose
-follows from annotated ones has theirs. No setting
-weighs E_O: its strength is the covariance.
-
-In place of E_O where there is no object: a person alone, or a track that is not believed.
-
-Nothing is known of the object's unknowns and nothing moves them; their poses are NaN throughout.
+so that the joint fit need not compare images again. The spread between several possible poses is
+not part of C: between two of them the images support nothing. A frame in which the object is lost
+has a wide C: it stays near the interpolated pose unless contact or its neighbours move it. No
+setting weighs E_O: its strength is the covariance.
 """
 
 from __future__ import annotations
@@ -21,31 +16,40 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from intercap_core.joint.equations import NormalEquations
+from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.sequential import TrackedPoses
 from intercap_core.joint.state import OBJECT, State
-from intercap_core.joint.terms.term import Term
+from intercap_core.joint.terms.term import Equation, JointTerm
 
 
-class ObjectData(Term):
-    """E_O about tracked poses, for the cameras' time offsets that were taken last."""
+class ObjectData(JointTerm):
+    """E_O about tracked poses, for the cameras' latest time offsets."""
 
     name = "object_data"
+    equation = Equation(
+        symbol="E_O of the track",
+        source="6",
+        formula="d^T C^-1 d / 2, d the offset from the tracked pose and C the track's covariance",
+        settings=("look_again",),
+    )
 
     def __init__(self, tracked: TrackedPoses) -> None:
         self._tracked = self._poses = tracked
 
     def take_offsets(self, time_offset: np.ndarray) -> None:
-        """Compare with the poses that offsets (C,), seconds, give from now on."""
+        """Use the poses that time offsets (C,), seconds, give."""
         self._poses = self._tracked.at(time_offset)
 
-    def add(self, state: State, equations: NormalEquations) -> None:
+    def add(self, state: State, equations: BandedEquations) -> None:
         """Add E_O at ``state``."""
         equations.add_blocks(self.name, OBJECT, *self._equations(self._poses.information, state))
 
     def of_views(self, used: np.ndarray, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """E_O's matrix (T, 6, 6), gradient (T, 6) and energy (T,) at ``state``, by the share of the
-        evidence that the views ``used`` (T, C) have."""
+        """E_O's matrix (T, 6, 6), gradient (T, 6) and energy (T,) at ``state`` of some views.
+
+        The track states no information of single views: the views in the mask ``used`` (T, C) have
+        their share of it.
+        """
         seen = self._poses.share.sum(axis=1) > 0
         kept = np.where(seen, (self._poses.share * used).sum(axis=1), 1.0)
         return self._equations(kept[:, None, None] * self._poses.information, state)
@@ -60,14 +64,24 @@ class ObjectData(Term):
         return information, gradient, 0.5 * (offset * gradient).sum(axis=1)
 
 
-class NoObject(Term):
-    """Keeps the equations definite over unknowns that no term knows; no energy."""
+class NoObject(JointTerm):
+    """In place of E_O without an object, or if its track is lost in all frames.
+
+    It keeps the equations definite over the object's unknowns, which no term constrains. It has no
+    energy, and the object's poses are NaN throughout.
+    """
 
     name = "no_object"
+    equation = Equation(
+        symbol="no object", source="beyond", formula="0; keeps the equations definite"
+    )
+
+    def __init__(self) -> None:
+        pass
 
     def take_offsets(self, time_offset: np.ndarray) -> None:
-        """Nothing was exposed."""
+        """Do nothing: no pose depends on the offsets."""
 
-    def add(self, state: State, equations: NormalEquations) -> None:
-        """Add ones to the diagonal: the step of these unknowns is 0."""
+    def add(self, state: State, equations: BandedEquations) -> None:
+        """Add ones to the diagonal, so that the step of these unknowns is 0."""
         equations.hold(OBJECT)

@@ -1,11 +1,10 @@
-"""Which parts of the soles stand, from how low and how still they are.
-
-Plant (beyond the paper): a foot that stands stays where it stands, on the floor.
+"""Plant (beyond the paper): a foot that stands does not move.
 
     E = sum over steps t, vertices i of P a_i rho(|x_i(t+1) - x_i(t)|^2) / 2 sigma^2
 
-with P the probability that this part of the sole stands over the step (:mod:`.contact.standing`)
-and a_i the vertex's share of it. Robust, as a foot may slide. Weighed by ``plant_weight``.
+P is the probability that this part of the sole stands over the step, from its height and speed, and
+a_i the vertex's share of it. rho is robust (Geman-McClure), as a foot may slide. Weighed by the
+setting ``plant_weight``.
 """
 
 from __future__ import annotations
@@ -13,57 +12,61 @@ from __future__ import annotations
 import numpy as np
 
 from intercap_core.body.joints import JOINT_INDEX
-from intercap_core.joint.contact.chain import Chain
-from intercap_core.joint.equations import NormalEquations
-from intercap_core.joint.floor import Ground
-from intercap_core.joint.geometry import Geometry
+from intercap_core.joint.contact.chain import DwellChain
+from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.skin import Patches
 from intercap_core.joint.state import BODY, State
-from intercap_core.joint.terms.term import Term, add_steps
+from intercap_core.joint.terms.term import Equation, JointTerm, TermContext
 from intercap_core.schemas import CONTACT_REGIONS
 
-# How far a grip and a sole creep: a random walk, metres in one second. Tuned on the studio.
+# Creep of a sole: a random walk, metres in one second. Tuned on the studio.
 PLANT_WALK = 0.003
-# Speeds of what truly slides, m/s: beyond the jitter of the fits. Tuned on the studio.
+# Slip that counts a quarter, m/s: above the jitter of the fits. Tuned on the studio.
 PLANT_OUTLIER = 0.15
+# Vertices that represent each half of a sole, at most: they move nearly as one.
 SOLE_VERTICES = 6
-# Of a part of a sole that stands, after errors of the fits: speed, m/s, and height above the floor,
-# metres; and of one that swings. Tuned on the studio.
-STANDING_SPEED, SWING_SPEED = 0.06, 0.6
-STANDING_HEIGHT, SWING_HEIGHT = 0.02, 0.15
-# Share of what stands that stands on something else than the floor, or where the floor is not.
-# Tuned on the studio.
+# Standard deviations of speed, m/s, and height above the floor, metres, of a part of a sole that
+# stands, after errors of the fits, and of one that swings. Tuned on the studio.
+STANDING_SPEED = 0.06
+SWING_SPEED = 0.6
+STANDING_HEIGHT = 0.02
+SWING_HEIGHT = 0.15
+# Share of standing soles that stand on something else than the floor. Tuned on the studio.
 STANDING_ELSEWHERE = 0.2
-# How often a second a part of a sole that swings comes to stand, and how long it stands, seconds.
-# Tuned on the studio.
-STANDING_BEGINS, STANDING_S = 0.18, 0.98
 
 _SOLES = tuple(
     JOINT_INDEX[f"{side}_{name}"] for side in ("left", "right") for name in ("ankle", "foot")
 )
-_STAND = Chain(STANDING_BEGINS, (STANDING_S,), (1.0,))
+# A sole that swings comes to stand 0.18 times a second, and stands for a second. Tuned on the
+# studio.
+_STANDING = DwellChain(begins=0.18, durations=(0.98,), shares=(1.0,))
 
 
 def sole_parts(patches: Patches, count: int) -> list[np.ndarray]:
-    """Members of the patches, at most ``count`` each, of heel and ball of the left and of the right
-    foot: a foot that rolls stands on one of them."""
+    """Indices of at most ``count`` patch vertices of heel and ball of either foot.
+
+    A foot that rolls stands on one of the two.
+    """
     feet = [CONTACT_REGIONS.index(f"{side}_foot") for side in ("left", "right")]
-    found = []
+    parts = []
     for joint in _SOLES:
         members = np.flatnonzero(np.isin(patches.region, feet) & (patches.joint == joint))
         if len(members):
             chosen = np.linspace(0, len(members) - 1, min(len(members), count)).round().astype(int)
-            found.append(members[chosen])
-    return found
+            parts.append(members[chosen])
+    return parts
 
 
 def standing_probability(sole: np.ndarray, height: np.ndarray | None, fps: float) -> np.ndarray:
     """Probability (T - 1,) that a part of a sole stands from each frame to the next.
 
-    ``sole`` (T, S, 3) its vertices and ``height`` (T, S) theirs above the floor, metres, None where
-    no floor is known. A two-state chain over half-normal speeds and normal heights, of what stands
-    and of what swings; what stands is on the floor, or on something at any height that a foot
-    reaches (a beam, a step), where stillness alone tells.
+    Posterior of a two-state chain with half-normal speeds and normal heights. A standing sole is on
+    the floor, or on something of any height that a foot reaches (a beam, a step), where only the
+    speed is informative.
+
+    Args:
+        sole: (T, S, 3) vertices, metres.
+        height: (T, S) their heights above the floor, metres; None without a floor.
     """
     if len(sole) < 2:
         return np.zeros(0)
@@ -75,50 +78,55 @@ def standing_probability(sole: np.ndarray, height: np.ndarray | None, fps: float
         odds = odds + np.logaddexp(
             np.log1p(-STANDING_ELSEWHERE) + on_floor, np.log(STANDING_ELSEWHERE)
         )
-    return _STAND.posterior(odds[:, None], fps)[:, 0]
+    return _STANDING.posterior(odds[:, None], fps)[:, 0]
 
 
 def _log_ratio(values: np.ndarray, narrow: float, wide: float) -> np.ndarray:
-    """Log-likelihood ratio of two half-normal distributions of these deviations."""
+    """Log-likelihood ratio of two half-normal distributions of these standard deviations."""
     return 0.5 * (values**2) * (wide**-2 - narrow**-2) + np.log(wide / narrow)
 
 
-class Plant(Term):
-    """Motion of what stands; ``floor`` None where none was seen: then stillness alone tells."""
+class Plant(JointTerm):
+    """Motion of soles that stand. Without a floor, stillness alone decides which stand."""
 
     name = "plant"
+    equation = Equation(
+        symbol="plant",
+        source="beyond",
+        formula="P rho(\\|\\|x(t+1) - x(t)\\|\\|^2) / (2 sigma^2), P the probability that this "
+        "half of the sole stands",
+        settings=("plant_weight",),
+    )
 
-    def __init__(self, geometry: Geometry, floor: Ground | None, fps: float, weight: float) -> None:
-        self._geometry, self._floor, self._fps = geometry, floor, fps
-        self._scale = weight * fps / PLANT_WALK**2
-        parts = sole_parts(geometry.patches, SOLE_VERTICES)
-        self._parts = [geometry.skin.patch[part] for part in parts]
-        self._index = np.concatenate([np.zeros(0, int), *self._parts])
-        self._weight = np.zeros((0, len(self._index)))
+    def __init__(self, context: TermContext) -> None:
+        super().__init__(context)
+        self._floor, self._fps = context.floor, context.fps
+        self._scale = context.settings.plant_weight * context.fps / PLANT_WALK**2
+        parts = sole_parts(self.geometry.patches, SOLE_VERTICES)
+        self._parts = [self.geometry.skin.patch[part] for part in parts]
+        self._index = np.concatenate([np.zeros(0, int), *self._parts])  # (K,) of the skin samples
+        self._weight = np.zeros((0, len(self._index)))  # (T - 1, K)
 
     def refresh(self, state: State) -> None:
-        """Take anew which parts of the soles stand over each step."""
-        skin = self._geometry.at(state).skin
+        """Estimate which parts of the soles stand over each step."""
+        skin = self.geometry.at(state).skin
         self._weight = np.zeros((max(len(state) - 1, 0), 0))
         for part in self._parts:
-            height = None
-            if self._floor is not None:
-                height = self._floor.heights(skin[:, part])
+            height = None if self._floor is None else self._floor.heights(skin[:, part])
             stands = standing_probability(skin[:, part], height, self._fps)
             share = np.repeat(stands[:, None] * self._scale / len(part), len(part), axis=1)
             self._weight = np.concatenate([self._weight, share], axis=1)
 
-    def add(self, state: State, equations: NormalEquations) -> None:
-        """Add the motion of soles at ``state``."""
+    def add(self, state: State, equations: BandedEquations) -> None:
+        """Add the motion of the soles at ``state``."""
         frames, count = len(state), len(self._index)
         if frames < 2 or not count:
             return
-        posed = self._geometry.at(state)
+        posed = self.geometry.at(state)
         points = posed.skin[:, self._index]
 
         def rows(at: slice, index: np.ndarray) -> np.ndarray:
             axes = np.broadcast_to(np.eye(3), (*points[at, index].shape, 3))
             return posed.skin_by_body(at, self._index[index], axes)
 
-        outlier = PLANT_OUTLIER / self._fps
-        add_steps(self.name, BODY, points, rows, self._weight, outlier, equations)
+        self.add_steps(BODY, points, rows, self._weight, PLANT_OUTLIER / self._fps, equations)

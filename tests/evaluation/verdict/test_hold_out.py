@@ -15,7 +15,7 @@ from intercap_core import artefacts
 from intercap_core.config import JointSettings
 from intercap_core.evaluation.verdict.hold_out import JOINTS, HeldOut, JudgedPart, hold_out
 from intercap_core.evaluation.verdict.judge import SequenceVerdict
-from intercap_core.joint.equations import NormalEquations
+from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.fit import assemble
 from intercap_core.joint.inputs import JointInputs, open_inputs
 from intercap_core.joint.minimise import limited
@@ -117,7 +117,7 @@ def test_one_step_goes_where_many_do(capture: fitted.Capture, held: HeldOut) -> 
             state = result.state
             for _ in range(6):
                 assembly.problem.refresh(state)
-                equations = NormalEquations(len(state))
+                equations = BandedEquations(len(state))
                 for term in assembly.problem.terms:
                     if term is not assembly.body and term is not assembly.object_:
                         term.add(state, equations)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from intercap_core.config import ContactInterval
-from intercap_core.joint.contact.annotated import annotation_evidence, oddities
+from intercap_core.joint.contact.annotated import annotation_evidence, find_issues
 from intercap_core.joint.contact.detect import RegionMotion, contact_probability
 
 FPS = 15.0
@@ -114,7 +114,7 @@ def test_oddities_name_frames_and_part(intervals, near, expected):
     distance = np.full((60, 2), 2.0)
     distance[list(near)] = 0.0
     given = [_interval(*interval) for interval in intervals]
-    found = oddities(given, REGIONS, distance, UNSEEN)
+    found = find_issues(given, REGIONS, distance, UNSEEN)
     evidence, labels = annotation_evidence(given, REGIONS, 60, 5)
     assert np.isfinite(evidence).all() and np.isin(labels, (-1, 0, 1)).all()
     if expected is None:

@@ -5,13 +5,13 @@ from itertools import pairwise, product
 import numpy as np
 import pytest
 
-from intercap_core.joint.contact.chain import Chain
+from intercap_core.joint.contact.chain import DwellChain
 
 FPS = 15.0
-TOUCH = Chain(0.6, (0.3, 3.0), (0.8, 0.2))
+TOUCH = DwellChain(0.6, (0.3, 3.0), (0.8, 0.2))
 
 
-@pytest.mark.parametrize("chain", [Chain(0.2, (1.0,), (1.0,)), TOUCH])
+@pytest.mark.parametrize("chain", [DwellChain(0.2, (1.0,), (1.0,)), TOUCH])
 def test_posterior_equals_enumeration_of_all_paths(chain):
     evidence = np.array([[1.0], [-2.0], [0.5], [3.0]])
     states = 1 + len(chain.durations)

@@ -8,6 +8,8 @@ from intercap_core.joint.contact.detect import (
     contact_probability,
     lasting_error,
 )
+from intercap_core.joint.contact.estimate import ContactEstimate
+from intercap_core.schemas import CONTACT_REGIONS
 
 FPS = 15.0
 
@@ -87,3 +89,13 @@ def test_a_lasting_error_is_the_weighted_mean_of_prior_and_measurements():
     untouched, sigma = lasting_error(motion, np.full((10, 1), 0.4), 2.0)
     assert untouched == 0
     np.testing.assert_allclose(sigma, np.hypot(0.01, FRAME_SIGMA), rtol=1e-9)
+
+
+def test_unknown_contact_does_not_change():
+    shape = (4, len(CONTACT_REGIONS))
+    labels = np.full(shape, -1, np.int8)
+    unknown, half, none = (
+        ContactEstimate(np.full(shape, value), labels) for value in (np.nan, 0.5, 0.0)
+    )
+    assert unknown.change(unknown) == 0
+    assert half.change(none) == 0.5

@@ -6,7 +6,7 @@ import pytest
 from intercap_core.joint.contact.detect import (
     STANDARD_GRAVITY,
     UNHELD_PROBABILITY,
-    held,
+    find_held,
     support_evidence,
 )
 
@@ -25,11 +25,11 @@ TIME = np.arange(20)[:, None] / FPS
     ],
 )
 def test_held_is_what_neither_rests_nor_falls(path, height, expected):
-    assert (held(path, np.full(20, height), UP, FPS) == expected).all()
+    assert (find_held(path, np.full(20, height), UP, FPS) == expected).all()
 
 
 def test_two_frames_say_nothing():
-    assert not held(np.zeros((2, 3)), np.ones(2), UP, FPS).any()
+    assert not find_held(np.zeros((2, 3)), np.ones(2), UP, FPS).any()
 
 
 def test_support_is_the_message_of_at_least_one_touching():
