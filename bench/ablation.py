@@ -85,7 +85,7 @@ def _grasps(project: Project, paths: Paths, output: Path) -> Path | None:
         )
         for hold in holds(handling.probability)[:1]:
             picture = closeup(handling, hold)
-            sheet = cv2.imdecode(np.frombuffer(picture.jpeg, np.uint8), cv2.IMREAD_COLOR)
+            sheet = cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_COLOR)
             head = np.full((_HEAD_PX, sheet.shape[1], 3), 255, np.uint8)
             words = f"{name}: {hold.caption}".replace("–", "-")
             cv2.putText(head, words, (3, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.45, _INK, 1, cv2.LINE_AA)

@@ -1,4 +1,4 @@
-"""A project as the annotation page asks of it: what is to be seen, and what may be changed."""
+"""Requests of the annotation page: reading and changing a project."""
 
 from __future__ import annotations
 
@@ -33,12 +33,19 @@ from intercap_core.output.site.tables import sequence_table
 from intercap_core.project import Project, load_project
 from intercap_core.schemas import CONTACT_REGIONS, SUMMARY
 
-_MOST = 1e9  # of a number that a page tells
-OPEN_SEQUENCES = 3  # with their images and meshes in memory
+_MOST = 1e9  # largest number that a page may send
+OPEN_SEQUENCES = 3  # whose images and meshes stay in memory
 
 
 class Annotator:
-    """A project as the page sees it; ``by`` is who annotates, kept with what is answered."""
+    """A project that is being annotated.
+
+    Args:
+        settings: the project's config.yaml.
+        by: name of the annotator, saved with answers.
+        cores: number of cores of runs, 0 for all.
+        profile: Snakemake profile of a cluster.
+    """
 
     def __init__(
         self, settings: Path, *, by: str = "", cores: int = 0, profile: Path | None = None
@@ -51,17 +58,19 @@ class Annotator:
         self._opened: OrderedDict[str, Opened] = OrderedDict()
         self._lock = threading.Lock()
 
-    # --- looking -------------------------------------------------------------------------------
+    # --- reading -------------------------------------------------------------------------------
 
     def sequences(self) -> dict[str, Any]:
-        """The table, read again: rows may have come."""
+        """Return the table of sequences, which is read again."""
         self.project = load_project(self.settings)
         rows = self._list.rows(self.project)
         return {"dataset": self.project.config.dataset, "by": self.by, "sequences": rows}
 
     def opened(self, name: str, version: str = "now") -> Opened:
-        """The sequence's artefacts, or those before the last run; raises HTTPException where the
-        table has no such sequence."""
+        """Return the sequence's artefacts, "now" or "before" the last run.
+
+        Raises HTTPException if the table has no such sequence.
+        """
         if name not in self.project.sequences or version not in ("now", "before"):
             raise HTTPException(404, f"there is no sequence {name[:80]!r} in the table")
         key = f"{version}/{name}"
@@ -75,18 +84,18 @@ class Annotator:
             return self._opened[key]
 
     def sequence(self, name: str) -> dict[str, Any]:
-        """Everything but images and meshes."""
+        """Return everything but images and meshes."""
         opened = self.opened(name)
-        if not opened.there("frames"):
+        if not opened.has("frames"):
             by_hand = shlex.join(["intercap", "run", str(self.settings), "--", "--until", "frames"])
-            told = f"no images have been read of this recording yet: run it, or `{by_hand}`"
+            note = f"no images have been read of this recording yet: run it, or `{by_hand}`"
             found: dict[str, Any] = {
-                "sequence": name, "frames": 0, "notes": [told], "result": opened.stamp(),
+                "sequence": name, "frames": 0, "notes": [note], "result": opened.stamp(),
             }  # fmt: skip
         else:
             try:
                 found = result.describe(opened)
-            except UserError as error:  # a run can make the images anew
+            except UserError as error:  # a run can read the images again
                 found = {
                     "sequence": name, "frames": 0, "notes": [str(error)], "result": opened.stamp(),
                 }  # fmt: skip
@@ -97,7 +106,7 @@ class Annotator:
             "person": row.subject,
             "annotation": self.annotation(name),
             "regions": list(CONTACT_REGIONS),
-            "read_only": "the studio writes this annotation anew with the recording"
+            "read_only": "the studio writes this annotation together with the recording"
             if made
             else document.locked(self.project.annotation_path(name)),
             "profile": str(self.runs.profile or ""),
@@ -106,12 +115,11 @@ class Annotator:
         return found
 
     def annotation(self, name: str) -> dict[str, Any]:
-        """The annotation file as it is."""
-        found = document.read(self.project.annotation_path(name))
-        return told_of(found)
+        """Return the annotation file."""
+        return document_to_json(document.read(self.project.annotation_path(name)))
 
     def state(self, name: str) -> dict[str, Any]:
-        """What tells an open page that annotation or results are others by now."""
+        """Return stamps by which an open page notices changed annotations or results."""
         opened = self.opened(name)
         return {
             "annotation": document.read(self.project.annotation_path(name)).digest,
@@ -119,63 +127,64 @@ class Annotator:
         }
 
     def questions(self, name: str) -> list[dict[str, Any]]:
-        """Open questions, those first that change most."""
+        """Return open questions, those with the largest effect first."""
         answered = questions.read_answers(self._answers(name))
         return questions.propose(self.opened(name), answered)
 
     # --- changing ------------------------------------------------------------------------------
 
-    def check(self, name: str, told: dict[str, Any]) -> dict[str, Any]:
-        """What is wrong with changed sections, what changes in the file, and what runs again."""
+    def check(self, name: str, request: dict[str, Any]) -> dict[str, Any]:
+        """Return faults of changed sections, the difference in the file, and stages to re-run."""
         now = document.read(self.project.annotation_path(name))
-        changes = _changes(told)
+        changes = _changes(request)
         faults, text = self._edited(name, now, changes)
         found: dict[str, Any] = {"faults": faults, "digest": now.digest, "difference": ""}
         if faults:
             return found
         found["difference"] = document.difference(now.text, text, now.path.name)
-        if told.get("plan"):
+        if request.get("plan"):
             annotation = Annotation.model_validate(document.sections_with(now, changes))
             edited = rerun.EditedProject.of(self.project, name, annotation)
             found["touched"] = rerun.touched(edited, name)
         return found
 
-    def save(self, name: str, told: dict[str, Any]) -> dict[str, Any]:
-        """Save changed sections into the file that the page has read."""
+    def save(self, name: str, request: dict[str, Any]) -> dict[str, Any]:
+        """Save changed sections if the file is still the one that the page has read."""
         if self.project.annotation_made(name):
-            raise UserError("the studio writes this annotation; it is not changed here")
+            raise UserError("the studio writes this annotation; it cannot be changed here")
         path = self.project.annotation_path(name)
         now = document.read(path)
-        changes = _changes(told)
-        if now.digest != told.get("digest"):
-            base = str(told.get("text", ""))
+        changes = _changes(request)
+        if now.digest != request.get("digest"):
+            base = str(request.get("text", ""))
             raise document.Changed(now, document.difference(base, now.text, path.name))
         faults, text = self._edited(name, now, changes)
         if faults:
-            raise UserError("; ".join(f"{one['where']}: {one['words']}" for one in faults))
+            raise UserError("; ".join(f"{fault['where']}: {fault['words']}" for fault in faults))
         saved = document.save(now, text)
         if self.by:
-            told = {"kind": "saved", "sections": sorted(changes)}
-            with contextlib.suppress(OSError):  # the annotation is saved, whoever did it
-                questions.keep_answer(self._answers(name), told, self.by)
-        return told_of(saved)
+            record = {"kind": "saved", "sections": sorted(changes)}
+            with contextlib.suppress(OSError):  # the annotation itself is saved
+                questions.keep_answer(self._answers(name), record, self.by)
+        return document_to_json(saved)
 
-    def answer(self, name: str, told: dict[str, Any]) -> dict[str, Any]:
-        """Keep an answer, so that it is not asked again."""
-        opened = self.opened(name)
-        del opened
-        kept = {key: told.get(key) for key in ("kind", "part", "answer", "first", "last", "frame")}
+    def answer(self, name: str, request: dict[str, Any]) -> dict[str, Any]:
+        """Save an answer, so that its question is not asked again."""
+        self.opened(name)
+        kept = {
+            key: request.get(key) for key in ("kind", "part", "answer", "first", "last", "frame")
+        }
         if any(v is not None and not isinstance(v, str | int) for v in kept.values()):
-            raise UserError("an answer has words and frames")
+            raise UserError("an answer may have texts and frame numbers only")
         if any(len(str(v)) > 80 for v in kept.values()):
-            raise UserError("an answer's words are too long")
-        kept |= {key: _number(told, key) for key in ("from_s", "to_s")}
+            raise UserError("a text of the answer is longer than 80 characters")
+        kept |= {key: _number(request, key) for key in ("from_s", "to_s")}
         questions.keep_answer(self._answers(name), kept, self.by or None)
         return {"questions": self.questions(name)}
 
-    def snap(self, name: str, told: dict[str, Any]) -> dict[str, Any]:
-        """The object's pose fitted to the images of a frame."""
-        entry, pose = self._object(name), _pose(told)
+    def snap(self, name: str, request: dict[str, Any]) -> dict[str, Any]:
+        """Fit the object's pose to the images of a frame."""
+        entry, pose = self._object(name), _pose(request)
         opened = self.opened(name)
         with opened.images() as images:
             if not 0 <= pose.frame < images.num_sets:
@@ -186,32 +195,32 @@ class Annotator:
         return found.__dict__
 
     def read_surface(self, name: str) -> dict[str, Any]:
-        """Where people are likely to touch the sequence's object."""
+        """Return where people are likely to touch the sequence's object."""
         return objects.read_surface(self.project, self._object(name))
 
-    def surface(self, name: str, told: dict[str, Any]) -> dict[str, Any]:
-        """Keep where people are likely to touch the object, for all sequences that have it."""
-        vertices = told["vertices"]
+    def surface(self, name: str, request: dict[str, Any]) -> dict[str, Any]:
+        """Save where people are likely to touch the object, for all of its sequences."""
+        vertices = request["vertices"]
         if not isinstance(vertices, list) or not all(type(v) is int for v in vertices):
-            raise UserError("vertices are numbers of the mesh's")
+            raise UserError("vertices must be a list of vertex numbers")
         if any(not 0 <= v < _MOST for v in vertices):
-            raise UserError("a vertex is not one of the mesh's")
-        digest = str(told["digest"])
+            raise UserError("a vertex number is outside of the mesh")
+        digest = str(request["digest"])
         saved = objects.save_surface(self.project, self._object(name), vertices, digest)
         self.project = load_project(self.settings)
         return saved
 
     def read_symmetry(self, name: str) -> dict[str, Any]:
-        """How the sequence's object can be turned and look the same."""
+        """Return the symmetry of the sequence's object."""
         return objects.read_symmetry(self.project, self._object(name))
 
-    def symmetry(self, name: str, told: dict[str, Any]) -> dict[str, Any]:
-        """Keep the object's symmetry, for all sequences that have it."""
-        wanted = told["symmetry"]
+    def symmetry(self, name: str, request: dict[str, Any]) -> dict[str, Any]:
+        """Save the object's symmetry, for all of its sequences."""
+        wanted = request["symmetry"]
         if not isinstance(wanted, dict):
-            raise UserError("symmetry is discrete, continuous or sphere")
+            raise UserError("symmetry must be discrete, continuous or sphere")
         entry = self._object(name)
-        saved = objects.save_symmetry(self.project, entry, wanted, str(told["digest"]))
+        saved = objects.save_symmetry(self.project, entry, wanted, str(request["digest"]))
         self.project = load_project(self.settings)
         return saved
 
@@ -221,18 +230,18 @@ class Annotator:
             raise UserError(f"sequence {name!r} names no object")
         return entry
 
-    def point(self, name: str, told: dict[str, Any]) -> dict[str, Any]:
-        """The point of the room under a pixel."""
+    def point(self, name: str, request: dict[str, Any]) -> dict[str, Any]:
+        """Return the 3D point at a pixel."""
         opened = self.opened(name)
-        frame, x, y = int(_number(told, "frame")), _number(told, "x"), _number(told, "y")
+        frame, x, y = int(_number(request, "frame")), _number(request, "x"), _number(request, "y")
         with opened.images() as images:
             if not 0 <= frame < images.num_sets:
                 raise UserError(f"there is no frame {frame}")
-        return {"point": snap.point_under(opened, str(told["camera"]), frame, x, y)}
+        return {"point": snap.point_under(opened, str(request["camera"]), frame, x, y)}
 
-    def run(self, name: str, told: dict[str, Any]) -> dict[str, Any]:
-        """Start, stop or look at a run."""
-        wanted = told.get("do")
+    def run(self, name: str, request: dict[str, Any]) -> dict[str, Any]:
+        """Start or stop a run; return its state."""
+        wanted = request.get("do")
         project = self.project
         if wanted == "start":
             self.opened(name)
@@ -243,11 +252,14 @@ class Annotator:
         return self.run_state(name)
 
     def run_state(self, name: str) -> dict[str, Any]:
-        """The run's progress, and the command that does the same."""
+        """Return the run's progress, and the equivalent command."""
         self.opened(name)
-        told = rerun.command(self.project, name, cores=self.runs.cores, profile=self.runs.profile)
+        command = rerun.command(
+            self.project, name, cores=self.runs.cores, profile=self.runs.profile
+        )
+        cluster = self.runs.profile is not None
         progress = self.runs.progress(self.project)
-        return progress | {"command": shlex.join(told), "cluster": self.runs.profile is not None}
+        return progress | {"command": shlex.join(command), "cluster": cluster}
 
     def _answers(self, name: str) -> Path:
         return questions.answers_path(self.project.annotation_path(name))
@@ -255,7 +267,7 @@ class Annotator:
     def _edited(
         self, name: str, now: document.Document, changes: dict[str, Any]
     ) -> tuple[list[dict[str, str]], str]:
-        """What is wrong with the annotation when it is changed, and the file's text then."""
+        """Return faults of the changed annotation, and the file's changed text."""
         if now.problem:
             return [{"where": "file", "words": now.problem}], now.text
         sections = document.sections_with(now, changes)
@@ -264,64 +276,64 @@ class Annotator:
         if faults:
             return faults, now.text
         text = document.patched(now, changes)
-        # an entry that stays as it is written may be wrong by its form alone: 12.0 is no frame
+        # an unchanged entry may have an invalid form, such as frame 12.0
         return document.faults(document.parsed(text)), text
 
     def _faults(self, name: str, annotation: Annotation) -> list[dict[str, str]]:
-        """What the recording says against an annotation."""
-        told = [annotation.check_object(self.project.sequences[name].object)]
+        """Return contradictions between an annotation and the recording."""
+        faults = [annotation.check_object(self.project.sequences[name].object)]
         recorded = self.project.recording_extent(name)
-        told.append(
+        faults.append(
             annotation.check_recording(recorded)
             if recorded
             else fault_of_cameras(self.project, name, annotation)
         )
         return [{"where": words.partition(".")[0].partition("[")[0].split(" ")[0], "words": words}
-                for words in told if words]  # fmt: skip
+                for words in faults if words]  # fmt: skip
 
 
-def _number(told: dict[str, Any], key: str) -> float:
-    value = told.get(key)
+def _number(request: dict[str, Any], key: str) -> float:
+    value = request.get(key)
     if not isinstance(value, int | float) or not -_MOST < value < _MOST:
-        raise UserError(f"{key} is to be a number")
+        raise UserError(f"{key} must be a number")
     return float(value)
 
 
-def told_of(found: document.Document) -> dict[str, Any]:
-    """An annotation file as the page is told of it."""
+def document_to_json(found: document.Document) -> dict[str, Any]:
+    """Serialize an annotation file for the page."""
     return {
         "path": str(found.path), "text": found.text, "digest": found.digest,
         "sections": found.sections, "problem": found.problem, "note": found.note,
     }  # fmt: skip
 
 
-def _changes(told: dict[str, Any]) -> dict[str, Any]:
-    changes = told.get("changes")
+def _changes(request: dict[str, Any]) -> dict[str, Any]:
+    changes = request.get("changes")
     if not isinstance(changes, dict):
-        raise UserError("changes are sections by name")
+        raise UserError("changes must be sections by name")
     return changes
 
 
-def _pose(told: dict[str, Any]) -> ObjectPose:
-    faults = document.faults({"object_poses": [told]})
+def _pose(request: dict[str, Any]) -> ObjectPose:
+    faults = document.faults({"object_poses": [request]})
     if faults:
         raise UserError(f"{faults[0]['where']}: {faults[0]['words']}")
-    return ObjectPose.model_validate(told)
+    return ObjectPose.model_validate(request)
 
 
 class SequenceList:
-    """Rows of all sequences; a summary is read again only where it is another file."""
+    """Rows of all sequences; a summary is read again only if its file changed."""
 
     def __init__(self) -> None:
         self._known: dict[Path, tuple[tuple[int, int], SequenceMetrics | str]] = {}
 
     def rows(self, project: Project) -> list[dict[str, Any]]:
-        """A row a sequence, worst first by the report's own rank, those without a result last."""
+        """Return a row per sequence, worst first by the site's rank, without a result last."""
         rows, measured = [], []
         for name, row in project.sequences.items():
             found = self._summary(project.artefact(name, "summary"))
             annotation = project.annotation_path(name)
-            one: dict[str, Any] = {
+            entry: dict[str, Any] = {
                 "name": name, "subject": row.subject, "object": row.object or "", "rank": None,
                 "annotated": annotation.is_file(),
                 "answered": answers_path(annotation).is_file(),
@@ -330,7 +342,7 @@ class SequenceList:
             }  # fmt: skip
             if isinstance(found, SequenceMetrics):
                 measured.append(found)
-                one |= {
+                entry |= {
                     "frames": len(found),
                     "flagged": int(found.values["flagged"].sum()),
                     "errors": {
@@ -338,16 +350,16 @@ class SequenceList:
                         for e in stated_errors(found)
                     },
                 }
-            rows.append(one)
+            rows.append(entry)
         if measured:
             table = sequence_table(measured, {})
             ranks = dict(zip(table["sequence"], table["rank"], strict=True))
-            for one in rows:
-                one["rank"] = int(ranks[one["name"]]) if one["name"] in ranks else None
-        return sorted(rows, key=lambda one: (one["rank"] is None, one["rank"] or 0))
+            for entry in rows:
+                entry["rank"] = int(ranks[entry["name"]]) if entry["name"] in ranks else None
+        return sorted(rows, key=lambda entry: (entry["rank"] is None, entry["rank"] or 0))
 
     def _summary(self, path: Path) -> SequenceMetrics | str:
-        """A sequence's figures, or why there are none."""
+        """Return a sequence's figures, or why there are none."""
         try:
             stat = path.stat()
         except OSError:

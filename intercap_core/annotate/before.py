@@ -1,7 +1,7 @@
-"""The result before the last runs from the page: what is kept of it, and the new one beside it.
+"""The previous result of a sequence: backup before a run from the page, and comparison.
 
-A run that was stopped or failed leaves results of two annotations; so what was there before it
-stays "the result before" until a run has ended well and the next one starts.
+A run that failed or was stopped leaves results of two annotations. The backup is therefore kept
+until a run has succeeded and the next run starts.
 """
 
 from __future__ import annotations
@@ -25,23 +25,25 @@ from intercap_core.project import Project
 from intercap_core.schemas import JOINT, OBJECT_TRACK
 from intercap_core.stage_list import SEQUENCE_STAGES
 
-_MARK = "kept.json"  # when it was kept, for which stages' run, and whether that ended well
+_MARK = "kept.json"  # time of the backup, stages of the run, and whether the run succeeded
 
 
 def before_folder(project: Project, sequence: str) -> Path:
-    """Where the result before the last runs from the page is kept."""
+    """Return the folder of the backup."""
     return project.results / ".annotate" / sequence / "before"
 
 
 def before_paths(project: Project, sequence: str) -> dict[str, Path]:
-    """Artefacts by stage as they were before the last runs from the page."""
+    """Return the artefacts of the backup by stage."""
     folder = before_folder(project, sequence)
     return {stage: folder / f"{stage}.h5" for stage in SEQUENCE_STAGES}
 
 
 def keep(project: Project, sequence: str, stages: Sequence[str]) -> None:
-    """Hold on to the artefacts that are there before a run of ``stages``, without a copy where the
-    file system has links; not where the run before did not end well."""
+    """Back up the artefacts before a run of ``stages``, by hard links if possible.
+
+    The backup is not replaced if the previous run did not succeed.
+    """
     folder = before_folder(project, sequence)
     kept = _mark(folder)
     if kept is not None and not _ended_well(project, sequence, kept):
@@ -62,7 +64,7 @@ def keep(project: Project, sequence: str, stages: Sequence[str]) -> None:
 
 
 def ended_well(project: Project, sequence: str) -> None:
-    """The run for which the result was kept has ended well: the next one replaces it."""
+    """Record that the run succeeded, so that the next run replaces the backup."""
     folder = before_folder(project, sequence)
     kept = _mark(folder)
     if kept is not None:
@@ -70,18 +72,20 @@ def ended_well(project: Project, sequence: str) -> None:
 
 
 def _ended_well(project: Project, sequence: str, kept: Mapping[str, Any]) -> bool:
-    """Whether the run is known to have ended well, or all that it was to make has been made since
-    (by a server that was killed, or on a terminal)."""
-    made = [project.artefact(sequence, s) for s in SEQUENCE_STAGES if s in kept["stages"]]
+    """Return whether the run succeeded, or all its artefacts were written since.
+
+    The latter happens if the server was killed, or by a run in a terminal.
+    """
+    outputs = [project.artefact(sequence, s) for s in SEQUENCE_STAGES if s in kept["stages"]]
     return bool(kept["ended"]) or (
-        bool(made) and all(p.is_file() and p.stat().st_mtime > kept["at"] for p in made)
+        bool(outputs) and all(p.is_file() and p.stat().st_mtime > kept["at"] for p in outputs)
     )
 
 
 def _mark(folder: Path) -> dict[str, Any] | None:
     try:
-        found = json.loads((folder / _MARK).read_text(encoding="utf-8"))
-        return {"at": float(found["at"]), "stages": list(found["stages"]), "ended": found["ended"]}
+        mark = json.loads((folder / _MARK).read_text(encoding="utf-8"))
+        return {"at": float(mark["at"]), "stages": list(mark["stages"]), "ended": mark["ended"]}
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
@@ -92,13 +96,15 @@ def _write(folder: Path, kept: Mapping[str, Any]) -> None:
     part.replace(folder / _MARK)
 
 
-def beside(project: Project, sequence: str) -> dict[str, Any]:
-    """The new result beside the one before the last runs: figures of the verdict, and by how much
-    body and object moved, millimetres. Empty where there was none."""
+def compare(project: Project, sequence: str) -> dict[str, Any]:
+    """Compare the result with the backup: figures, and motion of body and object, millimetres.
+
+    Without a backup, there are no rows of old figures.
+    """
     old = before_paths(project, sequence)
     new = {stage: project.artefact(sequence, stage) for stage in SEQUENCE_STAGES}
     rows: list[dict[str, Any]] = []
-    found: dict[str, Any] = {
+    comparison: dict[str, Any] = {
         "rows": rows,
         "there": old["joint"].is_file(),
         **_when(project, sequence),
@@ -110,18 +116,17 @@ def beside(project: Project, sequence: str) -> dict[str, Any]:
         with artefacts.read(old["joint"], JOINT) as a, artefacts.read(new["joint"], JOINT) as b:
             if a["joints"].shape == b["joints"].shape:
                 moved = np.linalg.norm(a["joints"] - b["joints"], axis=2).mean(1)
-                found["body_moved_mm"] = (1e3 * moved).round(1).tolist()
+                comparison["body_moved_mm"] = (1e3 * moved).round(1).tolist()
                 shift = np.linalg.norm(a["translation"] - b["translation"], axis=1)
                 if np.isfinite(shift).all():
-                    found["object_moved_mm"] = (1e3 * shift).round(1).tolist()
+                    comparison["object_moved_mm"] = (1e3 * shift).round(1).tolist()
     except artefacts.Unreadable:
         pass
-    return found
+    return comparison
 
 
 def _when(project: Project, sequence: str) -> dict[str, Any]:
-    """When the old result was made and when it was kept, and whether a run that did not end well
-    lies between."""
+    """Return times of the old result and its backup, and whether a run since did not succeed."""
     folder = before_folder(project, sequence)
     kept, joint = _mark(folder), before_paths(project, sequence)["joint"]
     if kept is None or not joint.is_file():

@@ -1,7 +1,7 @@
-"""The annotation file as a text: a patch by section, its difference, a save that loses nothing.
+"""The annotation file: reading, changes by section, and safe saving.
 
-Comments, order and layout stay: only the lines of the sections that change are written anew, and in
-them what stays equal keeps its form. A save is refused where the file is not the one that was read.
+Comments, order and layout stay: only lines of changed values are rewritten. A save is refused if
+the file changed since it was read.
 """
 
 from __future__ import annotations
@@ -22,50 +22,59 @@ from typing import Any
 import yaml
 from pydantic import ValidationError
 
-from intercap_core.annotate.yaml_entries import same
-from intercap_core.annotate.yaml_sections import NoLayout, with_section
+from intercap_core.annotate.yaml_edit import replace_section
+from intercap_core.annotate.yaml_entries import UnsupportedLayout, equal_values
 from intercap_core.config import STATED_EMPTY, Annotation
 from intercap_core.errors import UserError
 from intercap_core.inputs.documents import parse_yaml, yaml_fault
 from intercap_core.inputs.files import MAX_SETTINGS_BYTES, read_bytes
 
-NO_FILE = "none"  # the digest where there is no file
+NO_FILE = "none"  # digest if there is no file
 _BOM = b"\xef\xbb\xbf"
 _PART = ".part"
 
 
 class Changed(UserError):
-    """The file is another one than was read: ``now`` is what it holds, ``difference`` by whom else
-    it was changed, as a unified diff."""
+    """The file changed since it was read.
+
+    Args:
+        now: the file's present content.
+        difference: unified diff from the content that was read.
+    """
 
     def __init__(self, now: Document, difference: str) -> None:
-        super().__init__(f"{now.path}: was changed by somebody else meanwhile; nothing was saved")
+        super().__init__(
+            f"{now.path}: was changed by somebody else in the meantime; nothing was saved"
+        )
         self.now, self.difference = now, difference
 
 
 @dataclass(frozen=True)
 class Document:
-    """``text`` of the file at ``path``, "" where there is none; ``digest`` of its bytes;
-    ``problem``: why it is no annotation, "" = it is one; ``note``: what else is odd;
-    ``marked``: it begins with a byte order mark, which is not of the text."""
+    """Content of a YAML file."""
 
     path: Path
     text: str
+    """"" if there is no file."""
     digest: str
+    """SHA-256 of the file's bytes."""
     sections: dict[str, Any]
     problem: str = ""
+    """Why the file cannot be used, "" if it can."""
     note: str = ""
+    """Remark about the file."""
     marked: bool = False
+    """The file begins with a byte order mark, which is not part of ``text``."""
 
 
 def read(path: Path) -> Document:
-    """The annotation file as it is now; a broken one is told in ``problem``.
+    """Read a file; ``problem`` describes invalid YAML.
 
-    Raises UserError where it cannot be read at all.
+    Raises UserError if the file cannot be read at all.
     """
     note = ""
     if _parts(path):
-        note = f"a save of {path} was cut off; the file is as it was before"
+        note = f"a save of {path} was interrupted; the file is unchanged"
     if not path.exists():
         return Document(path, "", NO_FILE, {}, note=note)
     data = read_bytes(path, MAX_SETTINGS_BYTES)
@@ -73,10 +82,11 @@ def read(path: Path) -> Document:
     try:
         text = data.decode("utf-8-sig")
         sections = parsed(text)
-        told_as = json.dumps(sections, allow_nan=False, ensure_ascii=False)
-        told_as.encode()  # raises where a page cannot be told the values
+        json.dumps(sections, allow_nan=False, ensure_ascii=False).encode()  # as the page reads it
     except TypeError:
-        words = f"{path}: holds a value that no annotation has, as a date; correct it in an editor"
+        words = (
+            f"{path}: has a value that no annotation has, such as a date; correct it in an editor"
+        )
         return Document(path, text, digest, {}, words, note)
     except (UnicodeError, yaml.YAMLError, ValueError) as error:
         shown = data.decode("utf-8", "replace")
@@ -86,37 +96,37 @@ def read(path: Path) -> Document:
 
 
 def patched(document: Document, changes: Mapping[str, Any]) -> str:
-    """The file's text with sections of an annotation changed; None takes a section away, and so
-    does an empty list, but where that states something (``STATED_EMPTY``).
+    """Return the annotation's text with changed sections.
 
-    Raises UserError where the file cannot be changed without harm.
+    None removes a section, as does an empty list unless it is a statement (``STATED_EMPTY``).
+    Raises UserError if the file cannot be changed without loss.
     """
     unknown = sorted(set(changes) - set(Annotation.model_fields))
     if unknown:
         raise UserError(f"{document.path}: an annotation has no section {unknown[0]!r}")
-    told = _stated(changes)
-    return with_changes(document, {k: told[k] for k in Annotation.model_fields if k in told})
+    stated = _stated(changes)
+    return with_changes(document, {k: stated[k] for k in Annotation.model_fields if k in stated})
 
 
 def sections_with(document: Document, changes: Mapping[str, Any]) -> dict[str, Any]:
-    """The sections of the file with ``changes``, which are as in :func:`patched`."""
+    """Return the file's sections with ``changes``, as in :func:`patched`."""
     return _changed(document.sections, _stated(changes))
 
 
 def _stated(changes: Mapping[str, Any]) -> dict[str, Any]:
-    """None for what states nothing."""
+    """Replace empty values that are no statement by None."""
     return {k: None if v in ([], ()) and k not in STATED_EMPTY else v for k, v in changes.items()}
 
 
 def _changed(sections: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    found = {**sections, **changes}
-    return {k: v for k, v in found.items() if v is not None or k not in changes}
+    merged = {**sections, **changes}
+    return {k: v for k, v in merged.items() if v is not None or k not in changes}
 
 
 def with_changes(document: Document, changes: Mapping[str, Any]) -> str:
-    """The file's text with entries of its mapping changed; None takes one away.
+    """Return the file's text with changed entries of its mapping; None removes an entry.
 
-    Raises UserError where the file cannot be changed without harm.
+    Raises UserError if the file cannot be changed without loss.
     """
     if document.problem:
         raise UserError(document.problem)
@@ -124,9 +134,9 @@ def with_changes(document: Document, changes: Mapping[str, Any]) -> str:
     wanted = _changed(document.sections, changes)
     try:
         for section, value in changes.items():
-            text = with_section(text, section, value)
-        done = same(parsed(text), wanted)
-    except (NoLayout, yaml.YAMLError):  # an alias of what was taken away
+            text = replace_section(text, section, value)
+        done = equal_values(parsed(text), wanted)
+    except (UnsupportedLayout, yaml.YAMLError):  # such as an alias of a removed value
         done = False
     if not done:
         raise UserError(
@@ -137,22 +147,22 @@ def with_changes(document: Document, changes: Mapping[str, Any]) -> str:
 
 
 def faults(sections: Mapping[str, Any]) -> list[dict[str, str]]:
-    """What is wrong with an annotation's sections: ``where`` and ``words`` of each."""
+    """Return the faults of an annotation's sections, each with ``where`` and ``words``."""
     try:
         Annotation.model_validate(dict(sections))
     except ValidationError as error:
         return [
             {
-                "where": ".".join(map(str, one["loc"])) or "annotation",
-                "words": one["msg"].removeprefix("Value error, "),
+                "where": ".".join(map(str, fault["loc"])) or "annotation",
+                "words": fault["msg"].removeprefix("Value error, "),
             }
-            for one in error.errors(include_url=False)
+            for fault in error.errors(include_url=False)
         ]
     return []
 
 
 def difference(old: str, new: str, name: str) -> str:
-    """Unified diff of two texts of the file ``name``; "" where they are the same."""
+    """Return the unified diff of two texts of the file ``name``; "" if they are equal."""
     lines = difflib.unified_diff(
         old.splitlines(), new.splitlines(), f"{name} (saved)", f"{name} (new)", lineterm="", n=2
     )
@@ -160,15 +170,14 @@ def difference(old: str, new: str, name: str) -> str:
 
 
 def save(document: Document, text: str) -> Document:
-    """Write ``text`` in place of the file that ``document`` was read from; whole or not at all.
+    """Replace the file that ``document`` was read from, atomically.
 
-    Raises Changed where the file is another one by now, UserError where it cannot or may not be
-    written.
+    Raises Changed if the file changed since it was read, UserError if it cannot be written.
     """
-    path = Path(os.path.realpath(document.path))  # a link stays one
+    path = Path(os.path.realpath(document.path))  # links stay links
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with _alone(path.parent):
+        with _locked(path.parent):
             now = read(path)
             if now.digest != document.digest:
                 raise Changed(now, difference(document.text, now.text, path.name))
@@ -181,13 +190,13 @@ def save(document: Document, text: str) -> Document:
 
 
 def replace(path: Path, text: str) -> None:
-    """Under a temporary name beside the file, to the disk, then renamed.
+    """Write a temporary file in the same folder, flush it to disk, and rename it.
 
-    Raises UserError where the file there is read-only: to rename onto it would be allowed.
+    Raises UserError if the file is read-only, which renaming would not notice.
     """
-    if kept := locked(path):
-        raise UserError(kept)
-    for part in _parts(path):  # of a save that was cut off
+    if reason := locked(path):
+        raise UserError(reason)
+    for part in _parts(path):  # of an interrupted save
         part.unlink(missing_ok=True)
     mode = path.stat().st_mode & 0o777 if path.exists() else None
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=_PART, dir=path.parent)
@@ -207,31 +216,31 @@ def replace(path: Path, text: str) -> None:
         raise
     folder = os.open(path.parent, os.O_RDONLY)
     try:
-        with contextlib.suppress(OSError):  # some file systems sync no folders
+        with contextlib.suppress(OSError):  # some file systems cannot sync folders
             os.fsync(folder)
     finally:
         os.close(folder)
 
 
 def locked(path: Path) -> str:
-    """Why the file may not be written, "" = it may be, or there is none.
+    """Return why the file may not be written, "" if it may or does not exist.
 
-    By its mode too: for root the system refuses nothing.
+    The mode is checked as well, because the system refuses nothing to root.
     """
     real = Path(os.path.realpath(path))
     if not real.exists():
         return ""
-    found = real.stat()
-    own = found.st_uid == os.geteuid()
+    status = real.stat()
+    own = status.st_uid == os.geteuid()
     bits = stat.S_IWUSR if own else stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
-    if found.st_mode & bits and os.access(real, os.W_OK):
+    if status.st_mode & bits and os.access(real, os.W_OK):
         return ""
-    return f"{path}: is read-only for you; nothing is saved into it until its mode allows it"
+    return f"{path}: is read-only for you; change its mode to save annotations"
 
 
 @contextlib.contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Hold the folder against another annotator's save, where the file system has locks."""
+def _locked(folder: Path) -> Iterator[None]:
+    """Lock the folder against other annotators, if the file system supports locks."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         with contextlib.suppress(OSError):
@@ -242,13 +251,13 @@ def _alone(folder: Path) -> Iterator[None]:
 
 
 def _parts(path: Path) -> list[Path]:
+    """Return temporary files of interrupted saves."""
     real = Path(os.path.realpath(path))
-    found = real.parent.glob(f".{real.name}.*{_PART}") if real.parent.is_dir() else ()
-    return sorted(found)
+    return sorted(real.parent.glob(f".{real.name}.*{_PART}")) if real.parent.is_dir() else []
 
 
 def parsed(text: str) -> dict[str, Any]:
-    """The sections of a text; raises yaml.YAMLError or ValueError where it has none."""
+    """Parse the sections of a text; raises yaml.YAMLError or ValueError."""
     values = parse_yaml(text)
     if values is None:
         return {}

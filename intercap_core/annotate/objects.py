@@ -1,5 +1,6 @@
-"""Where people are likely to touch an object: vertices painted on its mesh, kept in the list that
-objects.yaml names. The list is of the object, so of all sequences that have it.
+"""Contact surface and symmetry of an object, in the files that its entry in objects.yaml names.
+
+Both belong to the object and therefore to all of its sequences.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ from intercap_core.geometry.rigid.mesh_files import load_mesh
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 from intercap_core.project import Project, tidy
 
-_SAME = 1e-6  # of the object's size: a vertex of the file is this one of the mesh
+_SAME = 1e-6  # vertices closer than this share of the object's diameter are equal
 
 
 def read_surface(project: Project, entry: ObjectEntry) -> dict[str, Any]:
-    """The painted ``vertices`` of the mesh, where they are kept, and the digest to save them by."""
+    """Return the painted vertices, the path of their list, and its digest."""
     mesh = ObjectMesh.load(entry)
     ids = mesh.contact_vertices if entry.contact_vertices is not None else np.zeros(0, int)
     users = [n for n, row in project.sequences.items() if row.object == entry.name]
@@ -40,10 +41,9 @@ def read_surface(project: Project, entry: ObjectEntry) -> dict[str, Any]:
 def save_surface(
     project: Project, entry: ObjectEntry, vertices: list[int], digest: str
 ) -> dict[str, Any]:
-    """Write the painted vertices, by the numbers of the mesh file, and name the list in
-    objects.yaml where it is not named yet.
+    """Write the painted vertices by their numbers in the mesh file; name the list in objects.yaml.
 
-    Raises UserError where the list is another one than was read, or nothing is painted.
+    Raises UserError if the list changed since it was read, or no vertex is painted.
     """
     mesh, path = ObjectMesh.load(entry), _list_of(entry)
     painted = np.zeros(len(mesh.vertices), bool)
@@ -52,7 +52,7 @@ def save_surface(
         raise UserError(f"object {entry.name!r}: paint at least one of its {len(painted)} vertices")
     painted[ids] = True
     if _digest(path) != digest:
-        raise UserError(f"{path}: was changed by somebody else meanwhile; load the page again")
+        raise UserError(f"{path}: was changed by somebody else in the meantime; reload the page")
     in_file = np.asarray(load_mesh(Path(entry.mesh)).vertices, np.float64)
     away, nearest = cKDTree(mesh.vertices).query(np.nan_to_num(in_file, nan=1e9))
     chosen = np.flatnonzero(painted[nearest] & (away <= _SAME * mesh.diameter))
@@ -64,7 +64,7 @@ def save_surface(
 
 
 def _list_of(entry: ObjectEntry) -> Path:
-    """The list that the entry names where it is JSON, else one beside the mesh."""
+    """Return the list that the entry names if it is JSON, else a file next to the mesh."""
     named = entry.contact_vertices
     if named is not None and named.suffix == ".json":
         return named
@@ -74,9 +74,9 @@ def _list_of(entry: ObjectEntry) -> Path:
 def _name_list(project: Project, entry: ObjectEntry, path: Path) -> None:
     objects = tidy(project.path.parent / project.config.objects)
     found = document.read(objects)
-    told = dict(found.sections[entry.name])
-    told["contact_vertices"] = os.path.relpath(path, objects.parent)
-    document.save(found, document.with_changes(found, {entry.name: told}))
+    changed = dict(found.sections[entry.name])
+    changed["contact_vertices"] = os.path.relpath(path, objects.parent)
+    document.save(found, document.with_changes(found, {entry.name: changed}))
 
 
 def _digest(path: Path) -> str:
@@ -84,12 +84,12 @@ def _digest(path: Path) -> str:
 
 
 def read_symmetry(project: Project, entry: ObjectEntry) -> dict[str, Any]:
-    """The object's symmetry as objects.yaml has it, and the digest to save it by."""
+    """Return the object's symmetry and the digest of objects.yaml."""
     found = document.read(_file(project))
-    told = found.sections.get(entry.name) or {}
+    settings = found.sections.get(entry.name) or {}
     users = [n for n, row in project.sequences.items() if row.object == entry.name]
     return {
-        "symmetry": told.get("symmetry") or {}, "path": str(found.path), "digest": found.digest,
+        "symmetry": settings.get("symmetry") or {}, "path": str(found.path), "digest": found.digest,
         "sequences": len(users),
     }  # fmt: skip
 
@@ -97,21 +97,21 @@ def read_symmetry(project: Project, entry: ObjectEntry) -> dict[str, Any]:
 def save_symmetry(
     project: Project, entry: ObjectEntry, symmetry: dict[str, Any], digest: str
 ) -> dict[str, Any]:
-    """Write the object's symmetry, {} = none; the file's other lines stay.
+    """Write the object's symmetry, {} for none, into objects.yaml.
 
-    Raises UserError where it is impossible, or objects.yaml is another file than was read.
+    Raises UserError if the symmetry is invalid, or objects.yaml changed since it was read.
     """
     try:
         SymmetryGroup.from_settings(Symmetry.model_validate(symmetry))
     except (ValidationError, ValueError) as error:
-        told = str(error).splitlines()[0][:200]
-        raise UserError(f"object {entry.name!r}: symmetry is impossible ({told})") from None
+        fault = str(error).splitlines()[0][:200]
+        raise UserError(f"object {entry.name!r}: symmetry is invalid ({fault})") from None
     found = document.read(_file(project))
     if found.problem:
         raise UserError(found.problem)
     if found.digest != digest:
         raise UserError(
-            f"{found.path}: was changed by somebody else meanwhile; load the page again"
+            f"{found.path}: was changed by somebody else in the meantime; reload the page"
         )
     own = {k: v for k, v in dict(found.sections[entry.name]).items() if k != "symmetry"}
     own |= {"symmetry": symmetry} if symmetry else {}

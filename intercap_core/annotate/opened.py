@@ -1,4 +1,4 @@
-"""What is open of a sequence's artefacts, for as long as the files stay the same."""
+"""Open artefacts of a sequence, and its images as small JPEGs."""
 
 from __future__ import annotations
 
@@ -23,59 +23,63 @@ T = TypeVar("T")
 
 
 class Opened:
-    """One sequence's artefacts: images stay open, and what is made of files is kept until one of
-    them is another. For several threads; ``lock`` keeps the images open while they are read.
+    """Artefacts of one sequence, with a cache of results that is valid until the files change.
 
-    ``paths`` by stage.
+    It is thread-safe; ``lock`` keeps the images open while they are read.
+
+    Args:
+        paths: artefacts by stage, by default those of the project.
     """
 
     def __init__(self, project: Project, name: str, paths: dict[str, Path] | None = None) -> None:
         self.project, self.name = project, name
         self.paths = paths or {s: project.artefact(name, s) for s in SEQUENCE_STAGES}
         self.lock = threading.RLock()
-        self._made: dict[str, tuple[tuple[str, ...], Any]] = {}
+        self._cache: dict[str, tuple[tuple[str, ...], Any]] = {}
         self._making: defaultdict[str, threading.RLock] = defaultdict(threading.RLock)
         self._stack = contextlib.ExitStack()
         self._images: tuple[str, Frames, Frames, np.ndarray] | None = None
 
     def stamp(self, *stages: str) -> str:
-        """Tells these artefacts, all by default, from others at the same places."""
+        """Return a stamp that changes with these artefacts, by default with any."""
         return "-".join(_stamp(self.paths[stage]) for stage in stages or self.paths)
 
-    def there(self, stage: str) -> bool:
-        """Whether the stage has written."""
+    def has(self, stage: str) -> bool:
+        """Return whether the artefact of a stage exists."""
         return self.paths[stage].is_file()
 
-    def made(self, key: str, stages: tuple[str, ...], make: Callable[[], T]) -> T:
-        """What ``make`` returns, made anew where an artefact of these ``stages`` is another; once,
-        however many ask for it meanwhile."""
+    def cached(self, key: str, stages: tuple[str, ...], make: Callable[[], T]) -> T:
+        """Return the result of ``make``, called again if an artefact of ``stages`` changed.
+
+        Concurrent callers wait for one call.
+        """
         with self.lock:
             making = self._making[key]
         with making:
             stamps = tuple(_stamp(self.paths[stage]) for stage in stages)
-            known = self._made.get(key)
+            known = self._cache.get(key)
             if known is None or known[0] != stamps:
                 known = stamps, make()
-                self._made[key] = known
+                self._cache[key] = known
             return known[1]
 
     @contextlib.contextmanager
     def images(self) -> Iterator[Frames]:
-        """The images by the moment that they show, or by set as long as there is no scene.
+        """Open the images by the frame that they show; by set if there is no scene artefact.
 
-        Raises UserError where the frames cannot be read.
+        Raises UserError if the frames cannot be read.
         """
         with self.lock:
             yield self._opened()[1]
 
     @contextlib.contextmanager
     def sets(self) -> Iterator[Frames]:
-        """The images by set, as they were recorded."""
+        """Open the images by set, as recorded."""
         with self.lock:
             yield self._opened()[0]
 
     def dropped(self) -> np.ndarray:
-        """(T,) bool: the sets that were dropped by annotation when the frames were read."""
+        """Return which sets (T,) were dropped by annotation when the frames were read."""
         with self.lock:
             return self._opened()[2]
 
@@ -94,7 +98,7 @@ class Opened:
         return self._images[1:]
 
     def close(self) -> None:
-        """Let the files go."""
+        """Close the files."""
         with self.lock:
             self._images = None
             self._stack.close()
@@ -108,13 +112,13 @@ def _stamp(path: Path) -> str:
     return f"{found.st_size:x}.{found.st_mtime_ns:x}.{found.st_ino:x}"
 
 
-WIDTHS = (240, 320, 480, 640, 960, 1280)  # pixels; others are rounded up to one, or as recorded
+WIDTHS = (240, 320, 480, 640, 960, 1280)  # pixels; requests are rounded up to one of these
 KEPT_BYTES = 192 << 20
-_QUALITY = 78  # of JPEG: 20 kB of an image 480 pixels wide
+_QUALITY = 78  # of JPEG: 20 kB for an image 480 pixels wide
 
 
 class Pictures:
-    """Reduced images, the last ones kept in memory."""
+    """Reduced images with a cache of the last used."""
 
     def __init__(self, kept_bytes: int = KEPT_BYTES) -> None:
         self._kept: OrderedDict[tuple[str, str, int, int, int], bytes] = OrderedDict()
@@ -122,9 +126,11 @@ class Pictures:
         self._lock = threading.Lock()
 
     def jpeg(self, opened: Opened, camera: str, moment: int, width: int) -> bytes | None:
-        """The image of ``camera`` that shows a moment, at least ``width`` pixels wide where it is
-        recorded so; None where there is none. Raises UserError where it cannot be read."""
-        wide = next((one for one in WIDTHS if one >= width), 0)
+        """Return the image of a camera at a frame, at least ``width`` pixels wide if recorded so.
+
+        None if there is no image. Raises UserError if it cannot be read.
+        """
+        wide = next((size for size in WIDTHS if size >= width), 0)
         with opened.images() as frames:
             names = frames.rig.names
             if camera not in names or not 0 <= moment < frames.num_sets:
@@ -162,7 +168,7 @@ class Pictures:
 
 
 def _reduction(recorded: int, wide: int) -> Literal[1, 2, 4]:
-    """How many pixels the decoder may join into one."""
+    """Return by which factor the decoder may reduce an image."""
     if recorded >= 4 * wide:
         return 4
     return 2 if recorded >= 2 * wide else 1

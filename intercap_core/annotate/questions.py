@@ -1,5 +1,7 @@
-"""A few questions whose answers change most: lost objects, ambiguous turns, contact at even odds, a
-doubtful subject. What was answered is kept beside the annotation and never asked again.
+"""Questions to the annotator whose answers have the largest effect.
+
+They are about lost objects, ambiguous rotations, uncertain contact and doubtful subjects. Answers
+are saved next to the annotation, and an answered question is not asked again.
 """
 
 from __future__ import annotations
@@ -20,23 +22,23 @@ from intercap_core.errors import UserError
 from intercap_core.evaluation.flags import ranges
 from intercap_core.schemas import JOINT, OBJECT_TRACK, PERSON
 
-EVEN = (0.25, 0.75)  # probabilities of contact between which it is asked
-SHORTEST_S = 0.1  # contact at even odds for less time is not asked
+EVEN = (0.25, 0.75)  # range of uncertain probabilities of contact
+SHORTEST_S = 0.1  # shorter uncertain contact is ignored
 MOST = 40  # questions of a sequence at a time
 _MID_HIP = 8  # of the 135 keypoints
 _MAX_BYTES = 1 << 22
 
 
 def answers_path(annotation: Path) -> Path:
-    """Where answers are kept: beside the annotation, by the same name."""
+    """Return the file of answers to an annotation."""
     return annotation.with_name(f"{annotation.stem}.answers.jsonl")
 
 
 def propose(opened: Opened, answered: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Questions that are open, those first whose answer changes most frames.
+    """Return open questions, those that change most frames first.
 
-    Each has ``kind``, ``part``, frames ``first`` to ``last``, the ``frame`` to look at, the same in
-    seconds, its ``words``, ``weight`` (frames that the answer is expected to change) and the
+    Each has ``kind``, ``part``, frames ``first`` to ``last`` (``from_s`` to ``to_s`` in seconds),
+    the ``frame`` to look at, ``words``, ``weight`` (expected number of changed frames) and
     ``choices``.
     """
     found: list[dict[str, Any]] = []
@@ -47,34 +49,34 @@ def propose(opened: Opened, answered: Sequence[Mapping[str, Any]]) -> list[dict[
         for look in (_of_subject, _of_sides, _of_object, _of_contact):
             try:
                 found += look(opened, object_.replace("_", " "), times)
-            except UserError:  # not there, or of an older version: told by the result
+            except UserError:  # missing or of another version, which result.py reports
                 continue
-    for one in found:
-        one["from_s"] = round(float(times[one["first"]]), 3)
-        one["to_s"] = round(float(times[one["last"]]), 3)
-    left = [one for one in found if not any(_same(one, other) for other in answered)]
-    left.sort(key=lambda one: -one["weight"])
-    return left[:MOST]
+    for question in found:
+        question["from_s"] = round(float(times[question["first"]]), 3)
+        question["to_s"] = round(float(times[question["last"]]), 3)
+    unanswered = [q for q in found if not any(_answers(q, answer) for answer in answered)]
+    unanswered.sort(key=lambda question: -question["weight"])
+    return unanswered[:MOST]
 
 
 def read_answers(path: Path) -> list[dict[str, Any]]:
-    """What was answered; lines that are none (a write that was cut off) are left out."""
+    """Read the answers; incomplete lines of interrupted writes are skipped."""
     if not path.is_file() or path.stat().st_size > _MAX_BYTES:
         return []
     found = []
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         try:
-            told = json.loads(line)
+            answer = json.loads(line)
         except ValueError:
             continue
-        if isinstance(told, dict):
-            found.append(told)
+        if isinstance(answer, dict):
+            found.append(answer)
     return found
 
 
-def keep_answer(path: Path, told: Mapping[str, Any], by: str | None) -> None:
-    """Add an answer to the file; ``by`` names who answered, and then it is also told when."""
-    record = dict(told)
+def keep_answer(path: Path, answer: Mapping[str, Any], by: str | None) -> None:
+    """Append an answer to the file, with annotator and time if ``by`` is given."""
+    record = dict(answer)
     if by:
         record |= {"by": by, "at": datetime.now(UTC).isoformat(timespec="seconds")}
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -82,7 +84,7 @@ def keep_answer(path: Path, told: Mapping[str, Any], by: str | None) -> None:
     handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
     try:
         size = os.fstat(handle).st_size
-        if size and not _ends_line(path, size):  # after a write that was cut off
+        if size and not _ends_line(path, size):  # after an interrupted write
             line = "\n" + line
         os.write(handle, line.encode())
         os.fsync(handle)
@@ -96,8 +98,8 @@ def _ends_line(path: Path, size: int) -> bool:
         return file.read(1) == b"\n"
 
 
-def _same(question: Mapping[str, Any], answer: Mapping[str, Any]) -> bool:
-    """Whether an answer is of this question, whatever its frames are numbered by now."""
+def _answers(question: Mapping[str, Any], answer: Mapping[str, Any]) -> bool:
+    """Return whether an answer belongs to a question, by time, as frames may be renumbered."""
     if any(question[key] != answer.get(key) for key in ("kind", "part")):
         return False
     first, last = answer.get("from_s"), answer.get("to_s")
@@ -129,11 +131,11 @@ def _of_subject(opened: Opened, object_: str, times: np.ndarray) -> list[dict[st
     if not confidence > 0:
         return []
     why = f" ({doubts})" if doubts else ""
-    choices = (("yes", "Yes, this one"), ("no", "No: I click who it is"))
+    choices = (("yes", "Yes"), ("no", "No: I click the subject"))
     return [
         _question(
             "subject", "", 0, len(times) - 1, int(t),
-            f"Several people are seen. Is the marked one the subject?{why}",
+            f"Several people are visible. Is the marked person the subject?{why}",
             len(times), choices, camera=camera, x=round(float(x), 1), y=round(float(y), 1),
         )
     ]  # fmt: skip
@@ -143,11 +145,11 @@ def _of_sides(opened: Opened, object_: str, times: np.ndarray) -> list[dict[str,
     return [
         _question(
             "sides", "", one.first, one.last, one.frame,
-            "Are L and R, as the views' points have them, the subject's own left and right?",
+            "Are L and R in the views the subject's own left and right?",
             2.0 * (one.last - one.first + 1),
             (("yes", "Yes, in every view"), ("view", f"Exchanged in {one.camera}"),
              ("all", "Exchanged in every view"), ("mark", "I mark where"),
-             ("unsure", "Cannot be seen")),
+             ("unsure", "I cannot tell")),
             camera=one.camera, why=one.words,
         )
         for one in doubts(opened)
@@ -161,13 +163,13 @@ def _of_object(opened: Opened, object_: str, times: np.ndarray) -> list[dict[str
         lost, ambiguous = track["lost"], track["ambiguous"] & ~track["lost"]
     found = []
     for first, last, _ in ranges(["x" if one else "" for one in lost]):
-        choices = (("place", "I place it"), ("hidden", "It is not to be seen"))
+        choices = (("place", "I place it"), ("hidden", "It is not visible"))
         words = f"The {object_} is lost here. Where is it?"
         found.append(_question("lost", "", first, last, (first + last) // 2, words,
                                2.0 * (last - first + 1), choices))  # fmt: skip
     for first, last, _ in ranges(["x" if one else "" for one in ambiguous]):
-        turns = (("yes", "Yes, as drawn"), ("no", "No: I turn it"), ("unsure", "Cannot be seen"))
-        words = f"Is the {object_} turned as it is drawn?"
+        turns = (("yes", "Yes, as drawn"), ("no", "No: I rotate it"), ("unsure", "I cannot tell"))
+        words = f"Is the rotation of the {object_} as drawn?"
         found.append(_question("turn", "", first, last, (first + last) // 2, words,
                                3.0 + 1.5 * (last - first), turns))  # fmt: skip
     return found
@@ -188,7 +190,7 @@ def _of_contact(opened: Opened, object_: str, times: np.ndarray) -> list[dict[st
             run = p[first : last + 1]
             frame = first + int(np.abs(run - 0.5).argmin())
             words = f"Does the {region.replace('_', ' ')} touch the {object_} here?"
-            choices = (("yes", "It touches"), ("no", "It does not"), ("unsure", "Cannot be seen"))
+            choices = (("yes", "It touches"), ("no", "It does not"), ("unsure", "I cannot tell"))
             found.append(_question("contact", region, first, last, frame, words,
                                    float((4 * run * (1 - run)).sum()), choices))  # fmt: skip
     return found

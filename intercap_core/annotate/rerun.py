@@ -1,7 +1,4 @@
-"""Running again what an edit touches.
-
-What is touched is decided by ``pipeline.plan``, as for ``intercap run``, which is also what runs.
-"""
+"""Re-running the stages that an edit makes stale, by `intercap run`."""
 
 from __future__ import annotations
 
@@ -27,31 +24,31 @@ from intercap_core.project import Project
 from intercap_core.stage_list import LEAVES
 
 _LAST_LINES = 12
-_PLANNING = threading.Lock()  # Python 3.11 fails where two threads parse source at a time
-_PATIENCE_S = 10.0  # beyond what `intercap run` takes at most to end in order
+_PLANNING = threading.Lock()  # Python 3.11 fails if two threads parse source at a time
+_PATIENCE_S = 10.0  # added to the time in which `intercap run` ends in order
 
 
 @dataclass(frozen=True)
 class EditedProject(Project):
-    """A project in which one sequence's annotation is another than the file's."""
+    """A project with an unsaved annotation of one sequence."""
 
     edited: Mapping[str, Annotation] = field(default_factory=dict)
 
     @classmethod
     def of(cls, project: Project, sequence: str, annotation: Annotation) -> EditedProject:
-        """The project with ``annotation`` for a sequence."""
-        own = {one.name: getattr(project, one.name) for one in fields(Project)}
-        return cls(**own, edited={sequence: annotation})
+        """Return the project with another annotation of a sequence."""
+        values = {f.name: getattr(project, f.name) for f in fields(Project)}
+        return cls(**values, edited={sequence: annotation})
 
     def annotation(self, sequence: str, *, look_at_frames: bool = True) -> Annotation:
-        """As the project's own, but for the edited one."""
+        """Return the annotation of a sequence, unsaved if it is edited."""
         if sequence in self.edited:
             return self.edited[sequence]
         return super().annotation(sequence, look_at_frames=look_at_frames)
 
 
 def touched(project: Project, sequence: str) -> list[dict[str, Any]]:
-    """Stages that a run would make anew, in their order, with the reasons."""
+    """Return the stages that a run would compute, in order, with the reasons."""
     with _PLANNING:
         plan = Plan(project)
         found = [
@@ -65,14 +62,14 @@ def touched(project: Project, sequence: str) -> list[dict[str, Any]]:
 
 
 def targets(project: Project, sequence: str) -> list[str]:
-    """What Snakemake is asked for, so that it makes all of one sequence and nothing of others."""
+    """Return the Snakemake targets that compute all stages of one sequence."""
     return [str(project.artefact(sequence, stage)) for stage in LEAVES]
 
 
 def command(
     project: Project, sequence: str, *, cores: int = 0, profile: Path | None = None
 ) -> list[str]:
-    """`intercap run` of one sequence, as it is written in a shell."""
+    """Return the arguments of `intercap run` for one sequence."""
     return [
         "intercap", "run", str(project.path),
         *(("--cores", str(cores)) if cores else ()),
@@ -82,7 +79,7 @@ def command(
 
 
 class Runs:
-    """The one run that the page may have started, of one sequence at a time."""
+    """Runs that the page starts, one at a time."""
 
     def __init__(self, *, cores: int = 0, profile: Path | None = None) -> None:
         self.cores, self.profile = cores, profile
@@ -92,87 +89,88 @@ class Runs:
         self._stages: list[str] = []
         self._start = 0.0
         self._ended = 0.0
-        self._told_to_end = 0.0  # when, by time.monotonic; 0 = it was not
-        self._said: Path | None = None
+        self._stop_time = 0.0  # time.monotonic() of the request to stop, 0 = none
+        self._output: Path | None = None
 
     @property
     def going_on(self) -> bool:
-        """Whether a run that was started here has not ended."""
+        """True while a run that was started here has not ended."""
         return self._process is not None and self._process.poll() is None
 
     @property
     def sequence(self) -> str:
-        """Of the run that was started last, "" = none was."""
+        """Sequence of the last run, "" if there was none."""
         return self._sequence
 
     def start(self, project: Project, sequence: str) -> None:
-        """Run what is out of date of a sequence; what is there now is kept beside.
+        """Back up the results of a sequence and compute its stale stages.
 
-        Raises UserError where a run goes on, nothing is to be done, or jobs go to a cluster.
+        Raises UserError if a run is in progress, everything is up to date, or jobs need a cluster.
         """
-        told = command(project, sequence, cores=self.cores, profile=self.profile)
+        arguments = command(project, sequence, cores=self.cores, profile=self.profile)
         if self.profile is not None:
-            raise UserError(f"jobs go to a cluster: run {shlex.join(told)}")
+            raise UserError(f"jobs go to a cluster: run {shlex.join(arguments)}")
         with self._lock:
             if self.going_on:
-                raise UserError(f"a run of {self._sequence} goes on; wait for its end, or stop it")
+                raise UserError(
+                    f"a run of {self._sequence} is in progress; wait for its end, or stop it"
+                )
             self._stages = [one["stage"] for one in touched(project, sequence)]
             if not self._stages:
                 raise UserError(f"nothing to run: all results of {sequence} are up to date")
             self._note_end(project)
             before.keep(project, sequence, self._stages)
-            self._said = project.logs / "annotate.txt"  # no .log: those are of jobs
-            self._said.parent.mkdir(parents=True, exist_ok=True)
+            self._output = project.logs / "annotate.txt"  # not .log, which jobs use
+            self._output.parent.mkdir(parents=True, exist_ok=True)
             self._sequence, self._start, self._ended = sequence, time.time(), 0.0
-            self._told_to_end = 0.0
-            with open(self._said, "wb") as said:
+            self._stop_time = 0.0
+            with open(self._output, "wb") as output:
                 self._process = subprocess.Popen(
-                    [sys.executable, "-m", "intercap_core.cli", *told[1:]],
-                    stdout=said, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
+                    [sys.executable, "-m", "intercap_core.cli", *arguments[1:]],
+                    stdout=output, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
                     env={**os.environ, "NO_COLOR": "1"},
                 )  # fmt: skip
 
     def stop(self) -> None:
-        """Tell the run to end, with its jobs; what they had finished is kept. It is not waited for.
+        """Ask the run and its jobs to end, and return at once; finished results are kept.
 
-        Telling it again changes nothing as long as it may take to end in order; after that, it is
-        killed.
+        A second request has no effect while the run may end in order. After that, it kills the run.
         """
         with self._lock:
             if self._process is None or not self.going_on:
                 return
-            if not self._told_to_end:
-                self._told_to_end = time.monotonic()
+            if not self._stop_time:
+                self._stop_time = time.monotonic()
                 self._process.terminate()
-            elif time.monotonic() - self._told_to_end > ENDS_WITHIN_S + _PATIENCE_S:
+            elif time.monotonic() - self._stop_time > ENDS_WITHIN_S + _PATIENCE_S:
                 _kill(self._process)
 
     def wait(self) -> None:
-        """Until a run that was told to end has ended, or is taken for one that does not."""
+        """Wait until a stopped run has ended, at most as long as it may take."""
         if self._process is not None:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(ENDS_WITHIN_S + _PATIENCE_S)
 
     def progress(self, project: Project) -> dict[str, Any]:
-        """How far the last run is: the sequence, each of its stages' states and last words."""
+        """Return the state of the last run, with each stage's state and last line of its log."""
         if self._process is None:
             return {"state": "none"}
         status = self._process.poll()
         self._note_end(project)
         stages = [{"stage": stage, **self._stage(project, stage)} for stage in self._stages]
-        told = bool(self._told_to_end)
+        stopping = bool(self._stop_time)
         if status is None:
-            state = "ending" if told else "running"
+            state = "ending" if stopping else "running"
         else:
-            state = "done" if status == 0 else ("stopped" if told else "failed")
+            state = "done" if status == 0 else ("stopped" if stopping else "failed")
         words = ""
-        if state == "failed" and self._said is not None and self._said.is_file():
-            lines = self._said.read_text(encoding="utf-8", errors="replace").splitlines()
+        if state == "failed" and self._output is not None and self._output.is_file():
+            lines = self._output.read_text(encoding="utf-8", errors="replace").splitlines()
             words = "\n".join(lines[-_LAST_LINES:])
         return {
             "state": state, "sequence": self._sequence, "stages": stages, "words": words,
             "seconds": round((self._ended or time.time()) - self._start, 1),
-            "ending_s": round(time.monotonic() - self._told_to_end, 1) if told else 0.0,
+            "ending_s": round(time.monotonic() - self._stop_time, 1) if stopping else 0.0,
             "ends_within_s": ENDS_WITHIN_S + _PATIENCE_S,
         }  # fmt: skip
 
@@ -195,7 +193,7 @@ class Runs:
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:
-    """The process and all that it has started."""
+    """Kill a process and its descendants."""
     import psutil
 
     with contextlib.suppress(psutil.NoSuchProcess):

@@ -1,5 +1,6 @@
-"""What the page knows of a sequence: its cameras, its frames, the result that is drawn and what
-speaks against it. What cannot be read is a sentence among ``notes``; all else is there.
+"""Description of a sequence for the page: cameras, frames, drawn result and doubts about it.
+
+Artefacts that cannot be read are reported in ``notes``; everything else is shown.
 """
 
 from __future__ import annotations
@@ -25,15 +26,9 @@ from intercap_core.pipeline.provenance import read_manifest
 from intercap_core.schemas import BODY_FIT, JOINT, METRICS, OBJECT_TRACK, PERSON, SCENE
 from intercap_core.sequence_inputs import SequencePaths
 
-DOUBTED = 1.5  # times the part's stated error: a frame that the verdict doubts
-_DRAWN = {
-    "scene",
-    "body_fit",
-    "joint",
-    "metrics",
-    "object_track",
-}  # what the viewer shows is of these
-_LENGTHS = {  # a dataset of each stage with a row a frame
+DOUBTED = 1.5  # frames with a larger multiple of the part's stated error are doubtful
+_DRAWN = {"scene", "body_fit", "joint", "metrics", "object_track"}  # drawn by the viewer
+_LENGTHS = {  # a dataset of each stage with a row per frame
     "scene": (SCENE, "times"),
     "person": (PERSON, "missing"),
     "object_track": (OBJECT_TRACK, "lost"),
@@ -41,12 +36,12 @@ _LENGTHS = {  # a dataset of each stage with a row a frame
     "joint": (JOINT, "flagged"),
     "metrics": (METRICS, "flagged"),
 }
-_CALL = 'showInterCap("'  # what the page's script hands the data to
-_VIEWER = ("frames", "scene", "body_fit")
+_CALL = 'showInterCap("'  # call in the page's script, before the data
+_VIEWER = ("frames", "scene", "body_fit")  # stages that the viewer needs
 
 
 def describe(opened: Opened) -> dict[str, Any]:
-    """All but images and meshes, as JSON; raises UserError where there are no frames to show."""
+    """Return everything but images and meshes for JSON; raises UserError without frames."""
     with opened.lock:
         found: dict[str, Any] = {"notes": [], "places": []}
         with opened.images() as images:
@@ -68,74 +63,76 @@ def describe(opened: Opened) -> dict[str, Any]:
         for look in (_scene, _person, _track, _body, _joint, _metrics):
             stage = look.__name__[1:]
             stage = {"track": "object_track", "body": "body_fit"}.get(stage, stage)
-            if not opened.there(stage):
+            if not opened.has(stage):
                 continue
             try:
                 _same_recording(opened, stage, found["frames"])
                 rig = look(opened, found) or rig
-            except UserError as error:  # an older version, damaged, or another recording's
+            except UserError as error:  # another version, damaged, or of another recording
                 found["notes"].append(str(error))
                 broken.add(stage)
         found["cameras"] = _cameras(rig)
-        found["viewer"] = all(opened.there(stage) for stage in _VIEWER) and not broken & _DRAWN
-        if not opened.there("joint"):
+        found["viewer"] = all(opened.has(stage) for stage in _VIEWER) and not broken & _DRAWN
+        if not opened.has("joint"):
             found["notes"].append(
                 "there is no joint result yet: "
-                + ("the sequential fits are shown" if found["viewer"] else "images alone are shown")
+                + ("the sequential fits are shown" if found["viewer"] else "only images are shown")
             )
         recordings = opened.project.sequences[opened.name].recordings
         if not recordings.exists():
             found["notes"].append(
-                f"{recordings}: the recordings are not there; what is computed can be looked at "
-                "and mended, a run that reads them fails until the table names their new place"
+                f"{recordings}: the recordings are missing; computed results can be viewed and "
+                "annotated, but a run that reads recordings fails until the table has their path"
             )
         found["places"].sort(key=lambda place: -place["weight"])
     return found
 
 
 def viewer_payload(opened: Opened) -> str:
-    """The 4D viewer's data; raises UserError where there is no body yet or it is not readable."""
+    """Return the 4D viewer's data; raises UserError without a readable body."""
     project = opened.project
 
-    def made() -> str:
-        drawn = _of_page(opened)
-        if drawn:
-            return payload(*_the_result_alone(*unpacked(drawn)))
+    def make() -> str:
+        data = _data_of_page(opened)
+        if data:
+            return payload(*_final_result(*unpacked(data)))
         paths = SequencePaths(
             **{stage: path for stage, path in opened.paths.items() if stage != "summary"}
         )
         content = gather(paths, project.models(opened.name))
-        return payload(*_the_result_alone(content.header, content.arrays))
+        return payload(*_final_result(content.header, content.arrays))
 
-    missing = [stage for stage in _VIEWER if not opened.there(stage)]
+    missing = [stage for stage in _VIEWER if not opened.has(stage)]
     if missing:
-        raise UserError(f"sequence {opened.name!r} has no body yet: stage {missing[0]!r} lacks")
+        raise UserError(
+            f"sequence {opened.name!r} has no body yet: no result of stage {missing[0]!r}"
+        )
     stages = (*_VIEWER, "joint", "metrics", "object_track", "person", "detections")
-    return opened.made("viewer", stages, made)
+    return opened.cached("viewer", stages, make)
 
 
-def _the_result_alone(
+def _final_result(
     header: dict[str, Any], arrays: dict[str, np.ndarray]
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Without earlier fits and the studio's truth: half of what goes through a tunnel."""
+    """Remove earlier fits and truth, which halves the data."""
     shown, *others = header["versions"]
-    left_out = tuple(f"{name}/" for name in (*others, "truth"))
+    removed = tuple(f"{name}/" for name in (*others, "truth"))
     versions = {shown: header["versions"][shown]}
-    kept = {name: values for name, values in arrays.items() if not name.startswith(left_out)}
+    kept = {name: values for name, values in arrays.items() if not name.startswith(removed)}
     return header | {"versions": versions}, kept
 
 
-def _of_page(opened: Opened) -> str:
-    """The viewer's data of the site's page, where that was made of these very artefacts; "" = not.
+def _data_of_page(opened: Opened) -> str:
+    """Return the viewer's data of the site's page if it was made from these artefacts, else "".
 
-    Of a long sequence it saves a minute.
+    This saves a minute for a long sequence.
     """
     page = opened.project.artefact(opened.name, "page")
     script, record = page / page_of.SCRIPT, read_manifest(page)
     if record is None or not script.is_file():
         return ""
     for stage, identity in record.artefacts.items():
-        own = read_manifest(opened.paths[stage]) if opened.there(stage) else None
+        own = read_manifest(opened.paths[stage]) if opened.has(stage) else None
         if own is None or own.fingerprint != identity:
             return ""
     _, called, data = script.read_text(encoding="utf-8").rpartition(_CALL)
@@ -143,13 +140,15 @@ def _of_page(opened: Opened) -> str:
 
 
 def object_payload(opened: Opened) -> str:
-    """The object's mesh and, where it is tracked, poses (T, 3, 4) master_from_object, for the
-    overlay; raises UserError where the sequence names no object."""
+    """Return the object's mesh and its poses (T, 3, 4) master_from_object for the overlay.
+
+    Raises UserError if the sequence has no object.
+    """
     entry = opened.project.object_of(opened.name)
     if entry is None:
         raise UserError(f"sequence {opened.name!r} names no object")
 
-    def made() -> str:
+    def make() -> str:
         mesh = ObjectMesh.load(entry)
         arrays = {
             "vertices": mesh.vertices.astype(np.float32),
@@ -166,18 +165,20 @@ def object_payload(opened: Opened) -> str:
             arrays[f"poses/{name}"] = poses[:, :3].astype(np.float32)
         return payload(header, arrays)
 
-    return opened.made("object", ("joint", "object_track"), made)
+    return opened.cached("object", ("joint", "object_track"), make)
 
 
 def _same_recording(opened: Opened, stage: str, frames: int) -> None:
-    """Raise UserError where an artefact has not as many frames as the images: they were read anew
-    since, and the stage was not run again."""
+    """Raise UserError if an artefact has another number of frames than the images.
+
+    This happens if the images were read again and the stage was not.
+    """
     schema, key = _LENGTHS[stage]
     with artefacts.read(opened.paths[stage], schema) as source:
         count = source.describe(key)[0][0]
     if count != frames:
         raise UserError(
-            f"{opened.paths[stage]}: has {count} frames, and {frames} were read since: it is not "
+            f"{opened.paths[stage]}: has {count} frames, but {frames} were read since; it is not "
             f"shown; re-run stage {stage!r}"
         )
 
@@ -220,14 +221,14 @@ def _track(opened: Opened, found: dict[str, Any]) -> None:
         if not found["track"]["object"]:
             return
         found["places"] += _runs(track["lost"], "object", "the object is lost", 3.0)
-        words = "the object may be turned another way"
+        words = "the rotation of the object is ambiguous"
         found["places"] += _runs(track["ambiguous"], "object", words, 2.0)
 
 
 def _body(opened: Opened, found: dict[str, Any]) -> None:
     with artefacts.read(opened.paths["body_fit"], BODY_FIT) as fit:
         failed = fit["failed"]
-    found["places"] += _runs(failed, "body", "no believable body", 2.5)
+    found["places"] += _runs(failed, "body", "the body fit failed", 2.5)
 
 
 def _joint(opened: Opened, found: dict[str, Any]) -> Rig | None:
@@ -241,7 +242,7 @@ def _joint(opened: Opened, found: dict[str, Any]) -> Rig | None:
             }
         found["flags"] = ranges(joint.text("flag_reason"))
         moved = joint["master_from_colour"]
-    if opened.there("scene"):
+    if opened.has("scene"):
         return Rig.from_scene(opened.paths["scene"]).moved(moved)
     return None
 
@@ -270,7 +271,7 @@ def _metrics(opened: Opened, found: dict[str, Any]) -> None:
 
 
 def _doubted(part: str, error: float, by_frame: np.ndarray) -> Iterator[dict[str, Any]]:
-    """Runs of frames whose stated error is well above the sequence's, each at its worst frame."""
+    """Return runs of frames with a stated error well above the sequence's, at their worst frame."""
     if not np.isfinite(error):
         return
     high = np.nan_to_num(by_frame) > DOUBTED * error
@@ -289,7 +290,7 @@ def _runs(mask: np.ndarray, kind: str, words: str, weight: float) -> list[dict[s
 def _place(
     first: int, last: int, kind: str, words: str, weight: float, frame: int | None = None
 ) -> dict[str, Any]:
-    """A run of frames to look at, and the frame to jump to."""
+    """Return a run of frames to check, and the frame to show."""
     middle = (first + last) // 2 if frame is None else frame
     return {
         "first": int(first), "last": int(last), "frame": int(middle), "kind": kind,
@@ -298,7 +299,7 @@ def _place(
 
 
 def _cameras(rig: Rig) -> list[dict[str, Any]]:
-    """Lens (13,) and colour_from_master (3, 4) of each camera, None where the pose is not known."""
+    """Return lens (13,) and colour_from_master (3, 4) of each camera, None for unknown poses."""
     return [
         {
             "name": camera.name,
@@ -313,6 +314,6 @@ def _cameras(rig: Rig) -> list[dict[str, Any]]:
 
 
 def _bytes(share: np.ndarray) -> str:
-    """Shares 0..1 in 255ths, row by row, in base64."""
+    """Encode shares 0..1 as bytes, row by row, in base64."""
     values = np.rint(255 * np.clip(np.nan_to_num(share), 0, 1)).astype(np.uint8)
     return base64.b64encode(values.tobytes()).decode()

@@ -1,4 +1,4 @@
-"""`intercap annotate`: the server on the loopback, and the address to open."""
+"""`intercap annotate`: a server on the loopback address."""
 
 from __future__ import annotations
 
@@ -27,9 +27,19 @@ def serve(
     show: bool = False,
     say: Callable[[str], None] = print,
 ) -> None:
-    """Serve the page until the process is interrupted; ``port`` 0 = any that is free.
+    """Serve the page until the process is interrupted.
 
-    Raises UserError where the project has a fault, the port is taken or a library is missing.
+    Args:
+        settings: the project's config.yaml.
+        sequence: sequence to open, by default the list of sequences.
+        port: 0 for any free port.
+        by: name of the annotator.
+        cores: number of cores of runs, 0 for all.
+        profile: Snakemake profile of a cluster.
+        show: open the default browser.
+        say: prints the address and instructions.
+
+    Raises UserError if the project has a fault, the port is in use or a library is missing.
     """
     try:
         import uvicorn
@@ -61,7 +71,7 @@ def serve(
         say(f"open {address}")
         tunnel = f"ssh -L {used}:{HOST}:{used} {socket.gethostname()}"
         say(f"from another machine: {tunnel}, then the same address")
-        say("who has the address may change annotations; Ctrl+C ends it")
+        say("anybody with the address may change annotations; Ctrl+C ends the server")
         if show:
             _show(address)
         options = uvicorn.Config(
@@ -73,14 +83,16 @@ def serve(
         finally:
             annotator.runs.stop()
             if annotator.runs.going_on:
-                say(f"the run of {annotator.runs.sequence} is ending; what is done is kept")
+                say(f"the run of {annotator.runs.sequence} is ending; finished results are kept")
                 annotator.runs.wait()
 
 
 def _show(address: str) -> None:
-    """Open the default browser by a file that only its user reads: other users of the machine see
-    the arguments of programs, and the address has the token."""
-    folder = Path(tempfile.mkdtemp(prefix="intercap-annotate-"))  # of this user alone
+    """Open the default browser with a file that only this user can read.
+
+    The address contains the token, and other users can see the arguments of programs.
+    """
+    folder = Path(tempfile.mkdtemp(prefix="intercap-annotate-"))  # readable by this user only
     page = folder / "open.html"
     page.write_text(f'<meta http-equiv="refresh" content="0;url={address}">', encoding="utf-8")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)

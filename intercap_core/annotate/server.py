@@ -1,4 +1,9 @@
-"""The page's server: what it shows as JSON, JPEG and arrays, and what it may ask to be done."""
+"""HTTP server of the annotation page, and its protection.
+
+Login nodes are shared: other users can reach ports of the loopback address, and web pages can send
+requests to them from the annotator's browser. Each request therefore carries a token in a header,
+which other pages cannot set. Requests to another host or from another origin are refused.
+"""
 
 from __future__ import annotations
 
@@ -20,19 +25,17 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from intercap_core.annotate import before, document, result, sides
-from intercap_core.annotate.annotator import Annotator, told_of
+from intercap_core.annotate.annotator import Annotator, document_to_json
 from intercap_core.annotate.opened import Opened
 from intercap_core.errors import UserError
 from intercap_core.output.viewer.page import DATA as VIEWER
 
 PAGE = Path(__file__).parent / "page"
-_KEEP = {
-    "cache-control": "private, max-age=86400, immutable"
-}  # of what has its stamp in its address
+_KEEP = {"cache-control": "private, max-age=86400, immutable"}  # for addresses that contain a stamp
 
 
 def application(annotator: Annotator, token: str) -> App:
-    """The server of a project; every request under /api/ carries the ``token``."""
+    """Return the server of a project; every request under /api/ must carry the ``token``."""
 
     def page(_: Request) -> Response:
         return FileResponse(PAGE / "index.html", headers={"cache-control": "no-cache"})
@@ -70,17 +73,17 @@ def application(annotator: Annotator, token: str) -> App:
             name = request.path_params["name"]
             annotator.opened(name)
             try:
-                told = json.loads(await request.body())
+                content = json.loads(await request.body())
             except (ValueError, RecursionError):
-                told = None
-            if not isinstance(told, dict):
+                content = None
+            if not isinstance(content, dict):
                 raise HTTPException(400, "expected a JSON object")
-            return _json(await run_in_threadpool(function, name, told))
+            return _json(await run_in_threadpool(function, name, content))
 
         return endpoint
 
-    def beside(name: str) -> dict[str, Any]:
-        return before.beside(annotator.project, name)
+    def compare(name: str) -> dict[str, Any]:
+        return before.compare(annotator.project, name)
 
     of = "/api/sequences/{name}"
     squeezed = [Middleware(GZipMiddleware, compresslevel=6)]
@@ -95,7 +98,7 @@ def application(annotator: Annotator, token: str) -> App:
         Route(f"{of}/state", look(annotator.state)),
         Route(f"{of}/questions", look(annotator.questions)),
         Route(f"{of}/run", look(annotator.run_state), methods=["GET"]),
-        Route(f"{of}/beside", look(beside)),
+        Route(f"{of}/beside", look(compare)),
         Route(f"{of}/surface", look(annotator.read_surface), methods=["GET"]),
         Route(f"{of}/symmetry", look(annotator.read_symmetry), methods=["GET"]),
         Route(f"{of}/image/{{camera}}/{{frame:int}}", image),
@@ -120,8 +123,8 @@ def application(annotator: Annotator, token: str) -> App:
 
 
 def _changed(_: Request, error: Any) -> Response:
-    told = {"error": str(error), "now": told_of(error.now), "difference": error.difference}
-    return _json(told, 409)
+    content = {"error": str(error), "now": document_to_json(error.now)}
+    return _json(content | {"difference": error.difference}, 409)
 
 
 def _json(value: Any, status: int = 200) -> Response:
@@ -129,8 +132,8 @@ def _json(value: Any, status: int = 200) -> Response:
 
 
 TOKEN_HEADER = "x-intercap-token"
-HOSTS = ("127.0.0.1", "localhost", "::1")  # any port: a tunnel's own end may have another
-MAX_BODY = 1 << 20
+HOSTS = ("127.0.0.1", "localhost", "::1")  # with any port, as a tunnel may use another
+MAX_BODY = 1 << 20  # bytes of a request
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -150,13 +153,13 @@ App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 
 class Guard:
-    """Refuses what does not come from the page, and adds the headers that bind the page itself."""
+    """Refuse requests that do not come from the page; add security headers to responses."""
 
     def __init__(self, app: App, token: str) -> None:
         self._app, self._token = app, token
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer one request, as ASGI has it."""
+        """Answer one ASGI request."""
         if scope["type"] != "http":
             if scope["type"] == "lifespan":
                 await self._app(scope, receive, send)
@@ -178,30 +181,34 @@ class Guard:
 
 
 def refusal(method: str, path: str, headers: dict[str, str], token: str) -> tuple[int, str] | None:
-    """Status and reason for which a request is refused, None = it is answered."""
+    """Return status and reason if a request is refused, else None."""
     host = headers.get("host", "")
     try:
         name = urlsplit(f"//{host}").hostname
     except ValueError:
         name = None
     if name not in HOSTS:
-        return 400, "this server answers on the loopback alone: use 127.0.0.1 or localhost"
+        return 400, "this server answers on the loopback address only: use 127.0.0.1 or localhost"
     origin = headers.get("origin")
     if origin is not None and origin != f"http://{host}":
         return 403, "the request comes from another page"
     if not path.startswith("/api/"):
-        return None if method in ("GET", "HEAD") else (405, "only what is under /api/ is changed")
+        return (
+            None
+            if method in ("GET", "HEAD")
+            else (405, "only addresses under /api/ accept this method")
+        )
     if headers.get("sec-fetch-site", "same-origin") != "same-origin":
         return 403, "the request comes from another page"
     given = headers.get(TOKEN_HEADER, "")
     if not secrets.compare_digest(given.encode(), token.encode()):
-        return 401, "the token is missing or another one: open the address that was printed"
+        return 401, "the token is missing or wrong: open the address that was printed"
     if method not in ("GET", "HEAD"):
         if origin is None:
-            return 403, "the request does not say which page it comes from"
+            return 403, "the request has no origin"
         length = headers.get("content-length", "")
         if not length.isdigit() or int(length) > MAX_BODY:
-            return 413, f"a request holds at most {MAX_BODY} bytes"
+            return 413, f"a request may have at most {MAX_BODY} bytes"
     return None
 
 

@@ -1,6 +1,4 @@
-"""Left and right of the subject: its limbs as a detector named them and as the result has them, and
-where that is in doubt.
-"""
+"""Left and right of the subject: detected sides, sides of the result, and doubts about them."""
 
 from __future__ import annotations
 
@@ -25,12 +23,12 @@ from intercap_core.stages.person import subject_keypoints
 
 POINTS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle", "big_toe")  # of each side
 BONES = ((0, 1), (1, 2), (3, 4), (4, 5), (5, 6))
-# Of how much better another way suits the build, a negative log likelihood: right bodies of the
-# studio stay below 2, mirrored ones are beyond 2.5 in two frames of three.
+# Difference of negative log likelihoods of the build, tuned on the studio: correct bodies stay
+# below 2, mirrored bodies exceed 2.5 in two of three frames.
 AGAINST_BUILD = 2.5
-MOST_VIEWS = 0.5  # of those that see a limb; exchanged in more, the detector is contradicted
-WEIGHT = 3.0  # of an exchange in all views beside what speaks against the build
-JOINED = 3  # doubted frames with at most so many others between are one place
+MOST_VIEWS = 0.5  # share of the views of a limb from which an exchange contradicts the detector
+WEIGHT = 3.0  # of an exchange in all views, relative to AGAINST_BUILD's scale
+JOINED = 3  # doubtful frames with at most this many frames between are one run
 _KEYPOINTS = [KEYPOINT_NAMES.index(f"{s}_{p}") for s in ("left", "right") for p in POINTS]
 _JOINTS = [JOINT_INDEX[f"{s}_{p}"] for s in ("left", "right") for p in (*POINTS[:-1], "foot")]
 _NOWHERE = -1
@@ -39,89 +37,94 @@ _STAGES = ("detections", "scene", "person", "joint", "body_fit")
 
 @dataclass(frozen=True)
 class Sides:
-    """``detected`` (T, C, 14, 2) int16: pixels of the subject's limbs, first all of what a detector
-    called left, then right; -1 = not seen. ``exchanged`` (T, C, 2): whether stage ``person`` took
-    arms and legs for the other side's: 1 yes, 0 no, -1 not seen. ``result`` (T, 14, 3) of
-    ``source``, metres in the master's frame; NaN = none. ``against`` (T,): how much better another
-    way suits the body's build; ``jumped`` (T,): the result's limbs jump to the other side and back.
-    ``image_of`` (T, C): the set whose image shows each moment.
-    """
+    """Sides of the subject's limbs over T frames and C cameras."""
 
     cameras: list[str]
     detected: np.ndarray
+    """(T, C, 14, 2) int16 pixels of the detector's left, then right limbs; -1 = not visible."""
     exchanged: np.ndarray
+    """(T, C, 2) whether stage person exchanged arms and legs: 1 yes, 0 no, -1 not visible."""
     result: np.ndarray
+    """(T, 14, 3) limbs of the result, master frame, metres; NaN = none."""
     source: str
+    """Stage of ``result``."""
     against: np.ndarray
+    """(T,) by how much exchanged sides suit the body's build better, negative log likelihood."""
     jumped: np.ndarray
+    """(T,) the result's limbs jump to the other side and back."""
     image_of: np.ndarray
+    """(T, C) set whose image shows each frame."""
 
 
 @dataclass(frozen=True)
 class Doubt:
-    """Frames ``first`` to ``last``, best looked at in ``frame``; of the ``camera`` most sides were
-    exchanged."""
+    """A run of frames with doubtful sides."""
 
     first: int
     last: int
     frame: int
+    """Frame to look at."""
     camera: str
+    """Camera with most exchanged sides."""
     words: str
 
 
 def sides_of(opened: Opened) -> Sides:
-    """Raises UserError where an artefact lacks, cannot be read or is of another recording."""
-    return opened.made("sides", _STAGES, lambda: _sides(opened))
+    """Compute the sides; raises UserError if an artefact is missing, unreadable or does not fit."""
+    return opened.cached("sides", _STAGES, lambda: _sides(opened))
 
 
 def sides_payload(opened: Opened) -> str:
-    """What the page draws, as the viewer's package has it."""
+    """Serialize what the page draws."""
 
-    def made() -> str:
-        found = sides_of(opened)
-        header = {"cameras": found.cameras, "bones": [list(b) for b in BONES],
-                  "points": list(POINTS), "source": found.source}  # fmt: skip
+    def make() -> str:
+        sides = sides_of(opened)
+        header = {"cameras": sides.cameras, "bones": [list(b) for b in BONES],
+                  "points": list(POINTS), "source": sides.source}  # fmt: skip
         arrays: dict[str, np.ndarray] = {
-            "detected": found.detected,
-            "exchanged": np.any(found.exchanged > 0, axis=2).astype(np.uint8),
-            "result": found.result.astype(np.float32),
+            "detected": sides.detected,
+            "exchanged": np.any(sides.exchanged > 0, axis=2).astype(np.uint8),
+            "result": sides.result.astype(np.float32),
         }
         return payload(header, arrays)
 
-    return opened.made("sides as sent", _STAGES, made)
+    return opened.cached("sides payload", _STAGES, make)
 
 
 def doubts(opened: Opened) -> list[Doubt]:
-    """Where stage ``person`` contradicted the detector in most views, the body's build speaks
-    against its choice, or the result's limbs jump from side to side; what the annotation states to
-    be exchanged is no contradiction."""
-    found = sides_of(opened)
-    stated = np.zeros(found.image_of.shape, bool)
-    with contextlib.suppress(UserError):  # an annotation that is none is told elsewhere
+    """Return runs of frames with doubtful sides.
+
+    Sides are doubtful if stage person contradicted the detector in most views (unless the
+    annotation states the exchange), if the body's build suits exchanged sides better, or if limbs
+    of the result jump from side to side.
+    """
+    sides = sides_of(opened)
+    stated = np.zeros(sides.image_of.shape, bool)
+    with contextlib.suppress(UserError):  # faults of the annotation are reported elsewhere
         annotation = opened.project.annotation(opened.name, look_at_frames=False)
         stated = images_with_stated_sides(
-            annotation.left_right, found.cameras, found.image_of, opened.name
+            annotation.left_right, sides.cameras, sides.image_of, opened.name
         )
-    limbs = np.where(found.exchanged < 0, -1, found.exchanged ^ stated[..., None])
-    return _runs(limbs, found)
+    limbs = np.where(sides.exchanged < 0, -1, sides.exchanged ^ stated[..., None])
+    return _runs(limbs, sides)
 
 
 def _sides(opened: Opened) -> Sides:
-    found = Detections.load(opened.paths["detections"])
+    detections = Detections.load(opened.paths["detections"])
     with artefacts.read(opened.paths["scene"], SCENE) as scene:
         image_of = scene["image_of"]
-    found = found.showing(image_of)
+    detections = detections.showing(image_of)
     with artefacts.read(opened.paths["person"], PERSON) as person:
         chosen, used, joints = person["person"], person["keypoints"], person["joints"]
         cameras = person.text("camera_names")
     counts = np.array(
-        [[len(found.people(t, c)) for c in range(len(cameras))] for t in range(len(chosen))]
+        [[len(detections.people(t, c)) for c in range(len(cameras))] for t in range(len(chosen))]
     )
-    if cameras != list(found.camera_names) or (chosen >= counts).any():
+    if cameras != list(detections.camera_names) or (chosen >= counts).any():
         raise UserError(
-            f"{opened.paths['person']}: was made of other detections; re-run stage 'person'"
+            f"{opened.paths['person']}: was made from other detections; re-run stage 'person'"
         )
-    given = subject_keypoints(found, chosen).astype(used.dtype)
+    given = subject_keypoints(detections, chosen).astype(used.dtype)
     confident = opened.project.config.person.min_confidence
     limbs = np.stack([_exchanged(given, used, limb, confident) for limb in (ARMS, LEGS)], 2)
     points = given[:, :, _KEYPOINTS]
@@ -136,7 +139,7 @@ def _sides(opened: Opened) -> Sides:
 def _exchanged(
     given: np.ndarray, used: np.ndarray, limb: np.ndarray, confident: float
 ) -> np.ndarray:
-    """Whether a limb (T, C) was exchanged: 1 yes, 0 no, -1 it is not seen."""
+    """Return whether a limb (T, C) was exchanged: 1 yes, 0 no, -1 not visible."""
     own, as_found, other = used[:, :, limb], given[:, :, limb], swap_sides(given)[:, :, limb]
     seen = (as_found[..., 2] >= confident).any(2)
     exchanged = (own == other).all((2, 3)) & (own != as_found).any((2, 3))
@@ -144,8 +147,7 @@ def _exchanged(
 
 
 def _result(opened: Opened, joints: np.ndarray) -> tuple[str, np.ndarray, np.ndarray]:
-    """The limbs (T, 14, 3) of the best body that there is, else of the triangulated keypoints; and
-    the frames in which they jumped to the other side."""
+    """Return stage, limbs (T, 14, 3) and frames with jumps (T,) of the most refined result."""
     for stage, schema in (("joint", JOINT), ("body_fit", BODY_FIT)):
         try:
             with artefacts.read(opened.paths[stage], schema) as body:
@@ -173,7 +175,7 @@ def _runs(limbs: np.ndarray, sides: Sides) -> list[Doubt]:
         if contradicted[run].any():
             why.append("the detector is contradicted in half of the views or more")
         if (against[run] >= AGAINST_BUILD).any():
-            why.append("knees, feet or head speak for the other way")
+            why.append("knees, feet or head suit exchanged sides better")
         if jumped[run].any():
             why.append("the body's limbs jump to the other side and back")
         worst = first + int((against[run] + WEIGHT * share[run].max(1)).argmax())

@@ -1,5 +1,4 @@
-"""The object's pose of one frame, fitted to the images from where a person has put it; and points
-of the room under a pixel."""
+"""Fit of the object's pose in one frame, started by the annotator; and 3D points at pixels."""
 
 from __future__ import annotations
 
@@ -30,22 +29,26 @@ from intercap_core.object_track.view import View
 from intercap_core.schemas import SCENE
 
 NEEDED = ("frames", "detections", "scene", "person")
-REACH_DIAMETERS = (0.35, 0.7, 1.2)  # of the object: how far from the start it is looked for
-FITTED_AROUND = 4  # of the places around, those that agree most
-NEAR_PX = 5.0  # of a click, in the colour image as recorded
-SAME_SURFACE_M = 0.03  # of points under a click, behind the nearest one
+REACH_DIAMETERS = (0.35, 0.7, 1.2)  # distances of other starts, in diameters of the object
+FITTED_AROUND = 4  # number of other starts that are fitted
+NEAR_PX = 5.0  # largest distance of a depth point from a click, in the colour image
+SAME_SURFACE_M = 0.03  # depth range of points that count as the clicked surface
 
 
 @dataclass(frozen=True)
 class Snapped:
-    """Pose master_from_object as the annotation has it, rad and m; ``overlap`` mean IoU over the
-    ``views`` that show it, ``seen``: the images bear it out; by how much it moved, m and rad."""
+    """A fitted pose master_from_object, as the annotation stores it."""
 
     rotation_vector: list[float]
+    """Radians."""
     translation: list[float]
+    """Metres."""
     overlap: float
+    """Mean IoU over ``views``."""
     views: int
+    """Number of views that show the object."""
     seen: bool
+    """The images support the pose."""
     moved_m: float
     turned_rad: float
 
@@ -57,21 +60,21 @@ def snap(
     rotation_vector: list[float],
     translation: list[float],
 ) -> Snapped:
-    """Fit the pose of a frame to depth and masks of all views, from this one.
+    """Fit the pose of a frame to depth and masks of all views, from this start.
 
-    Raises UserError where what it needs of the earlier stages is not there.
+    Raises UserError if a result of an earlier stage is missing.
     """
-    missing = [stage for stage in NEEDED if not opened.there(stage)]
+    missing = [stage for stage in NEEDED if not opened.has(stage)]
     if missing:
         raise UserError(f"a fit to the images needs stage {missing[0]!r}; run it first")
     settings = opened.project.config.object_track
     start = rigid(Rotation.from_rotvec(rotation_vector).as_matrix(), np.array(translation))
     with opened.sets() as images:
-        mesh = opened.made("mesh", (), lambda: ObjectMesh.load(entry).simplified(TRACKING_FACES))
-        detected = opened.made(
+        mesh = opened.cached("mesh", (), lambda: ObjectMesh.load(entry).simplified(TRACKING_FACES))
+        detected = opened.cached(
             "detections", ("detections",), lambda: Detections.load(opened.paths["detections"])
         )
-        source = opened.made(
+        source = opened.cached(
             "recording",
             NEEDED,
             lambda: ObjectRecording(
@@ -100,8 +103,10 @@ def _fitted(
     settings: ObjectTrackSettings,
     labels: tuple[str, ...],
 ) -> Fit:
-    """The fit from ``start`` (4, 4); where the images do not bear it out, the likeliest of it and
-    of those from places around it that agree most."""
+    """Fit from ``start`` (4, 4); if the images do not support the result, also from poses around.
+
+    Returns the fit with the highest likelihood.
+    """
     renderer = open_renderer("cpu")
 
     def fitted(pose: np.ndarray) -> Fit:
@@ -127,16 +132,16 @@ def _fitted(
 
 
 def point_under(opened: Opened, camera: str, frame: int, x: float, y: float) -> list[float]:
-    """The point (3,), master frame, metres, that a pixel of the colour image as recorded shows.
+    """Return the point (3,), master frame, metres, at a pixel of the colour image as recorded.
 
-    By the camera's depth, else where the ray meets the floor that is known. Raises UserError where
-    neither tells.
+    It is measured by depth, or else the ray is intersected with the floor. Raises UserError if
+    neither is possible.
     """
     with opened.images() as images:
         rig = images.rig
         bias = np.zeros(len(rig))
         normal = point = np.full(3, np.nan)
-        if opened.there("scene"):
+        if opened.has("scene"):
             with artefacts.read(opened.paths["scene"], SCENE) as scene:
                 rig, bias = Rig.from_artefact(scene), scene["depth_bias"]
                 normal, point = scene["ground_normal"], scene["ground_point"]
@@ -148,7 +153,7 @@ def point_under(opened: Opened, camera: str, frame: int, x: float, y: float) -> 
     if not (0 <= x < lens.width and 0 <= y < lens.height):
         raise UserError(f"x {x:g}, y {y:g} is outside of the image of camera {camera}")
     if not np.isfinite(rig[c].master_from_colour).all():
-        raise UserError(f"camera {camera}: its pose is not known, so no point can be placed by it")
+        raise UserError(f"camera {camera}: its pose is unknown, so no point can be placed with it")
     if depth is not None:
         points = master_points(depth, rig[c]).points.astype(np.float64)
         seen = apply(rig[c].colour_from_master, points)
@@ -168,6 +173,6 @@ def point_under(opened: Opened, camera: str, frame: int, x: float, y: float) -> 
         if far > 0:
             return (origin + far * ray).round(4).tolist()
     raise UserError(
-        f"camera {camera} has no depth at this pixel of frame {frame}; click beside it, or use "
+        f"camera {camera} has no depth at this pixel of frame {frame}; click next to it, or use "
         "another camera"
     )

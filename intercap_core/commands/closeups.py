@@ -41,6 +41,6 @@ def draw_closeups(
         for hold in found:
             path = folder / f"{name}_{hold.side}_{hold.first:04d}-{hold.last:04d}.jpg"
             folder.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(closeup(handling, hold).jpeg)
+            path.write_bytes(closeup(handling, hold).data)
             written.append(path)
     return written, empty

@@ -21,11 +21,11 @@ from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.output.export import body_files, bop, coco, contact, glb, meshes, parameters
 from intercap_core.output.export.about import About, BodyFile, Deviations, Verdict
-from intercap_core.output.export.body_files import Written
-from intercap_core.output.export.contact import TouchingSurfaces
+from intercap_core.output.export.body_files import WrittenBody
+from intercap_core.output.export.contact import ContactVertices, StatedContact
 from intercap_core.output.export.motion import Coordinates, Motion, read_motion, z_up_frame
 from intercap_core.output.export.readme import needs_object, readme
-from intercap_core.output.export.silhouettes import Exposures, body_vertices, object_poses
+from intercap_core.output.export.silhouettes import Scenes, body_vertices
 from intercap_core.schemas import JOINT, SCENE
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 from intercap_core.stages.folders import EXPORT_MARKER, check_replaceable, replaced
@@ -52,31 +52,32 @@ def run(
     UserError if an artefact or the object's mesh is missing or broken, if the metrics do not belong
     to the joint result, or if ``output`` holds anything but an export.
     """
-    object_, output = models.object_, Path(output)
+    output = Path(output)
     check_replaceable(output, marker=MARKER, what="export")
-    mesh = None if object_ is None else ObjectMesh.load(object_)
-    with artefacts.read(paths.scene, SCENE) as setting:
-        given = Rig.from_artefact(setting)
-        zup_from_master, upright = setting["zup_from_master"], z_up_frame(setting)
-        image_of, times = setting["image_of"], setting["times"]
-        fps = float(setting.attributes["fps"])
+    with artefacts.read(paths.scene, SCENE) as scene:
+        rig = Rig.from_artefact(scene)
+        zup_from_master, z_up_name = scene["zup_from_master"], z_up_frame(scene)
+        image_of, times = scene["image_of"], scene["times"]
+        fps = float(scene.attributes["fps"])
     with artefacts.read(paths.joint, JOINT) as fit:
-        rig = given.moved(fit["master_from_colour"])
-        exposures = Exposures(image_of, times, fit["time_offset"])
+        rig = rig.moved(fit["master_from_colour"])
+        time_offset = fit["time_offset"]
     motion = read_motion(paths.joint, fps, models.body_models, models.gender, zup_from_master)
+    mesh = None
+    if models.object_ is not None:
+        mesh = ObjectMesh.load(models.object_)
     if not motion.has_object:
         mesh = None
     z_up = settings.frame == "z-up"
-    viewed_from_master = zup_from_master if z_up else np.eye(4)
-    viewed = motion.moved(zup_from_master, upright) if z_up else motion
-    named = sorted(set(settings.formats))
-    formats = [name for name in named if mesh is not None or not needs_object(name)]
-    for name in set(named) - set(formats):
+    viewed = motion.moved(zup_from_master, z_up_name) if z_up else motion
+    requested = sorted(set(settings.formats))
+    formats = [name for name in requested if mesh is not None or not needs_object(name)]
+    for name in set(requested) - set(formats):
         log.info("sequence %s: there is no object, so %s is not exported", motion.sequence, name)
     about = _about(paths, motion, mesh)
     posed = set(formats) & (_IMAGE_FORMATS | {"meshes"})
     bodies = body_vertices(motion) if posed else np.zeros((0, 0, 3))
-    poses = list(object_poses(motion, rig, exposures))
+    scenes = Scenes(motion, rig, mesh, image_of, times, time_offset, bodies)
     with replaced(output) as folder:
         for name in formats:
             if name == "intercap":
@@ -84,36 +85,32 @@ def run(
                 parameters.write_intercap(folder / "intercap" / "res.pkl", motion, about)
             elif name == "amass":
                 parameters.write_amass(folder / "amass", viewed, about)
-            elif name == "bop" and object_ is not None and mesh is not None:
-                number = bop.object_id(object_.mesh)
-                bop.write(
-                    folder / "bop", motion, rig, mesh, number, exposures, about,
-                    bodies if settings.masks else None, poses,
-                )  # fmt: skip
+            elif name == "bop" and models.object_ is not None:
+                number = bop.object_id(models.object_.mesh)
+                bop.write(folder / "bop", scenes, number, about, masks=settings.masks)
             elif name == "coco":
-                coco.write(
-                    folder / "coco" / "annotations.json", motion, rig, mesh, exposures, about,
-                    bodies, poses,
-                )  # fmt: skip
+                coco.write(folder / "coco" / "annotations.json", scenes, about)
             elif name == "contact" and about.contact is not None and about.touching is not None:
                 contact.write(folder / "contact", about.contact, about.touching)
             elif name == "meshes":
-                some = (apply(viewed_from_master, b) for b in bodies[:: settings.mesh_every])
+                viewed_from_master = zup_from_master if z_up else np.eye(4)
+                placed = (apply(viewed_from_master, b) for b in bodies[:: settings.mesh_every])
                 meshes.write(
-                    folder / "meshes", viewed, some, mesh, about,
+                    folder / "meshes", viewed, placed, mesh, about,
                     kind=settings.mesh_format, every=settings.mesh_every,
                 )  # fmt: skip
             elif name == "glb":
                 (folder / "glb").mkdir()
                 glb.write(folder / "glb" / f"{motion.sequence}.glb", viewed, mesh, about, z_up=z_up)
-        files: Sequence[Written] = ()
+        files: Sequence[WrittenBody] = ()
         if set(formats) & _BODY_FORMATS:
             files = body_files.write(folder / "body", about.body)
         if settings.images and set(formats) & _IMAGE_FORMATS:
-            _copy_images(folder, paths.frames, rig, exposures, formats)
+            _copy_images(folder, paths.frames, scenes, formats)
         if about.verdict.stated:
-            _dump(folder / "verdict.json", {"sequence": motion.sequence, **about.verdict.whole()})
-        text = readme(motion, viewed, mesh, named, about, files, kind=settings.mesh_format)
+            summary = {"sequence": motion.sequence, **about.verdict.summary()}
+            _dump(folder / "verdict.json", summary)
+        text = readme(motion, viewed, mesh, requested, about, files, kind=settings.mesh_format)
         (folder / "README.txt").write_text(text, encoding="utf-8")
         coordinates = {
             **dict.fromkeys(("amass", "meshes"), Coordinates.of(viewed)),
@@ -127,32 +124,31 @@ def run(
 
 
 def _about(paths: SequencePaths, motion: Motion, mesh: ObjectMesh | None) -> About:
-    """Errors, flags and contact that accompany each format; no deviations for imported results."""
+    """Read errors, flags and contact; imported results have no deviations."""
     measured = SequenceMetrics.read(paths.metrics)
     if len(measured) != len(motion):
         raise UserError(
             f"{paths.metrics}: holds {len(measured)} frames, but the joint result of sequence "
-            f"{motion.sequence!r} {len(motion)}: it was measured on another; re-run stage 'metrics'"
+            f"{motion.sequence!r} has {len(motion)}: it was measured on another result; re-run "
+            "stage 'metrics'"
         )
     return About(
         motion.sequence,
         BodyFile.of(motion.model, motion.gender),
         [str(reason) for reason in measured.values["flag_reason"]],
-        None if mesh is None else contact.StatedContact.read(paths.joint),
+        None if mesh is None else StatedContact.read(paths.joint),
         Verdict.of(measured),
-        None if mesh is None else TouchingSurfaces.read(paths.metrics, motion, mesh),
+        None if mesh is None else ContactVertices.read(paths.metrics, motion, mesh),
         None if motion.made_by else Deviations.read(paths.body_fit, paths.object_track, motion),
         motion.made_by,
     )
 
 
-def _copy_images(
-    folder: Path, frames: Path, rig: Rig, exposures: Exposures, formats: Sequence[str]
-) -> None:
-    """Copy the recorded colour images that show a frame to the folders of the image formats."""
+def _copy_images(folder: Path, frames: Path, scenes: Scenes, formats: Sequence[str]) -> None:
+    """Copy the recorded colour images of all frames to the folders of the image formats."""
     with Frames.open(frames) as recorded:
-        for c, camera in enumerate(rig):
-            for image in sorted({int(i) for i in exposures.image_of[:, c] if i >= 0}):
+        for c, camera in enumerate(scenes.rig):
+            for image in sorted(scenes.frames_of(c)):
                 packet = recorded.colour_jpeg(image, c)
                 if packet is None:
                     continue
@@ -172,7 +168,7 @@ def _write_manifest(
     formats: Sequence[str],
     about: About,
     coordinates: Mapping[str, Coordinates],
-    body: Sequence[Written],
+    body: Sequence[WrittenBody],
 ) -> None:
     files = sorted(path for path in output.rglob("*") if path.is_file())
     content: dict[str, Any] = {
@@ -183,15 +179,15 @@ def _write_manifest(
         "frames": len(motion),
         "fps": motion.fps,
         "formats": list(formats),
-        "frame": {name: place.frame for name, place in coordinates.items()},
-        "up": {name: place.told()["up"] for name, place in coordinates.items()},
-        "up_axis": {name: place.up_axis for name, place in coordinates.items()},
-        "units": {name: place.units for name, place in coordinates.items()},
-        "body": about.body.told(),
+        "frame": {name: own.frame for name, own in coordinates.items()},
+        "up": {name: own.to_json()["up"] for name, own in coordinates.items()},
+        "up_axis": {name: own.up_axis for name, own in coordinates.items()},
+        "units": {name: own.units for name, own in coordinates.items()},
+        "body": about.body.to_json(),
         "body_files": {
             file.name: {k: v for k, v in vars(file).items() if k != "name"} for file in body
         },
-        **about.verdict.told(),
+        **about.verdict.to_json(),
         "files": {
             path.relative_to(output).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
             for path in files

@@ -27,8 +27,15 @@ from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.output.site.body_section import read_fit
 from intercap_core.output.site.capture_section import read_capture
-from intercap_core.output.site.closeups import CloseUp, closeup, holds, read_handling
-from intercap_core.output.site.overlays import Fit, Overlay, choose_cameras, choose_frames, overlays
+from intercap_core.output.site.closeups import closeup, holds, read_handling
+from intercap_core.output.site.drawing import EncodedImage
+from intercap_core.output.site.overlays import (
+    Overlay,
+    PosedFit,
+    choose_cameras,
+    choose_frames,
+    overlays,
+)
 from intercap_core.output.site.sequence_page import SequenceContent, ViewerParts, page
 from intercap_core.output.site.track_section import TrackFacts, read_track
 from intercap_core.output.viewer import page as viewer
@@ -65,12 +72,12 @@ def run(
     check_replaceable(output, marker=MARKER, what="page")
     measured = SequenceMetrics.read(paths.metrics)
     shown = models if measured.has_object else replace(models, object_=None)
-    with artefacts.read(paths.joint, JOINT) as fit, artefacts.read(paths.scene, SCENE) as setting:
+    with artefacts.read(paths.joint, JOINT) as fit, artefacts.read(paths.scene, SCENE) as scene:
         model = load_model(models.body_models, models.gender, fit)
         mesh = None if shown.object_ is None else ObjectMesh.load(shown.object_)
-        posed = Fit(model, read_parameters(fit), fit["rotation"], fit["translation"], mesh)
-        rig, image_of = Rig.from_artefact(setting), setting["image_of"]
-        master = rig.names.index(str(setting.attributes["master"]))
+        posed = PosedFit(model, read_parameters(fit), fit["rotation"], fit["translation"], mesh)
+        rig, image_of = Rig.from_artefact(scene), scene["image_of"]
+        master = rig.names.index(str(scene.attributes["master"]))
         description, energies = _describe_joint(fit, rig, master), _energies(fit)
         rig = rig.moved(fit["master_from_colour"])
     note, drawn = "", []
@@ -103,7 +110,7 @@ def run(
 def _overlays(
     frames: Path,
     measured: SequenceMetrics,
-    fit: Fit,
+    fit: PosedFit,
     rig: Rig,
     image_of: np.ndarray,
     settings: PageSettings,
@@ -161,8 +168,10 @@ def _energies(joint: Artefact) -> list[tuple[str, float, float]]:
     ]
 
 
-def _closeups(paths: SequencePaths, models: SequenceModels, truth: Path | None) -> list[CloseUp]:
-    """Close-ups of the longest hand contacts; [] without an object."""
+def _closeups(
+    paths: SequencePaths, models: SequenceModels, truth: Path | None
+) -> list[EncodedImage]:
+    """Draw close-ups of the longest hand contacts; [] without an object."""
     if models.object_ is None:
         return []
     known = truth if truth is not None and truth.is_file() else None
@@ -172,16 +181,15 @@ def _closeups(paths: SequencePaths, models: SequenceModels, truth: Path | None) 
 
 def _track(paths: SequencePaths, entry: ObjectEntry) -> TrackFacts:
     with artefacts.read(paths.scene, SCENE) as scene:
-        moments = Detections.load(paths.detections).showing(scene["image_of"])
-    found = moments.with_candidates_of(paths.person)
+        detections = Detections.load(paths.detections).showing(scene["image_of"])
+    detections = detections.with_candidates_of(paths.person)
     with artefacts.read(paths.object_track, OBJECT_TRACK) as track:
         candidate = track["candidate"]
 
     def kept(t: int, c: int) -> bytes:
-        return found.candidates(t, c)[candidate[t, c]].rle if candidate[t, c] >= 0 else b""
+        return detections.candidates(t, c)[candidate[t, c]].rle if candidate[t, c] >= 0 else b""
 
-    mesh = ObjectMesh.load(entry)
-    return read_track(paths, mesh, kept)
+    return read_track(paths, ObjectMesh.load(entry), kept)
 
 
 def _made_by(paths: SequencePaths) -> dict[str, str]:

@@ -101,7 +101,7 @@ def test_one_run_at_a_time_and_it_can_be_stopped(
     _pretend(monkeypatch, "import time; time.sleep(60)")
     runs = rerun.Runs()
     runs.start(project, NAME)
-    with pytest.raises(UserError, match="goes on"):
+    with pytest.raises(UserError, match="in progress"):
         runs.start(project, NAME)
     runs.stop()
     _ended(runs)
@@ -127,7 +127,7 @@ def test_a_run_that_takes_its_time_to_end_is_not_waited_for_and_told_once(
     assert time.monotonic() - begin < 2.0
     _until(lambda: said.read_text().startswith("told"))
     assert runs.progress(project)["state"] == "ending" and said.read_text() == "told 1"
-    with pytest.raises(UserError, match="goes on"):
+    with pytest.raises(UserError, match="in progress"):
         runs.start(project, NAME)
     monkeypatch.setattr(rerun, "ENDS_WITHIN_S", -rerun._PATIENCE_S)  # it has had its time
     runs.stop()
@@ -149,7 +149,7 @@ def test_the_result_before_stays_until_a_run_has_ended_well(
         runs.start(project, NAME)
         _ended(runs)
         runs.progress(project)
-        assert before.beside(project, NAME)["unfinished"] == bool(status)
+        assert before.compare(project, NAME)["unfinished"] == bool(status)
         contents.append((old, kept.read_bytes()))
         new = joint.with_suffix(".new")
         new.write_bytes(old + bytes([number]))  # what the run has made, whole or not
@@ -158,7 +158,7 @@ def test_the_result_before_stays_until_a_run_has_ended_well(
         monkeypatch.chdir(project.path.parent.parent)
     first = contents[0][0]
     assert [held for _, held in contents] == [first, first, first, contents[3][0]]
-    told = before.beside(project, NAME)
+    told = before.compare(project, NAME)
     assert told["made_at"] <= told["kept_at"]
 
 
@@ -172,7 +172,7 @@ def test_a_run_that_ended_on_a_terminal_counts_as_ended(
         path = project.artefact(NAME, stage)
         path.touch()
         os.utime(path, (later, later))
-    assert not before.beside(project, NAME)["unfinished"]
+    assert not before.compare(project, NAME)["unfinished"]
 
 
 def test_the_result_before_is_kept_and_held_against_the_new_one(
@@ -188,14 +188,14 @@ def test_the_result_before_is_kept_and_held_against_the_new_one(
     with h5py.File(new, "r+") as file:
         file["joints"][...] += np.float32([0.0, 0.0, 0.01])
     new.replace(joint)
-    found = before.beside(project, NAME)
+    found = before.compare(project, NAME)
     assert found["there"] and found["body_moved_mm"] == pytest.approx([10.0] * 6, abs=0.1)
     assert found["object_moved_mm"] == [0.0] * 6
 
 
 def test_a_sequence_without_results_has_nothing_beside_it(project: Project) -> None:
     shutil.rmtree(project.results / NAME)
-    assert not before.beside(project, NAME)["there"]
+    assert not before.compare(project, NAME)["there"]
 
 
 def test_what_is_out_of_date_is_marked_before_snakemake_lists_the_marks(project: Project) -> None:

@@ -215,7 +215,7 @@ def test_images_alone_are_shown_where_nothing_else_is_there(page: Served, settin
             path.unlink()
     told = page.json(OF)
     assert told["frames"] == 6 and not told["viewer"]
-    assert any("images alone" in note for note in told["notes"])
+    assert any("only images" in note for note in told["notes"])
     assert page.get(f"/api/{OF}/image/k2/0?width=240")[0] == 200
     assert page.get(f"/api/{OF}/viewer")[0] == 422
     assert page.json(f"{OF}/questions") == []
@@ -247,12 +247,12 @@ def test_a_result_of_other_frames_is_named_and_not_drawn(page: Served, settings:
     other = small_project(settings.parent / "shorter", total=4)
     shutil.copy(artefact(other, "joint"), artefact(settings, "joint"))
     told = page.json(OF)
-    assert any("has 4 frames, and 6 were read" in note for note in told["notes"])
+    assert any("has 4 frames, but 6 were read" in note for note in told["notes"])
     assert "contact" not in told and not told["viewer"]
 
 
 def test_recordings_that_were_moved_are_named(page: Served) -> None:
-    assert any("the recordings are not there" in note for note in page.json(OF)["notes"])
+    assert any("the recordings are missing" in note for note in page.json(OF)["notes"])
 
 
 def test_results_that_change_while_the_page_is_open_are_noticed(

@@ -1,5 +1,4 @@
-"""What goes with the numbers of every export: which body they move, their frame and units, and how
-far they are to be trusted."""
+"""Facts that accompany the numbers of every export: the body file, coordinates and reliability."""
 
 from __future__ import annotations
 
@@ -25,16 +24,23 @@ from intercap_core.evaluation.verdict.figures import (
     held_out_cameras,
     stated_errors,
 )
-from intercap_core.output.export.contact import StatedContact, TouchingSurfaces
-from intercap_core.output.export.motion import Coordinates, Motion, listed
+from intercap_core.output.export.contact import ContactVertices, StatedContact
+from intercap_core.output.export.motion import Coordinates, Motion, rounded_lists
 from intercap_core.schemas import BODY_FIT, OBJECT_TRACK
 
 SMPLX, OPEN = "smplx", "intercap-open-body"  # names of surface models
+DEVIATIONS_SOURCE = (
+    "stated by the sequential fits of body and object, before the joint fit, which states none"
+)
+_VERDICT_MEANING = (
+    "held_in: medians over the frames that the camera judges, of the result; held_out: of a result "
+    "fitted without the camera; shift_mm: distance between both results for each part"
+)
 
 
 @dataclass(frozen=True)
 class BodyFile:
-    """The mesh that the parameters move: another one with the same parameters is another person."""
+    """The body file whose mesh the parameters move. They give another person with another mesh."""
 
     path: Path
     gender: str
@@ -48,16 +54,16 @@ class BodyFile:
 
     @property
     def is_open(self) -> bool:
-        """It is the project's own body, which may be given away; else a licensed file."""
+        """True for the project's own body, which may be redistributed; False if licensed."""
         return self.path == OPEN_BODY
 
     @property
     def surface_model(self) -> str:
-        """Its name: readers that know ``smplx`` load a licensed SMPL-X file by it."""
+        """Name of the surface model. Readers load a licensed SMPL-X file for ``smplx``."""
         return OPEN if self.is_open else SMPLX
 
-    def told(self) -> dict[str, Any]:
-        """In the words of JSON."""
+    def to_json(self) -> dict[str, Any]:
+        """Serialize for JSON."""
         return {
             "surface_model_type": self.surface_model,
             "body_file": self.path.name,
@@ -70,109 +76,130 @@ class BodyFile:
 
 
 @dataclass(frozen=True, eq=False)
-class About:
-    """``flags`` (T,) reasons, empty = trusted; ``contact`` and ``touching`` None without an object,
-    ``deviations`` None where another program made the result, of which nothing is stated."""
+class Verdict:
+    """Errors that the verdict without truth states of P judged parts over T frames."""
 
-    sequence: str
-    body: BodyFile
-    flags: Sequence[str]
-    contact: StatedContact | None
-    verdict: Verdict
-    touching: TouchingSurfaces | None = None
-    deviations: Deviations | None = None
-    made_by: str = ""
+    stated: Sequence[StatedError]
+    """Stated error of each part."""
+    per_frame_mm: np.ndarray
+    """(P, T) stated error of each part by frame, millimetres, NaN if none is stated."""
+    cameras: Sequence[HeldOutCamera]
+    """Cameras that were held out."""
 
-    def told(self, coordinates: Coordinates) -> dict[str, Any]:
-        """In the words of JSON, for numbers in these ``coordinates``."""
-        found: dict[str, Any] = {
-            "sequence": self.sequence,
-            "body": self.body.told(),
-            **coordinates.told(),
-            "flagged_frames": {str(t): reason for t, reason in enumerate(self.flags) if reason},
-            **self.verdict.told(),
-        }
-        if self.made_by:
-            found["made_by"] = self.made_by
-        if self.contact is not None:
-            found["contact"] = [
-                {"part": part, "start": start, "end": end}
-                for part, start, end in self.contact.intervals()
-            ]
-        return found | {"by_frame": self._by_frame()}
+    @classmethod
+    def of(cls, metrics: SequenceMetrics) -> Verdict:
+        stated = stated_errors(metrics)
+        per_frame = (
+            1e3 * metrics.values["verdict/error_frame"] if stated else np.zeros((0, len(metrics)))
+        )
+        return cls(stated, per_frame, held_out_cameras(metrics))
 
-    def text(self, coordinates: Coordinates) -> str:
-        """The same as a file of JSON."""
-        return json.dumps(self.told(coordinates), separators=(",", ":")) + "\n"
+    @property
+    def stated_parts(self) -> list[int]:
+        """Indices of the parts for which an error is stated."""
+        return [part for part, error in enumerate(self.stated) if not error.silent]
 
-    def arrays(self, coordinates: Coordinates) -> dict[str, np.ndarray]:
-        """The same as arrays."""
+    def to_json(self) -> dict[str, Any]:
+        """Serialize everything but the values per frame."""
         return {
-            **{key: np.array(value) for key, value in self.body.told().items()},
-            **coordinates.arrays(),
-            **({"made_by": np.array(self.made_by)} if self.made_by else {}),
-            **self.by_frame_arrays(),
+            "stated_error_mm": {
+                error.part: {"mean": round(error.stated, 2), "factor": round(error.factor, 2)}
+                for error in self.stated
+                if not error.silent
+            },
+            "nothing_is_stated_of": {e.part: e.silent for e in self.stated if e.silent},
+            "verdict_by_camera": [_camera_to_json(camera) for camera in self.cameras],
         }
 
-    def by_frame_arrays(self) -> dict[str, np.ndarray]:
-        """What is known of every frame: flags, contact, deviations and the verdict."""
-        found = {
-            "flagged": np.array([bool(reason) for reason in self.flags]),
-            "flag_reason": np.array(list(self.flags)),
-            **self.verdict.arrays(),
+    def per_frame_json(self) -> dict[str, Any]:
+        """Serialize the stated errors by part and frame."""
+        return {
+            "stated_error_mm": {
+                self.stated[part].part: rounded_lists(self.per_frame_mm[part], 2)
+                for part in self.stated_parts
+            }
         }
-        if self.contact is not None:
-            found |= {
-                "contact_region": np.array(self.contact.regions),
-                "contact_probability": self.contact.probability,
-                "contact_annotated": self.contact.annotated,
+
+    def summary(self) -> dict[str, Any]:
+        """Serialize the whole verdict, with the meaning of its entries, for a separate file."""
+        return {
+            **self.to_json(),
+            "meaning": _VERDICT_MEANING,
+            "by_frame": self.per_frame_json(),
+            "frame": "none: sizes of errors",
+            "units": "as each name or entry says",
+        }
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Serialize for npz files."""
+        stated = [self.stated[part] for part in self.stated_parts]
+        arrays = {
+            "stated_error_part": np.array([error.part for error in stated]),
+            "stated_error_mm": np.array([error.stated for error in stated]),
+            "stated_error_factor": np.array([error.factor for error in stated]),
+            "stated_error_by_frame_mm": self.per_frame_mm[self.stated_parts],
+        }
+        if self.cameras:
+            parts = list(self.cameras[0].shift_mm)
+            arrays |= {
+                "verdict_camera": np.array([c.camera for c in self.cameras]),
+                "verdict_of": np.array([f"{view.of}, {view.unit}" for view in IMAGE_MEASURES]),
+                "verdict_held_in": np.array([c.held_in for c in self.cameras]),
+                "verdict_held_out": np.array([c.held_out for c in self.cameras]),
+                "verdict_part": np.array(parts),
+                "verdict_shift_mm": np.array(
+                    [[c.shift_mm[part] for part in parts] for c in self.cameras]
+                ),
             }
-        if self.touching is not None:
-            found |= self.touching.arrays()
-        if self.deviations is not None:
-            found |= self.deviations.arrays()
-        return found
+        return arrays
 
-    def _by_frame(self) -> dict[str, Any]:
-        found = self.verdict.by_frame_told()
-        if self.contact is not None:
-            found |= {
-                "contact_region": list(self.contact.regions),
-                "contact_probability": listed(self.contact.probability, 4),
-                "contact_annotated": self.contact.annotated.tolist(),
+
+def _camera_to_json(camera: HeldOutCamera) -> dict[str, Any]:
+    return {
+        "camera": camera.camera,
+        **{
+            view.key.removesuffix("_px").removesuffix("_m"): {
+                "of": view.of,
+                "unit": view.unit,
+                "held_in": rounded_lists(np.array(held_in), 3),
+                "held_out": rounded_lists(np.array(held_out), 3),
             }
-        if self.touching is not None:
-            found |= self.touching.told()
-        if self.deviations is not None:
-            found |= self.deviations.told()
-        return found
-
-
-SOURCE = "stated by the sequential fits of body and object, before the joint fit, which states none"
+            for view, held_in, held_out in zip(
+                IMAGE_MEASURES, camera.held_in, camera.held_out, strict=True
+            )
+        },
+        "shift_mm": {p: rounded_lists(np.array(mm), 2) for p, mm in camera.shift_mm.items()},
+    }
 
 
 @dataclass(frozen=True, eq=False)
 class Deviations:
-    """Along one coordinate, in the mean square over the three: of each ``joint`` (T, 55) m, of the
-    object's position (T,) m and turn (T,) rad, None without an object, NaN where its track is
-    lost. They do not depend on the frame of coordinates."""
+    """Standard deviations along one coordinate that the sequential fits state.
+
+    Each is the root mean square over the three coordinates and therefore valid in every frame.
+    """
 
     joint: np.ndarray
+    """(T, 55) of each body joint, metres."""
     object_position: np.ndarray | None
+    """(T,) metres, NaN where the track is lost; None without an object."""
     object_turn: np.ndarray | None
+    """(T,) radians, NaN where the track is lost; None without an object."""
 
     @classmethod
     def read(cls, body_fit: Path, object_track: Path, motion: Motion) -> Deviations:
-        """Raises UserError where an artefact has other frames than the motion, and as reading
-        does."""
+        """Read both artefacts.
+
+        Raises UserError if their number of frames differs from the motion's, and as reading does.
+        """
         with artefacts.read(body_fit, BODY_FIT) as fit:
             joint = fit["joint_sigma"].astype(np.float32)
-        _check(body_fit, "body_fit", len(joint), motion)
+        _check_frames(body_fit, "body_fit", len(joint), motion)
         if not motion.has_object:
             return cls(joint, None, None)
         with artefacts.read(object_track, OBJECT_TRACK) as track:
             covariance, lost = track["covariance"], track["lost"]
-        _check(object_track, "object_track", len(lost), motion)
+        _check_frames(object_track, "object_track", len(lost), motion)
         turn, position = (
             np.sqrt(np.trace(covariance[:, part, part], axis1=1, axis2=2) / 3)
             for part in (slice(0, 3), slice(3, 6))
@@ -183,138 +210,121 @@ class Deviations:
             np.where(lost, np.nan, turn).astype(np.float32),
         )
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """As arrays, by the names that go with every export."""
-        found = {
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Serialize for npz files: metres and radians."""
+        arrays = {
             "joint_name": np.array(JOINT_NAMES),
             "joint_sigma": self.joint,
-            "sigma_source": np.array(SOURCE),
+            "sigma_source": np.array(DEVIATIONS_SOURCE),
         }
         if self.object_position is not None and self.object_turn is not None:
-            found |= {
+            arrays |= {
                 "object_position_sigma": self.object_position,
                 "object_rotation_sigma": self.object_turn,
             }
-        return found
+        return arrays
 
-    def told(self) -> dict[str, Any]:
-        """In the words of JSON: millimetres and degrees, null = not known."""
-        found: dict[str, Any] = {
+    def to_json(self) -> dict[str, Any]:
+        """Serialize for JSON: millimetres and degrees, None for NaN."""
+        entries: dict[str, Any] = {
             "joint_name": list(JOINT_NAMES),
-            "joint_sigma_mm": listed(1e3 * self.joint, 1),
-            "sigma_source": SOURCE,
+            "joint_sigma_mm": rounded_lists(1e3 * self.joint, 1),
+            "sigma_source": DEVIATIONS_SOURCE,
         }
         if self.object_position is not None and self.object_turn is not None:
-            found |= {
-                "object_position_sigma_mm": listed(1e3 * self.object_position, 2),
-                "object_rotation_sigma_deg": listed(np.degrees(self.object_turn), 3),
+            entries |= {
+                "object_position_sigma_mm": rounded_lists(1e3 * self.object_position, 2),
+                "object_rotation_sigma_deg": rounded_lists(np.degrees(self.object_turn), 3),
             }
-        return found
+        return entries
 
 
-def _check(path: Path, stage: str, frames: int, motion: Motion) -> None:
+def _check_frames(path: Path, stage: str, frames: int, motion: Motion) -> None:
     if frames != len(motion):
         raise UserError(
             f"{path}: holds {frames} frames, but the joint result of sequence {motion.sequence!r} "
-            f"{len(motion)}; re-run stage {stage!r} and what follows"
+            f"has {len(motion)}; re-run stage {stage!r} and the stages after it"
         )
-
-
-MEANING = (
-    "held_in: medians over the frames that the camera judges, of the result; held_out: of a result "
-    "fitted without the camera; shift_mm: how far a part is elsewhere without it"
-)
 
 
 @dataclass(frozen=True, eq=False)
-class Verdict:
-    """``stated`` of every judged part, ``by_frame`` (P, T) millimetres in their order, NaN where
-    nothing is said; ``cameras`` that were held out."""
+class About:
+    """Everything that an export states about its numbers."""
 
-    stated: Sequence[StatedError]
-    by_frame: np.ndarray
-    cameras: Sequence[HeldOutCamera]
+    sequence: str
+    body: BodyFile
+    flags: Sequence[str]
+    """(T,) reason why each frame is flagged, "" if it is trusted."""
+    contact: StatedContact | None
+    """Contact by body region; None without an object."""
+    verdict: Verdict
+    touching: ContactVertices | None = None
+    """Contact by vertex; None without an object."""
+    deviations: Deviations | None = None
+    """None for imported results, which state no deviations."""
+    made_by: str = ""
+    """The other program that made an imported result."""
 
-    @classmethod
-    def of(cls, metrics: SequenceMetrics) -> Verdict:
-        stated = stated_errors(metrics)
-        by_frame = (
-            1e3 * metrics.values["verdict/error_frame"] if stated else np.zeros((0, len(metrics)))
-        )
-        return cls(stated, by_frame, held_out_cameras(metrics))
+    def to_json(self, coordinates: Coordinates) -> dict[str, Any]:
+        """Serialize for JSON next to numbers in these ``coordinates``."""
+        entries: dict[str, Any] = {
+            "sequence": self.sequence,
+            "body": self.body.to_json(),
+            **coordinates.to_json(),
+            "flagged_frames": {str(t): reason for t, reason in enumerate(self.flags) if reason},
+            **self.verdict.to_json(),
+        }
+        if self.made_by:
+            entries["made_by"] = self.made_by
+        if self.contact is not None:
+            entries["contact"] = [
+                {"part": part, "start": start, "end": end}
+                for part, start, end in self.contact.intervals()
+            ]
+        return entries | {"by_frame": self._per_frame_json()}
 
-    @property
-    def said(self) -> list[int]:
-        """Places of the parts of which an error is stated."""
-        return [place for place, error in enumerate(self.stated) if not error.silent]
+    def to_json_text(self, coordinates: Coordinates) -> str:
+        """Serialize to the text of a JSON file."""
+        return json.dumps(self.to_json(coordinates), separators=(",", ":")) + "\n"
 
-    def told(self) -> dict[str, Any]:
-        """In the words of JSON."""
+    def to_arrays(self, coordinates: Coordinates) -> dict[str, np.ndarray]:
+        """Serialize for npz files."""
         return {
-            "stated_error_mm": {
-                error.part: {"mean": round(error.stated, 2), "factor": round(error.factor, 2)}
-                for error in self.stated
-                if not error.silent
-            },
-            "nothing_is_stated_of": {e.part: e.silent for e in self.stated if e.silent},
-            "verdict_by_camera": [self._camera(one) for one in self.cameras],
+            **{key: np.array(value) for key, value in self.body.to_json().items()},
+            **coordinates.to_arrays(),
+            **({"made_by": np.array(self.made_by)} if self.made_by else {}),
+            **self.per_frame_arrays(),
         }
 
-    def by_frame_told(self) -> dict[str, Any]:
-        """Stated errors by part and frame, for JSON."""
-        return {
-            "stated_error_mm": {
-                self.stated[place].part: listed(self.by_frame[place], 2) for place in self.said
+    def per_frame_arrays(self) -> dict[str, np.ndarray]:
+        """Serialize flags, contact, deviations and verdict of every frame for npz files."""
+        arrays = {
+            "flagged": np.array([bool(reason) for reason in self.flags]),
+            "flag_reason": np.array(list(self.flags)),
+            **self.verdict.to_arrays(),
+        }
+        if self.contact is not None:
+            arrays |= {
+                "contact_region": np.array(self.contact.regions),
+                "contact_probability": self.contact.probability,
+                "contact_annotated": self.contact.annotated,
             }
-        }
+        if self.touching is not None:
+            arrays |= self.touching.to_arrays()
+        if self.deviations is not None:
+            arrays |= self.deviations.to_arrays()
+        return arrays
 
-    def whole(self) -> dict[str, Any]:
-        """All of it, with what the words mean: a file of its own."""
-        return {
-            **self.told(),
-            "meaning": MEANING,
-            "by_frame": self.by_frame_told(),
-            "frame": "none: sizes of errors",
-            "units": "as each name or entry says",
-        }
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """As arrays, by the names that go with every export."""
-        said = [self.stated[place] for place in self.said]
-        found = {
-            "stated_error_part": np.array([error.part for error in said]),
-            "stated_error_mm": np.array([error.stated for error in said]),
-            "stated_error_factor": np.array([error.factor for error in said]),
-            "stated_error_by_frame_mm": self.by_frame[self.said],
-        }
-        if self.cameras:
-            parts = list(self.cameras[0].shift_mm)
-            found |= {
-                "verdict_camera": np.array([one.camera for one in self.cameras]),
-                "verdict_of": np.array([f"{view.of}, {view.unit}" for view in IMAGE_MEASURES]),
-                "verdict_held_in": np.array([one.held_in for one in self.cameras]),
-                "verdict_held_out": np.array([one.held_out for one in self.cameras]),
-                "verdict_part": np.array(parts),
-                "verdict_shift_mm": np.array(
-                    [[one.shift_mm[part] for part in parts] for one in self.cameras]
-                ),
+    def _per_frame_json(self) -> dict[str, Any]:
+        entries = self.verdict.per_frame_json()
+        if self.contact is not None:
+            entries |= {
+                "contact_region": list(self.contact.regions),
+                "contact_probability": rounded_lists(self.contact.probability, 4),
+                "contact_annotated": self.contact.annotated.tolist(),
             }
-        return found
-
-    @staticmethod
-    def _camera(one: HeldOutCamera) -> dict[str, Any]:
-        return {
-            "camera": one.camera,
-            **{
-                view.key.removesuffix("_px").removesuffix("_m"): {
-                    "of": view.of,
-                    "unit": view.unit,
-                    "held_in": listed(np.array(held_in), 3),
-                    "held_out": listed(np.array(held_out), 3),
-                }
-                for view, held_in, held_out in zip(
-                    IMAGE_MEASURES, one.held_in, one.held_out, strict=True
-                )
-            },
-            "shift_mm": {p: listed(np.array(mm), 2) for p, mm in one.shift_mm.items()},
-        }
+        if self.touching is not None:
+            entries |= self.touching.to_json()
+        if self.deviations is not None:
+            entries |= self.deviations.to_json()
+        return entries

@@ -1,9 +1,8 @@
-"""The open body beside an export: the file that was fitted with, and the same in the two layouts of
-columns that readers of SMPL-X files know.
+"""The open body in an export: the fitted file, and its content in two layouts of other readers.
 
-The project's file has as many shape as expression columns, 30 + 30. Readers of the field take
-expression from column 10 of a file with fewer than 400 columns and from column 300 of any other, so
-they would take columns of shape for it.
+The project's file has 30 shape columns and 30 expression columns. Readers of SMPL-X files take the
+expression from column 10 if a file has fewer than 400 columns, otherwise from column 300. In the
+project's file they would find shape columns there.
 """
 
 from __future__ import annotations
@@ -20,13 +19,13 @@ from intercap_core.body.joints import JOINT_NAMES
 from intercap_core.body.maps import maps_path
 from intercap_core.output.export.about import BodyFile
 
-_POSE_DIRECTIONS = 9 * (len(JOINT_NAMES) - 1)  # of a rotation matrix a joint but the pelvis
+_POSE_DIRECTIONS = 9 * (len(JOINT_NAMES) - 1)  # a rotation matrix for each joint but the pelvis
 _FRAME = "rest pose of the body: y up, facing z, x to its left; origin near the chest"
 
 
 @dataclass(frozen=True)
 class Layout:
-    """``shape`` columns of betas, followed by ``expression`` columns."""
+    """Number of shape columns, followed by the number of expression columns."""
 
     shape: int
     expression: int
@@ -40,17 +39,19 @@ SMALL, FULL = Layout(10, 10), Layout(300, 100)
 
 
 @dataclass(frozen=True)
-class Written:
-    """A body file of an export: its name, the digest of its content and which columns are whose."""
+class WrittenBody:
+    """A body file of an export."""
 
     name: str
     digest: str
     betas: str
+    """Columns of the shape, as start:stop."""
     expression: str
+    """Columns of the expression, as start:stop."""
 
 
 def layouts(body: BodyFile) -> Sequence[Layout]:
-    """Those that hold as many columns as the parameters have."""
+    """Return the layouts with enough columns for the parameters."""
     return [
         layout
         for layout in (SMALL, FULL)
@@ -58,12 +59,12 @@ def layouts(body: BodyFile) -> Sequence[Layout]:
     ]
 
 
-def write(folder: Path, body: BodyFile) -> Sequence[Written]:
-    """Write the body's file, its maps of named points and regions, and a file for each layout into
-    the new ``folder``; says what was written. Licensed files are not copied: nothing is written.
+def write(folder: Path, body: BodyFile) -> Sequence[WrittenBody]:
+    """Write the body file, its maps of points and regions, and a file per layout into ``folder``.
 
-    Columns beyond those of the parameters are zero, and so are the pose blend shapes, which the
-    open body has none of; the numbers are those of the file, bit by bit.
+    Columns beyond those of the parameters are zero, as are the pose blend shapes, which the open
+    body does not have. All other numbers are copied bit by bit. Returns the written files, none
+    for a licensed body.
     """
     if not body.is_open:
         return ()
@@ -73,22 +74,22 @@ def write(folder: Path, body: BodyFile) -> Sequence[Written]:
     with np.load(body.path, allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
     half = arrays["shapedirs"].shape[2] // 2
-    found = [
-        Written(body.path.name, file_digest(body.path), f"0:{half}", f"{half}:{2 * half}"),
+    written = [
+        WrittenBody(body.path.name, file_digest(body.path), f"0:{half}", f"{half}:{2 * half}"),
     ]
     for layout in layouts(body):
         path = folder / f"{body.path.stem}_{layout.name}.npz"
         np.savez_compressed(path, allow_pickle=True, **_laid_out(arrays, body, layout))
         start = layout.shape
-        found.append(
-            Written(
+        written.append(
+            WrittenBody(
                 path.name,
                 file_digest(path),
                 f"0:{body.num_betas}",
                 f"{start}:{start + body.num_expression}",
             )
         )
-    return found
+    return written
 
 
 def _laid_out(
@@ -104,7 +105,7 @@ def _laid_out(
         **arrays,
         "shapedirs": columns,
         "posedirs": np.zeros((vertices, 3, _POSE_DIRECTIONS), table.dtype),
-        # a pickled dictionary, as in the published files: readers ask for it
+        # a pickled dictionary, which readers expect, as in the published files
         "joint2num": np.array({name: place for place, name in enumerate(JOINT_NAMES)}),
         "surface_model_type": np.array(body.surface_model),
         "fitted_with": np.array(f"{body.path.name}, digest {file_digest(body.path)}"),

@@ -1,4 +1,4 @@
-"""Object poses in the BOP benchmark's layout: one scene a camera, millimetres."""
+"""Object poses in the layout of the BOP benchmark: one scene per camera, millimetres."""
 
 from __future__ import annotations
 
@@ -12,49 +12,40 @@ import cv2
 import numpy as np
 import trimesh
 
-from intercap_core.geometry.camera.rig import Camera, Rig
+from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.output.export.about import About
 from intercap_core.output.export.meshes import ply
-from intercap_core.output.export.motion import Coordinates, Motion
-from intercap_core.output.export.silhouettes import Exposures, Shown, frames_of, images_of
+from intercap_core.output.export.motion import Coordinates
+from intercap_core.output.export.silhouettes import Scenes, Silhouettes
 
 UNITS = "millimetres, radians, pixels; rotations are matrices row by row"
-LEAST_VISIBLE = 0.1  # share of an object that is seen, of BOP's targets (BOP Challenge 2019)
+LEAST_VISIBLE = 0.1  # visible share of a target object (BOP Challenge 2019)
 
 
 def object_id(mesh_path: Path) -> int:
-    """BOP numbers its objects: the number that the mesh's file name starts with, or 1."""
+    """Return the number that the mesh's file name starts with, else 1."""
     number = re.match(r"\d+", mesh_path.stem)
     return max(1, int(number.group())) if number else 1
 
 
-def write(
-    folder: Path,
-    motion: Motion,
-    rig: Rig,
-    mesh: ObjectMesh,
-    obj_id: int,
-    exposures: Exposures,
-    about: About,
-    bodies: np.ndarray | None,
-    poses: Sequence[dict[int, np.ndarray]],
-) -> None:
-    """Write ``models/``, one scene folder a camera, numbered in the rig's order, and the targets.
+def write(folder: Path, scenes: Scenes, obj_id: int, about: About, *, masks: bool) -> None:
+    """Write ``models/``, one scene folder per camera in the rig's order, and the targets.
 
-    Images are numbered by their frame set; each has the pose at its own exposure (``poses`` by
-    camera and image, see :func:`.silhouettes.object_poses`). With ``bodies`` (T, V, 3) masks and
-    boxes are drawn, with what the body hides. ``motion`` is in the master camera's frame.
+    Images are numbered by their frame set. Each has the pose at its own exposure. ``masks`` also
+    draws masks and boxes with occlusion by the body.
     """
+    mesh = scenes.mesh
+    assert mesh is not None
     _write_model(folder / "models", mesh, obj_id)
     lenses: dict[str, Any] = {}
     targets = []
-    for number, camera in enumerate(rig):
+    for number, camera in enumerate(scenes.rig):
         scene = folder / "scenes" / f"{number:06d}"
         scene.mkdir(parents=True)
-        shown = poses[number]
-        _dump(scene / "scene_camera.json", scene_camera(camera, list(shown)))
-        _dump(scene / "scene_gt.json", scene_gt(camera, shown, obj_id))
+        poses = scenes.poses[number]
+        _dump(scene / "scene_camera.json", scene_camera(camera, list(poses)))
+        _dump(scene / "scene_gt.json", scene_gt(camera, poses, obj_id))
         lens = camera.colour
         lenses[f"{number:06d}"] = {
             "camera": camera.name,
@@ -65,24 +56,26 @@ def write(
         if number == 0:
             _dump(folder / "camera.json", _camera(camera))
         info: dict[str, Any] = {}
-        if bodies is not None:
-            images = images_of(camera, number, motion, bodies, mesh, shown, exposures)
-            info = {str(one.image): [_draw(scene, one, camera)] for one in images}
+        if masks:
+            info = {
+                str(drawn.image): [_write_masks(scene, drawn, camera)]
+                for drawn in scenes.draw(number)
+            }
             _dump(scene / "scene_gt_info.json", info)
-        frame_of = frames_of(exposures, number)
-        shows = {
+        frame_of = scenes.frames_of(number)
+        frames = {
             str(image): {"frame": frame_of[image], "flagged": about.flags[frame_of[image]]}
-            for image in shown
+            for image in poses
         }
-        _dump(scene / "scene_about.json", {"camera": camera.name, "images": shows})
+        _dump(scene / "scene_about.json", {"camera": camera.name, "images": frames})
         targets += [
             {"scene_id": number, "im_id": image, "obj_id": obj_id, "inst_count": 1}
-            for image in shown
+            for image in poses
             if not info or info[str(image)][0]["visib_fract"] >= LEAST_VISIBLE
         ]
     _dump(folder / "test_targets_bop19.json", targets)
     _dump(folder / "lenses.json", lenses)
-    text = about.text(Coordinates.of(motion, UNITS))
+    text = about.to_json_text(Coordinates.of(scenes.motion, UNITS))
     (folder / "about.json").write_text(text, encoding="utf-8")
 
 
@@ -97,7 +90,7 @@ def _write_model(folder: Path, mesh: ObjectMesh, obj_id: int) -> None:
 
 
 def _camera(camera: Camera) -> dict[str, Any]:
-    """BOP's camera.json holds one lens: the first camera's; each scene's own is in its scene."""
+    """Return the content of camera.json: the first camera's lens. Each scene has its own lens."""
     lens = camera.colour
     return {
         "fx": lens.fx, "fy": lens.fy, "cx": lens.cx, "cy": lens.cy,
@@ -105,16 +98,16 @@ def _camera(camera: Camera) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _draw(scene: Path, shown: Shown, camera: Camera) -> dict[str, Any]:
-    """Write both masks of the object in an image; returns its entry of scene_gt_info."""
-    for name, mask in (("mask", shown.whole_object), ("mask_visib", shown.object_)):
+def _write_masks(scene: Path, drawn: Silhouettes, camera: Camera) -> dict[str, Any]:
+    """Write both masks of the object in an image; return its entry of scene_gt_info.json."""
+    for name, mask in (("mask", drawn.whole_object), ("mask_visib", drawn.object_)):
         (scene / name).mkdir(exist_ok=True)
-        path = scene / name / f"{shown.image:06d}_000000.png"
+        path = scene / name / f"{drawn.image:06d}_000000.png"
         path.write_bytes(cv2.imencode(".png", mask.image(camera))[1].tobytes())
-    whole, visible = shown.whole_object.area, shown.object_.area
+    whole, visible = drawn.whole_object.area, drawn.object_.area
     return {
-        "bbox_obj": shown.whole_object.box(),
-        "bbox_visib": shown.object_.box(),
+        "bbox_obj": drawn.whole_object.box(),
+        "bbox_visib": drawn.object_.box(),
         "px_count_all": whole,
         "px_count_valid": whole,
         "px_count_visib": visible,
@@ -123,8 +116,10 @@ def _draw(scene: Path, shown: Shown, camera: Camera) -> dict[str, Any]:
 
 
 def scene_camera(camera: Camera, images: Sequence[int]) -> dict[str, Any]:
-    """Of each of the ``images``: ``cam_K`` row by row, pixels; world = the master camera, its
-    translation in millimetres."""
+    """Return the lens and pose of each image.
+
+    ``cam_K`` is in pixels, row by row. The world is the master camera's frame, in millimetres.
+    """
     pose = camera.colour_from_master
     entry = {
         "cam_K": camera.colour.matrix.ravel().tolist(),
@@ -136,9 +131,10 @@ def scene_camera(camera: Camera, images: Sequence[int]) -> dict[str, Any]:
 
 
 def scene_gt(camera: Camera, poses: Mapping[int, np.ndarray], obj_id: int) -> dict[str, Any]:
-    """``cam_R_m2c`` and ``cam_t_m2c``: colour camera from model, translation in millimetres.
+    """Return colour_from_object of each image, translations in millimetres.
 
-    ``poses``: master_from_object (4, 4) of each image by its number.
+    Args:
+        poses: master_from_object (4, 4) by image number.
     """
     in_camera = {image: camera.colour_from_master @ pose for image, pose in poses.items()}
     return {
@@ -154,7 +150,7 @@ def scene_gt(camera: Camera, poses: Mapping[int, np.ndarray], obj_id: int) -> di
 
 
 def model_info(mesh: ObjectMesh) -> dict[str, Any]:
-    """Size, diameter and symmetries of the model, millimetres."""
+    """Return size, diameter and symmetries of the model, millimetres."""
     low, high = 1e3 * mesh.vertices.min(0), 1e3 * mesh.vertices.max(0)
     info: dict[str, Any] = {
         "diameter": 1e3 * mesh.diameter,
@@ -166,7 +162,7 @@ def model_info(mesh: ObjectMesh) -> dict[str, Any]:
         info["symmetries_continuous"] = [
             {"axis": symmetry.axis.tolist(), "offset": (1e3 * symmetry.offset).tolist()}
         ]
-    elif symmetry.sphere:  # BOP has no sphere: turns about two axes generate every rotation
+    elif symmetry.sphere:  # BOP has no sphere; rotations about two axes generate all
         info["symmetries_continuous"] = [
             {"axis": axis, "offset": [0.0, 0.0, 0.0]} for axis in ([0, 0, 1], [1, 0, 0])
         ]

@@ -1,4 +1,4 @@
-"""Person and object in every recorded image, as COCO writes them: masks, boxes, keypoints."""
+"""Masks, boxes and keypoints of person and object in every recorded image, in COCO's format."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from intercap_core.geometry.camera.rig import Camera, Rig
+from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import apply
-from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.output.export.about import About
 from intercap_core.output.export.motion import Coordinates, Motion
-from intercap_core.output.export.silhouettes import Exposures, Shown, images_of
+from intercap_core.output.export.silhouettes import Scenes, Silhouettes
 
 PERSON, OBJECT = 1, 2
 KEYPOINTS = (
@@ -23,60 +22,49 @@ KEYPOINTS = (
     "left_elbow", "right_elbow", "left_wrist", "right_wrist", "left_hip", "right_hip", "left_knee",
     "right_knee", "left_ankle", "right_ankle",
 )  # fmt: skip
-# The same points among the 135 of the body, whose first 25 are in OpenPose's order.
+# Indices of these points among the body's 135, whose first 25 are in OpenPose's order
 _PLACES = np.array([0, 16, 15, 18, 17, 5, 2, 6, 3, 7, 4, 12, 9, 13, 10, 14, 11])
 _SKELETON = [
     [16, 14], [14, 12], [17, 15], [15, 13], [12, 13], [6, 12], [7, 13], [6, 7], [6, 8], [7, 9],
     [8, 10], [9, 11], [2, 3], [1, 2], [1, 3], [2, 4], [3, 5], [4, 6], [5, 7],
 ]  # fmt: skip
 UNITS = "pixels of the images as recorded, x right and y down, seconds"
-_INSIDE_M = 0.15  # how far below the skin that is seen a point of the body may lie
-_UNSEEN, _HIDDEN, _SEEN = 0, 1, 2
+_INSIDE_M = 0.15  # largest depth of a keypoint below the skin (half a trunk's depth)
+_HIDDEN, _VISIBLE = 1, 2  # COCO's visibility; 0 = not in the image
 
 
-def write(
-    path: Path,
-    motion: Motion,
-    rig: Rig,
-    mesh: ObjectMesh | None,
-    exposures: Exposures,
-    about: About,
-    bodies: np.ndarray,
-    poses: list[dict[int, np.ndarray]],
-) -> None:
-    """Write ``annotations.json``'s content to ``path``.
+def write(path: Path, scenes: Scenes, about: About) -> None:
+    """Write the annotations of all images to ``path``.
 
-    ``motion`` is in the master frame, as are ``bodies`` (T, V, 3) and ``poses`` by camera and
-    image. Image files are named <camera>/<number>.jpg, whether they are copied or not.
+    Image files are named <camera>/<number>.jpg, whether or not they are exported.
     """
-    keypoints = _keypoints(motion, bodies)
+    keypoints = _keypoints(scenes.motion)
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
-    for number, camera in enumerate(rig):
-        shown = images_of(camera, number, motion, bodies, mesh, poses[number], exposures)
-        for one in shown:
+    for number, camera in enumerate(scenes.rig):
+        for drawn in scenes.draw(number):
             image = {
                 "id": len(images) + 1,
-                "file_name": f"{camera.name}/{one.image:06d}.jpg",
+                "file_name": f"{camera.name}/{drawn.image:06d}.jpg",
                 "width": camera.colour.width,
                 "height": camera.colour.height,
                 "camera": camera.name,
-                "frame": one.t,
-                "time_s": float(exposures.times[one.t] + exposures.time_offset[number]),
-                "flagged": about.flags[one.t],
+                "frame": drawn.t,
+                "time_s": float(scenes.times[drawn.t] + scenes.time_offset[number]),
+                "flagged": about.flags[drawn.t],
             }
             images.append(image)
-            for entry in _annotations(one, camera, keypoints[one.t]):
+            for entry in _annotations(drawn, camera, keypoints[drawn.t]):
                 annotations.append({"id": len(annotations) + 1, "image_id": image["id"], **entry})
     categories: list[dict[str, Any]] = [
         {"id": PERSON, "name": "person", "keypoints": list(KEYPOINTS), "skeleton": _SKELETON}
     ]
-    if mesh is not None:
-        categories.append({"id": OBJECT, "name": mesh.name, "supercategory": "object"})
+    if scenes.mesh is not None:
+        categories.append({"id": OBJECT, "name": scenes.mesh.name, "supercategory": "object"})
     content = {
         "info": {
-            "description": motion.sequence,
-            **about.told(Coordinates.of(motion, UNITS)),
+            "description": scenes.motion.sequence,
+            **about.to_json(Coordinates.of(scenes.motion, UNITS)),
         },
         "images": images,
         "annotations": annotations,
@@ -86,19 +74,21 @@ def write(
     path.write_text(json.dumps(content, separators=(",", ":")) + "\n", encoding="utf-8")
 
 
-def _keypoints(motion: Motion, bodies: np.ndarray) -> np.ndarray:
-    """(T, 17, 3) of the bodies (T, V, 3)."""
-    model, found = motion.model, []
-    for t in range(len(bodies)):
+def _keypoints(motion: Motion) -> np.ndarray:
+    """Return COCO's keypoints (T, 17, 3) of the body, metres."""
+    model, points = motion.model, []
+    for t in range(len(motion)):
         parameters = motion.parameters.frames(slice(t, t + 1))
         parameters = type(parameters)(**{k: v.to(model.dtype) for k, v in vars(parameters).items()})
         with torch.no_grad():
-            found.append(model.keypoints_of(parameters)[0].numpy()[_PLACES])
-    return np.stack(found)
+            points.append(model.keypoints_of(parameters)[0].numpy()[_PLACES])
+    return np.stack(points)
 
 
-def _annotations(shown: Shown, camera: Camera, points: np.ndarray) -> Iterator[dict[str, Any]]:
-    for category, mask in ((PERSON, shown.body), (OBJECT, shown.object_)):
+def _annotations(
+    drawn: Silhouettes, camera: Camera, points: np.ndarray
+) -> Iterator[dict[str, Any]]:
+    for category, mask in ((PERSON, drawn.body), (OBJECT, drawn.object_)):
         if not mask.area:
             continue
         entry: dict[str, Any] = {
@@ -112,28 +102,31 @@ def _annotations(shown: Shown, camera: Camera, points: np.ndarray) -> Iterator[d
             },
         }
         if category == PERSON:
-            told = _visible(shown, camera, points)
-            entry["keypoints"] = [round(float(v), 2) for v in told.ravel()]
-            entry["num_keypoints"] = int((told[:, 2] > 0).sum())
+            keypoints = _with_visibility(drawn, camera, points)
+            entry["keypoints"] = [round(float(v), 2) for v in keypoints.ravel()]
+            entry["num_keypoints"] = int((keypoints[:, 2] > 0).sum())
         yield entry
 
 
-def _visible(shown: Shown, camera: Camera, points: np.ndarray) -> np.ndarray:
-    """x, y and COCO's visibility (17, 3) of points in space: 2 where what is seen there lies before
-    the point by no more than a body is thick, 1 where it is hidden, 0 outside of the image."""
+def _with_visibility(drawn: Silhouettes, camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Return x, y and COCO's visibility (17, 3) of points (17, 3) in the master frame.
+
+    Visibility is 0 outside of the image. Inside it is 2, or 1 if the visible surface is more than
+    a body's thickness in front of the point.
+    """
     lens = camera.colour
     local = apply(camera.colour_from_master, points.astype(np.float64))
-    found = np.zeros((len(points), 3))
+    keypoints = np.zeros((len(points), 3))
     for k in np.flatnonzero(lens.inside_model(local)):
         x, y = lens.project(local[k : k + 1])[0]
         if not (-0.5 <= x < lens.width - 0.5 and -0.5 <= y < lens.height - 0.5):
             continue
-        row, column = round(y) - shown.body.y0, round(x) - shown.body.x0
-        state = _HIDDEN
-        height, width = shown.depth.shape
+        row, column = round(y) - drawn.body.y0, round(x) - drawn.body.x0
+        visibility = _HIDDEN
+        height, width = drawn.depth.shape
         if 0 <= row < height and 0 <= column < width:
-            depth = float(shown.depth[row, column])
+            depth = float(drawn.depth[row, column])
             if depth == 0 or depth > local[k, 2] - _INSIDE_M:
-                state = _SEEN
-        found[k] = x, y, state
-    return found
+                visibility = _VISIBLE
+        keypoints[k] = x, y, visibility
+    return keypoints

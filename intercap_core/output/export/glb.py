@@ -1,9 +1,8 @@
-"""An animated glTF 2.0 file: the body as a skinned mesh with 55 joints, the object, where there is
-one, as a node.
+"""An animated glTF 2.0 file: the body as a skinned mesh with 55 joints, and the object as a node.
 
-glTF is y up: a root node turns the motion's z-up frame. Skinning takes each vertex's four largest
-weights, as every viewer does, and the first frame's shape and expression; pose correctives of a
-licensed body file are left out, since glTF skins know none.
+glTF is y up, so a root node turns the motion's frame. Skinning uses the four largest weights of
+each vertex, the limit of most viewers, and the first frame's shape and expression. Pose correctives
+of a licensed body file are omitted, because glTF skins have none.
 """
 
 from __future__ import annotations
@@ -31,13 +30,13 @@ _SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 _COMPONENTS = {"<f4": _FLOAT, "<u2": _USHORT, "<u4": _UINT, "|u1": _UBYTE}
 _BODY_COLOUR = (0.72, 0.60, 0.52, 1.0)
 _ROUGHNESS = 0.8
-# x right, y up, z towards the viewer, from the motion's frame
+# glTF's frame (x right, y up, z towards the viewer) from the motion's frame
 _YUP_FROM_ZUP = Rotation.from_euler("x", -90, degrees=True)
 _YUP_FROM_CAMERA = Rotation.from_euler("x", 180, degrees=True)
 
 
 class _Document:
-    """The JSON part and the binary buffer of one file, grown accessor by accessor."""
+    """The JSON part and the binary buffer of one file."""
 
     def __init__(self) -> None:
         self.json: dict[str, Any] = {
@@ -60,7 +59,7 @@ class _Document:
         target: int | None = None,
         bounds: bool = False,
     ) -> int:
-        """Append an array (N,) or (N, k) and return its accessor; ``bounds`` adds min and max."""
+        """Append an array (N,) or (N, k); return its accessor. ``bounds`` adds min and max."""
         values = np.ascontiguousarray(values)
         data = values.tobytes()
         view: dict[str, Any] = {
@@ -85,12 +84,12 @@ class _Document:
         return len(self.json["accessors"]) - 1
 
     def add(self, kind: str, entry: dict[str, Any]) -> int:
-        """Append to one of the lists of the JSON part and return the index."""
+        """Append an entry to a list of the JSON part; return its index."""
         self.json.setdefault(kind, []).append(entry)
         return len(self.json[kind]) - 1
 
     def bytes(self) -> bytes:
-        """The whole file."""
+        """Serialize the whole file."""
         self.json["buffers"] = [{"byteLength": self._length}]
         text = json.dumps(self.json, separators=(",", ":")).encode()
         text += b" " * (-len(text) % 4)
@@ -108,26 +107,29 @@ class _Document:
 
 
 def write(path: Path, motion: Motion, mesh: ObjectMesh | None, about: About, *, z_up: bool) -> None:
-    """Write the body, and the object unless ``mesh`` is None; ``z_up`` says whether the motion's
-    frame is z-up or a camera's. What ``about`` says is in the asset's extras."""
+    """Write the body, the object unless ``mesh`` is None, and ``about`` in the asset's extras.
+
+    Args:
+        z_up: the motion's frame is z-up; otherwise it is a camera's.
+    """
     document = _Document()
     root = _YUP_FROM_ZUP if z_up else _YUP_FROM_CAMERA
-    document.json["asset"]["extras"] = about.told(coordinates(motion, z_up=z_up))
+    document.json["asset"]["extras"] = about.to_json(coordinates(motion, z_up=z_up))
     times = document.accessor((np.arange(len(motion)) / motion.fps).astype("<f4"), bounds=True)
     animation: dict[str, Any] = {"name": motion.sequence, "samplers": [], "channels": []}
     skeleton, body = _body(document, motion, animation, times)
     children = [skeleton]
     if mesh is not None:
         children.append(_object(document, motion, mesh, animation, times))
-    world = {"name": "world", "rotation": _listed(root.as_quat()), "children": children}
-    # A skinned mesh's own place means nothing to the format, so it stays at the top.
+    world = {"name": "world", "rotation": _to_floats(root.as_quat()), "children": children}
+    # glTF ignores the transform of a skinned mesh, so its node is at the top.
     document.json["scenes"][0]["nodes"] = [document.add("nodes", world), body]
     document.add("animations", animation)
     path.write_bytes(document.bytes())
 
 
 def coordinates(motion: Motion, *, z_up: bool) -> Coordinates:
-    """Those of the scene, which the root turns."""
+    """Return the coordinates of the scene after the root's rotation."""
     if z_up:
         frame = f"y up, turned by the node world from: {motion.frame}"
         return Coordinates(frame, _YUP_FROM_ZUP.apply(motion.up))
@@ -136,7 +138,7 @@ def coordinates(motion: Motion, *, z_up: bool) -> Coordinates:
 
 
 def rest_pose(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) and joints (55, 3) of the shaped body in the T-pose, metres."""
+    """Return vertices (V, 3) and joints (55, 3) of the shaped body in the T-pose, metres."""
     params = motion.parameters
     rest = replace(
         motion.model.zeros(1),
@@ -154,14 +156,14 @@ def _body(
     animation: dict[str, Any],
     times: int,
 ) -> tuple[int, int]:
-    """Add the skinned mesh and its skeleton; returns the pelvis' node and the mesh's."""
+    """Add the skinned mesh and its skeleton; return the nodes of pelvis and mesh."""
     vertices, joints = rest_pose(motion)
     faces = motion.model.faces.numpy()
     weights = motion.model.skinning_weights.numpy()
     strongest = np.argsort(-weights, axis=1, kind="stable")[:, :4]
     kept = np.take_along_axis(weights, strongest, 1)
     kept = kept / kept.sum(1, keepdims=True)
-    strongest = np.where(kept > 0, strongest, 0)  # the format wants joint 0 where nothing weighs
+    strongest = np.where(kept > 0, strongest, 0)  # required by glTF for zero weights
     geometry = _geometry(document, vertices, faces)
     geometry["attributes"]["JOINTS_0"] = document.accessor(strongest.astype("|u1"), target=_ARRAY)
     geometry["attributes"]["WEIGHTS_0"] = document.accessor(kept.astype("<f4"), target=_ARRAY)
@@ -172,7 +174,7 @@ def _body(
     for index, name in enumerate(JOINT_NAMES):
         parent = PARENTS[index]
         offset = joints[index] - (joints[parent] if parent >= 0 else 0)
-        node: dict[str, Any] = {"name": name, "translation": _listed(offset)}
+        node: dict[str, Any] = {"name": name, "translation": _to_floats(offset)}
         below = [first + child for child, up in enumerate(PARENTS) if up == index]
         if below:
             node["children"] = below
@@ -251,18 +253,18 @@ def _channel(
 
 
 def _continuous(quaternions: np.ndarray) -> np.ndarray:
-    """Choose signs (T, 4) so that neighbours lie in one hemisphere: players interpolate them."""
+    """Choose signs of quaternions (T, 4) so that players interpolate along the shorter arc."""
     flips = np.sign(np.einsum("ti,ti->t", quaternions[1:], quaternions[:-1]))
     signs = np.cumprod(np.concatenate([[1.0], np.where(flips < 0, -1.0, 1.0)]))
     return quaternions * signs[:, None]
 
 
 def _linear(colours: np.ndarray) -> np.ndarray:
-    """sRGB bytes (V, 4) to the linear values that glTF's vertex colours are."""
-    found = linear(colours)
-    found[:, 3] = colours[:, 3] / 255.0
-    return found
+    """Convert sRGB bytes (V, 4) to linear values, as glTF's vertex colours are."""
+    values = linear(colours)
+    values[:, 3] = colours[:, 3] / 255.0
+    return values
 
 
-def _listed(values: np.ndarray) -> list[float]:
+def _to_floats(values: np.ndarray) -> list[float]:
     return [float(v) for v in values]

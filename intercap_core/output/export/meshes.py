@@ -1,4 +1,4 @@
-"""Body and object of each frame as mesh files, named as the InterCap release names them."""
+"""Body and object of each frame as mesh files with the names of the InterCap release."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from intercap_core.output.export.about import About
 from intercap_core.output.export.motion import Coordinates, Motion
 
 Kind = Literal["ply", "obj"]
-_DIGITS = 6  # of an obj's coordinates: micrometres
+_DIGITS = 6  # decimals of coordinates in obj files: micrometres
 
 
 def write(
@@ -27,12 +27,14 @@ def write(
     kind: Kind,
     every: int,
 ) -> None:
-    """Write ``Mesh/<frame>_second.<kind>``, the body, and ``<frame>_second_obj.<kind>``, the object
-    where it has a pose, of every so many frames, from the first on; and ``about.json``.
+    """Write every ``every``-th frame into ``Mesh`` as <frame>_second.<kind>, the body, and
+    <frame>_second_obj.<kind>, the object if it has a pose; and ``about.json``.
 
-    ``bodies`` (V, 3), one for each of these frames, are in the motion's frame. Vertices keep their
-    order and number. A ply says in ``contact`` of each vertex whether it touches the other mesh; an
-    obj has no place for it.
+    Vertices keep their order and number. In a ply file, ``contact`` of each vertex says whether it
+    touches the other mesh.
+
+    Args:
+        bodies: vertices (V, 3) for each written frame, in the motion's frame.
     """
     files = folder / "Mesh"
     files.mkdir(parents=True)
@@ -41,7 +43,7 @@ def write(
     touching = about.touching
     frames = range(0, len(motion), every)
     for t, vertices in zip(frames, bodies, strict=True):
-        lines = [f"sequence {about.sequence}, frame {t}", *coordinates.lines()]
+        lines = [f"sequence {about.sequence}, frame {t}", *coordinates.header_lines()]
         path = files / f"{t:05d}_second.{kind}"
         body = trimesh.Trimesh(vertices, faces, process=False)
         _save(path, body, touching.body.at(t) if touching else None, lines, kind)
@@ -51,7 +53,7 @@ def write(
         object_ = trimesh.Trimesh(placed, mesh.faces, vertex_colors=mesh.colours, process=False)
         path = files / f"{t:05d}_second_obj.{kind}"
         _save(path, object_, touching.object_.at(t) if touching else None, lines, kind)
-    (folder / "about.json").write_text(about.text(coordinates), encoding="utf-8")
+    (folder / "about.json").write_text(about.to_json_text(coordinates), encoding="utf-8")
 
 
 def _save(
@@ -76,7 +78,7 @@ def _save(
 
 
 def ply(mesh: trimesh.Trimesh, lines: Sequence[str]) -> bytes:
-    """A binary ply without normals, with ``lines`` as comments in its head."""
+    """Serialize as a binary ply without normals, with ``lines`` as comments in its header."""
     data = trimesh.exchange.ply.export_ply(mesh, vertex_normal=False)
     first, rest = data.split(b"element vertex", 1)
     comments = "".join(f"comment {line}\n" for line in lines)

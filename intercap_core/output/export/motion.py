@@ -1,4 +1,4 @@
-"""What every export is made from: one body and one object over T frames, in a named frame."""
+"""A joint result as the exporters read it, and the coordinate frames that exported files name."""
 
 from __future__ import annotations
 
@@ -17,41 +17,52 @@ from intercap_core.body.parameters import BodyParameters
 from intercap_core.config import BodyModels
 from intercap_core.schemas import JOINT
 
+METRES = "metres, radians, seconds"
+_AXIS_TOLERANCE = 1e-4  # rad between a vector and the axis by which it is named
+_FLOOR = "z-up: gravity-aligned, ground at z = 0, metres"
+_STATED_FLOOR = "z-up: up and ground at z = 0 as stated with the calibration, metres"
+_UP_SOURCE = {
+    "gravity": "by the gravity sensors",
+    "stated": "as stated with the calibration",
+    "cameras": "by the mean of the cameras' own up, which may be tilted",
+}
+
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A joint result, float64; ``object_`` is "" and its poses are NaN where there is none.
-
-    ``parameters`` are those of the body, ``pelvis`` (3,) its pelvis joint in the shaped rest pose;
-    ``rotation`` (T, 3, 3) and ``translation`` (T, 3) are frame_from_object. ``frame`` says in words
-    which frame both are in, ``up`` (3,) is the unit vector up in it, NaN = not known. ``made_by``
-    names another program that found it, "" = this one.
-    """
+    """A joint result over T frames, float64, in one coordinate frame."""
 
     sequence: str
     subject: str
     object_: str
+    """Name of the object, "" without one."""
     gender: str
     fps: float
     model: BodyModel
     parameters: BodyParameters
     pelvis: np.ndarray
+    """(3,) pelvis joint in the shaped rest pose, metres."""
     rotation: np.ndarray
+    """(T, 3, 3) frame_from_object, NaN where the object has no pose."""
     translation: np.ndarray
+    """(T, 3) frame_from_object, metres, NaN where the object has no pose."""
     frame: str
+    """Name and axes of the coordinate frame."""
     up: np.ndarray
+    """(3,) unit vector up in that frame, NaN if unknown."""
     made_by: str = ""
+    """The other program that made an imported result, "" for this program."""
 
     def __len__(self) -> int:
         return len(self.rotation)
 
     @property
     def has_object(self) -> bool:
-        """Whether there is an object in any frame."""
+        """True if the object has a pose in any frame."""
         return bool(np.isfinite(self.translation).any())
 
     def moved(self, new_from_old: np.ndarray, frame: str) -> Motion:
-        """The same motion seen from another frame; ``new_from_old`` (4, 4) is rigid.
+        """Return the motion in another frame; ``new_from_old`` (4, 4) is rigid.
 
         SMPL-X turns a body about its pelvis joint p, which lies off the origin, and then adds
         ``transl``: x = R (v - p) + p + transl. In the new frame R' = A R and
@@ -84,25 +95,28 @@ def read_motion(
     gender: str,
     zup_from_master: np.ndarray | None = None,
 ) -> Motion:
-    """Read a joint artefact in the master camera's frame; raises UserError as reading does.
+    """Read a joint artefact in the master camera's frame.
 
-    ``zup_from_master`` (4, 4) says where up is there, None = nobody does.
+    Args:
+        zup_from_master: (4, 4) of the scene, None if the direction up is unknown.
+
+    Raises UserError as :func:`artefacts.read` does.
     """
     with artefacts.read(joint, JOINT) as artefact:
         single = read_parameters(artefact)
         rotation, translation = artefact["rotation"], artefact["translation"]
-        told = artefact.attributes
+        attributes = artefact.attributes
         model = load_model(body_models, gender, artefact)
     vector = single.vector().double()
     parameters = BodyParameters.from_vector(vector, num_betas=model.num_betas)
-    # Expression moves the joints of a licensed file by nothing measurable: the first frame's serves
+    # The expression does not measurably move the joints, so the first frame's is used for all.
     rest = replace(model.zeros(1), betas=single.betas[:1], expression=single.expression[:1])
     with torch.no_grad():
         pelvis = model.forward(rest, vertex_ids=np.array([0])).joints[0, 0].double().numpy()
     return Motion(
-        sequence=str(told["sequence"]),
-        subject=str(told["subject"]),
-        object_=str(told["object"]),
+        sequence=str(attributes["sequence"]),
+        subject=str(attributes["subject"]),
+        object_=str(attributes["object"]),
         gender=gender,
         fps=fps,
         model=model,
@@ -112,46 +126,44 @@ def read_motion(
         translation=translation,
         frame="master colour camera: x right, y down, z forward, metres",
         up=np.full(3, np.nan) if zup_from_master is None else zup_from_master[2, :3].copy(),
-        made_by=str(told.get("made_by", "")),
+        made_by=str(attributes.get("made_by", "")),
     )
-
-
-METRES = "metres, radians, seconds"
-_ALONG = 1e-4  # of a unit vector's components, from which on it is not along an axis
 
 
 @dataclass(frozen=True, eq=False)
 class Coordinates:
-    """``frame`` in words; ``up`` (3,) the unit vector up in it, NaN = not known; ``units``."""
+    """Coordinate frame and units of the numbers in a file."""
 
     frame: str
+    """Name and axes of the frame."""
     up: np.ndarray
+    """(3,) unit vector up in the frame, NaN if unknown."""
     units: str = METRES
 
     @classmethod
     def of(cls, motion: Motion, units: str = METRES) -> Coordinates:
-        """Those of a motion."""
+        """Return the coordinates of a motion."""
         return cls(motion.frame, motion.up, units)
 
     @property
     def up_axis(self) -> str:
-        """The axis that points up, as ``z`` or ``-y``, else that there is none."""
+        """The axis that points up, such as ``z`` or ``-y``, or why no axis does."""
         for axis, value in zip("xyz", self.up, strict=True):
-            if abs(abs(value) - 1) < _ALONG**2:
+            if abs(abs(value) - 1) < _AXIS_TOLERANCE**2:
                 return axis if value > 0 else f"-{axis}"
-        return "none: the vector up is" if np.isfinite(self.up).all() else "not known"
+        return "none: see the vector up" if np.isfinite(self.up).all() else "unknown"
 
-    def told(self) -> dict[str, Any]:
-        """In the words of JSON."""
+    def to_json(self) -> dict[str, Any]:
+        """Serialize for JSON."""
         return {
             "frame": self.frame,
             "up_axis": self.up_axis,
-            "up": listed(self.up, 6),
+            "up": rounded_lists(self.up, 6),
             "units": self.units,
         }
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """The same as arrays."""
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Serialize for npz files."""
         return {
             "frame": np.array(self.frame),
             "up_axis": np.array(self.up_axis),
@@ -159,34 +171,26 @@ class Coordinates:
             "units": np.array(self.units),
         }
 
-    def lines(self) -> list[str]:
-        """The same for the head of a text file, a line each."""
+    def header_lines(self) -> list[str]:
+        """Serialize for the header of a text file, one entry per line."""
         up = " ".join(f"{value:.6f}" for value in self.up)
         return [f"frame: {self.frame}", f"up: {self.up_axis} ({up})", f"units: {self.units}"]
 
 
-_BY_FLOOR = "z-up: gravity-aligned, ground at z = 0, metres"
-_BY_STATED_FLOOR = "z-up: up and ground at z = 0 as stated with the calibration, metres"
-_BY_HINT = {
-    "gravity": "by the gravity sensors",
-    "stated": "as stated with the calibration",
-    "cameras": "by the mean of the cameras' own up, which may be tilted",
-}
-
-
 def z_up_frame(scene: artefacts.Artefact) -> str:
-    """The frame to which ``zup_from_master`` of a scene artefact leads."""
-    said = scene.attributes
-    if said["ground_found"]:
-        return _BY_STATED_FLOOR if said["ground_source"] == "stated" else _BY_FLOOR
-    hint = _BY_HINT.get(str(said.get("up_source")), "by a hint that the scene does not name")
-    return f"z-up: {hint}; no floor is known, z = 0 at the master camera, metres"
+    """Name the z-up frame of a scene artefact, with the source of its floor and vertical."""
+    attributes = scene.attributes
+    if attributes["ground_found"]:
+        return _STATED_FLOOR if attributes["ground_source"] == "stated" else _FLOOR
+    source = _UP_SOURCE.get(
+        str(attributes.get("up_source")), "by a hint that the scene does not name"
+    )
+    return f"z-up: {source}; no floor is known, z = 0 at the master camera, metres"
 
 
-def listed(values: np.ndarray, digits: int) -> Any:
-    """An array of any shape as lists of numbers of so many decimals, None where one is not
-    finite."""
+def rounded_lists(values: np.ndarray, digits: int) -> Any:
+    """Convert an array of any shape to nested lists of rounded numbers for JSON; None for NaN."""
     if values.ndim:
-        return [listed(part, digits) for part in values]
+        return [rounded_lists(part, digits) for part in values]
     number = float(values)
     return round(number, digits) if np.isfinite(number) else None

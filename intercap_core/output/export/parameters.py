@@ -1,8 +1,4 @@
-"""Body motion as AMASS stores it (SMPL-X variant), with the object's poses beside it.
-
-``surface_model_type`` names the mesh that was fitted: ``smplx`` of a licensed file alone, since the
-same parameters make another person of another mesh.
-"""
+"""Body parameters and object poses as AMASS and as the InterCap release store them."""
 
 from __future__ import annotations
 
@@ -16,9 +12,28 @@ from scipy.spatial.transform import Rotation
 from intercap_core.output.export.about import About
 from intercap_core.output.export.motion import Coordinates, Motion
 
+NUM_HAND_COMPONENTS = 12  # of a hand's pose in the InterCap release (SMPLify-X's default)
 
-def body_arrays(motion: Motion) -> dict[str, np.ndarray]:
-    """AMASS's keys; ``poses`` (T, 165) holds the 55 joints in SMPL-X's order."""
+
+def write_amass(folder: Path, motion: Motion, about: About) -> None:
+    """Write ``body.npz`` and, with an object, ``object.npz`` into the new ``folder``.
+
+    The bytes repeat, because numpy dates all entries 1980.
+    """
+    folder.mkdir()
+    coordinates = Coordinates.of(motion)
+    np.savez(
+        folder / "body.npz",
+        allow_pickle=False,
+        **{**about.to_arrays(coordinates), **amass_body(motion)},
+    )
+    if motion.has_object:
+        facts = {**about.per_frame_arrays(), **coordinates.to_arrays()}
+        np.savez(folder / "object.npz", allow_pickle=False, **object_arrays(motion), **facts)
+
+
+def amass_body(motion: Motion) -> dict[str, np.ndarray]:
+    """Return AMASS's keys (SMPL-X variant); ``poses`` (T, 165) holds 55 joints in SMPL-X order."""
     params, total = motion.parameters, len(motion)
     poses = params.full_pose().reshape(total, 165).numpy().astype(np.float32)
     return {
@@ -39,7 +54,7 @@ def body_arrays(motion: Motion) -> dict[str, np.ndarray]:
 
 
 def object_arrays(motion: Motion) -> dict[str, np.ndarray]:
-    """The object in the same frame: x = rotation[t] @ vertex + translation[t], metres."""
+    """Return the object in the same frame: x = rotation[t] @ vertex + translation[t], metres."""
     return {
         "object": np.array(motion.object_),
         "mocap_frame_rate": np.array(motion.fps),
@@ -48,35 +63,30 @@ def object_arrays(motion: Motion) -> dict[str, np.ndarray]:
     }
 
 
-def write_amass(folder: Path, motion: Motion, about: About) -> None:
-    """Write ``body.npz`` and, where there is one, ``object.npz``; numpy dates their entries 1980,
-    so bytes repeat."""
-    folder.mkdir()
-    coordinates = Coordinates.of(motion)
-    np.savez(
-        folder / "body.npz",
-        allow_pickle=False,
-        **{**about.arrays(coordinates), **body_arrays(motion)},
-    )
-    if motion.has_object:
-        of_object = {**about.by_frame_arrays(), **coordinates.arrays()}
-        np.savez(folder / "object.npz", allow_pickle=False, **object_arrays(motion), **of_object)
+def write_intercap(path: Path, motion: Motion, about: About) -> None:
+    """Write the InterCap release's pickle (protocol 4) with an entry ``about``, and an npz file.
 
-
-NUM_HAND_COMPONENTS = 12  # of the release; SMPLify-X's number, with flat_hand_mean=False
+    Equal input gives equal bytes. In both files, facts about every frame are arrays.
+    """
+    values, coordinates = intercap_result(motion), Coordinates.of(motion)
+    facts = about.to_json(coordinates) | {"by_frame": about.per_frame_arrays()}
+    with path.open("wb") as file:
+        _OldNamesPickler(file, protocol=4).dump({**values, "about": facts})
+    arrays = {key: np.asarray(value) for key, value in values.items()}
+    np.savez(path.with_suffix(".npz"), allow_pickle=False, **arrays, **about.to_arrays(coordinates))
 
 
 def intercap_result(motion: Motion) -> dict[str, Any]:
-    """The release's keys and shapes for T frames, and the full hand poses beside its 12 components.
+    """Return the release's keys and shapes for T frames, plus the full hand poses.
 
-    ``body_pose`` is (1, 63 T), as released. Without an object its keys are left out.
-    ``pose_embedding`` is VPoser's and left out.
+    ``body_pose`` is (1, 63 T), as released. Without an object, its keys are omitted.
+    ``pose_embedding`` belongs to VPoser and is omitted.
     """
     params, total = motion.parameters, len(motion)
-    of_object = {}
+    object_values = {}
     if motion.has_object:
         turns = Rotation.from_matrix(motion.rotation).as_rotvec()
-        of_object = {
+        object_values = {
             "ob_pose": list(turns.astype(np.float32)),
             "ob_trans": list(motion.translation.astype(np.float32)),
         }
@@ -85,23 +95,23 @@ def intercap_result(motion: Motion) -> dict[str, Any]:
         for index, side in enumerate(("left", "right"))
     }
     return {
-        "global_orient": _single(params.global_orient),
-        "transl": _single(params.transl),
-        "body_pose": _single(params.body_pose).reshape(1, 63 * total),
+        "global_orient": _to_float32(params.global_orient),
+        "transl": _to_float32(params.transl),
+        "body_pose": _to_float32(params.body_pose).reshape(1, 63 * total),
         **hands,
-        "left_hand_pose_axis_angle": _single(params.left_hand_pose),
-        "right_hand_pose_axis_angle": _single(params.right_hand_pose),
-        "betas": _single(params.betas.expand(total, -1)),
-        "expression": _single(params.expression.expand(total, -1)),
-        "jaw_pose": _single(params.jaw_pose),
-        "leye_pose": _single(params.leye_pose),
-        "reye_pose": _single(params.reye_pose),
-        **of_object,
+        "left_hand_pose_axis_angle": _to_float32(params.left_hand_pose),
+        "right_hand_pose_axis_angle": _to_float32(params.right_hand_pose),
+        "betas": _to_float32(params.betas.expand(total, -1)),
+        "expression": _to_float32(params.expression.expand(total, -1)),
+        "jaw_pose": _to_float32(params.jaw_pose),
+        "leye_pose": _to_float32(params.leye_pose),
+        "reye_pose": _to_float32(params.reye_pose),
+        **object_values,
     }
 
 
 def hand_components(motion: Motion, side: int) -> np.ndarray:
-    """Coefficients (T, 12) whose pose is nearest to the full one, over the hand's mean pose."""
+    """Fit PCA coefficients (T, 12) over the hand's mean pose to the full pose."""
     params = motion.parameters
     pose = (params.left_hand_pose, params.right_hand_pose)[side].numpy()
     mean = motion.model.hand_mean[side].numpy().astype(np.float64)
@@ -109,12 +119,12 @@ def hand_components(motion: Motion, side: int) -> np.ndarray:
     return np.linalg.lstsq(basis.T, (pose - mean).T, rcond=None)[0].T.astype(np.float32)
 
 
-def _single(values: Any) -> np.ndarray:
+def _to_float32(values: Any) -> np.ndarray:
     return np.ascontiguousarray(values.numpy(), np.float32)
 
 
-class _OldNames(pickle._Pickler):  # the C pickler offers no hook for names
-    """Names numpy's functions as numpy 1 did, so that numpy 1 and 2 both load the file."""
+class _OldNamesPickler(pickle._Pickler):  # the C pickler offers no hook for names
+    """Write numpy's function names as numpy 1 has them, which both numpy 1 and 2 can load."""
 
     def save_global(self, obj: Any, name: str | None = None) -> None:
         module = str(getattr(obj, "__module__", ""))
@@ -124,14 +134,3 @@ class _OldNames(pickle._Pickler):  # the C pickler offers no hook for names
         old = module.replace("numpy._core.", "numpy.core.")
         self.write(pickle.GLOBAL + f"{old}\n{obj.__name__}\n".encode())  # type: ignore[attr-defined]
         self.memoize(obj)  # type: ignore[attr-defined]
-
-
-def write_intercap(path: Path, motion: Motion, about: About) -> None:
-    """Write the pickle, protocol 4, with ``about`` beside the release's keys, and the same as .npz;
-    equal input gives equal bytes. What ``about`` has of every frame are arrays in both."""
-    found, coordinates = intercap_result(motion), Coordinates.of(motion)
-    told = about.told(coordinates) | {"by_frame": about.by_frame_arrays()}
-    with path.open("wb") as file:
-        _OldNames(file, protocol=4).dump({**found, "about": told})
-    arrays = {key: np.asarray(value) for key, value in found.items()}
-    np.savez(path.with_suffix(".npz"), allow_pickle=False, **arrays, **about.arrays(coordinates))

@@ -1,12 +1,12 @@
-"""What each recorded image shows of body and object, by the fit: masks that hide each other.
+"""Silhouettes of body and object in the recorded images, with mutual occlusion.
 
-Drawn through each camera's own lens, so that they lie on the images as they were recorded.
+They are rendered through each camera's own lens and match the distorted images as recorded.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -20,35 +20,25 @@ from intercap_core.geometry.rigid.shots import Drawable, Rendering
 from intercap_core.geometry.solve.time_series import rigid_velocity
 from intercap_core.output.export.motion import Motion
 
-_BATCH = 32
-
-
-@dataclass(frozen=True, eq=False)
-class Exposures:
-    """Which images show the motion's T frames, and when: ``image_of`` (T, C) the set whose image
-    of each camera shows each frame, -1 = none; ``times`` (T,) s of the frames; ``time_offset``
-    (C,) s by which each camera exposes later."""
-
-    image_of: np.ndarray
-    times: np.ndarray
-    time_offset: np.ndarray
+_BATCH = 32  # frames posed at a time
 
 
 @dataclass(frozen=True, eq=False)
 class Mask:
-    """Part of an image: pixel [0, 0] of ``pixels`` (h, w) bool is image pixel (x0, y0)."""
+    """Part of an image."""
 
     x0: int
     y0: int
     pixels: np.ndarray
+    """(h, w) bool; pixel [0, 0] is image pixel (x0, y0)."""
 
     @property
     def area(self) -> int:
-        """Pixels that are set."""
+        """Number of set pixels."""
         return int(np.count_nonzero(self.pixels))
 
     def box(self) -> list[int]:
-        """x, y, width, height of the set pixels; BOP's -1 where none is set."""
+        """Return x, y, width, height of the set pixels; all -1 (BOP's convention) if none is."""
         rows, columns = (np.flatnonzero(self.pixels.any(axis)) for axis in (1, 0))
         if not len(rows):
             return [-1, -1, -1, -1]
@@ -56,96 +46,112 @@ class Mask:
         return [x, y, int(columns[-1] - columns[0]) + 1, int(rows[-1] - rows[0]) + 1]
 
     def rle(self, camera: Camera) -> bytes:
-        """COCO's compressed run lengths in the whole image."""
+        """Encode as COCO's compressed run lengths of the whole image."""
         lens = camera.colour
         return encode_window(self.pixels, self.x0, self.y0, lens.height, lens.width)
 
     def image(self, camera: Camera) -> np.ndarray:
-        """255 where it is set, in the whole image (H, W) uint8."""
-        whole = np.zeros((camera.colour.height, camera.colour.width), np.uint8)
+        """Return the whole image (H, W) uint8, 255 where the mask is set."""
+        image = np.zeros((camera.colour.height, camera.colour.width), np.uint8)
         height, width = self.pixels.shape
-        whole[self.y0 : self.y0 + height, self.x0 : self.x0 + width][self.pixels] = 255
-        return whole
+        image[self.y0 : self.y0 + height, self.x0 : self.x0 + width][self.pixels] = 255
+        return image
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
-    """One image of a camera: its number, the frame ``t`` that it shows, ``pose`` master_from_object
-    (4, 4) when it was exposed; ``body`` and ``object_`` as far as they are seen, ``whole_object``
-    behind the body too; ``depth`` (h, w) metres of what is seen, in the window of ``body``."""
+class Silhouettes:
+    """Body and object in one image of a camera."""
 
     image: int
+    """Number of the image (its frame set)."""
     t: int
+    """Frame that the image shows."""
     pose: np.ndarray
+    """(4, 4) master_from_object at the time of exposure."""
     body: Mask
+    """Visible part of the body."""
     object_: Mask
+    """Visible part of the object."""
     whole_object: Mask
+    """The object without occlusion by the body."""
     depth: np.ndarray
+    """(h, w) depth of the visible surface, metres, in the window of ``body``; 0 = background."""
 
 
-def object_poses(motion: Motion, rig: Rig, exposures: Exposures) -> Iterator[dict[int, np.ndarray]]:
-    """For each camera, master_from_object (4, 4) of each of its images, by the image's number, when
-    it was exposed; NaN in frames without an object's pose."""
-    poses = rigid(motion.rotation, motion.translation)
-    known = np.isfinite(poses).all(axis=(1, 2))
-    twist = np.zeros((len(motion), 6))
-    twist[known] = rigid_velocity(poses[known], np.ones(known.sum(), bool), exposures.times[known])
-    for number in range(len(rig)):
-        seen = apply_step(poses, exposures.time_offset[number] * twist)
-        yield {image: seen[t] for image, t in sorted(frames_of(exposures, number).items())}
+@dataclass(frozen=True, eq=False)
+class Scenes:
+    """A motion in the master camera's frame with the images that show its T frames."""
 
+    motion: Motion
+    rig: Rig
+    mesh: ObjectMesh | None
+    """None without an object."""
+    image_of: np.ndarray
+    """(T, C) number of each camera's image that shows each frame, -1 = none."""
+    times: np.ndarray
+    """(T,) seconds."""
+    time_offset: np.ndarray
+    """(C,) seconds by which each camera exposes later."""
+    bodies: np.ndarray
+    """(T, V, 3) vertices of the body, master frame; empty if no format needs them."""
+    poses: list[dict[int, np.ndarray]] = field(init=False)
+    """For each camera, master_from_object (4, 4) by image number at the time of exposure; NaN if
+    the object has no pose."""
 
-def frames_of(exposures: Exposures, camera: int) -> dict[int, int]:
-    """Which frame each image of a camera shows, by the image's number."""
-    shown = enumerate(exposures.image_of[:, camera])
-    return {int(image): t for t, image in shown if image >= 0}
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "poses", list(self._poses_at_exposure()))
+
+    def _poses_at_exposure(self) -> Iterator[dict[int, np.ndarray]]:
+        poses = rigid(self.motion.rotation, self.motion.translation)
+        known = np.isfinite(poses).all(axis=(1, 2))
+        twist = np.zeros((len(self.motion), 6))
+        twist[known] = rigid_velocity(poses[known], np.ones(known.sum(), bool), self.times[known])
+        for number in range(len(self.rig)):
+            exposed = apply_step(poses, self.time_offset[number] * twist)
+            yield {image: exposed[t] for image, t in sorted(self.frames_of(number).items())}
+
+    def frames_of(self, number: int) -> dict[int, int]:
+        """Map the image numbers of a camera to the frames that they show."""
+        images = enumerate(self.image_of[:, number])
+        return {int(image): t for t, image in images if image >= 0}
+
+    def draw(self, number: int) -> Iterator[Silhouettes]:
+        """Draw all images of a camera.
+
+        The object has its pose at the time of exposure. The body has its pose in the frame, some
+        milliseconds earlier or later.
+        """
+        camera, mesh, frame_of = self.rig[number], self.mesh, self.frames_of(number)
+        faces = self.motion.model.faces.numpy()
+        for image, pose in self.poses[number].items():
+            t = frame_of[image]
+            drawn = [Drawable(self.bodies[t], faces, camera.colour_from_master)]
+            empty = Mask(0, 0, np.zeros((0, 0), bool))
+            whole = empty
+            if mesh is not None and np.isfinite(pose).all():
+                placed = camera.colour_from_master @ pose
+                drawn.append(Drawable(mesh.vertices, mesh.faces, placed, mesh.watertight))
+                alone = render(
+                    mesh.vertices, mesh.faces, camera.colour, placed, cull_back=mesh.watertight
+                )
+                whole = Mask(alone.x0, alone.y0, alone.mask)
+            both = render_scene(drawn, camera.colour)
+            object_ = _visible_part(both, 1) if len(drawn) > 1 else empty
+            yield Silhouettes(image, t, pose, _visible_part(both, 0), object_, whole, both.depth)
 
 
 def body_vertices(motion: Motion) -> np.ndarray:
-    """(T, V, 3) float32, in the motion's frame."""
+    """Compute the body's vertices (T, V, 3) float32 in the motion's frame."""
     parameters = motion.parameters.__class__(
         **{k: v.to(motion.model.dtype) for k, v in vars(motion.parameters).items()}
     )
-    found = []
+    vertices = []
     with torch.no_grad():
         for first in range(0, len(motion), _BATCH):
             posed = motion.model.forward(parameters.frames(slice(first, first + _BATCH)))
-            found.append(posed.vertices.numpy())
-    return np.concatenate(found)
+            vertices.append(posed.vertices.numpy())
+    return np.concatenate(vertices)
 
 
-def images_of(
-    camera: Camera,
-    number: int,
-    motion: Motion,
-    bodies: np.ndarray,
-    mesh: ObjectMesh | None,
-    poses: dict[int, np.ndarray],
-    exposures: Exposures,
-) -> Iterator[Shown]:
-    """What each image of a camera shows; ``motion`` and ``bodies`` are in the master frame.
-
-    The object is where it was when the image was exposed; the body is that of the frame, which is
-    some milliseconds earlier or later.
-    """
-    frame_of = frames_of(exposures, number)
-    faces = motion.model.faces.numpy()
-    for image, pose in poses.items():
-        t = frame_of[image]
-        drawn = [Drawable(bodies[t], faces, camera.colour_from_master)]
-        nothing = Mask(0, 0, np.zeros((0, 0), bool))
-        whole = nothing
-        if mesh is not None and np.isfinite(pose).all():
-            placed = camera.colour_from_master @ pose
-            drawn.append(Drawable(mesh.vertices, mesh.faces, placed, mesh.watertight))
-            alone = render(
-                mesh.vertices, mesh.faces, camera.colour, placed, cull_back=mesh.watertight
-            )
-            whole = Mask(alone.x0, alone.y0, alone.mask)
-        both = render_scene(drawn, camera.colour)
-        object_ = _part(both, 1) if len(drawn) > 1 else nothing
-        yield Shown(image, t, pose, _part(both, 0), object_, whole, both.depth)
-
-
-def _part(rendering: Rendering, number: int) -> Mask:
+def _visible_part(rendering: Rendering, number: int) -> Mask:
     return Mask(rendering.x0, rendering.y0, rendering.body == number)

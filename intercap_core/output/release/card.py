@@ -1,7 +1,7 @@
-"""The dataset's card: what it holds, how good it is, in which conventions, and under which licence.
+"""The dataset's card: content, accuracy, conventions, licence, and splits for training and test.
 
-One set of facts, as JSON for programs and as Markdown for people; its head is what dataset hubs
-read of a README.
+The same facts are written as JSON for programs and as Markdown for people, with the header that
+dataset hubs read.
 """
 
 from __future__ import annotations
@@ -30,32 +30,32 @@ from intercap_core.versions import versions
 Facts = dict[str, Any]
 
 _TEMPLATES = Path(__file__).parent / "data"
-_NUMBER = re.compile(r"\d+(\.\d+)?")  # in a reason: what differs from frame to frame
-_MAX_REASONS = 12  # that frames are flagged for, most frequent first
-# What dataset hubs call the size, and up to how many frames.
+_NUMBER = re.compile(r"\d+(\.\d+)?")  # numbers in reasons differ between frames
+_MAX_REASONS = 12  # most frequent reasons of flags
+# Size categories of dataset hubs: upper limit in frames, name
 _SIZES = (
     (1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"),
     (10_000_000, "1M<n<10M"),
 )  # fmt: skip
 CONVENTIONS = {
-    "length": "metres; tables say millimetres in their columns' names",
+    "length": "metres; columns of tables in millimetres have it in their names",
     "angle": "radians; rotations are 3x3 matrices or rotation vectors, applied on the left",
     "artefacts": "the master colour camera's frame: x right, y down, z forward",
-    "exports": "amass, glb and meshes as export.json says, z up with the ground at z = 0 unless it "
-    "says otherwise; intercap, bop and coco in camera frames",
+    "exports": "amass, glb and meshes: see export.json, by default z up with the ground at z = 0; "
+    "intercap, bop and coco: camera frames",
     "frames": "numbered from 0, the frame sets of the recording; images of a camera may have "
-    "slipped, image_of in scene.h5 and the exports' own numbers say which shows which frame",
-    "body": "parameters in SMPL-X's order for the body file named; another file with the same "
-    "parameters is another person",
+    "slipped: image_of in scene.h5 and the numbers in exports assign images to frames",
+    "body": "parameters in SMPL-X's order for the named body file; with another file, the same "
+    "parameters give another person",
     "contact": "probability by frame and body region that it touches the object",
-    "flags": "frames that the program itself does not trust, with reasons; leave them out",
+    "flags": "frames that the program does not trust, with reasons; exclude them",
     "errors": "stated without truth, by cameras held out: the true error is within the factor in "
     "four of five cases",
 }
 FORMATS = {
     "intercap": "*/export/intercap/res.pkl and res.npz: as the InterCap release",
     "amass": "*/export/amass/body.npz and object.npz: AMASS keys",
-    "bop": "*/export/bop: the object's poses, masks and lenses as BOP has them",
+    "bop": "*/export/bop: the object's poses, masks and lenses in BOP's format",
     "coco": "*/export/coco/annotations.json: masks, boxes and keypoints of person and object",
     "glb": "*/export/glb: animated body and object",
     "contact": "*/export/contact: contact by frame and region, and the vertices that touch",
@@ -73,11 +73,13 @@ def facts(
     failed: Mapping[str, str],
     virtual: bool,
 ) -> Facts:
-    """Everything that the card says, fit for JSON.
+    """Return the content of the card for JSON.
 
-    ``groups``: the tables by "objects", "subjects" and "intents"; ``formats`` of the exports;
-    ``failed``: sequences without a result, with the reason; ``virtual``: the studio made all
-    recordings.
+    Args:
+        groups: tables by "objects", "subjects" and "intents".
+        formats: formats of the exports.
+        failed: sequences without a result, with the reason.
+        virtual: the studio made all recordings.
     """
     measured = [s.metrics for s in summaries]
     frames = sum(len(s) for s in measured)
@@ -108,8 +110,8 @@ def facts(
         "flagged": _flagged(summaries),
         "failed": [{"sequence": name, "reason": why} for name, why in sorted(failed.items())],
         "bodies": _bodies(summaries),
-        "splits": {"subject": _told(by_subject, measured, "subject"),
-                   "object": _told(by_object, measured, "object_")},
+        "splits": {"subject": _split_to_json(by_subject, measured, "subject"),
+                   "object": _split_to_json(by_object, measured, "object_")},
         "formats": {name: FORMATS[name] for name in FORMATS if name in formats},
         "conventions": CONVENTIONS,
         "stages": _stages(summaries),
@@ -118,7 +120,7 @@ def facts(
 
 
 def split_table(summaries: Sequence[SequenceSummary], settings: CardSettings) -> pd.DataFrame:
-    """One row a sequence: its place in both splits, "" where it has none."""
+    """Return one row per sequence with its part of both splits, "" for none."""
     measured = [s.metrics for s in summaries]
     by_subject, by_object = _splits(measured, settings)
     return pd.DataFrame(
@@ -138,7 +140,7 @@ def split_table(summaries: Sequence[SequenceSummary], settings: CardSettings) ->
 
 
 def markdown(card: Facts) -> str:
-    """The card for people, with the head that dataset hubs read."""
+    """Return the card as Markdown, with the header that dataset hubs read."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(_TEMPLATES),
         autoescape=False,
@@ -152,7 +154,7 @@ def markdown(card: Facts) -> str:
 
 
 def _splits(measured: Sequence[SequenceMetrics], settings: CardSettings) -> tuple[Split, Split]:
-    """By subject and by object."""
+    """Split by subject and by object."""
     subjects: Counter[str] = Counter()
     objects: Counter[str] = Counter()
     for sequence in measured:
@@ -167,7 +169,7 @@ def _splits(measured: Sequence[SequenceMetrics], settings: CardSettings) -> tupl
 
 
 def _records(table: pd.DataFrame) -> list[dict[str, Any]]:
-    """What the card says of each group; None where it is not known."""
+    """Return the card's figures of each group; None if unknown."""
     columns = ["sequences", "frames", "minutes", "contact_percent", "flagged_percent"]
     rows = []
     for row in table.to_dict("records"):
@@ -185,7 +187,7 @@ def _plain(value: Any) -> int | float | None:
 def _accuracy(summaries: Sequence[SequenceSummary]) -> dict[str, Any]:
     measured = [s.metrics for s in summaries]
     clouds, depth = figures.cloud_figures(measured), figures.penetration_figures(measured)
-    found: dict[str, Any] = {
+    accuracy: dict[str, Any] = {
         "stated_mm": {part: round(value, 2) for part, value in mean_stated(measured).items()},
         "nothing_stated_of": sum(bool(e.silent) for s in measured for e in stated_errors(s)),
         "body_to_cloud_mm": _plain(clouds["body_visible_mm"]),
@@ -196,15 +198,15 @@ def _accuracy(summaries: Sequence[SequenceSummary]) -> dict[str, Any]:
         true = figures.truth_figures(measured, "joint")
         keys = ("body_pve_mm", "body_mpjpe_mm", "hand_mpjpe_mm", "object_translation_mm",
                 "object_rotation_deg", "contact_region_f1")  # fmt: skip
-        found["against_truth"] = {key: _plain(true[key]) for key in keys if key in true}
-    return found
+        accuracy["against_truth"] = {key: _plain(true[key]) for key in keys if key in true}
+    return accuracy
 
 
 def _flagged(summaries: Sequence[SequenceSummary]) -> dict[str, Any]:
     counted: Counter[str] = Counter()
     for s in summaries:
-        for said in s.metrics.values["flag_reason"]:
-            kinds = {_NUMBER.sub("…", part.strip()) for part in str(said).split(";")}
+        for reasons in s.metrics.values["flag_reason"]:
+            kinds = {_NUMBER.sub("…", part.strip()) for part in str(reasons).split(";")}
             counted.update(kinds - {""})
     flags = np.concatenate([s.metrics.values["flagged"] for s in summaries])
     return {
@@ -217,12 +219,12 @@ def _flagged(summaries: Sequence[SequenceSummary]) -> dict[str, Any]:
 
 
 def _bodies(summaries: Sequence[SequenceSummary]) -> list[dict[str, Any]]:
-    own = file_digest(OPEN_BODY)
+    open_digest = file_digest(OPEN_BODY)
     bodies = {s.body for s in summaries}
     return [
         {
             "gender": body.gender,
-            "open": body.digest == own,
+            "open": body.digest == open_digest,
             "digest": body.digest,
             "num_betas": body.num_betas,
             "num_expression": body.num_expression,
@@ -231,31 +233,32 @@ def _bodies(summaries: Sequence[SequenceSummary]) -> list[dict[str, Any]]:
     ]
 
 
-def _told(found: Split, measured: Sequence[SequenceMetrics], attribute: str) -> dict[str, Any]:
-    told: dict[str, Any] = {"why_not": found.why}
-    for part, groups in (("train", found.train), ("test", found.test)):
+def _split_to_json(
+    split_: Split, measured: Sequence[SequenceMetrics], attribute: str
+) -> dict[str, Any]:
+    entries: dict[str, Any] = {"why_not": split_.why}
+    for part, groups in (("train", split_.train), ("test", split_.test)):
         own = [s for s in measured if getattr(s, attribute) in groups]
-        told[part] = {
+        entries[part] = {
             "groups": list(groups),
             "sequences": len(own),
             "frames": sum(len(s) for s in own),
         }
-    return told
+    return entries
 
 
 def _stages(summaries: Sequence[SequenceSummary]) -> dict[str, list[dict[str, Any]]]:
-    """By stage: each version of its artefact and digest of its settings, and of how many
-    sequences. More than one is a mix."""
-    found: dict[str, Counter[tuple[int, str]]] = {}
+    """Count sequences by stage, schema version and digest of settings."""
+    counts: dict[str, Counter[tuple[int, str]]] = {}
     for s in summaries:
         for stage, made in s.made_by.items():
-            found.setdefault(stage, Counter())[made] += 1
+            counts.setdefault(stage, Counter())[made] += 1
     return {
         stage: [
             {"version": version, "settings": digest, "sequences": count}
             for (version, digest), count in counted.most_common()
         ]
-        for stage, counted in found.items()
+        for stage, counted in counts.items()
     }
 
 
@@ -264,43 +267,45 @@ TRAIN, TEST = "train", "test"
 
 @dataclass(frozen=True)
 class Split:
-    """``test``: the groups (subjects or objects) that are held out; ``train``: the others. ``why``
-    it is none, "" = it is one."""
+    """Groups (subjects or objects) for training and for test."""
 
     train: tuple[str, ...]
     test: tuple[str, ...]
     why: str = ""
+    """Why there is no split, "" if there is one."""
 
     def of(self, group: str) -> str:
-        """Where a group's sequences belong; "" of a sequence that has none."""
+        """Return the part of a group; "" without a group."""
         if not group:
             return ""
         return TEST if group in self.test else TRAIN
 
 
 def split(frames: Mapping[str, int], *, share: float, named: Sequence[str] = ()) -> Split:
-    """Hold out groups whose ``frames`` come near to ``share`` of all.
+    """Hold out groups whose ``frames`` are about ``share`` of all.
 
-    Groups are taken in the order of a digest of their names, so that the choice has nothing to do
-    with how they are named or numbered, and the same groups give the same split. Those ``named``
-    are held out instead, where any are; names that no group has are let be.
+    Groups are chosen in the order of a digest of their names. The choice is therefore independent
+    of their numbering, and the same groups give the same split.
+
+    Args:
+        named: groups to hold out instead; unknown names are ignored.
     """
     groups = sorted(frames, key=lambda name: hashlib.sha256(name.encode()).digest())
     if named:
         test = {name for name in named if name in frames}
         why = "" if test else f"none of {', '.join(named)} has a sequence"
         if test == set(frames):
-            test, why = set(), "all there are would be held out"
+            test, why = set(), "all groups would be held out"
         return _of(frames, test, why)
     if len(groups) < 2 or share <= 0:
-        why = "there is only one" if len(groups) == 1 else "there is none"
-        return _of(frames, set(), why if share > 0 else "none is asked for")
-    goal, taken, test = share * sum(frames.values()), 0, set()
+        why = "there is only one group" if len(groups) == 1 else "there is no group"
+        return _of(frames, set(), why if share > 0 else "the share of the test part is 0")
+    goal, total, test = share * sum(frames.values()), 0, set()
     for name in groups:
-        left = len(groups) - len(test) > 1
-        if left and abs(taken + frames[name] - goal) < abs(taken - goal):
+        remaining = len(groups) - len(test) > 1
+        if remaining and abs(total + frames[name] - goal) < abs(total - goal):
             test.add(name)
-            taken += frames[name]
+            total += frames[name]
     return _of(frames, test or {min(groups, key=frames.__getitem__)}, "")
 
 

@@ -1,5 +1,6 @@
-"""The dataset in the Croissant format 1.0 (mlcommons.org/croissant): where its files are, what the
-columns of its tables hold, so that loaders and search engines know it.
+"""Description of the dataset in the Croissant format 1.0 (mlcommons.org/croissant).
+
+It lists files and columns of tables for loaders and search engines.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ _CONTEXT = {
     "examples": {"@id": "cr:examples", "@type": "@json"},
     **{name: f"cr:{name}" for name in _TERMS},
 }
-_FILES = {  # formats of the exports: glob patterns and media type
+_FILES = {  # glob pattern and media type of each export format
     "intercap": ("*/export/intercap/*", "application/octet-stream"),
     "amass": ("*/export/amass/*.npz", "application/octet-stream"),
     "bop": ("*/export/bop/**/*.json", "application/json"),
@@ -47,7 +48,7 @@ _FILES = {  # formats of the exports: glob patterns and media type
 
 
 def croissant(card: Facts, folder: Path, tables: Mapping[str, pd.DataFrame]) -> dict[str, Any]:
-    """Croissant's JSON of a dataset in ``folder``, whose ``tables`` are written in tables/."""
+    """Return the content of croissant.json of a dataset in ``folder``; ``tables`` are written."""
     described: dict[str, Any] = {
         "@context": _CONTEXT,
         "@type": "sc:Dataset",

@@ -1,4 +1,4 @@
-"""The list of a dataset's files, with their digests and with what made them; and its check."""
+"""Manifest of a released dataset: files with digests, and their origin; and its check."""
 
 from __future__ import annotations
 
@@ -19,34 +19,37 @@ log = logging.getLogger(__name__)
 MANIFEST, SUMS = "release.json", "release.sha256"
 FORMAT = 1
 KINDS = ("card", "tables", "site", "export", "artefact")
-_RECORDINGS = "recordings"  # what the studio made: inputs, with their truth
-_BLOCK = 1 << 22
+_RECORDINGS = "recordings"  # inputs that the studio made, with their truth
+_BLOCK = 1 << 22  # bytes read at a time
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One file: its path in the dataset's folder, of which ``kind``, its size and SHA-256."""
+    """One released file."""
 
     path: str
+    """Relative to the dataset's folder."""
     kind: str
+    """One of KINDS."""
     bytes: int
     sha256: str
 
 
 @dataclass(frozen=True)
 class Differences:
-    """Paths that a folder lacks, holds with other content, or holds beside those released."""
+    """Paths that differ between a folder and its manifest."""
 
     missing: list[str] = field(default_factory=list)
     changed: list[str] = field(default_factory=list)
     unknown: list[str] = field(default_factory=list)
+    """Files that the manifest does not list."""
 
     def __bool__(self) -> bool:
         return bool(self.missing or self.changed)
 
 
 def kind_of(path: PurePosixPath) -> str | None:
-    """What a file of a dataset's folder is; None where it is not the dataset's."""
+    """Return the kind of a file in a dataset's folder; None if it is not part of the dataset."""
     if any(part.startswith(".") for part in path.parts) or path.parts[0] == _RECORDINGS:
         return None
     if len(path.parts) == 1:
@@ -64,12 +67,14 @@ def write(
     sequences: Sequence[str] | None = None,
     threads: int = 1,
 ) -> list[Entry]:
-    """Write ``release.json`` and ``release.sha256``, which sha256sum -c reads, into the dataset's
-    ``folder``.
+    """Write ``release.json`` and ``release.sha256`` (for sha256sum -c) into ``folder``.
 
-    ``made_with``: what is said of versions and settings, fit for JSON. ``kinds`` of files that are
-    released; of the folders of sequences those of ``sequences`` alone, where given. Raises
-    UserError where there are none.
+    Args:
+        made_with: versions and settings, for JSON.
+        kinds: kinds of files to release.
+        sequences: sequences to release, by default all.
+
+    Raises UserError if there are no such files.
     """
     paths = [
         (path, kind)
@@ -78,106 +83,106 @@ def write(
     ]
     if not paths:
         raise UserError(
-            f"{folder}: holds nothing to release of {', '.join(kinds)}; run the project before"
+            f"{folder}: has no files to release ({', '.join(kinds)}); run the project first"
         )
     progress = Progress(log, "read", len(paths), "files")
 
-    def entry(item: tuple[PurePosixPath, str]) -> Entry:
+    def read_entry(item: tuple[PurePosixPath, str]) -> Entry:
         path, kind = item
         digest, size = _digest(folder / path)
         progress.step()
         return Entry(path.as_posix(), kind, size, digest)
 
-    entries = ThreadPool(threads).map(entry, paths)
-    told = {"format": FORMAT, **made_with, "files": [vars(one) for one in entries]}
-    (folder / MANIFEST).write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
-    lines = [f"{one.sha256}  {one.path}\n" for one in entries]
+    entries = ThreadPool(threads).map(read_entry, paths)
+    content = {"format": FORMAT, **made_with, "files": [vars(entry) for entry in entries]}
+    (folder / MANIFEST).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    lines = [f"{entry.sha256}  {entry.path}\n" for entry in entries]
     (folder / SUMS).write_text("".join(lines), encoding="utf-8")
     return entries
 
 
 def check(folder: Path, *, threads: int = 1) -> tuple[int, Differences]:
-    """Compare a dataset's ``folder`` with the ``release.json`` in it: how many files that lists,
-    and what differs.
+    """Compare a dataset's ``folder`` with its release.json.
 
-    Raises UserError where there is none, or it is broken.
+    Returns the number of listed files and the differences. Raises UserError if release.json is
+    missing or broken.
     """
     listed = _read(folder / MANIFEST)
 
-    def state(one: Entry) -> str:
-        path = folder / one.path
-        there = path.is_file()
-        same = there and path.stat().st_size == one.bytes and _digest(path)[0] == one.sha256
+    def compare(entry: Entry) -> str:
+        path = folder / entry.path
+        exists = path.is_file()
+        same = exists and path.stat().st_size == entry.bytes and _digest(path)[0] == entry.sha256
         progress.step()
-        return "" if same else "changed" if there else "missing"
+        return "" if same else "changed" if exists else "missing"
 
     progress = Progress(log, "checked", len(listed), "files")
-    states = ThreadPool(threads).map(state, listed)
-    found: dict[str, list[str]] = {"missing": [], "changed": []}
-    for one, said in zip(listed, states, strict=True):
-        if said:
-            found[said].append(one.path)
-    known = {one.path for one in listed}
-    kinds = {one.kind for one in listed}
+    states = ThreadPool(threads).map(compare, listed)
+    differing: dict[str, list[str]] = {"missing": [], "changed": []}
+    for entry, state in zip(listed, states, strict=True):
+        if state:
+            differing[state].append(entry.path)
+    known = {entry.path for entry in listed}
+    kinds = {entry.kind for entry in listed}
     unknown = [
         path.as_posix()
         for path, kind in _files(folder)
         if kind in kinds and path.as_posix() not in known
     ]
-    return len(listed), Differences(found["missing"], found["changed"], unknown)
+    return len(listed), Differences(differing["missing"], differing["changed"], unknown)
 
 
 def _files(folder: Path) -> list[tuple[PurePosixPath, str]]:
     if not folder.is_dir():
-        raise UserError(f"{folder}: no such folder; run the project before, or name another folder")
-    found = []
+        raise UserError(f"{folder}: no such folder; run the project first, or name another folder")
+    files = []
     for path in sorted(folder.rglob("*")):
         if path.is_file() and not path.is_symlink():
             relative = PurePosixPath(path.relative_to(folder).as_posix())
             kind = kind_of(relative)
             if kind is not None:
-                found.append((relative, kind))
-    return found
+                files.append((relative, kind))
+    return files
 
 
 def _sequence_of(path: PurePosixPath, kind: str) -> str | None:
-    """Whose file it is; None of the dataset as a whole."""
+    """Return the sequence of a file; None for files of the whole dataset."""
     if kind == "site":
         return path.parts[2] if path.parts[1] == "sequences" else None
     return path.parts[0] if kind in ("export", "artefact") else None
 
 
 def _digest(path: Path) -> tuple[str, int]:
-    found, size = hashlib.sha256(), 0
+    digest, size = hashlib.sha256(), 0
     with open(path, "rb") as file:
         while block := file.read(_BLOCK):
-            found.update(block)
+            digest.update(block)
             size += len(block)
-    return found.hexdigest(), size
+    return digest.hexdigest(), size
 
 
 def _read(path: Path) -> list[Entry]:
-    """The files that a manifest lists; nothing that it says leads out of its folder."""
+    """Read a manifest; paths that lead out of its folder are refused."""
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))
-        if told["format"] != FORMAT:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if content["format"] != FORMAT:
             raise UserError(
-                f"{path}: is of format {told['format']!r}, expected {FORMAT}; check it with the "
+                f"{path}: has format {content['format']!r}, expected {FORMAT}; check it with the "
                 "version of this program that wrote it"
             )
         entries = [
-            Entry(str(one["path"]), str(one["kind"]), int(one["bytes"]), str(one["sha256"]))
-            for one in told["files"]
+            Entry(str(file["path"]), str(file["kind"]), int(file["bytes"]), str(file["sha256"]))
+            for file in content["files"]
         ]
     except FileNotFoundError:
         raise UserError(
-            f"{path}: there is no such file; name the folder of a released dataset, or write one "
+            f"{path}: no such file; name the folder of a released dataset, or write a release "
             "with intercap release SETTINGS"
         ) from None
     except (OSError, ValueError, TypeError, KeyError) as error:
-        raise UserError(f"{path}: is no list of released files ({error!r})") from None
-    for one in entries:
-        pure = PurePosixPath(one.path)
+        raise UserError(f"{path}: is not a manifest of a release ({error!r})") from None
+    for entry in entries:
+        pure = PurePosixPath(entry.path)
         if pure.is_absolute() or ".." in pure.parts or kind_of(pure) is None:
-            raise UserError(f"{path}: lists {one.path!r}, which is not a file of this dataset")
+            raise UserError(f"{path}: lists {entry.path!r}, which is not a file of this dataset")
     return entries

@@ -1,4 +1,4 @@
-"""The page's section on one body's fit: its evidence, and the stated deviation of every joint."""
+"""Section of a page on the body's fit: its evidence, and the stated deviation of every joint."""
 
 from __future__ import annotations
 
@@ -26,51 +26,49 @@ from intercap_core.output.site.overlays import choose_frames
 from intercap_core.schemas import BODY_FIT, PERSON, SCENE
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 
-GOOD_PX = 8.0  # a view agrees up to this median error, at 1080 rows
-_ROWS = 4  # moments of the sheet
-_LEAST_MM = 10.0  # height of the charts at least
+GOOD_PX = 8.0  # a view agrees up to this median keypoint error, scaled to 1080 rows
+_ROWS = 4  # frames of the sheet
+_LEAST_MM = 10.0  # least height of the charts
 VIEW_STATES = {
-    "agrees": f"keypoints within {GOOD_PX:g} px of 1080 rows",
-    "partly": "further off",
-    "nothing": "person not seen",
+    "agrees": f"keypoint error up to {GOOD_PX:g} px at 1080 rows",
+    "partly": "larger error",
+    "nothing": "person not visible",
 }
 FIT_STATES = {
     "moving": "fitted",
-    "doubtful": "not determined by what was seen",
-    "lost": "not fitted: bridged between its neighbours",
+    "doubtful": "not determined by the observations",
+    "lost": "not fitted: interpolated between fitted frames",
 }
 
 
 @dataclass(frozen=True, eq=False)
 class BodyFacts:
-    """One body's fit, NaN = not known.
-
-    ``pixels`` (T, C) median errors of the keypoints, and ``rows`` (C,) of each camera's image;
-    ``cloud_mm`` (T,) median distance of the person's points; ``sigma_mm`` (T, 55) stated deviation
-    of the joints; ``state`` (T,) of FIT_STATES.
-    """
+    """The fit of one body over T frames and C cameras; unknown values are NaN."""
 
     name: str
     subject: str
     cameras: list[str]
     rows: np.ndarray
+    """(C,) height of each camera's image, pixels."""
     pixels: np.ndarray
+    """(T, C) median error of the keypoints, pixels."""
     cloud_mm: np.ndarray
+    """(T,) median distance of the person's points."""
     sigma_mm: np.ndarray
+    """(T, 55) stated deviation of the joints."""
     state: list[str]
+    """(T,) keys of FIT_STATES."""
     sheet: Sheet | None
     note: str = ""
+    """Why there is no sheet."""
 
 
 def read_fit(paths: SequencePaths, models: SequenceModels) -> BodyFacts:
-    """Read and draw one fit. What cannot be drawn is left out, with its reason in ``note``.
-
-    Raises UserError as :func:`artefacts.read` does.
-    """
-    with artefacts.read(paths.scene, SCENE) as setting:
-        rig, image_of = Rig.from_artefact(setting), setting["image_of"]
-    with artefacts.read(paths.person, PERSON) as people:
-        detected = people["keypoints"]
+    """Read and draw the fit; raises UserError as :func:`artefacts.read` does."""
+    with artefacts.read(paths.scene, SCENE) as scene:
+        rig, image_of = Rig.from_artefact(scene), scene["image_of"]
+    with artefacts.read(paths.person, PERSON) as person:
+        detected = person["keypoints"]
     with artefacts.read(paths.body_fit, BODY_FIT) as fit:
         parameters = read_parameters(fit)
         worst = fit["joint_sigma"][:, BODY_JOINTS].max(1)
@@ -86,7 +84,7 @@ def read_fit(paths: SequencePaths, models: SequenceModels) -> BodyFacts:
             with Frames.open(paths.frames) as images:
                 faces = model.faces.numpy()
                 sheet = body_sheet(images.showing(image_of), rig, bodies, faces, detected)
-        except UserError as error:  # one unreadable image must not prevent the report
+        except UserError as error:  # an unreadable image must not prevent the page
             note = str(error)
         untrusted = fit["failed"] | fit["bridged"]
         return BodyFacts(
@@ -107,24 +105,24 @@ def read_fit(paths: SequencePaths, models: SequenceModels) -> BodyFacts:
 
 
 def context(facts: BodyFacts) -> dict[str, Any]:
-    """What the template needs; the sheet is left as it is."""
+    """Return the variables of the template body.html.j2."""
     bridged, unsure = facts.state.count("lost"), facts.state.count("doubtful")
-    doubts = [f"{n} {word}" for n, word in ((bridged, "bridged"), (unsure, "doubtful")) if n]
-    beside = ", ".join(doubts) or "no frame in doubt"
+    counts = [f"{n} {word}" for n, word in ((bridged, "interpolated"), (unsure, "doubtful")) if n]
+    label = ", ".join(counts) or "no doubtful frame"
     if np.isfinite(facts.cloud_mm).any():
-        beside += f" · points {np.nanmedian(facts.cloud_mm):.1f} mm off"
-    rows = [charts.StateRow("fit", charts.state_runs(facts.state, FIT_STATES), beside)]
+        label += f" · points {np.nanmedian(facts.cloud_mm):.1f} mm off"
+    rows = [charts.StateRow("fit", charts.state_runs(facts.state, FIT_STATES), label)]
     for c, name in enumerate(facts.cameras):
         pixels = facts.pixels[:, c]
         seen = np.isfinite(pixels)
         limit = GOOD_PX * facts.rows[c] / 1080
         states = [
-            "nothing" if not there else "agrees" if value <= limit else "partly"
-            for there, value in zip(seen, pixels, strict=True)
+            "nothing" if not visible else "agrees" if value <= limit else "partly"
+            for visible, value in zip(seen, pixels, strict=True)
         ]
-        said = f"{100 * seen.mean():.0f} % seen"
-        said += f" · {np.median(pixels[seen]):.1f} px" if seen.any() else ""
-        rows.append(charts.StateRow(name, charts.state_runs(states, VIEW_STATES), said))
+        label = f"{100 * seen.mean():.0f} % visible"
+        label += f" · {np.median(pixels[seen]):.1f} px" if seen.any() else ""
+        rows.append(charts.StateRow(name, charts.state_runs(states, VIEW_STATES), label))
     return {
         "name": facts.name,
         "subject": facts.subject,
@@ -142,7 +140,7 @@ def context(facts: BodyFacts) -> dict[str, Any]:
 
 
 def _over_time(facts: BodyFacts) -> str:
-    """The least sure joint of the body and of each hand, over the frames."""
+    """Plot the largest deviation of body joints and of each hand over the frames."""
     left, right = FINGER_JOINTS
     parts = (
         ("body", "c1", BODY_JOINTS), ("left hand", "c2", left), ("right hand", "c3", right),
@@ -153,14 +151,14 @@ def _over_time(facts: BodyFacts) -> str:
     return charts.line_chart(
         [charts.Series(name, colour, np.arange(total), y) for (name, colour), y in worst.items()],
         x_label="frame",
-        y_label="deviation of the least sure joint, mm",
+        y_label="largest deviation of a joint, mm",
         x_range=(0.0, float(max(total - 1, 1))),
         y_range=(0.0, top),
     )
 
 
 def _by_joint(facts: BodyFacts) -> str:
-    """Each joint's stated deviation, in the median frame and the worst one; fingers by hand."""
+    """Plot the median and largest stated deviation of each joint; fingers are pooled by hand."""
     sigma = facts.sigma_mm
     rows = [
         (JOINT_NAMES[j].replace("_", " "), sigma[:, j]) for j in range(*BODY_JOINTS.indices(55))
@@ -180,18 +178,20 @@ def _by_joint(facts: BodyFacts) -> str:
 
 FIT_COLOUR, KEYPOINT_COLOUR = (107, 168, 235), (255, 210, 64)  # RGB
 _CELL_PX = 220
-_MARGIN = 0.06  # of the body's box, around it
-_CONFIDENT = 0.3
-# Trunk, arms, legs, feet and nose; the rest of the face is in the outline.
+_MARGIN = 0.06  # around the body's box, share of its size
+_CONFIDENT = 0.3  # least confidence of drawn keypoints
+# Trunk, arms, legs, feet and nose
 _BONES = keypoint_pairs([*SKELETON, *FEET]).tolist()
 
 
 @dataclass(frozen=True, eq=False)
 class PosedBody:
-    """One frame's fit, master frame: ``vertices`` (V, 3), ``keypoints`` (135, 3)."""
+    """The fit in one frame, master frame, metres."""
 
     vertices: np.ndarray
+    """(V, 3)"""
     keypoints: np.ndarray
+    """(135, 3)"""
 
 
 def body_sheet(
@@ -203,7 +203,9 @@ def body_sheet(
 ) -> Sheet:
     """Draw outline and bones of the fits, and the detected keypoints, over crops of the images.
 
-    ``bodies`` by frame, in the order of the rows; ``detected`` (T, C, 135, 3) x, y, confidence.
+    Args:
+        bodies: by frame, in the order of the rows.
+        detected: (T, C, 135, 3) x, y, confidence.
     """
 
     def draw(camera: Camera, t: int, c: int, rgb: np.ndarray) -> np.ndarray | None:
@@ -224,23 +226,23 @@ def _cell(
     crop = _crop(lens.project(local[seen])) if (seen := lens.sees(local)).any() else None
     if crop is None:
         return None
-    cell = crop.of(rgb)
+    cell = crop.extract(rgb)
     drawn = render(body.vertices, faces, lens, camera.colour_from_master, cull_back=True)
     crop.outline(cell, drawn.mask, drawn.x0, drawn.y0, FIT_COLOUR)
     points = apply(camera.colour_from_master, body.keypoints[BODY])
     known = lens.sees(points)
-    at = crop.placed(lens.project(np.where(known[:, None], points, [0.0, 0.0, 1.0])))
+    at = crop.to_cell(lens.project(np.where(known[:, None], points, [0.0, 0.0, 1.0])))
     for a, b in _BONES:
         if known[a] and known[b]:
             cv2.line(cell, _pixel(at[a]), _pixel(at[b]), FIT_COLOUR, 1, cv2.LINE_AA)
     confident = detected[BODY][detected[BODY, 2] >= _CONFIDENT]
-    for dot in crop.placed(confident[:, :2]):
+    for dot in crop.to_cell(confident[:, :2]):
         cv2.circle(cell, _pixel(dot), 2, KEYPOINT_COLOUR, -1, cv2.LINE_AA)
     return cell
 
 
 def _crop(pixels: np.ndarray) -> Crop:
-    """The square around the body's pixels (N, 2)."""
+    """Return the square around the body's pixels (N, 2)."""
     low, high = pixels.min(0), pixels.max(0)
     size = max(int((1 + 2 * _MARGIN) * float((high - low).max())), 32)
     x0, y0 = np.rint((low + high - size) / 2).astype(int)

@@ -11,10 +11,16 @@ from intercap_core import artefacts
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import apply
-from intercap_core.output.site.drawing import encode_jpeg
-from intercap_core.output.site.point_cloud import FusedCloud, View, fuse, measured_points, splat
+from intercap_core.output.site.drawing import EncodedImage, encode_jpeg
+from intercap_core.output.site.point_cloud import (
+    FusedCloud,
+    Viewpoint,
+    fuse,
+    measured_points,
+    splat,
+)
 
-# One colour a camera, told apart on light and dark ground
+# A colour per camera, distinguishable on light and dark background
 CAMERA_COLOURS = (
     "#4e9bde", "#f28e2b", "#59a14f", "#e15759", "#b07aa1", "#d4b13a", "#3fa7a3", "#ff7fa5",
     "#9c755f", "#8c8c8c", "#7570b3", "#a0c15a", "#c0448f", "#5b7fd1", "#c97b3d", "#4f8f74",
@@ -23,12 +29,12 @@ _GROUND = np.array((0.075, 0.086, 0.105), np.float32)
 _SIZE = (840, 560)
 _FOCAL = 900.0
 _SIDES = (("front", 22.0, 20.0), ("other side, from above", 200.0, 48.0))  # from the master, deg
-_MARGIN_M = 0.35  # shown around the cameras' ring
-_LARGEST_M, _SMALLEST_M = 4.0, 1.0  # radius that is shown
-_FLOOR_M, _TOP_M = -0.25, 2.6  # heights that are shown
-_AIM_M = 0.65  # height in the middle of the pictures
-_CELL_M = 0.5  # of the floor's grid
-_DISTANCES = np.arange(2.2, 4.0, 0.1)  # of the viewer, in radii: the nearest that shows all cameras
+_MARGIN_M = 0.35  # shown around the ring of cameras
+_LARGEST_M, _SMALLEST_M = 4.0, 1.0  # limits of the shown radius
+_FLOOR_M, _TOP_M = -0.25, 2.6  # limits of the shown heights
+_AIM_M = 0.65  # height at the centre of the pictures
+_CELL_M = 0.5  # spacing of the floor's grid
+_DISTANCES = np.arange(2.2, 4.0, 0.1)  # viewing distances in radii, the nearest that fits is used
 _BORDER_PX = 24
 _FRUSTUM_M = 0.28
 _NEAR_M = 0.1
@@ -42,54 +48,46 @@ _FEW_IN_SLICE = 40
 _SCALE_BAR_M = 0.1
 _DOT_PX = 2
 _STRIP_M, _STRIP_BIN_M, _STRIP_HEIGHT_M = 0.3, 0.08, 0.08
-_STRIPS_M = (0.0, 0.3, -0.3, 0.6, -0.6)  # from the middle
-_STANDING_M = 0.4  # up to this height something stands on the strip
+_STRIPS_M = (0.0, 0.3, -0.3, 0.6, -0.6)  # y of candidate strips from the centre
+_STANDING_M = 0.4  # points up to this height are objects on the strip
 _FEW_IN_BIN = 5
 _INK, _SHADOW = (235, 235, 235), (10, 12, 16)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
-_SHIFT = 4  # binary digits after the point in what OpenCV draws
-
-
-@dataclass(frozen=True, eq=False)
-class CapturePicture:
-    """``data`` bytes of a picture, ``kind`` "jpeg" or "png"; ``caption`` says what it shows."""
-
-    caption: str
-    kind: str
-    data: bytes
-    width: int
-    height: int
+_SHIFT = 4  # fractional bits of the coordinates that OpenCV draws
 
 
 @dataclass(frozen=True, eq=False)
 class FloorProfile:
-    """Height (N,) over the floor along a strip (N,) as camera ``c`` sees it, metres."""
+    """Height over the floor along a strip, as one camera measures it."""
 
     c: int
+    """Index of the camera."""
     along: np.ndarray
+    """(N,) position along the strip, metres."""
     height: np.ndarray
+    """(N,) metres."""
 
 
 @dataclass(frozen=True, eq=False)
 class CapturePictures:
-    """Pictures of one frame set: ``when`` ("before", "after" or "") and what belongs to each.
-
-    ``views`` by side, ``slice_`` (empty where no two cameras measure anything at one height) and
-    ``profiles`` (empty without a floor); each has one entry for each of ``when``.
-    """
+    """Pictures of one frame set, before and after refinement."""
 
     frame: int
     when: tuple[str, ...]
-    views: tuple[tuple[CapturePicture, ...], ...]
-    slice_: tuple[CapturePicture, ...]
+    """("before", "after"), or ("",) if refinement changed nothing."""
+    views: tuple[tuple[EncodedImage, ...], ...]
+    """By side, then by ``when``."""
+    slice_: tuple[EncodedImage, ...]
+    """By ``when``; empty if no two cameras measure points at the same height."""
     profiles: tuple[tuple[FloorProfile, ...], ...]
+    """By ``when``, then by camera; empty without a floor."""
 
 
 def draw_capture(images: Frames, scene: artefacts.Artefact) -> CapturePictures:
-    """Draw the moment that most cameras recorded, nearest to the middle of the sequence.
+    """Draw the frame set that most cameras recorded, nearest to the middle of the sequence.
 
-    Where the refined poses differ from those given, everything is drawn before and after. Raises
-    UserError where a recorded JPEG does not decode.
+    It is drawn before and after refinement if refinement changed a pose. Raises UserError if a
+    recorded image does not decode.
     """
     rig = Rig.from_artefact(scene)
     start = rig.moved(scene["master_from_colour_start"])
@@ -102,16 +100,16 @@ def draw_capture(images: Frames, scene: artefacts.Artefact) -> CapturePictures:
     measured = measured_points(shown, rig, t)
     world = scene["zup_from_master"]
     clouds = [fuse(measured, cameras, world, shift) for _, cameras, shift in states]
-    stage = _Stage.around(clouds[-1], rig, world)
-    clouds = [cloud.where(stage.holds(cloud.points)) for cloud in clouds]
-    level = Slice.of(clouds[-1], stage.centre)
+    room = _ShownRoom.around(clouds[-1], rig, world)
+    clouds = [cloud.where(room.contains(cloud.points)) for cloud in clouds]
+    level = Slice.of(clouds[-1], room.centre)
     words = [f"{when} refinement" if when else "" for when, *_ in states]
     return CapturePictures(
         frame=t,
         when=tuple(when for when, *_ in states),
         views=tuple(
             tuple(
-                stage.picture(side, cloud, cameras, world, word)
+                room.picture(side, cloud, cameras, world, word)
                 for cloud, (_, cameras, _), word in zip(clouds, states, words, strict=True)
             )
             for side in _SIDES
@@ -119,14 +117,14 @@ def draw_capture(images: Frames, scene: artefacts.Artefact) -> CapturePictures:
         slice_=tuple(
             level.picture(cloud, word) for cloud, word in zip(clouds, words, strict=True) if level
         ),
-        profiles=tuple(tuple(floor_profiles(cloud, stage.centre)) for cloud in clouds)
+        profiles=tuple(tuple(floor_profiles(cloud, room.centre)) for cloud in clouds)
         if scene.attributes["ground_found"]
         else (),
     )
 
 
 def choose_set(images: Frames) -> int:
-    """The set with the most depth images, nearest to the middle; without any, colour images."""
+    """Return the set with most depth images, nearest to the middle; without depth, colour."""
     count = images.depth_available.sum(1)
     if not count.any():
         count = images.colour_available.sum(1)
@@ -135,15 +133,15 @@ def choose_set(images: Frames) -> int:
 
 
 def floor_profiles(cloud: FusedCloud, centre: np.ndarray) -> list[FloorProfile]:
-    """Median heights of the floor in a strip along x near the middle, camera by camera.
+    """Return median heights of the floor along a strip parallel to x, camera by camera.
 
-    ``centre`` (2,) is the middle. Of several strips that one is taken on which least stands.
+    The strip is near ``centre`` (2,), where the fewest points are above the floor.
     """
-    height, beside = cloud.points[:, 2], cloud.points[:, 1] - centre[1]
-    standing = beside[(height > _STRIP_HEIGHT_M) & (height < _STANDING_M)]
+    height, offset = cloud.points[:, 2], cloud.points[:, 1] - centre[1]
+    standing = offset[(height > _STRIP_HEIGHT_M) & (height < _STANDING_M)]
     least = min(_STRIPS_M, key=lambda at: int((np.abs(standing - at) < _STRIP_M / 2).sum()))
     low = (np.abs(height) < _STRIP_HEIGHT_M) & (cloud.normals[:, 2] > 0.9)
-    low &= np.abs(beside - least) < _STRIP_M / 2
+    low &= np.abs(offset - least) < _STRIP_M / 2
     profiles = []
     for c in np.unique(cloud.camera[low]):
         points = cloud.points[low & (cloud.camera == c)]
@@ -159,19 +157,20 @@ def floor_profiles(cloud: FusedCloud, centre: np.ndarray) -> list[FloorProfile]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Stage:
-    """The part of the room that is shown: ``centre`` (2,) and ``radius`` on the floor, metres.
-
-    ``azimuth`` of the first camera, radians; ``gain`` makes dark images bright.
-    """
+class _ShownRoom:
+    """The part of the room that is shown, z up."""
 
     centre: np.ndarray
+    """(2,) on the floor, metres."""
     radius: float
+    """On the floor, metres."""
     azimuth: float
+    """Of the first camera seen from the centre, radians."""
     gain: float
+    """Factor that brightens dark images."""
 
     @classmethod
-    def around(cls, cloud: FusedCloud, rig: Rig, world_from_master: np.ndarray) -> _Stage:
+    def around(cls, cloud: FusedCloud, rig: Rig, world_from_master: np.ndarray) -> _ShownRoom:
         eyes = apply(world_from_master, rig.master_from_colour[:, :3, 3])
         centre = np.median(cloud.points[:, :2], 0) if len(cloud.points) else eyes[:, :2].mean(0)
         reach = np.linalg.norm(eyes[:, :2] - centre, axis=1).max() + _MARGIN_M
@@ -182,8 +181,8 @@ class _Stage:
         azimuth = float(np.arctan2(first[1], first[0]))
         return cls(centre.astype(np.float64), radius, azimuth, gain)
 
-    def holds(self, points: np.ndarray) -> np.ndarray:
-        """Which points (N, 3) are shown."""
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Return which points (N, 3) are shown."""
         near = np.linalg.norm(points[:, :2] - self.centre.astype(points.dtype), axis=1)
         return (near < self.radius) & (points[:, 2] > _FLOOR_M) & (points[:, 2] < _TOP_M)
 
@@ -194,17 +193,17 @@ class _Stage:
         rig: Rig,
         world: np.ndarray,
         when: str,
-    ) -> CapturePicture:
-        """The coloured cloud with the floor's grid and the cameras."""
+    ) -> EncodedImage:
+        """Draw the coloured cloud with the floor's grid and the cameras."""
         name, azimuth, elevation = side
         target = np.append(self.centre, _AIM_M)
         places = [_frustum(camera, world @ camera.master_from_colour) for camera in rig]
         for distance in _DISTANCES * self.radius:
-            view = View.towards(
+            view = Viewpoint.towards(
                 target, self.azimuth + np.radians(azimuth), np.radians(elevation), distance,
                 _FOCAL, _SIZE,
             )  # fmt: skip
-            if view.holds(np.concatenate(places), _BORDER_PX):
+            if view.contains(np.concatenate(places), _BORDER_PX):
                 break
         colours, depth = splat(cloud, view)
         colours *= self.gain
@@ -213,11 +212,10 @@ class _Stage:
         self._draw_floor(picture, depth, view)
         for c, (camera, corners) in enumerate(zip(rig, places, strict=True)):
             _draw_frustum(picture, view, corners, c, camera.name)
-        data = encode_jpeg(picture / np.float32(255))
-        return CapturePicture(_captioned(name, when), "jpeg", data, *_SIZE)
+        return encode_jpeg(picture / np.float32(255), _captioned(name, when))
 
-    def _draw_floor(self, picture: np.ndarray, depth: np.ndarray, view: View) -> None:
-        """Lay the grid over the floor where nothing stands in front of it."""
+    def _draw_floor(self, picture: np.ndarray, depth: np.ndarray, view: Viewpoint) -> None:
+        """Blend the grid over the floor where it is visible."""
         lines = np.arange(-np.floor(self.radius / _CELL_M), self.radius / _CELL_M) * _CELL_M
         layer = np.zeros(depth.shape, np.uint8)
         for offset in lines:
@@ -242,15 +240,17 @@ class _Stage:
 
 
 def _frustum(camera: Camera, pose: np.ndarray) -> np.ndarray:
-    """Apex and four corners (5, 3) of a camera's pyramid under ``pose`` (4, 4)."""
+    """Return apex and corners (5, 3) of a camera's viewing pyramid under ``pose`` (4, 4)."""
     lens = camera.colour
     half = 0.5 * np.array([lens.width / lens.fx, lens.height / lens.fy])
     corners = [[x * half[0], y * half[1], 1] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     return apply(pose, _FRUSTUM_M * np.array([[0, 0, 0], *corners]))
 
 
-def _draw_frustum(picture: np.ndarray, view: View, corners: np.ndarray, c: int, name: str) -> None:
-    """A camera's pyramid in its colour, with its name above."""
+def _draw_frustum(
+    picture: np.ndarray, view: Viewpoint, corners: np.ndarray, c: int, name: str
+) -> None:
+    """Draw a camera's viewing pyramid in its colour, with its name above."""
     pairs = [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)]
     at, z = view.project(corners)
     for shade, thick in ((_SHADOW, 3), (_rgb(c), 1)):
@@ -266,12 +266,12 @@ def _draw_frustum(picture: np.ndarray, view: View, corners: np.ndarray, c: int, 
 
 def _draw_lines(
     picture: np.ndarray,
-    view: View,
+    view: Viewpoint,
     ends: np.ndarray,
     colour: int | tuple[int, ...],
     thick: int = 1,
 ) -> None:
-    """Lines (N, 2, 3), smooth at the edges; those that reach behind the viewer are left out."""
+    """Draw anti-aliased lines (N, 2, 3); lines that reach behind the viewer are skipped."""
     at, z = view.project(ends.reshape(-1, 3))
     kept = (z > _NEAR_M).reshape(-1, 2).all(1) & (np.abs(at.reshape(-1, 4)).max(1) < 1e4)
     for a, b in np.rint(at.reshape(-1, 2, 2)[kept] * 2**_SHIFT).astype(int).tolist():
@@ -280,17 +280,20 @@ def _draw_lines(
 
 @dataclass(frozen=True)
 class Slice:
-    """A level rectangle of the room: ``height`` and ``centre`` (2,), metres; ``scale`` px/m."""
+    """A horizontal rectangle of the room."""
 
     height: float
+    """Metres."""
     centre: np.ndarray
+    """(2,) metres."""
     scale: float
+    """Pixels per metre."""
 
     @classmethod
     def of(cls, cloud: FusedCloud, centre: np.ndarray) -> Slice | None:
-        """The level at which most cameras measure something around the middle, and most points.
+        """Choose the height at which most cameras have points near the centre, then most points.
 
-        None where two cameras never meet.
+        None if no two cameras have points at the same height.
         """
         near = np.abs(cloud.points[:, :2] - centre).max(1) < _SLICE_HALF_M
         best, found = (1, 0), None
@@ -306,8 +309,8 @@ class Slice:
         extent = np.maximum(_SLICE_MARGIN * (high - low), _SLICE_LEAST_M)
         return cls(found[0], (low + high) / 2, float((np.array(_SLICE_SIZE) / extent).min()))
 
-    def picture(self, cloud: FusedCloud, when: str) -> CapturePicture:
-        """Points of the layer seen from above, in their cameras' colours, with a scale."""
+    def picture(self, cloud: FusedCloud, when: str) -> EncodedImage:
+        """Draw the points at this height from above in their cameras' colours, with a scale."""
         width, height = _SLICE_SIZE
         inside = np.abs(cloud.points[:, 2] - self.height) < _SLICE_THICK_M / 2
         at = (cloud.points[inside, :2] - self.centre) * [self.scale, -self.scale]
@@ -323,7 +326,7 @@ class Slice:
         label = f"{100 * _SCALE_BAR_M:.0f} cm"
         cv2.putText(picture, label, (x, y - 8), _FONT, 0.5, _INK, 1, cv2.LINE_AA)
         name = _captioned(f"slice at {self.height:.1f} m", when)
-        return CapturePicture(name, "png", _png(picture), width, height)
+        return _encode_png(picture, name)
 
 
 def _rgb(c: int) -> tuple[int, int, int]:
@@ -336,6 +339,7 @@ def _captioned(name: str, when: str) -> str:
     return f"{name}, {when}" if when else name
 
 
-def _png(rgb: np.ndarray) -> bytes:
+def _encode_png(rgb: np.ndarray, caption: str) -> EncodedImage:
     options = [cv2.IMWRITE_PNG_COMPRESSION, 6]
-    return cv2.imencode(".png", rgb[..., ::-1], options)[1].tobytes()
+    data = cv2.imencode(".png", rgb[..., ::-1], options)[1].tobytes()
+    return EncodedImage(data, "png", rgb.shape[1], rgb.shape[0], caption)

@@ -1,4 +1,4 @@
-"""The page's section on one capture: its time, its cameras, their pairs, the floor."""
+"""Section of a page on the capture: time, cameras, pairs of cameras, floor."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from intercap_core.output.site.capture_pictures import (
 from intercap_core.schemas import FRAMES, SCENE
 
 _MAX_PAIRS = 45
-_LEAST_PROFILE_MM = 10.0
-_BIAS = 6  # of a camera's rows of camera_covariance, after its turn and its shift
-_GAP = 1.5  # frame periods between two sets that are more than one step apart
+_LEAST_PROFILE_MM = 10.0  # least height of the floor's charts
+_BIAS = 6  # row of the depth bias in a camera's block of camera_covariance
+_GAP = 1.5  # frame periods between neighbouring sets that count as a gap
 STATES = ("recorded", "part", "slipped", "missing", "dropped")
 _WORDS = {
     "recorded": "recorded",
     "part": "only one of colour and depth",
-    "slipped": "shows an older moment",
+    "slipped": "shows an earlier frame",
     "missing": "no image",
     "dropped": "dropped by annotation",
 }
@@ -38,52 +38,52 @@ _WORDS = {
 
 @dataclass(frozen=True, eq=False)
 class CameraFacts:
-    """One camera of a capture; seconds, metres, NaN = not known.
-
-    ``state`` (T,) of STATES; ``slip`` (T,) whole frames; ``turned_deg`` and ``moved`` by
-    refinement, ``slide`` the deviation of the pose in the direction in which it is least known,
-    ``depth_bias_sigma`` that of the depth bias.
-    """
+    """One camera of a capture of T frame sets; seconds and metres, unknown values are NaN."""
 
     name: str
     state: Sequence[str]
+    """(T,) keys of STATES."""
     slip: Sequence[int]
+    """(T,) whole frames by which images are late."""
     start: float
     end: float
     offset: float
+    """Seconds by which the camera exposes later."""
     offset_sigma: float
     depth_bias: float
     depth_bias_sigma: float
     moved: float
+    """Distance by which refinement moved the camera."""
     turned_deg: float
+    """Angle by which refinement rotated the camera."""
     slide: float
+    """Standard deviation of the pose in its least certain direction."""
     verdict: str
     note: str
 
     @property
     def recorded(self) -> int:
-        """Sets with an image of this camera."""
+        """Number of sets with an image of this camera."""
         return sum(state in ("recorded", "part", "slipped") for state in self.state)
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Two cameras whose surfaces overlap; residuals in metres, NaN = no overlap.
-
-    ``moving`` is before, after and points of what moves.
-    """
+    """Residuals of two cameras with overlapping views, metres; NaN without overlap."""
 
     name: str
     before: float
     after: float
     points: int
     weak: bool
+    """Few points support the pair."""
     moving: tuple[float, float, int]
+    """Before, after and number of points of moving surfaces."""
 
 
 @dataclass(frozen=True, eq=False)
 class CaptureFacts:
-    """One capture as the frames and scene artefacts tell it; metres and seconds."""
+    """One capture, from its frames and scene artefacts; metres and seconds."""
 
     name: str
     fps: float
@@ -99,16 +99,15 @@ class CaptureFacts:
 
 
 def read_capture(frames: Path, scene: Path) -> CaptureFacts:
-    """Read and draw one capture from its frames and scene artefacts.
+    """Read and draw one capture; raises UserError as :func:`artefacts.read` does.
 
-    What cannot be drawn is left out, with its reason in ``note``. Raises UserError as
-    :func:`artefacts.read` does.
+    If an image is unreadable, ``pictures`` is None and ``note`` has the reason.
     """
     with artefacts.read(frames, FRAMES) as recorded, artefacts.read(scene, SCENE) as refined:
         pictures, note = None, ""
         try:
             pictures = draw_capture(Frames(recorded), refined)
-        except UserError as error:  # one image that does not decode must not prevent the report
+        except UserError as error:  # an unreadable image must not prevent the page
             note = str(error)
         names = recorded.text("camera_names")
         times, fps = recorded["times"], float(recorded.attributes["fps"])
@@ -133,7 +132,7 @@ def camera_states(
     slip: np.ndarray,
     dropped: np.ndarray,
 ) -> list[str]:
-    """What each set holds of one camera, one of STATES, from what is there; all (T,)."""
+    """Return the state of one camera in each set, a key of STATES; arguments are (T,)."""
     state = np.full(len(colour), "missing", object)
     state[colour | depth] = "part"
     state[colour & (depth | (not depth.any()))] = "recorded"
@@ -143,13 +142,13 @@ def camera_states(
 
 
 def gaps(times: np.ndarray, fps: float) -> list[tuple[int, int]]:
-    """Where time runs on without any image: (set before the gap, number of sets missing)."""
+    """Return gaps without any image: (set before the gap, number of missing sets)."""
     steps = np.diff(times) * fps
     return [(int(t), round(float(steps[t])) - 1) for t in np.flatnonzero(steps > _GAP)]
 
 
 def context(facts: CaptureFacts) -> dict[str, Any]:
-    """What the template prints of one capture."""
+    """Return the variables of the template capture.html.j2."""
     drawn = facts.pictures
     pictures = [*drawn.views, drawn.slice_] if drawn else []
     return {
@@ -182,16 +181,17 @@ def _cameras(recorded: artefacts.Artefact, refined: artefacts.Artefact) -> list[
     )
     has_depth = refined["depth_size"][:, 0] > 0
     variance = np.einsum("cici->ci", refined["camera_covariance"])[:, _BIAS]
-    bias_sigma = np.sqrt(np.maximum(variance, 0))  # 0 = none is stated
+    bias_sigma = np.sqrt(np.maximum(variance, 0))  # 0 = not stated
     notes = zip(recorded.text("note"), refined.text("note"), strict=True)
-    # artefacts from before each camera was judged by itself have neither
-    told = "camera_verdict" in refined
-    slides = np.linalg.norm(refined["camera_slide"], axis=1) if told else np.full(len(end), np.nan)
-    verdicts = refined.text("camera_verdict") if told else [""] * len(end)
+    judged = "camera_verdict" in refined  # absent in artefacts of earlier versions
+    slides = (
+        np.linalg.norm(refined["camera_slide"], axis=1) if judged else np.full(len(end), np.nan)
+    )
+    verdicts = refined.text("camera_verdict") if judged else [""] * len(end)
     result = []
     for c, (name, words) in enumerate(zip(recorded.text("camera_names"), notes, strict=True)):
-        there = np.flatnonzero(colour[:, c] | depth[:, c])
-        first, last = times[there[[0, -1]]] if len(there) else (np.nan, np.nan)
+        recorded_sets = np.flatnonzero(colour[:, c] | depth[:, c])
+        first, last = times[recorded_sets[[0, -1]]] if len(recorded_sets) else (np.nan, np.nan)
         result.append(
             CameraFacts(
                 name=name,
@@ -227,20 +227,21 @@ def _pairs(scene: artefacts.Artefact, names: Sequence[str]) -> list[Pair]:
 
 
 def _ground(scene: artefacts.Artefact) -> str:
-    told = scene.attributes
-    if not told["ground_found"]:
-        words = f"no floor was seen or annotated, upright by {told.get('up_source', 'a hint')}"
-    elif told["ground_source"] == "stated":
-        words = "as stated with the calibration"
+    stated = scene.attributes
+    if not stated["ground_found"]:
+        source = stated.get("up_source", "a hint")
+        text = f"no floor was found or annotated, vertical by {source}"
+    elif stated["ground_source"] == "stated":
+        text = "as stated with the calibration"
     else:
-        words = f"{told['ground_source']}, {int(told['ground_inliers']):,} points support it"
-        rms = 1e3 * float(told["ground_rms"])
-        words += f", RMS {rms:.1f} mm" if np.isfinite(rms) else ""
-    return f"{words}; {told['ground_note']}" if "ground_note" in told else words
+        text = f"{stated['ground_source']}, {int(stated['ground_inliers']):,} supporting points"
+        rms = 1e3 * float(stated["ground_rms"])
+        text += f", RMS {rms:.1f} mm" if np.isfinite(rms) else ""
+    return f"{text}; {stated['ground_note']}" if "ground_note" in stated else text
 
 
 def _pair_charts(pairs: Sequence[Pair]) -> list[tuple[str, str]]:
-    """Residuals of the static surfaces, and of what moves: (caption, SVG)."""
+    """Plot residuals of static and of moving surfaces: (caption, SVG)."""
     worst = sorted(pairs, key=lambda pair: -np.nan_to_num(pair.after, nan=-1.0))[:_MAX_PAIRS]
     shown = [pair for pair in pairs if pair in worst]
     static = [(pair, pair.before, pair.after, pair.points) for pair in shown]
@@ -258,7 +259,7 @@ def _pair_charts(pairs: Sequence[Pair]) -> list[tuple[str, str]]:
                 "median distance, mm",
             ),
         )
-        for what, rows in (("static surfaces", static), ("the person and what moves", moving))
+        for what, rows in (("static surfaces", static), ("person and moving surfaces", moving))
         if any(points for *_, points in rows)
     ]
 
@@ -266,23 +267,23 @@ def _pair_charts(pairs: Sequence[Pair]) -> list[tuple[str, str]]:
 def _timeline(facts: CaptureFacts) -> str:
     rows = []
     for camera in facts.cameras:
-        said = [
+        states = [
             f"slipped by {slip}" if state == "slipped" else state
             for state, slip in zip(camera.state, camera.slip, strict=True)
         ]
         runs = []
-        for first, last, words in flags.ranges(said):
+        for first, last, words in flags.ranges(states):
             state, _, frames = words.partition(" by ")
             at = f"{first}" if first == last else f"{first}–{last}"
             late = f", {frames} {_frames(int(frames))} before" if frames else ""
             runs.append((first, last, state, f"{at}: {_WORDS[state]}{late}"))
-        rows.append(charts.StateRow(camera.name, runs, _beside(camera)))
+        rows.append(charts.StateRow(camera.name, runs, _row_label(camera)))
     marks = [(t, f"{count} {_sets(count)} without any image") for t, count in facts.gaps]
     return charts.state_timeline(rows, len(facts.times), marks)
 
 
-def _beside(camera: CameraFacts) -> str:
-    """What is written at the end of a camera's row of the timeline."""
+def _row_label(camera: CameraFacts) -> str:
+    """Return the text at the end of a camera's row of the timeline."""
     if not camera.recorded:
         return "no image"
     parts = [f"{camera.start:.2f}–{camera.end:.2f} s"]
@@ -297,7 +298,7 @@ def _beside(camera: CameraFacts) -> str:
 
 
 def _slipped(camera: CameraFacts) -> str:
-    """By how many frames its images are late, e.g. "slipped by 2 or 3"."""
+    """Describe by how many frames images are late, such as "slipped by 2 or 3"."""
     late = {
         slip for state, slip in zip(camera.state, camera.slip, strict=True) if state == "slipped"
     }
@@ -311,12 +312,12 @@ def _offset(camera: CameraFacts) -> str:
 
 
 def _bias(camera: CameraFacts) -> str:
-    """Millimetres, with its deviation where one is stated; "" of a camera without depth."""
+    """Format the bias in millimetres with its deviation; "" for a camera without depth."""
     if not np.isfinite(camera.depth_bias):
         return ""
-    words = f"{1e3 * camera.depth_bias:.1f}"
+    text = f"{1e3 * camera.depth_bias:.1f}"
     sigma = camera.depth_bias_sigma
-    return f"{words} ± {1e3 * sigma:.1f}" if np.isfinite(sigma) else words
+    return f"{text} ± {1e3 * sigma:.1f}" if np.isfinite(sigma) else text
 
 
 def _row(camera: CameraFacts, master: str) -> dict[str, Any]:
@@ -337,7 +338,7 @@ def _row(camera: CameraFacts, master: str) -> dict[str, Any]:
 
 
 def _profile_charts(drawn: CapturePictures) -> list[tuple[str, str]]:
-    """The floor before and after on one scale: (caption, SVG)."""
+    """Plot the floor before and after refinement with one scale: (caption, SVG)."""
     every = [profile for profiles in drawn.profiles for profile in profiles]
     if not every:
         return []

@@ -1,4 +1,4 @@
-"""Charts as inline SVG: coloured by the page's style sheet, the same bytes for the same numbers."""
+"""Charts as inline SVG, coloured by the page's style sheet; equal numbers give equal bytes."""
 
 from __future__ import annotations
 
@@ -11,25 +11,26 @@ import numpy as np
 
 from intercap_core.evaluation import flags
 
-_WIDTH, _HEIGHT = 440, 290  # of a line chart: read on a phone without being made larger
+_WIDTH, _HEIGHT = 440, 290  # of a line chart, readable on a phone
 _LEFT, _RIGHT, _TOP, _BOTTOM = 56, 16, 34, 44
 _ROW = 22
 _LABEL = 150
-_LETTER = 6.6  # width of a letter of a legend, on average
+_LETTER = 6.6  # mean width of a letter in a legend
 _LEGEND_ROW = 18
 
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """A line through (x, y), drawn in the page's ``colour`` (a CSS class) or in one as "#rrggbb".
-
-    A line without a name is not in the legend.
-    """
+    """A line of a chart."""
 
     name: str
+    """Entry in the legend, "" for none."""
     colour: str
+    """CSS class or "#rrggbb"."""
     x: np.ndarray
+    """(N,)"""
     y: np.ndarray
+    """(N,)"""
 
 
 def line_chart(
@@ -41,7 +42,7 @@ def line_chart(
     y_range: tuple[float, float],
     marks: Sequence[tuple[float, str]] = (),
 ) -> str:
-    """Lines with axes, a grid and a legend; ``marks`` are labelled vertical lines."""
+    """Plot lines with axes, grid and legend; ``marks`` are labelled vertical lines."""
     named = [line for line in series if line.name]
     legend = _legend([line.name for line in named])
     top = _TOP + _LEGEND_ROW * max((row for _, row in legend), default=0)
@@ -87,7 +88,7 @@ def line_chart(
 
 
 def _legend(names: Sequence[str]) -> list[tuple[float, int]]:
-    """Where each name's line begins, and in which row: those that fit stand side by side."""
+    """Return x and row of each entry of a legend; rows are filled from left to right."""
     places, x, row = [], float(_LEFT), 0
     for name in names:
         wide = max(100, 44 + _LETTER * len(name))
@@ -100,19 +101,19 @@ def _legend(names: Sequence[str]) -> list[tuple[float, int]]:
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """One row of a timeline: ``runs`` are (first, last, what it says on hovering).
-
-    With ``levels``, of each frame in 0..1, the row is filled up to them, in place of bars.
-    """
+    """A row of a timeline."""
 
     name: str
     colour: str
+    """CSS class."""
     runs: Sequence[tuple[int, int, str]]
+    """First and last frame of each bar, and its tooltip."""
     levels: np.ndarray | None = None
+    """(T,) in 0..1: the row is filled to these levels instead of showing bars."""
 
 
 def timeline(bands: Sequence[Band], total: int) -> str:
-    """Rows of bars over ``total`` frames."""
+    """Draw rows of bars over ``total`` frames."""
     width, tall = 860, _ROW - 7
     inner = width - _LABEL - _RIGHT
     height = _ROW * len(bands) + 24
@@ -128,7 +129,7 @@ def timeline(bands: Sequence[Band], total: int) -> str:
             f'<rect class="track" x="{_LABEL}" y="{y}" width="{inner}" height="{tall}" rx="3"/>'
         )
         if band.levels is not None:
-            ends = [(at_x(t), y + tall * (1 - one)) for t, one in _steps(band.levels)]
+            ends = [(at_x(t), y + tall * (1 - level)) for t, level in _steps(band.levels)]
             line = "".join(f"H{x:.1f}V{down:.1f}" for x, down in ends)
             parts.append(
                 f'<path class="fill {band.colour}" d="M{_LABEL} {y + tall}{line}'
@@ -138,13 +139,13 @@ def timeline(bands: Sequence[Band], total: int) -> str:
                 f'<line class="half" x1="{_LABEL}" x2="{_LABEL + inner}" '
                 f"{_same('y', y + tall / 2)}/>"
             )
-        for first, last, says in band.runs:
+        for first, last, title in band.runs:
             x = at_x(first)
             long = max(1.5, inner * (last + 1 - first) / total)
             kind = f"fill {band.colour}" if band.levels is None else "hover"
             parts.append(
                 f'<rect class="{kind}" x="{x:.1f}" y="{y}" width="{long:.1f}" '
-                f'height="{tall}" rx="2"><title>{escape(says)}</title></rect>'
+                f'height="{tall}" rx="2"><title>{escape(title)}</title></rect>'
             )
     for tick in ticks(0, total, 8):
         if tick < total:
@@ -153,7 +154,7 @@ def timeline(bands: Sequence[Band], total: int) -> str:
 
 
 def _steps(levels: np.ndarray) -> list[tuple[int, float]]:
-    """The frames from which a level (T,) is another, in fiftieths; unknown ones are 0."""
+    """Return frames at which levels (T,), rounded to fiftieths, change; NaN counts as 0."""
     rounded = np.rint(50 * np.nan_to_num(levels)) / 50
     changed = np.flatnonzero(np.diff(rounded, prepend=-1.0))
     return [(int(t), float(rounded[t])) for t in changed]
@@ -161,11 +162,13 @@ def _steps(levels: np.ndarray) -> list[tuple[int, float]]:
 
 @dataclass(frozen=True)
 class StateRow:
-    """A row that is always in some state: ``runs`` (first, last, state, what it says), a text."""
+    """A row of a timeline that has a state in every frame."""
 
     name: str
     runs: Sequence[tuple[int, int, str, str]]
-    beside: str
+    """First and last frame, state (a CSS class) and tooltip of each run."""
+    label: str
+    """Text at the end of the row."""
 
 
 def state_timeline(
@@ -173,9 +176,10 @@ def state_timeline(
     total: int,
     marks: Sequence[tuple[int, str]] = (),
 ) -> str:
-    """Rows of ``total`` frames in the page's colours of states (CSS classes).
+    """Draw rows of states over ``total`` frames.
 
-    ``marks``: vertical lines after a frame, with what they say on hovering.
+    Args:
+        marks: vertical lines after a frame, with their tooltips.
     """
     left, inner, bottom = _room_for([row.name for row in rows]), 560, _ROW * len(rows)
     width, height = left + inner + 330, bottom + 24
@@ -187,19 +191,19 @@ def state_timeline(
     for index, row in enumerate(rows):
         y = _ROW * index + 4
         parts.append(_text(left - 8, y + 12, row.name, "tick", "end"))
-        for first, last, state, says in row.runs:
+        for first, last, state, title in row.runs:
             x = at_x(first)
             long = max(1.5, at_x(last + 1) - x)
             parts.append(
                 f'<rect class="state {state}" x="{x:.1f}" y="{y}" width="{long:.1f}" '
-                f'height="{_ROW - 7}"><title>{escape(says)}</title></rect>'
+                f'height="{_ROW - 7}"><title>{escape(title)}</title></rect>'
             )
-        parts.append(_text(left + inner + 10, y + 12, row.beside, "tick", "start"))
-    for frame, says in marks:
+        parts.append(_text(left + inner + 10, y + 12, row.label, "tick", "start"))
+    for frame, title in marks:
         x = at_x(frame + 1)
         parts.append(
             f'<line class="gap" {_same("x", x)} y1="0" y2="{bottom}">'
-            f"<title>{escape(says)}</title></line>"
+            f"<title>{escape(title)}</title></line>"
         )
     for tick in ticks(0, total, 8):
         if tick < total and tick == int(tick):
@@ -208,7 +212,7 @@ def state_timeline(
 
 
 def state_runs(states: Sequence[str], words: Mapping[str, str]) -> list[tuple[int, int, str, str]]:
-    """Runs of the same state for a :class:`StateRow`, with what ``words`` say of it."""
+    """Return the runs of a :class:`StateRow`; ``words`` has the tooltip of each state."""
     return [
         (a, b, state, f"{a}–{b}: {words[state]}" if b > a else f"{a}: {words[state]}")
         for a, b, state in flags.ranges(states)
@@ -217,16 +221,16 @@ def state_runs(states: Sequence[str], words: Mapping[str, str]) -> list[tuple[in
 
 @dataclass(frozen=True)
 class Bar:
-    """A number, drawn as a bar with a thin line on to the ``most`` it comes to."""
+    """A value and a maximum, drawn as a bar and a thin line."""
 
     name: str
     value: float
     most: float
-    beside: str
+    label: str
 
 
 def _upright_grid(top: float, left: float, inner: float, height: float) -> list[str]:
-    """Lines and numbers at values from 0 to ``top``, over ``inner`` px from ``left`` on."""
+    """Draw vertical grid lines with numbers from 0 to ``top``."""
     parts = []
     for tick in ticks(0, top):
         x = left + inner * tick / top
@@ -236,7 +240,7 @@ def _upright_grid(top: float, left: float, inner: float, height: float) -> list[
 
 
 def bars(rows: Sequence[Bar], unit: str) -> str:
-    """One bar a row, with its value."""
+    """Draw one bar per row, with its value."""
     top = max([*(row.most for row in rows), 1e-9])
     left, inner, tall = _room_for([row.name for row in rows]), 300, 16
     width, height = left + inner + 150, tall * len(rows) + 40
@@ -250,7 +254,7 @@ def bars(rows: Sequence[Bar], unit: str) -> str:
                 f'<rect class="bar {css}" x="{left}" y="{y + down}" '
                 f'width="{max(1.0, inner * value / top):.1f}" height="{thick}"/>'
             )
-        text = f"{row.value:.1f}, {row.beside}"
+        text = f"{row.value:.1f}, {row.label}"
         parts.append(_text(left + inner + 10, y + 9, text, "tick", "start"))
     parts.append(_text(left + inner / 2, height - 6, unit, "label", "middle"))
     return "".join([*parts, "</svg>"])
@@ -258,17 +262,18 @@ def bars(rows: Sequence[Bar], unit: str) -> str:
 
 @dataclass(frozen=True)
 class BarPair:
-    """A number before and after; ``weak`` ones rest on little."""
+    """A value before and after."""
 
     name: str
     before: float
     after: float
-    beside: str
+    label: str
     weak: bool
+    """The values have little support."""
 
 
 def bar_pairs(rows: Sequence[BarPair], unit: str) -> str:
-    """Two bars a row, before over after, with their values."""
+    """Draw two bars per row, before above after, with their values."""
     top = max([*(v for r in rows for v in (r.before, r.after) if math.isfinite(v)), 1e-9])
     left, inner, tall = _room_for([row.name for row in rows]), 360, 24
     width, height = left + inner + 190, tall * len(rows) + 40
@@ -287,15 +292,15 @@ def bar_pairs(rows: Sequence[BarPair], unit: str) -> str:
         values = " → ".join(
             f"{v:.1f}" if math.isfinite(v) else "–" for v in (row.before, row.after)
         )
-        beside = f"  ·  {row.beside}" if row.beside else ""
-        text = f"{values}{beside}{', weak' if row.weak else ''}"
+        label = f"  ·  {row.label}" if row.label else ""
+        text = f"{values}{label}{', weak' if row.weak else ''}"
         parts.append(_text(left + inner + 10, y + 12, text, "tick", "start"))
     parts.append(_text(left + inner / 2, height - 6, unit, "label", "middle"))
     return "".join([*parts, "</svg>"])
 
 
 def dumbbells(rows: Sequence[tuple[str, float, float]], unit: str) -> str:
-    """One row a pair of numbers, before and after."""
+    """Draw one row per pair of numbers, before and after."""
     finite = [v for _, *pair in rows for v in pair if math.isfinite(v)]
     top = max([*finite, 1e-9]) * 1.1
     width, height = 640, _ROW * len(rows) + 40
@@ -319,7 +324,7 @@ def dumbbells(rows: Sequence[tuple[str, float, float]], unit: str) -> str:
 
 
 def ticks(low: float, high: float, count: int = 6) -> list[float]:
-    """Round numbers from ``low`` to ``high``, about ``count`` of them."""
+    """Return about ``count`` round numbers from ``low`` to ``high``."""
     step = (high - low) / count
     size = 10 ** math.floor(math.log10(step)) if step > 0 else 1.0
     step = min((s * size for s in (1, 2, 5, 10) if s * size >= step * 0.999), default=size)
@@ -335,7 +340,7 @@ def _open(width: int, height: int, name: str) -> str:
 
 
 def _room_for(names: Sequence[str]) -> int:
-    """Width of a column of labels, pixels."""
+    """Return the width of a column of labels, pixels."""
     return 16 + max(30, min(240, 7 * max((len(name) for name in names), default=0)))
 
 

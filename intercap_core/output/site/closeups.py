@@ -1,7 +1,7 @@
-"""Close-ups of hands that hold: the joint fit beside the sequential fits and, where known, truth.
+"""Close-ups of hand contacts: the joint fit next to the sequential fits and, if known, truth.
 
-Each hand's contact, as the joint stage states it, is cut into holds. A hold is drawn at its middle
-frame from two sides, the same for all columns: those from which most of hand and object is seen.
+A hold is a run of frames in which the joint stage states contact of a hand. It is drawn at its
+middle frame from the two viewpoints that show most of hand and object, the same for all columns.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.render import render_scene
 from intercap_core.geometry.rigid.shots import Drawable
-from intercap_core.output.site.drawing import Painted, draw, encode_jpeg
+from intercap_core.output.site.drawing import ColouredMesh, EncodedImage, draw, encode_jpeg
 from intercap_core.output.site.overlays import BODY_COLOUR, OBJECT_COLOUR
 from intercap_core.schemas import JOINT, SCENE
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 
 SIDES = ("left", "right")
 TOUCHING_COLOUR = (0.86, 0.20, 0.26)
-HOLDING = 0.5  # probability of a hold, as everywhere where contact is stated
+HOLDING = 0.5  # least probability of contact, as in all output
 VIEWS = 2
 _CELL_PX, _GAP_PX, _HEAD_PX = 200, 4, 18
-_FIELD_M = 0.25  # width and height of what a cell shows, at the hand
-_DISTANCE_M = 0.8
-_SURVEY_PX = 48  # of pictures for choosing viewpoints
-_APART_DEG = 60.0  # between both viewpoints
-_STEEPEST = 0.8  # of a viewing direction, its share along the room's up: nobody looks from below
-_NEAR_M = 0.03  # of the object: skin that a viewpoint should show
+_FIELD_M = 0.25  # width and height of a cell at the hand
+_DISTANCE_M = 0.8  # of the viewer from the hand
+_SURVEY_PX = 48  # side of pictures for choosing viewpoints
+_APART_DEG = 60.0  # least angle between both viewpoints
+_STEEPEST = 0.8  # largest vertical component of a viewing direction from above
+_NEAR_M = 0.03  # a viewpoint should show skin within this distance of the object
 _GROUND, _INK = 225, (40, 44, 52)
 _CELL = np.ones((_CELL_PX, _CELL_PX, 3), np.float32)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
@@ -49,21 +49,24 @@ _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 @dataclass(frozen=True, eq=False)
 class Column:
-    """One version of what happened: ``body`` gives the vertices (V, 3) of a frame, on the fitted
-    mesh; the object has ``vertices`` (Vo, 3) and ``faces`` (Fo, 3) under ``rotation`` (T, 3, 3) and
-    ``translation`` (T, 3). Master frame, metres."""
+    """Body and object of one result over T frames, master frame, metres."""
 
     name: str
     body: Callable[[int], np.ndarray]
+    """Returns the body's vertices (V, 3) of a frame."""
     vertices: np.ndarray
+    """(Vo, 3) of the object, in its own frame."""
     faces: np.ndarray
+    """(Fo, 3) of the object."""
     watertight: bool
     rotation: np.ndarray
+    """(T, 3, 3) master_from_object."""
     translation: np.ndarray
+    """(T, 3) master_from_object."""
 
-    def at(self, t: int) -> Moment:
-        """Body and object in frame ``t``."""
-        return Moment(
+    def at(self, t: int) -> PosedPair:
+        """Pose body and object in frame ``t``."""
+        return PosedPair(
             self.body(t).astype(np.float64),
             self.vertices @ self.rotation[t].T + self.translation[t],
             self.faces,
@@ -72,61 +75,56 @@ class Column:
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
-    """``body`` (V, 3) and the object's ``vertices`` (Vo, 3) with its ``faces`` (Fo, 3), master
-    frame, metres."""
+class PosedPair:
+    """Body and object in one frame, master frame, metres."""
 
     body: np.ndarray
+    """(V, 3)"""
     vertices: np.ndarray
+    """(Vo, 3) of the object."""
     faces: np.ndarray
+    """(Fo, 3) of the object."""
     watertight: bool
 
     def distance(self, ids: np.ndarray) -> np.ndarray:
-        """Signed distance (N,) of the skin vertices ``ids`` (N,) to the object."""
+        """Return signed distances (N,) of the body vertices ``ids`` (N,) to the object."""
         surface = PosedObject(self.vertices, self.faces, watertight=self.watertight)
         return surface.signed_distance(self.body[ids], np.eye(3), np.zeros(3))
 
 
 @dataclass(frozen=True, eq=False)
 class Handling:
-    """``columns`` of one sequence, the last one truth where it is ``known``; ``probability`` (T, 2)
-    that the left and the right hand touch; ``up`` (3,) of the room, master frame."""
+    """Results of one sequence with their contact of both hands."""
 
     model: BodyModel
     columns: tuple[Column, ...]
-    known: bool
+    """The last column is the truth if ``has_truth``."""
+    has_truth: bool
     probability: np.ndarray
+    """(T, 2) probability of contact of the left and right hand."""
     up: np.ndarray
+    """(3,) unit vector, master frame."""
 
 
 @dataclass(frozen=True)
 class Hold:
-    """Frames ``first`` to ``last`` in which the hand of a ``side`` touches."""
+    """A run of frames in which one hand touches the object."""
 
     side: str
     first: int
     last: int
+    """Included."""
 
     @property
     def frame(self) -> int:
-        """The one in the middle."""
+        """The middle frame."""
         return (self.first + self.last) // 2
 
     @property
     def caption(self) -> str:
-        """What a picture of it shows."""
+        """Caption of a picture."""
         span = f"{self.first}–{self.last}" if self.last > self.first else f"{self.first}"
         return f"{self.side} hand, frames {span}, drawn at {self.frame}"
-
-
-@dataclass(frozen=True, eq=False)
-class CloseUp:
-    """``jpeg`` bytes: a row for each viewpoint, a column for each version."""
-
-    hold: Hold
-    jpeg: bytes
-    width: int
-    height: int
 
 
 def read_handling(
@@ -136,10 +134,14 @@ def read_handling(
     truth: Path | None,
     joints: Mapping[str, Path] | None = None,
 ) -> Handling:
-    """Read what is drawn from the artefacts of a sequence with an object, and its ``truth``.
+    """Read the artefacts of a sequence with an object.
 
-    ``joints`` are joint.h5 by the name of their column; by default the sequence's own is "joint",
-    beside "sequential". Holds are those of the last one. Raises UserError as reading does.
+    Args:
+        truth: truth file, None if unknown.
+        joints: joint.h5 by name of their column, the last of which defines the holds; by default
+            the columns are "sequential" and "joint" of the sequence's own artefacts.
+
+    Raises UserError as reading does.
     """
     assert models.object_ is not None
     mesh = ObjectMesh.load(models.object_)
@@ -167,53 +169,53 @@ def read_handling(
     with artefacts.read(paths.scene, SCENE) as scene:
         times, fps = scene["times"], float(scene.attributes["fps"])
         up = scene["zup_from_master"][2, :3].astype(float)
-    known = False
+    has_truth = False
     if truth is not None:
         true = Truth.load(truth, times, fps, model.num_vertices)
         if true.vertices is not None:
-            known = True
+            has_truth = True
             columns.append(
                 Column(
                     "truth", true.vertices.__getitem__, true.object_vertices, true.object_faces,
                     mesh.watertight, true.rotation, true.translation,
                 )
             )  # fmt: skip
-    return Handling(model, tuple(columns), known, probability, up)
+    return Handling(model, tuple(columns), has_truth, probability, up)
 
 
 def holds(probability: np.ndarray) -> list[Hold]:
-    """Runs of frames in which a hand's ``probability`` (T, 2) is over a half, longest first."""
-    found = [
+    """Return runs of frames with a probability (T, 2) above HOLDING, longest first."""
+    runs = [
         Hold(side, first, last)
         for side, values in zip(SIDES, probability.T, strict=True)
         for first, last, _ in flags.ranges(["x" if p > HOLDING else "" for p in values])
     ]
-    return sorted(found, key=lambda hold: (hold.first - hold.last, hold.first, hold.side))
+    return sorted(runs, key=lambda hold: (hold.first - hold.last, hold.first, hold.side))
 
 
-def closeup(handling: Handling, hold: Hold) -> CloseUp:
-    """Draw one hold."""
+def closeup(handling: Handling, hold: Hold) -> EncodedImage:
+    """Draw one hold: a row for each viewpoint, a column for each result."""
     model, t = handling.model, hold.frame
     hand = np.asarray(model.regions[f"{hold.side}_hand"])
     arms = _forearm_faces(model)
-    moments = [column.at(t) for column in handling.columns]
-    fitted = moments[-2] if handling.known else moments[-1]
+    pairs = [column.at(t) for column in handling.columns]
+    fitted = pairs[-2] if handling.has_truth else pairs[-1]
     views = _viewpoints(fitted, hand, arms, handling.up)
     step = _CELL_PX + _GAP_PX
-    shape = (_HEAD_PX + len(views) * step - _GAP_PX, len(moments) * step - _GAP_PX, 3)
+    shape = (_HEAD_PX + len(views) * step - _GAP_PX, len(pairs) * step - _GAP_PX, 3)
     sheet = np.full(shape, _GROUND, np.uint8)
-    for c, (column, moment) in enumerate(zip(handling.columns, moments, strict=True)):
-        colours = _skin_colours(moment, arms)
+    for c, (column, pair) in enumerate(zip(handling.columns, pairs, strict=True)):
+        colours = _skin_colours(pair, arms)
         for row, view in enumerate(views):
-            picture = draw(_painted(moment, arms, colours, view), _lens(_CELL_PX))
+            picture = draw(_coloured(pair, arms, colours, view), _lens(_CELL_PX))
             y, x = _HEAD_PX + row * step, c * step
             sheet[y : y + _CELL_PX, x : x + _CELL_PX] = np.rint(255 * picture.over(_CELL))
-        words = column.name
-        if handling.known and c < len(moments) - 1:
-            off = np.linalg.norm((moment.body - moments[-1].body)[hand], axis=1).mean()
-            words += f", hand {1e3 * off:.1f} mm off"
-        cv2.putText(sheet, words, (c * step + 3, 13), _FONT, 0.4, _INK, 1, cv2.LINE_AA)
-    return CloseUp(hold, encode_jpeg(sheet / np.float32(255)), sheet.shape[1], sheet.shape[0])
+        label = column.name
+        if handling.has_truth and c < len(pairs) - 1:
+            off = np.linalg.norm((pair.body - pairs[-1].body)[hand], axis=1).mean()
+            label += f", hand {1e3 * off:.1f} mm off"
+        cv2.putText(sheet, label, (c * step + 3, 13), _FONT, 0.4, _INK, 1, cv2.LINE_AA)
+    return encode_jpeg(sheet / np.float32(255), hold.caption)
 
 
 def _lens(pixels: int) -> Intrinsics:
@@ -222,7 +224,7 @@ def _lens(pixels: int) -> Intrinsics:
 
 
 def _forearm_faces(model: BodyModel) -> np.ndarray:
-    """Faces (F, 3) of both forearms and hands: what a trunk would hide is what is looked at."""
+    """Return faces (F, 3) of both forearms and hands. Other parts would occlude the contact."""
     parts = [
         index
         for name, index in JOINT_INDEX.items()
@@ -234,34 +236,35 @@ def _forearm_faces(model: BodyModel) -> np.ndarray:
 
 
 def _viewpoints(
-    fitted: Moment, hand: np.ndarray, arms: np.ndarray, up: np.ndarray
+    fitted: PosedPair, hand: np.ndarray, arms: np.ndarray, up: np.ndarray
 ) -> list[np.ndarray]:
-    """camera_from_master (4, 4) of the two sides that show most of the skin beside the object."""
+    """Choose camera_from_master (4, 4) of two viewpoints that show most skin and object."""
     target = fitted.body[hand].mean(0)
     near = np.zeros(len(fitted.body), bool)
     near[hand[fitted.distance(hand) < _NEAR_M]] = True
     showing = near[arms].any(1)
-    lens, found = _lens(_SURVEY_PX), []
+    lens, candidates = _lens(_SURVEY_PX), []
     for direction in _directions(up):
-        pose = _looking(target, direction, up)
+        pose = _look_at(target, direction, up)
         drawn = render_scene(
             [Drawable(fitted.body, arms, pose), Drawable(fitted.vertices, fitted.faces, pose)], lens
         )
         skin = int(showing[drawn.face[drawn.body == 0]].sum())
-        thing = int((drawn.body == 1).sum())
-        found.append((np.sqrt(skin * min(thing, skin)) + 1e-3 * skin, direction, pose))
-    order = sorted(range(len(found)), key=lambda i: (-found[i][0], i))
+        visible = int((drawn.body == 1).sum())
+        score = np.sqrt(skin * min(visible, skin)) + 1e-3 * skin
+        candidates.append((score, direction, pose))
+    order = sorted(range(len(candidates)), key=lambda i: (-candidates[i][0], i))
     chosen = order[:1]
     limit = np.cos(np.radians(_APART_DEG))
     for i in order:
-        apart = all(found[i][1] @ found[j][1] < limit for j in chosen)
+        apart = all(candidates[i][1] @ candidates[j][1] < limit for j in chosen)
         if len(chosen) < VIEWS and apart:
             chosen.append(i)
-    return [found[i][2] for i in chosen]
+    return [candidates[i][2] for i in chosen]
 
 
 def _directions(up: np.ndarray) -> list[np.ndarray]:
-    """Unit viewing directions all round, from slightly below to steeply above."""
+    """Return unit viewing directions all around, from slightly below to steeply above."""
     side = np.cross(up, [0.0, 0.0, 1.0] if abs(up[2]) < 0.9 else [1.0, 0.0, 0.0])
     side /= np.linalg.norm(side)
     front = np.cross(side, up)
@@ -272,27 +275,27 @@ def _directions(up: np.ndarray) -> list[np.ndarray]:
     ]
 
 
-def _looking(target: np.ndarray, direction: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """camera_from_master (4, 4) of a camera that looks along ``direction`` at ``target``."""
+def _look_at(target: np.ndarray, direction: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Return camera_from_master (4, 4) of a camera that looks along ``direction`` at ``target``."""
     right = np.cross(direction, up)
     right /= np.linalg.norm(right)
     turn = np.stack([right, np.cross(direction, right), direction])
     return rigid(turn, turn @ (direction * _DISTANCE_M - target))
 
 
-def _skin_colours(moment: Moment, arms: np.ndarray) -> np.ndarray:
-    """Colours (V, 3): skin that touches the object, or is inside it, has its own."""
+def _skin_colours(pair: PosedPair, arms: np.ndarray) -> np.ndarray:
+    """Return colours (V, 3). Skin that touches the object, or is inside it, is red."""
     used = np.unique(arms)
-    colours = np.tile(BODY_COLOUR, (len(moment.body), 1))
-    colours[used[moment.distance(used) < CONTACT_M]] = TOUCHING_COLOUR
+    colours = np.tile(BODY_COLOUR, (len(pair.body), 1))
+    colours[used[pair.distance(used) < CONTACT_M]] = TOUCHING_COLOUR
     return colours
 
 
-def _painted(
-    moment: Moment, arms: np.ndarray, colours: np.ndarray, view: np.ndarray
-) -> list[Painted]:
-    thing = np.tile(OBJECT_COLOUR, (len(moment.vertices), 1))
+def _coloured(
+    pair: PosedPair, arms: np.ndarray, colours: np.ndarray, view: np.ndarray
+) -> list[ColouredMesh]:
+    object_colours = np.tile(OBJECT_COLOUR, (len(pair.vertices), 1))
     return [
-        Painted(moment.body, arms, colours, view),
-        Painted(moment.vertices, moment.faces, thing, view),
+        ColouredMesh(pair.body, arms, colours, view),
+        ColouredMesh(pair.vertices, pair.faces, object_colours, view),
     ]

@@ -1,9 +1,10 @@
-"""Shaded pictures of meshes through a real lens, smooth at the edges."""
+"""Encoded images, anti-aliased renderings of meshes, and sheets of small pictures."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -16,35 +17,57 @@ from intercap_core.geometry.rigid.shots import Drawable, Rendering
 from intercap_core.geometry.rigid.surfaces import vertex_normals
 
 _JPEG_QUALITY = 82
-_AMBIENT = 0.38
+_AMBIENT = 0.38  # share of light that does not depend on the direction of the surface
 _LIGHT = np.array([-0.35, -0.55, -0.76])  # towards the light, camera frame: above, left, in front
-_SMOOTHING = 2  # pictures are drawn this much larger and scaled down
+_SMOOTHING = 2  # supersampling factor
+# of sheets
+_GAP_PX, _HEAD_PX = 4, 18
+_GROUND = (19, 22, 27)  # RGB
+_INK, _DIM = (235, 235, 235), (120, 128, 138)  # RGB
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 @dataclass(frozen=True, eq=False)
-class Painted:
-    """A mesh in its own frame with colours (V, 3) in 0..1, RGB, and its place in the camera."""
+class EncodedImage:
+    """A compressed image for a page."""
+
+    data: bytes
+    kind: Literal["jpeg", "png"]
+    width: int
+    height: int
+    caption: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class ColouredMesh:
+    """A mesh with a colour per vertex."""
 
     vertices: np.ndarray
+    """(V, 3) in the mesh's frame."""
     faces: np.ndarray
+    """(F, 3)"""
     colours: np.ndarray
+    """(V, 3) RGB in 0..1."""
     camera_from_mesh: np.ndarray
+    """(4, 4)"""
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
-    """``rgb`` (H, W, 3) float in 0..1, premultiplied by ``alpha`` (H, W)."""
+class RenderedImage:
+    """A rendering with transparency."""
 
     rgb: np.ndarray
+    """(H, W, 3) float in 0..1, premultiplied by ``alpha``."""
     alpha: np.ndarray
+    """(H, W) in 0..1."""
 
     def over(self, background: np.ndarray, opacity: float = 1.0) -> np.ndarray:
-        """Lay over an image (H, W, 3) in 0..1."""
+        """Blend over an image (H, W, 3) in 0..1."""
         return self.rgb * opacity + background * (1 - opacity * self.alpha[..., None])
 
 
-def draw(meshes: Sequence[Painted], lens: Intrinsics) -> Picture:
-    """Draw meshes that hide each other, in the whole image of ``lens``."""
+def draw(meshes: Sequence[ColouredMesh], lens: Intrinsics) -> RenderedImage:
+    """Render meshes with mutual occlusion into the whole image of ``lens``."""
     fine = lens.scaled(_SMOOTHING)
     rendering = render_scene(
         [Drawable(m.vertices, m.faces, m.camera_from_mesh) for m in meshes], fine
@@ -53,11 +76,14 @@ def draw(meshes: Sequence[Painted], lens: Intrinsics) -> Picture:
     if rendering.depth.size:
         large[rendering.window] = _shade(meshes, rendering, fine)
     image = cv2.resize(large, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
-    return Picture(image[..., :3], image[..., 3])
+    return RenderedImage(image[..., :3], image[..., 3])
 
 
-def _shade(meshes: Sequence[Painted], rendering: Rendering, lens: Intrinsics) -> np.ndarray:
-    """RGBA (h, w, 4) of the window: interpolated colours under one light and an ambient."""
+def _shade(meshes: Sequence[ColouredMesh], rendering: Rendering, lens: Intrinsics) -> np.ndarray:
+    """Shade the rendering's window: interpolated colours, one light and ambient light.
+
+    Returns RGBA (h, w, 4).
+    """
     result = np.zeros((*rendering.depth.shape, 4), np.float32)
     rays = lens.rays[rendering.window]
     light = _LIGHT / np.linalg.norm(_LIGHT)
@@ -81,7 +107,7 @@ def _shade(meshes: Sequence[Painted], rendering: Rendering, lens: Intrinsics) ->
 
 
 def _barycentric(p: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Weights (N, 3) of the corners at points p (N, 3) on triangles a, b, c (N, 3)."""
+    """Return barycentric weights (N, 3) of points p (N, 3) on triangles a, b, c (N, 3)."""
     normal = np.cross(b - a, c - a)
     scale = np.maximum((normal * normal).sum(1), 1e-20)
     of_b = (np.cross(p - a, c - a) * normal).sum(1) / scale
@@ -94,49 +120,45 @@ def _mix(values: np.ndarray, corners: np.ndarray, weights: np.ndarray) -> np.nda
     return sum(values[corners[:, k]] * weights[:, k, None] for k in range(3))
 
 
-def encode_jpeg(rgb: np.ndarray) -> bytes:
-    """JPEG of an image (H, W, 3) in 0..1."""
+def encode_jpeg(rgb: np.ndarray, caption: str = "") -> EncodedImage:
+    """Encode an image (H, W, 3) in 0..1 as JPEG."""
     bgr = np.rint(np.clip(rgb[..., ::-1], 0, 1) * 255).astype(np.uint8)
     options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
-    return cv2.imencode(".jpg", bgr, options)[1].tobytes()
+    data = cv2.imencode(".jpg", bgr, options)[1].tobytes()
+    return EncodedImage(data, "jpeg", bgr.shape[1], bgr.shape[0], caption)
 
 
-def encode_png(picture: Picture) -> bytes:
-    """PNG with transparency."""
+def encode_png(picture: RenderedImage, caption: str = "") -> EncodedImage:
+    """Encode a rendering as PNG with transparency."""
     alpha = picture.alpha[..., None]
     straight = picture.rgb / np.maximum(alpha, 1e-6)
     bgra = np.concatenate([straight[..., ::-1], alpha], 2)
     pixels = np.rint(np.clip(bgra, 0, 1) * 255).astype(np.uint8)
-    return cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes()
-
-
-_GAP_PX, _HEAD_PX = 4, 18
-_GROUND = (19, 22, 27)
-_INK, _DIM = (235, 235, 235), (120, 128, 138)
-_FONT = cv2.FONT_HERSHEY_SIMPLEX
+    data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes()
+    return EncodedImage(data, "png", pixels.shape[1], pixels.shape[0], caption)
 
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """``jpeg`` bytes: a row for each of ``frames``, a column for each camera."""
+    """A table of small pictures: a row per frame, a column per camera."""
 
-    jpeg: bytes
-    width: int
-    height: int
+    image: EncodedImage
     frames: Sequence[int]
 
 
 @dataclass(frozen=True)
 class Crop:
-    """A square of ``size`` image pixels with its corner at (x0, y0), shown as ``cell`` pixels."""
+    """A square part of an image, shown at another size."""
 
     x0: int
     y0: int
     size: int
+    """Side in image pixels."""
     cell: int
+    """Side in shown pixels."""
 
-    def of(self, rgb: np.ndarray) -> np.ndarray:
-        """The part of an image (H, W, 3) as a cell; its rim goes on where the image ends."""
+    def extract(self, rgb: np.ndarray) -> np.ndarray:
+        """Cut the square out of an image (H, W, 3); border pixels are repeated beyond its edge."""
         centre = (self.x0 + (self.size - 1) / 2, self.y0 + (self.size - 1) / 2)
         window = cv2.getRectSubPix(np.ascontiguousarray(rgb), (self.size, self.size), centre)
         return cv2.resize(window, (self.cell, self.cell), interpolation=cv2.INTER_AREA)
@@ -149,7 +171,7 @@ class Crop:
         y: int,
         colour: tuple[int, int, int],
     ) -> None:
-        """Draw the rim of a mask (h, w) whose corner is at image pixel (x, y)."""
+        """Draw the contour of a mask (h, w) whose corner is at image pixel (x, y)."""
         square = np.zeros((self.size, self.size), np.uint8)
         height, width = mask.shape
         x, y = x - self.x0, y - self.y0
@@ -161,8 +183,8 @@ class Crop:
         contours, _ = cv2.findContours(small, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         cv2.drawContours(cell, contours, -1, colour, 1, cv2.LINE_AA)
 
-    def placed(self, pixels: np.ndarray) -> np.ndarray:
-        """Image pixels (N, 2) as whole pixels of the cell."""
+    def to_cell(self, pixels: np.ndarray) -> np.ndarray:
+        """Convert image pixels (N, 2) to whole pixels of the cell."""
         scaled = (pixels - [self.x0, self.y0] + 0.5) * (self.cell / self.size) - 0.5
         return np.rint(np.clip(scaled, -1e4, 1e4)).astype(int)
 
@@ -171,11 +193,14 @@ CellDrawer = Callable[[Camera, int, int, np.ndarray], np.ndarray | None]
 
 
 def make_sheet(
-    images: Frames, rig: Rig, frames: Sequence[int], cell_px: int, draw: CellDrawer
+    images: Frames, rig: Rig, frames: Sequence[int], cell_px: int, draw_cell: CellDrawer
 ) -> Sheet:
-    """``draw(camera, t, c, rgb)`` gives a cell of ``cell_px``, None where nothing is in view.
+    """Draw a sheet of cells of ``cell_px`` pixels.
 
-    ``images`` show each frame's moment (:meth:`Frames.showing`).
+    Args:
+        images: images by the frame that they show (:meth:`Frames.showing`).
+        draw_cell: called with camera, frame, index of the camera and RGB image; returns the cell,
+            or None if nothing is in view.
     """
     step = cell_px + _GAP_PX
     sheet = np.empty((len(frames) * step + _HEAD_PX, len(rig) * step, 3), np.uint8)
@@ -184,14 +209,13 @@ def make_sheet(
         cv2.putText(sheet, camera.name[:16], (c * step + 4, 13), _FONT, 0.42, _INK, 1, cv2.LINE_AA)
         for row, t in enumerate(frames):
             image = images.colour(t, c)
-            cell = None if image is None else draw(camera, t, c, image[..., ::-1])
+            cell = None if image is None else draw_cell(camera, t, c, image[..., ::-1])
             y, x = _HEAD_PX + row * step, c * step
             if cell is not None:
                 sheet[y : y + cell_px, x : x + cell_px] = cell
             if c == 0 or cell is None:
-                words = f"frame {t}" if c == 0 else "no image" if image is None else "not in view"
+                label = f"frame {t}" if c == 0 else "no image" if image is None else "not in view"
                 ink = _INK if cell is not None else _DIM
-                cv2.putText(sheet, words, (x + 4, y + 13), _FONT, 0.4, (0, 0, 0), 3, cv2.LINE_AA)
-                cv2.putText(sheet, words, (x + 4, y + 13), _FONT, 0.4, ink, 1, cv2.LINE_AA)
-    height, width = sheet.shape[:2]
-    return Sheet(encode_jpeg(sheet / np.float32(255)), width, height, list(frames))
+                cv2.putText(sheet, label, (x + 4, y + 13), _FONT, 0.4, (0, 0, 0), 3, cv2.LINE_AA)
+                cv2.putText(sheet, label, (x + 4, y + 13), _FONT, 0.4, ink, 1, cv2.LINE_AA)
+    return Sheet(encode_jpeg(sheet / np.float32(255)), list(frames))

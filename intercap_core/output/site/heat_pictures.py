@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 import trimesh
@@ -14,30 +12,20 @@ from intercap_core.body.model import BodyModel
 from intercap_core.evaluation.summary import SurfaceHeat
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.transforms import rigid
-from intercap_core.output.site.drawing import Painted, draw, encode_png
+from intercap_core.output.site.drawing import ColouredMesh, EncodedImage, draw, encode_png
 
-# From no contact to the map's maximum, sRGB: grey skin, yellow, red, dark red
+# sRGB, from no contact to the map's maximum: grey skin, yellow, red, dark red
 COLOUR_STOPS = ((0.80, 0.81, 0.83), (0.99, 0.80, 0.25), (0.91, 0.26, 0.15), (0.40, 0.02, 0.12))
 _STOP_AT = (0.0, 0.25, 0.6, 1.0)
-_FAR = 40.0  # distance in sizes of what is shown: nearly parallel rays
-_MAX_EDGE_M = 0.012  # an object's mesh is refined to this before values are put on it
-_KERNEL_M = 0.006  # deviation of the kernel that spreads the surface points' values
-_WRIST_M = 0.03  # of the forearm shown with a hand
-_ARMS_DOWN = 1.0  # rad, of each shoulder from the T-pose
-
-
-@dataclass(frozen=True, eq=False)
-class HeatPicture:
-    """``png`` bytes, transparent around what is drawn, with a caption."""
-
-    caption: str
-    png: bytes
-    width: int
-    height: int
+_FAR = 40.0  # viewing distance in sizes of the surface: nearly parallel rays
+_MAX_EDGE_M = 0.012  # an object's mesh is subdivided to edges of at most this length
+_KERNEL_M = 0.006  # standard deviation of the kernel that interpolates surface points
+_WRIST_M = 0.03  # length of the forearm shown with a hand
+_ARMS_DOWN = 1.0  # rad, rotation of each shoulder from the T-pose
 
 
 def colours(values: np.ndarray, top: float) -> np.ndarray:
-    """Colours (V, 3) of values (V,), the last one at ``top``."""
+    """Return colours (V, 3) of values (V,); ``top`` has the last colour."""
     share = np.clip(values / max(top, 1e-12), 0, 1)
     stops = np.array(COLOUR_STOPS)
     return np.column_stack([np.interp(share, _STOP_AT, stops[:, k]) for k in range(3)])
@@ -45,11 +33,11 @@ def colours(values: np.ndarray, top: float) -> np.ndarray:
 
 def body_surfaces(
     model: BodyModel, likelihood: np.ndarray
-) -> list[tuple[str, list[HeatPicture], float]]:
-    """The body, front and back with lowered arms, and each hand from both sides.
+) -> list[tuple[str, list[EncodedImage], float]]:
+    """Draw the body with lowered arms from both sides, and each hand from both sides.
 
-    Each with its name and its own highest likelihood, which its last colour stands for, as in the
-    paper's figure: hands touch far more often than the rest.
+    Returns name, pictures and highest likelihood of each surface. The highest likelihood has the
+    last colour, as in the paper's figure, because hands touch far more often than other parts.
     """
     params = model.zeros(1)
     for index, turn in ((JOINT_INDEX["left_shoulder"], -1), (JOINT_INDEX["right_shoulder"], 1)):
@@ -59,7 +47,7 @@ def body_surfaces(
     faces, top = model.faces.numpy(), highest(likelihood)
     paint, up = colours(likelihood, top), np.array([0, 1.0, 0])
     whole = [
-        _look(standing, faces, paint, view, up, (280, 480), name)
+        _draw_from(standing, faces, paint, view, up, (280, 480), name)
         for name, view in (("front", [0, 0, 1.0]), ("back", [0, 0, -1.0]))
     ]
     surfaces = [("body", whole, top)]
@@ -70,11 +58,11 @@ def body_surfaces(
         wrist = joints[JOINT_INDEX[f"{side}_wrist"], 0]
         shown = outwards * (template[:, 0] - wrist) > -_WRIST_M
         kept = faces[shown[faces].all(1)]
-        fingers = np.array([outwards, 0, 0])  # the T-pose's fingers point away from the body
+        fingers = np.array([outwards, 0, 0])  # in the T-pose, fingers point away from the body
         top = highest(likelihood[shown])
         paint = colours(likelihood, top)
         hand = [
-            _look(template, kept, paint, view, fingers, (240, 240), f"{side} hand, {what}")
+            _draw_from(template, kept, paint, view, fingers, (240, 240), f"{side} hand, {what}")
             for what, view in (("palm", [0, -1.0, 0]), ("back", [0, 1.0, 0]))
         ]
         surfaces.append((f"{side} hand", hand, top))
@@ -82,7 +70,7 @@ def body_surfaces(
 
 
 def highest(likelihood: np.ndarray) -> float:
-    """What a map's last colour stands for: its maximum; all grey where nothing touches."""
+    """Return the likelihood of a map's last colour: its maximum, or 1e-6 without contact."""
     return max(float(likelihood.max(initial=0.0)), 1e-6)
 
 
@@ -91,25 +79,25 @@ def object_pictures(
     faces: np.ndarray,
     heat: SurfaceHeat,
     top: float,
-) -> list[HeatPicture]:
-    """Two opposite views of an object (V, 3), (F, 3), from above (its frame is z up)."""
+) -> list[EncodedImage]:
+    """Draw two opposite views of an object (V, 3), (F, 3) from above; its frame is z up."""
     fine, triangles = trimesh.remesh.subdivide_to_size(vertices, faces, _MAX_EDGE_M, max_iter=12)
-    paint = colours(_spread(heat, fine), top)
+    paint = colours(_interpolate(heat, fine), top)
     up = np.array([0, 0, 1.0])
     return [
-        _look(fine, triangles, paint, view, up, (260, 260), name)
+        _draw_from(fine, triangles, paint, view, up, (260, 260), name)
         for name, view in (("one side", [0.8, -0.9, 0.5]), ("other side", [-0.8, 0.9, 0.5]))
     ]
 
 
-def _spread(heat: SurfaceHeat, points: np.ndarray) -> np.ndarray:
-    """Kernel mean (N,) of the surface points' values at other points of the surface."""
+def _interpolate(heat: SurfaceHeat, points: np.ndarray) -> np.ndarray:
+    """Interpolate the likelihood at points (N, 3) of the surface by a Gaussian kernel."""
     distance, near = cKDTree(heat.points).query(points, k=min(12, len(heat.points)))
     weight = np.exp(-0.5 * (distance / _KERNEL_M) ** 2) + 1e-12
     return (weight * heat.likelihood[near]).sum(1) / weight.sum(1)
 
 
-def _look(
+def _draw_from(
     vertices: np.ndarray,
     faces: np.ndarray,
     paint: np.ndarray,
@@ -117,8 +105,8 @@ def _look(
     up: np.ndarray,
     size: tuple[int, int],
     caption: str,
-) -> HeatPicture:
-    """Draw the faces from far away along a direction, filling a picture of width and height."""
+) -> EncodedImage:
+    """Draw the faces from far away; they fill a picture of ``size`` (width, height)."""
     backward = np.asarray(towards_viewer, np.float64)
     backward = backward / np.linalg.norm(backward)
     right = np.cross(up, backward)
@@ -131,5 +119,5 @@ def _look(
     focal = 0.92 * distance * min(size[0] / extent[0], size[1] / extent[1])
     lens = Intrinsics(*size, focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2)
     pose = rigid(turn, np.array([0, 0, distance]) - middle)
-    picture = draw([Painted(vertices, faces, paint, pose)], lens)
-    return HeatPicture(caption, encode_png(picture), *size)
+    picture = draw([ColouredMesh(vertices, faces, paint, pose)], lens)
+    return encode_png(picture, caption)

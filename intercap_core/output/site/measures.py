@@ -1,4 +1,4 @@
-"""The page's measures: errors against truth, penetration, distances to clouds, camera poses."""
+"""Measures on the pages: truth, penetration, distances to clouds, cameras and verdict."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from intercap_core.stage_list import ESTIMATES
 _MAX_CAMERA_ROWS = 40
 _HISTOGRAM_MM = 30.0
 _BIN_MM = 1.0
-_LEAST_ACCELERATION_MM = 5.0  # top of the chart, at the least
+_LEAST_ACCELERATION_MM = 5.0  # least height of the chart
 _PUBLISHED_CLOUD_MM = (20.29, 18.50)  # body and object, the paper's Experiments
 _NAMES = {"object_track": "object track", "body_fit": "body fit", "joint": "joint"}
-# key, what it is, digits, whether more is better (None: neither)
+# key, label, digits, True if larger is better (None: neither)
 _TRUTH_ROWS: tuple[tuple[str, str, int, bool | None], ...] = (
     ("body_pve_mm", "body, per vertex, mm", 1, False),
     ("body_mpjpe_mm", "body, 22 joints, mm", 1, False),
@@ -49,7 +49,7 @@ _TRUTH_ROWS: tuple[tuple[str, str, int, bool | None], ...] = (
 
 
 def truth(sequences: Sequence[SequenceMetrics]) -> dict[str, Any] | None:
-    """The table against truth by stage; None without truth."""
+    """Return the table of errors against truth by stage; None without truth."""
     known = [s for s in sequences if s.has_truth]
     if not known:
         return None
@@ -57,35 +57,35 @@ def truth(sequences: Sequence[SequenceMetrics]) -> dict[str, Any] | None:
     rows = []
     for key, name, digits, more in _TRUTH_ROWS:
         values = [by_stage[stage].get(key) for stage in ESTIMATES]
-        found = [v for v in values if v is not None]
-        if not found:
+        known_values = [v for v in values if v is not None]
+        if not known_values:
             continue
         best = None
-        if len(found) > 1 and more is not None:
-            best = max(found) if more else min(found)
+        if len(known_values) > 1 and more is not None:
+            best = max(known_values) if more else min(known_values)
         printed = ["" if v is None else f"{v:.{digits}f}" for v in values]
-        alike = len({text for text in printed if text}) == 1
+        tied = len({text for text in printed if text}) == 1
         rows.append(
             {
                 "name": name,
                 "cells": [
-                    {"text": text, "best": v is not None and v == best and not alike}
+                    {"text": text, "best": v is not None and v == best and not tied}
                     for text, v in zip(printed, values, strict=True)
                 ],
             }
         )
-    own = figures.pooled(known, "truth/penetration_mean")
+    depth = figures.pooled(known, "truth/penetration_mean")
     touching = figures.pooled(known, "truth/contact_frame")
-    own_mm = float("nan")
-    if own is not None and touching is not None and touching.any():
-        own_mm = 1e3 * float(own[touching].mean())
+    depth_mm = float("nan")
+    if depth is not None and touching is not None and touching.any():
+        depth_mm = 1e3 * float(depth[touching].mean())
     return {
         "sequences": len(known),
         "frames": sum(len(s) for s in known),
         "stages": [_NAMES[stage] for stage in ESTIMATES],
         "rows": rows,
         "flags": figures.flag_figures(known),
-        "own_penetration": own_mm,
+        "own_penetration": depth_mm,
         "sweep": _sweep(known),
         "reliability": _reliability(known),
     }
@@ -94,9 +94,9 @@ def truth(sequences: Sequence[SequenceMetrics]) -> dict[str, Any] | None:
 def _sweep(known: Sequence[SequenceMetrics]) -> str:
     lines = []
     for stage, colour in (("body_fit", "c2"), ("joint", "c1")):
-        found = figures.contact_sweep(known, stage)
-        if found and np.isfinite(list(found.values())).all():
-            x, y = np.array(list(found)), np.array(list(found.values()))
+        f1 = figures.contact_sweep(known, stage)
+        if f1 and np.isfinite(list(f1.values())).all():
+            x, y = np.array(list(f1)), np.array(list(f1.values()))
             lines.append(charts.Series(_NAMES[stage], colour, x, y))
     if not lines:
         return ""
@@ -111,7 +111,7 @@ def _sweep(known: Sequence[SequenceMetrics]) -> str:
 
 
 def _reliability(known: Sequence[SequenceMetrics]) -> str:
-    """Share of true contact over the stated probability of contact, in bins."""
+    """Plot the share of true contact over the stated probability of contact."""
     table = contact_figures.contact_reliability(known)
     if table is None or len(table.count) < 2:
         return ""
@@ -121,15 +121,14 @@ def _reliability(known: Sequence[SequenceMetrics]) -> str:
             charts.Series("calibrated", "c2", np.array([0.0, 1.0]), np.array([0.0, 1.0])),
         ],
         x_label="stated probability of contact",
-        y_label="share that truly touches",
+        y_label="share of true contact",
         x_range=(0, 1),
         y_range=(0, 1),
     )
 
 
 def penetration(sequences: Sequence[SequenceMetrics]) -> dict[str, Any] | None:
-    """Histogram, cumulative curve and figures over contact frames; None where no sequence has an
-    object."""
+    """Return histogram, cumulative curve and figures over contact frames; None without objects."""
     touching = figures.pooled(sequences, "contact_frame")
     if touching is None:
         return None
@@ -154,7 +153,7 @@ def penetration(sequences: Sequence[SequenceMetrics]) -> dict[str, Any] | None:
         "bin": f"{_BIN_MM:g}",
         "histogram": charts.line_chart(
             lines,
-            x_label="penetration depth, mm (the last bin holds all beyond)",
+            x_label="penetration depth, mm (last bin: all larger)",
             y_label="contact frames",
             x_range=x_range,
             y_range=(0, 1.08 * tallest),
@@ -171,7 +170,7 @@ def penetration(sequences: Sequence[SequenceMetrics]) -> dict[str, Any] | None:
 
 
 def accelerations(sequences: Sequence[SequenceMetrics]) -> str:
-    """Share of frames up to an acceleration, of body and object; "" where no frame has one."""
+    """Plot the cumulative distribution of accelerations; "" if there are none."""
     lines = []
     for name, colour, key in (
         ("body", "c1", "acceleration_body"),
@@ -200,11 +199,11 @@ def accelerations(sequences: Sequence[SequenceMetrics]) -> str:
 
 
 def clouds(dataset: str, sequences: Sequence[SequenceMetrics]) -> list[dict[str, Any]]:
-    """Rows of distances to the clouds: found, floor, published; millimetres."""
+    """Return rows of distances to the clouds: measured, noise floor, published; millimetres."""
     names = ("body_mm", "object_mm", "body_visible_mm", "object_visible_mm")
-    found = figures.cloud_figures(sequences)
+    measured = figures.cloud_figures(sequences)
     floor = figures.floor_figures(sequences)
-    rows = [{"name": dataset, "cells": [found[n] for n in names], "reference": False}]
+    rows = [{"name": dataset, "cells": [measured[n] for n in names], "reference": False}]
     if floor:
         cells = [floor.get(n) for n in names]
         rows.append({"name": "floor: true poses", "cells": cells, "reference": True})
@@ -217,7 +216,7 @@ def cameras(
     sequences: Sequence[SequenceMetrics],
     residuals: Mapping[str, Sequence[tuple[str, float, float]]],
 ) -> dict[str, Any]:
-    """Residuals before and after refinement: by pair for one sequence, by sequence for several."""
+    """Return residuals before and after refinement, by pair or, for several sequences, by those."""
     if len(residuals) == 1:
         rows = [(n, 1e3 * a, 1e3 * b) for n, a, b in next(iter(residuals.values()))]
     else:
@@ -238,7 +237,7 @@ def cameras(
     }
 
 
-# dataset, what it is, scale to the unit that is printed, digits
+# dataset, label, unit, scale to that unit, digits
 _VIEWS: tuple[tuple[str, str, str, float, int], ...] = (
     ("keypoint_px", "keypoints", "px", 1.0, 1),
     ("person_m", "person's points", "mm", 1e3, 1),
@@ -248,8 +247,11 @@ _VIEWS: tuple[tuple[str, str, str, float, int], ...] = (
 
 
 def verdict(sequences: Sequence[SequenceMetrics], shown: set[str]) -> dict[str, Any] | None:
-    """What the template prints, cameras of the sequences ``shown`` alone; None where no sequence
-    was judged."""
+    """Return the variables of the template verdict.html.j2; None if no sequence was judged.
+
+    Args:
+        shown: names of the sequences whose cameras are listed.
+    """
     judged = [s for s in sequences if "verdict/error" in s.values]
     if not judged:
         return None
@@ -271,11 +273,11 @@ def verdict(sequences: Sequence[SequenceMetrics], shown: set[str]) -> dict[str, 
 
 
 def _row(name: str, parts: Sequence[str], errors: Sequence[StatedError]) -> dict[str, Any]:
-    found = {e.part: e for e in errors}
+    by_part = {e.part: e for e in errors}
     silent = list(dict.fromkeys(e.silent for e in errors if e.silent))
     return {
         "sequence": name,
-        "cells": [_cell(found.get(part)) for part in parts],
+        "cells": [_cell(by_part.get(part)) for part in parts],
         "silent": "; ".join(silent),
     }
 
@@ -291,7 +293,7 @@ def _cell(error: StatedError | None) -> dict[str, Any]:
 
 
 def _cameras(s: SequenceMetrics) -> list[dict[str, Any]]:
-    """A row for each camera that was held out."""
+    """Return a row for each camera that was held out."""
     values = s.values
     moved = np.sqrt(_mean(values["verdict/shift"] ** 2, axis=2))  # (P, C)
     rows = []
@@ -322,7 +324,7 @@ def _median(values: np.ndarray) -> float:
 
 
 def _mean(values: np.ndarray, axis: int) -> np.ndarray:
-    """Over what is known; NaN where nothing is."""
+    """Average finite values; NaN where none is finite."""
     known = np.isfinite(values)
     total = np.where(known, values, 0).sum(axis=axis)
     return total / np.where(known.any(axis=axis), known.sum(axis=axis), np.nan)

@@ -17,31 +17,29 @@ from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.render import render_scene
 from intercap_core.geometry.rigid.shots import Drawable
-from intercap_core.output.site.drawing import Painted, draw, encode_jpeg
+from intercap_core.output.site.drawing import ColouredMesh, EncodedImage, draw, encode_jpeg
 
 BODY_COLOUR = (0.42, 0.66, 0.92)
 OBJECT_COLOUR = (1.0, 0.62, 0.18)
 _OPACITY = 0.62
-_HEIGHT_PX = 420
-_MARGIN = 0.10  # of the crop's size, around body and object
+_HEIGHT_PX = 420  # largest height of an overlay
+_MARGIN = 0.10  # around body and object, share of the crop's size
 _MIN_ASPECT, _MAX_ASPECT = 0.6, 1.6
-_SURVEY_SCALE = 0.15  # of the image, for choosing cameras
-_APART_DEG = 50.0  # between the viewing directions of the cameras that are shown
+_SURVEY_SCALE = 0.15  # of images for choosing cameras
+_APART_DEG = 50.0  # least angle between the viewing directions of chosen cameras
 
 
 @dataclass(frozen=True, eq=False)
 class Overlay:
-    """One picture: ``jpeg`` bytes of the image with the fit drawn over it."""
+    """A recorded image with the fit drawn over it."""
 
     camera: str
     frame: int
-    jpeg: bytes
-    width: int
-    height: int
+    image: EncodedImage
 
 
-class Fit:
-    """The joint result of one sequence, posed frame by frame."""
+class PosedFit:
+    """The joint result of one sequence, posed frame by frame in the master frame."""
 
     def __init__(
         self,
@@ -51,7 +49,7 @@ class Fit:
         translation: np.ndarray,
         mesh: ObjectMesh | None,
     ) -> None:
-        """``mesh`` is None where there is no object."""
+        """``mesh`` is None without an object."""
         self._model = model
         self._parameters = parameters
         self._rotation = rotation
@@ -60,31 +58,31 @@ class Fit:
         self.faces = model.faces.numpy()
 
     def body(self, t: int) -> np.ndarray:
-        """Vertices (V, 3) float64, master frame."""
+        """Return the body's vertices (V, 3) float64."""
         with torch.no_grad():
             posed = self._model.forward(self._parameters.frames(slice(t, t + 1)))
         return posed.vertices[0].numpy().astype(np.float64)
 
     @property
     def objects(self) -> tuple[ObjectMesh, ...]:
-        """The object's mesh, where there is one."""
+        """The object's mesh, () without an object."""
         return () if self._mesh is None else (self._mesh,)
 
     def object_pose(self, t: int) -> np.ndarray:
-        """master_from_object (4, 4)."""
+        """Return master_from_object (4, 4)."""
         return rigid(self._rotation[t], self._translation[t])
 
     def object_vertices(self, t: int) -> np.ndarray:
-        """Vertices (Vo, 3), master frame; none where there is no object."""
+        """Return the object's vertices (Vo, 3); Vo = 0 without an object."""
         if self._mesh is None:
             return np.zeros((0, 3))
         return self._mesh.vertices @ self._rotation[t].T + self._translation[t]
 
 
 def choose_frames(residual: np.ndarray, count: int) -> list[int]:
-    """Evenly spread frames and the one with the largest ``residual`` (T,), in order of time.
+    """Choose ``count`` evenly spread frames, among them the one with the largest residual (T,).
 
-    NaN counts as no residual.
+    NaN counts as no residual. Frames are in order of time.
     """
     total = len(residual)
     if total <= count:
@@ -92,7 +90,7 @@ def choose_frames(residual: np.ndarray, count: int) -> list[int]:
     worst = int(np.argmax(np.nan_to_num(residual, nan=-np.inf)))
     spread = [int((i + 0.5) * total / max(1, count - 1)) for i in range(count - 1)]
     chosen = sorted({worst, *spread})
-    for t in range(total):  # the worst one may have been chosen already
+    for t in range(total):  # the worst frame may be one of the spread frames
         if len(chosen) >= count:
             break
         if t not in chosen:
@@ -100,8 +98,8 @@ def choose_frames(residual: np.ndarray, count: int) -> list[int]:
     return chosen
 
 
-def choose_cameras(fit: Fit, rig: Rig, frames: Sequence[int], count: int) -> list[int]:
-    """Cameras that see most of the object beside the body, from different sides, best first."""
+def choose_cameras(fit: PosedFit, rig: Rig, frames: Sequence[int], count: int) -> list[int]:
+    """Choose cameras that see most of the object, from different sides, best first."""
     seen = np.zeros(len(rig))
     for c, camera in enumerate(rig):
         lens = camera.colour.scaled(_SURVEY_SCALE)
@@ -136,13 +134,14 @@ def choose_cameras(fit: Fit, rig: Rig, frames: Sequence[int], count: int) -> lis
 def overlays(
     images: Frames,
     rig: Rig,
-    fit: Fit,
+    fit: PosedFit,
     cameras: Sequence[int],
     frames: Sequence[int],
 ) -> list[Overlay]:
-    """Pictures in the order of cameras, then frames; an image that is missing is left out.
+    """Draw the fit over images, in the order of cameras, then frames; skip missing images.
 
-    ``images`` are those that show each frame's moment (:meth:`Frames.showing`).
+    Args:
+        images: images by the frame that they show (:meth:`Frames.showing`).
     """
     result = []
     bodies = {t: fit.body(t) for t in frames}
@@ -164,9 +163,9 @@ def overlays(
             crop = cv2.resize(crop, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
             picture = draw(
                 [
-                    _painted(bodies[t], fit.faces, BODY_COLOUR, camera.colour_from_master),
+                    _coloured(bodies[t], fit.faces, BODY_COLOUR, camera.colour_from_master),
                     *(
-                        _painted(
+                        _coloured(
                             mesh.vertices,
                             mesh.faces,
                             OBJECT_COLOUR,
@@ -178,18 +177,18 @@ def overlays(
                 lens,
             )
             laid = picture.over(crop[..., ::-1] / np.float32(255), _OPACITY)
-            result.append(Overlay(camera.name, t, encode_jpeg(laid), lens.width, lens.height))
+            result.append(Overlay(camera.name, t, encode_jpeg(laid)))
     return result
 
 
-def _painted(
+def _coloured(
     vertices: np.ndarray,
     faces: np.ndarray,
     colour: tuple[float, ...],
     pose: np.ndarray,
-) -> Painted:
+) -> ColouredMesh:
     colours = np.broadcast_to(np.array(colour), (len(vertices), 3))
-    return Painted(vertices, faces, colours, pose)
+    return ColouredMesh(vertices, faces, colours, pose)
 
 
 def _window(
@@ -197,7 +196,10 @@ def _window(
     bodies: Sequence[np.ndarray],
     objects: Sequence[np.ndarray],
 ) -> tuple[int, int, int, int] | None:
-    """x, y, width, height of the image part that holds body and object in all frames."""
+    """Return x, y, width, height of the image part that shows body and object in all frames.
+
+    None if they are not in view.
+    """
     lens, pose = camera.colour, camera.colour_from_master
     points = np.concatenate([*bodies, *objects]) @ pose[:3, :3].T + pose[:3, 3]
     points = points[lens.inside_model(points)]

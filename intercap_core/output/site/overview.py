@@ -1,4 +1,4 @@
-"""The site's first page: the whole dataset's figures, and the way to each sequence."""
+"""First page of the site: figures of the whole dataset, and links to the sequences."""
 
 from __future__ import annotations
 
@@ -14,14 +14,13 @@ from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.summary import SequenceSummary
 from intercap_core.evaluation.verdict.figures import mean_stated
 from intercap_core.output.site import measures
+from intercap_core.output.site.drawing import EncodedImage
 from intercap_core.output.site.embed import css, embedded, render, span, tile
-from intercap_core.output.site.heat_pictures import COLOUR_STOPS, HeatPicture
+from intercap_core.output.site.heat_pictures import COLOUR_STOPS
 from intercap_core.versions import versions
 
 _MAX_RUNS = 400  # rows of the list of flagged frames
-_MAX_ANSWERS = 12  # values of a column that become a filter's choices in a row of their own
-
-# columns of the tables by object, subject, intent and camera with a word for readers, and the unit
+# Labels and units of table columns
 _FIGURES = {
     "acceleration_body_mm": ("acceleration, body", "mm/frame²"),
     "acceleration_object_mm": ("acceleration, object", "mm/frame²"),
@@ -50,39 +49,43 @@ _FIGURES = {
 
 @dataclass(frozen=True, eq=False)
 class Heat:
-    """Pictures of one surface's heatmap, and the likelihood that its last colour stands for."""
+    """Pictures of one surface's heatmap."""
 
     name: str
-    pictures: Sequence[HeatPicture]
+    pictures: Sequence[EncodedImage]
     top: float
+    """Likelihood of the last colour."""
     frames: int
 
 
 @dataclass(frozen=True, eq=False)
 class DatasetContent:
-    """All that the overview is made from.
-
-    ``table`` has a row a sequence, ``groups`` the tables by object, subject, intent and camera, by
-    name. ``failed``: sequences without a result and why; ``remarks``: what the merge says of
-    others. ``page_of``: the address of each sequence's page from the overview. ``changed``: name,
-    value and default of each setting that is not the program's own.
-    """
+    """Content of the overview."""
 
     dataset: str
     sequences: Sequence[SequenceSummary]
     table: pd.DataFrame
+    """A row per sequence."""
     groups: Mapping[str, pd.DataFrame]
+    """Tables by object, subject, intent and camera."""
     surfaces: Sequence[Heat]
+    """Heatmaps of the body and the hands."""
     objects: Sequence[Heat]
+    """Heatmaps of the objects."""
     body_frames: int
+    """Frames of the body's heatmaps."""
     page_of: Mapping[str, str]
+    """Address of each sequence's page relative to the overview."""
     failed: Mapping[str, str] = field(default_factory=dict)
+    """Sequences without a result, with the reason."""
     remarks: Mapping[str, str] = field(default_factory=dict)
+    """Remarks of the merge about other sequences."""
     changed: Sequence[tuple[str, str, str]] = ()
+    """Name, value and default of each setting that differs from its default."""
 
 
 def page(content: DatasetContent) -> str:
-    """The page as text."""
+    """Return the HTML of the page."""
     measured = [s.metrics for s in content.sequences]
     rows = _rows(content)
     runs = [
@@ -202,7 +205,7 @@ def _rows(content: DatasetContent) -> list[dict[str, Any]]:
 
 
 def _counts(measured: Sequence[SequenceMetrics]) -> dict[str, Any]:
-    """Sequences by subject (rows) and object (columns), as the paper's table of the dataset."""
+    """Count sequences by subject (rows) and object (columns), as in the paper's table."""
     subjects = sorted({s.subject for s in measured})
     objects = sorted({s.object_ for s in measured})
     count = np.zeros((len(subjects), len(objects)), int)
@@ -219,21 +222,21 @@ def _counts(measured: Sequence[SequenceMetrics]) -> dict[str, Any]:
 
 
 def _printed(table: pd.DataFrame) -> dict[str, Any]:
-    """Heads, each with its unit, and cells as text, of the columns that a reader looks for."""
+    """Format the columns of interest: heads with units, and cells."""
     shown = [str(name) for name in table if "." not in str(name) or name in _FIGURES]
     cells = [
-        ["–" if _unknown(value) else _text(value) for value in row]
+        ["–" if _is_unknown(value) else _text(value) for value in row]
         for row in table[shown].itertuples(index=False, name=None)
     ]
     return {
-        "heads": [_head(name) for name in shown],
+        "heads": [_label(name) for name in shown],
         "rows": cells,
         "left_out": len(table.columns) - len(shown),
     }
 
 
-def _head(column: str) -> tuple[str, str]:
-    """What a column holds, and its unit."""
+def _label(column: str) -> tuple[str, str]:
+    """Return label and unit of a column."""
     if column in _FIGURES:
         return _FIGURES[column]
     for ending, unit in (("_mm", "mm"), ("_ms", "ms"), ("_percent", "%")):
@@ -242,7 +245,7 @@ def _head(column: str) -> tuple[str, str]:
     return column.replace("_", " "), ""
 
 
-def _unknown(value: object) -> bool:
+def _is_unknown(value: object) -> bool:
     return value is None or value == "" or (isinstance(value, float) and not np.isfinite(value))
 
 
@@ -270,12 +273,12 @@ def _surface(heat: Heat) -> dict[str, Any]:
         "name": heat.name,
         "top": heat.top,
         "frames": heat.frames,
-        "pictures": [embedded(p, p.caption) for p in heat.pictures],
+        "pictures": [embedded(picture) for picture in heat.pictures],
     }
 
 
 def _made_by(sequences: Sequence[SequenceSummary]) -> list[dict[str, Any]]:
-    """For each stage, how many sequences were made with which settings: more than one is a mix."""
+    """Count sequences by stage, schema version and settings. Several entries are a mixture."""
     counted: dict[str, dict[str, list[str]]] = {}
     for s in sequences:
         for stage, (version, digest) in s.made_by.items():
@@ -286,12 +289,12 @@ def _made_by(sequences: Sequence[SequenceSummary]) -> list[dict[str, Any]]:
             "stage": stage,
             "made": [
                 {"digest": made, "count": len(names), "names": names}
-                for made, names in sorted(found.items(), key=lambda pair: -len(pair[1]))
+                for made, names in sorted(versions_.items(), key=lambda pair: -len(pair[1]))
             ],
         }
-        for stage, found in counted.items()
+        for stage, versions_ in counted.items()
     ]
 
 
-def _counted(count: int, what: str) -> str:
-    return f"{count:,} {what}{'' if count == 1 else 's'}"
+def _counted(count: int, noun: str) -> str:
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"

@@ -1,4 +1,4 @@
-"""Coloured points of all cameras in one frame set, and pictures of them from any place."""
+"""Coloured point clouds of all cameras in one frame set, and their rendering."""
 
 from __future__ import annotations
 
@@ -13,51 +13,60 @@ from intercap_core.geometry.camera.clouds import colour_lookup
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import apply
 
-_MAX_POINTS = 600_000  # of all cameras together: more than the pictures have pixels
-_EDGE = 0.06  # depth may change by this share over two grid steps, or the pixel is at an edge
+_MAX_POINTS = 600_000  # of all cameras together, more than the pictures have pixels
+_EDGE = 0.06  # a larger relative change of depth over two grid steps is an edge
 _GRAZING = 0.12  # cosine between ray and normal below which depth is noise
-_UNCOLOURED = (0.55, 0.55, 0.58)  # of a camera that has no image in this set
-_SAME_SURFACE_M = 0.015  # points this close behind a pixel's nearest one are averaged with it
+_UNCOLOURED = (0.55, 0.55, 0.58)  # colour of points without a colour image
+_SAME_SURFACE_M = 0.015  # points this close behind the nearest of a pixel are averaged with it
 _BEHIND_M = 0.03  # a point hides those of neighbouring pixels this much farther away
-_CLOSED = 5  # of eight neighbours drawn make an empty pixel a hole in a surface
+_CLOSED = 5  # an empty pixel with this many drawn neighbours is a hole in a surface
 _NEIGHBOURS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
 
 
 @dataclass(frozen=True, eq=False)
 class CameraPoints:
-    """What one camera ``c`` measured: ``points`` and unit ``normals`` (N, 3) of its depth camera's
-    frame, ``rays`` (N, 3) with z = 1, ``colours`` (N, 3) RGB in 0..1."""
+    """Points that one camera measured, in its depth camera's frame."""
 
     c: int
+    """Index of the camera."""
     points: np.ndarray
+    """(N, 3) metres."""
     normals: np.ndarray
+    """(N, 3) unit vectors."""
     rays: np.ndarray
+    """(N, 3) with z = 1."""
     colours: np.ndarray
+    """(N, 3) RGB in 0..1."""
 
 
 @dataclass(frozen=True, eq=False)
 class FusedCloud:
-    """Points of all cameras in one frame: ``points``, ``normals``, ``colours`` (N, 3) and the
-    ``camera`` (N,) that measured each."""
+    """Points of all cameras in one coordinate frame."""
 
     points: np.ndarray
+    """(N, 3) metres."""
     normals: np.ndarray
+    """(N, 3) unit vectors."""
     colours: np.ndarray
+    """(N, 3) RGB in 0..1."""
     camera: np.ndarray
+    """(N,) index of the measuring camera."""
 
     def where(self, kept: np.ndarray) -> FusedCloud:
-        """The points of a mask (N,)."""
+        """Return the points of a mask (N,)."""
         return FusedCloud(
             self.points[kept], self.normals[kept], self.colours[kept], self.camera[kept]
         )
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """A pinhole camera: ``view_from_world`` (4, 4), x right, y down, z forward, and its image."""
+class Viewpoint:
+    """A pinhole camera (x right, y down, z forward) and its image size."""
 
     view_from_world: np.ndarray
+    """(4, 4)"""
     focal: float
+    """Pixels."""
     width: int
     height: int
 
@@ -70,7 +79,7 @@ class View:
         distance: float,
         focal: float,
         size: tuple[int, int],
-    ) -> View:
+    ) -> Viewpoint:
         """Look at ``target`` (3,), z up, from ``distance`` metres; angles in radians."""
         away = np.array(
             [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth),
@@ -85,35 +94,35 @@ class View:
 
     @property
     def eye(self) -> np.ndarray:
-        """Where it stands (3,)."""
+        """Position (3,) in the world."""
         return -self.view_from_world[:3, :3].T @ self.view_from_world[:3, 3]
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels (N, 2) and depths (N,) of points (N, 3); pixel centres at integers."""
+        """Return pixels (N, 2) and depths (N,) of points (N, 3); pixel centres are integers."""
         local = apply(self.view_from_world, points)
         z = local[:, 2]
         middle = np.array([(self.width - 1) / 2, (self.height - 1) / 2], points.dtype)
         safe = np.where(z > 1e-6, z, 1)
         return local[:, :2] * (points.dtype.type(self.focal) / safe[:, None]) + middle, z
 
-    def holds(self, points: np.ndarray, border: float) -> bool:
-        """Whether all points (N, 3) are in the picture, ``border`` pixels from its edges."""
+    def contains(self, points: np.ndarray, border: float) -> bool:
+        """Return whether all points (N, 3) are at least ``border`` pixels inside the image."""
         at, z = self.project(points)
         high = np.array([self.width, self.height]) - border
         return bool((z > 0).all() and (at > border).all() and (at < high).all())
 
 
 def measured_points(images: Frames, rig: Rig, t: int) -> list[CameraPoints]:
-    """Points of every camera that has a depth image in set ``t``, thinned to a common number.
+    """Compute the points of every camera with a depth image in set ``t``, thinned evenly.
 
-    ``rig`` gives the lenses. Raises UserError where a recorded JPEG does not decode.
+    Raises UserError if a recorded image does not decode.
     """
     seen = [c for c, camera in enumerate(rig) if camera.depth and images.depth_available[t, c]]
     found = []
     for c in seen:
         depth = images.depth(t, c)
         assert depth is not None
-        points = _of_camera(c, rig[c], depth, images.colour(t, c), _MAX_POINTS // len(seen))
+        points = _camera_points(c, rig[c], depth, images.colour(t, c), _MAX_POINTS // len(seen))
         found.append(points)
     return found
 
@@ -124,9 +133,10 @@ def fuse(
     world_from_master: np.ndarray,
     bias: np.ndarray,
 ) -> FusedCloud:
-    """Bring all cameras' points into one frame by the poses of ``rig``.
+    """Transform all cameras' points into one frame by the poses of ``rig``.
 
-    ``bias`` (C,) metres is taken off each camera's depth.
+    Args:
+        bias: (C,) metres, subtracted from each camera's depth.
     """
     points, normals = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.float32)]
     colours, cameras = [np.zeros((0, 3), np.float32)], [np.zeros(0, np.int32)]
@@ -139,11 +149,11 @@ def fuse(
     return FusedCloud(*(np.concatenate(part) for part in (points, normals, colours, cameras)))
 
 
-def splat(cloud: FusedCloud, view: View) -> tuple[np.ndarray, np.ndarray]:
-    """Picture (H, W, 3) RGB and depth (H, W), infinite where nothing is drawn.
+def splat(cloud: FusedCloud, view: Viewpoint) -> tuple[np.ndarray, np.ndarray]:
+    """Render the cloud; return RGB (H, W, 3) and depth (H, W), infinite where it is empty.
 
-    Only surfaces that face the viewer are drawn, so that a room is open towards it. A pixel is the
-    mean of the points at its nearest surface, and covers its neighbours, so that a surface closes.
+    Only surfaces that face the viewer are drawn, so that a room is open towards the viewer. A pixel
+    is the mean of the points of its nearest surface, and covers its neighbours to close surfaces.
     """
     to_viewer = view.eye.astype(np.float32) - cloud.points
     facing = np.flatnonzero(np.einsum("ij,ij->i", to_viewer, cloud.normals) > 0)
@@ -165,9 +175,9 @@ def splat(cloud: FusedCloud, view: View) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _spread(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Let every drawn pixel cover its neighbours that are empty or farther away; close holes.
+    """Let every drawn pixel cover neighbours that are empty or farther away, then close holes.
 
-    Returns the flat pixel (H, W) that each one shows, and its depth (H, W).
+    Returns for each pixel (H, W) the flat index of the pixel that it shows, and the depth.
     """
     source, near = _cover(np.arange(depth.size).reshape(depth.shape), depth, depth)
     drawn = np.isfinite(near).astype(np.uint8)
@@ -181,7 +191,7 @@ def _cover(
     depth: np.ndarray,
     coverable: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Put the nearest of its eight neighbours where it is in front of ``coverable`` (H, W)."""
+    """Replace a pixel by its nearest neighbour if that is in front of ``coverable`` (H, W)."""
     height, width = depth.shape
     result, near, limit = source.copy(), depth.copy(), coverable.copy()
     padded = np.pad(depth, 1, constant_values=np.inf)
@@ -194,7 +204,7 @@ def _cover(
     return result, near
 
 
-def _of_camera(
+def _camera_points(
     c: int,
     camera: Camera,
     depth: np.ndarray,
@@ -224,7 +234,7 @@ def _of_camera(
 
 
 def _thinned(camera: Camera, shape: tuple[int, ...], step: int) -> Camera:
-    """The camera whose depth image is every ``step``-th row and column of the real one's."""
+    """Return the camera whose depth image has every ``step``-th row and column."""
     lens = camera.depth
     assert lens is not None
     thin = replace(
@@ -235,11 +245,11 @@ def _thinned(camera: Camera, shape: tuple[int, ...], step: int) -> Camera:
 
 
 def _normals(grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit normals (H, W, 3) towards the camera of a grid of points, and where they are known."""
+    """Return unit normals (H, W, 3) of a grid of points, towards the camera, and their mask."""
     across, down = np.zeros_like(grid), np.zeros_like(grid)
     across[:, 1:-1] = grid[:, 2:] - grid[:, :-2]
     down[1:-1] = grid[2:] - grid[:-2]
-    normals = np.cross(down, across)  # x right, y down: this one points back at the camera
+    normals = np.cross(down, across)  # x right, y down: towards the camera
     length = np.linalg.norm(normals, axis=2)
     z = grid[..., 2]
     smooth = (z > 0) & np.isfinite(length) & (length > 0)

@@ -1,4 +1,4 @@
-"""The page of one sequence: one HTML file, with the 4D viewer's files beside it."""
+"""Page of one sequence: an HTML file, which loads the 4D viewer from the same folder."""
 
 from __future__ import annotations
 
@@ -16,62 +16,66 @@ from intercap_core.evaluation.verdict.figures import stated_errors
 from intercap_core.output.site import body_section, capture_section, charts, measures, track_section
 from intercap_core.output.site.body_section import BodyFacts
 from intercap_core.output.site.capture_section import CaptureFacts
-from intercap_core.output.site.closeups import CloseUp
+from intercap_core.output.site.drawing import EncodedImage
 from intercap_core.output.site.embed import css, embedded, render, span, tile
 from intercap_core.output.site.overlays import BODY_COLOUR, OBJECT_COLOUR, Overlay
 from intercap_core.output.site.track_section import TrackFacts
 from intercap_core.schemas import METRIC_REGIONS
 from intercap_core.versions import versions
 
-_LEAST_MM = 10.0  # top of a chart of distances, at the least
+_LEAST_MM = 10.0  # least height of charts of distances
 
 
 @dataclass(frozen=True)
 class ViewerParts:
-    """What the page holds for the viewer, whose data lie in a file beside it: the policy of what
-    may be loaded, its style sheet, its element, and what loads the file. HTML, put in as it is."""
+    """Parts of the page for the viewer, inserted without escaping."""
 
     policy: str
+    """Content security policy."""
     style: str
+    """Style sheet."""
     element: str
+    """HTML element of the viewer."""
     load: str
+    """HTML element that loads the viewer's script and data."""
 
 
 @dataclass(frozen=True, eq=False)
 class SequenceContent:
-    """All that a sequence's page is made from.
-
-    ``overlays`` by camera, or in ``note`` why there are none; ``joint`` says in words how the joint
-    fit went; ``energies``: name, before and after of each of its terms. ``made_by``: what to print
-    of each stage's artefact. ``annotated``: contact that the user stated, None = none. ``track`` is
-    None where there is no object.
-    """
+    """Content of a sequence's page."""
 
     metrics: SequenceMetrics
     intent: str
     overlays: Sequence[Overlay]
+    """In the order of cameras."""
     note: str
+    """Why there are no overlays."""
     joint: str
+    """Summary of the joint fit."""
     energies: Sequence[tuple[str, float, float]]
-    closeups: Sequence[CloseUp]
+    """Name of each energy term with its values before and after the joint fit."""
+    closeups: Sequence[EncodedImage]
     capture: CaptureFacts
     track: TrackFacts | None
+    """None without an object."""
     body: BodyFacts
     annotated: Sequence[ContactInterval] | None
+    """Annotated contact."""
     made_by: Mapping[str, str]
+    """Schema version and digest of settings by stage."""
     body_file: str
     viewer: ViewerParts | None = None
 
 
 def page(content: SequenceContent) -> str:
-    """The page as text."""
+    """Return the HTML of the page."""
     s = content.metrics
     cameras: dict[str, list[dict[str, Any]]] = {}
     for overlay in content.overlays:
         caption = f"camera {overlay.camera}, frame {overlay.frame}"
         if s.values["flagged"][overlay.frame]:
             caption += f" (flagged: {s.values['flag_reason'][overlay.frame]})"
-        cameras.setdefault(overlay.camera, []).append(embedded(overlay, caption))
+        cameras.setdefault(overlay.camera, []).append(embedded(overlay.image, caption))
     context = {
         "name": s.name,
         "subject": s.subject,
@@ -94,7 +98,7 @@ def page(content: SequenceContent) -> str:
         "joint": content.joint,
         "cameras": list(cameras.values()),
         "note": content.note,
-        "closeups": [embedded(picture, picture.hold.caption) for picture in content.closeups],
+        "closeups": [embedded(picture) for picture in content.closeups],
         "capture": _capture(content.capture),
         "track": None
         if content.track is None
@@ -143,40 +147,40 @@ def _tiles(s: SequenceMetrics) -> list[dict[str, str]]:
 
 
 def _bands(s: SequenceMetrics, annotated: Sequence[ContactInterval] | None) -> list[charts.Band]:
-    """Flags; frames in contact, and of each region as annotated, as stated and by the meshes."""
+    """Return rows for flags, frames in contact, and contact of each region by source."""
     reasons = flags.ranges(list(s.values["flag_reason"]))
     bands = [
         charts.Band("flagged", "flag", [(a, b, f"{span(a, b)}: {why}") for a, b, why in reasons])
     ]
-    stated_by_user: dict[str, list[tuple[int, int, str]]] = {}
+    annotated_runs: dict[str, list[tuple[int, int, str]]] = {}
     for interval in annotated or ():
         last = min(interval.end, len(s)) - 1
         if last >= interval.start:
-            says = f"{span(interval.start, last)}: annotated"
-            stated_by_user.setdefault(interval.part, []).append((interval.start, last, says))
+            title = f"{span(interval.start, last)}: annotated"
+            annotated_runs.setdefault(interval.part, []).append((interval.start, last, title))
     if not s.has_object:
         return bands
     bands.append(charts.Band("in contact", "any", _runs(s.values["contact_frame"])))
     names = list(s.values["region_names"])
-    if "any" in stated_by_user:
-        bands.append(charts.Band("any, annotated", "said", stated_by_user["any"]))
+    if "any" in annotated_runs:
+        bands.append(charts.Band("any, annotated", "said", annotated_runs["any"]))
     for region in METRIC_REGIONS:
-        says = region.replace("_", " ")
-        if region in stated_by_user:
-            bands.append(charts.Band(f"{says}, annotated", "said", stated_by_user[region]))
+        label = region.replace("_", " ")
+        if region in annotated_runs:
+            bands.append(charts.Band(f"{label}, annotated", "said", annotated_runs[region]))
         stated = s.values["contact_probability"][:, names.index(region)]
         touching = s.values["region_contact"][:, names.index(region)]
-        if (stated >= 0.5).any() or touching.any() or region in stated_by_user:
+        if (stated >= 0.5).any() or touching.any() or region in annotated_runs:
             runs = _stated_runs(stated)
-            bands.append(charts.Band(f"{says}, stated", "touch", runs, levels=stated))
+            bands.append(charts.Band(f"{label}, stated", "touch", runs, levels=stated))
         if touching.any():
-            bands.append(charts.Band(f"{says}, meshes", "any", _runs(touching)))
+            bands.append(charts.Band(f"{label}, meshes", "any", _runs(touching)))
     return bands
 
 
 def _residuals(s: SequenceMetrics) -> list[tuple[str, str]]:
-    """Charts over the frames, each with what it shows."""
-    found = [
+    """Return charts over the frames with their captions."""
+    residuals = [
         _over_frames(
             s,
             (
@@ -185,8 +189,7 @@ def _residuals(s: SequenceMetrics) -> list[tuple[str, str]]:
                 ("penetration", "c3", "penetration_mean"),
             ),
             "distance, mm",
-            "Distance of the visible surfaces to the clouds, and how deep the body is inside the "
-            "object.",
+            "Distance of visible surfaces to the clouds, and depth of the body inside the object.",
         ),
         _over_frames(
             s,
@@ -195,7 +198,7 @@ def _residuals(s: SequenceMetrics) -> list[tuple[str, str]]:
                 ("object", "c2", "acceleration_object"),
             ),
             "acceleration, mm/frame²",
-            "Second differences at 30 frames a second: what jitters stands out.",
+            "Second differences at 30 frames per second, which show jitter.",
         ),
     ]
     if "verdict/error_frame" in s.values:
@@ -204,36 +207,36 @@ def _residuals(s: SequenceMetrics) -> list[tuple[str, str]]:
             (str(part), colour, 1e3 * s.values["verdict/error_frame"][p].astype(np.float64))
             for p, (part, colour) in enumerate(parts)
         ]
-        says = "Error that the verdict states, by frame; no line where it says nothing."
-        found.append(_chart(lines, "stated error, mm", says))
-    return [pair for pair in found if pair is not None]
+        caption = "Error that the verdict states, by frame; no line where it states none."
+        residuals.append(_chart(lines, "stated error, mm", caption))
+    return [pair for pair in residuals if pair is not None]
 
 
 def _over_frames(
-    s: SequenceMetrics, lines: Sequence[tuple[str, str, str]], unit: str, says: str
+    s: SequenceMetrics, lines: Sequence[tuple[str, str, str]], unit: str, caption: str
 ) -> tuple[str, str] | None:
     return _chart(
         [(n, colour, 1e3 * s.values[key].astype(np.float64)) for n, colour, key in lines
          if key in s.values],
         unit,
-        says,
+        caption,
     )  # fmt: skip
 
 
 def _chart(
-    lines: Sequence[tuple[str, str, np.ndarray]], unit: str, says: str
+    lines: Sequence[tuple[str, str, np.ndarray]], unit: str, caption: str
 ) -> tuple[str, str] | None:
     series = []
     for name, colour, values in lines:
         known = np.flatnonzero(np.isfinite(values))
-        # a line for each run of known frames; the first of them is named
+        # a line for each run of known frames; only the first has a name in the legend
         for run in np.split(known, np.flatnonzero(np.diff(known) > 1) + 1):
             if len(run):
                 first = run[0] == known[0]
                 series.append(charts.Series(name if first else "", colour, run, values[run]))
     if not series:
         return None
-    top = max(_LEAST_MM, 1.1 * max(float(one.y.max()) for one in series))
+    top = max(_LEAST_MM, 1.1 * max(float(line.y.max()) for line in series))
     total = len(lines[0][2])
     drawn = charts.line_chart(
         series,
@@ -242,18 +245,18 @@ def _chart(
         x_range=(0.0, float(max(total - 1, 1))),
         y_range=(0.0, top),
     )
-    return drawn, says
+    return drawn, caption
 
 
 def _energies(terms: Sequence[tuple[str, float, float]]) -> str:
-    """Each term's share of the joint fit's energy at the start and at the end; "" of none."""
+    """Plot each term's share of the initial energy before and after the joint fit."""
     if not terms:
         return ""
-    whole = max(sum(before for _, before, _ in terms), 1e-12)
+    total = max(sum(before for _, before, _ in terms), 1e-12)
     return charts.bar_pairs(
         [
             charts.BarPair(
-                name.replace("_", " "), 100 * before / whole, 100 * after / whole, "", False
+                name.replace("_", " "), 100 * before / total, 100 * after / total, "", False
             )
             for name, before, after in terms
             if max(before, after) > 0
@@ -263,18 +266,19 @@ def _energies(terms: Sequence[tuple[str, float, float]]) -> str:
 
 
 def _capture(facts: CaptureFacts) -> dict[str, Any]:
-    found = capture_section.context(facts)
-    found["pictures"] = [[embedded(p, p.caption) for p in row] for row in found["pictures"]]
-    return found
+    variables = capture_section.context(facts)
+    variables["pictures"] = [[embedded(p) for p in row] for row in variables["pictures"]]
+    return variables
 
 
-def _with_sheet(found: dict[str, Any]) -> dict[str, Any]:
-    """A section's context with its sheet, where it has one, as the page embeds it."""
-    sheet = found["sheet"]
+def _with_sheet(variables: dict[str, Any]) -> dict[str, Any]:
+    """Embed the sheet of a section, if it has one."""
+    sheet = variables["sheet"]
     if sheet is not None:
         rows = ", ".join(map(str, sheet.frames))
-        found["sheet"] = embedded(sheet, f"{found['name']}, frames {rows} in every camera")
-    return found
+        caption = f"{variables['name']}, frames {rows} in every camera"
+        variables["sheet"] = embedded(sheet.image, caption)
+    return variables
 
 
 def _runs(mask: np.ndarray) -> list[tuple[int, int, str]]:
@@ -283,8 +287,8 @@ def _runs(mask: np.ndarray) -> list[tuple[int, int, str]]:
 
 
 def _stated_runs(probability: np.ndarray) -> list[tuple[int, int, str]]:
-    """Runs in which contact is likelier than not, with the mean probability (T,) in words."""
+    """Return runs with a probability (T,) of at least a half, and its mean in the title."""
     return [
-        (first, last, f"{says}: {100 * probability[first : last + 1].mean():.0f} %")
-        for first, last, says in _runs(probability >= 0.5)
+        (first, last, f"{frames}: {100 * probability[first : last + 1].mean():.0f} %")
+        for first, last, frames in _runs(probability >= 0.5)
     ]

@@ -1,4 +1,4 @@
-"""Which settings a dataset was made with, as far as they are not the program's own."""
+"""Settings of a dataset that differ from their defaults."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 from intercap_core.config import Config
 
-# what is of one machine, or told elsewhere: where files are, the card, what the studio is to make
+# places of files, and sections that other parts of the page show
 _LEFT_OUT = {
     "dataset", "exclude", "sequences", "subjects", "objects", "annotations", "results",
     "body_models", "card", "studio",
@@ -15,7 +15,7 @@ _LEFT_OUT = {
 
 
 def changed(config: Config) -> list[tuple[str, str, str]]:
-    """Name, value and default of each setting that has another value than its default."""
+    """Return name, value and default of each setting that differs from its default."""
     own = config.model_dump(exclude=_LEFT_OUT)
     defaults = Config(dataset="any").model_dump(exclude=_LEFT_OUT)
     return [
@@ -26,25 +26,25 @@ def changed(config: Config) -> list[tuple[str, str, str]]:
 
 
 def _leaves(values: dict[str, Any], above: str = "") -> list[tuple[str, Any]]:
-    found: list[tuple[str, Any]] = []
+    leaves: list[tuple[str, Any]] = []
     for key, value in values.items():
         name = f"{above}{key}"
         if isinstance(value, dict) and value:
-            found += _leaves(value, f"{name}.")
+            leaves += _leaves(value, f"{name}.")
         else:
-            found.append((name, value))
-    return found
+            leaves.append((name, value))
+    return leaves
 
 
 def _at(values: Any, name: str) -> Any:
-    """What stands under a dotted name; None where nothing does."""
+    """Return the value of a dotted name, None if there is none."""
     for key in name.split("."):
         values = values.get(key) if isinstance(values, dict) else None
     return values
 
 
 def _text(value: Any) -> str:
-    if isinstance(value, PurePath):  # of files the name alone: folders are of one machine
+    if isinstance(value, PurePath):  # without its folder, which depends on the machine
         return value.name
     if isinstance(value, list | tuple | set):
         return ", ".join(map(_text, value))

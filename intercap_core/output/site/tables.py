@@ -1,4 +1,4 @@
-"""The dataset's tables: a row a sequence, frame, object, subject, intent and camera."""
+"""Tables of the dataset by sequence, frame, object, subject, intent and camera."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ _MILLIMETRES = {
     "ground_penetration", "body_to_cloud", "object_to_cloud", "body_visible_to_cloud",
     "object_visible_to_cloud", "cloud_to_body",
 }  # fmt: skip
-_RANKED = {  # columns of the table of sequences and what they are a measure of
+_RANKED = {  # columns of the table of sequences, and the measures that they rank
     "vertex_to_cloud.body_visible_mm": "body_to_cloud",
     "vertex_to_cloud.object_visible_mm": "object_to_cloud",
     "penetration.p98_mm": "penetration",
 }
 _ACCELERATIONS = {"acceleration_body", "acceleration_object"}
-_JUDGED_VIEWS = (  # what the verdict says of a camera, and its unit in the table
+_JUDGED_VIEWS = (  # the verdict's measures of a camera, scale and unit of their columns
     ("keypoint_px", 1.0, ""), ("person_m", 1e3, "_mm"), ("overlap", 1.0, ""),
     ("object_depth_m", 1e3, "_mm"),
 )  # fmt: skip
@@ -38,12 +38,15 @@ def sequence_table(
     residuals: Mapping[str, tuple[float, float]],
     intents: Mapping[str, str] | None = None,
 ) -> pd.DataFrame:
-    """One row a sequence; lengths in millimetres, accelerations in mm/frame^2 at 30 fps.
+    """Return one row per sequence; lengths in millimetres, accelerations in mm/frame^2 at 30 fps.
 
-    ``residuals``: median point-to-plane distance between cameras before and after refinement, by
-    sequence, metres; ``intents`` by sequence, "" = not stated. Columns ``<stage>.<figure>`` are
-    errors against truth. ``rank`` orders the sequences by :func:`worst_first`, 1 = worst. What a
-    sequence does not have is NaN.
+    Columns ``<stage>.<figure>`` are errors against truth. Column ``rank`` is :func:`worst_first`.
+    Values that a sequence does not have are NaN.
+
+    Args:
+        residuals: median point-to-plane distance between cameras before and after refinement, by
+            sequence, metres.
+        intents: by sequence, "" if not stated.
     """
     rows = []
     for s in sequences:
@@ -76,14 +79,14 @@ def sequence_table(
         rows.append(row)
     table = pd.DataFrame(rows)
     for name in _RANKED:
-        if name not in table:  # of no sequence, where nobody handles an object
+        if name not in table:  # no sequence has an object
             table[name] = np.nan
     table.insert(1, "rank", worst_first(table))
     return table
 
 
 def _figures(sequences: Sequence[SequenceMetrics]) -> dict[str, float]:
-    """Penetration, distances to clouds with their floor, and accelerations of some sequences."""
+    """Pool penetration, distances to clouds with their noise floor, and accelerations."""
     row = {}
     for name, value in figures.penetration_figures(sequences).items():
         row[f"penetration.{name}"] = value
@@ -101,10 +104,11 @@ def _figures(sequences: Sequence[SequenceMetrics]) -> dict[str, float]:
 def group_table(
     sequences: Sequence[SequenceMetrics], by: str, group_of: Mapping[str, str]
 ) -> pd.DataFrame:
-    """One row a group, over all frames of its sequences, with the units of the other tables.
+    """Return one row per group, over all frames of its sequences; missing values are NaN.
 
-    ``group_of`` names each sequence's group, "" = it has none and is left out; ``by`` heads the
-    first column. What a group does not have is NaN.
+    Args:
+        by: name of the first column.
+        group_of: group of each sequence, "" for none.
     """
     rows = []
     for group in sorted({group_of[s.name] for s in sequences} - {""}):
@@ -130,8 +134,7 @@ def group_table(
 
 
 def camera_table(summaries: Sequence[SequenceSummary]) -> pd.DataFrame:
-    """One row a camera of a sequence: images, time, depth, by how much it was moved, and what the
-    verdict says of it; milliseconds, millimetres, pixels. NaN = not known."""
+    """Return one row per sequence and camera; milliseconds, millimetres, pixels, NaN if unknown."""
     rows = []
     for summary in summaries:
         rig, values = summary.rig, summary.metrics.values
@@ -153,15 +156,17 @@ def camera_table(summaries: Sequence[SequenceSummary]) -> pd.DataFrame:
                 held = values["verdict/held_camera"] == place
                 for key, scale, unit in _JUDGED_VIEWS:
                     for end, frames in (("", slice(None)), ("_held_out", held)):
-                        found = scale * _median(values[f"verdict/{key}{end}"][frames, place])
-                        row[f"verdict.{key.removesuffix('_m')}{end}{unit}"] = found
+                        value = scale * _median(values[f"verdict/{key}{end}"][frames, place])
+                        row[f"verdict.{key.removesuffix('_m')}{end}{unit}"] = value
             rows.append(row)
     return pd.DataFrame(rows)
 
 
 def camera_groups(cameras: pd.DataFrame) -> pd.DataFrame:
-    """One row a camera over all its sequences: sums of images, means of the other numbers of
-    :func:`camera_table` weighted by frames, of those that know them; and how many have a note."""
+    """Return one row per camera over all its sequences.
+
+    Images are summed. The other numbers of :func:`camera_table` are means weighted by frames.
+    """
     if cameras.empty:
         return pd.DataFrame(columns=["camera", "sequences", "frames", "images"])
     rows = []
@@ -183,11 +188,11 @@ def camera_groups(cameras: pd.DataFrame) -> pd.DataFrame:
 
 
 def worst_first(table: pd.DataFrame) -> pd.Series:
-    """Rank of each sequence, 1 = worst: by the mean of its ranks in several measures.
+    """Return the rank of each sequence, 1 = worst, by its mean rank in several measures.
 
-    Share of flagged frames, body and object visible distance to the cloud, the 98th percentile of
-    penetration, and the stated error of each judged part, worst where nothing can be said. Without
-    an object there are no measures of it. Ranks need no weights between units.
+    The measures are: share of flagged frames, distances of the visible body and object to the
+    cloud, 98th percentile of penetration, and the stated error of each part (worst if none is
+    stated). Measures of the object are omitted without an object.
     """
     measures = pd.DataFrame(
         {
@@ -208,7 +213,7 @@ def worst_first(table: pd.DataFrame) -> pd.Series:
 
 
 def frame_table(sequences: Sequence[SequenceMetrics]) -> pd.DataFrame:
-    """One row a frame; millimetres, degrees, mm/frame^2 at 30 fps."""
+    """Return one row per frame; millimetres, degrees, mm/frame^2 at 30 fps."""
     parts = []
     for s in sequences:
         total = len(s)
@@ -244,20 +249,20 @@ def frame_table(sequences: Sequence[SequenceMetrics]) -> pd.DataFrame:
 
 
 def write(folder: Path, tables: Mapping[str, pd.DataFrame]) -> None:
-    """Write NAME.parquet and NAME.csv of each table; equal content, equal bytes."""
+    """Write NAME.parquet and NAME.csv of each table; equal content gives equal bytes."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, table in tables.items():
         table.to_parquet(folder / f"{name}.parquet", index=False)
         rounded = table.assign(
             **{c: _significant(table[c]) for c in table.select_dtypes("float").columns}
         )
-        # several times as fast as pandas' own, whose time was half of a large dataset's merging
+        # pyarrow writes csv several times as fast as pandas
         rows = pyarrow.Table.from_pandas(rounded, preserve_index=False)
         csv.write_csv(rows, folder / f"{name}.csv")
 
 
 def _significant(values: pd.Series) -> np.ndarray:
-    """Six significant digits; what is not finite stays."""
+    """Round finite values to six significant digits."""
     found = values.to_numpy(np.float64, copy=True)
     known = np.isfinite(found) & (found != 0)
     scale = 10.0 ** (5 - np.floor(np.log10(np.abs(found[known]))))

@@ -1,4 +1,4 @@
-"""The page's section on one object's track: its start, its evidence, its stated deviation."""
+"""Section of a page on the object's track: start, evidence and stated deviation."""
 
 from __future__ import annotations
 
@@ -24,46 +24,51 @@ from intercap_core.output.site.overlays import choose_frames
 from intercap_core.schemas import OBJECT_TRACK, SCENE
 from intercap_core.sequence_inputs import SequencePaths
 
-GOOD_OVERLAP = 0.7
-_ROWS = 5  # moments of the sheet
-_LEAST_MM, _LEAST_DEG = 5.0, 2.0  # heights of the charts at least
-_MOST_DEG = 90.0
+GOOD_OVERLAP = 0.7  # a view agrees from this IoU
+_ROWS = 5  # frames of the sheet
+_LEAST_MM, _LEAST_DEG = 5.0, 2.0  # least heights of the charts
+_MOST_DEG = 90.0  # largest deviation that the chart shows
 VIEW_STATES = {
-    "agrees": f"candidate kept, IoU from {GOOD_OVERLAP:g}",
-    "partly": "kept, less overlap",
-    "nothing": "none kept",
+    "agrees": f"candidate used, IoU {GOOD_OVERLAP:g} or more",
+    "partly": "candidate used, smaller IoU",
+    "nothing": "no candidate used",
 }
 TRACK_STATES = {
     "moving": "tracked",
     "resting": "at rest",
-    "doubtful": "another pose may be the true one",
-    "carried": "not seen, carried from annotated poses",
+    "doubtful": "ambiguous: another pose may be true",
+    "carried": "not visible, propagated from annotated poses",
     "lost": "lost",
-    "gone": "not seen for so long that it seems to have left",
+    "gone": "not visible for so long that it has probably left",
 }
 
 
 @dataclass(frozen=True, eq=False)
 class TrackFacts:
-    """One object's track; metres and radians inside, NaN = not known.
-
-    ``overlap``, ``depth``, ``contour`` (T, C) of each view; ``state`` (T,) of TRACK_STATES;
-    ``sigma_mm``, ``sigma_deg`` (T,) the largest stated deviation; ``recovered`` frames.
-    """
+    """The track of one object over T frames and C cameras; unknown values are NaN."""
 
     name: str
     object_: str
     seed: str
+    """Frame of the first pose and its source."""
     cameras: list[str]
     overlap: np.ndarray
+    """(T, C) IoU with the candidate."""
     depth: np.ndarray
+    """(T, C) residual of the depth, metres."""
     contour: np.ndarray
+    """(T, C) residual of the silhouette, pixels."""
     state: list[str]
+    """(T,) keys of TRACK_STATES."""
     sigma_mm: np.ndarray
+    """(T,) largest stated deviation of the position."""
     sigma_deg: np.ndarray
+    """(T,) largest stated deviation of the rotation."""
     recovered: list[int]
+    """Frames in which a lost object was found again."""
     sheet: Sheet | None
     note: str = ""
+    """Why there is no sheet, and doubts of the track."""
 
 
 def read_track(
@@ -71,11 +76,13 @@ def read_track(
     mesh: ObjectMesh,
     kept: Callable[[int, int], bytes],
 ) -> TrackFacts:
-    """Read and draw one track; ``kept(t, c)`` gives the RLE of the candidate that it kept.
+    """Read and draw one track.
 
-    What cannot be drawn is left out, with its reason in ``note``; of an object that was found in no
-    frame, that is why. Raises UserError as
-    :func:`artefacts.read` does.
+    Args:
+        kept: returns the RLE of the candidate that the track uses in frame t and camera c, b"" if
+            it uses none.
+
+    Raises UserError as :func:`artefacts.read` does.
     """
     with artefacts.read(paths.object_track, OBJECT_TRACK) as track:
         poses = np.array(
@@ -83,7 +90,7 @@ def read_track(
         )
         source = track.attributes["seed_source"]
         sheet, note = None, str(track.attributes["doubts"])
-        seed = "nowhere: it was found in no frame"
+        seed = "none: the object was found in no frame"
         if source != NO_TRACK:
             sheet, note = _sheet(paths.frames, paths.scene, mesh, poses, kept, track["overlap"])
             found = "annotated" if source == "annotated" else "found by search"
@@ -120,11 +127,11 @@ def _sheet(
     kept: Callable[[int, int], bytes],
     overlap: np.ndarray,
 ) -> tuple[Sheet | None, str]:
-    """The sheet, or None and why: one unreadable image must not prevent the report."""
+    """Draw the sheet; if an image is unreadable, return None and the reason."""
     try:
-        with artefacts.read(scene, SCENE) as setting, Frames.open(frames) as images:
-            moments = images.showing(setting["image_of"])
-            rig = Rig.from_artefact(setting)
+        with artefacts.read(scene, SCENE) as refined, Frames.open(frames) as images:
+            moments = images.showing(refined["image_of"])
+            rig = Rig.from_artefact(refined)
             shown = choose_frames(1 - _mean(overlap, 1), _ROWS)
             return track_sheet(moments, rig, mesh, poses, kept, shown), ""
     except (UserError, ValueError) as error:  # ValueError: a candidate that does not decode
@@ -132,19 +139,20 @@ def _sheet(
 
 
 def context(facts: TrackFacts) -> dict[str, Any]:
-    """What the template needs; the sheet is left as it is."""
+    """Return the variables of the template track.html.j2."""
     total = len(facts.state)
     states = charts.state_runs(facts.state, TRACK_STATES)
-    rows = [charts.StateRow("track", states, _counted(facts))]
+    rows = [charts.StateRow("track", states, _state_counts(facts))]
     for c, name in enumerate(facts.cameras):
         overlap = facts.overlap[:, c]
         kept = np.isfinite(overlap)
         seen = ["nothing" if not k else _grade(v) for k, v in zip(kept, overlap, strict=True)]
-        beside = f"{100 * kept.mean():.0f} % kept"
+        label = f"{100 * kept.mean():.0f} % used"
         if kept.any():
-            beside += f" · IoU {_median(overlap):.2f}"
-            beside += _also(1e3 * facts.depth[:, c], "mm") + _also(facts.contour[:, c], "px")
-        rows.append(charts.StateRow(name, charts.state_runs(seen, VIEW_STATES), beside))
+            label += f" · IoU {_median(overlap):.2f}"
+            label += _median_text(1e3 * facts.depth[:, c], "mm")
+            label += _median_text(facts.contour[:, c], "px")
+        rows.append(charts.StateRow(name, charts.state_runs(seen, VIEW_STATES), label))
     marks = [(t - 1, f"{t}: found again") for t in facts.recovered]
     return {
         "name": facts.name,
@@ -156,8 +164,8 @@ def context(facts: TrackFacts) -> dict[str, Any]:
         "charts": [
             _chart(values, label, least, most)
             for values, label, least, most in (
-                (facts.sigma_mm, "deviation of place, mm", _LEAST_MM, np.inf),
-                (facts.sigma_deg, "deviation of turn, degrees", _LEAST_DEG, _MOST_DEG),
+                (facts.sigma_mm, "deviation of the position, mm", _LEAST_MM, np.inf),
+                (facts.sigma_deg, "deviation of the rotation, degrees", _LEAST_DEG, _MOST_DEG),
             )
             if np.isfinite(values).any()
         ],
@@ -171,7 +179,7 @@ def context(facts: TrackFacts) -> dict[str, Any]:
 
 
 def _states(**flags: np.ndarray) -> list[str]:
-    """The state (T,) of each frame: the first of the ``flags`` (T,) that is set, by their names."""
+    """Return for each frame the name of its first set flag (T,), "moving" if none is set."""
     return [
         next((name for name, own in zip(flags, of_frame, strict=True) if own), "moving")
         for of_frame in zip(*flags.values(), strict=True)
@@ -182,13 +190,13 @@ def _grade(overlap: float) -> str:
     return "agrees" if overlap >= GOOD_OVERLAP else "partly"
 
 
-def _counted(facts: TrackFacts) -> str:
+def _state_counts(facts: TrackFacts) -> str:
     parts = [
         f"{n} {word}"
         for word in ("gone", "lost", "carried", "doubtful", "resting")
         if (n := facts.state.count(word))
     ]
-    return " · ".join(parts) or "no frame in doubt"
+    return " · ".join(parts) or "no doubtful frame"
 
 
 def _chart(values: np.ndarray, label: str, least: float, most: float) -> str:
@@ -205,7 +213,7 @@ def _chart(values: np.ndarray, label: str, least: float, most: float) -> str:
     )
 
 
-def _also(values: np.ndarray, unit: str) -> str:
+def _median_text(values: np.ndarray, unit: str) -> str:
     return f" · {_median(values):.1f} {unit}" if np.isfinite(values).any() else ""
 
 
@@ -214,13 +222,13 @@ def _median(values: np.ndarray) -> float:
 
 
 def _mean(values: np.ndarray, axis: int) -> np.ndarray:
-    """Means over what is known; 0 where nothing is."""
+    """Average finite values; 0 where none is finite."""
     known = np.isfinite(values)
     return np.where(known, values, 0).sum(axis) / np.maximum(known.sum(axis), 1)
 
 
 def _largest(covariance: np.ndarray) -> np.ndarray:
-    """The largest deviation (T,) of covariances (T, 3, 3); NaN where none is stated."""
+    """Return the largest deviation (T,) of covariances (T, 3, 3); NaN where they are."""
     result = np.full(len(covariance), np.nan)
     known = np.isfinite(covariance).all((1, 2))
     result[known] = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance[known])[:, -1], 0))
@@ -229,7 +237,7 @@ def _largest(covariance: np.ndarray) -> np.ndarray:
 
 TRACK_COLOUR, CANDIDATE_COLOUR = (255, 158, 46), (64, 224, 255)  # RGB
 _CELL_PX = 148
-_REACH = 1.35  # of the object's diameter: what a cell shows
+_REACH = 1.35  # side of a cell in diameters of the object
 
 
 def track_sheet(
@@ -240,10 +248,12 @@ def track_sheet(
     kept: Callable[[int, int], bytes],
     frames: Sequence[int],
 ) -> Sheet:
-    """Draw the track's outline and that of the kept candidate over crops of the images.
+    """Draw the outlines of track and candidate over crops of the images.
 
-    ``poses`` (T, 4, 4) master_from_object; ``kept(t, c)`` the RLE of the candidate that the track
-    kept in camera c, empty = none. ``images`` show each frame's moment.
+    Args:
+        images: images by the frame that they show.
+        poses: (T, 4, 4) master_from_object.
+        kept: as in :func:`read_track`.
     """
 
     def draw(camera: Camera, t: int, c: int, rgb: np.ndarray) -> np.ndarray | None:
@@ -259,7 +269,7 @@ def _cell(
     pose: np.ndarray,
     rle: bytes,
 ) -> np.ndarray | None:
-    """The image around the object, enlarged to a cell, with both outlines; None: not in view."""
+    """Draw the image around the object with both outlines; None if it is not in view."""
     lens = camera.colour
     in_camera = camera.colour_from_master @ pose
     centre = in_camera[:3, :3] @ mesh.centre_of_mass + in_camera[:3, 3]
@@ -268,7 +278,7 @@ def _cell(
     x, y = lens.project(centre[None])[0]
     size = max(int(_REACH * mesh.diameter * lens.fx / centre[2]), 16)
     crop = Crop(int(x) - size // 2, int(y) - size // 2, size, _CELL_PX)
-    cell = crop.of(rgb)
+    cell = crop.extract(rgb)
     drawn = render(mesh.vertices, mesh.faces, lens, in_camera, cull_back=mesh.watertight)
     crop.outline(cell, drawn.mask, drawn.x0, drawn.y0, TRACK_COLOUR)
     if rle:

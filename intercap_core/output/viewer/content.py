@@ -1,5 +1,4 @@
-"""What the viewer shows of a sequence, from its artefacts: bodies, object, clouds, cameras, images,
-contact and flags, all z-up."""
+"""Data of the viewer, from a sequence's artefacts, in the z-up frame."""
 
 from __future__ import annotations
 
@@ -31,24 +30,26 @@ from intercap_core.output.viewer.skinning import skinned
 from intercap_core.schemas import BODY_FIT, JOINT, METRICS, OBJECT_TRACK, SCENE
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 
-MOMENTS = 40  # of clouds and images: every n-th frame, so that at most so many have them
-TRUE_MOMENTS = 60  # of the true body, which has no skeleton of its own to move it by
-CLOUD_POINTS = (2500, 800)  # of person and object in a moment, spread evenly
+MOMENTS = 40  # at most this many evenly spread frames have clouds and images
+TRUE_MOMENTS = 60  # at most this many frames have the true body, which has no skeleton
+CLOUD_POINTS = (2500, 800)  # at most this many points of person and object per frame
 IMAGE_WIDTH_PX = 256
-MESH_FACES = 20000  # of an object; a scan with more is drawn with every n-th face's corner alone
+MESH_FACES = 20000  # an object with more faces is simplified
 _JPEG_QUALITY = 70
-_SURVEY_STEP = 7  # of body vertices, to find the clouds near the meshes
+_SURVEY_STEP = 7  # every n-th body vertex finds the points near the meshes
 
-IMPORTED = "another program's"  # in place of the joint fit
+IMPORTED = "another program's"  # label of imported results
 VERSIONS = {"joint": "joint fit", "sequential": "sequential fits", "truth": "truth"}
 
 
 @dataclass
 class Content:
-    """A header for JSON and arrays by name, of T frames."""
+    """The viewer's data of T frames."""
 
     header: dict[str, Any] = field(default_factory=dict)
+    """Serialized as JSON."""
     arrays: dict[str, np.ndarray] = field(default_factory=dict)
+    """By name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,13 +61,13 @@ class _Body:
 
 
 def gather(paths: SequencePaths, models: SequenceModels, *, truth: Path | None = None) -> Content:
-    """The data that the viewer shows of a sequence.
+    """Collect the data of a sequence.
 
-    The artefacts of frames, scene and body_fit must exist; of the other stages, those that exist
-    are shown. Raises UserError if an artefact is missing or broken.
+    The artefacts of frames, scene and body_fit must exist; those of other stages are optional.
+    Raises UserError if an artefact is missing or broken.
     """
     object_, body_models, gender = models.object_, models.body_models, models.gender
-    there = {stage: path for stage, path in paths.by_stage().items() if path.is_file()}
+    existing = {stage: path for stage, path in paths.by_stage().items() if path.is_file()}
     content = Content()
     with artefacts.read(paths.scene, SCENE) as scene:
         zup, rig, image_of = scene["zup_from_master"], Rig.from_artefact(scene), scene["image_of"]
@@ -75,8 +76,8 @@ def gather(paths: SequencePaths, models: SequenceModels, *, truth: Path | None =
     bodies: dict[str, _Body] = {}
     flags: Sequence[str] = ()
     imported = False
-    if "joint" in there:
-        with artefacts.read(there["joint"], JOINT) as joint:
+    if "joint" in existing:
+        with artefacts.read(existing["joint"], JOINT) as joint:
             model = load_model(body_models, gender, joint)
             bodies["joint"] = _Body(
                 model, read_parameters(joint), joint["rotation"], joint["translation"]
@@ -85,17 +86,17 @@ def gather(paths: SequencePaths, models: SequenceModels, *, truth: Path | None =
             flags = joint.text("flag_reason")
             imported = "made_by" in joint.attributes
             _add_stated_contact(content, joint, model)
-    bodies["sequential"] = _sequential(paths.body_fit, there, body_models, gender)
+    bodies["sequential"] = _sequential(paths.body_fit, existing, body_models, gender)
     names = {**VERSIONS, "joint": IMPORTED} if imported else VERSIONS
     shown = next(iter(bodies.values()))
     total = shown.parameters.batch
-    if "metrics" in there:
-        flags = _add_measured(content, there["metrics"], shown.model.num_vertices)
+    if "metrics" in existing:
+        flags = _add_measured(content, existing["metrics"], shown.model.num_vertices)
     mesh = None
     known = np.isfinite(shown.translation).all(1)
     if object_ is not None and any(np.isfinite(b.translation).any() for b in bodies.values()):
         mesh = ObjectMesh.load(object_)
-        vertices, faces, colours = _light(mesh)
+        vertices, faces, colours = _simplified(mesh)
         content.arrays["object/vertices"] = vertices.astype(np.float32)
         content.arrays["object/faces"] = faces.astype(np.uint32)
         content.arrays["object/colours"] = colours
@@ -119,7 +120,7 @@ def gather(paths: SequencePaths, models: SequenceModels, *, truth: Path | None =
         }
         _add_cameras(content, rig, zup)
         _add_images(content, images, rig, moments)
-        if {"detections", "person", "object_track"} <= there.keys():
+        if {"detections", "person", "object_track"} <= existing.keys():
             objects = None if mesh is None or not known.any() else mesh
             clouds = read_clouds(images, rig, bias, image_of, paths)
             _add_clouds(content, clouds, shown, objects, moments, zup)
@@ -131,20 +132,20 @@ def gather(paths: SequencePaths, models: SequenceModels, *, truth: Path | None =
 
 
 def _sequential(
-    body_fit: Path, there: Mapping[str, Path], body_models: BodyModels, gender: str
+    body_fit: Path, existing: Mapping[str, Path], body_models: BodyModels, gender: str
 ) -> _Body:
     with artefacts.read(body_fit, BODY_FIT) as fit:
         model, parameters = load_model(body_models, gender, fit), read_parameters(fit)
     rotation = np.full((parameters.batch, 3, 3), np.nan)
     translation = np.full((parameters.batch, 3), np.nan)
-    if "object_track" in there:
-        with artefacts.read(there["object_track"], OBJECT_TRACK) as track:
+    if "object_track" in existing:
+        with artefacts.read(existing["object_track"], OBJECT_TRACK) as track:
             rotation, translation = track["rotation"], track["translation"]
     return _Body(model, parameters, rotation, translation)
 
 
 def _add_stated_contact(content: Content, joint: Artefact, model: BodyModel) -> None:
-    """Probability by region (T, R) in 255ths, and the region of each vertex, 255 = none."""
+    """Add the probability by region (T, R) in 255ths, and each vertex's region, 255 = none."""
     probability = np.nan_to_num(joint["contact_probability"])
     names = joint.text("region_names")
     region = np.full(model.num_vertices, 255, np.uint8)
@@ -156,22 +157,22 @@ def _add_stated_contact(content: Content, joint: Artefact, model: BodyModel) -> 
 
 
 def _add_measured(content: Content, metrics: Path, num_vertices: int) -> Sequence[str]:
-    """Which vertices touch, a bit each (T, ceil(V / 8)); returns the reasons of flags."""
+    """Add touching vertices as bits (T, ceil(V / 8)); return the reasons of flags."""
     with artefacts.read(metrics, METRICS) as measured:
         if "body_to_object" in measured:
             touching = measured["body_to_object"] <= CONTACT_M
             if touching.shape[1] != num_vertices:
                 raise UserError(
                     f"{metrics}: sequence {measured.attributes['sequence']!r} was measured on a "
-                    f"body of {touching.shape[1]} vertices, and its fitted body has "
+                    f"body of {touching.shape[1]} vertices, but its fitted body has "
                     f"{num_vertices}; re-run stage 'metrics'"
                 )
             content.arrays["contact/touching"] = np.packbits(touching, axis=1, bitorder="little")
         return measured.text("flag_reason")
 
 
-def _light(mesh: ObjectMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices, faces and colours (Vo, 3) uint8, with at most MESH_FACES faces."""
+def _simplified(mesh: ObjectMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return vertices, faces and colours (Vo, 3) uint8 with at most MESH_FACES faces."""
     if len(mesh.faces) <= MESH_FACES:
         return mesh.vertices, mesh.faces, mesh.colours.astype(np.uint8)
     import open3d as o3d
@@ -186,25 +187,25 @@ def _light(mesh: ObjectMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _add_body(content: Content, name: str, body: _Body, zup: np.ndarray) -> None:
-    found = skinned(body.model, body.parameters)
-    transforms = np.einsum("ab,tjbc->tjac", zup[:3, :3], found.transforms)
+    skin = skinned(body.model, body.parameters)
+    transforms = np.einsum("ab,tjbc->tjac", zup[:3, :3], skin.transforms)
     transforms[..., 3] += zup[:3, 3]
-    largest = np.abs(found.modes).max((1, 2), initial=1e-9)
+    largest = np.abs(skin.modes).max((1, 2), initial=1e-9)
     content.arrays |= {
-        f"{name}/rest": found.rest.astype(np.float32),
-        f"{name}/joints": found.joints.astype(np.uint8),
-        f"{name}/weights": np.rint(65535 * found.weights).astype(np.uint16),
+        f"{name}/rest": skin.rest.astype(np.float32),
+        f"{name}/joints": skin.joints.astype(np.uint8),
+        f"{name}/weights": np.rint(65535 * skin.weights).astype(np.uint16),
         f"{name}/transforms": transforms.astype(np.float32),
-        f"{name}/modes": np.rint(found.modes / largest[:, None, None] * 32767).astype(np.int16),
-        f"{name}/amounts": (found.amounts * (largest / 32767)).astype(np.float32),
+        f"{name}/modes": np.rint(skin.modes / largest[:, None, None] * 32767).astype(np.int16),
+        f"{name}/amounts": (skin.amounts * (largest / 32767)).astype(np.float32),
     }
-    content.header.setdefault("error_mm", {})[name] = round(1e3 * found.error_m, 3)
+    content.header.setdefault("error_mm", {})[name] = round(1e3 * skin.error_m, 3)
 
 
 def _add_poses(
     content: Content, name: str, rotation: np.ndarray, translation: np.ndarray, zup: np.ndarray
 ) -> None:
-    """(T, 3, 4) zup_from_object; NaN where there is none."""
+    """Add zup_from_object (T, 3, 4), NaN without a pose."""
     poses = np.concatenate(
         [zup[:3, :3] @ rotation, (translation @ zup[:3, :3].T + zup[:3, 3])[..., None]], 2
     )
@@ -212,7 +213,7 @@ def _add_poses(
 
 
 def _add_cameras(content: Content, rig: Rig, zup: np.ndarray) -> None:
-    """Pose, focal lengths, centre and size of each camera that is known."""
+    """Add pose, focal lengths, centre and size of each camera with a known pose."""
     cameras = []
     for camera in rig:
         pose = zup @ camera.master_from_colour
@@ -231,8 +232,7 @@ def _add_cameras(content: Content, rig: Rig, zup: np.ndarray) -> None:
 
 
 def _add_images(content: Content, images: Frames, rig: Rig, moments: np.ndarray) -> None:
-    """JPEGs end to end, and where each begins, by moment and camera; straightened, so that they lie
-    on a plane before the camera."""
+    """Add concatenated undistorted JPEGs by frame and camera, and the offset of each."""
     data, starts = [], [0]
     names = [camera["name"] for camera in content.header["cameras"]]
     for t in moments:
@@ -242,7 +242,7 @@ def _add_images(content: Content, images: Frames, rig: Rig, moments: np.ndarray)
             packet = b""
             try:
                 image = images.colour(int(t), c, reduction=4)
-            except UserError:  # an image that does not decode is told by its stages
+            except UserError:  # the stages report images that do not decode
                 image = None
             if image is not None:
                 lens = camera.colour.scaled(IMAGE_WIDTH_PX / camera.colour.width)
@@ -264,7 +264,7 @@ def _add_clouds(
     moments: np.ndarray,
     zup: np.ndarray,
 ) -> None:
-    """Points of person and object in each moment, quantised, and where each begins."""
+    """Add quantised points of person and object by frame, and the offset of each frame."""
     random = np.random.default_rng(0)
     parts: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     for t in moments:
@@ -288,13 +288,13 @@ def _add_clouds(
 
 
 def _add_truth(content: Content, true: Truth, zup: np.ndarray) -> None:
-    """The true body on the fitted mesh, every n-th frame, and the true object."""
+    """Add the true body in every n-th frame and the true object."""
     if true.vertices is not None:
         total = len(true.vertices)
         chosen = np.unique(np.linspace(0, total - 1, min(total, TRUE_MOMENTS)).round().astype(int))
         vertices = apply(zup, true.vertices[chosen].reshape(-1, 3).astype(np.float64))
         steps, low, step = quantised(vertices.reshape(len(chosen), -1, 3))
-        # differences between moments deflate to half of what places do; they wrap around
+        # differences between frames compress to half the size of positions; they may wrap around
         moved = np.diff(steps, axis=0, prepend=np.zeros_like(steps[:1]))
         content.arrays["truth/vertices"] = moved
         content.header["truth"] = {"moments": chosen.tolist(), "low": low, "step": step}
@@ -306,7 +306,7 @@ def _add_truth(content: Content, true: Truth, zup: np.ndarray) -> None:
 
 
 def quantised(points: np.ndarray) -> tuple[np.ndarray, list[float], float]:
-    """Points (..., 3) as uint16 steps above a corner, the corner (3,) and the step, metres."""
+    """Quantise points (..., 3); return uint16 steps, their origin (3,) and step size, metres."""
     flat = points.reshape(-1, 3)
     low = flat.min(0) if len(flat) else np.zeros(3)
     extent = float((flat.max(0) - low).max()) if len(flat) else 1.0

@@ -1,4 +1,8 @@
-"""The viewer's part of a page, and a page of its own."""
+"""The viewer in a page, and a page of its own, with its data in a script in the same folder.
+
+Pages opened from disk may not read files, but may load scripts. The script calls the viewer with
+one argument in base64: a JSON header and the concatenated arrays, compressed.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +20,7 @@ from intercap_core.output.viewer.content import gather
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 
 SCRIPT = "viewer.js"
-# The file beside the page is of the same origin where a server gives it, and of none on a disk;
-# pictures are made from the data.
+# The script has the same origin on a server and scheme file: on disk; images are made from data.
 POLICY = (
     "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; "
     "script-src 'self' file: 'unsafe-inline'"
@@ -25,17 +28,17 @@ POLICY = (
 
 
 def style() -> str:
-    """What stands in the page's style sheet."""
+    """Return the viewer's style sheet."""
     return (DATA / "viewer.css").read_text(encoding="utf-8")
 
 
 def element() -> str:
-    """What stands where the viewer is to be; :func:`load` comes after it."""
+    """Return the HTML element of the viewer; :func:`load` comes after it."""
     return (DATA / "viewer.html").read_text(encoding="utf-8")
 
 
 def load() -> str:
-    """What loads the file that lies beside the page, once the page stands."""
+    """Return the HTML element that loads the script."""
     return f'<script src="{SCRIPT}" async></script>'
 
 
@@ -47,12 +50,12 @@ def write_script(
     truth: Path | None = None,
 ) -> None:
     """Write the viewer with a sequence's data; see :func:`.content.gather` for the arguments."""
-    found = gather(paths, models, truth=truth)
-    output.write_text(script(found.header, found.arrays), encoding="utf-8")
+    content = gather(paths, models, truth=truth)
+    output.write_text(script(content.header, content.arrays), encoding="utf-8")
 
 
 def standalone(name: str) -> str:
-    """A page that is nothing but the viewer of a sequence."""
+    """Return a page that contains only the viewer."""
     text = (DATA / "standalone.html").read_text(encoding="utf-8")
     parts = {"POLICY": POLICY, "NAME": html.escape(name), "STYLE": style(), "VIEWER": element(),
              "LOAD": load()}  # fmt: skip
@@ -66,7 +69,7 @@ _TYPES = {"float32": "<f4", "uint32": "<u4", "uint16": "<u2", "int16": "<i2", "u
 
 
 def script(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
-    """The viewer's code with its data: a classic script, which fills the page's viewer."""
+    """Return the viewer's code and data as a classic script."""
     code = "\n".join(
         (DATA / name).read_text(encoding="utf-8") for name in ("three.js", "viewer.js")
     )
@@ -74,8 +77,11 @@ def script(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
 
 
 def payload(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
-    """Base64 of: length of the header (uint32), the header, the arrays, each from a multiple of
-    four bytes on."""
+    """Serialize header and arrays.
+
+    Returns base64 of the compressed bytes: length of the header (uint32), header, and arrays, each
+    aligned to four bytes.
+    """
     places: dict[str, dict[str, Any]] = {}
     chunks: list[bytes] = []
     length = 0
@@ -93,7 +99,7 @@ def payload(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
 
 
 def unpacked(text: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """What :func:`payload` was made from; the viewer reads it the same way."""
+    """Parse the result of :func:`payload`, as the viewer does."""
     whole = zlib.decompress(base64.b64decode(text))
     start = 4 + int.from_bytes(whole[:4], "little")
     header = json.loads(whole[4:start])

@@ -95,7 +95,7 @@ def test_images_alone_are_shown_and_can_be_annotated(settings: Path) -> None:
         if path.stem != "frames":
             path.unlink()
     with served(settings) as server, open_page(server) as page:
-        assert "images alone" in page.page.locator("#banners").inner_text()
+        assert "only images" in page.page.locator("#banners").inner_text()
         page.page.keyboard.press("ArrowRight")
         page.wait("document.body.dataset.drawn === '1'")
         page.page.keyboard.press("x")

@@ -107,11 +107,11 @@ def test_the_readme_says_it_of_every_format(everything: Path) -> None:
     [
         ([0, 0, 1], "z"),
         ([0, -1, 0], "-y"),
-        (Rotation.from_euler("x", 5, degrees=True).apply([0, -1, 0]), "none: the vector up is"),
-        ([np.nan] * 3, "not known"),
+        (Rotation.from_euler("x", 5, degrees=True).apply([0, -1, 0]), "none: see the vector up"),
+        ([np.nan] * 3, "unknown"),
     ],
 )
 def test_an_axis_is_named_where_one_is_up(up: Any, axis: str) -> None:
     place = Coordinates("somewhere", np.array(up, float))
-    assert place.up_axis == axis and place.told()["up_axis"] == axis
-    json.dumps(place.told(), allow_nan=False)
+    assert place.up_axis == axis and place.to_json()["up_axis"] == axis
+    json.dumps(place.to_json(), allow_nan=False)

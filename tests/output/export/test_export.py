@@ -34,7 +34,7 @@ from intercap_core.inputs.arrays import read_pickle
 from intercap_core.output.export import bop, coco
 from intercap_core.output.export.about import About, BodyFile, Verdict
 from intercap_core.output.export.motion import read_motion
-from intercap_core.output.export.silhouettes import Exposures, object_poses
+from intercap_core.output.export.silhouettes import Scenes
 from intercap_core.schemas import METRICS
 from intercap_core.stages import export
 from tests.helpers import exported
@@ -189,11 +189,10 @@ def test_bop_poses_are_those_of_each_image_when_it_was_exposed(
     slip = np.zeros((total, 3), np.int32)
     slip[2:, 1] = 1
     image_of = images_of_moments(slip, np.ones((total, 3), bool))
-    exposures = Exposures(image_of, times, late)
-    poses = list(object_poses(motion, capture.rig, exposures))
+    scenes = Scenes(motion, capture.rig, capture.mesh, image_of, times, late, np.zeros((0, 0, 3)))
     nothing = Verdict((), np.zeros((0, total)), ())
     about = About("cap", BodyFile.of(motion.model, "neutral"), [""] * total, None, nothing)
-    bop.write(tmp_path / "bop", motion, capture.rig, capture.mesh, 9, exposures, about, None, poses)
+    bop.write(tmp_path / "bop", scenes, 9, about, masks=False)
     path = tmp_path / "bop" / "scenes" / "000001"
     entries = json.loads((path / "scene_gt.json").read_text())
     assert sorted(entries) == sorted(json.loads((path / "scene_camera.json").read_text()))

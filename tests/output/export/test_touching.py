@@ -243,7 +243,7 @@ def test_metrics_without_the_object_are_named(capture: fitted.Capture, tmp_path:
     made, path = exported.changed(capture, "metrics", tmp_path)
     with h5py.File(path, "r+") as file:
         del file["body_to_object"]
-    with pytest.raises(UserError, match="holds no body_to_object, though sequence 'cap' has"):
+    with pytest.raises(UserError, match="has no body_to_object, although sequence 'cap' has"):
         exported.run(made, tmp_path / "out")
 
 
@@ -255,5 +255,5 @@ def test_fits_of_another_number_of_frames_are_named(
         made = fitted.Capture(
             **{**vars(capture), "paths": capture.paths | {stage: longer.paths[stage]}}
         )
-        with pytest.raises(UserError, match=f"6 frames.*sequence 'cap' 5; re-run stage '{stage}'"):
+        with pytest.raises(UserError, match=f"6 frames.*'cap' has 5; re-run stage '{stage}'"):
             exported.run(made, tmp_path / "out")

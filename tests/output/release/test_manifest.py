@@ -68,18 +68,18 @@ def test_differences_are_told_apart(folder: Path) -> None:
 def test_kinds_and_sequences_choose(folder: Path) -> None:
     entries = manifest.write(folder, {}, kinds=("site", "export"), sequences=["s02"])
     assert [one.path for one in entries] == ["site/index.html", "site/sequences/s02/index.html"]
-    with pytest.raises(UserError, match="holds nothing to release of export"):
+    with pytest.raises(UserError, match="no files to release"):
         manifest.write(folder, {}, kinds=("export",), sequences=["s02"])
 
 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (None, "there is no such file"),
-        ("{", "is no list of released files"),
-        ("[]", "is no list of released files"),
-        ('{"format": 9, "files": []}', "is of format 9"),
-        ('{"format": 1, "files": [{"path": "a/b.h5"}]}', "is no list of released files"),
+        (None, "no such file"),
+        ("{", "is not a manifest"),
+        ("[]", "is not a manifest"),
+        ('{"format": 9, "files": []}', "has format 9"),
+        ('{"format": 1, "files": [{"path": "a/b.h5"}]}', "is not a manifest"),
         ('{"format": 1, "files": [{"path": "../b", "kind": "card", "bytes": 1, "sha256": ""}]}',
          "is not a file of this dataset"),
         ('{"format": 1, "files": [{"path": "/etc/x", "kind": "card", "bytes": 1, "sha256": ""}]}',

@@ -35,12 +35,12 @@ def test_ten_equal_subjects_give_two() -> None:
     ("frames", "share", "named", "test", "why"),
     [
         ({"a": 5}, 0.2, (), (), "only one"),
-        ({}, 0.2, (), (), "there is none"),
-        ({"a": 5, "b": 5}, 0.0, (), (), "none is asked for"),
+        ({}, 0.2, (), (), "there is no group"),
+        ({"a": 5, "b": 5}, 0.0, (), (), "test part is 0"),
         ({"a": 5, "b": 500}, 0.2, (), ("a",), ""),
         ({"a": 5, "b": 5, "c": 5}, 0.2, ("b", "not_recorded"), ("b",), ""),
         ({"a": 5, "b": 5}, 0.0, ("b",), ("b",), ""),
-        ({"a": 5, "b": 5}, 0.2, ("a", "b"), (), "all there are"),
+        ({"a": 5, "b": 5}, 0.2, ("a", "b"), (), "all groups"),
         ({"a": 5, "b": 5}, 0.2, ("x",), (), "none of x"),
     ],
 )

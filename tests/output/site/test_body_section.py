@@ -44,14 +44,14 @@ def test_states_of_fit_and_views_and_deviations_by_joint(made: fitted.Capture) -
     assert facts.sigma_mm[0, 20] == pytest.approx(20)
     found = body_section.context(facts)
     timeline = found["timeline"]
-    assert "1 bridged" in timeline and timeline.count('class="state lost"') == 1
+    assert "1 interpolated" in timeline and timeline.count('class="state lost"') == 1
     # 8 px of 1080 rows are 2 px of 270
     assert timeline.count('class="state agrees"') == 1
     assert timeline.count('class="state partly"') == 1
     assert timeline.count('class="state nothing"') == 1
-    assert "100 % seen · 1.9 px" in timeline and "0 % seen" in timeline
+    assert "100 % visible · 1.9 px" in timeline and "0 % visible" in timeline
     over_time, by_joint = found["charts"]
-    assert "deviation of the least sure joint" in over_time
+    assert "largest deviation of a joint" in over_time
     assert "left wrist" in by_joint and "20.0, up to 20.0" in by_joint
     assert "10.0, up to 40.0" in by_joint and "right fingers" in by_joint
 
@@ -68,8 +68,8 @@ def test_another_body_file_than_was_fitted_is_named(made: fitted.Capture, tmp_pa
 def test_the_sheet_shows_fit_and_keypoints(made: fitted.Capture) -> None:
     sheet = _facts(made).sheet
     assert sheet is not None and len(sheet.frames) == 4 and 1 in sheet.frames  # the worst one
-    bgr = cv2.imdecode(np.frombuffer(sheet.jpeg, np.uint8), cv2.IMREAD_COLOR)
-    assert bgr.shape == (sheet.height, sheet.width, 3)
+    bgr = cv2.imdecode(np.frombuffer(sheet.image.data, np.uint8), cv2.IMREAD_COLOR)
+    assert bgr.shape == (sheet.image.height, sheet.image.width, 3)
     first, *others = np.array_split(bgr[..., ::-1].astype(int), 3, axis=1)
     assert all((np.abs(c - FIT_COLOUR).max(-1) < 70).sum() > 100 for c in (first, *others))
 
@@ -96,13 +96,13 @@ def test_a_body_that_no_camera_sees_is_not_drawn(made: fitted.Capture, tmp_path:
         fit["transl"][:, 1] += 50.0  # far under the floor
     sheet = _facts(made, body_fit=path).sheet
     assert sheet is not None
-    bgr = cv2.imdecode(np.frombuffer(sheet.jpeg, np.uint8), cv2.IMREAD_COLOR)
+    bgr = cv2.imdecode(np.frombuffer(sheet.image.data, np.uint8), cv2.IMREAD_COLOR)
     assert (np.abs(bgr[..., ::-1].astype(int) - FIT_COLOUR).max(-1) < 70).sum() < 50
 
 
 def test_a_crop_places_pixels_and_outlines_alike() -> None:
     crop = Crop(10, 20, 40, 80)
-    assert crop.placed(np.array([[10.0, 20.0], [49.0, 59.0]])).tolist() == [[0, 0], [78, 78]]
+    assert crop.to_cell(np.array([[10.0, 20.0], [49.0, 59.0]])).tolist() == [[0, 0], [78, 78]]
     cell = np.zeros((80, 80, 3), np.uint8)
     crop.outline(cell, np.ones((10, 10), bool), 20, 30, (255, 255, 255))
     rows, columns = np.nonzero(cell[..., 0])

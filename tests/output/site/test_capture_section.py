@@ -15,8 +15,9 @@ import pytest
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.output.site import capture_section, charts
-from intercap_core.output.site.capture_pictures import CapturePicture, choose_set, floor_profiles
-from intercap_core.output.site.point_cloud import FusedCloud, View, fuse, splat
+from intercap_core.output.site.capture_pictures import choose_set, floor_profiles
+from intercap_core.output.site.drawing import EncodedImage
+from intercap_core.output.site.point_cloud import FusedCloud, Viewpoint, fuse, splat
 from tests.helpers import fitted_capture as fitted
 from tests.helpers.reduced_capture import Reduction
 
@@ -31,7 +32,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
     return found
 
 
-def _decoded(picture: CapturePicture) -> np.ndarray:
+def _decoded(picture: EncodedImage) -> np.ndarray:
     image = cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_COLOR)
     assert image.shape == (picture.height, picture.width, 3)
     return image
@@ -58,7 +59,7 @@ def test_facts_of_cameras_and_pairs(made: fitted.Capture) -> None:
     assert moved == pytest.approx([0, 0.012, 0], abs=1e-6)
     assert [camera.turned_deg for camera in facts.cameras] == pytest.approx([0, 0, 0], abs=1e-4)
     assert [pair.name for pair in facts.pairs] == ["k1–k2", "k2–k3", "k3–k1"]
-    assert "1,000 points" in facts.ground and "4.0 mm" in facts.ground
+    assert "1,000 supporting points" in facts.ground and "4.0 mm" in facts.ground
 
 
 def test_a_depth_bias_is_told_with_its_deviation(made: fitted.Capture, tmp_path: Path) -> None:
@@ -128,8 +129,8 @@ def test_the_timeline_tells_how_late_slipped_images_are(made: fitted.Capture) ->
         slip=[0, 2, 2, 1, 0, 0],
     )
     drawn = capture_section.context(replace(facts, cameras=[facts.cameras[0], late]))["timeline"]
-    assert "1–2: shows an older moment, 2 frames before" in drawn
-    assert "3: shows an older moment, 1 frame before" in drawn
+    assert "1–2: shows an earlier frame, 2 frames before" in drawn
+    assert "3: shows an earlier frame, 1 frame before" in drawn
     assert "3 slipped by 1 or 2" in drawn and "1 missing" in drawn
 
 
@@ -169,18 +170,18 @@ def _both(first: FusedCloud, second: FusedCloud) -> FusedCloud:
 
 
 def test_near_points_hide_far_ones_and_backs_are_not_drawn() -> None:
-    view = View.towards(np.zeros(3), 0.0, 0.0, 4.0, 100.0, (60, 60))
+    view = Viewpoint.towards(np.zeros(3), 0.0, 0.0, 4.0, 100.0, (60, 60))
     cloud = _both(_wall(0.0), _wall(1.0, camera=1))
     picture, depth = splat(cloud, view)
     assert depth[30, 30] == pytest.approx(3.0) and picture[30, 30, 0] == pytest.approx(0.75)
     assert depth[15:45, 15:45].max() == pytest.approx(3.0)  # no holes
     assert np.isinf(
-        splat(_wall(0.0), View.towards(np.zeros(3), np.pi, 0.0, 4.0, 100.0, (60, 60)))[1]
+        splat(_wall(0.0), Viewpoint.towards(np.zeros(3), np.pi, 0.0, 4.0, 100.0, (60, 60)))[1]
     ).all()
 
 
 def test_a_point_is_drawn_where_the_view_projects_it() -> None:
-    view = View.towards(np.array([0, 0, 1.0]), np.pi / 2, 0.0, 5.0, 100.0, (101, 101))
+    view = Viewpoint.towards(np.array([0, 0, 1.0]), np.pi / 2, 0.0, 5.0, 100.0, (101, 101))
     at, z = view.project(np.array([[0, 0, 1.0], [-1, 0, 1], [0, 0, 2]]))
     assert z == pytest.approx([5, 5, 5])
     assert at == pytest.approx(np.array([[50, 50], [70, 50], [50, 30]]))  # x to the left, z up

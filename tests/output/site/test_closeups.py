@@ -46,9 +46,9 @@ def handling(capture: fitted.Capture) -> Handling:
     return read(capture, capture.paths["truth"])
 
 
-def cells(picture: closeups.CloseUp, columns: int) -> np.ndarray:
+def cells(picture: closeups.EncodedImage, columns: int) -> np.ndarray:
     """(rows, columns, 200, 200, 3) RGB of the picture's cells."""
-    image = cv2.imdecode(np.frombuffer(picture.jpeg, np.uint8), 1)[..., ::-1].astype(int)
+    image = cv2.imdecode(np.frombuffer(picture.data, np.uint8), 1)[..., ::-1].astype(int)
     assert image.shape == (picture.height, picture.width, 3)
     return np.array(
         [
@@ -88,7 +88,7 @@ def test_every_cell_shows_skin_and_object_and_truth_touches(handling: Handling) 
     (hold,) = closeups.holds(handling.probability)
     assert hold == Hold("right", 1, 3)
     picture = closeups.closeup(handling, hold)
-    assert len(picture.jpeg) < PAGE_BYTES
+    assert len(picture.data) < PAGE_BYTES
     shown = cells(picture, 3)
     red, green, blue = np.moveaxis(shown, -1, 0)
     skin = ((blue - red > 40) & (blue > 60)).sum((2, 3))
@@ -96,14 +96,14 @@ def test_every_cell_shows_skin_and_object_and_truth_touches(handling: Handling) 
     assert (skin > 500).all() and (ball > 500).all()
     touching = ((red - green > 60) & (np.abs(green - blue) < 40)).sum((2, 3))
     assert touching[:, 2].max() > 10  # the palm is 1 mm inside the true ball
-    assert picture.jpeg == closeups.closeup(handling, hold).jpeg
+    assert picture.data == closeups.closeup(handling, hold).data
     # the fits differ by what was put in, so that their cells do as well
     assert np.abs(shown[:, 1] - shown[:, 2]).max() > 100
 
 
 def test_the_same_fit_looks_the_same_in_each_column(handling: Handling) -> None:
     joint = handling.columns[1]
-    same = replace(handling, columns=(joint, joint), known=False)
+    same = replace(handling, columns=(joint, joint), has_truth=False)
     shown = cells(closeups.closeup(same, Hold("right", 1, 3)), 2)
     assert np.abs(shown[:, 0] - shown[:, 1])[:, :190, :190].max() < 60  # JPEG at the rim
     assert np.abs(shown[0, 0] - shown[1, 0]).mean() > 5  # two sides

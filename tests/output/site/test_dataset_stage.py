@@ -261,7 +261,7 @@ def test_what_heatmaps_cannot_take_is_told_and_the_rest_counts(
     with h5py.File(paths["s01_o03"], "r+") as file:
         file.attrs["body_model"] = "0123456789abcdef"
     text = merge(paths, captures, tmp_path / "out").read_text()
-    assert "3 sequences, 12 frames" in text and "What does not fit together" in text
+    assert "3 sequences, 12 frames" in text and "Remarks" in text
     for words in (
         "its body has 11 vertices", "measured with another mesh", "(digest 0123456789abcdef)"
     ):  # fmt: skip

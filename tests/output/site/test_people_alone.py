@@ -148,7 +148,7 @@ def test_the_pages_show_each_sequence_what_it_has(out: Path) -> None:
         for name in (HELD, ALONE, MISSED)
     }
     assert all("data:image/jpeg" in part for part in parts.values())
-    assert ">in contact<" in parts[HELD] and "touches the object" in parts[HELD]
+    assert ">in contact<" in parts[HELD] and "of body parts with the object" in parts[HELD]
     for name in (ALONE, MISSED):
         assert ">in contact<" not in parts[name]
     table = pd.read_csv(out / "tables" / "sequences.csv").set_index("sequence")
@@ -160,4 +160,5 @@ def test_the_pages_show_each_sequence_what_it_has(out: Path) -> None:
             assert f"<td>{table.loc[name, f'verdict.{of}_odd_even_mm']:.1f}</td>" in section
     assert "p01, alone, 4 frames" in parts[ALONE] and 'id="track"' not in parts[ALONE]
     missed = parts[MISSED].split('id="track"')[1].split('id="body"')[0]
-    assert WHY in missed and "found in no frame" in missed and "deviation of place" not in missed
+    assert WHY in missed and "found in no frame" in missed
+    assert "deviation of the position" not in missed

@@ -59,7 +59,7 @@ def test_states_of_track_and_views(made: fitted.Capture) -> None:
     timeline = found["timeline"]
     assert timeline.count('class="state lost"') == 1 and "1 lost · 1 doubtful" in timeline
     assert 'class="state partly"' in timeline and 'class="state agrees"' in timeline
-    assert "2: found again" in timeline and "0 % kept" in timeline
+    assert "2: found again" in timeline and "0 % used" in timeline
 
 
 def test_a_carried_frame_is_told_as_such_before_it_is_doubtful() -> None:
@@ -75,8 +75,8 @@ def test_a_carried_frame_is_told_as_such_before_it_is_doubtful() -> None:
 def test_the_sheet_shows_both_outlines_in_every_camera(made: fitted.Capture) -> None:
     sheet = _facts(made).sheet
     assert sheet is not None and len(sheet.frames) == 5
-    bgr = cv2.imdecode(np.frombuffer(sheet.jpeg, np.uint8), cv2.IMREAD_COLOR)
-    assert bgr.shape == (sheet.height, sheet.width, 3)
+    bgr = cv2.imdecode(np.frombuffer(sheet.image.data, np.uint8), cv2.IMREAD_COLOR)
+    assert bgr.shape == (sheet.image.height, sheet.image.width, 3)
     columns = np.array_split(bgr[..., ::-1].astype(int), 3, axis=1)
     for column in columns:
         assert (np.abs(column - TRACK_COLOUR).max(-1) < 70).sum() > 100

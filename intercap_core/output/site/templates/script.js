@@ -9,7 +9,7 @@ for (const table of document.querySelectorAll("table.sortable")) {
     head.append(button);
     button.addEventListener("click", () => {
       const now = head.getAttribute("aria-sort");
-      const up = now ? now === "descending" : words; // figures begin with the highest
+      const up = now ? now === "descending" : words; // numbers begin with the largest
       heads.forEach((other) => other.removeAttribute("aria-sort"));
       head.setAttribute("aria-sort", up ? "ascending" : "descending");
       const body = table.tBodies[0];
@@ -69,7 +69,7 @@ const enlarge = (image) => {
   large.alt = image.alt;
   dialog.querySelector("p").textContent = image.alt;
   dialog.showModal();
-  // as large as the window, and no smaller than it is: what is wider is scrolled
+  // as large as the window, and no smaller than the picture; wider pictures are scrolled
   const room = [dialog.clientWidth - 8, dialog.clientHeight - 48];
   const [wide, tall] = [Number(image.getAttribute("width")), Number(image.getAttribute("height"))];
   const scale = Math.max(1, Math.min(room[0] / wide, room[1] / tall));
