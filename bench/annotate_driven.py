@@ -24,7 +24,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bench import annotate_page
-from bench.annotate_hand import Hand, Point
+from bench.annotate_page import Hand, Point
 from bench.command import exit_on_user_error
 from intercap_core import artefacts
 from intercap_core.annotate.questions import answers_path

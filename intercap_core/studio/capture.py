@@ -29,11 +29,16 @@ from intercap_core.studio.rig import STAGGER_S
 from intercap_core.studio.skeleton import turn, unit
 from intercap_core.studio.stage import StageState, StudioStage
 
-CONTACT_M = 0.0045
-SEEN_PIXELS, SEEN_SHARE = 40, 0.05  # of the object, for a view to count as seeing it
-OFF_SURFACE_M = 0.001
-ABOVE_SOLE_M = 0.03  # what a sole stands on is sought from here
-ANNOTATION_ERROR_M, ANNOTATION_ERROR_DEG, ANNOTATION_ERROR_FRAMES = 0.010, 5.0, 5
+CONTACT_M = 0.0045  # skin this near to the object touches it
+# A view sees the object if it shows this many pixels and this share of it
+SEEN_PIXELS = 40
+SEEN_SHARE = 0.05
+OFF_SURFACE_M = 0.001  # visibility rays start this far outside the surface
+ABOVE_SOLE_M = 0.03  # rays down to the support of a sole start this far above it
+# Largest errors of an annotation
+ANNOTATION_ERROR_M = 0.010
+ANNOTATION_ERROR_DEG = 5.0
+ANNOTATION_ERROR_FRAMES = 5
 
 
 def write_truth(

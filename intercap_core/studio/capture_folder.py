@@ -97,7 +97,7 @@ def _triangle(a, b, c, za, zb, zc, aligned):
 
 
 SOUND_RATE = 16_000  # samples a second
-WRONG_SIZE = 1.5  # of the images that a wrong calibration is for
+WRONG_SIZE = 1.5  # image size of a wrong calibration, relative to the recording
 SWAPPED = (3, 4)  # cameras 4 and 5 of InterCap's release
 
 

@@ -16,7 +16,7 @@ from intercap_core.config import ObjectEntry
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh_files import load_mesh
 
-SCALE_ERROR = 0.005  # of the true size, up or down
+SCALE_ERROR = 0.005  # of the true size, larger or smaller
 # RMS of the smooth displacement along the normal, in parts of the object's radius (root mean square
 # distance of its surface from its origin): 0.3 mm of a cup, 0.7 of a football, 1.4 of a suitcase,
 # 1.9 of a chair. Waves are as long as the radius says, so a cup is no more crumpled than a chair.
@@ -28,7 +28,7 @@ WAVES = 48
 PAINTS = ((0.92, 0.91, 0.88), (0.13, 0.13, 0.14), (0.70, 0.12, 0.13), (0.11, 0.28, 0.60),
           (0.84, 0.42, 0.17), (0.16, 0.46, 0.31), (0.88, 0.76, 0.24),
           (0.50, 0.51, 0.53))  # fmt: skip
-PRINTS = (3, 7)  # spots of another colour on a printed object, at least and below
+PRINTS = (3, 7)  # number of spots on a printed object, the end excluded
 PRINT_RADIUS = (0.15, 0.45)  # of a spot, in parts of the object's radius
 
 
@@ -141,8 +141,8 @@ def _smooth_displacement(
     return field * SURFACE_ERROR * radius / rms
 
 
-GAP_M = 0.0003  # skin that was pressed stays this far outside, so that float32 keeps it outside
-NEAR_M = 0.01
+GAP_M = 0.0003  # pressed skin stays this far outside, so that float32 keeps it outside
+NEAR_M = 0.01  # points farther from the object's box are not tested
 
 
 def press_out(

@@ -17,9 +17,11 @@ from intercap_core.studio.noise import NoiseSource
 from intercap_core.studio.room import FLOOR_HALF_M, Room
 from intercap_core.studio.subjects import Subject, body_colours, subject_names
 
-CELL_M = 0.05  # of the floor plan
-FLOOR_UP_M, WALLS_BEYOND_M = 0.03, 2.8  # floor and walls are no obstacles
-OTHER_COLOURS = 0.25  # at least this far from the subject's, mean of the clothed surface, RGB
+CELL_M = 0.05  # grid of the floor plan
+# Obstacles are points above the floor and inside the walls
+FLOOR_UP_M = 0.03
+WALLS_BEYOND_M = 2.8
+OTHER_COLOURS = 0.25  # least RGB distance of the mean colours of both persons' clothes
 _CORNERS = np.array([[a, b, 4 - a - b] for a in range(5) for b in range(5 - a)]) / 4
 
 

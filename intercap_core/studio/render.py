@@ -23,12 +23,12 @@ from intercap_core.studio.noise import gaussian
 from intercap_core.studio.room import Room
 
 BODY, OBJECT, PASSER_BY = 1, 2, 3  # what an identity image holds; 0 is the room
-BOX_MARGIN_PX = 1
-AMBIENT = 0.42
-VOID = 0.04  # grey of what lies beyond the room
+BOX_MARGIN_PX = 1  # of the window around moving surfaces
+AMBIENT = 0.42  # light from all directions
+VOID = 0.04  # grey level beyond the room
 # Directions to the lamps and their strength: two ceiling lamps
 LAMPS = (((0.45, 0.3, 0.85), 0.42), ((-0.6, -0.25, 0.75), 0.30))
-CAMERA_GAMMA = 2.2  # light adds up, grey levels are its power 1 / 2.2, as sRGB's nearly are
+CAMERA_GAMMA = 2.2  # grey levels are linear light to the power 1 / 2.2, as nearly in sRGB
 
 
 @dataclass(frozen=True)

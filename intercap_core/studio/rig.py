@@ -17,19 +17,67 @@ from intercap_core.geometry.camera.transforms import invert, rigid
 from intercap_core.studio.noise import NoiseSource
 from intercap_core.studio.skeleton import turn, unit
 
-RADIUS_M, RADIUS_SPREAD_M = 2.55, 0.2
-HEIGHTS_M, HEIGHT_SPREAD_M = (1.05, 2.05), 0.08
-AIM_HEIGHT_M = 0.85
-STAGGER_S = 160e-6  # the designed delay of each subordinate
-EXTRINSIC_ERROR_M, EXTRINSIC_ERROR_DEG = 0.010, 0.5  # of the rig file, at noise 1
-FOCAL_ERROR, CENTRE_ERROR_PX = 3e-4, 0.25  # of the devices' own calibration
-MAX_OFFSET_S = 0.008
-SLIPPING_CAMERAS = 2
-SLIPPED_FRAMES = (1, 4)
-SLIP_LASTS = (5, 20)  # sets until a silent slip is over
-SLIP_STAYS = 0.3  # share of the silent slips that last to the end
-COLOUR_FROM_DEPTH_M = (-0.0320, -0.0021, 0.0039)
-DEPTH_TILT_DEG = 5.6  # the depth camera looks down against the colour camera
+
+@dataclass(frozen=True)
+class RingLayout:
+    """Places of the cameras."""
+
+    radius_m: float = 2.55
+    """Distance from the middle."""
+    radius_spread_m: float = 0.2
+    """Random deviation, at most."""
+    heights_m: tuple[float, float] = (1.05, 2.05)
+    """Alternating heights."""
+    height_spread_m: float = 0.08
+    """Random deviation, at most."""
+    aim_height_m: float = 0.85
+    """Height above the middle at which the cameras look."""
+    colour_from_depth_m: tuple[float, float, float] = (-0.0320, -0.0021, 0.0039)
+    """Translation, as in real devices' calibrations."""
+    depth_tilt_deg: float = 5.6
+    """The depth camera looks down relative to the colour camera, as in real devices."""
+
+
+RING = RingLayout()
+
+
+# Delay of each subordinate, so that the lasers do not interfere (Azure Kinect documentation)
+STAGGER_S = 160e-6
+
+
+@dataclass(frozen=True)
+class RigErrors:
+    """Errors of a rig at noise 1."""
+
+    extrinsic_m: float = 0.010
+    """Camera position in the rig file."""
+    extrinsic_deg: float = 0.5
+    """Camera orientation in the rig file."""
+    focal: float = 3e-4
+    """Relative, of the devices' own calibration; standard deviation."""
+    centre_px: float = 0.25
+    """Principal point at 1080p, standard deviation."""
+    max_offset_s: float = 0.008
+    """Exposure relative to the device time, at most."""
+    slipping_cameras: int = 2
+    """Cameras that lose frames or deliver late ones."""
+    slipped_frames: tuple[int, int] = (1, 4)
+    """Fewest and most frames of a slip."""
+    slip_sets: tuple[int, int] = (5, 20)
+    """Sets until a silent slip is over."""
+    slip_stays: float = 0.3
+    """Share of the silent slips that last to the end."""
+    clock_jitter_s: float = 100e-6
+    """Standard deviation of a subordinate's device times."""
+    max_jitter: float = 3.0
+    """Largest jitter, in standard deviations."""
+    depth_gaps: tuple[int, int] = (1, 3)
+    """Fewest and most episodes without depth, in one camera."""
+    depth_gap_sets: tuple[int, int] = (1, 3)
+    """Fewest and most sets of such an episode."""
+
+
+ERRORS = RigErrors()
 
 
 @dataclass(frozen=True)
@@ -83,8 +131,8 @@ def build_rig(
         error = np.eye(4)
         if index:
             error = rigid(
-                turn(unit(rng.normal(size=3)) * np.radians(EXTRINSIC_ERROR_DEG) * noise),
-                unit(rng.normal(size=3)) * EXTRINSIC_ERROR_M * noise,
+                turn(unit(rng.normal(size=3)) * np.radians(ERRORS.extrinsic_deg) * noise),
+                unit(rng.normal(size=3)) * ERRORS.extrinsic_m * noise,
             )
         assert camera.depth is not None
         claimed.append(
@@ -95,10 +143,10 @@ def build_rig(
                 master_from_colour=_about_centre(camera.master_from_colour, error),
             )
         )
-    offset = rng.uniform(-MAX_OFFSET_S, MAX_OFFSET_S, cameras) * noise
-    offset = np.clip(offset, -2 * MAX_OFFSET_S, 2 * MAX_OFFSET_S)
+    offset = rng.uniform(-ERRORS.max_offset_s, ERRORS.max_offset_s, cameras) * noise
+    offset = np.clip(offset, -2 * ERRORS.max_offset_s, 2 * ERRORS.max_offset_s)
     offset -= offset[0]  # the sets' times are the master's
-    offset = np.clip(offset, -MAX_OFFSET_S * noise, MAX_OFFSET_S * noise)
+    offset = np.clip(offset, -ERRORS.max_offset_s * noise, ERRORS.max_offset_s * noise)
     missing, slip = _slips(rng, capture.frames, settings)
     return StudioRig(
         Rig(tuple(true)),
@@ -136,10 +184,12 @@ def _ring(rng: np.random.Generator, cameras: int) -> list[np.ndarray]:
     first = rng.uniform(0, 2 * np.pi)
     for index in range(cameras):
         azimuth = first + 2 * np.pi * index / cameras + np.radians(rng.uniform(-5, 5))
-        radius = RADIUS_M + rng.uniform(-RADIUS_SPREAD_M, RADIUS_SPREAD_M)
-        height = HEIGHTS_M[index % 2] + rng.uniform(-HEIGHT_SPREAD_M, HEIGHT_SPREAD_M)
+        radius = RING.radius_m + rng.uniform(-RING.radius_spread_m, RING.radius_spread_m)
+        height = RING.heights_m[index % 2] + rng.uniform(
+            -RING.height_spread_m, RING.height_spread_m
+        )
         eye = np.array([radius * np.cos(azimuth), radius * np.sin(azimuth), height])
-        aim = np.array([0, 0, AIM_HEIGHT_M]) + rng.normal(0, 0.05, 3)
+        aim = np.array([0, 0, RING.aim_height_m]) + rng.normal(0, 0.05, 3)
         forward = unit(aim - eye)
         right = unit(np.cross(forward, [0, 0, 1.0]))
         rotation = np.stack([right, np.cross(forward, right), forward], 1)
@@ -200,14 +250,14 @@ def _in_mode(lens: Intrinsics, mode: Mode, other: Mode) -> Intrinsics:
 
 
 def _colour_from_depth(rng: np.random.Generator) -> np.ndarray:
-    tilt = np.array([np.radians(-DEPTH_TILT_DEG), 0, 0]) + np.radians(rng.normal(0, 0.25, 3))
-    return rigid(turn(tilt), np.array(COLOUR_FROM_DEPTH_M) + rng.normal(0, 2e-4, 3))
+    tilt = np.array([np.radians(-RING.depth_tilt_deg), 0, 0]) + np.radians(rng.normal(0, 0.25, 3))
+    return rigid(turn(tilt), np.array(RING.colour_from_depth_m) + rng.normal(0, 2e-4, 3))
 
 
 def _recalibrated(lens: Intrinsics, rng: np.random.Generator, noise: float) -> Intrinsics:
     """The lens with the errors of the device's own calibration."""
-    focal = 1 + rng.normal(0, FOCAL_ERROR) * noise
-    centre = rng.normal(0, CENTRE_ERROR_PX, 2) * noise * lens.width / 1920
+    focal = 1 + rng.normal(0, ERRORS.focal) * noise
+    centre = rng.normal(0, ERRORS.centre_px, 2) * noise * lens.width / 1920
     return replace(
         lens, fx=lens.fx * focal, fy=lens.fy * focal, cx=lens.cx + centre[0], cy=lens.cy + centre[1]
     )
@@ -226,13 +276,13 @@ def _slips(
     others = np.arange(1, cameras)
     if len(others) == 0 or frames < 8 or settings.noise == 0:
         return tuple(frozenset(m) for m in missing), slip
-    for camera in rng.permutation(others)[:SLIPPING_CAMERAS]:
-        length = int(rng.integers(SLIPPED_FRAMES[0], SLIPPED_FRAMES[1] + 1))
+    for camera in rng.permutation(others)[: ERRORS.slipping_cameras]:
+        length = int(rng.integers(ERRORS.slipped_frames[0], ERRORS.slipped_frames[1] + 1))
         first = max(2, length)  # nothing is shown that was before the recording
         start = int(rng.integers(first, max(first + 1, frames - length - 2)))
         if settings.slips == "silent":
-            end = start + int(rng.integers(*SLIP_LASTS))
-            slip[start : frames if rng.random() < SLIP_STAYS else end, camera] = length
+            end = start + int(rng.integers(*ERRORS.slip_sets))
+            slip[start : frames if rng.random() < ERRORS.slip_stays else end, camera] = length
         else:
             missing[camera].update(range(start, min(frames, start + length)))
     late, early = rng.permutation(others)[[0, -1]]
@@ -241,10 +291,6 @@ def _slips(
     return tuple(frozenset(m) for m in missing), slip
 
 
-CLOCK_JITTER_S = 100e-6  # of a subordinate's device times, at noise 1
-MAX_JITTER = 3.0  # times the above
-DEPTH_GAPS = (1, 3)  # episodes without depth in one camera
-DEPTH_GAP_FRAMES = (1, 3)
 ONE_CAMERA_EACH = (
     "dead_half", "no_depth", "zero_depth", "same_serial", "backwards_clock", "wrong_resolution"
 )  # fmt: skip
@@ -270,14 +316,14 @@ class Failures:
         jitter = np.zeros((frames, cameras))
         empty, away = np.zeros((2, frames, cameras), bool)
         rng = noise.rng("clocks")
-        steps = np.clip(rng.normal(size=(frames, cameras)), -MAX_JITTER, MAX_JITTER)
-        jitter[:, 1:] = steps[:, 1:] * CLOCK_JITTER_S * noise.scale
+        steps = np.clip(rng.normal(size=(frames, cameras)), -ERRORS.max_jitter, ERRORS.max_jitter)
+        jitter[:, 1:] = steps[:, 1:] * ERRORS.clock_jitter_s * noise.scale
         rng = noise.rng("depth gaps")
         if noise.scale > 0 and cameras > 1 and frames >= 8:
             camera = int(rng.integers(1, cameras))
-            for _ in range(int(rng.integers(DEPTH_GAPS[0], DEPTH_GAPS[1] + 1))):
+            for _ in range(int(rng.integers(ERRORS.depth_gaps[0], ERRORS.depth_gaps[1] + 1))):
                 start = int(rng.integers(0, frames - 1))
-                length = int(rng.integers(DEPTH_GAP_FRAMES[0], DEPTH_GAP_FRAMES[1] + 1))
+                length = int(rng.integers(ERRORS.depth_gap_sets[0], ERRORS.depth_gap_sets[1] + 1))
                 which = empty if rng.random() < 0.5 else away
                 which[start : start + length, camera] = True
         away |= not capture.depth

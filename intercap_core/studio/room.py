@@ -13,14 +13,34 @@ from typing import Literal, NamedTuple
 import cv2
 import numpy as np
 
-FLOOR_HALF_M = 6.0
-WALL_HEIGHT_M = 2.7
-WALL_DISTANCE_M = (3.0, 3.7)
-TWIN_SCALE = (0.87, 0.94, 1.07, 1.15)  # sizes of another object of the object's class
-TWIN_DISTANCE_M = (1.5, 1.75)
-LOW_M, STAND_M = 0.35, (0.45, 0.75)  # what is lower stands on a box of such a height
-PILLAR_DISTANCE_M, PILLAR_HALF_M, PILLAR_HEIGHT_M = (1.2, 1.5), (0.03, 0.05), 1.9
-PILLARS_MAX = 3
+FLOOR_HALF_M = 6.0  # half the side of the floor
+
+
+@dataclass(frozen=True)
+class RoomLayout:
+    """Sizes and places in a room, metres."""
+
+    wall_height: float = 2.7
+    wall_distance: tuple[float, float] = (3.0, 3.7)
+    """From the middle."""
+    twin_scale: tuple[float, ...] = (0.87, 0.94, 1.07, 1.15)
+    """Sizes of another object of the object's class, relative to the object."""
+    twin_distance: tuple[float, float] = (1.5, 1.75)
+    """From the middle."""
+    low: float = 0.35
+    """A lower twin stands on a box."""
+    stand: tuple[float, float] = (0.45, 0.75)
+    """Height of that box."""
+    pillar_distance: tuple[float, float] = (1.2, 1.5)
+    """From the hidden place."""
+    pillar_half: tuple[float, float] = (0.03, 0.05)
+    """Half the thickness."""
+    pillar_height: float = 1.9
+    pillars: int = 3
+    """Largest number."""
+
+
+LAYOUT = RoomLayout()
 
 
 @dataclass(frozen=True)
@@ -131,11 +151,11 @@ def _walls(rng: np.random.Generator) -> list[Box]:
     walls = []
     heading = rng.uniform(0, 2 * np.pi)
     for turn_by in (0, np.pi / 2, np.pi)[: int(rng.integers(2, 4))]:
-        far = rng.uniform(*WALL_DISTANCE_M)
+        far = rng.uniform(*LAYOUT.wall_distance)
         angle = heading + turn_by
         x, y = far * np.cos(angle), far * np.sin(angle)
         walls.append(
-            Box((x - 0.05, y - 4.0, 0.0), (x + 0.05, y + 4.0, WALL_HEIGHT_M), angle, "wall")
+            Box((x - 0.05, y - 4.0, 0.0), (x + 0.05, y + 4.0, LAYOUT.wall_height), angle, "wall")
         )
         px, py = (far - 0.06) * np.cos(angle), (far - 0.06) * np.sin(angle)
         side = rng.uniform(-1.2, 1.2)
@@ -179,13 +199,13 @@ def _twin(rng: np.random.Generator, eyes: np.ndarray, twin: Twin) -> tuple[list[
     between, gaps = _between(eyes)
     gap = int(rng.integers(len(between)))
     angle = between[gap] + gaps[gap] * rng.uniform(-0.2, 0.2)
-    far, heading = rng.uniform(*TWIN_DISTANCE_M), rng.uniform(0, 2 * np.pi)
-    points = rng.choice(TWIN_SCALE) * twin.vertices
+    far, heading = rng.uniform(*LAYOUT.twin_distance), rng.uniform(0, 2 * np.pi)
+    points = rng.choice(LAYOUT.twin_scale) * twin.vertices
     x, y = far * np.cos(angle), far * np.sin(angle)
     stand = []
     height = 0.0
-    if np.ptp(points[:, 2]) < LOW_M:
-        height = rng.uniform(*STAND_M)
+    if np.ptp(points[:, 2]) < LAYOUT.low:
+        height = rng.uniform(*LAYOUT.stand)
         half = 0.03 + np.abs(points[:, :2]).max()
         stand.append(Box((x - half, y - half, 0), (x + half, y + half, height), angle, "cardboard"))
     cos, sin = np.cos(heading), np.sin(heading)
@@ -196,13 +216,13 @@ def _twin(rng: np.random.Generator, eyes: np.ndarray, twin: Twin) -> tuple[list[
 
 def _pillars(rng: np.random.Generator, eyes: np.ndarray, place: np.ndarray) -> list[Box]:
     """Pillars that hide ``place`` (2,) from some of the cameras."""
-    count = min(int(rng.integers(1, PILLARS_MAX + 1)), len(eyes) // 2)
+    count = min(int(rng.integers(1, LAYOUT.pillars + 1)), len(eyes) // 2)
     pillars = []
     for eye in eyes[rng.permutation(len(eyes))[:count]]:
         towards = eye - place
-        far, half = rng.uniform(*PILLAR_DISTANCE_M), rng.uniform(*PILLAR_HALF_M)
+        far, half = rng.uniform(*LAYOUT.pillar_distance), rng.uniform(*LAYOUT.pillar_half)
         x, y = place + towards / np.linalg.norm(towards) * far
-        low, high = (x - half, y - half, 0.0), (x + half, y + half, PILLAR_HEIGHT_M)
+        low, high = (x - half, y - half, 0.0), (x + half, y + half, LAYOUT.pillar_height)
         pillars.append(Box(low, high, float(np.arctan2(towards[1], towards[0])), "wood"))
     return pillars
 

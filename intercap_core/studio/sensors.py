@@ -154,17 +154,39 @@ def _field(lens: Intrinsics, mode: str) -> np.ndarray:
     return lit & np.isfinite(lens.rays[..., 0])
 
 
-SPEED_M_S = 343.0
-BEFORE_S = 3.0  # sounds begin before the first set, and last beyond the last
-STEP_EVERY_S, STEP_S = (0.4, 0.8), 0.05
-SYLLABLE_EVERY_S, SYLLABLE_S = (0.15, 0.6), (0.08, 0.25)
-VOICE_HZ = (250.0, 3000.0)
-MOUTH_M = 0.6  # above the pelvis
-REVERBERATION_S = (0.25, 0.6)  # until it has fallen by 60 dB; of a room with furniture, or bare
-ROOM_LEVEL = (0.5, 1.2)  # of the reverberation's energy, relative to the direct sound's
-NOISE_DB = (5.0, 20.0)  # of the sound over the device's own noise
-MAX_LATENCY_S = 0.04  # of a device's sound against its images, to either side
-LOUDEST = 0.5
+@dataclass(frozen=True)
+class Acoustics:
+    """Sounds, room and microphones."""
+
+    speed_m_s: float = 343.0
+    """Speed of sound in air at 20 °C."""
+    before_s: float = 3.0
+    """Sounds start before the first set and end after the last."""
+    step_every_s: tuple[float, float] = (0.4, 0.8)
+    """Interval between steps."""
+    step_s: float = 0.05
+    """Duration of a step."""
+    syllable_every_s: tuple[float, float] = (0.15, 0.6)
+    """Interval between syllables."""
+    syllable_s: tuple[float, float] = (0.08, 0.25)
+    """Duration of a syllable."""
+    voice_hz: tuple[float, float] = (250.0, 3000.0)
+    """Band of the voice."""
+    mouth_m: float = 0.6
+    """Height of the mouth above the pelvis."""
+    reverberation_s: tuple[float, float] = (0.25, 0.6)
+    """Time for a fall by 60 dB, in furnished and in bare rooms."""
+    room_level: tuple[float, float] = (0.5, 1.2)
+    """Energy of the reverberation relative to the direct sound."""
+    noise_db: tuple[float, float] = (5.0, 20.0)
+    """Level of the sound above the device's noise."""
+    max_latency_s: float = 0.04
+    """Of a device's sound relative to its images."""
+    loudest: float = 0.5
+    """Largest sample."""
+
+
+ACOUSTICS = Acoustics()
 
 
 @dataclass(frozen=True)
@@ -183,30 +205,34 @@ def heard(stage: StudioStage, index: int, first_s: float, seconds: float) -> np.
     """
     rng = stage.noise.rng("microphone", stage.rig.true.names[index])
     eye = (invert(stage.rig.master_from_stage) @ stage.rig.true[index].master_from_colour)[:3, 3]
-    latency = rng.uniform(-MAX_LATENCY_S, MAX_LATENCY_S) * min(1.0, stage.noise.scale)
+    latency = rng.uniform(-ACOUSTICS.max_latency_s, ACOUSTICS.max_latency_s) * min(
+        1.0, stage.noise.scale
+    )
     count = round(seconds * RATE)
-    lead = round(max(REVERBERATION_S) * RATE)  # reverberation of earlier sounds
+    lead = round(max(ACOUSTICS.reverberation_s) * RATE)  # reverberation of earlier sounds
     direct = np.zeros(lead + count)
     for event in _events(stage):
         far = max(0.3, float(np.linalg.norm(event.place - eye)))
-        start = lead + round((event.time_s + far / SPEED_M_S + latency - first_s) * RATE)
+        start = lead + round((event.time_s + far / ACOUSTICS.speed_m_s + latency - first_s) * RATE)
         there = slice(max(0, start), max(0, min(len(direct), start + len(event.samples))))
         if there.start < there.stop:
             direct[there] += event.samples[there.start - start : there.stop - start] / far
     sound = signal.fftconvolve(direct, _room(stage, rng))[lead : lead + count]
     power = float((sound**2).mean())
-    noise = np.sqrt(power * 10 ** (-rng.uniform(*NOISE_DB) / 10)) if power > 0 else 1e-4
+    noise = np.sqrt(power * 10 ** (-rng.uniform(*ACOUSTICS.noise_db) / 10)) if power > 0 else 1e-4
     sound += rng.normal(0, noise, count)
-    return (LOUDEST * sound / max(np.abs(sound).max(initial=0.0), 1e-9)).astype(np.float32)
+    return (ACOUSTICS.loudest * sound / max(np.abs(sound).max(initial=0.0), 1e-9)).astype(
+        np.float32
+    )
 
 
 def _room(stage: StudioStage, rng: np.random.Generator) -> np.ndarray:
     """Impulse response of the room between this device and a person in the middle."""
-    fall = stage.noise.rng("reverberation").uniform(*REVERBERATION_S)
+    fall = stage.noise.rng("reverberation").uniform(*ACOUSTICS.reverberation_s)
     times = np.arange(round(fall * RATE)) / RATE
     tail = rng.normal(size=len(times)) * 10 ** (-3 * times / fall)
     tail[: round(0.002 * RATE)] = 0
-    tail *= np.sqrt(rng.uniform(*ROOM_LEVEL) / (tail**2).sum())
+    tail *= np.sqrt(rng.uniform(*ACOUSTICS.room_level) / (tail**2).sum())
     tail[0] = 1.0
     return tail
 
@@ -224,19 +250,19 @@ def _events(stage: StudioStage) -> list[_Event]:
     def person(time_s: float) -> np.ndarray:
         return np.array([np.interp(time_s, stage.set_times, axis) for axis in pelvis.T])
 
-    events, end = [], stage.duration + BEFORE_S
-    time_s = -BEFORE_S
-    while (time_s := time_s + rng.uniform(*STEP_EVERY_S)) < end:
-        count = round(STEP_S * RATE)
+    events, end = [], stage.duration + ACOUSTICS.before_s
+    time_s = -ACOUSTICS.before_s
+    while (time_s := time_s + rng.uniform(*ACOUSTICS.step_every_s)) < end:
+        count = round(ACOUSTICS.step_s * RATE)
         burst = rng.normal(size=count) * np.exp(-np.arange(count) / (0.2 * count))
         events.append(
             _Event(time_s, rng.uniform(0.3, 1.0) * burst, person(time_s) * np.array([1, 1, 0]))
         )
-    voice = signal.butter(2, VOICE_HZ, "bandpass", fs=RATE, output="sos")
-    time_s = -BEFORE_S
-    while (time_s := time_s + rng.uniform(*SYLLABLE_EVERY_S)) < end:
-        count = round(rng.uniform(*SYLLABLE_S) * RATE)
+    voice = signal.butter(2, ACOUSTICS.voice_hz, "bandpass", fs=RATE, output="sos")
+    time_s = -ACOUSTICS.before_s
+    while (time_s := time_s + rng.uniform(*ACOUSTICS.syllable_every_s)) < end:
+        count = round(rng.uniform(*ACOUSTICS.syllable_s) * RATE)
         syllable = signal.sosfilt(voice, rng.normal(size=count)) * np.hanning(count)
-        mouth = person(time_s) + np.array([0, 0, MOUTH_M])
+        mouth = person(time_s) + np.array([0, 0, ACOUSTICS.mouth_m])
         events.append(_Event(time_s, rng.uniform(0.3, 1.0) * syllable, mouth))
     return events

@@ -15,10 +15,10 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core.body.joints import JOINT_INDEX, PARENTS
 
-REST_UP, REST_FORWARD = np.array([0.0, 1, 0]), np.array([0.0, 0, 1])
-# Shares of a limb's length: beyond the first, targets are met less and less far, up to the second,
-# so that knees and elbows never lock (where they would snap)
-REACH_FREE, REACH_MOST = 0.972, 0.994
+# Shares of a limb's length. Targets beyond the first are met in part, up to the second: knees and
+# elbows never lock, where they would snap.
+REACH_FREE = 0.972
+REACH_MOST = 0.994
 
 
 def unit(v: np.ndarray) -> np.ndarray:

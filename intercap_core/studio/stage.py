@@ -26,10 +26,10 @@ from intercap_core.studio.rig import Failures, StudioRig, build_rig, started_apa
 from intercap_core.studio.room import Furnishing, Twin, build_room
 from intercap_core.studio.subjects import Subject, build_names, in_heavy_shoes, subject_names
 
-BARE_ROOM_SHARE = 0.2  # of the captures have a floor and nothing else
-OFF_CENTRE_M = 0.12  # how far the action is from the middle of the ring
-LOOKS = ("mesh", "plain", "printed")  # of the object, as likely as each other
-SMALL_M = 0.35  # a smaller object may be hidden from most cameras
+BARE_ROOM_SHARE = 0.2  # of the captures with room: random
+OFF_CENTRE_M = 0.12  # standard deviation of the action from the ring's middle
+LOOKS = ("mesh", "plain", "printed")  # equally likely
+SMALL_M = 0.35  # pillars may hide smaller objects
 
 
 ANY_LAYOUT = frozenset({"dead_half", "no_depth", "zero_depth", "no_overlap"})

@@ -252,12 +252,27 @@ def _quaternion_product(vector: np.ndarray, quaternion: np.ndarray) -> np.ndarra
     return np.concatenate([imaginary, -(vector * v).sum(-1, keepdims=True)], -1)
 
 
-SOLE_M = 0.022
-LEATHER_M = (0.010, 0.015)
-THICKEST_M = 0.045  # a sole fills the arch of a foot, and no more
-SHAFT_M = 0.01  # how far above the ankles shoes end
-RIM_M = 0.02  # over which the leather gets thin there
-SLOPING = 0.3  # how far down normals point from where on the skin is over the sole
+@dataclass(frozen=True)
+class HeavyShoes:
+    """Work boots, metres."""
+
+    sole: float = 0.022
+    """Thickness of the sole below the lowest skin."""
+    leather: tuple[float, float] = (0.010, 0.015)
+    """Thickness at the sides."""
+    thickest: float = 0.045
+    """Largest thickness of a sole, which fills the foot's arch."""
+    shaft: float = 0.01
+    """Height of the shoe's end above the ankles."""
+    rim: float = 0.02
+    """Height over which the leather gets thin at the end."""
+    sloping: float = 0.3
+    """Downward component of normals of skin above the sole."""
+
+
+SHOES_HEAVY = HeavyShoes()
+
+
 FEET = ((7, 10), (8, 11))  # joints: ankle and ball of the left foot, of the right one
 
 
@@ -272,27 +287,27 @@ def in_heavy_shoes(subject: Subject, rng: np.random.Generator) -> Subject:
 
     The bare feet stay the true body; the soles stand on the floor. ``rng`` draws the leather.
     """
-    leather = rng.uniform(*LEATHER_M)
+    leather = rng.uniform(*SHOES_HEAVY.leather)
     down = -subject.normals(subject.rest[None])[0, :, 1]
     clothing, height = subject.clothing.copy(), subject.rest[:, 1]
     worn = shoe_area(subject)
     for foot in FEET:
         share = np.asarray(subject.weights[:, foot].sum(1)).ravel()
         own = np.flatnonzero(worn & (share > 0.5))
-        ground = height[own].min() - SOLE_M
+        ground = height[own].min() - SHOES_HEAVY.sole
         # along the normal down to the sole, but not farther to the side than leather may be thick
         across = np.sqrt(np.maximum(1 - down[own] ** 2, 1e-6))
-        deep = (height[own] - ground) / np.maximum(down[own], SLOPING)
-        sole = np.minimum(deep, LEATHER_M[1] / across)
-        sides = leather * np.clip((_top(subject) - height[own]) / RIM_M, 0.3, 1)
-        below = np.maximum(sides, np.minimum(sole, THICKEST_M))
-        clothing[own] = np.where(down[own] > SLOPING, below, sides)
-    return replace(subject, clothing=clothing, sole_m=SOLE_M)
+        deep = (height[own] - ground) / np.maximum(down[own], SHOES_HEAVY.sloping)
+        sole = np.minimum(deep, SHOES_HEAVY.leather[1] / across)
+        sides = leather * np.clip((_top(subject) - height[own]) / SHOES_HEAVY.rim, 0.3, 1)
+        below = np.maximum(sides, np.minimum(sole, SHOES_HEAVY.thickest))
+        clothing[own] = np.where(down[own] > SHOES_HEAVY.sloping, below, sides)
+    return replace(subject, clothing=clothing, sole_m=SHOES_HEAVY.sole)
 
 
 def _top(subject: Subject) -> float:
     """Height in the T-pose at which shoes end, metres."""
-    return float(subject.rest_joints[[7, 8], 1].mean()) + SHAFT_M
+    return float(subject.rest_joints[[7, 8], 1].mean()) + SHOES_HEAVY.shaft
 
 
 SKIN = ((0.87, 0.68, 0.56), (0.72, 0.52, 0.40), (0.50, 0.34, 0.25), (0.93, 0.76, 0.66))

@@ -13,8 +13,7 @@ from intercap_core.studio.objects import object_colours
 from intercap_core.studio.stage import StudioStage
 from intercap_core.studio.subjects import (
     FEET,
-    LEATHER_M,
-    SOLE_M,
+    SHOES_HEAVY,
     Subject,
     build_names,
     in_heavy_shoes,
@@ -179,19 +178,23 @@ def test_soles_are_flat_and_leather_is_as_thick_as_stated(name: str) -> None:
     normals = bare.normals(bare.rest[None])[0]
     for foot in FEET:
         own = shoe_area(bare) & (np.asarray(bare.weights[:, foot].sum(1)).ravel() > 0.5)
-        ground = bare.rest[own, 1].min() - SOLE_M
+        ground = bare.rest[own, 1].min() - SHOES_HEAVY.sole
         assert shod.rest_clothed[own, 1].min() == pytest.approx(ground, abs=1e-4)
         under = own & (normals[:, 1] < -0.9)
         assert np.percentile(shod.rest_clothed[under, 1] - ground, 90) < 0.001
-        level = own & (np.abs(normals[:, 1]) < 0.2) & (bare.rest[:, 1] < ground + SOLE_M + 0.03)
+        level = (
+            own
+            & (np.abs(normals[:, 1]) < 0.2)
+            & (bare.rest[:, 1] < ground + SHOES_HEAVY.sole + 0.03)
+        )
         thick = shod.clothing[level]
-        assert LEATHER_M[0] <= thick.min() and thick.max() <= LEATHER_M[1]
+        assert SHOES_HEAVY.leather[0] <= thick.min() and thick.max() <= SHOES_HEAVY.leather[1]
 
 
 def test_a_person_stands_on_the_soles() -> None:
     """Bare feet are at the height of the sole, soles on the floor."""
     settings = StudioSettings(captures={}, cameras=1)
-    for shoes, height in (("plain", 0.0), ("heavy", SOLE_M)):
+    for shoes, height in (("plain", 0.0), ("heavy", SHOES_HEAVY.sole)):
         capture = StudioCapture(
             interaction="walk_and_wave", subject="s06", seed=11, frames=20, shoes=shoes
         )

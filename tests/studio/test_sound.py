@@ -15,7 +15,7 @@ from intercap_core.studio.capture import erring_starts
 from intercap_core.studio.capture_folder import SOUND_RATE as STUDIO_RATE
 from intercap_core.studio.capture_folder import Device, DeviceFrame
 from intercap_core.studio.layouts import FOLDERS
-from intercap_core.studio.sensors import MAX_LATENCY_S, heard
+from intercap_core.studio.sensors import ACOUSTICS, heard
 from intercap_core.studio.stage import StudioStage
 
 SECONDS = 3.0
@@ -47,7 +47,7 @@ def test_the_sound_tells_when_cameras_started(seed):
     start, sigma = sound_starts([listened(track) for track in tracks])
     errors = (start - start[0]) + stage.rig.late_s
     assert np.isfinite(start).all() and (sigma < 0.035).all()
-    assert np.abs(errors).max() < 2 * MAX_LATENCY_S + TRAVEL_S
+    assert np.abs(errors).max() < 2 * ACOUSTICS.max_latency_s + TRAVEL_S
     assert np.abs(errors[1:]).max() > 0.001  # microphones are no clocks
 
 

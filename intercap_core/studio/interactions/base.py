@@ -14,7 +14,7 @@ from intercap_core.studio.motion import Puppet, Trunk
 from intercap_core.studio.objects import TrueObject
 from intercap_core.studio.room import Box
 
-SCRIPT_S = 3.0  # a script's own length; longer recordings play it slower
+SCRIPT_S = 3.0  # length of a script; longer recordings play it slower
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,11 @@ from intercap_core.studio.interactions.base import transform
 from intercap_core.studio.motion import Puppet
 from intercap_core.studio.skeleton import unit
 
-PALM_PRESSED_M = 0.001
-FINGER_MEETS_M, THUMB_NEAR_M = 0.002, 0.008  # such a grasp is good enough
-FAR_M = 0.03  # a finger that ends farther off counts as this far
+PALM_PRESSED_M = 0.001  # depth to which the object presses the palm
+# A grasp with at most this gap of each finger, or this sum of gaps, is accepted at once
+FINGER_MEETS_M = 0.002
+THUMB_NEAR_M = 0.008
+FAR_M = 0.03  # larger gaps count as this gap
 # The grasped surface meets the hand this far beyond the palm's middle, towards the fingers
 ALONG_FINGERS_M = 0.030
 THUMB_BENDS = (1.0, 0.5, 0.15)  # of the thumb's largest flexion, in the order of tries

@@ -243,7 +243,7 @@ def _matrices(pose: WristPose) -> np.ndarray:
     return result
 
 
-PALMS_BELOW_M = 0.01  # the middle of an object held between palms
+PALMS_BELOW_M = 0.01  # palms below the object's middle
 
 
 def between_palms(script: HandlingScript) -> dict[int, Grip]:
