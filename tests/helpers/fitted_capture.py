@@ -136,6 +136,27 @@ def make_capture(
     folder: Path, *, name: str = "cap", object_name: str = "football", total: int = 5
 ) -> Capture:
     """Write all artefacts of a capture of ``total`` frame sets into ``folder``."""
+    capture, params, keypoints = _pose_capture(folder, object_name, total)
+    tips = keypoints[:, [29, 33, 37, 41, 45, 50, 54, 58, 62, 66]]
+    views = _draw(capture)
+    _write_frames(capture, views, name)
+    _write_scene(capture, name)
+    _write_detections(capture, views, name)
+    _write_person(capture, views, keypoints, name)
+    _write_fits(capture, params, name)
+    _write_truth(capture, tips, name)
+    return capture
+
+
+def open_capture(folder: Path, *, object_name: str, total: int) -> Capture:
+    """Return a capture that :func:`make_capture` has written."""
+    return _pose_capture(folder, object_name, total)[0]
+
+
+def _pose_capture(
+    folder: Path, object_name: str, total: int
+) -> tuple[Capture, BodyParameters, np.ndarray]:
+    """Return the capture, the true body, and its keypoints (T, 135, 3)."""
     torch.manual_seed(0)
     model = open_body()
     entry = object_entry(object_name)
@@ -145,7 +166,6 @@ def make_capture(
     with torch.no_grad():
         posed = model.forward(params)
         keypoints = model.keypoints(posed).double().numpy()
-    tips = keypoints[:, [29, 33, 37, 41, 45, 50, 54, 58, 62, 66]]
     vertices, joints = posed.vertices.numpy(), posed.joints.numpy()
     palm = vertices[:, model.regions["right_hand"]]
     side = palm[:, :, 0].argmin(1)  # outermost palm vertex, image left
@@ -160,14 +180,7 @@ def make_capture(
           "metrics")},
         entry, mesh, model, rig, vertices, joints, rotation, translation,
     )  # fmt: skip
-    views = _draw(capture)
-    _write_frames(capture, views, name)
-    _write_scene(capture, name)
-    _write_detections(capture, views, name)
-    _write_person(capture, views, keypoints, name)
-    _write_fits(capture, params, name)
-    _write_truth(capture, tips, name)
-    return capture
+    return capture, params, keypoints
 
 
 def take_object_away(capture: Capture) -> None:

@@ -22,21 +22,29 @@ from intercap_core.stages import dataset, metrics, page, summary
 from tests.helpers import fitted_capture as fitted
 
 MEASURED = ("frames", "scene", "detections", "person", "object_track", "body_fit", "joint")
+TWO_CAPTURES = {"s01_o03": "football", "s01_o09": "cup"}  # sequence: object
+INTENTS = {"s01_o03": "use", "s01_o09": "pass"}
 FAILED = {"s03_o01": "k2.mkv: is cut after 3 s <and> more; record it again"}
 
 
-def two_captures(folder: Path) -> dict[str, fitted.Capture]:
-    """One sequence with truth, whose ball is held, and one without, whose cup is not; measured."""
-    made = {}
-    for name, object_name in (("s01_o03", "football"), ("s01_o09", "cup")):
+def make_two_captures(folder: Path) -> None:
+    """Write one sequence with truth, whose ball is held, and one without, whose cup is not."""
+    for name, object_name in TWO_CAPTURES.items():
         (folder / name).mkdir(parents=True)
-        made[name] = fitted.make_capture(folder / name, name=name, object_name=object_name, total=4)
-        with h5py.File(made[name].paths["joint"], "r+") as file:
+        made = fitted.make_capture(folder / name, name=name, object_name=object_name, total=4)
+        with h5py.File(made.paths["joint"], "r+") as file:
             hands = [CONTACT_REGIONS.index(f"{side}_hand") for side in ("left", "right")]
             file["contact_probability"][:2, hands] = 0.9 if object_name == "football" else 0.1
             file["contact_probability"][3, hands] = 0.9 if object_name == "football" else 0.1
-        measure(made[name], truth=object_name == "football")
-    return made
+        measure(made, truth=object_name == "football")
+
+
+def open_two_captures(folder: Path) -> dict[str, fitted.Capture]:
+    """Return the captures that :func:`make_two_captures` has written."""
+    return {
+        name: fitted.open_capture(folder / name, object_name=object_name, total=4)
+        for name, object_name in TWO_CAPTURES.items()
+    }
 
 
 def measure(capture: fitted.Capture, *, truth: bool = False) -> None:
@@ -78,18 +86,29 @@ def write_site(
 ) -> Path:
     """Everything that is beside the artefacts of a dataset, in the folder ``out``."""
     for sequence, capture in captures.items():
-        measured = SequenceMetrics.read(capture.paths["metrics"])
-        page.run(
-            paths=capture.inputs(*STAGES["page"].reads),
-            sequence=row(sequence, (intents or {}).get(sequence)),
-            models=replace(capture.models, object_=capture.object_ if measured.object_ else None),
-            contact=None,
-            settings=settings or PageSettings(),
-            output=out / "site" / "sequences" / sequence,
-            truth=capture.paths["truth"],
-        )
+        write_page(capture, out, sequence, (intents or {}).get(sequence), settings)
     merge(write_summaries(captures, out / "summaries", intents), captures, out, name, failed)
     return out
+
+
+def write_page(
+    capture: fitted.Capture,
+    out: Path,
+    sequence: str,
+    intent: str | None = None,
+    settings: PageSettings | None = None,
+) -> None:
+    """A sequence's page, in the site of the folder ``out``."""
+    measured = SequenceMetrics.read(capture.paths["metrics"])
+    page.run(
+        paths=capture.inputs(*STAGES["page"].reads),
+        sequence=row(sequence, intent),
+        models=replace(capture.models, object_=capture.object_ if measured.object_ else None),
+        contact=None,
+        settings=settings or PageSettings(),
+        output=out / "site" / "sequences" / sequence,
+        truth=capture.paths["truth"],
+    )
 
 
 def merge(

@@ -8,7 +8,6 @@ import json
 import pickle
 import pickletools
 import shutil
-import struct
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from typing import Any
 import cv2
 import h5py
 import numpy as np
+import pygltflib
 import pytest
 import torch
 import trimesh
@@ -94,15 +94,6 @@ def test_amass_body_and_object_stand_on_the_ground(
         at = arrays["rotation"][3] @ capture.mesh.vertices[7] + arrays["translation"][3]
     world = capture.rotation[3] @ capture.mesh.vertices[7] + capture.translation[3] + OBJECT_OFFSET
     assert at == pytest.approx(turn @ world + shift, abs=1e-9)
-
-
-def test_amass_in_the_camera_frame(capture: fitted.Capture, tmp_path: Path) -> None:
-    out = exported.run(capture, tmp_path / "out", formats=("amass",), frame="camera")
-    with np.load(out / "amass" / "body.npz") as arrays:
-        found = _amass_vertices(capture, arrays)
-    assert found == pytest.approx(capture.vertices + OFFSET, abs=1e-5)
-    names = ["README.txt", "amass", "body", "export.json", "verdict.json"]
-    assert sorted(p.name for p in out.iterdir()) == names
 
 
 def test_moving_a_motion_forth_and_back(capture: fitted.Capture) -> None:
@@ -211,7 +202,7 @@ def test_no_file_claims_smplx_for_another_mesh(capture: fitted.Capture, folder: 
         read_pickle(folder / "intercap" / "res.pkl")["about"]["body"],
         json.loads((folder / "bop" / "about.json").read_text())["body"],
         json.loads((folder / "coco" / "annotations.json").read_text())["info"]["body"],
-        _Gltf((folder / "glb" / "cap.glb").read_bytes()).json["asset"]["extras"]["body"],
+        pygltflib.GLTF2().load(str(folder / "glb" / "cap.glb")).asset.extras["body"],
     ]
     for path in (folder / "amass" / "body.npz", folder / "intercap" / "res.npz"):
         with np.load(path) as arrays:
@@ -224,24 +215,6 @@ def test_no_file_claims_smplx_for_another_mesh(capture: fitted.Capture, folder: 
     assert "it is not SMPL-X" in (folder / "README.txt").read_text()
     licensed = BodyFile(Path("SMPLX_MALE.npz"), "male", 10475, 10, 10)
     assert licensed.surface_model == "smplx" and not licensed.is_open
-
-
-def test_flags_contact_and_stated_errors_go_with_the_numbers(
-    capture: fitted.Capture, folder: Path
-) -> None:
-    with artefacts.read(capture.paths["metrics"], METRICS) as measured:
-        reasons = measured.text("flag_reason")
-        probability, regions = measured["contact_probability"], measured.text("region_names")
-    for path in (folder / "amass" / "body.npz", folder / "intercap" / "res.npz"):
-        with np.load(path) as arrays:
-            assert arrays["flag_reason"].tolist() == reasons
-            assert arrays["contact_probability"] == pytest.approx(probability)
-            assert arrays["contact_region"].tolist() == regions
-            assert "metres" in str(arrays["units"]) and str(arrays["frame"])
-            assert len(arrays["stated_error_mm"]) == len(arrays["stated_error_part"])
-    said = json.loads((folder / "bop" / "about.json").read_text())
-    assert set(said["flagged_frames"].values()) == {reason for reason in reasons if reason}
-    assert "contact" in said
 
 
 def test_bop_masks_are_what_the_body_leaves(capture: fitted.Capture, folder: Path) -> None:
@@ -269,17 +242,6 @@ def test_bop_masks_are_what_the_body_leaves(capture: fitted.Capture, folder: Pat
     assert targets and set(targets[0]) == {"scene_id", "im_id", "obj_id", "inst_count"}
     lens = json.loads((folder / "bop" / "camera.json").read_text())
     assert lens["fx"] == capture.rig[0].colour.fx
-
-
-def test_bop_mask_covers_the_projected_vertices(capture: fitted.Capture, folder: Path) -> None:
-    camera = capture.rig[0]
-    world = capture.mesh.vertices @ capture.rotation[2].T + capture.translation[2] + OBJECT_OFFSET
-    pose = camera.colour_from_master
-    pixels = camera.colour.project(world @ pose[:3, :3].T + pose[:3, 3])
-    mask = cv2.imread(str(folder / "bop" / "scenes" / "000000" / "mask" / "000002_000000.png"), -1)
-    near = cv2.dilate(mask, np.ones((3, 3)))
-    column, row = np.rint(pixels).astype(int).T
-    assert (near[row, column] > 0).mean() > 0.99
 
 
 def test_coco_is_read_by_its_own_library(capture: fitted.Capture, folder: Path) -> None:
@@ -332,118 +294,6 @@ def test_bop_states_symmetries(capture: fitted.Capture) -> None:
     )
     assert len(ball["symmetries_continuous"]) == 2
     assert bop.object_id(Path("09_cup.ply")) == 9 and bop.object_id(Path("cup.obj")) == 1
-
-
-COMPONENT_TYPES = {5121: "u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-ELEMENT_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-
-
-class _Gltf:
-    """A reader of its own: checks the structure, evaluates nodes, skins and animations."""
-
-    def __init__(self, data: bytes) -> None:
-        magic, version, length = struct.unpack("<4sII", data[:12])
-        assert (magic, version, length) == (b"glTF", 2, len(data))
-        json_length, kind = struct.unpack("<I4s", data[12:20])
-        assert kind == b"JSON" and json_length % 4 == 0
-        self.json = json.loads(data[20 : 20 + json_length])
-        binary_length, kind = struct.unpack("<I4s", data[20 + json_length : 28 + json_length])
-        assert kind == b"BIN\0" and binary_length % 4 == 0
-        self.binary = data[28 + json_length :]
-        assert len(self.binary) == binary_length == self.json["buffers"][0]["byteLength"]
-
-    def accessor(self, index: int) -> np.ndarray:
-        entry = self.json["accessors"][index]
-        view = self.json["bufferViews"][entry["bufferView"]]
-        dtype = np.dtype(COMPONENT_TYPES[entry["componentType"]])
-        width = ELEMENT_WIDTHS[entry["type"]]
-        assert view["byteOffset"] % 4 == 0
-        assert view["byteOffset"] + view["byteLength"] <= len(self.binary)
-        assert entry["count"] * width * dtype.itemsize == view["byteLength"]
-        values = np.frombuffer(self.binary, dtype, entry["count"] * width, view["byteOffset"])
-        values = values.reshape(entry["count"], width)
-        if "min" in entry:
-            assert values.min(0).tolist() == entry["min"] and values.max(0).tolist() == entry["max"]
-        assert np.isfinite(values).all()
-        return values[:, 0] if width == 1 else values
-
-    def world(self, t: int) -> dict[str, np.ndarray]:
-        """Place (4, 4) of every node in key frame ``t``, by name."""
-        local = []
-        for node in self.json["nodes"]:
-            local.append([Rotation.from_quat(node.get("rotation", [0, 0, 0, 1])),
-                          np.array(node.get("translation", [0, 0, 0]))])  # fmt: skip
-        animation = self.json["animations"][0]
-        for channel in animation["channels"]:
-            sampler = animation["samplers"][channel["sampler"]]
-            value = self.accessor(sampler["output"])[t]
-            target = channel["target"]
-            slot = {"rotation": 0, "translation": 1}[target["path"]]
-            local[target["node"]][slot] = Rotation.from_quat(value) if slot == 0 else value
-        places: dict[str, np.ndarray] = {}
-
-        def visit(index: int, parent: np.ndarray) -> None:
-            pose = np.eye(4)
-            pose[:3, :3], pose[:3, 3] = local[index][0].as_matrix(), local[index][1]
-            node = self.json["nodes"][index]
-            places[node["name"]] = parent @ pose
-            for child in node.get("children", []):
-                visit(child, parent @ pose)
-
-        for root in self.json["scenes"][0]["nodes"]:
-            visit(root, np.eye(4))
-        assert len(places) == len(self.json["nodes"])
-        return places
-
-    def skinned(self, places: dict[str, np.ndarray]) -> np.ndarray:
-        skin = self.json["skins"][0]
-        mesh = self.json["meshes"][next(n["mesh"] for n in self.json["nodes"] if "skin" in n)]
-        attributes = mesh["primitives"][0]["attributes"]
-        points, weights = (
-            self.accessor(attributes["POSITION"]),
-            self.accessor(attributes["WEIGHTS_0"]),
-        )
-        assert weights.sum(1) == pytest.approx(1, abs=1e-6)
-        inverse = self.accessor(skin["inverseBindMatrices"]).reshape(-1, 4, 4).transpose(0, 2, 1)
-        names = [self.json["nodes"][index]["name"] for index in skin["joints"]]
-        matrices = np.stack([places[name] for name in names]) @ inverse
-        chosen = matrices[self.accessor(attributes["JOINTS_0"])]
-        blended = (chosen * weights[..., None, None]).sum(1)
-        return np.einsum("vij,vj->vi", blended[:, :3, :3], points) + blended[:, :3, 3]
-
-
-def test_glb_plays_the_same_body_and_object(
-    capture: fitted.Capture, folder: Path, zup_from_master: np.ndarray
-) -> None:
-    gltf = _Gltf((folder / "glb" / "cap.glb").read_bytes())
-    times = gltf.accessor(gltf.json["animations"][0]["samplers"][0]["input"])
-    assert times == pytest.approx(np.arange(len(capture.vertices)) / fitted.FPS)
-    for index in range(len(gltf.json["accessors"])):
-        gltf.accessor(index)
-    yup_from_zup = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-    turn = yup_from_zup @ zup_from_master[:3, :3]
-    shift = yup_from_zup @ zup_from_master[:3, 3]
-    for t in (0, 4):
-        places = gltf.world(t)
-        found = gltf.skinned(places)
-        expected = (capture.vertices[t] + OFFSET) @ turn.T + shift
-        error = np.linalg.norm(found - expected, axis=1)
-        # where more than four joints pull (0.3 % of the vertices) the format's four are not exact
-        assert (error < 1e-5).mean() > 0.99 and error.max() < 0.01
-        cup = places["cup"]
-        object_ = (capture.rotation[t] @ capture.mesh.vertices.T).T + capture.translation[t]
-        object_ = (object_ + OBJECT_OFFSET) @ turn.T + shift
-        assert capture.mesh.vertices @ cup[:3, :3].T + cup[:3, 3] == pytest.approx(
-            object_, abs=1e-5
-        )
-        assert found[:, 1].max() - found[:, 1].min() > 1.4  # upright: y is up
-
-
-def test_glb_loads_in_trimesh(capture: fitted.Capture, folder: Path) -> None:
-    scene = trimesh.load(folder / "glb" / "cap.glb")
-    assert set(scene.geometry) == {"body", "cup"}
-    assert len(scene.geometry["body"].faces) == len(capture.model.faces)
-    assert scene.geometry["cup"].is_watertight == capture.mesh.watertight
 
 
 def test_manifest_is_complete_and_names_every_frame(folder: Path) -> None:

@@ -126,7 +126,21 @@ def _between(motion: Motion, at: float) -> BodyParameters:
     )
 
 
-@pytest.mark.parametrize("at", [0.0, 1.25, 2.5, 4.0])
+def test_accessors_are_aligned_bounded_and_finite(path: Path) -> None:
+    player = Player(pygltflib.GLTF2().load(str(path)))
+    for index, entry in enumerate(player.file.accessors):
+        view, values = player.file.bufferViews[entry.bufferView], player.values(index)
+        assert view.byteOffset % 4 == 0 and values.nbytes == view.byteLength
+        assert np.isfinite(values).all()
+        if entry.min:
+            assert (values.min(0).tolist(), values.max(0).tolist()) == (entry.min, entry.max)
+    times = player.values(player.file.animations[0].samplers[0].input).ravel()
+    assert times == pytest.approx(np.arange(5) / fitted.FPS)
+    skinned = player.file.meshes[player.file.nodes[player.node("body")].mesh].primitives[0]
+    assert player.values(skinned.attributes.WEIGHTS_0).sum(1) == pytest.approx(1, abs=1e-6)
+
+
+@pytest.mark.parametrize("at", [0.0, 1.25, 4.0])
 def test_body_and_object_are_where_they_are_at_any_moment(
     at: float, path: Path, motion: Motion, lively: fitted.Capture
 ) -> None:

@@ -87,6 +87,8 @@ def test_contact_is_in_every_format(
 ) -> None:
     with artefacts.read(capture.paths["joint"], JOINT) as joint:
         regions, probability = joint.text("region_names"), joint["contact_probability"]
+    with artefacts.read(capture.paths["metrics"], METRICS) as measured:
+        reasons = measured.text("flag_reason")
     told = _told(everything)
     assert len(told) == 8
     for name, found in told.items():
@@ -100,6 +102,8 @@ def test_contact_is_in_every_format(
         said = np.array(found["contact_probability"])
         assert said == pytest.approx(probability, abs=1e-4), name
         assert np.shape(found["contact_annotated"]) == probability.shape
+        if not _is_json(found):
+            assert list(found["flag_reason"]) == reasons, name
 
 
 def test_deviations_and_stated_errors_are_in_every_format(

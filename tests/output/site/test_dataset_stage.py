@@ -20,27 +20,7 @@ from intercap_core.schemas import HEATMAPS, METRICS
 from intercap_core.stage_list import STAGES
 from intercap_core.stages import page
 from tests.helpers import fitted_capture as fitted
-from tests.helpers.site import FAILED, merge, row, two_captures, write_site, write_summaries
-
-
-@pytest.fixture(scope="module")
-def captures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, fitted.Capture]:
-    return two_captures(tmp_path_factory.mktemp("captures"))
-
-
-def _run(captures: dict[str, fitted.Capture], out: Path, **settings: int) -> Path:
-    return write_site(
-        captures,
-        out,
-        settings=PageSettings(**settings),
-        failed=FAILED,
-        intents={"s01_o03": "use"},
-    )
-
-
-@pytest.fixture(scope="module")
-def out(captures: dict[str, fitted.Capture], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return _run(captures, tmp_path_factory.mktemp("dataset"))
+from tests.helpers.site import FAILED, INTENTS, merge, row, write_page, write_summaries
 
 
 class _Reader(HTMLParser):
@@ -76,28 +56,28 @@ def _page(out: Path, name: str) -> Path:
 
 
 @pytest.fixture(scope="module")
-def overview(out: Path) -> _Reader:
-    return _read(out / "site" / "index.html")
+def overview(site: Path) -> _Reader:
+    return _read(site / "site" / "index.html")
 
 
 @pytest.fixture(scope="module")
-def pages(out: Path, captures: dict[str, fitted.Capture]) -> dict[str, _Reader]:
-    return {name: _read(_page(out, name)) for name in captures}
+def pages(site: Path, captures: dict[str, fitted.Capture]) -> dict[str, _Reader]:
+    return {name: _read(_page(site, name)) for name in captures}
 
 
-def test_all_files_are_there(out: Path) -> None:
-    summary = json.loads((out / "summary.json").read_text())
+def test_all_files_are_there(site: Path) -> None:
+    summary = json.loads((site / "summary.json").read_text())
     assert (summary["dataset"], summary["sequences"], summary["frames"]) == ("demo", 2, 8)
     assert summary["truth"]["joint"]["body_pve_mm"] == pytest.approx(10, abs=1e-2)
     assert set(summary["truth"]["object_track"]) == {
         "object_translation_mm", "object_rotation_deg", "acceleration_error"
     }  # fmt: skip
-    assert len(pd.read_parquet(out / "tables" / "sequences.parquet")) == 2
-    assert len(pd.read_parquet(out / "tables" / "frames.parquet")) == 8
+    assert len(pd.read_parquet(site / "tables" / "sequences.parquet")) == 2
+    assert len(pd.read_parquet(site / "tables" / "frames.parquet")) == 8
 
 
-def test_heatmaps_are_shares_of_frames(out: Path, captures: dict[str, fitted.Capture]) -> None:
-    with artefacts.read(out / "heatmaps.h5", HEATMAPS) as heat:
+def test_heatmaps_are_shares_of_frames(site: Path, captures: dict[str, fitted.Capture]) -> None:
+    with artefacts.read(site / "heatmaps.h5", HEATMAPS) as heat:
         body, names = heat["body_likelihood"], heat.text("object_names")
         offsets, likelihood = heat["object_offsets"], heat["object_likelihood"]
     assert names == ["cup", "football"]
@@ -113,9 +93,9 @@ def test_heatmaps_are_shares_of_frames(out: Path, captures: dict[str, fitted.Cap
 
 
 def test_tables_by_object_subject_intent_and_camera(
-    out: Path, captures: dict[str, fitted.Capture]
+    site: Path, captures: dict[str, fitted.Capture]
 ) -> None:
-    tables = {path.stem: pd.read_csv(path) for path in (out / "tables").glob("*.csv")}
+    tables = {path.stem: pd.read_csv(path) for path in (site / "tables").glob("*.csv")}
     assert set(tables) == {
         "sequences",
         "frames",
@@ -129,7 +109,7 @@ def test_tables_by_object_subject_intent_and_camera(
     assert tables["objects"]["object"].tolist() == ["cup", "football"]
     subject = tables["subjects"].iloc[0]
     assert (subject["sequences"], subject["frames"]) == (2, 8)
-    assert tables["intents"][["intent", "frames"]].values.tolist() == [["use", 4]]
+    assert tables["intents"][["intent", "frames"]].values.tolist() == [["pass", 4], ["use", 4]]
     # a group of one sequence has that sequence's figures
     by_name = tables["sequences"].set_index("sequence")
     ball = tables["objects"].set_index("object").loc["football"]
@@ -142,21 +122,21 @@ def test_tables_by_object_subject_intent_and_camera(
     assert (first["camera"], first["sequences"], first["images"]) == ("k1", 2, 8)
     assert first["depth_bias_mm"] == pytest.approx(own["depth_bias_mm"].mean(), abs=1e-6)
     for name in tables:
-        read = pd.read_parquet(out / "tables" / f"{name}.parquet")
+        read = pd.read_parquet(site / "tables" / f"{name}.parquet")
         assert len(read) == len(tables[name]) and list(read) == list(tables[name])
 
 
 def test_pages_need_nothing_beside_the_site(
-    out: Path, overview: _Reader, pages: dict[str, _Reader]
+    site: Path, overview: _Reader, pages: dict[str, _Reader]
 ) -> None:
     for folder, shown in (
-        (out / "site", overview),
-        *((_page(out, n).parent, pages[n]) for n in pages),
+        (site / "site", overview),
+        *((_page(site, n).parent, pages[n]) for n in pages),
     ):
         for address in shown.addresses:
             if not address.startswith(("data:", "#")):
                 target = (folder / address.partition("#")[0]).resolve()
-                assert target.is_relative_to((out / "site").resolve()) and target.is_file()
+                assert target.is_relative_to((site / "site").resolve()) and target.is_file()
         for image in shown.images[:-1]:  # the last one is the empty enlargement
             assert image["alt"]
             data = base64.b64decode(str(image["src"]).split(";base64,")[1])
@@ -296,11 +276,18 @@ def test_overlay_covers_the_person_in_the_image(
 
 
 def test_same_input_same_bytes(
-    captures: dict[str, fitted.Capture], out: Path, tmp_path: Path
+    captures: dict[str, fitted.Capture], site: Path, tmp_path: Path
 ) -> None:
-    again = _run(captures, tmp_path)
-    for path in sorted(p for p in out.rglob("*") if p.is_file()):
-        assert (again / path.relative_to(out)).read_bytes() == path.read_bytes(), path.name
+    write_page(captures["s01_o03"], tmp_path, "s01_o03", "use")
+    merge(
+        write_summaries(captures, tmp_path / "summaries", INTENTS),
+        captures,
+        tmp_path,
+        "demo",
+        FAILED,
+    )
+    for path in sorted(p for p in tmp_path.rglob("*") if p.is_file()):
+        assert (site / path.relative_to(tmp_path)).read_bytes() == path.read_bytes(), path.name
 
 
 def test_a_dataset_without_results_says_so(tmp_path: Path) -> None:

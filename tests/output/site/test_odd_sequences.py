@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import h5py
@@ -13,12 +13,13 @@ import pytest
 
 from intercap_core.commands.report import write_site
 from intercap_core.errors import UserError
-from intercap_core.project import load_project
+from intercap_core.project import Project, load_project
 from intercap_core.schemas import METRICS
 from tests.helpers import fitted_capture as fitted
 from tests.helpers.site import MEASURED, measure
 
-GOOD, ODD = "good", "odd"
+GOOD = "good"
+MARKUP = '<b onclick="x">p&01</b>'
 Damage = Callable[[Path], object]  # of a sequence's folder
 
 
@@ -29,20 +30,21 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
     return made
 
 
-@pytest.fixture
-def settings(capture: fitted.Capture, tmp_path: Path) -> Path:
-    """A project of two sequences, all computed: the second one is a copy of the first."""
-    path = fitted.write_project(tmp_path, capture, GOOD)
-    folder = tmp_path / "results" / "trial"
-    shutil.copy(capture.paths["metrics"], folder / GOOD)
-    shutil.copytree(folder / GOOD, folder / ODD)
-    for artefact in (folder / ODD).iterdir():
-        _set(artefact, sequence=ODD)
-    table = tmp_path / "sequences.tsv"
-    head, row = table.read_text().splitlines()
-    rows = [row.rpartition("\t")[0], row.rpartition("\t")[0].replace(GOOD, ODD, 1)]
-    table.write_text("\n".join([head.rpartition("\t")[0], *rows]) + "\n")
-    return path
+def _project(folder: Path, capture: fitted.Capture, copies: Iterable[str] = ()) -> Project:
+    """A project of the measured capture without truth, and copies of it, with small pages."""
+    path = fitted.write_project(folder, capture, GOOD)
+    path.write_text(path.read_text() + "page: {cameras: 1, frames: 1}\n")
+    results = folder / "results" / "trial"
+    shutil.copy(capture.paths["metrics"], results / GOOD)
+    for name in copies:
+        shutil.copytree(results / GOOD, results / name)
+        for artefact in (results / name).iterdir():
+            _set(artefact, sequence=name)
+    table = folder / "sequences.tsv"
+    head, row = (line.rpartition("\t")[0] for line in table.read_text().splitlines())
+    rows = [row, *(row.replace(GOOD, name, 1) for name in copies)]
+    table.write_text("\n".join([head, *rows]) + "\n")
+    return load_project(path)
 
 
 def _set(artefact: Path, **attributes: object) -> None:
@@ -58,45 +60,56 @@ def _of_another_body(folder: Path) -> None:
         file.create_dataset("body_to_object", data=distances, fletcher32=True)
 
 
-@pytest.mark.parametrize(
-    ("damage", "says"),
-    [
-        (lambda folder: (folder / "metrics.h5").unlink(), [f"{ODD}/summary.h5"]),
-        (
-            lambda folder: _set(folder / "metrics.h5", schema_version=METRICS.version + 1),
-            [f"{ODD}/metrics.h5", f"version {METRICS.version + 1}", "re-run stage 'metrics'"],
-        ),
-        (_of_another_body, ["a body of 1000 vertices", "not in the body's heatmap"]),
-        (lambda folder: _set(folder / "joint.h5", body_model="0123"), ["another body file"]),
-    ],
-    ids=["no metrics", "metrics of another version", "another body's vertices", "another body"],
-)
-def test_what_is_wrong_with_one_sequence_is_told_and_the_other_is_shown(
-    settings: Path, damage: Damage, says: list[str], caplog: pytest.LogCaptureFixture
+DAMAGES: dict[str, tuple[Damage, list[str]]] = {
+    "no_metrics": (lambda folder: (folder / "metrics.h5").unlink(), ["no_metrics/summary.h5"]),
+    "other_version": (
+        lambda folder: _set(folder / "metrics.h5", schema_version=METRICS.version + 1),
+        [
+            "other_version/metrics.h5",
+            f"version {METRICS.version + 1}",
+            "re-run stage 'metrics'",
+        ],
+    ),
+    "other_vertices": (_of_another_body, ["a body of 1000 vertices", "not in the body's heatmap"]),
+    "other_body": (
+        lambda folder: _set(folder / "joint.h5", body_model="0123"),
+        ["another body file"],
+    ),
+}
+
+
+def test_a_damaged_sequence_is_named_and_the_others_are_shown(
+    capture: fitted.Capture, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    project = load_project(settings)
-    damage(project.results / ODD)
+    project = _project(tmp_path, capture, DAMAGES)
+    for name, (damage, _) in DAMAGES.items():
+        damage(project.results / name)
+    for stage in ("body_fit", "metrics"):
+        _set(project.results / GOOD / f"{stage}.h5", subject=MARKUP)
     with caplog.at_level(logging.WARNING):
         overview = write_site(project)
     pages = overview.parent / "sequences"
-    assert (pages / GOOD / "index.html").is_file() and not (pages / ODD).exists()
+    assert [path.name for path in pages.iterdir()] == [GOOD]
     text = overview.read_text()
-    assert ODD in text and f"sequences/{GOOD}/index.html" in text
-    told = caplog.text + text
-    for words in says:
-        assert words.replace("'", "&#39;") in told or words in told
+    assert f"sequences/{GOOD}/index.html" in text
+    for name, (_, expected) in DAMAGES.items():
+        assert name in text
+        for part in expected:
+            assert part.replace("'", "&#39;") in text or part in caplog.text + text
+    for shown in (text, (pages / GOOD / "index.html").read_text()):
+        assert "<b onclick" not in shown
+        assert "&lt;b onclick=&#34;x&#34;&gt;p&amp;01&lt;/b&gt;" in shown
 
 
-def test_an_empty_dataset_says_that_nothing_is_computed(settings: Path) -> None:
-    project = load_project(settings)
-    for name in (GOOD, ODD):
-        shutil.rmtree(project.results / name)
+def test_an_empty_dataset_names_its_sequences(capture: fitted.Capture, tmp_path: Path) -> None:
+    project = _project(tmp_path, capture)
+    shutil.rmtree(project.results / GOOD)
     with pytest.raises(UserError, match="dataset 'trial': no sequence has a result") as raised:
         write_site(project)
-    assert GOOD in str(raised.value) and ODD in str(raised.value)
+    assert GOOD in str(raised.value)
 
 
-def test_a_sequence_without_contact_is_shown_as_that(
+def test_a_sequence_without_contact_has_no_figures_of_it(
     capture: fitted.Capture, tmp_path: Path
 ) -> None:
     """The ball hangs a metre away: no contact frame, no close-up, no figure of penetration."""
@@ -112,14 +125,9 @@ def test_a_sequence_without_contact_is_shown_as_that(
         **{**capture.__dict__, "paths": {**paths, "metrics": tmp_path / "metrics.h5"}}
     )
     measure(apart)
-    project_folder = tmp_path / "project"
-    project_folder.mkdir()
+    (tmp_path / "project").mkdir()
     apart.paths["truth"] = capture.paths["truth"]
-    path = fitted.write_project(project_folder, apart, GOOD)
-    table = project_folder / "sequences.tsv"
-    table.write_text("\n".join(line.rpartition("\t")[0] for line in table.read_text().splitlines()))
-    shutil.copy(apart.paths["metrics"], project_folder / "results" / "trial" / GOOD)
-    overview = write_site(load_project(path))
+    overview = write_site(_project(tmp_path / "project", apart))
     text = overview.read_text()
     page = (overview.parent / "sequences" / GOOD / "index.html").read_text()
     assert "maximum 0.0 % of 3 frames" in text and ">nan" not in text
@@ -127,16 +135,3 @@ def test_a_sequence_without_contact_is_shown_as_that(
     assert "<span>penetration</span><b>–</b>" in page
     with h5py.File(overview.parents[1] / GOOD / "summary.h5") as file:
         assert not np.any(file["contact_frame"][()])
-
-
-def test_a_name_with_markup_in_it_is_a_name(settings: Path) -> None:
-    project = load_project(settings)
-    name = '<b onclick="x">p&01</b>'
-    for stage in ("body_fit", "metrics"):
-        _set(project.results / ODD / f"{stage}.h5", subject=name)
-    overview = write_site(project)
-    for page in (overview, overview.parent / "sequences" / ODD / "index.html"):
-        text = page.read_text()
-        assert (
-            "<b onclick" not in text and "&lt;b onclick=&#34;x&#34;&gt;p&amp;01&lt;/b&gt;" in text
-        )

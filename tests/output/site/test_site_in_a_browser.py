@@ -9,7 +9,6 @@ import pytest
 
 from intercap_core.output.viewer.page import SCRIPT, standalone
 from tests.helpers.browser import DESK, PHONE, asked, needs_chromium, serious_faults, visit
-from tests.helpers.site import FAILED, two_captures, write_site
 
 pytestmark = needs_chromium
 SEQUENCE = "s01_o03"
@@ -19,21 +18,14 @@ _TOUCHABLE_PX = 24.0  # WCAG 2.2, 2.5.8, target size (minimum)
 
 
 @pytest.fixture(scope="module")
-def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def pages(site: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Overview, a sequence's page, and its viewer alone."""
-    out = write_site(
-        two_captures(tmp_path_factory.mktemp("captures")),
-        tmp_path_factory.mktemp("site"),
-        failed=FAILED,
-        intents={SEQUENCE: "use", "s01_o09": "pass"},
-    )
-    folder = out / "site" / "sequences" / SEQUENCE
-    alone = out / "alone"
-    alone.mkdir()
+    folder = site / "site" / "sequences" / SEQUENCE
+    alone = tmp_path_factory.mktemp("alone")
     (alone / SCRIPT).write_bytes((folder / SCRIPT).read_bytes())
     (alone / "index.html").write_text(standalone(SEQUENCE))
     return {
-        "overview": out / "site" / "index.html",
+        "overview": site / "site" / "index.html",
         "sequence": folder / "index.html",
         "viewer": alone / "index.html",
     }

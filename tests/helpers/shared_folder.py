@@ -1,0 +1,31 @@
+"""Folders that are built once in a test session and read by the tests of several workers."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+
+def shared_folder(
+    factory: pytest.TempPathFactory, key: str, make: Callable[[Path], object]
+) -> Path:
+    """Return the folder ``key`` of this session, built by the first caller; tests only read it.
+
+    Args:
+        make: fills the folder that it is given.
+    """
+    base = factory.getbasetemp()
+    root = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "shared"
+    folder, done = root / key, root / f"{key}.done"
+    root.mkdir(exist_ok=True)
+    with open(root / f"{key}.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not done.exists():
+            folder.mkdir(parents=True)
+            make(folder)
+            done.touch()
+    return folder
