@@ -249,7 +249,7 @@ def test_a_page_without_its_file_says_so(shown: Path, tmp_path: Path) -> None:
     (tmp_path / "none" / "index.html").write_text(shown.read_text())
     with visit(tmp_path / "none" / "index.html") as visited:
         assert visited.page.get_by_role("status").inner_text() == (
-            "This page's file viewer.js is not beside it."
+            "The file viewer.js is not in the folder of this page."
         )
         assert visited.page.evaluate("window.intercapViewer") is None
 
