@@ -45,9 +45,8 @@ from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.sequential import SequentialFits
 from intercap_core.joint.skin import contact_patches
 from intercap_core.joint.state import State
-from intercap_core.object_track.constants import TRACKING_FACES
 from intercap_core.object_track.observer import Observer
-from intercap_core.object_track.recording import ObjectRecording
+from intercap_core.object_track.recording import TRACKING_FACES, ObjectRecording
 from intercap_core.object_track.tracker import Tracker
 from intercap_core.object_track.view import View
 from intercap_core.project import Project
@@ -127,16 +126,7 @@ class ObjectClip:
 
     def tracker(self) -> Tracker:
         """The project's tracker on these frames."""
-        return Tracker(
-            self.mesh,
-            self.views.__getitem__,
-            self._labels_by_view,
-            self.settings,
-            times=self.times,
-            labels=self.labels,
-            up=self.up,
-            joints=self.joints,
-        )
+        return Tracker(self.observer())
 
     def observer(self) -> Observer:
         """The observer of one pass of the tracker over the images."""
@@ -145,9 +135,10 @@ class ObjectClip:
             self.views.__getitem__,
             self._labels_by_view,
             self.settings,
-            self.labels,
-            self.up,
-            self.joints,
+            self.times,
+            labels=self.labels,
+            up=self.up,
+            joints=self.joints,
         )
 
     @cached_property

@@ -34,7 +34,7 @@ from intercap_core.geometry.rigid.render import Renderer
 from intercap_core.geometry.rigid.shots import Shot, Surface
 from intercap_core.object_track.fit import MotionPrior, fit_pose
 from intercap_core.object_track.reduced_mask import EMPTY, ReducedMask, reduced_lens
-from intercap_core.object_track.view import Candidate, View, ViewGeometry
+from intercap_core.object_track.view import Candidate, FitContext, View, ViewGeometry
 
 VIEWS = (1, 2, 4, 6, 12, 16)
 FACES = (150, 600, 2400, 10_000)
@@ -88,10 +88,9 @@ class Scene:
         """The pose (4, 4) fitted as in a pass, from a little off."""
         start = apply_step(self.pose, OFF)
         prior = MotionPrior(start)
-        return fit_pose(
-            self.mesh, self.views, start, prior=prior, min_overlap=0.3, background_term=True,
-            rounds=(3, 3), start_scale=0.5, renderer=renderer,
-        ).pose  # fmt: skip
+        context = FitContext(self.mesh, renderer=renderer)
+        fit = fit_pose(context, self.views, start, prior=prior, rounds=(3, 3), start_scale=0.5)
+        return fit.pose
 
 
 def tracking_scaling(mesh: ObjectMesh) -> dict[str, float]:

@@ -35,10 +35,9 @@ from intercap_core.commands.run import run_workflow
 from intercap_core.errors import UserError
 from intercap_core.evaluation.object_pose import LOST_ROTATION_DEG, LOST_TRANSLATION_M
 from intercap_core.geometry.camera.transforms import apply_step, rigid
-from intercap_core.object_track.constants import FIT_ROUNDS
-from intercap_core.object_track.fit import MotionPrior, fit_pose
+from intercap_core.object_track.fit import FIT_ROUNDS, MotionPrior, fit_pose
 from intercap_core.object_track.given_poses import GivenPose
-from intercap_core.object_track.motion import expected, extrapolated
+from intercap_core.object_track.motion import extrapolate, predict_prior
 from intercap_core.object_track.view import View
 from intercap_core.project import load_project
 
@@ -137,8 +136,10 @@ def one_pass(clip: ObjectClip, start: np.ndarray) -> Run:
         fit = observer.fit(0, start, MotionPrior(start), rounds=FIT_ROUNDS, scale=1.0)
         found = [fit.pose, fit.pose]  # before the first frame it rested
         for t in range(1, len(clip)):
-            guess = extrapolated(*found[-2:])
-            found.append(observer.fit(t, guess, expected(*found[-2:], guess, clip.step_s)).pose)
+            guess = extrapolate(*found[-2:])
+            found.append(
+                observer.fit(t, guess, predict_prior(*found[-2:], guess, clip.step_s)).pose
+            )
         poses = np.array(found[1:])
         seconds.append(time.perf_counter() - begin)
     return Run.of(clip, poses, statistics.median(seconds))
@@ -149,7 +150,7 @@ def paper(clip: ObjectClip, start: np.ndarray, recipe: Recipe) -> Run:
     begin, before, now = time.perf_counter(), start, start
     poses: list[np.ndarray] = []
     for views in clip.views:
-        guess = extrapolated(before, now)
+        guess = extrapolate(before, now)
         fit = adam(clip, views, guess, recipe, recipe.steps if poses else recipe.first_steps)
         before, now = (now if poses else fit.poses[-1]), fit.poses[-1]
         poses.append(now)
@@ -407,20 +408,12 @@ def _convergence_of_ours(
 ) -> np.ndarray:
     """Rows (steps, 3) of seconds, millimetres and degrees."""
     rows: list[np.ndarray] = []
+    context = clip.observer().context
     for rounds in CONVERGENCE_ROUNDS:
         found: list[tuple[float, ...]] = []
         for t, start in zip(frames, starts, strict=True):
             begin = time.perf_counter()
-            fit = fit_pose(
-                clip.mesh,
-                clip.views[t],
-                start,
-                prior=None,
-                min_overlap=clip.settings.min_overlap,
-                background_term=clip.settings.background_term,
-                labels=clip.labels,
-                rounds=rounds,
-            )
+            fit = fit_pose(context, clip.views[t], start, rounds=rounds)
             seconds = time.perf_counter() - begin
             found.append((seconds, *map(float, clip.errors(fit.pose, int(t)))))
         rows.append(np.median(found, axis=0))

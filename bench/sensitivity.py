@@ -57,7 +57,7 @@ class Probe:
 RISKIEST = (
     Probe("object_track.ALWAYS_PRESENT", "a candidate that is always there is furniture"),
     Probe("object_track.SOMETIMES_PRESENT", "one that is there for a while only is not"),
-    Probe("object_track.BESIDE_FRAMES", "frames that make what stands elsewhere another thing"),
+    Probe("object_track.RIVAL_FRAMES", "frames that make what stands elsewhere another thing"),
     Probe("object_track.VIEW_SAMPLES", "how much a view says"),
     Probe("object_track.RIVAL_LOG_RATIO", "hypotheses that are followed"),
     Probe("object_track.AMBIGUOUS_PROBABILITY", "when a rival pose makes a frame ambiguous"),

@@ -18,14 +18,10 @@ from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply, rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.render import open_renderer
-from intercap_core.object_track.constants import (
-    ASSESS_MIN_OVERLAP,
-    SEEN_LOG_RATIO,
-    TRACKING_FACES,
-)
 from intercap_core.object_track.fit import Fit, MotionPrior, assess_all, fit_pose
-from intercap_core.object_track.recording import ObjectRecording
-from intercap_core.object_track.view import View
+from intercap_core.object_track.likelihood import SEEN_LOG_RATIO
+from intercap_core.object_track.recording import TRACKING_FACES, ObjectRecording
+from intercap_core.object_track.view import FitContext, View
 from intercap_core.schemas import SCENE
 
 NEEDED = ("frames", "detections", "scene", "person")
@@ -107,13 +103,10 @@ def _fitted(
 
     Returns the fit with the highest likelihood.
     """
-    renderer = open_renderer("cpu")
+    context = FitContext.from_settings(mesh, labels, settings, open_renderer("cpu"))
 
     def fitted(pose: np.ndarray) -> Fit:
-        return fit_pose(
-            mesh, views, pose, prior=MotionPrior(pose), min_overlap=settings.min_overlap,
-            background_term=settings.background_term, labels=labels, renderer=renderer,
-        )  # fmt: skip
+        return fit_pose(context, views, pose, prior=MotionPrior(pose))
 
     best = fitted(start)
     if best.log_ratio > SEEN_LOG_RATIO:
@@ -124,9 +117,7 @@ def _fitted(
     around = np.repeat(start[None], len(steps) * len(REACH_DIAMETERS), 0)
     shifts = [mesh.diameter * far * steps for far in REACH_DIAMETERS]
     around[:, :3, 3] += np.concatenate(shifts)
-    seen = assess_all(
-        mesh, views, around, min_overlap=ASSESS_MIN_OVERLAP, labels=labels, renderer=renderer
-    )
+    seen = assess_all(context, views, around)
     order = np.argsort([-one.log_ratio for one in seen], kind="stable")[:FITTED_AROUND]
     return max([best, *(fitted(around[k]) for k in order)], key=lambda one: one.log_ratio)
 

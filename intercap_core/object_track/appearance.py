@@ -1,13 +1,12 @@
-"""Colours of the object's surface, learnt while it is tracked: they decide turns that its shape
-leaves open.
+"""Colours of the object's surface, learnt while it is tracked.
 
-The surface is cut into patches. What a view shows of one is its colour in logarithms of linear
-light, where a camera's gain and shading add: a brightness and two ratios of channels. Of a pose x
-it says the log-likelihood ratio
+They decide between rotations that the shape leaves ambiguous. The surface is divided into patches.
+The colour of a patch is stated in logarithms of linear light, where a camera's gain and shading
+add: a brightness and two ratios of channels. The log-likelihood ratio of a pose x is
 
-    log p(colours | those learnt, turned with x) - log p(colours | any of the object's)
+    log p(colours | those learnt, moved with x) - log p(colours | any of the object's)
 
-so an object of one colour says nothing, whatever its colour; nor does a side that was never seen.
+so an object of one colour decides nothing, and neither does a side that was never seen.
 """
 
 from __future__ import annotations
@@ -15,64 +14,82 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 
 from intercap_core.geometry.rigid.mesh import Paint
-from intercap_core.object_track.constants import (
-    COLOUR_COST_MAX,
-    COLOUR_HALF_SAMPLES_PX,
-    COLOUR_MIN_SIGMA,
-    COLOUR_RANGE,
-    COLOUR_SAMPLES,
-    COLOURED_SHARE,
-    EXPOSURE_SIGMA,
-    GAIN_SIGMA,
-    LEARNING_STEPS,
-    PAINT_EXPLAINS,
-    SHADING_SIGMA,
-)
-from intercap_core.object_track.light import linear
-from intercap_core.object_track.surface_kernel import patches_of
 
-LEVELS_USED = slice(10, 251)  # darker ones are noise, brighter ones saturated
+STEEP_COSINE = 0.3  # between surface and ray, below which a pixel mixes patches
+COLOUR_SAMPLES = 2.0  # independent samples of a view's colours at most
+COLOUR_HALF_SAMPLES_PX = 60  # pixels at which half of them count
+# Standard deviations in logarithms of light.
+EXPOSURE_SIGMA = 0.1  # of a view's exposure and white balance from frame to frame
+GAIN_SIGMA = 0.15  # of a camera's gain
+SHADING_SIGMA = 0.4  # of the light from one side relative to the other
+# Of measured colours at least: shadows and lamps change the brightness more than the two ratios.
+COLOUR_MIN_SIGMA = np.array([0.25, 0.08, 0.08])
+COLOUR_RANGE = 2.0  # from white to black paint
+COLOURED_SHARE = 0.5  # of the noise's variance that the variance of the colours must exceed
+COLOUR_COST_MAX = 4.5  # three standard deviations: an occluder, a highlight
+LEARNING_STEPS = 4  # alternations of colours and gains
+PAINT_EXPLAINS = 0.5  # share of the colours' variance that the mesh's own colours must explain
+
+LEVELS_USED = slice(10, 251)  # darker grey levels are noise, brighter ones are saturated
+
+
+def linear(levels: np.ndarray) -> np.ndarray:
+    """Convert uint8 grey levels to light (...,), 0 to 1, by the curve of sRGB (IEC 61966-2-1)."""
+    value = np.asarray(levels) / 255.0
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
 LIGHT = np.full(256, np.nan)
-"""Logarithms of light of grey levels; NaN where a level says nothing."""
+"""Logarithms of light of grey levels, NaN outside of ``LEVELS_USED``."""
 LIGHT[LEVELS_USED] = np.log(linear(np.arange(256)[LEVELS_USED]))
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
-    """What frame t shows of the surface at one pose, patch by patch, all views together.
-
-    ``patch`` (N,) numbers, ``colour`` (N, 3) as in :mod:`.surface_kernel`, ``normal`` (N, 3) of the
-    patches in the master frame, ``view`` (N,) in ascending order, ``pixels`` (N,).
-    """
+class SurfaceColours:
+    """Colours of the surface in one frame at one pose, patch by patch."""
 
     frame: int
+    """Frame."""
     patch: np.ndarray
+    """(N,) numbers of the patches."""
     colour: np.ndarray
+    """(N, 3) mean colours."""
     normal: np.ndarray
+    """(N, 3) unit normals of the patches, master frame."""
     view: np.ndarray
+    """(N,) view of each patch, ascending."""
     pixels: np.ndarray
+    """(N,) pixels of each patch."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Known:
-    """Colours of P patches: ``mean`` and ``variance`` (P, 3)."""
+class _PatchColours:
+    """Colours of P patches."""
 
     mean: np.ndarray
+    """(P, 3)."""
     variance: np.ndarray
+    """(P, 3)."""
 
 
 class Appearance:
-    """The surface's colours, learnt from ``sightings`` of frames in which the pose is certain.
-
-    ``paint`` are those that the mesh brings; they count as far as they explain what is seen.
-    """
+    """Colours of the surface, learnt from frames with a certain pose."""
 
     def __init__(
-        self, sightings: Sequence[Sighting], views: int, paint: Paint | None, size: float
+        self, sightings: Sequence[SurfaceColours], views: int, paint: Paint | None, size: float
     ) -> None:
+        """Learn the colours.
+
+        Args:
+            sightings: colours of the frames, each with another pose.
+            views: number of views.
+            paint: colours of the mesh; they count if they explain the learnt ones.
+            size: size of a patch, metres.
+        """
         self.sightings = tuple(sightings)
         self._patches = np.unique(np.concatenate([one.patch for one in sightings]))
         self._gain = np.zeros((views, 3))
@@ -88,23 +105,23 @@ class Appearance:
         self._painted = None if paint is None else self._compare(paint, size)
 
     @property
-    def says_something(self) -> bool:
+    def is_coloured(self) -> bool:
         """Whether the object has more than one colour."""
         return bool((self._spread > COLOURED_SHARE * self._noise).any())
 
-    def log_ratio(self, seen: Sighting, apart: int) -> float:
-        """The log-likelihood ratio of a sighting's pose, nats, by the colours of frames that are at
-        least ``apart`` from its own."""
+    def log_ratio(self, seen: SurfaceColours, apart: int) -> float:
+        """Return the log-likelihood ratio of a pose, nats.
+
+        Only colours of frames at least ``apart`` from its own count.
+        """
         return self._ratio(seen, self._known(np.abs(self._frames - seen.frame) >= apart))
 
-    def paint_log_ratio(self, seen: Sighting) -> float:
-        """The same by the mesh's own colours alone; 0 where they are not the object's."""
+    def paint_log_ratio(self, seen: SurfaceColours) -> float:
+        """Return the same for the mesh's own colours; 0 if they are not the object's."""
         return 0.0 if self._painted is None else self._ratio(seen, self._painted)
 
-    # --- learning ------------------------------------------------------------------------------
-
     def _learn(self) -> None:
-        """Colours, the cameras' gains, and how far both are off, in turns."""
+        """Estimate colours, gains of the cameras, and the noise of both in turns."""
         views = np.concatenate([one.view for one in self.sightings])
         cameras = np.unique(views)
         for _ in range(LEARNING_STEPS):
@@ -120,20 +137,23 @@ class Appearance:
                 colour = one.colour - self._gain[one.view] - known.mean[at]
                 left.append(self._unshaded(one, colour))
             residual = np.concatenate(left)
-            # a camera may have seen one side alone: what may be colour is not taken for its gain
+            # a camera may have seen one side only: its gain is not what may be colour
             share = GAIN_SIGMA**2 / (GAIN_SIGMA**2 + self._noise)
             for camera in cameras:
                 left_over = residual[views == camera] + self._gain[camera]
                 self._gain[camera] = share * np.median(left_over, axis=0)
             self._gain[cameras] -= self._gain[cameras].mean(0)
-            # what the other frames do not foretell is noise: a hand before the object, a shadow
+            # what other frames do not predict is noise: a hand in front of the object, a shadow
             noise = _mean_square(residual)
             self._noise = np.maximum(noise, COLOUR_MIN_SIGMA**2)
             self._spread = np.maximum(_mean_square(np.concatenate(plain)) - noise, 0.0)
 
     def _add_up(self, plain: Sequence[np.ndarray]) -> None:
-        """Mean colours of the patches by frame, a frame's views as one look; ``plain`` are the
-        sightings' differences from the average."""
+        """Average the colours of the patches by frame.
+
+        All views of a frame count as one observation. ``plain`` are the differences from the
+        average.
+        """
         count = len(self._patches)
         for number, (one, colour) in enumerate(zip(self.sightings, plain, strict=True)):
             at, _ = self._find(one.patch)
@@ -143,27 +163,29 @@ class Appearance:
                 own = np.bincount(at, one.pixels * (self._average + colour)[:, channel], count)
                 self._totals[number, :, channel] = own / np.maximum(weight, 1e-9)
 
-    def _known(self, frames: np.ndarray) -> _Known:
-        """The patches' colours by those of the learnt frames that ``frames`` (N,) bool tells."""
+    def _known(self, frames: np.ndarray) -> _PatchColours:
+        """Return the colours of the patches by the learnt frames in the mask ``frames`` (N,)."""
         spread = np.maximum(self._spread, 1e-9)
         looks = self._looks[frames].sum(0)[:, None]
         variance = 1 / (1 / spread + looks / self._noise)
         total = self._totals[frames].sum(0)
-        return _Known(variance * (self._average / spread + total / self._noise), variance)
+        return _PatchColours(variance * (self._average / spread + total / self._noise), variance)
 
     def _find(self, patch: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Places (N,) of patches among those known, and whether each is."""
+        """Return the indices (N,) of patches among the known ones, and whether each is known."""
         at = np.minimum(np.searchsorted(self._patches, patch), len(self._patches) - 1)
         return at, self._patches[at] == patch
 
-    def _unshaded(self, seen: Sighting, colour: np.ndarray) -> np.ndarray:
-        """Differences of colour (N, 3) of a sighting without what light that falls from one side,
-        and each view's exposure, may explain of them (ridge regression on the normals)."""
+    def _unshaded(self, seen: SurfaceColours, colour: np.ndarray) -> np.ndarray:
+        """Remove shading and exposure from differences of colour (N, 3).
+
+        Ridge regression on the normals: light from one side, and the exposure of each view.
+        """
         result = colour.copy()
         starts = np.flatnonzero(np.diff(seen.view, prepend=-1))
         for start, stop in zip(starts, [*starts[1:], len(seen.view)], strict=True):
             own = slice(start, stop)
-            # its patches err together: a view of one side alone must not lose its colour
+            # patches of a view err together: a view of one side only must keep its colour
             weight = COLOUR_SAMPLES * seen.pixels[own, None] / seen.pixels[own].sum()
             light = np.concatenate(
                 [np.full((stop - start, 1), EXPOSURE_SIGMA), SHADING_SIGMA * seen.normal[own]], 1
@@ -175,11 +197,8 @@ class Appearance:
                 result[own, channels] -= design @ np.linalg.solve(matrix, force)
         return result
 
-    # --- comparing -----------------------------------------------------------------------------
-
-    def _ratio(self, seen: Sighting, known: _Known) -> float:
-        """Sum over views of mean log-likelihood ratios of their pixels, times the independent
-        samples that these are."""
+    def _ratio(self, seen: SurfaceColours, known: _PatchColours) -> float:
+        """Sum the mean log-likelihood ratios of the views times their independent samples."""
         at, is_known = self._find(seen.patch)
         colour = seen.colour - self._gain[seen.view]
         any_ = self._unshaded(seen, colour - self._average)
@@ -196,11 +215,11 @@ class Appearance:
             found += samples * float(seen.pixels[here] @ ratio[here]) / pixels
         return found
 
-    def _compare(self, paint: Paint, size: float) -> _Known | None:
-        """The mesh's own colours of the patches, where they explain those learnt."""
+    def _compare(self, paint: Paint, size: float) -> _PatchColours | None:
+        """Return the mesh's own colours of the patches if they explain the learnt ones."""
         number = patches_of(paint.points, paint.normals, size)
         at, is_known = self._find(number)
-        # a scan has no noise that would drown its darkest and brightest colours
+        # a scan has no noise in its darkest and brightest colours
         levels = np.clip(paint.colours, LEVELS_USED.start, LEVELS_USED.stop - 1)
         red, green, blue = LIGHT[levels].T
         colour = np.stack([(red + green + blue) / 3, red - green, blue - green], 1)
@@ -217,20 +236,126 @@ class Appearance:
         mean[there] += np.median(learnt[there] - mean[there], axis=0)
         off = _mean_square(learnt[there] - mean[there])
         square = _mean_square(learnt[there] - self._average)
-        # of all channels together: paint of another copy may be right in one by chance
+        # all channels together, as paint of another copy may match in one by chance
         if (off / self._noise).sum() > (1 - PAINT_EXPLAINS) * (square / self._noise).sum():
             return None
         variance = np.where(there[:, None], off, self._spread)
-        return _Known(mean, variance)
+        return _PatchColours(mean, variance)
 
 
 def _cost(residual: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """Minus log-likelihoods (N,) of residuals (N, 3), up to a constant; outliers cost no more than
-    so much."""
+    """Return minus log-likelihoods (N,) of residuals (N, 3) up to a constant, bounded."""
     cost = np.minimum(0.5 * residual**2 / variance, COLOUR_COST_MAX)
     return (cost + 0.5 * np.log(variance)).sum(1)
 
 
 def _mean_square(residual: np.ndarray) -> np.ndarray:
-    """Mean square (3,) of residuals (N, 3), none of which counts for more than colours differ."""
+    """Return the mean square (3,) of residuals (N, 3), each bounded by ``COLOUR_RANGE``."""
     return (np.clip(residual, -COLOUR_RANGE, COLOUR_RANGE) ** 2).mean(0)
+
+
+@numba.njit(cache=True, nogil=True)
+def patch_of(point, normal, size):
+    """Return the number of the patch of a surface point.
+
+    A patch is a cell of a grid of ``size`` metres and the axis that the surface faces most.
+    """
+    facing = 0
+    for axis in range(1, 3):
+        if abs(normal[axis]) > abs(normal[facing]):
+            facing = axis
+    side = 2 * facing + (1 if normal[facing] > 0 else 0)
+    number = 0
+    for axis in range(3):
+        number = number * 1024 + int(np.floor(point[axis] / size)) + 512
+    return 6 * number + side
+
+
+@numba.njit(cache=True, nogil=True)
+def patches_of(points, normals, size):
+    """Return :func:`patch_of` of points (N, 3): (N,) int64."""
+    found = np.empty(len(points), np.int64)
+    for i in range(len(points)):
+        found[i] = patch_of(points[i], normals[i], size)
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def seen_patches(
+    depth,
+    face,
+    x0,
+    y0,
+    mask,
+    mx,
+    my,
+    rays,
+    picture,
+    light,
+    object_from_camera,
+    face_normals,
+    size,
+    steep,
+):
+    """Return the patches of all pixels that show the object, with faces and colours.
+
+    A pixel counts if it and its neighbours lie in the rendering and in the candidate's mask.
+
+    Args:
+        depth, face: (h, w) of the rendering, whose first pixel is (x0, y0) of the image.
+        mask: the candidate's mask, whose first pixel is (mx, my).
+        rays: (H, W, 2) of the lens.
+        picture: (H, W, 3) uint8 BGR.
+        light: (256,) logarithms of light of grey levels, NaN if too dark or saturated.
+        object_from_camera: (4, 4).
+        face_normals: (F, 3), object frame.
+        size: size of a patch, metres.
+        steep: least cosine between surface and ray.
+
+    Returns:
+        Patches (n,), faces (n,) and colours (n, 3): brightness, red to green and blue to green.
+    """
+    height, width = face.shape
+    found = np.empty(height * width, np.int64)
+    faces = np.empty(height * width, np.int64)
+    colours = np.empty((height * width, 3))
+    point = np.empty(3)
+    count = 0
+    for v in range(1, height - 1):
+        for u in range(1, width - 1):
+            f = face[v, u]
+            if f < 0:
+                continue
+            blue = light[picture[y0 + v, x0 + u, 0]]
+            green = light[picture[y0 + v, x0 + u, 1]]
+            red = light[picture[y0 + v, x0 + u, 2]]
+            if np.isnan(blue + green + red):
+                continue
+            inside = True
+            for a, b in ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)):
+                j, i = v + a + y0 - my, u + b + x0 - mx
+                if face[v + a, u + b] < 0 or not (
+                    0 <= j < mask.shape[0] and 0 <= i < mask.shape[1] and mask[j, i]
+                ):
+                    inside = False
+            if not inside:
+                continue
+            z = depth[v, u]
+            x, y = rays[y0 + v, x0 + u, 0] * z, rays[y0 + v, x0 + u, 1] * z
+            across, length = 0.0, 0.0
+            for axis in range(3):
+                along = (
+                    object_from_camera[axis, 0] * x
+                    + object_from_camera[axis, 1] * y
+                    + object_from_camera[axis, 2] * z
+                )
+                point[axis] = along + object_from_camera[axis, 3]
+                across -= along * face_normals[f, axis]
+                length += along * along
+            if across < steep * np.sqrt(length):
+                continue
+            found[count], faces[count] = patch_of(point, face_normals[f], size), f
+            colours[count, 0] = (blue + green + red) / 3
+            colours[count, 1], colours[count, 2] = red - green, blue - green
+            count += 1
+    return found[:count], faces[:count], colours[:count]

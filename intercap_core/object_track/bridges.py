@@ -1,73 +1,95 @@
-"""Where the object may be while it is lost: in the hand that held it, or on the straight way.
+"""Poses of lost frames between known ones: in the hand that held the object, or on a straight path.
 
-What is held is hidden most: by the hand, by the head that it is raised to, by the body. A hand that
-carries the object from where it was seen last to where it is seen next held it in between.
+A held object is often hidden: by the hand, by the head, by the body. A hand that carries the object
+from where it was last seen to where it is next seen held it in between. Of the possible paths the
+one is taken that motion and images together make the likeliest.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from intercap_core.geometry.camera.transforms import apply_step, step_between
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.object_track.constants import (
+from intercap_core.geometry.solve.time_series import rigid_velocity
+from intercap_core.object_track.decoder import (
+    FIRST_HAND,
     HELD_M,
     HELD_M_S,
     HELD_RAD,
     HELD_RAD_S,
+    mode_log_ratios,
+    pose_distances,
 )
-from intercap_core.object_track.motion import hand_motions
-from intercap_core.object_track.steps import FIRST_HAND, mode_log_ratios
+from intercap_core.object_track.fit import FIT_ROUNDS, Fit, MotionPrior
+from intercap_core.object_track.given_poses import UNSEEN_S
+from intercap_core.object_track.likelihood import CONTRADICTED_LOG_RATIO
+from intercap_core.object_track.motion import estimate_hand_motions, unwrap_symmetry
+from intercap_core.object_track.observer import Observer
+
+# Standard deviations, or distances, at which a pose is as good as lost: one frame in six would be
+# off by more. Tuned on the studio.
+UNSURE_M = 0.035
+UNSURE_RAD = np.radians(15)
+# Nats by which a path in a hand must be likelier than any different path to be sure: odds of seven
+# to one. A longer free motion costs 3 more even if nobody sees anything.
+CARRIED_LOG_RATIO = 2.0
 
 
 @dataclass(frozen=True)
 class Bridge:
-    """One way that the object may have gone in lost frames: its ``poses`` (N, 4, 4) in the
-    ``frames`` (N,), the equivalent pose ``end`` (4, 4) of the known frame after that it leads to,
-    what speaks for it, nats, as a motion from the known frame before to that one, and what the
-    hand's motion tells of the poses, the ``information`` (N, 6, 6) of (turn on the left, shift),
-    zero where no hand carries it."""
+    """One possible path of the object through N lost frames."""
 
     frames: np.ndarray
+    """(N,) the lost frames."""
     poses: np.ndarray
+    """(N, 4, 4) poses in them."""
     end: np.ndarray
+    """(4, 4) equivalent pose of the known frame after them to which the path leads."""
     log_ratio: float
+    """Log-probability of the motion from the known frame before to the one after, nats."""
     information: np.ndarray
+    """(N, 6, 6) of (turn on the left, shift) by the motion of the hand, zero without a hand."""
 
 
 @dataclass(frozen=True)
 class Gap:
-    """Lost frames between the known frames ``before`` and ``after`` of a track of ``poses`` (T, 4,
-    4) at ``times`` (T,), seconds; ``joints`` (T, K, 3) of the person, metres, NaN unknown."""
+    """Lost frames between two known frames of a track."""
 
     mesh: ObjectMesh
+    """The object."""
     poses: np.ndarray
+    """(T, 4, 4) poses of the track."""
     times: np.ndarray
+    """(T,) seconds."""
     joints: np.ndarray | None
+    """(T, K, 3) of the person, metres, NaN where unknown."""
     before: int
+    """Known frame before the gap."""
     after: int
+    """Known frame after the gap."""
 
     @property
     def seconds(self) -> float:
-        """From the known frame before to the one after."""
+        """Time from the known frame before to the one after."""
         return float(self.times[self.after] - self.times[self.before])
 
     def bridges(self) -> list[Bridge]:
-        """The straight way, at rest or free, and with each hand that may have held the object and
-        is known in some of the frames."""
+        """Return the possible paths: straight, and with each hand that may have held the object."""
         a, b = self.before, self.after
         same = self.mesh.symmetry.nearest_equivalent_pose
         frames = np.arange(a + 1, b)
-        hands = [] if self.joints is None else hand_motions(self.joints[[a, b]])
-        ways = mode_log_ratios(self.mesh, self.poses[[a]], self.poses[[b]], self.seconds, hands)
-        ratio = ways[:, 0, 0]
+        hands = [] if self.joints is None else estimate_hand_motions(self.joints[[a, b]])
+        modes = mode_log_ratios(self.mesh, self.poses[[a]], self.poses[[b]], self.seconds, hands)
+        ratio = modes[:, 0, 0]
         end = same(self.poses[b], self.poses[a])
         direct = self._straight(end)
         nothing = np.zeros((len(frames), 6, 6))
-        found = [Bridge(frames, direct, end, float(ratio[:FIRST_HAND].max()), nothing)]
+        result = [Bridge(frames, direct, end, float(ratio[:FIRST_HAND].max()), nothing)]
         for number, (hand, own) in enumerate(zip(hands, ratio[FIRST_HAND:], strict=True)):
             if hand is None or not np.isfinite(own):
                 continue
@@ -76,34 +98,36 @@ class Gap:
             for i, t in enumerate(frames):
                 pose = self._in_hand(number, int(t), end)
                 if pose is not None:
-                    poses[i], information[i] = pose, self._hold(int(t))
+                    poses[i], information[i] = pose, self._hand_information(int(t))
             if information.any():
-                found.append(Bridge(frames, poses, end, float(own), information))
-        return found
+                result.append(Bridge(frames, poses, end, float(own), information))
+        return result
 
     def _straight(self, end: np.ndarray) -> np.ndarray:
-        """Poses (N, 4, 4) on the straight way to ``end`` (4, 4)."""
+        """Return poses (N, 4, 4) on the straight path to ``end`` (4, 4)."""
         poses = self.poses[self.before : self.after + 1].copy()
         poses[-1] = end
         known = np.zeros(len(poses), bool)
         known[[0, -1]] = True
-        return straight(poses, known)[1:-1]
+        return interpolate_poses(poses, known)[1:-1]
 
     def _in_hand(self, hand: int, t: int, end: np.ndarray) -> np.ndarray | None:
-        """The pose (4, 4) of frame ``t`` as the hand carries it from both sides, to ``end`` (4, 4);
-        None where the hand is unknown."""
+        """Return the pose (4, 4) of frame ``t`` as the hand carries it from both sides.
+
+        ``end`` (4, 4) is the pose after the gap. None if the motion of the hand is unknown.
+        """
         assert self.joints is not None
         carried = []
         for u, pose in ((self.before, self.poses[self.before]), (self.after, end)):
-            motion = hand_motions(self.joints[[u, t]])[hand]
+            motion = estimate_hand_motions(self.joints[[u, t]])[hand]
             if motion is None:
                 return None
             carried.append(motion.carry(pose))
         share = (self.times[t] - self.times[self.before]) / self.seconds
         return apply_step(carried[0], share * step_between(*carried))
 
-    def _hold(self, t: int) -> np.ndarray:
-        """What a hold tells of frame ``t`` (6, 6): the less, the longer before and after it."""
+    def _hand_information(self, t: int) -> np.ndarray:
+        """Return the information (6, 6) of a hold on frame ``t``; it falls with the time."""
         nearer = min(
             self.times[t] - self.times[self.before], self.times[self.after] - self.times[t]
         )
@@ -111,17 +135,125 @@ class Gap:
         return np.diag(np.repeat([turn, shift], 3) ** -2.0)
 
 
-def straight(poses: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Poses (T, 4, 4) with the frames that are not ``known`` (T,) filled in: shortest turn and
-    straight line between known neighbours, held at the ends."""
+def interpolate_poses(poses: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Fill in the poses (T, 4, 4) of frames that are not ``known`` (T,).
+
+    Shortest turn and straight line between known neighbours, constant at the ends.
+    """
     at = np.flatnonzero(known)
     if not len(at) or len(at) == len(known):
         return poses.copy()
     frames = np.clip(np.arange(len(known)), at[0], at[-1])
-    found = np.tile(np.eye(4), (len(known), 1, 1))
-    found[:, :3, 3] = np.stack([np.interp(frames, at, poses[at, k, 3]) for k in range(3)], axis=1)
-    found[:, :3, :3] = poses[at[0], :3, :3]
+    result = np.tile(np.eye(4), (len(known), 1, 1))
+    result[:, :3, 3] = np.stack([np.interp(frames, at, poses[at, k, 3]) for k in range(3)], axis=1)
+    result[:, :3, :3] = poses[at[0], :3, :3]
     if len(at) > 1:
-        found[:, :3, :3] = Slerp(at, Rotation.from_matrix(poses[at, :3, :3]))(frames).as_matrix()
-    found[at] = poses[at]
-    return found
+        result[:, :3, :3] = Slerp(at, Rotation.from_matrix(poses[at, :3, :3]))(frames).as_matrix()
+    result[at] = poses[at]
+    return result
+
+
+@dataclass(frozen=True)
+class FilledTrack:
+    """A track whose lost frames are filled in. Forms are zero outside of hand-carried frames."""
+
+    poses: np.ndarray
+    """(T, 4, 4) poses."""
+    hand: np.ndarray
+    """(T, 6, 6) information of the hand's motion."""
+    images: np.ndarray
+    """(T, 6, 6) information of the images in the same frames."""
+    pull: np.ndarray
+    """(T, 6) J'r of the hand; the images pull as much in the opposite direction."""
+    sure: np.ndarray
+    """(T,) lost frames through which a hand surely carried the object."""
+
+
+def fill_lost(observer: Observer, poses: np.ndarray, lost: np.ndarray) -> FilledTrack:
+    """Fill in the lost frames of a track by the likeliest path between known frames.
+
+    A hand surely carried the object if no different path is nearly as likely, the images do not
+    contradict it, and the gap is short. Known poses are replaced by equivalent ones that follow
+    each other.
+
+    Args:
+        observer: the recording.
+        poses: (T, 4, 4) of the track.
+        lost: (T,) bool.
+    """
+    count, symmetry, known, times = len(poses), observer.mesh.symmetry, ~lost, observer.times
+    track = unwrap_symmetry(symmetry, poses, known)
+    hand, images = np.zeros((count, 6, 6)), np.zeros((count, 6, 6))
+    pull, sure = np.zeros((count, 6)), np.zeros(count, bool)
+    for a, b in pairwise(np.flatnonzero(known).tolist()):
+        if b == a + 1:
+            continue
+        paths = Gap(observer.mesh, track, times, observer.joints, a, b).bridges()
+        fits = [_fit_path(observer, path) for path in paths] if len(paths) > 1 else []
+        seen = np.array(
+            [
+                observer.share * sum(map(_path_log_ratio, path.poses, path.information, own))
+                for path, own in zip(paths, fits, strict=False)
+            ]
+        )
+        total = seen + [path.log_ratio for path in paths] if len(paths) > 1 else np.zeros(1)
+        best = int(total.argmax())
+        path = paths[best]
+        track[a + 1 : b] = [fit.pose for fit in fits[best]] if fits else path.poses
+        track[b] = path.end
+        track[b:] = unwrap_symmetry(symmetry, track[b:], known[b:])
+        held = np.any(path.information, axis=(1, 2))
+        for i, t in enumerate(path.frames):
+            if held[i]:
+                hand[t] = path.information[i]
+                images[t] = np.linalg.inv(fits[best][i].covariance) - path.information[i]
+                pull[t] = path.information[i] @ step_between(path.poses[i], track[t])
+        rivals = [
+            total[i] for i, other in enumerate(paths) if _is_different(observer.mesh, path, other)
+        ]
+        if (
+            held.any()
+            and total[best] - max(rivals, default=-np.inf) > CARRIED_LOG_RATIO
+            and seen[best] > CONTRADICTED_LOG_RATIO
+            and times[b] - times[a] < UNSEEN_S
+        ):
+            sure[path.frames] = held
+    first, last = np.flatnonzero(known)[[0, -1]] if known.any() else (0, count - 1)
+    track[:first], track[last + 1 :] = track[first], track[last]
+    return FilledTrack(track, hand, images, pull, sure)
+
+
+def _path_log_ratio(pose: np.ndarray, information: np.ndarray, fit: Fit) -> float:
+    """Return the images' log-likelihood ratio of a fit, less its deviation from the path.
+
+    ``pose`` (4, 4) and ``information`` (6, 6) are those of the path. The straight path is not
+    fitted, so it has no deviation.
+    """
+    step = step_between(pose, fit.pose)
+    return fit.log_ratio - 0.5 * float(step @ information @ step)
+
+
+def _is_different(mesh: ObjectMesh, one: Bridge, two: Bridge) -> bool:
+    """Return whether two paths lead to different poses in some frame."""
+    pairs = [
+        pose_distances(mesh, p[None], q[None]) for p, q in zip(one.poses, two.poses, strict=True)
+    ]
+    return any(turn[0, 0] > UNSURE_RAD or shift[0, 0] > UNSURE_M for turn, shift in pairs)
+
+
+def _fit_path(observer: Observer, path: Bridge) -> list[Fit]:
+    """Compare a path with the images; poses in a hand are fitted, with the hand as prior."""
+    motion = rigid_velocity(
+        path.poses, np.ones(len(path.frames), bool), observer.times[path.frames]
+    )
+    result = []
+    for t, pose, information, twist in zip(
+        path.frames.tolist(), path.poses, path.information, motion, strict=True
+    ):
+        if information.any():
+            turn, shift = information.diagonal()[[0, 3]] ** -0.5
+            prior = MotionPrior(pose, sigma_m=float(shift), sigma_rad=float(turn))
+            result.append(observer.fit(t, pose, prior, FIT_ROUNDS, twist=twist))
+        else:
+            result.append(observer.assess(t, pose, twist=twist))
+    return result

@@ -1,9 +1,9 @@
-"""What the surface's colours say of the hypotheses that shape and motion leave open.
+"""Decision by the surface's colours between hypotheses that shape and motion leave ambiguous.
 
-Colours that are learnt while tracking are relative to the poses they are learnt with: where a turn
-is open in all frames alike, they decide nothing, but they keep one side of the object from being
-taken for the other half way. So they are learnt once for each pose that one frame leaves open, and
-what follows from each counts by its evidence. Colours that the mesh brings have no such freedom.
+Colours that are learnt while tracking are relative to the poses they are learnt with. If a turn is
+ambiguous in all frames alike they decide nothing, but they keep a side of the object from being
+confused with another halfway. Therefore colours are learnt once for each ambiguous pose of one
+frame, and each result counts by its evidence. Colours of the mesh itself are absolute.
 """
 
 from __future__ import annotations
@@ -14,142 +14,145 @@ from dataclasses import replace
 import numpy as np
 
 from intercap_core.geometry.rigid.shots import Shot, Surface
-from intercap_core.object_track.appearance import LIGHT, Appearance, Sighting
-from intercap_core.object_track.candidates import choose
-from intercap_core.object_track.constants import (
-    ABSENT_LOG_RATIO,
-    ASSESS_MIN_OVERLAP,
-    COLOUR_EVERY_S,
-    ERROR_LASTING_S,
-    GAUGES,
-    KEY_FRAME_S,
-    LEARNING_FRAMES,
-    LEARNING_FRAMES_MIN,
-    PAINT_LOOKS,
-    PATCHES_ACROSS,
-    RIVAL_PROBABILITY,
+from intercap_core.object_track.appearance import (
+    LIGHT,
     STEEP_COSINE,
-    SURE_PROBABILITY,
-    WEAK_GAUGE,
+    Appearance,
+    SurfaceColours,
+    seen_patches,
 )
-from intercap_core.object_track.decoder import NOT_SEEN, Decoded, given, mixed
+from intercap_core.object_track.decoder import HIDDEN, Decoded, decode_given, mix_decisions
+from intercap_core.object_track.evidence import ERROR_LASTING_S
 from intercap_core.object_track.fit import Fit, seen_by
-from intercap_core.object_track.hypotheses import Hypotheses
+from intercap_core.object_track.hypotheses import RIVAL_PROBABILITY, Hypotheses
 from intercap_core.object_track.observer import Observer
-from intercap_core.object_track.surface_kernel import seen_patches
+from intercap_core.object_track.proposals import KEY_FRAME_S
+from intercap_core.object_track.view_report import ASSESS_MIN_OVERLAP, choose_candidate
+
+PATCHES_ACROSS = 12  # patches per diameter: a centimetre of a cup, two pixels at 3 m
+LEARNING_FRAMES = 12  # frames from which colours are learnt, at most ...
+LEARNING_FRAMES_MIN = 3  # ... and at least
+PAINT_LOOKS = 3  # independent observations by the mesh's own colours, in all frames together
+GAUGES = 3  # poses of one frame relative to which colours are learnt
+WEAK_GAUGE = 0.05  # probability of such a pose below which it may lack certain frames
+SURE_PROBABILITY = 0.8  # of a pose, given that of one frame, from which colours are learnt
+COLOUR_EVERY_S = 1 / 15  # frames nearer than this show the same colours
 
 
 class ColourDecision:
-    """Decides anew where colours tell hypotheses apart; ``share`` is how many independent
-    observations a frame is, ``step_s`` the seconds between two."""
+    """Decides again between hypotheses that colours distinguish."""
 
-    def __init__(
-        self, observer: Observer, hypotheses: Hypotheses, share: float, step_s: float
-    ) -> None:
+    def __init__(self, observer: Observer, hypotheses: Hypotheses, absent: float) -> None:
+        """``absent`` is the argument of :func:`.decoder.decode`, nats per frame."""
         self._observer = observer
         self._hypotheses = hypotheses
-        self._share = share
-        self._apart = max(1, round(ERROR_LASTING_S / step_s))
-        self._every = max(1, round(COLOUR_EVERY_S / step_s))
-        self._keys = max(1, round(KEY_FRAME_S / step_s))
+        self._absent = absent
         self._size = observer.mesh.diameter / PATCHES_ACROSS
-        self._seen: dict[tuple[int, int], Sighting | None] = {}
+        self._seen: dict[tuple[int, int], SurfaceColours | None] = {}
         self._pictures: tuple[int, list[np.ndarray | None]] | None = None
 
     def decide(
         self, emissions: Sequence[np.ndarray], steps: Sequence[np.ndarray], decoded: Decoded
     ) -> Decoded:
-        """``decoded`` from these (see :func:`.decoder.decode`), and what colours add to it."""
+        """Return ``decoded`` (see :func:`.decoder.decode`) with the evidence of colours."""
         sure = np.array(
-            [0.0 if k == NOT_SEEN else p[k]
-             for p, k in zip(decoded.probability, decoded.path, strict=True)]
-        )  # fmt: skip
+            [
+                0.0 if k == HIDDEN else p[k]
+                for p, k in zip(decoded.probability, decoded.path, strict=True)
+            ]
+        )
         first = int(sure.argmax())
         if self._observer.pictures is None or not sure[first]:
             return decoded
         own = decoded.probability[first][:-1]
-        absent = self._share * ABSENT_LOG_RATIO
         gauges = [int(k) for k in np.argsort(-own)[:GAUGES] if own[k] > RIVAL_PROBABILITY]
-        relative = {k: given(emissions, steps, first, k, absent) for k in gauges}
-        rivals = self._open(list(relative.values()))
+        relative = {k: decode_given(emissions, steps, first, k, self._absent) for k in gauges}
+        rivals = self._ambiguous(list(relative.values()))
         if not gauges or (not rivals and (self._observer.paint is None or len(gauges) == 1)):
             return decoded
-        learnt = {k: self._learn(one) for k, one in relative.items()}
+        learnt = {k: self._learn(result) for k, result in relative.items()}
         if any(learnt[k] is None and own[k] > WEAK_GAUGE for k in gauges):
             return decoded
-        found = []
+        results = []
         for k, colours in learnt.items():
             if colours is not None:
-                values = self._added(emissions, colours, rivals)
-                again = given(values, steps, first, k, absent)
-                found.append(replace(again, evidence=again.evidence + self._painted(colours)))
-        return mixed(found) if found else decoded
+                values = self._add_colours(emissions, colours, rivals)
+                again = decode_given(values, steps, first, k, self._absent)
+                evidence = again.evidence + self._paint_log_ratio(colours)
+                results.append(replace(again, evidence=evidence))
+        return mix_decisions(results) if results else decoded
 
-    def _open(self, relative: Sequence[Decoded]) -> dict[int, np.ndarray]:
-        """The hypotheses of each frame whose choice is open in any of these, some frames left out
-        that are near others; all of them are asked about the same."""
-        found = {}
-        for t in range(0, len(relative[0].path) if relative else 0, self._every):
-            likely = np.array([one.probability[t][:-1] > RIVAL_PROBABILITY for one in relative])
+    def _ambiguous(self, relative: Sequence[Decoded]) -> dict[int, np.ndarray]:
+        """Return the ambiguous hypotheses of each frame in any of these results.
+
+        Frames that are near others are skipped. The same hypotheses are compared in all results.
+        """
+        every = self._observer.frames_in(COLOUR_EVERY_S)
+        rivals = {}
+        for t in range(0, len(relative[0].path) if relative else 0, every):
+            likely = np.array(
+                [result.probability[t][:-1] > RIVAL_PROBABILITY for result in relative]
+            )
             if any(
-                own.sum() > 1 or (own.any() and one.path[t] == NOT_SEEN)
-                for one, own in zip(relative, likely, strict=True)
+                own.sum() > 1 or (own.any() and result.path[t] == HIDDEN)
+                for result, own in zip(relative, likely, strict=True)
             ):
-                found[t] = np.flatnonzero(likely.any(0))
-        return found
+                rivals[t] = np.flatnonzero(likely.any(0))
+        return rivals
 
     def _learn(self, decoded: Decoded) -> Appearance | None:
-        """The colours of certain frames; None where there are too few."""
+        """Learn the colours of certain frames; None if there are too few."""
         certain = [
             t
-            for t in range(0, len(decoded.path), self._keys)
-            if decoded.path[t] != NOT_SEEN
+            for t in range(0, len(decoded.path), self._observer.frames_in(KEY_FRAME_S))
+            if decoded.path[t] != HIDDEN
             and decoded.probability[t][decoded.path[t]] > SURE_PROBABILITY
         ]
         some = np.linspace(0, len(certain) - 1, min(len(certain), LEARNING_FRAMES)).round()
-        seen = [self._sighting(certain[i], decoded.path[certain[i]]) for i in some.astype(int)]
-        kept = [one for one in seen if one is not None]
+        seen = [self._colours(certain[i], decoded.path[certain[i]]) for i in some.astype(int)]
+        kept = [colours for colours in seen if colours is not None]
         if len(kept) < LEARNING_FRAMES_MIN:
             return None
         views = len(self._observer.views(kept[0].frame))
         return Appearance(kept, views, self._observer.paint, self._size)
 
-    def _painted(self, learnt: Appearance) -> float:
-        """What the mesh's own colours say for the poses of the frames that were learnt from: where
-        they are wrong they are so in all frames, which count as a few looks."""
+    def _paint_log_ratio(self, learnt: Appearance) -> float:
+        """Return the evidence of the mesh's own colours for the poses of the learnt frames, nats.
+
+        Wrong colours are wrong in all frames, so all frames count as a few observations.
+        """
         return PAINT_LOOKS * float(np.mean([learnt.paint_log_ratio(s) for s in learnt.sightings]))
 
-    def _added(
+    def _add_colours(
         self,
         emissions: Sequence[np.ndarray],
         learnt: Appearance,
         rivals: Mapping[int, np.ndarray],
     ) -> list[np.ndarray]:
-        """The emissions with what the learnt colours say where the choice is open."""
+        """Return the emissions with the evidence of the learnt colours in ambiguous frames."""
+        apart = self._observer.frames_in(ERROR_LASTING_S)
         values = [own.copy() for own in emissions]
-        if learnt.says_something:
+        if learnt.is_coloured:
             for t, some in rivals.items():
-                seen = {int(k): self._sighting(t, int(k)) for k in some}
-                ratio = {
-                    k: self._share * learnt.log_ratio(one, self._apart)
-                    for k, one in seen.items()
-                    if one is not None
+                seen = {int(k): self._colours(t, int(k)) for k in some}
+                ratios = {
+                    k: self._observer.share * learnt.log_ratio(colours, apart)
+                    for k, colours in seen.items()
+                    if colours is not None
                 }
-                # what was not looked at is no better for it
-                values[t] += min([0.0, *ratio.values()])
-                for k, found in ratio.items():
-                    values[t][k] = emissions[t][k] + found
+                # hypotheses that were not compared gain nothing
+                values[t] += min([0.0, *ratios.values()])
+                for k, ratio in ratios.items():
+                    values[t][k] = emissions[t][k] + ratio
         return values
 
-    # --- seeing --------------------------------------------------------------------------------
-
-    def _sighting(self, t: int, k: int) -> Sighting | None:
-        """What frame t shows at its hypothesis k; None where it shows nothing of it."""
+    def _colours(self, t: int, k: int) -> SurfaceColours | None:
+        """Return the colours of frame t at its hypothesis k, cached; None if nothing is visible."""
         if (t, k) not in self._seen:
-            self._seen[t, k] = self._look(t, self._hypotheses.fits[t][k])
+            self._seen[t, k] = self._measure(t, self._hypotheses.fits[t][k])
         return self._seen[t, k]
 
-    def _look(self, t: int, fit: Fit) -> Sighting | None:
+    def _measure(self, t: int, fit: Fit) -> SurfaceColours | None:
         observer, mesh = self._observer, self._observer.mesh
         assert observer.pictures is not None
         if self._pictures is None or self._pictures[0] != t:
@@ -160,12 +163,11 @@ class ColourDecision:
             Shot(view.geometry.lens, view.geometry.colour_from_master @ pose)
             for view, pose in zip(views, poses, strict=True)
         ]
+        renderings = observer.context.renderer.draw(Surface.of(mesh), shots)
         parts = []
-        for number, (view, shot, drawn) in enumerate(
-            zip(views, shots, observer.renderer.draw(Surface.of(mesh), shots), strict=True)
-        ):
+        for number, (view, shot, drawn) in enumerate(zip(views, shots, renderings, strict=True)):
             picture = pictures[number]
-            candidate = choose(view, drawn, ASSESS_MIN_OVERLAP, observer.labels)
+            candidate = choose_candidate(view, drawn, ASSESS_MIN_OVERLAP, observer.labels)
             if picture is None or candidate is None:
                 continue
             patch, face, colour = seen_patches(
@@ -176,12 +178,12 @@ class ColourDecision:
             )  # fmt: skip
             if len(patch):
                 normals = mesh.face_normals[face] @ poses[number][:3, :3].T
-                parts.append((number, *_by_patch(patch, colour, normals)))
+                parts.append((number, *_average_by_patch(patch, colour, normals)))
         if not parts:
             return None
         number, patch, colour, normal, pixels = zip(*parts, strict=True)
         of_view = np.repeat(number, [len(p) for p in patch])
-        return Sighting(
+        return SurfaceColours(
             t,
             np.concatenate(patch),
             np.concatenate(colour),
@@ -191,10 +193,10 @@ class ColourDecision:
         )
 
 
-def _by_patch(
+def _average_by_patch(
     patch: np.ndarray, colour: np.ndarray, normals: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Patches (N,), their mean colours (N, 3), unit normals (N, 3) and pixels (N,)."""
+    """Return patches (N,), their mean colours (N, 3), unit normals (N, 3) and pixels (N,)."""
     kept, at, pixels = np.unique(patch, return_inverse=True, return_counts=True)
     mean, normal = (
         np.stack([np.bincount(at, values[:, k], len(kept)) for k in range(3)], 1) / pixels[:, None]

@@ -1,60 +1,231 @@
-"""Which hypothesis is true in every frame: a hidden Markov model over all frames.
+"""Decision between the hypotheses of all frames by a hidden Markov model.
 
-The states of a frame are its hypotheses, each under every mode of motion (:mod:`.steps`), and,
-last, that none of them is true: the object is hidden, or it has left. Probabilities come from the
-forward-backward algorithm, the most likely sequence from that of Viterbi (Rabiner, Proceedings of
-the IEEE 77(2), 1989).
+The states of a frame are its hypotheses, each in every mode of motion (at rest, free, in a hand),
+and two states without a hypothesis: the object is hidden, or it has left. Modes last and change
+seldom. The most likely step of a mode has log-probability 0 whatever the mode's width, because
+poses are a few hypotheses and not densities.
+
+Probabilities come from the forward-backward algorithm, the most likely sequence from the Viterbi
+algorithm (Rabiner, Proceedings of the IEEE 77(2), 1989).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from scipy.special import logsumexp
 
-from intercap_core.object_track.constants import LEAVE_COST
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.object_track.motion import HandMotion
 
-NOT_SEEN = -1
-_CERTAIN = 1e4  # nats: far more than all frames say
-_NEVER = -600.0  # nats: the least that a frame says, of which the exponential is still a number
+# Standard deviations of the motion between frames; tuned on the studio, as all values below.
+MOVING_M_S = 2.5  # free motion: a swing, a kick
+MOVING_TURN_RAD_S = 7.0
+STANDING_M = 0.015  # fits of an object at rest
+STANDING_RAD = np.radians(8)
+HELD_M = 0.02  # in a hand: fits and joints ...
+HELD_RAD = np.radians(10)
+HELD_M_S = 0.3  # ... and slipping
+HELD_RAD_S = 1.0
+# Costs are minus log-likelihoods, nats.
+FREE_COST_S = 30.0  # of free motion per second: rest and hands explain most recordings
+FREE_LASTING_S = 0.1  # the longest time that it costs: the object may have rested meanwhile
+MODE_CHANGES_S = 1.0  # changes from one mode of motion to another per second
+JUMP_COST = 10.0  # of a step that no motion explains
+VANISH_COST = 7.0  # of going out of sight
+APPEAR_COST = 7.0  # of coming into sight
+LEAVE_COST = 4.0  # of leaving the room or coming back, in addition
+# Cost of going out of reach between two sure frames, and of coming back: clutter is anywhere in a
+# room, of which the reachable part is a hundredth.
+EXCURSION_COST = 5.0
+REACH_M = 0.2  # reach: error of either pose ...
+REACH_M_S = 4.0  # ... and the speed of a thrown object
+
+FIRST_HAND = 2  # modes of motion: rest, free, then each hand
+HIDDEN = -1  # in paths: no hypothesis is true
+_CERTAIN = 1e4  # nats, far more than the evidence of all frames
+_LEAST = -600.0  # nats of a frame, so that the exponential is not zero
+
+
+def step_costs(
+    mesh: ObjectMesh,
+    before: np.ndarray,
+    after: np.ndarray,
+    seconds: float,
+    hands: Sequence[HandMotion | None],
+    free_cost_s: float = FREE_COST_S,
+) -> np.ndarray:
+    """Return log-probabilities of the steps between the hypotheses of two frames.
+
+    Args:
+        mesh: the object.
+        before: (K, 4, 4) poses.
+        after: (L, 4, 4) poses.
+        seconds: time between the frames.
+        hands: motions of the H hands, None where unknown. A hand must be near enough to hold the
+            object.
+        free_cost_s: cost of free motion, nats per second.
+
+    Returns:
+        (M, M, K + 1, L + 1) by the mode of the step before, the mode of this step, and the states;
+            M = 2 + H. The last state of either frame is that no hypothesis is true.
+    """
+    modes = FIRST_HAND + len(hands)
+    found = np.zeros((modes, modes, len(before) + 1, len(after) + 1))
+    found[..., :-1, -1], found[..., -1, :-1] = -VANISH_COST, -APPEAR_COST
+    if not (len(before) and len(after)):
+        return found
+    own = mode_log_ratios(mesh, before, after, seconds, hands, free_cost_s)
+    changes = np.full((modes, modes), np.log(-np.expm1(-MODE_CHANGES_S * seconds)))
+    np.fill_diagonal(changes, 0.0)
+    # one of the modes that are possible from a pose is true
+    possible = np.where(np.isfinite(own).any(2), 0.0, -np.inf)
+    share = changes[:, :, None] - logsumexp(changes[:, :, None] + possible, axis=1, keepdims=True)
+    found[..., :-1, :-1] = share[..., None] + own
+    return found
+
+
+def mode_log_ratios(
+    mesh: ObjectMesh,
+    before: np.ndarray,
+    after: np.ndarray,
+    seconds: float,
+    hands: Sequence[HandMotion | None],
+    free_cost_s: float = FREE_COST_S,
+) -> np.ndarray:
+    """Return log-probabilities (M, K, L) of the steps between poses in each mode of motion."""
+    turn, shift = pose_distances(mesh, before, after)
+    moved = (turn / (MOVING_TURN_RAD_S * seconds)) ** 2 + (shift / (MOVING_M_S * seconds)) ** 2
+    ways = [
+        -0.5 * ((turn / STANDING_RAD) ** 2 + (shift / STANDING_M) ** 2),
+        -np.minimum(0.5 * moved, JUMP_COST) - free_cost_s * min(seconds, FREE_LASTING_S),
+        *(_hand_log_ratios(mesh, before, after, seconds, hand) for hand in hands),
+    ]
+    return np.array(ways)
+
+
+def _hand_log_ratios(
+    mesh: ObjectMesh, before: np.ndarray, after: np.ndarray, seconds: float, hand: HandMotion | None
+) -> np.ndarray:
+    """Return log-probabilities (K, L) of the steps in this hand."""
+    if hand is None:
+        return np.full((len(before), len(after)), -np.inf)
+    turn, shift = pose_distances(mesh, hand.carry(before), after)
+    centres = np.array([mesh.centre_at(pose) for pose in before])
+    turn_sigma = np.hypot(HELD_RAD, HELD_RAD_S * seconds)
+    # an error of the hand's turn moves what is far from it
+    arm = np.linalg.norm(centres - hand.start, axis=1)
+    shift_sigma = np.sqrt(HELD_M**2 + (HELD_M_S * seconds) ** 2 + (arm * turn_sigma) ** 2)
+    found = -0.5 * ((turn / turn_sigma) ** 2 + (shift / shift_sigma[:, None]) ** 2)
+    found[~hand.reaches(centres, mesh.diameter / 2)] = -np.inf
+    return found
+
+
+def pose_distances(
+    mesh: ObjectMesh, before: np.ndarray, after: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distances of all pairs of poses (K, 4, 4) and (L, 4, 4).
+
+    Returns:
+        Turns (K, L), radians, up to symmetry; and shifts (K, L) of the centre, metres.
+    """
+    turn = np.radians(
+        mesh.symmetry.rotation_error_deg(before[:, None, :3, :3], after[None, :, :3, :3])
+    )
+    here, there = (
+        poses[:, :3, :3] @ mesh.centre_of_mass + poses[:, :3, 3] for poses in (before, after)
+    )
+    return turn, np.linalg.norm(there[None] - here[:, None], axis=-1)
+
+
+def find_excursions(
+    centres: Sequence[np.ndarray], path: np.ndarray, sure: np.ndarray, times: np.ndarray
+) -> list[np.ndarray]:
+    """Find hypotheses that cannot be reached from the sure frames around.
+
+    A hypothesis is out of reach if it is too far from the sure frame before or after, provided that
+    one of these can be reached from the other.
+
+    Args:
+        centres: [T] (K_t, 3) of the hypotheses, metres.
+        path: (T,) chosen hypothesis of each frame.
+        sure: (T,) frames whose choice is sure.
+        times: (T,) seconds.
+
+    Returns:
+        [T] (K_t,) bool.
+    """
+
+    def reaches(a: np.ndarray, b: np.ndarray, seconds: float) -> np.ndarray:
+        return np.linalg.norm(a - b, axis=-1) < REACH_M + REACH_M_S * seconds
+
+    known = np.flatnonzero(sure).tolist()
+    places = np.array([centres[t][path[t]] for t in known]).reshape(-1, 3)
+    found = [np.zeros(len(own), bool) for own in centres]
+    for i, (u, v) in enumerate(pairwise(known)):
+        if v > u + 1 and reaches(places[i], places[i + 1], times[v] - times[u]):
+            for t in range(u + 1, v):
+                found[t] = ~(
+                    reaches(centres[t], places[i], times[t] - times[u])
+                    & reaches(centres[t], places[i + 1], times[v] - times[t])
+                )
+    return found
+
+
+def add_excursion_costs(
+    steps: Sequence[np.ndarray], away: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """Add :data:`EXCURSION_COST` to steps from and to hypotheses that are out of reach.
+
+    Args:
+        steps: [T - 1] (M, M, K_t + 1, K_t+1 + 1) log-probabilities.
+        away: [T] (K_t,) of :func:`find_excursions`.
+    """
+    result = []
+    for step, (before, after) in zip(steps, pairwise(away), strict=True):
+        out, back = np.append(before, False), np.append(after, False)
+        result.append(step - EXCURSION_COST * (out[:, None] != back))
+    return result
 
 
 @dataclass(frozen=True)
 class Decoded:
-    """``path`` (T,) the index of the most likely hypothesis, :data:`NOT_SEEN` where none is true;
-    ``probability`` [T] of each hypothesis and, last, of none, given all frames; ``gone`` (T,), of
-    the object having left; ``evidence``, the log-likelihood of all frames, against that it is in
-    none."""
+    """Result of the hidden Markov model."""
 
     path: np.ndarray
+    """(T,) index of the most likely hypothesis, :data:`HIDDEN` if none is true."""
     probability: list[np.ndarray]
+    """[T] (K_t + 1,) of each hypothesis and, last, of none, given all frames."""
     gone: np.ndarray
+    """(T,) probability that the object has left."""
     evidence: float
+    """Log-likelihood of all frames, relative to the object being in none."""
 
 
 def decode(
     emissions: Sequence[np.ndarray], steps: Sequence[np.ndarray], absent: float = 0.0
 ) -> Decoded:
-    """The model's states of T frames.
+    """Decode the states of T frames.
 
-    ``emissions`` [T] (K_t,) log-likelihoods of the hypotheses, against that none is true; ``steps``
-    [T - 1] (M, M, K_t + 1, K_t+1 + 1) log-probabilities of going in one mode of motion, and another
-    from then on, from one of them, or none, to the next; none is in no mode, and those of the first
-    count for it. Where none is true the object is hidden, or it has left, which costs more at
-    either end and ``absent`` nats a frame less: what is in the room is seldom hidden from all
-    cameras for long.
+    Args:
+        emissions: [T] (K_t,) log-likelihoods of the hypotheses, relative to that none is true.
+        steps: [T - 1] (M, M, K_t + 1, K_t+1 + 1) of :func:`step_costs`. Hidden states have no mode;
+            the entries of the first mode count for them.
+        absent: nats per frame by which having left is likelier than being hidden. An object in the
+            room is seldom hidden from all cameras for long.
     """
     modes = len(steps[0]) if steps else 1
     values = [np.append(np.repeat(own, modes), [0.0, absent]) for own in emissions]
     values[0][:-2] -= np.log(modes)
     for end in (0, -1):
         values[end][-1] -= LEAVE_COST
-    ways = [_ways(step) for step in steps]
-    path = np.array(_likeliest(values, ways)) // modes
-    path[path >= [len(own) for own in emissions]] = NOT_SEEN
-    shares, evidence = _shares(values, ways)
+    ways = [_state_steps(step) for step in steps]
+    path = np.array(_viterbi(values, ways)) // modes
+    path[path >= [len(own) for own in emissions]] = HIDDEN
+    shares, evidence = _forward_backward(values, ways)
     return Decoded(
         path,
         [np.append(own[:-2].reshape(-1, modes).sum(1), own[-2] + own[-1]) for own in shares],
@@ -63,9 +234,11 @@ def decode(
     )
 
 
-def _ways(step: np.ndarray) -> np.ndarray:
-    """Log-probabilities (K * M + 2, L * M + 2) of going from each state to the next, hypothesis by
-    hypothesis and in it mode by mode; then hidden and gone."""
+def _state_steps(step: np.ndarray) -> np.ndarray:
+    """Return log-probabilities (K * M + 2, L * M + 2) between the states of two frames.
+
+    States are ordered by hypothesis, then mode; the last two are hidden and gone.
+    """
     modes, count, following = len(step), step.shape[2] - 1, step.shape[3] - 1
     ways = np.empty((count * modes + 2, following * modes + 2))
     between = step[:, :, :-1, :-1].transpose(2, 0, 3, 1)
@@ -79,8 +252,8 @@ def _ways(step: np.ndarray) -> np.ndarray:
     return ways
 
 
-def _likeliest(values: Sequence[np.ndarray], ways: Sequence[np.ndarray]) -> list[int]:
-    """The states [T] of the most likely sequence."""
+def _viterbi(values: Sequence[np.ndarray], ways: Sequence[np.ndarray]) -> list[int]:
+    """Return the most likely sequence of states [T] (Viterbi)."""
     best, came = values[0], []
     for way, value in zip(ways, values[1:], strict=True):
         reach = best[:, None] + way
@@ -92,12 +265,16 @@ def _likeliest(values: Sequence[np.ndarray], ways: Sequence[np.ndarray]) -> list
     return chosen[::-1]
 
 
-def _shares(
+def _forward_backward(
     values: Sequence[np.ndarray], ways: Sequence[np.ndarray]
 ) -> tuple[list[np.ndarray], float]:
-    """The probability of each state [T], and the log-likelihood of all frames."""
+    """Run the forward-backward algorithm.
+
+    Returns:
+        The probability of each state [T], and the log-likelihood of all frames.
+    """
     moves = [np.exp(way) for way in ways]
-    seen = [np.exp(np.maximum(value - value.max(), _NEVER)) for value in values]
+    seen = [np.exp(np.maximum(value - value.max(), _LEAST)) for value in values]
     evidence = float(sum(value.max() for value in values))
     ahead: list[np.ndarray] = []
     for t, own in enumerate(seen):
@@ -112,14 +289,14 @@ def _shares(
     return [one / one.sum() for one in both], evidence
 
 
-def given(
+def decode_given(
     emissions: Sequence[np.ndarray],
     steps: Sequence[np.ndarray],
     frame: int,
     state: int,
     absent: float = 0.0,
 ) -> Decoded:
-    """:func:`decode`, given the state of one frame: one of its hypotheses."""
+    """Decode as :func:`decode`, given that hypothesis ``state`` of ``frame`` is true."""
     known = list(emissions)
     known[frame] = np.full(len(known[frame]), -_CERTAIN)
     known[frame][state] = emissions[frame][state] + _CERTAIN
@@ -127,8 +304,8 @@ def given(
     return replace(found, evidence=found.evidence - _CERTAIN)
 
 
-def mixed(found: Sequence[Decoded]) -> Decoded:
-    """What follows from several that exclude each other, by their evidence."""
+def mix_decisions(found: Sequence[Decoded]) -> Decoded:
+    """Average results that exclude each other, weighted by their evidence."""
     evidence = np.array([one.evidence for one in found])
     share = np.exp(evidence - logsumexp(evidence))
     probability = [

@@ -1,4 +1,4 @@
-"""What the views of one frame set say about small motions of a pose, each view for itself."""
+"""Evidence of the views of a frame set on small motions of a pose, as quadratic forms."""
 
 from __future__ import annotations
 
@@ -8,95 +8,95 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.geometry.rigid.render import Renderer, default_renderer
-from intercap_core.object_track.constants import (
-    COMMON_ERROR_VARIANCE,
+from intercap_core.object_track.fit import (
     CONTOUR_SCALES_PX,
     DEPTH_SCALES_M,
-    MIN_NOISE_VARIANCE,
-    REPORT_CONTOUR_SCALE,
-    UNKNOWN_SIGMA,
+    REPORT_CONTOUR_PX,
+    view_fits,
 )
-from intercap_core.object_track.fit import view_fits
-from intercap_core.object_track.view import View
+from intercap_core.object_track.view import FitContext, View
 from intercap_core.object_track.view_fit import NormalEquations, ViewFit
 from intercap_core.object_track.view_report import ViewReport
+
+# Total variance of the views' errors (common and independent) over the independent part, of shifts
+# and of turns: errors common to all views (calibration, masks that are too large) shift the object
+# rather than rotate it. Tuned on the studio.
+COMMON_ERROR_VARIANCE = 4.0
+COMMON_TURN_VARIANCE = 1.5
+TURN_SCALE = np.repeat([np.sqrt(COMMON_TURN_VARIANCE / COMMON_ERROR_VARIANCE), 1.0], 3)
+"""(6,) factor of the standard deviations that were computed with ``COMMON_ERROR_VARIANCE``."""
+# Duration of errors of masks: frames within it are one independent observation. Tuned on the
+# studio.
+ERROR_LASTING_S = 0.3
+# Least variance of the views' errors over the stated one: a few views may agree by chance. Tuned on
+# the studio.
+MIN_NOISE_VARIANCE = 0.05
+# Standard deviations (rad, metres) of an unobserved pose: a uniform angle; a room.
+UNKNOWN_SIGMA = np.repeat([np.pi / np.sqrt(3), 1.0], 3)
 
 
 @dataclass(frozen=True)
 class PoseEvidence:
-    """What each view of a frame set says about small motions of a pose: the weighted J'J
-    ``information`` (V, 6, 6) and J'r ``gradient`` (V, 6) of (turn on the left, shift), in units of
-    one standard deviation; zero from a view that says nothing. No prior is in them. ``of_depth``
-    (V, 6, 6) and ``depth_gradient`` (V, 6) are the part of them that depth gives. ``reports`` is
-    how each view agrees with the pose."""
+    """Evidence of V views on small motions (turn on the left, shift) of a pose, without a prior.
+
+    J'J and J'r are weighted in units of one standard deviation, zero for a view without evidence.
+    """
 
     information: np.ndarray
+    """(V, 6, 6) J'J."""
     gradient: np.ndarray
+    """(V, 6) J'r."""
     of_depth: np.ndarray
+    """(V, 6, 6) part of ``information`` that depth gives."""
     depth_gradient: np.ndarray
+    """(V, 6) part of ``gradient`` that depth gives."""
     reports: tuple[ViewReport, ...]
+    """Agreement of each view with the pose."""
 
 
 def evidence_at(
-    mesh: ObjectMesh,
-    views: list[View],
-    pose: np.ndarray,
-    *,
-    min_overlap: float,
-    background_term: bool,
-    labels: tuple[str, ...] = (),
-    twist: np.ndarray | None = None,
-    renderer: Renderer | None = None,
+    context: FitContext, views: list[View], pose: np.ndarray, twist: np.ndarray | None = None
 ) -> PoseEvidence:
-    """The images' evidence at ``pose`` (4, 4) with the last, sharpest robust scales."""
-    renderer = renderer or default_renderer()
-    fits = view_fits(renderer, mesh, views, pose, min_overlap, labels, twist)
+    """Evaluate the evidence of the images at ``pose`` (4, 4) with the last robust scales."""
+    fits = view_fits(context, views, pose, twist)
 
     def terms(fit: ViewFit) -> tuple[NormalEquations, NormalEquations, ViewReport]:
         fit.choose()
         depth = fit.depth_terms(DEPTH_SCALES_M[1])
-        contour = fit.contour_terms(CONTOUR_SCALES_PX[1], background_term)
-        return depth, contour, fit.report(REPORT_CONTOUR_SCALE * CONTOUR_SCALES_PX[1])
+        contour = fit.contour_terms(CONTOUR_SCALES_PX[1], context.background_term)
+        return depth, contour, fit.report(REPORT_CONTOUR_PX)
 
-    found = renderer.pool.map(terms, fits)
-    depth = [np.array(part) for part in zip(*(one[0] for one in found), strict=True)]
-    contour = [np.array(part) for part in zip(*(one[1] for one in found), strict=True)]
+    by_view = context.renderer.pool.map(terms, fits)
+    depth = [np.array(part) for part in zip(*(terms[0] for terms in by_view), strict=True)]
+    contour = [np.array(part) for part in zip(*(terms[1] for terms in by_view), strict=True)]
     return PoseEvidence(
         depth[0] + contour[0],
         depth[1] + contour[1],
         depth[0],
         depth[1],
-        tuple(report for *_, report in found),
+        tuple(report for *_, report in by_view),
     )
 
 
 def report_at(
-    mesh: ObjectMesh,
-    view: View,
-    pose: np.ndarray,
-    *,
-    min_overlap: float,
-    labels: tuple[str, ...] = (),
-    twist: np.ndarray | None = None,
-    renderer: Renderer | None = None,
+    context: FitContext, view: View, pose: np.ndarray, twist: np.ndarray | None = None
 ) -> ViewReport:
-    """How one view agrees with ``pose`` (4, 4): what :func:`evidence_at` reports of it."""
-    renderer = renderer or default_renderer()
-    (fit,) = view_fits(renderer, mesh, [view], pose, min_overlap, labels, twist)
+    """Return the report of :func:`evidence_at` for one view and ``pose`` (4, 4)."""
+    (fit,) = view_fits(context, [view], pose, twist)
     fit.choose()
-    return fit.report(REPORT_CONTOUR_SCALE * CONTOUR_SCALES_PX[1])
+    return fit.report(REPORT_CONTOUR_PX)
 
 
-def views_noise(found: Sequence[PoseEvidence]) -> float:
-    """Factor of the evidence's stated variance, from how far the views' gradients disagree.
+def views_noise(evidences: Sequence[PoseEvidence]) -> float:
+    """Estimate the factor of the stated variance from how far the gradients of the views disagree.
 
-    At the minimum each view v of a frame still has a gradient g_v; if its errors are independent,
-    with s^2 times its stated variance, E[g_v g_v'] = s^2 H_v less its share in the minimum. What
-    all views have in common (calibration, masks that are too large) does not show and comes on top.
+    At the minimum each view v of a frame still has a gradient g_v. If its errors are independent
+    with s^2 times its stated variance, E[g_v g_v'] = s^2 H_v less its share in the minimum. Errors
+    that all views have in common (calibration, masks that are too large) do not show and come on
+    top.
     """
     squares = freedom = 0.0
-    for evidence in found:
+    for evidence in evidences:
         total = evidence.information.sum(0) + np.diag(UNKNOWN_SIGMA**-2)
         inverse = np.linalg.inv(total)
         share = np.einsum("vij,ji->v", evidence.information, inverse) / 6
@@ -105,3 +105,90 @@ def views_noise(found: Sequence[PoseEvidence]) -> float:
         freedom += float((6 * share * (1 - share)).sum())
     apart = squares / freedom if freedom > 1 else 1.0
     return float(np.clip(apart, MIN_NOISE_VARIANCE / COMMON_ERROR_VARIANCE, 1.0))
+
+
+def free_turns(mesh: ObjectMesh, pose: np.ndarray) -> np.ndarray:
+    """Return the steps (N, 6) of a pose (4, 4) that no image shows.
+
+    These are turns about the axis of a continuous symmetry, or any turn of a sphere.
+    """
+    symmetry = mesh.symmetry
+    if symmetry.sphere:
+        axes, offset = np.eye(3), np.zeros(3)
+    elif symmetry.axis is not None and symmetry.offset is not None:
+        axes, offset = symmetry.axis[None], symmetry.offset
+    else:
+        return np.zeros((0, 6))
+    turn = axes @ pose[:3, :3].T
+    return np.concatenate([turn, -np.cross(turn, pose[:3, :3] @ offset)], axis=1)
+
+
+def without_turns(
+    information: np.ndarray, gradient: np.ndarray, steps: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Remove the evidence on ``steps`` (N, 6), which the facets of a round mesh seem to give.
+
+    Args:
+        information: (..., 6, 6).
+        gradient: (..., 6).
+        steps: (N, 6) of :func:`free_turns`.
+    """
+    for step in steps:
+        row = information @ step
+        size = np.maximum(row @ step, 1e-9)
+        seen = (row @ step > 1e-9) / size
+        gradient = gradient - row * (seen * (gradient @ step))[..., None]
+        information = information - row[..., :, None] * row[..., None, :] * seen[..., None, None]
+    return information, gradient
+
+
+@dataclass(frozen=True)
+class FrameEvidence:
+    """Evidence of T frames on small motions (turn on the left, shift) of their poses."""
+
+    poses: np.ndarray
+    """(T, 4, 4) at which the evidence was evaluated."""
+    information: np.ndarray
+    """(T, 6, 6) J'J."""
+    gradient: np.ndarray
+    """(T, 6) J'r."""
+
+    def about(self, centre: np.ndarray) -> FrameEvidence:
+        """Express poses and steps about ``centre`` (3,) of the object instead of its origin.
+
+        The translations become the positions of the centre.
+        """
+        # the origin's shift is the centre's and what the turn adds
+        to_origin = steps_about_point(self.poses[:, :3, :3] @ centre)
+        back = to_origin.transpose(0, 2, 1)
+        poses = self.poses.copy()
+        poses[:, :3, 3] += poses[:, :3, :3] @ centre
+        return FrameEvidence(
+            poses,
+            back @ self.information @ to_origin,
+            np.einsum("tij,tj->ti", back, self.gradient),
+        )
+
+    @property
+    def own(self) -> np.ndarray:
+        """Steps (T, 6) to the minimum of the evidence of each frame alone."""
+        damped = self.information + np.diag(UNKNOWN_SIGMA**-2)
+        return -np.linalg.solve(damped, self.gradient[..., None])[..., 0]
+
+
+def steps_about_point(arms: np.ndarray) -> np.ndarray:
+    """Return matrices (T, 6, 6) from steps about one point to steps about another.
+
+    The second point lies ``arms`` (T, 3) before the first, so its shift gains turn x -arm.
+    """
+    x, y, z = arms.T
+    result = np.tile(np.eye(6), (len(arms), 1, 1))
+    result[:, 3:, :3] = np.stack(
+        [
+            np.stack([0 * x, -z, y], 1),
+            np.stack([z, 0 * x, -x], 1),
+            np.stack([-y, x, 0 * x], 1),
+        ],
+        1,
+    )
+    return result

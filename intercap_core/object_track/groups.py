@@ -1,7 +1,12 @@
-"""Candidates of different views that may show one object: joined where they lie together in space.
+"""Groups of candidates of different views that may show one object, and their outlines.
 
-Where depth measures a candidate its points say where it is; else the rays through the middles of
-two views' masks do, where they meet and both masks have the size that the object would have there.
+If depth measures a candidate, its points give the position. Otherwise the rays through the middles
+of two views' masks do, if they meet and both masks have the object's size there.
+
+The outline of a mask is its support function h(d) = max over its pixels p of d . p: its extent in
+each direction of the image. The object's own support is reached at a vertex of its convex hull, so
+residuals of hundreds of poses need no rendering. Parts that a person or the image's edge cuts off
+are unknown.
 """
 
 from __future__ import annotations
@@ -17,48 +22,162 @@ from intercap_core.formats.detections.instance import PERSON_LABEL
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.camera.triangulation import midpoints
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.object_track.constants import (
-    CLOUD_MAX_SPREAD,
-    CLOUD_PERCENTILE,
-    CLOUD_STRIDE,
-    GROUP_SLACK_M,
-    MAX_GROUPS,
-    NO_LABEL_PRIOR,
-    ON_PERSON_SHARE,
-    OTHER_LABEL_PRIOR,
-    OUTLINE_MAX_WIDTH,
-    OUTLINE_MIN_WIDTH,
-    PERSON_SIZED_SHARE,
-    RAY_MISS_SHARE,
-    SAME_OBJECT_SHARE,
-    SHARED_SIGHTINGS,
-    SIGHTING_MIN_POINTS,
-)
-from intercap_core.object_track.outlines import Outline
+from intercap_core.object_track.object_silhouette import rim_mask
 from intercap_core.object_track.view import Candidate, View
+
+OUTLINE_CUT_PX = 2  # reduced pixels from a person or the image's edge, where masks may be cut off
+OUTLINE_DIRECTIONS = 16  # image directions in which the support function is sampled
+OUTLINE_MIN_DEPTH_M = 0.1  # smaller depths are clamped to keep divisions finite
+# A candidate is the person if more than the first share of its pixels is on the person and it has
+# the label or covers more than the second share of the person. Tuned on the studio, as all sizes
+# and priors below.
+ON_PERSON_SHARE = 0.6
+PERSON_SIZED_SHARE = 0.3
+LOCATED_MIN_POINTS = 15  # of a candidate's cloud, or pixels of its mask
+CLOUD_MAX_SPREAD = 0.75  # of the diameter, from a candidate's centre to its points
+SAME_OBJECT_SHARE = 0.6  # of the diameter: distance of measured centres of one object's two sides
+GROUP_SLACK_M = 0.03  # added to all sizes that groups are tested by
+RAY_MISS_SHARE = 0.35  # of the diameter: distance of a ray through a mask's middle from the object
+# Width of a mask over the diameter at the object's distance: seen end on or half hidden; smeared.
+OUTLINE_MIN_WIDTH = 0.12
+OUTLINE_MAX_WIDTH = 1.25
+OTHER_LABEL_PRIOR = 0.5  # of a candidate with the label of another class; detectors err
+NO_LABEL_PRIOR = 0.8  # of a candidate without a label
+SHARED_CANDIDATES = 0.5  # groups that share more than this with a better one are duplicates
+
+_ANGLES = 2 * np.pi * np.arange(OUTLINE_DIRECTIONS) / OUTLINE_DIRECTIONS
+_COMPASS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], 1)
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
-    """One candidate of one ``image``, that of view number ``view``, and, where that has depth, the
-    measured ``points`` (N, 3), master frame, with their ``centre`` (3,). ``label_prior``: 1 where
-    its label is one of the object's, less else."""
+class MaskOutline:
+    """Support function of one view's mask, at z = 1 of its colour camera, without distortion."""
+
+    support: np.ndarray
+    """(D,) extent in each direction."""
+    known: np.ndarray
+    """(D,) bool, false where the mask is cut off."""
+    middle: np.ndarray
+    """(2,) middle of the mask."""
+    extent: float
+    """Largest width."""
+    colour_from_master: np.ndarray
+    """(4, 4) of the camera."""
+
+    @classmethod
+    def of(cls, view: View, candidate: Candidate) -> MaskOutline | None:
+        """Compute the outline of a candidate's mask; None if all of it is cut off."""
+        mask, lens = candidate.mask, view.geometry.lens
+        row, column = np.nonzero(rim_mask(np.pad(mask.mask, 1)))
+        x, y = column + mask.x0 - 1, row + mask.y0 - 1
+        rays = lens.rays[y, x].astype(np.float64)
+        fine = np.isfinite(rays[:, 0])
+        x, y, rays = x[fine], y[fine], rays[fine]
+        if not len(rays):
+            return None
+        reach = rays @ _COMPASS.T
+        ends = reach.argmax(0)
+        support = reach[ends, np.arange(OUTLINE_DIRECTIONS)]
+        width = support + np.roll(support, OUTLINE_DIRECTIONS // 2)
+        known = ~_is_cut_off(view, candidate, x[ends], y[ends])
+        if not known.any():
+            return None
+        middle = (support[:, None] * _COMPASS).sum(0) * 2 / OUTLINE_DIRECTIONS
+        pose = view.geometry.camera.colour_from_master
+        return cls(support, known, middle, float(width.max()), pose)
+
+    @property
+    def eye(self) -> np.ndarray:
+        """Centre (3,) of the camera, master frame."""
+        return -self.colour_from_master[:3, :3].T @ self.colour_from_master[:3, 3]
+
+    @property
+    def ray(self) -> np.ndarray:
+        """Unit direction (3,) through the middle, master frame."""
+        ray = self.colour_from_master[:3, :3].T @ np.append(self.middle, 1.0)
+        return ray / np.linalg.norm(ray)
+
+
+def _is_cut_off(view: View, candidate: Candidate, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return whether the mask's pixels x, y (N,) lie beside a person or the image's edge."""
+    lens = view.geometry.lens
+    cut = (x < OUTLINE_CUT_PX) | (y < OUTLINE_CUT_PX)
+    cut |= (x >= lens.width - OUTLINE_CUT_PX) | (y >= lens.height - OUTLINE_CUT_PX)
+    for dx in range(-OUTLINE_CUT_PX, OUTLINE_CUT_PX + 1):
+        for dy in range(-OUTLINE_CUT_PX, OUTLINE_CUT_PX + 1):
+            other = view.person.sample(x + dx, y + dy)
+            cut |= other & ~candidate.mask.sample(x + dx, y + dy)
+    return cut
+
+
+def hull_vertices(mesh: ObjectMesh) -> np.ndarray:
+    """Return the vertices (H, 3) of the mesh's convex hull."""
+    from scipy.spatial import ConvexHull
+
+    return mesh.vertices[ConvexHull(mesh.vertices).vertices]
+
+
+def outline_residuals(
+    outline: MaskOutline, hull: np.ndarray, rotation: np.ndarray, translation: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Compute how far the object extends beyond the mask (N, D), metres, and the Jacobian (N, D,
+    6).
+
+    The columns are a turn, then a shift, of the object in its own frame: pose <- pose * exp(step).
+    Directions in which the mask is cut off are zero.
+
+    Args:
+        outline: of the mask.
+        hull: (H, 3) vertices of the convex hull, object frame.
+        rotation, translation: (N, 3, 3) and (N, 3) of master_from_object.
+    """
+    pose = outline.colour_from_master
+    turned = pose[:3, :3] @ rotation
+    placed = translation @ pose[:3, :3].T + pose[:3, 3]
+    points = np.einsum("nij,hj->nhi", turned, hull) + placed[:, None]
+    z = np.maximum(points[..., 2], OUTLINE_MIN_DEPTH_M)
+    flat = points[..., :2] / z[..., None]
+    reach = flat @ _COMPASS.T  # (N, H, D)
+    ends = reach.argmax(1)
+    number = np.arange(len(rotation))[:, None]
+    distance = np.maximum(placed[:, 2], OUTLINE_MIN_DEPTH_M)[:, None]
+    residual = (np.take_along_axis(reach, ends[:, None], 1)[:, 0] - outline.support) * distance
+    towards = np.broadcast_to(_COMPASS, (len(rotation), OUTLINE_DIRECTIONS, 2))
+    along = -(towards * flat[number, ends]).sum(-1, keepdims=True)
+    by_camera = np.concatenate([towards, along], -1) * (distance / z[number, ends])[..., None]
+    by_shift = by_camera @ turned
+    by_turn = np.cross(hull[ends], by_shift)
+    jacobian = np.concatenate([by_turn, by_shift], -1)
+    return residual * outline.known, jacobian * outline.known[:, None]
+
+
+@dataclass(frozen=True, eq=False)
+class LocatedCandidate:
+    """One candidate of one view, with the position that it gives."""
 
     view: int
+    """Number of the view."""
     candidate: Candidate
+    """The candidate."""
     label_prior: float
+    """1 with one of the object's labels, less otherwise."""
     points: np.ndarray
+    """(N, 3) measured points, master frame; empty without depth."""
     centre: np.ndarray | None
+    """(3,) median of the points; None without depth."""
     image: View
+    """The view."""
 
     @cached_property
-    def outline(self) -> Outline | None:
-        """Its outline; None where all of it is cut off. Few searches ask for it."""
-        return Outline.of(self.image, self.candidate)
+    def outline(self) -> MaskOutline | None:
+        """MaskOutline of the candidate, None if all of it is cut off; computed on request."""
+        return MaskOutline.of(self.image, self.candidate)
 
     def away(self, point: np.ndarray, diameter: float) -> float:
-        """Distance of the candidate from a place (3,), in units of the largest distance within one
-        object."""
+        """Return the distance of the candidate from a point (3,).
+
+        The unit is the largest distance within one object.
+        """
         if self.centre is not None:
             return float(np.linalg.norm(self.centre - point)) / (
                 SAME_OBJECT_SHARE * diameter + GROUP_SLACK_M
@@ -77,8 +196,8 @@ class Sighting:
         return across / (RAY_MISS_SHARE * diameter + GROUP_SLACK_M)
 
 
-Group = list[Sighting]
-"""At most one sighting a view."""
+Group = list[LocatedCandidate]
+"""At most one candidate of each view."""
 
 
 def find_groups(
@@ -86,17 +205,24 @@ def find_groups(
     views: list[View],
     labels: tuple[str, ...],
     place_prior: Callable[[np.ndarray], float] | None = None,
-    limit: int = MAX_GROUPS,
+    limit: int = 3,
 ) -> list[Group]:
-    """The first ``limit`` groups of candidates that may be the object, the most likely first.
+    """Find groups of candidates that may be the object.
 
-    ``labels`` are the classes that the object may be given; ``place_prior`` says of a place (3,)
-    how likely what is there is the object; where it cannot be there is no group.
+    Args:
+        mesh: the object.
+        views: views of the frame set.
+        labels: detector classes of the object.
+        place_prior: prior of a position (3,) to be that of the object; groups at 0 are dropped.
+        limit: largest number of groups.
+
+    Returns:
+        The groups, the most likely first.
     """
-    measured = _measured(views, mesh.diameter, labels)
-    outlined = _outlined(views, labels)
+    measured = _locate_by_depth(views, mesh.diameter, labels)
+    outlined = _locate_by_outline(views, labels)
     places = [(s.centre, [s]) for s in measured if s.centre is not None]
-    places += [(point, []) for point in _crossings(outlined, mesh.diameter)]
+    places += [(point, []) for point in _ray_crossings(outlined, mesh.diameter)]
     sightings = measured + outlined
     groups: list[tuple[float, Group]] = []
     for place, anchor in places:
@@ -109,16 +235,19 @@ def find_groups(
                 group.append(others[nearest])
         value = sum(s.label_prior for s in group)
         if place_prior is not None:
-            value *= place_prior(centre_of(group))
+            value *= place_prior(locate_group(group))
         if value > 0:
             groups.append((value, group))
     groups.sort(key=lambda item: -item[0])
-    return _different([group for _, group in groups], limit)
+    return _distinct_groups([group for _, group in groups], limit)
 
 
-def centre_of(group: Group) -> np.ndarray:
-    """Where the group is (3,): the mean of the views' mean points, or where their rays cross."""
-    # the mean of the views' means: a near view holds more points but not more of the object
+def locate_group(group: Group) -> np.ndarray:
+    """Return the position (3,) of a group: the mean over its views of their mean points.
+
+    The mean of means, because a near view has more points but not more of the object. Without
+    depth, the point nearest to the rays.
+    """
     means = [s.points.mean(0) for s in group if len(s.points)]
     if means:
         return np.mean(means, axis=0)
@@ -128,22 +257,21 @@ def centre_of(group: Group) -> np.ndarray:
     return np.linalg.solve(across.sum(0), np.einsum("nij,nj->i", across, eyes))
 
 
-def _different(groups: list[Group], limit: int) -> list[Group]:
-    """The first few groups that share at most half of their members with an earlier one."""
+def _distinct_groups(groups: list[Group], limit: int) -> list[Group]:
+    """Keep the first groups that do not share most of their members with an earlier one."""
     kept: list[Group] = []
     for group in groups:
         if len(kept) == limit:
             break
         members = {(s.view, s.candidate.index) for s in group}
         known = [{(s.view, s.candidate.index) for s in other} for other in kept]
-        if all(len(members & other) <= SHARED_SIGHTINGS * len(members) for other in known):
+        if all(len(members & other) <= SHARED_CANDIDATES * len(members) for other in known):
             kept.append(group)
     return kept
 
 
-def _crossings(outlined: list[Sighting], diameter: float) -> list[np.ndarray]:
-    """Points (3,) where the rays through two views' masks intersect and both masks have the size
-    that the object would have there."""
+def _ray_crossings(outlined: list[LocatedCandidate], diameter: float) -> list[np.ndarray]:
+    """Find points (3,) where the rays of two views meet and both masks have the object's size."""
     found = []
     for a, b in combinations(outlined, 2):
         if a.view == b.view:
@@ -155,9 +283,12 @@ def _crossings(outlined: list[Sighting], diameter: float) -> list[np.ndarray]:
     return found
 
 
-def _could_be(view: View) -> list[Candidate]:
-    """All candidates that are not the person: labels err, so none is left out for its label
-    alone."""
+def _possible_candidates(view: View) -> list[Candidate]:
+    """Return the candidates of a view that are not the person.
+
+    Labels may be wrong, so none is left out for its label alone. An object that is held in front of
+    the body may lie in the person's mask.
+    """
     found = []
     for candidate in view.candidates:
         mask = candidate.mask
@@ -167,9 +298,7 @@ def _could_be(view: View) -> list[Candidate]:
             large = (
                 candidate.label == PERSON_LABEL or mask.area > PERSON_SIZED_SHARE * view.person.area
             )
-            if not (
-                on_person and large
-            ):  # an object held before the body may lie in the person's mask
+            if not (on_person and large):
                 found.append(candidate)
     return found
 
@@ -180,30 +309,32 @@ def _label_prior(label: str, labels: tuple[str, ...]) -> float:
     return 1.0 if label in labels or (not labels and label != PERSON_LABEL) else OTHER_LABEL_PRIOR
 
 
-def _outlined(views: list[View], labels: tuple[str, ...]) -> list[Sighting]:
-    """The outline of every candidate in views without depth that could be the object."""
+def _locate_by_outline(views: list[View], labels: tuple[str, ...]) -> list[LocatedCandidate]:
+    """Locate the candidates of views without depth by their outlines."""
     found = []
     for number, view in enumerate(views):
-        for candidate in _could_be(view) if view.depth is None else ():
+        for candidate in _possible_candidates(view) if view.depth is None else ():
             label_prior = _label_prior(candidate.label, labels)
-            one = Sighting(number, candidate, label_prior, np.zeros((0, 3)), None, view)
-            if candidate.mask.area >= SIGHTING_MIN_POINTS and one.outline is not None:
-                found.append(one)
+            located = LocatedCandidate(number, candidate, label_prior, np.zeros((0, 3)), None, view)
+            if candidate.mask.area >= LOCATED_MIN_POINTS and located.outline is not None:
+                found.append(located)
     return found
 
 
-def _measured(views: list[View], diameter: float, labels: tuple[str, ...]) -> list[Sighting]:
-    """The measured points of every candidate that could be the object."""
+def _locate_by_depth(
+    views: list[View], diameter: float, labels: tuple[str, ...]
+) -> list[LocatedCandidate]:
+    """Locate the candidates of views with depth by their points."""
     found = []
     for number, view in enumerate(views):
         geometry = view.geometry
         if view.depth is None or geometry.depth_lens is None:
             continue
-        candidates = _could_be(view)
+        candidates = _possible_candidates(view)
         if not candidates:
             continue
-        depth = view.depth[::CLOUD_STRIDE, ::CLOUD_STRIDE]
-        rays = geometry.depth_lens.rays[::CLOUD_STRIDE, ::CLOUD_STRIDE]
+        depth = view.depth[::2, ::2]
+        rays = geometry.depth_lens.rays[::2, ::2]
         valid = (depth > 0) & np.isfinite(rays[..., 0])
         depth, rays = depth[valid], rays[valid]
         local = np.column_stack([rays * depth[:, None], depth])
@@ -212,17 +343,17 @@ def _measured(views: list[View], diameter: float, labels: tuple[str, ...]) -> li
         pixel = np.rint(geometry.lens.project(apply(camera.colour_from_depth, local))).astype(int)
         for candidate in candidates:
             inside = np.flatnonzero(candidate.mask.sample(pixel[:, 0], pixel[:, 1]))
-            if len(inside) < SIGHTING_MIN_POINTS:
+            if len(inside) < LOCATED_MIN_POINTS:
                 continue
             z = depth[inside]
             inside = inside[np.abs(z - np.median(z)) < CLOUD_MAX_SPREAD * diameter]
-            if len(inside) < SIGHTING_MIN_POINTS:
+            if len(inside) < LOCATED_MIN_POINTS:
                 continue  # two surfaces, with the middle between them
             points = apply(camera.master_from_depth, local[inside]).astype(np.float64)
             centre = np.median(points, axis=0)
-            spread = np.percentile(np.linalg.norm(points - centre, axis=1), CLOUD_PERCENTILE)
+            spread = np.percentile(np.linalg.norm(points - centre, axis=1), 90)
             if spread > CLOUD_MAX_SPREAD * diameter:
                 continue
             label_prior = _label_prior(candidate.label, labels)
-            found.append(Sighting(number, candidate, label_prior, points, centre, view))
+            found.append(LocatedCandidate(number, candidate, label_prior, points, centre, view))
     return found

@@ -1,4 +1,8 @@
-"""Hypotheses of every frame: local optima of the images' likelihood, followed through time."""
+"""Hypotheses of every frame, followed through time, and their prior besides the images.
+
+A hypothesis is a local optimum of the images' likelihood. The prior weighs it by its place in the
+room, by how upright it is, and by annotated poses.
+"""
 
 from __future__ import annotations
 
@@ -8,79 +12,173 @@ import numpy as np
 
 from intercap_core.geometry.camera.transforms import step_between
 from intercap_core.geometry.solve.time_series import rigid_velocity
-from intercap_core.object_track.constants import (
-    BASIN,
-    CONTRADICTED_LOG_RATIO,
-    CROWDED,
-    FIT_ROUNDS,
-    MAX_HYPOTHESES,
-    MOTION_CHANGED_M,
-    MOTION_CHANGED_RAD,
-    PRIOR_CONTRADICTED,
-    PRIOR_WIDENED,
-    RIVAL_LOG_RATIO,
-    RIVAL_PROBABILITY,
-    SEEN_LOG_RATIO,
-    UNSEEN_S,
+from intercap_core.object_track.decoder import (
+    EXCURSION_COST,
+    HIDDEN,
+    JUMP_COST,
+    REACH_M,
+    Decoded,
+    pose_distances,
 )
-from intercap_core.object_track.decoder import NOT_SEEN, Decoded
-from intercap_core.object_track.fit import Fit, MotionPrior
-from intercap_core.object_track.motion import about, expected, extrapolated, unwrapped
+from intercap_core.object_track.fit import FIT_ROUNDS, Fit, MotionPrior
+from intercap_core.object_track.given_poses import UNSEEN_S, GivenPose
+from intercap_core.object_track.likelihood import CONTRADICTED_LOG_RATIO, SEEN_LOG_RATIO
+from intercap_core.object_track.motion import (
+    extrapolate,
+    predict_prior,
+    shift_twist,
+    unwrap_symmetry,
+)
 from intercap_core.object_track.observer import Observer
-from intercap_core.object_track.prior import Prior
-from intercap_core.object_track.search import same_pose
+from intercap_core.object_track.turns import same_pose
+
+# A fit that ends this many standard deviations of its prior away is repeated with a prior this many
+# times as wide: the object started to move or stopped.
+PRIOR_CONTRADICTED = 1.5
+PRIOR_WIDENED = 4.0
+BASIN = (0.04, 15.0)  # metres and degrees within which all fits lead to one pose
+MAX_HYPOTHESES = 12  # of a frame: turns of a mug with a hidden handle, 30 degrees apart
+CROWDED = (0.04, 20.0)  # metres and degrees; of too many hypotheses, one this near to another goes
+# A moving object is fitted again if its motion until a view exposes changes by this.
+MOTION_CHANGED_M = 0.003
+MOTION_CHANGED_RAD = np.radians(0.5)
+RIVAL_PROBABILITY = 0.01  # hypotheses below are not considered further
+RIVAL_LOG_RATIO = 5.0  # nats of independent evidence below the best, up to which to follow
+UPRIGHT_LOG_RATIO = (
+    2.0  # nats times the cosine of the angle to the standing pose; tuned on the studio
+)
+# Nats of one frame for its annotated pose, and for all poses within reach of it. The latter is the
+# cost of a jump there and back for that frame alone.
+ANNOTATION_LOG_RATIO = 10.0
+ANNOTATED_LOG_RATIO = 2 * (JUMP_COST + EXCURSION_COST)
+
+
+class Prior:
+    """Weighs hypotheses by all that is known besides the images of their frame.
+
+    Attributes:
+        given: annotated poses by frame.
+    """
+
+    def __init__(self, observer: Observer) -> None:
+        self._observer = observer
+        self.given: dict[int, GivenPose] = {}
+
+    def near_annotated(self, hidden: np.ndarray) -> np.ndarray:
+        """Find frames (T,) bool near annotated poses that are near ``hidden`` frames (T,) as well.
+
+        Near is the time for which an object is followed without being seen.
+        """
+        times = self._observer.times
+        result = np.zeros(len(times), bool)
+        for t in self.given:
+            near = np.abs(times - times[t]) < UNSEEN_S
+            if hidden[near].any():
+                result |= near
+        return result
+
+    def weigh(self, t: int, fits: list[Fit]) -> np.ndarray:
+        """Return the evidence (K,) for hypotheses of frame t relative to none being true, nats.
+
+        Hypotheses that explain one object share the prior of its place
+        (:meth:`.places.Places.weigh`) and differ by the evidence of the images.
+        """
+        mesh, places, share = self._observer.mesh, self._observer.places, self._observer.share
+        ratio = np.array([fit.log_ratio for fit in fits])
+        result = ratio.copy()
+        number = group_by_candidates(fits)
+        for group in range(number.max(initial=-1) + 1):
+            members = number == group
+            best = int(np.where(members, ratio, -np.inf).argmax())
+            own = max(float(ratio[best]), 0.0)
+            place = mesh.centre_at(fits[best].pose)
+            result[members] -= own - places.weigh(t, place, own, share)
+        if self._observer.up is not None:
+            up = self._observer.up / np.linalg.norm(self._observer.up)
+            result += UPRIGHT_LOG_RATIO * np.array([fit.pose[:3, 2] @ up for fit in fits])
+        if t in self.given and fits:
+            poses = np.array([fit.pose for fit in fits])
+            _, shift = pose_distances(mesh, self.given[t].pose[None], poses)
+            squared = self.given[t].squared_distances(mesh, poses)
+            near = np.maximum(ANNOTATION_LOG_RATIO - 0.5 * squared, 0.0)
+            result += (ANNOTATED_LOG_RATIO * (shift[0] < REACH_M) + near) / share
+        return result
+
+
+def group_by_candidates(fits: list[Fit]) -> np.ndarray:
+    """Number (K,) the objects that the hypotheses of a frame explain.
+
+    Hypotheses that mostly choose the same candidates explain the same object.
+    """
+    number = np.zeros(len(fits), int)
+    leaders: list[np.ndarray] = []
+    for k in sorted(range(len(fits)), key=lambda k: -fits[k].log_ratio):
+        kept = np.array([view.candidate for view in fits[k].views])
+        same = [int(((kept == other) & (kept >= 0)).sum()) for other in leaders]
+        most = int(np.argmax(same)) if same else -1
+        if most >= 0 and same[most] and 2 * same[most] >= int((kept >= 0).sum()):
+            number[k] = most
+        else:
+            number[k] = len(leaders)
+            leaders.append(kept)
+    return number
 
 
 class Hypotheses:
-    """The fits [T] that may be true, each frame's in the order in which they were found.
+    """Hypotheses of every frame.
 
-    ``share`` is how many independent observations a frame is; ``times`` (T,) seconds.
+    Attributes:
+        fits: hypotheses [T] in the order in which they were added.
     """
 
-    def __init__(self, observer: Observer, prior: Prior, share: float, times: np.ndarray) -> None:
+    def __init__(self, observer: Observer, prior: Prior) -> None:
         self._observer = observer
         self._prior = prior
-        self._share = share
-        self._times = times
-        self._step_s = float(np.median(np.diff(times))) if len(times) > 1 else UNSEEN_S
-        self._patience = max(1, round(UNSEEN_S / self._step_s))
+        self._times = observer.times
+        self._patience = observer.frames_in(UNSEEN_S)
         self.fits: list[list[Fit]] = [[] for _ in range(observer.count)]
 
     def known(self, t: int, pose: np.ndarray) -> int | None:
-        """The hypothesis of frame t at this pose (4, 4), if there is one."""
+        """Return the hypothesis of frame t at this pose (4, 4), if any."""
         for k, fit in enumerate(self.fits[t]):
             if same_pose(self._observer.mesh, fit.pose, pose):
                 return k
         return None
 
     def seen(self, t: int, pose: np.ndarray) -> int | None:
-        """:meth:`known`, where the images support it."""
+        """Return :meth:`known` if the images support that hypothesis."""
         k = self.known(t, pose)
         return k if k is not None and self.fits[t][k].log_ratio > SEEN_LOG_RATIO else None
 
     def best(self, t: int) -> float:
-        """What speaks for frame t's likeliest hypothesis, nats; 0 where nothing does."""
+        """Return the weight of the likeliest hypothesis of frame t, nats, at least 0."""
         return float(self._prior.weigh(t, self.fits[t]).max(initial=0.0))
 
     def shown(self, t: int) -> bool:
-        """Whether the images of frame t support any of its hypotheses."""
+        """Return whether the images of frame t support any of its hypotheses."""
         return any(fit.log_ratio > SEEN_LOG_RATIO for fit in self.fits[t])
 
     def add(self, t: int, fit: Fit) -> None:
-        """Add a hypothesis of frame t; of two at one pose the likelier stays. Of too many one goes,
-        so that turns that nothing tells apart stay spread."""
+        """Add a hypothesis to frame t.
+
+        The likelier of two at one pose is kept. Of too many hypotheses one is dropped so that
+        ambiguous turns stay evenly spread.
+        """
         own = self.fits[t]
         k = self.known(t, fit.pose)
         if k is None:
             own.append(fit)
             if len(own) > MAX_HYPOTHESES:
-                del own[self._least_missed(t)]
+                del own[self._most_redundant(t)]
         elif fit.log_ratio > own[k].log_ratio:
             own[k] = fit
 
-    def _least_missed(self, t: int) -> int:
-        """The least likely hypothesis of frame t: of those that the images do not support, or of
-        those that have a likelier one close by, or of all."""
+    def _most_redundant(self, t: int) -> int:
+        """Return the least likely hypothesis of frame t.
+
+        First among those that the images do not support, then among those that have a likelier one
+        close by, then among all.
+        """
         own, mesh = self.fits[t], self._observer.mesh
         order = [int(k) for k in np.argsort(self._prior.weigh(t, own))]
         if own[order[0]].log_ratio < SEEN_LOG_RATIO < own[order[-1]].log_ratio:
@@ -91,31 +189,37 @@ class Hypotheses:
         return order[0]
 
     def follow(self, t: int, fit: Fit) -> None:
-        """Add a fit of frame t and where it leads in the frames before and after, until it meets
-        what is known, is not seen for long or is hopelessly worse than another."""
+        """Add a fit of frame t and follow it through the frames before and after.
+
+        It ends where it meets a known hypothesis, is unseen for long or is hopelessly worse than
+        another one.
+        """
         self.add(t, fit)
         for frames in (range(t + 1, self._observer.count), range(t - 1, -1, -1)):
             self._follow(t, fit.pose, frames)
 
-    def see_moving(self, decoded: Decoded) -> set[int]:
-        """Fit again what moves, as each view saw it when it exposed; the frames that changed.
+    def refit_moving(self, decoded: Decoded) -> set[int]:
+        """Fit moving objects again as each view saw them at its exposure.
 
-        The motion is that of the frames around, better known than when a frame was fitted; rivals
-        move as what is believed does.
+        The motion is that of the decided poses around, which is better known than at the first fit.
+        Rivals move as the decided hypothesis.
+
+        Returns:
+            The frames that changed.
         """
-        known = decoded.path != NOT_SEEN
+        known = decoded.path != HIDDEN
         poses = np.tile(np.eye(4), (len(known), 1, 1))
-        frames = [t for t, k in enumerate(decoded.path) if k != NOT_SEEN]
+        frames = np.flatnonzero(known).tolist()
         for t in frames:
             poses[t] = self.fits[t][decoded.path[t]].pose
         motion = rigid_velocity(
-            unwrapped(self._observer.mesh.symmetry, poses, known), known, self._times
+            unwrap_symmetry(self._observer.mesh.symmetry, poses, known), known, self._times
         )
         changed = set()
         for t in frames:
             late = max(abs(view.geometry.time_offset_s) for view in self._observer.views(t))
             for k, fit in enumerate(self.fits[t]):
-                twist = about(motion[t], poses[t, :3, 3], fit.pose[:3, 3])
+                twist = shift_twist(motion[t], poses[t, :3, 3], fit.pose[:3, 3])
                 turn, shift = np.abs(twist - fit.twist).reshape(2, 3).max(1) * late
                 if decoded.probability[t][k] < RIVAL_PROBABILITY or (
                     turn < MOTION_CHANGED_RAD and shift < MOTION_CHANGED_M
@@ -127,11 +231,11 @@ class Hypotheses:
                     self.fits[t][k] = again
                     changed.add(t)
             if t in changed:
-                self._join(t)
+                self._merge_equal(t)
         return changed
 
-    def _join(self, t: int) -> None:
-        """Leave one of several hypotheses of frame t that have become one pose, the likeliest."""
+    def _merge_equal(self, t: int) -> None:
+        """Keep the likeliest of several hypotheses of frame t that have become one pose."""
         left, self.fits[t] = sorted(self.fits[t], key=lambda fit: -fit.log_ratio), []
         for fit in left:
             if self.known(t, fit.pose) is None:
@@ -139,21 +243,21 @@ class Hypotheses:
 
     def _follow(self, last: int, pose: np.ndarray, frames: Iterable[int]) -> None:
         before = now = pose
-        unseen, deficit = 0, 0.0
+        unseen, deficit, step_s = 0, 0.0, self._observer.step_s
         for t in frames:
-            predicted = self._likeliest(t, last, before, now)
+            predicted = self._predict(t, last, before, now)
             twist = step_between(now, predicted) / (self._times[t] - self._times[last])
             last = t
             if self.seen(t, predicted) is not None:
                 return
-            prior = expected(before, now, predicted, self._step_s, unseen * self._step_s)
+            prior = predict_prior(before, now, predicted, step_s, unseen * step_s)
             fit = self._fit(t, predicted, prior, twist)
             if self.seen(t, fit.pose) is not None:
                 return
             weights = self._prior.weigh(t, [fit, *self.fits[t]])
             if fit.log_ratio > CONTRADICTED_LOG_RATIO:
                 self.add(t, fit)
-            deficit += self._share * float(weights.max(initial=0.0) - weights[0])
+            deficit += self._observer.share * float(weights.max(initial=0.0) - weights[0])
             if deficit > RIVAL_LOG_RATIO or unseen >= self._patience:
                 return
             if fit.log_ratio > SEEN_LOG_RATIO:
@@ -163,22 +267,23 @@ class Hypotheses:
                 before = now = predicted
                 unseen += 1
 
-    def _likeliest(self, t: int, last: int, before: np.ndarray, now: np.ndarray) -> np.ndarray:
-        """The pose (4, 4) expected in frame t that its images support best: at constant velocity,
-        as in frame ``last``, or carried by a hand."""
-        starts = [extrapolated(before, now)]
+    def _predict(self, t: int, last: int, before: np.ndarray, now: np.ndarray) -> np.ndarray:
+        """Predict the pose (4, 4) of frame t that its images support best.
+
+        Predictions are constant velocity, the pose of frame ``last``, and with each hand.
+        """
+        starts = [extrapolate(before, now)]
         for pose in (now, *self._observer.carried(last, t, now)):
             if not any(same_pose(self._observer.mesh, pose, other, BASIN) for other in starts):
                 starts.append(pose)
         if len(starts) == 1:
             return starts[0]
         rates = step_between(now, np.array(starts)) / (self._times[t] - self._times[last])
-        found = self._observer.assess_all(t, np.array(starts), twists=rates)
-        return max(found, key=lambda one: one.log_ratio).pose
+        assessed = self._observer.assess_all(t, np.array(starts), twists=rates)
+        return max(assessed, key=lambda fit: fit.log_ratio).pose
 
     def _fit(self, t: int, start: np.ndarray, prior: MotionPrior, twist: np.ndarray) -> Fit:
-        """The fit of frame t from ``start`` (4, 4), moving by ``twist`` (6,); its prior widened
-        where the images contradict it."""
+        """Fit frame t from ``start`` (4, 4), with a wider prior if the images contradict it."""
         fit = self._observer.fit(t, start, prior, twist=twist)
         step = np.abs(step_between(prior.pose, fit.pose))
         limit = np.repeat([prior.sigma_rad, prior.sigma_m], 3) * PRIOR_CONTRADICTED

@@ -10,28 +10,31 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
-from intercap_core.object_track.constants import (
-    GROWTH_LOST_M_S,
-    GROWTH_LOST_RAD_S,
-    HOLDING_REACH_M,
-    ONSET_M_S,
-    ONSET_RAD_S,
-    ONSET_STEP_SHARE,
-    PALM_MIN_SINE,
-    STILL_M,
-    STILL_RAD,
-)
 from intercap_core.object_track.fit import MotionPrior
 
-# Elbow, wrist, and the knuckles of the index and the little finger, right and left.
+# An object that moves less per frame rests, and no motion is predicted. Above the jitter of fits;
+# tuned on the studio, as the next values.
+STILL_M = 0.004
+STILL_RAD = np.radians(1.5)
+# Standard deviation of the change of the velocity from one frame to the next.
+ONSET_M_S = 0.6
+ONSET_RAD_S = np.radians(60)
+ONSET_STEP_SHARE = 0.5  # standard deviation relative to the last step, which may stop or double
+# Standard deviation added per second without observation.
+GROWTH_LOST_M_S = 1.2
+GROWTH_LOST_RAD_S = np.radians(240)
+HOLDING_REACH_M = 0.20  # from a wrist to the surface of a held object: a hand's length (anatomy)
+PALM_MIN_SINE = 0.1  # sine of the angle of a palm's two edges, usually 0.3
+
 _HANDS = [
     [KEYPOINT_NAMES.index(f"{side}_{name}") for name in ("elbow", "wrist", "index1", "pinky1")]
     for side in ("right", "left")
 ]
+"""Elbow, wrist, and knuckles of index and little finger, right and left."""
 
 
-def extrapolated(before: np.ndarray, now: np.ndarray) -> np.ndarray:
-    """The next pose at constant velocity; the last one where the object is at rest."""
+def extrapolate(before: np.ndarray, now: np.ndarray) -> np.ndarray:
+    """Predict the next pose at constant velocity; the last pose if the object rests."""
     shift = now[:3, 3] - before[:3, 3]
     turn = Rotation.from_matrix(now[:3, :3] @ before[:3, :3].T)
     predicted = now.copy()
@@ -42,17 +45,23 @@ def extrapolated(before: np.ndarray, now: np.ndarray) -> np.ndarray:
     return predicted
 
 
-def expected(
+def predict_prior(
     before: np.ndarray,
     now: np.ndarray,
     predicted: np.ndarray,
     step_s: float,
     unseen_s: float = 0.0,
 ) -> MotionPrior:
-    """The prior around the prediction: the object may start to move, turn or stop.
+    """Return the prior around a prediction: the object may start to move, turn or stop.
 
-    From rest, one frame's share of a hand's acceleration; in motion, half of the last step in
-    addition; more for every second since the object was last seen. ``step_s`` between frames.
+    The deviations are those of an onset of motion from rest, half of the last step, and a growth
+    with the time without observation.
+
+    Args:
+        before, now: last two poses (4, 4).
+        predicted: (4, 4) mean of the prior.
+        step_s: seconds between frames.
+        unseen_s: seconds since the object was seen.
     """
     shift = float(np.linalg.norm(now[:3, 3] - before[:3, 3]))
     turn = float(Rotation.from_matrix(now[:3, :3] @ before[:3, :3].T).magnitude())
@@ -65,31 +74,37 @@ def expected(
 
 @dataclass(frozen=True)
 class HandMotion:
-    """A hand's motion between two frames: by ``turn`` (3, 3) about the wrist, which goes from
-    ``start`` (3,) to ``end`` (3,), metres."""
+    """Motion of a hand between two frames."""
 
     turn: np.ndarray
+    """(3, 3) rotation about the wrist."""
     start: np.ndarray
+    """(3,) position of the wrist before, metres."""
     end: np.ndarray
+    """(3,) position of the wrist after."""
 
     def reaches(self, centres: np.ndarray, radius: float) -> np.ndarray:
-        """Whether the hand may hold, before the motion, what is at ``centres`` (..., 3) and as
-        large as ``radius``, metres."""
+        """Return whether the hand may hold an object before the motion.
+
+        Args:
+            centres: (..., 3) of the object, metres.
+            radius: of the object, metres.
+        """
         return np.linalg.norm(centres - self.start, axis=-1) < radius + HOLDING_REACH_M
 
     def carry(self, poses: np.ndarray) -> np.ndarray:
-        """Poses (..., 4, 4) of what is held, after the motion."""
+        """Return the poses (..., 4, 4) of a held object after the motion."""
         found = poses.copy()
         found[..., :3, :3] = self.turn @ poses[..., :3, :3]
         found[..., :3, 3] = (poses[..., :3, 3] - self.start) @ self.turn.T + self.end
         return found
 
 
-def hand_motions(joints: np.ndarray) -> list[HandMotion | None]:
-    """The motions of the right and of the left hand between two frames, None where it is unknown.
+def estimate_hand_motions(joints: np.ndarray) -> list[HandMotion | None]:
+    """Estimate the motions of the right and the left hand between two frames, None if unknown.
 
-    ``joints`` (2, K, 3) of the person in both, NaN unknown. A hand turns as its palm does, or,
-    where that is not seen in both frames, as the forearm.
+    A hand turns like its palm, or like the forearm if the palm is not seen in both frames.
+    ``joints`` (2, K, 3) are those of the person, NaN where unknown.
     """
     found: list[HandMotion | None] = []
     for elbow, wrist, index, pinky in _HANDS:
@@ -106,9 +121,14 @@ def hand_motions(joints: np.ndarray) -> list[HandMotion | None]:
     return found
 
 
-def unwrapped(symmetry: SymmetryGroup, poses: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Equivalent poses (T, 4, 4) of which the ``known`` (T,) follow each other as closely as the
-    symmetry allows."""
+def unwrap_symmetry(symmetry: SymmetryGroup, poses: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Replace known poses by equivalent ones that follow each other as closely as possible.
+
+    Args:
+        symmetry: of the object.
+        poses: (T, 4, 4).
+        known: (T,) bool.
+    """
     result = poses.copy()
     if not symmetry.trivial:
         for s, t in pairwise(np.flatnonzero(known)):
@@ -116,29 +136,38 @@ def unwrapped(symmetry: SymmetryGroup, poses: np.ndarray, known: np.ndarray) -> 
     return result
 
 
-def about(twist: np.ndarray, point: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """The same motion (6,), of which ``twist`` states the shift of ``point`` (3,), with that of
-    ``other`` (3,)."""
+def shift_twist(twist: np.ndarray, point: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Express a motion by the shift of another point.
+
+    ``twist`` (6,) states the shift of ``point`` (3,), the result that of ``other`` (3,).
+    """
     return np.append(twist[:3], twist[3:] + np.cross(twist[:3], other - point))
 
 
-def carried(joints: np.ndarray, now: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
-    """Poses (N, 4, 4) of an object in each hand that may hold it, in the next frame.
+def carry_in_hands(
+    joints: np.ndarray, now: np.ndarray, centre: np.ndarray, radius: float
+) -> np.ndarray:
+    """Return poses (N, 4, 4) in the next frame of an object in each hand that may hold it.
 
-    ``joints`` (2, K, 3) of the person in the pose's frame and the next, NaN unknown; ``now`` (4, 4)
-    the pose, ``centre`` (3,) of the object there and its ``radius``, metres.
+    Args:
+        joints: (2, K, 3) of the person in this frame and the next, NaN where unknown.
+        now: (4, 4) pose of the object in this frame.
+        centre: (3,) of the object in this frame, metres.
+        radius: of the object, metres.
     """
     found = [
         hand.carry(now)
-        for hand in hand_motions(joints)
+        for hand in estimate_hand_motions(joints)
         if hand is not None and hand.reaches(centre, radius)
     ]
     return np.array(found).reshape(-1, 4, 4)
 
 
 def _palm(index: np.ndarray, pinky: np.ndarray) -> np.ndarray | None:
-    """Axes (3, 3), in columns, of a palm with these directions (3,) from the wrist to the knuckles;
-    None where they are unknown or one line."""
+    """Return the axes (3, 3), in columns, of a palm from its directions (3,) to the knuckles.
+
+    None if the directions are unknown or parallel.
+    """
     normal = np.cross(index, pinky)
     size = float(np.linalg.norm(normal))
     if not size > PALM_MIN_SINE * float(np.linalg.norm(index) * np.linalg.norm(pinky)):
@@ -148,7 +177,7 @@ def _palm(index: np.ndarray, pinky: np.ndarray) -> np.ndarray | None:
 
 
 def _between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The smallest rotation (3, 3) from direction ``a`` to ``b`` (3,); none where one is NaN."""
+    """Return the smallest rotation (3, 3) from direction ``a`` to ``b`` (3,); identity if NaN."""
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
         return np.eye(3)
     a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)

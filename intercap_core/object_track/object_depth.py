@@ -1,31 +1,184 @@
-"""Depth term of E_O, the object's energy: lambda_depth || (R_D - D) * S ||^2 of equation 1.
+"""Depth term of E_O: lambda_depth || (R_D - D) * S ||^2 of equation 1.
 
-R_D is the rendered depth, D the measured one, S the object's mask; lambda_depth is in
-:mod:`intercap_core.object_track.view_fit`. Where the paper compares depth along the ray, the
-residual here is the same difference taken along the normal of the rendered triangle (point to
-plane): the measured point's distance to the plane that the ray hits. It is the depth difference
-times the cosine of incidence, so that grazing surfaces do not dominate, and it is linear in small
-motions. What a fit runs, compiled and summed, is :mod:`.object_depth_kernel`; this is the plain
-form that it is tested against.
+R_D is the rendered depth, D the measured depth, S the object's mask; lambda_depth is in
+:mod:`intercap_core.object_track.view_fit`. The paper compares depth along the ray. The residual
+here is point to plane: the same difference along the normal of the rendered triangle. It equals the
+depth difference times the cosine of incidence, so grazing surfaces do not dominate, and it is
+linear in small motions.
+
+:func:`residuals` is the readable form. The compiled functions compute the same residual and
+Jacobian pixel by pixel, directly into the normal equations; tests compare the two.
 """
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 
 
 def residuals(
     observed: np.ndarray, hit: np.ndarray, normals: np.ndarray, origin: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Point-to-plane residuals (N,) in metres and their Jacobian (N, 6).
+    """Compute point-to-plane residuals n . (observed - hit) (N,) and their Jacobian (N, 6), metres.
 
-    ``observed`` (N, 3) measured points, fixed; ``hit`` (N, 3) surface points under the same
-    pixels and ``normals`` (N, 3) their unit normals, which move with the object; ``origin`` (3,)
-    the object's translation; all in the master frame, metres. Residual: n . (observed - hit),
-    positive where the measured surface lies outside the rendered one. The Jacobian is exact for
-    the motion X' = exp(w) (X - origin) + origin + d, columns w (rad) then d (m).
+    A residual is positive if the measured surface lies outside the rendered one. The Jacobian is
+    exact for the motion X' = exp(w) (X - origin) + origin + d; its columns are w (rad), then d (m).
+
+    Args (master frame, metres):
+        observed: (N, 3) measured points, fixed.
+        hit: (N, 3) surface points of the object under the same pixels; they move with it.
+        normals: (N, 3) unit normals at ``hit``; they move with the object.
+        origin: (3,) translation of the object.
     """
     gap = np.einsum("ij,ij->i", normals, observed - hit)
     # d/dw [exp(w) n . (p - X')] = n x (p - X) - (X - o) x n = n x (p - o)
     turn = np.cross(normals, observed - origin)
     return gap, np.concatenate([turn, -normals], axis=1)
+
+
+@numba.njit(cache=True, nogil=True)
+def normal_equations(
+    rendered,
+    face,
+    shift,
+    measured,
+    points,
+    trust,
+    face_normals,
+    rotation,
+    origin,
+    eye,
+    gate,
+    scale,
+):
+    """Sum the depth term over a rendering: J'WJ (6, 6), J'Wr (6,) and the number of pixels used.
+
+    Columns as in :func:`residuals`; all lengths in metres.
+
+    Args:
+        rendered, face: (h, w) depth and face number of the rendering, -1 outside.
+        shift: offset (x, y) of the rendering's first pixel in the patch of measurements.
+        measured: (H, W) depth, 0 where invalid.
+        points: (H, W, 3) measured points, master frame.
+        trust: (H, W) weight of each measured pixel.
+        face_normals: (F, 3) unit normals, object frame.
+        rotation, origin: (3, 3) and (3,) of master_from_object.
+        eye: (3,) centre of the camera, master frame.
+        gate: largest difference of the two depths.
+        scale: Geman-McClure scale.
+    """
+    hessian, gradient = np.zeros((6, 6)), np.zeros(6)
+    count = 0
+    row = np.empty(6)
+    for v in range(max(0, -shift[1]), min(rendered.shape[0], measured.shape[0] - shift[1])):
+        for u in range(max(0, -shift[0]), min(rendered.shape[1], measured.shape[1] - shift[0])):
+            f = face[v, u]
+            x, y = u + shift[0], v + shift[1]
+            if f < 0 or measured[y, x] <= 0 or trust[y, x] <= 0:
+                continue
+            here = np.float64(rendered[v, u])
+            if not np.abs(measured[y, x] - here) < gate:
+                continue
+            count += 1
+            nx, ny, nz = _rotated_normal(face_normals, f, rotation)
+            px, py, pz = points[y, x, 0], points[y, x, 1], points[y, x, 2]
+            # the rendered point lies on the same ray: eye + (p - eye) * rendered / measured
+            short = 1.0 - here / measured[y, x]
+            residual = short * (nx * (px - eye[0]) + ny * (py - eye[1]) + nz * (pz - eye[2]))
+            ox, oy, oz = px - origin[0], py - origin[1], pz - origin[2]
+            row[0], row[1], row[2] = ny * oz - nz * oy, nz * ox - nx * oz, nx * oy - ny * ox
+            row[3], row[4], row[5] = -nx, -ny, -nz
+            robust = scale * scale / (scale * scale + residual * residual)
+            weight = trust[y, x] * robust * robust
+            for i in range(6):
+                weighted = weight * row[i]
+                gradient[i] += weighted * residual
+                for j in range(i, 6):
+                    hessian[i, j] += weighted * row[j]
+    for i in range(6):
+        for j in range(i):
+            hessian[i, j] = hessian[j, i]
+    return hessian, gradient, count
+
+
+@numba.njit(cache=True, nogil=True)
+def matches(rendered, face, shift, measured, points, face_normals, rotation, eye):
+    """Compare measured and rendered depth in all pixels that have both.
+
+    Arguments as in :func:`normal_equations`.
+
+    Returns:
+        gap: (N,) measured minus rendered depth, metres.
+        across: (N,) distance of the measured points from the rendered planes, metres.
+        where: (N, 2) pixels x, y of the patch.
+    """
+    most = rendered.shape[0] * rendered.shape[1]
+    gap, across = np.empty(most), np.empty(most)
+    where = np.empty((most, 2), np.int32)
+    count = 0
+    for v in range(max(0, -shift[1]), min(rendered.shape[0], measured.shape[0] - shift[1])):
+        for u in range(max(0, -shift[0]), min(rendered.shape[1], measured.shape[1] - shift[0])):
+            f = face[v, u]
+            x, y = u + shift[0], v + shift[1]
+            if f < 0 or measured[y, x] <= 0:
+                continue
+            here = np.float64(rendered[v, u])
+            nx, ny, nz = _rotated_normal(face_normals, f, rotation)
+            short = 1.0 - here / measured[y, x]
+            gap[count] = measured[y, x] - here
+            across[count] = np.abs(
+                short
+                * (
+                    nx * (points[y, x, 0] - eye[0])
+                    + ny * (points[y, x, 1] - eye[1])
+                    + nz * (points[y, x, 2] - eye[2])
+                )
+            )
+            where[count, 0], where[count, 1] = x, y
+            count += 1
+    return gap[:count], across[:count], where[:count]
+
+
+@numba.njit(cache=True, nogil=True)
+def agreement(rendered, face, x0, y0, measured, rays, face_normals, rotation, free_m, scale):
+    """Compare a rendering with the whole depth image.
+
+    A pixel agrees by scale^2 / (scale^2 + r^2); r is the point-to-plane distance in metres.
+
+    Args:
+        rendered, face: (h, w) of the rendering, whose first pixel is (x0, y0) of the image.
+        measured: (H, W) depth in metres, 0 where invalid.
+        rays: (H, W, 2) of the depth lens.
+        face_normals: (F, 3) unit normals, object frame.
+        rotation: (3, 3) depth camera_from_object.
+        free_m: a pixel measured nearer than the rendering by more than this is occluded, metres.
+        scale: distance at which a pixel agrees by half, metres.
+
+    Returns:
+        Pixels compared, pixels not occluded, and the sum of the agreement of the latter.
+    """
+    compared, free, total = 0, 0, 0.0
+    for v in range(rendered.shape[0]):
+        for u in range(rendered.shape[1]):
+            f = face[v, u]
+            depth = measured[y0 + v, x0 + u]
+            if f < 0 or depth <= 0:
+                continue
+            compared += 1
+            gap = np.float64(depth) - rendered[v, u]
+            if gap > -free_m:
+                free += 1
+                nx, ny, nz = _rotated_normal(face_normals, f, rotation)
+                r = gap * (nx * rays[y0 + v, x0 + u, 0] + ny * rays[y0 + v, x0 + u, 1] + nz)
+                total += scale * scale / (scale * scale + r * r)
+    return compared, free, total
+
+
+@numba.njit(cache=True, nogil=True)
+def _rotated_normal(face_normals, f, rotation):
+    x, y, z = face_normals[f, 0], face_normals[f, 1], face_normals[f, 2]
+    return (
+        rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z,
+        rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z,
+        rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z,
+    )

@@ -1,10 +1,10 @@
-"""The images of one recording and the questions that tracking asks of them, frame by frame."""
+"""One recording of one object, with the searches, fits and comparisons of its frames."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -12,65 +12,80 @@ import numpy as np
 from intercap_core.config import ObjectTrackSettings
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh import ObjectMesh, Paint
-from intercap_core.geometry.rigid.render import Renderer, open_renderer
-from intercap_core.object_track.constants import (
-    ASSESS_MIN_OVERLAP,
-    LOOK_NEAR_M,
-    PASS_ROUNDS,
-    PASS_SCALE,
-)
-from intercap_core.object_track.evidence import PoseEvidence, evidence_at
-from intercap_core.object_track.fit import (
-    Fit,
-    MotionPrior,
-    assess_all,
-    fit_pose,
-)
-from intercap_core.object_track.motion import carried
+from intercap_core.geometry.rigid.render import open_renderer
+from intercap_core.object_track.evidence import ERROR_LASTING_S, PoseEvidence, evidence_at
+from intercap_core.object_track.fit import Fit, MotionPrior, assess_all, fit_pose
+from intercap_core.object_track.motion import carry_in_hands
 from intercap_core.object_track.places import Places
-from intercap_core.object_track.search import rank_frames, search
-from intercap_core.object_track.view import View
-from intercap_core.object_track.view_cache import ViewCache
+from intercap_core.object_track.recording import ViewCache
+from intercap_core.object_track.search import SearchLimits, rank_frames, search_pose
+from intercap_core.object_track.view import FitContext, View
 from intercap_core.progress import Progress
 
+PASS_ROUNDS = (3, 3)  # as FIT_ROUNDS, if the start is the pose of a neighbouring frame
+PASS_SCALE = 0.5  # of the first robust scales in that case
+SEARCH_RADIUS_M = 0.75  # around known positions: what a hand moves meanwhile
+
 Pictures = Callable[[int], list[np.ndarray | None]]
-"""Of frame t the views' images (h, w, 3) uint8 BGR, reduced; None where there is none."""
+"""Returns the reduced colour images (h, w, 3) uint8 BGR of frame t, None where there is none."""
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(eq=False)
 class Observer:
-    """One object in T frames.
-
-    ``load`` gives the views of frame t, one a camera; ``labels_by_view`` [T][C][candidates] the
-    labels alone; ``labels`` the classes the object may be given; ``up`` (3,) the vertical;
-    ``joints`` (T, K, 3) of the person, NaN unknown, master frame; ``surveyed`` frames in which
-    something was seen that may be the object, the most promising first; ``pictures`` the colour
-    images, ``paint`` the mesh's own colours, where there are any.
-    """
+    """One object in T frames of one recording."""
 
     mesh: ObjectMesh
+    """Mesh that is rendered."""
     load: Callable[[int], list[View]]
+    """Returns the views of frame t, one per camera."""
     labels_by_view: list[list[list[str]]]
+    """Labels [T][C][candidates]."""
     settings: ObjectTrackSettings
+    """Settings of stage ``object_track``."""
+    times: np.ndarray
+    """(T,) of the frames, seconds."""
     labels: tuple[str, ...] = ()
+    """Detector classes of the object; empty: any but a person."""
     up: np.ndarray | None = None
+    """(3,) vertical in the master frame."""
     joints: np.ndarray | None = None
+    """(T, K, 3) of the person, master frame, NaN where unknown."""
     pictures: Pictures | None = None
+    """Colour images of the views."""
     paint: Paint | None = None
+    """Colours of the mesh."""
     views: Callable[[int], list[View]] = field(init=False)
-    renderer: Renderer = field(init=False)
+    """``load`` with a cache."""
+    context: FitContext = field(init=False)
+    """Object and settings of all fits."""
 
     def __post_init__(self) -> None:
         self.views = ViewCache(self.load)
         self._progress = Progress(log, f"{self.mesh.name}: fitted", None, "poses")
-        self.renderer = open_renderer(self.settings.render_on)
+        self.context = FitContext.from_settings(
+            self.mesh, self.labels, self.settings, open_renderer(self.settings.render_on)
+        )
 
     @property
     def count(self) -> int:
-        """Frames, T."""
+        """Number of frames, T."""
         return len(self.labels_by_view)
+
+    @cached_property
+    def step_s(self) -> float:
+        """Median time between frames, seconds."""
+        return float(np.median(np.diff(self.times))) if self.count > 1 else ERROR_LASTING_S
+
+    @cached_property
+    def share(self) -> float:
+        """Independent observations per frame."""
+        return min(1.0, self.step_s / ERROR_LASTING_S)
+
+    def frames_in(self, seconds: float) -> int:
+        """Return the number of frames in ``seconds``, at least 1."""
+        return max(1, round(seconds / self.step_s))
 
     @cached_property
     def _survey(self) -> tuple[Places, list[int]]:
@@ -78,17 +93,17 @@ class Observer:
 
     @property
     def places(self) -> Places:
-        """Where in the room the object may be."""
+        """Prior of positions in the room."""
         return self._survey[0]
 
     def frames_to_search(self) -> list[int]:
-        """All frames, the most promising first."""
+        """Return all frames, the most promising first."""
         first = self._survey[1]
         known = set(first)
         return first + [t for t in rank_frames(self.labels_by_view, self.labels) if t not in known]
 
-    def promise(self, t: int) -> int:
-        """Views of frame t with a candidate that has one of the object's labels, or none."""
+    def count_promising_views(self, t: int) -> int:
+        """Count the views of frame t with a candidate that has no label or one of the object."""
         return sum(
             any(label in self.labels or not label or not self.labels for label in view)
             for view in self.labels_by_view[t]
@@ -107,28 +122,27 @@ class Observer:
         places: np.ndarray | None = None,
         motion: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> list[Fit]:
-        """Fitted hypotheses of frame t, the likeliest first; ``rotations`` (N, 3, 3) are tried, or
-        all there are, near ``places`` (M, 3), or anywhere, in ``motion`` (:func:`.search.search`).
+        """Search the pose of frame t.
+
+        Args:
+            t: frame.
+            rotations, motion: as in :class:`.search.SearchLimits`.
+            places: (M, 3) positions near which to search; None = everywhere.
+
+        Returns:
+            Fitted hypotheses, the likeliest first.
         """
 
         def place_prior(place: np.ndarray) -> float:
-            if places is not None and np.linalg.norm(places - place, axis=1).min() > LOOK_NEAR_M:
+            if (
+                places is not None
+                and np.linalg.norm(places - place, axis=1).min() > SEARCH_RADIUS_M
+            ):
                 return 0.0
             return self.places.prior(t, place)
 
-        return search(
-            self.mesh,
-            self.field,
-            self.views(t),
-            labels=self.labels,
-            up=self.up,
-            min_overlap=self.settings.min_overlap,
-            background_term=self.settings.background_term,
-            place_prior=place_prior,
-            rotations=rotations,
-            motion=motion,
-            renderer=self.renderer,
-        )
+        limits = SearchLimits(self.up, place_prior, rotations, motion)
+        return search_pose(self.context, self.field, self.views(t), limits)
 
     def fit(
         self,
@@ -140,42 +154,31 @@ class Observer:
         mesh: ObjectMesh | None = None,
         twist: np.ndarray | None = None,
     ) -> Fit:
-        """The pose (4, 4) of frame t fitted from one that is nearly right, of an object that moves
-        by ``twist`` (6,); ``mesh`` instead of the object's own."""
+        """Fit the pose (4, 4) of frame t from a start that is nearly right.
+
+        ``mesh`` replaces the object's own; the other arguments are those of :func:`.fit.fit_pose`.
+        """
         self._progress.step()
         return fit_pose(
-            mesh or self.mesh,
+            self._context_of(mesh),
             self.views(t),
             pose,
             prior=prior,
-            min_overlap=self.settings.min_overlap,
-            background_term=self.settings.background_term,
-            labels=self.labels,
             rounds=rounds,
             start_scale=scale,
             twist=twist,
-            renderer=self.renderer,
         )
 
     def evidence(self, t: int, pose: np.ndarray, twist: np.ndarray) -> PoseEvidence:
-        """What frame t says about a pose (4, 4) of an object that moves by ``twist`` (6,)."""
-        return evidence_at(
-            self.mesh,
-            self.views(t),
-            pose,
-            min_overlap=self.settings.min_overlap,
-            background_term=self.settings.background_term,
-            labels=self.labels,
-            twist=twist,
-            renderer=self.renderer,
-        )
+        """Evaluate the evidence of frame t on a pose (4, 4) that moves by ``twist`` (6,)."""
+        return evidence_at(self.context, self.views(t), pose, twist)
 
     def carried(self, t: int, u: int, pose: np.ndarray) -> np.ndarray:
-        """Poses (N, 4, 4) of frame u of what hands may hold at ``pose`` (4, 4) in frame t."""
+        """Return poses (N, 4, 4) in frame u of an object in hands, from its ``pose`` in frame t."""
         if self.joints is None:
             return np.zeros((0, 4, 4))
         centre, radius = self.mesh.centre_at(pose), self.mesh.diameter / 2
-        return carried(self.joints[[t, u]], pose, centre, radius)
+        return carry_in_hands(self.joints[[t, u]], pose, centre, radius)
 
     def assess(
         self,
@@ -184,8 +187,7 @@ class Observer:
         mesh: ObjectMesh | None = None,
         twist: np.ndarray | None = None,
     ) -> Fit:
-        """How well a pose (4, 4) agrees with frame t as it is, of an object that moves by ``twist``
-        (6,); ``mesh`` instead of the object's."""
+        """Compare a pose (4, 4) with frame t without a fit; arguments as in :meth:`fit`."""
         return self.assess_all(t, pose[None], mesh, None if twist is None else twist[None])[0]
 
     def assess_all(
@@ -195,13 +197,8 @@ class Observer:
         mesh: ObjectMesh | None = None,
         twists: np.ndarray | None = None,
     ) -> list[Fit]:
-        """:meth:`assess` of many poses (N, 4, 4) at once, moving by ``twists`` (N, 6)."""
-        return assess_all(
-            mesh or self.mesh,
-            self.views(t),
-            poses,
-            min_overlap=ASSESS_MIN_OVERLAP,
-            labels=self.labels,
-            twists=twists,
-            renderer=self.renderer,
-        )
+        """Compare many poses (N, 4, 4), moving by ``twists`` (N, 6), with frame t at once."""
+        return assess_all(self._context_of(mesh), self.views(t), poses, twists)
+
+    def _context_of(self, mesh: ObjectMesh | None) -> FitContext:
+        return self.context if mesh is None else replace(self.context, mesh=mesh)

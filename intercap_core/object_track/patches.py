@@ -1,6 +1,6 @@
-"""The part of a view around the object that a fit compares with: measured points, mask contours.
+"""The part of a view around the object that a fit compares with: measured points and contours.
 
-Cut once where a fit begins, with room for the pose to move; renderings come and go inside.
+A patch is cut when a fit begins, with room for the pose to move. Renderings change inside it.
 """
 
 from __future__ import annotations
@@ -12,32 +12,40 @@ import numpy as np
 
 from intercap_core.geometry.camera.projection_kernels import project_point
 from intercap_core.geometry.rigid.shots import Rendering
-from intercap_core.object_track.constants import OUTSIDE_MASK_WEIGHT, PATCH_MARGIN_M
-from intercap_core.object_track.object_silhouette_kernel import rim
+from intercap_core.object_track.object_silhouette import rim_pixels
 from intercap_core.object_track.reduced_mask import ReducedMask
 from intercap_core.object_track.view import View
+
+# The pose may move this far before measured points leave the patch: farther than the first robust
+# scale of a fit.
+PATCH_MARGIN_M = 0.08
+# Weight of a depth pixel at the rendered depth outside of the candidate; tuned on the studio.
+OUTSIDE_MASK_WEIGHT = 0.3
 
 
 @dataclass(frozen=True, eq=False)
 class DepthPatch:
-    """Measured points in a window of the reduced depth image that begins at pixel (x0, y0).
-
-    ``depth`` (h, w) metres, 0 invalid; ``points`` (h, w, 3) float32, master frame; ``trust``
-    (h, w) 1 inside the candidate, less outside, 0 on a person; ``on_person`` (h, w) bool.
-    """
+    """Measured points in a window of the reduced depth image."""
 
     x0: int
+    """Column of the first pixel in the reduced depth image."""
     y0: int
+    """Row of the first pixel."""
     depth: np.ndarray
+    """(h, w) metres, 0 where invalid."""
     points: np.ndarray
+    """(h, w, 3) float32, master frame."""
     trust: np.ndarray
+    """(h, w) weight: 1 inside the candidate, less outside, 0 on a person."""
     on_person: np.ndarray
+    """(h, w) bool, pixels on a person."""
 
     @classmethod
     def cut(cls, view: View, mask: ReducedMask, predicted: Rendering) -> DepthPatch | None:
-        """Cut around a rendering in the depth image; None without depth, or out of the image.
+        """Cut the patch around a rendering in the depth image.
 
-        ``mask`` is the candidate's, in the reduced colour image.
+        ``mask`` is the candidate in the reduced colour image. Returns None without depth or outside
+        of the image.
         """
         geometry = view.geometry
         lens = geometry.depth_lens
@@ -59,48 +67,52 @@ class DepthPatch:
 
     @property
     def place(self) -> tuple[int, int]:
-        """The first pixel x, y in the reduced depth image."""
+        """First pixel (x, y) in the reduced depth image."""
         return self.x0, self.y0
 
 
 @dataclass(frozen=True, eq=False)
 class ContourPatch:
-    """The candidate's mask in a window of the reduced colour image that begins at (x0, y0).
-
-    ``inside`` the mask and ``person`` who is in it but outside the mask, (h, w) bool; pixels x, y
-    of the window: ``rim`` (R, 2) all pixels on the mask's border, row y from ``starts`` (h + 1,),
-    and ``contour`` (K, 2) those of them where no person in front ends the mask.
-    """
+    """The candidate's mask in a window of the reduced colour image."""
 
     x0: int
+    """Column of the first pixel in the reduced colour image."""
     y0: int
+    """Row of the first pixel."""
     inside: np.ndarray
+    """(h, w) bool, the mask."""
     person: np.ndarray
+    """(h, w) bool, people outside of the mask."""
     rim: np.ndarray
+    """(R, 2) pixels x, y of the window on the mask's border, row by row."""
     starts: np.ndarray
+    """(h + 1,) index of the first rim pixel of each row."""
     contour: np.ndarray
+    """(K, 2) rim pixels where no person in front ends the mask."""
 
     @classmethod
     def cut(cls, view: View, mask: ReducedMask, predicted: Rendering) -> ContourPatch | None:
-        """Cut around a rendering in the colour image; None where the mask has no border there."""
+        """Cut the patch around a rendering in the colour image; None if the mask has no border
+        there.
+        """
         lens = view.geometry.lens
         margin = int(_pixels_per_metre(predicted, lens.fx) * PATCH_MARGIN_M) + 4
         left, top, right, bottom = _around(predicted, margin, (lens.height, lens.width))
         shape = (max(bottom - top, 0), max(right - left, 0))
         inside = mask.window(left, top, *shape)
         person = view.person.window(left, top, *shape) & ~inside
-        border, starts = rim(inside)
+        border, starts = rim_pixels(inside)
         if not len(border):
             return None
         return cls(left, top, inside, person, border, starts, _own(border, person))
 
     @property
     def place(self) -> tuple[int, int]:
-        """The first pixel x, y in the reduced colour image."""
+        """First pixel (x, y) in the reduced colour image."""
         return self.x0, self.y0
 
     def holds(self, image: Rendering) -> bool:
-        """Whether a rendering lies inside the window."""
+        """Return whether a rendering lies inside the window."""
         height, width = self.inside.shape
         own_height, own_width = image.face.shape
         return (
@@ -117,7 +129,7 @@ def _pixels_per_metre(rendering: Rendering, focal: float) -> float:
 
 
 def _around(image: Rendering, margin: int, shape: tuple[int, ...]) -> tuple[int, int, int, int]:
-    """A rendering's window widened and clipped to the image (H, W): left, top, right, bottom."""
+    """Widen a rendering's window and clip it to the image (H, W): left, top, right, bottom."""
     height, width = image.face.shape
     return (
         max(image.x0 - margin, 0),
@@ -129,7 +141,7 @@ def _around(image: Rendering, margin: int, shape: tuple[int, ...]) -> tuple[int,
 
 @numba.njit(cache=True, nogil=True)
 def _own(border, person):
-    """Border pixels (K, 2) with no person (h, w) among the pixel and its eight neighbours."""
+    """Keep the border pixels (K, 2) that have no person (h, w) among their eight neighbours."""
     height, width = person.shape
     kept = np.empty_like(border)
     count = 0
@@ -163,9 +175,10 @@ def _lift(
     px,
     py,
 ):
-    """Depth, points, trust and on_person of a :class:`DepthPatch`; masks with their first pixels.
+    """Compute depth, points, trust and on_person of a :class:`DepthPatch`.
 
-    ``colour`` (13,) is the reduced colour lens, in whose pixels the masks are.
+    Masks are given with their first pixels, in pixels of the reduced colour lens with parameters
+    ``colour`` (13,).
     """
     height, width = bottom - top, right - left
     depth = np.zeros((height, width), np.float32)

@@ -1,10 +1,9 @@
-"""Prior of places in the room over the whole recording: which of several similar things is the
-object.
+"""Prior of positions in the room: which of several similar objects is the tracked one.
 
-Another chair, a second cup: not everything of the object's class and size is the object. The object
-is the one that the person handles: it moves, or the person is near it. A thing that stays in one
-place from the first frame to the last with nobody near is another one, and so is a thing that is
-visible in its place while the object is reliably tracked elsewhere.
+Another chair, a second cup: not every object of the class and size is the tracked object. The
+tracked object is the one that the person handles: it moves, or the person is near it. An object
+that stays in one place from the first to the last frame with nobody near is another one, and so is
+an object that is visible in its place while the tracked object is elsewhere.
 """
 
 from __future__ import annotations
@@ -15,50 +14,64 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.object_track.constants import (
-    ALWAYS_PRESENT,
-    AT_HAND_M,
-    BESIDE_FRAMES,
-    CLUTTER_LOG_RATIO,
-    MIN_PLACE_PRIOR,
-    MOVED_PRIOR,
-    NEAREST_QUANTILE,
-    OUT_OF_REACH_M,
-    SAME_PLACE_M,
-    SAME_PLACE_SHARE,
-    SEARCH_GOOD_LOG_RATIO,
-    SOMETIMES_PRESENT,
-    SUREST_PLACE,
-    SURVEYED_FRAMES,
-    SURVEYED_GROUPS,
-    UNHANDLED_LOG_RATIO,
-)
-from intercap_core.object_track.groups import centre_of, find_groups
+from intercap_core.object_track.groups import find_groups, locate_group
+from intercap_core.object_track.likelihood import SEARCH_GOOD_LOG_RATIO
 from intercap_core.object_track.view import View
 
-_BODY_AND_HANDS = slice(0, 67)  # of the 135 keypoints; the face touches what the mouth does
+# Distance from the nearest joint to the object's surface, metres; tuned on the studio, as all
+# values below.
+AT_HAND_M = 0.10  # within reach
+OUT_OF_REACH_M = 0.45
+# Quantile over frames of the distance to the person that counts as their approach: nobody is near
+# the object all the time.
+NEAREST_QUANTILE = 0.1
+SURVEYED_FRAMES = 12  # surveyed before tracking, spread over the recording
+SURVEYED_GROUPS = 6  # groups of candidates in each of them
+# Positions within this distance are one place: views see different sides of an object.
+SAME_PLACE_SHARE = 0.3  # of the diameter
+SAME_PLACE_M = 0.05  # added
+# Shares of the surveyed frames in which a place is occupied.
+ALWAYS_PRESENT = 0.85
+SOMETIMES_PRESENT = 0.5
+MOVED_PRIOR = 0.8  # prior of an object that was not in its place all the time
+MIN_PLACE_PRIOR = 0.1  # prior of an object that stands far from the person all the time
+MAX_PLACE_PRIOR = 1 - 1e-6  # keeps log-odds finite
+UNHANDLED_LOG_RATIO = 10.0  # nats of a frame against an object that moves with nobody near
+RIVAL_FRAMES = 2  # frames with the place occupied while the object is elsewhere: another object
+# Largest evidence, nats, that a similar object takes off the evidence for the object in its place:
+# a part of furniture, not a twin that the track may have mistaken.
+CLUTTER_LOG_RATIO = 10.0
+
+_BODY_AND_HANDS = slice(0, 67)  # of the 135 keypoints, without the face
 
 
 @dataclass(eq=False)
-class Standing:
-    """A place (3,), metres, master frame, where something was in ``share`` of the surveyed frames,
-    and in the frames of ``beside`` while the object was elsewhere."""
+class OccupiedPlace:
+    """A place where candidates were seen in several surveyed frames."""
 
     place: np.ndarray
+    """(3,) position, metres, master frame."""
     share: float
-    beside: set[int] = field(default_factory=set)
+    """Share of the surveyed frames in which it was occupied."""
+    rival_frames: set[int] = field(default_factory=set)
+    """Frames in which it was occupied while the object was elsewhere."""
 
 
 class Places:
-    """Places where candidates were seen, each with the prior that the thing there is the object.
-
-    ``joints`` (T, K, 3) of the person, NaN unknown, metres, master frame; None where no person is
-    known.
+    """Places where candidates were seen, each with the prior that the object there is the tracked
+    one.
     """
 
     def __init__(
-        self, mesh: ObjectMesh, standing: list[Standing], joints: np.ndarray | None
+        self, mesh: ObjectMesh, standing: list[OccupiedPlace], joints: np.ndarray | None
     ) -> None:
+        """Initialise the prior.
+
+        Args:
+            mesh: the object.
+            standing: occupied places.
+            joints: (T, K, 3) of the person, master frame, NaN where unknown; None without a person.
+        """
         self._reach = 0.5 * mesh.radius
         self._same = SAME_PLACE_SHARE * mesh.diameter + SAME_PLACE_M
         self._joints = None if joints is None else joints[:, _BODY_AND_HANDS]
@@ -75,14 +88,25 @@ class Places:
         labels: tuple[str, ...],
         joints: np.ndarray | None,
     ) -> tuple[Places, list[int]]:
-        """Look at a few of ``count`` frames; also those frames, the most promising first."""
+        """Survey a few frames of the recording.
+
+        Args:
+            mesh: the object.
+            load: returns the views of a frame.
+            count: number of frames.
+            labels: detector classes of the object.
+            joints: (T, K, 3) of the person, as in the constructor.
+
+        Returns:
+            The places, and the surveyed frames with candidates, the most promising first.
+        """
         frames = sorted({int(t) for t in np.linspace(0, count - 1, SURVEYED_FRAMES).round()})
         seen = []
         for t in frames:
             groups = find_groups(mesh, load(t), labels, limit=SURVEYED_GROUPS)
-            seen.append([(centre_of(g), sum(s.label_prior for s in g)) for g in groups])
+            seen.append([(locate_group(g), sum(s.label_prior for s in g)) for g in groups])
         same = SAME_PLACE_SHARE * mesh.diameter + SAME_PLACE_M
-        places = cls(mesh, _clusters(frames, seen, same), joints)
+        places = cls(mesh, _cluster_places(frames, seen, same), joints)
         best = [
             max((value * places.prior(t, place) for place, value in here), default=0.0)
             for t, here in zip(frames, seen, strict=True)
@@ -91,53 +115,69 @@ class Places:
         return places, [frames[i] for i in order if best[i] > 0]
 
     def prior(self, t: int, place: np.ndarray) -> float:
-        """Prior, 0.1 to 1, that the thing at ``place`` (3,) in frame t is the object."""
+        """Return the prior, 0.1 to 1, that an object at ``place`` (3,) in frame t is the tracked
+        one.
+        """
         found = self._nearest(place)
         if found is None:
             return max(MOVED_PRIOR, _closeness(self._gaps(place, slice(t, t + 1))))
         standing, place_prior = found
-        return MIN_PLACE_PRIOR if len(standing.beside) >= BESIDE_FRAMES else place_prior
+        return MIN_PLACE_PRIOR if len(standing.rival_frames) >= RIVAL_FRAMES else place_prior
 
     def weigh(self, t: int, place: np.ndarray, ratio: float, share: float) -> float:
-        """What is left of ``ratio`` nats for the object at ``place`` (3,) in frame t.
+        """Combine the images' evidence for the object at ``place`` (3,) in frame t with its prior.
 
-        Where a thing stands for most of the recording, the images count no more than what is known
-        of it: another thing of the object's class looks like the object. What is away from any
-        such place moves, and mostly somebody moves it. ``share`` is how many independent
-        observations a frame is.
+        In a place that is occupied for most of the recording, the images count no more than the
+        prior: another object of the class looks like the tracked one. Away from such places the
+        object moves, and mostly somebody moves it.
+
+        Args:
+            t: frame.
+            place: (3,) position, master frame.
+            ratio: log-likelihood ratio of the images, nats.
+            share: independent observations per frame.
+
+        Returns:
+            Nats.
         """
         if any(np.linalg.norm(other - place) < self._same for other in self._others):
             return min(ratio, 0.0) - CLUTTER_LOG_RATIO
-        ratio -= self._like_the_object(place)
+        ratio -= self._clutter_ratio(place)
         found = self._nearest(place)
         if found is None or found[0].share < SOMETIMES_PRESENT:
             gaps = self._gaps(place, slice(t, t + 1))
             return ratio - (UNHANDLED_LOG_RATIO * (1 - _closeness(gaps)) if len(gaps) else 0.0)
-        prior = min(self.prior(t, place), SUREST_PLACE)
+        prior = min(self.prior(t, place), MAX_PLACE_PRIOR)
         return min(ratio, float(np.log(prior / (1 - prior))) / share)
 
-    def _nearest(self, place: np.ndarray) -> tuple[Standing, float] | None:
-        """The known place at ``place`` (3,), if any, and its prior."""
+    def _nearest(self, place: np.ndarray) -> tuple[OccupiedPlace, float] | None:
+        """Return the known place at ``place`` (3,) and its prior, if any."""
         away = [float(np.linalg.norm(s.place - place)) for s, _ in self._standing]
         nearest = int(np.argmin(away)) if away else 0
         return self._standing[nearest] if away and away[nearest] < self._same else None
 
     def claim(self, place: np.ndarray) -> None:
-        """Mark the thing at ``place`` (3,) as the object, wherever the person is."""
+        """Mark the object at ``place`` (3,) as the tracked one, wherever the person is."""
         self._standing = [
             (s, place_prior)
             for s, place_prior in self._standing
             if np.linalg.norm(s.place - place) >= self._same
         ]
 
-    def seen_beside(self, t: int, place: np.ndarray, object_at: np.ndarray, ratio: float) -> None:
-        """Record that something looks like the object at ``place`` (3,) in frame t, by ``ratio``
-        nats, in which the object itself is at ``object_at`` (3,)."""
+    def add_rival(self, t: int, place: np.ndarray, object_at: np.ndarray, ratio: float) -> None:
+        """Record a similar object in frame t, while the tracked object is elsewhere.
+
+        Args:
+            t: frame.
+            place: (3,) position of the similar object.
+            object_at: (3,) position of the tracked object.
+            ratio: log-likelihood ratio of the images for the similar object, nats.
+        """
         found = self._nearest(place)
         apart = found is not None and np.linalg.norm(found[0].place - object_at) >= self._same
         if found is not None and apart and ratio > SEARCH_GOOD_LOG_RATIO:
-            found[0].beside.add(t)
-        likeness = self._likeness(place)
+            found[0].rival_frames.add(t)
+        likeness = self._clutter_at(place)
         if np.linalg.norm((place if likeness is None else likeness[0]) - object_at) < self._same:
             return
         if likeness is None:
@@ -145,31 +185,35 @@ class Places:
             self._clutter.append(likeness)
         likeness[1][t] = max(ratio, likeness[1].get(t, 0.0))
 
-    def seen_beside_given(self, place: np.ndarray) -> None:
-        """Record that something is seen at ``place`` (3,) in a frame in which somebody gave the
-        object's pose elsewhere: it is another thing, in all frames."""
+    def exclude(self, place: np.ndarray) -> None:
+        """Exclude ``place`` (3,) in all frames.
+
+        The images show an object there in a frame whose annotated pose is elsewhere.
+        """
         if not any(np.linalg.norm(other - place) < self._same for other in self._others):
             self._others.append(place)
 
-    def forget_clutter(self) -> None:
-        """Forget how much the things beside the object look like it, before it is told anew."""
+    def clear_rivals(self) -> None:
+        """Clear the records of :meth:`add_rival`, before they are made again."""
         self._clutter.clear()
 
-    def _likeness(self, place: np.ndarray) -> tuple[np.ndarray, dict[int, float]] | None:
-        """The clutter at ``place`` (3,), if any."""
+    def _clutter_at(self, place: np.ndarray) -> tuple[np.ndarray, dict[int, float]] | None:
+        """Return the recorded clutter at ``place`` (3,), if any."""
         away = [float(np.linalg.norm(seen_at - place)) for seen_at, _ in self._clutter]
         nearest = int(np.argmin(away)) if away else 0
         return self._clutter[nearest] if away and away[nearest] < self._same else None
 
-    def _like_the_object(self, place: np.ndarray) -> float:
-        """Nats for the object of what stays at ``place`` (3,) while the object is elsewhere: no
-        evidence that it is there now."""
-        found = self._likeness(place)
-        if found is None or len(found[1]) < BESIDE_FRAMES:
+    def _clutter_ratio(self, place: np.ndarray) -> float:
+        """Return the evidence, nats, of a similar object that stays at ``place`` (3,).
+
+        It is no evidence for the tracked object there.
+        """
+        found = self._clutter_at(place)
+        if found is None or len(found[1]) < RIVAL_FRAMES:
             return 0.0
         return min(float(np.mean(list(found[1].values()))), CLUTTER_LOG_RATIO)
 
-    def _standing_prior(self, standing: Standing) -> float:
+    def _standing_prior(self, standing: OccupiedPlace) -> float:
         handled = _closeness(self._gaps(standing.place, slice(None)))
         left = MOVED_PRIOR * min(
             (ALWAYS_PRESENT - standing.share) / (ALWAYS_PRESENT - SOMETIMES_PRESENT), 1.0
@@ -177,7 +221,7 @@ class Places:
         return max(handled, left, MIN_PLACE_PRIOR)
 
     def _gaps(self, place: np.ndarray, frames: slice) -> np.ndarray:
-        """About how far (N,) the person is from an object there, metres, where that is known."""
+        """Return distances (N,) of the person from an object at ``place``, metres, where known."""
         if self._joints is None:
             return np.zeros(0)
         distance = np.linalg.norm(self._joints[frames] - place, axis=-1)
@@ -186,24 +230,26 @@ class Places:
 
 
 def _closeness(gaps: np.ndarray) -> float:
-    """Prior from the smallest of the distances (N,), metres: 1 within reach, 0.1 far away or
-    unknown."""
+    """Return the prior from distances (N,) to the person, metres.
+
+    It is 1 within reach and 0.1 far away or if no distance is known.
+    """
     gap = float(np.quantile(gaps, NEAREST_QUANTILE)) if len(gaps) else np.inf
     return float(
         np.clip((OUT_OF_REACH_M - gap) / (OUT_OF_REACH_M - AT_HAND_M), MIN_PLACE_PRIOR, 1.0)
     )
 
 
-def _clusters(
+def _cluster_places(
     frames: list[int], seen: list[list[tuple[np.ndarray, float]]], same: float
-) -> list[Standing]:
-    """Places in which something was ``seen`` in more than one of the ``frames``."""
+) -> list[OccupiedPlace]:
+    """Cluster the candidates that were seen in more than one of the ``frames``."""
     every = [(t, place) for t, here in zip(frames, seen, strict=True) for place, _ in here]
     places = np.array([place for _, place in every]).reshape(-1, 3)
     frame = np.array([t for t, _ in every], int)
     free = np.ones(len(every), bool)
     looked = sum(1 for here in seen if here)
-    found: list[Standing] = []
+    found: list[OccupiedPlace] = []
     while free.any():
         together = (np.linalg.norm(places[:, None] - places, axis=-1) < same) & free
         counts = np.array([len(set(frame[row])) for row in together])
@@ -211,6 +257,6 @@ def _clusters(
         if counts[best] < 2:
             break
         members = together[best]
-        found.append(Standing(places[members].mean(0), counts[best] / max(looked, 1)))
+        found.append(OccupiedPlace(places[members].mean(0), counts[best] / max(looked, 1)))
         free &= ~members
     return found

@@ -1,4 +1,4 @@
-"""Where hypotheses come from: an annotation, a search, the frames around, near symmetries."""
+"""Sources of hypotheses: annotated poses, searches, neighbouring frames, near symmetries."""
 
 from __future__ import annotations
 
@@ -9,138 +9,126 @@ from dataclasses import replace
 import numpy as np
 
 from intercap_core.geometry.camera.transforms import apply_step, rotation_exp, step_between
-from intercap_core.object_track.constants import (
-    ANNOTATION_FRAMES,
-    BASIN,
-    DENIED_LOG_RATIO,
-    DOUBTFUL_PROBABILITY,
-    DOUBTFUL_SHARE,
-    FIT_ROUNDS,
-    HIDDEN_SHARE,
-    KEY_FRAME_S,
-    LOOK_NEAR_S,
-    NEAR_FITTED,
-    NEAR_TURN_SEARCH_RAD,
-    RIVAL_LOG_RATIO,
-    RUN_SEARCHED_S,
-    SEARCH_EVERY_S,
-    SEARCH_GOOD_LOG_RATIO,
-    SEARCHES_MIN,
-    SEED_SEARCHES,
-    SEED_SEARCHES_MAX,
-    SEED_SURE_LOG_RATIO,
-    SEEN_LOG_RATIO,
-    TURNS_FOLLOWED,
-)
-from intercap_core.object_track.decoder import NOT_SEEN, Decoded
-from intercap_core.object_track.fit import Fit, MotionPrior
+from intercap_core.object_track.decoder import HIDDEN, Decoded
+from intercap_core.object_track.fit import FIT_ROUNDS, Fit, MotionPrior
 from intercap_core.object_track.given_poses import GivenPose
-from intercap_core.object_track.hypotheses import Hypotheses
-from intercap_core.object_track.motion import about
+from intercap_core.object_track.hypotheses import BASIN, RIVAL_LOG_RATIO, Hypotheses, Prior
+from intercap_core.object_track.likelihood import SEARCH_GOOD_LOG_RATIO, SEEN_LOG_RATIO
+from intercap_core.object_track.motion import shift_twist
 from intercap_core.object_track.observer import Observer
-from intercap_core.object_track.prior import Prior
-from intercap_core.object_track.search import same_pose
-from intercap_core.object_track.turns import near_turns
+from intercap_core.object_track.turns import find_near_symmetries, same_pose
+
+SEED_SEARCHES = 3  # frames searched for the start; more while nothing is found
+SEED_SEARCHES_MAX = 10
+SEED_SURE_LOG_RATIO = 40.0  # nats at which the search for the start ends
+SEARCHES_MIN = 6  # frames searched with all rotations ...
+SEARCH_EVERY_S = 0.5  # ... and one more in this time
+RUN_SEARCHED_S = 0.2  # a visible run of this length is searched in one of its frames
+NEAR_FRAMES_S = 0.3  # time to frames whose poses start the search of an uncertain frame
+NEAR_FITTED = 3  # of these starts that are fitted, until one is good
+NEAR_TURN_SEARCH_RAD = np.radians(35)  # turn of the rotations around these starts
+TURNS_FOLLOWED = 2  # near symmetries of a key frame
+KEY_FRAME_S = 0.2  # time between the frames in which near symmetries and colours are compared
+ANNOTATION_FRAMES = 5  # error of the frame number of an annotation
+DOUBTFUL_PROBABILITY = 0.9  # of the chosen hypothesis, below which a frame is uncertain
+# Shares of the usual weight below which more is searched near a pose, and elsewhere too; tuned on
+# the studio.
+DOUBTFUL_SHARE = 0.5
+HIDDEN_SHARE = 0.25
+# Log-likelihood ratio at which the images of a frame clearly contradict an annotated pose: two or
+# three views see past the object. An occluded frame reaches -6, and so does chance. Tuned on five
+# objects of the studio at noise 2 with two cameras.
+DENIED_LOG_RATIO = -25.0
 
 log = logging.getLogger(__name__)
 
 
 class NotFound(Exception):
-    """No frame shows anything that could be the object."""
+    """No frame shows a possible object."""
 
 
 class Proposals:
-    """Adds hypotheses; ``times`` (T,) seconds, ``step_s`` between frames."""
+    """Adds hypotheses to the frames of a recording."""
 
-    def __init__(
-        self,
-        observer: Observer,
-        hypotheses: Hypotheses,
-        prior: Prior,
-        times: np.ndarray,
-        step_s: float,
-    ) -> None:
+    def __init__(self, observer: Observer, hypotheses: Hypotheses, prior: Prior) -> None:
         self._observer = observer
         self._hypotheses = hypotheses
         self._prior = prior
-        self._times = times
-        self._step_s = step_s
-        self._reach = max(1, round(LOOK_NEAR_S / step_s))
+        self._times = observer.times
+        self._reach = observer.frames_in(NEAR_FRAMES_S)
         self._searched: set[int] = set()
-        self._searched_near_given: set[int] = set()
-        self._looked: set[int] = set()
-
-    # --- where to start ------------------------------------------------------------------------
+        self._searched_near_annotated: set[int] = set()
+        self._searched_nearby: set[int] = set()
 
     def start(self) -> int:
-        """Search the most promising frames and follow what is found; the best one's number.
+        """Search the most promising frames and follow what is found.
 
-        Raises NotFound where nothing is.
+        Returns the best frame. Raises NotFound if nothing is found.
         """
-        seen: list[tuple[float, int, list[Fit]]] = []
+        results: list[tuple[float, int, list[Fit]]] = []
         for tried, t in enumerate(self._observer.frames_to_search()):
-            if tried >= SEED_SEARCHES_MAX or (tried >= SEED_SEARCHES and seen):
+            if tried >= SEED_SEARCHES_MAX or (tried >= SEED_SEARCHES and results):
                 break
             self._searched.add(t)
-            found = self._observer.search(t)
-            if found:
-                best = float(self._prior.weigh(t, found).max())
-                seen.append((best, t, found))
+            fits = self._observer.search(t)
+            if fits:
+                best = float(self._prior.weigh(t, fits).max())
+                results.append((best, t, fits))
                 if best > SEED_SURE_LOG_RATIO:
                     break
-        if not seen:
+        if not results:
             raise NotFound
-        seen.sort(key=lambda one: -one[0])
-        best, first, found = seen[0]
+        results.sort(key=lambda result: -result[0])
+        best, first, fits = results[0]
         if best < SEEN_LOG_RATIO:
             # no match near the person: take the best match, wherever it is
-            likeliest = max(found, key=lambda fit: fit.log_ratio)
+            likeliest = max(fits, key=lambda fit: fit.log_ratio)
             self._observer.places.claim(self._observer.mesh.centre_at(likeliest.pose))
-        for _, t, found in seen:
-            self._follow(t, found)
+        for _, t, fits in results:
+            self._follow(t, fits)
         log.info("first frame %d, %.0f nats", first, best)
         return first
 
-    def annotated(self, given: GivenPose) -> GivenPose | None:
-        """Follow a pose that a person gave, and take it for its frame's where the images do not
-        contradict it clearly.
+    def add_annotated(self, given: GivenPose) -> GivenPose | None:
+        """Follow an annotated pose, unless the images clearly contradict it.
 
-        Returns it where they show it there or hide what is there; where they contradict it and show
-        it in a frame beside, as of that frame; None where they show it in none.
+        Returns:
+            The pose if the images support it or hide the object. If they contradict it, the same
+            pose in a neighbouring frame that shows it; None if no frame does.
         """
         t, pose = given.frame, given.pose
         wide = self._observer.fit(t, pose, MotionPrior(pose), FIT_ROUNDS, 1.0)
-        found = [wide] if wide.log_ratio > SEEN_LOG_RATIO else []
-        if not found or not given.holds(self._observer.mesh, wide.pose):
+        fits = [wide] if wide.log_ratio > SEEN_LOG_RATIO else []
+        if not fits or not given.holds(self._observer.mesh, wide.pose):
             own = self._observer.fit(t, pose, given.prior, FIT_ROUNDS)
             if own.log_ratio > DENIED_LOG_RATIO:
-                found.append(own)
-        if not found:
-            return self._annotated_beside(given)
-        self._take(given, found)
+                fits.append(own)
+        if not fits:
+            return self._find_in_neighbours(given)
+        self._take(given, fits)
         return given
 
-    def _annotated_beside(self, given: GivenPose) -> GivenPose | None:
-        """The given pose as of the frame beside its own that shows it, after following it."""
+    def _find_in_neighbours(self, given: GivenPose) -> GivenPose | None:
+        """Follow the annotated pose in the neighbouring frame that shows it, if any."""
         t, pose = given.frame, given.pose
         near = range(
             max(t - ANNOTATION_FRAMES, 0), min(t + ANNOTATION_FRAMES + 1, self._observer.count)
         )
-        found: tuple[int, Fit] | None = None
+        best: tuple[int, Fit] | None = None
         for u in sorted(near, key=lambda u: abs(u - t)):
             fit = self._observer.fit(u, pose, MotionPrior(pose), rounds=FIT_ROUNDS, scale=1.0)
-            if found is None or fit.log_ratio > found[1].log_ratio + RIVAL_LOG_RATIO:
-                found = u, fit
-            if found[1].log_ratio > SEED_SURE_LOG_RATIO:
+            if best is None or fit.log_ratio > best[1].log_ratio + RIVAL_LOG_RATIO:
+                best = u, fit
+            if best[1].log_ratio > SEED_SURE_LOG_RATIO:
                 break
-        if found is None or found[1].log_ratio < SEEN_LOG_RATIO or found[0] in self._prior.given:
+        if best is None or best[1].log_ratio < SEEN_LOG_RATIO or best[0] in self._prior.given:
             return None
-        seen = replace(given, frame=found[0], pose=found[1].pose)
-        self._take(seen, [found[1]])
-        return seen
+        shown = replace(given, frame=best[0], pose=best[1].pose)
+        self._take(shown, [best[1]])
+        return shown
 
     def _take(self, given: GivenPose, fits: list[Fit]) -> None:
-        """Follow fits of a given pose's frame; the first says where the object is handled."""
+        """Follow the fits of an annotated frame; the first one claims its place."""
         t = given.frame
         self._prior.given[t] = given
         if fits[0].log_ratio > SEEN_LOG_RATIO:
@@ -150,39 +138,37 @@ class Proposals:
             if self._hypotheses.known(t, fit.pose) is None:
                 self._hypotheses.follow(t, fit)
 
-    # --- where it is not sure ------------------------------------------------------------------
+    def search_uncertain(self, decoded: Decoded) -> bool:
+        """Search the uncertain frames; returns whether a hypothesis is new.
 
-    def look(self, decoded: Decoded) -> bool:
-        """Look for the object in the frames in doubt; whether something new was found.
-
-        First with the rotations that the frames around lead to, outwards from where it is sure, and
-        with all once in each time that the object is seen, and near poses that somebody gave; then,
-        in some frames, with all.
+        First with the rotations of neighbouring frames, outwards from sure frames; with all
+        rotations once in each visible run and near annotated poses; then in some frames with all
+        rotations.
         """
         fits = self._hypotheses.fits
         ratio, sure = np.zeros(len(fits)), np.zeros(len(fits))
         for t, k in enumerate(decoded.path):
-            ratio[t] = 0.0 if k == NOT_SEEN else self._prior.weigh(t, fits[t])[k]
+            ratio[t] = 0.0 if k == HIDDEN else self._prior.weigh(t, fits[t])[k]
             sure[t] = decoded.probability[t][k]
         usual = float(np.median(ratio[ratio > 0])) if (ratio > 0).any() else 0.0
         poor = DOUBTFUL_SHARE * usual
-        doubt = (ratio < poor) | (sure < DOUBTFUL_PROBABILITY) | (decoded.path == NOT_SEEN)
+        doubt = (ratio < poor) | (sure < DOUBTFUL_PROBABILITY) | (decoded.path == HIDDEN)
         known = {int(t): fits[t][decoded.path[t]].pose for t in np.flatnonzero(~doubt)}
         new = False
         waiting = [int(t) for t in np.flatnonzero(doubt)]
         for t in sorted(waiting, key=lambda t: min((abs(t - u) for u in known), default=0)):
-            if self._hypotheses.best(t) < poor and t not in self._looked:
-                new |= self._look_near(t, known)
-        near = self._prior.near_given(self._times, decoded.path == NOT_SEEN)
-        new |= self._look_near_given([t for t in waiting if near[t]], known)
+            if self._hypotheses.best(t) < poor and t not in self._searched_nearby:
+                new |= self._search_nearby(t, known)
+        near = self._prior.near_annotated(decoded.path == HIDDEN)
+        new |= self._search_near_annotated([t for t in waiting if near[t]], known)
         most = SEARCHES_MIN + int((self._times[-1] - self._times[0]) / SEARCH_EVERY_S)
-        for t in self._unsearched(decoded.path, ratio)[: max(most - len(self._searched), 0)]:
+        for t in self._unsearched_runs(decoded.path, ratio)[: max(most - len(self._searched), 0)]:
             self._searched.add(t)
             new |= self._follow(t, self._observer.search(t))
         if new:
             return True
-        apart = max(1, round(SEARCH_EVERY_S / self._step_s)) // 2
-        # a pose that motion is sure of is hidden, rather than elsewhere
+        apart = self._observer.frames_in(SEARCH_EVERY_S) // 2
+        # a hidden pose that motion makes sure is not elsewhere
         open_ = (sure < DOUBTFUL_PROBABILITY) | (ratio < HIDDEN_SHARE * usual)
         waiting = [t for t in waiting if open_[t]]
         while len(self._searched) < most and not new:
@@ -194,74 +180,83 @@ class Proposals:
             ]
             if not waiting:
                 break
-            t = max(waiting, key=self._observer.promise)
+            t = max(waiting, key=self._observer.count_promising_views)
             self._searched.add(t)
             new = self._follow(t, self._observer.search(t))
         return new
 
-    def _look_near_given(self, frames: list[int], known: dict[int, np.ndarray]) -> bool:
-        """Search the ``frames``, which are near given poses, with all rotations, once, around where
-        the object is in the nearest of the frames ``known``; whether something new was found.
-        Somebody says that it is there: it is worth as many searches as frames."""
+    def _search_near_annotated(self, frames: list[int], known: dict[int, np.ndarray]) -> bool:
+        """Search ``frames`` near annotated poses once, around the nearest ``known`` poses.
+
+        All rotations are tried; returns whether a hypothesis is new. The annotation makes it worth
+        the time.
+        """
         new = False
         for t in frames:
-            if t not in self._searched | self._searched_near_given:
-                self._searched_near_given.add(t)
-                poses = [known[u] for u in _beside(t, known)]
+            if t not in self._searched | self._searched_near_annotated:
+                self._searched_near_annotated.add(t)
+                poses = [known[u] for u in _neighbours(t, known)]
                 places = np.array([self._observer.mesh.centre_at(pose) for pose in poses])
                 new |= self._follow(t, self._observer.search(t, places=places if poses else None))
         return new
 
-    def look_again(self, changed: set[int]) -> None:
-        """Let :meth:`look` look once more where what is known around has ``changed``."""
+    def allow_search_near(self, changed: set[int]) -> None:
+        """Let :meth:`search_uncertain` search again near frames whose hypotheses have changed."""
         near = range(-self._reach, self._reach + 1)
-        self._looked -= {t + step for t in changed for step in near}
+        self._searched_nearby -= {t + step for t in changed for step in near}
 
-    def _unsearched(self, path: np.ndarray, ratio: np.ndarray) -> list[int]:
-        """The likeliest frame of every time that the object is seen for longer, in no frame of
-        which it was searched: what reappears may have turned out of sight."""
-        seen = np.flatnonzero(path != NOT_SEEN)
+    def _unsearched_runs(self, path: np.ndarray, ratio: np.ndarray) -> list[int]:
+        """Return the likeliest frame of every longer visible run without a searched frame.
+
+        An object that reappears may have turned out of sight.
+        """
+        seen = np.flatnonzero(path != HIDDEN)
         runs = np.split(seen, np.flatnonzero(np.diff(seen) > 1) + 1)
         return [
             int(run[ratio[run].argmax()])
             for run in runs
-            if len(run) * self._step_s >= RUN_SEARCHED_S and not self._searched & set(run.tolist())
+            if len(run) * self._observer.step_s >= RUN_SEARCHED_S
+            and not self._searched & set(run.tolist())
         ]
 
-    def _look_near(self, t: int, known: dict[int, np.ndarray]) -> bool:
-        """Search frame t with the rotations that the frames around lead to, ``known`` poses (4, 4)
-        by frame; whether something new was found."""
-        starts, rates = self._expected(t, known)
+    def _search_nearby(self, t: int, known: dict[int, np.ndarray]) -> bool:
+        """Search frame t from the ``known`` poses (4, 4) of neighbouring frames.
+
+        Returns whether a hypothesis is new.
+        """
+        starts, rates = self._starts(t, known)
         if not len(starts):
             return False
-        self._looked.add(t)
-        seen = self._observer.assess_all(t, starts, twists=rates)
-        found: list[Fit] = []
+        self._searched_nearby.add(t)
+        assessed = self._observer.assess_all(t, starts, twists=rates)
+        fits: list[Fit] = []
         tried: list[np.ndarray] = []
-        for start in sorted(seen, key=lambda one: -one.log_ratio):
+        for start in sorted(assessed, key=lambda fit: -fit.log_ratio):
             if len(tried) == NEAR_FITTED or any(
                 same_pose(self._observer.mesh, start.pose, other, BASIN) for other in tried
             ):
                 continue
             tried.append(start.pose)
             prior = MotionPrior(start.pose)
-            found.append(
+            fits.append(
                 self._observer.fit(t, start.pose, prior, FIT_ROUNDS, 1.0, twist=start.twist)
             )
-            if found[-1].log_ratio > SEARCH_GOOD_LOG_RATIO:
+            if fits[-1].log_ratio > SEARCH_GOOD_LOG_RATIO:
                 break
-        best = max(found, key=lambda one: one.log_ratio)
+        best = max(fits, key=lambda fit: fit.log_ratio)
         if best.log_ratio < SEARCH_GOOD_LOG_RATIO:
             turns = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]) * NEAR_TURN_SEARCH_RAD
             around = rotation_exp(turns)[:, None] @ starts[None, :, :3, :3]
             places = [self._observer.mesh.centre_at(start) for start in starts]
             motion = best.twist, best.pose[:3, 3]
-            found += self._observer.search(t, around.reshape(-1, 3, 3), np.array(places), motion)
-        return self._follow(t, found)
+            fits += self._observer.search(t, around.reshape(-1, 3, 3), np.array(places), motion)
+        return self._follow(t, fits)
 
-    def _expected(self, t: int, known: dict[int, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Poses (N, 4, 4) of frame t by those of the frames around, and their twists (N, 6): as
-        they are, at constant velocity or in a hand from either side, and between."""
+    def _starts(self, t: int, known: dict[int, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Predict poses (N, 4, 4) of frame t and their twists (N, 6) from neighbouring frames.
+
+        From either side: at rest, at constant velocity, in a hand; and between both sides.
+        """
         fits, reach = self._hypotheses.fits, self._reach
         same = self._observer.mesh.symmetry.nearest_equivalent_pose
         poses = {}
@@ -272,72 +267,74 @@ class Proposals:
                 poses[u] = fits[u][int(self._prior.weigh(u, fits[u]).argmax())].pose
         before = [u for u in poses if u < t][:-3:-1]
         after = [u for u in poses if u > t][:2]
-        found, rates = [], []
+        starts, rates = [], []
         for near in (before, after):
             if not near:
                 continue
             here = poses[near[0]]
             ahead = self._times[t] - self._times[near[0]]
-            found.append(here)
+            starts.append(here)
             rates.append(np.zeros(6))
             if len(near) > 1:
                 rate = step_between(same(poses[near[1]], here), here) / (
                     self._times[near[0]] - self._times[near[1]]
                 )
-                found.append(apply_step(here, rate * ahead))
+                starts.append(apply_step(here, rate * ahead))
                 rates.append(rate)
             for pose in self._observer.carried(near[0], t, here):
-                found.append(pose)
+                starts.append(pose)
                 rates.append(step_between(here, pose) / ahead)
         if before and after:
             a, b = before[0], after[0]
             gap = self._times[b] - self._times[a]
             rate = step_between(poses[a], same(poses[b], poses[a])) / gap
-            found.append(apply_step(poses[a], rate * (self._times[t] - self._times[a])))
+            starts.append(apply_step(poses[a], rate * (self._times[t] - self._times[a])))
             rates.append(rate)
-        return np.array(found).reshape(-1, 4, 4), np.array(rates).reshape(-1, 6)
+        return np.array(starts).reshape(-1, 4, 4), np.array(rates).reshape(-1, 6)
 
-    # --- near symmetries -----------------------------------------------------------------------
+    def add_near_symmetries(self, decoded: Decoded) -> bool:
+        """Follow near symmetries of the object where they look as likely as the chosen hypothesis.
 
-    def turn(self, decoded: Decoded) -> bool:
-        """Follow turns of a nearly symmetric object from where they look as likely; whether one is
-        new."""
-        turns = near_turns(self._observer.mesh, self._observer.field)
-        every = max(1, round(KEY_FRAME_S / self._step_s))
-        # what is followed from one of them may change the order in others
+        Returns whether a hypothesis is new.
+        """
+        turns = find_near_symmetries(self._observer.mesh, self._observer.field)
+        every = self._observer.frames_in(KEY_FRAME_S)
+        # copied, since following from one key frame may change the order in others
         keys = {
             t: self._hypotheses.fits[t][decoded.path[t]]
             for t in range(0, len(decoded.path), every)
-            if decoded.path[t] != NOT_SEEN and len(turns) > 1
+            if decoded.path[t] != HIDDEN and len(turns) > 1
         }
         new = False
         for t, own in keys.items():
             poses = own.pose @ turns[1:]
-            moving = np.array([about(own.twist, own.pose[:3, 3], pose[:3, 3]) for pose in poses])
-            found = self._observer.assess_all(t, poses, twists=moving)
-            found = [one for one in found if one.log_ratio > own.log_ratio - RIVAL_LOG_RATIO]
-            found.sort(key=lambda one: -one.log_ratio)
-            for other in found[:TURNS_FOLLOWED]:
+            rates = np.array(
+                [shift_twist(own.twist, own.pose[:3, 3], pose[:3, 3]) for pose in poses]
+            )
+            fits = self._observer.assess_all(t, poses, twists=rates)
+            fits = [fit for fit in fits if fit.log_ratio > own.log_ratio - RIVAL_LOG_RATIO]
+            fits.sort(key=lambda fit: -fit.log_ratio)
+            for other in fits[:TURNS_FOLLOWED]:
                 if self._hypotheses.known(t, other.pose) is None:
                     prior = MotionPrior(other.pose)
                     fit = self._observer.fit(t, other.pose, prior, twist=other.twist)
                     new |= self._follow(t, [fit])
         return new
 
-    def _follow(self, t: int, found: list[Fit]) -> bool:
-        """Follow those of the fits of frame t that may be true; whether one was new."""
+    def _follow(self, t: int, fits: list[Fit]) -> bool:
+        """Follow those of the fits of frame t that may be true; returns whether one is new."""
         own = self._hypotheses.fits[t]
-        weights = self._prior.weigh(t, [*found, *own])
+        weights = self._prior.weigh(t, [*fits, *own])
         least = max(float(weights.max(initial=0.0)) - RIVAL_LOG_RATIO, SEEN_LOG_RATIO)
         new = False
-        for fit, weight in zip(found, weights, strict=False):
+        for fit, weight in zip(fits, weights, strict=False):
             if weight > least and self._hypotheses.seen(t, fit.pose) is None:
                 self._hypotheses.follow(t, fit)
                 new = True
         return new
 
 
-def _beside(t: int, known: Collection[int]) -> list[int]:
-    """The nearest of the ``known`` frames before and after frame t, where there are any."""
+def _neighbours(t: int, known: Collection[int]) -> list[int]:
+    """Return the nearest ``known`` frames before and after frame t."""
     before, after = [u for u in known if u < t], [u for u in known if u > t]
     return [*([max(before)] if before else []), *([min(after)] if after else [])]

@@ -1,9 +1,12 @@
-"""The views of one recording as the tracker uses them, read from the artefacts when asked for."""
+"""The views of one recording, read from the artefacts on request and cached."""
 
 from __future__ import annotations
 
 import logging
+from collections import OrderedDict
+from collections.abc import Callable
 from pathlib import Path
+from threading import Lock
 from typing import Literal
 
 import numpy as np
@@ -13,22 +16,25 @@ from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import Candidate, Detections
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig
-from intercap_core.object_track.constants import (
-    CANDIDATE_MAX_EXTENT,
-    CANDIDATE_MIN_EXTENT,
-    CANDIDATE_SLACK_M,
-)
-from intercap_core.object_track.view import View, ViewGeometry, distances
+from intercap_core.object_track.view import View, ViewGeometry, camera_distances
 from intercap_core.schemas import PERSON, SCENE
+
+TRACKING_FACES = 600  # of the rendered mesh; within 0.5 mm of the full mesh
+VIEW_CACHE_BYTES = 800_000_000  # 90 frame sets of six unreduced depth images, 360 of a suitcase's
+# A candidate is kept if its extent is within these shares of the object's diameter: partly hidden,
+# or with something that the object touches. Tuned on the studio.
+CANDIDATE_MIN_EXTENT = 0.25
+CANDIDATE_MAX_EXTENT = 1.4
+CANDIDATE_SLACK_M = 0.05  # added to the largest extent
 
 log = logging.getLogger(__name__)
 
-# By the step of the reduced grid, how many pixels a decoder may join.
 _DECODED_BY: dict[int, Literal[1, 2, 4]] = {2: 2, 4: 4}
+"""Reduction that the image decoder applies, by the step of the reduced grid."""
 
 
 class ObjectRecording:
-    """The views of every moment, read from the artefacts when asked for."""
+    """Views, pictures and labels of every moment of a recording."""
 
     def __init__(
         self,
@@ -38,6 +44,15 @@ class ObjectRecording:
         person: Path,
         diameter_m: float,
     ) -> None:
+        """Open the views of a recording.
+
+        Args:
+            frames: the recording.
+            detections: candidates of the recording.
+            scene: artefact of stage ``scene``.
+            person: artefact of stage ``person``.
+            diameter_m: diameter of the object, metres.
+        """
         rig = Rig.from_scene(scene)
         with artefacts.read(scene, SCENE) as artefact:
             present = artefact["present"]
@@ -59,7 +74,7 @@ class ObjectRecording:
         self._masks = [masks[t * len(rig) : (t + 1) * len(rig)] for t in range(frames.num_sets)]
         usable = present & np.isfinite(rig.master_from_colour).all((1, 2))
         self.count, self.cameras = len(rig), [int(c) for c in np.flatnonzero(usable)]
-        away = distances([rig[c] for c in self.cameras], self.joints)
+        away = camera_distances([rig[c] for c in self.cameras], self.joints)
         self.geometry = [
             ViewGeometry.for_object(
                 rig[c], diameter_m, float(np.nan_to_num(bias[c])), float(late[c]), distance
@@ -73,11 +88,11 @@ class ObjectRecording:
         ]
 
     def views(self, t: int) -> list[View]:
-        """What each usable camera shows of moment t."""
+        """Return the view of each usable camera at moment t."""
         return [self.view(t, place) for place in range(len(self.cameras))]
 
     def view(self, t: int, place: int) -> View:
-        """What the usable camera at ``place`` among :attr:`cameras` shows of moment t."""
+        """Return the view of camera number ``place`` among :attr:`cameras` at moment t."""
         c = self.cameras[place]
         candidates = [
             (candidate.index, candidate.label, candidate.score, candidate.rle)
@@ -89,8 +104,10 @@ class ObjectRecording:
         return View.build(geometry, depth, self._masks[t][c], candidates, detected, room)
 
     def pictures(self, t: int) -> list[np.ndarray | None]:
-        """The colour image (h, w, 3) uint8 BGR of each usable camera at moment t, on its reduced
-        grid; None where there is none that can be read."""
+        """Return the colour image (h, w, 3) uint8 BGR of each usable camera at moment t.
+
+        Images are on the reduced grid; None if there is no readable image.
+        """
         found: list[np.ndarray | None] = []
         for c, geometry in zip(self.cameras, self.geometry, strict=True):
             image = self._picture(t, c, _DECODED_BY.get(geometry.step, 1))
@@ -101,7 +118,7 @@ class ObjectRecording:
         return found
 
     def _picture(self, t: int, c: int, reduction: Literal[1, 2, 4]) -> np.ndarray | None:
-        """The image as its decoder reduces it, or whole where that is of another size."""
+        """Decode an image at reduced size, or in full if its size is unexpected."""
         try:
             return self._frames.colour(t, c, reduction)
         except UserError as error:
@@ -113,7 +130,7 @@ class ObjectRecording:
             return None
 
     def _candidates(self, t: int, c: int) -> list[Candidate]:
-        """What may be the object by its size, where that is known."""
+        """Return the candidates that the object may be by their size, where that is known."""
         low, high = (
             CANDIDATE_MIN_EXTENT * self._diameter_m,
             CANDIDATE_MAX_EXTENT * self._diameter_m + CANDIDATE_SLACK_M,
@@ -122,8 +139,47 @@ class ObjectRecording:
         return [one for one in found if not (one.extent_m < low or one.extent_m > high)]
 
     def labels(self) -> list[list[list[str]]]:
-        """Labels [T][usable cameras][candidates] of what was detected."""
+        """Return the labels [T][usable cameras][candidates]."""
         return [
             [[candidate.label for candidate in self._candidates(t, c)] for c in self.cameras]
             for t in range(self._frames.num_sets)
         ]
+
+
+class ViewCache:
+    """Calls ``load(t)`` for the views of frame t once, and again only after they were evicted."""
+
+    def __init__(
+        self, load: Callable[[int], list[View]], max_bytes: int = VIEW_CACHE_BYTES
+    ) -> None:
+        self._load = load
+        self._max_bytes = max_bytes
+        self._kept: OrderedDict[int, list[View]] = OrderedDict()
+        self._bytes = 0
+        self._lock = Lock()
+
+    def __call__(self, t: int) -> list[View]:
+        """Return the views of frame t, one per camera. One thread loads at a time."""
+        with self._lock:
+            return self._get(t)
+
+    def kept(self, t: int) -> list[View] | None:
+        """Return the views of frame t if they are cached; nothing is loaded or evicted."""
+        with self._lock:
+            return self._kept.get(t)
+
+    def _get(self, t: int) -> list[View]:
+        if t in self._kept:
+            self._kept.move_to_end(t)
+            return self._kept[t]
+        views = self._load(t)
+        self._kept[t] = views
+        self._bytes += _size(views)
+        while self._bytes > self._max_bytes and len(self._kept) > 1:
+            _, oldest = self._kept.popitem(last=False)
+            self._bytes -= _size(oldest)
+        return views
+
+
+def _size(views: list[View]) -> int:
+    return sum(view.nbytes for view in views)

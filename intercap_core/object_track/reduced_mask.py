@@ -1,7 +1,7 @@
-"""Masks decoded straight onto every n-th pixel, in the smallest window that holds them.
+"""Masks decoded onto every n-th pixel, in the smallest window that contains them.
 
-The tracker compares silhouettes of a hundred pixels; decoding a full 1080p mask for each candidate
-of each view would cost more than the fit.
+The tracker compares silhouettes of about a hundred pixels. Decoding a full 1080p mask for each
+candidate of each view would cost more than the fit.
 """
 
 from __future__ import annotations
@@ -9,22 +9,31 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+import cv2
 import numba
 import numpy as np
 
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 
+MASK_BORDER_PX = 6.0  # difference of two masks of one person at their borders, pixels at full
+# resolution; tuned on the studio, as the two shares below
+BLOB_PERSON_SHARE = 0.25  # of the person's pixels; a candidate with more contains the person
+BLOB_MIN_REST_SHARE = 0.01  # of the candidate's pixels that have to remain without the person
+
 
 @dataclass(frozen=True, eq=False)
 class ReducedMask:
-    """A mask (h, w) bool whose pixel [j, i] is pixel ((x0 + i), (y0 + j)) of the reduced image."""
+    """A mask in a window of the reduced image."""
 
     x0: int
+    """Column of the first pixel in the reduced image."""
     y0: int
+    """Row of the first pixel."""
     mask: np.ndarray
+    """(h, w) bool."""
 
     def window(self, x0: int, y0: int, height: int, width: int) -> np.ndarray:
-        """The mask on another window of the reduced image, False where this one has no pixel."""
+        """Return the mask in another window of the reduced image, False outside of its own."""
         result = np.zeros((height, width), bool)
         own_height, own_width = self.mask.shape
         left, right = max(x0, self.x0), min(x0 + width, self.x0 + own_width)
@@ -36,7 +45,7 @@ class ReducedMask:
         return result
 
     def sample(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """The mask at integer reduced pixels x, y (N,): (N,) bool."""
+        """Return the mask (N,) at integer reduced pixels x, y (N,)."""
         column, row = x - self.x0, y - self.y0
         inside = (
             (column >= 0) & (row >= 0) & (column < self.mask.shape[1]) & (row < self.mask.shape[0])
@@ -55,7 +64,7 @@ EMPTY = ReducedMask(0, 0, np.zeros((0, 0), bool))
 
 
 def reduced_lens(lens: Intrinsics, step: int) -> Intrinsics:
-    """The lens whose pixel (i, j) is pixel (i * step, j * step) of ``lens``."""
+    """Return the lens whose pixel (i, j) is pixel (i * step, j * step) of ``lens``."""
     return Intrinsics(
         (lens.width - 1) // step + 1,
         (lens.height - 1) // step + 1,
@@ -69,9 +78,9 @@ def reduced_lens(lens: Intrinsics, step: int) -> Intrinsics:
 
 
 def decode(rle: bytes, lens: Intrinsics, step: int) -> ReducedMask:
-    """Decode a COCO compressed RLE of ``lens``'s image at every ``step``-th pixel.
+    """Decode a COCO compressed RLE of the image of ``lens`` at every ``step``-th pixel.
 
-    Raises ValueError where the runs do not fill the image.
+    Raises ValueError if the runs do not fill the image.
     """
     if not rle:
         return EMPTY
@@ -90,7 +99,7 @@ def decode(rle: bytes, lens: Intrinsics, step: int) -> ReducedMask:
 
 @numba.njit(cache=True, nogil=True)
 def _counts(text: np.ndarray) -> np.ndarray:
-    """Run lengths of the compressed string, zeros first (format of pycocotools' maskApi.c)."""
+    """Decode the run lengths, zeros first (format of pycocotools' maskApi.c)."""
     counts = np.empty(len(text), np.int64)
     number = 0
     position = 0
@@ -113,7 +122,7 @@ def _counts(text: np.ndarray) -> np.ndarray:
 
 @numba.njit(cache=True, nogil=True)
 def _bounds(runs: np.ndarray, height: int, step: int) -> tuple[int, int, int, int]:
-    """Reduced left, right, top, bottom, inclusive, of the reduced pixels set."""
+    """Return left, right, top, bottom (inclusive) of the reduced pixels set."""
     left, right, top, bottom = 1 << 30, -1, 1 << 30, -1
     start = 0
     for i in range(len(runs)):
@@ -134,6 +143,7 @@ def _bounds(runs: np.ndarray, height: int, step: int) -> tuple[int, int, int, in
 
 @numba.njit(cache=True, nogil=True)
 def _fill(runs: np.ndarray, height: int, step: int, left: int, top: int, mask: np.ndarray) -> None:
+    """Set the pixels of the runs in ``mask``, whose first pixel is (left, top)."""
     start = 0
     for i in range(len(runs)):
         end = start + runs[i]
@@ -146,3 +156,36 @@ def _fill(runs: np.ndarray, height: int, step: int, left: int, top: int, mask: n
                 for row in range((first + step - 1) // step, last // step + 1):
                     mask[row - top, column // step - left] = True
         start = end
+
+
+def remove_person(mask: ReducedMask, person: ReducedMask, step: int) -> ReducedMask | None:
+    """Remove the person from a candidate that covers both person and object.
+
+    Slivers along the person's silhouette are discarded.
+
+    Args:
+        mask: the candidate.
+        person: the person's mask.
+        step: reduction of both masks.
+
+    Returns:
+        The largest remaining part. None if the candidate does not cover the person, or nothing
+            else.
+    """
+    if not mask.area or not person.area:
+        return None
+    here = person.window(mask.x0, mask.y0, *mask.mask.shape)
+    if (here & mask.mask).sum() < BLOB_PERSON_SHARE * person.area:
+        return None
+    rest = (mask.mask & ~here).astype(np.uint8)
+    size = max(3, 2 * round(0.5 * MASK_BORDER_PX / step) + 1)
+    opened = cv2.morphologyEx(rest, cv2.MORPH_OPEN, np.ones((size, size), np.uint8))
+    count, parts, sizes, _ = cv2.connectedComponentsWithStats(opened)
+    if count < 2:
+        return None
+    largest = 1 + int(sizes[1:, cv2.CC_STAT_AREA].argmax())
+    left, top, width, height, area = sizes[largest]
+    if area < BLOB_MIN_REST_SHARE * mask.area:
+        return None
+    kept = parts[top : top + height, left : left + width] == largest
+    return ReducedMask(mask.x0 + int(left), mask.y0 + int(top), kept)

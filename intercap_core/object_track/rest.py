@@ -1,10 +1,10 @@
-"""When the object is at rest: a change-point test on what each frame's images say.
+"""Segments in which the object is at rest: a change-point test on the evidence of the images.
 
-A segment rests if one pose explains all its frames within their evidence, whose errors last: masks
-and calibration make a resting object look as if it crept. So a frame that moves must pay for a pose
-of its own more than lasting errors would buy it, and the cheapest partition of the recording into
-rests and motions is found exactly (dynamic programming; Jackson et al. 2005). How far estimates
-wander at rest is measured on the rests themselves, once, to see slow motions too.
+A segment is at rest if one pose explains all its frames within their evidence. Errors of masks and
+calibration last and make a resting object seem to creep. A moving frame therefore costs more than
+lasting errors would gain by a pose of their own. The cheapest partition of the recording into rests
+and motions is found exactly by dynamic programming (Jackson et al. 2005). The variance of estimates
+at rest is measured on the rests themselves, once, so that slow motions are found too.
 """
 
 from __future__ import annotations
@@ -12,29 +12,37 @@ from __future__ import annotations
 import numpy as np
 
 from intercap_core.geometry.camera.transforms import rotation_exp, step_between
-from intercap_core.object_track.constants import (
-    BLIP_APART_SQUARED,
-    BLIP_FRAMES,
-    BLIP_SAME_SQUARED,
-    CUT_LONGER,
-    CUT_REST_COST,
-    ERROR_LASTING_S,
-    MAX_REST_FRAMES,
-    MIN_REST_S,
-    MOVING_COST,
-    REST_COST,
-    REST_EDGE_SQUARED,
-    REST_MAX_DISTANCE,
-    REST_VARIANCE_BOUNDS,
-    UNSEEN_MOVING_COST,
-)
-from intercap_core.object_track.smooth import FrameEvidence
+from intercap_core.object_track.evidence import ERROR_LASTING_S, FrameEvidence
+
+MIN_REST_S = 0.25  # shortest rest; tuned on the studio, as all values below
+BLIP_FRAMES = 2  # within these an object cannot move away and back: a tenth of a second at 30 Hz
+MAX_REST_FRAMES = 900  # tested against one pose
+# Costs are minus log-likelihoods of one independent observation.
+MOVING_COST = 9.0  # of a pose of its own: six numbers, each of which must differ from noise
+UNSEEN_MOVING_COST = 1.0  # of a frame without evidence
+REST_COST = 8.0  # of one more rest: its pose, its begin and its end
+CUT_REST_COST = 5.0  # of a rest that the recording's begin or end cuts
+CUT_LONGER = 0.9  # of MOVING_COST, by which a longer cut rest costs more, up to REST_COST
+REST_MAX_DISTANCE = np.repeat([0.35, 0.10], 3)  # rad, metres: farther away no rest is tested
+REST_VARIANCE_BOUNDS = (0.5, 2.0)  # of the measured variance at rest over the stated one
+# Squared normalised distances (chi square with 6 degrees of freedom: mean 6, 95 % below 12.6).
+REST_EDGE_SQUARED = 9.0  # of a first or last frame of a rest that has already moved
+BLIP_SAME_SQUARED = 10.0  # of equal poses
+BLIP_APART_SQUARED = 25.0  # of different poses
 
 
-def resting(evidence: FrameEvidence, times: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """Which frames (T,) rest, as segments numbered from 0, -1 where the object moves.
+def find_rests(evidence: FrameEvidence, times: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """Find the frames at rest.
 
-    Frames without evidence rest where those around them do at one pose.
+    Frames without evidence rest if those around them rest at one pose.
+
+    Args:
+        evidence: evidence of T frames.
+        times: (T,) seconds.
+        centre: (3,) of the object, object frame.
+
+    Returns:
+        (T,) number of the rest segment from 0, -1 while the object moves.
     """
     evidence = evidence.about(centre)
     count = len(times)
@@ -42,7 +50,7 @@ def resting(evidence: FrameEvidence, times: np.ndarray, centre: np.ndarray) -> n
     poses = evidence.poses.copy()
     poses[:, :3, :3] = rotation_exp(own[:, :3]) @ poses[:, :3, :3]
     poses[:, :3, 3] += own[:, 3:]
-    information = _without_blips(poses, evidence.information)
+    information = _remove_blips(poses, evidence.information)
     seen = np.trace(information, axis1=1, axis2=2) > 0
     step = float(np.median(np.diff(times))) if count > 1 else ERROR_LASTING_S
     share = min(1.0, step / ERROR_LASTING_S)
@@ -55,7 +63,7 @@ def resting(evidence: FrameEvidence, times: np.ndarray, centre: np.ndarray) -> n
             break
         wander = float(np.clip(wander * spread, *REST_VARIANCE_BOUNDS))
     information = information / wander
-    return _joined(_trimmed(segments, poses, information), poses, information * share, seen)
+    return _merge(_trim(segments, poses, information), poses, information * share, seen)
 
 
 def _partition(
@@ -66,7 +74,19 @@ def _partition(
     share: float,
     shortest: int,
 ) -> tuple[np.ndarray, float | None]:
-    """Segments (T,), and the mean squared residual of a degree of freedom at rest."""
+    """Find the cheapest partition.
+
+    Args:
+        poses, information: (T, 4, 4) and (T, 6, 6) evidence.
+        seen: (T,) frames with evidence.
+        weight: factor of the squared residuals.
+        share: independent observations per frame.
+        shortest: frames of the shortest rest.
+
+    Returns:
+        Segments (T,), and the mean squared residual per degree of freedom at rest, None without
+            rest.
+    """
     count = len(poses)
     moving = np.where(seen, MOVING_COST, UNSEEN_MOVING_COST) * share
     best_rest, best_move = np.full(count + 1, np.inf), np.full(count + 1, np.inf)
@@ -74,8 +94,7 @@ def _partition(
     began = np.zeros(count + 1, int)
     rested_before = np.zeros(count + 1, bool)
     residual = np.zeros(count + 1)
-    # in ascending order: the cheapest partition of the frames before a is known when segments from
-    # a are tried
+    # ascending, so that the cheapest partition of the frames before a is known
     for a in range(count):
         if a:
             stay, go = best_move[a - 1], best_rest[a - 1]
@@ -84,8 +103,8 @@ def _partition(
         until = min(a + MAX_REST_FRAMES, count)
         spread = _spread(poses[a:until], information[a:until], seen[a:until])
         ends = a + 1 + np.arange(len(spread))
-        # of a rest at its begin or end the recording may show a part alone; what is longer costs no
-        # more than to take its last frames for a motion
+        # the recording may show a part of its first and its last rest; a longer one costs no more
+        # than to move in its last frames
         length = ends - a
         cut = (a == 0) | (ends == count)
         longer = np.maximum(length - shortest + 1, 0) * MOVING_COST * share * CUT_LONGER
@@ -116,7 +135,9 @@ def _partition(
 
 
 def _spread(poses: np.ndarray, information: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Squared normalised distances (L,) of the first 1, 2, ... frames from their common pose."""
+    """Return squared normalised distances (L,) of the first 1, 2, ... frames from their common
+    pose.
+    """
     offset = step_between(np.broadcast_to(poses[0], poses.shape), poses)
     offset[~seen] = 0
     far = (np.abs(offset) > REST_MAX_DISTANCE).any(1)
@@ -130,9 +151,11 @@ def _spread(poses: np.ndarray, information: np.ndarray, seen: np.ndarray) -> np.
     return np.maximum(squares - np.einsum("ti,ti->t", gradient, common), 0.0)
 
 
-def _trimmed(segments: np.ndarray, poses: np.ndarray, information: np.ndarray) -> np.ndarray:
-    """The segments (T,) without frames at their ends in which the object already moves: correlated
-    errors do not begin just when a motion does."""
+def _trim(segments: np.ndarray, poses: np.ndarray, information: np.ndarray) -> np.ndarray:
+    """Remove frames from the ends of segments (T,) in which the object already moves.
+
+    Correlated errors do not begin just when a motion does.
+    """
     result = segments.copy()
     for number in range(segments.max(initial=-1) + 1):
         rest = np.flatnonzero(segments == number)
@@ -143,7 +166,7 @@ def _trimmed(segments: np.ndarray, poses: np.ndarray, information: np.ndarray) -
             np.einsum("ti,tij,tj->t", offset - common, information[rest], offset - common)
             > REST_EDGE_SQUARED
         )
-        # nothing says that a frame at its end, in which nothing is seen, still rests
+        # frames without evidence at the ends do not count as resting
         inside = np.flatnonzero(~off & (np.trace(information[rest], axis1=1, axis2=2) > 0))
         if not len(inside):
             continue
@@ -154,11 +177,13 @@ def _trimmed(segments: np.ndarray, poses: np.ndarray, information: np.ndarray) -
     return result
 
 
-def _joined(
+def _merge(
     segments: np.ndarray, poses: np.ndarray, information: np.ndarray, seen: np.ndarray
 ) -> np.ndarray:
-    """The segments (T,), with neighbours merged where one pose explains both: rests split by a
-    single outlier or by the limit on a rest's length."""
+    """Merge neighbouring segments (T,) that one pose explains.
+
+    A single outlier or the limit of a rest's length may have split a rest.
+    """
     result = np.full_like(segments, -1)
     number, last = -1, np.zeros(0, int)
     for old in range(segments.max(initial=-1) + 1):
@@ -176,25 +201,27 @@ def _joined(
     return result
 
 
-def _without_blips(poses: np.ndarray, information: np.ndarray) -> np.ndarray:
-    """The information (T, 6, 6), zero for outliers: one or two frames at another pose between
-    frames at equal ones."""
+def _remove_blips(poses: np.ndarray, information: np.ndarray) -> np.ndarray:
+    """Return the information (T, 6, 6), zero for outliers.
+
+    An outlier is one or two frames at another pose between frames at equal ones.
+    """
     result = information.copy()
     for width in range(1, BLIP_FRAMES + 1):
         inner = np.arange(1, len(poses) - width)
         if not len(inner):
             break
         before, after = inner - 1, inner + width
-        same = _distance(poses, information, before, after) < BLIP_SAME_SQUARED
+        same = _squared_distance(poses, information, before, after) < BLIP_SAME_SQUARED
         for k in range(width):
-            same &= _distance(poses, information, before, inner + k) > BLIP_APART_SQUARED
+            same &= _squared_distance(poses, information, before, inner + k) > BLIP_APART_SQUARED
         for k in range(width):
             result[inner[same] + k] = 0
     return result
 
 
-def _distance(poses: np.ndarray, information: np.ndarray, a: np.ndarray, b: np.ndarray):
-    """Squared distances (N,) of frames a and b in the evidence of the one that says less."""
+def _squared_distance(poses: np.ndarray, information: np.ndarray, a: np.ndarray, b: np.ndarray):
+    """Return squared distances (N,) of frames a and b in the evidence of the weaker one."""
     offset = step_between(poses[a], poses[b])
     both = [np.einsum("ni,nij,nj->n", offset, information[i], offset) for i in (a, b)]
     return np.minimum(*both)

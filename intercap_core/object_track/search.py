@@ -1,162 +1,146 @@
-"""Find the object's pose in a frame set with nothing to start from.
+"""Search of the object's pose in a frame set without a start.
 
-Candidates of different views are joined where they lie together; rotations from a grid over SO(3)
-modulo the symmetry group are aligned to what they show, points or silhouettes; the best are
-rendered and compared with every view, and the best of those are fitted.
+Candidates of different views are joined to groups. A grid of rotations over SO(3) modulo the
+symmetry group is aligned to each group. The best poses are rendered and compared with every view,
+and the best of those are fitted.
+
+The alignment is point-to-plane ICP to the measured points for all rotations at once. The outlines
+of the masks are added where views have no depth, or where few views leave many poses that fit the
+points. Weights are Geman-McClure with a scale that shrinks from the error of the grid.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from intercap_core.formats.detections.instance import PERSON_LABEL
+from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.geometry.rigid.render import Renderer
-from intercap_core.geometry.rigid.symmetry import SymmetryGroup
-from intercap_core.object_track.alignment import align
-from intercap_core.object_track.constants import (
-    ASSESS_MIN_OVERLAP,
-    FULL_SEARCH,
-    GRID_ROTATIONS,
-    GRID_SPACING_DEG,
-    HOPELESS_LOG_RATIO,
-    NEAR_SEARCH,
-    OWN_TURN_STEPS,
-    SAME_AXIS_COSINE,
-    SAME_POSE_DEG,
-    SAME_POSE_M,
-    SEARCH_GOOD_LOG_RATIO,
-    SEARCH_MIN_OVERLAP,
-    SEEN_LOG_RATIO,
-    TRUSTED_PLACE,
-    TURNS_FITTED,
-    UPRIGHT_TURNS,
-)
+from intercap_core.geometry.solve.robust import geman_mcclure_weight
 from intercap_core.object_track.fit import Fit, assess_all, fit_pose
-from intercap_core.object_track.groups import centre_of, find_groups
-from intercap_core.object_track.motion import about
-from intercap_core.object_track.view import View
+from intercap_core.object_track.groups import (
+    Group,
+    find_groups,
+    hull_vertices,
+    locate_group,
+    outline_residuals,
+)
+from intercap_core.object_track.likelihood import SEARCH_GOOD_LOG_RATIO, SEEN_LOG_RATIO
+from intercap_core.object_track.motion import shift_twist
+from intercap_core.object_track.turns import axis_turns, rotation_grid, same_pose
+from intercap_core.object_track.view import FitContext, View
+
+ALIGNED_POINTS = 150  # of all views together
+ICP_STEPS = 6
+ICP_KEPT = {1: 96, 3: 48}  # step after which only so many rotations continue
+ICP_SCALES_M = (0.08, 0.015)  # first and last Geman-McClure scale: error of the grid, noise
+# A measured point cannot lie on a face that looks away from the camera. Its weight, and its least
+# residual in metres; tuned on the studio.
+FACING_AWAY_WEIGHT = 0.1
+FACING_AWAY_MIN_M = 0.01
+ICP_MAX_RESIDUAL_M = 0.05  # larger residuals count as this
+OUTLINE_ALIGNED_VIEWS = (
+    2  # in groups of up to so many views, outlines of views with depth count too
+)
+# Poses rendered after the alignment, and fitted after that.
+FULL_SEARCH = (16, 3)  # with all rotations
+NEAR_SEARCH = (6, 2)  # with given rotations
+SEARCH_MIN_OVERLAP = 0.2  # largest ``min_overlap`` of a fit to a searched pose
+# Nats by which a start may be worse than a fit and still lead to a rival of it: a fit gains up to
+# 15 nats, measured on the studio (bottle to chair).
+HOPELESS_LOG_RATIO = 15.0
+AXIS_TURN_STEPS = 12  # turns of the best pose about each axis that are compared with it
+TURNS_FITTED = 3  # of them
+TRUSTED_PLACE = 0.5  # prior of a position whose good pose ends the search; tuned on the studio
 
 
-def search(
-    mesh: ObjectMesh,
-    field: DistanceField,
-    views: list[View],
-    *,
-    labels: tuple[str, ...],
-    up: np.ndarray | None,
-    min_overlap: float,
-    background_term: bool,
-    place_prior: Callable[[np.ndarray], float] | None = None,
-    rotations: np.ndarray | None = None,
-    motion: tuple[np.ndarray, np.ndarray] | None = None,
-    renderer: Renderer | None = None,
+@dataclass(frozen=True)
+class SearchLimits:
+    """What is known about the pose before a search."""
+
+    up: np.ndarray | None = None
+    """(3,) vertical in the master frame: standing poses are tried more finely."""
+    place_prior: Callable[[np.ndarray], float] | None = None
+    """Prior, 0 to 1, of a position (3,)."""
+    rotations: np.ndarray | None = None
+    """(N, 3, 3) rotations to try instead of the whole grid."""
+    motion: tuple[np.ndarray, np.ndarray] | None = None
+    """Twist (6,) of the object per second, and the point (3,) that moves by it."""
+
+
+def search_pose(
+    context: FitContext, field: DistanceField, views: list[View], limits: SearchLimits
 ) -> list[Fit]:
-    """Fitted hypotheses of the pose, the likeliest first; none where nothing is detected.
+    """Search the pose of a frame set.
 
-    ``field`` is the mesh's distance field; ``labels`` are the detector classes that the object may
-    be given (empty: any but a person); ``up`` (3,) is the vertical in the master frame, to try the
-    standing poses more finely; ``place_prior`` says of a place (3,) how likely what is there is the
-    object, 0 to 1; ``rotations`` (N, 3, 3) are tried alone where they are known roughly;
-    ``motion`` is a twist (6,) of the object in a second, see :func:`.fit.fit_pose`, and the point
-    (3,) that moves by it; ``renderer`` draws, None = the CPU.
+    Args:
+        context: object and settings.
+        field: distance field of the mesh.
+        views: views of the frame set.
+        limits: what is known about the pose.
+
+    Returns:
+        Fitted hypotheses, the likeliest first; empty if nothing is detected.
     """
+    mesh = context.mesh
+    fit_context = replace(context, min_overlap=min(context.min_overlap, SEARCH_MIN_OVERLAP))
 
-    def fitted(starts: list[Fit], best: float = SEEN_LOG_RATIO) -> list[Fit]:
-        """Fits from the starts, the likeliest first, those left out that are hopeless beside the
-        ``best`` known."""
+    def fit_starts(starts: list[Fit], best: float = SEEN_LOG_RATIO) -> list[Fit]:
+        """Fit the starts that are not hopeless compared with the ``best`` log-likelihood ratio."""
         fits: list[Fit] = []
         for start in starts:
             best = max([best, *(fit.log_ratio for fit in fits)])
             if start.log_ratio > best - HOPELESS_LOG_RATIO:
-                fits.append(
-                    fit_pose(
-                        mesh,
-                        views,
-                        start.pose,
-                        prior=None,
-                        min_overlap=min(min_overlap, SEARCH_MIN_OVERLAP),
-                        background_term=background_term,
-                        labels=labels,
-                        twist=start.twist,
-                        renderer=renderer,
-                    )
-                )
+                fits.append(fit_pose(fit_context, views, start.pose, twist=start.twist))
         return fits
 
-    def compared(poses: np.ndarray) -> list[Fit]:
-        found = assess_all(
-            mesh,
-            views,
-            poses,
-            min_overlap=ASSESS_MIN_OVERLAP,
-            labels=labels,
-            twists=None
-            if motion is None
-            else np.array([about(*motion, pose[:3, 3]) for pose in poses]),
-            renderer=renderer,
-        )
-        return sorted(found, key=lambda fit: -fit.log_ratio)
+    def compare(poses: np.ndarray) -> list[Fit]:
+        """Compare poses (N, 4, 4) with the views; the likeliest first."""
+        twists = None
+        if limits.motion is not None:
+            twists = np.array([shift_twist(*limits.motion, pose[:3, 3]) for pose in poses])
+        return sorted(assess_all(context, views, poses, twists), key=lambda fit: -fit.log_ratio)
 
-    known = rotations is not None
-    number_compared, number_fitted = NEAR_SEARCH if known else FULL_SEARCH
+    rotations = limits.rotations
+    number_compared, number_fitted = FULL_SEARCH if rotations is None else NEAR_SEARCH
     if rotations is None:
-        rotations = rotation_grid(mesh.symmetry, up)
-    found: list[Fit] = []
-    for group in find_groups(mesh, views, labels, place_prior):
+        rotations = rotation_grid(mesh.symmetry, limits.up)
+    prior = limits.place_prior
+    fits: list[Fit] = []
+    for group in find_groups(mesh, views, context.labels, prior):
         poses = align(mesh, field, group, views, rotations)
-        here = fitted(compared(_distinct(mesh, poses, number_compared))[:number_fitted])
-        found += here
-        trusted = place_prior is None or place_prior(centre_of(group)) > TRUSTED_PLACE
-        if trusted and any(fit.log_ratio > SEARCH_GOOD_LOG_RATIO for fit in here):
+        of_group = fit_starts(compare(_distinct(mesh, poses, number_compared))[:number_fitted])
+        fits += of_group
+        trusted = prior is None or prior(locate_group(group)) > TRUSTED_PLACE
+        if trusted and any(fit.log_ratio > SEARCH_GOOD_LOG_RATIO for fit in of_group):
             break
-    found.sort(key=lambda fit: -fit.log_ratio)
-    if found and not known and not mesh.symmetry.sphere:
+    fits.sort(key=lambda fit: -fit.log_ratio)
+    if fits and limits.rotations is None and not mesh.symmetry.sphere:
         # a mug looks much the same with its handle elsewhere, a box from its back
-        turned = compared(found[0].pose @ own_turns(mesh, OWN_TURN_STEPS))[:TURNS_FITTED]
-        found += fitted(turned, found[0].log_ratio)
-        found.sort(key=lambda fit: -fit.log_ratio)
+        turned = compare(fits[0].pose @ axis_turns(mesh, AXIS_TURN_STEPS))[:TURNS_FITTED]
+        fits += fit_starts(turned, fits[0].log_ratio)
+        fits.sort(key=lambda fit: -fit.log_ratio)
     kept: list[Fit] = []
-    for fit in found:
+    for fit in fits:
         if not any(same_pose(mesh, fit.pose, other.pose) for other in kept):
             kept.append(fit)
     return kept
 
 
-def own_turns(mesh: ObjectMesh, steps: int) -> np.ndarray:
-    """Turns (N, 4, 4) of the object about the axes of its frame and its principal axes.
-
-    ``steps`` angles a full turn; those that the symmetry group holds anyway are left out. They
-    turn about the middle of its box, where a turned silhouette covers the old one best.
-    """
-    centre = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
-    found = []
-    for axis in own_axes(mesh):
-        for angle in 2 * np.pi * np.arange(1, steps) / steps:
-            turn = np.eye(4)
-            turn[:3, :3] = Rotation.from_rotvec(angle * axis).as_matrix()
-            turn[:3, 3] = centre - turn[:3, :3] @ centre
-            if not same_pose(mesh, turn, np.eye(4)):
-                found.append(turn)
-    return np.array(found).reshape(-1, 4, 4)
-
-
-def own_axes(mesh: ObjectMesh) -> np.ndarray:
-    """Unit vectors (N, 3): the axes of the object's frame and its principal axes if others."""
-    _, principal = np.linalg.eigh(np.cov(mesh.vertices.T))
-    new = np.abs(principal).max(0) < SAME_AXIS_COSINE  # a mug's handle tilts them
-    return np.concatenate([np.eye(3), principal[:, new]], 1).T
-
-
 def rank_frames(labels_by_view: list[list[list[str]]], labels: tuple[str, ...]) -> list[int]:
-    """Frames in the order in which to search them.
+    """Order the frames for searching.
 
-    ``labels_by_view`` [T][C][candidates] are the candidates' labels. Frames in which more views
-    hold a likely label come first; among equals those far from the ones taken already.
+    Frames in which more views have a candidate with a likely label come first; among equal frames
+    those far from the ones before.
+
+    Args:
+        labels_by_view: labels [T][C][candidates].
+        labels: detector classes of the object.
     """
     count = len(labels_by_view)
     support = np.array(
@@ -181,65 +165,8 @@ def rank_frames(labels_by_view: list[list[list[str]]], labels: tuple[str, ...]) 
     return order
 
 
-def rotation_grid(symmetry: SymmetryGroup, up: np.ndarray | None) -> np.ndarray:
-    """Rotations (N, 3, 3) that cover SO(3) modulo the group, and the upright ones."""
-    if symmetry.sphere:
-        return np.eye(3)[None]
-    spread = 2 if symmetry.axis is not None else 1
-    grid = _super_fibonacci(GRID_ROTATIONS)
-    if up is not None:
-        turns = Rotation.from_rotvec(
-            np.outer(2 * np.pi * np.arange(UPRIGHT_TURNS) / UPRIGHT_TURNS, (0, 0, 1))
-        ).as_matrix()
-        grid = np.concatenate([_standing(up) @ turns, grid])
-    # one of each set of equivalent rotations: those nearest to what was kept already
-    kept: list[np.ndarray] = []
-    spacing = GRID_SPACING_DEG * spread
-    for rotation in grid:
-        if (
-            symmetry.trivial
-            or not kept
-            or symmetry.rotation_error_deg(np.array(kept), rotation).min() > spacing
-        ):
-            kept.append(rotation)
-    return np.array(kept)
-
-
-def same_pose(
-    mesh: ObjectMesh,
-    a: np.ndarray,
-    b: np.ndarray,
-    limits: tuple[float, float] = (SAME_POSE_M, SAME_POSE_DEG),
-) -> bool:
-    """Whether two poses (4, 4) are one, up to symmetry and a difference of ``limits``, metres and
-    degrees."""
-    angle = float(mesh.symmetry.rotation_error_deg(a[:3, :3], b[:3, :3]))
-    shift = float(np.linalg.norm(mesh.centre_at(a) - mesh.centre_at(b)))
-    return shift < limits[0] and angle < limits[1]
-
-
-def _super_fibonacci(count: int) -> np.ndarray:
-    """Evenly spread rotations (count, 3, 3): Alexa, Super-Fibonacci Spirals, CVPR 2022."""
-    phi, psi = np.sqrt(2.0), 1.533751168755204288118041
-    s = np.arange(count) + 0.5
-    r, big_r = np.sqrt(s / count), np.sqrt(1 - s / count)
-    alpha, beta = 2 * np.pi * s / phi, 2 * np.pi * s / psi
-    quaternions = np.stack(
-        [r * np.sin(alpha), r * np.cos(alpha), big_r * np.sin(beta), big_r * np.cos(beta)], 1
-    )
-    return Rotation.from_quat(quaternions).as_matrix()
-
-
-def _standing(up: np.ndarray) -> np.ndarray:
-    """A rotation (3, 3) that takes the object's z axis to ``up``."""
-    z = up / np.linalg.norm(up)
-    x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z], 1)
-
-
 def _distinct(mesh: ObjectMesh, poses: np.ndarray, count: int) -> np.ndarray:
-    """The first ``count`` of the poses (N, 4, 4) that are not the same as one before."""
+    """Return the first ``count`` poses (N, 4, 4) that differ from all before."""
     kept: list[np.ndarray] = []
     for pose in poses:
         if not any(same_pose(mesh, pose, other) for other in kept):
@@ -247,3 +174,111 @@ def _distinct(mesh: ObjectMesh, poses: np.ndarray, count: int) -> np.ndarray:
             if len(kept) == count:
                 break
     return np.array(kept)
+
+
+def align(
+    mesh: ObjectMesh,
+    field: DistanceField,
+    group: Group,
+    views: Sequence[View],
+    rotations: np.ndarray,
+) -> np.ndarray:
+    """Align rotations to a group of candidates (ICP with successive halving).
+
+    Args:
+        mesh, field: the object and its distance field.
+        group: candidates of the object.
+        views: views of the frame set.
+        rotations: (N, 3, 3).
+
+    Returns:
+        Poses (M, 4, 4), the best first.
+    """
+    cloud, eyes = _cloud(group, views)
+    few = len(group) <= OUTLINE_ALIGNED_VIEWS
+    shapes = [s.outline for s in group if (few or s.centre is None) and s.outline]
+    hull = hull_vertices(mesh) if shapes else np.zeros((0, 3))
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    middle = (area[:, None] * (a + b + c) / 3).sum(0) / area.sum()
+    rotation = rotations.copy()
+    translation = locate_group(group) - rotation @ middle
+    scales = [*np.geomspace(*ICP_SCALES_M, ICP_STEPS), ICP_SCALES_M[-1]]
+    residual = np.zeros(len(rotation))
+    for number, scale in enumerate(scales):
+        few_points = slice(None, None, 3 if number < 2 else 1)
+        count = len(rotation)
+        hessian, gradient = np.zeros((count, 6, 6)), np.zeros((count, 6))
+        costs = []
+        if len(cloud):
+            cost, h, g = _to_points(
+                field, cloud[few_points], eyes[few_points], rotation, translation, scale
+            )
+            hessian, gradient = hessian + h, gradient + g
+            costs.append(cost)
+        for shape in shapes:
+            gap, jacobian = outline_residuals(shape, hull, rotation, translation)
+            weight = geman_mcclure_weight(gap**2, scale)
+            weighted = jacobian * weight[..., None]
+            hessian += np.einsum("ndi,ndj->nij", weighted, jacobian)
+            gradient -= np.einsum("ndi,nd->ni", weighted, gap)
+            costs.append(np.minimum(np.abs(gap[:, shape.known]), ICP_MAX_RESIDUAL_M))
+        residual = np.concatenate(costs, 1).mean(1)
+        hessian += 1e-3 * np.einsum("nii,ij->nij", hessian, np.eye(6)) + 1e-6 * np.eye(6)
+        step = np.linalg.solve(hessian, gradient[..., None])[..., 0]
+        # at most 15 degrees and 5 cm
+        limit = np.maximum(1.0, np.linalg.norm(step[:, :3], axis=1) / np.radians(15))
+        limit = np.maximum(limit, np.linalg.norm(step[:, 3:], axis=1) / 0.05)
+        step /= limit[:, None]
+        # the step moves the object in its own frame: pose <- pose * exp(step)
+        translation = translation + np.einsum("nij,nj->ni", rotation, step[:, 3:])
+        rotation = rotation @ Rotation.from_rotvec(step[:, :3]).as_matrix()
+        order = np.argsort(residual, kind="stable")
+        if number in ICP_KEPT:
+            order = order[: ICP_KEPT[number]]
+        rotation, translation = rotation[order], translation[order]
+    return rigid(rotation, translation)
+
+
+def _cloud(group: Group, views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (P, 3), equally many of each view, and the camera centre of each (P, 3)."""
+    measured = [s for s in group if len(s.points)]
+    if not measured:
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    share = ALIGNED_POINTS // len(measured)
+    parts = [
+        s.points[np.linspace(0, len(s.points) - 1, min(share, len(s.points))).astype(int)]
+        for s in measured
+    ]
+    centres = [views[s.view].geometry.camera.master_from_depth[:3, 3] for s in measured]
+    eyes = [np.broadcast_to(e, part.shape) for e, part in zip(centres, parts, strict=True)]
+    return np.concatenate(parts), np.concatenate(eyes)
+
+
+def _to_points(
+    field: DistanceField,
+    cloud: np.ndarray,
+    eyes: np.ndarray,
+    rotation: np.ndarray,
+    translation: np.ndarray,
+    scale: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the cost (N, P) of each point, the normal matrix (N, 6, 6) and the gradient (N, 6)."""
+    count = len(rotation)
+    local = np.einsum("nji,npj->npi", rotation, cloud[None] - translation[:, None])
+    closest = field.closest(local.reshape(-1, 3))
+    points = closest.points.reshape(count, -1, 3)
+    normals = closest.normals.reshape(count, -1, 3)
+    gap = local - points
+    along = (gap * normals).sum(-1)
+    distance = np.linalg.norm(gap, axis=-1)
+    to_eye = np.einsum("nji,npj->npi", rotation, (eyes - cloud)[None])
+    facing = (to_eye * normals).sum(-1) > 0
+    weight = geman_mcclure_weight(distance**2, scale) * np.where(facing, 1.0, FACING_AWAY_WEIGHT)
+    cost = np.minimum(
+        np.where(facing, distance, np.maximum(distance, FACING_AWAY_MIN_M)), ICP_MAX_RESIDUAL_M
+    )
+    jacobian = np.concatenate([np.cross(local, normals), normals], -1)
+    weighted = jacobian * weight[..., None]
+    hessian = np.einsum("npi,npj->nij", weighted, jacobian)
+    return cost, hessian, np.einsum("npi,np->ni", weighted, along)

@@ -1,68 +1,35 @@
-"""The most probable track over all frames, from what each frame's images say about its pose.
+"""Most probable track over all frames from the evidence of each frame.
 
-Around the pose at which a frame was looked at, its evidence is a quadratic form of small motions.
-Neighbouring frames are tied by the accelerations that hands and gravity cause; both are robust, so
-that a frame whose evidence was taken at a wrong pose and a kick or a drop cost little. Frames that
-share a node share one pose: an object at rest. Solved by Gauss-Newton with a banded Cholesky
-factor, whose inverse is the covariance. Beyond the paper, whose tracker ends with equation 1.
+Around the pose at which a frame was evaluated, its evidence is a quadratic form of small motions.
+Neighbouring frames are coupled by the accelerations that hands and gravity cause. Both are robust:
+a frame that was evaluated at a wrong pose, a kick or a drop cost little. Frames of one node share
+one pose: an object at rest. The track is solved by Gauss-Newton with a banded Cholesky factor,
+whose inverse is the covariance. Beyond the paper, whose tracker ends with equation 1.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from intercap_core.geometry.camera.transforms import apply_step, rotation_log, step_between
 from intercap_core.geometry.solve.robust import geman_mcclure_weight
-from intercap_core.object_track.constants import (
-    ACCELERATION_M_S2,
-    ACCELERATION_RAD_S2,
-    IMPACT_SIGMAS,
-    INVERTED_MARGIN,
-    INVERTED_NODES,
-    OUTLIER_SIGMAS,
-    REST_SAMPLES,
-    SMOOTH_CONVERGED,
-    SMOOTH_MAX_TURN_RAD,
-    SMOOTH_STEPS,
-    TYPICAL_REACH_M,
-    TYPICAL_SLACK,
-    UNKNOWN_SIGMA,
-)
+from intercap_core.object_track.evidence import UNKNOWN_SIGMA, FrameEvidence, steps_about_point
 
-BAND = 2  # nodes that an acceleration couples to the one before
+# Standard deviation of accelerations of a carried object; a kick is an outlier. Tuned on the
+# studio.
+ACCELERATION_M_S2 = 6.0
+ACCELERATION_RAD_S2 = 20.0
+IMPACT_SIGMAS = 3.0  # standard deviations of an acceleration beyond which it is an impact
+OUTLIER_SIGMAS = 5.0  # evidence this many standard deviations away counts a quarter
+SMOOTH_STEPS = 12  # Gauss-Newton steps at most
+SMOOTH_CONVERGED = np.repeat([1e-5, 1e-6], 3)  # rad, metres
+TYPICAL_REACH_M = 0.03  # frames of a rest farther apart do not show one place
+TYPICAL_SLACK = 0.1  # of the largest cost, within which the frame with most evidence is typical
+INVERTED_NODES = 64  # nodes that are inverted at once
+INVERTED_MARGIN = 40  # neighbouring nodes that matter to them
 
-
-@dataclass(frozen=True)
-class FrameEvidence:
-    """The evidence of T frames: ``poses`` (T, 4, 4) at which each was looked at, J'J
-    ``information`` (T, 6, 6) and J'r ``gradient`` (T, 6) there, of (turn on the left, shift)."""
-
-    poses: np.ndarray
-    information: np.ndarray
-    gradient: np.ndarray
-
-    def about(self, centre: np.ndarray) -> FrameEvidence:
-        """The same with poses and steps about ``centre`` (3,) of the object instead of its origin:
-        the translations are where the centre is."""
-        # the origin's shift is the centre's and what the turn adds
-        to_origin = with_turn(self.poses[:, :3, :3] @ centre)
-        back = to_origin.transpose(0, 2, 1)
-        poses = self.poses.copy()
-        poses[:, :3, 3] += poses[:, :3, :3] @ centre
-        return FrameEvidence(
-            poses,
-            back @ self.information @ to_origin,
-            np.einsum("tij,tj->ti", back, self.gradient),
-        )
-
-    @property
-    def own(self) -> np.ndarray:
-        """Steps (T, 6) to where each frame's evidence alone would have the object."""
-        damped = self.information + np.diag(UNKNOWN_SIGMA**-2)
-        return -np.linalg.solve(damped, self.gradient[..., None])[..., 0]
+BAND = 2  # nodes before to which an acceleration couples a node
 
 
 def smooth(
@@ -73,23 +40,28 @@ def smooth(
     centre: np.ndarray,
     stated: FrameEvidence | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Poses (T, 4, 4) and covariances (T, 6, 6) of all frames together, from ``start`` (T, 4, 4).
+    """Solve for the poses (T, 4, 4) and covariances (T, 6, 6) of all frames.
 
-    ``node`` (T,) numbers the frames from 0, never falling, frames at rest alike; ``times`` (T,)
-    seconds; ``centre`` (3,) of the object, whose path is smooth. What somebody ``stated`` counts
-    whole: it is no look at an object at rest, and no outlier.
+    Args:
+        evidence: evidence of the frames.
+        start: (T, 4, 4) start poses.
+        node: (T,) number of each frame's node from 0, ascending; resting frames share a node.
+        times: (T,) seconds.
+        centre: (3,) of the object, whose path is smooth.
+        stated: evidence of annotated poses, which is not robust and counts in full at rest.
     """
     count = int(node[-1]) + 1
     size = np.bincount(node)
     evidence = evidence.about(centre)
     information, own = evidence.information, evidence.own
     first = _typical_frames(evidence, node)
-    share = np.minimum(1.0, REST_SAMPLES / size)[node]
+    # a rest counts as one observation, as errors of masks and calibration do not average out
+    share = (1.0 / size)[node]
     state = start.copy()
     state[:, :3, 3] += state[:, :3, :3] @ centre
-    state = _without_blips(state, times)[first]
+    state = _remove_blips(state, times)[first]
     bands = np.zeros((0, 0, 0, 0))
-    told = stated.about(centre) if stated is not None else None
+    given = stated.about(centre) if stated is not None else None
     for _ in range(SMOOTH_STEPS):
         offset = step_between(evidence.poses, state[node])
         distance = np.einsum("ti,tij,tj->t", offset - own, information, offset - own)
@@ -101,19 +73,17 @@ def smooth(
         force = evidence.gradient + np.einsum("tij,tj->ti", information, offset)
         np.add.at(gradient, node, weight[:, None] * force)
         gradient += offset[first] * UNKNOWN_SIGMA**-2
-        if told is not None:
-            offset = step_between(told.poses, state[node])
-            np.add.at(bands[0], node, told.information)
-            force = told.gradient + np.einsum("tij,tj->ti", told.information, offset)
+        if given is not None:
+            offset = step_between(given.poses, state[node])
+            np.add.at(bands[0], node, given.information)
+            force = given.gradient + np.einsum("tij,tj->ti", given.information, offset)
             np.add.at(gradient, node, force)
         _add_motion(state, node, times, bands, gradient)
         matrix = cholesky_banded(_banded(bands), lower=True, check_finite=False)
         step = -cho_solve_banded((matrix, True), gradient.ravel(), check_finite=False).reshape(
             -1, 6
         )
-        step /= np.maximum(
-            1.0, np.linalg.norm(step[:, :3], axis=1, keepdims=True) / SMOOTH_MAX_TURN_RAD
-        )
+        step /= np.maximum(1.0, np.linalg.norm(step[:, :3], axis=1, keepdims=True) / 0.5)
         state = apply_step(state, step)
         if (np.abs(step) < SMOOTH_CONVERGED).all():
             break
@@ -121,13 +91,16 @@ def smooth(
     poses = state[node]
     arms = poses[:, :3, :3] @ centre
     poses[:, :3, 3] -= arms
-    to_origin = with_turn(arms)
+    to_origin = steps_about_point(arms)
     return poses, to_origin @ covariance @ to_origin.transpose(0, 2, 1)
 
 
 def _typical_frames(evidence: FrameEvidence, node: np.ndarray) -> np.ndarray:
-    """The frame (N,) int of each of N nodes that most of its evidence is near, ``node`` (T,) as in
-    :func:`smooth`: a robust fit would believe the one wrong frame of a rest that it starts from."""
+    """Return the frame (N,) of each node that is near most of its evidence.
+
+    A robust fit that starts at the one wrong frame of a rest would stay there. ``node`` (T,) as in
+    :func:`smooth`.
+    """
     weight = np.sqrt(np.trace(evidence.information, axis1=1, axis2=2))
     place = evidence.poses[:, :3, 3]
     found = np.zeros(int(node[-1]) + 1, int)
@@ -142,11 +115,11 @@ def _typical_frames(evidence: FrameEvidence, node: np.ndarray) -> np.ndarray:
     return found
 
 
-def _without_blips(poses: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Poses (T, 4, 4) in which a frame that jumps away and back lies between its neighbours.
+def _remove_blips(poses: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Move frames that jump away and back between their neighbours; poses (T, 4, 4).
 
-    A robust fit that starts at a wrong pose would believe it. A kick or a drop changes the velocity
-    once, a wrong frame three times to and fro.
+    A robust fit that starts at a wrong pose would stay there. A kick or a drop changes the velocity
+    once, a wrong frame three times back and forth.
     """
     result = poses.copy()
     if len(poses) < 5:
@@ -188,7 +161,7 @@ def _add_motion(
     residual = np.concatenate(
         [spin / mean / ACCELERATION_RAD_S2, shift / mean / ACCELERATION_M_S2], axis=1
     )
-    # of d(residual) by the steps of a, b and c
+    # derivatives of the residual by the steps of a, b and c
     parts = np.zeros((3, len(a), 6, 6))
     eye = np.eye(3)
     one, two = (eye / before[..., None]), (eye / after[..., None])
@@ -213,7 +186,7 @@ def _add_motion(
 
 
 def _banded(bands: np.ndarray) -> np.ndarray:
-    """Blocks (BAND + 1, N, 6, 6), block (n + k, n), in LAPACK's lower banded layout."""
+    """Convert blocks (BAND + 1, N, 6, 6), block (n + k, n), to LAPACK's lower banded layout."""
     count = bands.shape[1]
     result = np.zeros((6 * (BAND + 1), 6 * count))
     for k in range(BAND + 1):
@@ -227,7 +200,7 @@ def _banded(bands: np.ndarray) -> np.ndarray:
 
 
 def _covariance(banded: np.ndarray, count: int) -> np.ndarray:
-    """Diagonal blocks (N, 6, 6) of the inverse; far frames do not matter to each other."""
+    """Return the diagonal blocks (N, 6, 6) of the inverse, for which far nodes do not matter."""
     found = np.zeros((count, 6, 6))
     for start in range(0, count, INVERTED_NODES):
         stop = min(start + INVERTED_NODES, count)
@@ -244,19 +217,3 @@ def _covariance(banded: np.ndarray, count: int) -> np.ndarray:
         index = np.arange(stop - start)
         found[start:stop] = blocks[index, :, index]
     return found
-
-
-def with_turn(arms: np.ndarray) -> np.ndarray:
-    """Matrices (T, 6, 6) from steps about one point to steps about another, which lies ``arms``
-    (T, 3) before it: the shift gains turn x -arm."""
-    x, y, z = arms.T
-    result = np.tile(np.eye(6), (len(arms), 1, 1))
-    result[:, 3:, :3] = np.stack(
-        [
-            np.stack([0 * x, -z, y], 1),
-            np.stack([z, 0 * x, -x], 1),
-            np.stack([-y, x, 0 * x], 1),
-        ],
-        1,
-    )
-    return result

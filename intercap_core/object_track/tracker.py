@@ -1,244 +1,242 @@
-"""The object's pose over time: hypotheses in every frame, one decision over all of them.
+"""Track of the object: hypotheses in every frame and one decision over all frames.
 
-What a search finds in a few frames is followed both ways; a hidden Markov model says what is true
-in every frame and how surely; where it is not sure, more is looked for and it decides again. The
-continuous estimates follow from it: rest, smoothness, covariance (:mod:`.whole`).
+Poses that a search finds in a few frames are followed forwards and backwards. A hidden Markov model
+(:mod:`.decoder`) decides which hypothesis is true in every frame. Frames that stay uncertain are
+searched, and the model decides again. :mod:`.whole` then refines the decided poses: rest,
+smoothness and covariance.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from intercap_core.config import ObjectTrackSettings
 from intercap_core.geometry.camera.transforms import step_between
-from intercap_core.geometry.rigid.mesh import ObjectMesh, Paint
+from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.colour_decision import ColourDecision
-from intercap_core.object_track.constants import (
-    ABSENT_LOG_RATIO,
-    AMBIGUOUS_PROBABILITY,
-    APART_M,
-    APART_RAD,
-    DOUBTFUL_PROBABILITY,
-    ERROR_LASTING_S,
+from intercap_core.object_track.decoder import (
     FREE_COST_S,
-    GONE_PROBABILITY,
-    LOST_PROBABILITY,
-    MOTION_ROUNDS,
-    NOTHING_LOG_RATIO,
+    HIDDEN,
     REACH_M,
-    ROUNDS,
-    SEEN_LOG_RATIO,
+    Decoded,
+    add_excursion_costs,
+    decode,
+    find_excursions,
+    step_costs,
 )
-from intercap_core.object_track.decoder import NOT_SEEN, Decoded, decode
 from intercap_core.object_track.fit import Fit
-from intercap_core.object_track.frame_result import FrameResult, flagged
-from intercap_core.object_track.given_poses import GivenPose, against
-from intercap_core.object_track.hypotheses import Hypotheses
+from intercap_core.object_track.given_poses import GivenPose
+from intercap_core.object_track.hypotheses import Hypotheses, Prior, group_by_candidates
+from intercap_core.object_track.likelihood import SEEN_LOG_RATIO
 from intercap_core.object_track.mesh_check import mesh_doubts
-from intercap_core.object_track.motion import HandMotion, hand_motions
-from intercap_core.object_track.observer import Observer, Pictures
-from intercap_core.object_track.prior import Prior, things
-from intercap_core.object_track.proposals import NotFound, Proposals
-from intercap_core.object_track.steps import excursions, step_costs, with_excursions
-from intercap_core.object_track.view import View
-from intercap_core.object_track.whole import WholeTrack
+from intercap_core.object_track.motion import estimate_hand_motions
+from intercap_core.object_track.observer import Observer
+from intercap_core.object_track.proposals import DOUBTFUL_PROBABILITY, NotFound, Proposals
+from intercap_core.object_track.whole import FrameResult, FrameStatus, WholeTrack, flag_frames
+
+SEARCH_ROUNDS = 15  # of decision and search, at most
+MOTION_ROUNDS = 3  # of fits of the moving object, at most
+# Having left is likelier than being hidden from all cameras by this, nats of an independent
+# observation: after about two seconds. Tuned on the studio, as all values below.
+ABSENT_LOG_RATIO = 1.0
+# Hypotheses farther apart are different poses.
+APART_M = 0.05
+APART_RAD = np.radians(20)
+LOST_PROBABILITY = 0.5  # of no hypothesis, above which a frame is lost
+GONE_PROBABILITY = 0.5  # of having left, above which a lost frame is gone
+AMBIGUOUS_PROBABILITY = 0.2  # of different poses, above which a frame is ambiguous
+# Nats of all believed frames, as independent observations, below which there is no object. False
+# detections reach 8; the least of real objects (a cup behind a hand without depth) is about 25.
+NOTHING_LOG_RATIO = 12.0
 
 
 @dataclass(frozen=True)
 class Track:
-    """All frames (T), the frame that the track started from and how its pose was found:
-    ``borne_out``, whether the track agrees with an annotated pose. ``evidence``: nats that the
-    images of all believed frames say for it, as independent looks. ``doubts`` say in words what
-    speaks against the mesh and against annotated poses."""
+    """The track of one recording."""
 
     frames: list[FrameResult]
+    """Result of each frame (T)."""
     seed_frame: int
+    """Frame from which the track started."""
     annotated: bool
+    """Whether poses were annotated."""
     evidence: float
+    """Log-likelihood ratio of all believed frames as independent observations, nats."""
     borne_out: bool = True
+    """Whether the track agrees with an annotated pose, if there is one."""
     doubts: tuple[str, ...] = ()
+    """Warnings about the mesh and annotated poses."""
 
     @property
     def of_nothing(self) -> bool:
-        """Whether the images say too little for there to be an object at all, which nobody who has
-        annotated its pose is asked."""
+        """Whether the images show no object at all; never if poses are annotated."""
         return not self.annotated and self.evidence < NOTHING_LOG_RATIO
 
 
 class Tracker:
-    """Tracks one object through one recording.
+    """Tracks the object of ``observer`` through its recording."""
 
-    ``load`` gives the views of frame t, one a camera; ``labels_by_view`` [T][C][candidates] the
-    labels alone; ``times`` (T,) of the frames, seconds; ``labels`` the classes the object may be
-    given; ``up`` (3,) the vertical; ``joints`` (T, 135, 3) of the person, who handles the object;
-    ``pictures`` the views' colour images; ``paint`` the mesh's own colours.
-    """
-
-    def __init__(
-        self,
-        mesh: ObjectMesh,
-        load: Callable[[int], list[View]],
-        labels_by_view: list[list[list[str]]],
-        settings: ObjectTrackSettings,
-        *,
-        times: np.ndarray,
-        labels: tuple[str, ...],
-        up: np.ndarray | None,
-        joints: np.ndarray | None = None,
-        pictures: Pictures | None = None,
-        paint: Paint | None = None,
-    ) -> None:
-        self._observer = Observer(
-            mesh, load, labels_by_view, settings, labels, up, joints, pictures, paint
-        )
-        self._mesh = mesh
-        self._times = times
-        self._hands = _hands(joints, len(times))
-        step = float(np.median(np.diff(times))) if len(times) > 1 else ERROR_LASTING_S
-        self._share = min(1.0, step / ERROR_LASTING_S)
-        self._prior = Prior(self._observer, self._share)
-        self._hypotheses = Hypotheses(self._observer, self._prior, self._share, times)
-        self._proposals = Proposals(self._observer, self._hypotheses, self._prior, times, step)
-        self._colours = ColourDecision(self._observer, self._hypotheses, self._share, step)
+    def __init__(self, observer: Observer) -> None:
+        self._observer = observer
+        self._mesh = observer.mesh
+        joints, times = observer.joints, observer.times
+        self._hands = [
+            [] if joints is None else estimate_hand_motions(joints[[t, t + 1]])
+            for t in range(len(times) - 1)
+        ]
+        self._prior = Prior(observer)
+        self._hypotheses = Hypotheses(observer, self._prior)
+        self._proposals = Proposals(observer, self._hypotheses, self._prior)
+        self._absent = observer.share * ABSENT_LOG_RATIO
+        self._colours = ColourDecision(observer, self._hypotheses, self._absent)
         self._emissions: list[np.ndarray] = []
         self._steps: list[np.ndarray] = []
 
-    def run(self, given: Sequence[GivenPose] = ()) -> Track:
-        """Track from ``given`` poses, or from what is searched for.
+    def run(self, annotated: Sequence[GivenPose] = ()) -> Track:
+        """Track the object.
 
-        Raises NotFound where no frame shows what could be the object.
+        Args:
+            annotated: poses that a person annotated; without them the object is searched for.
+
+        Raises NotFound if no frame shows a possible object.
         """
-        annotated = [(one, self._proposals.annotated(one)) for one in given]
-        placed = [taken for _, taken in annotated if taken is not None]
-        seed = self._start([one.frame for one in placed])
-        decoded = self._decode()
-        decoded = self._look(decoded)
-        if self._proposals.turn(decoded):
+        accepted = [self._proposals.add_annotated(given) for given in annotated]
+        placed = [given for given in accepted if given is not None]
+        seed = self._start([given.frame for given in placed])
+        decoded = self._search(self._decode())
+        if self._proposals.add_near_symmetries(decoded):
             decoded = self._decode()
         for _ in range(MOTION_ROUNDS):
-            changed = self._hypotheses.see_moving(decoded)
+            changed = self._hypotheses.refit_moving(decoded)
             if not changed:
                 break
-            self._proposals.look_again(changed)
-            decoded = self._look(self._decode())
+            self._proposals.allow_search_near(changed)
+            decoded = self._search(self._decode())
         decoded = self._colours.decide(self._emissions, self._steps, decoded)
-        if (decoded.path == NOT_SEEN).all():
+        if (decoded.path == HIDDEN).all():
             raise NotFound
         frames = self._results(decoded)
         held = [
-            one
-            for one, taken in annotated
-            if taken is one and one.holds(self._mesh, frames[one.frame].fit.pose)
+            given
+            for given, taken in zip(annotated, accepted, strict=True)
+            if taken is given and given.holds(self._mesh, frames[given.frame].fit.pose)
         ]
-        refined = WholeTrack(self._observer, self._times, self._share).refine(frames, held)
-        final = flagged(self._mesh, refined)
-        # a recording that is shorter than one independent look is one all the same
-        share = max(self._share, 1 / max(len(final), 1))
-        evidence = share * sum(frame.fit.log_ratio for frame in final if not frame.lost)
+        final = flag_frames(self._mesh, WholeTrack(self._observer).refine(frames, held))
         doubts = [
-            told for one, taken in annotated if (told := against(self._mesh, one, taken, final))
+            describe_contradiction(self._mesh, given, taken, final[given.frame])
+            for given, taken in zip(annotated, accepted, strict=True)
         ]
-        borne_out = not given or any(
-            one.holds(self._mesh, final[one.frame].fit.pose) for one in placed
-        )
         doubts += mesh_doubts(self._observer, final)
-        return Track(final, seed, bool(given), evidence, borne_out, tuple(doubts))
+        return Track(
+            final,
+            seed,
+            bool(annotated),
+            self._evidence(final),
+            not annotated
+            or any(given.holds(self._mesh, final[given.frame].fit.pose) for given in placed),
+            tuple(filter(None, doubts)),
+        )
 
-    def _start(self, frames: list[int]) -> int:
-        """The frame to start from: the first of the given ``frames`` that shows the object, else
-        one that is searched for, else the first of them.
+    def _evidence(self, frames: list[FrameResult]) -> float:
+        """Return the log-likelihood ratio of all frames that are not lost, nats."""
+        # a recording shorter than one independent observation counts as one
+        share = max(self._observer.share, 1 / max(len(frames), 1))
+        return share * sum(frame.fit.log_ratio for frame in frames if not frame.lost)
 
-        Raises NotFound where there is none.
+    def _start(self, annotated: list[int]) -> int:
+        """Return the frame to start from.
+
+        The first of the ``annotated`` frames that shows the object, else one that is found by a
+        search, else the first annotated one. Raises NotFound if there is none.
         """
-        for t in frames:
+        for t in annotated:
             if self._hypotheses.shown(t):
                 return t
         try:
             return self._proposals.start()
         except NotFound:
-            if not frames:
+            if not annotated:
                 raise
-            return frames[0]
+            return annotated[0]
 
-    def _look(self, decoded: Decoded) -> Decoded:
-        """Decide anew until nothing more is found in the frames in doubt."""
-        for _ in range(ROUNDS):
-            if not self._proposals.look(decoded):
+    def _search(self, decoded: Decoded) -> Decoded:
+        """Search uncertain frames and decide again until nothing new is found."""
+        for _ in range(SEARCH_ROUNDS):
+            if not self._proposals.search_uncertain(decoded):
                 break
             decoded = self._decode()
         return decoded
 
     def _decode(self) -> Decoded:
-        """Decide over all frames, and tell the places' prior where the object surely was."""
-        fits = self._hypotheses.fits
+        """Decide over all frames, and update the prior of places where the object surely was."""
+        times, fits = self._observer.times, self._hypotheses.fits
         weights = [self._prior.weigh(t, own) for t, own in enumerate(fits)]
         poses = [np.array([fit.pose for fit in own]).reshape(-1, 4, 4) for own in fits]
         steps = self._step_costs(poses, np.full(len(poses) - 1, FREE_COST_S))
-        self._emissions = [self._share * weight for weight in weights]
-        absent = self._share * ABSENT_LOG_RATIO
-        decoded = decode(self._emissions, steps, absent)
-        # where somebody gave poses as it is out of sight, the usual motions explain nothing
-        near = self._prior.near_given(self._times, decoded.path == NOT_SEEN)
+        self._emissions = [self._observer.share * weight for weight in weights]
+        decoded = decode(self._emissions, steps, self._absent)
+        # near annotated poses of a hidden object the usual motions explain nothing
+        near = self._prior.near_annotated(decoded.path == HIDDEN)
         if near.any():
             free = np.where(near[1:] | near[:-1], 0.0, FREE_COST_S)
             steps = self._step_costs(poses, free)
-            decoded = decode(self._emissions, steps, absent)
-        sure = np.array(
-            [k != NOT_SEEN and decoded.probability[t][k] > DOUBTFUL_PROBABILITY
-             for t, k in enumerate(decoded.path)]
-        )  # fmt: skip
+            decoded = decode(self._emissions, steps, self._absent)
         centres = [np.array([self._mesh.centre_at(p) for p in own]).reshape(-1, 3) for own in poses]
-        away = excursions(centres, decoded.path, sure, self._times)
-        self._steps = with_excursions(steps, away)
-        decoded = decode(self._emissions, self._steps, absent)
-        places = self._observer.places
-        places.forget_clutter()
-        for t, one in self._prior.given.items():
-            self._tell_others(t, one, fits[t])
-        for t, k in enumerate(decoded.path):
-            if k != NOT_SEEN and decoded.probability[t][k] > DOUBTFUL_PROBABILITY:
-                thing = things(fits[t])
-                for other, fit in enumerate(fits[t]):
-                    if thing[other] != thing[k] and fit.log_ratio > SEEN_LOG_RATIO:
-                        places.seen_beside(t, centres[t][other], centres[t][k], fit.log_ratio)
+        away = find_excursions(centres, decoded.path, _sure_frames(decoded), times)
+        self._steps = add_excursion_costs(steps, away)
+        decoded = decode(self._emissions, self._steps, self._absent)
+        self._update_places(decoded, centres)
         return decoded
 
     def _step_costs(self, poses: list[np.ndarray], free: np.ndarray) -> list[np.ndarray]:
-        """Of the steps [T - 1] between the hypotheses' poses [T] (K, 4, 4), where free motion costs
-        ``free`` (T - 1,) nats a second."""
+        """Return the steps [T - 1] between the poses [T] (K, 4, 4) of the hypotheses.
+
+        ``free`` (T - 1,) is the cost of free motion, nats per second.
+        """
         return [
             step_costs(
                 self._mesh, poses[t], poses[t + 1], float(gap), self._hands[t], float(free[t])
             )
-            for t, gap in enumerate(np.diff(self._times))
+            for t, gap in enumerate(np.diff(self._observer.times))
         ]
 
-    def _tell_others(self, t: int, given: GivenPose, fits: list[Fit]) -> None:
-        """Tell the places' prior what else the ``fits`` of frame t see than the object at the pose
-        that is given of it."""
+    def _update_places(self, decoded: Decoded, centres: list[np.ndarray]) -> None:
+        """Record the other objects that are seen while the object is surely elsewhere."""
+        fits, places = self._hypotheses.fits, self._observer.places
+        places.clear_rivals()
+        for t, given in self._prior.given.items():
+            self._exclude_others(t, given, centres[t])
+        for t in np.flatnonzero(_sure_frames(decoded)).tolist():
+            k, number = decoded.path[t], group_by_candidates(fits[t])
+            for other, fit in enumerate(fits[t]):
+                if number[other] != number[k] and fit.log_ratio > SEEN_LOG_RATIO:
+                    places.add_rival(t, centres[t][other], centres[t][k], fit.log_ratio)
+
+    def _exclude_others(self, t: int, given: GivenPose, centres: np.ndarray) -> None:
+        """Exclude the places of other objects that frame t shows, by its annotated pose.
+
+        ``centres`` (K, 3) are those of the hypotheses of frame t.
+        """
+        fits = self._hypotheses.fits[t]
+        number = group_by_candidates(fits)
+        own = [number[k] for k, fit in enumerate(fits) if given.holds(self._mesh, fit.pose)]
         centre = self._mesh.centre_at(given.pose)
-        centres = np.array([self._mesh.centre_at(fit.pose) for fit in fits]).reshape(-1, 3)
-        thing = things(fits)
-        own = [thing[k] for k, fit in enumerate(fits) if given.holds(self._mesh, fit.pose)]
         far = np.linalg.norm(centres - centre, axis=1) > REACH_M + self._mesh.diameter
         for k, fit in enumerate(fits):
-            if far[k] and thing[k] not in own and fit.log_ratio > SEEN_LOG_RATIO:
-                self._observer.places.seen_beside_given(centres[k])
-
-    # --- the outcome ---------------------------------------------------------------------------
+            if far[k] and number[k] not in own and fit.log_ratio > SEEN_LOG_RATIO:
+                self._observer.places.exclude(centres[k])
 
     def _results(self, decoded: Decoded) -> list[FrameResult]:
-        """The chosen hypotheses (T), what speaks against each and what the others add to its
-        covariance."""
+        """Return the chosen hypotheses (T) with what the others add to their covariance."""
         result = []
         for t, (own, k) in enumerate(zip(self._hypotheses.fits, decoded.path, strict=True)):
             probability = decoded.probability[t]
-            if k == NOT_SEEN:
-                gone = bool(decoded.gone[t] > GONE_PROBABILITY)
-                result.append(FrameResult(self._guess(t), True, gone=gone, probability=0.0))
+            if k == HIDDEN:
+                gone = decoded.gone[t] > GONE_PROBABILITY
+                status = FrameStatus.GONE if gone else FrameStatus.LOST
+                result.append(FrameResult(self._guess(t), status, probability=0.0))
                 continue
             symmetry, pose = self._mesh.symmetry, own[k].pose
             poses = np.array([symmetry.nearest_equivalent_pose(fit.pose, pose) for fit in own])
@@ -256,7 +254,7 @@ class Tracker:
             result.append(
                 FrameResult(
                     own[k],
-                    bool(lost),
+                    FrameStatus.LOST if lost else FrameStatus.SEEN,
                     ambiguous=other > AMBIGUOUS_PROBABILITY and not lost,
                     probability=float(probability[k]),
                     spread=np.einsum("k,ki,kj->ij", rivals, steps, steps),
@@ -265,14 +263,49 @@ class Tracker:
         return result
 
     def _guess(self, t: int) -> Fit:
-        """A frame in which nothing is believed: the nearest frame's pose, as it agrees here."""
+        """Return the likeliest pose of the nearest frame with hypotheses, compared with frame t."""
         fits = self._hypotheses.fits
         u = min((u for u, own in enumerate(fits) if own), key=lambda u: abs(u - t))
         weights = self._prior.weigh(u, fits[u])
-        found = self._observer.assess(t, fits[u][int(weights.argmax())].pose)
-        return Fit(found.pose, np.eye(6), found.views)
+        assessed = self._observer.assess(t, fits[u][int(weights.argmax())].pose)
+        return Fit(assessed.pose, np.eye(6), assessed.views)
 
 
-def _hands(joints: np.ndarray | None, count: int) -> list[list[HandMotion | None]]:
-    """How the hands move from each of the frames (T) to the next."""
-    return [[] if joints is None else hand_motions(joints[[t, t + 1]]) for t in range(count - 1)]
+def _sure_frames(decoded: Decoded) -> np.ndarray:
+    """Return the frames (T,) bool whose chosen hypothesis is sure."""
+    return np.array(
+        [
+            k != HIDDEN and decoded.probability[t][k] > DOUBTFUL_PROBABILITY
+            for t, k in enumerate(decoded.path)
+        ]
+    )
+
+
+def describe_contradiction(
+    mesh: ObjectMesh, given: GivenPose, taken: GivenPose | None, frame: FrameResult
+) -> str:
+    """Return a warning if the track contradicts an annotated pose, else an empty string.
+
+    Args:
+        mesh: the object.
+        given: the annotated pose.
+        taken: the pose as it was used, in its own or in another frame; None = it was not used.
+        frame: final result of the annotated frame.
+    """
+    turn, shift = given.distance(mesh, frame.fit.pose)
+    subject = (
+        f"annotated pose of frame {given.frame} (stated to {1e3 * given.sigma_m:.0f} mm and "
+        f"{np.degrees(given.sigma_rad):.0f} degrees)"
+    )
+    if not frame.lost and given.holds(mesh, frame.fit.pose):
+        return ""
+    if taken is not None and taken.frame != given.frame:
+        return (
+            f"{subject}: the images show the object there in frame {taken.frame}; correct its frame"
+        )
+    if frame.lost:
+        return f"{subject}: the images contradict it, and show the object nowhere; correct it"
+    return (
+        f"{subject}: the images show the object {1e3 * shift:.0f} mm and {np.degrees(turn):.0f} "
+        "degrees from it; correct it"
+    )

@@ -1,7 +1,7 @@
-"""Near symmetries: turns of an object that are hard to tell apart, found on its mesh.
+"""Rotations of an object: search grid, turns about its own axes, and near symmetries.
 
-A mug looks much the same with its handle elsewhere, a box from its back. Such turns bring the
-surface nearly back onto itself; the tracker follows them as hypotheses (:mod:`.proposals`).
+A near symmetry nearly maps the surface onto itself, such as a mug turned about its axis or a box by
+half a turn. The tracker follows such turns as hypotheses (:mod:`.proposals`).
 """
 
 from __future__ import annotations
@@ -12,36 +12,42 @@ from scipy.spatial.transform import Rotation
 from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 from intercap_core.geometry.solve.robust import geman_mcclure_weight
-from intercap_core.object_track.constants import (
-    NEAR_TURN_CHANGED_SHARE,
-    NEAR_TURN_DISTINCT_DEG,
-    NEAR_TURN_FAR_M,
-    NEAR_TURN_FAR_SHARE,
-    NEAR_TURN_FINE_RAD,
-    NEAR_TURN_ICP_START,
-    NEAR_TURN_ICP_STEPS,
-    NEAR_TURN_POINT_WEIGHT,
-    NEAR_TURN_POINTS,
-    NEAR_TURN_STEPS,
-)
-from intercap_core.object_track.search import own_axes
+
+GRID_ROTATIONS = 240  # of a trivial group: about 40 degrees apart, inside the fit's basin
+GRID_SPACING_DEG = 12.0  # equivalent rotations nearer than this are duplicates; twice for an axis
+UPRIGHT_TURNS = 24  # rotations of the standing pose about the vertical, 15 degrees apart
+SAME_POSE_M = 0.02  # poses within this distance ...
+SAME_POSE_DEG = 12.0  # ... and angle are one hypothesis
+SAME_AXIS_COSINE = float(np.cos(np.radians(10)))  # of axes that are equal
+NEAR_TURN_STEPS = 12  # tried angles per full turn about an axis
+NEAR_TURN_POINTS = 200  # surface points that are compared
+NEAR_TURN_POINT_WEIGHT = 0.05  # of point-to-point residuals relative to point-to-plane residuals
+# A surface point is clearly displaced if it is farther from the surface than these; tuned on the
+# studio.
+NEAR_TURN_FAR_M = 0.003
+NEAR_TURN_FAR_SHARE = 0.01  # of the diameter
+NEAR_TURN_CHANGED_SHARE = 0.3  # turns that displace fewer points are near symmetries
+NEAR_TURN_DISTINCT_DEG = 45.0  # half turns nearer than this are duplicates
 
 
-def near_turns(mesh: ObjectMesh, field: DistanceField) -> np.ndarray:
-    """Turns (N, 4, 4) of the object that hardly change it, the identity first.
+def find_near_symmetries(mesh: ObjectMesh, field: DistanceField) -> np.ndarray:
+    """Find turns (N, 4, 4) of the object that hardly change it, the identity first.
 
-    All angles about an axis of near symmetry, and single angles where the surface comes back to
-    itself; elements of the symmetry group left out. ``field`` is the mesh's distance field.
+    These are all angles about an axis of near symmetry, and single angles that map the surface onto
+    itself. Elements of the symmetry group are left out. ``field`` is the mesh's distance field.
     """
     found = [np.eye(4)]
     if mesh.symmetry.sphere:
         return found[0][None]
     half = NEAR_TURN_STEPS // 2
-    angles = np.array([NEAR_TURN_FINE_RAD, *(2 * np.pi * np.arange(1, half + 1) / NEAR_TURN_STEPS)])
-    axes = own_axes(mesh)
+    # the first angle is small, to catch a slow slide along a near symmetry
+    fine = np.pi / NEAR_TURN_STEPS
+    angles = np.array([fine, *(2 * np.pi * np.arange(1, half + 1) / NEAR_TURN_STEPS)])
+    axes = object_axes(mesh)
     rotations = Rotation.from_rotvec((axes[:, None] * angles[:, None]).reshape(-1, 3)).as_matrix()
-    placed, shares = _placed(mesh, field, rotations)
+    placed, shares = _align_turned(mesh, field, rotations)
     flips = []
     for about, (_, *share) in zip(
         placed.reshape(len(axes), -1, 4, 4), shares.reshape(len(axes), -1), strict=True
@@ -67,26 +73,33 @@ def near_turns(mesh: ObjectMesh, field: DistanceField) -> np.ndarray:
 
 
 def changed_share(mesh: ObjectMesh, field: DistanceField, motion: np.ndarray) -> float:
-    """Share of the surface that a motion (4, 4) of the object brings clearly off the surface."""
+    """Return the share of the surface that a motion (4, 4) of the object clearly displaces."""
     moved = _surface(mesh) @ motion[:3, :3].T + motion[:3, 3]
     return float((field.distance(moved) > _far(mesh)).mean())
 
 
-def _placed(
+def _align_turned(
     mesh: ObjectMesh, field: DistanceField, rotations: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The turns (N, 4, 4) by ``rotations`` (N, 3, 3), shifted so that most of the surface falls
-    onto itself, and the share (N,) of it that stays far."""
+    """Shift turned surfaces so that most of each falls onto the surface itself.
+
+    Args:
+        mesh, field: the object and its distance field.
+        rotations: (N, 3, 3).
+
+    Returns:
+        The turns (N, 4, 4), and the share (N,) of the surface that each displaces.
+    """
     points, far = _surface(mesh), _far(mesh)
     turned = points @ rotations.transpose(0, 2, 1)
     shift = (points - turned).mean(1)
-    for scale in far * np.geomspace(NEAR_TURN_ICP_START, 1, NEAR_TURN_ICP_STEPS):
+    for scale in far * np.geomspace(6.0, 1, 5):
         at = turned + shift[:, None]
         closest = field.closest(at.reshape(-1, 3))
         gap = closest.points.reshape(at.shape) - at
         normals = closest.normals.reshape(at.shape)
         weight = geman_mcclure_weight((gap**2).sum(-1), scale)[..., None]
-        # point to plane, a little to the point where no plane holds it
+        # point to plane; a little point to point, for directions that no plane constrains
         little = NEAR_TURN_POINT_WEIGHT * weight.sum(1)
         matrix = (normals * weight).transpose(0, 2, 1) @ normals + little[:, None] * np.eye(3)
         pull = (weight * (normals * (normals * gap).sum(-1, keepdims=True))).sum(1)
@@ -97,12 +110,12 @@ def _placed(
 
 
 def _far(mesh: ObjectMesh) -> float:
-    """Distance from the surface from which a point is noticed, metres."""
+    """Return the distance from the surface at which a point is clearly displaced, metres."""
     return max(NEAR_TURN_FAR_M, NEAR_TURN_FAR_SHARE * mesh.diameter)
 
 
 def _surface(mesh: ObjectMesh) -> np.ndarray:
-    """Points (N, 3) spread evenly over the surface."""
+    """Sample points (N, 3) evenly on the surface."""
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1).cumsum()
     rng = np.random.default_rng(0)
@@ -111,3 +124,87 @@ def _surface(mesh: ObjectMesh) -> np.ndarray:
     u, v = rng.random((2, NEAR_TURN_POINTS, 1))
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
     return a[face] + u * (b - a)[face] + v * (c - a)[face]
+
+
+def axis_turns(mesh: ObjectMesh, steps: int) -> np.ndarray:
+    """Return turns (N, 4, 4) of the object about its own axes, ``steps`` angles per full turn.
+
+    They turn about the middle of its box, where a turned silhouette covers the old one best. Turns
+    of the symmetry group are left out.
+    """
+    centre = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
+    found = []
+    for axis in object_axes(mesh):
+        for angle in 2 * np.pi * np.arange(1, steps) / steps:
+            turn = np.eye(4)
+            turn[:3, :3] = Rotation.from_rotvec(angle * axis).as_matrix()
+            turn[:3, 3] = centre - turn[:3, :3] @ centre
+            if not same_pose(mesh, turn, np.eye(4)):
+                found.append(turn)
+    return np.array(found).reshape(-1, 4, 4)
+
+
+def object_axes(mesh: ObjectMesh) -> np.ndarray:
+    """Return unit vectors (N, 3): the axes of the object's frame and its other principal axes."""
+    _, principal = np.linalg.eigh(np.cov(mesh.vertices.T))
+    new = np.abs(principal).max(0) < SAME_AXIS_COSINE  # a handle tilts them
+    return np.concatenate([np.eye(3), principal[:, new]], 1).T
+
+
+def rotation_grid(symmetry: SymmetryGroup, up: np.ndarray | None) -> np.ndarray:
+    """Return rotations (N, 3, 3) that cover SO(3) modulo the symmetry group.
+
+    If the vertical ``up`` (3,) is known, the grid is denser among standing poses.
+    """
+    if symmetry.sphere:
+        return np.eye(3)[None]
+    spread = 2 if symmetry.axis is not None else 1
+    grid = _super_fibonacci(GRID_ROTATIONS)
+    if up is not None:
+        turns = Rotation.from_rotvec(
+            np.outer(2 * np.pi * np.arange(UPRIGHT_TURNS) / UPRIGHT_TURNS, (0, 0, 1))
+        ).as_matrix()
+        grid = np.concatenate([_standing(up) @ turns, grid])
+    # keep one of each set of equivalent rotations
+    kept: list[np.ndarray] = []
+    spacing = GRID_SPACING_DEG * spread
+    for rotation in grid:
+        if (
+            symmetry.trivial
+            or not kept
+            or symmetry.rotation_error_deg(np.array(kept), rotation).min() > spacing
+        ):
+            kept.append(rotation)
+    return np.array(kept)
+
+
+def same_pose(
+    mesh: ObjectMesh,
+    a: np.ndarray,
+    b: np.ndarray,
+    limits: tuple[float, float] = (SAME_POSE_M, SAME_POSE_DEG),
+) -> bool:
+    """Return whether two poses (4, 4) are equal up to symmetry and ``limits`` (m, degrees)."""
+    angle = float(mesh.symmetry.rotation_error_deg(a[:3, :3], b[:3, :3]))
+    shift = float(np.linalg.norm(mesh.centre_at(a) - mesh.centre_at(b)))
+    return shift < limits[0] and angle < limits[1]
+
+
+def _super_fibonacci(count: int) -> np.ndarray:
+    """Spread ``count`` rotations evenly (Alexa, Super-Fibonacci Spirals, CVPR 2022)."""
+    phi, psi = np.sqrt(2.0), 1.533751168755204288118041
+    s = np.arange(count) + 0.5
+    r, big_r = np.sqrt(s / count), np.sqrt(1 - s / count)
+    alpha, beta = 2 * np.pi * s / phi, 2 * np.pi * s / psi
+    quaternions = np.stack(
+        [r * np.sin(alpha), r * np.cos(alpha), big_r * np.sin(beta), big_r * np.cos(beta)], 1
+    )
+    return Rotation.from_quat(quaternions).as_matrix()
+
+
+def _standing(up: np.ndarray) -> np.ndarray:
+    """Return a rotation (3, 3) that takes the object's z axis to ``up``."""
+    z = up / np.linalg.norm(up)
+    x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], 1)

@@ -1,4 +1,4 @@
-"""What one frame set shows of the object: reduced masks and depth of every view."""
+"""One frame set as the tracker sees it: reduced masks and depth of every view."""
 
 from __future__ import annotations
 
@@ -8,32 +8,45 @@ from functools import cached_property
 
 import numpy as np
 
+from intercap_core.config import ObjectTrackSettings
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera
-from intercap_core.object_track.blobs import without_person
-from intercap_core.object_track.constants import (
-    MAX_REDUCTION,
-    REDUCED_DEPTH_PX,
-    REDUCED_SILHOUETTE_PX,
-    TYPICAL_DISTANCE_M,
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.render import Renderer, default_renderer
+from intercap_core.object_track.reduced_mask import (
+    EMPTY,
+    ReducedMask,
+    decode,
+    reduced_lens,
+    remove_person,
 )
-from intercap_core.object_track.reduced_mask import EMPTY, ReducedMask, decode, reduced_lens
+
+TYPICAL_DISTANCE_M = 2.5  # of the object from a camera of a capture ring, if nothing is known
+# The object is compared at about this many pixels across. More cost time and carry no more
+# information, since neighbouring pixels of a mask or a depth image err together.
+REDUCED_SILHOUETTE_PX = 80
+REDUCED_DEPTH_PX = 60
+MAX_REDUCTION = 4  # every n-th pixel at most
 
 
 @dataclass(frozen=True, eq=False)
 class ViewGeometry:
-    """A camera with its reduced lenses; pixel (i, j) of a reduced image is (i, j) * step.
-
-    It exposes ``time_offset_s`` later than the frame set's time.
-    """
+    """A camera with its reduced lenses; pixel (i, j) of a reduced image is pixel (i, j) * step."""
 
     camera: Camera
+    """Camera at full resolution."""
     lens: Intrinsics
+    """Reduced colour lens."""
     step: int
+    """Reduction of the colour image."""
     depth_lens: Intrinsics | None
+    """Reduced depth lens; None without a depth camera."""
     depth_step: int
+    """Reduction of the depth image."""
     depth_bias_m: float = 0.0
+    """Systematic error that is subtracted from the measured depth, metres."""
     time_offset_s: float = 0.0
+    """Exposure after the time of the frame set, seconds."""
 
     @classmethod
     def for_object(
@@ -44,9 +57,14 @@ class ViewGeometry:
         time_offset_s: float = 0.0,
         distance_m: float = TYPICAL_DISTANCE_M,
     ) -> ViewGeometry:
-        """Choose the reduction by how large the object appears where it mostly is.
+        """Choose the reduction by the apparent size of the object.
 
-        Metres: ``diameter_m`` of the object, ``distance_m`` of it from the camera.
+        Args:
+            camera: the camera.
+            diameter_m: diameter of the object, metres.
+            depth_bias_m: as the field.
+            time_offset_s: as the field.
+            distance_m: usual distance of the object from the camera, metres.
         """
         angle = diameter_m / distance_m
         step = _step(camera.colour.fx, angle, REDUCED_SILHOUETTE_PX)
@@ -62,21 +80,19 @@ class ViewGeometry:
         )
 
     def corrected(self, camera: Camera, depth_bias_m: float, time_offset_s: float) -> ViewGeometry:
-        """The same lenses at the pose of ``camera``, with another depth bias and exposure."""
+        """Return the same lenses with another camera pose, depth bias and time offset."""
         return replace(self, camera=camera, depth_bias_m=depth_bias_m, time_offset_s=time_offset_s)
 
     def reduced_depth(self, depth_mm: np.ndarray) -> np.ndarray:
-        """Depth (H, W) uint16 mm on the reduced grid: float32 metres, bias removed, 0 invalid."""
+        """Reduce depth (H, W) uint16 mm to float32 metres without bias, 0 where invalid."""
         raw = depth_mm[:: self.depth_step, :: self.depth_step]
         depth = raw * np.float32(1e-3) - np.float32(self.depth_bias_m)
         depth[raw == 0] = 0
         return depth
 
-    # Computed once: a fit asks for them thousands of times.
-
     @cached_property
     def colour_from_master(self) -> np.ndarray:
-        """(4, 4) of the camera."""
+        """(4, 4) of the camera; cached, as the next ones, because fits read it often."""
         return np.ascontiguousarray(self.camera.colour_from_master)
 
     @cached_property
@@ -86,23 +102,28 @@ class ViewGeometry:
 
     @cached_property
     def master_from_depth(self) -> np.ndarray:
-        """(4, 4) of the camera, which has depth."""
+        """(4, 4); the camera must have depth."""
         return np.ascontiguousarray(self.camera.master_from_depth)
 
     @cached_property
     def depth_from_master(self) -> np.ndarray:
-        """(4, 4) of the camera, which has depth."""
+        """(4, 4); the camera must have depth."""
         return np.ascontiguousarray(self.camera.depth_from_master)
 
     @cached_property
     def depth_from_colour(self) -> np.ndarray:
-        """(4, 4) of the camera, which has depth."""
+        """(4, 4); the camera must have depth."""
         return self.depth_from_master @ self.master_from_colour
 
 
-def distances(cameras: Sequence[Camera], joints: np.ndarray) -> list[float]:
-    """How far (metres) each camera is from what happens: from the person's joints (T, K, 3),
-    master frame, NaN where unknown; :data:`TYPICAL_DISTANCE_M` where no joint is known."""
+def camera_distances(cameras: Sequence[Camera], joints: np.ndarray) -> list[float]:
+    """Return the median distance of each camera from the person's joints, metres.
+
+    Args:
+        cameras: C cameras.
+        joints: (T, K, 3) of the person, master frame, NaN where unknown. If no joint is known, all
+            distances are ``TYPICAL_DISTANCE_M``.
+    """
     places = joints[np.isfinite(joints).all(-1)]
     if not len(places):
         return [TYPICAL_DISTANCE_M] * len(cameras)
@@ -116,32 +137,38 @@ def _step(focal_px: float, angle: float, wanted_px: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """One segmentation candidate of an image; ``index`` is its place in the detections."""
+    """One segmentation candidate of an image."""
 
     index: int
+    """Index in the detections of the image."""
     label: str
+    """Class name, empty if the detector names none."""
     score: float
+    """The detector's score."""
     mask: ReducedMask
+    """Reduced mask."""
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One image of a frame set: what the tracker uses of it.
-
-    ``depth`` (h, w) float32 metres on the reduced depth grid, bias removed, 0 where invalid; None
-    where there is no depth image. ``background`` the same of the empty room, (0, 0) where that is
-    not known. ``detected``: whether candidates are known for this image.
-    """
+    """One image of a frame set."""
 
     geometry: ViewGeometry
+    """Camera and reduced lenses."""
     depth: np.ndarray | None
+    """(h, w) float32 metres without bias on the reduced grid, 0 where invalid; None without depth.
+    """
     person: ReducedMask
+    """Mask of the person."""
     candidates: tuple[Candidate, ...]
+    """Candidates, each with its reduced mask."""
     detected: bool = True
+    """Whether candidates are known for this image, so that their absence is evidence."""
     background: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    """(h, w) depth of the empty room in the same form; (0, 0) if unknown."""
 
     def through(self, geometry: ViewGeometry) -> View:
-        """The same image through :meth:`ViewGeometry.corrected` geometry."""
+        """Return the same image with :meth:`ViewGeometry.corrected` geometry."""
 
         def nearer(depth: np.ndarray) -> np.ndarray:
             by = np.float32(geometry.depth_bias_m - self.geometry.depth_bias_m)
@@ -156,7 +183,7 @@ class View:
 
     @property
     def nbytes(self) -> int:
-        """Memory of the images."""
+        """Memory of the images, bytes."""
         masks = [self.person, *(candidate.mask for candidate in self.candidates)]
         depth = 0 if self.depth is None else self.depth.nbytes
         return depth + sum(mask.mask.nbytes for mask in masks)
@@ -171,11 +198,18 @@ class View:
         detected: bool = True,
         background: np.ndarray | None = None,
     ) -> View:
-        """Reduce one image's depth (H, W) uint16 mm, person mask and candidates.
+        """Reduce one image.
 
-        A candidate is (index, label, score, RLE); one that holds the person beside something else
-        is there a second time without the person. ``background`` (h, w) is reduced already
-        (:meth:`ViewGeometry.reduced_depth`). Raises ValueError where a mask does not fit the image.
+        A candidate that contains the person and something else is added a second time without the
+        person. Raises ValueError if a mask does not fit the image.
+
+        Args:
+            geometry: camera and reduced lenses.
+            depth_mm: (H, W) uint16 mm; None without a depth image.
+            person_rle: mask of the person, COCO compressed RLE.
+            candidates: (index, label, score, RLE) of each candidate.
+            detected: as the field.
+            background: as the field; None if unknown.
         """
         depth = None if depth_mm is None else geometry.reduced_depth(depth_mm)
         colour, step = geometry.camera.colour, geometry.step
@@ -187,7 +221,34 @@ class View:
         parts = tuple(
             replace(candidate, mask=part)
             for candidate in found
-            if (part := without_person(candidate.mask, person, step)) is not None
+            if (part := remove_person(candidate.mask, person, step)) is not None
         )
         room = np.zeros((0, 0), np.float32) if background is None else background
         return cls(geometry, depth, person, found + parts, detected, room)
+
+
+@dataclass(frozen=True)
+class FitContext:
+    """Object and settings that are the same in all fits and comparisons of one recording."""
+
+    mesh: ObjectMesh
+    """Mesh that is rendered."""
+    labels: tuple[str, ...] = ()
+    """Detector classes of the object; empty: any but a person."""
+    min_overlap: float = 0.3
+    """Smallest IoU with the render at which a fit uses a candidate."""
+    background_term: bool = True
+    """Whether fits penalise render over known background (beyond the paper)."""
+    renderer: Renderer = field(default_factory=default_renderer)
+    """Draws the mesh, and runs the views in parallel."""
+
+    @classmethod
+    def from_settings(
+        cls,
+        mesh: ObjectMesh,
+        labels: tuple[str, ...],
+        settings: ObjectTrackSettings,
+        renderer: Renderer,
+    ) -> FitContext:
+        """Take overlap and background term from the settings of stage ``object_track``."""
+        return cls(mesh, labels, settings.min_overlap, settings.background_term, renderer)

@@ -1,84 +1,171 @@
-"""How a view agrees with a pose: overlap of the masks, depth where nothing is in front."""
+"""Agreement of a view with a pose: overlap of the masks, and depth where nothing is in front.
+
+The candidate that shows the object is chosen by render-compare-and-preserve as in the paper.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 
-from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.shots import Rendering
-from intercap_core.object_track import object_depth_kernel
-from intercap_core.object_track.candidates import choose, mask_overlap, visible_pixels
-from intercap_core.object_track.constants import AGREEMENT_SCALE_M, FREE_SPACE_M, MIN_RENDERED_PX
+from intercap_core.object_track import object_depth
 from intercap_core.object_track.likelihood import log_ratio
-from intercap_core.object_track.view import View
+from intercap_core.object_track.reduced_mask import ReducedMask
+from intercap_core.object_track.view import Candidate, FitContext, View
+
+MIN_RENDERED_PX = 12  # renderings with fewer pixels are not compared
+LIKELY_LABEL_BONUS = 0.05  # of overlap: breaks ties between candidates; tuned on the studio
+FREE_SPACE_M = 0.03  # depth this much behind (nearer than) the render is background (an occluder);
+# above the sensor's systematic error and that of the pose, tuned on the studio
+AGREEMENT_SCALE_M = 0.010  # a pixel this far off agrees by half: Azure Kinect's systematic error
+ASSESS_MIN_OVERLAP = 0.1  # smallest IoU of a candidate that an unfitted pose is compared with
+
+
+def choose_candidate(
+    view: View, predicted: Rendering, min_overlap: float, labels: tuple[str, ...]
+) -> Candidate | None:
+    """Choose the candidate with the largest overlap with the visible render.
+
+    The object's labels break ties. Returns None if no overlap reaches ``min_overlap``.
+    """
+    best, best_rank = None, 0.0
+    if predicted.area < MIN_RENDERED_PX:
+        return None
+    for candidate in view.candidates:
+        overlap = mask_overlap(predicted, candidate.mask, view.person)
+        rank = overlap + (LIKELY_LABEL_BONUS if candidate.label in labels else 0.0)
+        if overlap >= min_overlap and rank > best_rank:
+            best, best_rank = candidate, rank
+    return best
+
+
+def mask_overlap(image: Rendering, mask: ReducedMask, person: ReducedMask) -> float:
+    """Return the IoU of a mask and the part of a render that no person outside the mask hides."""
+    if not image.meets(mask.x0, mask.y0, *mask.mask.shape):
+        return 0.0
+    visible, common = _compare(
+        image.face, image.x0, image.y0, person.mask, person.x0, person.y0, mask.mask, mask.x0,
+        mask.y0,
+    )  # fmt: skip
+    return common / max(1, visible + mask.area - common)
+
+
+def visible_pixels(image: Rendering, person: ReducedMask) -> int:
+    """Count the pixels of a render that no person hides."""
+    if not image.meets(person.x0, person.y0, *person.mask.shape):
+        return image.area
+    hidden = _covered(image.face, image.x0, image.y0, person.mask, person.x0, person.y0)
+    return image.area - hidden
+
+
+@numba.njit(cache=True, nogil=True)
+def _compare(face, x0, y0, person, px, py, mask, mx, my):
+    """Count the visible rendered pixels, and those in the mask; windows with their origins."""
+    visible, common = 0, 0
+    for v in range(face.shape[0]):
+        own, other = v + y0 - my, v + y0 - py
+        for u in range(face.shape[1]):
+            if face[v, u] < 0:
+                continue
+            x = u + x0
+            if 0 <= own < mask.shape[0] and 0 <= x - mx < mask.shape[1] and mask[own, x - mx]:
+                visible += 1
+                common += 1
+            elif not (
+                0 <= other < person.shape[0]
+                and 0 <= x - px < person.shape[1]
+                and person[other, x - px]
+            ):
+                visible += 1
+    return visible, common
+
+
+@numba.njit(cache=True, nogil=True)
+def _covered(face, x0, y0, mask, mx, my):
+    """Count the rendered pixels in the mask."""
+    count = 0
+    for y in range(max(y0, my), min(y0 + face.shape[0], my + mask.shape[0])):
+        for x in range(max(x0, mx), min(x0 + face.shape[1], mx + mask.shape[1])):
+            if face[y - y0, x - x0] >= 0 and mask[y - my, x - mx]:
+                count += 1
+    return count
 
 
 @dataclass(frozen=True)
 class ViewReport:
-    """How one view agrees with a pose.
-
-    ``overlap`` IoU of candidate and visible render (NaN: no candidate); ``depth_residual_m`` and
-    ``contour_residual_px`` medians (NaN: none); ``visible_px`` rendered pixels that nothing
-    hides; ``depth_agreement`` how close to the render they are measured, 0 to 1 (NaN: no depth);
-    ``detected``: candidates are known for this image, so that none says something.
-    """
+    """Agreement of one view with a pose. Residuals are NaN if nothing was compared."""
 
     candidate: int
+    """Index of the chosen candidate, -1 = none."""
     overlap: float
+    """IoU of candidate and visible render; NaN without a candidate."""
     depth_residual_m: float
+    """Median point-to-plane distance, metres."""
     contour_residual_px: float
+    """Median contour distance, pixels at full resolution."""
     visible_px: int
+    """Rendered pixels that are not occluded."""
     depth_agreement: float
+    """Agreement of the unoccluded depth, 0 to 1; NaN without depth."""
     detected: bool = True
+    """Whether candidates are known for this image."""
     log_ratio: float = 0.0
+    """Log-likelihood ratio, nats (:mod:`.likelihood`)."""
 
 
 def quick_report(
-    mesh: ObjectMesh,
+    context: FitContext,
     view: View,
     pose: np.ndarray,
     silhouette: Rendering,
     drawn_depth: Rendering | None,
-    min_overlap: float,
-    labels: tuple[str, ...],
 ) -> ViewReport:
-    """Compare the renderings of a pose (4, 4) with the view, no correspondences: overlap, depth."""
-    candidate = choose(view, silhouette, min_overlap, labels)
+    """Compare the renderings of a pose (4, 4) with a view, without correspondences.
+
+    ``drawn_depth`` is None without depth.
+    """
+    candidate = choose_candidate(view, silhouette, ASSESS_MIN_OVERLAP, context.labels)
     overlap = mask_overlap(silhouette, candidate.mask, view.person) if candidate else float("nan")
     visible = visible_pixels(silhouette, view.person)
     agreement = float("nan")
     geometry = view.geometry
     if view.depth is not None and drawn_depth is not None and geometry.depth_lens is not None:
-        compared, free, total = object_depth_kernel.agreement(
+        compared, free, total = object_depth.agreement(
             drawn_depth.depth,
             drawn_depth.face,
             drawn_depth.x0,
             drawn_depth.y0,
             view.depth,
             geometry.depth_lens.rays,
-            mesh.face_normals,
+            context.mesh.face_normals,
             geometry.depth_from_master[:3, :3] @ pose[:3, :3],
             FREE_SPACE_M,
             AGREEMENT_SCALE_M,
         )
         if free >= MIN_RENDERED_PX:
             agreement = total / free
-        visible = unhidden(silhouette, visible, free, compared)
+        visible = count_unoccluded(silhouette, visible, free, compared)
     number = candidate.index if candidate else -1
     nothing = float("nan")
-    ratio = log_ratio(mesh, view, pose, silhouette, drawn_depth, candidate, visible, labels)
+    ratio = log_ratio(context, view, pose, silhouette, drawn_depth, candidate, visible)
     return ViewReport(number, overlap, nothing, nothing, visible, agreement, view.detected, ratio)
 
 
 def depth_agreement(
     gap: np.ndarray, across: np.ndarray, on_person: np.ndarray
 ) -> tuple[float, int]:
-    """How well measured depth fits where nothing is in front, and of how many pixels that holds.
+    """Compare measured depth with the render where nothing is in front.
 
-    ``gap`` (N,) measured minus rendered depth, ``across`` (N,) the same across the surface, both
-    metres; pixels on a person (N,) and those measured nearer do not count. NaN for too few.
+    Args:
+        gap: (N,) measured minus rendered depth, metres.
+        across: (N,) point-to-plane distance, metres.
+        on_person: (N,) pixels on a person, which do not count.
+
+    Returns:
+        Mean agreement (NaN if too few pixels) and the number of pixels without an occluder.
     """
     free = ~on_person & (gap > -FREE_SPACE_M)
     count = int(free.sum())
@@ -88,9 +175,15 @@ def depth_agreement(
     return float((scale / (scale + across[free] ** 2)).mean()), count
 
 
-def unhidden(silhouette: Rendering, visible: int, free: int, compared: int) -> int:
-    """Pixels of a rendered silhouette that nothing hides: of those that no person's mask covers
-    (``visible``) at most the share ``free`` of ``compared`` before which depth finds nothing."""
+def count_unoccluded(silhouette: Rendering, visible: int, free: int, compared: int) -> int:
+    """Estimate the pixels of a silhouette that are not occluded.
+
+    Args:
+        silhouette: rendering in the colour image.
+        visible: pixels that no person's mask covers.
+        free: pixels of the depth image without an occluder ...
+        compared: ... of this many.
+    """
     if compared <= MIN_RENDERED_PX:
         return visible
     if free < MIN_RENDERED_PX:

@@ -1,235 +1,375 @@
-"""The decided track over all frames together: rest, smoothness, uncertainty."""
+"""Refinement of the decided track over all frames: rest, smoothness, covariance and flags.
+
+The status of a frame (:class:`FrameStatus`) says what its pose rests on. Lost frames are filled in
+(:mod:`.bridges`), the images are evaluated at the poses, rest segments are found (:mod:`.rest`) and
+the most probable track is solved for (:mod:`.smooth`), together with annotated poses
+(:mod:`.given_poses`).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from enum import IntEnum
 from itertools import pairwise
 
 import numpy as np
 
+from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.solve.time_series import rigid_velocity
-from intercap_core.object_track.constants import (
-    BASIN,
-    BRIDGED_S,
+from intercap_core.object_track.bridges import UNSURE_M, UNSURE_RAD, FilledTrack, fill_lost
+from intercap_core.object_track.decoder import pose_distances
+from intercap_core.object_track.evidence import (
     COMMON_ERROR_VARIANCE,
-    CONTRADICTED_LOG_RATIO,
-    DENIED_LOG_RATIO,
-    FREE_AXIS_SIGMA_RAD,
-    RELOOK_LOG_RATIO,
-    REST_FRAMES_SEEN_AGAIN,
-    SEEN_LOG_RATIO,
-    UNDONE_LOG_RATIO,
+    TURN_SCALE,
     UNKNOWN_SIGMA,
-    UNSURE_M,
-    UNSURE_RAD,
+    FrameEvidence,
+    PoseEvidence,
+    free_turns,
+    views_noise,
+    without_turns,
 )
-from intercap_core.object_track.evidence import PoseEvidence, views_noise
-from intercap_core.object_track.filled import Filled, fill
 from intercap_core.object_track.fit import Fit
-from intercap_core.object_track.frame_result import FrameResult
-from intercap_core.object_track.free_turns import free_turns, without_turns
 from intercap_core.object_track.given_poses import (
-    TURNS_LESS,
     GivenEvidence,
     GivenPose,
-    at_edges,
+    flag_edges,
     seconds_since,
 )
+from intercap_core.object_track.hypotheses import BASIN
+from intercap_core.object_track.likelihood import CONTRADICTED_LOG_RATIO, SEEN_LOG_RATIO
 from intercap_core.object_track.observer import Observer
-from intercap_core.object_track.rest import resting
-from intercap_core.object_track.smooth import FrameEvidence, smooth
-from intercap_core.object_track.steps import apart
+from intercap_core.object_track.proposals import DENIED_LOG_RATIO
+from intercap_core.object_track.rest import find_rests
+from intercap_core.object_track.smooth import smooth
+
+REST_FRAMES_REEVALUATED = 12  # frames of a rest whose images are evaluated again
+# Nats that a pose loses by smoothing so that the decided pose fitted its frame only by chance.
+UNDONE_LOG_RATIO = 10.0
+REEVALUATED_LOG_RATIO = 2.0  # nats that the evidence at a smoothed pose may be lower to replace it
+# Standard deviation of the centre up to which a pose is carried from annotated ones. Beyond, the
+# joint fit bridges a lost object as well. Tuned on the studio, as the next two.
+CARRIED_M = 0.15
+BRIDGED_S = 0.3  # a gap between equal poses shorter than this is filled with them
+FREE_AXIS_SIGMA_RAD = np.radians(25)  # standard deviation of a turn that was not observed
+
+
+class FrameStatus(IntEnum):
+    """What the pose of a frame rests on."""
+
+    SEEN = 0
+    """The images of the frame."""
+    BRIDGED = 1
+    """The frames around: a hand carried the object, or it stayed in place for a moment."""
+    CARRIED = 2
+    """Annotated poses; the images do not show the object."""
+    LOST = 3
+    """Nothing; no hypothesis is believed."""
+    GONE = 4
+    """Nothing; all frames together say that the object has left the room."""
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """One frame of the track."""
+
+    fit: Fit
+    """Pose, covariance and agreement with the views."""
+    status: FrameStatus = FrameStatus.SEEN
+    """What the pose rests on."""
+    ambiguous: bool = False
+    """Whether a different pose may be the true one."""
+    probability: float = 1.0
+    """Probability of the pose's hypothesis given all frames."""
+    spread: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
+    """(6, 6) covariance of (turn on the left, shift) that other hypotheses add to the fit's."""
+    recovered: bool = False
+    """Whether the frame is the first after lost ones."""
+    resting: bool = False
+    """Whether the object is at rest."""
+    free_axis: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    """(3,) axis, master frame, about which a turn was not observed; 0 = there is none."""
+
+    @property
+    def lost(self) -> bool:
+        """Whether the pose rests on nothing."""
+        return self.status >= FrameStatus.LOST
+
+    @property
+    def gone(self) -> bool:
+        """Whether the object has left the room."""
+        return self.status == FrameStatus.GONE
+
+    @property
+    def carried(self) -> bool:
+        """Whether the pose follows from annotated ones alone."""
+        return self.status == FrameStatus.CARRIED
+
+
+def flag_frames(mesh: ObjectMesh, frames: list[FrameResult]) -> list[FrameResult]:
+    """Flag the frames (T) of a refined track by their covariance.
+
+    A frame is lost if its position is uncertain, and ambiguous if its turn is. A carried frame is
+    ambiguous if either is uncertain, and lost if its position is as good as unknown. The first
+    frame after lost ones is recovered.
+    """
+    result: list[FrameResult] = []
+    for frame in frames:
+        # other hypotheses count by their probability, not by their distance
+        shift, turn = _deviations(mesh, frame.fit.pose, frame.fit.covariance)
+        lost = frame.lost or shift > (CARRIED_M if frame.carried else UNSURE_M)
+        unsure = frame.ambiguous or turn > UNSURE_RAD or shift > UNSURE_M
+        result.append(
+            replace(
+                frame,
+                status=FrameStatus.LOST if lost and not frame.gone else frame.status,
+                ambiguous=unsure and not lost,
+                recovered=bool(result) and result[-1].lost and not lost,
+            )
+        )
+    return result
+
+
+def _deviations(mesh: ObjectMesh, pose: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
+    """Return the largest standard deviations of the centre, metres, and of the turn, radians.
+
+    Turns about the axis of a continuous symmetry do not count.
+    """
+    arm = pose[:3, :3] @ mesh.centre_of_mass
+    about = np.cross(np.eye(3), arm)  # row i: shift of the centre by a turn about axis i
+    to_centre = np.concatenate([about.T, np.eye(3)], axis=1)
+    shift = to_centre @ covariance @ to_centre.T
+    turn = covariance[:3, :3]
+    if mesh.symmetry.sphere:
+        turn = np.zeros((3, 3))
+    elif mesh.symmetry.axis is not None:
+        axis = pose[:3, :3] @ mesh.symmetry.axis
+        across = np.eye(3) - np.outer(axis, axis)
+        turn = across @ turn @ across
+    return _largest_deviation(shift), _largest_deviation(turn)
+
+
+def _largest_deviation(covariance: np.ndarray) -> float:
+    return float(np.sqrt(max(np.linalg.eigvalsh(covariance)[-1], 0.0)))
+
+
+@dataclass(frozen=True)
+class _SmoothedTrack:
+    """The solution over all frames, before its status is decided."""
+
+    fits: list[Fit]
+    """Pose, covariance and agreement with the views of each frame."""
+    segment: np.ndarray
+    """(T,) number of the rest segment, -1 while the object moves."""
+    free_axis: np.ndarray
+    """(T, 3) axes about which a turn was not observed."""
+    status: np.ndarray
+    """(T,) SEEN, BRIDGED in a hand, or LOST: also frames that end far from what they show."""
+    carried: np.ndarray
+    """(T,) frames that annotated poses lead to through unseen ones."""
+
+    @property
+    def poses(self) -> np.ndarray:
+        """Poses (T, 4, 4)."""
+        return np.array([fit.pose for fit in self.fits])
+
+    @property
+    def log_ratios(self) -> np.ndarray:
+        """Log-likelihood ratios (T,) of the images, nats."""
+        return np.array([fit.log_ratio for fit in self.fits])
 
 
 class WholeTrack:
-    """Refines the track of the object that ``observer`` sees; ``times`` (T,) seconds, ``share`` of
-    an independent observation that a frame is."""
+    """Refines the track of the object that ``observer`` sees."""
 
-    def __init__(self, observer: Observer, times: np.ndarray, share: float) -> None:
+    def __init__(self, observer: Observer) -> None:
         self._observer = observer
         self._mesh = observer.mesh
-        self._times = times
-        self._share = share
+        self._times = observer.times
 
     def refine(
-        self, frames: list[FrameResult], held: Sequence[GivenPose] = ()
+        self, frames: list[FrameResult], given: Sequence[GivenPose] = ()
     ) -> list[FrameResult]:
-        """The frames with the poses, covariances, rests and free axes that all together show, and
-        that the given poses say that are ``held``.
+        """Refine poses and covariances by all frames and the annotated poses together.
 
-        A lost frame is found again where the likeliest way from the frames before to those after
-        leads to a pose that the images support, where a hand surely carried it and they do not
-        contradict, or where those around for a moment are at like poses. A frame that smoothing
-        moves far from its own fit becomes lost, unless they support the smoothed pose, and so does
-        one whose final pose they contradict. Where they show nothing, from a given pose on, it is
-        carried from there, and in doubt in all frames but those that poses are given of; and so is
-        what comes into sight or leaves it there in a single view.
+        Args:
+            frames: decided frames (T).
+            given: annotated poses that the decided frames agree with.
+
+        Returns:
+            The frames with the refined poses. A lost frame is found if its filled-in pose is
+            supported by the images, if a hand surely carried the object, or if it lies between
+            equal poses for a moment. A frame becomes lost if smoothing moves it far from its own
+            evidence, or if the images contradict its pose. Carried frames are ambiguous except the
+            annotated ones; so are frames beside them in which one view alone shows the object.
         """
-        lost = np.array([frame.lost for frame in frames])
         fits = [frame.fit for frame in frames]
+        lost = np.array([frame.lost for frame in frames])
         decided = np.array([fit.log_ratio for fit in fits])
-        # what was followed without being seen is left to the given poses
-        at = [given.frame for given in held]
+        at = [pose.frame for pose in given]
+        # poses that were followed unseen are left to the annotated ones
         lost |= np.isfinite(seconds_since(at, decided < SEEN_LOG_RATIO, self._times))
         lost[at] = False
-        fits, segment, free_axis, pulled, in_hand, reached = self._smoothed(fits, lost, held)
-        ratio = np.array([fit.log_ratio for fit in fits])
-        reached &= ratio < SEEN_LOG_RATIO
-        # what was decided may have fitted one moment and not the motion through it
-        undone = (ratio < SEEN_LOG_RATIO) & (ratio < decided - UNDONE_LOG_RATIO)
-        contradicted = undone | (ratio < CONTRADICTED_LOG_RATIO)
-        contradicted &= ~reached | (ratio < DENIED_LOG_RATIO)
-        lost = ((lost | pulled) & (ratio < SEEN_LOG_RATIO)) | contradicted
-        doubtful = reached.copy()
-        doubtful[at] = False
-        poses = np.array([fit.pose for fit in fits])
-        lost &= contradicted | ~(in_hand | reached | self._nowhere(poses, lost))
-        doubtful |= at_edges(fits, lost | reached, at, self._times)
+        smoothed = self._smooth(fits, lost, given)
+        status = self._decide_status(smoothed, decided)
+        ambiguous = status == FrameStatus.CARRIED
+        ambiguous[at] = False
+        ambiguous |= flag_edges(smoothed.fits, status >= FrameStatus.CARRIED, at, self._times)
         return [
             replace(
                 frame,
-                fit=fit,
-                lost=bool(unseen),
-                gone=frame.gone and bool(unseen),
-                resting=bool(number >= 0),
-                free_axis=axis,
-                ambiguous=frame.ambiguous or bool(doubt),
-                carried=bool(nothing),
+                fit=smoothed.fits[t],
+                status=frame.status if frame.gone and status[t] == FrameStatus.LOST
+                else FrameStatus(status[t]),
+                resting=bool(smoothed.segment[t] >= 0),
+                free_axis=smoothed.free_axis[t],
+                ambiguous=frame.ambiguous or bool(ambiguous[t]),
             )
-            for frame, fit, number, axis, unseen, nothing, doubt in zip(
-                frames, fits, segment, free_axis, lost, reached, doubtful, strict=True
-            )
-        ]
+            for t, frame in enumerate(frames)
+        ]  # fmt: skip
 
-    def _nowhere(self, poses: np.ndarray, lost: np.ndarray) -> np.ndarray:
-        """Lost frames (T,) bool that are few, between two at like poses: it went nowhere."""
-        found = np.zeros(len(lost), bool)
+    def _decide_status(self, smoothed: _SmoothedTrack, decided: np.ndarray) -> np.ndarray:
+        """Decide the status (T,) of each frame.
+
+        ``decided`` (T,) are the log-likelihood ratios of the decided poses before smoothing.
+        """
+        ratio = smoothed.log_ratios
+        unseen = ratio < SEEN_LOG_RATIO
+        carried = smoothed.carried & unseen
+        # a decided pose may have fitted its frame and not the motion through it
+        undone = unseen & (ratio < decided - UNDONE_LOG_RATIO)
+        contradicted = undone | (ratio < CONTRADICTED_LOG_RATIO)
+        contradicted &= ~carried | (ratio < DENIED_LOG_RATIO)
+        status = np.where(unseen, smoothed.status, FrameStatus.SEEN)
+        status[contradicted] = FrameStatus.LOST
+        in_place = self._between_equal_poses(smoothed.poses, status != FrameStatus.SEEN)
+        status[in_place & (status == FrameStatus.LOST)] = FrameStatus.BRIDGED
+        status[carried] = FrameStatus.CARRIED
+        status[contradicted] = FrameStatus.LOST
+        return status
+
+    def _between_equal_poses(self, poses: np.ndarray, lost: np.ndarray) -> np.ndarray:
+        """Find frames (T,) in short gaps between equal poses: the object stayed in place."""
+        result = np.zeros(len(lost), bool)
         for a, b in pairwise(np.flatnonzero(~lost).tolist()):
             if b - a > 1 and self._times[b] - self._times[a] < BRIDGED_S:
-                turn, shift = apart(self._mesh, poses[[a]], poses[[b]])
-                found[a + 1 : b] = shift[0, 0] < UNSURE_M and turn[0, 0] < UNSURE_RAD
-        return found
+                turn, shift = pose_distances(self._mesh, poses[[a]], poses[[b]])
+                result[a + 1 : b] = shift[0, 0] < UNSURE_M and turn[0, 0] < UNSURE_RAD
+        return result
 
-    # --- all frames together -------------------------------------------------------------------
-
-    def _smoothed(
-        self, fits: list[Fit], lost: np.ndarray, held: Sequence[GivenPose]
-    ) -> tuple[list[Fit], np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """The fits, the number (T,) of the rest that each frame belongs to (-1: none), the axes
-        (T, 3) about which nothing was seen, and which frames (T,) end far from what they show, in
-        which lost ones a hand surely carries it, and which are reached from the poses ``held``."""
-        poses = np.array([fit.pose for fit in fits])
-        filled = fill(self._observer, poses, lost, self._times, self._share)
+    def _smooth(
+        self, fits: list[Fit], lost: np.ndarray, given: Sequence[GivenPose]
+    ) -> _SmoothedTrack:
+        """Solve for the track, evaluate the images at the solution, and solve again."""
+        count = len(fits)
+        filled = fill_lost(self._observer, np.array([fit.pose for fit in fits]), lost)
         poses = filled.poses
         motion = rigid_velocity(poses, ~lost, self._times)
         blind = lost.copy()
-        for given in held:
-            blind[given.frame] |= fits[given.frame].log_ratio < SEEN_LOG_RATIO
-        found = [
+        for pose in given:
+            blind[pose.frame] |= fits[pose.frame].log_ratio < SEEN_LOG_RATIO
+        evidence = [
             None if blind[t] else self._observer.evidence(t, poses[t], motion[t])
-            for t in range(len(fits))
+            for t in range(count)
         ]
-        stated = self._stated(held, poses, found)
-        looked = poses.copy()
-        track, covariance, segment = self._solved(looked, found, filled, stated, poses)
-        motion = rigid_velocity(track, np.ones(len(fits), bool), self._times)
+        stated = self._given_evidence(given, poses, evidence)
+        evaluated = poses.copy()
+        track, covariance, segment = self._solve(evaluated, evidence, filled, stated, poses)
+        motion = rigid_velocity(track, np.ones(count, bool), self._times)
         motion[segment >= 0] = 0
-        for t in reversed(
-            self._worth_a_look(segment)
-        ):  # the images read last are still in the cache
+        # in reverse, because the views of the last frames are still cached
+        for t in reversed(self._frames_to_reevaluate(segment)):
             again = self._observer.evidence(t, track[t], motion[t])
-            before = found[t]
-            least = SEEN_LOG_RATIO if before is None else _ratio(before) - RELOOK_LOG_RATIO
-            if _ratio(again) > least:
-                found[t], looked[t] = again, track[t]
-        track, covariance, segment = self._solved(looked, found, filled, stated, track)
-        covariance *= np.outer(TURNS_LESS, TURNS_LESS)
-        free = self._free_axes(track, covariance)
-        result = [
-            Fit(pose, own, seen.reports if seen else fit.views, twist)
-            for fit, pose, own, seen, twist in zip(
-                fits, track, covariance, found, motion, strict=True
-            )
-        ]
-        turn, shift = self._between(looked, track)
-        known = np.array([seen is not None for seen in found])
-        pulled = (shift > UNSURE_M) & known
-        differs = known & ((shift > BASIN[0]) | (turn > np.radians(BASIN[1])))
-        for t in map(int, np.flatnonzero(differs | blind)):
-            seen = self._observer.assess(t, track[t], twist=motion[t])
-            result[t] = replace(result[t], views=seen.views)
-        return result, segment, free, pulled, filled.sure, stated.reached
-
-    def _stated(
-        self, held: Sequence[GivenPose], poses: np.ndarray, found: list[PoseEvidence | None]
-    ) -> GivenEvidence:
-        """What the given poses ``held`` say beside the ``poses`` (T, 4, 4), at which this was
-        ``found``."""
-        if not held:
-            return GivenEvidence.none(poses)
-        unseen = np.array([seen is None or _ratio(seen) < SEEN_LOG_RATIO for seen in found])
-        return GivenEvidence.of(self._mesh, held, poses, unseen, self._times)
-
-    def _between(self, one: np.ndarray, two: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How far (T,) two tracks' poses (T, 4, 4) are turned, radians, and their centres apart,
-        metres."""
-        pairs = [apart(self._mesh, one[[t]], two[[t]]) for t in range(len(one))]
+            before = evidence[t]
+            least = SEEN_LOG_RATIO
+            if before is not None:
+                least = _log_ratio(before) - REEVALUATED_LOG_RATIO
+            if _log_ratio(again) > least:
+                evidence[t], evaluated[t] = again, track[t]
+        track, covariance, segment = self._solve(evaluated, evidence, filled, stated, track)
+        covariance *= np.outer(TURN_SCALE, TURN_SCALE)
+        free_axis = self._free_axes(track, covariance)
+        pairs = [pose_distances(self._mesh, evaluated[[t]], track[[t]]) for t in range(count)]
         turn, shift = np.array(pairs).reshape(-1, 2).T
-        return turn, shift
+        known = np.array([own is not None for own in evidence])
+        moved_off = known & ((shift > BASIN[0]) | (turn > np.radians(BASIN[1]))) | blind
+        result = []
+        for t, (fit, own) in enumerate(zip(fits, evidence, strict=True)):
+            views = own.reports if own else fit.views
+            if moved_off[t]:
+                views = self._observer.assess(t, track[t], twist=motion[t]).views
+            result.append(Fit(track[t], covariance[t], views, motion[t]))
+        status = np.where(lost | (known & (shift > UNSURE_M)), FrameStatus.LOST, FrameStatus.SEEN)
+        status[filled.sure] = FrameStatus.BRIDGED
+        return _SmoothedTrack(result, segment, free_axis, status, stated.carried)
 
-    def _solved(
+    def _given_evidence(
+        self, given: Sequence[GivenPose], poses: np.ndarray, evidence: list[PoseEvidence | None]
+    ) -> GivenEvidence:
+        """Return the evidence of annotated poses beside ``poses`` (T, 4, 4)."""
+        if not given:
+            return GivenEvidence.none(poses)
+        unseen = np.array([own is None or _log_ratio(own) < SEEN_LOG_RATIO for own in evidence])
+        return GivenEvidence.of(self._mesh, given, poses, unseen, self._times)
+
+    def _solve(
         self,
-        looked: np.ndarray,
-        found: list[PoseEvidence | None],
-        filled: Filled,
+        evaluated: np.ndarray,
+        evidence: list[PoseEvidence | None],
+        filled: FilledTrack,
         stated: GivenEvidence,
         start: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Poses and covariances of all frames from the evidence at ``looked`` (T, 4, 4), and the
-        rests, for which what is ``filled`` in or ``stated`` does not count."""
-        count = len(looked)
-        noise = COMMON_ERROR_VARIANCE * views_noise([e for e in found if e is not None])
+        """Solve for poses (T, 4, 4), covariances (T, 6, 6) and rest segments (T,).
+
+        Filled-in and annotated poses do not count as evidence for a rest.
+
+        Args:
+            evaluated: (T, 4, 4) poses at which the evidence was evaluated.
+            evidence: evidence of each frame, None in lost ones.
+            filled: poses of lost frames.
+            stated: evidence of annotated poses.
+            start: (T, 4, 4) start of the solver.
+        """
+        count = len(evaluated)
+        noise = COMMON_ERROR_VARIANCE * views_noise([own for own in evidence if own is not None])
         information, gradient = np.zeros((count, 6, 6)), np.zeros((count, 6))
-        for t, evidence in enumerate(found):
-            if evidence is not None:
-                information[t] = evidence.information.sum(0) / noise
-                gradient[t] = evidence.gradient.sum(0) / noise
-        combined = self._without_symmetry(FrameEvidence(looked, information, gradient))
+        for t, own in enumerate(evidence):
+            if own is not None:
+                information[t] = own.information.sum(0) / noise
+                gradient[t] = own.gradient.sum(0) / noise
+        combined = self._without_symmetry(FrameEvidence(evaluated, information, gradient))
         centre = self._mesh.centre_of_mass
-        segment = resting(combined, self._times, centre)
-        segment[stated.moving(self._mesh, looked, segment)] = -1
+        segment = find_rests(combined, self._times, centre)
+        segment[stated.exclude_from_rests(self._mesh, evaluated, segment)] = -1
         same = (segment[1:] == segment[:-1]) & (segment[1:] >= 0)
         node = np.concatenate([[0], np.cumsum(~same)])
-        unseen = [evidence is None for evidence in found]
-        # what a hand tells of frames that follow each other is as good as one observation
-        hand = self._share * filled.hand
+        unseen = [own is None for own in evidence]
+        # the hand's evidence in successive frames is as good as one observation
+        share = self._observer.share
+        hand = share * filled.hand
         information[unseen] = (hand + filled.images / noise)[unseen]
-        gradient[unseen] = filled.pull[unseen] * (self._share - 1 / noise)
-        combined = self._without_symmetry(FrameEvidence(looked, information, gradient))
-        told = None
-        if stated.held:
-            told = self._without_symmetry(
-                FrameEvidence(looked, stated.information, stated.gradient(looked))
+        gradient[unseen] = filled.pull[unseen] * (share - 1 / noise)
+        combined = self._without_symmetry(FrameEvidence(evaluated, information, gradient))
+        given = None
+        if stated.given:
+            given = self._without_symmetry(
+                FrameEvidence(evaluated, stated.information, stated.gradient(evaluated))
             )
-        poses, covariance = smooth(combined, start, node, self._times, centre, told)
+        poses, covariance = smooth(combined, start, node, self._times, centre, given)
         return poses, covariance, segment
 
-    def _worth_a_look(self, segment: np.ndarray) -> list[int]:
-        """All moving frames and a few of each rest."""
+    def _frames_to_reevaluate(self, segment: np.ndarray) -> list[int]:
+        """Return all moving frames and a few of each rest."""
         frames = list(np.flatnonzero(segment < 0))
         for number in range(segment.max(initial=-1) + 1):
             rest = np.flatnonzero(segment == number)
-            some = (
-                np.linspace(0, len(rest) - 1, min(REST_FRAMES_SEEN_AGAIN, len(rest)))
-                .round()
-                .astype(int)
-            )
-            frames += list(rest[some])
+            some = np.linspace(0, len(rest) - 1, min(REST_FRAMES_REEVALUATED, len(rest)))
+            frames += list(rest[some.round().astype(int)])
         return sorted(map(int, frames))
 
     def _without_symmetry(self, evidence: FrameEvidence) -> FrameEvidence:
-        """The evidence without the spurious information of a round mesh's facets about its spin."""
+        """Remove the spurious information of a round mesh's facets on its spin."""
         information, gradient = evidence.information.copy(), evidence.gradient.copy()
         for t, pose in enumerate(evidence.poses):
             steps = free_turns(self._mesh, pose)
@@ -237,7 +377,10 @@ class WholeTrack:
         return FrameEvidence(evidence.poses, information, gradient)
 
     def _free_axes(self, poses: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-        """Axes (T, 3) about which a turn shows nothing; ``covariance`` becomes wide about them."""
+        """Return axes (T, 3) about which a turn was not observed, 0 = none.
+
+        ``covariance`` (T, 6, 6) is widened about the axes of a continuous symmetry.
+        """
         axes = np.zeros((len(poses), 3))
         for t, pose in enumerate(poses):
             steps = free_turns(self._mesh, pose)
@@ -253,5 +396,5 @@ class WholeTrack:
         return axes
 
 
-def _ratio(evidence: PoseEvidence) -> float:
+def _log_ratio(evidence: PoseEvidence) -> float:
     return sum(view.log_ratio for view in evidence.reports)

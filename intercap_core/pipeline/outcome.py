@@ -11,7 +11,7 @@ import numpy as np
 
 from intercap_core import artefacts, schemas
 from intercap_core.artefacts import Artefact
-from intercap_core.object_track.absent import SOURCE as NO_TRACK
+from intercap_core.object_track.artefact import SOURCE_NONE as NO_TRACK
 
 _CHOSEN_BY = {
     "named": ", the subject is named",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,16 +17,23 @@ from intercap_core.formats.detections.read import Detections
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh, Paint
-from intercap_core.object_track.absent import NOT_NAMED, SOURCE, absent_track
-from intercap_core.object_track.constants import NOTHING_LOG_RATIO, TOLD_SHARE, TRACKING_FACES
+from intercap_core.object_track.artefact import (
+    NOT_NAMED,
+    SOURCE_NONE,
+    absent_track,
+    track_datasets,
+)
 from intercap_core.object_track.given_poses import GivenPose
-from intercap_core.object_track.object_size import label_doubt, size_doubt
+from intercap_core.object_track.mesh_check import label_doubt, size_doubt
+from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.proposals import NotFound
-from intercap_core.object_track.recording import ObjectRecording
-from intercap_core.object_track.tracker import Track, Tracker
+from intercap_core.object_track.recording import TRACKING_FACES, ObjectRecording
+from intercap_core.object_track.tracker import NOTHING_LOG_RATIO, Track, Tracker
 from intercap_core.schemas import OBJECT_TRACK
 
 log = logging.getLogger(__name__)
+
+UNSOUND_SHARE = 0.5  # of lost, or lost and ambiguous frames, above which a warning is logged
 
 
 def run(
@@ -41,17 +49,16 @@ def run(
 ) -> None:
     """Track the object through the recording and write the object_track artefact.
 
-    Where ``object_`` is None, a person alone, or the images show nothing of it, it says so: lost in
-    every frame, without a pose. The track agrees with the annotated ``poses`` of some frames unless
-    the images contradict them clearly; without any, it is searched for. Raises UserError where the
-    mesh or an input artefact is unusable, or a pose is of a frame that is not there.
+    If ``object_`` is None (a person alone) or no image shows the object, all frames are written as
+    lost, without a pose. The track agrees with the annotated ``poses`` unless the images clearly
+    contradict them; without any, the object is searched for. Raises UserError if the mesh or an
+    input artefact is unusable, or if an annotated frame does not exist.
     """
     if object_ is None:
         with Frames.open(frames) as recording:
-            _write_absent(output, recording, "", [NOT_NAMED], settings)
+            _write(output, recording, "", [NOT_NAMED], settings, None, [])
         return
     mesh = ObjectMesh.load(object_)
-    simple = mesh.simplified(TRACKING_FACES)
     with Frames.open(frames) as recording:
         detected = Detections.load(detections)
         source = ObjectRecording(recording, detected, scene, person, mesh.diameter)
@@ -61,101 +68,99 @@ def run(
                 f"sequence {sequence}: no camera has images and a pose; check the recordings and "
                 "the calibration"
             )
-        doubts = [
-            label_doubt(detected, object_.labels),
-            size_doubt(recording, detected, recording.rig, mesh.diameter, object_.labels),
-        ]
-        for doubt in filter(None, doubts):
-            log.warning("sequence %s: object %r: %s", sequence, object_.name, doubt)
-        tracker = Tracker(
-            simple,
+        observer = Observer(
+            mesh.simplified(TRACKING_FACES),
             source.views,
             source.labels(),
             settings,
-            times=recording.time_s,
+            recording.time_s,
             labels=object_.labels,
             up=source.up if np.isfinite(source.up).all() else None,
             joints=source.joints,
             pictures=source.pictures,
             paint=Paint.load(Path(object_.mesh), mesh),
         )
+        warn = partial(log.warning, "sequence %s: object %r: %s", sequence, object_.name)
+        doubts = [
+            doubt
+            for doubt in (
+                label_doubt(detected, object_.labels),
+                size_doubt(recording, detected, mesh.diameter, object_.labels),
+            )
+            if doubt
+        ]
+        for doubt in doubts:
+            warn(doubt)
+        track: Track | None = None
         try:
-            track = tracker.run(_given(poses, recording.num_sets, sequence))
-            nothing = _nothing(track)
+            track = Tracker(observer).run(_given(poses, recording.num_sets, sequence))
+            reason = _absence(track)
         except NotFound:
-            nothing = (
+            reason = (
                 "it was found in no frame (no segmentation candidate, with depth or in two views, "
                 f"fits its size; labels expected: {', '.join(object_.labels) or 'any'})"
             )
-        if nothing:
-            nothing += (
+        if track is None or reason:
+            reason += (
                 ": no frame has a pose of it; check the candidates, annotate 'object_poses', or "
                 "clear the column 'object' where there is none"
             )
-            log.warning("sequence %s: object %r: %s", sequence, object_.name, nothing)
-            told = [nothing, *filter(None, doubts)]
-            _write_absent(output, recording, object_.name, told, settings)
+            warn(reason)
+            _write(output, recording, object_.name, [reason, *doubts], settings, None, [])
             return
-        names = list(recording.rig.names)
-    told = [*(doubt for doubt in doubts if doubt), *track.doubts]
-    for doubt in track.doubts:
-        log.warning("sequence %s: object %r: %s", sequence, object_.name, doubt)
-    _tell(track, sequence)
-    with artefacts.write(
-        output,
-        OBJECT_TRACK,
-        settings_digest=digest(settings),
-        sequence=sequence,
-        object=object_.name,
-        seed_frame=track.seed_frame,
-        seed_source=_source(track),
-        doubts="; ".join(told),
-    ) as writer:
-        for key, values in _datasets(track, source.cameras, len(names)).items():
-            writer.put(key, values)
-        writer.put("camera_names", names)
+        for doubt in track.doubts:
+            warn(doubt)
+        _warn_if_unsound(track, sequence)
+        doubts += track.doubts
+        _write(output, recording, object_.name, doubts, settings, track, source.cameras)
 
 
-def _nothing(track: Track) -> str:
-    """Why the track is not believed in any frame, "" = it is in some."""
+def _absence(track: Track) -> str:
+    """Return why the track is not believed in any frame; empty if it is in some."""
     believed = sum(not frame.lost for frame in track.frames)
     if believed == 0:
         return "its track is lost in every frame"
     if track.of_nothing:
         return (
-            f"what was tracked in {believed} of {len(track.frames)} frames is not believed, as all "
-            f"images together hardly show it ({track.evidence:.0f} nats, expected "
+            f"the track in {believed} of {len(track.frames)} frames is not believed, as all images "
+            f"together hardly show it ({track.evidence:.0f} nats, expected "
             f"{NOTHING_LOG_RATIO:.0f} and more)"
         )
     return ""
 
 
-def _write_absent(
+def _write(
     output: Path,
     recording: Frames,
     name: str,
     doubts: list[str],
     settings: ObjectTrackSettings,
+    track: Track | None,
+    cameras: list[int],
 ) -> None:
-    """Write that there is no object, with the reasons."""
+    """Write the artefact; without a ``track``, that there is no object."""
     names = list(recording.rig.names)
+    if track is None:
+        datasets = absent_track(recording.num_sets, len(names))
+    else:
+        datasets = track_datasets(track, cameras, len(names))
     with artefacts.write(
         output,
         OBJECT_TRACK,
         settings_digest=digest(settings),
         sequence=recording.sequence,
         object=name,
-        seed_frame=-1,
-        seed_source=SOURCE,
+        seed_frame=-1 if track is None else track.seed_frame,
+        seed_source=_seed_source(track),
         doubts="; ".join(doubts),
     ) as writer:
-        for key, values in absent_track(recording.num_sets, len(names)).items():
+        for key, values in datasets.items():
             writer.put(key, values)
         writer.put("camera_names", names)
 
 
 def _given(poses: Sequence[ObjectPose], count: int, sequence: str) -> list[GivenPose]:
-    """The annotated poses as the tracker takes them, of a recording of ``count`` frame sets."""
+    """Convert the annotated poses for a recording of ``count`` frame sets."""
     beyond = [pose.frame for pose in poses if pose.frame >= count]
     if beyond:
         raise UserError(
@@ -175,18 +180,20 @@ def _given(poses: Sequence[ObjectPose], count: int, sequence: str) -> list[Given
     ]
 
 
-def _source(track: Track) -> str:
+def _seed_source(track: Track | None) -> str:
+    if track is None:
+        return SOURCE_NONE
     if not track.annotated:
         return "search"
     return "annotated" if track.borne_out else "annotated against the images"
 
 
-def _tell(track: Track, sequence: str) -> None:
-    """What whoever runs the stage should know of a track that is not sound."""
+def _warn_if_unsound(track: Track, sequence: str) -> None:
+    """Log warnings about lost, gone and ambiguous frames."""
     count = len(track.frames)
     lost = sum(frame.lost for frame in track.frames)
     gone = sum(frame.gone for frame in track.frames)
-    doubtful = sum(frame.ambiguous for frame in track.frames)
+    ambiguous = sum(frame.ambiguous for frame in track.frames)
     if gone:
         log.warning(
             "sequence %s: in %d of %d frames no camera shows the object for so long that it seems "
@@ -195,7 +202,7 @@ def _tell(track: Track, sequence: str) -> None:
             gone,
             count,
         )
-    if lost > TOLD_SHARE * count:
+    if lost > UNSOUND_SHARE * count:
         log.warning(
             "sequence %s: the object is lost in %d of %d frames; check the candidates, or "
             "annotate 'object_poses'",
@@ -203,46 +210,12 @@ def _tell(track: Track, sequence: str) -> None:
             lost,
             count,
         )
-    elif lost + doubtful > TOLD_SHARE * count:
+    elif lost + ambiguous > UNSOUND_SHARE * count:
         log.warning(
-            "sequence %s: of %d frames the object is lost in %d, and quite different poses explain "
-            "%d alike; annotate 'object_poses' to decide",
+            "sequence %s: of %d frames the object is lost in %d, and different poses explain %d "
+            "equally well; annotate 'object_poses' to decide",
             sequence,
             count,
             lost,
-            doubtful,
+            ambiguous,
         )
-
-
-def _datasets(track: Track, cameras: list[int], count: int) -> dict[str, np.ndarray]:
-    """The artefact's datasets by name; cameras without a view keep -1 and NaN."""
-    shape = (len(track.frames), count)
-    candidate = np.full(shape, -1, np.int32)
-    overlap, depth, contour = (np.full(shape, np.nan, np.float32) for _ in range(3))
-    for t, frame in enumerate(track.frames):
-        for c, view in zip(cameras, frame.fit.views, strict=True):
-            candidate[t, c] = view.candidate
-            overlap[t, c] = view.overlap
-            depth[t, c] = view.depth_residual_m
-            contour[t, c] = view.contour_residual_px
-    poses = np.array([frame.fit.pose for frame in track.frames])
-    carried = {"carried": np.array([frame.carried for frame in track.frames])}
-    return {
-        "rotation": poses[:, :3, :3],
-        "translation": poses[:, :3, 3],
-        "candidate": candidate,
-        "overlap": overlap,
-        "depth_residual": depth,
-        "silhouette_residual": contour,
-        "views": np.array([frame.fit.support for frame in track.frames], np.int8),
-        "covariance": np.array([frame.fit.covariance + frame.spread for frame in track.frames]),
-        "spread": np.array([frame.spread for frame in track.frames]),
-        "lost": np.array([frame.lost for frame in track.frames]),
-        "gone": np.array([frame.gone for frame in track.frames]),
-        "recovered": np.array([frame.recovered for frame in track.frames]),
-        "probability": np.array([frame.probability for frame in track.frames], np.float32),
-        "ambiguous": np.array([frame.ambiguous for frame in track.frames]),
-        "resting": np.array([frame.resting for frame in track.frames]),
-        "free_axis": np.array([frame.free_axis for frame in track.frames]),
-        **(carried if track.annotated else {}),
-    }

@@ -38,7 +38,7 @@ from intercap_core.geometry.camera.transforms import apply, rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.render import render_scene
 from intercap_core.geometry.rigid.shots import Drawable, Rendering
-from intercap_core.object_track.absent import SOURCE, absent_track
+from intercap_core.object_track.artefact import SOURCE_NONE, absent_track
 from intercap_core.schemas import (
     BODY_FIT,
     CONTACT_REGIONS,
@@ -187,7 +187,7 @@ def take_object_away(capture: Capture) -> None:
     """Make the capture one of a person alone: artefacts up to joint, and the truth."""
     total, count = len(capture.vertices), len(capture.rig)
     with h5py.File(capture.paths["object_track"], "r+") as file:
-        file.attrs["object"], file.attrs["seed_source"] = "", SOURCE
+        file.attrs["object"], file.attrs["seed_source"] = "", SOURCE_NONE
         for key, values in absent_track(total, count).items():
             file[key][...] = values
     with h5py.File(capture.paths["joint"], "r+") as file:

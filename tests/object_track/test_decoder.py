@@ -1,4 +1,4 @@
-"""The decision over all frames: against all sequences by hand, and on worked cases."""
+"""The hidden Markov model against all sequences by hand, and on worked cases."""
 
 from __future__ import annotations
 
@@ -9,28 +9,27 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.object_track.constants import (
-    ABSENT_LOG_RATIO,
-    ERROR_LASTING_S,
+from intercap_core.object_track.decoder import (
     EXCURSION_COST,
     FREE_COST_S,
     HELD_M,
     HELD_M_S,
     HELD_RAD,
     HELD_RAD_S,
+    HIDDEN,
     JUMP_COST,
     LEAVE_COST,
     MODE_CHANGES_S,
     STANDING_M,
-)
-from intercap_core.object_track.decoder import NOT_SEEN, decode
-from intercap_core.object_track.motion import HandMotion
-from intercap_core.object_track.steps import (
-    excursions,
+    add_excursion_costs,
+    decode,
+    find_excursions,
     mode_log_ratios,
     step_costs,
-    with_excursions,
 )
+from intercap_core.object_track.evidence import ERROR_LASTING_S
+from intercap_core.object_track.motion import HandMotion
+from intercap_core.object_track.tracker import ABSENT_LOG_RATIO
 from tests.geometry.rigid.conftest import catalogue
 
 NO_HAND = [None, None]
@@ -50,7 +49,7 @@ def poses_of(places: list[float], degrees: float = 0.0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("modes", [1, 2])
-def test_it_is_the_sum_over_all_sequences(modes: int) -> None:
+def test_it_equals_the_sum_over_all_sequences(modes: int) -> None:
     """States of a frame: each hypothesis in each mode, hidden, gone."""
     rng = np.random.default_rng(4)
     counts = [2, 0, 3, 1]
@@ -82,7 +81,7 @@ def test_it_is_the_sum_over_all_sequences(modes: int) -> None:
     total = np.logaddexp.reduce(list(likely.values()))
     assert found.evidence == pytest.approx(total)
     best = max(likely, key=lambda one: likely[one])
-    assert found.path.tolist() == [NOT_SEEN if isinstance(what, str) else what for what, _ in best]
+    assert found.path.tolist() == [HIDDEN if isinstance(what, str) else what for what, _ in best]
     for t, n in enumerate(counts):
         share = {what: 0.0 for what in (*range(n), "hidden", "gone")}
         for sequence, log in likely.items():
@@ -92,17 +91,17 @@ def test_it_is_the_sum_over_all_sequences(modes: int) -> None:
         assert found.gone[t] == pytest.approx(share["gone"], rel=1e-9)
 
 
-def test_one_frame_alone_and_no_hypothesis_at_all() -> None:
+def test_a_single_frame_and_frames_without_hypotheses() -> None:
     found = decode([np.array([2.0, 1.0])], [])
     assert found.path.tolist() == [0]
     weights = np.array([np.exp(2), np.exp(1), 1 + np.exp(-2 * LEAVE_COST)])
     assert found.probability[0] == pytest.approx(weights / weights.sum())
     nothing = decode([np.zeros(0)] * 3, [np.zeros((1, 1, 1, 1))] * 2)
-    assert (nothing.path == NOT_SEEN).all()
+    assert (nothing.path == HIDDEN).all()
     assert all(p == pytest.approx([1.0], abs=1e-12) for p in nothing.probability)
 
 
-def test_a_weak_preference_does_not_pay_for_a_jump_and_a_lasting_one_does(cup: ObjectMesh) -> None:
+def test_only_a_lasting_preference_pays_for_a_jump(cup: ObjectMesh) -> None:
     """Two poses half a turn apart; the images prefer the second from frame 6 on."""
     both = np.concatenate([poses_of([0.0]), poses_of([0.0], 180)])
     steps = [step_costs(cup, both, both, 1 / 15, NO_HAND)] * 9
@@ -115,7 +114,7 @@ def test_a_weak_preference_does_not_pay_for_a_jump_and_a_lasting_one_does(cup: O
     assert path(5.0) == [0] * 6 + [1] * 4
 
 
-def test_at_rest_freely_or_in_a_hand_each_has_its_cost(cup: ObjectMesh) -> None:
+def test_each_mode_of_motion_has_its_cost(cup: ObjectMesh) -> None:
     here, there = poses_of([0.0]), poses_of([0.0, 0.02, 1.0])
     every = step_costs(cup, here, there, 1 / 15, NO_HAND)
     rest, free, right, left = np.diagonal(every)[0, :-1].T  # in the mode of the step before
@@ -138,8 +137,8 @@ def test_at_rest_freely_or_in_a_hand_each_has_its_cost(cup: ObjectMesh) -> None:
 
 @pytest.mark.parametrize("hands", [1, 2])
 @pytest.mark.parametrize("fps", [5, 15, 30])
-def test_more_modes_make_no_pose_likelier(cup: ObjectMesh, hands: int, fps: int) -> None:
-    """What stands beside still hands may be held as well: that says nothing for its being there."""
+def test_more_modes_do_not_raise_the_evidence(cup: ObjectMesh, hands: int, fps: int) -> None:
+    """An object at rest beside hands that do not move may be held as well."""
     still = HandMotion(np.eye(3), np.array([0.1, 0, 0]), np.array([0.1, 0, 0]))
     here, count = poses_of([0.0]), 3 * fps
 
@@ -152,10 +151,8 @@ def test_more_modes_make_no_pose_likelier(cup: ObjectMesh, hands: int, fps: int)
 
 @pytest.mark.parametrize("fps", [1, 5, 30])
 @pytest.mark.parametrize("gap_s", [0.0, 0.5, 3.0])
-def test_what_moved_across_a_gap_is_the_same_object(
-    cup: ObjectMesh, fps: int, gap_s: float
-) -> None:
-    """Seen by 30 nats of an independent frame throughout; half a metre away after the gap."""
+def test_an_object_moved_across_a_gap_is_the_same(cup: ObjectMesh, fps: int, gap_s: float) -> None:
+    """Evidence of 30 nats per independent frame; half a metre away after the gap."""
     places = [0.0] * 6 + [0.5] * 6
     seconds = [1 / fps] * 11
     seconds[5] += gap_s
@@ -168,9 +165,9 @@ def test_what_moved_across_a_gap_is_the_same_object(
     assert found.path.tolist() == [0] * 12
 
 
-def test_a_hand_carries_it_through_hidden_frames_by_its_turn(cup: ObjectMesh) -> None:
-    """For 8 frames nothing is seen; the palm turns by 70 degrees meanwhile. Two turns look alike
-    after that: the one that the palm made, and none."""
+def test_a_turning_hand_carries_it_through_hidden_frames(cup: ObjectMesh) -> None:
+    """Nothing is seen for 8 frames while the palm turns by 70 degrees. Afterwards the pose turned
+    with the palm and the old pose look alike."""
     turns = [*[0.0] * 3, *np.linspace(0, 70, 10)[1:], *[70.0] * 3]
     wrist = np.array([0.06, 0.0, 0.0])
     held, steps = [], []
@@ -194,7 +191,7 @@ def test_a_hand_carries_it_through_hidden_frames_by_its_turn(cup: ObjectMesh) ->
     assert found.probability[-1][0] > 0.8 > resting[0]
 
 
-def test_it_turns_with_the_palm_about_the_wrist(cup: ObjectMesh) -> None:
+def test_a_held_object_turns_about_the_wrist(cup: ObjectMesh) -> None:
     turn = Rotation.from_euler("z", 40, degrees=True).as_matrix()
     wrist, end = np.array([0.1, 0.0, 0.0]), np.array([0.15, 0.02, 0.0])
     before = poses_of([0.0])
@@ -212,7 +209,7 @@ def test_it_turns_with_the_palm_about_the_wrist(cup: ObjectMesh) -> None:
     assert held[1] == pytest.approx(-0.5 * ((np.radians(40) / sigma) ** 2 + shift**2))
 
 
-def test_what_is_not_seen_for_a_second_is_hidden_and_for_long_has_left(cup: ObjectMesh) -> None:
+def test_it_is_hidden_for_a_second_and_gone_after_five(cup: ObjectMesh) -> None:
     here = poses_of([0.0])
 
     def after(seconds: float) -> tuple[list[int], float]:
@@ -221,21 +218,21 @@ def test_what_is_not_seen_for_a_second_is_hidden_and_for_long_has_left(cup: Obje
         emissions = [np.full(len(own), 4.0) for own in poses]
         steps = [step_costs(cup, a, b, 1 / 15, NO_HAND) for a, b in pairwise(poses)]
         found = decode(emissions, steps, ABSENT_LOG_RATIO * 1 / 15 / ERROR_LASTING_S)
-        assert (found.path[9:-9] == NOT_SEEN).all() and (found.path[:9] == 0).all()
+        assert (found.path[9:-9] == HIDDEN).all() and (found.path[:9] == 0).all()
         return found.path.tolist(), float(found.gone[9 + unseen // 2])
 
     assert after(1.0)[1] < 0.2
     assert after(5.0)[1] > 0.9
 
 
-def test_what_a_symmetry_hides_is_no_motion() -> None:
+def test_turns_of_a_symmetry_are_no_motion() -> None:
     bottle = ObjectMesh.load(catalogue()["bottle"])
     spun = step_costs(bottle, poses_of([0.0]), poses_of([0.0], 120), 1 / 15, NO_HAND)
     assert spun[0, 0, 0, 0] == pytest.approx(-np.log(2 - np.exp(-MODE_CHANGES_S / 15)))
 
 
-def test_equal_evidence_is_even_odds(cup: ObjectMesh) -> None:
-    """Handle left or right, nothing decides: the probabilities say so in every frame."""
+def test_equal_evidence_gives_equal_probabilities(cup: ObjectMesh) -> None:
+    """A handle left or right: both hypotheses stay equally probable."""
     both = np.concatenate([poses_of([0.0], 60), poses_of([0.0], -60)])
     steps = [step_costs(cup, both, both, 1 / 15, NO_HAND)] * 7
     found = decode([np.array([6.0, 6.0])] * 8, steps)
@@ -243,15 +240,15 @@ def test_equal_evidence_is_even_odds(cup: ObjectMesh) -> None:
         assert own[:2] == pytest.approx([0.5, 0.5], abs=1e-2)
 
 
-def test_what_cannot_be_reached_between_sure_frames_costs_twice() -> None:
-    """At rest, hidden for three frames in which clutter two metres away looks a little like it."""
+def test_excursions_between_sure_frames_cost_twice() -> None:
+    """At rest, hidden for three frames with clutter two metres away."""
     there, clutter = np.zeros((1, 3)), np.array([[2.0, 0.0, 0.0]])
     centres = [there, clutter, np.concatenate([there, clutter]), clutter, there]
     times = np.arange(5) / 15
     sure = np.array([True, False, False, False, True])
-    away = excursions(centres, np.array([0, 0, 0, 0, 0]), sure, times)
+    away = find_excursions(centres, np.array([0, 0, 0, 0, 0]), sure, times)
     assert [own.tolist() for own in away] == [[False], [True], [False, True], [True], [False]]
-    steps = with_excursions(
+    steps = add_excursion_costs(
         [np.zeros((1, 1, len(a) + 1, len(b) + 1)) for a, b in pairwise(centres)], away
     )
     assert steps[0][0, 0].tolist() == [[-EXCURSION_COST, 0], [-EXCURSION_COST, 0]]
@@ -260,10 +257,10 @@ def test_what_cannot_be_reached_between_sure_frames_costs_twice() -> None:
         [0, -EXCURSION_COST, 0],
     ]
     far = [*centres[:4], clutter]  # sure frames that contradict each other say nothing
-    assert not any(own.any() for own in excursions(far, np.zeros(5, int), sure, times))
+    assert not any(own.any() for own in find_excursions(far, np.zeros(5, int), sure, times))
 
 
-def test_free_motion_costs_what_is_asked(cup):
+def test_the_cost_of_free_motion_is_an_argument(cup):
     here, there = np.eye(4)[None], np.eye(4)[None].copy()
     there[0, 0, 3] = 0.1
     usual = mode_log_ratios(cup, here, there, 1 / 15, [])

@@ -1,18 +1,40 @@
-"""Which of two like things is the object, and a start with everything wrong at once."""
+"""Prior of places and hypotheses, and a start beside a twin of the object."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from intercap_core.config import ObjectTrackSettings
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.object_track.constants import CLUTTER_LOG_RATIO
+from intercap_core.object_track.fit import Fit
+from intercap_core.object_track.given_poses import GivenPose
+from intercap_core.object_track.hypotheses import (
+    ANNOTATED_LOG_RATIO,
+    ANNOTATION_LOG_RATIO,
+    UPRIGHT_LOG_RATIO,
+    Prior,
+    group_by_candidates,
+)
 from intercap_core.object_track.observer import Observer
-from intercap_core.object_track.places import Places, Standing
+from intercap_core.object_track.places import (
+    CLUTTER_LOG_RATIO,
+    UNHANDLED_LOG_RATIO,
+    OccupiedPlace,
+    Places,
+)
 from intercap_core.object_track.tracker import Tracker
+from intercap_core.object_track.view_report import ViewReport
 from tests.geometry.rigid.conftest import catalogue
 from tests.helpers.object_capture import FPS, HarshCapture
+from tests.object_track.scenes import FIVE_DEGREES
 
-HANDLED, APART = np.array([0.0, 0.0, 2.0]), np.array([1.2, 0.0, 2.5])
+SHARE = 0.25
+HANDLED, APART, AWAY = (np.array(p) for p in ([0.0, 0, 2], [1.2, 0, 2.5], [-1.5, 0, 2]))
+REPORT = ViewReport(0, 0.9, 0.002, 1.0, 500, 0.95)
 
 
 @pytest.fixture(scope="module")
@@ -20,114 +42,170 @@ def bottle() -> ObjectMesh:
     return ObjectMesh.load(catalogue()["bottle"])
 
 
-def _joints(place: np.ndarray, count: int) -> np.ndarray:
+@pytest.fixture(scope="module")
+def cup() -> ObjectMesh:
+    return ObjectMesh.load(catalogue()["cup"])
+
+
+def joints_at(place: np.ndarray, count: int = 20) -> np.ndarray:
     joints = np.full((count, 135, 3), np.nan)
     joints[:, :25] = place + np.array([0.0, 0.0, 0.05])
     return joints
 
 
-def test_what_the_person_is_at_or_what_left_is_the_object(bottle):
-    standing = [Standing(HANDLED, 1.0), Standing(APART, 1.0)]
-    places = Places(bottle, standing, _joints(HANDLED, 20))
+def test_the_handled_or_moved_object_is_the_tracked_one(bottle):
+    occupied = [OccupiedPlace(HANDLED, 1.0), OccupiedPlace(APART, 1.0)]
+    places = Places(bottle, occupied, joints_at(HANDLED))
     assert places.prior(3, HANDLED) == 1.0 and places.prior(3, APART) == 0.1
-    elsewhere = np.array([-1.0, 0.0, 3.0])
-    assert 0.1 < places.prior(3, elsewhere) < 1.0  # something new there moves
-    left = Places(bottle, [Standing(HANDLED, 1.0), Standing(APART, 0.4)], None)
-    assert left.prior(3, APART) > left.prior(3, HANDLED)
+    assert 0.1 < places.prior(3, np.array([-1.0, 0.0, 3.0])) < 1.0  # a new place: it moved
+    moved = Places(bottle, [OccupiedPlace(HANDLED, 1.0), OccupiedPlace(APART, 0.4)], None)
+    assert moved.prior(3, APART) > moved.prior(3, HANDLED)
     places.claim(APART)
     assert places.prior(3, APART) > 0.5
 
 
-def test_what_is_seen_while_the_object_is_given_elsewhere_is_another(bottle):
-    places = Places(bottle, [], _joints(HANDLED, 20))
-    before = places.weigh(3, HANDLED, 20.0, 0.2)
-    assert before == 20.0
-    places.seen_beside_given(HANDLED + 0.01)
+def test_an_excluded_place_is_never_the_object(bottle):
+    places = Places(bottle, [], joints_at(HANDLED))
+    assert places.weigh(3, HANDLED, 20.0, 0.2) == 20.0
+    places.exclude(HANDLED + 0.01)
     assert places.weigh(3, HANDLED, 20.0, 0.2) == -CLUTTER_LOG_RATIO
     assert places.weigh(3, HANDLED, -4.0, 0.2) == -4.0 - CLUTTER_LOG_RATIO
     assert places.weigh(3, HANDLED + np.array([0, 0.3, 0]), 20.0, 0.2) > 0
-    places.forget_clutter()
+    places.clear_rivals()
     assert places.weigh(3, HANDLED, 20.0, 0.2) == -CLUTTER_LOG_RATIO
 
 
-def test_a_brief_visit_is_not_being_handled(bottle):
-    joints = _joints(HANDLED, 40)
+def test_a_brief_visit_is_not_handling(bottle):
+    joints = joints_at(HANDLED, 40)
     joints[:2, :25] = APART
-    places = Places(bottle, [Standing(APART, 1.0)], joints)
+    assert Places(bottle, [OccupiedPlace(APART, 1.0)], joints).prior(3, APART) == 0.1
+
+
+def test_a_place_occupied_meanwhile_is_another_object(bottle):
+    places = Places(bottle, [OccupiedPlace(APART, 0.8)], joints_at(APART))
+    assert places.prior(3, APART) == 1.0
+    places.add_rival(8, APART, HANDLED, 40.0)
+    places.add_rival(8, APART, HANDLED, 40.0)  # one frame counts once
+    places.add_rival(12, APART, APART + 0.01, 40.0)  # the object itself
+    places.add_rival(14, APART, HANDLED, 5.0)  # little evidence
+    assert places.prior(3, APART) == 1.0
+    places.add_rival(16, APART, HANDLED, 40.0)
     assert places.prior(3, APART) == 0.1
 
 
-def test_what_stands_there_while_the_object_is_elsewhere_is_another(bottle):
-    twin = Standing(APART, 0.8)
-    places = Places(bottle, [twin], _joints(APART, 20))  # the person walks past it
-    assert places.prior(3, APART) == 1.0
-    places.seen_beside(8, APART, HANDLED, 40.0)
-    places.seen_beside(8, APART, HANDLED, 40.0)  # one frame counts once
-    places.seen_beside(12, APART, APART + 0.01, 40.0)  # the object itself
-    places.seen_beside(14, APART, HANDLED, 5.0)  # it hardly looks like it
-    assert places.prior(3, APART) == 1.0
-    places.seen_beside(16, APART, HANDLED, 40.0)
-    assert places.prior(3, APART) == 0.1
-
-
-def test_what_is_beside_the_object_in_its_own_place_marks_nothing(bottle):
-    """Object and rival on either side of one standing place, which is the object's."""
-    standing = Standing(APART, 0.8)
-    places = Places(bottle, [standing], _joints(APART, 20))
+def test_rivals_within_the_objects_own_place_do_not_count(bottle):
+    places = Places(bottle, [OccupiedPlace(APART, 0.8)], joints_at(APART))
     aside = np.array([0.07, 0.0, 0.0])
-    one, two = APART - aside, APART + aside
     for t in (3, 9, 12):
-        places.seen_beside(t, two, one, 40.0)
+        places.add_rival(t, APART + aside, APART - aside, 40.0)
     assert places.prior(3, APART) == 1.0
 
 
-def test_what_clutter_looks_like_is_no_evidence_for_the_object_there(bottle):
-    """By 6 and 10 nats a thing looks like the bottle while that is elsewhere; then 7 nats there are
-    none, and 40 are the bottle, which was put there."""
-    places = Places(bottle, [], _joints(APART, 20))
+def test_evidence_of_clutter_is_subtracted(bottle):
+    """By 6 and 10 nats clutter looks like the bottle while that is elsewhere."""
+    places = Places(bottle, [], joints_at(APART))
+    elsewhere = places.weigh(3, HANDLED, 7.0, 0.2)
     assert places.weigh(3, APART, 7.0, 0.2) == 7.0
     for t, nats in ((8, 10.0), (8, 9.0), (12, 6.0)):
-        places.seen_beside(t, APART, HANDLED, nats)
+        places.add_rival(t, APART, HANDLED, nats)
     assert places.weigh(3, APART + 0.01, 7.0, 0.2) == pytest.approx(7.0 - 8.0)
     assert places.weigh(3, APART, 40.0, 0.2) == pytest.approx(40.0 - 8.0)
     for t in (14, 15, 16):
-        places.seen_beside(t, APART, HANDLED, 50.0)  # a twin, perhaps: it keeps most of its nats
+        places.add_rival(t, APART, HANDLED, 50.0)  # may be a twin: it keeps most of its evidence
     assert places.weigh(3, APART, 40.0, 0.2) == pytest.approx(40.0 - CLUTTER_LOG_RATIO)
-    assert places.weigh(3, HANDLED, 7.0, 0.2) == pytest.approx(
-        Places(bottle, [], _joints(APART, 20)).weigh(3, HANDLED, 7.0, 0.2)
-    )
-    places.forget_clutter()
+    assert places.weigh(3, HANDLED, 7.0, 0.2) == pytest.approx(elsewhere)
+    places.clear_rivals()
     assert places.weigh(3, APART, 7.0, 0.2) == 7.0
 
 
-@pytest.mark.parametrize("name", ["tennis_racquet"])
-def test_starts_by_itself_beside_a_twin_with_all_that_detectors_do_wrong(name):
-    entry = catalogue()[name]
-    mesh = ObjectMesh.load(entry)
-    capture = HarshCapture(mesh, 4, label=entry.labels[0], still=0.2)
+def fit_of(mesh: ObjectMesh, place: np.ndarray, ratio: float, candidate: int, up: int = 1) -> Fit:
+    pose = np.diag([1.0, up, up, 1.0])
+    pose[:3, 3] = place - pose[:3, :3] @ mesh.centre_of_mass
+    view = replace(REPORT, candidate=candidate, log_ratio=ratio / 4)
+    return Fit(pose, np.eye(6), (view,) * 4)
+
+
+def prior_of(mesh: ObjectMesh, up: np.ndarray | None = None) -> Prior:
+    occupied = [OccupiedPlace(HANDLED, 1.0), OccupiedPlace(APART, 1.0)]
+    places = Places(mesh, occupied, joints_at(HANDLED - [0, 0, 0.05]))
+    times = np.arange(20) / 4
+    observer = SimpleNamespace(mesh=mesh, places=places, up=up, share=SHARE, times=times)
+    return Prior(observer)  # type: ignore[arg-type]
+
+
+def test_a_twin_weighs_no_more_than_its_place(cup):
+    held, twin = fit_of(cup, HANDLED, 12.0, 0), fit_of(cup, APART, 60.0, 1)
+    found = prior_of(cup).weigh(3, [held, twin])
+    assert found[0] == pytest.approx(12.0)  # the person is at it
+    assert found[1] == pytest.approx(np.log(0.1 / 0.9) / SHARE)
+
+
+def test_poses_of_one_candidate_differ_by_their_evidence(cup):
+    twin, beside = fit_of(cup, APART, 60.0, 1), fit_of(cup, APART + np.array([0.4, 0, 0]), 20.0, 1)
+    found = prior_of(cup).weigh(3, [twin, beside])
+    assert found[1] == pytest.approx(found[0] - 40.0)
+
+
+def test_objects_that_move_far_from_everybody_need_evidence(cup):
+    found = prior_of(cup).weigh(3, [fit_of(cup, AWAY, 30.0, 2)])
+    assert found[0] == pytest.approx(30.0 - 0.9 * UNHANDLED_LOG_RATIO)
+
+
+def test_upright_and_annotated_poses_weigh_more(cup):
+    stands, hangs = (fit_of(cup, HANDLED, 12.0, n, up=u) for n, u in ((0, 1), (1, -1)))
+    prior = prior_of(cup, np.array([0.0, 0.0, 2.0]))
+    plain = prior.weigh(3, [stands, hangs])
+    assert plain[0] - plain[1] == pytest.approx(2 * UPRIGHT_LOG_RATIO)
+    prior.given[3] = GivenPose(3, hangs.pose, 0.01, FIVE_DEGREES)
+    annotated = prior.weigh(3, [stands, hangs])
+    most = ANNOTATED_LOG_RATIO + ANNOTATION_LOG_RATIO
+    assert annotated[1] - plain[1] == pytest.approx(most / SHARE)
+    assert annotated[0] - plain[0] <= ANNOTATED_LOG_RATIO / SHARE  # turned over: within reach only
+    np.testing.assert_allclose(prior.weigh(4, [stands, hangs]), plain)
+
+
+def test_hypotheses_are_grouped_by_candidates(cup):
+    fits = [fit_of(cup, HANDLED, r, c) for r, c in ((10.0, 0), (30.0, 1), (20.0, 0), (5.0, -1))]
+    number = group_by_candidates(fits)
+    assert number[0] == number[2] and len(set(number)) == 3
+    assert group_by_candidates([]).shape == (0,)
+
+
+def test_frames_near_annotated_and_hidden_frames(cup):
+    prior = prior_of(cup)
+    hidden = np.isin(np.arange(20), [2, 9])
+    assert not prior.near_annotated(hidden).any()
+    prior.given[4] = prior.given[15] = GivenPose(4, np.eye(4), 0.01, 0.1)
+    assert np.flatnonzero(prior.near_annotated(hidden)).tolist() == [*range(1, 8)]
+    hidden[18] = True
+    near = [*range(1, 8), *range(12, 19)]
+    assert np.flatnonzero(prior.near_annotated(hidden)).tolist() == near
+
+
+def harsh_observer(capture: HarshCapture, mesh: ObjectMesh) -> Observer:
     images = [capture.views(t) for t in range(capture.count)]
     labels = [[[c.label for c in view.candidates] for view in views] for views in images]
-    up = capture.master_from_room[:3, 2]
+    return Observer(
+        mesh, images.__getitem__, labels, ObjectTrackSettings(), np.arange(capture.count) / FPS,
+        (capture.label,), up=capture.master_from_room[:3, 2], joints=capture.joints,
+    )  # fmt: skip
 
-    def tracker(joints):
-        return Tracker(
-            mesh.simplified(600), images.__getitem__, labels, ObjectTrackSettings(),
-            times=np.arange(capture.count) / FPS, labels=entry.labels, up=up, joints=joints,
-        )  # fmt: skip
 
-    for frame, true in zip(tracker(capture.joints).run().frames, capture.poses, strict=True):
+def test_the_tracker_starts_beside_a_twin_with_bad_detections():
+    entry = catalogue()["tennis_racquet"]
+    mesh = ObjectMesh.load(entry)
+    capture = HarshCapture(mesh, 3, label=entry.labels[0], still=0.2)
+    track = Tracker(harsh_observer(capture, mesh.simplified(600))).run()
+    for frame, true in zip(track.frames, capture.poses, strict=True):
         pose = frame.fit.pose
         assert not frame.lost
         assert np.linalg.norm(pose[:3, 3] - true[:3, 3]) < 0.02
         assert mesh.symmetry.rotation_error_deg(pose[:3, :3], true[:3, :3]) < 10
 
 
-def test_frames_with_something_that_moves_are_searched_first(bottle):
+def test_a_twin_with_nobody_near_has_a_low_prior(bottle):
     capture = HarshCapture(bottle, 3, label="bottle", missed=(1.0, 1.0))
-    observer = Observer(
-        bottle, capture.views, [[[]] * 6] * 3, ObjectTrackSettings(), ("bottle",),
-        joints=capture.joints,
-    )  # fmt: skip
+    observer = harsh_observer(capture, bottle)
     assert sorted(observer.frames_to_search()) == [0, 1, 2]
-    place_prior = [place_prior for _, place_prior in observer.places._standing]
-    assert place_prior and max(place_prior) < 0.5, "only the twin is seen, and nobody is there"
+    priors = [prior for _, prior in observer.places._standing]
+    assert priors and max(priors) < 0.5

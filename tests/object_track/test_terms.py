@@ -1,24 +1,47 @@
-"""Jacobians of the two terms of equation 1, and masks decoded on every n-th pixel."""
+"""Terms of equation 1: finite differences, and compiled against readable forms."""
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from intercap_core.geometry.camera.intrinsics import Intrinsics
-from intercap_core.geometry.camera.masks import encode
-from intercap_core.geometry.camera.rig import Camera
+from intercap_core.geometry.camera import projection
+from intercap_core.geometry.camera.projection_kernels import (
+    project_point,
+    project_point_with_jacobian,
+)
 from intercap_core.geometry.camera.transforms import rigid
+from intercap_core.geometry.rigid.mesh import ObjectMesh
+from intercap_core.geometry.rigid.render import render
 from intercap_core.object_track import object_depth, object_silhouette
-from intercap_core.object_track.reduced_mask import decode, reduced_lens
-from intercap_core.object_track.view import ViewGeometry, distances
-from tests.helpers.synthetic_capture import COLOUR, COLOUR_FROM_DEPTH, DEPTH
+from tests.geometry.rigid.conftest import catalogue
+from tests.geometry.rigid.test_render import LENS, PINHOLE
+from tests.helpers.synthetic_capture import COLOUR
 
-RNG = np.random.default_rng(0)
-LENS = COLOUR.scaled(0.5)
+RNG = np.random.default_rng(5)
+HALF_LENS = COLOUR.scaled(0.5)
 STEPS = np.eye(6) * 1e-6
+MASTER = np.eye(4)
+MASTER[:3, :3] = Rotation.from_rotvec([0.2, -0.4, 0.1]).as_matrix()
+MASTER[:3, 3] = 0.3, 0.1, -0.2  # master_from_camera
 
 
-def _moved(points, origin, step):
+def _pose(shift=(0, 0, 0), turn=(0, 0, 0)):
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_rotvec(np.add((0.4, 0.8, -0.3), turn)).as_matrix()
+    pose[:3, 3] = np.add((0.25, -0.1, 1.8), shift)
+    return pose
+
+
+@pytest.fixture(scope="module")
+def renders():
+    """Two renderings of a chair; the second one is the measurement."""
+    mesh = ObjectMesh.load(catalogue()["chair"])
+    there = _pose((0.01, 0.006, 0.012), (0.02, 0.03, -0.02))
+    return mesh, *(render(mesh.vertices, mesh.faces, LENS, pose) for pose in (_pose(), there))
+
+
+def _move(points, origin, step):
     return (points - origin) @ Rotation.from_rotvec(step[:3]).as_matrix().T + origin + step[3:]
 
 
@@ -30,7 +53,7 @@ def test_depth_jacobian_against_finite_differences():
 
     def value(step):
         turned = normals @ Rotation.from_rotvec(step[:3]).as_matrix().T
-        return object_depth.residuals(observed, _moved(hit, origin, step), turned, origin)[0]
+        return object_depth.residuals(observed, _move(hit, origin, step), turned, origin)[0]
 
     _, jacobian = object_depth.residuals(observed, hit, normals, origin)
     numeric = np.stack([(value(s) - value(-s)) / 2e-6 for s in STEPS], 1)
@@ -40,81 +63,172 @@ def test_depth_jacobian_against_finite_differences():
 def test_silhouette_jacobian_against_finite_differences():
     points = RNG.normal(size=(40, 3)) * 0.3 + (0, 0, 2.5)
     camera = rigid(Rotation.from_rotvec([0.1, 0.2, 0.3]).as_matrix(), np.array([0.1, -0.2, 0.3]))
-    targets = LENS.project(points @ camera[:3, :3].T + camera[:3, 3])
+    targets = HALF_LENS.project(points @ camera[:3, :3].T + camera[:3, 3])
     targets = targets + RNG.normal(size=targets.shape) * 6
     origin = np.array([0.1, 0.0, 2.4])
 
     def value(step):
-        moved = _moved(points, origin, step)
-        return object_silhouette.residuals(moved, targets, LENS, camera, origin)[0]
+        moved = _move(points, origin, step)
+        return object_silhouette.residuals(moved, targets, HALF_LENS, camera, origin)[0]
 
-    _, jacobian = object_silhouette.residuals(points, targets, LENS, camera, origin)
+    _, jacobian = object_silhouette.residuals(points, targets, HALF_LENS, camera, origin)
     numeric = np.stack([(value(s) - value(-s)) / 2e-6 for s in STEPS], 1)
     np.testing.assert_allclose(jacobian, numeric, atol=1e-5 * np.abs(numeric).max())
 
 
-def test_rim_is_the_inner_border_and_not_the_image_edge():
+def test_the_rim_excludes_the_image_edge():
     mask = np.zeros((9, 12), bool)
     mask[2:6, 5:] = True
     expected = np.zeros_like(mask)
     expected[2, 5:] = expected[5, 5:] = expected[2:6, 5] = True
-    np.testing.assert_array_equal(object_silhouette.rim(mask), expected)
+    np.testing.assert_array_equal(object_silhouette.rim_mask(mask), expected)
 
 
-@pytest.mark.parametrize("step", [1, 2, 3])
-def test_reduced_masks_equal_every_nth_pixel(step):
-    lens = Intrinsics(97, 53, 50, 50, 48, 26)
-    for number in range(12):
-        mask = RNG.random((53, 97)) < (0.5 if number % 2 else 0.02)
-        if number == 4:
-            mask[:] = True
-        if number == 6:
-            mask[:] = False
-        reduced = decode(encode(mask), lens, step)
-        expected = mask[::step, ::step]
-        small = reduced_lens(lens, step)
-        assert (small.height, small.width) == expected.shape
-        np.testing.assert_array_equal(reduced.window(0, 0, *expected.shape), expected)
-        assert reduced.area == expected.sum()
-        y, x = np.mgrid[-2:5, -3:9].reshape(2, -1)
-        inside = (x >= 0) & (y >= 0)
-        want = np.zeros(len(x), bool)
-        want[inside] = expected[y[inside], x[inside]]
-        np.testing.assert_array_equal(reduced.sample(x, y), want)
+@pytest.mark.parametrize("lens", [PINHOLE, LENS], ids=["pinhole", "lens"])
+def test_the_compiled_projection_equals_the_readable_one(lens):
+    points = RNG.normal(size=(200, 3)) * (0.8, 0.6, 0.5) + (0, 0, 2)
+    points = points[lens.inside_model(points)]
+    pixels, jacobian = projection.project_with_jacobian(points, lens.parameters)
+    found = np.array([project_point_with_jacobian(*p, lens.parameters) for p in points])
+    np.testing.assert_allclose(found[:, :2], pixels, atol=1e-9)
+    np.testing.assert_allclose(found[:, 2:].reshape(-1, 2, 3), jacobian, rtol=1e-9, atol=1e-9)
+    anywhere = RNG.normal(size=(200, 3)) * 3  # beyond the calibration and behind the camera too
+    found = np.array([project_point(*p, lens.parameters) for p in anywhere])
+    np.testing.assert_allclose(found, lens.project(anywhere), rtol=1e-9)
 
 
-def test_reduced_pixels_are_the_same_rays():
-    small = reduced_lens(COLOUR, 3)
-    pixels = np.array([[0, 0], [100, 50], [639, 359]])
-    np.testing.assert_allclose(small.unproject(pixels), COLOUR.unproject(pixels * 3), atol=1e-12)
+def _measurements(image):
+    """Measured depth (H, W) in the whole image, and the points it measures, master frame."""
+    depth = np.zeros((LENS.height, LENS.width), np.float32)
+    depth[image.window] = image.depth
+    local = np.concatenate([LENS.rays * depth[..., None], depth[..., None]], -1)
+    return depth, (local @ MASTER[:3, :3].T + MASTER[:3, 3]).astype(np.float32)
 
 
-def test_a_mask_of_another_size_is_refused():
-    with pytest.raises(ValueError, match="does not fit"):
-        decode(encode(np.ones((5, 5), bool)), COLOUR, 2)
+def test_the_compiled_depth_term_equals_the_readable_one(renders):
+    mesh, image, other = renders
+    measured, points = _measurements(other)
+    trust = RNG.uniform(size=measured.shape).astype(np.float32)
+    trust[::3] = 0
+    pose = MASTER @ _pose()
+    gate, scale = 0.04, 0.015
+    hessian, gradient, count = object_depth.normal_equations(
+        image.depth, image.face, (image.x0, image.y0), measured, points, trust,
+        mesh.face_normals, pose[:3, :3], pose[:3, 3], MASTER[:3, 3], gate, scale,
+    )  # fmt: skip
+    here = (slice(image.y0, None), slice(image.x0, None))
+    near = image.mask & (measured[image.window] > 0) & (trust[image.window] > 0)
+    near &= np.abs(measured[image.window] - image.depth.astype(float)) < gate
+    v, u = np.nonzero(near)
+    observed = points[here][v, u].astype(float)
+    rays = np.column_stack([LENS.rays[here][v, u], np.ones(len(u))]).astype(float)
+    hit = (rays * image.depth[v, u, None]) @ MASTER[:3, :3].T + MASTER[:3, 3]
+    normals = mesh.face_normals[image.face[v, u]] @ pose[:3, :3].T
+    residual, jacobian = object_depth.residuals(observed, hit, normals, pose[:3, 3])
+    weight = trust[here][v, u] * (scale**2 / (scale**2 + residual**2)) ** 2
+    assert count == len(u) > 300
+    expected = (jacobian * weight[:, None]).T @ jacobian
+    np.testing.assert_allclose(hessian, expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())
+    expected = (jacobian * weight[:, None]).T @ residual
+    np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())
+    gap, across, where = object_depth.matches(
+        image.depth, image.face, (image.x0, image.y0), measured, points, mesh.face_normals,
+        pose[:3, :3], MASTER[:3, 3],
+    )  # fmt: skip
+    kept = (np.abs(gap) < gate) & (trust[where[:, 1], where[:, 0]] > 0)
+    np.testing.assert_allclose(across[kept], np.abs(residual), atol=1e-6)
 
 
-def _geometry(diameter: float, distance: float, scale: float = 1.0) -> ViewGeometry:
-    camera = Camera("k1", COLOUR.scaled(scale), DEPTH, COLOUR_FROM_DEPTH, np.eye(4))
-    return ViewGeometry.for_object(camera, diameter, distance_m=distance)
+def test_compiled_rims_and_nearest_pixels():
+    mask = cv2.GaussianBlur(RNG.normal(size=(60, 80)), (0, 0), 4) > 0
+    pixels, starts = object_silhouette.rim_pixels(mask)
+    expected = np.argwhere(object_silhouette.rim_mask(mask))[:, ::-1]
+    np.testing.assert_array_equal(pixels, expected)
+    np.testing.assert_array_equal(np.diff(starts), np.bincount(expected[:, 1], minlength=60))
+    for x, y in RNG.integers(-10, 90, size=(300, 2)):
+        distance = np.linalg.norm(pixels - (x, y), axis=1)
+        for limit in (4.0, 1e3):
+            index = object_silhouette.nearest(pixels, starts, x, y, limit)
+            if 0 <= y < 60 or index >= 0:
+                assert (index < 0) == (distance.min() >= limit)
+            if index >= 0:
+                assert distance[index] == distance.min()
 
 
-def test_images_are_reduced_by_how_large_the_object_appears():
-    """Every pixel of a cup counts; a suitcase near by would be 400 px high: each fourth does."""
-    assert (_geometry(0.1, 2.2).step, _geometry(0.1, 2.2).depth_step) == (1, 1)
-    assert _geometry(0.1, 2.2, scale=2 / 3).step == 1
-    assert [_geometry(0.62, distance).step for distance in (1.4, 3.0, 8.0)] == [4, 2, 1]
-    assert _geometry(1.1, 1.0).step == 4
-    for distance in (1.5, 2.0, 3.0, 4.0, 6.0):
-        for diameter in (0.25, 0.6, 1.0):
-            geometry = _geometry(diameter, distance)
-            shown = geometry.camera.colour.fx * diameter / distance
-            assert geometry.step in (1, 4) or 50 < shown / geometry.step < 125
+def test_the_compiled_silhouette_term_equals_the_readable_one(renders):
+    _, image, other = renders
+    left, top = min(image.x0, other.x0) - 5, min(image.y0, other.y0) - 5
+    shape = (max(image.y0, other.y0) + 400 - top, max(image.x0, other.x0) + 400 - left)
+    inside, drawn = np.zeros(shape, bool), np.zeros(shape, bool)
+    for target, source in ((inside, other), (drawn, image)):
+        y, x = np.nonzero(source.mask)
+        target[y + source.y0 - top, x + source.x0 - left] = True
+    person = np.zeros(shape, bool)
+    person[: shape[0] // 3] = True
+    person &= ~inside
+    border, starts = object_silhouette.rim_pixels(inside)
+    limit, scale, corner = 9.0, 5.0, (image.x0, image.y0)
+    at, target, missed, size = object_silhouette.correspondences(
+        image.face, corner, inside, person, (left, top), border, border, starts, True, limit, 12
+    )
+    own = np.argwhere(object_silhouette.rim_mask(drawn))[:, ::-1]
+    assert size == len(own) and 0 < missed < len(at)
+
+    def reach(points, others):
+        distance = np.linalg.norm(points[:, None] - others[None], axis=2).min(1)
+        return np.sort(distance[distance < limit])
+
+    outside = own[~inside[own[:, 1], own[:, 0]] & ~person[own[:, 1], own[:, 0]]]
+    lengths = np.linalg.norm(at - target, axis=1)
+    misses = border[~drawn[border[:, 1], border[:, 0]]]
+    np.testing.assert_allclose(np.sort(lengths[:missed]), reach(misses, own))
+    np.testing.assert_allclose(np.sort(lengths[missed:]), reach(outside, border))
+
+    origin = (MASTER @ _pose())[:3, 3]
+    hessian, gradient, residuals = object_silhouette.normal_equations(
+        at, target, image.depth, corner, LENS.rays, LENS.parameters, MASTER, origin, scale
+    )
+    z = image.depth[at[:, 1] - image.y0, at[:, 0] - image.x0].astype(float)
+    local = np.column_stack([LENS.rays[at[:, 1], at[:, 0]] * z[:, None], z])
+    points = local @ MASTER[:3, :3].T + MASTER[:3, 3]
+    residual, jacobian = object_silhouette.residuals(
+        points, target.astype(float), LENS, np.linalg.inv(MASTER), origin
+    )
+    weight = (scale**2 / (scale**2 + residual**2)) ** 2
+    np.testing.assert_allclose(residuals, residual, atol=1e-3)
+    for found, expected in (
+        (hessian, (jacobian * weight[:, None]).T @ jacobian),
+        (gradient, (jacobian * weight[:, None]).T @ residual),
+    ):
+        np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
 
 
-def test_distance_of_each_camera_from_the_person():
-    joints = np.full((2, 5, 3), np.nan)
-    cameras = [_geometry(1.0, 1.0).camera]
-    assert distances(cameras, joints) == [2.5]
-    joints[1, :3] = (0, 0, 3.5), (0, 0, 4.0), (0, 0, 9.0)
-    assert distances(cameras, joints) == [4.0]
+def test_rim_points_are_kept_before_measured_background(renders):
+    _, image, _ = renders
+    at = np.argwhere(object_silhouette.rim_mask(image.mask))[:, ::-1] + (image.x0, image.y0)
+    at = at.astype(np.int32)
+    measured = np.zeros((LENS.height, LENS.width), np.float32)
+    measured[:, ::2] = image.depth.max() + 0.5
+    measured[:, 1::4] = image.depth[image.mask].min() - 0.1
+    clear = object_silhouette.sees_past(
+        at, image.depth, (image.x0, image.y0), LENS.rays, np.eye(4), LENS.parameters, measured,
+        (0, 0), 0.03,
+    )  # fmt: skip
+    np.testing.assert_array_equal(clear, at[:, 0] % 4 != 1)
+
+
+def test_agreement_equals_that_of_the_matches(renders):
+    mesh, image, other = renders
+    measured, points = _measurements(other)
+    pose = _pose()
+    compared, free, total = object_depth.agreement(
+        image.depth, image.face, image.x0, image.y0, measured, LENS.rays, mesh.face_normals,
+        pose[:3, :3], 0.03, 0.01,
+    )  # fmt: skip
+    in_master = MASTER @ pose
+    gap, across, _ = object_depth.matches(
+        image.depth, image.face, (image.x0, image.y0), measured, points, mesh.face_normals,
+        in_master[:3, :3], MASTER[:3, 3],
+    )  # fmt: skip
+    assert (compared, free) == (len(gap), (gap > -0.03).sum())
+    assert total == pytest.approx((1e-4 / (1e-4 + across[gap > -0.03] ** 2)).sum(), rel=1e-4)

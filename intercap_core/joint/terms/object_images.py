@@ -34,15 +34,18 @@ from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.sequential import TrackedPoses
 from intercap_core.joint.state import OBJECT, State
 from intercap_core.joint.terms.term import Equation, JointTerm
-from intercap_core.object_track.constants import (
-    CONTRADICTED_LOG_RATIO,
-    TRACKING_FACES,
+from intercap_core.object_track.evidence import (
     UNKNOWN_SIGMA,
+    PoseEvidence,
+    evidence_at,
+    free_turns,
+    report_at,
+    views_noise,
+    without_turns,
 )
-from intercap_core.object_track.evidence import PoseEvidence, evidence_at, report_at, views_noise
-from intercap_core.object_track.free_turns import free_turns, without_turns
-from intercap_core.object_track.recording import ObjectRecording
-from intercap_core.object_track.view_cache import ViewCache
+from intercap_core.object_track.likelihood import CONTRADICTED_LOG_RATIO
+from intercap_core.object_track.recording import TRACKING_FACES, ObjectRecording, ViewCache
+from intercap_core.object_track.view import FitContext
 from intercap_core.object_track.view_report import ViewReport
 
 # Standard deviations from its own pose at which evidence counts a quarter. Tuned on the studio.
@@ -74,12 +77,12 @@ class ObjectImages:
         self._recording = recording
         self._views = ViewCache(recording.views, VIEWS_KEPT_BYTES)
         self._geometry = list(recording.geometry)
-        self._settings, self._labels = settings, labels
-        self._renderer = open_renderer(settings.render_on, threads=1)
         self._threads = ThreadPool()
         if threads is not None:
             self._threads = threads
         self.mesh, self.cameras = mesh.simplified(TRACKING_FACES), recording.cameras
+        renderer = open_renderer(settings.render_on, threads=1)
+        self._context = FitContext.from_settings(self.mesh, labels, settings, renderer)
         self.count = recording.count
 
     def take_cameras(self, cameras: Cameras) -> None:
@@ -133,15 +136,8 @@ class ObjectImages:
             number = place[int(camera[t])]
             kept = self._views.kept(t)
             view = self._recording.view(t, number) if kept is None else kept[number]
-            return report_at(
-                self.mesh,
-                view.through(self._geometry[number]),
-                poses[t],
-                min_overlap=self._settings.min_overlap,
-                labels=self._labels,
-                twist=twists[t],
-                renderer=self._renderer,
-            )
+            seen = view.through(self._geometry[number])
+            return report_at(self._context, seen, poses[t], twists[t])
 
         return dict(zip(shown, self._threads.map(report, shown), strict=True))
 
@@ -150,16 +146,7 @@ class ObjectImages:
             view.through(geometry)
             for view, geometry in zip(self._views(t), self._geometry, strict=True)
         ]
-        found = evidence_at(
-            self.mesh,
-            views,
-            pose,
-            min_overlap=self._settings.min_overlap,
-            background_term=self._settings.background_term,
-            labels=self._labels,
-            twist=twist,
-            renderer=self._renderer,
-        )
+        found = evidence_at(self._context, views, pose, twist)
         turns = free_turns(self.mesh, pose)
         depth = without_turns(found.of_depth, found.depth_gradient, turns)
         contour = without_turns(

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from intercap_core.body.joints import JOINT_NAMES, PARENTS
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.surfaces import vertex_normals
-from intercap_core.object_track.light import linear
+from intercap_core.object_track.appearance import linear
 from intercap_core.output.export.about import About
 from intercap_core.output.export.motion import Coordinates, Motion
 

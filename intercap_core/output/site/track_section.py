@@ -17,7 +17,7 @@ from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.render import render
-from intercap_core.object_track.absent import SOURCE as NO_TRACK
+from intercap_core.object_track.artefact import SOURCE_NONE as NO_TRACK
 from intercap_core.output.site import charts
 from intercap_core.output.site.drawing import Crop, Sheet, make_sheet
 from intercap_core.output.site.overlays import choose_frames

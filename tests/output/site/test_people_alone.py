@@ -15,7 +15,7 @@ from intercap_core.commands.evaluate.sequences import areas
 from intercap_core.config import MetricsSettings, PageSettings
 from intercap_core.evaluation.figures import SequenceMetrics, flag_figures, truth_figures
 from intercap_core.evaluation.summary import SequenceSummary, collect_heatmaps
-from intercap_core.object_track.absent import SOURCE, absent_track
+from intercap_core.object_track.artefact import SOURCE_NONE, absent_track
 from intercap_core.schemas import CONTACT_REGIONS
 from intercap_core.stages import metrics
 from tests.helpers import fitted_capture as fitted
@@ -30,7 +30,7 @@ WHY = "the track is of nothing"
 def _miss(capture: fitted.Capture) -> None:
     """The object is there, and its track is lost in every frame."""
     with h5py.File(capture.paths["object_track"], "r+") as file:
-        file.attrs["seed_source"], file.attrs["doubts"] = SOURCE, WHY
+        file.attrs["seed_source"], file.attrs["doubts"] = SOURCE_NONE, WHY
         for key, values in absent_track(TOTAL, len(capture.rig)).items():
             file[key][...] = values
     with h5py.File(capture.paths["joint"], "r+") as file:
