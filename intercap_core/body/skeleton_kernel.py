@@ -37,7 +37,7 @@ class RestJoints(NamedTuple):
         return cls(selection.template[1:].numpy(), selection.directions[1:].numpy())
 
 
-class Chain(NamedTuple):
+class PosedPoints(NamedTuple):
     """B posed bodies and N of their points, for kernels: :class:`Skeleton` and
     :class:`.selection.Selection` as arrays."""
 
@@ -72,9 +72,9 @@ class Skeleton(NamedTuple):
     moved: np.ndarray
     """(B, 55, 3, S) derivatives of the offsets by the shape; of no body without derivatives."""
 
-    def chain(self, selection: Selection, rest: np.ndarray) -> Chain:
+    def chain(self, selection: Selection, rest: np.ndarray) -> PosedPoints:
         """Return the arrays of a selection's points; rest (B,N,3)."""
-        return Chain(
+        return PosedPoints(
             rest, *self, selection.directions.numpy(), selection.bones.numpy(),
             selection.bone_weights.numpy(), selection.chain.numpy(), selection.below.numpy(),
         )  # fmt: skip

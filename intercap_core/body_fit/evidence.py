@@ -27,7 +27,7 @@ from intercap_core.body_fit.matching import Matcher, PosedSkin
 from intercap_core.body_fit.observations import Observations, PersonCloud
 from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.body_fit.self_contact import SelfContact, find_contacts, join_frames
-from intercap_core.body_fit.surface import COVERINGS, Surface, choose_samples
+from intercap_core.body_fit.surface import COVERINGS, SkinSurface, choose_samples
 from intercap_core.body_fit.term_inputs import CloudRows, KeypointSet, Pairs, Views, keypoint_set
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.solve.robust import SIGMA_PER_MAD
@@ -107,7 +107,7 @@ class Evidence:
         self.clouds = [clouds[t] for t in self.frames]
         self.has_cloud = any(cloud is not None for cloud in self.clouds)
         self.samples = choose_samples(model)
-        self.surface = Surface.around_samples(model, self.samples)
+        self.surface = SkinSurface.around_samples(model, self.samples)
         sample, patch = (
             torch.as_tensor(places, device=model.device)
             for places in (self.surface.sample, self.surface.patch)

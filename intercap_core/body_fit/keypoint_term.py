@@ -6,8 +6,8 @@ with Geman and McClure's rho_J, the projection Pi^v of view v, the detection J_i
 of the detector and the precision k = 1 / sigma^2 of a keypoint. Beyond the paper: X_i is the
 model's keypoint plus an offset o_i that is constant in the frame of the bone that carries it.
 Detectors and body models mean different points by the same name ("hip"), and the difference is the
-same in every frame. o_i is estimated with a Gaussian prior, see :class:`.problem.Layout`. Also
-beyond the paper: triangulated keypoints count in the same way, by their distance in metres.
+same in every frame. o_i is estimated with a Gaussian prior (:class:`.problem.ParameterLayout`).
+Also beyond the paper: triangulated keypoints count in the same way, by their distance in metres.
 
 The residuals of all views depend on the body through the 3D point alone. They are summed into one
 gradient (3,) and one matrix (3, 3) by the point before the derivatives of the body are applied.

@@ -19,7 +19,7 @@ from torch import Tensor
 from intercap_core.body_fit.free_space import seen_through
 from intercap_core.body_fit.observations import PersonCloud
 from intercap_core.body_fit.outlines import RimSamples, touching
-from intercap_core.body_fit.surface import MATCH_SIDEWAYS_M, NORMAL_LENGTH_M, Samples, Surface
+from intercap_core.body_fit.surface import MATCH_SIDEWAYS_M, NORMAL_LENGTH_M, Samples, SkinSurface
 from intercap_core.geometry.camera.rig import Rig
 
 MATCH_COSINE = 0.3  # smallest, between the normals of a point and its vertex; tuned on the studio
@@ -43,7 +43,7 @@ def match_points(
     normals: Tensor,
     vertices: Tensor,
     vertex_normals: Tensor,
-    surface: Surface,
+    surface: SkinSurface,
     reach: float,
 ) -> Matches:
     """Match points to the sample that is nearest in position and orientation.
@@ -74,7 +74,7 @@ def match_in_torch(
     normals: Tensor,
     vertices: Tensor,
     vertex_normals: Tensor,
-    surface: Surface,
+    surface: SkinSurface,
     reach: float,
 ) -> Matches:
     """The readable form of :func:`match_points`, on any device."""
@@ -152,14 +152,14 @@ class FrameMatches(NamedTuple):
 class Matcher:
     """Matches the measurements of a frame to the S samples of a surface."""
 
-    surface: Surface
+    surface: SkinSurface
     sample: Tensor
     """(S,) index of each sample in the surface."""
     rims: RimSamples
     """Samples that rims of masks can touch."""
 
     @classmethod
-    def of(cls, samples: Samples, surface: Surface, device: torch.device) -> Matcher:
+    def of(cls, samples: Samples, surface: SkinSurface, device: torch.device) -> Matcher:
         sample = torch.as_tensor(surface.sample, device=device)
         return cls(surface, sample, RimSamples.of(samples, surface))
 

@@ -13,7 +13,7 @@ from intercap_core import artefacts
 from intercap_core.artefacts import unpack_ragged
 from intercap_core.body.keypoints import BODY
 from intercap_core.body_fit.free_space import DepthWindow
-from intercap_core.body_fit.outlines import Outline, trace_outline
+from intercap_core.body_fit.outlines import MaskRim, trace_outline
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import FROM_DETECTOR
 from intercap_core.formats.recordings.frames import Frames
@@ -157,7 +157,7 @@ class PersonCloud:
     """(M,) camera index."""
     windows: tuple[DepthWindow, ...] = ()
     """Depth around the person, by camera."""
-    outlines: tuple[Outline, ...] = ()
+    outlines: tuple[MaskRim, ...] = ()
     """Rims of the person's masks that a detector drew, by camera."""
 
     def of_view(self, view: int) -> PersonCloud:

@@ -20,7 +20,7 @@ import cv2
 import numba
 import numpy as np
 
-from intercap_core.body_fit.surface import MATCH_SIDEWAYS_M, NORMAL_LENGTH_M, Samples, Surface
+from intercap_core.body_fit.surface import MATCH_SIDEWAYS_M, NORMAL_LENGTH_M, Samples, SkinSurface
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.mask_pixels import drawn
 from intercap_core.geometry.camera.masks import Runs
@@ -39,7 +39,7 @@ _COSINE = (
 
 
 @dataclass(frozen=True, eq=False)
-class Outline:
+class MaskRim:
     """The rim of the person's mask in one camera."""
 
     view: int
@@ -50,7 +50,7 @@ class Outline:
     """(M, 3) float32 outward unit normals of the planes that touch the person there."""
 
 
-def trace_outline(mask: Runs, others: Runs | None, lens: Intrinsics, view: int) -> Outline | None:
+def trace_outline(mask: Runs, others: Runs | None, lens: Intrinsics, view: int) -> MaskRim | None:
     """Return points evenly along the rim of the mask, or None if there are none.
 
     Points next to ``others``, the mask of other detected objects, are left out: the person may
@@ -79,7 +79,7 @@ def trace_outline(mask: Runs, others: Runs | None, lens: Intrinsics, view: int) 
     good = np.isfinite(length) & (length > 0)
     rays, normals = rays[good], normals[good] / length[good, None]
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    return Outline(view, rays.astype(np.float32), normals.astype(np.float32))
+    return MaskRim(view, rays.astype(np.float32), normals.astype(np.float32))
 
 
 def _rim(mask: Runs) -> tuple[np.ndarray, np.ndarray]:
@@ -116,13 +116,13 @@ class RimSamples(NamedTuple):
     """(S, 20) indices in the surface."""
 
     @classmethod
-    def of(cls, samples: Samples, surface: Surface) -> RimSamples:
+    def of(cls, samples: Samples, surface: SkinSurface) -> RimSamples:
         number = np.flatnonzero(~samples.hand)
         return cls(number, surface.sample[number], surface.patch[number])
 
 
 def touching(
-    rim: Outline,
+    rim: MaskRim,
     master_from_colour: np.ndarray,
     vertices: np.ndarray,
     normals: np.ndarray,

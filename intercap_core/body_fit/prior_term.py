@@ -5,7 +5,8 @@ observations are weighted by their noise, so Gaussian priors are in units of the
 deviation and have weight 1, where the paper sets its lambdas empirically. E_theta_b is VPoser if
 the user has it; the open default is a broad Gaussian about standing at ease. E_psi, of the
 expression, is the paper's curly E. E_beta of a shape that all frames share is in
-:class:`.problem.Layout`. Beyond the paper: anatomical limits of the joints, with either pose prior.
+:class:`.problem.ParameterLayout`. Beyond the paper: anatomical limits of the joints, with either
+pose prior.
 """
 
 from __future__ import annotations

@@ -70,7 +70,7 @@ class Shared(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Layout:
+class ParameterLayout:
     """Places of n own and m shared parameters in the solver's vectors, and the shared priors."""
 
     columns: Tensor
@@ -205,9 +205,9 @@ class BodyProblem(TermInputs):
         self.terms = self._terms = self.terms or terms_on(device, self.model, self.samples)
 
     @property
-    def layout(self) -> Layout:
+    def layout(self) -> ParameterLayout:
         """The current places of the parameters."""
-        return Layout(
+        return ParameterLayout(
             self.columns, self.model.num_betas, self.one_shape, self.fit_shared, self.definition
         )
 

@@ -54,7 +54,7 @@ class Settled:
 
 
 @dataclass(frozen=True)
-class Fit:
+class BodyFit:
     """The fit of N of the sequence's T frames."""
 
     frames: np.ndarray
@@ -112,7 +112,7 @@ class Fitter:
         self.frames = self.evidence.frames
         self.one_shape = settings.shape == "shared"
 
-    def run(self) -> Fit:
+    def run(self) -> BodyFit:
         """Fit all frames in the order that the module describes."""
         evidence, hands, face = self.evidence, self.settings.hands, self.settings.face
         base = self.model.zeros(len(self.frames)).vector()
@@ -210,14 +210,14 @@ class Fitter:
         pixels = residuals[:, :, BODY].norm(dim=-1)
         return torch.where(problem.views.confidence[:, :, BODY] > 0, pixels, torch.nan)
 
-    def _report(self, problem: BodyProblem, hessian: Tensor) -> Fit:
+    def _report(self, problem: BodyProblem, hessian: Tensor) -> BodyFit:
         """Return the solution with its residuals."""
         assert problem.views is not None
         evidence, views, index = self.evidence, problem.views, problem.keypoints.index
         residuals = evidence.pixel_residuals(problem)
         pixels = self._body_errors(problem, residuals)
         whitened = pixels / views.sigma[:, :, BODY]
-        return Fit(
+        return BodyFit(
             frames=self.frames,
             vectors=problem.base,
             columns=problem.columns,

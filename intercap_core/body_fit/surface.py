@@ -155,7 +155,7 @@ def _outer(points: np.ndarray, faces: np.ndarray, joint: np.ndarray) -> np.ndarr
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class SkinSurface:
     """The R vertices of a body whose faces touch a sample's patch, with F faces."""
 
     model: BodyModel
@@ -177,7 +177,7 @@ class Surface:
     """(G + 1,) start of each group in ``order``, and the end."""
 
     @classmethod
-    def around_samples(cls, model: BodyModel, samples: Samples) -> Surface:
+    def around_samples(cls, model: BodyModel, samples: Samples) -> SkinSurface:
         every = model.faces.cpu().numpy()
         met = np.zeros(model.num_vertices, bool)
         met[samples.vertex] = met[samples.patch] = True

@@ -9,14 +9,14 @@ from torch import Tensor
 from intercap_core.body.joints import NUM_JOINTS
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
-from intercap_core.body_fit.schedule import Fit
+from intercap_core.body_fit.schedule import BodyFit
 
 # Error of a joint that ten shape components leave, metres along one coordinate: 1.3 mm in the mean
 # over adults that the open body was not made from, measured (docs/body.md).
 _MODEL_SIGMA_M = 0.001
 
 
-def joint_covariance(model: BodyModel, fit: Fit) -> Tensor:
+def joint_covariance(model: BodyModel, fit: BodyFit) -> Tensor:
     """Return the covariance (N, 55, 3, 3) of each joint's position, master frame, square metres.
 
     With own parameters o, shared ones s, and the blocks H of the Hessian of the whitened energy,

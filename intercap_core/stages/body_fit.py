@@ -23,7 +23,7 @@ from intercap_core.body_fit.bridge import bridge, bridged_sigma, continuous
 from intercap_core.body_fit.definition import Definition
 from intercap_core.body_fit.observations import person_clouds, read_observations
 from intercap_core.body_fit.recover import JUMP_M, jumps
-from intercap_core.body_fit.schedule import Fit, Fitter
+from intercap_core.body_fit.schedule import BodyFit, Fitter
 from intercap_core.body_fit.uncertainty import deviation, joint_covariance, widen
 from intercap_core.config import BodyFitSettings, BodyModels, SubjectEntry, digest
 from intercap_core.errors import UserError
@@ -145,7 +145,7 @@ class _Uncertainty(NamedTuple):
 
 
 def _state_uncertainty(
-    model: BodyModel, fit: Fit, times: np.ndarray, fitted: np.ndarray, joints: np.ndarray
+    model: BodyModel, fit: BodyFit, times: np.ndarray, fitted: np.ndarray, joints: np.ndarray
 ) -> _Uncertainty:
     """Return the uncertainty of the ``fitted`` frames (T,) and of the bridged ones.
 

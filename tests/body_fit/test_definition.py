@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from intercap_core.body_fit.definition import POINTS, UNKNOWN_SIGMA_M, Definition
-from intercap_core.body_fit.problem import Layout
+from intercap_core.body_fit.problem import ParameterLayout
 from intercap_core.errors import UserError
 
 
@@ -63,10 +63,10 @@ def test_a_folder_or_missing_file_is_reported(tmp_path: Path) -> None:
 
 def test_prior_of_offsets_is_centred_on_the_definition() -> None:
     known = _some(1)
-    layout = Layout(torch.arange(3), 10, True, True, known)
+    layout = ParameterLayout(torch.arange(3), 10, True, True, known)
     at = torch.as_tensor(known.offsets).reshape(-1)
     mean = torch.cat([torch.zeros(10).double(), at, torch.zeros(9).double()])
     assert layout.prior_cost(mean) == 0
     step = torch.as_tensor(np.random.default_rng(2).normal(0, 1e-3, len(mean)))
-    wide = Layout(torch.arange(3), 10, True, True, Definition.unknown())
+    wide = ParameterLayout(torch.arange(3), 10, True, True, Definition.unknown())
     assert layout.prior_cost(mean + step) > wide.prior_cost(step)

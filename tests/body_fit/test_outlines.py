@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from intercap_core.body_fit.outlines import Outline, RimSamples, touching, trace_outline
+from intercap_core.body_fit.outlines import MaskRim, RimSamples, touching, trace_outline
 from intercap_core.geometry.camera import masks
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.transforms import rigid
@@ -39,13 +39,13 @@ def _runs(mask: np.ndarray) -> masks.Runs:
     return masks.Runs(masks.encode(mask), *mask.shape)
 
 
-def _rim(mask: masks.Runs) -> Outline:
+def _rim(mask: masks.Runs) -> MaskRim:
     found = trace_outline(mask, None, LENS, 0)
     assert found is not None
     return found
 
 
-def _touching(rim: Outline, radius: float, late: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def _touching(rim: MaskRim, radius: float, late: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Of a ball where the seen one is, and so large; ``late`` metres along x of the camera."""
     turn, shift = MASTER_FROM_COLOUR[:3, :3], MASTER_FROM_COLOUR[:3, 3]
     vertices = (radius * BALL.vertices + CENTRE) @ turn.T + shift

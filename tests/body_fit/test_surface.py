@@ -9,7 +9,7 @@ import torch
 from intercap_core.body.model import BodyModel
 from intercap_core.body_fit import matching
 from intercap_core.body_fit.first_hit import first_hits
-from intercap_core.body_fit.surface import Samples, Surface, choose_samples
+from intercap_core.body_fit.surface import Samples, SkinSurface, choose_samples
 from intercap_core.geometry.rigid.distance import o3d
 from intercap_core.geometry.rigid.surfaces import vertex_normals
 from tests.helpers.bodies import posed_normals, random_normal
@@ -21,8 +21,8 @@ def samples(body: BodyModel) -> Samples:
 
 
 @pytest.fixture(scope="module")
-def surface(body: BodyModel, samples: Samples) -> Surface:
-    return Surface.around_samples(body, samples)
+def surface(body: BodyModel, samples: Samples) -> SkinSurface:
+    return SkinSurface.around_samples(body, samples)
 
 
 def test_samples_cover_the_outer_skin(body: BodyModel, samples: Samples) -> None:
@@ -36,7 +36,7 @@ def test_samples_cover_the_outer_skin(body: BodyModel, samples: Samples) -> None
 
 
 def test_surface_poses_what_samples_need(
-    body: BodyModel, samples: Samples, surface: Surface
+    body: BodyModel, samples: Samples, surface: SkinSurface
 ) -> None:
     x = body.zeros(2).vector().clone()
     x[:, :165] += 0.3 * random_normal(2, 165).float()
@@ -51,7 +51,7 @@ def test_surface_poses_what_samples_need(
 
 
 def test_points_off_the_skin_are_measured(
-    body: BodyModel, surface: Surface, samples: Samples
+    body: BodyModel, surface: SkinSurface, samples: Samples
 ) -> None:
     """Points on normals of outer vertices are matched at their height, from either side."""
     vertices, normals = (values[0] for values in surface.posed(body.zeros()))
@@ -68,7 +68,7 @@ def test_points_off_the_skin_are_measured(
     assert len(back.valid) > 10 and not bool(back.valid.any())
 
 
-def test_compiled_matches_equal_torch(body: BodyModel, surface: Surface) -> None:
+def test_compiled_matches_equal_torch(body: BodyModel, surface: SkinSurface) -> None:
     x = body.zeros(2).vector().clone()
     x[:, :165] += 0.3 * random_normal(2, 165).float()
     generator = torch.Generator().manual_seed(1)

@@ -9,14 +9,14 @@ import torch
 from intercap_core.body.model import BodyModel
 from intercap_core.body_fit.problem import columns_of
 from intercap_core.body_fit.quality import PartEvidence
-from intercap_core.body_fit.schedule import Fit, Settled
+from intercap_core.body_fit.schedule import BodyFit, Settled
 from intercap_core.body_fit.uncertainty import deviation, joint_covariance, widen
 
 SHARED = 10 + 75 + 8
 MODEL_M = 0.001
 
 
-def _fit(model: BodyModel, frames: int, counts: float, excess: float = 1.0) -> Fit:
+def _fit(model: BodyModel, frames: int, counts: float, excess: float = 1.0) -> BodyFit:
     """Equal frames of a random energy."""
     columns = columns_of(model, hands=True, face=True, betas=False)
     size = len(columns) + SHARED
@@ -24,18 +24,18 @@ def _fit(model: BodyModel, frames: int, counts: float, excess: float = 1.0) -> F
     hessian = 50 * (rows.transpose(1, 2) @ rows).double().expand(frames, -1, -1)
     vectors = model.zeros(frames).vector()
     nothing = torch.zeros(frames)
-    return Fit(
+    return BodyFit(
         np.arange(frames), vectors, columns, hessian, True, torch.full((SHARED,), counts),
         torch.full((frames,), excess), nothing, nothing,
         Settled(*[nothing] * 5), PartEvidence(*[nothing] * 5),
     )  # fmt: skip
 
 
-def _sigma(model: BodyModel, fit: Fit) -> np.ndarray:
+def _sigma(model: BodyModel, fit: BodyFit) -> np.ndarray:
     return deviation(joint_covariance(model, fit).numpy())
 
 
-def _whole(model: BodyModel, fit: Fit) -> np.ndarray:
+def _whole(model: BodyModel, fit: BodyFit) -> np.ndarray:
     """(55,) deviations from the inverse of one frame's whole Hessian."""
     lin = model.linearise(
         model.parameters(fit.vectors[:1]), vertex_ids=np.array([0]), joints=True

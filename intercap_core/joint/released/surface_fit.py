@@ -22,7 +22,7 @@ from torch import Tensor
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import NUM_POSE, TRANSL
 from intercap_core.body_fit.matching import MATCH_COSINE, average, match_points
-from intercap_core.body_fit.surface import Surface, choose_samples
+from intercap_core.body_fit.surface import SkinSurface, choose_samples
 from intercap_core.formats.released import Skin
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.surfaces import vertex_normals
@@ -90,7 +90,7 @@ class _Surfaces:
         self.model = model
         self.shape = slice(TRANSL.stop, TRANSL.stop + model.num_betas)
         samples = choose_samples(model)
-        self.skin = Surface.around_samples(model, samples)
+        self.skin = SkinSurface.around_samples(model, samples)
         self.hand = torch.as_tensor(samples.hand)
         self.ids = self.skin.ids[self.skin.sample]
         self.outer = np.unique(self.skin.ids[self.skin.patch])
