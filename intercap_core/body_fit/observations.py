@@ -55,7 +55,7 @@ class Observations:
     """RLE of the person's mask in each of T * C images, empty = none."""
     mask_source: np.ndarray
     """(T, C) origin of each mask, as in the person artefact."""
-    beside: list[bytes]
+    other_masks: list[bytes]
     """RLE of other detected objects in each of T * C images, empty = none."""
     background: list[np.ndarray | None]
     """Depth of the empty room in each camera, mm."""
@@ -118,9 +118,9 @@ def read_observations(scene: Path, person: Path) -> Observations:
         joints, views = read["joints"].astype(np.float64), read["joint_views"]
         inlier = read["inlier"]
         masks, source = unpack_ragged(read["mask_offsets"], read["mask_rle"]), read["mask_source"]
-        beside = [b""] * len(masks)
+        others = [b""] * len(masks)
         if "beside_offsets" in read:
-            beside = unpack_ragged(read["beside_offsets"], read["beside_rle"])
+            others = unpack_ragged(read["beside_offsets"], read["beside_rle"])
     confidence = np.clip(np.nan_to_num(keypoints[..., 2]), 0.0, 1.0)
     disputed = (views >= 2)[:, None] & ~inlier
     confidence = np.where(disputed, _OUTLIER_VIEW_TRUST * confidence, confidence)
@@ -134,7 +134,7 @@ def read_observations(scene: Path, person: Path) -> Observations:
         joint_views=views,
         masks=masks,
         mask_source=source,
-        beside=beside,
+        other_masks=others,
         background=background,
         depth_bias=depth_bias,
         image_of=image_of,
@@ -211,8 +211,8 @@ def _fuse(
             continue
         depth = None if camera.depth is None else reader.depth(t, c)
         # a mask without a detector counts only where there is no depth and other objects are known
-        if seen.mask_source[t, c] == FROM_DETECTOR or (depth is None and seen.beside[at]):
-            rim = trace_outline(mask, _runs(seen.beside[at], camera), camera.colour, c)
+        if seen.mask_source[t, c] == FROM_DETECTOR or (depth is None and seen.other_masks[at]):
+            rim = trace_outline(mask, _runs(seen.other_masks[at], camera), camera.colour, c)
             outlines += [] if rim is None else [rim]
         if depth is None:
             continue
