@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from intercap_core.body.joints import NUM_JOINTS, PARENTS
 
-_SMALL_ANGLE_SQUARED = 1e-4  # below this the series' next term is under 1e-10
+SMALL_ANGLE_SQUARED = 1e-4  # below this the series' next term is under 1e-10
 _CACHE_BYTES = 2 << 20  # of blended bones in memory at once: the cache of a core
 
 
@@ -25,7 +25,7 @@ def skew(v: Tensor) -> Tensor:
 
 def _coefficients(theta_squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """sin(t)/t, (1-cos t)/t^2, (t-sin t)/t^3, smooth (also for autograd) through zero."""
-    small = theta_squared < _SMALL_ANGLE_SQUARED
+    small = theta_squared < SMALL_ANGLE_SQUARED
     t2 = torch.where(small, torch.ones_like(theta_squared), theta_squared)
     t = t2.sqrt()
     s2 = torch.where(small, theta_squared, torch.zeros_like(theta_squared))

@@ -14,11 +14,11 @@ import numba
 import numpy as np
 
 from intercap_core.body.joints import NUM_JOINTS, PARENTS
+from intercap_core.body.kinematics import SMALL_ANGLE_SQUARED
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
 from intercap_core.body.selection import Selection
 
-_SMALL_ANGLE_SQUARED = 1e-4
 _SHAPE, _TRANSL = TRANSL.stop, TRANSL.start
 _PARENTS = np.array(PARENTS)
 
@@ -150,7 +150,7 @@ def pose(rest: RestJoints, vectors: np.ndarray, *, derivatives: bool) -> Skeleto
 def _rodrigues(x, y, z, local, jacobian):
     """Write rotation and left Jacobian (3,3) of the axis-angle x, y, z; see :mod:`.kinematics`."""
     t2 = x * x + y * y + z * z
-    if t2 < _SMALL_ANGLE_SQUARED:
+    if t2 < SMALL_ANGLE_SQUARED:
         a = 1 - t2 / 6 + t2 * t2 / 120
         b = 0.5 - t2 / 24 + t2 * t2 / 720
         c = 1 / 6 - t2 / 120 + t2 * t2 / 5040
