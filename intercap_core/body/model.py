@@ -170,12 +170,6 @@ class BodyModel:
         """Split parameter vectors (B,P)."""
         return BodyParameters.from_vector(vector, num_betas=self.num_betas)
 
-    def hand_pose(self, coefficients: Tensor, side: int) -> Tensor:
-        """Return the axis-angle (B,45) of coefficients (B,n) of the first n components; side 0 is
-        the left hand."""
-        count = coefficients.shape[-1]
-        return self.hand_mean[side] + coefficients @ self.hand_components[side, :count]
-
     def forward(
         self, params: BodyParameters, *, vertex_ids: Tensor | np.ndarray | None = None
     ) -> BodyOutput:

@@ -359,4 +359,4 @@ class Evidence:
         share = self.cloud_weight * _SAMPLE_SHARE
         weight = share * total / (total + _HALF_WEIGHT_POINTS) / noise**2
         target = mean + (found.normal * found.where).sum(2)
-        return CloudRows(target, found.normal, weight, mean)
+        return CloudRows(target, found.normal, weight)

@@ -79,8 +79,6 @@ class CloudRows(NamedTuple):
     """(T, N, 3) normal of the surface at the sample."""
     weight: Tensor
     """(T, N) weight, 1/m^2, 0 = no point."""
-    distance: Tensor
-    """(T, N) mean signed distance of the points at the last matching, outside positive, metres."""
 
     def frames(self, index: Tensor | np.ndarray) -> CloudRows:
         """Return the rows of the frames ``index`` (b,)."""

@@ -11,6 +11,7 @@ import torch
 from intercap_core.body.joints import JOINT_NAMES
 from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.maps import maps_path
+from intercap_core.body.model import BodyModel
 
 
 def open_arrays() -> dict[str, np.ndarray]:
@@ -51,3 +52,9 @@ def random_vector(batch: int, size: int, seed: int, dtype: torch.dtype) -> torch
     vector = torch.randn(batch, size, generator=generator, dtype=dtype)
     vector[:, :165] *= 0.4
     return vector
+
+
+def hand_pose(model: BodyModel, coefficients: torch.Tensor, side: int) -> torch.Tensor:
+    """Axis-angle (B,45) of coefficients (B,n) of the first n components; side 0 is left."""
+    count = coefficients.shape[-1]
+    return model.hand_mean[side] + coefficients @ model.hand_components[side, :count]

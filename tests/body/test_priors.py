@@ -12,7 +12,7 @@ from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
 from intercap_core.body.priors import LIMITS_DEG, REST_SPREAD_DEG
 
-from .conftest import random_vector
+from .conftest import hand_pose, random_vector
 
 Rows = priors.DiagonalRows | priors.LinearRows
 
@@ -82,7 +82,7 @@ def test_likely_hands_are_within_limits(body64: BodyModel) -> None:
     for side, at in ((0, slice(75, 120)), (1, slice(120, 165))):
         code = torch.randn(200, 45, generator=generator, dtype=torch.float64)
         code = code.clamp(-1.5, 1.5) * body64.hand_deviation[side]
-        vector[:, at] = body64.hand_pose(code, side)
+        vector[:, at] = hand_pose(body64, code, side)
     rows = _hand(body64, 0, 45)(vector)
     assert rows.residuals.abs().max() < 1.5 + 1e-5
     assert priors.joint_limits(vector).residuals.abs().median() == 0

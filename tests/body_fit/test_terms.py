@@ -83,7 +83,7 @@ def _problem(model: BodyModel) -> BodyProblem:
         rows=CloudRows(
             _random(FRAMES, count, seed=8),
             torch.nn.functional.normalize(_random(FRAMES, count, 3, seed=9), dim=2),
-            200 * _random(FRAMES, count, seed=10).clamp_min(0), torch.zeros(FRAMES, count),
+            200 * _random(FRAMES, count, seed=10).clamp_min(0),
         ),
         pairs=pairs, self_weight=1.0, fit_shared=True,
     )  # fmt: skip
