@@ -539,7 +539,7 @@ class SequenceEntry(Model):
     results: Path | None = None
     """Another program's results for this sequence, in the master camera's frame; they replace the
     joint fit in metrics and pages. InterCap's res.pkl or its folder, or BEHAVE's sequence folder
-    with its registrations. See docs/recordings.md."""
+    with its registrations. See docs/releases.md."""
     truth: Path | None = None
     """Truth file of a virtual recording; read by the metrics only."""
     annotation: Path | None = None
