@@ -1,9 +1,10 @@
-"""Damaged files of every kind that a user supplies, thousands, each read in a process of its own.
+"""Damaged files of every kind that a user supplies.
 
-One is accepted and plausible, or refused in one sentence that names it.
+A damaged file must be accepted with plausible content, or refused in one sentence that names it.
 
-- ``kinds_*``: the kinds of files: a good one, its reader, and what holds of anything it accepts
-- ``mutations``: how a file is damaged, from a seed
-- ``forks``: reads a case in a child with limits of time and memory, and says how it ended
-- ``run``: thousands of cases, `make fuzz`; ``test_fuzz`` runs a few hundred
+- ``kinds``, ``kinds_recordings``: good files of each kind and their readers
+- ``damage``: strategies of hypothesis that damage a file
+- ``child``: reads a case in a child process with limits of time and memory
+- ``plausible``: what no reader may return
+- ``run``: thousands of cases, `make fuzz`; ``test_fuzz`` runs a few of each kind
 """

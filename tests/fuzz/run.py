@@ -1,143 +1,104 @@
-"""Run thousands of cases on all cores, or one by its id: ``python -m tests.fuzz.run``."""
+"""Damage files of every kind and read them: ``python -m tests.fuzz.run``.
+
+A damaged file must be refused by its name, or be accepted with plausible content. Hypothesis draws
+the damage and reduces what fails to a simple case.
+"""
 
 from __future__ import annotations
 
 import argparse
-import contextlib
-import json
 import os
-import queue
-import subprocess
 import sys
-import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
+from hypothesis import HealthCheck, given, seed, settings
+from hypothesis import strategies as st
+
 from intercap_core.pipeline.job import THREAD_VARIABLES
-from tests.fuzz.forks import Outcome, good_files, run_case
+from tests.fuzz.child import good_files, read_damaged
+from tests.fuzz.damage import damaged
 from tests.fuzz.kinds import KINDS
+from tests.fuzz.plausible import Kind
 
 CASES, SEED = 10_000, 1
 
 
-def numbers_of_cases(total: int) -> dict[str, int]:
-    """How many cases each kind has, by its share."""
-    shares = sum(kind.share for kind in KINDS.values())
-    counts = {name: max(1, int(total * kind.share / shares)) for name, kind in KINDS.items()}
-    order = sorted(counts, key=lambda name: -KINDS[name].share)
-    for place in range(abs(rest := total - sum(counts.values()))):
-        counts[order[place % len(order)]] += 1 if rest > 0 else -1
+def check_kind(kind: Kind, cases: int, number: int) -> Counter[str]:
+    """Run cases of a kind and count results; raises AssertionError with the simplest failure."""
+    counts: Counter[str] = Counter()
+    with good_files(kind) as good:
+        contents = {name: (good / name).read_bytes() for name in kind.damaged}
+
+        @seed(number)
+        @settings(
+            max_examples=cases, deadline=None, database=None, suppress_health_check=HealthCheck
+        )
+        @given(data=st.data())
+        def check(data: st.DataObject) -> None:
+            name = data.draw(st.sampled_from(sorted(contents)))
+            content = data.draw(damaged(contents[name], kind.form))
+            verdict = read_damaged(kind, good, name, content)
+            counts[verdict.result] += 1
+            assert verdict.result != "unexplained", f"{kind.name}: {name}: {verdict.words}"
+
+        check()
     return counts
 
 
-def outcomes(total: int, seed: int, worker: int = 0, workers: int = 1) -> Iterator[Outcome]:
-    """The undamaged files of each kind and their cases, of which this worker has every n-th."""
-    for name, count in numbers_of_cases(total).items():
-        kind = KINDS[name]
-        with good_files(kind) as good:
-            kind.read(good)  # kernels are compiled and libraries loaded before the first fork
-            if worker == 0:
-                yield run_case(kind, -1, seed, good)
-            for number in range(worker, count, workers):
-                yield run_case(kind, number, seed, good)
-
-
-def _worker(total: int, seed: int, place: str) -> None:
-    worker, workers = map(int, place.split("/"))
-    for outcome in outcomes(total, seed, worker, workers):
-        print(json.dumps(outcome.__dict__), flush=True)
-
-
-def _lines(total: int, seed: int, workers: int) -> Iterator[Outcome]:
-    if workers == 1:
-        yield from outcomes(total, seed)
-        return
-    commands = [
-        [
-            *(sys.executable, "-m", "tests.fuzz.run", "--cases", str(total)),
-            *("--seed", str(seed), "--worker", f"{n}/{workers}"),
-        ]
-        for n in range(workers)
-    ]
-    running = [subprocess.Popen(c, stdout=subprocess.PIPE, text=True) for c in commands]
-    lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
-
-    def forward(process: subprocess.Popen[str]) -> None:
-        assert process.stdout is not None
-        for line in process.stdout:
-            lines.put(line)
-        lines.put(None)
-
-    for process in running:
-        threading.Thread(target=forward, args=(process,), daemon=True).start()
-    ended = 0
-    while ended < len(running):
-        line = lines.get()
-        if line is None:
-            ended += 1
-            continue
-        with contextlib.suppress(ValueError):  # libraries print as well
-            yield Outcome(**json.loads(line))
-    if any(process.wait() for process in running):
-        raise SystemExit(f"a worker ended with {[process.returncode for process in running]}")
+def _report(name: str, cases: int, number: int) -> tuple[Counter[str], str]:
+    try:
+        return check_kind(KINDS[name], cases, number), ""
+    except Exception as error:
+        notes = [note[:300] for note in getattr(error, "__notes__", ())]
+        return Counter(), " ".join([f"{name}: {error!r:.1000}", *notes])
 
 
 def main() -> None:
-    """Read the command line, run, and say how the cases ended."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    """Read the command line, run, and print how the cases ended."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--cases", type=int, default=CASES)
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--case", help="one case again, as it was printed: kind:number")
-    parser.add_argument("--keep", type=Path, help="write the outcomes here as well")
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS), metavar="KIND")
     parser.add_argument("--output", type=Path, default=Path("results/bench.json"))
-    parser.add_argument("--worker", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if any(os.environ.get(variable) != "1" for variable in THREAD_VARIABLES):
         # threads do not outlive a fork, and libraries count them when they are loaded
         alone = os.environ | dict.fromkeys(THREAD_VARIABLES, "1")
         os.execve(sys.executable, [sys.executable, "-m", "tests.fuzz.run", *sys.argv[1:]], alone)
-    if arguments.worker:
-        return _worker(arguments.cases, arguments.seed, arguments.worker)
-    if arguments.case:
-        name, _, number = arguments.case.partition(":")
-        with good_files(KINDS[name]) as good:
-            KINDS[name].read(good)
-            outcome = run_case(KINDS[name], int(number), arguments.seed, good)
-        print(f"{outcome.case} ({outcome.damage}): {outcome.verdict}: {outcome.told}")
-        raise SystemExit(outcome.verdict == "unexplained")
     started = time.monotonic()
+    cases = -(-arguments.cases // len(arguments.kinds))
     counts: Counter[str] = Counter()
-    refused_seeds = 0
-    kept = arguments.keep.open("w") if arguments.keep else None
-    for outcome in _lines(arguments.cases, arguments.seed, arguments.workers):
-        if kept is not None:
-            print(json.dumps(outcome.__dict__), file=kept, flush=True)
-        if outcome.case.endswith(":-1"):
-            if outcome.verdict != "ok":
-                refused_seeds += 1
-                print(f"{outcome.case} is a good file: {outcome.verdict}: {outcome.told}")
-            continue
-        counts[outcome.verdict] += 1
-        if outcome.verdict == "unexplained":
-            print(f"{outcome.case} ({outcome.damage}): {outcome.told}", flush=True)
-    total = sum(counts.values())
+    failures = []
+    with ProcessPoolExecutor(arguments.workers) as pool:
+        tasks = [pool.submit(_report, name, cases, arguments.seed) for name in arguments.kinds]
+        for task in tasks:
+            of_kind, failure = task.result()
+            counts += of_kind
+            if failure:
+                failures.append(failure)
+                print(failure, flush=True)
     print(
-        f"{total} cases of {len(KINDS)} kinds in {time.monotonic() - started:.0f} s: "
-        f"{counts['refused']} refused, {counts['ok']} accepted, {counts['unexplained']} "
-        f"unexplained; {refused_seeds} good files refused. One again: "
-        f"python -m tests.fuzz.run --seed {arguments.seed} --case KIND:NUMBER"
+        f"{counts.total()} cases of {len(arguments.kinds)} kinds in "
+        f"{time.monotonic() - started:.0f} s: {counts['refused']} refused, {counts['ok']} "
+        f"accepted; {len(failures)} kinds failed"
     )
     from bench.command import add_figures
 
+    refused = sum("good files" in failure for failure in failures)
     add_figures(
         arguments.output,
         "fuzz",
-        {"cases": total, "unexplained": counts["unexplained"], "seeds_refused": refused_seeds},
+        {
+            "cases": counts.total(),
+            "unexplained": len(failures) - refused,
+            "seeds_refused": refused,
+        },
     )
-    raise SystemExit(bool(counts["unexplained"] or refused_seeds))
+    raise SystemExit(bool(failures))
 
 
 if __name__ == "__main__":

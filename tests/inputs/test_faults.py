@@ -24,6 +24,7 @@ from intercap_core.geometry.rigid.mesh_files import load_mesh
 from intercap_core.studio.calibration import write_calibration
 from intercap_core.studio.mkv import MkvWriter
 from tests.fuzz.kinds import KINDS
+from tests.fuzz.plausible import check_plausible
 from tests.helpers.kinect_files import MODES, jpeg_at, make_camera
 from tests.helpers.tiny_onnx import Graph
 
@@ -97,11 +98,6 @@ def _centimetres(folder: Path) -> None:
 
 REFUSED = {
     "no information": (kinect("CalibrationInformation", "null"), "expected an object"),
-    "a list of information": (kinect("CalibrationInformation", "[]"), "expected an object"),
-    "information as text": (kinect("CalibrationInformation", '"x"'), "expected an object"),
-    "nested attachment": (
-        ("kinect-calibration", whole("calibration.json", b"[" * 200_000)), "nested too deeply",
-    ),
     "a lens of 401 digits": (parameter(1, 2, HUGE), "finite numbers"),
     "a radius of 401 digits": (kinect(CAMERA.format(1) + ".MetricRadius", HUGE), "radius|finite"),
     "a shift of 401 digits": (kinect(CAMERA.format(1) + ".Rt.Translation.0", HUGE), "rigid"),
@@ -142,10 +138,6 @@ REFUSED = {
     "weights without numbers": (
         ("vposer", lambda folder: _reweighted(folder, lambda w: w.to("meta"))), "meta",
     ),
-    "weights of 10^12 that take no bytes": (
-        ("vposer", lambda folder: _reweighted(folder, lambda w: w[:1, :1].expand(10**6, 10**6))),
-        "shapes",
-    ),
     "10^9 faces and 12": (
         ("mesh-ply-text", text("box.ply", "element face 12", "element face 1000000000")),
         "states 1000000008 elements",
@@ -184,9 +176,9 @@ def test_a_fault_is_refused_by_file_and_place(name: str, tmp_path: Path) -> None
     edit(tmp_path)
     with pytest.raises(UserError) as caught:
         KINDS[kind].read(tmp_path)
-    told = str(caught.value)
-    assert re.search(words, told), told
-    assert any(file in told for file in (*KINDS[kind].damaged, str(tmp_path))) and len(told) < 1500
+    message = str(caught.value)
+    assert re.search(words, message), message
+    assert any(file in message for file in (*KINDS[kind].damaged, str(tmp_path)))
 
 
 @pytest.mark.parametrize(
@@ -202,14 +194,14 @@ def test_a_fault_is_refused_by_file_and_place(name: str, tmp_path: Path) -> None
         ),
     ],
 )  # fmt: skip
-def test_a_candidate_that_cannot_be_is_left_out(
+def test_impossible_candidates_are_left_out(
     place: str, raw: str, words: str, tmp_path: Path
 ) -> None:
     kind = KINDS["coco-results"]
     kind.make(tmp_path)
-    assert kind.read(tmp_path) == []
+    assert not check_plausible(kind.read(tmp_path))
     values("k1.json", place, raw)(tmp_path)
-    notes = kind.read(tmp_path)
+    notes = check_plausible(kind.read(tmp_path))
     assert notes and re.search(words, "; ".join(notes)), notes
 
 
@@ -220,11 +212,11 @@ def test_outlines_of_real_shapes_are_filled() -> None:
     assert abs(filled.sum() - np.pi * 400 * 250) < 2000
 
 
-def test_a_mask_whose_name_is_no_text_has_a_label_that_is(tmp_path: Path) -> None:
+def test_labels_of_undecodable_mask_names_are_text(tmp_path: Path) -> None:
     kind = KINDS["mask-images"]
     kind.make(tmp_path)
     (tmp_path / "k1/a__cup.png").rename(tmp_path / "k1/a__c\udcffup.png")
-    assert kind.read(tmp_path) == []  # its reader encodes every label
+    assert not check_plausible(kind.read(tmp_path))  # encodes every label
 
 
 @pytest.mark.parametrize(
@@ -239,7 +231,7 @@ def test_a_mask_whose_name_is_no_text_has_a_label_that_is(tmp_path: Path) -> Non
         ),
     ],
 )
-def test_times_of_recordings_that_no_clock_has(
+def test_impossible_times_of_recordings_are_refused(
     options: dict[str, Any], words: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "k1.mkv"
@@ -252,7 +244,7 @@ def test_times_of_recordings_that_no_clock_has(
         KinectFile(path)
 
 
-def test_a_jpeg_of_head_and_end_alone_is_no_image(tmp_path: Path) -> None:
+def test_a_jpeg_without_image_data_is_refused(tmp_path: Path) -> None:
     KINDS["images"].make(tmp_path)
     good = (tmp_path / "a.jpg").read_bytes()
     assert encoded_size(good) == (64, 48)
@@ -286,7 +278,7 @@ def _constant_rcnn(path: Path, boxes: object, scores: object, mask: tuple[int, i
         ([10, 10, 90, 90], 0.9, (1, 40_000), "outputs"),
     ],
 )
-def test_outputs_of_models_that_cannot_be(
+def test_impossible_outputs_of_models_are_refused(
     boxes: list[float], score: float, mask: tuple[int, int], words: str, tmp_path: Path
 ) -> None:
     _constant_rcnn(tmp_path / "model.onnx", boxes, score, mask)
@@ -299,7 +291,7 @@ def test_outputs_of_models_that_cannot_be(
 @pytest.mark.parametrize(
     "shape", [[1, 3, 40_000, 40_000], [1, 3, 10**9, 10**9], [10**9, 3, 64, 64]]
 )
-def test_inputs_of_models_that_no_memory_holds(shape: list[int], tmp_path: Path) -> None:
+def test_models_with_huge_inputs_are_refused(shape: list[int], tmp_path: Path) -> None:
     path = tmp_path / "model.onnx"
     KINDS["onnx-yolo"].make(tmp_path)
     model = onnx.load(path)
@@ -310,12 +302,12 @@ def test_inputs_of_models_that_no_memory_holds(shape: list[int], tmp_path: Path)
         KINDS["onnx-yolo"].read(tmp_path)
 
 
-def test_no_frame_is_left(tmp_path: Path) -> None:
+def test_dropping_every_frame_is_refused(tmp_path: Path) -> None:
     assert "all 3 frames" in str(Annotation(drop_frames=(0, 1, 2)).check_frames(3))
     assert Annotation(drop_frames=(0, 1)).check_frames(3) is None
 
 
-def test_textures_are_looked_for_beside_the_mesh_alone(tmp_path: Path) -> None:
+def test_textures_outside_the_folder_of_the_mesh_are_ignored(tmp_path: Path) -> None:
     import cv2
 
     folder = tmp_path / "object"
@@ -329,7 +321,7 @@ def test_textures_are_looked_for_beside_the_mesh_alone(tmp_path: Path) -> None:
         assert not (colours[:, :3] == (255, 0, 0)).all(1).any()
 
 
-def test_a_network_reads_no_other_file(tmp_path: Path) -> None:
+def test_models_with_external_data_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "model.onnx"
     KINDS["onnx-yolo"].make(tmp_path)
     model = onnx.load(path)
@@ -344,7 +336,7 @@ def test_a_network_reads_no_other_file(tmp_path: Path) -> None:
         KINDS["onnx-yolo"].read(tmp_path)
 
 
-def test_truth_that_is_none(tmp_path: Path) -> None:
+def test_damaged_truth_is_refused(tmp_path: Path) -> None:
     (tmp_path / "truth.h5").write_text("no truth")
-    told = faults_of_truth(tmp_path / "truth.h5")
-    assert len(told) == 1 and str(tmp_path / "truth.h5") in told[0]
+    (fault,) = faults_of_truth(tmp_path / "truth.h5")
+    assert str(tmp_path / "truth.h5") in fault

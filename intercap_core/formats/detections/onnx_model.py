@@ -125,7 +125,12 @@ class OnnxModel:
             ) from None
         if wanted not in session.get_providers():  # onnxruntime falls back to the CPU silently
             raise _no_device(path, device, onnxruntime)
-        return cls(path, session)
+        try:
+            return cls(path, session)
+        except UnicodeDecodeError:
+            raise UserError(
+                f"{path}: is no ONNX model that can be run (a name is not UTF-8); export it again"
+            ) from None
 
     def run(self, images: np.ndarray) -> list[np.ndarray]:
         """Outputs for images (B, 3, H, W); raises UserError if the model fails on them."""
