@@ -188,7 +188,7 @@ def _run(runs: list[ProjectRun], parallel: int, cores: int, lock: int, console: 
         time.sleep(POLL_SECONDS)
         for run in running:
             assert run.process is not None and run.watcher is not None
-            run.watcher.tell()
+            run.watcher.print_changes()
             if run.process.poll() is not None:
                 _end(run, console)
         now = time.monotonic()
