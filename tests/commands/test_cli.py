@@ -306,7 +306,7 @@ FAR_OUT = [v for i in range(133) for v in (1300.0 + i, 20.0, 0.5)]
     ("name", "content", "says"),
     [
         ("k1.json", "{", "k1.json is not valid JSON"),
-        ("k1.json", {"bodies": []}, "k1.json holds an object with bodies, expected OpenPose's"),
+        ("k1.json", {"bodies": []}, "k1.json holds an object with bodies, expected a list"),
         ("k1.json", [{"image_id": 0, "keypoints": [1.0] * 54}],
          "1 of its first 1 people cannot be used (first: entry 0 (image 0): has 18 keypoints"),
         ("k1.json", [{"image_id": 0, "keypoints": FAR_OUT}], "another size"),

@@ -115,7 +115,7 @@ def test_files_for_other_tools_hold_the_body(project: Project) -> None:
     result = pickle.loads((folder / "intercap" / "res.pkl").read_bytes())
     assert len(result["transl"]) == 6 and not {"ob_pose", "ob_trans"} & result.keys()
     text = (folder / "README.txt").read_text()
-    assert "bop is left out" in text and "contact is left out" in text
+    assert "bop is omitted" in text and "contact is omitted" in text
     assert "object pose" not in text and "Object mesh" not in text
     told = json.loads((folder / "export.json").read_text())
     assert (told["object"], told["formats"]) == ("", ["amass", "coco", "glb", "intercap"])

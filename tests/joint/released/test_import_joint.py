@@ -112,7 +112,7 @@ def test_report_and_viewer_say_whose_they_are(imported: fitted.Capture, tmp_path
     page = (out / "site" / "sequences" / NAME / "index.html").read_text()
     assert "1 with results of another program" in overview
     assert "made by another program: res.pkl" in page and "energy of each term" not in page
-    assert "1 sequences hold results of another program" in (out / "card.md").read_text()
+    assert "1 sequences have results of another program" in (out / "card.md").read_text()
 
 
 def test_gaps_are_filled_and_flagged(
