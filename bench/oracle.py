@@ -63,8 +63,8 @@ from intercap_core.project import Project, load_project
 from intercap_core.schemas import SCENE, TRUTH
 
 REMOVED_SHARE = 0.1  # of the faces
-# Half of what is removed is one patch, the rest are clumps of so many faces: their holes have more
-# than the four edges that loading a mesh closes.
+# Number of faces in each small hole. Half of the removed faces are one patch, the others such holes;
+# with six faces they have more than the four edges up to which loading a mesh closes a hole.
 CLUMP_FACES = 6
 
 
@@ -113,7 +113,7 @@ def _true_cameras(found: Artefact, true: Artefact, biases: bool) -> tuple[np.nda
     poses = np.where(np.isfinite(given), poses, given)
     if biases:
         if "depth_bias" not in true:
-            raise UserError(f"{true.path}: states no depth bias; make the recording anew")
+            raise UserError(f"{true.path}: has no depth bias; make the recording again")
         bias = np.where(np.isfinite(bias), true["depth_bias"][order], bias)
     return poses, bias
 
@@ -136,21 +136,21 @@ def removed_faces(vertices: np.ndarray, faces: np.ndarray, seed: int) -> np.ndar
     """Mask (F,) of the faces to remove: one patch and scattered clumps."""
     rng = np.random.default_rng(seed)
     mesh = trimesh.Trimesh(vertices, faces, process=False, validate=False)
-    beside: list[list[int]] = [[] for _ in faces]
+    neighbours: list[list[int]] = [[] for _ in faces]
     for a, b in mesh.face_adjacency:
-        beside[a].append(int(b))
-        beside[b].append(int(a))
+        neighbours[a].append(int(b))
+        neighbours[b].append(int(a))
     share = mesh.area_faces / mesh.area_faces.sum()
     removed = np.zeros(len(faces), bool)
     total = round(REMOVED_SHARE * len(faces))
-    _remove_patch(removed, beside, int(rng.choice(len(faces), p=share)), total // 2)
+    _remove_patch(removed, neighbours, int(rng.choice(len(faces), p=share)), total // 2)
     while (left := total - int(removed.sum())) > 0:
         first = int(rng.choice(np.flatnonzero(~removed)))
-        _remove_patch(removed, beside, first, min(CLUMP_FACES, left))
+        _remove_patch(removed, neighbours, first, min(CLUMP_FACES, left))
     return removed
 
 
-def _remove_patch(removed: np.ndarray, beside: list[list[int]], first: int, count: int) -> None:
+def _remove_patch(removed: np.ndarray, neighbours: list[list[int]], first: int, count: int) -> None:
     """Remove up to ``count`` faces around ``first``, in the order of a breadth-first search."""
     waiting, seen = [first], {first}
     for face in waiting:
@@ -158,7 +158,7 @@ def _remove_patch(removed: np.ndarray, beside: list[list[int]], first: int, coun
             return
         count -= not removed[face]
         removed[face] = True
-        new = [other for other in beside[face] if other not in seen]
+        new = [other for other in neighbours[face] if other not in seen]
         waiting += new
         seen.update(new)
 
