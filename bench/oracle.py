@@ -63,7 +63,7 @@ from intercap_core.project import Project, load_project
 from intercap_core.schemas import SCENE, TRUTH
 
 REMOVED_SHARE = 0.1  # of the faces
-# Number of faces in each small hole. Half of the removed faces are one patch, the others such holes;
+# Faces in each small hole. Half of the removed faces are one patch, the others such holes;
 # with six faces they have more than the four edges up to which loading a mesh closes a hole.
 CLUMP_FACES = 6
 
