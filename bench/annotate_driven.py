@@ -29,7 +29,7 @@ from bench.command import exit_on_user_error
 from intercap_core import artefacts
 from intercap_core.annotate.questions import answers_path
 from intercap_core.annotate.rerun import targets
-from intercap_core.commands.bench import put_figures
+from intercap_core.commands.bench import replace_figures
 from intercap_core.commands.evaluate.objects import measure
 from intercap_core.errors import UserError
 from intercap_core.evaluation import figures
@@ -462,7 +462,7 @@ def main() -> None:
     options = parser.parse_args()
     with exit_on_user_error():
         found = driven(options.settings, options.cores)
-        put_figures(options.output, found, instead_of=("annotate.",))
+        replace_figures(options.output, found, ("annotate.",))
     for name, value in found.items():
         print(f"{name}: {value:.4g}")
     if "annotate.clicks" not in found:

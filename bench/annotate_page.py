@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from intercap_core.commands.bench import put_figures
+from intercap_core.commands.bench import replace_figures
 from intercap_core.errors import UserError
 
 if TYPE_CHECKING:
@@ -279,7 +279,7 @@ def main() -> None:
         raise SystemExit(str(error)) from None
     for name, value in found.items():
         print(f"{name}: {value}")
-    put_figures(options.output, found, instead_of=("annotate.page_",))
+    replace_figures(options.output, found, ("annotate.page_",))
 
 
 if __name__ == "__main__":

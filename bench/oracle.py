@@ -49,7 +49,7 @@ from bench.again import artefacts_of, check_run, compute_once
 from bench.command import exit_on_user_error
 from intercap_core import artefacts
 from intercap_core.artefacts import Artefact
-from intercap_core.commands.bench import put_figures
+from intercap_core.commands.bench import replace_figures
 from intercap_core.commands.evaluate.part import console_of, number
 from intercap_core.config import ObjectEntry
 from intercap_core.errors import UserError
@@ -442,7 +442,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             cores=cores,
         )
         print_tables(found)
-        put_figures(options.output, flat(found), instead_of=_OWN)
+        replace_figures(options.output, flat(found), _OWN)
     print(options.output)
 
 

@@ -24,10 +24,7 @@ from intercap_core.project import Project, load_project
 from intercap_core.schemas import FRAMES
 from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
 
-SAMPLE_SECONDS = 0.1
-EXTRACTIONS = 3
-JUDGEMENTS = 3
-MEGABYTE = 1 << 20
+REPEATS = 3  # measured runs, after one that imports and compiles
 MEASURED = SEQUENCE_STAGES[: SEQUENCE_STAGES.index("metrics") + 1]
 
 
@@ -35,29 +32,29 @@ def measure(settings: Path, output: Path, *, cores: int = 0) -> None:
     """Measure the project's first sequence and write flat JSON with the keys ``area.measure``.
 
     Makes a virtual recording first, then runs all stages up to the metrics through the workflow, so
-    that process starts are included and the studio is not. Figures of other commands in the file
-    are kept. Raises UserError if a stage fails.
+    that process starts are included and the studio is not. Keeps the figures of other commands in
+    the file. Raises UserError if a stage fails.
 
     - ``STAGE.seconds_per_frame``, ``STAGE.peak_memory_mb``: job of one stage.
-    - ``verdict.seconds_per_frame``: the part of the metrics stage of :func:`judgement`.
+    - ``verdict.seconds_per_frame``: duration of the held-out evaluation, see :func:`time_hold_out`.
     - ``end_to_end.peak_memory_mb``: largest sum of the resident memory of all processes.
-    - ``frames.fps``: speed of :func:`extraction`.
+    - ``frames.fps``: speed of the frames stage, see :func:`time_extraction`.
     """
     project = load_project(settings)
     sequence = next(iter(project.sequences))
-    made = project.recordings_made(sequence)
-    if made is not None:
-        _run(settings, str(made / "capture.json"), cores)
+    recordings = project.recordings_made(sequence)
+    if recordings is not None:
+        _run(settings, str(recordings / "capture.json"), cores)
     shutil.rmtree(project.results / sequence, ignore_errors=True)
     seconds, peak = _run(settings, str(project.artefact(sequence, "metrics")), cores)
     with artefacts.read(project.artefact(sequence, "frames"), FRAMES) as source:
         frames, cameras = source["colour_index"].shape
     figures = {
         "end_to_end.seconds_per_frame": round(seconds / frames, 4),
-        "end_to_end.peak_memory_mb": round(peak / MEGABYTE, 1),
+        "end_to_end.peak_memory_mb": round(peak / (1 << 20), 1),
         **_stages(project, sequence, frames),
-        **extraction(project, sequence, frames),
-        **judgement(settings, sequence, frames),
+        **time_extraction(project, sequence, frames),
+        **time_hold_out(settings, sequence, frames),
     }
     add_figures(output, figures)
     _print(figures, f"{sequence}: {frames} frame sets of {cameras} cameras")
@@ -70,11 +67,11 @@ def add_figures(output: Path, figures: Mapping[str, float]) -> None:
     Raises UserError if the file is no JSON object.
     """
     areas = {f"{key.partition('.')[0]}." for key in figures}
-    put_figures(output, figures, instead_of=tuple(areas))
+    replace_figures(output, figures, tuple(areas))
 
 
-def put_figures(output: Path, figures: Mapping[str, float], *, instead_of: tuple[str, ...]) -> None:
-    """Add figures to a JSON file; those whose name begins with any of ``instead_of`` are removed.
+def replace_figures(output: Path, figures: Mapping[str, float], prefixes: tuple[str, ...]) -> None:
+    """Add figures to a JSON file and remove those whose name begins with one of ``prefixes``.
 
     Raises UserError if the file is no JSON object.
     """
@@ -84,7 +81,7 @@ def put_figures(output: Path, figures: Mapping[str, float], *, instead_of: tuple
             known = dict(json.loads(output.read_text(encoding="utf-8")))
         except (ValueError, TypeError):
             raise UserError(f"{output} holds no figures; remove it or name another file") from None
-    kept = {key: value for key, value in known.items() if not key.startswith(instead_of)}
+    kept = {key: value for key, value in known.items() if not key.startswith(prefixes)}
     output.parent.mkdir(parents=True, exist_ok=True)
     output.write_text(json.dumps({**kept, **figures}, indent=1) + "\n", encoding="utf-8")
 
@@ -107,7 +104,7 @@ def _run(settings: Path, target: str, cores: int) -> tuple[float, int]:
         except psutil.NoSuchProcess:
             continue  # ended between listing and asking
         peak = max(peak, total)
-        time.sleep(SAMPLE_SECONDS)
+        time.sleep(0.1)
     if process.returncode:
         raise UserError(f"the run up to {target} failed; its messages are above")
     return time.monotonic() - start, peak
@@ -127,17 +124,17 @@ def _stages(project: Project, sequence: str, frames: int) -> dict[str, float]:
     return figures
 
 
-def extraction(project: Project, sequence: str, frames: int) -> dict[str, float]:
-    """Speed of the frames stage, and the size of its artefact relative to the recordings.
+def time_extraction(project: Project, sequence: str, frames: int) -> dict[str, float]:
+    """Speed of the frames stage, and the size of its artefact.
 
-    - ``frames.fps``: frame sets per second, median of ``EXTRACTIONS`` runs in one process after a
-      first run.
+    - ``frames.fps``: frame sets per second, median over ``REPEATS`` runs.
     - ``frames.bytes_ratio``: bytes of frames.h5 over bytes of the recording files.
+    - ``frames.bytes_per_set``, ``frames.recorded_bytes_per_set``: the same per frame set.
     """
     seconds = []
     with tempfile.TemporaryDirectory(dir=project.results) as folder:
         output = Path(folder) / "frames.h5"
-        for _ in range(1 + EXTRACTIONS):  # the first one imports and warms up
+        for _ in range(1 + REPEATS):
             output.unlink(missing_ok=True)
             start = time.perf_counter()
             run_step("frames", project, sequence, inputs={}, output=output)
@@ -154,18 +151,17 @@ def extraction(project: Project, sequence: str, frames: int) -> dict[str, float]
     }
 
 
-def judgement(settings: Path, sequence: str, frames: int) -> dict[str, float]:
-    """``verdict.seconds_per_frame``: what holding out adds to the metrics stage.
+def time_hold_out(settings: Path, sequence: str, frames: int) -> dict[str, float]:
+    """``verdict.seconds_per_frame``: seconds that the held-out evaluation adds to stage metrics.
 
-    The stage with it less the stage without it, medians of ``JUDGEMENTS`` runs in turn within one
-    process whose imports are done.
+    Difference of the medians over ``REPEATS`` alternating runs with and without it in one process.
     """
     seconds: dict[bool, list[float]] = {True: [], False: []}
     projects = {
         hold_out: load_project(settings, {"metrics": {"hold_out": hold_out}})
         for hold_out in seconds
     }
-    for _ in range(1 + JUDGEMENTS):  # the first one imports and compiles
+    for _ in range(1 + REPEATS):
         for hold_out, project in projects.items():
             inputs = {name: project.artefact(sequence, name) for name in STAGES["metrics"].reads}
             with tempfile.TemporaryDirectory(dir=project.results) as folder:

@@ -7,15 +7,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from intercap_core.config import Annotation, DetectionsSettings, FramesSettings, SequenceEntry
+from intercap_core.config import Annotation, FramesSettings, SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.project import Project, tidy
 
 if TYPE_CHECKING:
     from intercap_core.commands.check_recordings import RecordingFindings
     from intercap_core.formats.recordings.source import RecordingLayout
-
-MAX_LABELS = 8  # labels listed in a note
 
 
 @dataclass(frozen=True)
@@ -84,8 +82,8 @@ def check_detector(project: Project) -> list[Fault]:
 
 
 def _list_labels(labels: list[str]) -> str:
-    more = f" and {len(labels) - MAX_LABELS} more" if len(labels) > MAX_LABELS else ""
-    return ", ".join(labels[:MAX_LABELS]) + more
+    more = f" and {len(labels) - 8} more" if len(labels) > 8 else ""
+    return ", ".join(labels[:8]) + more
 
 
 @dataclass
@@ -110,9 +108,9 @@ def check_sequences(project: Project) -> Findings:
 
     Reads a few images per recording. For virtual recordings, checks that the studio can make them.
     """
-    found = Findings()
-    meshes = {name: _check_mesh(project, name, found) for name in project.objects_named()}
-    faults = found.faults
+    findings = Findings()
+    meshes = {name: _check_mesh(project, name, findings) for name in project.objects_named()}
+    faults = findings.faults
     faults += _annotations_without_sequence(project)
     for name, row in project.sequences.items():
         try:
@@ -131,9 +129,9 @@ def check_sequences(project: Project) -> Findings:
             continue
         recording = _check_files(row, project.config.frames)
         faults += [Fault(name, message) for message in recording.faults]
-        found.notes += [Fault(name, message) for message in recording.notes]
-        found.summaries += [Fault(name, recording.summary)] if recording.summary else []
-    return found
+        findings.notes += [Fault(name, message) for message in recording.notes]
+        findings.summaries += [Fault(name, recording.summary)] if recording.summary else []
+    return findings
 
 
 def fault_of_cameras(project: Project, name: str, annotation: Annotation) -> str | None:
@@ -170,7 +168,7 @@ def notes_of_sequences(project: Project) -> list[Fault]:
 
 def _notes_of_cameras(project: Project, row: SequenceEntry) -> list[str]:
     from intercap_core.formats.detections.candidate_files import has_candidates
-    from intercap_core.formats.detections.keypoint_files import has_keypoints
+    from intercap_core.formats.detections.keypoint_files import has_keypoints, preview_keypoints
     from intercap_core.formats.recordings.layouts import open_layout
 
     try:
@@ -205,31 +203,17 @@ def _notes_of_cameras(project: Project, row: SequenceEntry) -> list[str]:
                 for name in without
             ]
         having = [name for name in recorded if name not in without]
-        notes += _notes_of_keypoints(settings, folder, layout, having)
+        full = settings.keypoint_full_confidence
+        for name in having:
+            size = _colour_size(layout, name)
+            if size is not None:
+                notes += preview_keypoints(folder, name, size=size, full_confidence=full)
     if row.candidates is not None and row.candidates.is_dir():
         folder = row.candidates
         having = [name for name in recorded if has_candidates(folder, name, row.layout)]
         without = [name for name in recorded if name not in having and not segmented]
         notes += [f"{folder} has no {name}.json; add this camera's candidates" for name in without]
         notes += _notes_of_candidates(project, row, layout, having)
-    return notes
-
-
-def _notes_of_keypoints(
-    settings: DetectionsSettings,
-    folder: Path,
-    layout: RecordingLayout,
-    cameras: list[str],
-) -> list[str]:
-    """Notes on layout, position and confidence of the first people of each camera."""
-    from intercap_core.formats.detections.keypoint_files import preview_keypoints
-
-    notes: list[str] = []
-    for name in cameras:
-        size = _colour_size(layout, name)
-        if size is not None:
-            full = settings.keypoint_full_confidence
-            notes += preview_keypoints(folder, name, size=size, full_confidence=full)
     return notes
 
 
@@ -243,10 +227,7 @@ def _colour_size(layout: RecordingLayout, camera: str) -> tuple[int, int] | None
 
 
 def _notes_of_candidates(
-    project: Project,
-    row: SequenceEntry,
-    layout: RecordingLayout,
-    cameras: list[str],
+    project: Project, row: SequenceEntry, layout: RecordingLayout, cameras: list[str]
 ) -> list[str]:
     """Notes on format, size and labels of the first candidates of each camera."""
     from intercap_core.formats.detections.candidate_files import preview_candidates
@@ -260,17 +241,17 @@ def _notes_of_candidates(
         size = _colour_size(layout, name)
         if size is None:
             continue
-        seen = preview_candidates(
+        preview = preview_candidates(
             row.candidates, name, size=size, names=class_names(settings.category_names)
         )
-        notes += seen.notes
-        labels |= seen.labels
+        notes += preview.notes
+        labels |= preview.labels
     entry = project.object_of(row.sequence)
     expected = () if entry is None else entry.labels
     if labels and expected and not labels & {*expected}:
-        found = sorted(label or "no label" for label in labels)
+        named = sorted(label or "no label" for label in labels)
         notes.append(
-            f"{row.candidates}: the labels of the first results are {_list_labels(found)}; "
+            f"{row.candidates}: the labels of the first results are {_list_labels(named)}; "
             f"object {row.object!r} expects {', '.join(expected)}; add its labels to "
             "objects.yaml, or set detections.category_names"
         )
@@ -288,7 +269,7 @@ def _annotations_without_sequence(project: Project) -> list[Fault]:
     ]
 
 
-def _check_mesh(project: Project, name: str, found: Findings) -> str | None:
+def _check_mesh(project: Project, name: str, findings: Findings) -> str | None:
     """Error message if an object's mesh cannot be used; warnings on a usable one become notes."""
     from intercap_core.geometry.rigid import mesh
 
@@ -302,7 +283,7 @@ def _check_mesh(project: Project, name: str, found: Findings) -> str | None:
     finally:
         mesh.log.removeHandler(warnings)
         mesh.log.propagate = True
-    found.notes += [Fault("", text) for text in warnings.texts]
+    findings.notes += [Fault("", text) for text in warnings.texts]
     return None
 
 
@@ -342,11 +323,13 @@ def _check_files(row: SequenceEntry, settings: FramesSettings) -> RecordingFindi
         faults += faults_of_truth(row.truth)
     if not row.recordings.is_dir():
         return RecordingFindings(
-            faults=[f"column recordings names {row.recordings}, which is no folder", *faults]
+            faults=[f"column recordings names {row.recordings}, which is not a folder", *faults]
         )
-    found = _check_recordings(row, settings) if row.calibration.exists() else RecordingFindings()
-    found.faults[:0] = faults
-    return found
+    if not row.calibration.exists():
+        return RecordingFindings(faults=faults)
+    findings = _check_recordings(row, settings)
+    findings.faults[:0] = faults
+    return findings
 
 
 def faults_of_truth(path: Path) -> list[str]:
@@ -387,6 +370,6 @@ def _check_recordings(row: SequenceEntry, settings: FramesSettings) -> Recording
         if name not in known
     ]
     posed = [name for name in used if name in known]
-    found = check_recordings(row, layout, posed, without_depth=not settings.depth)
-    found.faults[:0] = faults
-    return found
+    findings = check_recordings(row, layout, posed, without_depth=not settings.depth)
+    findings.faults[:0] = faults
+    return findings

@@ -18,9 +18,7 @@ from intercap_core.formats.recordings.source import RecordingLayout, RecordingPr
 # Length of a recording as a share of the other cameras' or of the length that its header states.
 MIN_LENGTH_SHARE = 0.5  # a shorter one is a fault
 FULL_LENGTH_SHARE = 0.95  # a shorter one is noted
-MIN_IMAGE_SHARE = 0.9  # of the number that rate and duration give; recordings lose a few images
-MIN_DETECTED_SHARE = 0.9  # of a camera's images
-MAX_COUNTED_BYTES = 64 << 20  # larger detection files are not counted; this size takes 0.5 s
+MIN_IMAGE_SHARE = 0.9  # of the expected images or detections; recordings lose a few images
 _IMAGE_ID = re.compile(rb'"(?:image_id|file_name)"\s*:\s*("[^"]*"|[^,}\s]+)')
 
 
@@ -110,41 +108,47 @@ def _check_recording(
     recording: CameraRecording,
     expected_s: float | None,
 ) -> None:
-    source, found = recording.source, recording.preview
-    if found.size is None:
+    source, preview = recording.source, recording.preview
+    if preview.size is None:
         findings.faults.append(
             f"{source}: camera {name} has no image that can be read, expected "
             f"{recording.size[0]}x{recording.size[1]}; copy or record it again"
         )
-    elif found.size != recording.size:
+    elif preview.size != recording.size:
         findings.faults.append(
-            f"{source}: camera {name}'s images are {found.size[0]}x{found.size[1]}, "
+            f"{source}: camera {name}'s images are {preview.size[0]}x{preview.size[1]}, "
             f"{row.calibration} is for {recording.size[0]}x{recording.size[1]}, so the camera "
             "would be left out; give the calibration of this resolution"
         )
-    findings.notes += [f"{source}: camera {name} {fault}; copy it again" for fault in found.faults]
-    images = str(found.images) if found.counted else f"about {found.images or 'no'}"
-    if found.share < FULL_LENGTH_SHARE or recording.truncated:
-        there = f"about {found.share:.0%} of the stated length" if found.share < 1 else "no end"
+    findings.notes += [
+        f"{source}: camera {name} {fault}; copy it again" for fault in preview.faults
+    ]
+    images = str(preview.images) if preview.counted else f"about {preview.images or 'no'}"
+    if preview.share < FULL_LENGTH_SHARE or recording.truncated:
+        part = f"about {preview.share:.0%} of the stated length" if preview.share < 1 else "no end"
         text = (
-            f"{source}: camera {name}'s recording is cut off: it has {there} ({images} images); "
+            f"{source}: camera {name}'s recording is cut off: it has {part} ({images} images); "
             "copy or record it again"
         )
-        (findings.faults if found.share < MIN_LENGTH_SHARE else findings.notes).append(text)
-    if found.seconds is not None and expected_s is not None and found.share >= FULL_LENGTH_SHARE:
-        shorter = found.seconds + 1 / recording.fps < FULL_LENGTH_SHARE * expected_s
+        (findings.faults if preview.share < MIN_LENGTH_SHARE else findings.notes).append(text)
+    if (
+        preview.seconds is not None
+        and expected_s is not None
+        and preview.share >= FULL_LENGTH_SHARE
+    ):
+        shorter = preview.seconds + 1 / recording.fps < FULL_LENGTH_SHARE * expected_s
         if shorter:
             text = (
-                f"{source}: camera {name} lasts {found.seconds:.1f} s ({images} images), the "
+                f"{source}: camera {name} lasts {preview.seconds:.1f} s ({images} images), the "
                 f"other cameras {expected_s:.1f} s; copy it again, or leave it out (frames.cameras)"
             )
-            most = found.seconds < MIN_LENGTH_SHARE * expected_s
+            most = preview.seconds < MIN_LENGTH_SHARE * expected_s
             (findings.faults if most else findings.notes).append(text)
-    if found.counted and found.seconds is not None and found.images is not None:
-        expected = round(found.seconds * recording.fps) + 1
-        if found.images < MIN_IMAGE_SHARE * expected:
+    if preview.counted and preview.seconds is not None and preview.images is not None:
+        expected = round(preview.seconds * recording.fps) + 1
+        if preview.images < MIN_IMAGE_SHARE * expected:
             findings.notes.append(
-                f"{source}: camera {name} has {found.images} images in {found.seconds:.1f} s, "
+                f"{source}: camera {name} has {preview.images} images in {preview.seconds:.1f} s, "
                 f"expected about {expected} at {recording.fps:g} a second; add the missing images "
                 "or correct fps or the timestamps"
             )
@@ -164,12 +168,12 @@ def _check_detections(row: SequenceEntry, name: str, images: int | None) -> list
         if not images or not count:
             continue
         folder = getattr(row, kind)
-        if count < MIN_DETECTED_SHARE * images:
+        if count < MIN_IMAGE_SHARE * images:
             notes.append(
                 f"{folder}: {kind} of camera {name} cover {count} of its {images} images; run "
                 "the detector on all of them"
             )
-        elif count * MIN_DETECTED_SHARE > images:
+        elif count * MIN_IMAGE_SHARE > images:
             notes.append(
                 f"{folder}: {kind} of camera {name} cover {count} images, it has {images}; "
                 "they may belong to another recording, or the recording is cut off"
@@ -186,7 +190,7 @@ def _count(file: Path | None, image_files: list[Path]) -> int | None:
     """
     if file is None:
         return len(image_files) or None
-    if file.stat().st_size > MAX_COUNTED_BYTES:
+    if file.stat().st_size > 64 << 20:  # would take more than 0.5 s
         return None
     return len(set(_IMAGE_ID.findall(file.read_bytes()))) or None
 

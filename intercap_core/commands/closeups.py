@@ -1,4 +1,4 @@
-"""`intercap closeups`: pictures of hands that hold, one file for each hold."""
+"""`intercap closeups`: one picture of each hand contact."""
 
 from __future__ import annotations
 
@@ -13,10 +13,15 @@ from intercap_core.project import load_project
 def draw_closeups(
     settings: Path, sequences: Sequence[str], output: Path | None = None
 ) -> tuple[list[Path], list[str]]:
-    """Draw every hold of ``sequences``, all of the project's where none is named.
+    """Draw every hand contact of ``sequences``, of all sequences if none is named.
 
-    Returns the pictures written, into ``output`` or the project's results, and the sequences
-    without a hold. Raises UserError where a sequence is unknown or was not taken to the joint fit.
+    Raises UserError if a sequence is unknown or has no joint fit.
+
+    Args:
+        output: folder of the pictures; default: ``closeups`` in the project's results.
+
+    Returns:
+        The written pictures, and the names of the sequences without a hand contact.
     """
     project = load_project(settings)
     folder = output or project.results / "closeups"
@@ -25,8 +30,8 @@ def draw_closeups(
     unknown = [name for name in sequences if name not in project.sequences]
     if unknown:
         raise UserError(
-            f"there is no sequence {unknown[0]!r} in the table; it lists "
-            f"{', '.join(project.sequences)}"
+            f"{project.path}: there is no sequence {unknown[0]!r}, expected one of "
+            f"{', '.join(project.sequences)}; correct the name"
         )
     written, empty = [], []
     for name in sequences or project.sequences:
@@ -35,10 +40,10 @@ def draw_closeups(
             empty.append(name)
             continue
         handling = read_handling(project.paths(name), models, truth=project.sequences[name].truth)
-        found = holds(handling.probability)
-        if not found:
+        contacts = holds(handling.probability)
+        if not contacts:
             empty.append(name)
-        for hold in found:
+        for hold in contacts:
             path = folder / f"{name}_{hold.side}_{hold.first:04d}-{hold.last:04d}.jpg"
             folder.mkdir(parents=True, exist_ok=True)
             path.write_bytes(closeup(handling, hold).data)

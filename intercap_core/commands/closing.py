@@ -14,7 +14,6 @@ from intercap_core.pipeline.job import warnings_of
 from intercap_core.project import Project
 from intercap_core.stage_list import STAGES
 
-MAX_REASONS = 4  # most frequent reasons of flagged frames that are printed per sequence
 MAX_SEQUENCES = 20  # printed sequences; the file has all
 FILE = "remarks.txt"  # in the folder of the logs
 
@@ -40,7 +39,7 @@ class Remarks:
 
 def remarks(project: Project) -> list[Remarks]:
     """Remarks of all sequences that have any, largest share of flagged frames first."""
-    found = []
+    sequences = []
     for name in project.sequences:
         flagged = frames = 0
         texts: list[str] = []
@@ -58,19 +57,14 @@ def remarks(project: Project) -> list[Remarks]:
                 texts += [f"{stage}: {text}" for text in new]
                 if stage == "metrics":
                     flagged, frames, reasons = outcome.flagged_frames(path)
-                    named = [f"{text} ({count})" for text, count in reasons[:MAX_REASONS]]
+                    named = [f"{text} ({count})" for text, count in reasons[:4]]
                     if named:
                         texts.insert(0, f"{flagged} of {frames} frames flagged: {'; '.join(named)}")
             except UserError as error:  # an artefact of an older version; the text says what to do
                 texts.append(str(error))
         if texts:
-            found.append(Remarks(name, flagged, frames, tuple(texts)))
-    return sorted(found, key=lambda one: (-one.share, -len(one.texts), one.sequence))
-
-
-def of_dataset(project: Project) -> list[str]:
-    """Warnings of the job that merges the sequences."""
-    return warnings_of(project.logs / "dataset.log")
+            sequences.append(Remarks(name, flagged, frames, tuple(texts)))
+    return sorted(sequences, key=lambda s: (-s.share, -len(s.texts), s.sequence))
 
 
 def _not_noted(log: Path, sequence: str, notes: list[str]) -> list[str]:
@@ -87,14 +81,12 @@ def print_remarks(project: Project, console: Console) -> None:
 
     Remarks on the dataset come first, then those on up to ``MAX_SEQUENCES`` sequences.
     """
-    of_all, found = of_dataset(project), remarks(project)
-    blocks = [
-        [f"{one.sequence} (logs: {project.logs / one.sequence})", *one.texts] for one in found
-    ]
+    of_all, sequences = warnings_of(project.logs / "dataset.log"), remarks(project)
+    blocks = [[f"{s.sequence} (logs: {project.logs / s.sequence})", *s.texts] for s in sequences]
     head = [["the dataset", *of_all]] if of_all else []
-    if found:
+    if sequences:
         head.append(
-            [f"{len(found)} of {len(project.sequences)} sequences have remarks, worst first:"]
+            [f"{len(sequences)} of {len(project.sequences)} sequences have remarks, worst first:"]
         )
     path = project.logs / FILE
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -23,36 +23,38 @@ _COLUMNS = (
 
 
 def print_comparison(old: Path, new: Path, output: Path | None = None) -> list[Path]:
-    """Print what changed, most first, and write the tables into the folder ``output``.
+    """Print the changes, largest first, and write all tables into the folder ``output``.
 
-    Returns the files written. Raises UserError where a folder holds no results.
+    Returns the written files. Raises UserError if a folder holds no results.
     """
     if output is not None and output.exists() and not output.is_dir():
         raise UserError(f"{output}: is a file, expected a folder for tables; name another output")
-    found = compare(old, new)
+    comparison = compare(old, new)
     console = Console()
-    console.print(_table(found))
-    if len(found.figures):
-        console.print(_figures(found))
-    same = int((found.sequences["state"] == SAME).sum())
-    differs = len(found.sequences) - same
+    console.print(_table(comparison))
+    if len(comparison.figures):
+        console.print(_figures(comparison))
+    same = int((comparison.sequences["state"] == SAME).sum())
+    differs = len(comparison.sequences) - same
     left = max(0, differs - ROWS)
     more = f" ({left} of them are not printed)" if left else ""
     console.print(
-        f"{differs} of {len(found.sequences)} sequences differ{more}, {len(found.frames)} frames; "
-        f"{same} are the same",
+        f"{differs} of {len(comparison.sequences)} sequences differ{more}, "
+        f"{len(comparison.frames)} frames; {same} are the same",
         highlight=False,
     )
     if output is None:
         return []
     output.mkdir(parents=True, exist_ok=True)
     paths = [output / name for name in TABLES]
-    for path, table in zip(paths, (found.sequences, found.frames, found.figures), strict=True):
+    for path, table in zip(
+        paths, (comparison.sequences, comparison.frames, comparison.figures), strict=True
+    ):
         table.to_csv(path, index=False, float_format="%.6g")
     return paths
 
 
-def _table(found: Comparison) -> Table:
+def _table(comparison: Comparison) -> Table:
     table = Table(box=None, pad_edge=False)
     table.add_column("sequence")
     table.add_column("state")
@@ -60,7 +62,7 @@ def _table(found: Comparison) -> Table:
         table.add_column(head, justify="right")
     table.add_column("flagged", justify="right")
     table.add_column("body stated, mm", justify="right")
-    shown = found.sequences[found.sequences["state"] != SAME].head(ROWS)
+    shown = comparison.sequences[comparison.sequences["state"] != SAME].head(ROWS)
     for row in shown.to_dict("records"):
         cells = [_number(row[key], digits) for _, key, digits in _COLUMNS]
         flagged = _pair(row["flagged_before"], row["flagged_after"], 0)
@@ -70,13 +72,10 @@ def _table(found: Comparison) -> Table:
     return table
 
 
-def _figures(found: Comparison) -> Table:
+def _figures(comparison: Comparison) -> Table:
     """The datasets' figures side by side."""
-    table = Table(box=None, pad_edge=False)
-    table.add_column("all frames")
-    for head in ("old", "new"):
-        table.add_column(head, justify="right")
-    for name, old, new in found.figures.itertuples(index=False):
+    table = Table("all frames", "old", "new", box=None, pad_edge=False)
+    for name, old, new in comparison.figures.itertuples(index=False):
         table.add_row(escape(str(name)), f"{old:.4g}", f"{new:.4g}")
     return table
 

@@ -1,4 +1,4 @@
-"""`intercap keypoint-definition`: a detector's joints, learnt from the project's bodies."""
+"""`intercap keypoint-definition`: learn where a detector places its keypoints on the body."""
 
 from __future__ import annotations
 
@@ -11,15 +11,19 @@ from intercap_core.project import load_project
 
 
 def learn_definition(settings: Path, output: Path) -> str:
-    """Write the table from all sequences whose bodies are fitted, and say in a sentence what it
-    holds. Raises UserError where too few people were recorded with depth."""
+    """Average the detector's keypoint offsets over all fitted bodies and write them as a table.
+
+    Returns a summary in one sentence. Raises UserError if too few people were recorded with depth.
+    """
     project = load_project(settings)
     fits = [project.artefact(name, "body_fit") for name in project.sequences]
-    found, people = average_offsets([path for path in fits if path.is_file()])
-    found.write(output, f"{project.config.dataset}, {len(people)} people: {', '.join(people)}")
-    offset = 1e3 * np.linalg.norm(found.offsets, axis=1)
+    definition, people = average_offsets([path for path in fits if path.is_file()])
+    names = ", ".join(people)
+    definition.write(output, f"{project.config.dataset}, {len(people)} people: {names}")
+    offset = 1e3 * np.linalg.norm(definition.offsets, axis=1)
     return (
-        f"{output}: from {len(people)} people, points {offset.mean():.0f} mm from the body model's "
-        f"in the mean, {offset.max():.0f} at most, known to {1e3 * found.sigma.mean():.0f} mm; "
-        "name it in body_fit.keypoint_definition"
+        f"{output}: learned from {len(people)} people; the keypoints are {offset.mean():.0f} mm "
+        f"from the body model's on average, at most {offset.max():.0f} mm, with a standard "
+        f"deviation of {1e3 * definition.sigma.mean():.0f} mm; set "
+        "body_fit.keypoint_definition to this file"
     )

@@ -1,7 +1,7 @@
-"""Files that are generated from the code, so that they cannot disagree with it.
+"""`intercap docs`: documentation that is generated from the code.
 
-The settings with their defaults, the explanation of every setting and column, JSON schemas for
-editors, the contents of every artefact, and how rooms and stages hang together.
+Settings with their defaults, tables of all settings and columns, JSON schemas for editors, the
+contents of every artefact, and the table of the joint fit's terms.
 """
 
 from __future__ import annotations
@@ -24,15 +24,13 @@ ENTRIES: dict[str, tuple[type[BaseModel], str, str]] = {
     "objects": (ObjectEntry, "objects.yaml", "Objects, one an entry under its name"),
     "annotation": (Annotation, "annotations/<sequence>.yaml", "What a person adds by hand"),
 }
-# The default settings name a dataset; the studio's section belongs to virtual recordings alone.
 STARTING_DATASET = "my_dataset"
-LEFT_OUT_OF_DEFAULTS = ("studio",)
 # Lines of docs/equations.md between which the table of the joint terms is generated.
 TERMS_BEGIN, TERMS_END = "<!-- joint terms -->\n", "<!-- end of joint terms -->\n"
 
 
 def generate(root: Path, *, write: bool) -> list[Path]:
-    """Bring the generated files under ``root`` up to date; returns those that were not."""
+    """Return the stale generated files under ``root``; with ``write``, update them."""
     stale = []
     for relative, text in contents(root).items():
         path = root / relative
@@ -45,7 +43,7 @@ def generate(root: Path, *, write: bool) -> list[Path]:
 
 
 def contents(root: Path) -> dict[str, str]:
-    """Every generated file's text, by its path below the project's root."""
+    """Text of every generated file by its path, relative to ``root``."""
     files = {
         "config/config.yaml": default_settings(),
         "config/README.md": settings_page(),
@@ -59,7 +57,7 @@ def contents(root: Path) -> dict[str, str]:
 
 
 def default_settings() -> str:
-    """config.yaml with every default, each under what it means."""
+    """config.yaml with every default below its description."""
     lines = [
         "# Settings of a dataset. Every line but the dataset's name is a default and may go.",
         "# config/README.md lists allowed values; paths are relative to this file.",
@@ -78,7 +76,7 @@ def _settings(
     lines: list[str],
 ) -> None:
     for name, entry in schema["properties"].items():
-        if name in LEFT_OUT_OF_DEFAULTS and not pad:
+        if name == "studio" and not pad:  # for virtual recordings only
             continue
         lines += [""] if not pad else []
         lines += [f"{pad}# {_meaning(entry, top)}"]
@@ -105,7 +103,7 @@ def equations_page(page: str) -> str:
 
 
 def settings_page() -> str:
-    """config/README.md: every entry of every file that a user writes."""
+    """config/README.md: all entries of the files that a user writes."""
     lines = [
         "# What goes into this folder",
         "",
@@ -160,7 +158,7 @@ def _cell(text: str) -> str:
 
 
 def _resolved(entry: dict[str, Any], top: dict[str, Any]) -> dict[str, Any]:
-    """Follow references, also those of optional and repeated entries, to an inner model."""
+    """Schema of the inner model of an entry, which may be optional or repeated."""
     options = _options(entry)
     for candidate in (*options, entry.get("items", {}), entry.get("additionalProperties", {})):
         if isinstance(candidate, dict) and candidate:
@@ -173,13 +171,13 @@ def _resolved(entry: dict[str, Any], top: dict[str, Any]) -> dict[str, Any]:
 
 
 def _options(entry: dict[str, Any]) -> list[dict[str, Any]]:
-    """The forms that an entry may have, beside being absent."""
+    """Alternatives of an entry, without null."""
     either = (*entry.get("anyOf", ()), *entry.get("oneOf", ()))
     return [option for option in either if option.get("type") != "null"]
 
 
 def _kind(entry: dict[str, Any], top: dict[str, Any]) -> str:
-    """What a value may be, in words."""
+    """Allowed values in words."""
     options = _options(entry)
     if options:
         return " or ".join(_kind(option, top) for option in options)
@@ -209,7 +207,7 @@ def _kind(entry: dict[str, Any], top: dict[str, Any]) -> str:
 
 
 def artefacts_page() -> str:
-    """docs/artefacts.md: what every stage writes."""
+    """docs/artefacts.md: contents of every artefact."""
     lines = [
         "# What every artefact holds",
         "",

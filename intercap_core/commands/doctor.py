@@ -1,10 +1,10 @@
-"""`intercap doctor`: what this machine has of what a run needs, and how much disk it will take."""
+"""`intercap doctor`: check software, devices, disk space and locks of this machine."""
 
 from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,26 +20,28 @@ from intercap_core.versions import versions
 
 GOOD, NOTE, BAD = "ok", "note", "problem"
 _COLOURS = {GOOD: "green", NOTE: "yellow", BAD: "red"}
-_SPARE = 1.2  # of what is expected to be needed
-# File systems that several machines see.
+# File systems that several machines share.
 _SHARED = ("nfs", "nfs4", "lustre", "gpfs", "beegfs", "ceph", "cifs", "smb3", "fuse.glusterfs")
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One line: ``state`` is one of the words above."""
+    """One line of the table."""
 
     what: str
+    """What was checked."""
     state: str
+    """``GOOD``, ``NOTE`` or ``BAD``."""
     words: str
+    """What was found."""
 
 
 def findings(project: Project | None) -> Iterator[Finding]:
-    """Everything that is looked at; of a ``project`` its device, body files, disk and locks too."""
+    """Check the machine; with a ``project`` also its device, body files, disk and locks."""
     for name, version in versions():
         yield Finding(name, GOOD, version)
     deciding = ", ".join(f"{name} {version}" for name, version in library_versions().items())
-    yield Finding("decide numbers", GOOD, f"{deciding}; {processor()}, {os.cpu_count()} cores")
+    yield Finding("numerical libraries", GOOD, f"{deciding}; {processor()}, {os.cpu_count()} cores")
     yield _gpu(project)
     if project is not None:
         yield _bodies(project)
@@ -51,13 +53,13 @@ def findings(project: Project | None) -> Iterator[Finding]:
 
 
 def print_findings(project: Project | None) -> bool:
-    """Print them as a table; whether there is no problem."""
+    """Print all findings as a table; True if none is a problem."""
     table = Table(box=None, pad_edge=False, show_header=False)
     good = True
-    for one in findings(project):
-        colour = _COLOURS[one.state]
-        table.add_row(one.what, f"[{colour}]{one.state}[/{colour}]", one.words)
-        good &= one.state != BAD
+    for finding in findings(project):
+        colour = _COLOURS[finding.state]
+        table.add_row(finding.what, f"[{colour}]{finding.state}[/{colour}]", finding.words)
+        good &= finding.state != BAD
     Console().print(table)
     return good
 
@@ -71,7 +73,9 @@ def _gpu(project: Project | None) -> Finding:
         words = "" if wanted or project is None else "; the settings ask for the CPU (device: cpu)"
         return Finding("GPU", GOOD, f"{name}{words}")
     if wanted:
-        return Finding("GPU", BAD, "the settings ask for it (device: cuda), and PyTorch finds none")
+        return Finding(
+            "GPU", BAD, "the settings ask for a GPU (device: cuda), but PyTorch finds none"
+        )
     return Finding("GPU", GOOD, "none found, none needed (device: cpu)")
 
 
@@ -87,52 +91,49 @@ def _bodies(project: Project) -> Finding:
 
 
 def _disk(project: Project) -> Iterator[Finding]:
-    """What is there, what the sequences that are missing will need, and what may be dropped."""
-    found = disk_usage(project)
+    """Disk space of the results and of the missing sequences, and what may be deleted."""
+    usage = disk_usage(project)
     words = (
-        f"{found.present / 1e9:.1f} GB of results are there, {found.missing / 1e9:.1f} GB more are "
-        f"expected{found.basis}, {found.free / 1e9:.1f} GB are free"
+        f"the results have {usage.present / 1e9:.1f} GB, {usage.missing / 1e9:.1f} GB more are "
+        f"expected{usage.basis}, {usage.free / 1e9:.1f} GB are free"
     )
-    yield Finding("disk", BAD if found.free < _SPARE * found.missing else GOOD, words)
-    share = 100 * found.per_output["frames"] / max(sum(found.per_output.values()), 1)
+    enough = usage.free >= 1.2 * usage.missing
+    yield Finding("disk", GOOD if enough else BAD, words)
+    share = 100 * usage.per_output["frames"] / max(sum(usage.per_output.values()), 1)
     yield Finding(
-        "what may go", NOTE,
-        f"frames.h5 ({share:.0f} % of a sequence) when a dataset is done: the next run makes it "
-        "again; nothing else is worth it",
+        "deletable", NOTE,
+        f"frames.h5 ({share:.0f} % of a sequence) when a dataset is done; a later run writes it "
+        "again",
     )  # fmt: skip
 
 
-def _there(path: Path) -> Path:
-    return next(one for one in (path, *path.resolve().parents) if one.exists())
-
-
 def _file_system(results: Path) -> Finding:
-    place = _there(results).resolve()
+    place = next(path for path in (results, *results.resolve().parents) if path.exists()).resolve()
     kind, at = "unknown", ""
     try:
         with open("/proc/mounts", encoding="utf-8") as file:
             for line in file:
-                _, mount, found, *_ = line.split()
+                _, mount, mounted, *_ = line.split()
                 if place.is_relative_to(mount) and len(mount) >= len(at):
-                    kind, at = found, mount
+                    kind, at = mounted, mount
     except OSError:
         pass
     shared = kind in _SHARED
-    words = f"{place} lies on {kind}"
+    words = f"{place} is on {kind}"
     if not shared:
-        words += ", which other machines may not see: on a cluster results must lie on a shared one"
+        words += ", which other machines may not see; a cluster needs a shared file system"
     return Finding("file system", GOOD if shared else NOTE, words)
 
 
 def _locks(project: Project) -> Finding:
     owner = lease_holder(project.results / "run")
     if owner is not None:
-        return Finding("locks", NOTE, f"a run is going on: {owner}")
+        return Finding("locks", NOTE, f"a run is active: {owner}")
     if any(Path(".snakemake/locks").glob("*")):
         return Finding(
             "locks", NOTE,
-            "Snakemake left a lock here; `intercap run` clears it after a run of its own that was "
-            "killed, else `snakemake --unlock` does when no Snakemake works here",
+            "there is a lock of Snakemake; `intercap run` removes it if its own run was killed; "
+            "otherwise run `snakemake --unlock` when no Snakemake is active in this folder",
         )  # fmt: skip
     return Finding("locks", GOOD, "none")
 
@@ -140,7 +141,7 @@ def _locks(project: Project) -> Finding:
 def _scheduler() -> Finding:
     slurm = shutil.which("sbatch")
     if slurm is None:
-        return Finding("scheduler", GOOD, "no Slurm here; runs use this machine's cores")
+        return Finding("scheduler", GOOD, "no Slurm; runs use this machine's cores")
     try:
         import snakemake_executor_plugin_slurm as plugin
     except ImportError:
@@ -155,10 +156,9 @@ def _scheduler() -> Finding:
 def _browser() -> Finding:
     import webbrowser
 
-    find: Callable[[str], str | None] = shutil.which
-    program = find("chromium") or find("google-chrome") or find("firefox")
+    programs = ("chromium", "google-chrome", "firefox")
     try:
-        program = program or webbrowser.get().name
+        program = next(filter(None, map(shutil.which, programs)), None) or webbrowser.get().name
     except webbrowser.Error:
-        return Finding("browser", NOTE, "none here: copy the site's folder to where one is")
+        return Finding("browser", NOTE, "none; copy the site's folder to a machine with a browser")
     return Finding("browser", GOOD, str(program))

@@ -1,4 +1,4 @@
-"""What an artefact holds, printed for a person: numbers as a table, texts as they are."""
+"""`intercap inspect`: print the contents of an artefact."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from intercap_core import artefacts, schemas
 from intercap_core.errors import UserError
 from intercap_core.evaluation.flags import ranges
 
-TEXTS_TOLD = 30  # lines of one dataset
-
 
 def print_summary(path: Path, *, verify: bool = False) -> None:
-    """Print attributes, datasets and the count of set flags; with ``verify``, read everything.
+    """Print attributes, datasets, the number of set flags and the texts.
 
-    Raises UserError where the file is not a whole artefact, or (verifying) a checksum is wrong.
+    Args:
+        verify: read every dataset, which checks the checksums.
+
+    Raises UserError if the file is no complete artefact or a checksum is wrong.
     """
     known = {s.name: s for s in vars(schemas).values() if isinstance(s, artefacts.Schema)}
     name = artefacts.schema_name(path)
@@ -30,7 +31,7 @@ def print_summary(path: Path, *, verify: bool = False) -> None:
     with artefacts.read(path, schema) as source:
         for key, value in sorted(source.attributes.items()):
             console.print(f"[bold]{escape(key)}[/bold]  {escape(str(value))}", highlight=False)
-        table = Table("dataset", "shape", "type", "units", "frame", "set", "what", box=None)
+        table = Table("dataset", "shape", "type", "units", "frame", "set", "meaning", box=None)
         for key in source.keys():  # noqa: SIM118 (an Artefact is not a mapping)
             shape, dtype, units, frame = source.describe(key)
             try:
@@ -53,8 +54,10 @@ def print_summary(path: Path, *, verify: bool = False) -> None:
 
 
 def _print_texts(source: artefacts.Artefact, key: str, console: Console) -> None:
-    """The dataset's texts that are not empty, equal neighbours together; nothing for numbers and
-    for names alone."""
+    """Print the non-empty texts of a dataset, equal neighbours in one line.
+
+    Prints nothing for datasets of numbers and of names.
+    """
     shape, dtype, _, _ = source.describe(key)
     if dtype != "text" or len(shape) != 1 or key.endswith("_names"):
         return
@@ -66,10 +69,11 @@ def _print_texts(source: artefacts.Artefact, key: str, console: Console) -> None
         lines = [f"{name}: {text}" for name, text in zip(cameras, texts, strict=True) if text]
     if lines:
         console.print(f"[bold]{escape(key)}[/bold]", highlight=False)
-    for line in lines[:TEXTS_TOLD]:
+    shown = 30
+    for line in lines[:shown]:
         console.print(f"  {line}", highlight=False, markup=False, soft_wrap=True)
-    if len(lines) > TEXTS_TOLD:
-        console.print(f"  ... and {len(lines) - TEXTS_TOLD} more", highlight=False)
+    if len(lines) > shown:
+        console.print(f"  ... and {len(lines) - shown} more", highlight=False)
 
 
 def _span(first: int, last: int) -> str:

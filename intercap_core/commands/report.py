@@ -12,8 +12,6 @@ from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
 
 log = logging.getLogger(__name__)
 
-_OF_THE_SITE = ("summary", "page")
-
 
 def write_site(project: Project) -> Path:
     """Write missing and stale summaries and pages and the site's first page; returns its path.
@@ -22,7 +20,7 @@ def write_site(project: Project) -> Path:
     """
     for name in project.sequences:
         inputs = {stage: project.artefact(name, stage) for stage in SEQUENCE_STAGES}
-        for stage in _OF_THE_SITE:
+        for stage in ("summary", "page"):
             if not all(inputs[source].is_file() for source in STAGES[stage].reads):
                 continue
             output = project.artefact(name, stage)

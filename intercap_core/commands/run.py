@@ -33,12 +33,7 @@ from intercap_core.stage_list import STAGES
 
 POLL_SECONDS = 0.5
 ROWS = 24  # rows of the table: a standard terminal's height
-ENDED = "finished"
-REPORT_EVERY_S = 30.0  # interval of progress lines if the output is no terminal
-COLUMNS = tuple(STAGES)
 DRY_RUN = {"-n", "--dry-run", "--dryrun"}
-LAST_LINES = 15
-FULL_BELOW_BYTES = 1_000_000
 ENDS_WITHIN_S = 90.0  # time for jobs to end; the executor has 60 s to cancel a cluster's jobs
 SLURM_COMMANDS = {"sbatch", "scancel", "squeue", "sacct", "scontrol"}  # they end by themselves
 GO_ON = "Slurm's jobs go on"  # begins the executor's line if it could not cancel jobs
@@ -55,7 +50,7 @@ class JobState:
     words: str
     """Duration of a finished job, or reason of a failure."""
     log: Path
-    """Path of the log."""
+    """Log file of the job."""
 
 
 def run_workflow(
@@ -94,8 +89,8 @@ def _exclusive(project: Project, settings: Path, console: Console) -> Iterator[N
             snakemake = _snakemake_here()
             if snakemake:
                 raise UserError(
-                    f"{project.results}: the run by {killed} was killed, but its jobs go on "
-                    f"(process {snakemake} is their Snakemake); wait for its end, or end it"
+                    f"{project.results}: the run by {killed} was killed, but its jobs are still "
+                    f"running (their Snakemake is process {snakemake}); wait for them, or end them"
                 )
             console.print(f"the run by {killed} was killed: going on where it stopped")
             subprocess.run(snakemake_command(settings, arguments=["--unlock"]), capture_output=True)
@@ -177,12 +172,8 @@ def _run(
         for line in dict.fromkeys(line for line in printed if line.startswith(GO_ON)):
             console.print(line, highlight=False, markup=False, soft_wrap=True)
         raise SystemExit(end.status) from None
-    failures = watcher.failures()
-    for name, words in failures.items():
-        console.print(f"[red]{escape(name)}[/red] {escape(words)}", highlight=False, soft_wrap=True)
+    failures = watcher.print_failures(failed=bool(status))
     if status and not failures:
-        lines = watcher.transcript.read_text(encoding="utf-8").splitlines()
-        console.print("\n".join(lines[-LAST_LINES:]), highlight=False, markup=False)
         why = _full_disk(project) or "the workflow stopped"
         raise UserError(f"{why}; its whole output is in {watcher.transcript}")
     bad = sorted(
@@ -211,7 +202,7 @@ def _unlock(settings: Path) -> None:
 def _full_disk(project: Project) -> str:
     """Error message about a full disk among those that a run writes to; "" if none is full."""
     for place in (project.results, project.logs, Path.cwd()):
-        if free_bytes(place) < FULL_BELOW_BYTES:
+        if free_bytes(place) < 1_000_000:
             return f"the disk of {place} is full; free space, then run again to continue"
     return ""
 
@@ -289,6 +280,17 @@ class Watcher:
             if job.state != "finished"
         }
 
+    def print_failures(self, *, failed: bool, prefix: str = "") -> dict[str, str]:
+        """Print and return the failures; if the run failed without one, print its last lines."""
+        failures = self.failures()
+        for name, words in failures.items():
+            line = f"[red]{escape(prefix + name)}[/red] {escape(words)}"
+            self._console.print(line, highlight=False, soft_wrap=True)
+        if failed and not failures:
+            lines = self.transcript.read_text(encoding="utf-8").splitlines()
+            self._console.print("\n".join(lines[-15:]), highlight=False, markup=False)
+        return failures
+
     def table(self) -> Group:
         """Table of the sequences with running or failed jobs, by stage, and counts of all."""
         jobs = self.jobs()
@@ -296,7 +298,7 @@ class Watcher:
         for name, job in jobs.items():
             if name.partition(":")[0] in of_sequence:
                 of_sequence[name.partition(":")[0]].append(job.state)
-        ended = {name for name, states in of_sequence.items() if states and set(states) == {ENDED}}
+        ended = {name for name, states in of_sequence.items() if set(states) == {"finished"}}
         order = {"running": 0, "failed": 1}
         shown = sorted(
             (name for name, states in of_sequence.items() if set(states) & set(order)),
@@ -307,11 +309,11 @@ class Watcher:
             f"{self.steps()} jobs done; of {len(of_sequence)} sequences {len(ended)} are finished, "
             f"{waiting} are waiting or up to date"
         )
-        table = Table("sequence", *COLUMNS, box=None, header_style="bold")
+        table = Table("sequence", *STAGES, box=None, header_style="bold")
         for sequence in shown[:ROWS]:
             making = jobs.get(f"{sequence}: studio")
             first = f"{sequence} (recording)" if making and making.state == "running" else sequence
-            cells = [self._cell(sequence, stage, jobs) for stage in COLUMNS]
+            cells = [self._cell(sequence, stage, jobs) for stage in STAGES]
             table.add_row(first, *cells)
         more = f", {len(shown) - ROWS} more running or failed" if len(shown) > ROWS else ""
         return Group(table, counts + more)
@@ -323,24 +325,18 @@ class Watcher:
             return "[dim]kept[/dim]" if there else "[dim]-[/dim]"
         if job.state == "running":
             return "[yellow]runs[/yellow]"
-        return (
-            f"[green]{escape(job.words)}[/green]"
-            if job.state == "finished"
-            else "[red]failed[/red]"
-        )
+        finished = job.state == "finished"
+        return f"[green]{escape(job.words)}[/green]" if finished else "[red]failed[/red]"
 
     def print_changes(self) -> None:
-        """Print each job when it has ended, and a progress line every ``REPORT_EVERY_S``.
-
-        For outputs that are no terminal.
-        """
+        """Print each job when it has ended, and every 30 s the progress; without a terminal."""
         jobs = self.jobs()
         for name, job in jobs.items():
             if job.state != "running" and name not in self._printed:
                 self._printed.add(name)
                 words = f"{name}: {job.state} {job.words}"
                 self._console.print(words, highlight=False, markup=False, soft_wrap=True)
-        if time.monotonic() - self._printed_at >= REPORT_EVERY_S:
+        if time.monotonic() - self._printed_at >= 30.0:
             self._printed_at = time.monotonic()
             self._console.print(self.progress(), highlight=False, markup=False, soft_wrap=True)
 

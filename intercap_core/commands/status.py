@@ -24,7 +24,6 @@ from intercap_core.stage_list import STAGES
 log = logging.getLogger(__name__)
 
 ROWS = 40  # printed sequences that are not done
-NAMES = 6  # sequences listed per reason
 DONE, RUNNING, FAILED, STALE, MISSING = "done", "running", "failed", "out of date", "missing"
 WAITING = "waits"  # an artefact that the stage reads is not done
 _MARKS = {
@@ -40,9 +39,9 @@ class StageStatus:
     state: str
     """One of the constants above."""
     words: tuple[str, ...] = ()
-    """Reasons of a stale or failed output, or the process that is making it."""
+    """Reasons of a stale or failed output, or the process that is computing it."""
     made_on: str = ""
-    """Device and processor, if the output was made on others than this machine's."""
+    """Device and processor, if the output was computed on another machine's."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +56,9 @@ class Status:
     def of(self, sequence: str) -> str:
         """State of a sequence: the first of running, failed, stale, missing, waiting that a stage
         has, otherwise done."""
-        found = {stage.state for stage in self.sequences[sequence].values()}
+        states = {stage.state for stage in self.sequences[sequence].values()}
         order = (RUNNING, FAILED, STALE, MISSING, WAITING)
-        return next((state for state in order if state in found), DONE)
+        return next((state for state in order if state in states), DONE)
 
 
 def status(project: Project) -> Status:
@@ -76,21 +75,21 @@ def status(project: Project) -> Status:
 
 def _of_sequence(project: Project, plan: Plan, name: str) -> dict[str, StageStatus]:
     states = plan.states(name)
-    found: dict[str, StageStatus] = {}
+    outputs: dict[str, StageStatus] = {}
     for stage, state in states.items():
         output = plan.output(name, stage)
         owner = lease_holder(output)
         if owner is not None:
-            found[stage] = StageStatus(RUNNING, (str(owner),))
+            outputs[stage] = StageStatus(RUNNING, (str(owner),))
         elif state.status is OutputStatus.done:
-            found[stage] = StageStatus(DONE, (), state.made_on)
+            outputs[stage] = StageStatus(DONE, (), state.made_on)
         else:
-            found[stage] = _not_done(project, name, stage, state, found)
-    return found
+            outputs[stage] = _not_done(project, name, stage, state, outputs)
+    return outputs
 
 
 def _not_done(
-    project: Project, name: str, stage: str, state: OutputState, found: Mapping[str, StageStatus]
+    project: Project, name: str, stage: str, state: OutputState, outputs: Mapping[str, StageStatus]
 ) -> StageStatus:
     log = project.logs / name / f"{stage}.log"
     if log.is_file():
@@ -98,7 +97,7 @@ def _not_done(
         if ended == "failed":
             return StageStatus(FAILED, (words,))
     reads = STAGES[stage].reads if stage in STAGES else ()
-    if any(found[other].state != DONE for other in reads if other in found):
+    if any(outputs[other].state != DONE for other in reads if other in outputs):
         return StageStatus(WAITING)
     return StageStatus(STALE if state.status is OutputStatus.stale else MISSING, state.reasons)
 
@@ -110,52 +109,52 @@ def print_status(project: Project, *, every: bool = False, as_json: bool = False
         every: include the sequences that are done.
         as_json: print all states as JSON instead.
     """
-    found = status(project)
+    current = status(project)
     if as_json:
-        print(json.dumps(_to_json(found), indent=1, ensure_ascii=False))
+        print(json.dumps(_to_json(current), indent=1, ensure_ascii=False))
         return
     console = Console()
-    states = {name: found.of(name) for name in found.sequences}
+    states = {name: current.of(name) for name in current.sequences}
     counts = {state: list(states.values()).count(state) for state in _MARKS}
     words = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
     console.print(f"{project.config.dataset}: {words} of {len(states)} sequences", highlight=False)
     shown = [name for name in states if every or states[name] != DONE]
     if shown:
-        console.print(_table(found, shown[:ROWS] if not every else shown))
+        console.print(_table(current, shown[:ROWS] if not every else shown))
     if len(shown) > ROWS and not every:
         console.print(f"... and {len(shown) - ROWS} more; --all prints them", highlight=False)
     if shown:
         marks = ", ".join(f"{mark} {state}" for state, mark in _MARKS.items())
         console.print(f"[dim]{marks}[/dim]", highlight=False)
-    for line in _reasons(found):
+    for line in _reasons(current):
         console.print(line, highlight=False, markup=False, soft_wrap=True)
-    if found.dataset.state != DONE:
-        why = f": {'; '.join(found.dataset.words)}" if found.dataset.words else ""
-        words = f"the site's first page, tables and card are {found.dataset.state}{why}"
+    if current.dataset.state != DONE:
+        why = f": {'; '.join(current.dataset.words)}" if current.dataset.words else ""
+        words = f"the site's first page, tables and card are {current.dataset.state}{why}"
         console.print(words, highlight=False, markup=False, soft_wrap=True)
-    for machine, count in _other_machines(found).items():
+    for machine, count in _other_machines(current).items():
         console.print(
-            f"{count} results were made on another machine or device ({machine}); they may differ "
-            "in the last digits and are not computed again",
+            f"{count} results were computed on another machine or device ({machine}); they may "
+            "differ in the last digits and are not recomputed",
             highlight=False, markup=False, soft_wrap=True,
         )  # fmt: skip
 
 
-def _table(found: Status, names: list[str]) -> Table:
-    stages = list(dict.fromkeys(stage for name in names for stage in found.sequences[name]))
+def _table(current: Status, names: list[str]) -> Table:
+    stages = list(dict.fromkeys(stage for name in names for stage in current.sequences[name]))
     table = Table("sequence", *stages, box=None, header_style="bold", pad_edge=False)
     for name in names:
-        own = found.sequences[name]
+        own = current.sequences[name]
         table.add_row(
             escape(name), *(_MARKS[own[stage].state] if stage in own else "" for stage in stages)
         )
     return table
 
 
-def _reasons(found: Status) -> list[str]:
+def _reasons(current: Status) -> list[str]:
     """Each reason with its stage and sequences, most frequent first."""
     sequences: dict[tuple[str, str, str], list[str]] = {}
-    for name, stages in found.sequences.items():
+    for name, stages in current.sequences.items():
         for stage, output in stages.items():
             if output.state in (FAILED, STALE, RUNNING):
                 for words in output.words:
@@ -165,22 +164,22 @@ def _reasons(found: Status) -> list[str]:
     for (state, stage, words), names in sorted(
         sequences.items(), key=lambda item: (order.index(item[0][0]), -len(item[1]))
     ):
-        more = f" and {len(names) - NAMES} more" if len(names) > NAMES else ""
-        lines.append(f"{stage} {state} in {', '.join(names[:NAMES])}{more}: {words}")
+        more = f" and {len(names) - 6} more" if len(names) > 6 else ""
+        lines.append(f"{stage} {state} in {', '.join(names[:6])}{more}: {words}")
     return lines
 
 
-def _other_machines(found: Status) -> Counter[str]:
+def _other_machines(current: Status) -> Counter[str]:
     """Number of outputs by the other machine that made them."""
     return Counter(
         output.made_on
-        for stages in found.sequences.values()
+        for stages in current.sequences.values()
         for output in stages.values()
         if output.made_on
     )
 
 
-def _to_json(found: Status) -> dict[str, object]:
+def _to_json(current: Status) -> dict[str, object]:
     def entry(output: StageStatus) -> dict[str, object]:
         return {
             "state": output.state, "reasons": list(output.words), "made_on": output.made_on
@@ -189,31 +188,27 @@ def _to_json(found: Status) -> dict[str, object]:
     return {
         "sequences": {
             name: {
-                "state": found.of(name),
+                "state": current.of(name),
                 "stages": {stage: entry(output) for stage, output in stages.items()},
             }
-            for name, stages in found.sequences.items()
+            for name, stages in current.sequences.items()
         },
-        "dataset": entry(found.dataset),
+        "dataset": entry(current.dataset),
     }
 
 
 def print_verification(project: Project) -> bool:
     """Read all data of every artefact and print the damaged ones; True if none is damaged."""
-    paths = [
-        project.artefact(name, stage)
-        for name in project.sequences
-        for stage in STAGES
-        if project.artefact(name, stage).exists()
-    ]
+    outputs = (project.artefact(name, stage) for name in project.sequences for stage in STAGES)
+    paths = [path for path in outputs if path.exists()]
     console = Console()
     damaged: list[str] = []
     progress = Progress(log, "verified", len(paths), "files")
     for path in paths:
-        found = find_damage(path)
-        if not found and read_manifest(path) is None:
-            found = f"{path}: has no manifest, or a damaged one; delete it and run again"
-        damaged += [found] if found else []
+        damage = find_damage(path)
+        if not damage and read_manifest(path) is None:
+            damage = f"{path}: has no manifest, or a damaged one; delete it and run again"
+        damaged += [damage] if damage else []
         progress.step()
     for words in damaged:
         console.print(words, highlight=False, markup=False, soft_wrap=True)

@@ -1,4 +1,4 @@
-"""What ``intercap tables`` does."""
+"""`intercap tables`: write settings and tables for a released dataset."""
 
 from __future__ import annotations
 
@@ -15,12 +15,15 @@ from intercap_core.tables.project_files import write_project
 
 
 @dataclass(frozen=True)
-class Tables:
-    """Files written, sequences listed, and what the user must know."""
+class WrittenTables:
+    """Result of :func:`write_tables`."""
 
     written: list[Path]
+    """Files of the project."""
     sequences: int
+    """Number of sequences in the table."""
     remarks: list[str]
+    """Remarks for the user, by sequence."""
 
 
 def write_tables(
@@ -32,11 +35,18 @@ def write_tables(
     sources: intercap.Sources,
     objects: Path,
     replace: bool,
-) -> Tables:
-    """Write the project of a release into ``output``; see the layouts' modules.
+) -> WrittenTables:
+    """Write the project of a release in the layout "intercap" or "behave" into ``output``.
 
-    Raises UserError where the release is not as it must be, and where files are there that would
-    be written over, unless ``replace``.
+    The layouts are described in :mod:`intercap_core.tables`. Raises UserError if a folder of the
+    release is missing or malformed, or if files exist in ``output`` and ``replace`` is False.
+
+    Args:
+        root: folder of the release.
+        dataset: name of the dataset; default: the layout.
+        sources: folders of the release outside ``root``.
+        objects: folder for the meshes.
+        replace: overwrite existing files.
     """
     name = dataset or layout
     try:
@@ -48,20 +58,20 @@ def write_tables(
         ) from None
     for path in (root, sources.calibrations, sources.annotations, sources.meshes, sources.results):
         if path is not None and not path.is_dir():
-            raise UserError(f"{path}: there is no such folder; correct the path")
+            raise UserError(f"{path}: no such folder; correct the path")
     if layout == "intercap":
         draft = intercap.draft(root, sources, dataset=name, objects=objects)
     elif layout == "behave":
         if changed(sources, results=None) != intercap.Sources():
             raise UserError(
-                "layout 'behave' has calibration, meshes and detections in places of its own; "
+                "layout 'behave' has fixed places for calibration, meshes and detections; "
                 "leave out --calibrations, --annotations, --meshes, --keypoints and --candidates"
             )
         draft = behave.draft(root, dataset=name, results=sources.results)
     else:
-        raise UserError(f"layout {layout!r} is not known, expected intercap or behave")
+        raise UserError(f"layout {layout!r} is unknown, expected intercap or behave; correct it")
     written = write_project(draft, output, replace=replace)
     remarks = draft.remarks + [
         f"{row.columns['sequence']}: {remark}" for row in draft.rows for remark in row.remarks
     ]
-    return Tables(written, len(draft.rows), remarks)
+    return WrittenTables(written, len(draft.rows), remarks)

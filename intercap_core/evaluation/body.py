@@ -26,7 +26,7 @@ def visible_vertex_error(
     true_vertices: np.ndarray,
     visible: np.ndarray,
 ) -> np.ndarray:
-    """PVE (...) over the vertices in the mask ``visible`` (..., V); NaN where the mask is empty."""
+    """PVE (...) over the vertices in the mask ``visible`` (..., V); NaN if the mask is empty."""
     error = np.linalg.norm(vertices - true_vertices, axis=-1)
     count = visible.sum(-1)
     mean = (error * visible).sum(-1) / np.maximum(count, 1)

@@ -70,14 +70,14 @@ class BodyClouds:
         person: Path,
         model: BodyModel,
     ) -> Iterator[BodyClouds]:
-        """Context manager; raises UserError where an artefact cannot be read."""
+        """Context manager; raises UserError if an artefact cannot be read."""
         with Frames.open(frames) as images, artefacts.read(scene, SCENE) as found:
             rig = Rig.from_artefact(found)
             images = images.showing(found["image_of"])
             yield cls(images, rig, read_person_masks(person), found["depth_bias"], model)
 
     def measure(self, t: int, vertices: np.ndarray, truth: Truth) -> dict[str, float]:
-        """Mean distances of frame ``t`` by CLOUD_KEYS, metres; NaN where no point was measured.
+        """Mean distances of frame ``t`` by CLOUD_KEYS, metres; NaN if no point was measured.
 
         - ``cloud_to_mesh``: from the points to the fitted mesh, vertices (V, 3).
         - ``mesh_to_cloud_visible``: from samples of the mesh to the points. Only samples that a
@@ -127,21 +127,36 @@ class BodyErrors:
 
     sequence: str
     interaction: str
-    truth: Path  # the file with the truth
-    views: int  # number of cameras with images
-    pve: np.ndarray  # (T,) mean error of all vertices
-    visible: np.ndarray  # (T,) mean error of the vertices that a camera truly sees
-    joints: np.ndarray  # (T, 22) error of each body joint
-    hands: np.ndarray  # (T, 2) mean error of joints and tips of the left and right hand
-    hands_wrist: np.ndarray  # (T, 2) the same with the wrist aligned
-    touching: np.ndarray  # (T, 2) whether the hand truly touches the object
-    face: np.ndarray  # (T,) mean error of 68 landmarks
-    face_aligned: np.ndarray  # (T,) the same after rigid alignment
-    acceleration: np.ndarray  # (T,) error, metres per frame^2 at 30 fps
-    normalised: np.ndarray  # (T, 22) joint errors over their stated deviation
-    normalised_hands: np.ndarray  # (T, 30) finger joint errors over their stated deviation
-    flagged: np.ndarray  # (T,) the stage marked the frame as unreliable
-    clouds: dict[str, np.ndarray] = field(default_factory=dict)  # (N,) by CLOUD_KEYS, every EVERY
+    truth: Path
+    """The file with the truth."""
+    views: int
+    """Number of cameras with images."""
+    pve: np.ndarray
+    """(T,) mean error of all vertices."""
+    visible: np.ndarray
+    """(T,) mean error of the vertices that a camera truly sees."""
+    joints: np.ndarray
+    """(T, 22) error of each body joint."""
+    hands: np.ndarray
+    """(T, 2) mean error of joints and tips of the left and right hand."""
+    hands_wrist: np.ndarray
+    """(T, 2) the same with the wrist aligned."""
+    touching: np.ndarray
+    """(T, 2) whether the hand truly touches the object."""
+    face: np.ndarray
+    """(T,) mean error of 68 landmarks."""
+    face_aligned: np.ndarray
+    """(T,) the same after rigid alignment."""
+    acceleration: np.ndarray
+    """(T,) error, metres per frame^2 at 30 fps."""
+    normalised: np.ndarray
+    """(T, 22) joint errors over their stated deviation."""
+    normalised_hands: np.ndarray
+    """(T, 30) finger joint errors over their stated deviation."""
+    flagged: np.ndarray
+    """(T,) the stage marked the frame as unreliable."""
+    clouds: dict[str, np.ndarray] = field(default_factory=dict)
+    """(N,) by CLOUD_KEYS, every EVERY."""
 
     @property
     def bad(self) -> np.ndarray:
@@ -163,7 +178,7 @@ def measure(
 ) -> BodyErrors:
     """Compare the artefact of stage ``body_fit`` with the truth of its recording.
 
-    Raises UserError where an artefact cannot be read or the truth is of another recording.
+    Raises UserError if an artefact cannot be read or the truth is of another recording.
     """
     track = read_body(paths.body_fit, "body_fit", body_models, gender)
     with artefacts.read(paths.scene, SCENE) as found:
@@ -226,7 +241,7 @@ def figures(recordings: Sequence[BodyErrors]) -> Figures:
     """Figures over several recordings, millimetres: means over all their frames.
 
     ``hand_grasp`` figures are over the frames in which the hand truly touches the object. Recall
-    and precision of the flags are omitted where they are undefined.
+    and precision of the flags are omitted if they are undefined.
     """
     if not recordings:
         return {}

@@ -32,15 +32,18 @@ SAME, CHANGED, ADDED, REMOVED, UNLIKE = "same", "changed", "added", "removed", "
 class Comparison:
     """Differences between two versions, millimetres and degrees."""
 
-    sequences: pd.DataFrame  # one row per sequence of either version, most changed first
-    frames: pd.DataFrame  # one row per changed frame
-    figures: pd.DataFrame  # "figure", "old", "new" of summary.json; empty if a version lacks it
+    sequences: pd.DataFrame
+    """One row per sequence of either version, most changed first."""
+    frames: pd.DataFrame
+    """One row per changed frame."""
+    figures: pd.DataFrame
+    """"figure", "old", "new" of summary.json; empty if a version lacks it."""
 
 
 def compare(old: Path, new: Path) -> Comparison:
     """Compare two results folders, sequence by sequence.
 
-    Folders with a joint artefact are sequences. Raises UserError where a version has none.
+    Folders with a joint artefact are sequences. Raises UserError if a version has none.
     """
     before, after = (_sequences(folder) for folder in (old, new))
     rows: list[dict[str, object]] = []
@@ -194,7 +197,7 @@ def _named(regions: np.ndarray, which: np.ndarray) -> Sequence[str]:
 
 
 def _measured(folder: Path, when: str) -> dict[str, object]:
-    """Number of flagged frames, and stated errors; empty where the summary cannot be read."""
+    """Number of flagged frames, and stated errors; empty if the summary cannot be read."""
     try:
         found = SequenceSummary.read(folder / "summary.h5").metrics
     except UserError:

@@ -53,12 +53,12 @@ def f1(counts: np.ndarray) -> float:
 
 
 def recall(found: np.ndarray, true: np.ndarray) -> float:
-    """Share of the true elements (N,) that were found; NaN where none is true."""
+    """Share of the true elements (N,) that were found; NaN if none is true."""
     return float(found[true].mean()) if true.any() else float("nan")
 
 
 def precision(found: np.ndarray, true: np.ndarray) -> float:
-    """Share of the found elements (N,) that are true; NaN where none was found."""
+    """Share of the found elements (N,) that are true; NaN if none was found."""
     return recall(true, found)
 
 
@@ -81,7 +81,7 @@ def depths(signed_distance: np.ndarray) -> Depths:
 def ground_penetration(vertices: np.ndarray, point: np.ndarray, normal: np.ndarray) -> float:
     """Depth of the deepest vertex below the floor, metres.
 
-    0 where all vertices are above the floor, NaN where the floor is not known.
+    0 where all vertices are above the floor, NaN if the floor is not known.
 
     Args:
         vertices: (V, 3) metres.
@@ -94,7 +94,7 @@ def ground_penetration(vertices: np.ndarray, point: np.ndarray, normal: np.ndarr
 
 
 def penetration_summary(per_frame_m: np.ndarray, contact_frame: np.ndarray) -> dict[str, float]:
-    """The paper's penetration figures over contact frames; NaN where no frame has contact.
+    """The paper's penetration figures over contact frames; NaN if no frame has contact.
 
     Returns mean, median and 98th percentile in millimetres, and the shares of frames whose depth is
     at most 5, 7, 10 and 20 mm.

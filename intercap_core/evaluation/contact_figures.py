@@ -59,9 +59,12 @@ def detected_figures(
 class Reliability:
     """Reliability table over the B probability bins that are not empty."""
 
-    count: np.ndarray  # (B,) number of statements
-    stated: np.ndarray  # (B,) mean stated probability
-    true: np.ndarray  # (B,) share of true contact
+    count: np.ndarray
+    """(B,) number of statements."""
+    stated: np.ndarray
+    """(B,) mean stated probability."""
+    true: np.ndarray
+    """(B,) share of true contact."""
 
 
 def reliability(probability: np.ndarray, true: np.ndarray) -> Reliability:

@@ -40,21 +40,30 @@ class FieldScene:
 
     sequence: str
     fps: float
-    apart_s: np.ndarray  # (N,) true delay of the images relative to their frame sets
-    late_s: np.ndarray  # (N,) error of the estimated delay, median over images
-    sigma_s: np.ndarray  # (N,) stated standard deviation of the delay
-    set_aside: np.ndarray  # (N,) the scene excluded the camera as its delay is undetermined
-    before: np.ndarray  # (N,) displacement by the given extrinsics, metres
-    after: np.ndarray  # (N,) displacement by the refined extrinsics, metres
-    stated: np.ndarray  # (N,) stated standard deviation of the displacement, metres
-    floor_m: float  # mean height error of the floor under the true feet; NaN without a floor
-    tilt_deg: float  # angle between estimated and true floor normal; NaN without a floor
+    apart_s: np.ndarray
+    """(N,) true delay of the images relative to their frame sets."""
+    late_s: np.ndarray
+    """(N,) error of the estimated delay, median over images."""
+    sigma_s: np.ndarray
+    """(N,) stated standard deviation of the delay."""
+    set_aside: np.ndarray
+    """(N,) the scene excluded the camera as its delay is undetermined."""
+    before: np.ndarray
+    """(N,) displacement by the given extrinsics, metres."""
+    after: np.ndarray
+    """(N,) displacement by the refined extrinsics, metres."""
+    stated: np.ndarray
+    """(N,) stated standard deviation of the displacement, metres."""
+    floor_m: float
+    """Mean height error of the floor under the true feet; NaN without a floor."""
+    tilt_deg: float
+    """Angle between estimated and true floor normal; NaN without a floor."""
 
 
 def measure(frames: Path, scene: Path, truth: Path) -> FieldScene:
     """Compare a scene artefact with its truth.
 
-    Raises UserError where an artefact cannot be read.
+    Raises UserError if an artefact cannot be read.
     """
     with (
         artefacts.read(frames, FRAMES) as recorded,
@@ -225,7 +234,7 @@ def measure_subject_share(person: Path, scene: Path, truth: Path) -> float:
 
     The chosen keypoints are compared with the true joints in the true cameras, with left and right
     exchanged where that fits better: a detection with exchanged sides is still the subject.
-    Raises UserError where an artefact cannot be read or the truth is of another recording.
+    Raises UserError if an artefact cannot be read or the truth is of another recording.
     """
     with (
         artefacts.read(person, PERSON) as chosen,

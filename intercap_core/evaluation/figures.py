@@ -39,12 +39,14 @@ class SequenceMetrics:
     object_: str
     fps: float
     has_truth: bool
-    values: dict[str, np.ndarray] = field(repr=False)  # by dataset of the metrics artefact
-    made_by: str = ""  # program that made an imported result; "" = this one
+    values: dict[str, np.ndarray] = field(repr=False)
+    """By dataset of the metrics artefact."""
+    made_by: str = ""
+    """Program that made an imported result; "" = this one."""
 
     @classmethod
     def read(cls, path: Path) -> SequenceMetrics:
-        """Read a metrics artefact; raises UserError where it cannot be read."""
+        """Read a metrics artefact; raises UserError if it cannot be read."""
         with artefacts.read(path, METRICS) as artefact:
             return cls.of(artefact)
 

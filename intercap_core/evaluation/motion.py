@@ -138,7 +138,7 @@ def slip_speed(
     """Speed (T,) at which fitted skin slides over the fitted object beyond the true slip, m/s.
 
     The mean over touching vertices of the tangential difference between fitted and true velocity in
-    the object's frame. NaN where no vertex touches both in the frame and :data:`SLIP_S` later.
+    the object's frame. NaN if no vertex touches both in the frame and :data:`SLIP_S` later.
 
     Args:
         local: (T, V, 3) fitted skin vertices in the fitted object's frame, metres.
@@ -173,8 +173,10 @@ STANDING_SHARE = 0.1  # of a sole's vertices that must carry weight; toes or a h
 class Floor:
     """The plane normal . x + offset = 0."""
 
-    normal: np.ndarray  # (3,) unit, pointing up
-    offset: float  # metres
+    normal: np.ndarray
+    """(3,) unit, pointing up."""
+    offset: float
+    """Metres."""
 
     def height(self, points: np.ndarray) -> np.ndarray:
         """Height (...) of points (..., 3) above the floor, metres."""
@@ -206,11 +208,14 @@ def support(
 
 @dataclass(frozen=True)
 class FootErrors:
-    """Errors of one foot between consecutive frames; NaN where they are not defined."""
+    """Errors of one foot between consecutive frames; NaN if they are not defined."""
 
-    speed: np.ndarray  # (T - 1,) speed along the floor of the vertices that carry weight, m/s
-    height: np.ndarray  # (T - 1,) mean height error of the vertices that carry weight, metres
-    swing: np.ndarray  # (T - 1,) mean distance of the sole from the true sole while it swings
+    speed: np.ndarray
+    """(T - 1,) speed along the floor of the vertices that carry weight, m/s."""
+    height: np.ndarray
+    """(T - 1,) mean height error of the vertices that carry weight, metres."""
+    swing: np.ndarray
+    """(T - 1,) mean distance of the sole from the true sole while it swings."""
 
 
 def foot_errors(
@@ -227,7 +232,7 @@ def foot_errors(
 
 
 def _masked_mean(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Means (T,) of the values (T, S) within ``mask``; NaN where the mask is empty."""
+    """Means (T,) of the values (T, S) within ``mask``; NaN if the mask is empty."""
     number = mask.sum(1)
     total = np.where(mask, values, 0.0).sum(1)
     return np.where(number > 0, total / np.maximum(number, 1), np.nan)

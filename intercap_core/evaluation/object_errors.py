@@ -32,18 +32,30 @@ class ObjectErrors:
     sequence: str
     object_: str
     fps: float
-    translation: np.ndarray  # (T,) error of the centre of mass, metres
-    rotation: np.ndarray  # (T,) error, degrees
-    turn: np.ndarray  # (T,) error of the rotation since the frame before, degrees
-    centre: np.ndarray  # (T, 3) centre of mass, metres
-    true_centre: np.ndarray  # (T, 3)
-    views: np.ndarray  # (T,) number of cameras that truly see the object
-    moves: np.ndarray  # (T,) whether the object truly moves
-    flagged: np.ndarray  # (T,) the stage marked the frame as unreliable
-    add_s: np.ndarray | None = None  # (T,) over the diameter
-    mssd: np.ndarray | None = None  # (T,) over the diameter
-    normalised: np.ndarray | None = None  # (T,) translation error over its stated deviation
-    normalised_turn: np.ndarray | None = None  # (T,) rotation error over its stated deviation
+    translation: np.ndarray
+    """(T,) error of the centre of mass, metres."""
+    rotation: np.ndarray
+    """(T,) error, degrees."""
+    turn: np.ndarray
+    """(T,) error of the rotation since the frame before, degrees."""
+    centre: np.ndarray
+    """(T, 3) centre of mass, metres."""
+    true_centre: np.ndarray
+    """(T, 3)."""
+    views: np.ndarray
+    """(T,) number of cameras that truly see the object."""
+    moves: np.ndarray
+    """(T,) whether the object truly moves."""
+    flagged: np.ndarray
+    """(T,) the stage marked the frame as unreliable."""
+    add_s: np.ndarray | None = None
+    """(T,) over the diameter."""
+    mssd: np.ndarray | None = None
+    """(T,) over the diameter."""
+    normalised: np.ndarray | None = None
+    """(T,) translation error over its stated deviation."""
+    normalised_turn: np.ndarray | None = None
+    """(T,) rotation error over its stated deviation."""
 
     @property
     def lost(self) -> np.ndarray:
@@ -54,7 +66,7 @@ class ObjectErrors:
 def measure(scene: Path, object_track: Path, truth: Path, mesh: ObjectMesh) -> ObjectErrors:
     """Compare the artefact of stage ``object_track`` with the truth of its recording.
 
-    Errors are infinite where the object was found in no frame. Raises UserError where an artefact
+    Errors are infinite if the object was found in no frame. Raises UserError if an artefact
     cannot be read or the truth is of another recording.
     """
     track = read_object(object_track, "object_track")
@@ -180,9 +192,7 @@ def figures(recordings: Sequence[ObjectErrors]) -> Figures:
         values = scale * np.concatenate(errors)[seen]
         if len(values):
             found[f"{key}_median_{unit}"] = float(np.median(values))
-            with np.errstate(
-                invalid="ignore"
-            ):  # errors are infinite where the object was never found
+            with np.errstate(invalid="ignore"):  # errors are infinite if the object was never found
                 found[f"{key}_p95_{unit}"] = float(np.percentile(values, 95))
     add, worst = _pooled([r.add_s for r in recordings]), _pooled([r.mssd for r in recordings])
     if len(add):

@@ -40,7 +40,7 @@ def rotation_error_deg(
 def lost(translation_error_m: np.ndarray, rotation_error_degrees: np.ndarray) -> np.ndarray:
     """Mask (...) of lost poses: errors above 50 mm or 20 degrees.
 
-    Errors are infinite where the object exists and no stage found it.
+    Errors are infinite if the object exists and no stage found it.
     """
     return (translation_error_m > LOST_TRANSLATION_M) | (rotation_error_degrees > LOST_ROTATION_DEG)
 
@@ -52,7 +52,7 @@ def first_seen_found(
 ) -> bool | None:
     """Whether the error is below 20 mm and 10 degrees in the first frame that shows the object.
 
-    All arguments are (T,). None where no camera sees the object.
+    All arguments are (T,). None if no camera sees the object.
     """
     seen = np.flatnonzero(views > 0)
     if len(seen) == 0:
@@ -71,7 +71,7 @@ def normalised_translation_error(
 ) -> np.ndarray:
     """Mahalanobis length (T,) of the translation error over its median; 1 if calibrated.
 
-    ``covariance`` (T, 6, 6) is of rotation vector and translation. The result is NaN where it is
+    ``covariance`` (T, 6, 6) is of rotation vector and translation. The result is NaN if it is
     not positive definite.
     """
     block = covariance[:, 3:, 3:]
@@ -92,7 +92,7 @@ def normalised_rotation_error(
 ) -> np.ndarray:
     """Mahalanobis length (T,) of the rotation error over its median; 1 if calibrated.
 
-    Axes with a stated deviation above ``UNKNOWN_TURN_DEG`` are excluded. NaN where all are.
+    Axes with a stated deviation above ``UNKNOWN_TURN_DEG`` are excluded. NaN if all are.
     """
     from scipy.stats import chi  # takes a second to import, which most processes do not need
 

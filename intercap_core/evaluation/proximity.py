@@ -93,7 +93,7 @@ class BodySurface:
 
 
 class _Solid:
-    """Signed distance to a ``surface``; the ``field`` decides the sign where it is not closed."""
+    """Signed distance to a ``surface``; the ``field`` decides the sign if it is not closed."""
 
     def __init__(self, surface: ShapedSurface, field: DistanceField | None = None) -> None:
         self._surface, self._field = surface, field

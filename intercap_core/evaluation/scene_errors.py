@@ -60,20 +60,28 @@ class Slip:
     """A run of images of one camera that all lag by the same number of frame sets."""
 
     camera: int
-    first: int  # first frame set
-    last: int  # last frame set
-    frames: int  # lag in frame sets
+    first: int
+    """First frame set."""
+    last: int
+    """Last frame set."""
+    frames: int
+    """Lag in frame sets."""
 
 
 @dataclass(frozen=True)
 class SlipCounts:
     """Detection of slips, counted by event and by image."""
 
-    found: int  # true slips that were detected
-    missed: int  # true slips that were not detected
-    false: int  # detections without a true slip
-    images_wrong: int  # images whose slip is not the true one
-    images: int  # all images
+    found: int
+    """True slips that were detected."""
+    missed: int
+    """True slips that were not detected."""
+    false: int
+    """Detections without a true slip."""
+    images_wrong: int
+    """Images whose slip is not the true one."""
+    images: int
+    """All images."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,14 +93,21 @@ class CaptureErrors:
 
     sequence: str
     room: str
-    before: np.ndarray  # (C-1,) displacement by the given extrinsics, metres, without the master
-    after: np.ndarray  # (C-1,) displacement by the refined extrinsics, metres
-    offset: np.ndarray  # (C-1,) time offsets relative to the master, seconds
-    offset_normalised: np.ndarray  # (C-1,) ``offset`` over its stated standard deviation
+    before: np.ndarray
+    """(C-1,) displacement by the given extrinsics, metres, without the master."""
+    after: np.ndarray
+    """(C-1,) displacement by the refined extrinsics, metres."""
+    offset: np.ndarray
+    """(C-1,) time offsets relative to the master, seconds."""
+    offset_normalised: np.ndarray
+    """(C-1,) ``offset`` over its stated standard deviation."""
     slips: SlipCounts
-    ground_m: float  # mean height error of the floor over the capture area
-    ground_deg: float  # angle between the normals
-    depth_bias: np.ndarray  # (C,) metres
+    ground_m: float
+    """Mean height error of the floor over the capture area."""
+    ground_deg: float
+    """Angle between the normals."""
+    depth_bias: np.ndarray
+    """(C,) metres."""
 
 
 def offset_errors(offset: np.ndarray, true_offset: np.ndarray, master: int) -> np.ndarray:
@@ -145,7 +160,7 @@ def ground_error(
 ) -> tuple[float, float]:
     """Mean height error over the capture area, metres, and the angle between normals, degrees.
 
-    NaN where no floor was found. Both normals are unit vectors that point up.
+    NaN if no floor was found. Both normals are unit vectors that point up.
 
     Args:
         point, normal: (3,) the estimated floor.
@@ -171,7 +186,7 @@ def ground_error(
 def measure(frames: Path, scene: Path, truth: Path) -> CaptureErrors:
     """Compare the scene artefact of one capture with its truth.
 
-    Raises UserError where an artefact cannot be read or the truth is of another recording.
+    Raises UserError if an artefact cannot be read or the truth is of another recording.
     """
     with (
         artefacts.read(frames, FRAMES) as recorded,
@@ -275,7 +290,7 @@ def figures(captures: Sequence[CaptureErrors]) -> dict[str, float]:
 
 
 def _true_bias(truth: artefacts.Artefact) -> np.ndarray:
-    """Depth biases (C,), NaN where the truth does not state them."""
+    """Depth biases (C,), NaN if the truth does not state them."""
     if "depth_bias" in truth:
         return truth["depth_bias"]
     return np.full(len(truth["time_offset"]), np.nan)

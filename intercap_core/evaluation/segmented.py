@@ -24,10 +24,11 @@ MARGIN_M = 0.25
 
 @dataclass(frozen=True, eq=False)
 class ViewMasks:
-    """Masks of one colour image; None where it has none."""
+    """Masks of one colour image; None if it has none."""
 
     person: Runs | None
-    object_: Runs | None  # the candidate that the object's track kept
+    object_: Runs | None
+    """The candidate that the object's track kept."""
 
 
 def segmented_points(
@@ -62,16 +63,20 @@ def segmented_points(
 class _Space:
     """A window of a depth image and a range of depths."""
 
-    low: tuple[int, int]  # first column and row
-    high: tuple[int, int]  # column and row after the last
-    nearest: float  # millimetres
-    farthest: float  # millimetres
+    low: tuple[int, int]
+    """First column and row."""
+    high: tuple[int, int]
+    """Column and row after the last."""
+    nearest: float
+    """Millimetres."""
+    farthest: float
+    """Millimetres."""
 
     @classmethod
     def around(cls, camera: Camera, near: np.ndarray) -> _Space | None:
         """Space around points (M, 3), master frame, with ``MARGIN_M``.
 
-        None where the camera sees none of the points.
+        None if the camera sees none of the points.
         """
         lens = camera.depth
         if lens is None:
@@ -112,7 +117,7 @@ class _Space:
 
 
 def read_person_masks(person: Path) -> list[list[bytes]]:
-    """Person masks (T, C) as COCO RLE bytes; empty where an image has none."""
+    """Person masks (T, C) as COCO RLE bytes; empty if an image has none."""
     with artefacts.read(person, PERSON) as people:
         masks = artefacts.unpack_ragged(people["mask_offsets"], people["mask_rle"])
         sets, cameras = people["person"].shape

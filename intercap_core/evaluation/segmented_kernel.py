@@ -15,7 +15,7 @@ _MILLIMETRE = np.float32(1e-3)
 def extent(points, pose, lens):
     """Minimum and maximum (2,3) of column, row and depth (metres) of the points in the image.
 
-    The minimum is infinite where no point is in the image. All arrays are float64.
+    The minimum is infinite if no point is in the image. All arrays are float64.
 
     Args:
         points: (M,3).

@@ -25,8 +25,10 @@ _FEET = ("left_foot", "right_foot")  # regions of the soles
 class _ObjectSurfaces:
     """Surfaces of the tracked and of the true object."""
 
-    mesh: ObjectMesh  # tracked
-    surface: PosedObject  # tracked
+    mesh: ObjectMesh
+    """Tracked."""
+    surface: PosedObject
+    """Tracked."""
     true_surface: DistanceField
 
     def true_normals(self, points: np.ndarray) -> np.ndarray:

@@ -27,9 +27,12 @@ class FittedBody:
     """The body model file with which a sequence was fitted."""
 
     gender: str
-    digest: str  # of the file
-    num_betas: int  # shape coefficients that were fitted
-    num_expression: int  # expression coefficients that were fitted
+    digest: str
+    """Of the file."""
+    num_betas: int
+    """Shape coefficients that were fitted."""
+    num_expression: int
+    """Expression coefficients that were fitted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,13 +40,19 @@ class SequenceSummary:
     """One sequence's summary artefact; contact is None without an object."""
 
     metrics: SequenceMetrics
-    intent: str  # of the table of sequences; "" if not given
+    intent: str
+    """Of the table of sequences; "" if not given."""
     body: FittedBody
-    rig: Mapping[str, np.ndarray] = field(repr=False)  # datasets ``rig/...`` of SUMMARY by name
-    body_contact: np.ndarray | None = field(repr=False)  # (V,) number of frames in contact
-    surface: np.ndarray | None = field(repr=False)  # (N, 3) object samples, object frame
-    surface_contact: np.ndarray | None = field(repr=False)  # (N,) number of frames in contact
-    made_by: Mapping[str, tuple[int, str]]  # schema version and settings digest by stage
+    rig: Mapping[str, np.ndarray] = field(repr=False)
+    """Datasets ``rig/...`` of SUMMARY by name."""
+    body_contact: np.ndarray | None = field(repr=False)
+    """(V,) number of frames in contact."""
+    surface: np.ndarray | None = field(repr=False)
+    """(N, 3) object samples, object frame."""
+    surface_contact: np.ndarray | None = field(repr=False)
+    """(N,) number of frames in contact."""
+    made_by: Mapping[str, tuple[int, str]]
+    """Schema version and settings digest by stage."""
 
     @property
     def name(self) -> str:
@@ -66,7 +75,7 @@ class SequenceSummary:
 
     @classmethod
     def read(cls, path: Path) -> SequenceSummary:
-        """Read a summary artefact; raises UserError where it cannot be read."""
+        """Read a summary artefact; raises UserError if it cannot be read."""
         with artefacts.read(path, SUMMARY) as artefact:
 
             def optional(key: str) -> np.ndarray | None:
@@ -166,19 +175,26 @@ def _rig(scene: Artefact) -> dict[str, np.ndarray | list[str]]:
 class SurfaceHeat:
     """Contact likelihood on the surface of one object."""
 
-    points: np.ndarray  # (N, 3) samples, object frame
-    likelihood: np.ndarray  # (N,) share of the frames in which a sample is in contact
-    frames: int  # number of frames
+    points: np.ndarray
+    """(N, 3) samples, object frame."""
+    likelihood: np.ndarray
+    """(N,) share of the frames in which a sample is in contact."""
+    frames: int
+    """Number of frames."""
 
 
 @dataclass(frozen=True, eq=False)
 class Heatmaps:
     """Contact likelihood on the body and on each object."""
 
-    body: np.ndarray  # (V,) share of the frames in which a vertex is in contact
-    body_frames: int  # number of frames
-    objects: dict[str, SurfaceHeat]  # by name of the object
-    left_out: dict[str, list[str]] = field(default_factory=dict)  # reasons by excluded sequence
+    body: np.ndarray
+    """(V,) share of the frames in which a vertex is in contact."""
+    body_frames: int
+    """Number of frames."""
+    objects: dict[str, SurfaceHeat]
+    """By name of the object."""
+    left_out: dict[str, list[str]] = field(default_factory=dict)
+    """Reasons by excluded sequence."""
 
 
 def collect_heatmaps(summaries: Sequence[SequenceSummary]) -> Heatmaps:

@@ -31,10 +31,14 @@ class BodyTrack:
 
     model: BodyModel
     parameters: BodyParameters
-    joints: np.ndarray  # (T, 55, 3)
-    tips: np.ndarray  # (T, 10, 3) fingertips, thumb to little finger, left hand first
-    flagged: np.ndarray  # (T,) the stage marked the frame as unreliable
-    sigma: np.ndarray | None = None  # (T, 55) stated standard deviation of the joints
+    joints: np.ndarray
+    """(T, 55, 3)."""
+    tips: np.ndarray
+    """(T, 10, 3) fingertips, thumb to little finger, left hand first."""
+    flagged: np.ndarray
+    """(T,) the stage marked the frame as unreliable."""
+    sigma: np.ndarray | None = None
+    """(T, 55) stated standard deviation of the joints."""
 
     def frame(self, t: int) -> np.ndarray:
         """Posed vertices (V, 3) float32 of one frame."""
@@ -51,12 +55,16 @@ class BodyTrack:
 
 @dataclass(frozen=True, eq=False)
 class ObjectTrack:
-    """T poses master_from_object; all NaN where the recording has no object."""
+    """T poses master_from_object; all NaN if the recording has no object."""
 
-    rotation: np.ndarray  # (T, 3, 3)
-    translation: np.ndarray  # (T, 3) metres
-    flagged: np.ndarray  # (T,) the stage marked the frame as unreliable
-    covariance: np.ndarray | None = None  # (T, 6, 6) of rotation vector and translation
+    rotation: np.ndarray
+    """(T, 3, 3)."""
+    translation: np.ndarray
+    """(T, 3) metres."""
+    flagged: np.ndarray
+    """(T,) the stage marked the frame as unreliable."""
+    covariance: np.ndarray | None = None
+    """(T, 6, 6) of rotation vector and translation."""
 
     @property
     def known(self) -> bool:
@@ -67,7 +75,7 @@ class ObjectTrack:
 def read_body(path: Path, stage: str, body_models: BodyModels, gender: str) -> BodyTrack:
     """Bodies of the artefact of stage ``"body_fit"`` or ``"joint"``.
 
-    Raises UserError where the artefact cannot be read.
+    Raises UserError if the artefact cannot be read.
     """
     with artefacts.read(path, BODY_FIT if stage == "body_fit" else JOINT) as artefact:
         parameters = read_parameters(artefact)
@@ -86,7 +94,7 @@ def read_body(path: Path, stage: str, body_models: BodyModels, gender: str) -> B
 def read_object(path: Path, stage: str) -> ObjectTrack:
     """Poses of the artefact of stage ``"object_track"`` or ``"joint"``.
 
-    Raises UserError where the artefact cannot be read.
+    Raises UserError if the artefact cannot be read.
     """
     with artefacts.read(path, OBJECT_TRACK if stage == "object_track" else JOINT) as artefact:
         first = stage == "object_track"

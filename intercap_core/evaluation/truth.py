@@ -23,7 +23,7 @@ def match_times(path: Path, true_times: np.ndarray, times: np.ndarray, fps: floa
 
     Both times are in seconds and increasing; ``path`` names the truth in the error message.
 
-    Raises UserError where the truth has no set within half a frame of a recorded set.
+    Raises UserError if the truth has no set within half a frame of a recorded set.
     """
     after = np.clip(np.searchsorted(true_times, times), 0, len(true_times) - 1)
     before = np.maximum(after - 1, 0)
@@ -44,24 +44,39 @@ class Truth:
     """True body and object in the recording's T frame sets, master frame, metres.
 
     Without an object the object's mesh is empty and its pose NaN. ``vertices`` and ``visible`` are
-    None where the fitted body's topology is not the one to which the truth was matched.
+    None if the fitted body's topology is not the one to which the truth was matched.
     """
 
-    vertices: np.ndarray | None  # (T, V, 3) points of the true skin at the fitted mesh's vertices
-    visible: np.ndarray | None  # (T, V) whether a camera truly sees them
-    joints: np.ndarray  # (T, 55, 3)
-    tips: np.ndarray  # (T, 10, 3) fingertips, thumb to little finger, left hand first
-    object_vertices: np.ndarray  # (Vo, 3) of the true object's mesh, object frame
-    object_faces: np.ndarray  # (Fo, 3)
-    object_visible: np.ndarray  # (T, Vo) whether a camera truly sees each object vertex
-    rotation: np.ndarray  # (T, 3, 3) master_from_object
-    translation: np.ndarray  # (T, 3) master_from_object
-    object_views: np.ndarray  # (T,) number of cameras that truly see the object
-    contact_region: np.ndarray  # (T, 12) true contact, in the order of METRIC_REGIONS
-    floor: Floor  # the plane on which bare soles stand
-    support_height: np.ndarray  # (T, 2) height of the surface under the left and the right sole
-    camera_names: tuple[str, ...]  # C names
-    master_from_colour: np.ndarray  # (C, 4, 4) true camera poses
+    vertices: np.ndarray | None
+    """(T, V, 3) points of the true skin at the fitted mesh's vertices."""
+    visible: np.ndarray | None
+    """(T, V) whether a camera truly sees them."""
+    joints: np.ndarray
+    """(T, 55, 3)."""
+    tips: np.ndarray
+    """(T, 10, 3) fingertips, thumb to little finger, left hand first."""
+    object_vertices: np.ndarray
+    """(Vo, 3) of the true object's mesh, object frame."""
+    object_faces: np.ndarray
+    """(Fo, 3)."""
+    object_visible: np.ndarray
+    """(T, Vo) whether a camera truly sees each object vertex."""
+    rotation: np.ndarray
+    """(T, 3, 3) master_from_object."""
+    translation: np.ndarray
+    """(T, 3) master_from_object."""
+    object_views: np.ndarray
+    """(T,) number of cameras that truly see the object."""
+    contact_region: np.ndarray
+    """(T, 12) true contact, in the order of METRIC_REGIONS."""
+    floor: Floor
+    """The plane on which bare soles stand."""
+    support_height: np.ndarray
+    """(T, 2) height of the surface under the left and the right sole."""
+    camera_names: tuple[str, ...]
+    """C names."""
+    master_from_colour: np.ndarray
+    """(C, 4, 4) true camera poses."""
 
     @property
     def has_object(self) -> bool:
@@ -72,7 +87,7 @@ class Truth:
     def load(cls, path: Path, times: np.ndarray, fps: float, num_vertices: int) -> Truth:
         """Read the truth at the frame sets' ``times`` (T,), seconds.
 
-        Raises UserError where the file is damaged or does not cover these times.
+        Raises UserError if the file is damaged or does not cover these times.
         """
         with artefacts.read(path, TRUTH) as file:
             at = match_times(path, file["times"], times, fps)

@@ -53,7 +53,7 @@ def run(
     what the dataset's card says, which is written beside ``summary``; ``virtual``: the studio made
     all recordings; ``failed`` are sequences without a result, with the reason; ``changed``: name,
     value and default of the settings that are not the program's own. A summary that is missing or
-    broken is told, left out and listed, as is what a heatmap cannot take. Raises UserError where no
+    broken is told, left out and listed, as is what a heatmap cannot take. Raises UserError if no
     sequence is left.
     """
     found, broken = _read(summaries)

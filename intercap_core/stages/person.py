@@ -58,7 +58,7 @@ def run(
     (its entry tells the labels of its candidates), or who is seen most near the middle. Its left
     and right are exchanged where ``left_right`` says that a detector exchanged them. A set in which
     one view alone sees the subject takes its points from that view's depth; sets in which
-    neither two views nor depth place it are flagged ``missing``. Raises UserError where that is so
+    neither two views nor depth place it are flagged ``missing``. Raises UserError if that is so
     in every set, the inputs are of different captures, or a point names nobody.
     """
     found = Detections.load(detections)

@@ -1,4 +1,4 @@
-"""What `intercap bench` says of the extraction, on recordings whose size is known."""
+"""Figures of `intercap bench` for recordings of known size."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from intercap_core.commands.bench import add_figures, extraction
+from intercap_core.commands.bench import add_figures, time_extraction
 from intercap_core.config import Config, ObjectEntry, SubjectEntry
 from intercap_core.errors import UserError
 from intercap_core.project import Project
@@ -26,7 +26,7 @@ def test_extraction_counts_sets_and_whole_files(tmp_path: Path) -> None:
     objects = {entry.object: ObjectEntry(name=entry.object, mesh=tmp_path / "none.ply")}
     project = Project(config, tmp_path / "config.yaml", {"one": entry}, subjects, objects)
     project.results.mkdir()
-    found = extraction(project, "one", 4)
+    found = time_extraction(project, "one", 4)
     recorded = sum(path.stat().st_size for path in folder.glob("*.mkv"))
     assert found["frames.recorded_bytes_per_set"] == pytest.approx(recorded / 4, abs=1)
     ratio = found["frames.bytes_per_set"] / found["frames.recorded_bytes_per_set"]

@@ -15,6 +15,7 @@ from intercap_core.commands.evaluate.part import (
     keyed,
     number,
     spread,
+    truth_of,
     variant,
 )
 from intercap_core.config import Config
@@ -26,7 +27,6 @@ from intercap_core.project import Project
 Bodies = Measured[BodyErrors]
 AREA = "body"
 OTHER_AREAS = ("object",)  # datasets whose recordings are measured here too
-_WIDTH = 190
 _COLUMNS = {
     "PVE": ("pve_mm", 1), "p95": ("pve_p95_mm", 1), "seen": ("pve_visible_mm", 1),
     "MPJPE": ("mpjpe_mm", 1), "hands": ("hand_mpjpe_mm", 1), "grasp": ("hand_grasp_mpjpe_mm", 1),
@@ -41,11 +41,9 @@ _FLAGS = ("bad_frames_share", "bad_frames_recall", "bad_frames_precision")
 
 def measure(project: Project, sequence: str) -> BodyErrors:
     """Errors of one recording's body after ``body_fit``."""
-    truth = project.sequences[sequence].truth
-    assert truth is not None
     return body_errors.measure(
         project.paths(sequence),
-        truth,
+        truth_of(project, sequence),
         project.config.body_models,
         project.subjects[project.sequences[sequence].subject].gender,
     )
@@ -128,7 +126,7 @@ def _compared(evaluations: Sequence[Bodies]) -> list[BodyErrors]:
 
 def print_bodies(evaluations: Sequence[Bodies]) -> None:
     """Print tables by interaction, by rig, by joint, and of each recording's worst frame."""
-    console = console_of(_WIDTH)
+    console = console_of(190)
     apart = _apart(evaluations)
     for found in apart:
         _print_interactions(console, found)

@@ -17,21 +17,19 @@ from intercap_core.commands.evaluate.part import (
     keyed,
     number,
     spread,
+    truth_of,
 )
 from intercap_core.evaluation import scene_errors
 from intercap_core.evaluation.scene_errors import CaptureErrors
 from intercap_core.project import Project
 
 Captures = Measured[CaptureErrors]
-_WIDTH = 112
 
 
 def measure(project: Project, sequence: str) -> CaptureErrors:
     """Errors of one capture after ``scene``."""
-    truth = project.sequences[sequence].truth
-    assert truth is not None
-    frames, scene = (project.artefact(sequence, stage) for stage in ("frames", "scene"))
-    return scene_errors.measure(frames, scene, truth)
+    paths = project.paths(sequence)
+    return scene_errors.measure(paths.frames, paths.scene, truth_of(project, sequence))
 
 
 def flat(evaluations: Sequence[Captures]) -> Figures:
@@ -47,7 +45,7 @@ def flat(evaluations: Sequence[Captures]) -> Figures:
 
 def print_captures(evaluations: Sequence[Captures]) -> None:
     """Print a table with a row per capture, and a table of figures with a column per project."""
-    console = console_of(_WIDTH)
+    console = console_of(112)
     heads = ("room", "poses mm", "after", "worst", "offset ms", "slips", "false", "floor mm",
              "deg")  # fmt: skip
     table = Table("capture", *heads, box=None, title="captures against truth, after scene")

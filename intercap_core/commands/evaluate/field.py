@@ -18,7 +18,7 @@ from rich.table import Table
 from intercap_core import artefacts
 from intercap_core.body.artefact import load_model
 from intercap_core.body.joints import JOINT_INDEX
-from intercap_core.commands.bench import judgement
+from intercap_core.commands.bench import time_hold_out
 from intercap_core.commands.evaluate.part import (
     EvaluationPart,
     Figures,
@@ -26,6 +26,7 @@ from intercap_core.commands.evaluate.part import (
     console_of,
     keyed,
     number,
+    truth_of,
 )
 from intercap_core.evaluation import field_errors, figures
 from intercap_core.evaluation.figures import SequenceMetrics
@@ -41,7 +42,6 @@ _BEAM_KEYS = ("body_pve", "planted_height", "planted_speed", "foot_swing")
 _BONES = (
     ("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist"),
 )  # fmt: skip
-_WIDTH = 122
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,10 +49,14 @@ class FieldSequence:
     """Errors of one recording under field conditions."""
 
     metrics: SequenceMetrics
-    bones: np.ndarray  # (B,) relative errors of the lengths of the limbs' bones
-    height_m: float  # error of the person's height
-    subject_right: float  # share of the images with a chosen person that show the subject
-    exported_alone: bool  # whether the export has a body and no object
+    bones: np.ndarray
+    """(B,) relative errors of the lengths of the limbs' bones."""
+    height_m: float
+    """Error of the person's height."""
+    subject_right: float
+    """Share of the images with a chosen person that show the subject."""
+    exported_alone: bool
+    """Whether the export has a body and no object."""
 
 
 FieldSequences = Measured[FieldSequence]
@@ -60,11 +64,9 @@ FieldSequences = Measured[FieldSequence]
 
 def measure(project: Project, sequence: str) -> FieldSequence:
     """Errors of one recording after ``metrics``."""
-    row = project.sequences[sequence]
-    assert row.truth is not None
-    joint = project.artefact(sequence, "joint")
-    with artefacts.read(joint, JOINT) as fitted, artefacts.read(row.truth, TRUTH) as true:
-        gender = project.subjects[row.subject].gender
+    paths, truth = project.paths(sequence), truth_of(project, sequence)
+    with artefacts.read(paths.joint, JOINT) as fitted, artefacts.read(truth, TRUTH) as true:
+        gender = project.subjects[project.sequences[sequence].subject].gender
         model = load_model(project.config.body_models, gender, fitted)
         shape = torch.as_tensor(np.atleast_2d(fitted["betas"]), dtype=model.dtype)
         rest = model.zeros(1)
@@ -75,8 +77,7 @@ def measure(project: Project, sequence: str) -> FieldSequence:
         person = Subject.load(str(true.attributes["subject"]))
     height = float(np.ptp(vertices[:, 1])) - float(np.ptp(person.rest[:, 1]))
     metrics = SequenceMetrics.read(project.artefact(sequence, "metrics"))
-    chosen, scene = (project.artefact(sequence, stage) for stage in ("person", "scene"))
-    right = field_errors.measure_subject_share(chosen, scene, row.truth)
+    right = field_errors.measure_subject_share(paths.person, paths.scene, truth)
     alone = exported_alone(project.artefact(sequence, "export"))
     return FieldSequence(metrics, own / known - 1, height, right, alone)
 
@@ -100,7 +101,7 @@ def seconds(project: Project, sequence: str) -> Figures:
     """``verdict.seconds_per_frame`` of one recording, measured as by `intercap bench`."""
     with artefacts.read(project.artefact(sequence, "frames"), FRAMES) as recorded:
         frames = len(recorded["times"])
-    return judgement(project.path, sequence, frames)
+    return time_hold_out(project.path, sequence, frames)
 
 
 def _lengths(joints: np.ndarray) -> np.ndarray:
@@ -171,7 +172,7 @@ def _of_a_person_alone(sequence: FieldSequence) -> bool:
 
 def print_field(evaluations: Sequence[FieldSequences]) -> None:
     """Print one row per recording: true and stated errors, bone lengths, height."""
-    console = console_of(_WIDTH)
+    console = console_of(122)
     heads = ("body mm", "stated", "hands mm", "stated", "object mm", "stated", "flagged %",
              "bones %", "height mm", "subject %")  # fmt: skip
     table = Table("recording", *heads, box=None, title="the field, after metrics")

@@ -18,6 +18,7 @@ from intercap_core.commands.evaluate.part import (
     console_of,
     keyed,
     number,
+    truth_of,
 )
 from intercap_core.evaluation import field_errors
 from intercap_core.evaluation.field_errors import FieldScene
@@ -26,15 +27,12 @@ from intercap_core.project import Project
 FieldScenes = Measured[FieldScene]
 # Prefixes of the datasets of each condition
 STARTS, RATES, FLOOR, BEAM = "field_starts", "field_rates", "field_floor", "field_beam"
-_WIDTH = 128
 
 
 def measure(project: Project, sequence: str) -> FieldScene:
     """Errors of one recording after ``scene``."""
-    truth = project.sequences[sequence].truth
-    assert truth is not None
-    frames, scene = (project.artefact(sequence, stage) for stage in ("frames", "scene"))
-    return field_errors.measure(frames, scene, truth)
+    paths = project.paths(sequence)
+    return field_errors.measure(paths.frames, paths.scene, truth_of(project, sequence))
 
 
 def flat(evaluations: Sequence[FieldScenes]) -> Figures:
@@ -57,7 +55,7 @@ def _of(evaluations: Sequence[FieldScenes], cause: str) -> list[FieldScene]:
 
 def print_scenes(evaluations: Sequence[FieldScenes]) -> None:
     """Print one row per recording."""
-    console = console_of(_WIDTH)
+    console = console_of(128)
     heads = ("apart s", "off ms", "stated ms", "set aside", "poses mm", "after", "stated", "worse",
              "floor mm", "deg")  # fmt: skip
     table = Table("recording", *heads, box=None, title="the field, after scene")

@@ -17,6 +17,7 @@ from intercap_core.commands.evaluate.part import (
     keyed,
     number,
     spread,
+    truth_of,
     variant,
 )
 from intercap_core.evaluation import object_errors
@@ -28,7 +29,6 @@ Objects = Measured[ObjectErrors]
 AREA = "object"
 # The dataset ``object`` and its copies with redrawn detector errors
 REDRAWN = re.compile(rf"{AREA}(_redrawn\d+)?")
-_WIDTH = 120
 _COLUMNS = {
     "mm": ("translation_median_mm", 1), "p95": ("translation_p95_mm", 1),
     "deg": ("rotation_median_deg", 2), "p95 deg": ("rotation_p95_deg", 1),
@@ -41,13 +41,12 @@ _COLUMNS = {
 
 def measure(project: Project, sequence: str) -> ObjectErrors:
     """Errors of one recording's object after ``object_track``."""
-    truth = project.sequences[sequence].truth
-    assert truth is not None
     entry = project.object_of(sequence)
     assert entry is not None
     mesh = ObjectMesh.load(entry)
-    scene, track = (project.artefact(sequence, stage) for stage in ("scene", "object_track"))
-    return object_errors.measure(scene, track, truth, mesh)
+    paths = project.paths(sequence)
+    truth = truth_of(project, sequence)
+    return object_errors.measure(paths.scene, paths.object_track, truth, mesh)
 
 
 def by_object(errors: Sequence[ObjectErrors]) -> dict[str, list[ObjectErrors]]:
@@ -81,7 +80,7 @@ def flat(evaluations: Sequence[Objects]) -> Figures:
 def lost_by_draw(evaluations: Sequence[Objects]) -> dict[str, list[float]]:
     """Share of lost frames of each object for each draw of the detector errors.
 
-    Only objects that all draws have; empty where there is only one draw.
+    Only objects that all draws have; empty if there is only one draw.
     """
     draws = [by_object(one.errors) for one in evaluations if REDRAWN.fullmatch(one.dataset)]
     if len(draws) < 2:
@@ -94,7 +93,7 @@ def lost_by_draw(evaluations: Sequence[Objects]) -> dict[str, list[float]]:
 
 def print_objects(evaluations: Sequence[Objects]) -> None:
     """Print for each project a table by object and a table by number of views."""
-    console = console_of(_WIDTH)
+    console = console_of(120)
     for found in evaluations:
         table = Table("object", *_COLUMNS, box=None)
         table.title = f"{found.dataset}: objects against truth, after object_track"

@@ -6,7 +6,7 @@ import hashlib
 import math
 import os
 import pickle
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, fields, is_dataclass
 from importlib import import_module
@@ -29,11 +29,10 @@ Targets = Sequence[tuple[str, Project]]  # last stage and project
 Columns = Mapping[str, tuple[str, int]]  # heading of a column to a figure's key and digits
 
 SPREAD = "_spread"  # suffix of the standard error of a figure
-# Figures without a standard error: counts, and keys that contain EXTREME
+# Figures without a standard error, like those whose key contains "worst"
 COUNTS = (
     "frames", "captures", "slips_true", "slips_missed", "slips_false", "object_worse_count",
 )  # fmt: skip
-EXTREME = "worst"
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,36 +40,40 @@ class Measured(Generic[Errors]):
     """Errors of the recordings of one project."""
 
     dataset: str
-    errors: Sequence[Errors]  # one per recording that reached the stage
-    missing: Sequence[str] = ()  # names of the recordings that did not
-    rig: str = ""  # description of the cameras and data that the settings select
+    errors: Sequence[Errors]
+    """One per recording that reached the stage."""
+    missing: Sequence[str] = ()
+    """Names of the recordings that did not."""
+    rig: str = ""
+    """Description of the cameras and data that the settings select."""
 
 
 @dataclass(frozen=True)
 class EvaluationPart(Generic[Errors]):
     """One part of the evaluation: how its recordings are computed, measured and reported."""
 
-    # Name of the module in this package; its code digest is part of the key of cached errors.
     name: str
-    # The stage whose artefact is compared with the truth.
+    """Name of the module in this package, whose code digest is part of the key of cached errors."""
     stage: str
-    # Other stages whose artefacts are read.
+    """Stage whose artefact is compared with the truth."""
     reads: tuple[str, ...]
-    # Measures the errors of (project, sequence).
+    """Other stages whose artefacts are read."""
     measure: Callable[[Project, str], Errors]
-    # Returns the figures of all projects, keys "area.measure".
+    """Measures the errors of (project, sequence)."""
     flat: Callable[[Sequence[Measured[Errors]]], Figures]
+    """Returns the figures of all projects, keys ``area.measure``."""
     print_tables: Callable[[Sequence[Measured[Errors]]], None]
-    # Describes the cameras and data that a project's settings select.
+    """Prints the tables of all projects."""
     rig: Callable[[Project], str] = lambda _: ""
-    # Dataclass of the errors if they are cached on disk; None = measured in every run.
+    """Describes the cameras and data that a project's settings select."""
     kept: type[Errors] | None = None
-    # Whether (project, sequence) has the measured quantity.
+    """Dataclass of the errors that are cached on disk; None to measure them in every run."""
     has: Callable[[Project, str], bool] = lambda _project, _sequence: True
-    # Last stage of a project's workflow if it is later than ``stage``.
+    """Whether (project, sequence) has the measured quantity."""
     last: Callable[[Project], str | None] = lambda _: None
-    # Measures durations of (project, sequence), once per evaluation.
+    """Last stage of a project's workflow if it is later than ``stage``."""
     timed: Callable[[Project, str], Figures] | None = None
+    """Measures durations of (project, sequence), once per evaluation."""
 
     def targets(self, projects: Sequence[Project]) -> Targets:
         """The last stage of each project's workflow."""
@@ -78,56 +81,50 @@ class EvaluationPart(Generic[Errors]):
 
     def time_one(self, projects: Sequence[Project]) -> Figures:
         """Figures of ``timed`` for the first recording with an artefact; empty if there is none."""
-        there = (
+        recordings = (
             (project, name)
             for project in projects
             for name in project.sequences
             if project.artefact(name, self.stage).is_file()
         )
-        first = next(there, None)
+        first = next(recordings, None)
         return {} if self.timed is None or first is None else self.timed(*first)
 
     def measure_all(self, projects: Sequence[Project], *, workers: int) -> list[Measured[Errors]]:
         """Measure every recording that has an artefact of the stage, in parallel processes.
 
-        Raises UserError where no sequence of a project has one.
+        Raises UserError if no sequence of a project has one.
         """
-        counted = [[n for n in project.sequences if self.has(project, n)] for project in projects]
-        there = [
-            [name for name in names if project.artefact(name, self.stage).is_file()]
-            for project, names in zip(projects, counted, strict=True)
+        wanted = [[n for n in project.sequences if self.has(project, n)] for project in projects]
+        names = [
+            [name for name in own if project.artefact(name, self.stage).is_file()]
+            for project, own in zip(projects, wanted, strict=True)
         ]
-        for project, names in zip(projects, there, strict=True):
-            if not names:
+        jobs = []
+        for project, own in zip(projects, names, strict=True):
+            if not own:
                 raise UserError(
                     f"{project.path}: no sequence has an artefact of stage {self.stage!r}; "
                     f"see the logs in {project.logs}"
                 )
-        module = import_module(f"intercap_core.commands.evaluate.{self.name}")
-        jobs = [
-            (module.__name__, project.path, name)
-            for project, names in zip(projects, there, strict=True)
-            for name in names
-        ]
+            jobs += [(self.name, project.path, name) for name in own]
         context = get_context("spawn")  # a fork would lose the threads of numerical libraries
         with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=context) as pool:
-            errors: Iterator[Any] = iter(
-                list(pool.map(_measure_recording, *zip(*jobs, strict=True)))
-            )
+            errors = iter(list(pool.map(_measure_recording, *zip(*jobs, strict=True))))
         return [
             Measured(
                 project.config.dataset,
-                [next(errors) for _ in names],
-                [name for name in wanted if name not in names],
+                [next(errors) for _ in own],
+                [name for name in all_names if name not in own],
                 self.rig(project),
             )
-            for project, wanted, names in zip(projects, counted, there, strict=True)
+            for project, all_names, own in zip(projects, wanted, names, strict=True)
         ]
 
 
-def _measure_recording(module: str, settings: Path, sequence: str) -> object:
-    part: EvaluationPart[object] = import_module(module).PART
-    return measure_cached(part, load_project(settings), sequence)
+def _measure_recording(part: str, settings: Path, sequence: str) -> Any:
+    module = import_module(f"intercap_core.commands.evaluate.{part}")
+    return measure_cached(module.PART, load_project(settings), sequence)
 
 
 def measure_cached(part: EvaluationPart[Errors], project: Project, sequence: str) -> Errors:
@@ -136,8 +133,7 @@ def measure_cached(part: EvaluationPart[Errors], project: Project, sequence: str
     The cache file is next to the artefacts; its name holds the digest of the inputs: files, the
     project's tables and settings, and code.
     """
-    truth = project.sequences[sequence].truth
-    assert truth is not None
+    truth = truth_of(project, sequence)
     if not truth.is_file():
         raise UserError(
             f"{truth}: the truth of {sequence!r} is missing, but its {part.stage} artefact exists; "
@@ -189,8 +185,15 @@ def _dataclass_of(kind: Any, values: dict[str, Any]) -> Any:
     return kind(**made)
 
 
+def truth_of(project: Project, sequence: str) -> Path:
+    """File with the truth of a recording; every evaluated one has it (:func:`require_truth`)."""
+    truth = project.sequences[sequence].truth
+    assert truth is not None
+    return truth
+
+
 def require_truth(project: Project) -> None:
-    """Raise UserError where a sequence has no truth."""
+    """Raise UserError if a sequence has no truth."""
     for name, row in project.sequences.items():
         if row.truth is None:
             raise UserError(
@@ -222,13 +225,16 @@ def spread(
     The sample standard deviation of the recordings' own figures over the square root of their
     number. Counts, extremes and figures of fewer than two recordings have none.
     """
-    alone = [figures([recording]) for recording in recordings]
-    found: Figures = {}
-    for key in dict.fromkeys(key for one in alone for key in one):
-        values = np.array([one[key] for one in alone if math.isfinite(one.get(key, math.nan))])
-        if len(values) > 1 and key not in COUNTS and EXTREME not in key:
-            found[f"{key}{SPREAD}"] = float(values.std(ddof=1) / np.sqrt(len(values)))
-    return found
+    samples: dict[str, list[float]] = {}
+    for recording in recordings:
+        for key, value in figures([recording]).items():
+            if math.isfinite(value) and key not in COUNTS and "worst" not in key:
+                samples.setdefault(key, []).append(value)
+    return {
+        f"{key}{SPREAD}": float(np.array(values).std(ddof=1) / np.sqrt(len(values)))
+        for key, values in samples.items()
+        if len(values) > 1
+    }
 
 
 def add_rows(

@@ -39,9 +39,12 @@ FAILING = (GateResult.WORSE, GateResult.MISSING)
 class GatedFigure:
     """One entry of the reference file."""
 
-    key: str  # key of the evaluation's JSON, "area.measure"
-    value: float  # the recorded figure, in the unit that ends its key
-    spread: float  # variation that is tolerated, same unit
+    key: str
+    """Key of the evaluation's JSON, "area.measure"."""
+    value: float
+    """The recorded figure, in the unit that ends its key."""
+    spread: float
+    """Variation that is tolerated, same unit."""
     higher_is_better: bool
 
     def judge(self, now: float | None) -> GateResult:
@@ -57,7 +60,7 @@ class GatedFigure:
 def read_reference(path: Path = REFERENCE) -> list[GatedFigure]:
     """Gated figures of a reference file, in the file's order.
 
-    Raises UserError where the file is missing or an entry is malformed.
+    Raises UserError if the file is missing or an entry is malformed.
     """
     try:
         entries = json.loads(path.read_text(encoding="utf-8"))
@@ -122,7 +125,7 @@ def passes_gate(figures: Mapping[str, float], reference: Sequence[GatedFigure]) 
 def update_reference(figures: Mapping[str, float], path: Path = REFERENCE) -> None:
     """Record the figures of a run as the new values of a reference file; spreads stay.
 
-    Raises UserError where the file is malformed or the run lacks one of its figures.
+    Raises UserError if the file is malformed or the run lacks one of its figures.
     """
     reference = read_reference(path)
     missing = [

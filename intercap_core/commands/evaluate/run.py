@@ -55,8 +55,8 @@ def evaluate(
 ) -> int:
     """Bring the evaluation's recordings up to date, print the tables and write the figures.
 
-    Returns 1 where a stage failed; recordings that failed are excluded from the figures and named.
-    Raises UserError where a project's settings are wrong or none of its sequences has a result.
+    Returns 1 if a stage failed; recordings that failed are excluded from the figures and named.
+    Raises UserError if a project's settings are wrong or none of its sequences has a result.
 
     Args:
         settings: settings files of the recordings of each part in ``PARTS``.
@@ -75,20 +75,19 @@ def evaluate(
     for some in projects.values():
         for project in some:
             require_truth(project)
-    frames = budget.recording_frames([project for some in projects.values() for project in some])
-    status = bring_up_to_date(wanted, frames, cores=cores)
+    status = bring_up_to_date(wanted, cores=cores)
     workers = cores or len(os.sched_getaffinity(0))
-    found: Figures = {}
+    figures: Figures = {}
     for name, some in projects.items():
         part = PARTS[name]
         measured = part.measure_all(some, workers=workers)
         part.print_tables(measured)
-        found |= part.flat(measured) | part.time_one(some)
-    minutes = budget.minutes_of_parts(budget.jobs_by_part(wanted), frames)
-    passed = (time.monotonic() - begin) / 60
-    budget.print_minutes(list(projects), minutes, passed)
-    found |= {f"time.{key}": value for key, value in {**minutes, "minutes": passed}.items()}
-    flat = {key: _rounded(value) for key, value in found.items() if math.isfinite(value)}
+        figures |= part.flat(measured) | part.time_one(some)
+    minutes = budget.minutes_of_parts(wanted)
+    duration = (time.monotonic() - begin) / 60
+    budget.print_minutes(list(projects), minutes, duration)
+    figures |= {f"time.{key}": value for key, value in {**minutes, "minutes": duration}.items()}
+    flat = {k: float(f"{value:.6g}") for k, value in figures.items() if math.isfinite(value)}
     output.parent.mkdir(parents=True, exist_ok=True)
     output.write_text(json.dumps(flat, indent=1, sort_keys=True) + "\n", encoding="utf-8")
     print(output)
@@ -99,8 +98,8 @@ def evaluate_quick(output: Path, *, cores: int = 0, renew_reference: bool = Fals
     """Evaluate the quick set and apply the regression gate; see :func:`evaluate`.
 
     ``renew_reference``: record the figures as the new reference instead of comparing them.
-    Returns 1 where a stage failed or a gated figure is worse than its reference by more than its
-    spread. Raises UserError where the reference file cannot be used.
+    Returns 1 if a stage failed or a gated figure is worse than its reference by more than its
+    spread. Raises UserError if the reference file cannot be used.
     """
     reference = read_reference(REFERENCE)  # before the run: a malformed file costs no time
     settings = {part: [QUICK_SETTINGS] for part in QUICK_PARTS}
@@ -113,7 +112,3 @@ def evaluate_quick(output: Path, *, cores: int = 0, renew_reference: bool = Fals
         print(f"{REFERENCE}: recorded")
         return 0
     return status if passes_gate(figures, reference) else 1
-
-
-def _rounded(value: float) -> float:
-    return float(f"{value:.6g}")

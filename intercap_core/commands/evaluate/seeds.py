@@ -23,7 +23,7 @@ TABLES = ("sequences", "subjects")
 def redraw_settings(settings: Mapping[str, Sequence[Path]], seed: int) -> dict[str, list[Path]]:
     """Write copies of the settings files of each part with new seeds derived from ``seed``.
 
-    Raises UserError where a settings file is invalid.
+    Raises UserError if a settings file is invalid.
     """
     return {
         part: [_written(load_project(path), seed) for path in paths]

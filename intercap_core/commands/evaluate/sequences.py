@@ -55,7 +55,6 @@ BY_OBJECT = {
     "p95 ": ("object_track", "object_rotation_p95_deg"),
     "contact F1": ("body_fit", "contact_f1"),
 }
-BY_OBJECT_WIDTH = 190  # characters
 Areas = dict[str, Figures]
 
 
@@ -64,7 +63,8 @@ class MeasuredSequence:
     """The metrics of one sequence."""
 
     metrics: SequenceMetrics
-    annotated: bool  # whether the sequence has annotations
+    annotated: bool
+    """Whether the sequence has annotations."""
 
 
 Sequences = Measured[MeasuredSequence]
@@ -96,7 +96,7 @@ def areas(sequences: Sequence[SequenceMetrics]) -> Areas:
     for stage in ESTIMATES:
         sweep = figures.contact_sweep(sequences, stage)
         found[stage].update({f"contact_f1_at_{mm:g}mm": value for mm, value in sweep.items()})
-    found["joint"] |= contact_figures.stated_contact_figures(known) | _beside_sequential(
+    found["joint"] |= contact_figures.stated_contact_figures(known) | _extra_joint_figures(
         known, found
     )
     penetration = figures.penetration_figures(sequences)
@@ -115,29 +115,29 @@ def areas(sequences: Sequence[SequenceMetrics]) -> Areas:
     }
 
 
-def _beside_sequential(sequences: Sequence[SequenceMetrics], found: Areas) -> Figures:
+def _extra_joint_figures(sequences: Sequence[SequenceMetrics], found: Areas) -> Figures:
     """Figures with which the joint stage is compared, and figures by object."""
     first = found["body_fit"]
-    beside = {as_: first[name] for name, as_ in SEQUENTIAL.items() if name in first}
+    extra = {as_: first[name] for name, as_ in SEQUENTIAL.items() if name in first}
     if any(s.object_ for s in sequences):
         worse = contact_figures.worse_objects(sequences)
-        beside |= {"object_worse_count": float(len(worse))}
+        extra |= {"object_worse_count": float(len(worse))}
     cameras = figures.extrinsics_figures(sequences)
     if "joint_mean_mm" in cameras:
-        beside["extrinsics_mm"] = cameras["joint_mean_mm"]
-        beside["extrinsics_scene_mm"] = cameras["after_mean_mm"]
+        extra["extrinsics_mm"] = cameras["joint_mean_mm"]
+        extra["extrinsics_scene_mm"] = cameras["after_mean_mm"]
     for stage, suffix in (("joint", ""), ("body_fit", "_sequential")):
         slips = contact_figures.slip_by_object(sequences, stage)
-        beside |= {f"slip_{name}{suffix}_mm_s": value for name, value in slips.items()}
+        extra |= {f"slip_{name}{suffix}_mm_s": value for name, value in slips.items()}
     for name, some in _by_object(sequences).items():
         turn = figures.object_figures(some, "joint").get("object_rotation_p95_deg")
         if turn is not None:
-            beside[f"{name}.object_rotation_p95_deg"] = turn
+            extra[f"{name}.object_rotation_p95_deg"] = turn
     depths = [figures.penetration_figures(some) for some in _by_object(sequences).values()]
     deepest = [found["mean_mm"] for found in depths if np.isfinite(found.get("mean_mm", np.nan))]
     if deepest:
-        beside["penetration_worst_object_mm"] = max(deepest)
-    return beside
+        extra["penetration_worst_object_mm"] = max(deepest)
+    return extra
 
 
 def _by_object(sequences: Sequence[SequenceMetrics]) -> dict[str, list[SequenceMetrics]]:
@@ -188,7 +188,7 @@ def print_sequences(evaluations: Sequence[Sequences]) -> None:
         table.title = f"sequential fits > joint, {group}"
         for name, of_object in _by_object(some).items():
             table.add_row(name, *_row(areas(of_object)))
-        Console(width=max(console.width, BY_OBJECT_WIDTH)).print(table)
+        Console(width=max(console.width, 190)).print(table)
     for name in (name for measured in evaluations for name in measured.missing):
         console.print(f"{name}: no metrics", highlight=False, markup=False)
 

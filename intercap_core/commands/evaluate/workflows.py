@@ -15,24 +15,48 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
 from rich.console import Console
-from rich.markup import escape
 
 from intercap_core.commands.check import check_bodies
-from intercap_core.commands.evaluate.budget import FRAMES, Jobs, expected_seconds, list_jobs
+from intercap_core.commands.evaluate.budget import STUDIO, Job, list_jobs
 from intercap_core.commands.evaluate.part import Targets
-from intercap_core.commands.run import LAST_LINES, POLL_SECONDS, Watcher, snakemake_command
+from intercap_core.commands.run import POLL_SECONDS, Watcher, snakemake_command
 from intercap_core.errors import UserError
 from intercap_core.project import Project
 
 SIDE_BY_SIDE = 2  # workflows at a time
-TELL_SECONDS = 60.0  # interval of the progress report
 LOCK = Path(".snakemake") / "evaluation.lock"
+# CPU seconds per frame of six 720P views on one core of an Intel Xeon at 2.5 GHz, measured on a
+# shared machine from the workflow's benchmark files. They order the workflows and predict the end.
+SECONDS_PER_FRAME = {
+    STUDIO: 0.75, "frames": 0.03, "detections": 0.01, "scene": 0.28, "person": 0.26,
+    "object_track": 0.40, "body_fit": 0.17, "joint": 0.30, "metrics": 0.26,
+}  # fmt: skip
+
+
+def expected_seconds(job: Job, frames: int) -> float:
+    """Expected CPU seconds of a job whose recording has this number of frames."""
+    config = job.project.config
+    rendered = 6 if config.studio is None else config.studio.cameras
+    views = rendered if job.stage == STUDIO else len(config.frames.cameras) or rendered
+    start = 2.5  # imports, compiled code from the cache
+    return start + SECONDS_PER_FRAME.get(job.stage, 0.3) * views / 6 * frames
+
+
+def frames_of_recordings(projects: Iterable[Project]) -> dict[Path, int]:
+    """Number of frames of each recording that the projects' studios render, by its folder."""
+    return {
+        (project.results / "recordings" / name).resolve(): entry.frames
+        for project in projects
+        if project.config.studio is not None
+        for name, entry in project.config.studio.captures.items()
+    }
 
 
 @dataclass(eq=False)
@@ -40,13 +64,17 @@ class ProjectRun:
     """The workflow of one project, planned, running or ended."""
 
     project: Project
-    stages: list[str]  # target stages
-    seconds: dict[str, list[float]]  # expected CPU seconds of all jobs, by rule
-    after: list[ProjectRun] = field(default_factory=list)  # projects that must end before
+    stages: list[str]
+    """Target stages."""
+    seconds: dict[str, list[float]]
+    """Expected CPU seconds of all jobs, by rule."""
+    after: list[ProjectRun] = field(default_factory=list)
+    """Projects that must end before this one starts."""
     watcher: Watcher | None = None
     process: subprocess.Popen[bytes] | None = None
     transcript: IO[str] | None = None
-    status: int | None = None  # exit status; None until the workflow has ended
+    status: int | None = None
+    """Exit status; None until the workflow has ended."""
 
     @property
     def expected(self) -> float:
@@ -56,21 +84,21 @@ class ProjectRun:
     def left(self) -> tuple[float, float]:
         """Expected CPU seconds of the remaining jobs, and of the completed jobs."""
         planned = self._planned()
+        mean = {rule: sum(values) / len(values) for rule, values in self.seconds.items()}
         if self.status is not None:
             counts = (planned or {}).items()
-            return 0.0, sum(n * _mean(self.seconds.get(rule, [])) for rule, n in counts)
+            return 0.0, sum(count * mean.get(rule, 0.0) for rule, count in counts)
         if planned is None or self.watcher is None:
             return self.expected, 0.0
-        finished = [
+        finished = Counter(
             name.rsplit(": ", 1)[-1]
             for name, job in self.watcher.jobs().items()
             if job.state != "running"
-        ]
+        )
         todo = done = 0.0
         for rule, count in planned.items():
-            ended, mean = finished.count(rule), _mean(self.seconds.get(rule, []))
-            todo += max(count - ended, 0) * mean
-            done += min(ended, count) * mean
+            todo += max(count - finished[rule], 0) * mean.get(rule, 0.0)
+            done += min(finished[rule], count) * mean.get(rule, 0.0)
         return todo, done
 
     def _planned(self) -> dict[str, int] | None:
@@ -80,30 +108,25 @@ class ProjectRun:
         text = self.watcher.transcript.read_text(encoding="utf-8", errors="replace")
         if "Nothing to be done" in text:
             return {}
-        _, found, rest = text.partition("Job stats:")
-        if not found or "\ntotal" not in rest:
+        _, heading, rest = text.partition("Job stats:")
+        if not heading or "\ntotal" not in rest:
             return None
         pairs = re.findall(r"^(\w+) +(\d+)$", rest.partition("\ntotal")[0], re.MULTILINE)
         return {rule: int(count) for rule, count in pairs}
 
 
-def bring_up_to_date(
-    wanted: Mapping[str, Targets],
-    frames: Mapping[Path, int],
-    *,
-    cores: int = 0,
-) -> int:
+def bring_up_to_date(wanted: Mapping[str, Targets], *, cores: int = 0) -> int:
     """Run the workflows of all projects to the stages that the parts need.
 
-    Failed jobs are printed; returns 1 where any failed. A run that was killed continues:
+    Prints failed jobs and returns 1 if any job failed. A run that was killed continues:
     Snakemake's lock is not used, and a system lock prevents two evaluations in one folder.
-    Raises UserError where another evaluation is running.
+    Raises UserError if another evaluation is running.
 
     Args:
         wanted: target stages and projects by part.
-        frames: number of frames by folder of the recording.
+        cores: number of cores; 0 for all.
     """
-    runs = plan_runs(wanted, frames)
+    runs = plan_runs(wanted)
     for run in runs:
         check_bodies(run.project)
     console = Console(stderr=True)
@@ -133,7 +156,7 @@ def bring_up_to_date(
     return max((1 if run.status else 0 for run in runs), default=0)
 
 
-def plan_runs(wanted: Mapping[str, Targets], frames: Mapping[Path, int]) -> list[ProjectRun]:
+def plan_runs(wanted: Mapping[str, Targets]) -> list[ProjectRun]:
     """One run per project with the target stages of all parts, in the order of starting."""
     stages: dict[Path, list[str]] = {}
     projects: dict[Path, Project] = {}
@@ -142,10 +165,14 @@ def plan_runs(wanted: Mapping[str, Targets], frames: Mapping[Path, int]) -> list
             key = project.path.resolve()
             projects[key] = project
             stages.setdefault(key, []).append(stage)
-    runs = [
-        ProjectRun(project, stages[key], _seconds(list_jobs(project, stages[key]), frames))
-        for key, project in projects.items()
-    ]
+    frames = frames_of_recordings(projects.values())
+    runs = []
+    for key, project in projects.items():
+        seconds: dict[str, list[float]] = {}
+        for job in list_jobs(project, stages[key]):
+            count = frames.get(project.sequences[job.sequence].recordings.resolve(), 45)
+            seconds.setdefault(job.stage, []).append(expected_seconds(job, count))
+        runs.append(ProjectRun(project, stages[key], seconds))
     for run in runs:
         read = {
             row.recordings.resolve()
@@ -169,14 +196,6 @@ def plan_runs(wanted: Mapping[str, Targets], frames: Mapping[Path, int]) -> list
     return sorted(runs, key=urgency, reverse=True)
 
 
-def _seconds(jobs: Jobs, frames: Mapping[Path, int]) -> dict[str, list[float]]:
-    found: dict[str, list[float]] = {}
-    for project, name, stage in jobs:
-        count = frames.get(project.sequences[name].recordings.resolve(), FRAMES)
-        found.setdefault(stage, []).append(expected_seconds(project, stage, count))
-    return found
-
-
 def _run(runs: list[ProjectRun], parallel: int, cores: int, lock: int, console: Console) -> None:
     begin = reported = time.monotonic()
     while any(run.status is None for run in runs):
@@ -190,9 +209,9 @@ def _run(runs: list[ProjectRun], parallel: int, cores: int, lock: int, console: 
             assert run.process is not None and run.watcher is not None
             run.watcher.print_changes()
             if run.process.poll() is not None:
-                _end(run, console)
+                _end(run)
         now = time.monotonic()
-        if now - reported > TELL_SECONDS:
+        if now - reported > 60.0:
             reported = now
             console.print(progress(runs, parallel, now - begin), highlight=False, markup=False)
 
@@ -231,21 +250,9 @@ def _start(run: ProjectRun, cores: int, lock: int, console: Console) -> None:
     )
 
 
-def _end(run: ProjectRun, console: Console) -> None:
+def _end(run: ProjectRun) -> None:
     assert run.process is not None and run.watcher is not None and run.transcript is not None
     run.transcript.close()
     run.status = run.process.returncode
-    failures = run.watcher.failures() if run.status else {}
-    for name, words in failures.items():
-        console.print(
-            f"[red]{escape(run.project.config.dataset)}: {escape(name)}[/red] {escape(words)}",
-            highlight=False,
-            soft_wrap=True,
-        )
-    if run.status and not failures:
-        lines = run.watcher.transcript.read_text(encoding="utf-8").splitlines()
-        console.print("\n".join(lines[-LAST_LINES:]), highlight=False, markup=False)
-
-
-def _mean(values: Sequence[float]) -> float:
-    return sum(values) / len(values) if values else 0.0
+    if run.status:
+        run.watcher.print_failures(failed=True, prefix=f"{run.project.config.dataset}: ")

@@ -16,10 +16,14 @@ from intercap_core.evaluation.figures import Figures, SequenceMetrics
 class ImageMeasure:
     """A measure of the agreement between a result and an image."""
 
-    key: str  # dataset within verdict/ of the metrics artefact
-    of: str  # description
-    unit: str  # unit in which it is reported
-    scale: float  # factor from the dataset's unit to ``unit``
+    key: str
+    """Dataset within verdict/ of the metrics artefact."""
+    of: str
+    """Description."""
+    unit: str
+    """Unit in which it is reported."""
+    scale: float
+    """Factor from the dataset's unit to ``unit``."""
 
 
 IMAGE_MEASURES = (
@@ -32,16 +36,19 @@ IMAGE_MEASURES = (
 
 @dataclass(frozen=True)
 class HeldOutCamera:
-    """Medians over the frames for which a camera was held out; NaN where unknown."""
+    """Medians over the frames for which a camera was held out; NaN if unknown."""
 
     camera: str
-    held_in: tuple[float, ...]  # errors of the result, in the order of IMAGE_MEASURES
-    held_out: tuple[float, ...]  # errors of the fit without the camera, same order
-    shift_mm: dict[str, float]  # RMS displacement of each part without the camera
+    held_in: tuple[float, ...]
+    """Errors of the result, in the order of IMAGE_MEASURES."""
+    held_out: tuple[float, ...]
+    """Errors of the fit without the camera, same order."""
+    shift_mm: dict[str, float]
+    """RMS displacement of each part without the camera."""
 
 
 def held_out_cameras(sequence: SequenceMetrics) -> Sequence[HeldOutCamera]:
-    """The figures of every camera that was held out; empty where none was."""
+    """The figures of every camera that was held out; empty if none was."""
     values = sequence.values
     if "verdict/held_camera" not in values:
         return ()
@@ -90,15 +97,20 @@ class StatedError:
 
     sequence: str
     part: str
-    stated: float  # millimetres; NaN where no error is stated
-    factor: float  # 80 % of the true errors are within this factor of ``stated``
-    true: float  # millimetres; NaN without truth
-    silent: str = ""  # reason why no error is stated
-    repeated: float = float("nan")  # mm, displacement if every other frame's images are not used
+    stated: float
+    """Millimetres; NaN if no error is stated."""
+    factor: float
+    """80 % of the true errors are within this factor of ``stated``."""
+    true: float
+    """Millimetres; NaN without truth."""
+    silent: str = ""
+    """Reason why no error is stated."""
+    repeated: float = float("nan")
+    """Mm, displacement if every other frame's images are not used."""
 
 
 def stated_errors(sequence: SequenceMetrics) -> Sequence[StatedError]:
-    """Stated errors of every part; empty where the metrics have no verdict."""
+    """Stated errors of every part; empty if the metrics have no verdict."""
     if sequence not in _stated_cache:
         _stated_cache[sequence] = _stated(sequence)
     return _stated_cache[sequence]

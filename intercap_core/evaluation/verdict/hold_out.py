@@ -82,31 +82,42 @@ JOINTS = {JudgedPart.BODY: slice(0, 22), JudgedPart.HANDS: slice(25, 55)}
 
 @dataclass(frozen=True, eq=False)
 class ViewErrors:
-    """Errors of a state in each image, (T, C); NaN where the image does not show the part."""
+    """Errors of a state in each image, (T, C); NaN if the image does not show the part."""
 
-    keypoint_px: np.ndarray  # median reprojection error of the body's keypoints
-    person_m: np.ndarray  # median distance of the person's points from the skin, less clothing
-    overlap: np.ndarray  # intersection over union of the object's mask and its render
-    object_depth_m: np.ndarray  # median depth error of the object
+    keypoint_px: np.ndarray
+    """Median reprojection error of the body's keypoints."""
+    person_m: np.ndarray
+    """Median distance of the person's points from the skin, less clothing."""
+    overlap: np.ndarray
+    """Intersection over union of the object's mask and its render."""
+    object_depth_m: np.ndarray
+    """Median depth error of the object."""
 
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
     """Result of a held-out evaluation of T frames; V cameras were held out in turn."""
 
-    cameras: np.ndarray  # (V,) indices of the cameras that were held out
-    camera_index: np.ndarray  # (T,) camera held out for this frame
-    all_cameras: ViewErrors  # errors of the result itself, in all cameras
-    held_out: ViewErrors  # errors in the held-out camera of a fit that did not use it
-    keypoint_m: np.ndarray  # (T,) keypoint error in the held-out camera at the person's distance
-    shift: dict[JudgedPart, np.ndarray]  # (V, T) displacement of a part without a camera, metres
-    repeated: dict[JudgedPart, np.ndarray]  # (T,) displacement if this frame's images are not used
+    cameras: np.ndarray
+    """(V,) indices of the cameras that were held out."""
+    camera_index: np.ndarray
+    """(T,) camera held out for this frame."""
+    all_cameras: ViewErrors
+    """Errors of the result itself, in all cameras."""
+    held_out: ViewErrors
+    """Errors in the held-out camera of a fit that did not use it."""
+    keypoint_m: np.ndarray
+    """(T,) keypoint error in the held-out camera at the person's distance."""
+    shift: dict[JudgedPart, np.ndarray]
+    """(V, T) displacement of a part without a camera, metres."""
+    repeated: dict[JudgedPart, np.ndarray]
+    """(T,) displacement if this frame's images are not used."""
 
 
 def hold_out(inputs: JointInputs, settings: JointSettings, result: JointResult) -> HeldOut | None:
     """Refit ``result`` without each camera and without every other frame, and compare.
 
-    None where fewer than two cameras show the person.
+    None if fewer than two cameras show the person.
     """
     assembly = assemble(inputs, settings)
     state = result.state

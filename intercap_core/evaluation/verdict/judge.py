@@ -26,10 +26,14 @@ Values = dict[str, np.ndarray | list[str]]
 class SequenceVerdict:
     """Held-out evaluation and stated errors of a sequence."""
 
-    cameras: tuple[str, ...]  # names of the C cameras
-    frames: int  # T
-    held: HeldOut | None  # None where fewer than two cameras show the person
-    stated: dict[JudgedPart, ErrorEstimate]  # without the object where the recording has none
+    cameras: tuple[str, ...]
+    """Names of the C cameras."""
+    frames: int
+    """T."""
+    held: HeldOut | None
+    """None if fewer than two cameras show the person."""
+    stated: dict[JudgedPart, ErrorEstimate]
+    """Without the object where the recording has none."""
 
     @classmethod
     def reach(
@@ -40,7 +44,7 @@ class SequenceVerdict:
     ) -> SequenceVerdict:
         """Evaluate the joint artefact with the inputs of the joint stage; no truth is read.
 
-        Raises UserError where an artefact or the mesh cannot be used.
+        Raises UserError if an artefact or the mesh cannot be used.
         """
         with artefacts.read(paths.scene, SCENE) as source:
             result = JointResult.read(paths.joint, source)

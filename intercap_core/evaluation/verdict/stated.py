@@ -30,9 +30,12 @@ MIN_JUDGED_SHARE = 0.5
 class Factors(NamedTuple):
     """Parameters of the stated error of one part."""
 
-    rest: float  # error that no held-out camera shows, metres
-    of: tuple[float, float, float, float]  # factors a, b, c, d of the FEATURES
-    spread: float  # 80 % of the true errors are within this factor of the stated error
+    rest: float
+    """Error that no held-out camera shows, metres."""
+    of: tuple[float, float, float, float]
+    """Factors a, b, c, d of the FEATURES."""
+    spread: float
+    """80 % of the true errors are within this factor of the stated error."""
 
 
 # Fitted to the virtual studio by `python -m bench.verdict`: 41 recordings with two to six cameras,
@@ -52,11 +55,16 @@ FEATURES = ("shift", "keypoint", "sigma", "moved")
 class ErrorEstimate:
     """The stated error of one part."""
 
-    error: float  # mean over the frames, metres; NaN where no error is stated
-    factor: float  # 80 % of the true errors are within this factor of ``error``
-    by_frame: np.ndarray  # (T,) metres; NaN in frames without a statement
-    features: dict[str, float]  # mean of each of FEATURES, metres
-    silent: str = ""  # reason why no error is stated; "" if one is stated
+    error: float
+    """Mean over the frames, metres; NaN if no error is stated."""
+    factor: float
+    """80 % of the true errors are within this factor of ``error``."""
+    by_frame: np.ndarray
+    """(T,) metres; NaN in frames without a statement."""
+    features: dict[str, float]
+    """Mean of each of FEATURES, metres."""
+    silent: str = ""
+    """Reason why no error is stated; "" if one is stated."""
 
 
 def estimate_error(
@@ -65,7 +73,7 @@ def estimate_error(
     """Estimate the error of ``part``.
 
     Args:
-        held: the held-out evaluation; None where there is none.
+        held: the held-out evaluation; None if there is none.
         sigma: (T,) standard deviation that the sequential fits state, metres.
         moved: (T,) displacement from the sequential fits to the joint fit, metres.
         known: (T,) mask of the frames in which the part was measured, not filled in.

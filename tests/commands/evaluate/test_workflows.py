@@ -1,4 +1,4 @@
-"""Which projects wait for which, what a run is expected to take, and what was done before."""
+"""Order of the workflows, their expected work, and their remaining work."""
 
 from __future__ import annotations
 
@@ -14,10 +14,16 @@ from intercap_core.cli import (
     OBJECT_SETTINGS,
     SEQUENCE_SETTINGS,
 )
-from intercap_core.commands.evaluate import budget
+from intercap_core.commands.evaluate.budget import BUDGET_MINUTES, Job, jobs_by_part
 from intercap_core.commands.evaluate.part import Targets
 from intercap_core.commands.evaluate.run import PARTS
-from intercap_core.commands.evaluate.workflows import ProjectRun, plan_runs, progress
+from intercap_core.commands.evaluate.workflows import (
+    ProjectRun,
+    expected_seconds,
+    frames_of_recordings,
+    plan_runs,
+    progress,
+)
 from intercap_core.project import load_project
 
 SETTINGS = {
@@ -38,16 +44,10 @@ def wanted() -> dict[str, Targets]:
     }
 
 
-def _frames(wanted: dict[str, Targets]) -> dict[Path, int]:
-    return budget.recording_frames(
-        [project for targets in wanted.values() for _, project in targets]
-    )
-
-
 def test_projects_wait_for_those_that_make_their_recordings(
     wanted: dict[str, Targets],
 ) -> None:
-    runs = plan_runs(wanted, _frames(wanted))
+    runs = plan_runs(wanted)
     by_name = {run.project.config.dataset: run for run in runs}
     assert len(runs) == len(by_name) == 1 + 3 + 7 + 7 + 5 + 7
     assert runs[0] is by_name["object"]  # what most wait for comes first
@@ -59,40 +59,43 @@ def test_projects_wait_for_those_that_make_their_recordings(
 
 
 def test_people_alone_are_taken_to_the_export_and_nobody_else(wanted: dict[str, Targets]) -> None:
-    runs = plan_runs(wanted, _frames(wanted))
-    to_export = [run for run in runs if "export" in run.stages]
+    to_export = [run for run in plan_runs(wanted) if "export" in run.stages]
     assert [run.project.config.dataset for run in to_export] == ["field_alone"]
     assert to_export[0].stages == ["export"]
-    jobs = [(name, stage) for _, name, stage in budget.list_jobs(to_export[0].project, ["export"])]
+    jobs = jobs_by_part({"field": [("export", to_export[0].project)]})["field"]
     for name in to_export[0].project.sequences:
-        own = [stage for of, stage in jobs if of == name]
+        own = [job.stage for job in jobs if job.sequence == name]
         assert own[0] == "studio" and own[-2:] == ["metrics", "export"] and len(own) == 10
 
 
 def test_a_smaller_ring_is_expected_to_take_less() -> None:
-    """Of the studio what it records counts, of a stage what it is given."""
-    four, six = (load_project(Path(f"config/field/{name}.yaml")) for name in ("rates", "shoes"))
+    """The studio renders all cameras; a stage reads those that the settings select."""
+    four, six, of_six = (
+        load_project(Path(f"config/{name}.yaml"))
+        for name in ("field/rates", "field/shoes", "body/four_view")
+    )
     for stage in ("studio", "scene"):
-        some, every = (
-            budget.expected_seconds(project, stage, 60) - budget.SECONDS_PER_START
-            for project in (four, six)
+        some, every, start = (
+            expected_seconds(Job(project, "", stage), frames)
+            for project, frames in ((four, 60), (six, 60), (six, 0))
         )
-        assert some == pytest.approx(4 / 6 * every)
-    of_six = load_project(Path("config/body/four_view.yaml"))
-    made = {stage: budget.expected_seconds(of_six, stage, 60) for stage in ("studio", "scene")}
-    assert made["scene"] == budget.expected_seconds(four, "scene", 60)
-    assert made["studio"] >= budget.expected_seconds(six, "studio", 60)
+        assert some - start == pytest.approx(4 / 6 * (every - start))
+    scene, studio = (expected_seconds(Job(of_six, "", stage), 60) for stage in ("scene", "studio"))
+    assert scene == expected_seconds(Job(four, "", "scene"), 60)
+    assert studio == expected_seconds(Job(six, "", "studio"), 60)
 
 
-def test_each_part_is_expected_to_keep_to_its_budget(
-    wanted: dict[str, Targets],
-) -> None:
-    frames = _frames(wanted)
-    minutes = budget.minutes_of_parts(budget.jobs_by_part(wanted), frames)
-    for part in PARTS:
-        assert minutes[f"{part}_minutes_expected"] <= minutes[f"{part}_minutes_budget"]
-    added_later = 11 + 33  # detections drawn anew; the field
-    assert sum(budget.BUDGET_MINUTES[part] for part in PARTS) <= 75 + added_later < 120
+def test_each_part_is_expected_to_keep_to_its_budget(wanted: dict[str, Targets]) -> None:
+    frames = frames_of_recordings(project for targets in wanted.values() for _, project in targets)
+    for part, jobs in jobs_by_part(wanted).items():
+        seconds = [
+            expected_seconds(
+                job, frames.get(job.project.sequences[job.sequence].recordings.resolve(), 45)
+            )
+            for job in jobs
+        ]
+        assert sum(seconds) / 120 <= BUDGET_MINUTES[part]
+    assert sum(BUDGET_MINUTES[part] for part in PARTS) < 120
 
 
 def test_what_is_left_shrinks_as_jobs_are_done(tmp_path: Path) -> None:
