@@ -348,6 +348,6 @@ def test_an_object_meshed_anew_under_old_contact_vertices(
     with pytest.raises(UserError) as caught:
         here.run()
     count = {2: 162, 4: 2562}[subdivisions]
-    for words in (contact, here.entry.mesh, 642, count, "choose the vertices anew"):
+    for words in (contact, here.entry.mesh, 642, count, "choose the vertices again"):
         assert str(words) in str(caught.value)
     assert not (tmp_path / "joint.h5").exists()

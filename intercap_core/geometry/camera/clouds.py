@@ -1,4 +1,4 @@
-"""Depth images to points, and depth pixels to the colour pixels that show the same surface.
+"""Points of depth images, and the colour pixels that show the surfaces of depth pixels.
 
 Pixels are addressed by their flat index, row * width + column, so that ``image.ravel()[index]``
 reads them.
@@ -15,33 +15,33 @@ from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import apply
 
 NEAREST_DEPTH_M = 0.25  # the sensor's own lower limit (NFOV; Azure Kinect DK specification)
-# A point this much behind another one of the same colour cell is hidden there. Larger than the
-# depth change over a cell of a surface seen at 80 degrees, 3 m away.
+# A point farther behind another point of its colour cell is hidden there. More than the depth
+# change over a cell of a surface seen at 80 degrees, 3 m away.
 HIDDEN_BEHIND_M = 0.05
 CELL_SPACINGS = 1.25  # cell of the visibility test, in spacings of projected depth pixels
 
 
 class Cloud(NamedTuple):
-    """Points (N, 3) float32, metres, and the flat depth pixel (N,) each came from."""
+    """Points of a depth image."""
 
     points: np.ndarray
+    """(N, 3) float32, metres."""
     depth_index: np.ndarray
+    """(N,) flat depth pixel of each point."""
 
 
 class ColourLookup(NamedTuple):
-    """Where depth pixels are in the colour image.
-
-    ``depth_index`` (N,) flat depth pixel; ``colour_index`` (N,) flat colour pixel, -1 outside the
-    image; ``hidden`` (N,) bool: a nearer surface covers the point in the colour camera, so the
-    colour pixel shows something else.
-    """
+    """Positions of depth pixels in the colour image."""
 
     depth_index: np.ndarray
+    """(N,) flat depth pixel."""
     colour_index: np.ndarray
+    """(N,) flat colour pixel, -1 outside the image."""
     hidden: np.ndarray
+    """(N,) bool: a nearer surface covers the point in the colour camera."""
 
     def sample(self, image: np.ndarray, outside: float = 0) -> np.ndarray:
-        """Read the colour-sized ``image`` (H, W) at every point: (N,), ``outside`` if not shown."""
+        """Read the colour-sized ``image`` (H, W) at every point (N,), else ``outside``."""
         shown = (self.colour_index >= 0) & ~self.hidden
         values = np.full(len(self.depth_index), outside, image.dtype)
         values[shown] = image.ravel()[self.colour_index[shown]]
@@ -49,10 +49,10 @@ class ColourLookup(NamedTuple):
 
 
 def depth_points(depth: np.ndarray, camera: Camera, index: np.ndarray | None = None) -> Cloud:
-    """Turn a depth image (H, W) uint16 mm into points of the *depth camera's* frame.
+    """Return the points of a depth image (H, W) uint16 mm in the *depth camera's* frame.
 
-    ``index`` picks flat pixels; invalid ones (0, or outside the lens' calibrated radius) are left
-    out of the result. Raises ValueError where the image does not fit the camera.
+    ``index`` selects flat pixels. Invalid pixels (0, or outside the lens's calibrated radius) are
+    left out. Raises ValueError if the image does not fit the camera.
     """
     lens = camera.depth
     if lens is None or depth.shape != (lens.height, lens.width):
@@ -69,7 +69,7 @@ def depth_points(depth: np.ndarray, camera: Camera, index: np.ndarray | None = N
 
 
 def master_points(depth: np.ndarray, camera: Camera, index: np.ndarray | None = None) -> Cloud:
-    """Turn a depth image (H, W) uint16 mm into points of the master frame; as above."""
+    """Return the points of a depth image in the master frame; see :func:`depth_points`."""
     cloud = depth_points(depth, camera, index)
     return Cloud(apply(camera.master_from_depth, cloud.points), cloud.depth_index)
 
@@ -79,12 +79,11 @@ def colour_lookup(
 ) -> ColourLookup:
     """Find the colour pixel of every valid depth pixel, or of those in ``index`` (flat).
 
-    A point counts as hidden when the depth image holds a surface more than ``HIDDEN_BEHIND_M``
-    nearer in the same or a neighbouring cell of the colour image (a z-buffer of all depth pixels
-    that could cover it, coarse enough to have no holes). The neighbours make it err to the safe
-    side: at a nearer surface's edge a seam of about two depth pixels is called hidden too. Depth on
-    the colour grid hides nothing: its pixels are the colour image's. Raises ValueError as
-    :func:`depth_points` does.
+    A point is hidden if the depth image holds a surface more than ``HIDDEN_BEHIND_M`` nearer in the
+    same or a neighbouring cell of the colour image. The cells form a z-buffer of all depth pixels
+    that could cover the point, coarse enough to have no holes. The neighbours err on the safe side:
+    about two depth pixels at the edge of a nearer surface count as hidden too. Depth on the colour
+    grid hides nothing. Raises ValueError as :func:`depth_points` does.
     """
     cloud = depth_points(depth, camera, index)
     if camera.aligned:
@@ -108,7 +107,7 @@ def colour_lookup(
 
 
 def _to_colour(cloud: Cloud, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Return colour pixels (N, 2) and depths in the colour camera (N,), 0 where not covered."""
+    """Return colour pixels (N, 2) and colour camera depths (N,), 0 outside the lens model."""
     assert camera.colour_from_depth is not None
     points = apply(camera.colour_from_depth, cloud.points)
     z = np.where(camera.colour.inside_model(points), points[:, 2], np.float32(0))
@@ -141,7 +140,7 @@ def _covered(
     occluder_z: np.ndarray,
     camera: Camera,
 ) -> np.ndarray:
-    """Tell which points (N,) lie behind an occluder in the colour image, by cells of it."""
+    """Return whether points (N,) lie behind an occluder in their cell of the colour image."""
     colour, depth = camera.colour, camera.depth
     assert depth is not None
     cell = CELL_SPACINGS * max(colour.fx / depth.fx, colour.fy / depth.fy, 1.0)

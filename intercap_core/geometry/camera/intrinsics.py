@@ -13,10 +13,10 @@ from intercap_core.geometry.camera import projection
 
 RAY_SPACING = 4  # px between the rays of a large image that are computed one by one
 SMALL_IMAGE = 100_000  # px: nothing is gained by interpolating
-DEFAULT_METRIC_RADIUS = 1.7  # what the Azure Kinect SDK takes where a calibration says 0
+DEFAULT_METRIC_RADIUS = 1.7  # default of the Azure Kinect SDK if a calibration states 0
 
-# Rays by size and parameters, for as long as some lens holds them: every reader of a recording has
-# lenses of its own.
+# Rays by size and parameters, shared while a lens holds them: every reader of a recording creates
+# its own lenses.
 _TABLES: WeakValueDictionary[tuple[int, int, bytes], np.ndarray] = WeakValueDictionary()
 
 
@@ -97,11 +97,11 @@ class Intrinsics:
         return projection.radius_table(self.parameters)
 
     def inside_model(self, points: Any) -> Any:
-        """Tell for points (..., 3) whether they are in front and within the metric radius."""
+        """Return whether points (..., 3) are in front and within the metric radius."""
         return projection.inside_model(points, self.parameters)
 
     def sees(self, points: Any) -> Any:
-        """Tell for points (..., 3) whether they are imaged: covered and inside the image."""
+        """Return whether points (..., 3) are inside the image and the lens model."""
         pixels = self.project(points)
         u, v = pixels[..., 0], pixels[..., 1]
         inside = (u >= -0.5) & (v >= -0.5) & (u < self.width - 0.5) & (v < self.height - 0.5)
@@ -109,12 +109,11 @@ class Intrinsics:
 
     @cached_property
     def rays(self) -> np.ndarray:
-        """The ray (height, width, 2) float32 of every pixel: X/Z and Y/Z, computed once for all
-        lenses of the same parameters that are in use.
+        """The ray (height, width, 2) float32 of every pixel: X/Z and Y/Z.
 
-        NaN where the calibration does not hold (outside the metric radius). A large image whose
-        calibration holds everywhere has every ``RAY_SPACING``-th ray computed and the others
-        interpolated by cubic splines, to 1e-4 px.
+        NaN outside the metric radius. Lenses with equal parameters share the table. In a large
+        image whose calibration holds everywhere, every ``RAY_SPACING``-th ray is computed and the
+        others are interpolated by cubic splines, to 1e-4 px.
         """
         key = (self.width, self.height, self.parameters.tobytes())
         table = _TABLES.get(key)

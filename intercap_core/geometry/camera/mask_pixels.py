@@ -1,7 +1,7 @@
-"""The depth pixels that show what a mask of the colour image covers.
+"""The depth pixels that show the surface covered by a mask of the colour image.
 
-The kernel is the look-up of :mod:`intercap_core.geometry.camera.clouds`, restricted to pixels that
-can reach the mask, and like it in single precision.
+The kernel is the look-up of :mod:`intercap_core.geometry.camera.clouds` in single precision,
+restricted to pixels that can reach the mask.
 """
 
 from __future__ import annotations
@@ -26,8 +26,7 @@ _NO_BACKGROUND = np.zeros((0, 0), np.uint16)
 
 
 def mask_window(depth: np.ndarray, camera: Camera, mask: Runs) -> Window | None:
-    """The rows and columns of the depth image (H, W) that can show the mask: its box, through both
-    lenses; None where there are none."""
+    """Return the rows and columns of the depth image (H, W) that can show the mask, or None."""
     x, y, w, h = mask.box
     if w == 0 or camera.depth is None or camera.colour_from_depth is None:
         return None
@@ -172,7 +171,7 @@ def _mask_pixels(
 
 @numba.njit(cache=True, nogil=True)
 def drawn(ends, box, height):
-    """The mask's box (w,h), column by column."""
+    """Return the mask inside its box (w, h), column by column."""
     mask = np.zeros((box[2], box[3]), np.bool_)
     for run in range(1, len(ends), 2):
         column, row = ends[run - 1] // height, ends[run - 1] % height
@@ -186,8 +185,10 @@ def drawn(ends, box, height):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")  # divisions that fail are no exceptions
 def _project(near, counts, rays, pose, lens, u, v, z):
-    """Colour pixels and depth (W,) of a row of depth pixels; depth 0 where the pixel does not count
-    or its point is outside the calibration's radius."""
+    """Write colour pixels and depth (W,) of a row of depth pixels to ``u``, ``v`` and ``z``.
+
+    The depth is 0 if the pixel does not count or its point is outside the lens model.
+    """
     fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, limit = lens
     distortion = (k1, k2, p1, p2, k3, k4, k5, k6)
     a, b, c, d = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]

@@ -1,9 +1,9 @@
-"""COCO's run-length masks: checked, and read at single pixels without decoding the image.
+"""COCO's run-length masks: validated, and read at single pixels without decoding the image.
 
 A compressed RLE is the string of pycocotools' ``maskApi``: lengths of runs in column-major order,
-zeros first. It does not know the image's size, so every function takes it. Strings come from
-users' files, and the C decoder writes past its buffer for one that does not fill the image, so
-they are parsed and checked here first.
+zeros first. It does not contain the image's size, so every function takes the size. Strings are
+validated here first, because the C decoder writes past its buffer if the runs do not fill the
+image.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ _LONGEST_OUTLINE = 1e6  # px; the C code keeps five points of each, and counts t
 
 
 class Runs:
-    """A mask of one image, kept as its runs.
+    """A mask of one image as runs.
 
-    ``ends`` (n,) int64: where each run ends in the column-major image; even runs are background.
-    Raises ValueError, in words that fit after a file's name, where the string is not an RLE of
+    ``ends`` (n,) int64 is the end of each run in the column-major image; even runs are background.
+    Raises ValueError, whose message fits after a file's name, if the string is no RLE of
     ``height`` x ``width`` pixels.
     """
 
@@ -77,7 +77,7 @@ def encode(mask: np.ndarray) -> bytes:
 def encode_window(window: np.ndarray, x0: int, y0: int, height: int, width: int) -> bytes:
     """Encode a mask (h, w) bool that lies at x0, y0 of an otherwise empty image.
 
-    The same string as of the whole image, in the time that the window takes.
+    The string equals that of the whole image, in the time that the window takes.
     """
     length = window.shape[0] + 1  # of a column, and an empty pixel that ends its last run
     columns = np.zeros(window.shape[1] * length + 1, bool)
@@ -104,7 +104,7 @@ def decode(rle: bytes, height: int, width: int) -> np.ndarray:
 def from_counts(counts: Sequence[int], height: int, width: int) -> bytes:
     """Compress an uncompressed RLE, a list of run lengths.
 
-    Raises ValueError where a length is not a whole number from 0 or they do not fill the image.
+    Raises ValueError if a length is no integer from 0 or the runs do not fill the image.
     """
     lengths = np.asarray(counts)
     if lengths.ndim != 1 or (lengths.size and lengths.dtype.kind not in "iu"):
@@ -123,8 +123,8 @@ def from_counts(counts: Sequence[int], height: int, width: int) -> bytes:
 def from_polygons(polygons: Sequence[Sequence[float]], height: int, width: int) -> bytes:
     """Fill polygons, each x, y, x, y, ... pixels, and encode their union.
 
-    Raises ValueError where one has fewer than three corners, a value that is not finite or farther
-    than 1e5 px from the image's corner, or where their outlines are longer than any shape's.
+    Raises ValueError for fewer than three corners, values that are not finite or farther than
+    1e5 px from the image's corner, and outlines longer than those of any shape.
     """
     outline = 0.0
     for polygon in polygons:
@@ -172,11 +172,10 @@ def _parse(rle: bytes) -> np.ndarray:
 
 @numba.njit(cache=True, nogil=True)
 def _run_ends(characters):
-    """Ends (n,) int64 of the runs of a string's ``characters`` (m,) uint8, and what is wrong with
-    it, ``_FINE`` = nothing.
+    """Return the ends (n,) int64 of the runs of ``characters`` (m,) uint8, and a fault code.
 
-    Each number is written in groups of 5 bits, lowest first, bit 5 = more follow, bit 4 of the
-    last = sign; from the fourth on it is the difference to the number two before.
+    Each number is written in groups of 5 bits, lowest first; bit 5 = more groups follow, bit 4 of
+    the last group = sign. From the fourth number on it is the difference to the number two before.
     """
     ends = np.empty(len(characters), np.int64)
     first = ends[:0]
@@ -214,7 +213,7 @@ def _run_ends(characters):
 
 @numba.njit(cache=True, nogil=True)
 def _box(ends, height):
-    """x, y, width, height of what runs with these ``ends`` (n,) set; all 0 where there is none."""
+    """Return x, y, width, height of the set pixels of runs with ``ends`` (n,); zeros if none."""
     left, right, top, bottom = -1, 0, height, -1
     for run in range(1, len(ends), 2):
         start, stop = ends[run - 1], ends[run]

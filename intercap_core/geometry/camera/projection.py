@@ -133,7 +133,7 @@ def project_with_jacobian(points: Any, parameters: Any) -> tuple[Any, Any]:
 
 
 def inside_model(points: Any, parameters: Any) -> Any:
-    """Tell for points (..., 3) whether the calibration covers them: in front, within the radius."""
+    """Return whether points (..., 3) are in front of the lens and within its metric radius."""
     xp = _namespace(points)
     q = _as_parameters(parameters, points, xp)
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
@@ -141,8 +141,10 @@ def inside_model(points: Any, parameters: Any) -> Any:
 
 
 def radius_table(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Radii (N,) of the normalised plane up to the metric radius, ascending, and what the radial
-    distortion makes of them (N,): the start of the inverse."""
+    """Return radii (N,) up to the metric radius, ascending, and their distorted radii (N,).
+
+    The inverse of the projection starts from this table.
+    """
     q = np.asarray(parameters, np.float64)
     radii = np.linspace(0.0, q[12], _TABLE_SIZE)
     return radii, np.maximum.accumulate(radii * _radial(radii * radii, q)[0])

@@ -1,9 +1,8 @@
-"""The lens of :mod:`.projection`, compiled: the one form that every compiled kernel calls.
+"""The lens model of :mod:`.projection` for compiled kernels, one point at a time.
 
-One point at a time; equal to :func:`.projection.project` and
-:func:`.projection.project_with_jacobian` to rounding everywhere, also nearer
-than ``MIN_DEPTH_M``, behind the camera and beyond the metric radius. Divisions follow IEEE 754
-instead of raising, so that loops around these functions can be vectorised.
+Equal to :func:`.projection.project` and :func:`.projection.project_with_jacobian` up to rounding,
+also nearer than ``MIN_DEPTH_M``, behind the camera and beyond the metric radius. Divisions follow
+IEEE 754 instead of raising, so that loops around these functions can be vectorised.
 """
 
 from __future__ import annotations
@@ -92,9 +91,11 @@ def project_point_with_jacobian(px, py, pz, parameters):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def unproject(pixels, parameters, radii, distorted_radii):
-    """X/Z and Y/Z (N, 2) of pixels (N, 2), all float64: the exact inverse of the projection, by
-    Newton's iteration from the radial part in the lens' :func:`.projection.radius_table`. NaN where
-    the model has no inverse."""
+    """Return X/Z and Y/Z (N, 2) of pixels (N, 2), float64: the exact inverse of the projection.
+
+    Newton's iteration from the radial part in the lens's :func:`.projection.radius_table`. NaN
+    where the model has no inverse.
+    """
     fx, fy, cx, cy = parameters[0], parameters[1], parameters[2], parameters[3]
     found = np.empty_like(pixels)
     for n in range(len(pixels)):

@@ -14,24 +14,27 @@ from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.transforms import invert
 from intercap_core.schemas import FRAMES, SCENE
 
-# Smallest eigenvalue, a camera, of the normal matrix of the point nearest to all optical axes: with
-# less they are as good as parallel, and the centre is this far ahead, metres. Tuned on the studio.
+# Smallest eigenvalue, per camera, of the normal matrix of the point nearest to all optical axes.
+# Below it the axes count as parallel, and the centre lies this far ahead of the cameras, metres.
+# Tuned on the studio.
 MIN_AXES_EIGENVALUE = 0.05
 PARALLEL_AXES_DISTANCE_M = 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """One colour camera and, where there is one, its depth camera.
-
-    ``colour_from_depth`` and ``master_from_colour`` are (4, 4), metres.
-    """
+    """One colour camera and its depth camera, if there is one."""
 
     name: str
+    """Name in the calibration and the recordings."""
     colour: Intrinsics
+    """Lens of the colour camera."""
     depth: Intrinsics | None
+    """Lens of the depth camera."""
     colour_from_depth: np.ndarray | None
+    """(4, 4), metres; None without depth."""
     master_from_colour: np.ndarray
+    """(4, 4), metres."""
 
     @cached_property
     def colour_from_master(self) -> np.ndarray:
@@ -52,7 +55,7 @@ class Camera:
 
     @cached_property
     def aligned(self) -> bool:
-        """Whether depth lies on the colour image's pixel grid: one lens, one place."""
+        """Whether depth lies on the colour image's pixel grid: same lens, same pose."""
         if self.depth is None or self.colour_from_depth is None:
             return False
         same_size = (self.depth.width, self.depth.height) == (self.colour.width, self.colour.height)
@@ -108,7 +111,7 @@ class Rig:
         return Rig(tuple(camera.moved(pose) for camera, pose in poses))
 
     def datasets(self) -> dict[str, np.ndarray | list[str]]:
-        """What the frames and scene artefacts hold about the cameras' lenses, by dataset name."""
+        """Return datasets of the cameras' lenses, as the frames and scene artefacts hold them."""
         no_lens = np.full(13, np.nan)
         no_pose = np.full((4, 4), np.nan)
         colour = self.colour_parameters
@@ -171,7 +174,7 @@ class Rig:
 
 
 def ring_centre(rig: Rig) -> np.ndarray:
-    """The point (3,) closest to all optical axes; for one camera, or parallel ones, 2 m ahead."""
+    """Return the point (3,) closest to all optical axes; 2 m ahead of parallel ones."""
     poses = rig.master_from_colour
     axes, centres = poses[:, :3, 2], poses[:, :3, 3]
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]

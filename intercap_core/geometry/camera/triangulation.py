@@ -1,7 +1,7 @@
-"""Points from pixels of several views, some of which are wrong.
+"""Triangulation of points from pixels of several views with outliers.
 
 Every pair of views proposes a point, the proposal that most views agree with wins, and the point
-is refined on the distorted pixels of the views that agree. All points at once.
+is refined on the distorted pixels of the inlier views. All points are processed at once.
 """
 
 from __future__ import annotations
@@ -15,28 +15,29 @@ from intercap_core.geometry.camera import projection
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply
 
-MIN_PARALLAX_DEG = 4.0  # two rays closer in direction than this do not give a depth
+MIN_PARALLAX_DEG = 4.0  # two rays with a smaller angle between them give no depth
 REFINE_STEPS = 4
 HUBER_PX_AT_1080P = 4.0  # typical standard deviation of good 2D detectors
-PARTNERS = 5  # of each camera, whose rays are crossed with its own before those of others
-BEST_PARALLAX_DEG = 70.0
-# Rays closer in direction than this, or opposite, agree by chance: at worst as much as two views of
-# full confidence are worth. Six views alternately high and low hardly ever have such pairs.
+PARTNERS = 5  # cameras that each camera is paired with first
+BEST_PARALLAX_DEG = 70.0  # preferred angle between the viewing directions of partners
+# Rays with a smaller angle, or opposite rays, may agree by chance. The cost of this is at most that
+# of two views of full confidence. Six views alternately high and low hardly ever have such pairs.
 CHANCE_PARALLAX_DEG, CHANCE_COST = 25.0, 2.0
 _BLOCK = 20_000  # points at once: bounds memory at some 100 MB with six views
 
 
 @dataclass(frozen=True)
 class Triangulation:
-    """``points`` (N, 3) metres, master frame, NaN = fewer than two views agree; ``inlier`` (N, C)
-    bool; ``error`` (N,) RMS reprojection error of the inliers, px, NaN = no point;
-    ``view_error`` (N, C) px, NaN = not seen or no point.
-    """
+    """Triangulated points and their reprojection errors."""
 
     points: np.ndarray
+    """(N, 3) metres, master frame; NaN if fewer than two views agree."""
     inlier: np.ndarray
+    """(N, C) bool: views that agree with the point."""
     error: np.ndarray
+    """(N,) RMS reprojection error of the inliers, px; NaN without a point."""
     view_error: np.ndarray
+    """(N, C) px; NaN if not seen or without a point."""
 
     @property
     def views(self) -> np.ndarray:
@@ -45,11 +46,10 @@ class Triangulation:
 
 
 def spread(found: Triangulation, rig: Rig) -> np.ndarray:
-    """What each point (N,) is off by, metres, by how the views that agree on it disagree; 0 where
-    there is none.
+    """Return the standard error of each point (N,), metres; 0 = no point.
 
-    n views tell 3 coordinates by 2n. With an RMS distance of e pixels the variance of one of them
-    is n e^2 / (2n - 3), and each of the point's is told by about 2n / 3 of them.
+    n views measure 3 coordinates by 2n values. With an RMS distance of e pixels the variance of a
+    value is n e^2 / (2n - 3), and about 2n / 3 values determine each coordinate.
     """
     eyes = rig.master_from_colour[:, :3, 3]
     away = np.linalg.norm(found.points[:, None] - eyes, axis=2)
@@ -60,13 +60,15 @@ def spread(found: Triangulation, rig: Rig) -> np.ndarray:
 
 
 def pixel_scale(rig: Rig) -> np.ndarray:
-    """(C,) pixels of each camera for one pixel of a 1080p image (by image height)."""
+    """Return pixels (C,) of each camera per pixel of a 1080p image, by image height."""
     return np.array([camera.colour.height / 1080 for camera in rig])
 
 
 def rays_of(pixels: np.ndarray, rig: Rig) -> np.ndarray:
-    """Directions (..., C, n, 3) float64 in the master frame, z = 1 in the camera, of pixels
-    (..., C, n, 2)."""
+    """Return directions (..., C, n, 3) float64, master frame, of pixels (..., C, n, 2).
+
+    z = 1 in the camera's frame.
+    """
     rays = np.empty((*pixels.shape[:-1], 3))
     for c, camera in enumerate(rig):
         directions = camera.colour.unproject(pixels[..., c, :, :])
@@ -77,10 +79,10 @@ def rays_of(pixels: np.ndarray, rig: Rig) -> np.ndarray:
 def midpoints(
     first: np.ndarray, second: np.ndarray, from_first: np.ndarray, from_second: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where pairs of rays come closest: midpoints (..., 3) and gaps (...), metres.
+    """Return the midpoints (..., 3) and gaps (...) between pairs of rays, metres.
 
-    ``first``, ``second`` (..., 3) directions, ``from_first``, ``from_second`` their origins. NaN
-    where the rays are nearly parallel (:data:`MIN_PARALLAX_DEG`) or meet behind an origin.
+    ``first``, ``second`` (..., 3) are directions, ``from_first``, ``from_second`` their origins.
+    NaN if the rays are nearly parallel (:data:`MIN_PARALLAX_DEG`) or meet behind an origin.
     """
     between = from_second - from_first
     aa, bb = (first * first).sum(-1), (second * second).sum(-1)
@@ -100,11 +102,11 @@ def midpoints(
 
 
 def view_pairs(rig: Rig) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-    """Pairs of cameras (a, b), a < b: those to try first, and the rest.
+    """Return pairs of cameras (a, b), a < b: those to try first, and the rest.
 
-    First come each camera's :data:`PARTNERS` whose viewing directions differ from its own most
-    nearly by :data:`BEST_PARALLAX_DEG`: up to six cameras these are all pairs, beyond their number
-    grows with the cameras', not with its square.
+    First come each camera's :data:`PARTNERS` whose viewing directions differ from its own by about
+    :data:`BEST_PARALLAX_DEG`. Up to six cameras these are all pairs; beyond, their number grows
+    linearly with the number of cameras.
     """
     axes = rig.master_from_colour[:, :3, 2]
     angle = np.degrees(np.arccos(np.clip(axes @ axes.T, -1, 1)))
@@ -207,8 +209,10 @@ def _best_proposal(
 
 
 def _agreed_by_chance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Cost (N,) of a proposal by rays (N, 3) that run nearly along each other: whatever is near the
-    line between two cameras that face each other, they agree on some point of it."""
+    """Return the cost (N,) of a proposal by rays (N, 3) that are nearly parallel.
+
+    Two cameras that face each other agree on some point for anything near the line between them.
+    """
     sine = np.linalg.norm(np.cross(first, second), axis=1)
     sine /= np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
     return CHANCE_COST * np.maximum(0, 1 - sine / np.sin(np.radians(CHANCE_PARALLAX_DEG)))
@@ -230,7 +234,7 @@ def _refined(points: np.ndarray, pixels: np.ndarray, weights: np.ndarray, rig: R
     weighted = jacobian * weight[..., None, None]
     normal = np.einsum("ncij,ncik->njk", weighted, jacobian)
     gradient = np.einsum("ncij,nci->nj", weighted, residual)
-    # A hair of damping keeps two nearly parallel rays from throwing the point away.
+    # A little damping limits the step for two nearly parallel rays.
     damping = 1e-6 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
     step = np.linalg.solve(normal + damping + 1e-12 * np.eye(3), gradient[..., None])[..., 0]
     result = points.copy()

@@ -1,9 +1,8 @@
-"""Holes of a mesh closed, where covering them is honest: small beside the object.
+"""Close small holes of a mesh.
 
-A hole is a loop of edges of one face each. It gets a new vertex at its middle and a fan of
-triangles to it: right for what is nearly flat, a guess for anything else, so that holes wider than
-a stated width are left alone. Vertices of the file keep their numbers, lists of contact vertices
-stay right.
+A hole is a loop of edges that belong to one face each. It gets a new vertex at its centre and a fan
+of triangles to it. This suits nearly flat holes only, so holes wider than a limit are left open.
+Vertices of the file keep their numbers, so that lists of contact vertices stay valid.
 """
 
 from __future__ import annotations
@@ -19,22 +18,22 @@ import trimesh
 from intercap_core.errors import UserError
 from intercap_core.geometry.rigid.mesh_files import colours_of, read_mesh
 
-SAME_PLACE_DECIMALS = 7  # vertices nearer than 0.1 micrometre are one, as the stages join them
-WRITTEN = (".ply", ".obj")
+SAME_PLACE_DECIMALS = 7  # vertices closer than 0.1 micrometre are joined, as in mesh.py
+OUTPUT_SUFFIXES = (".ply", ".obj")
 
 
 @dataclass(frozen=True)
 class Hole:
-    """One loop of open edges: the numbers of its vertices (n,), in the order of the missing faces.
-
-    ``width_m`` between its farthest vertices, ``middle`` (3,) metres in the mesh's frame,
-    ``bulge_m`` how far its vertices stand off its own plane, RMS.
-    """
+    """One loop of open edges."""
 
     loop: np.ndarray
+    """(n,) vertex indices, in the winding order of the missing faces."""
     width_m: float
+    """Largest distance between two of its vertices."""
     middle: np.ndarray
+    """(3,) mean of its vertices, metres in the mesh's frame."""
     bulge_m: float
+    """RMS distance of its vertices from their plane."""
 
     def __str__(self) -> str:
         at = ", ".join(f"{value:.3f}" for value in self.middle)
@@ -46,30 +45,39 @@ class Hole:
 
 @dataclass(frozen=True)
 class Closed:
-    """What became of a mesh's holes; ``strays`` are open edges that form no loop of their own."""
+    """Result of :func:`close_mesh`."""
 
     closed: tuple[Hole, ...]
+    """The holes, widest first."""
     strays: int
+    """Number of open edges that form no loop."""
     faces_added: int
+    """Number of new faces."""
     watertight: bool
+    """Whether every edge of the result joins two faces."""
 
 
 def close_mesh(source: Path, output: Path, *, widest_m: float | None, share: float) -> Closed:
-    """Write ``source`` with its holes closed to ``output``, which must not exist.
+    """Write ``source`` with its holes closed to ``output``.
 
-    Holes up to ``widest_m``, metres, are closed; None = up to ``share`` of the object's length.
-    Vertices stay, in order; the new ones follow. Textures become colours of vertices. Raises
-    UserError where a hole is wider, where there is none, and where the files cannot be used.
+    Vertices keep their order and new ones follow. Textures become vertex colours. Raises UserError
+    if a hole is wider than the limit, if there is none, or if a file cannot be used.
+
+    Args:
+        source: mesh file.
+        output: mesh file that must not exist.
+        widest_m: closes holes up to this width; None = up to ``share`` of the object's length.
+        share: see ``widest_m``.
     """
     if output.exists():
         raise UserError(f"{output}: exists, and is not written over; name another file")
-    if output.suffix.lower() not in WRITTEN:
-        raise UserError(f"{output}: expected a name that ends in {' or '.join(WRITTEN)}")
+    if output.suffix.lower() not in OUTPUT_SUFFIXES:
+        raise UserError(f"{output}: expected a name that ends in {' or '.join(OUTPUT_SUFFIXES)}")
     mesh = read_mesh(source)
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-    one = _one_of_place(vertices)
-    faces = _wound_alike(vertices, one, faces)
-    holes, strays = find_holes(vertices, one[faces])
+    first_at = _first_at_place(vertices)
+    faces = _with_consistent_winding(vertices, first_at, faces)
+    holes, strays = find_holes(vertices, first_at[faces])
     if not holes:
         raise UserError(
             f"{source}: has no hole to close"
@@ -92,21 +100,24 @@ def close_mesh(source: Path, output: Path, *, widest_m: float | None, share: flo
         validate=False,
     )
     _write(result, output)
-    return Closed(tuple(holes), strays, sum(map(len, added)), _is_closed(one[faces], added))
+    return Closed(tuple(holes), strays, sum(map(len, added)), _is_closed(first_at[faces], added))
 
 
 def find_holes(vertices: np.ndarray, faces: np.ndarray) -> tuple[list[Hole], int]:
-    """Holes of a mesh (V, 3) and (F, 3), widest first, and the open edges that are in none.
+    """Return the holes of a mesh, widest first, and the number of open edges in no hole.
 
-    Vertices of one place must have one number. Edges around which faces look different ways, or
-    that end where no other begins, are in none.
+    Edges between faces of inconsistent winding, and open chains of edges, form no hole.
+
+    Args:
+        vertices: (V, 3) metres.
+        faces: (F, 3); coinciding vertices must have one index.
     """
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(1)]
     directed = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     _, first, count = np.unique(
         np.sort(directed, axis=1), axis=0, return_index=True, return_counts=True
     )
-    # the missing face would run along its edges the other way
+    # the missing face has the opposite winding
     edges = directed[first[count == 1]][:, ::-1]
     leaving: dict[int, list[int]] = defaultdict(list)
     for start, end in edges.tolist():
@@ -119,7 +130,7 @@ def find_holes(vertices: np.ndarray, faces: np.ndarray) -> tuple[list[Hole], int
             if at not in path:
                 path.append(at)
                 continue
-            loop = path[path.index(at) :]  # a hole that touches another ends where it was met
+            loop = path[path.index(at) :]  # holes may touch at a vertex
             path = path[: path.index(at) + 1]
             if len(loop) >= 3:
                 holes.append(_hole(vertices, np.array(loop)))
@@ -137,22 +148,24 @@ def _hole(vertices: np.ndarray, loop: np.ndarray) -> Hole:
 
 
 def _fan(hole: Hole, middle: int) -> np.ndarray:
-    """Faces (n, 3) from each edge of the hole to its ``middle``'s number."""
+    """Return faces (n, 3) from each edge of the hole to the vertex index ``middle``."""
     following = np.roll(hole.loop, -1)
     return np.stack([hole.loop, following, np.full(len(hole.loop), middle)], axis=1)
 
 
-def _wound_alike(vertices: np.ndarray, one: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """The faces (F, 3), turned where neighbours look different ways."""
-    joined = trimesh.Trimesh(vertices, one[faces], process=False, validate=False)
+def _with_consistent_winding(
+    vertices: np.ndarray, first_at: np.ndarray, faces: np.ndarray
+) -> np.ndarray:
+    """Return faces (F, 3) with consistent winding."""
+    joined = trimesh.Trimesh(vertices, first_at[faces], process=False, validate=False)
     if not joined.is_winding_consistent:
         trimesh.repair.fix_winding(joined)
-    turned = (np.asarray(joined.faces) != one[faces]).any(1)
+    turned = (np.asarray(joined.faces) != first_at[faces]).any(1)
     return np.where(turned[:, None], faces[:, ::-1], faces)
 
 
-def _one_of_place(vertices: np.ndarray) -> np.ndarray:
-    """The first vertex (V,) at each vertex's place."""
+def _first_at_place(vertices: np.ndarray) -> np.ndarray:
+    """Return the index (V,) of the first vertex at the same place."""
     _, first, inverse = np.unique(
         vertices.round(SAME_PLACE_DECIMALS), axis=0, return_index=True, return_inverse=True
     )
@@ -166,13 +179,13 @@ def _is_closed(faces: np.ndarray, added: Sequence[np.ndarray]) -> bool:
 
 
 def _refusal(source: Path, wide: Sequence[Hole], limit: float, length: float) -> str:
-    told = "; ".join(str(hole) for hole in wide[:4])
+    listed = "; ".join(str(hole) for hole in wide[:4])
     more = f" and {len(wide) - 4} more" if len(wide) > 4 else ""
     return (
         f"{source}: {len(wide)} holes are wider than {1e3 * limit:.1f} mm (the object is "
-        f"{1e3 * length:.0f} mm long): {told}{more}; nobody knows what surface is there, so "
-        "nothing was written: scan or model it (MeshLab, Blender), or, where a flat cover is "
-        "right, say "
+        f"{1e3 * length:.0f} mm long): {listed}{more}; the shape of the missing surface is "
+        "unknown, so nothing was written: scan or model it (MeshLab, Blender), or, if a flat cover "
+        "is right, add "
         f"--widest-mm {np.ceil(1e3 * max(hole.width_m for hole in wide)):.0f}"
     )
 

@@ -1,8 +1,8 @@
 """Lists of the vertices of a mesh that people are likely to touch.
 
-A list is the ids alone (JSON, or a pickle as InterCap released), or ids with what they were chosen
-on, as :func:`contact_list` gives it (JSON or .npz): then a mesh that was built anew under an old
-list is noticed, also where all ids still exist.
+A list is the ids alone (JSON, or a pickle as InterCap released), or ids with the mesh's number of
+vertices and digest, as :func:`contact_list` returns it (JSON or .npz). The latter detects that the
+mesh was replaced, even if all ids still exist.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _IDS, _COUNT, _DIGEST = "contact_vertices", "mesh_vertices", "mesh_digest"
 
 
 def contact_list(ids: Sequence[int] | np.ndarray, vertices: np.ndarray) -> dict[str, Any]:
-    """What a list holds of ``ids`` (K,) chosen on a mesh file's ``vertices`` (V, 3), metres."""
+    """Return the content of a list of ``ids`` (K,) chosen on a file's ``vertices`` (V, 3)."""
     return {
         _COUNT: len(vertices),
         _DIGEST: vertices_digest(vertices),
@@ -32,15 +32,19 @@ def contact_list(ids: Sequence[int] | np.ndarray, vertices: np.ndarray) -> dict[
 
 
 def vertices_digest(vertices: np.ndarray) -> str:
-    """SHA-256 of a mesh file's vertices (V, 3) in their order, in single precision."""
+    """Return the SHA-256 of a mesh file's vertices (V, 3), in order, in single precision."""
     return hashlib.sha256(np.ascontiguousarray(vertices, "<f4").tobytes()).hexdigest()
 
 
 def read_contact_vertices(path: Path, mesh: Path, vertices: np.ndarray) -> np.ndarray:
-    """Ids (K,) of the likely-contact vertices that the list ``path`` names.
+    """Return the ids (K,) of likely-contact vertices listed in a file.
 
-    ``vertices`` (V, 3) are those of the file ``mesh``. Raises UserError naming the list: it is not
-    there, not a list of vertex ids, or belongs to another mesh.
+    Raises UserError that names the list if it is missing, no list of ids, or of another mesh.
+
+    Args:
+        path: the list.
+        mesh: the mesh file.
+        vertices: (V, 3) of the mesh file, metres.
     """
     values = _read(path)
     if isinstance(values, Mapping):
@@ -61,7 +65,7 @@ def read_contact_vertices(path: Path, mesh: Path, vertices: np.ndarray) -> np.nd
         outside = quoted(int(ids.max() if ids.max() >= len(vertices) else ids.min()))
         raise UserError(
             f"{path}: names vertex {outside}, the mesh has {len(vertices)}; the list belongs to "
-            f"another mesh than {mesh}: choose the vertices anew, or leave 'contact_vertices' out "
+            f"another mesh than {mesh}: choose the vertices again, or leave 'contact_vertices' out "
             "of objects.yaml"
         )
     return ids.astype(np.int64)
@@ -74,7 +78,7 @@ def _check_mesh(path: Path, values: Mapping[str, Any], mesh: Path, vertices: np.
         if expected is not None and str(expected) != str(found):
             raise UserError(
                 f"{path}: was chosen on a mesh with {key} {_shown(expected)}, {mesh} has {found}; "
-                "the mesh was built anew under an old list: choose the vertices anew, or leave "
+                "the mesh was changed after the list was made: choose the vertices again, or leave "
                 "'contact_vertices' out of objects.yaml"
             )
 

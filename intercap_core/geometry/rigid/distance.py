@@ -1,10 +1,10 @@
-"""Queries of a triangle mesh by Embree's tree: distances, inside or outside, and visibility.
+"""Queries of a triangle mesh by Embree: distances, inside or outside, and visibility.
 
-Open3D's RaycastingScene (Embree) in the mesh's own frame: the tree is built once and points move,
-so a rigid object's field is built once for all its poses. Inside of a surface with open edges is
-where it winds around a point by more than a half (the generalised winding number of Jacobson et al.
-2013, by the hierarchy of Barill et al. 2018); rays that leave through a hole would call points far
-outside inside. Its holes are closed, for the depth of what is inside, by the convex hull.
+Open3D's RaycastingScene (Embree) works in the mesh's own frame: the tree is built once and the
+query points move with the object. Inside of a surface with open edges is where its winding number
+exceeds a half (the generalised winding number of Jacobson et al. 2013, by the hierarchy of Barill
+et al. 2018), because rays through a hole would misclassify points outside. For depths inside, the
+convex hull closes its holes.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ import trimesh
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.rigid.surfaces import vertex_normals
 
-# Directions along which crossings are counted: one for a watertight mesh (measured without a sign
-# error on 10 k points), a vote of all where it says "inside", as a ray may pass along an edge. No
-# direction lies in a plane that people model in.
+# Directions of rays whose crossings are counted. The first decides (no sign error on 10 k points);
+# a ray may pass along an edge, so all vote on points that it calls inside. No direction lies in a
+# plane that people model in.
 _DIRECTIONS = np.array(
     [[0.83, 0.31, 0.46], [-0.39, 0.77, 0.51], [0.27, -0.43, 0.86], [-0.57, -0.61, -0.55],
      [0.41, 0.53, -0.74]]
 )  # fmt: skip
-# Distances that differ by less are those to the same point, metres: float32 at an object's size.
+# Distances that differ by less, metres, lead to the same point: float32 at an object's size.
 _SAME_PLACE = 1e-6
 VISIBLE_OFFSET_M = 0.001  # a vertex is lifted off its own surface before the ray is cast
 _OPEN3D_CORE = "open3d.cpu.pybind"
@@ -76,26 +76,29 @@ o3d = _load_open3d()
 
 @dataclass(frozen=True)
 class Closest:
-    """The nearest surface point of each query.
-
-    ``points`` (N, 3) metres, ``faces`` (N,) int32, ``barycentric`` (N, 3) weights of the face's
-    corners, ``normals`` (N, 3) outward unit normals of the faces.
-    """
+    """The nearest surface point of each query."""
 
     points: np.ndarray
+    """(N, 3) metres."""
     faces: np.ndarray
+    """(N,) int32 indices."""
     barycentric: np.ndarray
+    """(N, 3) weights of the face's corners."""
     normals: np.ndarray
+    """(N, 3) outward unit normals of the faces."""
 
 
 class DistanceField:
-    """Signed distance to a triangle mesh; negative inside. The hollow of a cup is outside.
+    """Signed distance to a triangle mesh, negative inside; the hollow of a cup is outside.
 
-    ``box`` (2, 3) are the mesh's least and largest coordinates.
-    ``vertices`` (V, 3) metres and ``faces`` (F, 3) outward; ``watertight`` says whether rays are
-    enough to tell inside from outside. Queries are in the mesh's frame, float64 in and out,
-    computed in float32: errors up to 1e-6 of the coordinates' size. ``threads`` = 0 takes all
-    cores; the result does not depend on it.
+    Queries are in the mesh's frame, float64 in and out, computed in float32 with errors up to 1e-6
+    of the coordinates' size. ``box`` (2, 3) holds the least and largest coordinates.
+
+    Args:
+        vertices: (V, 3) metres.
+        faces: (F, 3), wound outward.
+        watertight: whether rays suffice to decide inside and outside.
+        threads: 0 = all cores; the result does not depend on it.
     """
 
     def __init__(
@@ -124,10 +127,11 @@ class DistanceField:
         return np.where(inside, -distance, distance)
 
     def boundary(self, points: np.ndarray) -> tuple[np.ndarray, Closest]:
-        """Which of points (N, 3) are inside, and the closest point of the solid's boundary.
+        """Return which points (N, 3) are inside, and the closest point of the solid's boundary.
 
-        That of the surface; of what is inside an open one that of its hull where this is closer, so
-        that nothing is deeper than the object is thick. Faces and weights are the surface's.
+        The boundary is the surface. For points inside an open surface it is the convex hull where
+        this is closer, so that no depth exceeds the object's thickness. Faces and barycentric
+        weights always belong to the surface.
         """
         inside, found = self.inside(points), self.closest(points)
         if self._open is not None and inside.any():
@@ -140,15 +144,15 @@ class DistanceField:
         return self._scene.compute_distance(query).numpy().astype(np.float64)
 
     def met(self, start: np.ndarray, ahead: np.ndarray) -> np.ndarray:
-        """Whether rays from ``start`` (N, 3) along ``ahead`` (N, 3) meet the surface (N,)."""
+        """Return whether rays from ``start`` (N, 3) along ``ahead`` (N, 3) hit the surface (N,)."""
         rays = o3d.core.Tensor.from_numpy(np.concatenate([start, ahead], 1).astype(np.float32))
         return self._scene.test_occlusions(rays).numpy()
 
     def inside(self, points: np.ndarray) -> np.ndarray:
-        """Whether points (N, 3) are inside the solid: (N,) bool.
+        """Return whether points (N, 3) are inside the solid: (N,) bool.
 
-        Of a watertight mesh one ray a point; as a ray through an edge may count it twice or never,
-        the few points that are found inside are asked again with more rays.
+        A watertight mesh needs one ray a point; the few points found inside are checked with more
+        rays, because a ray through an edge may count it twice or never.
         """
         query = np.asarray(points, np.float32).reshape(-1, 3)
         if self._open is not None:
@@ -162,7 +166,7 @@ class DistanceField:
         return 2 * votes > len(_DIRECTIONS)
 
     def _odd(self, query: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Whether rays from points (N, 3) float32 cross the surface an odd number of times."""
+        """Return whether rays from points (N, 3) cross the surface an odd number of times."""
         towards = np.broadcast_to(direction.astype(np.float32), query.shape)
         rays = o3d.core.Tensor.from_numpy(np.concatenate([query, towards], 1))
         return self._scene.count_intersections(rays).numpy() % 2 == 1
@@ -173,10 +177,10 @@ class DistanceField:
 
 
 class SurfacePart:
-    """Distances to a part of a mesh's surface: what its vertices ``part`` (K,) span.
+    """Distances to the part of a mesh's surface that its vertices ``part`` (K,) span.
 
-    That is every face whose corners all belong to the part, and around a vertex that has no such
-    face all of its faces. ``whole`` says what is inside the object.
+    The part consists of the faces whose corners all belong to it, and of all faces around a vertex
+    that has no such face. ``whole`` decides what is inside the object.
     """
 
     def __init__(
@@ -197,10 +201,10 @@ class SurfacePart:
         self._face = np.flatnonzero(spanned).astype(np.int32)
 
     def boundary(self, points: np.ndarray) -> tuple[np.ndarray, Closest]:
-        """Which of points (N, 3) are inside the object just below the part, and its closest point.
+        """Return which points (N, 3) are inside the object below the part, and its closest points.
 
-        Inside the object but nearer to another part of its surface counts as outside: there the
-        distance to this part is no depth.
+        A point inside the object that is nearer to another part of the surface counts as outside,
+        because the distance to this part is no depth there.
         """
         inside, nearest = self._whole.boundary(points)
         found = _closest(self._scene, points)
@@ -225,7 +229,7 @@ class _OpenSurface:
         )
 
     def inside(self, query: np.ndarray) -> np.ndarray:
-        """Whether the surface winds around points (N, 3) by more than a half: (N,) bool."""
+        """Return whether the winding number at points (N, 3) exceeds a half: (N,) bool."""
         found = np.zeros(len(query), bool)
         near = np.flatnonzero(((query > self._low) & (query < self._high)).all(1))
         if len(near):
@@ -235,8 +239,8 @@ class _OpenSurface:
         return found
 
     def nearer(self, points: np.ndarray, inside: np.ndarray, found: Closest) -> Closest:
-        """``found`` (N), with the hull's points and normals where points (N, 3) are ``inside`` (N,)
-        and closer to it."""
+        """Return ``found`` (N) with points and normals of the hull where points (N, 3) are
+        ``inside`` (N,) and the hull is closer."""
         at = np.flatnonzero(inside)
         hull = _closest(self._hull, points[at])
         way, own = (
@@ -249,9 +253,9 @@ class _OpenSurface:
 
 
 class OcclusionScene:
-    """Which vertices of a mesh a camera sees, the mesh itself and others in the way.
+    """Visibility of a mesh's vertices from cameras, occluded by the mesh itself and by others.
 
-    All meshes in one common frame. Built once for a frame of the capture, asked for each camera.
+    All meshes are in one frame. Build it once for a frame of the capture and query each camera.
     ``offset_m`` lifts a vertex off its own surface before the ray is cast.
     """
 
@@ -275,7 +279,7 @@ class OcclusionScene:
         self._offset = offset_m
 
     def visible(self, intrinsics: Intrinsics, camera_from_mesh: np.ndarray) -> np.ndarray:
-        """Whether each vertex (V,) is in the image, faces the camera and is not hidden."""
+        """Return whether each vertex (V,) is in the image, faces the camera and is not occluded."""
         rotation, translation = camera_from_mesh[:3, :3], camera_from_mesh[:3, 3]
         eye = -rotation.T @ translation
         to_eye = eye - self._vertices
@@ -293,7 +297,7 @@ class OcclusionScene:
 
 
 def _scene(vertices: np.ndarray, faces: np.ndarray, threads: int) -> Any:
-    """The search tree of float32 vertices (V, 3) and uint32 faces (F, 3)."""
+    """Return the search tree of float32 vertices (V, 3) and uint32 faces (F, 3)."""
     scene = o3d.t.geometry.RaycastingScene(nthreads=threads)
     scene.add_triangles(o3d.core.Tensor.from_numpy(vertices), o3d.core.Tensor.from_numpy(faces))
     return scene

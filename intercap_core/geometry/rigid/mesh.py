@@ -1,4 +1,6 @@
-"""A rigid mesh as the stages use it: checked, repaired where safe, contact vertices, symmetry."""
+"""Rigid meshes of objects: checked, repaired where this is safe, with contact vertices, symmetry
+and colours.
+"""
 
 from __future__ import annotations
 
@@ -37,29 +39,30 @@ UNITS = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254}
 
 @dataclass(frozen=True, eq=False)
 class ObjectMesh:
-    """A rigid object in its own frame (the file's), metres, faces outward.
-
-    ``vertices`` (V, 3) float64, ``faces`` (F, 3) int32, ``contact_vertices`` (K,) int64 sorted,
-    ``colours`` (V, 3) uint8. ``watertight``: inside and outside are defined everywhere.
-    """
+    """A rigid object in the frame of its mesh file."""
 
     name: str
+    """Name in objects.yaml."""
     vertices: np.ndarray
+    """(V, 3) float64, metres."""
     faces: np.ndarray
+    """(F, 3) int32, wound so that normals point outward."""
     contact_vertices: np.ndarray
+    """(K,) int64, sorted: vertices that people are likely to touch."""
     symmetry: SymmetryGroup
+    """Motions that do not change the object's appearance."""
     colours: np.ndarray
+    """(V, 3) uint8, sRGB."""
     watertight: bool = True
+    """Whether every edge joins two faces, so that inside and outside are defined everywhere."""
 
     @classmethod
     def load(cls, entry: ObjectEntry) -> ObjectMesh:
         """Load and check the mesh, contact vertices and symmetry of an objects.yaml entry.
 
-        Vertices that coincide are joined, inconsistent winding is turned, small holes are closed
-        and faces without area left out, each with a warning; a surface that stays open is told
-        (``watertight`` is false) and used. Raises UserError naming the file, what is wrong with it
-        and what to do: no such file, no faces, coordinates that are not numbers, another unit than
-        metres, loose faces without an inside, contact vertices that are not its vertices.
+        Coinciding vertices are joined, inconsistent winding is turned, small holes are closed and
+        faces without area are left out, each with a warning. A mesh that stays open is used, with
+        ``watertight`` false. Raises UserError that names the file, the fault and the next step.
         """
         path = Path(entry.mesh)
         mesh = read_mesh(path)
@@ -96,22 +99,21 @@ class ObjectMesh:
 
     @cached_property
     def centre_of_mass(self) -> np.ndarray:
-        """Centre of mass (3,) at uniform density; of the surface where it is not closed."""
+        """Centre of mass (3,) at uniform density, or of the surface if it is not closed."""
         a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
         centroids = (a + b + c) / 3
         if not self.watertight:
             areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
             return (areas[:, None] * centroids).sum(0) / areas.sum()
-        middle = self.vertices.mean(0)  # tetrahedra from a near point keep the sum well scaled
+        middle = self.vertices.mean(0)  # tetrahedra from a near point limit rounding errors
         volumes = np.einsum("ij,ij->i", a - middle, np.cross(b - middle, c - middle))
         return (volumes[:, None] * (0.75 * centroids + 0.25 * middle)).sum(0) / volumes.sum()
 
     def simplified(self, max_faces: int, tolerance_m: float = SIMPLIFIED_TOLERANCE_M) -> ObjectMesh:
-        """The same object with about ``max_faces`` faces, for rendering and searching.
+        """Return the object with about ``max_faces`` faces, for rendering and search.
 
-        Contact vertices are left out (the vertices are others). Returns the mesh itself where it
-        is small enough, and as many faces as it takes to keep every vertex within
-        ``tolerance_m`` of the simplified surface.
+        Every vertex stays within ``tolerance_m`` of the simplified surface, with more faces if
+        necessary. Contact vertices are left out. Returns the mesh itself if it is small enough.
         """
         from intercap_core.geometry.rigid.distance import DistanceField, o3d
 
@@ -154,19 +156,24 @@ class ObjectMesh:
 
 @dataclass(frozen=True, eq=False)
 class Paint:
-    """Evenly spread points of a coloured surface: ``points`` and outward unit ``normals`` (N, 3) in
-    the object's frame, metres; ``colours`` (N, 3) uint8, sRGB."""
+    """Points spread evenly over a coloured surface."""
 
     points: np.ndarray
+    """(N, 3) metres, object frame."""
     normals: np.ndarray
+    """(N, 3) outward unit normals."""
     colours: np.ndarray
+    """(N, 3) uint8, sRGB."""
 
     @classmethod
     def load(cls, path: Path, outward: ObjectMesh) -> Paint | None:
-        """The colours of a mesh file; None where it has none or only one.
+        """Return the colours of a mesh file, or None if it has none or only one.
 
-        ``outward`` is the object that was loaded from it and knows which side of a face is out. A
-        texture that cannot be read counts as none.
+        A texture that cannot be read counts as none.
+
+        Args:
+            path: mesh file.
+            outward: the object loaded from it, whose faces are wound outward.
         """
         from intercap_core.geometry.rigid.distance import DistanceField
 
@@ -223,7 +230,7 @@ def _check_size(path: Path, mesh: trimesh.Trimesh) -> None:
         )
     if not HANDLED_MIN_M <= extent <= HANDLED_MAX_M:
         log.warning(
-            "%s: is %.3g m long; hardly anybody handles what is not %g to %g m, so check its unit",
+            "%s: is %.3g m long, people handle objects of %g to %g m; check its unit",
             path, extent, HANDLED_MIN_M, HANDLED_MAX_M,
         )  # fmt: skip
 
@@ -241,9 +248,9 @@ def _check_volume(path: Path, mesh: trimesh.Trimesh) -> None:
 def _without_loose_vertices(
     path: Path, mesh: trimesh.Trimesh
 ) -> tuple[trimesh.Trimesh, np.ndarray]:
-    """Return the mesh of the vertices that faces use, and each file vertex's place (V_file,).
+    """Return the mesh without vertices that no face uses, which would count in its size.
 
-    -1 = left out: such vertices are no surface, and would count in its size.
+    Also returns the new index (V_file,) of each vertex of the file, -1 = left out.
     """
     count = len(mesh.vertices)
     used = np.unique(mesh.faces)
@@ -263,7 +270,7 @@ def _without_loose_vertices(
 
 
 def _repair(path: Path, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, np.ndarray]:
-    """Return a consistent mesh and each file vertex's new id (V_file,)."""
+    """Return a consistent mesh and the new index (V_file,) of each vertex of the file."""
     new_id = np.arange(len(mesh.vertices))
     if mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0:
         return mesh, new_id
@@ -304,9 +311,9 @@ def _repair(path: Path, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, np.ndar
                 "inside; close the surface (e.g. with MeshLab's or Blender's remesher)"
             )
         log.warning(
-            "%s: not watertight, %.1f %% of its edges are open: object_track draws it from both "
-            "sides, in joint and metrics inside is what its surface winds around, so that contact "
-            "and penetration near the holes are uncertain; `intercap close-mesh` closes small ones",
+            "%s: not watertight, %.1f %% of its edges are open: object_track draws both sides of "
+            "its faces, joint and metrics decide inside by winding numbers, so contact and "
+            "penetration near the holes are uncertain; `intercap close-mesh` closes small holes",
             path, 100 * open_share,
         )  # fmt: skip
     return mesh, new_id.reshape(-1)
@@ -315,9 +322,13 @@ def _repair(path: Path, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, np.ndar
 def _contact_places(
     listed: Path | None, path: Path, vertices: np.ndarray, place: np.ndarray
 ) -> np.ndarray | None:
-    """Places (K,) of likely-contact vertices, or None where there is no list.
+    """Return indices (K,) of likely-contact vertices, or None if there is no list.
 
-    ``vertices`` (V, 3) of the file ``path``, ``place`` (V,) of each, -1 = left out.
+    Args:
+        listed: file of the list.
+        path: mesh file.
+        vertices: (V, 3) of the mesh file.
+        place: (V,) new index of each vertex, -1 = left out.
     """
     if listed is None:
         return None
@@ -326,6 +337,6 @@ def _contact_places(
     if (places < 0).all():
         raise UserError(
             f"{listed}: no face of the mesh uses any of its {len(ids)} vertices; the list belongs "
-            f"to another mesh than {path}: choose the vertices anew"
+            f"to another mesh than {path}: choose the vertices again"
         )
     return places[places >= 0]

@@ -1,6 +1,6 @@
-"""Mesh files, read within bounds: what a head states is held against what follows it.
+"""Mesh files. Counts in a file's header are compared with its content.
 
-Materials and textures are looked for beside the mesh and nowhere else, whatever path it names.
+Materials and textures are read from the folder of the mesh only, whatever path it names.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ _ERRORS = (*TEXTURE_ERRORS, ZeroDivisionError, NotImplementedError, RecursionErr
 
 
 def load_mesh(path: Path) -> Any:
-    """The triangle mesh of a file as it is, one mesh of a whole scene.
+    """Return the triangle mesh of a file; a scene becomes one mesh.
 
-    Raises UserError, naming the file, where it is no mesh or another one than its head states.
+    Raises UserError, naming the file, if it is no mesh or holds fewer faces than its header states.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -51,15 +51,15 @@ def load_mesh(path: Path) -> Any:
             mesh: Any = trimesh.load(
                 io.BytesIO(content),
                 file_type=suffix[1:],
-                resolver=_Beside(path.parent),
+                resolver=_FolderResolver(path.parent),
                 process=False,
                 force="mesh",
             )
         vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     except _ERRORS as error:
-        told = printable(str(error).partition("\n")[0][:200])
+        reason = printable(str(error).partition("\n")[0][:200])
         raise UserError(
-            f"{path}: not a readable mesh ({type(error).__name__}: {told}); export it again as "
+            f"{path}: not a readable mesh ({type(error).__name__}: {reason}); export it again as "
             ".ply or .obj"
         ) from None
     if vertices.ndim != 2 or len(vertices) == 0 or faces.ndim != 2 or len(faces) == 0:
@@ -75,7 +75,7 @@ def load_mesh(path: Path) -> Any:
 
 
 def read_mesh(path: Path) -> trimesh.Trimesh:
-    """The mesh of a file as it is; raises UserError, naming the file, where it is no mesh."""
+    """Return the mesh of a file with valid indices and finite vertices; raises UserError."""
     if not path.is_file():
         raise UserError(f"{path}: there is no such mesh; correct 'mesh' in objects.yaml")
     mesh = load_mesh(path)
@@ -97,7 +97,7 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
 
 
 def colours_of(mesh: trimesh.Trimesh) -> np.ndarray:
-    """Colours (V, 4) uint8 of the vertices, from a texture where there is one, else grey."""
+    """Return vertex colours (V, 4) uint8: stored ones, sampled from a texture, or grey."""
     visual: Any = mesh.visual
     try:
         if visual is not None and visual.kind == "texture":
@@ -110,8 +110,8 @@ def colours_of(mesh: trimesh.Trimesh) -> np.ndarray:
     return colours
 
 
-class _Beside(trimesh.resolvers.Resolver):
-    """Files beside the mesh by the last part of the name that it gives them."""
+class _FolderResolver(trimesh.resolvers.Resolver):
+    """Resolves the last part of a file's name in the folder of the mesh."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -129,12 +129,12 @@ class _Beside(trimesh.resolvers.Resolver):
     def write(self, name: str, data: Any) -> None:
         raise OSError("meshes are only read")
 
-    def namespaced(self, namespace: str) -> _Beside:
+    def namespaced(self, namespace: str) -> _FolderResolver:
         return self
 
 
 def _stated_faces(path: Path, content: bytes) -> int:
-    """How many faces a PLY's head states; raises UserError where what follows cannot hold them."""
+    """Return the number of faces in a PLY's header; raises UserError if the file is too short."""
     head, found, body = content.partition(b"end_header")
     if not content.startswith(b"ply") or not found:
         raise UserError(f"{path}: not a readable mesh (it has no head of a PLY); export it again")
@@ -164,7 +164,7 @@ def _stated_faces(path: Path, content: bytes) -> int:
 
 
 def _check_lists(path: Path, body: bytes, counts: dict[bytes, int]) -> None:
-    """Raise UserError where a face of an ASCII PLY has fewer vertices than it states."""
+    """Raise UserError if a face of an ASCII PLY has fewer vertices than it states."""
     lines = [line.split() for line in body.split(b"\n")[1:] if line.strip()]
     start = 0
     for name, count in counts.items():

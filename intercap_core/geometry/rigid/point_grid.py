@@ -1,7 +1,7 @@
-"""The nearest of many points that lie on surfaces: points in cubic cells, in rows along an axis.
+"""The nearest of many points that lie on surfaces: points in cubic cells.
 
-Cells that follow each other along a row hold points that follow each other in memory, so that the
-part of a row that a ball reaches is one loop.
+Cells that are consecutive along the last axis hold points that are consecutive in memory, so that
+the part of a row of cells that a ball reaches is one loop.
 """
 
 from __future__ import annotations
@@ -14,24 +14,27 @@ MOST_CELLS = 1 << 21  # larger cells beyond: what lies far apart is not dense
 
 
 class PointGrid:
-    """``points`` (N, 3), N > 0, metres, in single precision."""
+    """Search structure of ``points`` (N, 3), N > 0, metres, in single precision."""
 
     def __init__(self, points: np.ndarray, cell_m: float = CELL_M) -> None:
         self._cells = gridded(np.ascontiguousarray(points, np.float32), cell_m)
 
     def distance(self, queries: np.ndarray) -> np.ndarray:
-        """Distance (M,) float64 of finite queries (M, 3) to the nearest point, metres: errors up to
-        1e-6 of the coordinates' size. Fastest where queries that follow each other are
-        neighbours."""
+        """Return the distance (M,) float64 of finite queries (M, 3) to the nearest point, metres.
+
+        Errors are up to 1e-6 of the coordinates' size. Fastest if consecutive queries are close.
+        """
         asked = np.ascontiguousarray(queries, np.float32)
         return np.sqrt(_nearest(asked, *self._cells).astype(np.float64))
 
 
 @numba.njit(cache=True, nogil=True)
 def gridded(points, cell):
-    """Coordinates (3, N) of points (N, 3) float32, N > 0, cell by cell of ``cell`` metres or more;
-    where each cell's begin (cells + 1,); the first cell's corner (3,), the cells' number along each
-    axis (3,) and their size."""
+    """Sort points (N, 3) float32, N > 0, into cells of at least ``cell`` metres.
+
+    Returns coordinates (3, N) in the order of cells, the start (cells + 1,) of each cell, the
+    corner (3,) of the first cell, the number of cells along each axis (3,), and the cell size.
+    """
     count = len(points)
     low, high = points[0].astype(np.float64), points[0].astype(np.float64)
     for n in range(count):
@@ -71,8 +74,10 @@ def gridded(points, cell):
 
 @numba.njit(cache=True, nogil=True, fastmath={"nnan", "ninf", "nsz", "arcp"})
 def _nearest(queries, points, starts, low, number, size):
-    """Squared distance (M,) of finite queries (M, 3) float32 to the nearest point; the others are
-    as :func:`gridded` gives them. Each search starts from the point that was found last."""
+    """Return the squared distance (M,) of finite queries (M, 3) float32 to the nearest point.
+
+    The other arguments are results of :func:`gridded`. Each search starts at the point found last.
+    """
     xs, ys, zs = points[0], points[1], points[2]
     inverse = 1 / size
     found = np.empty(len(queries), np.float32)

@@ -22,16 +22,16 @@ from intercap_core.geometry.camera.projection_kernels import project_point
 from intercap_core.geometry.rigid.shots import Drawable, Rendering, Shot, Surface
 from intercap_core.geometry.solve.thread_pool import ThreadPool
 
-# Triangles that reach nearer than this are left out, metres: no Kinect images them (the data sheet
-# of the Azure Kinect begins at 0.25 m).
+# Triangles with a corner nearer than this are skipped, metres: the range of the Azure Kinect begins
+# at 0.25 m (data sheet).
 NEAR_M = 0.05
-# Straight edges between projected corners bend by less in any known lens, pixels.
+# Bound on the bend of an edge of the projected box in known lenses, pixels.
 BOX_MARGIN_PX = 2
-# How far a triangle's edge of L px may bend: L^2 times this over the focal length. Chords between
-# any two pixels of Azure Kinects' colour and depth images need at most 0.135.
+# An edge of L px bends by at most L^2 times this over the focal length. Chords between any two
+# pixels of Azure Kinects' colour and depth images need at most 0.135.
 BEND = 0.15
 SLACK_PX = 0.1  # rounding of the ray table and of small windows
-LARGE_PX = 6.0  # of a triangle from which its edges bound each row
+LARGE_PX = 6.0  # extent of a triangle from which its edges bound each row
 NO_FACE = -1
 
 
@@ -47,7 +47,7 @@ class Renderer:
     def draw(
         self, surface: Surface, shots: Sequence[Shot], *, margin_px: int = 0
     ) -> list[Rendering]:
-        """The smallest window that holds the mesh, widened by ``margin_px``, of every shot."""
+        """Return each shot's smallest window that holds the mesh, widened by ``margin_px``."""
         vertices = np.ascontiguousarray(surface.vertices, np.float64)
         faces = np.ascontiguousarray(surface.faces, np.int32)
 
@@ -63,7 +63,7 @@ class Renderer:
         return self.pool.map(draw_shot, shots)
 
     def visible(self, surface: Surface, shots: Sequence[Shot]) -> np.ndarray:
-        """Whether each shot (N) sees each vertex: (N, V) bool.
+        """Return whether each shot (N) sees each vertex: (N, V) bool.
 
         A vertex is visible if it is in the image, faces the camera and is not hidden by the mesh.
         """
@@ -92,7 +92,7 @@ def open_renderer(
 
 @lru_cache(maxsize=1)
 def default_renderer() -> Renderer:
-    """The CPU, with as many threads as the job may use."""
+    """Return the renderer with as many threads as the job may use."""
     return Renderer(_threads_of_job())
 
 
@@ -120,8 +120,8 @@ def render_scene(
 ) -> Rendering:
     """Draw meshes that occlude each other, in the smallest window that holds them all.
 
-    The window is widened by ``margin_px`` and clipped to the image; it is empty (0, 0) where
-    nothing is in view. Rays outside the lens's calibrated radius hit nothing.
+    The window is widened by ``margin_px`` and clipped to the image; it is empty (0, 0) if nothing
+    is in view. Rays outside the lens's calibrated radius hit nothing.
     """
     parameters, rays = intrinsics.parameters, intrinsics.rays
     box = np.array([np.inf, np.inf, -np.inf, -np.inf])
@@ -150,9 +150,9 @@ def render_scene(
 
 @numba.njit(cache=True, nogil=True)
 def _place(vertices, pose, parameters, box):
-    """Corners (V, 3) in the camera's frame and their pixels (V, 2); ``pose`` (4, 4).
+    """Return corners (V, 3) in the camera's frame and their pixels (V, 2); ``pose`` (4, 4).
 
-    Widens ``box`` (4,) = left, top, right, bottom by the points that are not too near.
+    Extends ``box`` (4,) = left, top, right, bottom by the points beyond ``NEAR_M``.
     """
     count = vertices.shape[0]
     corners, pixels = np.empty((count, 3)), np.empty((count, 2))
@@ -172,7 +172,7 @@ def _place(vertices, pose, parameters, box):
 
 @numba.njit(cache=True, nogil=True)
 def _window_of(box, margin_px, width, height):
-    """The box widened by a margin and clipped to the image: x0, y0, x1, y1; zeros where empty."""
+    """Return the box, widened and clipped to the image: x0, y0, x1, y1; zeros if it is empty."""
     margin = margin_px + BOX_MARGIN_PX
     x0 = max(np.floor(min(box[0], 1e6)) - margin, 0.0)
     y0 = max(np.floor(min(box[1], 1e6)) - margin, 0.0)
@@ -185,11 +185,17 @@ def _window_of(box, margin_px, width, height):
 
 @numba.njit(cache=True, nogil=True)
 def _draw(corners, pixels, x0, y0, faces, rays, focal, cull_back, number, depth, face, body):
-    """Z-buffer one mesh into a window: corners (V, 3) camera frame, pixels (V, 2) of the image.
+    """Draw one mesh into the z-buffer of a window.
 
-    ``rays`` (H, W, 2) of the whole image, ``focal`` its focal length in pixels; ``depth`` (h, w),
-    infinite where nothing was drawn yet, ``face`` and ``body`` (h, w) are overwritten where this
-    mesh, called ``number``, is nearer.
+    Args:
+        corners: (V, 3) camera frame.
+        pixels: (V, 2) of the image.
+        x0, y0: first pixel of the window.
+        rays: (H, W, 2) of the whole image.
+        focal: focal length, pixels.
+        number: index of the mesh, written to ``body``.
+        depth: (h, w), infinite where nothing is drawn; updated where this mesh is nearer.
+        face, body: (h, w), updated likewise.
     """
     height, width = depth.shape
     bounds = np.empty((3, 3))
@@ -251,9 +257,11 @@ def _draw(corners, pixels, x0, y0, faces, rays, focal, cull_back, number, depth,
 
 @numba.njit(cache=True, nogil=True)
 def _bound(edge, p, q, opposite, x0, y0, slack, bounds):
-    """Which columns of a row may lie on the inner side of the projected edge p q, or within
-    ``slack`` px outside: from (1) or up to (-1) ``bounds[edge, 0]`` * row + ``bounds[edge, 1]``,
-    the sign in ``bounds[edge, 2]``; 0 for all columns. Pixels (2,) of the image."""
+    """Bound the columns of a row inside the projected edge p q, or within ``slack`` px outside.
+
+    Writes ``bounds[edge]``: column = [0] * row + [1] is the first (1) or last (-1) column by the
+    sign in [2]; 0 = all columns. Points are pixels (2,) of the image.
+    """
     du, dv = q[0] - p[0], q[1] - p[1]
     inner = du * (opposite[1] - p[1]) - dv * (opposite[0] - p[0])
     side = 1.0 if inner > 0.0 else -1.0
@@ -269,7 +277,7 @@ def _bound(edge, p, q, opposite, x0, y0, slack, bounds):
 
 @numba.njit(cache=True, nogil=True)
 def _blank(height, width):
-    """Buffers of a window (h, w) with nothing drawn: depth, face, body."""
+    """Return empty buffers of a window (h, w): depth, face, body."""
     depth = np.full((height, width), np.float32(np.inf), np.float32)
     face = np.full((height, width), np.int32(NO_FACE), np.int32)
     body = np.full((height, width), np.int16(NO_FACE), np.int16)
@@ -278,7 +286,7 @@ def _blank(height, width):
 
 @numba.njit(cache=True, nogil=True)
 def _finish(depth, face):
-    """Depth 0 where nothing was hit."""
+    """Set the depth to 0 where nothing was hit."""
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
             if face[v, u] < 0:
@@ -287,7 +295,7 @@ def _finish(depth, face):
 
 @numba.njit(cache=True, nogil=True)
 def _draw_alone(vertices, faces, cull_back, pose, parameters, rays, margin_px):
-    """One mesh in the smallest window that holds it: x0, y0, depth, face, body."""
+    """Draw one mesh in the smallest window that holds it; returns x0, y0, depth, face, body."""
     box = np.array([np.inf, np.inf, -np.inf, -np.inf])
     corners, pixels = _place(vertices, pose, parameters, box)
     x0, y0, x1, y1 = _window_of(box, margin_px, rays.shape[1], rays.shape[0])

@@ -16,18 +16,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """A window of the image; pixel [0, 0] is image pixel (x0, y0).
-
-    ``depth`` (h, w) float32, z in the camera's frame, metres, 0 where nothing is hit; ``face``
-    (h, w) int32, -1 where nothing is hit; ``body`` (h, w) int16, which of the meshes drawn, -1
-    where none.
-    """
+    """A window of the image."""
 
     x0: int
+    """Image column of the window's first pixel."""
     y0: int
+    """Image row of the window's first pixel."""
     depth: np.ndarray
+    """(h, w) float32, z in the camera's frame, metres, 0 where nothing is hit."""
     face: np.ndarray
+    """(h, w) int32 index of the face, -1 where nothing is hit."""
     body: np.ndarray
+    """(h, w) int16 index of the mesh, -1 where nothing is hit."""
 
     @property
     def mask(self) -> np.ndarray:
@@ -46,7 +46,7 @@ class Rendering:
         return slice(self.y0, self.y0 + height), slice(self.x0, self.x0 + width)
 
     def meets(self, x0: int, y0: int, height: int, width: int) -> bool:
-        """Whether another window of the image shares a pixel with this one."""
+        """Return whether another window of the image shares a pixel with this one."""
         own_height, own_width = self.face.shape
         return (
             max(x0, self.x0) < min(x0 + width, self.x0 + own_width)
@@ -54,7 +54,7 @@ class Rendering:
         )  # fmt: skip
 
     def full_mask(self, intrinsics: Intrinsics, body: int | None = None) -> np.ndarray:
-        """The mask (H, W) in the whole image, of one mesh or of all."""
+        """Return the mask (H, W) in the whole image, of one mesh or of all."""
         image = np.zeros((intrinsics.height, intrinsics.width), bool)
         image[self.window] = self.mask if body is None else self.body == body
         return image
@@ -62,34 +62,40 @@ class Rendering:
 
 @dataclass(frozen=True, eq=False)
 class Drawable:
-    """A mesh and where it is: ``vertices`` (V, 3), ``faces`` (F, 3), ``camera_from_mesh`` (4, 4).
-
-    ``cull_back`` leaves out faces that look away: right, and twice as fast, for closed meshes.
-    """
+    """A mesh with its pose."""
 
     vertices: np.ndarray
+    """(V, 3) metres."""
     faces: np.ndarray
+    """(F, 3) indices."""
     camera_from_mesh: np.ndarray
+    """(4, 4)."""
     cull_back: bool = True
+    """Skip faces that face away: correct, and twice as fast, for closed meshes."""
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A mesh that is drawn many times: ``vertices`` (V, 3), ``faces`` (F, 3); see Drawable."""
+    """A mesh that is drawn many times."""
 
     vertices: np.ndarray
+    """(V, 3) metres."""
     faces: np.ndarray
+    """(F, 3) indices."""
     cull_back: bool = True
+    """Skip faces that face away, as in :class:`Drawable`."""
 
     @classmethod
     def of(cls, mesh: ObjectMesh) -> Surface:
-        """An object's mesh; back faces are left out where it is closed."""
+        """Return the surface of an object; back faces are skipped if it is closed."""
         return cls(mesh.vertices, mesh.faces, mesh.watertight)
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One image of a mesh: through which lens, and ``camera_from_mesh`` (4, 4)."""
+    """One view of a mesh."""
 
     lens: Intrinsics
+    """Lens of the image."""
     camera_from_mesh: np.ndarray
+    """(4, 4)."""

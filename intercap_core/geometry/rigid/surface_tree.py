@@ -1,13 +1,12 @@
-"""Distances to a mesh that moves or bends, of many points and up to a reach.
+"""Distances of many points to a mesh that moves or bends, up to a reach.
 
 Embree's tree (:mod:`intercap_core.geometry.rigid.distance`) is built again for every shape and
-searches without a limit. This tree keeps the order of its faces and stops at the reach, at a third
-of the time where most points are out of it.
+searches without a limit. This tree keeps the order of its faces and stops at the reach, in a third
+of the time if most points are beyond it.
 
-The tree is a perfect binary tree of boxes. Node 0 is the root, 2 i + 1 and 2 i + 2 are the children
-of node i, and the last level's nodes, the leaves, share the faces evenly, in an order that keeps
-neighbours together. So the tree has no pointers, and boxes of a mesh that moves are made anew in
-one pass over it.
+It is a perfect binary tree of boxes. Node 0 is the root, nodes 2 i + 1 and 2 i + 2 are the children
+of node i, and the leaves of the last level share the faces evenly, in an order that keeps
+neighbours together. So the tree needs no pointers, and one pass updates the boxes of a moving mesh.
 """
 
 from __future__ import annotations
@@ -20,10 +19,10 @@ _ROUNDING = 1e-6  # metres, of distances in single precision
 
 
 class SurfaceTree:
-    """The order of a mesh's faces, found once on one shape of it.
+    """The order of a mesh's faces, determined once on one shape of the mesh.
 
-    ``vertices`` (V, 3) and ``faces`` (F, 3), F > 0; other shapes may differ at will, searches in
-    them are merely slower.
+    ``vertices`` (V, 3) and ``faces`` (F, 3), F > 0. Searches in very different shapes are correct
+    but slower.
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
@@ -47,22 +46,21 @@ class ShapedSurface:
         self._triangles, self._boxes, self._levels = triangles, boxes, levels
 
     def distance(self, points: np.ndarray, reach: float) -> np.ndarray:
-        """Distance (N,) of points (N, 3) to the surface, metres, never negative, at most ``reach``.
+        """Return the distance (N,) of points (N, 3) to the surface, metres, 0 to ``reach``.
 
-        Computed in float32: errors up to 1e-6 of the coordinates' size. Fastest where points that
-        follow each other are neighbours.
+        Computed in float32 with errors up to 1e-6 of the coordinates' size. Fastest if consecutive
+        points are close.
         """
         queries, most = np.ascontiguousarray(points, np.float32), np.float32(reach * reach)
         found = _nearest(queries, self._triangles, self._boxes, self._levels, most)
         return np.where(found < most, np.sqrt(found.astype(np.float64)), reach)
 
     def signed_distance(self, points: np.ndarray, reach: float, deepest: float) -> np.ndarray:
-        """Distance (N,) of points (N, 3) to the surface of a mesh that is closed, metres, negative
-        inside: at most ``reach``, at least -``deepest``.
+        """Return the signed distance (N,) of points (N, 3) to a closed mesh, metres.
 
-        Inside is where a ray crosses the surface an odd number of times, as in
-        :mod:`intercap_core.geometry.rigid.distance`: what is inside two parts of a mesh that cuts
-        itself counts as outside. Points that are no numbers are at ``reach``.
+        Negative inside, at most ``reach``, at least -``deepest``. Inside is where a ray crosses the
+        surface an odd number of times, so the overlap of two parts of a self-intersecting mesh
+        counts as outside. Points that are not finite are at ``reach``.
         """
         queries = np.ascontiguousarray(points, np.float32)
         return _signed(
@@ -70,8 +68,10 @@ class ShapedSurface:
         )
 
     def blocks(self, starts: np.ndarray, ends: np.ndarray, blocked: np.ndarray) -> None:
-        """Set ``blocked`` (N,) bool where the way from ``starts`` to ``ends`` (N, 3) meets the
-        surface; what is set already is not asked."""
+        """Set ``blocked`` (N,) bool where segments ``starts`` to ``ends`` (N, 3) hit the surface.
+
+        Entries that are already set are skipped.
+        """
         _block(
             np.ascontiguousarray(starts, np.float64),
             np.ascontiguousarray(ends, np.float64),
@@ -90,8 +90,10 @@ def _closed(faces: np.ndarray) -> bool:
 
 @numba.njit(cache=True, nogil=True)
 def _ordered(centroids, levels):
-    """Faces (F,) int32 in the order of the leaves of a tree of ``levels`` splits: each node's are
-    halved at the median of their centroids (F, 3) along the longest side."""
+    """Return faces (F,) int32 in the order of the leaves of a tree of ``levels`` splits.
+
+    Each split halves a node's faces at the median of their centroids (F, 3) along the longest side.
+    """
     count = len(centroids)
     order = np.arange(count).astype(np.int32)
     for level in range(levels):
@@ -114,8 +116,8 @@ def _ordered(centroids, levels):
 
 @numba.njit(cache=True, nogil=True)
 def _fitted(vertices, corners, levels):
-    """Corners (F, 3, 3) of the faces ``corners`` (F, 3) in the leaves' order, and the boxes (N, 6)
-    of all nodes: least and largest coordinates."""
+    """Return corners (F, 3, 3) of the faces ``corners`` (F, 3) in the order of the leaves, and the
+    boxes (N, 6) of all nodes: least and largest coordinates."""
     count, leaves = len(corners), 1 << levels
     triangles = np.empty((count, 3, 3), np.float32)
     boxes = np.empty((2 * leaves - 1, 6), np.float32)
@@ -137,8 +139,10 @@ def _fitted(vertices, corners, levels):
 
 @numba.njit(cache=True, nogil=True)
 def _nearest(points, triangles, boxes, levels, reach_sq):
-    """Squared distance (M,) of points (M, 3) to the mesh, at most ``reach_sq``. Points that follow
-    each other had better be neighbours: each search starts from the face that was found last."""
+    """Return the squared distance (M,) of points (M, 3) to the mesh, at most ``reach_sq``.
+
+    Each search starts at the face found last, so consecutive points should be close.
+    """
     found = np.empty(len(points), np.float32)
     stack, reach = np.empty(levels + 2, np.int32), np.empty(levels + 2, np.float32)
     last = 0
@@ -152,17 +156,17 @@ def _nearest(points, triangles, boxes, levels, reach_sq):
 
 @numba.njit(cache=True, nogil=True)
 def _signed(points, triangles, boxes, levels, reach, deepest):
-    """Signed distance (M,), metres, of points (M, 3) float32 to a closed mesh, negative inside: at
-    most ``reach``, at least -``deepest``. Points that are no numbers are as far as can be.
+    """Return the signed distance (M,), metres, of points (M, 3) float32 to a closed mesh.
 
-    Inside is where a ray crosses the mesh an odd number of times. A ball that does not reach the
-    mesh is on one side of it: a ray is cast only of a point whose ball does not hold the last point
-    of which that is known, and that is not in this one's ball.
+    Negative inside, at most ``reach``, at least -``deepest``; points that are not finite are at
+    ``reach``. Inside is where a ray crosses the mesh an odd number of times. A ball that does not
+    reach the mesh lies on one side of it. A ray is cast only if neither this point's ball contains
+    the last decided point, nor that point's ball contains this one.
     """
     found = np.empty(len(points), np.float64)
     stack, ahead = np.empty(levels + 2, np.int32), np.empty(levels + 2, np.float32)
     last, within = 0, False
-    # of the last known point, and the radius of its ball
+    # the last decided point, and the radius of its ball
     cx, cy, cz, clear = np.inf, np.inf, np.inf, -np.inf
     reach_sq, deepest_sq = np.float32(reach * reach), np.float32(deepest * deepest)
     for m in range(len(points)):
@@ -190,10 +194,10 @@ def _signed(points, triangles, boxes, levels, reach, deepest):
 
 @numba.njit(cache=True, nogil=True)
 def _block(starts, ends, triangles, boxes, levels, blocked):
-    """Set ``blocked`` (M,) bool where the way from ``starts`` to ``ends`` (M, 3) float64 meets the
-    mesh, from either side; what is set already is passed over.
+    """Set ``blocked`` (M,) bool where segments ``starts`` to ``ends`` (M, 3) float64 hit the mesh.
 
-    Ways that follow each other had better be neighbours: the face that was met last comes first.
+    Hits count from either side, and entries that are set are skipped. Consecutive segments should
+    be close: the face that was hit last is tried first.
     """
     leaves, count = 1 << levels, len(triangles)
     stack = np.empty(levels + 2, np.int32)
@@ -232,14 +236,14 @@ def _block(starts, ends, triangles, boxes, levels, blocked):
 
 @numba.njit(inline="always")
 def _inverse(value):
-    """1 over a component of a way, finite where that is 0."""
+    """Return 1 over a component of a segment, finite if that is 0."""
     return 1.0 / value if abs(value) > 1e-12 else 1e12
 
 
 @numba.njit(cache=True, nogil=True)
 def _meets(x, y, z, u, v, w, triangles, at):
-    """Whether the way from a point (x, y, z) by (u, v, w) meets one of triangles (F, 3, 3) (Moeller
-    and Trumbore 1997)."""
+    """Return whether the segment from (x, y, z) by (u, v, w) hits one of triangles (F, 3, 3)
+    (Moeller and Trumbore 1997)."""
     ax, ay, az = triangles[at, 0, 0], triangles[at, 0, 1], triangles[at, 0, 2]
     bx, by, bz = triangles[at, 1, 0] - ax, triangles[at, 1, 1] - ay, triangles[at, 1, 2] - az
     cx, cy, cz = triangles[at, 2, 0] - ax, triangles[at, 2, 1] - ay, triangles[at, 2, 2] - az
@@ -261,8 +265,10 @@ def _meets(x, y, z, u, v, w, triangles, at):
 
 @numba.njit(cache=True, nogil=True)
 def _search(x, y, z, triangles, boxes, levels, most, last, stack, reach):
-    """Squared distance of a point to the mesh, at most ``most``, and the face where it is found,
-    sought from face ``last`` on."""
+    """Return the squared distance of a point to the mesh, at most ``most``, and its nearest face.
+
+    The search starts at face ``last``.
+    """
     leaves, count = 1 << levels, len(triangles)
     best = min(_to_triangle(x, y, z, triangles, last), most)
     size = 1
@@ -296,7 +302,7 @@ def _search(x, y, z, triangles, boxes, levels, most, last, stack, reach):
 
 @numba.njit(cache=True, nogil=True)
 def _odd(x, y, z, triangles, boxes, levels, stack):
-    """Whether a ray along the third axis crosses the mesh an odd number of times."""
+    """Return whether a ray along the third axis crosses the mesh an odd number of times."""
     leaves, count = 1 << levels, len(triangles)
     odd = False
     size, stack[0] = 1, 0
@@ -318,16 +324,16 @@ def _odd(x, y, z, triangles, boxes, levels, stack):
 
 @numba.njit(cache=True, nogil=True)
 def _crosses(x, y, z, corners):
-    """Whether a ray along the third axis crosses a triangle (3, 3).
+    """Return whether a ray along the third axis crosses a triangle (3, 3).
 
-    In double precision, and as if the point were off by an infinitely small (e, e^2) where it is
-    on an edge's line: faces that share an edge decide alike, so that a ray through an edge or a
-    corner of a closed mesh crosses it as often as its neighbours do (Edelsbrunner and Mucke 1990).
+    Computed in double precision. A point on the line of an edge is treated as moved by an
+    infinitesimal (e, e^2), so that the faces on both sides of an edge decide alike (simulation of
+    simplicity, Edelsbrunner and Mucke 1990).
     """
     total, height, sign = 0.0, 0.0, 0
     for k in range(3):
         a, b, c = corners[k], corners[(k + 1) % 3], corners[(k + 2) % 3]
-        # an edge is looked at from the same end by both of its faces
+        # both faces of an edge use the same direction of it
         turned = a[0] > b[0] or (a[0] == b[0] and a[1] > b[1])
         if turned:
             a, b = b, a

@@ -13,7 +13,7 @@ _STEP_U, _STEP_V = 0.7548776662466927, 0.5698402909980532
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Area-weighted outward unit normals (V, 3)."""
+    """Return area-weighted outward unit normals (V, 3)."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     face_normals = np.cross(b - a, c - a)
     normals = np.stack(
@@ -28,10 +28,12 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceSamples:
-    """Points spread evenly over a mesh's area: ``faces`` (N,), ``barycentric`` (N, 3)."""
+    """Points spread evenly over a mesh's area."""
 
     faces: np.ndarray
+    """(N,) indices."""
     barycentric: np.ndarray
+    """(N, 3) weights of the face's corners."""
 
     def of(self, values: np.ndarray, triangles: np.ndarray) -> np.ndarray:
         """Interpolate values (V, ...) at the vertices of ``triangles`` (F, 3): (N, ...)."""
@@ -44,7 +46,7 @@ class SurfaceSamples:
 
 
 def sample_surface(vertices: np.ndarray, triangles: np.ndarray, count: int) -> SurfaceSamples:
-    """Spread ``count`` points over the area of (V, 3), (F, 3); the same mesh gives the same."""
+    """Spread ``count`` points over the area of (V, 3), (F, 3), deterministically."""
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     reached = np.cumsum(area)

@@ -1,9 +1,9 @@
 """Symmetry groups of objects, as BOP's ``models_info`` states them.
 
-An element is a motion S of the object's frame under which the object looks the same: a pose
-``master_from_object`` and ``master_from_object @ S`` cannot be told apart. Discrete elements are
-4x4 transforms, continuous ones all rotations about one axis through ``offset``; the group holds
-every product of the two. ``sphere`` stands for all rotations about the origin.
+An element is a motion S of the object's frame that does not change the object's appearance: poses
+``master_from_object`` and ``master_from_object @ S`` are indistinguishable. Discrete elements are
+4x4 transforms. Continuous elements are all rotations about one axis through ``offset``. The group
+holds every product of the two. ``sphere`` stands for all rotations about the origin.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from intercap_core.config import Symmetry
 from intercap_core.geometry.camera.transforms import rigid, rotation_exp
 
 MAX_DISCRETE = 128  # elements of a symmetry group; the icosahedron's rotation group has 60
-SAME_TRANSFORM = 1e-3  # transforms nearer than this, per entry, are one: tables carry 4 digits
+SAME_TRANSFORM = 1e-3  # per entry; transforms that differ by less are equal: tables have 4 digits
 
 
 @dataclass(frozen=True)
 class SymmetryGroup:
-    """The group of one object.
-
-    ``discrete`` (n, 4, 4) is closed under products and starts with the identity; ``axis`` (3,) is
-    a unit vector or None; ``offset`` (3,) a point on the axis, metres; all in the object's frame.
-    """
+    """The symmetry group of one object, in the object's frame."""
 
     discrete: np.ndarray
+    """(n, 4, 4), closed under products, the identity first."""
     axis: np.ndarray | None = None
+    """(3,) unit vector of the continuous axis."""
     offset: np.ndarray | None = None
+    """(3,) point on the axis, metres."""
     sphere: bool = False
+    """Whether all rotations about the origin are symmetries."""
 
     @classmethod
     def none(cls) -> SymmetryGroup:
@@ -54,7 +54,7 @@ class SymmetryGroup:
                 or not np.allclose(transform[3], (0, 0, 0, 1))
             ):
                 raise ValueError(f"discrete[{row}] is not a rotation and translation")
-        for transform in given:  # tables round: products must stay rotations
+        for transform in given:  # products of rounded tables must stay rotations
             left, _, right = np.linalg.svd(transform[:3, :3])
             transform[:3, :3] = left @ right
         if len(symmetry.continuous) > 1:
@@ -95,8 +95,7 @@ class SymmetryGroup:
         rotation = self.nearest_equivalent(pose[:3, :3], reference[:3, :3])
         if self.sphere:
             return rigid(rotation, pose[:3, 3])
-        # the element S = pose^-1 equivalent has the rotation found; its translation follows from
-        # which discrete element it contains
+        # The translation of the element S = pose^-1 equivalent follows from its discrete element.
         element = pose[:3, :3].T @ rotation
         for discrete in self.discrete:
             rest = discrete[:3, :3].T @ element
@@ -114,10 +113,10 @@ class SymmetryGroup:
         return np.degrees(2 * np.arcsin(np.clip(chord / (2 * np.sqrt(2)), 0, 1)))
 
     def elements(self, steps: int = 72) -> np.ndarray:
-        """Sample the group as transforms (n, 4, 4), ``steps`` angles for a continuous axis.
+        """Return samples of the group (n, 4, 4), ``steps`` angles of a continuous axis.
 
-        For errors of vertices over the group (MSSD, MSPD). A sphere gives the identity alone: its
-        vertices' error is that of its centre.
+        For errors of vertices over the group (MSSD, MSPD). A sphere returns the identity, because
+        the error of its vertices is that of its centre.
         """
         if self.axis is None or self.sphere:
             return self.discrete.copy()
@@ -128,12 +127,12 @@ class SymmetryGroup:
         return (self.discrete[:, None] @ np.array(turns)[None]).reshape(-1, 4, 4)
 
     def _about_axis(self, rotation: np.ndarray) -> np.ndarray:
-        """``rotation`` (3, 3) as a motion that keeps the axis in place."""
+        """Return the motion (4, 4) by ``rotation`` (3, 3) that keeps the axis in place."""
         assert self.offset is not None
         return rigid(rotation, self.offset - rotation @ self.offset)
 
     def _aligned(self, rotation: np.ndarray, reference: np.ndarray) -> np.ndarray:
-        """One candidate (..., n, 3, 3) a discrete element, turned about the axis at its best.
+        """Return one candidate (..., n, 3, 3) per discrete element, rotated best about the axis.
 
         The angle maximises trace(M Rot(axis, angle)) with M = reference^T rotation D, which is
         aMa + cos (trM - aMa) + sin tr(M [a]x).
@@ -149,7 +148,7 @@ class SymmetryGroup:
 
 
 def _closure(generators: np.ndarray) -> np.ndarray:
-    """All products of the generators (n, 4, 4), the identity first."""
+    """Return all products of the generators (n, 4, 4), the identity first."""
     elements = [np.eye(4)]
     queue = list(generators)
     while queue:

@@ -1,6 +1,6 @@
-"""Exact solves of normal equations that couple neighbouring frames, in blocks.
+"""Exact solution of normal equations that couple neighbouring frames, in blocks.
 
-A system of T frames with n parameters each, where frame t meets frames up to t + w (w = 0 none,
+A system of T frames with n parameters each couples frame t with frames up to t + w (w = 0 none,
 1 velocity, 2 acceleration): a block-banded matrix (T n x T n), symmetric and positive definite.
 Block Cholesky over time: O(T (w + 1)^2 n^3) work and O(T (w + 1) n^2) memory.
 """
@@ -15,13 +15,11 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class BandedSystem:
-    """Blocks of a symmetric matrix.
-
-    bands (w+1, T, n, n): ``bands[k, t]`` is block (t + k, t), rows of frame t + k, columns of
-    frame t; ``bands[0]`` is symmetric, and the last k entries of ``bands[k]`` are not read.
-    """
+    """Blocks of a symmetric matrix."""
 
     bands: Tensor
+    """(w+1, T, n, n): ``bands[k, t]`` is block (t + k, t), rows of frame t + k, columns of frame t.
+    ``bands[0]`` is symmetric, and the last k entries of ``bands[k]`` are not read."""
 
     def __post_init__(self) -> None:
         w1, t, n, n2 = self.bands.shape
@@ -29,8 +27,10 @@ class BandedSystem:
             raise ValueError(f"bands have shape {tuple(self.bands.shape)}, expected (w+1, T, n, n)")
 
     def factorise(self, *, in_place: bool = False) -> BandedFactor | None:
-        """The Cholesky factor, or None where the matrix is not positive definite. ``in_place``: in
-        the memory of ``bands``, which then no longer hold the matrix."""
+        """Return the Cholesky factor, or None if the matrix is not positive definite.
+
+        ``in_place`` overwrites ``bands`` by the factor.
+        """
         lower = self.bands if in_place else self.bands.clone()
         w1, count = lower.shape[:2]
         if w1 == 1:
@@ -56,12 +56,13 @@ class BandedSystem:
 
 @dataclass(frozen=True)
 class BandedFactor:
-    """lower (w+1, T, n, n): the factor's blocks, laid out as `BandedSystem.bands`."""
+    """Cholesky factor of a :class:`BandedSystem`."""
 
     lower: Tensor
+    """(w+1, T, n, n), laid out as `BandedSystem.bands`."""
 
     def solve(self, right: Tensor) -> Tensor:
-        """x (T, n) of the system for right (T, n)."""
+        """Return the solution x (T, n) for the right-hand side (T, n)."""
         lower = self.lower
         w1, count = lower.shape[:2]
         x = right[..., None].clone()

@@ -29,18 +29,20 @@ _SHARED_SLACK = 100  # shared parameters count as settled within this many step 
 class NormalEquations(NamedTuple):
     """One linearisation of b frames with n own and m shared parameters.
 
-    cost (b,): f_b. gradient (b, n+m) and hessian (b, n+m, n+m): J^T W r and J^T W J of that frame
-    alone, its own columns first, the shared ones last. A prior on shared parameters is spread over
-    the frames (1/B of it in each).
+    A frame's own columns come first, the shared ones last. A prior on shared parameters is spread
+    over the frames (1/B of it in each).
     """
 
     cost: Tensor
+    """(b,) f_b."""
     gradient: Tensor
+    """(b, n+m) J^T W r of each frame alone."""
     hessian: Tensor
+    """(b, n+m, n+m) J^T W J of each frame alone."""
 
 
 class Problem(Protocol):
-    """What a caller provides. ``index`` (b,) says which of the B frames are asked for."""
+    """Energy to minimise. ``index`` (b,) selects frames out of B."""
 
     def linearise(self, own: Tensor, shared: Tensor, index: Tensor) -> NormalEquations:
         """Normal equations at own (b, n), shared (m,)."""
@@ -53,18 +55,21 @@ class Problem(Protocol):
 
 @dataclass
 class Solution:
-    """own (B, n), shared (m,), cost (B,); converged (B,) by the step's or the cost's size.
-
-    trials: steps tried. normal: the linearisation at the solution, where it was asked for (the
-    Hessian's inverse is the covariance of unit-variance residuals).
-    """
+    """Result of :func:`minimise`."""
 
     own: Tensor
+    """(B, n) parameters of each frame."""
     shared: Tensor
+    """(m,) parameters shared by all frames."""
     cost: Tensor
+    """(B,) f_b at the solution."""
     converged: Tensor
+    """(B,) bool, by the size of the step or of the decrease in cost."""
     trials: int
+    """Number of steps tried."""
     normal: NormalEquations | None = None
+    """Linearisation at the solution, if requested. The Hessian's inverse is the covariance of
+    unit-variance residuals."""
 
 
 def minimise(
@@ -139,7 +144,7 @@ def minimise(
 def _refresh(
     problem: Problem, normal: NormalEquations, own: Tensor, y: Tensor, index: Tensor
 ) -> NormalEquations:
-    """Linearise the frames of ``index`` where they stand now."""
+    """Update the linearisation of the frames in ``index``."""
     if len(index) == len(own):
         return problem.linearise(own, y, index)
     if len(index):
@@ -151,7 +156,7 @@ def _refresh(
 def _keep_the_better(
     problem: Problem, own: Tensor, trial: Tensor, trial_y: Tensor, new: Tensor, good: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Frames whose step failed may stay where they were, under the new shared parameters."""
+    """Let frames whose step failed keep their parameters under the new shared parameters."""
     bad = torch.nonzero(~good)[:, 0]
     if len(bad):
         stayed = problem.cost(own[bad], trial_y, bad)
@@ -166,7 +171,7 @@ def _keep_the_better(
 def _damped_step(
     normal: NormalEquations, lam: Tensor, num_shared: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Steps (b, n) and (m,) of the damped arrow, and which frames could be factorised (b,)."""
+    """Return steps (b, n) and (m,) of the damped arrow, and which frames were factorised (b,)."""
     gradient, n = normal.gradient, normal.gradient.shape[1] - num_shared
     a = normal.hessian[:, :n, :n].double()
     if a.dtype == normal.hessian.dtype:
@@ -176,7 +181,7 @@ def _damped_step(
     factor, info = torch.linalg.cholesky_ex(a)
     right = torch.cat([gradient[:, :n, None], normal.hessian[:, :n, n:]], 2).double()
     solved = info == 0
-    if not bool(solved.all()):  # leaves such a frame where it is; its damping grows
+    if not bool(solved.all()):  # such a frame keeps its parameters while its damping grows
         eye = torch.eye(n, dtype=a.dtype, device=a.device)
         factor = torch.where(solved[:, None, None], factor, eye)
         right = torch.where(solved[:, None, None], right, torch.zeros_like(right))

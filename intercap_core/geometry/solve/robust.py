@@ -1,9 +1,9 @@
 """Robust penalties of squared residuals, as rho(s) and its slope, the weight of Gauss-Newton.
 
-The convention of every solver here: a residual vector r with s = |r|^2 costs rho(s) / 2, whose
-gradient is w J^T r with w = d rho / d s. Replacing rho by the parabola of weight w keeps the
-gradient and leaves a positive semi-definite Hessian w J^T J (iteratively reweighted least squares).
-All rho have rho(0) = 0 and slope 1 at 0, so a scale alone says where a residual stops counting.
+Convention of all solvers: a residual vector r with s = |r|^2 costs rho(s) / 2, whose gradient is
+w J^T r with w = d rho / d s. Replacing rho by the parabola of weight w keeps the gradient and
+leaves a positive semi-definite Hessian w J^T J (iteratively reweighted least squares). All rho have
+rho(0) = 0 and slope 1 at 0, so the scale alone determines where a residual stops counting.
 """
 
 from __future__ import annotations
@@ -17,21 +17,23 @@ if TYPE_CHECKING:
 
 
 class Robust(NamedTuple):
-    """rho (...) of squared residuals, and its slope, the weight (...) in (0, 1]."""
+    """A robust penalty at squared residuals."""
 
     rho: Tensor
+    """(...) penalty."""
     weight: Tensor
+    """(...) slope of the penalty, in (0, 1]."""
 
 
-# Of a Gaussian, sigma over the median of absolute deviations: 1 / Phi^-1(3/4) (Hampel 1974).
+# Standard deviation over median absolute deviation of a Gaussian: 1 / Phi^-1(3/4) (Hampel 1974).
 SIGMA_PER_MAD = 1.4826
 
 
 @register_jitable
 def geman_mcclure_weight(squared: Any, scale: Any) -> Any:
-    """Weight in (0, 1] of squared residuals: the slope of :func:`geman_mcclure`'s rho.
+    """Return the weight in (0, 1] of squared residuals: the slope of :func:`geman_mcclure`'s rho.
 
-    ``squared`` (...) and ``scale``^2 are in the same units; tensors, arrays and numbers alike, also
+    ``squared`` (...) and ``scale``^2 have the same units. Takes tensors, arrays and numbers, also
     inside compiled kernels.
     """
     share = scale * scale / (squared + scale * scale)
@@ -39,9 +41,9 @@ def geman_mcclure_weight(squared: Any, scale: Any) -> Any:
 
 
 def geman_mcclure(squared: Tensor, scale: float | Tensor) -> Robust:
-    """Geman and McClure 1987, the paper's rho_J: an outlier's pull fades to nothing.
+    """Return the saturating penalty of Geman and McClure 1987, the paper's rho_J.
 
-    rho = scale^2 s / (s + scale^2), which is the field's rho^2 r^2 / (r^2 + rho^2); its slope is
+    rho = scale^2 s / (s + scale^2), the paper's rho^2 r^2 / (r^2 + rho^2); its slope is
     (scale^2 / (s + scale^2))^2.
     """
     import torch

@@ -1,4 +1,4 @@
-"""A few threads for work that runs without the interpreter's lock."""
+"""Threads for work that runs without the interpreter's lock."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Result = TypeVar("Result")
 
 
 class ThreadPool:
-    """``threads`` threads, the caller's own among them; one thread starts none."""
+    """A pool of ``threads`` threads, including the caller's; one thread starts none."""
 
     def __init__(self, threads: int = 1) -> None:
         if threads < 1:
@@ -21,9 +21,9 @@ class ThreadPool:
         self._pool = ThreadPoolExecutor(threads - 1) if threads > 1 else None
 
     def map(self, function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-        """``function`` of every item, in the items' order whatever the threads do.
+        """Return ``function`` of every item, in the order of the items.
 
-        Who is free takes the next item, so that unequal items need no planning.
+        Each thread takes the next item when it is free, so unequal items need no planning.
         """
         if self._pool is None or len(items) < 2:
             return [function(item) for item in items]
@@ -38,4 +38,4 @@ class ThreadPool:
         work()
         for helper in helpers:
             helper.result()
-        return results  # type: ignore[return-value]  # every place is filled
+        return results  # type: ignore[return-value]  # all items have a result

@@ -6,19 +6,19 @@ import numpy as np
 
 from intercap_core.geometry.camera.transforms import rotation_log
 
-MAX_GAP_S = 0.25  # positions farther apart in time say little about the velocity between
-EVEN = 0.2  # steps that differ by less are taken as equal by the fourth-order term
-LIMIT = 2.0  # of the slower one-sided difference, beyond which the other one is a jump
-# Fastest thrown or kicked object, m/s and rad/s; anything faster is a jump of the track.
-MAX_SPEED_M_S, MAX_TURN_RAD_S = 8.0, 20.0
+MAX_GAP_S = 0.25  # no velocity is computed across longer gaps
+EVEN = 0.2  # relative difference of time steps up to which the fourth-order term applies
+LIMIT = 2.0  # largest velocity in units of the slower one-sided difference; more is a jump
+# Fastest thrown or kicked object; anything faster is a jump of the track.
+MAX_SPEED_M_S = 8.0
+MAX_TURN_RAD_S = 20.0
 
 
 def filled_linearly(values: np.ndarray, at: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Values (T, D) with the rows that are not ``known`` (T,) replaced by straight lines.
+    """Return values (T, D) with rows that are not ``known`` (T,) interpolated linearly.
 
-    ``at`` (T,) increasing: times or frame numbers. Known rows stay as they are; before the first
-    and after the last one their values are held. Without any known row the values are returned as
-    they are.
+    ``at`` (T,) are increasing times or frame numbers. Before the first and after the last known row
+    its values are repeated. Without a known row the values are returned unchanged.
     """
     result = values.copy()
     if known.any() and not known.all():
@@ -34,14 +34,15 @@ def limited_velocity(
     max_speed: float,
     known: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Central differences (T, ..., D) of ``positions`` (T, ..., D) by ``times`` (T,), seconds.
+    """Return central differences (T, ..., D) of ``positions`` (T, ..., D) by ``times`` (T,) in s.
 
-    Of fourth order where two positions on each side are known, since hands turn round within a few
-    frames: of a motion at 2 Hz seen at 15 frames a second two positions show 89 %, four 98 %.
-    One wrong position between right ones makes one of its neighbours' one-sided differences large:
-    a velocity is no longer than ``LIMIT`` times the shorter of the two (van Leer's limiter of
-    slopes, 1977, for vectors), nor than ``max_speed``. Positions that are not ``known`` (T, ...)
-    have velocity 0 and are nobody's neighbour; with one neighbour the one-sided difference counts.
+    The differences are of fourth order where two positions on each side are known, because hands
+    reverse within a few frames: of a motion at 2 Hz recorded at 15 frames a second, second order
+    recovers 89 % and fourth order 98 %. One wrong position between correct ones enlarges one of its
+    neighbours' one-sided differences. Therefore no velocity is longer than ``LIMIT`` times the
+    shorter of the two (van Leer's slope limiter, 1977, for vectors), nor than ``max_speed``.
+    Positions that are not ``known`` (T, ...) have velocity 0 and are ignored as neighbours. With
+    one known neighbour the one-sided difference is used.
     """
     known = np.isfinite(positions).all(-1) if known is None else known
     change = np.diff(np.where(known[..., None], positions, 0), axis=0)
@@ -51,8 +52,8 @@ def limited_velocity(
 def limited_rate(
     change: np.ndarray, times: np.ndarray, *, max_speed: float, known: np.ndarray
 ) -> np.ndarray:
-    """:func:`limited_velocity` (T, ..., D) from the ``change`` (T-1, ..., D) from each position to
-    the next: of what is no vector itself, as rotations."""
+    """Return :func:`limited_velocity` (T, ..., D) from changes (T-1, ..., D) between consecutive
+    samples, for quantities that cannot be subtracted, such as rotations."""
     if len(times) < 2:
         return np.zeros((len(times), *change.shape[1:]))
     step = np.diff(times).reshape(-1, *[1] * (change.ndim - 1))
@@ -71,10 +72,14 @@ def limited_rate(
 
 
 def rigid_velocity(poses: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Turn (rad/s, from the left) and shift of the origin (m/s) in a second: (T, 6).
+    """Return angular velocity (rad/s) and velocity of the origin (m/s): (T, 6).
 
-    ``poses`` (T, 4, 4) master_from_object, believed where ``known`` (T,); ``times`` (T,) seconds.
     Zero where nothing is known; limited, so that a single jump hardly affects its neighbours.
+
+    Args:
+        poses: (T, 4, 4) master_from_object.
+        known: (T,) whether a pose is reliable.
+        times: (T,) seconds.
     """
     if len(poses) < 2:
         return np.zeros((len(poses), 6))
@@ -86,8 +91,11 @@ def rigid_velocity(poses: np.ndarray, known: np.ndarray, times: np.ndarray) -> n
 
 
 def _fourth_order(slope: np.ndarray, both: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """What second neighbours add to a central difference (T, ..., D), from ``slope`` and ``both``
-    (T-1, ...) between positions: (8 (x_1 - x_-1) - (x_2 - x_-2)) / 12 less (x_1 - x_-1) / 2."""
+    """Return the fourth-order correction of a central difference (T, ..., D).
+
+    (8 (x_1 - x_-1) - (x_2 - x_-2)) / 12 minus (x_1 - x_-1) / 2, from ``slope`` and ``both``
+    (T-1, ...) between samples.
+    """
     result = np.zeros((len(slope) + 1, *slope.shape[1:]))
     if len(slope) >= 4:
         one, two, three, four = (slope[k : len(slope) - 3 + k] for k in range(4))
@@ -110,11 +118,14 @@ def _shortened(vectors: np.ndarray, longest: np.ndarray | float) -> np.ndarray:
 def cheapest_sequence(
     first: np.ndarray, steps: np.ndarray, last: np.ndarray | None = None
 ) -> np.ndarray:
-    """States (T,) int64 that minimise first[s_0] + sum_t steps[t, s_t, s_t+1] + last[s_T-1].
+    """Return states (T,) int64 that minimise first[s_0] + sum_t steps[t, s_t, s_t+1] + last[s_T-1].
 
-    ``first`` and ``last`` (S,) are costs of the states that a sequence begins and ends in;
-    ``steps`` (T - 1, S, S) of going from one state to the next, the next one's own cost included.
-    Of equal costs the lowest state is taken.
+    Viterbi, IEEE Trans. Inf. Theory 13(2):260, 1967. Of equal costs the lowest state is chosen.
+
+    Args:
+        first: (S,) cost of each state at the start.
+        steps: (T - 1, S, S) cost of a transition, including the cost of the next state.
+        last: (S,) additional cost of each state at the end.
     """
     total, came_from = np.asarray(first), []
     for step in steps:

@@ -249,7 +249,7 @@ FAULTS = [
 
 
 @pytest.mark.parametrize(("form", "fault", "words"), FAULTS)
-def test_broken_files_are_told_in_one_sentence(tmp_path, form, fault, words):
+def test_broken_files_are_refused(tmp_path, form, fault, words):
     write, scale = FORMS[form]
     path = write(tmp_path)
     fault(path)
@@ -313,7 +313,7 @@ def test_parts_and_doubtful_folders(tmp_path):
         read_calibration(path, RECORDED)
 
 
-def test_a_scale_beside_a_file_in_metres_is_refused(tmp_path):
+def test_a_scale_for_a_file_in_metres_is_refused(tmp_path):
     path = tmp_path / "rig.json"
     path.write_text(json.dumps({"cameras": {}}))
     with pytest.raises(UserError, match="is in metres, yet column calibration_scale"):

@@ -115,7 +115,7 @@ def test_real_device_has_its_colour_lens_32_mm_beside_the_depth_lens(real_calibr
         (make_calibration(Rt={"Rotation": [2] * 9, "Translation": [0] * 3}), "rigid"),
     ],
 )
-def test_broken_calibrations_are_told_in_one_sentence(content, words):
+def test_broken_calibrations_are_refused(content, words):
     with pytest.raises(UserError, match=words):
         read(content)
 

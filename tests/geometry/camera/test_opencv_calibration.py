@@ -222,7 +222,7 @@ def change(path: str, value: object):
         (change("cameras.right", 3), "camera 'right': expected a name of"),
     ],
 )
-def test_broken_files_are_told_in_one_sentence(tmp_path, content, fault, words):
+def test_broken_files_are_refused(tmp_path, content, fault, words):
     fault(content)
     with pytest.raises(UserError, match=words):
         read(tmp_path, content)

@@ -103,7 +103,7 @@ def test_projection_never_folds_back_into_the_image():
         assert np.all(np.diff(distance, axis=0) > 0)
 
 
-def test_points_beyond_the_metric_radius_or_behind_are_finite_and_told_apart():
+def test_points_outside_the_lens_model_are_finite_and_flagged():
     points = np.array([[1.8, 0, 1.0], [1.6, 0, 1.0], [0, 0, -1.0], [0.0, 0, 0], [0, 0, 1.0]])
     assert np.all(np.isfinite(COLOUR.project(points)))
     assert COLOUR.inside_model(points).tolist() == [False, True, False, False, True]

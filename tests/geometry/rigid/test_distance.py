@@ -59,7 +59,7 @@ def box_without_its_lid() -> tuple[trimesh.Trimesh, DistanceField]:
     return box, DistanceField(box.vertices, box.faces[kept], watertight=False)
 
 
-def test_what_is_outside_a_holed_mesh_is_never_inside():
+def test_points_outside_a_mesh_with_holes_are_never_inside():
     """Rays that leave through the hole used to vote points a decimetre above it inside."""
     box, field = box_without_its_lid()
     rng = np.random.default_rng(5)

@@ -104,7 +104,7 @@ def test_equivalent_poses_move_points_by_group_elements():
                 assert np.abs(group.discrete - element).max((1, 2)).min() < 1e-9
 
 
-def test_what_is_a_rotation_in_single_precision_alone_has_an_equivalent(group):
+def test_rotations_in_single_precision_have_an_equivalent(group):
     """A pose that a hand carried through many frames is a rotation to some 1e-6."""
     rng = np.random.default_rng(3)
     pose, reference = np.eye(4), np.eye(4)
