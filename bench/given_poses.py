@@ -21,8 +21,8 @@ from scipy.spatial.transform import Rotation
 
 from bench.command import add_figures, exit_on_user_error
 from intercap_core import artefacts
+from intercap_core.annotation import ObjectPose
 from intercap_core.commands.evaluate.objects import measure
-from intercap_core.config import ObjectPose
 from intercap_core.errors import UserError
 from intercap_core.evaluation import object_errors
 from intercap_core.evaluation.object_errors import ObjectErrors

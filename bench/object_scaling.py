@@ -24,7 +24,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from bench.command import exit_on_user_error
-from intercap_core.config import ObjectEntry
+from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera

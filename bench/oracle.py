@@ -51,7 +51,7 @@ from intercap_core import artefacts
 from intercap_core.artefacts import Artefact
 from intercap_core.commands.bench import replace_figures
 from intercap_core.commands.evaluate.part import console_of, number
-from intercap_core.config import ObjectEntry
+from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.evaluation import figures
 from intercap_core.evaluation.figures import SequenceMetrics

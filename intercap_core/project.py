@@ -12,14 +12,9 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from intercap_core import artefacts
-from intercap_core.config import (
-    Annotation,
-    Config,
-    ObjectEntry,
-    RecordingExtent,
-    SequenceEntry,
-    SubjectEntry,
-)
+from intercap_core.annotation import Annotation, RecordingExtent
+from intercap_core.config import Config
+from intercap_core.entries import ObjectEntry, SequenceEntry, SubjectEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.class_names import read_label_map
 from intercap_core.inputs.documents import read_yaml

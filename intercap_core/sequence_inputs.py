@@ -5,14 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from intercap_core.config import (
-    BodyFitSettings,
-    BodyModels,
-    JointSettings,
-    ObjectEntry,
-    ObjectTrackSettings,
-    SubjectEntry,
-)
+from intercap_core.config import BodyFitSettings, BodyModels, JointSettings, ObjectTrackSettings
+from intercap_core.entries import ObjectEntry, SubjectEntry
 
 NOT_AN_INPUT = Path("not-an-input.h5")
 """Path of an artefact that the caller did not supply; opening it fails."""

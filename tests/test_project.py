@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 import yaml
 
+from intercap_core.annotation import Annotation
 from intercap_core.commands.docs import contents
-from intercap_core.config import Annotation, Config, digest
+from intercap_core.config import Config, digest
 from intercap_core.errors import UserError
 from intercap_core.project import Project, load_project
 

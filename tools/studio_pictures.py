@@ -17,7 +17,8 @@ import yaml
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings  # noqa: E402
+from intercap_core.config import StudioCapture, StudioSettings  # noqa: E402
+from intercap_core.entries import ObjectEntry  # noqa: E402
 from intercap_core.geometry.camera.intrinsics import Intrinsics  # noqa: E402
 from intercap_core.geometry.camera.transforms import invert, rigid  # noqa: E402
 from intercap_core.studio.interactions import interaction_named  # noqa: E402

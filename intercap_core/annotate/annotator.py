@@ -24,8 +24,9 @@ from intercap_core.annotate import (
 )
 from intercap_core.annotate.opened import Opened, Pictures
 from intercap_core.annotate.questions import answers_path
+from intercap_core.annotation import Annotation, ObjectPose
 from intercap_core.commands.check import fault_of_cameras
-from intercap_core.config import Annotation, ObjectEntry, ObjectPose
+from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.verdict.figures import stated_errors

@@ -24,7 +24,7 @@ from pydantic import ValidationError
 
 from intercap_core.annotate.yaml_edit import replace_section
 from intercap_core.annotate.yaml_entries import UnsupportedLayout, equal_values
-from intercap_core.config import STATED_EMPTY, Annotation
+from intercap_core.annotation import STATED_EMPTY, Annotation
 from intercap_core.errors import UserError
 from intercap_core.inputs.documents import parse_yaml, yaml_fault
 from intercap_core.inputs.files import MAX_SETTINGS_BYTES, read_bytes

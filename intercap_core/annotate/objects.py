@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from scipy.spatial import cKDTree
 
 from intercap_core.annotate import document
-from intercap_core.config import ObjectEntry, Symmetry
+from intercap_core.entries import ObjectEntry, Symmetry
 from intercap_core.errors import UserError
 from intercap_core.geometry.rigid.contact_vertices import contact_list
 from intercap_core.geometry.rigid.mesh import ObjectMesh

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from intercap_core.annotate import before
+from intercap_core.annotation import Annotation
 from intercap_core.commands.run import ENDS_WITHIN_S
-from intercap_core.config import Annotation
 from intercap_core.errors import UserError
 from intercap_core.pipeline.job import last_words, read_state
 from intercap_core.pipeline.plan import OutputStatus, Plan

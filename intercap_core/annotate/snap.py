@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core import artefacts
 from intercap_core.annotate.opened import Opened
-from intercap_core.config import ObjectEntry, ObjectTrackSettings
+from intercap_core.config import ObjectTrackSettings
+from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import Detections
 from intercap_core.geometry.camera.clouds import master_points

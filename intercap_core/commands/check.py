@@ -7,7 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from intercap_core.config import Annotation, FramesSettings, SequenceEntry
+from intercap_core.annotation import Annotation
+from intercap_core.config import FramesSettings
+from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.project import Project, tidy
 

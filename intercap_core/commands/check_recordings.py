@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from intercap_core.config import SequenceEntry
+from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.detections import candidate_files, keypoint_files
 from intercap_core.formats.recordings.source import RecordingLayout, RecordingPreview

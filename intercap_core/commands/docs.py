@@ -14,8 +14,10 @@ import yaml
 from pydantic import BaseModel
 
 from intercap_core import schemas
+from intercap_core.annotation import Annotation
 from intercap_core.artefacts import Schema
-from intercap_core.config import Annotation, Config, ObjectEntry, SequenceEntry, SubjectEntry
+from intercap_core.config import Config
+from intercap_core.entries import ObjectEntry, SequenceEntry, SubjectEntry
 
 ENTRIES: dict[str, tuple[type[BaseModel], str, str]] = {
     "config": (Config, "config.yaml", "Settings"),
@@ -105,17 +107,20 @@ def equations_page(page: str) -> str:
 def settings_page() -> str:
     """config/README.md: all entries of the files that a user writes."""
     lines = [
-        "# What goes into this folder",
+        "# Settings, tables and annotations",
         "",
-        "This page and the schemas in `schemas/` are generated from `intercap_core/config.py` by",
-        "`intercap docs`. Relative paths are relative to the file that holds them; an entry that",
-        "is not listed here is refused. `intercap check` says what is wrong before a run.",
+        "`intercap docs` generates this page and the schemas in `schemas/` from `config.py`,",
+        "`entries.py` and `annotation.py` in `intercap_core/`. Relative paths are relative to the",
+        "file that contains them. Unknown entries are errors; `intercap check` reports them.",
         "",
-        "`demo/` holds the settings of `make demo`; `evaluation/`, `capture/`, `object/` and",
-        "`body/` those of `make evaluate`, to the end, to the scene, to the object's track and to",
-        "the body's fit; `annotate/` those that it mends in a browser; `bench/` those of",
-        "`make bench`, `test/` a tiny capture for the tests.",
-        "`objects/` holds the meshes of `objects.yaml`.",
+        "| folder | contents |",
+        "|---|---|",
+        "| `demo/` | settings of `make demo` |",
+        "| `evaluation/`, `capture/`, `object/`, `body/`, `field/`, `annotate/` "
+        "| settings of `make evaluate` |",
+        "| `bench/` | settings of `make bench` |",
+        "| `test/` | two small recordings for the tests |",
+        "| `objects/` | meshes of `objects.yaml` |",
     ]
     for model, file, purpose in ENTRIES.values():
         schema = model.model_json_schema()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
-from intercap_core.config import Name
+from intercap_core.config_types import Name
 from intercap_core.errors import UserError
 from intercap_core.tables import behave, intercap
 from intercap_core.tables.project_files import write_project

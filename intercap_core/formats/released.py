@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from intercap_core.config import ObjectEntry
+from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.behave import FRAME_FOLDER
 from intercap_core.inputs.arrays import read_arrays, read_pickle

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from intercap_core.config import ContactInterval, JointSettings
+from intercap_core.annotation import ContactInterval
+from intercap_core.config import JointSettings
 from intercap_core.joint.cameras import CameraFit
 from intercap_core.joint.contact.estimate import ContactEstimate, ContactEstimator
 from intercap_core.joint.floor import FloorPlane, contradiction

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from intercap_core.annotation import ExchangedSides
 from intercap_core.body.keypoints import BODY, KEYPOINT_NAMES, LEFT_HAND, RIGHT_HAND
-from intercap_core.config import ExchangedSides
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.triangulation import Triangulation
 

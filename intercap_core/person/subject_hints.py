@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from intercap_core.annotation import SubjectPoint
 from intercap_core.body.keypoints import BODY, LEFT_HAND, RIGHT_HAND, SKELETON, keypoint_pairs
-from intercap_core.config import SubjectPoint
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.instance import PERSON_LABEL
 from intercap_core.formats.detections.read import Detections

@@ -4,7 +4,7 @@ The modules that a stage reaches are found by following imports, including those
 and calls of ``plugins.modules_of``.
 The digest covers their syntax trees without docstrings and comments, and the data files next to
 them: a reworded docstring makes nothing stale. Modules of declarations that all stages share
-(settings, schemas, project, constants) are followed name by name, so that a new setting of one
+(settings, tables, schemas, project) are followed name by name, so that a new setting of one
 stage does not make the others stale. The digests are cached in the user's cache folder under a
 checksum of the whole package, because walking the syntax trees takes seconds.
 """
@@ -26,15 +26,18 @@ from intercap_core.stage_list import STAGES
 
 PACKAGE = "intercap_core"
 ROOT = Path(__file__).resolve().parents[1]
+# Modules that many stages import for a few names each: only the names that are used count.
 DECLARATIONS = frozenset(
-    {f"{PACKAGE}.{name}" for name in ("config", "schemas", "project", "sequence_inputs")}
-)
+    f"{PACKAGE}.{name}"
+    for name in (
+        "annotation", "config", "config_types", "entries", "project", "schemas", "sequence_inputs",
+    )
+)  # fmt: skip
 # Modules that change no result: caches, messages, and the list of stages, of which the manifest
 # holds what concerns a stage (the artefacts that it reads and its row).
 NEUTRAL = frozenset(
     f"{PACKAGE}.{name}" for name in ("disk", "kernel_cache", "progress", "signals", "stage_list")
 )
-CONSTANTS = (".constants", "_constants")  # ends of names of modules that hold only constants
 DATA_FOLDERS = ("data", "templates")
 
 WHOLE = "*"  # stands for every name of a module
@@ -169,7 +172,7 @@ def modules_reached(module: str, *, root: Path = ROOT) -> dict[str, frozenset[st
         name, used = waiting.pop()
         if name in NEUTRAL:
             continue
-        if name not in DECLARATIONS and not name.endswith(CONSTANTS):
+        if name not in DECLARATIONS:
             used = WHOLE
         known = reached.get(name, frozenset())
         if used in known or WHOLE in known:

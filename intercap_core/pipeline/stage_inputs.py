@@ -12,7 +12,9 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from intercap_core.config import Annotation, BodyModels, Config, SequenceEntry
+from intercap_core.annotation import Annotation
+from intercap_core.config import BodyModels, Config
+from intercap_core.entries import SequenceEntry
 from intercap_core.formats.recordings.behave import find_intrinsics_folder
 from intercap_core.formats.recordings.layouts import input_files
 from intercap_core.formats.released import intercap_file

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from intercap_core import artefacts, schemas
-from intercap_core.config import Annotation
+from intercap_core.annotation import Annotation
 from intercap_core.errors import UserError
 from intercap_core.pipeline import outcome, stage_inputs
 from intercap_core.pipeline.checksums import (

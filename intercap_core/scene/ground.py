@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from intercap_core.config import MIN_FLOOR_SPREAD_M, floor_spread
+from intercap_core.annotation import MIN_FLOOR_SPREAD_M, floor_spread
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.rig import Rig, ring_centre
 from intercap_core.scene.up import UpDirection, degrees_between

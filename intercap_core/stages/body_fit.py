@@ -25,7 +25,8 @@ from intercap_core.body_fit.observations import person_clouds, read_observations
 from intercap_core.body_fit.recover import JUMP_M, jumps
 from intercap_core.body_fit.schedule import BodyFit, Fitter
 from intercap_core.body_fit.uncertainty import deviation, joint_covariance, widen
-from intercap_core.config import BodyFitSettings, BodyModels, SubjectEntry, digest
+from intercap_core.config import BodyFitSettings, BodyModels, digest
+from intercap_core.entries import SubjectEntry
 from intercap_core.errors import UserError
 from intercap_core.schemas import BODY_FIT, BODY_PARTS
 

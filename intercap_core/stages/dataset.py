@@ -15,7 +15,8 @@ from intercap_core import artefacts
 from intercap_core.body.artefact import file_digest
 from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.model import BodyModel
-from intercap_core.config import BodyModels, CardSettings, ObjectEntry
+from intercap_core.config import BodyModels, CardSettings
+from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.evaluation import figures
 from intercap_core.evaluation.contact import CONTACT_M

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.config import DetectionsSettings, SequenceEntry, digest
+from intercap_core.config import DetectionsSettings, digest
+from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.detections import candidate_files, keypoint_files
 from intercap_core.formats.detections.candidate_files import CandidatesByImage

@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.config import FramesSettings, SequenceEntry, digest
+from intercap_core.config import FramesSettings, digest
+from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import Extrinsics
 from intercap_core.formats.recordings.extract import ExtractedCamera, extract

@@ -13,9 +13,10 @@ import numpy as np
 import torch
 
 from intercap_core import artefacts
+from intercap_core.annotation import ContactInterval
 from intercap_core.body.keypoints import LEFT_HAND, RIGHT_HAND
 from intercap_core.body.model import BodyModel
-from intercap_core.config import ContactInterval, digest
+from intercap_core.config import digest
 from intercap_core.joint.cameras import CameraFit
 from intercap_core.joint.fit import fit
 from intercap_core.joint.inputs import open_inputs

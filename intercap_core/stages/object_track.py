@@ -11,7 +11,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from intercap_core import artefacts
-from intercap_core.config import ObjectEntry, ObjectPose, ObjectTrackSettings, digest
+from intercap_core.annotation import ObjectPose
+from intercap_core.config import ObjectTrackSettings, digest
+from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import Detections
 from intercap_core.formats.recordings.frames import Frames

@@ -10,14 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core import artefacts, schemas
+from intercap_core.annotation import ContactInterval
 from intercap_core.artefacts import Artefact
 from intercap_core.body.artefact import load_model, read_parameters
-from intercap_core.config import (
-    ContactInterval,
-    ObjectEntry,
-    PageSettings,
-    SequenceEntry,
-)
+from intercap_core.config import PageSettings
+from intercap_core.entries import ObjectEntry, SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.scene_errors import displacement

@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from intercap_core import artefacts
+from intercap_core.annotation import ExchangedSides, SubjectPoint
 from intercap_core.body.keypoints import NUM_KEYPOINTS
-from intercap_core.config import ExchangedSides, ObjectEntry, PersonSettings, SubjectPoint, digest
+from intercap_core.config import PersonSettings, digest
+from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import (
     FROM_DETECTOR,

@@ -16,7 +16,8 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from intercap_core import artefacts
-from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
+from intercap_core.config import StudioCapture, StudioSettings
+from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.progress import Progress
 from intercap_core.schemas import CONTACT_REGIONS, TRUTH

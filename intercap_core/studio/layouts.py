@@ -19,7 +19,7 @@ import yaml
 from pycocotools import mask as coco
 from scipy.spatial.transform import Rotation
 
-from intercap_core.config import LayoutName
+from intercap_core.config_types import LayoutName
 from intercap_core.formats.calibration.extrinsics import Extrinsics, write_rig_file
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Rig

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from intercap_core.config import ObjectEntry
+from intercap_core.entries import ObjectEntry
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh_files import load_mesh
 

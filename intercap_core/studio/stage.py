@@ -10,7 +10,9 @@ import numpy as np
 
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
-from intercap_core.config import LayoutName, ObjectEntry, StudioCapture, StudioSettings
+from intercap_core.config import StudioCapture, StudioSettings
+from intercap_core.config_types import LayoutName
+from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.transforms import invert
 from intercap_core.geometry.rigid.surfaces import vertex_normals

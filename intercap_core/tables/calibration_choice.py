@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from intercap_core.config import SequenceEntry
+from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.intercap import InterCapLayout
 from intercap_core.geometry.camera.clouds import master_points

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from intercap_core.config import SequenceEntry
+from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.intercap import camera_folders, numbered_images
 from intercap_core.inputs.documents import read_yaml

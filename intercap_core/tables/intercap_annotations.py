@@ -16,7 +16,7 @@ import numpy as np
 import yaml
 from pydantic import ValidationError
 
-from intercap_core.config import ANY_REGION, Annotation
+from intercap_core.annotation import ANY_REGION, Annotation
 from intercap_core.inputs.documents import parse_integer
 from intercap_core.inputs.files import MAX_SETTINGS_BYTES, Unreadable, read_text
 

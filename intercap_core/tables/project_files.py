@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from intercap_core.config import SequenceEntry
+from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 
 COLUMNS = (

@@ -10,7 +10,7 @@ import yaml
 from pydantic import ValidationError
 
 from intercap_core.annotate import document
-from intercap_core.config import STATED_EMPTY, Annotation
+from intercap_core.annotation import STATED_EMPTY, Annotation
 from intercap_core.errors import UserError
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "config" / "annotations.example.yaml"

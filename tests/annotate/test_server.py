@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 from intercap_core.annotate import rerun
-from intercap_core.config import Annotation
+from intercap_core.annotation import Annotation
 from intercap_core.errors import UserError
 from intercap_core.output.viewer.page import unpacked
 from tests.annotate.served import NAME, Served, annotation, artefact, copied, served, small_project

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from intercap_core.commands.bench import add_figures, time_extraction
-from intercap_core.config import Config, ObjectEntry, SubjectEntry
+from intercap_core.config import Config
+from intercap_core.entries import ObjectEntry, SubjectEntry
 from intercap_core.errors import UserError
 from intercap_core.project import Project
 from tests.helpers.kinect_files import entry_of, record

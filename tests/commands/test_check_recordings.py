@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from intercap_core.commands.check_recordings import RecordingFindings, check_recordings
-from intercap_core.config import SequenceEntry
+from intercap_core.entries import SequenceEntry
 from intercap_core.formats.recordings.layouts import open_layout
 from tests.helpers.kinect_files import entry_of, record
 from tests.helpers.plain_capture import CAMERAS, plain_entry, write_rig

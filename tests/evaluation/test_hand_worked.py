@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from intercap_core.config import ContinuousSymmetry, Symmetry
+from intercap_core.entries import ContinuousSymmetry, Symmetry
 from intercap_core.evaluation import body, contact, flags, motion, object_pose
 from intercap_core.evaluation.proximity import (
     BodySurface,

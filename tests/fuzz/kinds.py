@@ -19,7 +19,7 @@ from intercap_core.body.loading import OPEN_BODY, load_body_file
 from intercap_core.body.maps import load_maps, maps_path
 from intercap_core.body.vposer import VPoser
 from intercap_core.body_fit.definition import Definition
-from intercap_core.config import ObjectEntry
+from intercap_core.entries import ObjectEntry
 from intercap_core.formats.released import (
     object_poses_at_30_fps,
     person_poses_at_30_fps,

@@ -23,14 +23,8 @@ from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.model import BodyModel, with_hand_mean
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.body_fit.surface import COVERINGS
-from intercap_core.config import (
-    BodyFitSettings,
-    BodyModels,
-    JointSettings,
-    ObjectEntry,
-    ObjectTrackSettings,
-    SubjectEntry,
-)
+from intercap_core.config import BodyFitSettings, BodyModels, JointSettings, ObjectTrackSettings
+from intercap_core.entries import ObjectEntry, SubjectEntry
 from intercap_core.geometry.camera import masks
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera, Rig

@@ -12,7 +12,8 @@ import numpy as np
 import open3d as o3d
 import yaml
 
-from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
+from intercap_core.config import StudioCapture, StudioSettings
+from intercap_core.entries import ObjectEntry
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.person.groups import NOBODY

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.config import FramesSettings, SequenceEntry
+from intercap_core.config import FramesSettings
+from intercap_core.entries import SequenceEntry
 from intercap_core.formats.calibration.extrinsics import Extrinsics, write_rig_file
 from intercap_core.formats.calibration.k4a import COLOUR_MODES, DEPTH_MODES
 from intercap_core.geometry.camera.intrinsics import Intrinsics

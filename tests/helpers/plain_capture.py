@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from intercap_core.config import DetectionsSettings, FramesSettings, SequenceEntry
+from intercap_core.config import DetectionsSettings, FramesSettings
+from intercap_core.entries import SequenceEntry
 from intercap_core.formats.detections.read import Detections
 from intercap_core.stages import detections, frames
 

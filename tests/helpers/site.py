@@ -8,13 +8,8 @@ from pathlib import Path
 
 import h5py
 
-from intercap_core.config import (
-    CardSettings,
-    ExportSettings,
-    MetricsSettings,
-    PageSettings,
-    SequenceEntry,
-)
+from intercap_core.config import CardSettings, ExportSettings, MetricsSettings, PageSettings
+from intercap_core.entries import SequenceEntry
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.schemas import CONTACT_REGIONS
 from intercap_core.stage_list import STAGES

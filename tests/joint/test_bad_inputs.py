@@ -20,7 +20,8 @@ from scipy.spatial import cKDTree
 
 from intercap_core import artefacts
 from intercap_core.body.model import BodyModel
-from intercap_core.config import BodyModels, JointSettings, ObjectEntry, ObjectTrackSettings
+from intercap_core.config import BodyModels, JointSettings, ObjectTrackSettings
+from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.geometry.rigid.contact_vertices import contact_list
 from intercap_core.schemas import CONTACT_REGIONS, JOINT, OBJECT_TRACK

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from intercap_core.config import ObjectEntry
+from intercap_core.entries import ObjectEntry
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.render import Renderer
 from intercap_core.object_track.fit import MotionPrior, assess_all, fit_pose

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from intercap_core.config import DetectionsSettings, SequenceEntry
+from intercap_core.config import DetectionsSettings
+from intercap_core.entries import SequenceEntry
 from intercap_core.formats.detections.read import Detections
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.rigid.mesh import ObjectMesh

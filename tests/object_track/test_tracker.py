@@ -7,7 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from intercap_core import artefacts
-from intercap_core.config import ObjectPose, ObjectTrackSettings
+from intercap_core.annotation import ObjectPose
+from intercap_core.config import ObjectTrackSettings
 from intercap_core.errors import UserError
 from intercap_core.object_track.proposals import NotFound
 from intercap_core.object_track.tracker import Track

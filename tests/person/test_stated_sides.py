@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from intercap_core import artefacts
+from intercap_core.annotation import ExchangedSides
 from intercap_core.body.keypoints import KEYPOINT_NAMES
-from intercap_core.config import ExchangedSides, PersonSettings
+from intercap_core.config import PersonSettings
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.geometry.camera.triangulation import Triangulation

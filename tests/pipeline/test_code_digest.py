@@ -23,8 +23,6 @@ FILES = {
     "energy/ground.py": "WEIGHT = 2\n",
     "solve/__init__.py": "from intercap_core.solve import banded\n",
     "solve/banded.py": "import numpy as np\n",
-    "rigid/__init__.py": "",
-    "rigid/constants.py": "NEAR_M = 0.1\nFAR_M = 10 * NEAR_M\nANGLE_RAD = 0.2\n",
     "body/__init__.py": "",
     "body/model.py": "from . import maps\n",
     "body/maps.py": "",
@@ -33,7 +31,6 @@ FILES = {
     "stages/joint.py": (
         '"""Doc."""\nfrom intercap_core.config import B\nfrom intercap_core.schemas import ONE\n'
         "from intercap_core.project import digest\n"
-        "from intercap_core.rigid.constants import FAR_M\n"
         "def run():\n    from intercap_core.energy import contact\n"
         "    import intercap_core.body.model\n    return contact, digest\n"
     ),
@@ -60,7 +57,7 @@ def reached(package: Path, stage: str) -> set[str]:
 def test_imports_are_walked(package: Path) -> None:
     assert reached(package, "stages.joint") == {
         *("", "config", "schemas", "project", "energy", "energy.contact"),
-        *("body", "body.model", "body.maps", "rigid", "rigid.constants"),
+        *("body", "body.model", "body.maps"),
         *("stages", "stages.joint"),
     }
     assert reached(package, "stages.scene") == {
@@ -88,13 +85,10 @@ def test_discovered_modules_are_reached(package: Path) -> None:
         ("solve/banded.py", "import numpy as np\nx = 1\n", {"scene"}),
         ("body/maps.py", "x = 1\n", {"joint"}),
         ("body/data/body.npz", "other", {"joint"}),
-        # A room's constants count by name, with what they are made of
-        ("rigid/constants.py", FILES["rigid/constants.py"].replace("0.1", "0.3"), {"joint"}),
-        ("rigid/constants.py", FILES["rigid/constants.py"].replace("0.2", "0.3"), set()),
-        # Comments, docstrings and layout do not
+        # Comments, docstrings and layout do not count
         ("energy/contact.py", '"""Doc."""\n\nWEIGHT = 1  # why\n', set()),
         ("stages/joint.py", FILES["stages/joint.py"].replace("Doc", "Other"), set()),
-        # Declarations count by name, with what they are made of
+        # Declarations count by name, with the names that they use
         ("config.py", FILES["config.py"].replace("x: int = 1", "x: int = 2"), {"joint"}),
         ("config.py", FILES["config.py"].replace("y: int = 1", "y: int = 2"), set()),
         ("schemas.py", FILES["schemas.py"].replace("_SHARED = 1", "_SHARED = 5"), {"joint"}),

@@ -23,7 +23,8 @@ from intercap_core.body_fit.schedule import Fitter
 from intercap_core.body_fit.surface import COVERINGS, choose_samples
 from intercap_core.body_fit.term_inputs import keypoint_set
 from intercap_core.body_fit.terms import CompiledTerms, TorchTerms
-from intercap_core.config import BodyFitSettings, BodyModels, SubjectEntry
+from intercap_core.config import BodyFitSettings, BodyModels
+from intercap_core.entries import SubjectEntry
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.solve.levenberg_marquardt import minimise

@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from intercap_core.config import DetectionsSettings, SequenceEntry
+from intercap_core.config import DetectionsSettings
+from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.detections import coco
 from intercap_core.formats.detections.read import Detections

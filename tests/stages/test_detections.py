@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from intercap_core.config import DetectionsSettings, SequenceEntry
+from intercap_core.config import DetectionsSettings
+from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import Detections
 from intercap_core.geometry.camera import masks

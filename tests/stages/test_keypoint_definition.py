@@ -9,7 +9,8 @@ import pytest
 
 from intercap_core import artefacts
 from intercap_core.body_fit.definition import FITTED_SIGMA_M, average_offsets
-from intercap_core.config import BodyFitSettings, BodyModels, SubjectEntry
+from intercap_core.config import BodyFitSettings, BodyModels
+from intercap_core.entries import SubjectEntry
 from intercap_core.errors import UserError
 from intercap_core.schemas import BODY_FIT
 from intercap_core.stages import body_fit

@@ -19,9 +19,7 @@ tiny_pose = pytest.importorskip("tests.helpers.tiny_pose", exc_type=ImportError)
 
 from intercap_core import artefacts  # noqa: E402
 from intercap_core.body.keypoints import KEYPOINT_NAMES  # noqa: E402
-from intercap_core.config import (  # noqa: E402
-    SequenceEntry,
-)
+from intercap_core.entries import SequenceEntry  # noqa: E402
 from intercap_core.errors import UserError  # noqa: E402
 from intercap_core.geometry.camera import masks  # noqa: E402
 from intercap_core.schemas import DETECTIONS  # noqa: E402

@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from intercap_core.config import DetectionsSettings, FramesSettings, SequenceEntry
+from intercap_core.config import DetectionsSettings, FramesSettings
+from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import Detections
 from intercap_core.stages import detections, frames

@@ -18,8 +18,8 @@ from intercap_core.config import (
     ObjectTrackSettings,
     PageSettings,
     PersonSettings,
-    SubjectEntry,
 )
+from intercap_core.entries import SubjectEntry
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.rigid.mesh import ObjectMesh

@@ -16,9 +16,7 @@ pytest.importorskip("onnxruntime")
 tiny_onnx = pytest.importorskip("tests.helpers.tiny_onnx", exc_type=ImportError)
 
 from intercap_core import artefacts  # noqa: E402
-from intercap_core.config import (  # noqa: E402
-    SequenceEntry,
-)
+from intercap_core.entries import SequenceEntry  # noqa: E402
 from intercap_core.geometry.camera import masks  # noqa: E402
 from intercap_core.schemas import DETECTIONS  # noqa: E402
 

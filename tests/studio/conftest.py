@@ -7,7 +7,8 @@ from functools import cache
 
 import pytest
 
-from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
+from intercap_core.config import StudioCapture, StudioSettings
+from intercap_core.entries import ObjectEntry
 from intercap_core.studio.interactions import INTERACTIONS
 from intercap_core.studio.stage import StudioStage
 from tests.helpers.fitted_capture import object_entry as catalogue_entry

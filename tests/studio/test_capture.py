@@ -15,8 +15,10 @@ import yaml
 from pycocotools import mask as coco
 
 from intercap_core import artefacts
+from intercap_core.annotation import Annotation
 from intercap_core.body.keypoints import BODY
-from intercap_core.config import Annotation, ObjectEntry, StudioCapture, StudioSettings
+from intercap_core.config import StudioCapture, StudioSettings
+from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.evaluation.motion import support
 from intercap_core.evaluation.truth import Truth

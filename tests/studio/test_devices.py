@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from intercap_core import artefacts
-from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
+from intercap_core.config import StudioCapture, StudioSettings
+from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.k4a import DEPTH_MODES
 from intercap_core.formats.recordings.k4a import KinectFile

@@ -10,12 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
-from intercap_core.config import (
-    LayoutName,
-    SequenceEntry,
-    StudioCapture,
-    StudioSettings,
-)
+from intercap_core.config import StudioCapture, StudioSettings
+from intercap_core.config_types import LayoutName
+from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.layouts import open_layout
 from intercap_core.formats.recordings.source import Image

@@ -8,7 +8,8 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from intercap_core.config import ObjectEntry, StudioCapture, StudioSettings
+from intercap_core.config import StudioCapture, StudioSettings
+from intercap_core.entries import ObjectEntry
 from intercap_core.geometry.camera.transforms import invert
 from intercap_core.studio.keypoints import Detector
 from intercap_core.studio.noise import NoiseSource

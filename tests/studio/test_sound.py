@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from intercap_core.config import SequenceEntry, StudioCapture, StudioSettings
+from intercap_core.config import StudioCapture, StudioSettings
+from intercap_core.entries import SequenceEntry
 from intercap_core.formats.recordings.layouts import open_layout
 from intercap_core.formats.recordings.sound_delays import delay_between, sound_starts
 from intercap_core.formats.recordings.source import SOUND_RATE, Sound

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from intercap_core.cli import app
 from intercap_core.commands.check import faults_of_sequences
-from intercap_core.config import SequenceEntry
+from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.project import load_project

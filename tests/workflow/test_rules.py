@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from intercap_core.config import Annotation
+from intercap_core.annotation import Annotation
 from intercap_core.pipeline import stage_inputs
 from intercap_core.pipeline.checksums import InputChecksums
 from intercap_core.project import load_project

@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.config import SequenceEntry
+from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.coco import ImageKey
 from intercap_core.formats.recordings.image_files import FilesRecording

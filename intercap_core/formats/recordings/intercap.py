@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from intercap_core.config import SequenceEntry
+from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import read_extrinsics
 from intercap_core.formats.calibration.opencv import check_lens

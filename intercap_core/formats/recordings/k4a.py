@@ -19,7 +19,7 @@ import av
 import numpy as np
 from av.stream import Discard
 
-from intercap_core.config import SequenceEntry
+from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import read_extrinsics
 from intercap_core.formats.calibration.files import (

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from intercap_core.config import LayoutName, SequenceEntry
+from intercap_core.config_types import LayoutName
+from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.files import refuse_scale
 from intercap_core.formats.recordings.source import RecordingLayout

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from intercap_core.config import SequenceEntry
+from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import CAMERA_NAME
 from intercap_core.formats.calibration.files import RecordedCameras, read_calibration

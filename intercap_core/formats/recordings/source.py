@@ -16,7 +16,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from intercap_core.config import SequenceEntry
+from intercap_core.entries import SequenceEntry
 from intercap_core.formats.calibration.extrinsics import Extrinsics
 from intercap_core.geometry.camera.rig import Camera
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from intercap_core.config import ObjectEntry
+from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.geometry.rigid.contact_vertices import read_contact_vertices
 from intercap_core.geometry.rigid.mesh_files import TEXTURE_ERRORS, colours_of, load_mesh, read_mesh

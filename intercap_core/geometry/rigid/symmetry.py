@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from intercap_core.config import Symmetry
+from intercap_core.entries import Symmetry
 from intercap_core.geometry.camera.transforms import rigid, rotation_exp
 
 MAX_DISCRETE = 128  # elements of a symmetry group; the icosahedron's rotation group has 60

@@ -8,7 +8,7 @@ from itertools import groupby, pairwise
 
 import numpy as np
 
-from intercap_core.config import ANY_REGION, ContactInterval
+from intercap_core.annotation import ANY_REGION, ContactInterval
 
 # Log odds of an annotation away from its ends: above all that distance and slip can say against it.
 ANNOTATED_LOGIT = 12.0

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from intercap_core.config import ContactInterval, JointSettings
+from intercap_core.annotation import ContactInterval
+from intercap_core.config import JointSettings
 from intercap_core.joint.contact.annotated import AnnotationIssue, annotation_evidence, find_issues
 from intercap_core.joint.contact.detect import (
     RegionMotion,

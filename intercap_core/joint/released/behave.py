@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import POSE_BLOCKS, TRANSL
-from intercap_core.config import ObjectEntry
+from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.behave import frame_folders
 from intercap_core.formats.released import (

@@ -10,7 +10,8 @@ import pytest
 
 from intercap_core.commands.evaluate.captures import PART
 from intercap_core.commands.evaluate.part import measure_cached, spread
-from intercap_core.config import Config, ObjectEntry, SubjectEntry
+from intercap_core.config import Config
+from intercap_core.entries import ObjectEntry, SubjectEntry
 from intercap_core.errors import UserError
 from intercap_core.evaluation.scene_errors import CaptureErrors, SlipCounts
 from intercap_core.project import Project

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from intercap_core.config import SequenceEntry
+from intercap_core.entries import SequenceEntry
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.formats.recordings.synchronise import (
     OUTLIER,

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from intercap_core.config import SequenceEntry
+from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import Extrinsics, write_rig_file
 from intercap_core.formats.calibration.k4a import COLOUR_MODES, DEPTH_MODES

@@ -7,7 +7,8 @@ from typing import get_args
 
 import pytest
 
-from intercap_core.config import LayoutName, SequenceEntry
+from intercap_core.config_types import LayoutName
+from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.layouts import INPUTS, input_files, open_layout
 

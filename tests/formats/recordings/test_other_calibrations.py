@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from intercap_core.config import FramesSettings, SequenceEntry
+from intercap_core.config import FramesSettings
+from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.formats.recordings.layouts import open_layout

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from intercap_core import artefacts
-from intercap_core.config import FramesSettings, SequenceEntry
+from intercap_core.config import FramesSettings
+from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.schemas import FRAMES

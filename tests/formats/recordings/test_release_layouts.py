@@ -13,7 +13,8 @@ import pytest
 from scipy.spatial import cKDTree
 
 from intercap_core import artefacts
-from intercap_core.config import FramesSettings, SequenceEntry
+from intercap_core.config import FramesSettings
+from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import Extrinsics, write_rig_file
 from intercap_core.formats.calibration.k4a import COLOUR_MODES, DEPTH_MODES

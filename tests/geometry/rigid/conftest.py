@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from intercap_core.config import ObjectEntry
+from intercap_core.entries import ObjectEntry
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 
 CONFIG = Path(__file__).parents[3] / "config"

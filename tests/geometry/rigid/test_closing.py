@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from intercap_core.config import ObjectEntry
+from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.geometry.rigid.closing import close_mesh, find_holes
 from intercap_core.geometry.rigid.mesh import ObjectMesh

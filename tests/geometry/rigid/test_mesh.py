@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from intercap_core.config import ObjectEntry, Symmetry
+from intercap_core.entries import ObjectEntry, Symmetry
 from intercap_core.errors import UserError
 from intercap_core.geometry.rigid.contact_vertices import contact_list
 from intercap_core.geometry.rigid.distance import DistanceField

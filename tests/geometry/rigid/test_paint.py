@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from intercap_core.config import ObjectEntry
+from intercap_core.entries import ObjectEntry
 from intercap_core.geometry.rigid.mesh import ObjectMesh, Paint
 from tests.geometry.rigid.conftest import catalogue
 

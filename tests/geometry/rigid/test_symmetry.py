@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from intercap_core.config import ContinuousSymmetry, Symmetry
+from intercap_core.entries import ContinuousSymmetry, Symmetry
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from intercap_core.config import ContactInterval
+from intercap_core.annotation import ContactInterval
 from intercap_core.joint.contact.annotated import annotation_evidence, find_issues
 from intercap_core.joint.contact.detect import RegionMotion, contact_probability
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import yaml
 
-from intercap_core.config import Annotation
+from intercap_core.annotation import Annotation
 from intercap_core.joint.contact.annotated import annotation_evidence
 from intercap_core.output.export.contact import StatedContact, draft, table
 from intercap_core.schemas import CONTACT_REGIONS

@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from intercap_core import artefacts
 from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.parameters import BodyParameters
-from intercap_core.config import Symmetry
+from intercap_core.entries import Symmetry
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.synchronise import images_of_moments
 from intercap_core.geometry.camera.masks import decode

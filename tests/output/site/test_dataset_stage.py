@@ -14,7 +14,8 @@ import pandas as pd
 import pytest
 
 from intercap_core import artefacts
-from intercap_core.config import ContactInterval, PageSettings
+from intercap_core.annotation import ContactInterval
+from intercap_core.config import PageSettings
 from intercap_core.errors import UserError
 from intercap_core.schemas import HEATMAPS, METRICS
 from intercap_core.stage_list import STAGES

@@ -1,0 +1,79 @@
+"""Types and the base class of settings, tables and annotations."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    field_validator,
+)
+
+from intercap_core.inputs.files import path_fault
+
+MAX_POSITION_M = 50.0  # a capture volume is some metres wide
+
+
+def _metres(value: float) -> float:
+    if abs(value) >= MAX_POSITION_M:
+        raise ValueError(
+            f"positions are in metres, below {MAX_POSITION_M:.0f}; this looks like millimetres"
+        )
+    return value
+
+
+def _as_text(name: Any) -> Any:
+    """Convert names that YAML reads as integers to text."""
+    return str(name) if isinstance(name, int) and not isinstance(name, bool) else name
+
+
+def _not_reserved(name: str) -> str:
+    if name in RESERVED_SEQUENCES:
+        raise ValueError("this name is reserved for a folder of the results; choose another one")
+    return name
+
+
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_-]*$", max_length=80)]
+
+Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
+
+Positive = Annotated[float, Field(gt=0.0)]
+
+RESERVED_SEQUENCES = ("recordings", "site", "tables")  # other folders of the results
+
+Vector3 = tuple[float, float, float]
+
+CameraName = Annotated[str, BeforeValidator(_as_text), Field(pattern=r"^[A-Za-z0-9_-]+$")]
+
+Seconds = Annotated[float, Field(strict=True)]
+
+SequenceName = Annotated[Name, AfterValidator(_not_reserved)]
+
+Metres = Annotated[float, AfterValidator(_metres)]
+
+Position = tuple[Metres, Metres, Metres]
+
+FrameNumber = Annotated[int, Field(ge=0, strict=True)]
+
+LayoutName = Literal["k4a", "intercap", "behave", "plain"]
+
+
+class Model(BaseModel):
+    """Base of all settings models: no unknown keys, finite numbers, valid paths, immutable."""
+
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, use_attribute_docstrings=True, allow_inf_nan=False
+    )
+
+    @field_validator("*")
+    @classmethod
+    def _paths(cls, value: Any) -> Any:
+        fault = path_fault(value) if isinstance(value, Path) else None
+        if fault is not None:
+            raise ValueError(fault)
+        return value
