@@ -54,6 +54,7 @@ FULL = (
     "slurm/test_faults.py",
     "slurm/test_short.py",
     "workflow/test_identity.py",
+    "workflow/test_outputs.py",
 )
 # One test of each that `make test` runs as well.
 SMOKE = frozenset(

@@ -51,6 +51,7 @@ def test_a_killed_run_continues_and_replaces_damaged_results(
     assert [name for name, same in identical(victim, peaceful).items() if not same] == []
 
 
+@pytest.mark.full
 def test_one_command_replaces_damage_downstream_of_unchanged_results(
     victim: Victim, peaceful: Victim
 ) -> None:
@@ -65,7 +66,9 @@ def test_one_command_replaces_damage_downstream_of_unchanged_results(
     assert [name for name, same in identical(victim, peaceful).items() if not same] == []
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.full)]
+)
 def test_a_terminated_run_reports_once_and_leaves_no_parts(victim: Victim, number: int) -> None:
     victim.flow.artefact(ONE, "person").unlink()
     began = time.time() - 1.0
