@@ -11,6 +11,7 @@
 # make bench           seconds per frame and memory, also of the paper's recipe
 # make ablation        the joint fit without each of its terms (after make evaluate-quick)
 # make oracle          the joint fit with true cameras and meshes (after make evaluate-quick)
+# make annotate-driven errors of a project before and after its annotation in a browser
 # make report          the site of the demo, from the results that are there
 # make scale           223 sequences: a start with nothing to do, a check, the jobs of an edit
 # make scale-report    the site of 223 sequences of 300 frames
@@ -27,7 +28,7 @@ EXTRAS := workflow,test,bench,dev
 RUN_TESTS = $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo test test-fast test-all test-slurm lint ruff-check ruff-format imports snakefmt mypy \
-    snakemake-lint evaluate evaluate-quick bench ablation oracle report scale-report scale fuzz chaos \
+    snakemake-lint evaluate evaluate-quick bench ablation oracle annotate-driven report scale-report scale fuzz chaos \
     docs environment clean
 
 demo: $(STAMP)
@@ -70,10 +71,6 @@ snakemake-lint: $(STAMP)
 
 evaluate: $(STAMP)
 	$(BIN)/intercap evaluate --cores $(CORES)
-	$(BIN)/python -m bench.oracle config/object/config.yaml --output results/evaluation.json \
-	    --sequences cup_drink_s02 suitcase_carry_s10 stool_sit_s07 --cores $(CORES) \
-	    --variants "as it is" "true mesh" "starts at the truth" "open mesh"
-	$(BIN)/python -m bench.annotate_driven --cores $(CORES)
 
 evaluate-quick: $(STAMP)
 	$(BIN)/intercap evaluate --quick --output results/evaluation-quick.json --cores $(CORES)
@@ -89,6 +86,9 @@ ablation: $(STAMP)
 
 oracle: $(STAMP)
 	$(BIN)/python -m bench.oracle --cores $(CORES)
+
+annotate-driven: $(STAMP)
+	$(BIN)/python -m bench.annotate_driven --cores $(CORES)
 
 report: $(STAMP)
 	$(BIN)/intercap report config/demo/config.yaml

@@ -74,8 +74,7 @@ CAPTURE_SETTINGS = [
     Path(f"config/capture/{name}.yaml") for name in ("config", "family_b", "noise_2")
 ]
 FIELD_SCENE_SETTINGS = [
-    Path(f"config/field/{name}.yaml")
-    for name in ("starts_15", "starts_30", "starts_60", "rates", "floor", "beam")
+    Path(f"config/field/{name}.yaml") for name in ("starts_30", "rates", "floor", "beam")
 ]
 FIELD_SETTINGS = [
     Path("config/evaluation/config.yaml"),
@@ -85,24 +84,14 @@ FIELD_SETTINGS = [
     ),
 ]
 OBJECT_SETTINGS = [
-    Path(f"config/object/{name}.yaml")
-    for name in (
-        "config",
-        "no_detector",
-        "noise_05",
-        "noise_2",
-        "family_b",
-        "redrawn_1",
-        "redrawn_2",
-    )
+    Path(f"config/object/{name}.yaml") for name in ("config", "no_detector", "noise_2", "family_b")
 ]
 BODY_SETTINGS = [
-    *(Path(f"config/object/{name}.yaml") for name in ("config", "noise_05", "noise_2", "family_b")),
+    *(Path(f"config/object/{name}.yaml") for name in ("config", "noise_2", "family_b")),
     *(
         Path(f"config/body/{name}.yaml")
         for name in (
-            "per_frame_shape", "rgb_only", "four_view", "four_view_rgb_only", "two_view",
-            "two_view_rgb_only", "one_view",
+            "per_frame_shape", "rgb_only", "four_view", "two_view", "two_view_rgb_only", "one_view",
         )
     ),
 ]  # fmt: skip

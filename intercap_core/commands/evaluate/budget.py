@@ -15,10 +15,9 @@ from intercap_core.project import Project
 from intercap_core.stage_list import STAGES
 
 # Minutes on two cores that a part may add to `make evaluate`, for its recordings and the stages
-# that no earlier part computes. The sum must stay below 120. Of the objects' 34 minutes 11 are for
-# recordings with redrawn detections.
+# that no earlier part computes. The sum must not exceed 60.
 BUDGET_MINUTES = {
-    "sequences": 23, "captures": 13, "objects": 34, "bodies": 12, "field_scenes": 15, "field": 22,
+    "sequences": 16.5, "captures": 7, "objects": 10, "bodies": 6, "field_scenes": 7, "field": 12.5,
 }  # fmt: skip
 STUDIO = "studio"
 

@@ -32,11 +32,10 @@ from intercap_core.project import Project
 
 SIDE_BY_SIDE = 2  # workflows at a time
 LOCK = Path(".snakemake") / "evaluation.lock"
-# CPU seconds per frame of six 720P views on one core of an Intel Xeon at 2.5 GHz, measured on a
-# shared machine from the workflow's benchmark files. They order the workflows and predict the end.
+# CPU seconds per frame of six 720P views; CPU time of `make evaluate-quick` on an AMD EPYC.
 SECONDS_PER_FRAME = {
-    STUDIO: 0.75, "frames": 0.03, "detections": 0.01, "scene": 0.28, "person": 0.26,
-    "object_track": 0.40, "body_fit": 0.17, "joint": 0.30, "metrics": 0.26,
+    STUDIO: 0.52, "frames": 0.02, "detections": 0.02, "scene": 0.25, "person": 0.15,
+    "object_track": 0.22, "body_fit": 0.17, "joint": 0.37, "metrics": 0.30,
 }  # fmt: skip
 
 
@@ -45,7 +44,7 @@ def expected_seconds(job: Job, frames: int) -> float:
     config = job.project.config
     rendered = 6 if config.studio is None else config.studio.cameras
     views = rendered if job.stage == STUDIO else len(config.frames.cameras) or rendered
-    start = 2.5  # imports, compiled code from the cache
+    start = 1.3  # imports, compiled code from the cache
     return start + SECONDS_PER_FRAME.get(job.stage, 0.3) * views / 6 * frames
 
 

@@ -148,14 +148,13 @@ def test_reduced_bodies_share_recordings() -> None:
     assert first.config.studio is not None
     made = {row.recordings for row in first.sequences.values()}
     others = [project for project in projects if project.config.studio is None]
-    assert len(others) == 7
+    assert len(others) == 6
     for project in others:
         assert {row.recordings for row in project.sequences.values()} <= made
     assert [body_evaluation.rig_of(project.config) for project in others] == [
         "all views, one shape per frame",
         "all views, no depth",
         "4 views",
-        "4 views, no depth",
         "2 views",
         "2 views, no depth",
         "1 view",
