@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import fields
 from pathlib import Path
 from weakref import WeakValueDictionary
 
@@ -17,11 +18,6 @@ from intercap_core.body.vposer import VPoser
 from intercap_core.config import BodyModels
 from intercap_core.errors import UserError
 
-_NAMES = (
-    "betas", "expression", "global_orient", "body_pose", "left_hand_pose", "right_hand_pose",
-    "jaw_pose", "leye_pose", "reye_pose", "transl",
-)  # fmt: skip
-
 # Bodies by file, digest, numbers of coefficients and device, as long as they are referenced: a
 # stage that reads several artefacts has one body.
 _LOADED: WeakValueDictionary[tuple[str, int, int, str], BodyModel] = WeakValueDictionary()
@@ -35,7 +31,7 @@ def file_digest(path: Path) -> str:
 def load_pose_prior(body_models: BodyModels, model: BodyModel) -> VPoser | None:
     """Load the VPoser of the settings on the body's device; None = the open prior.
 
-    Raises UserError for an invalid file, or one of another version than the settings name.
+    Raises UserError if the file is invalid or of another version than the settings name.
     """
     if body_models.vposer is None:
         return None
@@ -45,10 +41,10 @@ def load_pose_prior(body_models: BodyModels, model: BodyModel) -> VPoser | None:
 
 def read_parameters(artefact: Artefact) -> BodyParameters:
     """Read all T frames of a body_fit or joint artefact; a shared shape has betas (1, S)."""
-    values = {
-        name: torch.as_tensor(np.atleast_2d(artefact[name]), dtype=torch.float32) for name in _NAMES
-    }
-    return BodyParameters(**values)
+    names = [field.name for field in fields(BodyParameters)]
+    arrays = (np.atleast_2d(artefact[name]) for name in names)
+    tensors = (torch.as_tensor(array, dtype=torch.float32) for array in arrays)
+    return BodyParameters(**dict(zip(names, tensors, strict=True)))
 
 
 def load_model(
@@ -56,7 +52,7 @@ def load_model(
 ) -> BodyModel:
     """Load the body that a body_fit or joint artefact was fitted with.
 
-    Raises UserError for a damaged body file, or if the settings name another file.
+    Raises UserError if the body file is damaged or the settings name another file.
     """
     path = body_models.of(gender) or OPEN_BODY
     digest = file_digest(path) if path.is_file() else ""

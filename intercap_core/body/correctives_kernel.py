@@ -50,8 +50,8 @@ class RestPoints(NamedTuple):
     correctives: Correctives | None
     """None without pose blend shapes."""
     gradient: np.ndarray
-    """(b, N, 3) gradient of the energy by these points, filled in by the terms; of no body where
-    it is not needed."""
+    """(b, N, 3) gradient of the energy by these points, filled in by the terms; b = 0 if it is not
+    needed."""
 
     @classmethod
     def of(
@@ -63,7 +63,7 @@ class RestPoints(NamedTuple):
 
     @property
     def tables(self) -> np.ndarray:
-        """(N, 3, 486), or of no point without pose blend shapes."""
+        """(N, 3, 486); N = 0 without pose blend shapes."""
         empty = np.empty((0, 3, NUM_FEATURES), self.points.dtype)
         return empty if self.correctives is None else self.correctives.tables
 

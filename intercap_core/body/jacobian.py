@@ -25,8 +25,6 @@ from intercap_core.body.kinematics import (
 from intercap_core.body.parameters import NUM_POSE, TRANSL
 from intercap_core.body.selection import Selection
 
-_CHUNK_BYTES = 64e6  # working set of one step of `normal_equations`
-
 
 def shaped_points(selection: Selection, shape: Tensor, local: Tensor) -> Tensor:
     """Return points (B,N,3) at rest, after shape (B,S) and the pose blend shapes of local
@@ -44,14 +42,6 @@ def shaped_points(selection: Selection, shape: Tensor, local: Tensor) -> Tensor:
             batch, count, 3
         )
     return points
-
-
-def blend(selection: Selection, posed: PosedJoints) -> tuple[Tensor, Tensor]:
-    """Return the blended matrix (B,N,3,3) and offset (B,N,3) of every point."""
-    batch = posed.rotations.shape[0]
-    both = torch.cat([posed.rotations.reshape(batch, NUM_JOINTS, 9), posed.offsets], 2)
-    mixed = selection.weights @ both
-    return mixed[..., :9].reshape(batch, -1, 3, 3), mixed[..., 9:]
 
 
 @dataclass(frozen=True)
@@ -138,19 +128,19 @@ class Linearisation:
         gradient = directions.new_zeros(batch, size)
         three = torch.arange(3, device=directions.device)
         tail = torch.arange(TRANSL.start, size, device=directions.device)
-        for block in self.selection.blocks:
-            if self.correctives is None:
-                active = block.joints
-            else:
-                active = torch.arange(NUM_JOINTS, device=directions.device)
+        order, starts, moved_by = self.selection.limbs
+        for first, last, joints in zip(starts, starts[1:], moved_by, strict=False):
+            points = torch.as_tensor(order[first:last], device=directions.device)
+            moving = np.flatnonzero(joints) if self.correctives is None else np.arange(NUM_JOINTS)
+            active = torch.as_tensor(moving, device=directions.device)
             columns = torch.cat([(3 * active[:, None] + three).reshape(-1), tail])
-            cost = len(block.rows) * directions.shape[2] * len(columns) * directions.element_size()
-            step = max(1, int(_CHUNK_BYTES // max(cost, 1)))
+            cost = len(points) * directions.shape[2] * len(columns) * directions.element_size()
+            step = max(1, int(64e6 // max(cost, 1)))  # bytes in memory at once
             for start in range(0, batch, step):
                 at = slice(start, start + step)
-                j = self._rows(at, block.rows, active, directions)
-                w = weights[at, block.rows].reshape(j.shape[:2])
-                r = residuals[at, block.rows].reshape(j.shape[:2])
+                j = self._rows(at, points, active, directions)
+                w = weights[at, points].reshape(j.shape[:2])
+                r = residuals[at, points].reshape(j.shape[:2])
                 weighted = j * w[..., None]
                 part = weighted.transpose(1, 2) @ j
                 frames = torch.arange(batch, device=j.device)[at]
@@ -186,16 +176,6 @@ def _cross(a: Tensor, b: Tensor) -> Tensor:
     return torch.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], -1)
 
 
-def turn_frames(posed: PosedJoints, axis_angle: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the rotation of each joint for a change of its axis-angle (B,55,3,3), in the world and
-    in the frame of its parent."""
-    parent = torch.tensor([max(p, 0) for p in PARENTS], device=axis_angle.device)
-    around = posed.rotations[:, parent].clone()
-    around[:, 0] = torch.eye(3, dtype=axis_angle.dtype, device=axis_angle.device)
-    turn_of_local = left_jacobian(axis_angle)
-    return around @ turn_of_local, turn_of_local
-
-
 def linearise(
     selection: Selection,
     points: Tensor,
@@ -205,7 +185,9 @@ def linearise(
 ) -> Linearisation:
     """Pose and differentiate rest points (B,N,3); axis_angle (B,55,3), directions (55,3,S)."""
     batch, count = points.shape[:2]
-    matrix, offset = blend(selection, posed)
+    both = torch.cat([posed.rotations.reshape(batch, NUM_JOINTS, 9), posed.offsets], 2)
+    blended = selection.weights @ both
+    matrix, offset = blended[..., :9].reshape(batch, -1, 3, 3), blended[..., 9:]
     placed = (matrix @ points[..., None])[..., 0] + offset
 
     bones = selection.bones
@@ -215,7 +197,11 @@ def linearise(
     turns = torch.einsum("nlk,bnki->bnli", selection.below, parts)
     turns = turns - selection.below.sum(2)[..., None] * posed.joints[:, selection.chain]
 
-    frames, turn_of_local = turn_frames(posed, axis_angle)
+    # rotations of a joint for a change of its axis-angle: in its parent's frame, in the world
+    turn_of_local = left_jacobian(axis_angle)
+    around = posed.rotations[:, [max(parent, 0) for parent in PARENTS]]
+    around[:, 0] = torch.eye(3, dtype=axis_angle.dtype, device=axis_angle.device)
+    frames = around @ turn_of_local
     _, moved_offsets = joint_shape_derivatives(posed, joint_directions)
     size = joint_directions.shape[-1]
     shape = (selection.weights @ moved_offsets.reshape(batch, NUM_JOINTS, -1)).reshape(

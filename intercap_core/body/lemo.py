@@ -32,12 +32,9 @@ from intercap_core.inputs.files import Unreadable
 FRAMES_PER_SECOND = 30.0
 COORDINATES = 3 * len(MARKER_NAMES)
 _ROWS, _COLUMNS = 1, 8  # of reflection, at each side
-_SLOPE = 0.2
 _CHANNELS = (1, 32, 64, 64, 64, 64)
 LATENT = _CHANNELS[-1] * (COORDINATES + 2 * _ROWS)
 FEWEST_FRAMES = _COLUMNS + 2  # a reflection repeats other columns than the one at the border
-_LARGEST_WEIGHT = 1e4  # far beyond those of a trained network
-_SPREAD_M = (1e-4, 100.0)  # of markers on a body that walks through a room: some decimetres
 _HINT = "take the release's file, or leave joint.lemo out for small accelerations of the joints"
 
 
@@ -63,7 +60,7 @@ class MotionEncoder:
 
         Raises UserError if a file is missing, damaged, or contains something else.
         """
-        state, spread = _state(weights), _spread(statistics)
+        state, spread = _read_state(weights), _read_spread(statistics)
         blocks = []
         for number, (inner, outer) in enumerate(pairwise(_CHANNELS), 1):
             shapes = {
@@ -73,7 +70,7 @@ class MotionEncoder:
                 f"enc_blc{number}.main.2.bias": (outer,),
             }
             first, first_bias, second, second_bias = (
-                _tensor(weights, state, name, shape).to(device, dtype)
+                _pick_tensor(weights, state, name, shape).to(device, dtype)
                 for name, shape in shapes.items()
             )
             blocks.append((first, first_bias, second, second_bias))
@@ -94,13 +91,11 @@ class MotionEncoder:
 def _convolve(
     image: Tensor, first: Tensor, first_bias: Tensor, second: Tensor, second_bias: Tensor
 ) -> Tensor:
-    image = functional.leaky_relu(functional.conv2d(image, first, first_bias, padding=1), _SLOPE)
-    return functional.leaky_relu(functional.conv2d(image, second, second_bias, padding=1), _SLOPE)
+    image = functional.leaky_relu(functional.conv2d(image, first, first_bias, padding=1), 0.2)
+    return functional.leaky_relu(functional.conv2d(image, second, second_bias, padding=1), 0.2)
 
 
-def _state(path: Path) -> dict[str, Tensor]:
-    if not path.is_file():
-        raise UserError(f"LEMO's encoder {path} does not exist; {_HINT}")
+def _read_state(path: Path) -> dict[str, Tensor]:
     try:
         return read_tensors(path, advice=_HINT)
     except Unreadable as error:
@@ -109,25 +104,22 @@ def _state(path: Path) -> dict[str, Tensor]:
         ) from error
 
 
-def _tensor(path: Path, state: dict[str, Tensor], name: str, shape: tuple[int, ...]) -> Tensor:
+def _pick_tensor(path: Path, state: dict[str, Tensor], name: str, shape: tuple[int, ...]) -> Tensor:
     if name not in state:
         raise UserError(f"LEMO's encoder {path} has no {name}, expected one {shape}; {_HINT}")
-    fault = tensor_fault(state[name], shape, _LARGEST_WEIGHT)
+    fault = tensor_fault(state[name], shape, largest=1e4)  # far beyond those of a trained network
     if fault is not None:
         raise UserError(f"LEMO's encoder {path}: {name} has {fault}, expected {shape}; {_HINT}")
     return state[name]
 
 
-def _spread(path: Path) -> np.ndarray:
+def _read_spread(path: Path) -> np.ndarray:
     """Read the standard deviation (243,) of the coordinates."""
-    if not path.is_file():
-        raise UserError(f"LEMO's statistics {path} do not exist; {_HINT}")
     try:
         arrays = read_arrays(path, advice=_HINT)
     except Unreadable as error:
         raise UserError(
-            f"LEMO's statistics {path} cannot be read ({error.reason}), expected an .npz with "
-            f"Xstd; {_HINT}"
+            f"LEMO's statistics: {path} {error.reason}, expected an .npz with Xstd; {_HINT}"
         ) from None
     if "Xstd" not in arrays:
         raise UserError(
@@ -144,10 +136,11 @@ def _spread(path: Path) -> np.ndarray:
         raise UserError(
             f"LEMO's statistics {path}: Xstd has {spread.dtype}, expected metres; {_HINT}"
         )
-    wrong = ~((spread > _SPREAD_M[0]) & (spread < _SPREAD_M[1]))
+    # markers of a body that walks through a room: some decimetres
+    wrong = ~((spread > 1e-4) & (spread < 100.0))
     if wrong.any():
         raise UserError(
             f"LEMO's statistics {path}: Xstd has {spread[wrong][:1]}, expected metres above 0, "
-            f"{_SPREAD_M[0]:g} to {_SPREAD_M[1]:g}; {_HINT}"
+            f"0.0001 to 100; {_HINT}"
         )
     return spread

@@ -34,15 +34,12 @@ _REQUIRED = (
     "hands_meanr", "hands_componentsl", "hands_componentsr", "lmk_faces_idx", "lmk_bary_coords",
     "dynamic_lmk_faces_idx", "dynamic_lmk_bary_coords",
 )  # fmt: skip
-_SMPLX_SHAPE_COLUMNS = 300  # a full file's expression starts here
-_HAND_COMPONENTS = (6, 45)
-_HEIGHT_M = (0.3, 3.0)  # from a newborn to more than the tallest person
 _OTHER_MODELS = {5: "FLAME", 16: "MANO", 24: "SMPL", 52: "SMPL-H"}  # by their joints
 _HINT = "name an SMPLX_NEUTRAL/MALE/FEMALE.npz as body model, or none for the open body"
 
 
 @dataclass(frozen=True)
-class BodyFile:
+class BodyArrays:
     """The arrays of a file in float64."""
 
     path: Path
@@ -83,8 +80,8 @@ def load_body_file(
     *,
     num_hand_components: int = 45,
     flat_hand_mean: bool = False,
-) -> BodyFile:
-    """Read and check a file. Raises UserError unless it is a complete SMPL-X file.
+) -> BodyArrays:
+    """Read and check a file. Raises UserError if it is no complete SMPL-X file.
 
     The first ``num_hand_components`` of each hand are kept. With ``flat_hand_mean`` they are
     relative to the flat hand (mean of zero).
@@ -92,14 +89,14 @@ def load_body_file(
     path = OPEN_BODY if path is None else Path(path)
     arrays = _read(path)
     _check(path, arrays)
-    shape, expression = _directions(path, arrays["shapedirs"], num_betas, num_expression)
+    shape, expression = _select_directions(path, arrays["shapedirs"], num_betas, num_expression)
     posedirs = arrays.get("posedirs")
     if posedirs is not None and posedirs.size and np.any(posedirs):
         posedirs = posedirs.astype(np.float64)
     else:
         posedirs = None
-    hands = _hands(path, arrays, num_hand_components, flat_hand_mean)
-    return BodyFile(
+    hands = _select_hands(path, arrays, num_hand_components, flat_hand_mean)
+    return BodyArrays(
         path=path,
         template=arrays["v_template"].astype(np.float64),
         faces=arrays["f"].astype(np.int64),
@@ -119,8 +116,6 @@ def load_body_file(
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
-    if not path.is_file():
-        raise UserError(f"Body file {path} does not exist: {_HINT}.")
     if path.suffix == ".pkl":
         raise UserError(
             f"Body file {path} is a pickle, which could run code: {_HINT} (npz of the same model)."
@@ -130,9 +125,7 @@ def _read(path: Path) -> dict[str, np.ndarray]:
     try:
         return read_arrays(path, wanted)
     except Unreadable as error:
-        raise UserError(
-            f"Body file {path} is not a readable npz ({error.reason}): {_HINT}."
-        ) from error
+        raise UserError(f"Body file {path} {error.reason}, expected an npz: {_HINT}.") from error
 
 
 def _check(path: Path, arrays: dict[str, np.ndarray]) -> None:
@@ -178,12 +171,12 @@ def _find_wrong_shapes(arrays: dict[str, np.ndarray]) -> Iterator[str]:
         **({"posedirs": (vertices, 3, 486)} if posedirs is not None and posedirs.size else {}),
     }
     for name, shape in shapes.items():
-        found = arrays[name].shape
-        if len(found) != len(shape) or any(
-            want is not None and want != have for want, have in zip(shape, found, strict=True)
+        actual = arrays[name].shape
+        if len(actual) != len(shape) or any(
+            want is not None and want != have for want, have in zip(shape, actual, strict=True)
         ):
             expected = tuple("any" if size is None else size for size in shape)
-            yield f"has {name} of shape {found}; expected {expected}"
+            yield f"has {name} of shape {actual}; expected {expected}"
 
 
 def _find_wrong_values(arrays: dict[str, np.ndarray]) -> Iterator[str]:
@@ -211,19 +204,19 @@ def _find_wrong_values(arrays: dict[str, np.ndarray]) -> Iterator[str]:
     if arrays["weights"].sum(1, dtype=np.float64).min() <= 0:
         yield "has a vertex whose weights are zero or negative; expected a sum of 1"
     height = float(np.ptp(arrays["v_template"][:, 1].astype(np.float64)))
-    if not _HEIGHT_M[0] <= height <= _HEIGHT_M[1]:
+    if not 0.3 <= height <= 3.0:  # from a newborn to more than the tallest person
         yield (
-            f"has a body {height:.4g} m tall; expected {_HEIGHT_M[0]} to {_HEIGHT_M[1]} m with y "
-            "up (is it in millimetres?)"
+            f"has a body {height:.4g} m tall; expected 0.3 to 3.0 m with y up (is it in "
+            "millimetres?)"
         )
 
 
-def _directions(
+def _select_directions(
     path: Path, table: np.ndarray, num_betas: int, num_expression: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return columns 0.. and 300.. of a full file, or the two halves of one with 20 columns."""
     columns = table.shape[2]
-    start = _SMPLX_SHAPE_COLUMNS if columns > _SMPLX_SHAPE_COLUMNS else columns // 2
+    start = 300 if columns > 300 else columns // 2  # where the expression starts
     if num_betas > start or num_expression > columns - start:
         raise UserError(
             f"Body file {path} has {start} shape and {columns - start} expression components; "
@@ -232,15 +225,13 @@ def _directions(
     return table[:, :, :num_betas], table[:, :, start : start + num_expression]
 
 
-def _hands(
+def _select_hands(
     path: Path, arrays: dict[str, np.ndarray], count: int, flat: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Return mean (2,45), first components (2,count,45) and their deviations (2,count)."""
-    fewest, most = _HAND_COMPONENTS
-    if not fewest <= count <= most:
+    if not 6 <= count <= 45:
         raise UserError(
-            f"Body file {path}: {count} hand components were requested; expected {fewest} to "
-            f"{most}."
+            f"Body file {path}: {count} hand components were requested; expected 6 to 45."
         )
     mean = np.stack([arrays["hands_meanl"], arrays["hands_meanr"]]).astype(np.float64)
     components = np.stack([arrays["hands_componentsl"], arrays["hands_componentsr"]])
@@ -278,7 +269,7 @@ class ShapePrior:
     """(S, S)"""
 
     @classmethod
-    def of(cls, file: BodyFile, gender: str, height_m: float | None = None) -> ShapePrior:
+    def of(cls, file: BodyArrays, gender: str, height_m: float | None = None) -> ShapePrior:
         """Return the prior of a subject of this gender and height, if it is known."""
         count = file.shape_directions.shape[2]
         mean, covariance = np.zeros(count), np.eye(count)
@@ -294,7 +285,7 @@ class ShapePrior:
             covariance = covariance - np.outer(gain, by_shape @ covariance)
         return cls(mean, np.linalg.cholesky((covariance + covariance.T) / 2))
 
-    def centred(self, file: BodyFile) -> BodyFile:
+    def centred(self, file: BodyArrays) -> BodyArrays:
         """Return the body with z in place of betas: shapes in units of this prior."""
         directions = file.shape_directions
         template = file.template + directions @ self.mean

@@ -69,11 +69,6 @@ class BodyMaps:
     """Vertex ids by region; None = find them on the template."""
 
 
-def smplx_maps() -> BodyMaps:
-    """Return the published ids of SMPL-X's mesh."""
-    return BodyMaps(_SMPLX_POINTS, np.array(list(_SMPLX_MARKERS.values())), None)
-
-
 def maps_path(body_path: Path) -> Path:
     """Return the path of the maps of a body file."""
     return body_path.with_name(body_path.stem + "_maps.json")
@@ -110,7 +105,7 @@ def load_maps(body_path: Path, num_vertices: int) -> BodyMaps:
             )
         return BodyMaps(points, markers, regions)
     if num_vertices == SMPLX_VERTICES:
-        return smplx_maps()
+        return BodyMaps(_SMPLX_POINTS, np.array(list(_SMPLX_MARKERS.values())), None)
     raise UserError(
         f"Body file {body_path} has {num_vertices} vertices, not SMPL-X's {SMPLX_VERTICES}, and no "
         f"{path.name} next to it: add that map, or use an SMPLX_*.npz file."
@@ -149,12 +144,12 @@ def find_regions(
     def share(*names: str) -> np.ndarray:
         return weights[:, [JOINT_INDEX[n] for n in names]].sum(1)
 
-    found: dict[str, np.ndarray] = {}
+    regions: dict[str, np.ndarray] = {}
     free = np.ones(len(vertices), bool)
 
     def claim(name: str, mask: np.ndarray) -> None:
-        found[name] = np.flatnonzero(mask & free)
-        free[found[name]] = False
+        regions[name] = np.flatnonzero(mask & free)
+        free[regions[name]] = False
 
     thigh_length = np.linalg.norm(at["left_knee"] - at["left_hip"])
     hip_y = (at["left_hip"][1] + at["right_hip"][1]) / 2
@@ -206,4 +201,4 @@ def find_regions(
         claim(f"{side}_forearm", share(f"{side}_elbow") > 0.5)
     claim("back", (torso > 0.5) & (normals[:, 2] < -0.3) & (vertices[:, 1] > seat_high))
     claim("chest", (torso > 0.5) & (normals[:, 2] > 0.3) & (vertices[:, 1] > seat_high))
-    return {name: found[name] for name in REGION_NAMES}
+    return {name: regions[name] for name in REGION_NAMES}

@@ -22,20 +22,12 @@ from intercap_core.body.kinematics import (
     rotation_from_axis_angle,
     skin,
 )
-from intercap_core.body.loading import BodyFile, load_body_file
+from intercap_core.body.loading import BodyArrays, load_body_file
 from intercap_core.body.maps import find_regions, load_maps
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.body.selection import Selection, select_points
 from intercap_core.errors import UserError
 
-_KEPT_SELECTIONS = 8
-_MOUTH_OUTLINE = slice(31, 43)  # landmarks 48 to 59 of dlib's 68
-_FALLBACK_HAND_DEVIATION = 0.35  # rad; for files without deviations of the hand components
-_WIDEST_M = 3.0  # arm span and depth
-_SKIN_M2 = (0.3, 6.0)  # clothes, hair and a newborn included
-_FARTHEST_JOINT_M = 0.05  # beyond the box around the skin
-_JOINTS_SPAN = 0.5  # of the skin's width and height
-_MOVE_M = (1e-4, 1.0)  # of the vertex farthest moved by one unit of a shape or expression component
 _HINT = "take the file as published, or none for the open body"
 
 
@@ -62,7 +54,7 @@ class BodyModel:
         markers: (81,) vertices of LEMO's markers, in the order of `maps.MARKER_NAMES`.
     """
 
-    def __init__(self, file: BodyFile, device: torch.device, dtype: torch.dtype) -> None:
+    def __init__(self, file: BodyArrays, device: torch.device, dtype: torch.dtype) -> None:
         def tensor(array: np.ndarray) -> Tensor:
             return torch.as_tensor(array, dtype=dtype, device=device)
 
@@ -82,11 +74,9 @@ class BodyModel:
         self.hand_mean = tensor(file.hand_mean)
         self.hand_components = tensor(file.hand_components)
         deviation = file.hand_deviation
-        self.hand_deviation = tensor(
-            np.full(file.hand_components.shape[:2], _FALLBACK_HAND_DEVIATION)
-            if deviation is None
-            else deviation
-        )
+        if deviation is None:
+            deviation = np.full(file.hand_components.shape[:2], 0.35)  # usual, rad (open body)
+        self.hand_deviation = tensor(deviation)
 
         maps = load_maps(file.path, len(file.template))
         self.keypoint_map: KeypointMap = keypoint_map(
@@ -116,8 +106,8 @@ class BodyModel:
     ) -> BodyModel:
         """Load an SMPL-X npz (300+100 or 10+10 shape columns), or the open body without a path.
 
-        Raises UserError for a file that is missing, incomplete or of another model, or that has
-        fewer components.
+        Raises UserError if the file is missing, incomplete, of another model, or has fewer
+        components.
 
         Args:
             path: body file; None = the open body.
@@ -231,7 +221,7 @@ class BodyModel:
                 self._weights[at],
                 (self._rest_joints, self._joint_directions) if joints else None,
             )
-            if len(self._selections) > _KEPT_SELECTIONS:
+            if len(self._selections) > 8:
                 self._selections.popitem(last=False)
         self._selections.move_to_end(key)
         return self._selections[key]
@@ -256,12 +246,11 @@ class BodyModel:
         return shaped_points(selection, shape, local), posed, axis_angle
 
 
-def _regions(file: BodyFile, rest_joints: np.ndarray) -> dict[str, np.ndarray]:
+def _regions(file: BodyArrays, rest_joints: np.ndarray) -> dict[str, np.ndarray]:
     corners = file.template[file.faces[file.landmark_faces]]
     landmarks = np.einsum("nk,nkc->nc", file.landmark_barycentric, corners)
-    return find_regions(
-        file.template, file.faces, file.weights, rest_joints, landmarks[_MOUTH_OUTLINE]
-    )
+    mouth_outline = landmarks[31:43]  # landmarks 48 to 59 of dlib's 68
+    return find_regions(file.template, file.faces, file.weights, rest_joints, mouth_outline)
 
 
 def with_hand_mean(model: BodyModel, params: BodyParameters) -> BodyParameters:
@@ -273,42 +262,31 @@ def check_body(model: BodyModel) -> None:
     """Raise UserError if the numbers of a body file cannot be those of a person."""
     template, joints = model.template, model.forward(model.zeros()).joints[0]
     low, high = template.amin(0), template.amax(0)
-    beyond = torch.maximum(low - joints, joints - high).amax()
+    width = float((high - low).amax())
+    beyond = float(torch.maximum(low - joints, joints - high).amax())
     area = _area(template, model.faces)
-    span = ((joints.amax(0) - joints.amin(0)) / (high - low))[:2].amin()
-    weights = model.skinning_weights
+    span = float(((joints.amax(0) - joints.amin(0)) / (high - low))[:2].amin())
+    weight = float(model.skinning_weights.amin())
     lengths = model.hand_components.norm(dim=2)
-    moves = _largest_move(model)
+    shortest, longest = float(lengths.amin()), float(lengths.amax())
+    move = _largest_move(model)
+    corners = model.keypoint_map.weights.sum(1)[model.keypoint_map.joint < 0]
+    # anatomy with a wide margin: the span of the arms, the skin of a newborn and of a clothed giant
     problems = (
-        (high - low).amax() > _WIDEST_M,
-        f"a body {float((high - low).amax()):.3g} m wide, expected at most {_WIDEST_M:g} m",
-    ), (
-        not _SKIN_M2[0] < area < _SKIN_M2[1],
-        f"{area:.3g} m2 of skin, expected {_SKIN_M2[0]:g} to {_SKIN_M2[1]:g}",
-    ), (
-        beyond > _FARTHEST_JOINT_M,
-        f"a joint {float(beyond):.3g} m outside of its skin (J_regressor)",
-    ), (
-        not span > _JOINTS_SPAN,
-        f"joints over {float(span):.0%} of its skin's width or height, expected at least "
-        f"{_JOINTS_SPAN:.0%} (J_regressor)",
-    ), (
-        weights.amin() < -1e-3,
-        f"a skinning weight of {float(weights.amin()):.3g}, expected none below 0 (weights)",
-    ), (
-        not _MOVE_M[0] < moves < _MOVE_M[1],
-        f"shape components that move the skin by up to {moves:.3g} m a unit, expected "
-        f"{_MOVE_M[0]:g} to {_MOVE_M[1]:g} m (shapedirs)",
-    ), (
-        lengths.amin() < 0.5 or lengths.amax() > 2,
-        f"hand components of length {float(lengths.amin()):.3g} to {float(lengths.amax()):.3g}, "
-        "expected 1 (hands_components)",
-    ), (
-        model.hand_deviation.amin() <= 0,
-        "a hand component that never varies (hands_deviation or hands_coeffs)",
-    ), (
-        abs(model.keypoint_map.weights.sum(1)[model.keypoint_map.joint < 0] - 1).max() > 0.01,
-        "landmarks whose corners do not add up to 1 (lmk_bary_coords)",
+        (width > 3.0, f"a body {width:.3g} m wide, expected at most 3 m"),
+        (not 0.3 < area < 6.0, f"{area:.3g} m2 of skin, expected 0.3 to 6"),
+        (beyond > 0.05, f"a joint {beyond:.3g} m outside of its skin (J_regressor)"),
+        (not span > 0.5, f"joints over {span:.0%} of its skin's width or height, expected at least "
+         "50% (J_regressor)"),
+        (weight < -1e-3, f"a skinning weight of {weight:.3g}, expected none below 0 (weights)"),
+        (not 1e-4 < move < 1.0, f"shape components that move the skin by up to {move:.3g} m a "
+         "unit, expected 0.0001 to 1 m (shapedirs)"),
+        (shortest < 0.5 or longest > 2, f"hand components of length {shortest:.3g} to "
+         f"{longest:.3g}, expected 1 (hands_components)"),
+        (model.hand_deviation.amin() <= 0,
+         "a hand component that never varies (hands_deviation or hands_coeffs)"),
+        (abs(corners - 1).max() > 0.01,
+         "landmarks whose corners do not add up to 1 (lmk_bary_coords)"),
     )  # fmt: skip
     for wrong, words in problems:
         if wrong:

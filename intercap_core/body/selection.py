@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -16,24 +15,16 @@ from torch import Tensor
 
 from intercap_core.body.joints import NUM_JOINTS, PARENTS, ancestors
 
-# Points that follow nearly the same joints share one dense block of the normal equations. This is
-# the block of a point by its heaviest joint.
-_BLOCK_OF_JOINT: tuple[int, ...] = (
+# Points that follow nearly the same joints share one dense block of the normal equations, a limb.
+# This is the limb of a point by the joint with the largest weight.
+_LIMB_OF_JOINT: tuple[int, ...] = (
     0, 1, 2, 0, 4, 5, 0, 4, 5, 9, 4, 5, 12, 9, 9, 12, 16, 17, 16, 17, 20, 21, 12, 12, 12,
     *(25 + 3 * (i // 3) for i in range(30)),
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Block:
-    """Rows (n,) of the selection and the joints (m,) that move any of them."""
-
-    rows: Tensor
-    joints: Tensor
-
-
 class Limbs(NamedTuple):
-    """N points grouped into L limbs, which follow nearly the same joints."""
+    """N points grouped into L limbs, whose points follow nearly the same joints."""
 
     order: np.ndarray
     """(N,) points, limb by limb."""
@@ -41,6 +32,15 @@ class Limbs(NamedTuple):
     """(L + 1,) start of each limb in the order, and the end."""
     moved_by: np.ndarray
     """(L, 55) bool, the joints that move a point of the limb."""
+
+    @classmethod
+    def of(cls, groups: Sequence[np.ndarray], moved_by: np.ndarray) -> Limbs:
+        """Return the limbs of groups of points, which the joints ``moved_by`` (N, 55) bool move."""
+        return cls(
+            np.concatenate(groups),
+            np.cumsum([0, *map(len, groups)]),
+            np.stack([moved_by[points].any(0) for points in groups]),
+        )
 
     def moved_by_point(self) -> np.ndarray:
         """Flag the joints (N, 55) of each point's own limb."""
@@ -69,18 +69,10 @@ class Selection:
     """(N, L) all joints whose rotation moves the point, padded with 0."""
     below: Tensor
     """(N, L, K) weight of bones[n, k] if it is chain[n, l] or a descendant, else 0."""
-    blocks: tuple[Block, ...]
+    limbs: Limbs
+    """Points that share one dense block of the normal equations."""
     num_vertices: int
     """Number of vertices; the other points are the 55 joints."""
-
-    @cached_property
-    def limbs(self) -> Limbs:
-        """The blocks as arrays."""
-        rows = [block.rows.cpu().numpy() for block in self.blocks]
-        moved_by = np.zeros((len(rows), NUM_JOINTS), bool)
-        for block, flags in zip(self.blocks, moved_by, strict=True):
-            flags[block.joints.cpu().numpy()] = True
-        return Limbs(np.concatenate(rows), np.cumsum([0, *map(len, rows)]), moved_by)
 
 
 _IS_ANCESTOR = np.zeros((NUM_JOINTS, NUM_JOINTS), bool)  # [joint, ancestor or itself]
@@ -118,6 +110,7 @@ def select_points(
     share = np.where(bones >= 0, np.take_along_axis(dense, np.maximum(bones, 0), 1), 0)
     moved_by = (dense > 0) @ _IS_ANCESTOR
     chain = _padded(moved_by)
+    limb = np.array(_LIMB_OF_JOINT)[dense.argmax(1)]
     hangs = _IS_ANCESTOR[np.maximum(bones, 0)[:, None, :], np.maximum(chain, 0)[:, :, None]]
     below = hangs * share[:, None, :] * (chain >= 0)[:, :, None]
 
@@ -133,15 +126,6 @@ def select_points(
         bone_weights=tensor(share).to(weights.dtype),
         chain=tensor(np.maximum(chain, 0)),
         below=tensor(below).to(weights.dtype),
-        blocks=tuple(
-            Block(tensor(rows), tensor(np.flatnonzero(moved_by[rows].any(0))))
-            for rows in _block_rows(dense)
-        ),
+        limbs=Limbs.of([np.flatnonzero(limb == name) for name in np.unique(limb)], moved_by),
         num_vertices=count,
     )
-
-
-def _block_rows(weights: np.ndarray) -> Sequence[np.ndarray]:
-    """Return the rows of each block, in the order of their joints."""
-    block = np.array(_BLOCK_OF_JOINT)[weights.argmax(1)]
-    return [np.flatnonzero(block == name) for name in np.unique(block)]

@@ -67,10 +67,10 @@ class Skeleton(NamedTuple):
     joints: np.ndarray
     """(B, 55, 3) metres."""
     frames: np.ndarray
-    """(B, 55, 3, 3) world rotation of a joint for a change of its axis-angle; of no body without
+    """(B, 55, 3, 3) world rotation of a joint for a change of its axis-angle; B = 0 without
     derivatives."""
     moved: np.ndarray
-    """(B, 55, 3, S) derivatives of the offsets by the shape; of no body without derivatives."""
+    """(B, 55, 3, S) derivatives of the offsets by the shape; B = 0 without derivatives."""
 
     def chain(self, selection: Selection, rest: np.ndarray) -> PosedPoints:
         """Return the arrays of a selection's points; rest (B,N,3)."""

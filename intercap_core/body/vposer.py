@@ -34,13 +34,11 @@ _VERSIONS = {
     2: (("decoder_net.0", "decoder_net.3", "decoder_net.5"), 0.01),
 }
 _PREFIXES = ("module.", "vp_model.")
-_MATRIX_LOG_EPSILON = 1e-7
 _SPREAD = 0.1  # rad; poses of AMASS are reconstructed to about 5 degrees (paper)
-_MAX_HIDDEN = 4096  # units of a hidden layer; the published ones have 512
-_LARGEST_WEIGHT = 1e3  # the published ones' are below 10
-_ADVICE = "expected TR00_E096.pt (version 1) or a V02_05 .ckpt (version 2): take the published file"
-_CODE_STEPS = 12
-_CODE_DAMPING = 0.3  # at the start, in units of the prior: the decoder is far from linear
+_ADVICE = (
+    "expected TR00_E096.pt (version 1) or a V02_05 .ckpt (version 2): take the published file, or "
+    "leave the setting out to use joint limits only"
+)
 
 
 class PoseGaussian(NamedTuple):
@@ -84,30 +82,25 @@ class VPoser:
 
         Raises UserError if the file is missing, or contains no decoder of this version.
         """
-        if not path.is_file():
-            raise UserError(
-                f"VPoser file {path} does not exist: expected TR00_E096.pt (version 1) or a V02_05 "
-                ".ckpt (version 2); leave the setting out to use joint limits alone."
-            )
         try:
-            read = read_tensors(path, advice=_ADVICE)
+            tensors = read_tensors(path, advice=_ADVICE)
         except Unreadable as error:
             raise UserError(f"VPoser file {path} {error.reason}: {_ADVICE}.") from error
-        weights = {_bare(name): value for name, value in read.items()}
-        for found, (names, slope) in _VERSIONS.items():
+        weights = {_bare(name): value for name, value in tensors.items()}
+        for stored, (names, slope) in _VERSIONS.items():
             parts = [(f"{name}.weight", f"{name}.bias") for name in names]
             if all(part in weights for pair in parts for part in pair):
-                if version not in (None, found):
+                if version not in (None, stored):
                     raise UserError(
-                        f"VPoser file {path} holds the weights of version {found}, and version "
+                        f"VPoser file {path} contains the weights of version {stored}, and version "
                         f"{version} is named: codes of the two mean different poses; name version "
-                        f"{found}, or take the file of version {version}."
+                        f"{stored}, or take the file of version {version}."
                     )
                 _check(path, tuple((weights[w], weights[b]) for w, b in parts))
                 layers = tuple(
                     (weights[w].to(device, dtype), weights[b].to(device, dtype)) for w, b in parts
                 )
-                return cls(found, layers, slope)
+                return cls(stored, layers, slope)
         raise UserError(
             f"VPoser file {path} has no decoder of version 1 or 2: expected keys such as "
             "bodyprior_dec_fc1.weight or vp_model.decoder_net.0.weight; take the published file."
@@ -129,14 +122,15 @@ class VPoser:
         """Decode codes (B,32) to body_pose (B,63), axis-angle."""
         return axis_angle_from_rotation(self.rotations(code)).reshape(*code.shape[:-1], 63)
 
-    def around(self, body_pose: Tensor) -> PoseGaussian:
+    def linearise(self, body_pose: Tensor) -> PoseGaussian:
         """Return the prior around poses (B,63), at their most likely codes (Gauss-Newton)."""
         code = body_pose.new_zeros(len(body_pose), LATENT)
         eye = torch.eye(LATENT, dtype=code.dtype, device=code.device)
         decoded, by_code = self.decode_with_jacobian(code)
         cost = self._cost(code, decoded, body_pose)
-        damping = torch.full_like(cost, _CODE_DAMPING)
-        for _ in range(_CODE_STEPS):
+        # in units of the prior: the decoder is far from linear
+        damping = torch.full_like(cost, 0.3)
+        for _ in range(12):
             gradient = code - (by_code.mT @ (body_pose - decoded)[..., None])[..., 0] / _SPREAD**2
             hessian = by_code.mT @ by_code / _SPREAD**2 + (1 + damping)[:, None, None] * eye
             trial = code - torch.linalg.solve(hessian, gradient)
@@ -177,7 +171,7 @@ def axis_angle_from_rotation(rotation: Tensor) -> Tensor:
     )
     trace = rotation.diagonal(dim1=-2, dim2=-1).sum(-1)
     sine_squared = (skewed**2).sum(-1) / 4
-    small = sine_squared < _MATRIX_LOG_EPSILON
+    small = sine_squared < 1e-7
     sine = torch.where(small, torch.ones_like(sine_squared), sine_squared).sqrt()
     angle = torch.atan2(sine, (trace - 1) / 2)
     factor = torch.where(small, 0.5 + sine_squared / 12, angle / (2 * sine))
@@ -191,18 +185,18 @@ def _bare(name: str) -> str:
 
 
 def _check(path: Path, layers: tuple[tuple[Tensor, Tensor], ...]) -> None:
-    found = tuple(tuple(tuple(part.shape) for part in pair) for pair in layers)
+    shapes = tuple(tuple(tuple(part.shape) for part in pair) for pair in layers)
     hidden = len(layers[0][1]) if layers[0][1].ndim else 0
     sizes = ((hidden, LATENT), (hidden, hidden), (6 * _JOINTS, hidden))
     expected = tuple((size, size[:1]) for size in sizes)
-    if found != expected or not 0 < hidden <= _MAX_HIDDEN:
+    if shapes != expected or not 0 < hidden <= 4096:  # the published files have 512
         raise UserError(
-            f"VPoser file {path} has decoder layers of shapes {quoted(found, 300)}; expected "
+            f"VPoser file {path} has decoder layers of shapes {quoted(shapes, 300)}; expected "
             f"{expected}: take the published file."
         )
     for (weight, bias), size in zip(layers, sizes, strict=True):
-        fault = tensor_fault(weight, size, _LARGEST_WEIGHT)
-        fault = fault or tensor_fault(bias, size[:1], _LARGEST_WEIGHT)
+        largest = 1e3  # weights of the published files are below 10
+        fault = tensor_fault(weight, size, largest) or tensor_fault(bias, size[:1], largest)
         if fault is not None:
             raise UserError(
                 f"VPoser file {path} has weights that are not finite numbers of a network "

@@ -9,13 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core.body.parameters import NUM_POSE
 
-# A velocity is measured to the nearest known frame between these times, seconds: nearer frames show
-# the noise of the fit, farther ones another motion. Tuned on the studio.
-_VELOCITY_WINDOW_S = (0.045, 0.15)
-# Weight of this velocity against the mean velocity of the bridge. On gaps of 1 to 15 frames at 15
-# Hz, anything from 0.7 to 1 is best: measured on the studio. It fades for bridges longer than 1 s,
-# which were not measured.
-_VELOCITY_WEIGHT = 0.85
 _FEWEST_BRIDGES = 5  # over known frames, to estimate the error of a bridge; tuned on the studio
 
 
@@ -64,12 +57,13 @@ def _velocity_frames(start: int, end: int, known: np.ndarray, times: np.ndarray)
     """Return the known frames before ``start`` and after ``end`` that determine the velocities
     there; ``start`` or ``end`` itself if no frame is near enough."""
     at = np.flatnonzero(known)
-    earlier, later = times[start] - times[at], times[at] - times[end]
-    found = []
-    for frame, seconds in ((start, earlier), (end, later)):
-        near = (seconds >= _VELOCITY_WINDOW_S[0]) & (seconds <= _VELOCITY_WINDOW_S[1])
-        found.append(int(at[near][seconds[near].argmin()]) if near.any() else frame)
-    return found[0], found[1]
+
+    def nearest(frame: int, seconds: np.ndarray) -> int:
+        # nearer frames show the noise of the fit, farther ones another motion; tuned on the studio
+        near = (seconds >= 0.045) & (seconds <= 0.15)
+        return int(at[near][seconds[near].argmin()]) if near.any() else frame
+
+    return nearest(start, times[start] - times[at]), nearest(end, times[at] - times[end])
 
 
 def _hermite(when: np.ndarray, knots: np.ndarray) -> np.ndarray:
@@ -85,7 +79,9 @@ def _hermite(when: np.ndarray, knots: np.ndarray) -> np.ndarray:
         slopes[0] = np.array([1.0, 0.0, -1.0, 0.0]) / (knots[0] - knots[2])
     if knots[3] > knots[1]:
         slopes[1] = np.array([0.0, -1.0, 0.0, 1.0]) / (knots[3] - knots[1])
-    weight = _VELOCITY_WEIGHT * min(1.0, 1.0 / length)
+    # weight of the velocities against the mean: 0.7 to 1 is best on gaps of 1 to 15 frames at 15 Hz
+    # (measured on the studio); bridges longer than 1 s were not measured
+    weight = 0.85 * min(1.0, 1.0 / length)
     first, last = (mean + weight * (slope - mean) for slope in slopes)
     rise = s**2 * (3 - 2 * s)
     ends = np.concatenate([1 - rise, rise, np.zeros_like(s), np.zeros_like(s)], 1)
@@ -93,7 +89,7 @@ def _hermite(when: np.ndarray, knots: np.ndarray) -> np.ndarray:
     return np.asarray(ends + length * bends)
 
 
-def continuous(rotation_vectors: np.ndarray) -> np.ndarray:
+def unwrap_turns(rotation_vectors: np.ndarray) -> np.ndarray:
     """Return rotation vectors (T, 3) of the same turns without jumps of a full turn.
 
     Each is v or v - 2 pi v / |v|, whichever is nearer to the previous one. A person who stands

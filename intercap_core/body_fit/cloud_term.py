@@ -18,6 +18,7 @@ points it has. :mod:`.matching` finds the points of each sample.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -42,7 +43,6 @@ from intercap_core.body_fit.term_inputs import (
 from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
 
 _SHAPE, _TRANSL = TRANSL.stop, TRANSL.start
-_ROWS_TOGETHER = 4  # rows that are added to a block at once: speed
 
 
 def residuals(points: Tensor, rows: CloudRows, thickness: Tensor, group: Tensor) -> Tensor:
@@ -128,54 +128,59 @@ class CompiledCloud:
             return None
         return PreparedCloud(
             self._source.selection,
-            self._group,
             self._source.at_rest(contiguous(bodies.vectors[:, _SHAPE:]), derivatives),
-            contiguous(rows.normal),
-            contiguous(rows.weight),
-            contiguous(rows.target),
-            contiguous(bodies.thickness),
+            CloudArrays(
+                contiguous(rows.normal),
+                contiguous(rows.weight),
+                contiguous(rows.target),
+                contiguous(bodies.thickness),
+                self._group,
+            ),
         )
+
+
+class CloudArrays(NamedTuple):
+    """:class:`.term_inputs.CloudRows` of T frames and N samples, and the G coverings."""
+
+    normal: np.ndarray
+    """(T, N, 3)"""
+    weight: np.ndarray
+    """(T, N) 1/m^2, 0 = no row."""
+    target: np.ndarray
+    """(T, N) metres."""
+    thickness: np.ndarray
+    """(G,) metres."""
+    group: np.ndarray
+    """(N,) covering of each sample."""
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedCloud:
-    """See :class:`.term_inputs.PreparedTerm`; fields as in :class:`.term_inputs.CloudRows`."""
+    """See :class:`.term_inputs.PreparedTerm`."""
 
     selection: Selection
-    group: np.ndarray
     rest: RestPoints
-    normal: np.ndarray
-    weight: np.ndarray
-    target: np.ndarray
-    thickness: np.ndarray
+    rows: CloudArrays
 
     def used(self, frames: np.ndarray) -> np.ndarray:
-        return np.asarray(self.weight[frames] > 0)
+        return np.asarray(self.rows.weight[frames] > 0)
 
     def add_cost(self, batch: Batch, cost: np.ndarray) -> None:
         chain = batch.skeleton.chain(self.selection, self.rest.points[batch.at])
-        add_cost(
-            chain, self.normal, self.weight, self.target, self.thickness, self.group, batch.frames,
-            cost,
-        )  # fmt: skip
+        add_cost(chain, self.rows, batch.frames, cost)
 
     def add(self, batch: Batch, equations: BatchEquations) -> None:
         chain = batch.skeleton.chain(self.selection, self.rest.points[batch.at])
         add_equations(
-            chain, self.selection.limbs, self.normal, self.weight, self.target, self.thickness,
-            self.group, batch.frames, equations.place,
-            equations.columns.of_coverings(len(self.thickness)), equations.cost,
-            equations.gradient, equations.hessian, self.rest.gradient[batch.at], self.rest.tables,
-            equations.by_pose,
+            chain, self.selection.limbs, self.rows, batch.frames, equations,
+            self.rest.gradient[batch.at], self.rest.tables,
         )  # fmt: skip
 
 
 @numba.njit(cache=True, nogil=True)
-def add_cost(chain, normal, weight, target, thickness, group, frames, cost):
-    """Add E_D to cost (B,) of the frames (B,).
-
-    normal (T,N,3), weight (T,N), 0 = no row, target (T,N); thickness (G,), group (N,).
-    """
+def add_cost(chain, rows, frames, cost):
+    """Add E_D of the rows, :class:`CloudArrays`, to cost (B,) of the frames (B,)."""
+    normal, weight, target, thickness, group = rows
     for b in range(len(frames)):
         t, total = frames[b], 0.0
         for i in range(len(group)):
@@ -281,41 +286,24 @@ def _add_squares(rows, weights, block):
 
 
 @numba.njit(cache=True, nogil=True)
-def add_equations(
-    chain,
-    limbs,
-    normal,
-    weight,
-    target,
-    thickness,
-    group,
-    frames,
-    place,
-    place_u,
-    cost,
-    gradient,
-    hessian,
-    rest_gradient,
-    tables,
-    by_pose,
-):
+def add_equations(chain, limbs, given, frames, equations, rest_gradient, tables):
     """Add the normal equations of E_D to those of the frames (B,).
 
-    limbs: :attr:`.Selection.limbs`.
-    normal (T,N,3), weight (T,N), 0 = no row, target (T,N): the rows.
-    thickness (G,), group (N,): coverings.
-    place (P,), place_u (G,): columns of parameters and coverings, -1 = fixed.
-    cost (B,), gradient (B,n), hessian (B,n,n): filled in place.
-    rest_gradient (B,N,3): gradient by the points at rest, filled in place.
-    tables (N,3,486), by_pose (B,54,3,9): see :mod:`intercap_core.body.correctives_kernel`; of no
-    body without pose blend shapes, like rest_gradient.
+    limbs: :class:`.selection.Limbs` of the samples. given: :class:`CloudArrays`.
+    equations: :class:`.term_inputs.BatchEquations`, filled in place.
+    rest_gradient (B,N,3): gradient by the points at rest, filled in place; tables (N,3,486): see
+    :mod:`intercap_core.body.correctives_kernel`. B and N are 0 without pose blend shapes.
     """
+    normal, weight, target, thickness, group = given
+    place, place_u, cost = equations.place, equations.place_u, equations.cost
+    gradient, hessian = equations.gradient, equations.hessian
     order, starts, moved_by = limbs
     dtype = hessian.dtype
     shape = np.flatnonzero(place[_SHAPE:] >= 0)
+    together = 4  # rows that are added to a block at once: speed
     arms = np.empty((chain.chain.shape[1], 3), dtype)
     by_shape = np.empty(len(place) - _SHAPE, dtype)
-    weights, weighted = np.empty(_ROWS_TOGETHER, dtype), np.empty(1, dtype)
+    weights, weighted = np.empty(together, dtype), np.empty(1, dtype)
     limbs_count, size = len(starts) - 1, len(place) + len(place_u)
     all_local = np.empty((limbs_count, len(place)), np.int64)
     all_local_u = np.empty((limbs_count, len(place_u)), np.int64)
@@ -330,7 +318,7 @@ def add_equations(
         for limb in range(limbs_count):
             m, filled = width[limb], 0
             local, local_u, to = all_local[limb], all_local_u[limb], all_to[limb]
-            rows, block = np.empty((_ROWS_TOGETHER, m), dtype), np.zeros((m, m), dtype)
+            rows, block = np.empty((together, m), dtype), np.zeros((m, m), dtype)
             sample_gradient = np.zeros(m, dtype)
             of_limb = np.flatnonzero(moved_by[limb, 1:]) + 1
             for at in range(starts[limb], starts[limb + 1]):
@@ -352,14 +340,14 @@ def add_equations(
                     back = turned_back(chain, b, i, n)
                     for d in range(3):
                         rest_gradient[b, i, d] -= weighted[0] * back[d]
-                    add_to_row(row, local, of_limb, back, tables[i], by_pose[b])
+                    add_to_row(row, local, of_limb, back, tables[i], equations.by_pose[b])
                 weights[filled] = w
                 filled += 1
-                if filled == _ROWS_TOGETHER:
+                if filled == together:
                     _add_squares(rows, weights, block)
                     filled = 0
             if filled:
-                for r in range(filled, _ROWS_TOGETHER):
+                for r in range(filled, together):
                     weights[r] = 0
                     rows[r] = 0
                 _add_squares(rows, weights, block)

@@ -21,7 +21,6 @@ from intercap_core.schemas import BODY_FIT
 
 POINTS = tuple(KEYPOINT_NAMES[BODY])
 _COLUMNS = ("point", "x_mm", "y_mm", "z_mm", "sigma_mm")
-_LARGEST_M = 0.1  # a larger offset means another joint
 UNKNOWN_SIGMA_M = 0.010  # of an offset without a definition; tuned on the studio
 FITTED_SIGMA_M = 0.003  # least value with a definition: offsets are fitted to 3 mm, measured
 
@@ -44,7 +43,7 @@ class Definition:
     def read(cls, path: Path | None) -> Definition:
         """Read a table that :meth:`write` wrote; None = unknown.
 
-        Raises UserError for other files.
+        Raises UserError if it is another file.
         """
         if path is None:
             return cls.unknown()
@@ -89,11 +88,12 @@ def _numbers(path: Path, row: Sequence[str]) -> list[float]:
         values = [float(cell) for cell in row[1:]]
     except ValueError:
         values = []
+    largest_mm = 100.0  # a larger offset means another joint (anatomy)
     size = np.abs(values).max() if len(values) == 4 else np.nan
-    if not size <= 1e3 * _LARGEST_M or not values[3] > 0.01:
+    if not size <= largest_mm or not values[3] > 0.01:
         raise UserError(
             f"{path}: point {quoted(row[0])} has {quoted(row[1:])}, expected three offsets and a "
-            f"deviation above 0 in mm, at most {1e3 * _LARGEST_M:.0f}; write it again by "
+            f"deviation above 0 in mm, at most {largest_mm:.0f}; write it again by "
             "'intercap keypoint-definition'"
         )
     return values
@@ -103,8 +103,8 @@ def average_offsets(fits: Sequence[Path]) -> tuple[Definition, list[str]]:
     """Return the definition from body_fit artefacts of recordings with depth, and the names of the
     people.
 
-    The recordings of a person are averaged first, so each person counts once. Raises UserError for
-    fewer than three people, since the definition cannot be separated from one person's shape.
+    The recordings of a person are averaged first, so each person counts once. Raises UserError if
+    there are fewer than three people: the definition cannot be separated from one person's shape.
     """
     of_person: dict[str, list[np.ndarray]] = {}
     no_depth = []

@@ -27,7 +27,12 @@ from intercap_core.body_fit.matching import Matcher, PosedSkin
 from intercap_core.body_fit.observations import Observations, PersonCloud
 from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.body_fit.self_contact import SelfContact, find_contacts, join_frames
-from intercap_core.body_fit.surface import COVERINGS, SkinSurface, choose_samples
+from intercap_core.body_fit.surface import (
+    COVERINGS,
+    SAMPLE_SHARE,
+    SkinSurface,
+    choose_samples,
+)
 from intercap_core.body_fit.term_inputs import CloudRows, KeypointSet, Pairs, Views, keypoint_set
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.solve.robust import SIGMA_PER_MAD
@@ -45,12 +50,6 @@ KEYPOINT_SIGMA_M = (
 # Factor of sigma for errors that persist over frames, which residuals hide. Tuned on the studio.
 PERSISTENCE = 1.5
 _LEAST_CONFIDENCE = 0.1  # below it, sigma no longer grows; tuned on the studio
-# Neighbouring samples lie on one fold of cloth: four make one measurement. Tuned on the studio.
-_SAMPLE_SHARE = 0.25
-_HALF_WEIGHT_POINTS = 2.0  # points with which a sample has half its weight; tuned on the studio
-_MAX_SPEED = 6.0  # m/s; hands and feet reach about 5 in everyday tasks; tuned on the studio
-_FRAMES_POSED = 16  # frames whose whole surface is posed at once: memory
-_FRAMES_KEPT = 256  # frames whose surface is kept for the next matching: 250 kB each
 
 
 def fit_confidence_exponent(confidence: Tensor, error: Tensor) -> float:
@@ -98,22 +97,20 @@ class Evidence:
     def __init__(
         self,
         model: BodyModel,
-        seen: Observations,
+        observations: Observations,
         clouds: list[PersonCloud | None],
         cloud_weight: float,
     ) -> None:
-        self.model, self.seen, self.cloud_weight = model, seen, cloud_weight
-        self.frames = np.flatnonzero(seen.usable)
+        self.model, self.cloud_weight = model, cloud_weight
+        self.observations = observations
+        self.frames = np.flatnonzero(observations.usable)
         self.clouds = [clouds[t] for t in self.frames]
         self.has_cloud = any(cloud is not None for cloud in self.clouds)
         self.samples = choose_samples(model)
         self.surface = SkinSurface.around_samples(model, self.samples)
-        sample, patch = (
-            torch.as_tensor(places, device=model.device)
-            for places in (self.surface.sample, self.surface.patch)
+        self._self_contact = SelfContact.of(model, self.samples)._replace(
+            vertex=self.surface.sample, patch=self.surface.patch
         )
-        contact = SelfContact.of(model, self.samples)
-        self._self_contact = replace(contact, vertex=sample, patch=patch)  # indices in the surface
         self._matcher = Matcher.of(self.samples, self.surface, model.device)
         self.sample_ids = torch.as_tensor(self.samples.vertex, device=model.device)
         self.group = torch.as_tensor(self.samples.group, device=model.device)
@@ -133,7 +130,7 @@ class Evidence:
         self.usual_confidence = torch.ones_like(self.keypoint_sigma)
         for part, value in KEYPOINT_SIGMA_M:
             self.keypoint_sigma[part] = value
-            seen_at = seen.confidence[self.frames, :, part]
+            seen_at = observations.confidence[self.frames, :, part]
             usual = np.median(seen_at[seen_at > 0]) if (seen_at > 0).any() else 1.0
             self.usual_confidence[part] = float(usual)
 
@@ -141,13 +138,15 @@ class Evidence:
         return torch.as_tensor(values, dtype=self.model.dtype, device=self.model.device)
 
     def take_cameras(self, rig: Rig, depth_bias: np.ndarray) -> None:
-        """Use other camera poses and depth biases (C,), metres, from now on."""
-        seen = self.seen
+        """Replace camera poses and depth biases (C,), metres."""
+        observations = self.observations
         self.clouds = [
-            None if cloud is None else cloud.through(rig, depth_bias, seen.rig, seen.depth_bias)
+            None
+            if cloud is None
+            else cloud.through(rig, depth_bias, observations.rig, observations.depth_bias)
             for cloud in self.clouds
         ]
-        self.seen = replace(seen, rig=rig, depth_bias=depth_bias)
+        self.observations = replace(observations, rig=rig, depth_bias=depth_bias)
 
     # --- keypoints ---------------------------------------------------------------------------
 
@@ -163,20 +162,20 @@ class Evidence:
 
         ``widened`` multiplies sigma, and with it the error from which a keypoint is an outlier.
         """
-        seen, frames = self.seen, self.frames
+        observations, frames = self.observations, self.frames
         problem.keypoints = self.keypoints(hands=hands, face=face)
         chosen = problem.keypoints.index
-        at = np.ix_(frames, np.arange(len(seen.rig)), chosen.cpu().numpy())
+        at = np.ix_(frames, np.arange(len(observations.rig)), chosen.cpu().numpy())
         points = self.points(problem)
-        pose = self._tensor(seen.rig.colour_from_master)
-        lenses = self._tensor(seen.rig.colour_parameters)
+        pose = self._tensor(observations.rig.colour_from_master)
+        lenses = self._tensor(observations.rig.colour_parameters)
         z = points[:, None] @ pose[:, 2, :3, None]
         z = z[..., 0] + pose[:, 2, 3][:, None]
-        confidence = self._tensor(seen.confidence[at])
+        confidence = self._tensor(observations.confidence[at])
         sigma = widened * self.keypoint_sigma[chosen] * lenses[:, None, 0] / z.clamp_min(0.3)
         sigma = sigma * self._sigma_factor(confidence, chosen)
         problem.views = Views(
-            self._tensor(seen.keypoints[at]),
+            self._tensor(observations.keypoints[at]),
             confidence,
             sigma.clamp_min(1.0),
             lenses,
@@ -215,17 +214,19 @@ class Evidence:
     def _shift(self, points: Tensor) -> Tensor | None:
         """Return the displacement (N, C, ..., 3) of points (N, ..., 3) until each camera exposes;
         None if all cameras expose at the time of the frame."""
-        offset = self.seen.time_offset
+        offset = self.observations.time_offset
         if not np.any(offset):
             return None
         return self._tensor(offset)[:, None, None] * self.velocity(points)[:, None]
 
     def velocity(self, points: Tensor) -> Tensor:
         """Return the velocity (N, ..., 3), m/s, of points (N, ..., 3) of the usable frames."""
-        found = limited_velocity(
-            points.double().cpu().numpy(), self.seen.times[self.frames], max_speed=_MAX_SPEED
+        velocity = limited_velocity(
+            points.double().cpu().numpy(),
+            self.observations.times[self.frames],
+            max_speed=6.0,  # m/s; hands reach about 5 in everyday tasks; tuned on the studio
         )
-        return self._tensor(found)
+        return self._tensor(velocity)
 
     def _sigma_factor(self, confidence: Tensor, index: Tensor) -> Tensor:
         """Return the factor (N, C, K) of sigma for keypoints ``index`` (K,) of this confidence."""
@@ -249,8 +250,8 @@ class Evidence:
                 self.keypoint_doubt[part] = fit_confidence_exponent(sure, off.mean(1))
                 factor = self._sigma_factor(views.confidence, index)[:, :, here][known]
                 usual = off / factor[:, None]
-                found = SIGMA_PER_MAD * PERSISTENCE * float(usual.median())
-                self.keypoint_sigma[part] = min(max(found, start * 0.1), start * 4.0)
+                estimate = SIGMA_PER_MAD * PERSISTENCE * float(usual.median())
+                self.keypoint_sigma[part] = min(max(estimate, start * 0.1), start * 4.0)
 
     # --- cloud -------------------------------------------------------------------------------
 
@@ -267,9 +268,9 @@ class Evidence:
             part = self.group == g
             known = rows.weight[:, part] > 0
             if bool(known.any()):
-                found = SIGMA_PER_MAD * float(residual[:, part][known].median())
+                estimate = SIGMA_PER_MAD * float(residual[:, part][known].median())
                 start = covering.noise
-                self.cloud_noise[g] = min(max(found, start * 0.1), start * 1.5)
+                self.cloud_noise[g] = min(max(estimate, start * 0.1), start * 1.5)
 
     def _bodies(self, base: Tensor) -> Iterator[tuple[int, Tensor, Tensor]]:
         """Pose the bodies ``base`` (N, P), a few at a time.
@@ -280,29 +281,30 @@ class Evidence:
         if self._posed is not None and torch.equal(self._posed[0], base):
             yield from self._posed[1]
             return
+        together, kept = 16, 256  # frames: memory; the surface of a frame has 250 kB
         self._posed, parts = None, []
         params = self.model.parameters(base)
-        for start in range(0, len(base), _FRAMES_POSED):
-            part = (start, *self.surface.posed(params.frames(slice(start, start + _FRAMES_POSED))))
-            if len(base) <= _FRAMES_KEPT:
+        for start in range(0, len(base), together):
+            part = (start, *self.surface.posed(params.frames(slice(start, start + together))))
+            if len(base) <= kept:
                 parts.append(part)
             yield part
         if parts:
             self._posed = (base.clone(), parts)
 
-    def touch(self, problem: BodyProblem) -> Pairs | None:
-        """Find where parts of the problem's bodies penetrate each other; None = nowhere, or the
-        term is switched off."""
+    def find_pairs(self, problem: BodyProblem) -> Pairs | None:
+        """Find the samples inside another part of the body; None if there are none or the term is
+        switched off."""
         if not problem.self_weight:
             return None
         ids = torch.as_tensor(self.surface.ids, device=self.model.device)
-        found = []
+        contacts = []
         for _, vertices, normals in self._bodies(problem.base):
-            found += self._threads.map(
+            contacts += self._threads.map(
                 lambda posed: find_contacts(self._self_contact, *posed),
                 list(zip(vertices, normals, strict=True)),
             )
-        return join_frames([(ids[inner], ids[outer], normal) for inner, outer, normal in found])
+        return join_frames([(ids[inner], ids[outer], normal) for inner, outer, normal in contacts])
 
     def match(
         self, problem: BodyProblem, reach: float, only: np.ndarray | None = None
@@ -314,7 +316,7 @@ class Evidence:
             reach: largest valid distance, metres.
             only: (N,) the one camera of each frame that counts; None = all cameras.
         """
-        count, size, views = len(self.frames), len(self.samples.vertex), len(self.seen.rig)
+        count, size, views = len(self.frames), len(self.samples.vertex), len(self.observations.rig)
         params = self.model.parameters(problem.base)
         where = self.model.forward(params, vertex_ids=self.sample_ids).vertices
         shift = self._shift(where)
@@ -323,8 +325,8 @@ class Evidence:
         expected = problem.thickness().repeat(views)
         normal = where.new_zeros(count, size, 3)
         for start, vertices, normals in self._bodies(problem.base):
-            normal[start : start + len(normals)] = normals[:, self._self_contact.vertex]
-            seen = [
+            normal[start : start + len(normals)] = normals[:, self._matcher.sample]
+            measured = [
                 (start + row, *posed)
                 for row, posed in enumerate(zip(vertices, normals, strict=True))
                 if self.clouds[start + row] is not None
@@ -336,27 +338,34 @@ class Evidence:
                 assert cloud is not None
                 if only is not None:
                     cloud = cloud.of_view(int(only[t]))
-                late = None if shift is None else shift[t]
-                skin = PosedSkin(vertices, normals, where[t], late)
-                found = self._matcher.match(
-                    cloud, self.seen.rig, self.seen.depth_bias, skin, expected, reach
+                skin = PosedSkin(vertices, normals, where[t], None if shift is None else shift[t])
+                matches = self._matcher.match(
+                    cloud,
+                    self.observations.rig,
+                    self.observations.depth_bias,
+                    skin,
+                    expected,
+                    reach,
                 )
-                of_views[t], points[t] = found.distance, found.points
-                self.measured[t], self.cloud_residual[t] = found.measured, found.residual
+                of_views[t], points[t] = matches.distance, matches.points
+                self.measured[t], self.cloud_residual[t] = matches.measured, matches.residual
 
-            self._threads.map(match_frame, seen)
+            self._threads.map(match_frame, measured)
         self.by_view = ViewDistances(of_views, points, where, normal)
         return self.rows(points)
 
     def rows(self, points: Tensor) -> CloudRows:
-        """Return the rows of the last :meth:`match` with these numbers of points (N, C, S), 0 = do
-        not count."""
-        found = self.by_view
-        assert found is not None, "match comes first"
+        """Return the rows of the last :meth:`match` with these numbers of points (N, C, S).
+
+        Samples with 0 points have no weight.
+        """
+        by_view = self.by_view
+        assert by_view is not None, "call match first"
         total = points.sum(1)
-        mean = (found.distance * points).sum(1) / total.clamp_min(1e-6)
+        mean = (by_view.distance * points).sum(1) / total.clamp_min(1e-6)
         noise = self.cloud_noise[self.group]
-        share = self.cloud_weight * _SAMPLE_SHARE
-        weight = share * total / (total + _HALF_WEIGHT_POINTS) / noise**2
-        target = mean + (found.normal * found.where).sum(2)
-        return CloudRows(target, found.normal, weight)
+        share = self.cloud_weight * SAMPLE_SHARE
+        # with two points a sample has half its weight; tuned on the studio
+        weight = share * total / (total + 2.0) / noise**2
+        target = mean + (by_view.normal * by_view.where).sum(2)
+        return CloudRows(target, by_view.normal, weight)

@@ -9,9 +9,8 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-_GROUP = 48  # triangles: speed
 # Share of their size by which triangles are enlarged, so that no ray passes between two.
-_BEYOND = 1e-9
+_MARGIN = 1e-9
 
 
 def first_hits(
@@ -26,17 +25,18 @@ def first_hits(
         directions: (N, 3) unit vectors.
     """
     corners = points[faces].astype(np.float64)
-    order, starts = _grouped(corners.mean(1))
+    order, starts = _group_triangles(corners.mean(1))
     return _first_hits(corners[order], starts, origins.astype(float), directions.astype(float))
 
 
-def _grouped(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _group_triangles(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Order points (N, 3) along Morton's curve, and group them.
 
     Returns the order (N,), the start of each group in it, and the end. A group starts where the
     curve enters another cube of 1/32 of the size of the mesh, and after 48 points.
     """
     bits, cube_bits = 9, 4  # of each coordinate: along the curve, and within a cube
+    size_of_group = 48  # triangles: speed
     low, size = points.min(0), np.ptp(points, axis=0).max()
     cell = ((points - low) / max(size, 1e-9) * (2**bits - 1)).astype(np.int64)
     place = np.zeros(len(points), np.int64)
@@ -46,7 +46,7 @@ def _grouped(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     order = np.argsort(place, kind="stable")
     cube = place[order] >> 3 * cube_bits
     enters = np.flatnonzero(np.diff(cube)) + 1
-    return order, np.union1d(enters, [*range(0, len(order), _GROUP), len(order)])
+    return order, np.union1d(enters, [*range(0, len(order), size_of_group), len(order)])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -60,9 +60,9 @@ def _first_hits(corners, starts, origins, directions):
             for c in range(3):
                 u, v, w = own[f, c, 0] - x[g], own[f, c, 1] - y[g], own[f, c, 2] - z[g]
                 radius[g] = max(radius[g], np.sqrt(u * u + v * v + w * w))
-    within = radius * radius * (1 + _BEYOND)
+    within = radius * radius * (1 + _MARGIN)
     along, aside = np.empty(groups), np.empty(groups)
-    found = np.full(len(origins), np.inf)
+    nearest = np.full(len(origins), np.inf)
     for r in range(len(origins)):
         ox, oy, oz = origins[r, 0], origins[r, 1], origins[r, 2]
         dx, dy, dz = directions[r, 0], directions[r, 1], directions[r, 2]
@@ -71,17 +71,17 @@ def _first_hits(corners, starts, origins, directions):
             along[g] = u * dx + v * dy + w * dz
             aside[g] = u * u + v * v + w * w - along[g] * along[g] - within[g]
         for g in range(groups):
-            if aside[g] > 0 or along[g] < -radius[g] or along[g] - radius[g] > found[r]:
+            if aside[g] > 0 or along[g] < -radius[g] or along[g] - radius[g] > nearest[r]:
                 continue
             for f in range(starts[g], starts[g + 1]):
-                t = _meets(corners[f], ox, oy, oz, dx, dy, dz)
-                if 0 < t < found[r]:
-                    found[r] = t
-    return found
+                t = _intersect(corners[f], ox, oy, oz, dx, dy, dz)
+                if 0 < t < nearest[r]:
+                    nearest[r] = t
+    return nearest
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _meets(triangle, ox, oy, oz, dx, dy, dz):
+def _intersect(triangle, ox, oy, oz, dx, dy, dz):
     """Return the distance along the ray to a triangle (3,3); -1 = no intersection."""
     ax, ay, az = triangle[0, 0], triangle[0, 1], triangle[0, 2]
     ux, uy, uz = triangle[1, 0] - ax, triangle[1, 1] - ay, triangle[1, 2] - az
@@ -92,10 +92,10 @@ def _meets(triangle, ox, oy, oz, dx, dy, dz):
         return -1.0
     sx, sy, sz = ox - ax, oy - ay, oz - az
     u = (sx * px + sy * py + sz * pz) / volume
-    if u < -_BEYOND or u > 1 + _BEYOND:
+    if u < -_MARGIN or u > 1 + _MARGIN:
         return -1.0
     qx, qy, qz = sy * uz - sz * uy, sz * ux - sx * uz, sx * uy - sy * ux
     v = (dx * qx + dy * qy + dz * qz) / volume
-    if v < -_BEYOND or u + v > 1 + _BEYOND:
+    if v < -_MARGIN or u + v > 1 + _MARGIN:
         return -1.0
     return (vx * qx + vy * qy + vz * qz) / volume

@@ -25,8 +25,8 @@ from intercap_core.geometry.camera.rig import Camera
 _BEHIND_M = 0.06
 # Largest cosine of the normal and the viewing direction: about 84 degrees. Tuned on the studio.
 _FACING = 0.1
-_NEAREST_M = 0.3  # depth; the range of the Azure Kinect (NFOV) starts at 0.5 m (data sheet)
-_REACH_M, _STEP_M = 0.05, 0.01  # length and step of the search inward; tuned on the studio
+# Smallest depth of a vertex, metres: the Azure Kinect (NFOV) measures from 0.5 m (data sheet).
+_NEAREST_M = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ class DepthWindow:
     """(h, w) uint16, mm."""
 
 
-def seen_through(
+def find_protruding(
     window: DepthWindow,
     camera: Camera,
     depth_bias: float,
@@ -62,41 +62,27 @@ def seen_through(
         (M,) distance by which it sticks out, metres, > 0.
     """
     assert camera.depth is not None
-    return _seen_through(
+    return _find_protruding(
         window.depth, *window.first, tuple(camera.depth.parameters.tolist()),
-        camera.depth_from_master, depth_bias, points, normals,
-        _BEHIND_M, _FACING, _NEAREST_M, _REACH_M, _STEP_M,
+        camera.depth_from_master, depth_bias + _BEHIND_M, points, normals,
     )  # fmt: skip
 
 
 @numba.njit(cache=True, nogil=True)
-def _seen_through(
-    depth,
-    top,
-    left,
-    lens,
-    pose,
-    bias,
-    points,
-    normals,
-    behind,
-    facing,
-    nearest,
-    reach,
-    step,
-):
-    """Compiled form of :func:`seen_through`.
+def _find_protruding(depth, top, left, lens, pose, behind, points, normals):
+    """Compiled form of :func:`find_protruding`.
 
     depth (h,w) uint16 mm, whose first pixel is at row ``top`` and column ``left`` of the image;
-    lens: thirteen parameters; pose (4,4): depth_from_master; bias: metres.
-    The other arguments are the constants of this module.
+    lens: thirteen parameters; pose (4,4): depth_from_master; behind: metres behind a vertex from
+    which a depth is not the person's.
     """
     index, away = np.empty(len(points), np.int64), np.empty(len(points))
-    count, steps = 0, int(np.rint(reach / step))
+    count = 0
+    steps, step = 5, 0.01  # number and length of the steps inward, metres; tuned on the studio
     for i in range(len(points)):
         px, py, pz = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
         z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
-        if not z > nearest:
+        if not z > _NEAREST_M:
             continue
         x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]
         y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]
@@ -104,15 +90,14 @@ def _seen_through(
         nx = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz
         ny = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz
         nz = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz
-        if not nx * x + ny * y + nz * z < facing * np.sqrt(x * x + y * y + z * z):
+        if not nx * x + ny * y + nz * z < _FACING * np.sqrt(x * x + y * y + z * z):
             continue
-        if not _past(depth, top, left, lens, x, y, z, bias + behind):
+        if not _is_measured_behind(depth, top, left, lens, x, y, z, behind):
             continue
         for s in range(1, steps + 1):
             way = s * step
-            if _past(
-                depth, top, left, lens, x - way * nx, y - way * ny, z - way * nz, bias + behind
-            ):
+            inward = x - way * nx, y - way * ny, z - way * nz
+            if _is_measured_behind(depth, top, left, lens, *inward, behind):
                 continue
             # the nearest step is within the error of the image: counting only the errors outward
             # would make every person thinner
@@ -125,9 +110,8 @@ def _seen_through(
 
 
 @numba.njit(cache=True, nogil=True)
-def _past(depth, top, left, lens, x, y, z, behind):
-    """Return whether the depth at a point, depth camera's frame, is more than ``behind`` metres
-    farther."""
+def _is_measured_behind(depth, top, left, lens, x, y, z, behind):
+    """Return whether a camera's depth at a point of its frame is ``behind`` metres farther."""
     u, v = project_point(x, y, z, lens)
     if not (np.isfinite(u) and np.isfinite(v)):
         return False

@@ -29,7 +29,7 @@ _PARENTS = np.array(PARENTS)
 
 class KeypointData(NamedTuple):
     """:class:`.term_inputs.Views` and :class:`.term_inputs.Targets` as arrays in the floating type
-    of the model. Absent ones have no frame."""
+    of the model. Without observations of a kind, its arrays are empty."""
 
     observed: np.ndarray
     confidence: np.ndarray
@@ -306,31 +306,16 @@ def _add_offset(turn, by_keypoint, matrix, weighted, to, first, gradient, hessia
 
 
 @numba.njit(cache=True, nogil=True)
-def add_equations(
-    skeleton,
-    pieces,
-    rest,
-    observed,
-    frames,
-    place,
-    first_offset,
-    offsets,
-    cost,
-    gradient,
-    hessian,
-    rest_gradient,
-    by_pose,
-):
+def add_equations(skeleton, pieces, rest, observed, frames, equations, rest_gradient):
     """Add the normal equations of E_J to those of the frames (B,).
 
     rest (B,E,3): pieces at rest.
-    place (P,): column of each parameter, -1 = fixed.
-    first_offset, offsets: first column and number of keypoint offsets, three columns each.
-    cost (B,), gradient (B,n), hessian (B,n,n): filled in place.
-    rest_gradient (B,E,3): gradient by the pieces at rest, filled in place.
-    by_pose (B,54,3,9): see :mod:`intercap_core.body.correctives_kernel`; of no body without pose
-    blend shapes, like rest_gradient.
+    equations: :class:`.term_inputs.BatchEquations`, filled in place.
+    rest_gradient (B,E,3): gradient by the pieces at rest, filled in place; B = 0 without pose blend
+    shapes.
     """
+    place, cost = equations.place, equations.cost
+    gradient, hessian = equations.gradient, equations.hessian
     dtype = hessian.dtype
     shape = np.flatnonzero(place[_SHAPE:] >= 0)
     moved = np.empty((3, len(place) - _SHAPE), dtype)
@@ -363,25 +348,17 @@ def add_equations(
                     )
                 if len(rest_gradient):
                     _add_correctives(
-                        skeleton,
-                        pieces,
-                        b,
-                        k,
-                        by_keypoint,
-                        rest_gradient,
-                        rows,
-                        local,
-                        of_limb,
-                        by_pose[b],
+                        skeleton, pieces, b, k, by_keypoint, rest_gradient, rows, local, of_limb,
+                        equations.by_pose[b],
                     )  # fmt: skip
                 for i in range(3):
                     for o in range(3):
                         narrow[i, o] = matrix[i, o]
                 _weigh(narrow, rows, weighted)
                 _add_product(rows, weighted, block)
-                if k < offsets:
+                if k < equations.offsets:
                     turn = skeleton.rotations[b, pieces.bone[pieces.carrier[k]]]
-                    first = first_offset + 3 * k
+                    first = equations.first_offset + 3 * k
                     _add_offset(
                         turn, by_keypoint, matrix, weighted, to, first, gradient[b], hessian[b]
                     )

@@ -59,12 +59,12 @@ class Keypoints(NamedTuple):
     rotations: Tensor
     """(B, K, 3, 3) of the bones that carry the offsets."""
     own_limb: Tensor | None = None
-    """(B, K, 3, n) derivatives for Gauss-Newton matrices: pose blend shapes by the joints of each
-    keypoint's own limb alone."""
+    """(B, K, 3, n) derivatives for Gauss-Newton matrices, which contain pose blend shapes only by
+    the joints of each keypoint's own limb."""
 
 
 class PointTerm(NamedTuple):
-    """A cost that depends on the body through points alone."""
+    """A cost as a function of K points of B bodies."""
 
     cost: Tensor
     """(B,)"""
@@ -288,11 +288,9 @@ class PreparedKeypoints:
         )
 
     def add(self, batch: Batch, equations: BatchEquations) -> None:
-        columns = equations.columns
         keypoint_kernel.add_equations(
             batch.skeleton, self.pieces, self.rest.points[batch.at], self.data, batch.frames,
-            equations.place, columns.offsets_at.start, columns.offsets, equations.cost,
-            equations.gradient, equations.hessian, self.rest.gradient[batch.at], equations.by_pose,
+            equations, self.rest.gradient[batch.at],
         )  # fmt: skip
 
 

@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from intercap_core.body_fit.free_space import seen_through
+from intercap_core.body_fit.free_space import find_protruding
 from intercap_core.body_fit.observations import PersonCloud
-from intercap_core.body_fit.outlines import RimSamples, touching
+from intercap_core.body_fit.outlines import RimSamples, find_touched
 from intercap_core.body_fit.surface import MATCH_SIDEWAYS_M, NORMAL_LENGTH_M, Samples, SkinSurface
 from intercap_core.geometry.camera.rig import Rig
 
@@ -58,64 +58,34 @@ def match_points(
         surface: samples and patches.
         reach: largest valid distance along the normal, metres.
     """
-    if vertices.device.type != "cpu":
-        return match_in_torch(points, normals, vertices, vertex_normals, surface, reach)
-    kind = vertices.dtype
-    found = _match(
-        points.to(kind).numpy(), normals.to(kind).numpy(), vertices.numpy(),
-        vertex_normals.numpy(), surface.sample, surface.patch, surface.order, surface.groups,
-        vertices.numpy().dtype.type(NORMAL_LENGTH_M), reach, MATCH_SIDEWAYS_M, MATCH_COSINE,
+
+    def array(values: Tensor) -> np.ndarray:
+        return values.to("cpu", vertices.dtype).numpy()
+
+    arrays = _match(
+        array(points), array(normals), array(vertices), array(vertex_normals), surface.sample,
+        surface.patch, surface.order, surface.groups, reach,
     )  # fmt: skip
-    return Matches(*map(torch.from_numpy, found))
-
-
-def match_in_torch(
-    points: Tensor,
-    normals: Tensor,
-    vertices: Tensor,
-    vertex_normals: Tensor,
-    surface: SkinSurface,
-    reach: float,
-) -> Matches:
-    """The readable form of :func:`match_points`, on any device."""
-    samples, patch = (
-        torch.as_tensor(places, device=vertices.device)
-        for places in (surface.sample, surface.patch)
-    )
-    v, n = vertices[samples], vertex_normals[samples]
-    centre = v.mean(0)
-    ours = torch.cat([v - centre, NORMAL_LENGTH_M * n], 1)
-    theirs = torch.cat([points - centre, NORMAL_LENGTH_M * normals], 1)
-    sample = torch.addmm((ours * ours).sum(1), theirs, ours.T, alpha=-2).argmin(1)
-    near = patch[sample]
-    gap = points[:, None] - vertices[near]
-    best = (gap * gap).sum(2).argmin(1, keepdim=True)
-    at = near.gather(1, best)[:, 0]
-    gap = gap.gather(1, best[..., None].expand(-1, 1, 3))[:, 0]
-    normal = vertex_normals[at]
-    distance = (normal * gap).sum(1)
-    sideways = (gap - distance[:, None] * normal).norm(dim=1)
-    valid = ((normal * normals).sum(1) > MATCH_COSINE) & (distance.abs() < reach)
-    return Matches(sample, distance, valid & (sideways < MATCH_SIDEWAYS_M))
+    return Matches(*(torch.as_tensor(values, device=vertices.device) for values in arrays))
 
 
 def average(
-    found: Matches, trust: Tensor, expected: Tensor, *, huber: float
+    matches: Matches, trust: Tensor, expected: Tensor, *, huber: float
 ) -> tuple[Tensor, Tensor]:
     """Return the mean distance (N,) at each sample and the effective number of points (N,).
 
     Args:
-        found: matches of M points.
+        matches: of M points.
         trust: (M,) weight of each point.
         expected: (N,) thickness of the covering at each sample, metres.
         huber: distance from ``expected`` beyond which a point has less weight, metres (one
             iteration of Huber's weight).
     """
-    excess = (found.distance - expected[found.sample]).abs()
-    weight = trust * found.valid * (huber / excess.clamp_min(huber))
+    excess = (matches.distance - expected[matches.sample]).abs()
+    weight = trust * matches.valid * (huber / excess.clamp_min(huber))
     total = torch.zeros(len(expected), dtype=trust.dtype, device=trust.device)
-    total = total.index_add(0, found.sample, weight)
-    summed = torch.zeros_like(total).index_add(0, found.sample, weight * found.distance)
+    total = total.index_add(0, matches.sample, weight)
+    summed = torch.zeros_like(total).index_add(0, matches.sample, weight * matches.distance)
     return summed / total.clamp_min(1e-6), total
 
 
@@ -131,7 +101,7 @@ class PosedSkin(NamedTuple):
     """(R, 3) unit normals; those of samples and patches are correct."""
     samples: Tensor
     """(S, 3) positions of the samples."""
-    late: Tensor | None
+    displacement: Tensor | None
     """(C, S, 3) displacement of the samples until each camera exposes."""
 
 
@@ -206,84 +176,71 @@ class Matcher:
 
     def _match_points(self, cloud: PersonCloud, skin: PosedSkin, reach: float) -> Matches:
         """Match the depth points, by sample."""
-        found = match_points(
+        matches = match_points(
             cloud.points, cloud.normals, skin.vertices, skin.normals, self.surface, reach
         )
-        if skin.late is None:
-            return found
-        outward = skin.normals[self.sample[found.sample]]
-        moved = (skin.late[cloud.view, found.sample] * outward).sum(1)
-        return found._replace(distance=found.distance - moved)
+        if skin.displacement is None:
+            return matches
+        outward = skin.normals[self.sample[matches.sample]]
+        moved = (skin.displacement[cloud.view, matches.sample] * outward).sum(1)
+        return matches._replace(distance=matches.distance - moved)
 
     def _find_protruding(
         self, cloud: PersonCloud, rig: Rig, depth_bias: np.ndarray, skin: PosedSkin
     ) -> tuple[Matches, Tensor]:
         """Match samples in front of a surface measured farther away, and return their trust."""
         outward = skin.normals[self.sample].cpu().numpy()
-        found = []
+        parts = []
         for window in cloud.windows:
-            view = window.view
-            late = skin.samples if skin.late is None else skin.samples + skin.late[view]
-            out, inside = seen_through(
-                window, rig[view], float(depth_bias[view]), late.cpu().numpy(), outward
+            view, samples = window.view, skin.samples
+            if skin.displacement is not None:
+                samples = samples + skin.displacement[view]
+            index, inside = find_protruding(
+                window, rig[view], float(depth_bias[view]), samples.cpu().numpy(), outward
             )
-            found.append((view, out, -inside))
-        return self._join(found, skin)
+            parts.append((view, index, -inside))
+        return self._join(parts, skin)
 
     def _find_on_rims(
         self, cloud: PersonCloud, rig: Rig, skin: PosedSkin, reach: float
     ) -> tuple[Matches, Tensor]:
         """Match samples that the rims of masks touch, and return their trust."""
         vertices, normals = skin.vertices.cpu().numpy(), skin.normals.cpu().numpy()
-        found = []
+        parts = []
         for rim in cloud.outlines:
-            late = None if skin.late is None else skin.late[rim.view].cpu().numpy()
+            moved = None if skin.displacement is None else skin.displacement[rim.view].cpu().numpy()
             pose = rig[rim.view].master_from_colour
-            at, apart = touching(rim, pose, vertices, normals, self.rims, reach, late)
-            found.append((rim.view, at, apart))
-        return self._join(found, skin)
+            index, distance = find_touched(rim, pose, vertices, normals, self.rims, reach, moved)
+            parts.append((rim.view, index, distance))
+        return self._join(parts, skin)
 
     def _join(
-        self, found: list[tuple[int, np.ndarray, np.ndarray]], skin: PosedSkin
+        self, parts: list[tuple[int, np.ndarray, np.ndarray]], skin: PosedSkin
     ) -> tuple[Matches, Tensor]:
         """Join samples (M,) and distances (M,) of all views, with the trust of one depth point."""
-        where = skin.samples
-        sample, distance = [self.sample[:0]], [where[:0, 0]]
-        for view, at, apart in found:
-            sample.append(self._row(view, torch.as_tensor(at, device=where.device)))
-            distance.append(torch.as_tensor(apart, dtype=where.dtype, device=where.device))
+        like = skin.samples
+        sample, distance = [self.sample[:0]], [like[:0, 0]]
+        for view, index, away in parts:
+            sample.append(self._row(view, torch.as_tensor(index, device=like.device)))
+            distance.append(torch.as_tensor(away, dtype=like.dtype, device=like.device))
         every = torch.cat(sample)
         matches = Matches(every, torch.cat(distance), torch.ones_like(every, dtype=torch.bool))
-        return matches, where.new_ones(len(every))
+        return matches, like.new_ones(len(every))
 
 
 # --- compiled --------------------------------------------------------------------------------
 
 
 @numba.njit(cache=True, nogil=True)
-def _match(
-    points,
-    point_normals,
-    vertices,
-    normals,
-    samples,
-    patch,
-    order,
-    starts,
-    length,
-    reach,
-    aside,
-    turned,
-):
-    """:func:`match_in_torch`, compiled: sample (M,), signed distance (M,), validity (M,).
+def _match(points, point_normals, vertices, normals, samples, patch, order, starts, reach):
+    """Return sample (M,), signed distance (M,) and validity (M,); see :func:`match_points`.
 
     points, point_normals (M,3): measured. vertices, normals (R,3): posed surface.
     samples (S,), patch (S,20): vertices. order (S,), starts (G + 1,): groups of samples; a group
     whose bounding sphere is farther than the best match so far is skipped.
-    length: metres per radian between normals. reach, aside: largest distances along the normal and
-    from it, metres. turned: smallest cosine between the normals.
     """
     groups, kind = len(starts) - 1, vertices.dtype
+    length = kind.type(NORMAL_LENGTH_M)
     own, centre = np.empty((6, len(order)), kind), np.zeros((6, groups), kind)
     radius, to_group = np.zeros(groups, kind), np.empty(groups, kind)
     longest = 0
@@ -330,9 +287,10 @@ def _match(
         distance[m] = height
         sx, sy, sz = gx - height * nx, gy - height * ny, gz - height * nz
         valid[m] = (
-            nx * point_normals[m, 0] + ny * point_normals[m, 1] + nz * point_normals[m, 2] > turned
+            nx * point_normals[m, 0] + ny * point_normals[m, 1] + nz * point_normals[m, 2]
+            > MATCH_COSINE
             and abs(height) < reach
-            and np.sqrt(sx * sx + sy * sy + sz * sz) < aside
+            and np.sqrt(sx * sx + sy * sy + sz * sz) < MATCH_SIDEWAYS_M
         )
     return sample, distance, valid
 

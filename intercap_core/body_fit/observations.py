@@ -24,15 +24,6 @@ from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.solve.thread_pool import ThreadPool
 from intercap_core.schemas import PERSON, SCENE
 
-# Factor of the confidence of a view that disagrees with the triangulated point. Tuned on the
-# studio.
-_OUTLIER_VIEW_TRUST = 0.2
-# Distance in front of the background from which a pixel is the person's, metres. Tuned on the
-# studio.
-_BEFORE_BACKGROUND_M = 0.04
-_NORMAL_BASE_PX = 3  # half the base over which a normal is measured; tuned on the studio
-_DEPTH_EDGE_M = 0.04  # a larger step within this base is an edge; tuned on the studio
-
 # neck, shoulders, mid hip, hips: keypoints that place the trunk
 TRUNK_KEYPOINTS = (1, 2, 5, 8, 9, 12)
 
@@ -82,8 +73,7 @@ class Observations:
     def usable(self) -> np.ndarray:
         """(T,) bool: a body can be placed, or six keypoints are known within 1 s of such a frame.
 
-        One view from the side, or over a table, may see no more than one shoulder. Tuned on the
-        studio.
+        One view from the side or over a table may see only one shoulder. Tuned on the studio.
         """
         placed = self.placed
         if not placed.any():
@@ -94,7 +84,7 @@ class Observations:
 
 
 def read_observations(scene: Path, person: Path) -> Observations:
-    """Read scene and person. Raises UserError if the artefacts do not belong together."""
+    """Read the observations. Raises UserError if the artefacts do not belong together."""
     with artefacts.read(scene, SCENE) as read:
         rig = Rig.from_artefact(read)
         sequence = str(read.attributes["sequence"])
@@ -122,8 +112,9 @@ def read_observations(scene: Path, person: Path) -> Observations:
         if "beside_offsets" in read:
             others = unpack_ragged(read["beside_offsets"], read["beside_rle"])
     confidence = np.clip(np.nan_to_num(keypoints[..., 2]), 0.0, 1.0)
-    disputed = (views >= 2)[:, None] & ~inlier
-    confidence = np.where(disputed, _OUTLIER_VIEW_TRUST * confidence, confidence)
+    # a view that disagrees with the triangulated point; the factor is tuned on the studio
+    outlier = (views >= 2)[:, None] & ~inlier
+    confidence = np.where(outlier, 0.2 * confidence, confidence)
     confidence[~np.isfinite(keypoints[..., :2]).all(-1)] = 0
     return Observations(
         sequence=sequence,
@@ -189,30 +180,32 @@ class PersonCloud:
 
 
 def person_clouds(
-    frames: Path, seen: Observations, count: int, device: torch.device
+    frames: Path, observations: Observations, count: int, device: torch.device
 ) -> list[PersonCloud | None]:
     """Return the cloud of every frame, of about ``count`` points; None = no mask."""
     with Frames.open(frames) as reader:
-        reader = reader.showing(seen.image_of)
+        reader = reader.showing(observations.image_of)
         return ThreadPool(torch.get_num_threads()).map(
-            lambda t: _fuse(reader, seen, t, count, device), range(seen.num_frames)
+            lambda t: _fuse(reader, observations, t, count, device), range(observations.num_frames)
         )
 
 
 def _fuse(
-    reader: Frames, seen: Observations, t: int, count: int, device: torch.device
+    reader: Frames, observations: Observations, t: int, count: int, device: torch.device
 ) -> PersonCloud | None:
     seen_by: list[tuple[int, np.ndarray, np.ndarray]] = []  # camera, depth image, pixels
     windows, outlines = [], []
-    for c, camera in enumerate(seen.rig):
-        at = t * len(seen.rig) + c
-        mask = _runs(seen.masks[at], camera)
+    for c, camera in enumerate(observations.rig):
+        at = t * len(observations.rig) + c
+        mask = _runs(observations.masks[at], camera)
         if mask is None:
             continue
         depth = None if camera.depth is None else reader.depth(t, c)
         # a mask without a detector counts only where there is no depth and other objects are known
-        if seen.mask_source[t, c] == FROM_DETECTOR or (depth is None and seen.other_masks[at]):
-            rim = trace_outline(mask, _runs(seen.other_masks[at], camera), camera.colour, c)
+        if observations.mask_source[t, c] == FROM_DETECTOR or (
+            depth is None and observations.other_masks[at]
+        ):
+            rim = trace_outline(mask, _runs(observations.other_masks[at], camera), camera.colour, c)
             outlines += [] if rim is None else [rim]
         if depth is None:
             continue
@@ -225,8 +218,8 @@ def _fuse(
             camera,
             mask,
             window,
-            background=seen.background[c],
-            before_m=_BEFORE_BACKGROUND_M,
+            background=observations.background[c],
+            before_m=0.04,  # of the background; tuned on the studio
             every=2,  # neighbouring rows show the same
         )
         if len(index):
@@ -243,7 +236,7 @@ def _fuse(
     parts: list[tuple[np.ndarray, ...]] = [(none.reshape(0, 3), none.reshape(0, 3), none, none)]
     for (c, depth, index), start in zip(seen_by, first[:-1], strict=True):
         chosen = index[pick[(pick >= start) & (pick < start + len(index))] - start]
-        in_master = _place_pixels(depth, seen.rig[c], chosen, seen.depth_bias[c])
+        in_master = _place_pixels(depth, observations.rig[c], chosen, observations.depth_bias[c])
         parts.append((*in_master, np.full(len(chosen), c)))
     points, normals, trust, view = (np.concatenate(p) for p in zip(*parts, strict=True))
     return PersonCloud(
@@ -277,6 +270,8 @@ def _measure_normals(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return points and unit normals (M, 3), depth camera's frame, and edge flags (M,)."""
     assert camera.depth is not None
+    base = 3  # px, half the base over which a normal is measured; tuned on the studio
+    edge_m = 0.04  # a larger step of depth within this base is an edge; tuned on the studio
     height, width = depth.shape
     rays = camera.depth.rays
     row, column = np.divmod(index, width)
@@ -286,14 +281,14 @@ def _measure_normals(
         r, c = np.clip(r, 0, height - 1), np.clip(c, 0, width - 1)
         there = depth[r, c].astype(np.float32) * np.float32(1e-3)
         ray = rays[r, c]
-        good = (there > 0) & (np.abs(there - z) < _DEPTH_EDGE_M) & np.isfinite(ray[:, 0])
+        good = (there > 0) & (np.abs(there - z) < edge_m) & np.isfinite(ray[:, 0])
         ray = np.where(good[:, None], ray, 0)
         return np.concatenate([ray * there[:, None], there[:, None]], 1), good
 
     ray = np.nan_to_num(rays[row, column])
     here = np.concatenate([ray * z[:, None], z[:, None]], 1)
     spans, smooth = [], np.ones(len(index), bool)
-    for dr, dc in ((0, _NORMAL_BASE_PX), (_NORMAL_BASE_PX, 0)):
+    for dr, dc in ((0, base), (base, 0)):
         ahead, a = at(row + dr, column + dc)
         back, b = at(row - dr, column - dc)
         # one-sided where the other side is another surface

@@ -25,17 +25,11 @@ from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.mask_pixels import drawn
 from intercap_core.geometry.camera.masks import Runs
 
-_BLUR_PX = 3.0  # over which the direction of the rim is measured; tuned on the studio
-_SHORTEST_PX = 40  # rims of smaller spots and holes are errors of the network; tuned on the studio
-# px outward of a rim at which another object is looked for, in an image of 720 lines: masks of
-# touching objects are some pixels apart. Tuned on the studio.
-_OUTWARD_AT_720P = (1.0, 4.0, 7.0)
 # Largest cosine between the line of sight and the normal of a sample on the rim: two thirds of the
 # spacing of samples on a limb. Tuned on the studio.
 _FACING = 0.6
-_COSINE = (
-    0.8  # smallest, between the normals of the rim's plane and its vertex; tuned on the studio
-)
+# Smallest cosine between the normals of the rim's plane and its vertex. Tuned on the studio.
+_COSINE = 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +54,8 @@ def trace_outline(mask: Runs, others: Runs | None, lens: Intrinsics, view: int) 
     inside = (pixels > 2) & (pixels < np.array([mask.width, mask.height]) - 3)
     own = inside.all(1)
     if others is not None:
-        for away in _OUTWARD_AT_720P:
+        # masks of touching objects are some pixels apart; px of 720 lines, tuned on the studio
+        for away in (1.0, 4.0, 7.0):
             ahead = np.rint(pixels + away * mask.height / 720 * outward).astype(int)
             own &= ~others.sample(*ahead.T)
     keep = np.flatnonzero(own)
@@ -84,16 +79,18 @@ def trace_outline(mask: Runs, others: Runs | None, lens: Intrinsics, view: int) 
 
 def _rim(mask: Runs) -> tuple[np.ndarray, np.ndarray]:
     """Return points (M, 2) along the rim, px, and outward unit directions (M, 2)."""
+    blur = 3.0  # px over which the direction of the rim is measured; tuned on the studio
+    shortest = 40  # px; rims of smaller spots and holes are errors of the network; tuned likewise
     x, y, width, height = mask.box
-    pad = round(3 * _BLUR_PX)
+    pad = round(3 * blur)
     window = np.zeros((height + 2 * pad, width + 2 * pad), np.uint8)
     window[pad:-pad, pad:-pad] = np.uint8(255) * drawn(mask.ends, mask.box, mask.height).T
     rims, _ = cv2.findContours(window, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    rims = [rim[:, 0] for rim in rims if len(rim) >= _SHORTEST_PX]
+    rims = [rim[:, 0] for rim in rims if len(rim) >= shortest]
     if not rims:
         return np.zeros((0, 2)), np.zeros((0, 2))
     at = np.concatenate(rims)
-    soft = cv2.GaussianBlur(window, (0, 0), _BLUR_PX)
+    soft = cv2.GaussianBlur(window, (0, 0), blur)
     column, row = at.T
     left, right = soft[row, column - 1].astype(float), soft[row, column + 1]
     above, below = soft[row - 1, column].astype(float), soft[row + 1, column]
@@ -121,14 +118,14 @@ class RimSamples(NamedTuple):
         return cls(number, surface.sample[number], surface.patch[number])
 
 
-def touching(
+def find_touched(
     rim: MaskRim,
     master_from_colour: np.ndarray,
     vertices: np.ndarray,
     normals: np.ndarray,
     samples: RimSamples,
     reach: float,
-    late: np.ndarray | None,
+    displacement: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find the samples that the planes of a rim touch.
 
@@ -139,7 +136,7 @@ def touching(
         normals: (R, 3)
         samples: samples that a rim can touch.
         reach: largest valid distance, metres.
-        late: (S, 3) displacement of the samples until the camera exposes, or None.
+        displacement: (S, 3) displacement of the samples until the camera exposes, or None.
 
     Returns:
         (M,) index of each touched sample.
@@ -148,38 +145,22 @@ def touching(
     pose = master_from_colour.astype(vertices.dtype)
     planes, rays = rim.normals @ pose[:3, :3].T, rim.rays @ pose[:3, :3].T
     at, distance, valid = _find_touched(
-        pose[:3, 3], rays, planes, vertices, normals, samples.vertex, samples.patch,
-        NORMAL_LENGTH_M, _FACING, reach, MATCH_SIDEWAYS_M, _COSINE,
-    )  # fmt: skip
+        pose[:3, 3], rays, planes, vertices, normals, samples.vertex, samples.patch, reach
+    )
     sample = samples.number[at]
-    if late is not None:
+    if displacement is not None:
         # along the normal of the sample, as in the residual of the sample
-        distance -= (late[sample] * normals[samples.vertex[at]]).sum(1)
+        distance -= (displacement[sample] * normals[samples.vertex[at]]).sum(1)
     return sample[valid], distance[valid]
 
 
 @numba.njit(cache=True, nogil=True)
-def _find_touched(
-    centre,
-    rays,
-    planes,
-    vertices,
-    normals,
-    samples,
-    patch,
-    length,
-    facing,
-    reach,
-    aside,
-    turned,
-):
+def _find_touched(centre, rays, planes, vertices, normals, samples, patch, reach):
     """Return sample (M,), signed outward distance (M,) and validity (M,) of rays through a rim.
 
-    centre (3,) of the camera, unit rays (M,3), normals ``planes`` (M,3), vertices and normals
-    (R,3): one frame. samples (S,), patch (S,20): vertices.
-    length: metres per radian between normals. facing: largest cosine between the normal of a
-    sample on the rim and the line of sight. reach, aside: largest distances along the plane's
-    normal and from the ray, metres. turned: smallest cosine between the normals.
+    centre (3,) of the camera; unit rays (M,3) and normals (M,3) of their planes; vertices and
+    normals (R,3) of one body; samples (S,) and their patch (S,20): vertices; reach: largest
+    distance along the plane's normal, metres.
     """
     kind, where = vertices.dtype, np.empty((6, len(samples)), vertices.dtype)
     rim = np.empty(len(samples), np.int64)
@@ -191,7 +172,7 @@ def _find_touched(
             gap = vertices[v, d] - centre[d]
             along += gap * normals[v, d]
             square += gap * gap
-        if along * along < facing * facing * square:
+        if along * along < _FACING * _FACING * square:
             rim[count] = s
             for d in range(3):
                 where[d, count] = vertices[v, d] - centre[d]
@@ -203,31 +184,30 @@ def _find_touched(
     valid = np.zeros(len(rays), np.bool_)
     if count == 0:
         return sample, distance, valid
-    turn = 2 * length * length  # |n - m|^2 = 2 - 2 n . m of unit vectors
+    turn = 2 * NORMAL_LENGTH_M * NORMAL_LENGTH_M  # |n - m|^2 = 2 - 2 n . m of unit vectors
     for m in range(len(rays)):
         rx, ry, rz = rays[m, 0], rays[m, 1], rays[m, 2]
         nx, ny, nz = planes[m, 0], planes[m, 1], planes[m, 2]
         tx, ty, tz = ry * nz - rz * ny, rz * nx - rx * nz, rx * ny - ry * nx
         for at in range(count):
             x, y, z = where[0, at], where[1, at], where[2, at]
-            height, beside = x * nx + y * ny + z * nz, x * tx + y * ty + z * tz
+            height, sideways = x * nx + y * ny + z * nz, x * tx + y * ty + z * tz
             cosine = where[3, at] * nx + where[4, at] * ny + where[5, at] * nz
-            apart[at] = height * height + beside * beside - turn * cosine
+            apart[at] = height * height + sideways * sideways - turn * cosine
         best = rim[np.argmin(apart)]
         least = vertices[0, 0] * 0 + np.inf
         for v in patch[best]:
-            x, y, z = (
-                vertices[v, 0] - centre[0],
-                vertices[v, 1] - centre[1],
-                vertices[v, 2] - centre[2],
-            )
-            height, beside = x * nx + y * ny + z * nz, x * tx + y * ty + z * tz
+            x = vertices[v, 0] - centre[0]
+            y = vertices[v, 1] - centre[1]
+            z = vertices[v, 2] - centre[2]
+            height, sideways = x * nx + y * ny + z * nz, x * tx + y * ty + z * tz
             cosine = normals[v, 0] * nx + normals[v, 1] * ny + normals[v, 2] * nz
             # a vertex nearer to the plane is not more on the rim
-            far = beside * beside - turn * cosine
+            far = sideways * sideways - turn * cosine
             if far < least:
                 least = far
                 distance[m] = -height
-                valid[m] = cosine > turned and abs(height) < reach and abs(beside) < aside
+                near = abs(height) < reach and abs(sideways) < MATCH_SIDEWAYS_M
+                valid[m] = near and cosine > _COSINE
         sample[m] = best
     return sample, distance, valid

@@ -35,16 +35,6 @@ from intercap_core.body_fit.term_inputs import (
 )
 from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
 
-# 1/rad; ranges of joints are means plus two standard deviations of people, with a soft edge of 4
-# degrees. Tuned on the studio.
-_LIMIT_WEIGHT = 1 / math.radians(4)
-# The penalty exp(sign theta) is 1 at the straight limb, where it should cost little. Tuned on the
-# studio.
-_BENDING_WEIGHT = 1 / 6
-# Smallest standard deviation of a hand component: some hardly vary among grasps. Tuned on the
-# studio.
-_SMALLEST_HAND_DEVIATION = 0.03
-
 _BODY_POSE = slice(3, 66)  # columns of the 21 body joints
 _BODY_START = _BODY_POSE.start
 _HANDS = (75, 120)  # first column of each hand
@@ -69,13 +59,20 @@ class PriorTerm:
             hand_share: factor of E_theta_h in one frame.
         """
         model = self.model
-        deviation = model.hand_deviation.clamp_min(_SMALLEST_HAND_DEVIATION)
+        # some hand components hardly vary among grasps: at least 0.03, tuned on the studio
+        deviation = model.hand_deviation.clamp_min(0.03)
         own = (model.hand_mean, model.hand_components, deviation)
         hands = [(priors.hand_pose(vectors, *own, side=side), hand_share**0.5) for side in (0, 1)]
+        # ranges of joints are means plus two standard deviations of people: their edge is soft, 4
+        # degrees (tuned on the studio)
+        limits = 1 / math.radians(4)
+        # the penalty exp(sign theta) is 1 at the straight limb, where it should cost little (tuned
+        # on the studio)
+        bending = 1 / 6
         return [
             (priors.rest_pose(vectors, first=1 if body_pose else JOINT_INDEX["jaw"]), 1.0),
-            (priors.joint_limits(vectors), _LIMIT_WEIGHT),
-            (priors.bending(vectors), _BENDING_WEIGHT),
+            (priors.joint_limits(vectors), limits),
+            (priors.bending(vectors), bending),
             *hands,
         ]
 
@@ -141,7 +138,7 @@ class PriorArrays(NamedTuple):
     bending: float
     """Squared weight of bending."""
     pose: np.ndarray
-    """(T, 63) mean of the learned prior; of no frame without one."""
+    """(T, 63) mean of the learned prior; T = 0 without a learned prior."""
     pose_precision: np.ndarray
     """(T, 63, 63)"""
 

@@ -30,16 +30,10 @@ from intercap_core.body_fit.terms import terms_on
 from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
 
 NUM_OFFSETS = 25  # OpenPose's body keypoints
-# Number of times that the prior of a shared parameter counts in every frame: errors of clothing and
-# detector persist over frames, so a recording is worth that many independent measurements fewer.
-# Tuned on the studio.
-_OFFSET_PRIOR_PER_FRAME = 0.3
-_SHAPE_PRIOR_PER_FRAME = 0.3
-_COVERING_PRIOR_PER_FRAME = 0.7
 
 
 def columns_of(model: BodyModel, *, hands: bool, face: bool, betas: bool) -> Tensor:
-    """Return the own parameters: trunk and limbs, and where requested hands, jaw and expression,
+    """Return the own parameters (n,): trunk and limbs, and if requested hands, jaw and expression,
     betas."""
     pose = list(range(0, 66))
     if face:
@@ -130,47 +124,45 @@ class ParameterLayout:
             vectors[:, self.shape] = betas
         return vectors
 
-    def prior_counts(self, like: Tensor) -> Tensor:
-        """Return how many times the prior of each shared parameter (m,) counts in a frame."""
-        parts = []
-        if self.one_shape:
-            parts.append(like.new_full((self.num_betas,), _SHAPE_PRIOR_PER_FRAME))
-        if self.fit_shared:
-            parts.append(like.new_full((3 * NUM_OFFSETS,), _OFFSET_PRIOR_PER_FRAME))
-            parts.append(like.new_full((len(COVERINGS),), _COVERING_PRIOR_PER_FRAME))
-        return torch.cat(parts) if parts else like.new_zeros(0)
-
     def prior_cost(self, shared: Tensor) -> Tensor:
         """Return the cost (scalar) of the shared parameters (m,) in each frame."""
-        if not len(shared):
-            return shared.new_zeros(())
-        return 0.5 * (self._precision(shared) * (shared - self._mean(shared)) ** 2).sum()
+        mean, precision, _ = self.prior(shared)
+        return 0.5 * (precision * (shared - mean) ** 2).sum()
 
     def add_prior(self, shared: Tensor, equations: NormalEquations) -> None:
         """Add this cost to the normal equations of each frame, whose last columns are shared."""
         if len(shared):
-            precision, first = self._precision(shared), equations.gradient.shape[1] - len(shared)
+            mean, precision, _ = self.prior(shared)
+            first = equations.gradient.shape[1] - len(shared)
             equations.cost.add_(self.prior_cost(shared))
-            equations.gradient[:, first:] += precision * (shared - self._mean(shared))
+            equations.gradient[:, first:] += precision * (shared - mean)
             equations.hessian.diagonal(dim1=1, dim2=2)[:, first:] += precision
 
-    def _precision(self, like: Tensor) -> Tensor:
-        """Return the precision (m,) of the shared parameters in each frame."""
-        spread = []
-        if self.one_shape:
-            spread.append(like.new_ones(self.num_betas))
-        if self.fit_shared:
-            spread.append(torch.as_tensor(self.definition.sigma).to(like).repeat_interleave(3))
-            spread.append(torch.tensor([c.spread for c in COVERINGS]).to(like))
-        return self.prior_counts(like) / torch.cat(spread) ** 2
+    def prior(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the Gaussian prior of the m shared parameters in the floating type of ``like``.
 
-    def _mean(self, like: Tensor) -> Tensor:
-        """Return the mean (m,) of the prior: zero except for the offsets."""
-        parts = [like.new_zeros(self.num_betas)] if self.one_shape else []
+        Errors of clothing and detector persist over frames, so a recording is worth fewer
+        independent measurements than it has frames: the prior counts in every frame.
+
+        Returns:
+            (m,) means.
+            (m,) precisions in each frame.
+            (m,) how many times the prior counts in each frame; tuned on the studio.
+        """
+        mean, sigma, counts = [like.new_zeros(0)], [like.new_zeros(0)], [like.new_zeros(0)]
+        if self.one_shape:
+            mean.append(like.new_zeros(self.num_betas))
+            sigma.append(like.new_ones(self.num_betas))
+            counts.append(like.new_full((self.num_betas,), 0.3))
         if self.fit_shared:
-            parts.append(torch.as_tensor(self.definition.offsets).to(like).reshape(-1))
-            parts.append(like.new_zeros(len(COVERINGS)))
-        return torch.cat(parts)
+            mean.append(torch.as_tensor(self.definition.offsets).to(like).reshape(-1))
+            sigma.append(torch.as_tensor(self.definition.sigma).to(like).repeat_interleave(3))
+            counts.append(like.new_full((3 * NUM_OFFSETS,), 0.3))
+            mean.append(like.new_zeros(len(COVERINGS)))
+            sigma.append(torch.tensor([c.spread for c in COVERINGS]).to(like))
+            counts.append(like.new_full((len(COVERINGS),), 0.7))
+        per_frame = torch.cat(counts)
+        return torch.cat(mean), per_frame / torch.cat(sigma) ** 2, per_frame
 
 
 # --- energy ----------------------------------------------------------------------------------
@@ -221,9 +213,9 @@ class BodyProblem(TermInputs):
 
     def accept(self, own: Tensor, shared: Tensor) -> None:
         """Set base, offsets and u to a solution."""
-        found = self.layout.split(shared, self.offsets, self.u)
-        self.base = self.layout.vectors(self.base, own, found.betas)
-        self.offsets, self.u = found.offsets.clone(), found.u.clone()
+        betas, offsets, u = self.layout.split(shared, self.offsets, self.u)
+        self.base = self.layout.vectors(self.base, own, betas)
+        self.offsets, self.u = offsets.clone(), u.clone()
 
     def thickness(self) -> Tensor:
         """Return the thickness (N,) of the covering at each sample, metres."""

@@ -9,13 +9,7 @@ import torch
 from torch import Tensor
 
 from intercap_core.body.joints import JOINT_INDEX, JOINT_NAMES
-from intercap_core.body.keypoints import (
-    CONTOUR,
-    FACE,
-    KEYPOINT_NAMES,
-    LEFT_HAND,
-    RIGHT_HAND,
-)
+from intercap_core.body.keypoints import CONTOUR, FACE, KEYPOINT_NAMES, LEFT_HAND, RIGHT_HAND
 from intercap_core.body_fit.keypoint_term import KEYPOINT_SCALE
 from intercap_core.schemas import BODY_PARTS
 
@@ -30,7 +24,6 @@ LARGEST_SIGMA_M = 0.026
 LARGEST_HAND_SIGMA_M = 0.013
 # A part is wrong if more than this share of its keypoints are outliers.
 _DISAGREEING_SHARE = 0.5
-_FACE_VISIBLE_SHARE = 0.5  # of the landmarks, in some view; tuned on the studio
 # Share of a part's samples with points from which depth determines it: half of the third of a limb
 # that one view sees.
 _MEASURED_SHARE = 0.15
@@ -42,63 +35,62 @@ MIRRORED_SIGMA_M = {"arm": 0.10, "leg": 0.15, "hand": 0.03}
 # an ankle 0.85 m from the hip (anatomy). The linear covariance of prior and fit is smaller.
 UNSEEN_SIGMA_M = {"arm": 0.20, "leg": 0.25}
 
-_LIMBS = {"arm": ("elbow", "wrist"), "leg": ("knee", "ankle", "big_toe", "small_toe", "heel")}
-_JOINTED = ("arm", "leg")
-_TRUNK = ("neck", "left_shoulder", "right_shoulder", "mid_hip", "left_hip", "right_hip")
-_JOINTS = {"arm": ("elbow", "wrist"), "leg": ("knee", "ankle", "foot")}
-_TRUNK_JOINTS = ("pelvis", "left_hip", "right_hip", "spine2", "neck", "left_shoulder",
-                 "right_shoulder", "head")  # fmt: skip
+
+class _Part(NamedTuple):
+    """A part of the body."""
+
+    keypoints: list[int]
+    joints: list[int]
+    carriers: list[int]
+    """Joints whose bones carry the skin of the part."""
 
 
-def _keypoints_of(part: str) -> np.ndarray:
-    """Return the indices (K,) of the keypoints of a part."""
-    side, _, limb = part.partition("_")
-    if part == "trunk":
-        return np.array([KEYPOINT_NAMES.index(name) for name in _TRUNK])
-    if part == "face":
-        return np.r_[FACE, CONTOUR]
+def _find_part(name: str) -> _Part:
+    """Return the keypoints and joints of one of `BODY_PARTS`; those of the face are its head's."""
+    side, _, limb = name.partition("_")
     if limb == "hand":
-        return np.r_[LEFT_HAND if side == "left" else RIGHT_HAND]
-    return np.array([KEYPOINT_NAMES.index(f"{side}_{name}") for name in _LIMBS[limb]])
+        first = JOINT_INDEX[f"{side}_index1"]
+        fingers = list(range(first, first + 15))
+        keypoints = LEFT_HAND if side == "left" else RIGHT_HAND
+        return _Part(np.r_[keypoints].tolist(), fingers, [JOINT_INDEX[f"{side}_wrist"], *fingers])
+    if name == "face":
+        head = [JOINT_INDEX["head"], JOINT_INDEX["jaw"]]
+        return _Part(np.r_[FACE, CONTOUR].tolist(), head, head)
+    points, joints, carriers = {
+        "trunk": (
+            "neck left_shoulder right_shoulder mid_hip left_hip right_hip",
+            "pelvis left_hip right_hip spine2 neck left_shoulder right_shoulder head",
+            "pelvis left_hip right_hip spine2 neck left_shoulder right_shoulder head",
+        ),
+        "arm": ("elbow wrist", "elbow wrist", "shoulder elbow"),
+        "leg": (
+            "knee ankle big_toe small_toe heel", "knee ankle foot", "hip knee ankle foot"
+        ),
+    }[limb or name]  # fmt: skip
+    prefix = f"{side}_" if limb else ""
+    return _Part(
+        [KEYPOINT_NAMES.index(prefix + point) for point in points.split()],
+        [JOINT_INDEX[prefix + joint] for joint in joints.split()],
+        [JOINT_INDEX[prefix + joint] for joint in carriers.split()],
+    )
 
 
-def _joints_of(part: str) -> list[int]:
-    """Return the joints of a part; those of the face are head and jaw."""
-    side, _, limb = part.partition("_")
-    if part == "trunk":
-        return [JOINT_INDEX[name] for name in _TRUNK_JOINTS]
-    if part == "face":
-        return [JOINT_INDEX["head"], JOINT_INDEX["jaw"]]
-    if limb == "hand":
-        first = JOINT_NAMES.index(f"{side}_index1")
-        return list(range(first, first + 15))
-    return [JOINT_INDEX[f"{side}_{name}"] for name in _JOINTS[limb]]
-
-
-def _carriers_of(part: str) -> list[int]:
-    """Return the joints whose bones carry the skin of a part."""
-    side, _, limb = part.partition("_")
-    if limb == "hand":
-        return [JOINT_INDEX[f"{side}_wrist"], *_joints_of(part)]
-    bones = {"arm": ("shoulder", "elbow"), "leg": ("hip", "knee", "ankle", "foot")}
-    if limb in bones:
-        return [JOINT_INDEX[f"{side}_{name}"] for name in bones[limb]]
-    return _joints_of(part)
+_PARTS = {name: _find_part(name) for name in BODY_PARTS}
 
 
 class PartEvidence(NamedTuple):
     """Support of each of the 8 parts by the observations of N frames."""
 
-    against: Tensor
+    outlier_share: Tensor
     """(N, 8) share of outliers among the part's observations, weighted by confidence; of arms and
-    legs that of their worst keypoint. NaN = the part is not seen."""
+    legs that of their worst keypoint. NaN = not visible."""
     distance: Tensor
-    """(N, 8) median distance of the observations, metres, NaN = the part is not seen."""
-    seen: Tensor
+    """(N, 8) median distance of the observations, metres, NaN = not visible."""
+    visible_share: Tensor
     """(N, 8) share of the part's keypoints that are inliers in some view."""
     views: Tensor
     """(N, 8) number of views in which a keypoint is an inlier, median over the keypoints."""
-    measured: Tensor
+    measured_share: Tensor
     """(N, 8) share of the part's samples with depth points."""
 
 
@@ -124,21 +116,21 @@ def compare_parts(
     result = PartEvidence(unknown, unknown.clone(), none, none.clone(), none.clone())
     metres = torch.where(confidence > 0, whitened * sigma, torch.nan)
     for column, part in enumerate(BODY_PARTS):
-        at = torch.isin(index, torch.as_tensor(_keypoints_of(part), device=index.device))
+        at = torch.isin(index, torch.as_tensor(_PARTS[part].keypoints, device=index.device))
         if not bool(at.any()):
             continue
         weight, good = confidence[:, :, at], whitened[:, :, at] <= KEYPOINT_SCALE
-        over = (1,) if part.endswith(_JOINTED) else (1, 2)
+        over = (1,) if part.endswith(("arm", "leg")) else (1, 2)
         share = 1 - (weight * good).sum(over) / weight.sum(over)
         # a correct elbow does not imply a correct wrist
-        result.against[:, column] = share if share.ndim == 1 else _worst(share)
+        result.outlier_share[:, column] = share if share.ndim == 1 else _worst(share)
         result.distance[:, column] = metres[:, :, at].flatten(1).nanmedian(1).values
         inliers = ((weight > 0) & good).sum(1)
-        result.seen[:, column] = (inliers > 0).to(weight).mean(1)
+        result.visible_share[:, column] = (inliers > 0).to(weight).mean(1)
         result.views[:, column] = inliers.to(weight).median(1).values
         if samples is not None:
-            on_part = np.isin(samples[0], _carriers_of(part))
-            result.measured[:, column] = samples[1][:, on_part].to(weight).mean(1)
+            on_part = np.isin(samples[0], _PARTS[part].carriers)
+            result.measured_share[:, column] = samples[1][:, on_part].to(weight).mean(1)
     return result
 
 
@@ -149,48 +141,52 @@ def _worst(share: Tensor) -> Tensor:
 
 
 def trunk_distance(evidence: PartEvidence) -> np.ndarray:
-    """Return the median distance (N,) of the trunk's keypoints, metres; NaN = none seen."""
+    """Return the median distance (N,) of the trunk's keypoints, metres; NaN = none visible."""
     return evidence.distance[:, BODY_PARTS.index("trunk")].cpu().numpy()
 
 
 def flag_unmeasured(evidence: PartEvidence) -> np.ndarray:
-    """Flag limbs and hands (N, 8) that one view alone supports, without depth points."""
-    found = (evidence.views < 2) & (evidence.measured < _MEASURED_SHARE) & (evidence.seen > 0)
-    result = np.asarray(found.cpu().numpy())
+    """Flag limbs and hands (N, 8) that only one view supports, without depth points."""
+    flags = (
+        (evidence.views < 2)
+        & (evidence.measured_share < _MEASURED_SHARE)
+        & (evidence.visible_share > 0)
+    )
+    result = np.asarray(flags.cpu().numpy())
     result[:, [BODY_PARTS.index(part) for part in ("trunk", "face")]] = False
     return result
 
 
 def flag_unmeasured_joints(evidence: PartEvidence) -> np.ndarray:
     """Flag the joints (N, 55) of these limbs and hands."""
-    found = flag_unmeasured(evidence)
-    result = np.zeros((len(found), len(JOINT_NAMES)), bool)
+    flags = flag_unmeasured(evidence)
+    result = np.zeros((len(flags), len(JOINT_NAMES)), bool)
     for column, part in enumerate(BODY_PARTS):
-        result[:, _joints_of(part)] |= found[:, column, None]
+        result[:, _PARTS[part].joints] |= flags[:, column, None]
     return result
 
 
 def _leaning(evidence: PartEvidence) -> np.ndarray:
     """Return the standard deviation (N, 8), metres, of parts that one view supports, whose mirrored
     pose is as likely, or that no view supports."""
-    known = np.clip(evidence.measured.cpu().numpy() / _MEASURED_SHARE, 0, 1)
+    known = np.clip(evidence.measured_share.cpu().numpy() / _MEASURED_SHARE, 0, 1)
     limbs = [part.partition("_")[2] for part in BODY_PARTS]
     mirrored = np.array([MIRRORED_SIGMA_M.get(limb, 0.0) for limb in limbs])
     unseen = np.array([UNSEEN_SIGMA_M.get(limb, 0.0) for limb in limbs])
     leaning = np.where(flag_unmeasured(evidence), mirrored * (1 - known) ** 2, 0.0)
-    return np.where(evidence.seen.cpu().numpy() == 0, unseen, leaning)
+    return np.where(evidence.visible_share.cpu().numpy() == 0, unseen, leaning)
 
 
 def widen_sigma(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
     """Return standard deviations (N, 55), metres, widened where a fit is one of several minima.
 
     If most observations contradict a part, the truth may be where they are: the deviation that
-    corresponds to their distance in two dimensions is added in quadrature. A limb that one view
-    alone sees may lean towards it or away, the more so the fewer points it has. An error of an arm
+    corresponds to their distance in two dimensions is added in quadrature. A limb that only one
+    view sees may lean towards it or away, the more so the fewer points it has. An error of an arm
     is also an error of its hand.
     """
     # the median length of a normal error in two dimensions is 1.1774 standard deviations
-    disputed = evidence.against.cpu().numpy() > _DISAGREEING_SHARE
+    disputed = evidence.outlier_share.cpu().numpy() > _DISAGREEING_SHARE
     distance = np.where(disputed, np.nan_to_num(evidence.distance.cpu().numpy()), 0) / 1.1774
     distance = np.hypot(distance, _leaning(evidence))
     for side in ("left", "right"):
@@ -198,7 +194,7 @@ def widen_sigma(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
         distance[:, hand] = np.maximum(distance[:, hand], distance[:, arm])
     result = sigma.copy()
     for column, part in enumerate(BODY_PARTS):
-        joints = _joints_of(part)
+        joints = _PARTS[part].joints
         result[:, joints] = np.hypot(result[:, joints], distance[:, column, None])
     return result
 
@@ -208,16 +204,16 @@ def flag_undetermined(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
 
     sigma (N, 55): standard deviation of the joints, metres.
     """
-    found = evidence.against.cpu().numpy() > _DISAGREEING_SHARE
+    flags = evidence.outlier_share.cpu().numpy() > _DISAGREEING_SHARE
     for column, part in enumerate(BODY_PARTS):
         limit = LARGEST_SIGMA_M
         if part.endswith("hand"):
             limit = LARGEST_HAND_SIGMA_M
-            found[:, column] |= evidence.seen[:, column].cpu().numpy() == 0
-        found[:, column] |= _rms(sigma[:, _joints_of(part)]) > limit
+            flags[:, column] |= evidence.visible_share[:, column].cpu().numpy() == 0
+        flags[:, column] |= _rms(sigma[:, _PARTS[part].joints]) > limit
     face = BODY_PARTS.index("face")
-    found[:, face] |= evidence.seen[:, face].cpu().numpy() < _FACE_VISIBLE_SHARE
-    return found
+    flags[:, face] |= evidence.visible_share[:, face].cpu().numpy() < 0.5  # tuned on the studio
+    return flags
 
 
 def expected_error(sigma: np.ndarray, share: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
-"""Outliers in time: find frames whose body departs from its neighbours' motion, and refit them.
+"""Find frames whose body departs from the motion of its neighbours, and refit them.
 
-A fit that starts from a wrong triangulation, or an arm whose depth one view cannot determine, ends
-in another minimum of the energy. The refit starts from an interpolation of the neighbours.
+A fit that starts from a wrong triangulation, or an arm whose depth one view cannot determine, may
+end in another minimum of the energy. The refit starts from an interpolation of the neighbours.
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ JUMP_M = 0.25
 _BODY_JOINTS = slice(0, JOINT_INDEX["right_wrist"] + 1)
 
 
-def jumps(joints: np.ndarray, times: np.ndarray, least: np.ndarray | float = JUMP_M) -> np.ndarray:
+def measure_jumps(
+    joints: np.ndarray, times: np.ndarray, least: np.ndarray | float = JUMP_M
+) -> np.ndarray:
     """Return the distance (N, J) of joints from their median over the frames around, metres.
 
     It is 0 if it does not exceed ``least``, and in frames without a frame before and after.
@@ -60,7 +62,7 @@ def recover(problem: BodyProblem, times: np.ndarray) -> np.ndarray:
     changed = np.zeros(len(times), bool)
     params = model.parameters(problem.base)
     joints = model.forward(params, vertex_ids=np.array([0])).joints[:, _BODY_JOINTS]
-    jumped = np.asarray((jumps(joints.double().cpu().numpy(), times) > 0).any(1))
+    jumped = np.asarray((measure_jumps(joints.double().cpu().numpy(), times) > 0).any(1))
     if not jumped.any() or jumped.all():
         return changed
     between = bridge(problem.base.double().cpu().numpy(), ~jumped, times)
@@ -70,10 +72,10 @@ def recover(problem: BodyProblem, times: np.ndarray) -> np.ndarray:
     everyone = torch.arange(len(at), device=base.device)
     nothing = base.new_zeros(0)
     before = again.cost(problem.base[at][:, again.columns], nothing, everyone)
-    found = minimise(again, again.own_start(), max_trials=10, cost_tolerance=1e-3)
-    kept = found.cost <= 1.2 * before + 5.0  # tuned on the studio
+    solution = minimise(again, again.own_start(), max_trials=10, cost_tolerance=1e-3)
+    kept = solution.cost <= 1.2 * before + 5.0  # tuned on the studio
     rows = problem.base[at].clone()
-    again.accept(found.own, nothing)
+    again.accept(solution.own, nothing)
     rows[kept] = again.base[kept]
     problem.base = problem.base.clone()
     problem.base[at] = rows

@@ -1,4 +1,11 @@
-"""The order of the fit: trunk, 3D keypoints, E_J, E_J + E_D, hands and face."""
+"""The body's fit in five steps, each from the result of the step before.
+
+1. The trunk is placed rigidly, then each frame is fitted to triangulated keypoints (:mod:`.start`).
+2. E_J: all frames with shared shape, first with wide sigmas.
+3. E_J + E_D: keypoint offsets and clothing become free; frames that jump are refitted.
+4. Hands and face, with the rest of the body fixed.
+5. All terms and parameters.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +46,7 @@ _WRISTS = ("left_wrist", "right_wrist")
 
 @dataclass(frozen=True)
 class Settled:
-    """Quantities estimated once for all frames, in addition to the shape."""
+    """Quantities that all frames share, in addition to the shape."""
 
     offsets: Tensor
     """(25, 3) offsets of the body keypoints in the frames of their bones, metres."""
@@ -86,7 +93,7 @@ class Fitter:
 
     Args:
         model: the body.
-        seen: observations of the sequence.
+        observations: of the sequence.
         clouds: points of each frame.
         settings: settings of the stage.
         pose_prior: learned prior of the body pose; None = the open prior.
@@ -97,7 +104,7 @@ class Fitter:
     def __init__(
         self,
         model: BodyModel,
-        seen: Observations,
+        observations: Observations,
         clouds: list[PersonCloud | None],
         settings: BodyFitSettings,
         pose_prior: VPoser | None = None,
@@ -108,12 +115,12 @@ class Fitter:
         self.definition = definition or Definition.unknown()
         self._terms = terms
         self._progress = Progress(log, "body: minimised", None, "rounds")
-        self.evidence = Evidence(model, seen, clouds, settings.cloud_weight)
+        self.evidence = Evidence(model, observations, clouds, settings.cloud_weight)
         self.frames = self.evidence.frames
         self.one_shape = settings.shape == "shared"
 
     def run(self) -> BodyFit:
-        """Fit all frames in the order that the module describes."""
+        """Fit all frames by the steps of the module."""
         evidence, hands, face = self.evidence, self.settings.hands, self.settings.face
         base = self.model.zeros(len(self.frames)).vector()
         problem = self._problem(
@@ -141,7 +148,7 @@ class Fitter:
             evidence.refine_sigma(problem)
             evidence.refine_cloud_noise(problem)
             problem.targets = None
-        recover(problem, evidence.seen.times[self.frames])
+        recover(problem, evidence.observations.times[self.frames])
         if hands or face:
             self._fit_extremities(problem)
         # Shared parameters stay free: only fitted hands determine the lengths of forearms and
@@ -150,7 +157,7 @@ class Fitter:
         for last in (False, True):
             if evidence.has_cloud:
                 problem.rows = evidence.match(problem, _CLOUD_REACH_M[-1])
-            problem.pairs = evidence.touch(problem)
+            problem.pairs = evidence.find_pairs(problem)
             evidence.refine_sigma(problem)
             evidence.observe_keypoints(problem, hands=hands, face=face)
             solution = self._minimise(problem, 4, keep_normal=last)
@@ -158,7 +165,7 @@ class Fitter:
         return self._report(problem, solution.normal.hessian)
 
     def resume(self, base: Tensor, settled: Settled) -> BodyProblem:
-        """Return the last round's problem at other bodies (N, P), with the settled quantities."""
+        """Return the problem of the last step at other bodies ``base`` (N, P)."""
         self.evidence.keypoint_sigma = settled.keypoint_sigma.to(base)
         self.evidence.cloud_noise = settled.cloud_noise.to(base)
         self.evidence.keypoint_doubt = settled.keypoint_doubt.to(base)
@@ -175,13 +182,15 @@ class Fitter:
         """Update correspondences, contacts, the pose prior and sigmas at the problem's bodies."""
         if self.evidence.has_cloud:
             problem.rows = self.evidence.match(problem, _CLOUD_REACH_M[-1])
-        problem.pairs = self.evidence.touch(problem)
+        problem.pairs = self.evidence.find_pairs(problem)
         self._linearise_pose_prior(problem)
         self.evidence.observe_keypoints(problem, hands=self.settings.hands, face=self.settings.face)
 
     def observe_only(self, problem: BodyProblem, view: np.ndarray) -> None:
-        """Compare the problem's bodies with one camera of each frame, ``view`` (N,): its points,
-        masks and body keypoints. This replaces the result of :meth:`observe`."""
+        """Update correspondences and keypoints as :meth:`observe`, with one camera of each frame.
+
+        view (N,): index of the camera, whose points, masks and body keypoints count.
+        """
         if self.evidence.has_cloud:
             problem.rows = self.evidence.match(problem, _CLOUD_REACH_M[-1], view)
         self.evidence.observe_keypoints(problem)
@@ -189,8 +198,8 @@ class Fitter:
     def residuals(self, problem: BodyProblem) -> tuple[Tensor, Tensor]:
         """Return the median pixel error (N, C) and cloud distance (N,), metres; NaN = nothing
         seen."""
-        found = self._body_errors(problem, self.evidence.pixel_residuals(problem))
-        return found.nanmedian(2).values, self.evidence.cloud_residual
+        pixels = self._body_errors(problem, self.evidence.pixel_residuals(problem))
+        return pixels.nanmedian(2).values, self.evidence.cloud_residual
 
     def _problem(self, **changes: Any) -> BodyProblem:
         """Return a problem with the settings and samples of this fit."""
@@ -223,7 +232,7 @@ class Fitter:
             columns=problem.columns,
             hessian=hessian,
             one_shape=problem.one_shape,
-            shared_counts=problem.layout.prior_counts(problem.base),
+            shared_counts=problem.layout.prior(problem.base)[2],
             # the median of a chi-squared variable with two degrees of freedom is 2 ln 2
             excess=((whitened**2 / 2).flatten(1).nanmedian(1).values / np.log(2)).clamp_min(1.0),
             pixel_residual=pixels.nanmedian(2).values,
@@ -262,17 +271,17 @@ class Fitter:
     def _linearise_pose_prior(self, problem: BodyProblem) -> None:
         """Linearise the learned pose prior, if there is one, about the problem's poses."""
         if self.pose_prior is not None:
-            problem.pose = self.pose_prior.around(problem.base[:, 3:66])
+            problem.pose = self.pose_prior.linearise(problem.base[:, 3:66])
 
     def _lift_by_depth(self) -> Targets | None:
-        """Return the body keypoints that one view's depth alone locates.
+        """Return the body keypoints that only the depth of one view locates; None = no keypoints.
 
-        They constrain the body until its cloud does. Occluded ones are far off: their pixels, with
-        a wide sigma at first, bring the limbs to the right place.
+        They constrain the body until its cloud does. The depth of an occluded keypoint is that of
+        the occluder: its pixels, with a wide sigma at first, bring the limb to the right place.
         """
-        seen = self.evidence.seen
-        joints = seen.joints[self.frames][:, BODY]
-        lifted = (seen.joint_views[self.frames][:, BODY] == 1) & np.isfinite(joints).all(2)
+        observations = self.evidence.observations
+        joints = observations.joints[self.frames][:, BODY]
+        lifted = (observations.joint_views[self.frames][:, BODY] == 1) & np.isfinite(joints).all(2)
         if not lifted.any():
             return None
         points, confidence = (
@@ -282,10 +291,9 @@ class Fitter:
         return Targets(points, confidence, START_SIGMA_M)
 
     def _fit_extremities(self, problem: BodyProblem) -> None:
-        """Fit wrists, fingers, jaw and expression; the rest of the body is fixed.
+        """Fit wrists, fingers, jaw and expression without the cloud; the rest of the body is fixed.
 
-        The cloud is not used yet. The wrists have not been rotated, so hands are far off: at first
-        no keypoint counts as an outlier.
+        No earlier step rotates the wrists, so hands may be far off: sigmas are wide at first.
         """
         hands, face = self.settings.hands, self.settings.face
         columns = columns_of(self.model, hands=hands, face=face, betas=False)

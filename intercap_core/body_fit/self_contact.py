@@ -8,7 +8,7 @@ relative to the thickness of their parts, never count as touching.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -22,9 +22,9 @@ from intercap_core.body_fit.surface import Samples
 from intercap_core.body_fit.term_inputs import Pairs
 from intercap_core.geometry.rigid.surfaces import vertex_normals
 
-# A sample outside by less than this may penetrate before the next search. Tuned on the studio.
-_WATCHED_M = 0.004
-_FAR = 1e6  # metres; farther than any distance on a body
+# Metres outside another part within which a sample also becomes a pair: it may penetrate the part
+# before the next search. Tuned on the studio.
+_MARGIN_M = 0.004
 
 _TRUNK = ("pelvis", "spine1", "spine2", "spine3", "left_collar", "right_collar")
 _HAND_PARTS = ("wrist", "thumb", "index", "middle", "ring", "pinky")
@@ -53,7 +53,7 @@ _HAND_OF_PART = np.array(
 
 
 def _hinged() -> np.ndarray:
-    """Flag the pairs of parts (parts, parts) that are neighbours along a limb."""
+    """Flag the pairs of parts (parts, parts) that a hinge of a limb joins."""
     table = np.zeros((len(_PART_NAMES), len(_PART_NAMES)), bool)
     for hinge in _HINGES:
         for side in ("left", "right"):
@@ -65,25 +65,24 @@ def _hinged() -> np.ndarray:
 # --- which samples may touch -----------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class SelfContact:
-    """Which of the N samples of a body may touch each other."""
+class SelfContact(NamedTuple):
+    """Which of the N samples of a body may touch each other, and their depth limits."""
 
-    vertex: Tensor
-    """(N,) vertex ids, see :class:`.surface.Samples`."""
-    patch: Tensor
-    """(N, 20) vertex ids."""
-    part: Tensor
+    vertex: np.ndarray
+    """(N,) index of each sample among the posed vertices, see :class:`.surface.Samples`."""
+    patch: np.ndarray
+    """(N, 20) indices of the vertices around each sample."""
+    part: np.ndarray
     """(N,) part of each sample."""
-    patch_part: Tensor
+    patch_part: np.ndarray
     """(N, 20) parts of the vertices of the patch."""
-    hand: Tensor
+    hand: np.ndarray
     """(N,) 0 left hand, 1 right hand, -1 none."""
-    apart: Tensor
+    apart: np.ndarray
     """(N, N) bool: the two samples may touch."""
-    deepest: Tensor
+    deepest: np.ndarray
     """(N,) greatest depth behind the surface at which a point counts as inside, metres."""
-    sideways: Tensor
+    sideways: np.ndarray
     """(N,) greatest distance from the normal line at which a point counts as inside, metres."""
 
     @classmethod
@@ -103,20 +102,17 @@ class SelfContact:
         apart &= own[:, None] != own
         around = np.linalg.norm(template[samples.patch] - template[samples.vertex, None], axis=2)
         spacing = np.sort(around, 1)[:, 6]  # a vertex has six neighbours (Euler)
-
-        def tensor(values: np.ndarray) -> Tensor:
-            return torch.as_tensor(values, device=model.device)
-
+        dtype = model.template.cpu().numpy().dtype
         return cls(
-            vertex=tensor(samples.vertex),
-            patch=tensor(samples.patch),
-            part=tensor(own),
-            patch_part=tensor(part[samples.patch]),
-            hand=tensor(_HAND_OF_PART[own]),
-            apart=tensor(apart),
+            vertex=samples.vertex,
+            patch=samples.patch,
+            part=own,
+            patch_part=part[samples.patch],
+            hand=_HAND_OF_PART[own],
+            apart=apart,
             # a deeper point is behind the far side (geometry), in the trunk tuned on the studio
-            deepest=tensor(np.minimum(0.5 * thickness, 0.06)).to(model.dtype),
-            sideways=tensor(spacing).to(model.dtype),
+            deepest=np.minimum(0.5 * thickness, 0.06).astype(dtype),
+            sideways=spacing.astype(dtype),
         )
 
 
@@ -150,12 +146,12 @@ def _geodesic_distances(
     # the geodesic distance is at least the Euclidean one
     straight = scipy.spatial.distance.cdist(points[vertex], points[vertex])
     farthest = np.where(straight <= limit, limit, 0).max(1)
-    found = np.full((count, count), np.inf)
+    distances = np.full((count, count), np.inf)
     for some in np.array_split(np.argsort(farthest, kind="stable"), 12):
-        found[some] = scipy.sparse.csgraph.dijkstra(
+        distances[some] = scipy.sparse.csgraph.dijkstra(
             graph, directed=False, indices=some, limit=farthest[some].max()
         )
-    return found
+    return distances
 
 
 # --- search ----------------------------------------------------------------------------------
@@ -164,106 +160,44 @@ Contacts = tuple[Tensor, Tensor, Tensor]
 """Vertex ids (M,) of penetrating samples, vertex ids (M,) and normals (M, 3) of the surface."""
 
 
-def join_frames(found: list[Contacts]) -> Pairs | None:
+def join_frames(contacts: list[Contacts]) -> Pairs | None:
     """Join the contacts of all frames, in order; None if there are none."""
-    counts = torch.tensor([len(inner) for inner, _, _ in found])
+    counts = torch.tensor([len(inner) for inner, _, _ in contacts])
     if not int(counts.sum()):
         return None
-    inner, outer, normal = (torch.cat(parts) for parts in zip(*found, strict=True))
+    inner, outer, normal = (torch.cat(parts) for parts in zip(*contacts, strict=True))
     vertices, place = torch.cat([inner, outer]).unique(return_inverse=True)
-    frame = torch.arange(len(found)).repeat_interleave(counts).to(inner.device)
+    frame = torch.arange(len(contacts)).repeat_interleave(counts).to(inner.device)
     return Pairs(frame, place[: len(inner)], place[len(inner) :], normal, vertices)
 
 
 def find_contacts(contact: SelfContact, vertices: Tensor, normals: Tensor) -> Contacts:
-    """Find the samples of one body inside another part, or outside by less than 4 mm.
+    """Find the samples of one body inside another part, or less than 4 mm outside of it.
 
-    vertices (V, 3) metres, unit normals (V, 3). Fingers of one hand are searched separately: the
-    next finger is closer than other parts that a hand may penetrate.
+    Fingers of one hand are searched separately: the next finger is closer than other parts that a
+    hand may penetrate.
+
+    Args:
+        contact: the samples.
+        vertices: (V, 3) posed vertices, metres.
+        normals: (V, 3) unit normals.
     """
-    if vertices.device.type != "cpu":
-        return find_in_torch(contact, vertices, normals)
-    given = (getattr(contact, field.name).numpy() for field in fields(contact))
-    found = _find(len(_PART_NAMES), _WATCHED_M, vertices.numpy(), normals.numpy(), *given)
-    inner, outer = map(torch.from_numpy, found)
+    parts = len(_PART_NAMES)
+    indices = _find(parts, vertices.cpu().numpy(), normals.cpu().numpy(), contact)
+    inner, outer = (torch.as_tensor(index, device=vertices.device) for index in indices)
     return inner, outer, normals[outer]
-
-
-def find_in_torch(contact: SelfContact, vertices: Tensor, normals: Tensor) -> Contacts:
-    """The readable form of :func:`find_contacts`, on any device."""
-    where = vertices[contact.vertex]
-    near = _near_other_parts(contact, where)
-    distance = torch.cdist(where[near], where)
-    same_hand = contact.hand[near, None] == contact.hand
-    same_hand &= contact.hand >= 0
-    found = []
-    for searched in (contact.apart[near] & ~same_hand, contact.apart[near] & same_hand):
-        nearest_distance, nearest = torch.where(searched, distance, _FAR).min(1)
-        some = nearest_distance < _FAR
-        found.append(_behind(contact, near[some], nearest[some], vertices, normals))
-    # normals agree where two fingers join: no collision
-    facing = (normals[found[1][0]] * normals[found[1][1]]).sum(1) < 0
-    found[1] = (found[1][0][facing], found[1][1][facing])
-    inner, outer = (torch.cat(part) for part in zip(*found, strict=True))
-    return inner, outer, normals[outer]
-
-
-def _behind(
-    contact: SelfContact, sample: Tensor, nearest: Tensor, vertices: Tensor, normals: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Choose the samples (M,) behind the surface around the nearest sample (M,) of another part.
-
-    Returns the vertex ids of the samples and of the vertices that they are behind.
-    """
-    patch = contact.patch[nearest]
-    gap = vertices[contact.vertex[sample], None] - vertices[patch]
-    square = (gap * gap).sum(2)
-    square = square + _FAR * (contact.patch_part[nearest] != contact.part[nearest, None])
-    best = square.argmin(1, keepdim=True)
-    outer = patch.gather(1, best)[:, 0]
-    gap = gap.gather(1, best[..., None].expand(-1, 1, 3))[:, 0]
-    normal = normals[outer]
-    height = (gap * normal).sum(1)
-    sideways = (gap - height[:, None] * normal).norm(dim=1)
-    inside = (height < _WATCHED_M) & (height > -contact.deepest[nearest])
-    inside &= sideways < contact.sideways[nearest]
-    return contact.vertex[sample[inside]], outer[inside]
-
-
-def _near_other_parts(contact: SelfContact, where: Tensor) -> Tensor:
-    """Return the samples (M,) inside the bounding box of another part."""
-    count = len(_PART_NAMES)
-    index = contact.part[:, None].expand(-1, 3)
-    low = where.new_full((count, 3), _FAR).scatter_reduce(0, index, where, "amin")
-    high = where.new_full((count, 3), -_FAR).scatter_reduce(0, index, where, "amax")
-    inside = (where[:, None] > low - _WATCHED_M) & (where[:, None] < high + _WATCHED_M)
-    inside = inside.all(2)
-    inside[torch.arange(len(where)), contact.part] = False
-    return inside.any(1).nonzero()[:, 0]
 
 
 @numba.njit(cache=True, nogil=True)
-def _find(
-    parts,
-    margin,
-    vertices,
-    normals,
-    samples,
-    patch,
-    part,
-    patch_part,
-    hand,
-    apart,
-    deepest,
-    sideways,
-):
-    """:func:`find_in_torch`, compiled: vertex ids (K,) of samples and of surfaces.
+def _find(parts, vertices, normals, contact):
+    """Return the vertices (K,) of penetrating samples and (K,) of the surfaces around them.
 
-    parts: number of parts; margin: metres outside that count as inside; the other arrays are the
-    fields of :class:`SelfContact`.
+    parts: number of parts; vertices, normals (V,3): one posed body.
     """
+    samples, patch, part, patch_part, hand, apart, deepest, sideways = contact
     count, kind = len(samples), vertices.dtype
-    order, starts = _by_part(part, parts)
+    order = np.argsort(part, kind="mergesort")  # by part; this sort is stable
+    starts = np.searchsorted(part[order], np.arange(parts + 1))
     where = np.empty((count, 3), kind)  # in that order
     low, high = np.full((parts, 3), np.inf, kind), np.full((parts, 3), -np.inf, kind)
     for at in range(count):
@@ -273,10 +207,10 @@ def _find(
             where[at, d] = x
             low[part[i], d] = min(low[part[i], d], x)
             high[part[i], d] = max(high[part[i], d], x)
-    nearest = np.full((2, count), -1)  # by whether it is on the same hand
+    nearest = np.full((2, count), -1)  # sample of another part; second row: of the same hand
     for i in range(count):
         here = vertices[samples[i]]
-        if not _in_a_box(here, part[i], low, high, margin):
+        if not _in_a_box(here, part[i], low, high):
             continue
         least = np.full(2, np.inf)
         for p in range(parts):
@@ -292,22 +226,21 @@ def _find(
                 if square < least[same_hand] and apart[i, order[at]]:
                     least[same_hand], nearest[same_hand, i] = square, order[at]
     inner, outer = np.empty(2 * count, np.int64), np.empty(2 * count, np.int64)
-    found = 0
+    pairs = 0
     for same_hand in range(2):
         for i in range(count):
             j = nearest[same_hand, i]
             if j < 0:
                 continue
+            # the vertex of the other part that is nearest to the sample
             v, at = samples[i], -1
             least_gap = vertices[0, 0] * 0 + np.inf
             for k in range(patch.shape[1]):
                 if patch_part[j, k] == part[j]:
                     w = patch[j, k]
-                    x, y, z = (
-                        vertices[v, 0] - vertices[w, 0],
-                        vertices[v, 1] - vertices[w, 1],
-                        vertices[v, 2] - vertices[w, 2],
-                    )
+                    x = vertices[v, 0] - vertices[w, 0]
+                    y = vertices[v, 1] - vertices[w, 1]
+                    z = vertices[v, 2] - vertices[w, 2]
                     square = x * x + y * y + z * z
                     if square < least_gap:
                         least_gap, at, gx, gy, gz = square, w, x, y, z
@@ -316,41 +249,26 @@ def _find(
             nx, ny, nz = normals[at, 0], normals[at, 1], normals[at, 2]
             height = nx * gx + ny * gy + nz * gz
             sx, sy, sz = gx - height * nx, gy - height * ny, gz - height * nz
-            if not (-deepest[j] < height < margin):
+            if not (-deepest[j] < height < _MARGIN_M):
                 continue
             if not np.sqrt(sx * sx + sy * sy + sz * sz) < sideways[j]:
                 continue
             # normals agree where two fingers join: no collision
             if same_hand and (normals[v, 0] * nx + normals[v, 1] * ny + normals[v, 2] * nz >= 0):
                 continue
-            inner[found], outer[found] = v, at
-            found += 1
-    return inner[:found].copy(), outer[:found].copy()
+            inner[pairs], outer[pairs] = v, at
+            pairs += 1
+    return inner[:pairs].copy(), outer[:pairs].copy()
 
 
 @numba.njit(cache=True, nogil=True)
-def _by_part(part, parts):
-    """Return the samples sorted by part, and the start of each part and the end."""
-    order, starts = np.empty(len(part), np.int64), np.zeros(parts + 1, np.int64)
-    for p in part:
-        starts[p + 1] += 1
-    for p in range(parts):
-        starts[p + 1] += starts[p]
-    place = starts.copy()
-    for i in range(len(part)):
-        order[place[part[i]]] = i
-        place[part[i]] += 1
-    return order, starts
-
-
-@numba.njit(cache=True, nogil=True)
-def _in_a_box(here, own, low, high, margin):
-    """Return whether a point (3,) lies in the box (parts,3) of a part other than ``own``."""
+def _in_a_box(here, own, low, high):
+    """Return whether a point (3,) is in the box of a part other than ``own``, or near it."""
     for p in range(len(low)):
         if p != own and (
-            here[0] > low[p, 0] - margin and here[0] < high[p, 0] + margin
-            and here[1] > low[p, 1] - margin and here[1] < high[p, 1] + margin
-            and here[2] > low[p, 2] - margin and here[2] < high[p, 2] + margin
+            here[0] > low[p, 0] - _MARGIN_M and here[0] < high[p, 0] + _MARGIN_M
+            and here[1] > low[p, 1] - _MARGIN_M and here[1] < high[p, 1] + _MARGIN_M
+            and here[2] > low[p, 2] - _MARGIN_M and here[2] < high[p, 2] + _MARGIN_M
         ):  # fmt: skip
             return True
     return False

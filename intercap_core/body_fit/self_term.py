@@ -26,6 +26,7 @@ from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
 from intercap_core.body.selection import Selection
 from intercap_core.body.skeleton_kernel import add_point, project_on_direction, turned_back
+from intercap_core.body_fit.surface import SAMPLE_SHARE
 from intercap_core.body_fit.term_inputs import (
     Batch,
     BatchEquations,
@@ -40,9 +41,7 @@ from intercap_core.geometry.solve.robust import geman_mcclure
 
 SELF_TOLERANCE_M = 0.003  # skin yields by some millimetres under pressure; tuned on the studio
 _REACH_M = 0.015  # depth at which the penalty levels off: scale of rho; tuned on the studio
-# 1/m^2. The skin is fitted to 8 mm on either side (measured on the studio). Neighbouring samples
-# penetrate together: four make one measurement (tuned on the studio).
-_WEIGHT = 0.25 / 0.008**2
+_WEIGHT = SAMPLE_SHARE / 0.008**2  # 1/m^2; the skin is fitted to 8 mm (measured on the studio)
 
 _SHAPE = TRANSL.stop
 
@@ -188,10 +187,7 @@ class PreparedSelfPenetration:
 
     def add(self, batch: Batch, equations: BatchEquations) -> None:
         chain = batch.skeleton.chain(self.selection, self.rest.points[batch.at])
-        add_equations(
-            chain, self.pairs, batch.frames, equations.place, equations.cost, equations.gradient,
-            equations.hessian, self.rest.gradient[batch.at],
-        )  # fmt: skip
+        add_equations(chain, self.pairs, batch.frames, equations, self.rest.gradient[batch.at])
 
 
 @numba.njit(cache=True, nogil=True)
@@ -216,14 +212,15 @@ def add_cost(chain, pairs, frames, cost):
 
 
 @numba.njit(cache=True, nogil=True)
-def add_equations(chain, pairs, frames, place, cost, gradient, hessian, rest_gradient):
+def add_equations(chain, pairs, frames, equations, rest_gradient):
     """Add the normal equations of E_P_self to those of the frames (B,).
 
-    place (P,): column of each parameter, -1 = fixed.
-    cost (B,), gradient (B,n), hessian (B,n,n): filled in place.
-    rest_gradient (B,N,3): gradient by the points at rest, filled in place; of no body without pose
-    blend shapes.
+    equations: :class:`.term_inputs.BatchEquations`, filled in place.
+    rest_gradient (B,N,3): gradient by the points at rest, filled in place; B = 0 without pose blend
+    shapes.
     """
+    place, cost = equations.place, equations.cost
+    gradient, hessian = equations.gradient, equations.hessian
     shape = np.flatnonzero(place[_SHAPE:] >= 0)
     columns = place[place >= 0]
     scratch = np.empty((chain.chain.shape[1], 3), hessian.dtype)

@@ -76,9 +76,9 @@ def fit_start(evidence: Evidence, problem: BodyProblem) -> torch.Tensor:
     rest = model.zeros()
     keypoints = model.keypoints_of(rest)[0].double().cpu().numpy()
     pelvis = model.forward(rest, vertex_ids=np.array([0])).joints[0, 0].double().cpu().numpy()
-    joints = evidence.seen.joints[evidence.frames]
+    joints = evidence.observations.joints[evidence.frames]
     placed = interpolate_unknown(
-        place_trunk(keypoints, joints, pelvis), evidence.seen.times[evidence.frames]
+        place_trunk(keypoints, joints, pelvis), evidence.observations.times[evidence.frames]
     )
     straight = _fit_triangulated(problem, placed, joints)
     poor = np.flatnonzero((straight.cost > 1.5 * straight.cost.median()).cpu().numpy())

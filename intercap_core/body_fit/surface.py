@@ -26,6 +26,11 @@ NORMAL_LENGTH_M = 0.06
 MATCH_SIDEWAYS_M = 0.03
 
 
+# Weight of a sample: neighbours lie on one fold of cloth and penetrate together, so four samples
+# make one measurement. Tuned on the studio.
+SAMPLE_SHARE = 0.25
+
+
 @dataclass(frozen=True)
 class Covering:
     """The layer between the skin and the measured surface."""
@@ -88,10 +93,10 @@ def choose_samples(model: BodyModel) -> Samples:
     joint = model.skinning_weights.argmax(1).cpu().numpy()
     hand_joints = [i for i, name in enumerate(JOINT_NAMES) if i >= 25 or name.endswith("wrist")]
     hand = np.isin(joint, hand_joints)
-    outer = _outer(template, faces, joint)
+    outer = _flag_outer_skin(template, faces, joint)
     # metres; that of hands is the width of a finger (anatomy), the other is tuned on the studio
     chosen = [
-        _grid(template, np.flatnonzero(outer & part), spacing)
+        _thin_by_grid(template, np.flatnonzero(outer & part), spacing)
         for part, spacing in ((~hand, 0.045), (hand, 0.015))
     ]
     vertex = np.concatenate(chosen)
@@ -99,7 +104,7 @@ def choose_samples(model: BodyModel) -> Samples:
     _, near = scipy.spatial.cKDTree(template[outside]).query(template[vertex], 20)
     names = [c.name for c in COVERINGS]
     group = np.array([_covering(joint[v], names) for v in vertex])
-    face = _is_face(template, joint, model)[vertex]
+    face = _flag_face(template, joint, model)[vertex]
     group[face] = names.index("bare")
     # the upper of a shoe begins 35 mm above the lowest skin (anatomy)
     low = template[vertex, 1] < template[:, 1].min() + 0.035
@@ -112,7 +117,7 @@ def _covering(joint: int, names: list[str]) -> int:
     return names.index(_COVERING_OF_JOINT.get(name, "bare"))
 
 
-def _is_face(template: np.ndarray, joint: np.ndarray, model: BodyModel) -> np.ndarray:
+def _flag_face(template: np.ndarray, joint: np.ndarray, model: BodyModel) -> np.ndarray:
     """Flag the front of the head below the brows: the box of the face landmarks, seen from z."""
     landmarks = template[model.keypoint_map.ids[67:118].reshape(-1)]
     low, high = landmarks.min(0), landmarks.max(0)
@@ -121,7 +126,7 @@ def _is_face(template: np.ndarray, joint: np.ndarray, model: BodyModel) -> np.nd
     return inside.all(1) & (template[:, 2] > low[2] - 0.01) & on_head
 
 
-def _grid(points: np.ndarray, ids: np.ndarray, spacing: float) -> np.ndarray:
+def _thin_by_grid(points: np.ndarray, ids: np.ndarray, spacing: float) -> np.ndarray:
     """Choose one id for each occupied cube of a grid: the point nearest to the cube's centre."""
     cell = np.floor(points[ids] / spacing).astype(np.int64)
     from_middle = np.abs(points[ids] / spacing - cell - 0.5).max(1)
@@ -130,7 +135,7 @@ def _grid(points: np.ndarray, ids: np.ndarray, spacing: float) -> np.ndarray:
     return np.sort(ids[order[first]])
 
 
-def _outer(points: np.ndarray, faces: np.ndarray, joint: np.ndarray) -> np.ndarray:
+def _flag_outer_skin(points: np.ndarray, faces: np.ndarray, joint: np.ndarray) -> np.ndarray:
     """Flag the vertices (V,) of the outer skin: no eyes, tongue, mouth cavity or nostrils.
 
     A vertex of the head is inside if a ray along its normal meets the mesh again.
@@ -179,17 +184,17 @@ class SkinSurface:
     @classmethod
     def around_samples(cls, model: BodyModel, samples: Samples) -> SkinSurface:
         every = model.faces.cpu().numpy()
-        met = np.zeros(model.num_vertices, bool)
-        met[samples.vertex] = met[samples.patch] = True
-        faces = every[met[every].any(1)]
+        used = np.zeros(model.num_vertices, bool)
+        used[samples.vertex] = used[samples.patch] = True
+        faces = every[used[every].any(1)]
         ids = np.unique(faces)
         place = np.full(model.num_vertices, -1)
         place[ids] = np.arange(len(ids))
         faces = place[faces]
         corner = faces.ravel()
-        face = np.repeat(np.arange(len(faces)), 3)[met[ids][corner]]
-        corner = corner[met[ids][corner]]
-        order, groups = _group(model, samples)
+        face = np.repeat(np.arange(len(faces)), 3)[used[ids][corner]]
+        corner = corner[used[ids][corner]]
+        order, groups = _group_samples(model, samples)
         return cls(
             model=model,
             ids=ids,
@@ -206,15 +211,13 @@ class SkinSurface:
         """Return vertices and unit normals (B, R, 3), metres. Only the normals of samples and
         patches are correct."""
         vertices = self.model.forward(params, vertex_ids=self.ids).vertices
-        if vertices.device.type != "cpu":
-            faces = torch.as_tensor(self.faces).to(vertices.device)
-            return vertices, vertex_normals(vertices, faces)
-        normals = torch.empty_like(vertices)
-        _vertex_normals(vertices.numpy(), self.faces, self.starts, self.around, normals.numpy())
-        return vertices, normals
+        posed = vertices.cpu()
+        normals = torch.empty_like(posed)
+        _vertex_normals(posed.numpy(), self.faces, self.starts, self.around, normals.numpy())
+        return vertices, normals.to(vertices.device)
 
 
-def _group(model: BodyModel, samples: Samples) -> tuple[np.ndarray, np.ndarray]:
+def _group_samples(model: BodyModel, samples: Samples) -> tuple[np.ndarray, np.ndarray]:
     """Halve the samples by place and normal at rest until the groups are small.
 
     Returns the order (N,) of the samples, and the start of each group and the end (G + 1,).

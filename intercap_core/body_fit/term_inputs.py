@@ -189,13 +189,11 @@ def _limbs(chains: list[frozenset[int]]) -> Limbs:
             limbs.append([k])
         else:
             home.append(k)
-    moved_by = np.zeros((len(limbs), NUM_JOINTS), bool)
-    for flags, limb in zip(moved_by, limbs, strict=True):
-        flags[sorted(chains[limb[0]])] = True
-    return Limbs(np.concatenate(limbs), np.cumsum([0, *map(len, limbs)]), moved_by)
+    moved_by = np.array([[joint in chain for joint in range(NUM_JOINTS)] for chain in chains])
+    return Limbs.of([np.array(limb) for limb in limbs], moved_by)
 
 
-# --- one evaluation --------------------------------------------------------------------------
+# --- inputs, bodies and columns --------------------------------------------------------------
 
 
 @dataclass(kw_only=True)
@@ -300,11 +298,16 @@ class Batch(NamedTuple):
 
 
 class BatchEquations(NamedTuple):
-    """The normal equations of a batch, filled in place by the kernels."""
+    """The normal equations of a batch, which the kernels fill in place."""
 
-    columns: Columns
     place: np.ndarray
     """(P,) column of each body parameter, -1 = fixed."""
+    place_u: np.ndarray
+    """(G,) column of each covering, -1 = fixed."""
+    first_offset: int
+    """First column of the keypoint offsets."""
+    offsets: int
+    """Number of keypoints whose offsets have three columns each."""
     cost: np.ndarray
     """(B,)"""
     gradient: np.ndarray
@@ -312,7 +315,8 @@ class BatchEquations(NamedTuple):
     hessian: np.ndarray
     """(B, n, n)"""
     by_pose: np.ndarray
-    """(B, 54, 3, 9) derivatives of the rotations by the pose; empty without pose blend shapes."""
+    """(B, 54, 3, 9) derivatives of the rotations by the pose, see
+    :mod:`intercap_core.body.correctives_kernel`; B = 0 without pose blend shapes."""
 
 
 class PreparedTerm(Protocol):

@@ -131,13 +131,17 @@ class CompiledTerms:
         terms = self._prepare(inputs, bodies, derivatives=True)
         moved = [term.rest for term in terms if term.rest and term.rest.correctives]
         place = columns.of_parameters(bodies.vectors.shape[1])
+        place_u = columns.of_coverings(len(bodies.thickness))
         whole = [part.numpy() for part in equations]
 
         def add_frames(at: slice) -> None:
             batch = self._batch(terms, bodies, at, derivatives=True)
             by_pose = rotation_derivatives(batch.vectors if moved else batch.vectors[:0])
             cost, gradient, hessian = (part[at] for part in whole)
-            own = BatchEquations(columns, place, cost, gradient, hessian, by_pose)
+            own = BatchEquations(
+                place, place_u, columns.offsets_at.start, columns.offsets, cost, gradient, hessian,
+                by_pose,
+            )  # fmt: skip
             for term in terms:
                 term.add(batch, own)
             if moved:
@@ -152,8 +156,8 @@ class CompiledTerms:
     def _prepare(
         self, inputs: TermInputs, bodies: Bodies, *, derivatives: bool
     ) -> list[PreparedTerm]:
-        found = [term.prepare(inputs, bodies, derivatives=derivatives) for term in self._terms]
-        return [term for term in found if term is not None]
+        terms = [term.prepare(inputs, bodies, derivatives=derivatives) for term in self._terms]
+        return [term for term in terms if term is not None]
 
     def _batch(
         self, terms: list[PreparedTerm], bodies: Bodies, at: slice, *, derivatives: bool

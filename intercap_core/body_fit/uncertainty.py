@@ -48,8 +48,8 @@ def joint_covariance(model: BodyModel, fit: BodyFit) -> Tensor:
         if fit.one_shape:
             by_shared[..., : len(betas)] += full[..., betas]
         excess = fit.excess[at, None, None, None].double()
-        found = _covariance(factor, by_own) * excess + _covariance(shared_factor, by_shared)
-        result[at] = found + model_error
+        own_error = _covariance(factor, by_own) * excess
+        result[at] = own_error + _covariance(shared_factor, by_shared) + model_error
     return result
 
 
@@ -59,9 +59,9 @@ def deviation(covariance: np.ndarray) -> np.ndarray:
 
 
 def widen(covariance: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """Grow covariances (..., 3, 3) in all directions until their deviation is ``sigma`` (...).
+    """Add the same variance in all directions until the deviation is ``sigma`` (...).
 
-    Flags and bridges, which widen them, have no direction.
+    covariance: (..., 3, 3).
     """
     more = sigma**2 - deviation(covariance) ** 2
     return covariance + more[..., None, None] * np.eye(3)

@@ -19,10 +19,10 @@ from intercap_core.body.loading import OPEN_BODY, ShapePrior, load_body_file
 from intercap_core.body.model import BodyModel, check_body
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.body_fit import quality
-from intercap_core.body_fit.bridge import bridge, bridged_sigma, continuous
+from intercap_core.body_fit.bridge import bridge, bridged_sigma, unwrap_turns
 from intercap_core.body_fit.definition import Definition
 from intercap_core.body_fit.observations import person_clouds, read_observations
-from intercap_core.body_fit.recover import JUMP_M, jumps
+from intercap_core.body_fit.recover import JUMP_M, measure_jumps
 from intercap_core.body_fit.schedule import BodyFit, Fitter
 from intercap_core.body_fit.uncertainty import deviation, joint_covariance, widen
 from intercap_core.config import BodyFitSettings, BodyModels, digest
@@ -88,7 +88,7 @@ def run(
     vectors = np.zeros((seen.num_frames, model.num_parameters))
     vectors[fit.frames] = fit.vectors.double().cpu().numpy()
     vectors = bridge(vectors, fitted, seen.times)
-    vectors[:, :3] = continuous(vectors[:, :3])
+    vectors[:, :3] = unwrap_turns(vectors[:, :3])
 
     params = model.parameters(torch.as_tensor(vectors, dtype=model.dtype, device=model.device))
     joints = model.forward(params, vertex_ids=np.array([0])).joints.cpu().numpy()
@@ -160,7 +160,7 @@ def _state_uncertainty(
     least = np.full_like(sigma, JUMP_M)
     least[fit.frames] *= ~quality.flag_unmeasured_joints(fit.parts)
     jumped = np.zeros_like(sigma)
-    jumped[fitted] = jumps(joints[fitted].astype(float), times[fitted], least[fitted])
+    jumped[fitted] = measure_jumps(joints[fitted].astype(float), times[fitted], least[fitted])
     sigma[fit.frames] = np.hypot(
         quality.widen_sigma(deviation(stated), fit.parts),
         jumped[fit.frames] / quality.MEDIAN_CHI_3,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,15 @@ from intercap_core.body.maps import maps_path
 from intercap_core.body.model import BodyModel
 
 
-def open_arrays() -> dict[str, np.ndarray]:
+@cache
+def _read_open_body() -> dict[str, np.ndarray]:
     with np.load(OPEN_BODY) as file:
         return {name: file[name] for name in file.files}
+
+
+def open_arrays() -> dict[str, np.ndarray]:
+    """Arrays of the open body's file; tests must not change them in place."""
+    return dict(_read_open_body())
 
 
 def save_body(path: Path, arrays: dict[str, np.ndarray]) -> Path:

@@ -8,7 +8,14 @@ import torch
 
 from intercap_core.body.keypoints import FACE, KEYPOINT_NAMES, LEFT_HAND
 from intercap_core.body.loading import OPEN_BODY
-from intercap_core.body.maps import MARKER_NAMES, POINT_NAMES, REGION_NAMES, maps_path, smplx_maps
+from intercap_core.body.maps import (
+    MARKER_NAMES,
+    POINT_NAMES,
+    REGION_NAMES,
+    SMPLX_VERTICES,
+    load_maps,
+    maps_path,
+)
 from intercap_core.body.model import BodyModel
 
 from .conftest import open_arrays
@@ -90,7 +97,7 @@ def test_maps_name_every_point_and_marker(body64: BodyModel) -> None:
     assert len(MARKER_NAMES) == 81 and len(body64.markers) == 81
     read = json.loads(maps_path(OPEN_BODY).read_text())
     assert set(read["points"]) == set(POINT_NAMES)
-    known = smplx_maps()
+    known = load_maps(Path("SMPLX_MALE.npz"), SMPLX_VERTICES)
     assert len(set(known.markers)) == 81 and max(known.points.values()) < 10_475
     at = dict(zip(MARKER_NAMES, body64.template.numpy()[body64.markers], strict=True))
     for name, point in at.items():

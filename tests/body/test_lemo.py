@@ -73,8 +73,8 @@ def _statistics(**values: np.ndarray) -> Callable[[Path, Path], None]:
 
 _FIRST = "enc_blc1.main.0.weight"
 MISTAKES: dict[str, tuple[Callable[[Path, Path], object], list[str]]] = {
-    "no weights": (lambda weights, _: weights.unlink(), ["Enc_last_model.pkl", "does not exist"]),
-    "no statistics": (lambda _, statistics: statistics.unlink(), [".npz", "do not exist"]),
+    "no weights": (lambda weights, _: weights.unlink(), ["Enc_last_model.pkl", "No such file"]),
+    "no statistics": (lambda _, statistics: statistics.unlink(), [".npz", "No such file"]),
     "damaged weights": (
         lambda weights, _: weights.write_bytes(b"PK\x03\x04 cut"),
         ["Enc_last_model.pkl", "damaged", "torch.save"],
@@ -91,7 +91,7 @@ MISTAKES: dict[str, tuple[Callable[[Path, Path], object], list[str]]] = {
     ),
     "no archive": (
         lambda _, statistics: statistics.write_text("Xstd"),
-        [".npz", "cannot be read", "Xstd"],
+        [".npz", "not a readable .npz", "Xstd"],
     ),
     "other statistics": (_statistics(Xmean=np.zeros(3)), ["contain Xmean", "expected Xstd"]),
     "67 markers": (_statistics(Xstd=np.ones(201)), ["(201,)", "(243,)", "81 markers"]),

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,11 +10,12 @@ import pytest
 import torch
 
 from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.body.loading import BodyArrays, load_body_file
 from intercap_core.body.model import BodyModel, check_body, with_hand_mean
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.errors import UserError
 
-from .conftest import hand_pose, open_arrays, random_vector, save_body
+from .conftest import hand_pose, open_arrays, random_vector
 
 if TYPE_CHECKING:
     from body_models.smplx.torch import SMPLX
@@ -57,6 +59,21 @@ def test_equals_the_peer_library_on_the_same_file(
     assert (out.joints - skeleton[..., :3, 3]).abs().max() < bound
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_a_gpu_gives_the_values_and_derivatives_of_the_cpu(full_file: Path) -> None:
+    results = []
+    for device in ("cpu", "cuda"):
+        model = BodyModel.load(full_file, device=device, dtype=torch.float64)
+        vector = random_vector(3, model.num_parameters, 1, torch.float64).to(device)
+        params, ids = model.parameters(vector), torch.arange(0, model.num_vertices, 97)
+        posed = model.forward(params)
+        linear = model.linearise(params, vertex_ids=ids, joints=True).full()
+        results.append((posed.vertices, posed.joints, model.keypoints_of(params), linear))
+    for expected, found in zip(*results, strict=True):
+        assert found.device.type == "cuda"
+        assert (found.cpu() - expected).abs().max() < 1e-10
+
+
 def test_shape_columns_of_a_full_file_are_those_of_the_open_body(full_file: Path) -> None:
     arrays = open_arrays()
     model = BodyModel.load(full_file, num_betas=300, num_expression=100)
@@ -68,26 +85,18 @@ def test_shape_columns_of_a_full_file_are_those_of_the_open_body(full_file: Path
     assert np.abs(model.forward(params).vertices[0].numpy() - expected).max() < 1e-6
 
 
-def test_a_subset_of_vertices_is_the_same_as_all_of_them(body: BodyModel) -> None:
-    params = body.parameters(random_vector(3, body.num_parameters, 2, torch.float32))
-    ids = torch.tensor([13000, 4, 777, 777, 9001])
+def test_parts_of_vertices_and_of_a_batch_equal_the_whole(body: BodyModel) -> None:
+    """The shape has one row for all bodies."""
+    vector = random_vector(3, body.num_parameters, 2, torch.float32)
+    params, ids = body.parameters(vector), torch.tensor([13000, 4, 777, 777, 9001])
+    assert torch.equal(params.vector(), vector)
+    assert torch.equal(params.full_pose().reshape(3, -1), vector[:, :165])
+    params.betas = params.betas[:1]
     full, part = body.forward(params), body.forward(params, vertex_ids=ids)
     assert torch.allclose(full.vertices[:, ids], part.vertices, atol=1e-6)
     assert torch.equal(full.joints, part.joints)
-
-
-def test_shape_and_pose_of_one_row_serve_the_whole_batch(body: BodyModel) -> None:
-    params = body.parameters(random_vector(3, body.num_parameters, 4, torch.float32))
-    params.betas = params.betas[:1]
-    one = body.forward(params.frames(slice(2, 3)))
-    assert torch.allclose(body.forward(params).vertices[2:], one.vertices, atol=1e-6)
-
-
-def test_parameter_vector_round_trip(body: BodyModel) -> None:
-    vector = random_vector(2, body.num_parameters, 6, torch.float32)
-    params = body.parameters(vector)
-    assert torch.equal(params.vector(), vector)
-    assert torch.equal(params.full_pose().reshape(2, -1), vector[:, :165])
+    last = body.forward(params.frames(slice(2, 3)))
+    assert torch.allclose(full.vertices[2:], last.vertices, atol=1e-6)
 
 
 def test_rest_pose_axes_and_flexion_directions(body: BodyModel) -> None:
@@ -117,9 +126,8 @@ def test_mean_hands_curl_to_the_palm(body: BodyModel) -> None:
     params = with_hand_mean(body, body.zeros())
     joints = body.forward(params).joints[0].numpy()
     flat = body.forward(body.zeros()).joints[0].numpy()
-    for name in ("left_middle3", "right_middle3", "left_ring3", "right_index3"):
-        i = JOINT_INDEX[name]
-        assert joints[i, 1] < flat[i, 1] - 0.01
+    tips = [JOINT_INDEX[n] for n in ("left_middle3", "right_middle3", "left_ring3", "right_index3")]
+    assert (joints[tips, 1] < flat[tips, 1] - 0.01).all()
     mirror = np.array([-1.0, 1, 1])
     left, right = joints[25:40], joints[40:55] * mirror
     assert np.abs(left - right).max() < 2e-3
@@ -134,7 +142,7 @@ def test_hand_components_are_orthonormal_and_mirrored(body64: BodyModel) -> None
     assert torch.equal(pose[0], body64.hand_mean[1])
 
 
-@pytest.mark.parametrize("count", [6, 12, 45])
+@pytest.mark.parametrize("count", [6, 12])
 def test_few_hand_components_are_those_of_all_with_zeros(count: int, body64: BodyModel) -> None:
     model = BodyModel.load(num_hand_components=count, dtype=torch.float64)
     assert model.hand_components.shape == (2, count, 45)
@@ -160,17 +168,8 @@ def test_flat_hand_mean_moves_the_origin_of_coefficients(body64: BodyModel) -> N
 
 @pytest.mark.parametrize("count", [5, 46])
 def test_wrong_numbers_of_hand_components_are_reported(count: int) -> None:
-    with pytest.raises(
-        UserError, match=f"{count} hand components were requested; expected 6 to 45"
-    ):
+    with pytest.raises(UserError, match=f"{count} hand components were requested; expected 6 to"):
         BodyModel.load(num_hand_components=count)
-
-
-def test_regressor_rows_sum_to_one_and_weights_are_a_partition(body: BodyModel) -> None:
-    arrays = open_arrays()
-    assert np.abs(arrays["J_regressor"].sum(1) - 1).max() < 1e-4
-    assert arrays["weights"].min() >= 0
-    assert np.abs(arrays["weights"].sum(1) - 1).max() < 1e-5
 
 
 @pytest.mark.parametrize(
@@ -241,7 +240,7 @@ BAD_FILES: dict[str, tuple[Callable[[dict], dict], str]] = {
     ),
     "no faces": (lambda a: a | {"f": a["f"][:0]}, "0 faces"),
     "text": (lambda a: a | {"weights": np.full(a["weights"].shape, "a")}, "weights of type"),
-    "objects": (lambda a: a | {"weights": np.array([None])}, "not a readable npz"),
+    "objects": (lambda a: a | {"weights": np.array([None])}, "no readable array 'weights'"),
     "scalar tree": (lambda a: a | {"kintree_table": np.array(3)}, "kintree_table of shape"),
     "face": (lambda a: a | {"f": a["f"] + np.uint32(1)}, "names number 13492 in f"),
     "negative face": (lambda a: a | {"f": a["f"].astype(np.int64) - 1}, "names number -1 in f"),
@@ -267,8 +266,8 @@ def test_files_that_are_not_npz_are_reported(tmp_path: Path) -> None:
     broken.write_bytes(b"PK\x03\x04 not a zip")
     pickle = tmp_path / "SMPLX_MALE.pkl"
     pickle.write_bytes(b"\x80\x04.")
-    for path, words in ((tmp_path / "none.npz", "does not exist"), (broken, "not a readable npz"),
-                        (pickle, "pickle")):  # fmt: skip
+    for path, words in ((tmp_path / "none.npz", "No such file"), (pickle, "pickle"),
+                        (broken, "not a readable .npz")):  # fmt: skip
         with pytest.raises(UserError, match=words):
             BodyModel.load(path)
 
@@ -283,37 +282,35 @@ def test_a_mesh_without_its_map_is_refused(tmp_path: Path) -> None:
         BodyModel.load(path)
 
 
-WRONG: dict[str, tuple[Callable[[dict], dict], str]] = {
-    "wide": (lambda a: {"v_template": a["v_template"] * [4, 1, 1]}, "m wide"),
-    "no skin": (lambda a: {"f": np.zeros_like(a["f"])}, "0 m2 of skin"),
-    "joints elsewhere": (
-        lambda a: {"J_regressor": a["J_regressor"] * 1.5},
-        "a joint .* outside of its skin",
-    ),
+WRONG: dict[str, tuple[Callable[[BodyArrays], dict], str]] = {
+    "wide": (lambda f: {"template": f.template * [4, 1, 1]}, "m wide"),
+    "no skin": (lambda f: {"faces": 0 * f.faces}, "0 m2 of skin"),
+    "joints elsewhere": (lambda f: {"joint_regressor": 1.5 * f.joint_regressor},
+                         "a joint .* outside of its skin"),
     "joints in one place": (
-        lambda a: {"J_regressor": np.full_like(a["J_regressor"], 1 / len(a["v_template"]))},
+        lambda f: {"joint_regressor": np.full((55, len(f.template)), 1 / len(f.template))},
         "joints over 0% of its skin's",
     ),
-    "negative weights": (lambda a: {"weights": a["weights"] - 0.01}, "skinning weight of -0"),
-    "one shape": (lambda a: {"shapedirs": a["shapedirs"] * 0}, "shapedirs"),
-    "shapes in millimetres": (
-        lambda a: {"shapedirs": a["shapedirs"].astype(np.float32) * 1000},
-        "move the skin by up to",
-    ),
-    "hand without components": (lambda a: {"hands_componentsl": np.zeros((45, 45))}, "length 0"),
-    "stiff hand": (lambda a: {"hands_deviationr": np.zeros(45)}, "never varies"),
-    "landmarks": (lambda a: {"lmk_bary_coords": a["lmk_bary_coords"] * 3}, "lmk_bary_coords"),
-}
+    "negative weights": (lambda f: {"weights": f.weights - 0.01}, "skinning weight of -0"),
+    "one shape": (lambda f: {"shape_directions": 0 * f.shape_directions,
+                             "expression_directions": 0 * f.expression_directions}, "shapedirs"),
+    "shapes in millimetres": (lambda f: {"shape_directions": 1000 * f.shape_directions},
+                              "move the skin by up to"),
+    "hand without components": (lambda f: {"hand_components": np.zeros((2, 45, 45))}, "length 0"),
+    "stiff hand": (lambda f: {"hand_deviation": np.zeros((2, 45))}, "never varies"),
+    "landmarks": (lambda f: {"landmark_barycentric": 3 * f.landmark_barycentric},
+                  "lmk_bary_coords"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_numbers_that_are_not_a_persons_are_reported(name: str, tmp_path: Path) -> None:
+def test_numbers_that_are_not_a_persons_are_reported(name: str) -> None:
     change, words = WRONG[name]
-    arrays = {k: v for k, v in open_arrays().items() if k != "posedirs"}
-    path = save_body(tmp_path / "SMPLX_MALE.npz", arrays | change(arrays))
+    file = load_body_file(None, 10, 10)
+    model = BodyModel(replace(file, **change(file)), torch.device("cpu"), torch.float32)
     with pytest.raises(UserError, match=words) as caught:
-        check_body(BodyModel.load(path))
-    assert str(path) in str(caught.value)
+        check_body(model)
+    assert str(file.path) in str(caught.value)
 
 
 def test_persons_are_accepted(body: BodyModel, full_file: Path) -> None:

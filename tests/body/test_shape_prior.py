@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 import torch
 
-from intercap_core.body.loading import HEIGHT_SIGMA_M, BodyFile, ShapePrior, load_body_file
+from intercap_core.body.loading import HEIGHT_SIGMA_M, BodyArrays, ShapePrior, load_body_file
 
 
 @pytest.fixture(scope="module")
-def file() -> BodyFile:
+def file() -> BodyArrays:
     return load_body_file(None, 10, 10)
 
 
-def _heights(prior: ShapePrior, file: BodyFile) -> np.ndarray:
+def _heights(prior: ShapePrior, file: BodyArrays) -> np.ndarray:
     """Of 400 people (400,), metres."""
     z = torch.as_tensor(np.random.default_rng(0).standard_normal((400, 10)))
     betas = prior.betas(z).numpy()
@@ -26,14 +26,14 @@ def _heights(prior: ShapePrior, file: BodyFile) -> np.ndarray:
     return np.ptp(file.template[:, 1]) + betas @ by_shape
 
 
-def test_the_neutral_prior_is_the_files_own(file: BodyFile) -> None:
+def test_the_neutral_prior_is_the_files_own(file: BodyArrays) -> None:
     prior = ShapePrior.of(file, "neutral")
     np.testing.assert_array_equal(prior.mean, 0)
     np.testing.assert_array_equal(prior.root, np.eye(10))
     np.testing.assert_array_equal(prior.centred(file).template, file.template)
 
 
-def test_heights_of_women_and_men_are_those_of_adults(file: BodyFile) -> None:
+def test_heights_of_women_and_men_are_those_of_adults(file: BodyArrays) -> None:
     """About 1.64 +- 0.08 m and 1.76 +- 0.08 m."""
     women, men = (_heights(ShapePrior.of(file, who), file) for who in ("female", "male"))
     assert women.mean() == pytest.approx(1.63, abs=0.02)
@@ -43,7 +43,9 @@ def test_heights_of_women_and_men_are_those_of_adults(file: BodyFile) -> None:
 
 @pytest.mark.parametrize("gender", ["female", "male", "neutral"])
 @pytest.mark.parametrize("height", [1.52, 1.90])
-def test_a_stated_height_narrows_one_direction(file: BodyFile, gender: str, height: float) -> None:
+def test_a_stated_height_narrows_one_direction(
+    file: BodyArrays, gender: str, height: float
+) -> None:
     before, after = ShapePrior.of(file, gender), ShapePrior.of(file, gender, height)
     heights = _heights(after, file)
     assert heights.mean() == pytest.approx(height, abs=0.02)
@@ -55,7 +57,7 @@ def test_a_stated_height_narrows_one_direction(file: BodyFile, gender: str, heig
     assert (np.abs(narrower - 1) < 1e-6).sum() == 9
 
 
-def test_shapes_in_units_of_the_prior_are_the_same_bodies(file: BodyFile) -> None:
+def test_shapes_in_units_of_the_prior_are_the_same_bodies(file: BodyArrays) -> None:
     prior = ShapePrior.of(file, "male", 1.9)
     z = np.random.default_rng(1).standard_normal(10)
     centred = prior.centred(file)
@@ -64,6 +66,6 @@ def test_shapes_in_units_of_the_prior_are_the_same_bodies(file: BodyFile) -> Non
     np.testing.assert_allclose(ours, file.template + file.shape_directions @ betas, atol=1e-9)
 
 
-def test_a_licensed_file_has_its_own_gender(file: BodyFile) -> None:
+def test_a_licensed_file_has_its_own_gender(file: BodyArrays) -> None:
     other = replace(file, path=Path("SMPLX_MALE.npz"))
     np.testing.assert_array_equal(ShapePrior.of(other, "male").mean, 0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from intercap_core.body_fit.outlines import MaskRim, RimSamples, touching, trace_outline
+from intercap_core.body_fit.outlines import MaskRim, RimSamples, find_touched, trace_outline
 from intercap_core.geometry.camera import masks
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.transforms import rigid
@@ -45,12 +45,16 @@ def _rim(mask: masks.Runs) -> MaskRim:
     return found
 
 
-def _touching(rim: MaskRim, radius: float, late: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Of a ball where the seen one is, and so large; ``late`` metres along x of the camera."""
+def _touching(
+    rim: MaskRim, radius: float, displacement: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Samples and distances of a ball of this radius, displaced along the camera's x, metres."""
     turn, shift = MASTER_FROM_COLOUR[:3, :3], MASTER_FROM_COLOUR[:3, 3]
     vertices = (radius * BALL.vertices + CENTRE) @ turn.T + shift
-    moved = np.broadcast_to(late * turn[:, 0], (len(vertices), 3))
-    return touching(rim, MASTER_FROM_COLOUR, vertices, BALL.vertices @ turn.T, SAMPLES, 0.05, moved)
+    moved = np.broadcast_to(displacement * turn[:, 0], (len(vertices), 3))
+    return find_touched(
+        rim, MASTER_FROM_COLOUR, vertices, BALL.vertices @ turn.T, SAMPLES, 0.05, moved
+    )
 
 
 def test_planes_touch_the_masked_ball() -> None:
@@ -77,7 +81,7 @@ def test_planes_beyond_reach_are_left_out() -> None:
 
 def test_motion_until_the_exposure_is_taken_out() -> None:
     rim = _rim(_mask(CENTRE, RADIUS))
-    sample, distance = _touching(rim, RADIUS, late=0.01)
+    sample, distance = _touching(rim, RADIUS, displacement=0.01)
     sideways = BALL.vertices[sample, 0]
     assert distance[sideways > 0.9].mean() == pytest.approx(-0.0095, abs=0.002)
     assert distance[sideways < -0.9].mean() == pytest.approx(0.0095, abs=0.002)

@@ -35,8 +35,8 @@ def test_a_good_fit_has_no_undetermined_part(fine):
     whitened, confidence, sigma = fine
     evidence = _evidence(whitened, confidence)
     assert _undetermined(evidence, sigma) == []
-    assert torch.equal(evidence.against, torch.zeros(1, 8))
-    assert torch.equal(evidence.seen, torch.ones(1, 8))
+    assert torch.equal(evidence.outlier_share, torch.zeros(1, 8))
+    assert torch.equal(evidence.visible_share, torch.ones(1, 8))
     assert quality.trunk_distance(evidence) == pytest.approx(0.014)
     np.testing.assert_array_equal(quality.widen_sigma(sigma, evidence), sigma)
 
@@ -68,7 +68,10 @@ def test_unseen_parts_are_undetermined_by_their_deviation(fine):
     assert _undetermined(_evidence(whitened, confidence), sigma) == ["face"]
     confidence[:] = 0
     evidence = _evidence(whitened, confidence)
-    assert torch.isnan(evidence.against).all() and np.isnan(quality.trunk_distance(evidence)).all()
+    assert (
+        torch.isnan(evidence.outlier_share).all()
+        and np.isnan(quality.trunk_distance(evidence)).all()
+    )
     sigma[0, [JOINT_INDEX["right_knee"], JOINT_INDEX["right_ankle"]]] = 0.09
     assert _undetermined(evidence, sigma) == ["right_leg", "left_hand", "right_hand", "face"]
 

@@ -162,7 +162,7 @@ def _along(problem: BodyProblem, term: TorchTerm, step: float) -> tuple[Tensor, 
 
 
 @pytest.mark.parametrize("exact", [False], indirect=True)  # else they omit some derivatives
-def test_gauss_newton_matrices_are_products_of_the_residuals_slopes(exact: BodyProblem) -> None:
+def test_gauss_newton_matrices_are_products_of_residual_slopes(exact: BodyProblem) -> None:
     """v^T H v = sum w (dr / dv)^2 along a way v, for E_D and for E_J without blend shapes."""
     model = exact.model
     problem = replace(exact, targets=None)

@@ -89,7 +89,7 @@ def _seen_from(fitter: Fitter, problem, held: float) -> CameraEvidence:
 @pytest.mark.parametrize("only", ["keypoints", "clouds"])
 def test_beside_known_bodies_a_wrong_camera_is_put_right(fitter: Fitter, only: str) -> None:
     evidence = fitter.evidence
-    start = Cameras(evidence.seen.rig, evidence.seen.depth_bias)
+    start = Cameras(evidence.observations.rig, evidence.observations.depth_bias)
     covariance = np.zeros((CAMERAS, FREEDOMS, CAMERAS, FREEDOMS))
     covariance[WRONG, :, WRONG] = np.diag(LOOSE)
     cameras = CameraFit(start, covariance)
@@ -103,7 +103,7 @@ def test_beside_known_bodies_a_wrong_camera_is_put_right(fitter: Fitter, only: s
         evidence.take_cameras(cameras.now.rig, cameras.now.depth_bias)
     found, true = cameras.now.rig[WRONG], ring(CAMERAS)[WRONG]
     apart = found.master_from_colour @ np.linalg.inv(true.master_from_colour)
-    at_body = evidence.seen.joints[0, 0]
+    at_body = evidence.observations.joints[0, 0]
     before = start.rig[WRONG].master_from_colour @ np.linalg.inv(true.master_from_colour)
     off, was = (np.linalg.norm(m[:3, :3] @ at_body + m[:3, 3] - at_body) for m in (apart, before))
     assert off < 0.5 * was
@@ -120,7 +120,7 @@ def test_beside_known_bodies_a_wrong_camera_is_put_right(fitter: Fitter, only: s
 def test_what_a_view_saw_moves_with_its_camera(fitter: Fitter) -> None:
     """Points of a cloud follow their camera's motion; a bias moves them along their rays."""
     evidence = fitter.evidence
-    cloud, seen = evidence.clouds[0], evidence.seen
+    cloud, seen = evidence.clouds[0], evidence.observations
     step = np.zeros((CAMERAS, FREEDOMS))
     step[1, SHIFT] = [0.01, 0.02, 0.03]
     moved = Cameras(seen.rig, seen.depth_bias).moved(step)
@@ -223,7 +223,7 @@ def test_small_parts_may_be_too_much_together_or_far_away() -> None:
 
 def test_a_camera_without_a_pose_says_nothing(fitter: Fitter) -> None:
     evidence = fitter.evidence
-    given = evidence.seen
+    given = evidence.observations
     poses = given.rig.master_from_colour.copy()
     poses[3] = np.nan
     confidence = given.confidence.copy()
@@ -235,9 +235,9 @@ def test_a_camera_without_a_pose_says_nothing(fitter: Fitter) -> None:
         confidence=torch.as_tensor(confidence[:, :, problem.keypoints.index.numpy()]).float(),
     )
     evidence.by_view.points[:, 3] = 0
-    evidence.seen = replace(given, rig=given.rig.moved(poses), confidence=confidence)
+    evidence.observations = replace(given, rig=given.rig.moved(poses), confidence=confidence)
     seen = _seen_from(fitter, problem, held=1.0)
-    evidence.seen = given
+    evidence.observations = given
     mine = slice(3 * FREEDOMS, 4 * FREEDOMS)
     assert np.isfinite(seen.hessian).all() and np.isfinite(seen.cross).all()
     assert not seen.hessian[mine].any() and not seen.pull[mine].any()

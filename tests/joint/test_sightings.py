@@ -74,12 +74,12 @@ def fitted(tmp_path_factory):
 def test_velocities_are_what_a_later_exposure_changes(fitted):
     fitter, problem = fitted
     evidence, step = fitter.evidence, 0.002
-    given = evidence.seen
+    given = evidence.observations
     before = observe_keypoints(evidence, problem), observe_clouds(evidence, problem)
-    evidence.seen = replace(given, time_offset=np.full(CAMERAS, step))
+    evidence.observations = replace(given, time_offset=np.full(CAMERAS, step))
     fitter.observe(problem)
     after = observe_keypoints(evidence, problem), observe_clouds(evidence, problem)
-    evidence.seen = given
+    evidence.observations = given
     fitter.observe(problem)
     for a, b, tolerance in zip(before, after, (0.02, 0.05), strict=True):
         same = (a.weight > 0) & (b.weight == a.weight)
@@ -93,6 +93,8 @@ def test_the_true_offsets_are_found_beside_the_true_bodies(fitted, kind):
     fitter, problem = fitted
     evidence = fitter.evidence
     seen = kind(evidence, problem)
-    found = estimate_offsets([seen], evidence.seen.times, evidence.seen.time_offset, NOTHING)
+    found = estimate_offsets(
+        [seen], evidence.observations.times, evidence.observations.time_offset, NOTHING
+    )
     assert np.abs(found.offset - LATE).max() < 1e-3
     assert (np.abs(found.offset - LATE)[1:] < 4 * found.sigma[1:] + 1e-4).all()

@@ -193,7 +193,7 @@ class BodyData(JointTerm):
         evidence = self._fitter.evidence
         evidence.take_cameras(cameras.rig, cameras.depth_bias)
         if time_offset is not None:
-            evidence.seen = replace(evidence.seen, time_offset=time_offset)
+            evidence.observations = replace(evidence.observations, time_offset=time_offset)
 
     def camera_evidence(self, state: State, share: float) -> CameraEvidence:
         """Evidence of keypoints and clouds about the cameras at ``state``.
@@ -201,7 +201,7 @@ class BodyData(JointTerm):
         ``share`` is the share of an independent observation that a frame is.
         """
         self._place(state)
-        count = FREEDOMS * len(self._fitter.evidence.seen.rig)
+        count = FREEDOMS * len(self._fitter.evidence.observations.rig)
         hessian, gradient, _ = self._equations(state)
         cross = np.zeros((len(state), BODY.stop, count))
         seen = CameraEvidence(
@@ -213,7 +213,7 @@ class BodyData(JointTerm):
     def residuals(self) -> BodyResiduals:
         """Distances of the body to the images at the last :meth:`refresh`."""
         pixels, metres = self._fitter.residuals(self._problem)
-        total = len(self._fitter.evidence.seen.times)
+        total = len(self._fitter.evidence.observations.times)
         keypoint = np.full((total, pixels.shape[1]), np.nan)
         cloud = np.full(total, np.nan)
         keypoint[self._fitter.frames] = pixels.cpu().numpy()
@@ -225,7 +225,7 @@ class BodyData(JointTerm):
 
         At the last :meth:`refresh`; NaN without points.
         """
-        seen = self._fitter.evidence.seen
+        seen = self._fitter.evidence.observations
         person = np.full((len(seen.times), len(seen.rig)), np.nan)
         found = self._fitter.evidence.by_view
         if found is not None:
@@ -237,7 +237,7 @@ class BodyData(JointTerm):
     @property
     def time_offset(self) -> np.ndarray:
         """(C,) time offset of each camera in the predictions, seconds."""
-        return self._fitter.evidence.seen.time_offset
+        return self._fitter.evidence.observations.time_offset
 
     def estimate_offsets(self, prior: OffsetPrior) -> OffsetEstimate:
         """Estimate the cameras' time offsets at the state of the last :meth:`refresh`."""
@@ -247,7 +247,7 @@ class BodyData(JointTerm):
             for points in (observe_keypoints(evidence, problem), observe_clouds(evidence, problem))
             if points is not None
         ]
-        times = evidence.seen.times[evidence.frames]
+        times = evidence.observations.times[evidence.frames]
         offsets = estimate_offsets(observations, times, self.time_offset, prior)
         log.info("time offsets, ms: %s", np.round(1e3 * offsets.offset, 2))
         return offsets
@@ -257,7 +257,7 @@ class BodyData(JointTerm):
         evidence = self._fitter.evidence
         change = float(np.abs(offset - self.time_offset).max())
         if change > OFFSET_UNCHANGED_S:
-            evidence.seen = replace(evidence.seen, time_offset=offset)
+            evidence.observations = replace(evidence.observations, time_offset=offset)
             self._fitter.observe(self._problem)
         return change
 
@@ -350,7 +350,7 @@ def _add_clouds(
 
 def _poses(evidence: Evidence) -> torch.Tensor:
     """Poses (C, 4, 4) of the cameras; zeros for a camera without a pose, which has no evidence."""
-    return torch.as_tensor(np.nan_to_num(evidence.seen.rig.master_from_colour))
+    return torch.as_tensor(np.nan_to_num(evidence.observations.rig.master_from_colour))
 
 
 def _array(values: torch.Tensor) -> np.ndarray:
