@@ -176,7 +176,7 @@ class Plan:
         if self.project.recordings_made(sequence) is not None:
             state = self._decide_studio(sequence, checksums)
             if state.status is not OutputStatus.done:
-                new_recording = "its recording is made anew"
+                new_recording = "its recording is rendered again"
             yield STUDIO, state
         try:
             annotation = self.project.annotation(sequence, look_at_frames=False)

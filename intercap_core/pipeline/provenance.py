@@ -92,7 +92,7 @@ class Manifest:
             *_changed_files(before.files, self.files),
             *([f"code of {', '.join(code)}"] if code else []),
             *([f"library {', '.join(libraries)}"] if libraries else []),
-            *([f"{', '.join(read)} made anew"] if read else []),
+            *([f"{', '.join(read)} changed"] if read else []),
         ]
 
 

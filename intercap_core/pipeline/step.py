@@ -67,7 +67,9 @@ def run_step(
                 _check_inputs(stage, sequence, inputs)
                 done = _make(stage, project, sequence, annotation, inputs, output, manifest, lease)
         if not done:  # this process was suspended until its lease expired
-            log.info("sequence %s, %s: another process has taken it over", sequence, stage)
+            log.info(
+                "sequence %s, %s: its lease was taken over by another process", sequence, stage
+            )
             keep = True
     if not STAGES[stage].writes_folder:
         for note in outcome.notes(stage, output):

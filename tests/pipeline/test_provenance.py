@@ -81,7 +81,7 @@ def test_the_machine_is_told_and_decides_nothing() -> None:
          "object's entry: mesh/cup.ply is gone"),
         ({"code": {"energy": "E", "joint": "j"}}, "code of energy"),
         ({"libraries": {"numpy": "2.2"}}, "library numpy 2.1 → 2.2"),
-        ({"artefacts": {"frames": "F", "scene": "s"}}, "frames made anew"),
+        ({"artefacts": {"frames": "F", "scene": "s"}}, "frames changed"),
     ],
 )  # fmt: skip
 def test_what_differs_is_named(changed: dict, words: str) -> None:
