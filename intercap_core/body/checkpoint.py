@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from intercap_core.inputs.arrays import PICKLE_ERRORS
-from intercap_core.inputs.files import MAX_MODEL_BYTES, Unreadable, check_file
+from intercap_core.inputs.files import MAX_MODEL_BYTES, UnreadableFile, check_file
 
 # Functions that build tensors from the storages of a file
 _ALLOWED = {
@@ -73,17 +73,17 @@ _ERRORS = (*PICKLE_ERRORS, RuntimeError, OSError, struct.error, zipfile.BadZipFi
 def read_tensors(path: Path, *, advice: str) -> dict[str, Tensor]:
     """Return the tensors by name, on the CPU, of a dictionary or its `state_dict`.
 
-    Raises Unreadable if the file is missing, too large or damaged, or contains no dictionary.
+    Raises UnreadableFile if the file is missing, too large or damaged, or contains no dictionary.
     """
     check_file(path, MAX_MODEL_BYTES, advice=advice)
     try:
         read = _read(path)
     except _ERRORS as error:
-        raise Unreadable(
+        raise UnreadableFile(
             path, f"is damaged or was not written by torch.save ({type(error).__name__})", advice
         ) from error
     if not isinstance(read, dict):
-        raise Unreadable(
+        raise UnreadableFile(
             path, f"contains a {type(read).__name__}, expected tensors by name", advice
         )
     state = read.get("state_dict", read)

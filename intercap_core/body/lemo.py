@@ -27,7 +27,7 @@ from intercap_core.body.checkpoint import read_tensors, tensor_fault
 from intercap_core.body.maps import MARKER_NAMES
 from intercap_core.errors import UserError
 from intercap_core.inputs.arrays import read_arrays
-from intercap_core.inputs.files import Unreadable
+from intercap_core.inputs.files import UnreadableFile
 
 FRAMES_PER_SECOND = 30.0
 COORDINATES = 3 * len(MARKER_NAMES)
@@ -98,7 +98,7 @@ def _convolve(
 def _read_state(path: Path) -> dict[str, Tensor]:
     try:
         return read_tensors(path, advice=_HINT)
-    except Unreadable as error:
+    except UnreadableFile as error:
         raise UserError(
             f"LEMO's encoder {path} {error.reason}, expected Enc_last_model.pkl; {_HINT}"
         ) from error
@@ -117,7 +117,7 @@ def _read_spread(path: Path) -> np.ndarray:
     """Read the standard deviation (243,) of the coordinates."""
     try:
         arrays = read_arrays(path, advice=_HINT)
-    except Unreadable as error:
+    except UnreadableFile as error:
         raise UserError(
             f"LEMO's statistics: {path} {error.reason}, expected an .npz with Xstd; {_HINT}"
         ) from None

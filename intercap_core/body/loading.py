@@ -20,7 +20,7 @@ from torch import Tensor
 from intercap_core.body.joints import NUM_JOINTS, PARENTS
 from intercap_core.errors import UserError
 from intercap_core.inputs.arrays import read_arrays
-from intercap_core.inputs.files import Unreadable
+from intercap_core.inputs.files import UnreadableFile
 
 OPEN_BODY = Path(__file__).parent / "data" / "open_body.npz"
 GENDERS_FILE = OPEN_BODY.with_name("open_body_genders.npz")
@@ -124,7 +124,7 @@ def _read(path: Path) -> dict[str, np.ndarray]:
               "hands_deviationr"}  # fmt: skip
     try:
         return read_arrays(path, wanted)
-    except Unreadable as error:
+    except UnreadableFile as error:
         raise UserError(f"Body file {path} {error.reason}, expected an npz: {_HINT}.") from error
 
 

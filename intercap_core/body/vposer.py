@@ -25,7 +25,7 @@ from torch.nn import functional
 
 from intercap_core.body.checkpoint import read_tensors, tensor_fault
 from intercap_core.errors import UserError
-from intercap_core.inputs.files import Unreadable, quoted
+from intercap_core.inputs.files import UnreadableFile, quoted
 
 LATENT = 32
 _JOINTS = 21
@@ -84,7 +84,7 @@ class VPoser:
         """
         try:
             tensors = read_tensors(path, advice=_ADVICE)
-        except Unreadable as error:
+        except UnreadableFile as error:
             raise UserError(f"VPoser file {path} {error.reason}: {_ADVICE}.") from error
         weights = {_bare(name): value for name, value in tensors.items()}
         for stored, (names, slope) in _VERSIONS.items():

@@ -16,7 +16,7 @@ import numpy as np
 from intercap_core import artefacts
 from intercap_core.body.keypoints import BODY, KEYPOINT_NAMES
 from intercap_core.errors import UserError
-from intercap_core.inputs.files import MAX_SETTINGS_BYTES, Unreadable, quoted, read_text
+from intercap_core.inputs.files import MAX_SETTINGS_BYTES, UnreadableFile, quoted, read_text
 from intercap_core.schemas import BODY_FIT
 
 POINTS = tuple(KEYPOINT_NAMES[BODY])
@@ -49,7 +49,7 @@ class Definition:
             return cls.unknown()
         try:
             lines = read_text(path, MAX_SETTINGS_BYTES).splitlines()
-        except Unreadable as error:
+        except UnreadableFile as error:
             raise UserError(
                 f"{path}: no readable text ({error.reason}); name a table that "
                 "'intercap keypoint-definition' wrote in body_fit.keypoint_definition, or remove "

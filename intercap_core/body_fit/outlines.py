@@ -22,7 +22,7 @@ import numpy as np
 
 from intercap_core.body_fit.surface import MATCH_SIDEWAYS_M, NORMAL_LENGTH_M, Samples, SkinSurface
 from intercap_core.geometry.camera.intrinsics import Intrinsics
-from intercap_core.geometry.camera.mask_pixels import drawn
+from intercap_core.geometry.camera.mask_pixels import decode_box
 from intercap_core.geometry.camera.masks import Runs
 
 # Largest cosine between the line of sight and the normal of a sample on the rim: two thirds of the
@@ -84,7 +84,7 @@ def _rim(mask: Runs) -> tuple[np.ndarray, np.ndarray]:
     x, y, width, height = mask.box
     pad = round(3 * blur)
     window = np.zeros((height + 2 * pad, width + 2 * pad), np.uint8)
-    window[pad:-pad, pad:-pad] = np.uint8(255) * drawn(mask.ends, mask.box, mask.height).T
+    window[pad:-pad, pad:-pad] = np.uint8(255) * decode_box(mask.ends, mask.box, mask.height).T
     rims, _ = cv2.findContours(window, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     rims = [rim[:, 0] for rim in rims if len(rim) >= shortest]
     if not rims:

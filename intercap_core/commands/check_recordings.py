@@ -22,7 +22,7 @@ MIN_IMAGE_SHARE = 0.9  # of the expected images or detections; recordings lose a
 _IMAGE_ID = re.compile(rb'"(?:image_id|file_name)"\s*:\s*("[^"]*"|[^,}\s]+)')
 
 
-class CameraRecording(NamedTuple):
+class CheckedRecording(NamedTuple):
     """Recording of one camera."""
 
     source: Path
@@ -64,7 +64,7 @@ def check_recordings(
         try:
             with layout.open(name) as recording:
                 lens, depth = recording.camera.colour, recording.camera.depth
-                recordings[name] = CameraRecording(
+                recordings[name] = CheckedRecording(
                     recording.source,
                     (lens.width, lens.height),
                     recording.fps,
@@ -87,7 +87,7 @@ def check_recordings(
     return findings
 
 
-def _expected_seconds(recordings: dict[str, CameraRecording]) -> dict[str, float]:
+def _expected_seconds(recordings: dict[str, CheckedRecording]) -> dict[str, float]:
     """Duration of each camera's recording by the others: median of their longer half, seconds.
 
     The longer half, because most recordings of a sequence may be cut off.
@@ -105,7 +105,7 @@ def _check_recording(
     findings: RecordingFindings,
     row: SequenceEntry,
     name: str,
-    recording: CameraRecording,
+    recording: CheckedRecording,
     expected_s: float | None,
 ) -> None:
     source, preview = recording.source, recording.preview
@@ -195,7 +195,7 @@ def _count(file: Path | None, image_files: list[Path]) -> int | None:
     return len(set(_IMAGE_ID.findall(file.read_bytes()))) or None
 
 
-def _summary(row: SequenceEntry, recordings: dict[str, CameraRecording]) -> str:
+def _summary(row: SequenceEntry, recordings: dict[str, CheckedRecording]) -> str:
     if not recordings:
         return ""
     previews = [recording.preview for recording in recordings.values()]

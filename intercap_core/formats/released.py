@@ -1,6 +1,6 @@
 """Released results: their common form, and the files of BEHAVE.
 
-BEHAVE has registrations in the folders of frames, and parameters at 30 fps.
+BEHAVE has registrations in the folders of frames, and parameters at 30 frames a second.
 
 A frame's folder ``t0003.000`` holds ``person/fit02/person_fit.ply`` (6,890 vertices, SMPL-H's) and
 ``.pkl`` (``pose``: 156 numbers of SMPL-H's 52 joints, or 72 of SMPL's 24), and of the object
@@ -25,10 +25,6 @@ from intercap_core.errors import UserError
 from intercap_core.formats.recordings.behave import FRAME_FOLDER
 from intercap_core.inputs.arrays import read_arrays, read_pickle
 
-MOST_M = 100.0  # larger coordinates are not in metres
-MOST_RAD = 100.0  # longer rotation vectors are not in radians
-# Largest side of a person's bounding box: from crouching to an arm raised.
-MIN_PERSON_M, MAX_PERSON_M = 0.5, 3.0
 INTERCAP = ("res.pkl", "res.npz", "res_2.pkl", "res_1.pkl")  # names of result files, newest first
 BEHAVE_PERSON, BEHAVE_OBJECT = "smpl_fit_all.npz", "object_fit_all.npz"  # parameters at 30 fps
 PERSON_MESH = Path("person", "fit02", "person_fit.ply")  # in the folder of a frame of BEHAVE
@@ -107,21 +103,11 @@ class Results:
         return np.all(parts, axis=0)
 
 
-def check_range(path: Path, name: str, values: np.ndarray, most: float) -> None:
-    """Raise UserError if finite ``values`` are too large for metres or radians."""
+def check_range(path: Path, name: str, values: np.ndarray) -> None:
+    """Raise UserError if coordinates or rotation vectors are too large for metres or radians."""
     finite = np.abs(values[np.isfinite(values)])
-    if (finite > most).any():
+    if (finite > 100).any():
         raise UserError(f"{path}: {name} reaches {finite.max():.0f}; expected metres and radians")
-
-
-def check_metres(path: Path, name: str, values: np.ndarray) -> None:
-    """Raise UserError if coordinates are too large for metres."""
-    check_range(path, name, values, MOST_M)
-
-
-def check_radians(path: Path, name: str, values: np.ndarray) -> None:
-    """Raise UserError if rotation vectors are too long for radians."""
-    check_range(path, name, values, MOST_RAD)
 
 
 _PERSON, _OBJECT_FIT = "person", "fit01"
@@ -139,15 +125,6 @@ class Skin(NamedTuple):
     faces: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
-class ObjectPoses:
-    """N poses of the centred template: rotation vectors and translations (N, 3)."""
-
-    path: Path
-    angle: np.ndarray
-    trans: np.ndarray
-
-
 def read_skin(path: Path) -> Skin:
     """Read a ``person_fit.ply``; raises UserError unless it has 6,890 vertices of a person."""
     from intercap_core.geometry.rigid.mesh import read_mesh
@@ -162,13 +139,13 @@ def read_skin(path: Path) -> Skin:
     if not np.isfinite(vertices).all():
         raise UserError(f"{path}: has a vertex that is no number; get BEHAVE's file again")
     extent = float(np.ptp(vertices, axis=0).max())
-    low, high = MIN_PERSON_M, MAX_PERSON_M
+    low, high = 0.5, 3.0  # from crouching to an arm raised
     if not low <= extent <= high:
         raise UserError(
             f"{path}: is {extent:.4g} m large, expected a person of {low:g} to {high:g} m; write "
             "it in metres"
         )
-    check_metres(path, "its vertices", vertices)
+    check_range(path, "its vertices", vertices)
     return Skin(vertices, np.asarray(mesh.faces, np.int32))
 
 
@@ -184,8 +161,7 @@ def read_object_pose(path: Path) -> tuple[np.ndarray, np.ndarray]:
     for name, found in (("angle", angle), ("trans", trans)):
         if found.shape != (3,) or not np.isfinite(found).all():
             raise UserError(f"{path}: {name} holds {found.size} numbers, expected 3 finite ones")
-    check_radians(path, "angle", angle)
-    check_metres(path, "trans", trans)
+        check_range(path, name, found)
     return angle, trans
 
 
@@ -204,10 +180,10 @@ def person_poses_at_30_fps(folder: Path) -> dict[int, np.ndarray]:
     path = folder / BEHAVE_PERSON
     if not path.exists():
         return {}
-    values = _arrays(path)
+    values = read_arrays(path, advice="get the file again")
     poses = _as_smplx(_numbers(values, "poses", path), path)
     if "frame_times" not in values and (folder / BEHAVE_OBJECT).is_file():  # as first released
-        values["frame_times"] = _arrays(folder / BEHAVE_OBJECT).get("frame_times", np.zeros(0))
+        values |= read_arrays(folder / BEHAVE_OBJECT, ["frame_times"], advice="get the file again")
     # Some sequences have more poses than times: frames without an object were removed at the end.
     return dict(zip(_times(values, path, len(poses)), poses, strict=False))
 
@@ -217,13 +193,12 @@ def object_poses_at_30_fps(folder: Path) -> dict[int, tuple[np.ndarray, np.ndarr
     path = folder / BEHAVE_OBJECT
     if not path.exists():
         return {}
-    values = _arrays(path)
+    values = read_arrays(path, advice="get the file again")
     angles, trans = (_numbers(values, name, path) for name in ("angles", "trans"))
     for name, found in (("angles", angles), ("trans", trans)):
         if found.ndim != 2 or found.shape[1] != 3 or len(found) != len(angles):
             raise UserError(f"{path}: {name} is {found.shape}, expected ({len(angles)}, 3)")
-    check_radians(path, "angles", angles)
-    check_metres(path, "trans", trans)
+        check_range(path, name, found)
     both = zip(angles, trans, strict=True)
     return dict(zip(_times(values, path, len(angles)), both, strict=False))
 
@@ -240,7 +215,7 @@ def _as_smplx(poses: np.ndarray, path: Path) -> np.ndarray:
         )
     if not np.isfinite(poses).all():
         raise UserError(f"{path}: a pose has values that are no numbers; get the file again")
-    check_radians(path, "a pose", poses)
+    check_range(path, "a pose", poses)
     theirs = poses.reshape(len(poses), _JOINTS[poses.shape[1]], 3)
     found = np.zeros((len(poses), 55, 3))
     found[:, :_BODY_JOINTS] = theirs[:, :_BODY_JOINTS]
@@ -254,10 +229,6 @@ def _named(path: Path) -> Mapping[str, Any]:
     if not isinstance(values, dict):
         raise UserError(f"{path}: holds {type(values).__name__}, expected numbers by name")
     return values
-
-
-def _arrays(path: Path) -> dict[str, np.ndarray]:
-    return read_arrays(path, advice="get the file again")
 
 
 def _numbers(values: Mapping[str, Any], name: str, path: Path) -> np.ndarray:

@@ -5,5 +5,5 @@
 - ``arrays``: arrays of .npz archives and pickles
 
 The readers expect damaged files, and execute nothing that a file names. A file that cannot be used
-raises :class:`files.Unreadable`, a ``UserError`` that names the file.
+raises :class:`files.UnreadableFile`, a ``UserError`` that names the file.
 """

@@ -20,7 +20,7 @@ import numpy as np
 from intercap_core.inputs.files import (
     MAX_ARRAYS_BYTES,
     MAX_PICKLE_BYTES,
-    Unreadable,
+    UnreadableFile,
     printable,
     read_bytes,
 )
@@ -62,20 +62,20 @@ def read_arrays(
 ) -> dict[str, np.ndarray]:
     """Return the arrays of an .npz by name, all or those in ``wanted``.
 
-    Raises Unreadable if it is no archive, unpacks to more than ``limit`` bytes, or if a wanted
+    Raises UnreadableFile if it is no archive, unpacks to more than ``limit`` bytes, or if a wanted
     array is damaged or holds neither numbers nor text.
     """
     content = read_bytes(path, limit, advice=advice)
     if content.startswith(b"\x93NUMPY"):
-        raise Unreadable(path, "is not a readable .npz archive (it is a single array)", advice)
+        raise UnreadableFile(path, "is not a readable .npz archive (it is a single array)", advice)
     try:
         archive = zipfile.ZipFile(io.BytesIO(content))
     except _ARCHIVE_ERRORS as error:
-        raise Unreadable(path, f"is not a readable .npz archive ({error})", advice) from None
+        raise UnreadableFile(path, f"is not a readable .npz archive ({error})", advice) from None
     unpacked = sum(entry.file_size for entry in archive.infolist())
     if unpacked > limit:
         words = f"unpacks to {unpacked / 1e6:.0f} MB, at most {limit / 1e6:.0f} are read"
-        raise Unreadable(path, words, advice)
+        raise UnreadableFile(path, words, advice)
     arrays = {}
     for entry in archive.infolist():
         name = entry.filename.removesuffix(".npy")
@@ -86,7 +86,7 @@ def read_arrays(
         except _ARCHIVE_ERRORS as error:
             reason = " ".join(printable(str(error)).split())[:200] or type(error).__name__
             words = f"has no readable array {name!r:.60} ({reason})"
-            raise Unreadable(path, words, advice) from None
+            raise UnreadableFile(path, words, advice) from None
     return arrays
 
 
@@ -120,7 +120,7 @@ class _Unpickler(pickle.Unpickler):
 def read_pickle(path: Path) -> Any:
     """Load a pickle of numpy arrays and plain Python values, such as results of InterCap.
 
-    Python 2 pickles are read as latin-1, as numpy advises. Raises Unreadable if the file is
+    Python 2 pickles are read as latin-1, as numpy advises. Raises UnreadableFile if the file is
     missing, damaged or names anything else.
     """
     content = read_bytes(Path(path), MAX_PICKLE_BYTES)
@@ -128,7 +128,7 @@ def read_pickle(path: Path) -> Any:
         return _Unpickler(io.BytesIO(content), encoding="latin1").load()
     except PICKLE_ERRORS as error:
         reason = printable(str(error))[:200] or type(error).__name__
-        raise Unreadable(
+        raise UnreadableFile(
             Path(path),
             f"not a pickle of numpy arrays and plain values ({reason})",
             "convert it to .npz or .json, or get the file again",

@@ -19,7 +19,7 @@ import yaml
 from intercap_core.inputs.files import (
     MAX_CALIBRATION_BYTES,
     MAX_SETTINGS_BYTES,
-    Unreadable,
+    UnreadableFile,
     read_bytes,
     read_text,
 )
@@ -79,32 +79,32 @@ def read_json(
     advice: str = "correct it",
     entry: Callable[[dict[str, Any]], Any] | None = None,
 ) -> Any:
-    """Parse a JSON file of at most ``limit`` bytes; raises Unreadable."""
+    """Parse a JSON file of at most ``limit`` bytes; raises UnreadableFile."""
     content = read_bytes(path, limit)
     try:
         return parse_json(content.decode("utf-8-sig"), entry)
     except ValueError as error:
-        raise Unreadable(path, f"is not valid JSON ({error})", advice) from None
+        raise UnreadableFile(path, f"is not valid JSON ({error})", advice) from None
 
 
 def read_object(path: Path, limit: int = MAX_CALIBRATION_BYTES) -> dict[str, Any]:
-    """Parse a JSON file that holds an object; raises Unreadable."""
+    """Parse a JSON file that holds an object; raises UnreadableFile."""
     content = read_json(path, limit)
     if not isinstance(content, dict):
         kind = type(content).__name__
-        raise Unreadable(path, f"expected names and values, found {kind}", "correct it")
+        raise UnreadableFile(path, f"expected names and values, found {kind}", "correct it")
     return content
 
 
 def read_toml(path: Path, limit: int = MAX_CALIBRATION_BYTES) -> dict[str, Any]:
-    """Parse a TOML file of at most ``limit`` bytes; raises Unreadable."""
+    """Parse a TOML file of at most ``limit`` bytes; raises UnreadableFile."""
     text = read_text(path, limit)
     try:
         return {key: _bounded_values(value) for key, value in tomllib.loads(text).items()}
     except RecursionError:
-        raise Unreadable(path, "is not valid TOML (nested too deeply)", "correct it") from None
+        raise UnreadableFile(path, "is not valid TOML (nested too deeply)", "correct it") from None
     except ValueError as error:
-        raise Unreadable(path, f"is not valid TOML ({error})", "correct it") from None
+        raise UnreadableFile(path, f"is not valid TOML ({error})", "correct it") from None
 
 
 def _bounded_values(content: Any) -> Any:
@@ -180,12 +180,12 @@ def read_yaml(
 ) -> Any:
     """Parse a YAML file of at most ``limit`` bytes; ``prepared`` changes its text first.
 
-    Raises Unreadable if it is missing, too large or malformed.
+    Raises UnreadableFile if it is missing, too large or malformed.
     """
     if not os.path.lexists(path):
-        raise Unreadable(path, "there is no such file")
+        raise UnreadableFile(path, "there is no such file")
     text = read_text(path, limit)
     try:
         return parse_yaml(text if prepared is None else prepared(text), loader)
     except (yaml.YAMLError, ValueError) as error:
-        raise Unreadable(path, f"not valid YAML{yaml_fault(error)}", "correct it") from None
+        raise UnreadableFile(path, f"not valid YAML{yaml_fault(error)}", "correct it") from None

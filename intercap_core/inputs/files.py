@@ -34,7 +34,7 @@ _REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = _REPR.maxset = _REPR.maxfrozens
 _REPR.maxstring = _REPR.maxother = 80
 
 
-class Unreadable(UserError):
+class UnreadableFile(UserError):
     """A file that cannot be used.
 
     ``reason`` fits after the file's name, for readers that continue without the file.
@@ -50,36 +50,36 @@ def read_bytes(
 ) -> bytes:
     """Return the content of a regular file of at most ``limit`` bytes, or its first ``head`` bytes.
 
-    Raises :class:`Unreadable` for other files, without waiting for pipes or devices.
+    Raises :class:`UnreadableFile` for other files, without waiting for pipes or devices.
     """
     check_file(path, limit, advice=advice)
     try:
         with open(path, "rb") as file:
             content = file.read(limit + 1 if head is None else min(head, limit))
     except OSError as error:
-        raise Unreadable(path, f"cannot be read ({error.strerror})", advice) from None
+        raise UnreadableFile(path, f"cannot be read ({error.strerror})", advice) from None
     if len(content) > limit:  # the file grew while it was read
-        raise Unreadable(path, _too_large(len(content), limit), advice)
+        raise UnreadableFile(path, _too_large(len(content), limit), advice)
     return content
 
 
 def check_file(path: Path, limit: int | None, *, advice: str = "check the path") -> int:
     """Return the size of a file that a library will open by its path.
 
-    Raises :class:`Unreadable` if it is no regular file or larger than ``limit`` bytes (None = of
-    any size).
+    Raises :class:`UnreadableFile` if it is no regular file or larger than ``limit`` bytes (None =
+    of any size).
     """
     try:
         status = os.stat(path)
     except OSError as error:
-        raise Unreadable(path, f"cannot be read ({error.strerror})", advice) from None
+        raise UnreadableFile(path, f"cannot be read ({error.strerror})", advice) from None
     except ValueError:  # a NUL, or characters that no file system has
-        raise Unreadable(path, "is no name that a file can have", advice) from None
+        raise UnreadableFile(path, "is no name that a file can have", advice) from None
     if not stat.S_ISREG(status.st_mode):
         kind = next((name for test, name in _FILE_TYPES.items() if test(status.st_mode)), "no file")
-        raise Unreadable(path, f"cannot be read (it is {kind}, no file)", advice)
+        raise UnreadableFile(path, f"cannot be read (it is {kind}, no file)", advice)
     if limit is not None and status.st_size > limit:
-        raise Unreadable(path, _too_large(status.st_size, limit), advice)
+        raise UnreadableFile(path, _too_large(status.st_size, limit), advice)
     return status.st_size
 
 
@@ -89,12 +89,12 @@ def read_text(path: Path, limit: int, *, advice: str = "check the path") -> str:
 
 
 def decode_text(path: Path, content: bytes) -> str:
-    """Decode UTF-8; raises :class:`Unreadable` with the line and byte that are not UTF-8."""
+    """Decode UTF-8; raises :class:`UnreadableFile` with the line and byte that are not UTF-8."""
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
-        raise Unreadable(
+        raise UnreadableFile(
             path, f"is not text in UTF-8 (line {line}, byte {error.start})", "write it as UTF-8"
         ) from None
 

@@ -10,34 +10,36 @@ from intercap_core.errors import UserError
 from intercap_core.formats.recordings.behave import frame_folders
 from intercap_core.formats.released import PERSON_MESH
 from intercap_core.inputs.documents import read_json
-from intercap_core.inputs.files import Unreadable
+from intercap_core.inputs.files import UnreadableFile
 from intercap_core.tables.project_files import Draft, Row
 
 SEQUENCE = re.compile(r"(Date\d{1,4})_(Sub\d{1,4})_([A-Za-z0-9]+)(?:_[A-Za-z0-9_-]+)?")
-LONGEST_NAME = 80  # of config.Name
-GENDERS = ("female", "male", "neutral")
 
 
 def draft(root: Path, *, dataset: str, results: Path | None = None) -> Draft:
-    """List the sequences of ``root``, which holds ``sequences``, ``calibs`` and ``objects``.
+    """List the sequences of the data set.
 
-    ``results`` (what the data set itself found) holds a folder for each sequence, or
-    ``sequences`` with these: ``root`` itself, whose folders of frames hold registrations, or the
-    parameters at 30 fps.
-    Sequences without frames or calibration, and objects without a mesh, are left out with a remark.
-    Raises UserError where nothing is left.
+    Sequences without frames, calibration or mesh are left out with a remark. Raises UserError if
+    no sequence is left.
+
+    Args:
+        root: folder with ``sequences``, ``calibs`` and ``objects``.
+        dataset: name of the project.
+        results: the data set's own results to convert, a folder for each sequence or ``sequences``
+            with these folders: ``root``, whose frames hold registrations, or the parameters at 30
+            frames a second. None = run the joint fit.
     """
     result = Draft(dataset)
     meshes: dict[str, dict[str, Any]] = {}
     folder = root / "sequences"
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
         match = SEQUENCE.fullmatch(path.name)
-        if not match or not path.is_dir() or len(path.name) > LONGEST_NAME:
+        if not match or not path.is_dir() or len(path.name) > 80:  # as config.Name
             continue
-        date, subject, thing = match.groups()
-        row, fault = _row(root, path, date, subject, thing)
-        mesh = _mesh(root, thing)
-        fault = fault or ("" if mesh else f"objects/{thing} holds no mesh")
+        date, subject, object_name = match.groups()
+        row, fault = _row(root, path, date, subject, object_name)
+        mesh = _find_mesh(root, object_name)
+        fault = fault or ("" if mesh else f"objects/{object_name} holds no mesh")
         if fault:
             result.remarks.append(f"{path.name} is left out: {fault}")
             continue
@@ -47,7 +49,7 @@ def draft(root: Path, *, dataset: str, results: Path | None = None) -> Draft:
             row.remarks.append(f"info.json states no gender: {subject} is {known}")
         elif gender != known:
             row.remarks.append(f"info.json says {gender}, another sequence of {subject} {known}")
-        meshes[thing] = {"mesh": mesh, "labels": [thing]}
+        meshes[object_name] = {"mesh": mesh, "labels": [object_name]}
         if results is not None:
             _name_results(row, results)
         result.rows.append(row)
@@ -61,13 +63,14 @@ def draft(root: Path, *, dataset: str, results: Path | None = None) -> Draft:
     return result
 
 
-def _row(root: Path, path: Path, date: str, subject: str, thing: str) -> tuple[Row, str]:
+def _row(root: Path, path: Path, date: str, subject: str, object_name: str) -> tuple[Row, str]:
+    """The row of a sequence, and why it cannot be used, "" = it can."""
     calibration = root / "calibs" / date / "config"
     row = Row(
         {
             "sequence": path.name,
             "subject": subject,
-            "object": thing,
+            "object": object_name,
             "layout": "behave",
             "recordings": path,
             "calibration": calibration,
@@ -87,29 +90,25 @@ def _row(root: Path, path: Path, date: str, subject: str, thing: str) -> tuple[R
 def _name_results(row: Row, results: Path) -> None:
     """Name the results of the row's sequence, or remark that there are none."""
     name = str(row.columns["sequence"])
-    places = [results / "sequences" / name, results / name]
     meshes = f"t*/{PERSON_MESH.as_posix()}"
-    there = next((place for place in places if any(place.glob(meshes))), None)
-    if there is None:
-        row.remarks.append(f"{results} holds no {name}/{meshes}: our joint fit is made")
-        return
-    row.columns["results"] = there
+    for folder in (results / "sequences" / name, results / name):
+        if any(folder.glob(meshes)):
+            row.columns["results"] = folder
+            return
+    row.remarks.append(f"{results} holds no {name}/{meshes}: the joint fit runs instead")
 
 
-def _mesh(root: Path, thing: str) -> Path | None:
-    """The simplified mesh, which is closed, before the textured scan."""
-    folder = root / "objects" / thing
-    for pattern in ("*_f[0-9]*.ply", "*.ply", "*.obj"):
-        found = sorted(folder.glob(pattern)) if folder.is_dir() else []
-        if found:
-            return found[0]
-    return None
+def _find_mesh(root: Path, object_name: str) -> Path | None:
+    """The simplified mesh, which is closed, or else another one; None if there is none."""
+    folder = root / "objects" / object_name
+    patterns = ("*_f[0-9]*.ply", "*.ply", "*.obj")
+    return next((path for pattern in patterns for path in sorted(folder.glob(pattern))), None)
 
 
 def _gender(path: Path) -> str | None:
     try:
         content = read_json(path / "info.json")
-    except Unreadable:
+    except UnreadableFile:
         return None
     gender = content.get("gender") if isinstance(content, dict) else None
-    return gender if gender in GENDERS else None
+    return gender if gender in ("female", "male", "neutral") else None

@@ -1,4 +1,4 @@
-"""Which of several calibrations belongs to a recording, by how well its depth images agree."""
+"""Choice of the calibration that belongs to a recording, by the agreement of its depth images."""
 
 from __future__ import annotations
 
@@ -16,29 +16,26 @@ from intercap_core.geometry.camera.clouds import master_points
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import apply, invert
 
-IMAGES = 7  # of each camera, spread over the recording: their median is the static background
-STEP = 4  # of the pixels that are compared, in rows and columns
-FAR_M = 0.3  # a surface this far off is another one, which hides the point from one camera
-MIN_POINTS = 500  # that two cameras must share
-CLEARLY = 0.9  # the best residual is at most this share of the next
-SAME_POSE = 1e-3  # metres or radians: two calibrations say the same about a pair of cameras
-
 
 @dataclass(frozen=True)
-class Choice:
-    """``best`` of the calibrations, None = cannot be told; ``residual_m``: of each."""
+class CalibrationChoice:
+    """Result of :func:`choose_calibration`."""
 
     best: str | None
+    """Name of the calibration with the clearly smallest residual; None if none is."""
     residual_m: dict[str, float]
+    """Residual of each calibration that could be compared, metres."""
 
 
-def choose_calibration(sequence: SequenceEntry, calibrations: Mapping[str, Path]) -> Choice:
+def choose_calibration(
+    sequence: SequenceEntry, calibrations: Mapping[str, Path]
+) -> CalibrationChoice:
     """Compare the calibration folders on the background depth of one recording.
 
-    Only pairs of cameras are looked at to which two calibrations give different relative poses.
-    The residual is the median distance along the ray between a camera's points and the surface
-    that the other measured, averaged over the pairs. Calibrations and cameras that cannot be read
-    are left out.
+    Only pairs of cameras to which two calibrations give different relative poses are compared. The
+    residual is the median distance along the ray between a camera's points and the surface that
+    the other camera measured, averaged over the pairs. The best residual must be at most 90 % of
+    the next. Calibrations and cameras that cannot be read are left out.
     """
     rigs: dict[str, dict[str, Camera]] = {}
     depths: dict[str, np.ndarray] = {}
@@ -58,8 +55,8 @@ def choose_calibration(sequence: SequenceEntry, calibrations: Mapping[str, Path]
         if any(np.isfinite(found)):
             residuals[name] = float(np.nanmean(found))
     order = sorted(residuals, key=lambda name: residuals[name])
-    decided = len(order) > 1 and residuals[order[0]] <= CLEARLY * residuals[order[1]]
-    return Choice(order[0] if decided else None, residuals)
+    decided = len(order) > 1 and residuals[order[0]] <= 0.9 * residuals[order[1]]
+    return CalibrationChoice(order[0] if decided else None, residuals)
 
 
 def _cameras(row: SequenceEntry, depths: dict[str, np.ndarray]) -> dict[str, Camera]:
@@ -75,14 +72,14 @@ def _cameras(row: SequenceEntry, depths: dict[str, np.ndarray]) -> dict[str, Cam
                     continue
                 cameras[name] = recording.camera
                 if name not in depths:
-                    depths[name] = _background(recording.sample_depth(IMAGES))
+                    depths[name] = _background(recording.sample_depth(7))
         except UserError:
             continue
     return cameras
 
 
 def _background(images: list[np.ndarray]) -> np.ndarray:
-    """Median (H, W) uint16 over images of the values that are there; 0 = none."""
+    """Median depth (H, W) uint16 of pixels that most images measured, otherwise 0."""
     stack = np.sort(np.stack(images) - np.uint16(1), axis=0)  # 0 wraps to the largest value
     known = (stack < 65535).sum(axis=0)
     middle = np.take_along_axis(stack, np.maximum(known - 1, 0)[None] // 2, axis=0)[0]
@@ -90,21 +87,21 @@ def _background(images: list[np.ndarray]) -> np.ndarray:
 
 
 def _differ(rigs: Mapping[str, dict[str, Camera]], a: str, b: str) -> bool:
-    """Whether two calibrations place camera b differently as camera a sees it."""
+    """Whether two calibrations differ in the pose of camera b relative to camera a."""
     poses = [invert(r[a].master_from_colour) @ r[b].master_from_colour for r in rigs.values()]
-    return any(np.abs(pose - poses[0]).max() > SAME_POSE for pose in poses[1:])
+    return any(np.abs(pose - poses[0]).max() > 1e-3 for pose in poses[1:])
 
 
 def _residual(a: Camera, b: Camera, depth_a: np.ndarray, depth_b: np.ndarray) -> float:
-    """Median distance, metres, of what a sees to what b measured; NaN = no overlap."""
+    """Median distance, metres, from points of a to the surface seen by b; NaN = no overlap."""
     lens = b.depth
     assert lens is not None
     thinned = np.zeros_like(depth_a)
-    thinned[::STEP, ::STEP] = depth_a[::STEP, ::STEP]
+    thinned[::4, ::4] = depth_a[::4, ::4]
     points = apply(b.depth_from_master, master_points(thinned, a).points)
     points = points[lens.sees(points)]
     column, row = np.rint(lens.project(points)).astype(np.int64).T
     measured = depth_b[np.minimum(row, lens.height - 1), np.minimum(column, lens.width - 1)] * 1e-3
     distance = np.abs(measured - points[:, 2])[measured > 0]
-    near = distance[distance < FAR_M]
-    return float(np.median(near)) if len(near) >= MIN_POINTS else np.nan
+    near = distance[distance < 0.3]  # metres; a farther surface hides the point from b
+    return float(np.median(near)) if len(near) >= 500 else np.nan

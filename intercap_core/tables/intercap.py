@@ -23,34 +23,34 @@ OBJECTS = (
 )  # fmt: skip
 MALE = (1, 2, 4, 5, 10)  # the release's own list; the others are female
 CALIBRATIONS = ("first", "second", "third")
-# Where the release says nothing: between the recordings of the first calibration and those of the
-# second lie those of the third.
-UNSTATED = "third"
 _NUMBER, _SEGMENT = re.compile(r"\d{1,2}"), re.compile(r"seg_?(\d{1,2})", re.IGNORECASE)
-_BESIDE = ("", "Data", "obj_track", "..", "../Data", "../obj_track")  # of the images' folder
 
 
 @dataclass(frozen=True)
 class Sources:
-    """Folders of the release beside the images; None = look for it, or do without.
+    """Folders of the release other than the images.
 
-    ``calibrations`` holds ``calibration_first``, ...; ``annotations`` a folder for each sequence;
-    ``meshes`` ``01.ply``, ...; ``keypoints``, ``candidates`` and ``results`` (what the release
-    itself found) a folder for each sequence.
+    The first three are searched for near the images if they are None; the others are optional.
     """
 
     calibrations: Path | None = None
+    """Holds ``calibration_first``, ``calibration_second`` and ``calibration_third``."""
     annotations: Path | None = None
+    """Holds a folder for each sequence."""
     meshes: Path | None = None
+    """Holds ``01.ply``, ``02.ply``, ..."""
     keypoints: Path | None = None
+    """Holds a folder for each sequence."""
     candidates: Path | None = None
+    """Holds a folder for each sequence."""
     results: Path | None = None
+    """The release's own results, a folder for each sequence."""
 
 
-def stated_calibration(subject: int, thing: int) -> str | None:
-    """Which calibration the release uses for a subject and an object; None = it does not say."""
-    early = thing <= 7
-    if (subject <= 3 and early) or (subject == 4 and thing <= 4):
+def stated_calibration(subject: int, object_number: int) -> str | None:
+    """The calibration that the release states for a subject and an object; None = not stated."""
+    early = object_number <= 7
+    if (subject <= 3 and early) or (subject == 4 and object_number <= 4):
         return "first"
     if (subject == 3 and not early) or (subject in (5, 6, 7) and early):
         return "third"
@@ -58,10 +58,15 @@ def stated_calibration(subject: int, thing: int) -> str | None:
 
 
 def draft(root: Path, sources: Sources, *, dataset: str, objects: Path) -> Draft:
-    """List the sequences below ``root``, which is or holds ``RGBD_Images``.
+    """List the sequences of the release.
 
-    ``objects`` is the objects.yaml to use where the release's meshes are not given. Raises
-    UserError where there are no sequences, or no calibrations.
+    Raises UserError if there are no sequences or no calibrations.
+
+    Args:
+        root: the folder ``RGBD_Images``, or the one that holds it.
+        sources: the other folders of the release.
+        dataset: name of the project.
+        objects: objects.yaml to use if the release's meshes are missing.
     """
     images = root / "RGBD_Images" if (root / "RGBD_Images").is_dir() else root
     folders = _sequence_folders(images)
@@ -71,9 +76,9 @@ def draft(root: Path, sources: Sources, *, dataset: str, objects: Path) -> Draft
             "release was unpacked to"
         )
     calibrations = _calibrations(sources.calibrations, images)
-    annotations_root = sources.annotations or _beside(images, "configs")
+    annotations_root = sources.annotations or _find_folder(images, "configs")
     annotated = annotation_folders(annotations_root) if annotations_root else {}
-    meshes = sources.meshes or _beside(images, "objs")
+    meshes = sources.meshes or _find_folder(images, "objs")
     result = Draft(dataset)
     for key, folder in folders.items():
         row = _row(key, folder, sources)
@@ -89,17 +94,18 @@ def draft(root: Path, sources: Sources, *, dataset: str, objects: Path) -> Draft
     if annotated:
         result.remarks.append(f"{len(annotated)} sequences of {annotations_root} have no images")
     if 9 in {key[0] for key in folders}:
-        result.remarks.append("subject 09 is female in the release; one loader of others says male")
+        result.remarks.append("subject 09 is female in the release; another loader states male")
     return result
 
 
 def _sequence_folders(images: Path) -> dict[Key, Path]:
     found: dict[Key, Path] = {}
     for subject in _numbered_folders(images):
-        for thing in _numbered_folders(subject):
-            for path in sorted(p for p in thing.iterdir() if p.is_dir()):
+        for object_folder in _numbered_folders(subject):
+            for path in sorted(p for p in object_folder.iterdir() if p.is_dir()):
                 match = _SEGMENT.fullmatch(path.name)
-                key = int(subject.name), int(thing.name), int(match.group(1)) if match else -1
+                segment = int(match.group(1)) if match else -1
+                key = int(subject.name), int(object_folder.name), segment
                 if match and 1 <= key[1] <= len(OBJECTS):
                     found.setdefault(key, path)
     return dict(sorted(found.items()))
@@ -111,8 +117,10 @@ def _numbered_folders(folder: Path) -> list[Path]:
     return sorted(p for p in folder.iterdir() if _NUMBER.fullmatch(p.name) and p.is_dir())
 
 
-def _beside(images: Path, name: str) -> Path | None:
-    places = (images / place / name for place in _BESIDE)
+def _find_folder(images: Path, name: str) -> Path | None:
+    """The folder ``name`` at any of its usual places near the images; None if there is none."""
+    near = ("", "Data", "obj_track", "..", "../Data", "../obj_track")
+    places = (images / place / name for place in near)
     return next((place for place in places if place.is_dir()), None)
 
 
@@ -121,7 +129,7 @@ def _calibrations(given: Path | None, images: Path) -> dict[str, Path]:
     if given is not None:
         found = {name: given / folder for name, folder in names.items()}
     else:
-        places = {name: _beside(images, folder) for name, folder in names.items()}
+        places = {name: _find_folder(images, folder) for name, folder in names.items()}
         found = {name: place for name, place in places.items() if place is not None}
     found = {name: folder for name, folder in found.items() if folder.is_dir()}
     if not found:
@@ -133,38 +141,38 @@ def _calibrations(given: Path | None, images: Path) -> dict[str, Path]:
 
 
 def _row(key: Key, folder: Path, sources: Sources) -> Row:
-    subject, thing, segment = key
-    name = f"s{subject:02d}_o{thing:02d}_seg{segment}"
+    subject, number, segment = key
+    name = f"s{subject:02d}_o{number:02d}_seg{segment}"
     columns: dict[str, str | Path] = {
         "sequence": name,
         "subject": f"s{subject:02d}",
-        "object": OBJECTS[thing - 1],
+        "object": OBJECTS[number - 1],
         "layout": "intercap",
         "recordings": folder,
     }
     usual = (
         name,
-        f"{subject:02d}/{thing:02d}/Seg_{segment}",
-        f"subject{subject:02d}_motion{thing:02d}_seg{segment}",
-        f"subject{subject:02d}_motion{thing:02d}_seg{segment:02d}",
+        f"{subject:02d}/{number:02d}/Seg_{segment}",
+        f"subject{subject:02d}_motion{number:02d}_seg{segment}",
+        f"subject{subject:02d}_motion{number:02d}_seg{segment:02d}",
     )
     for column in ("keypoints", "candidates", "results"):
-        above = getattr(sources, column)
-        places = [above / place for place in usual] if above is not None else []
-        there = next((place for place in places if place.is_dir()), None)
-        if there is not None:
-            columns[column] = there
+        parent = getattr(sources, column)
+        folders = [parent / place for place in usual] if parent is not None else []
+        own = next((folder for folder in folders if folder.is_dir()), None)
+        if own is not None:
+            columns[column] = own
     return Row(columns)
 
 
 def _frame_numbers(folder: Path) -> np.ndarray:
-    """Numbers (T,) of the frames of which some camera has a colour image, increasing."""
+    """Numbers (T,) of the frames of which any camera has a colour image, increasing."""
     numbers: set[int] = set()
     for camera in camera_folders(folder).values():
         try:
             numbers |= set(numbered_images(camera)[0])
         except UserError:
-            continue  # the frames stage sets this camera aside, and says why
+            continue  # the frames stage excludes this camera and notes the reason
     return np.array(sorted(numbers), np.int64)
 
 
@@ -191,12 +199,11 @@ def _calibration(key: Key, folder: Path, known: dict[str, Path], row: Row) -> Pa
     choice = choose_calibration(entry, known)
     measured = ", ".join(f"{n} {1000 * r:.1f} mm" for n, r in choice.residual_m.items())
     measured = f"residual of the background depth: {measured or 'not measured'}"
-    taken = choice.best or (UNSTATED if UNSTATED in known else next(iter(known)))
+    # The unstated recordings lie between those of the first and those of the third calibration.
+    name = choice.best or ("third" if "third" in known else next(iter(known)))
     why = "the best" if choice.best else "a guess, none is clearly the best"
-    row.remarks.append(
-        f"the release does not state this calibration; {taken} is {why} ({measured})"
-    )
-    return known[taken]
+    row.remarks.append(f"the release does not state this calibration; {name} is {why} ({measured})")
+    return known[name]
 
 
 def _annotate(
@@ -207,7 +214,7 @@ def _annotate(
     *,
     with_pose: bool,
 ) -> None:
-    """Convert a sequence's annotations; the first is named in the row, others are put aside."""
+    """Convert a sequence's annotations; the row names the first, others become alternatives."""
     name = row.columns["sequence"]
     for index, folder in enumerate(folders):
         converted = convert(folder, numbers, with_pose=with_pose)
@@ -229,7 +236,7 @@ def _objects(
     objects: Path,
     result: Draft,
 ) -> Path | dict[str, dict[str, Any]]:
-    """Entries for the release's meshes, or the objects.yaml that is there."""
+    """Entries for the release's meshes, or the path of objects.yaml without meshes."""
     used = Counter(key[1] for key in folders)
     known = read_yaml(objects) if objects.is_file() else {}
     known = known if isinstance(known, dict) else {}
@@ -241,7 +248,7 @@ def _objects(
             )
         result.remarks.append(
             f"objects are those of {objects}, not the release's own: name its meshes with --meshes "
-            "(without them its first poses of objects do not hold and are left out)"
+            "(without them its first poses of objects do not apply and are left out)"
         )
         return objects
     entries: dict[str, dict[str, Any]] = {}

@@ -1,4 +1,4 @@
-"""The InterCap release's annotations: when body and object touch, where the object starts.
+"""The InterCap release's annotations: intervals of contact, and the object's first pose.
 
 Each sequence has a folder ``subject<s>_motion<o>_seg<k>`` with ``contact.txt`` and ``config.ini``;
 the number after "motion" is the object's. There are more folders than sequences.
@@ -18,24 +18,22 @@ from pydantic import ValidationError
 
 from intercap_core.annotation import ANY_REGION, Annotation
 from intercap_core.inputs.documents import parse_integer
-from intercap_core.inputs.files import MAX_SETTINGS_BYTES, Unreadable, read_text
+from intercap_core.inputs.files import MAX_SETTINGS_BYTES, UnreadableFile, read_text
 
 FOLDER = re.compile(
     r"subject(\d{1,2})_(?:motion|object)(\d{1,2})_seg_?(\d{1,2})([A-Za-z0-9_-]*)", re.IGNORECASE
 )
-FARTHEST_START = (
-    2  # frames: where an image is missing, the release's tools take one of the next two
-)
-
 Key = tuple[int, int, int]  # subject, object, segment
 
 
 @dataclass
 class Converted:
-    """An annotation as the project's YAML, empty = nothing usable, and what was wrong with it."""
+    """Result of :func:`convert`."""
 
     text: str
+    """The annotation as YAML; "" if nothing can be used."""
     faults: list[str] = field(default_factory=list)
+    """What was left out, and why."""
 
 
 def annotation_folders(root: Path) -> dict[Key, list[Path]]:
@@ -44,17 +42,21 @@ def annotation_folders(root: Path) -> dict[Key, list[Path]]:
     for path in sorted(root.iterdir()):
         match = FOLDER.fullmatch(path.name)
         if match and path.is_dir():
-            subject, thing, segment = (int(number) for number in match.groups()[:3])
-            found.setdefault((subject, thing, segment), []).append((match.group(4), path))
+            subject, number, segment = (int(text) for text in match.groups()[:3])
+            found.setdefault((subject, number, segment), []).append((match.group(4), path))
     return {key: [path for _, path in sorted(paths)] for key, paths in found.items()}
 
 
 def convert(folder: Path, numbers: np.ndarray, *, with_pose: bool) -> Converted:
-    """Turn a folder's files into an annotation of the frame sets of one recording.
+    """Convert a folder's files to an annotation of the frame sets of one recording.
 
-    ``numbers`` (T,) are the numbers of the frames that any camera has, increasing: frame set t is
-    frame ``numbers[t]``. ``with_pose``: the object's mesh is the release's, so its first pose
-    holds. What cannot be read is left out and said.
+    Parts that cannot be read are left out and reported as faults.
+
+    Args:
+        folder: folder of one sequence.
+        numbers: (T,) increasing numbers of the frames that any camera has. Frame set t is frame
+            ``numbers[t]``.
+        with_pose: convert the object's first pose, which applies to the release's mesh only.
     """
     faults: list[str] = []
     sections: dict[str, Any] = {}
@@ -84,13 +86,13 @@ def _contact(
 ) -> list[dict[str, str | int]] | None:
     """Intervals of contact: lines alternate between first frame, from 1, and last frame.
 
-    None where there are none: an empty file does not say that nothing touches.
+    None if there are none: an empty file does not mean that there is no contact.
     """
     if not path.is_file():
         return None
     try:
         values = [parse_integer(word) for word in read_text(path, MAX_SETTINGS_BYTES).split()]
-    except (Unreadable, ValueError):
+    except (UnreadableFile, ValueError):
         faults.append("contact.txt is not a list of frame numbers")
         return None
     if len(values) % 2:
@@ -98,7 +100,7 @@ def _contact(
         values.pop()
     intervals: list[dict[str, str | int]] = []
     for first, end in zip(values[::2], values[1::2], strict=True):
-        start = first - 1  # counted from 1; the end is exclusive once that is so
+        start = first - 1  # counted from 1; the last frame from 1 is the exclusive end from 0
         if start < 0 or end <= start:
             faults.append(f"contact.txt: {first} to {end} is no interval")
             continue
@@ -124,14 +126,15 @@ def _object_pose(path: Path, numbers: np.ndarray, faults: list[str]) -> dict[str
         frame = parse_integer(parser["init_frame_id"]["id"])
         if len(translation) != 3 or len(rotation) != 3:
             raise ValueError
-    except (Unreadable, ValueError, KeyError, configparser.Error):
+    except (UnreadableFile, ValueError, KeyError, configparser.Error):
         faults.append(
             "config.ini has no [init_trans] trans, [init_rot] rot (three numbers each) and "
             "[init_frame_id] id"
         )
         return None
     at = int(np.searchsorted(numbers, frame))
-    if frame < 0 or at == len(numbers) or numbers[at] > frame + FARTHEST_START:
+    # If an image is missing, the release's tools use one of the next two.
+    if frame < 0 or at == len(numbers) or numbers[at] > frame + 2:
         faults.append(f"config.ini gives the object's pose in frame {frame}, which has no image")
         return None
     return {"frame": at, "rotation_vector": rotation, "translation": translation}

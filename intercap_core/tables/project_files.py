@@ -1,4 +1,4 @@
-"""A project's settings, tables and annotations, written for recordings that are there."""
+"""Writes a project's settings, tables and annotations for existing recordings."""
 
 from __future__ import annotations
 
@@ -21,34 +21,37 @@ REQUIRED = [name for name, info in SequenceEntry.model_fields.items() if info.is
 
 @dataclass
 class Row:
-    """One sequence: its columns, and remarks that stand above it in the table."""
+    """One sequence of the table."""
 
     columns: dict[str, str | Path]
+    """Cells by column."""
     remarks: list[str] = field(default_factory=list)
+    """Comments above the row."""
 
 
 @dataclass
 class Draft:
-    """What is to be written.
-
-    ``subjects``: gender by name; ``objects``: an objects.yaml that is there, or entries whose
-    ``mesh`` and ``contact_vertices`` are paths; ``annotations``: text by path below the folder
-    of annotations; ``remarks``: what the user must know, also written into config.yaml.
-    """
+    """Content of a project."""
 
     dataset: str
+    """Name of the project."""
     rows: list[Row] = field(default_factory=list)
+    """The sequences."""
     subjects: dict[str, str] = field(default_factory=dict)
+    """Gender by subject."""
     objects: Path | dict[str, dict[str, Any]] = field(default_factory=dict)
+    """An existing objects.yaml, or entries whose ``mesh`` and ``contact_vertices`` are paths."""
     annotations: dict[str, str] = field(default_factory=dict)
+    """Text by path below the folder of annotations."""
     remarks: list[str] = field(default_factory=list)
+    """Comments of config.yaml, which are also shown to the user."""
 
 
 def write_project(draft: Draft, folder: Path, *, replace: bool) -> list[Path]:
-    """Write config.yaml and what it names into ``folder``; returns the files written.
+    """Write config.yaml and the files that it names into ``folder``; returns their paths.
 
     Paths are written relative to the file that holds them. Raises UserError, before anything is
-    written, where a file is there and ``replace`` is False, or a path holds a tab or a line break.
+    written, if a file exists and ``replace`` is False, or if a path holds a tab or a line break.
     """
     files = {
         "config.yaml": _config(draft, folder),
@@ -58,12 +61,12 @@ def write_project(draft: Draft, folder: Path, *, replace: bool) -> list[Path]:
     if not isinstance(draft.objects, Path):
         files["objects.yaml"] = _objects(draft.objects, folder)
     files |= {f"annotations/{path}": text for path, text in draft.annotations.items()}
-    there = [folder / name for name in files if os.path.lexists(folder / name)]
-    if there and not replace:
-        more = f" (and {len(there) - 1} more)" if len(there) > 1 else ""
+    existing = [folder / name for name in files if os.path.lexists(folder / name)]
+    if existing and not replace:
+        more = f" (and {len(existing) - 1} more)" if len(existing) > 1 else ""
         raise UserError(
-            f"{there[0]}: is there already{more}, so nothing was written; name another output "
-            "folder, or add --replace to write these files anew"
+            f"{existing[0]}: exists already{more}, so nothing was written; name another output "
+            "folder, or add --replace to overwrite these files"
         )
     written = []
     try:

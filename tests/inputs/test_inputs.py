@@ -15,7 +15,7 @@ import pytest
 from intercap_core.inputs.arrays import read_arrays, read_pickle
 from intercap_core.inputs.documents import parse_json, parse_yaml, read_json, read_toml, read_yaml
 from intercap_core.inputs.files import (
-    Unreadable,
+    UnreadableFile,
     check_file,
     path_fault,
     quoted,
@@ -55,7 +55,7 @@ def test_only_regular_files_up_to_the_limit_are_read(name: str, tmp_path: Path) 
         read_pickle,
     ]
     for read in readers:
-        with pytest.raises(Unreadable) as caught:
+        with pytest.raises(UnreadableFile) as caught:
             read(path)
         assert str(path) in str(caught.value) and words in str(caught.value)
         assert str(path) not in caught.value.reason
@@ -65,14 +65,14 @@ def test_a_file_of_exactly_the_limit_is_read(tmp_path: Path) -> None:
     path = tmp_path / "a"
     path.write_bytes(b"12345")
     assert read_bytes(path, 5) == b"12345" and read_bytes(path, 5, head=2) == b"12"
-    with pytest.raises(Unreadable, match="at most"):
+    with pytest.raises(UnreadableFile, match="at most"):
         read_bytes(path, 4)
 
 
 @pytest.mark.parametrize("name", ["x" * 300, "a\0b", "y/" * 3000, "\udcff"])
 def test_impossible_paths_are_refused(name: str) -> None:
     assert path_fault(Path(name)) is not None
-    with pytest.raises(Unreadable):
+    with pytest.raises(UnreadableFile):
         read_bytes(Path(name), 10)
     assert path_fault(Path("a/b.json")) is None
 
@@ -82,7 +82,7 @@ def test_text_is_strict_utf_8_without_its_mark(tmp_path: Path) -> None:
     path.write_bytes(b"\xef\xbb\xbfone\ntwo")
     assert read_text(path, 100) == "one\ntwo"
     path.write_bytes(b"one\ntw\xff")
-    with pytest.raises(Unreadable, match=r"UTF-8 \(line 2, byte 6\)"):
+    with pytest.raises(UnreadableFile, match=r"UTF-8 \(line 2, byte 6\)"):
         read_text(path, 100)
 
 
@@ -128,7 +128,7 @@ def test_integers_beyond_64_bits_become_floats(tmp_path: Path) -> None:
 def test_malformed_yaml_is_refused(text: str, words: str, tmp_path: Path) -> None:
     path = tmp_path / "settings.yaml"
     path.write_text(text)
-    with pytest.raises(Unreadable, match=words) as caught:
+    with pytest.raises(UnreadableFile, match=words) as caught:
         read_yaml(path)
     assert str(path) in str(caught.value) and "not valid YAML" in str(caught.value)
 
@@ -163,7 +163,7 @@ def _head(shape: str, descr: str = "<f8") -> bytes:
     ],
 )
 def test_arrays_with_a_wrong_head_are_refused(content: bytes, words: str, tmp_path: Path) -> None:
-    with pytest.raises(Unreadable, match=words) as caught:
+    with pytest.raises(UnreadableFile, match=words) as caught:
         read_arrays(_npz(tmp_path / "a.npz", content))
     assert "'values'" in str(caught.value)
 
@@ -171,7 +171,7 @@ def test_arrays_with_a_wrong_head_are_refused(content: bytes, words: str, tmp_pa
 def test_the_unpacked_size_of_an_archive_is_limited(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
     np.savez_compressed(path, zeros=np.zeros(1 << 20))
-    with pytest.raises(Unreadable, match="unpacks to 8 MB, at most 1"):
+    with pytest.raises(UnreadableFile, match="unpacks to 8 MB, at most 1"):
         read_arrays(path, limit=1 << 20)
     assert read_arrays(path)["zeros"].shape == (1 << 20,)
 
@@ -210,7 +210,7 @@ class _Command:
 def test_pickles_of_other_objects_are_refused(content: bytes, words: str, tmp_path: Path) -> None:
     path = tmp_path / "a.pkl"
     path.write_bytes(content)
-    with pytest.raises(Unreadable, match=words) as caught:
+    with pytest.raises(UnreadableFile, match=words) as caught:
         read_pickle(path)
     assert str(path) in str(caught.value)
 

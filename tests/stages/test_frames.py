@@ -14,7 +14,6 @@ from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import Extrinsics, read_extrinsics, write_rig_file
 from intercap_core.formats.recordings.frames import Frames
-from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.schemas import FRAMES
 from intercap_core.stages import frames as stage
@@ -64,7 +63,8 @@ def test_every_image_is_in_its_set_unchanged(capture):
 
 def test_cameras_poses_and_gravity(capture):
     output = run(capture)
-    rig = Rig.from_frames(output)
+    with Frames.open(output) as frames:
+        rig = frames.rig
     assert rig.names == ("k1", "k2", "k3") and len(rig) == 3
     for index, camera in enumerate(rig):
         made = make_camera(index)

@@ -179,7 +179,7 @@ def test_nothing_is_written_over_unasked(release):
     table.write_text("mine")
     again = tables("InterCap", "--output", "config/intercap")
     assert isinstance(again.exception, UserError)
-    assert "config.yaml: is there already" in str(again.exception)
+    assert "config.yaml: exists already" in str(again.exception)
     assert "--replace" in str(again.exception) and table.read_text() == "mine"
     write("--replace")
     assert table.read_text() != "mine"

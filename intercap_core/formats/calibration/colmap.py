@@ -212,9 +212,6 @@ class _Bytes:
         self._at = end + 1
         return name
 
-    def skip(self, count: int) -> None:
-        self._at += count
-
 
 def _binary_lenses(content: _Bytes, path: Path) -> Iterator[tuple[int, Intrinsics]]:
     for _ in range(content.take("Q")[0]):
@@ -230,5 +227,5 @@ def _binary_images(content: _Bytes) -> Iterator[_Image]:
     for _ in range(content.take("Q")[0]):
         _, *values, camera = content.take("i7di")
         name = content.name()
-        content.skip(24 * content.take("Q")[0])  # points: x, y and an identity of 8 bytes each
+        content.take(f"{24 * content.take('Q')[0]}x")  # points: x, y and an identity, 8 bytes each
         yield _Image(tuple(values[:4]), tuple(values[4:]), camera, name)

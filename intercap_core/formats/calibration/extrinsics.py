@@ -19,7 +19,6 @@ from intercap_core.inputs.files import printable, quoted
 
 MAX_DISTANCE_M = 100.0  # of a camera from the file's origin; beyond it, the file is in millimetres
 MAX_TO_MASTER_M = 30.0  # a sports hall; beyond it, the file is in centimetres
-MIN_APART_M = 0.003  # between two centres of projection; the lenses of a phone are 10 mm apart
 CAMERA_NAME = re.compile(r"[A-Za-z0-9_-]+")  # also the names of HDF5 groups and of files
 
 
@@ -43,7 +42,6 @@ def read_extrinsics(path: Path) -> Extrinsics:
     translation ``T``, x_camera = R x_world + T; the cameras are named k1, k2, ... and k1 is the
     master. Raises UserError naming file and camera if something is missing or impossible.
     """
-    path = Path(path)
     return _read_release_folder(path) if path.is_dir() else _read_rig_file(path)
 
 
@@ -164,7 +162,8 @@ def relate_to_master(
                 f"{MAX_TO_MASTER_M:.0f} m, so it is likely in centimetres; write it in metres"
             )
         for other, other_centre in centres.items():
-            if other < name and np.linalg.norm(centre - other_centre) < MIN_APART_M:
+            apart = np.linalg.norm(centre - other_centre)
+            if other < name and apart < 0.003:  # metres; the lenses of a phone are 10 mm apart
                 raise UserError(
                     f"{path}: cameras {other!r} and {name!r} are in one place; correct the pose of "
                     "one of them"

@@ -31,14 +31,6 @@ from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.transforms import invert
 from intercap_core.plugins import modules_of
 
-# Metres between the two cameras farthest apart, at least. Below it, the scale is wrong: cameras
-# that record a whole person stand farther apart.
-MIN_RIG_M = 0.05
-# Images of one camera whose poses differ by more were not taken from one place. Reconstructions of
-# rooms are accurate to millimetres and tenths of a degree.
-SAME_POSE_M = 0.01
-SAME_POSE_DEG = 0.3
-
 
 @dataclass(frozen=True)
 class RecordedCameras:
@@ -99,7 +91,6 @@ def read_calibration(
         recorded: names and image sizes of the recorded cameras.
         scale: metres for one unit of the file, None = not stated.
     """
-    path = Path(path)
     calibration = read_tool_calibration(path, recorded or RecordedCameras(), scale)
     if calibration is not None:
         return calibration
@@ -206,7 +197,8 @@ def group_images_by_camera(
             distance *= scale or 0.0
             rotation = Rotation.from_matrix(pose[:3, :3] @ first_pose[:3, :3].T)
             angle = np.degrees(rotation.magnitude())
-            if distance > SAME_POSE_M or angle > SAME_POSE_DEG:
+            # Reconstructions of rooms are accurate to millimetres and tenths of a degree.
+            if distance > 0.01 or angle > 0.3:
                 raise UserError(
                     f"{path}: camera {name!r} has {len(own)} images, of which {first} and "
                     f"{image} are {distance:.3g} m and {angle:.2g} degrees apart, expected one "
@@ -239,8 +231,9 @@ def _check_size(path: Path, centres: np.ndarray, scale: float | None) -> None:
             f"{MAX_DISTANCE_M:.0f} m; state the unit in column calibration_scale of the table of "
             "sequences (0.001 = the file is in millimetres)"
         )
-    if len(centres) > 1 and extent < MIN_RIG_M:
+    least = 0.05  # metres; cameras that record a whole person stand farther apart
+    if len(centres) > 1 and extent < least:
         raise UserError(
             f"{path}: all its cameras lie within {1000 * extent:.3g} mm{stated}, expected at least "
-            f"{1000 * MIN_RIG_M:.0f} mm; correct the scale, or calibrate again"
+            f"{1000 * least:.0f} mm; correct the scale, or calibrate again"
         )

@@ -123,7 +123,7 @@ def read_calibration(
 ) -> Camera:
     """Make a :class:`Camera` of a calibration JSON as Azure Kinect recordings hold it.
 
-    Raises UserError naming ``source`` if the JSON or the mode is unknown.
+    Raises UserError naming ``source`` if the JSON is broken.
 
     Args:
         content: the JSON.
@@ -133,15 +133,6 @@ def read_calibration(
         source: the recording, for messages.
         master_from_colour: pose (4, 4), metres; None = the identity.
     """
-    for kind, mode, known in (
-        ("colour", colour_mode, COLOUR_MODES),
-        ("depth", depth_mode, DEPTH_MODES),
-    ):
-        if mode is not None and mode not in known:
-            raise UserError(
-                f"{source}: {kind} mode {mode!r} is not one of {', '.join(known)}; record in one "
-                "of these modes"
-            )
     pose = np.eye(4) if master_from_colour is None else master_from_colour
     try:
         cameras = _sensors(content, "Cameras", "Location")

@@ -30,7 +30,7 @@ from intercap_core.formats.calibration.opencv import (
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.transforms import invert, is_rigid
 from intercap_core.inputs.documents import read_json, read_object
-from intercap_core.inputs.files import Unreadable, numbers_of, quoted
+from intercap_core.inputs.files import UnreadableFile, numbers_of, quoted
 
 TRANSFORMS = "transforms.json"
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
@@ -44,7 +44,7 @@ def _recognises(path: Path) -> bool:
         return False
     try:
         content = read_json(path)
-    except Unreadable:
+    except UnreadableFile:
         return False  # the reader of OpenCV's files says what is wrong with it
     return isinstance(content, dict) and "frames" in content and "cameras" not in content
 

@@ -28,33 +28,12 @@ from intercap_core.geometry.camera.intrinsics import DEFAULT_METRIC_RADIUS, Intr
 from intercap_core.geometry.camera.projection import radial_fraction
 from intercap_core.geometry.camera.transforms import invert, is_rigid, rigid
 from intercap_core.inputs.documents import YamlLoader, read_json, read_yaml
-from intercap_core.inputs.files import MAX_CALIBRATION_BYTES, Unreadable, numbers_of, quoted
+from intercap_core.inputs.files import MAX_CALIBRATION_BYTES, UnreadableFile, numbers_of, quoted
 
-# Focal lengths in units of the longer side of the image. 0.2 sees 136 degrees across, about the
-# limit of a pinhole with distortion (the wide depth mode of the Azure Kinect has 0.49). 20 sees 3
-# degrees, as an 800 mm lens before a full-frame sensor.
-MIN_FOCAL_SIDES = 0.2
-MAX_FOCAL_SIDES = 20.0
-MAX_ASPECT = 2.0  # of fx to fy or fy to fx; anamorphic lenses squeeze by 2
-MAX_OFF_IMAGE = 1.0  # image widths by which a principal point may lie outside, as of cropped images
-# Radius of the normalised image plane up to which a lens is defined: the Azure Kinect's is 1.7, 10
-# is at 84 degrees. The Azure Kinect Sensor SDK takes a radius below 1e-4 as "not stated".
-MIN_METRIC_RADIUS = 1e-4
-MAX_METRIC_RADIUS = 10.0
-# The distorted image must grow with the angle over a quarter of the shorter side around its centre,
-# otherwise the coefficients are in another order or of another lens.
-LEAST_COVERED = 0.25
-# Factor by which the distortion may change the scale between centre and edge. Measured lenses stay
-# between a quarter and 2 (130 degrees of a GoPro: 0.3 at the corner).
-MAX_SCALE_CHANGE = 4.0
-MAX_TANGENTIAL = 0.5  # of the image's radius, at its edge; a lens that is mounted askew has 0.01
-MIN_FPS, MAX_FPS = 0.05, 10_000.0  # time lapse to high-speed cameras
-LONGEST_OFFSET_S = 1e9  # of clocks that count from 1970
+MIN_METRIC_RADIUS = 1e-4  # the Azure Kinect Sensor SDK takes a smaller radius as "not stated"
 # Between the colour and the depth lens of a camera; beyond it, the file is in millimetres.
 MAX_LENSES_APART_M = 1.0
 MAX_SIDE = 32_768  # px of an image; the largest sensors have half of it
-# Shares of the image by which a principal point lies off its middle; 0.03 is usual.
-MAX_OFF_CENTRE = 0.25
 _MATRIX_TYPES = ("opencv-matrix", "opencv-nd-matrix")  # OpenCV 5 writes vectors as the latter
 
 
@@ -89,7 +68,6 @@ def read_opencv_calibration(path: Path) -> Calibration:
 
     Raises UserError naming file, camera and field if something is missing or impossible.
     """
-    path = Path(path)
     if path.is_dir():
         suffixes = (".json", ".yaml", ".yml")
         files = sorted(file for file in path.iterdir() if file.suffix.lower() in suffixes)
@@ -146,13 +124,13 @@ def opencv_lens(size: tuple[int, int], matrix: Any, coefficients: Any, where: st
             f"{where}: camera_matrix is no [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels; "
             "correct it"
         )
-    if (np.abs(k[:2, 2] / size - 0.5) > MAX_OFF_CENTRE).any():
+    if (np.abs(k[:2, 2] / size - 0.5) > 0.25).any():  # shares of the image; 0.03 is usual
         raise UserError(
             f"{where}: the principal point {k[0, 2]:.0f}, {k[1, 2]:.0f} is that of images of about "
             f"{2 * k[0, 2]:.0f}x{2 * k[1, 2]:.0f}, image_size is {size[0]}x{size[1]}; give the "
             "calibration of this resolution"
         )
-    distortion = np.concatenate([d, np.zeros(8 - d.size)])
+    distortion = pad_distortion(d)
     arguments = (*size, k[0, 0], k[1, 1], k[0, 2], k[1, 2], distortion)
     turn = turning_radius(distortion)
     corners = np.array([[0, 0], [size[0], 0], [0, size[1]], size]) - 0.5
@@ -161,19 +139,34 @@ def opencv_lens(size: tuple[int, int], matrix: Any, coefficients: Any, where: st
     return check_lens(Intrinsics(*arguments, radius), where)
 
 
+def pad_distortion(coefficients: np.ndarray) -> np.ndarray:
+    """Distortion (8,) of 4, 5 or 8 coefficients; raises ValueError for another number."""
+    if coefficients.shape not in ((4,), (5,), (8,)):
+        raise ValueError(f"{coefficients.size} coefficients, expected 4, 5 or 8")
+    return np.concatenate([coefficients, np.zeros(8 - coefficients.size)])
+
+
 def turning_radius(distortion: np.ndarray) -> float:
     """Radius up to which a point that lies farther out is also imaged farther out.
 
-    The radial part of OpenCV's model, r d(r^2), must grow and stay finite up to there. The result
-    is at most 5, which is at 79 degrees. ``distortion`` has the shape (8,).
+    The result is at most 5, which is at 79 degrees. ``distortion`` has the shape (8,).
     """
     radius = np.linspace(0, 5, 50001)
-    lens = np.concatenate([(1, 1, 0, 0), distortion, (np.inf,)])
-    above, below = radial_fraction(radius * radius, lens)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        image = radius * above / below
-    bad = np.flatnonzero((np.diff(image) <= 0) | (below[1:] <= 0) | ~np.isfinite(image[1:]))
+    bad = np.flatnonzero(~_distort_radius(radius, distortion)[1])
     return float(radius[max(1, bad[0])] if len(bad) else radius[-1])
+
+
+def _distort_radius(radius: np.ndarray, distortion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Apply the radial part of OpenCV's model, r d(r^2), to increasing radii (N,).
+
+    Returns the distorted radii (N,), and where (N - 1,) they grow and stay finite.
+    """
+    lens = np.concatenate([(1, 1, 0, 0), distortion, (np.inf,)])
+    with np.errstate(all="ignore"):
+        above, below = radial_fraction(radius * radius, lens)
+        image = radius * above / below
+        grows = (np.diff(image) > 0) & (below[1:] > 0) & np.isfinite(image[1:])
+    return image, grows
 
 
 def check_lens(lens: Intrinsics, where: str) -> Intrinsics:
@@ -186,25 +179,28 @@ def check_lens(lens: Intrinsics, where: str) -> Intrinsics:
 
 def lens_fault(lens: Intrinsics) -> str | None:
     """Why the lens is impossible, for a message; None if it is possible."""
-    side = max(lens.width, lens.height)
-    low, high = MIN_FOCAL_SIDES * side, MAX_FOCAL_SIDES * side
     if not np.isfinite(lens.parameters).all():
         return "the lens has a value that is not a finite number"
+    # 0.2 sides see 136 degrees across, about the limit of a pinhole with distortion (the wide depth
+    # mode of the Azure Kinect has 0.49). 20 see 3 degrees, as 800 mm before a full-frame sensor.
+    side = max(lens.width, lens.height)
+    low, high = 0.2 * side, 20.0 * side
     for name, focal in (("fx", lens.fx), ("fy", lens.fy)):
         if not low <= focal <= high:
             return (
                 f"{name} is {focal:.4g} px, expected {low:.0f} to {high:.0f} for images of "
                 f"{lens.width}x{lens.height}"
             )
-    if not 1 / MAX_ASPECT <= lens.fx / lens.fy <= MAX_ASPECT:
-        return f"fx {lens.fx:.4g} and fy {lens.fy:.4g} differ by more than {MAX_ASPECT:g} times"
+    if not 0.5 <= lens.fx / lens.fy <= 2.0:  # anamorphic lenses squeeze by 2
+        return f"fx {lens.fx:.4g} and fy {lens.fy:.4g} differ by more than 2 times"
     for name, centre, size in (("cx", lens.cx, lens.width), ("cy", lens.cy, lens.height)):
-        if not -MAX_OFF_IMAGE * size <= centre <= (1 + MAX_OFF_IMAGE) * size:
+        if not -size <= centre <= 2 * size:  # outside only if the image is cropped
             return f"{name} is {centre:.4g} px, far outside the image's {size}"
-    if not MIN_METRIC_RADIUS <= lens.metric_radius <= MAX_METRIC_RADIUS:
+    largest = 10.0  # at 84 degrees; the Azure Kinect's is 1.7
+    if not MIN_METRIC_RADIUS <= lens.metric_radius <= largest:
         return (
             f"its metric radius is {lens.metric_radius:.4g}, expected {MIN_METRIC_RADIUS:g} to "
-            f"{MAX_METRIC_RADIUS:g}"
+            f"{largest:g}"
         )
     return _distortion_fault(lens)
 
@@ -212,22 +208,18 @@ def lens_fault(lens: Intrinsics) -> str | None:
 def _distortion_fault(lens: Intrinsics) -> str | None:
     """Why the distortion is impossible; None if it is possible.
 
-    Within the image, a point that lies farther out must be imaged farther out, and the scale may
-    change only so far.
+    A point that lies farther out must be imaged farther out within a quarter of the shorter side
+    around the centre; otherwise the coefficients are in another order or of another lens.
     """
     focal = min(lens.fx, lens.fy)
     edge = min(lens.width, lens.height) / 2 / focal  # radius of the normalised image plane
     distortion = np.asarray(lens.distortion, np.float64)
     radius = np.concatenate([[0], np.geomspace(1e-6, 1e-2, 200), np.linspace(0.01, 5, 4992)[1:]])
-    coefficients = np.concatenate([(1, 1, 0, 0), distortion, (np.inf,)])
-    with np.errstate(all="ignore"):
-        above, below = radial_fraction(radius * radius, coefficients)
-        image = radius * above / below
-        grows = (np.diff(image) > 0) & (below[1:] > 0) & np.isfinite(image[1:])
+    image, grows = _distort_radius(radius, distortion)
     turn = int(np.argmin(grows)) if not grows.all() else len(grows)
     covered = float(image[turn]) if np.isfinite(image[turn]) else 0.0
     shown = np.array2string(distortion, precision=4, max_line_width=200)
-    if covered < 2 * LEAST_COVERED * edge:
+    if covered < 0.5 * edge:
         return (
             f"the distortion {shown} turns back {covered * focal:.0f} px from the centre of images "
             f"of {lens.width}x{lens.height}"
@@ -235,23 +227,22 @@ def _distortion_fault(lens: Intrinsics) -> str | None:
     inside = image[: turn + 1] <= edge
     slope = np.diff(image[: turn + 1]) / np.diff(radius[: turn + 1])
     steepest = float(slope[inside[:-1]].max(initial=1.0))
-    if steepest > MAX_SCALE_CHANGE:
+    if steepest > 4:  # measured lenses: a quarter to 2 (130 degrees of a GoPro: 0.3 at the corner)
         return (
             f"the distortion {shown} scales the image's edge {steepest:.3g} times its centre, "
-            f"expected at most {MAX_SCALE_CHANGE:g}"
+            "expected at most 4"
         )
     tangential = 3 * float(np.abs(distortion[2:4]).max()) * min(edge, radius[turn])
-    if tangential > MAX_TANGENTIAL:
+    if tangential > 0.5:  # of the image's radius; a lens that is mounted askew has 0.01
         return f"the tangential distortion {shown} moves the image's edge by {tangential:.0%}"
     return None
 
 
-def check_rate(fps: float | None, where: str) -> None:
+def check_rate(fps: float, where: str) -> None:
     """Raise UserError for a frame rate that no camera has."""
-    if fps is not None and not MIN_FPS <= fps <= MAX_FPS:
-        raise UserError(
-            f"{where}: fps is {fps:.4g}, expected {MIN_FPS:g} to {MAX_FPS:g}; correct it"
-        )
+    low, high = 0.05, 10_000.0  # time lapse to high-speed cameras
+    if not low <= fps <= high:
+        raise UserError(f"{where}: fps is {fps:.4g}, expected {low:g} to {high:g}; correct it")
 
 
 def parse_number(value: Any, where: str, field: str, expected: str = "one number") -> float:
@@ -290,7 +281,7 @@ def opencv_pose(rotation: Any, translation: Any, where: str) -> np.ndarray:
 def _camera(entry: dict[str, Any], where: str, fps: float | None) -> CalibratedCamera:
     colour = _lens(entry, where)
     offset = parse_number(entry.get("time_offset", 0.0), where, "time_offset", "seconds")
-    if abs(offset) > LONGEST_OFFSET_S:
+    if abs(offset) > 1e9:  # clocks that count from 1970 are above it
         raise UserError(f"{where}: time_offset is {offset:.4g}, expected seconds; correct it")
     depth = entry.get("depth")
     lens, colour_from_depth = None, None
@@ -350,10 +341,6 @@ def _rate(entry: dict[str, Any], where: str) -> float | None:
     if value is None:
         return None
     fps = parse_number(value, where, "fps", "one positive number")
-    if fps <= 0:
-        raise UserError(
-            f"{where}: fps is {quoted(value)}, expected one positive number; correct it"
-        )
     check_rate(fps, where)
     return fps
 
@@ -398,7 +385,7 @@ def load_opencv(path: Path) -> dict[str, Any]:
                 loader=_Loader,
                 prepared=lambda text: text.removeprefix("%YAML:1.0"),
             )
-    except Unreadable as error:
+    except UnreadableFile as error:
         reason = re.sub("(is )?not valid (JSON|YAML)", "is not valid JSON or YAML", error.reason)
         raise UserError(f"{path}: {reason}; correct it") from None
     if not isinstance(content, dict):

@@ -31,11 +31,11 @@ from intercap_core.formats.detections.image_numbers import (
 from intercap_core.formats.detections.instance import Instance
 from intercap_core.formats.detections.mask_files import (
     MaskFile,
-    UnreadableMask,
     instance_masks,
     read_masks,
     release_masks,
 )
+from intercap_core.formats.recordings.image_files import DamagedImage
 from intercap_core.inputs.files import printable
 
 
@@ -213,7 +213,7 @@ def add_masks(
         for file in mask_files:
             try:
                 instances = read_masks(file, size)
-            except UnreadableMask as error:
+            except DamagedImage as error:
                 broken.append(f"{short_name(file.path)} {error}")
                 continue
             found.by_image.setdefault(number, []).extend(instances)

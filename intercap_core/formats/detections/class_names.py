@@ -13,7 +13,6 @@ from intercap_core.inputs.documents import parse_json, parse_yaml
 from intercap_core.inputs.files import quoted, read_text
 
 MAX_LABEL = 200  # characters; the artefact stores all labels at the length of the longest
-MAX_LABELS_BYTES = 1 << 26  # a list of classes has some kB; the annotations are not needed
 # COCO's 80 classes. Their published ids, from 1 to 90, have gaps.
 _CLASSES = (
     "person", "bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck", "boat",
@@ -93,7 +92,7 @@ def read_label_map(path: Path) -> dict[int, str]:
     """Read a file of class names. Raises UserError naming what is wrong with it."""
     text = read_text(
         path,
-        MAX_LABELS_BYTES,
+        1 << 26,  # a list of classes has some kB; the annotations are not needed
         advice="name a list of classes, such as a data set's 'categories' alone, as "
         "docs/detectors.md shows",
     )

@@ -19,12 +19,11 @@ from intercap_core.formats.detections.class_names import label_text, names_of
 from intercap_core.formats.detections.instance import Instance, to_rle
 from intercap_core.geometry.camera import masks
 from intercap_core.inputs.documents import json_decoder, parse_json
-from intercap_core.inputs.files import Unreadable, quoted, read_bytes
+from intercap_core.inputs.files import UnreadableFile, quoted, read_bytes
 
 MAX_JSON_BYTES = 1 << 29  # parsed JSON takes about six times its file size in memory
 HEAD_BYTES = 1 << 18  # of a long file, parsed for a preview
-# Scores are probabilities. The overlaps that Segment Anything predicts slightly exceed 1.
-MIN_SCORE, MAX_SCORE = -0.01, 1.2
+MAX_SCORE = 1.2  # the overlaps that Segment Anything predicts slightly exceed 1
 _LARGEST_ID = 2**31 - 1
 
 
@@ -167,7 +166,7 @@ def read_json(path: Path) -> Any:
 def _bytes(path: Path, head: int | None = None) -> bytes:
     try:
         return read_bytes(path, MAX_JSON_BYTES, head=head)
-    except Unreadable as error:
+    except UnreadableFile as error:
         smaller = "; write masks as compressed RLE, or one file an image"
         is_large = " MB, at most" in error.reason
         raise UnreadableDetections(error.reason + (smaller if is_large else "")) from None
@@ -295,7 +294,7 @@ def _score(entry: dict[str, Any]) -> float:
         score = float(value) if type(value) in (int, float) else math.nan
     except OverflowError:
         score = math.inf
-    if not MIN_SCORE <= score <= MAX_SCORE:
+    if not -0.01 <= score <= MAX_SCORE:
         raise ValueError(f"score is {quoted(value)}, expected a number from 0 to 1")
     return score
 

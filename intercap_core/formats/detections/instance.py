@@ -16,8 +16,6 @@ from intercap_core.geometry.camera import masks
 from intercap_core.inputs.files import quoted
 
 MAX_PIXELS = 1 << 27  # of a mask that is scaled; a full-frame camera has a fifth of this
-MAX_REDUCTION = 32.0  # of the side of an image to that of its mask; networks reduce by 4 to 32
-SAME_SHAPE_PX = 1.0  # rounding error of one side of a reduced image
 MASK_THRESHOLD = 128  # grey level of 8 bits; JPEG blurs the two values of a mask
 PERSON_LABEL = "person"  # name of the class of people in COCO and all lists that follow it
 
@@ -58,7 +56,8 @@ def scale_to(found: tuple[int, int], size: tuple[int, int]) -> tuple[float, floa
     if found == size:
         return 1.0, 1.0
     x, y = size[0] / found[0], size[1] / found[1]
-    if x > MAX_REDUCTION or abs(found[1] * x - size[1]) > max(x, 1) * SAME_SHAPE_PX:
+    # Networks reduce by 4 to 32; a side of a reduced image is rounded to a pixel.
+    if x > 32 or abs(found[1] * x - size[1]) > max(x, 1):
         raise ValueError(
             f"the mask has {found[0]}x{found[1]} pixels, the image {size[0]}x{size[1]}; segment "
             "the images as recorded"

@@ -28,7 +28,6 @@ from intercap_core.formats.detections.image_numbers import (
 from intercap_core.formats.detections.keypoints import KeypointReader, read_people, readers
 from intercap_core.inputs.files import printable
 
-EDGE_PX = 0.5  # the centres of pixels have integer coordinates
 # A person whose points all have smaller coordinates, px, has normalised ones: 0 to 1, and somewhat
 # more outside the image.
 MAX_NORMALISED_PX = 2.0
@@ -61,8 +60,9 @@ class KeypointCleaner:
         x, y, confidence = np.moveaxis(np.asarray(people, np.float64), -1, 0)
         with np.errstate(invalid="ignore"):
             seen = np.isfinite(people).all(-1) & (confidence > 0) & ((x != 0) | (y != 0))
-            inside = (np.minimum(x, y) >= -EDGE_PX) & (x < self.size[0] - EDGE_PX)
-            inside &= y < self.size[1] - EDGE_PX
+            # The centres of pixels have integer coordinates.
+            inside = (np.minimum(x, y) >= -0.5) & (x < self.size[0] - 0.5)
+            inside &= y < self.size[1] - 0.5
         beyond = seen & (confidence > self.full_confidence)
         self.seen += int(seen.sum())
         self.outside += int((seen & ~inside).sum())

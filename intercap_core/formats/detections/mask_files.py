@@ -21,16 +21,11 @@ from intercap_core.formats.detections.instance import (
     scale_to,
 )
 from intercap_core.formats.recordings.behave import frame_folders
-from intercap_core.formats.recordings.image_files import encoded_size
-from intercap_core.inputs.files import MAX_IMAGE_BYTES, Unreadable, printable, read_bytes
+from intercap_core.formats.recordings.image_files import DamagedImage, encoded_size, read_content
+from intercap_core.inputs.files import printable
 
 BEHAVE_PERSON = ("person_mask",)
 BEHAVE_OBJECT = ("obj_rend_mask", "obj_mask")  # the second is used if the first is missing
-MAX_MASK_VALUES = 1000  # instances in one mask image; an image with more is not a mask
-
-
-class UnreadableMask(Exception):
-    """The file is no mask of the image; the message follows the file's name."""
 
 
 class MaskFile(NamedTuple):
@@ -50,28 +45,25 @@ def read_masks(file: MaskFile, size: tuple[int, int]) -> list[Instance]:
     """Read the masks of an image of ``size`` (width, height) as instances of score 1.
 
     Empty masks are left out. A mask of the whole picture at another resolution is scaled. Raises
-    :class:`UnreadableMask`.
+    :class:`DamagedImage`.
     """
-    try:
-        content = read_bytes(file.path, MAX_IMAGE_BYTES)
-    except Unreadable as error:
-        raise UnreadableMask(error.reason) from None
-    found = encoded_size(content)
-    if found is None or found[0] * found[1] > MAX_PIXELS:
-        raise UnreadableMask("is no image" if found is None else "is too large an image")
+    content = read_content(file.path)
+    stored = encoded_size(content)
+    if stored is None or stored[0] * stored[1] > MAX_PIXELS:
+        raise DamagedImage("is no image" if stored is None else "is too large an image")
     kind = cv2.IMREAD_UNCHANGED if file.numbered else cv2.IMREAD_GRAYSCALE
     try:
         image = cv2.imdecode(np.frombuffer(content, np.uint8), kind)
     except cv2.error:  # the image takes more memory than OpenCV allows
         image = None
     if image is None:
-        raise UnreadableMask("is no image")
+        raise DamagedImage("is no image")
     if image.ndim == 3:
         image = image[..., :3].max(-1)
     try:
         scale_to((image.shape[1], image.shape[0]), size)
     except ValueError:
-        raise UnreadableMask(
+        raise DamagedImage(
             f"has {image.shape[1]}x{image.shape[0]} pixels, the image {size[0]}x{size[1]}"
         ) from None
     instances = []
@@ -91,8 +83,8 @@ def _split(image: np.ndarray, file: MaskFile) -> Iterator[np.ndarray]:
         yield image >= MASK_THRESHOLD
     else:
         values = np.unique(image)
-        if len(values) > MAX_MASK_VALUES:
-            raise UnreadableMask(
+        if len(values) > 1000:  # an image with more instances is not a mask
+            raise DamagedImage(
                 f"has {len(values)} different values, expected black and white or a number for "
                 "each instance"
             )

@@ -17,9 +17,7 @@ import numpy as np
 from intercap_core.errors import UserError
 from intercap_core.inputs.files import check_file, printable
 
-MAX_NETWORK_BYTES = 1 << 31  # limit of the ONNX format; larger models store weights in other files
-MAX_INPUT_SIDE = 8192  # px; detectors use 640 to 1333
-MAX_BATCH = 256  # images in one input
+FLOATS = ("tensor(float)", "tensor(float16)")  # types of outputs
 # Mean of ImageNet, blue first, as in Caffe's models; maskrcnn-benchmark subtracts it.
 CAFFE_MEAN_BGR = np.array([102.9801, 115.9465, 122.7717], np.float32)
 # Mean and standard deviation of ImageNet, red first; torchvision and mmpose normalise with them.
@@ -86,11 +84,11 @@ class OnnxModel:
         self._channels_last = lengths[0] != 3 and lengths[2] == 3
         height, width = lengths[:2] if self._channels_last else lengths[1:]
         self.size = (width, height) if width and height else None
-        if max(width or 1, height or 1) > MAX_INPUT_SIDE or (self.batch or 1) > MAX_BATCH:
+        if max(width or 1, height or 1) > 8192 or (self.batch or 1) > 256:  # detectors: up to 1333
             raise UserError(
                 f"{path}: takes {self.batch or 'any number of'} images of {width or 'any'}x"
-                f"{height or 'any'} pixels, expected at most {MAX_BATCH} of {MAX_INPUT_SIDE} a "
-                "side; export it at the size that it was trained with"
+                f"{height or 'any'} pixels, expected at most 256 of 8192 a side; export it at the "
+                "size that it was trained with"
             )
         self.metadata = dict(session.get_modelmeta().custom_metadata_map)
         self.outputs = [(o.name, tuple(o.shape), o.type) for o in session.get_outputs()]
@@ -117,7 +115,7 @@ class OnnxModel:
         if wanted not in onnxruntime.get_available_providers():
             raise _no_device(path, device, onnxruntime)
         try:
-            check_file(path, MAX_NETWORK_BYTES)
+            check_file(path, 1 << 31)  # limit of the format; larger models store weights elsewhere
             session = onnxruntime.InferenceSession(str(path), options, providers=[wanted])
         except _runtime_errors() as error:
             raise UserError(
@@ -133,7 +131,13 @@ class OnnxModel:
             ) from None
 
     def run(self, images: np.ndarray) -> list[np.ndarray]:
-        """Outputs for images (B, 3, H, W); raises UserError if the model fails on them."""
+        """Outputs for images (B, 3, H, W); raises UserError if the model fails on them.
+
+        For a model with a fixed batch size the last image is repeated.
+        """
+        missing = (self.batch or 0) - len(images)
+        if missing > 0:
+            images = np.concatenate([images, np.repeat(images[-1:], missing, 0)])
         values = images.transpose(0, 2, 3, 1) if self._channels_last else images
         values = values if self.batched else values[0]
         try:

@@ -22,27 +22,13 @@ from intercap_core.config import DetectionsSettings
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.instance import PERSON_LABEL, Instance
 from intercap_core.formats.detections.keypoints import LAYOUT_KEY, find_layout, to_shared
-from intercap_core.formats.detections.onnx_model import OnnxModel
+from intercap_core.formats.detections.onnx_model import FLOATS, OnnxModel
 
 HeatmapGrid = Literal["msra", "udp"]
 
 _EDGE = 2  # cells at the border, where there is no second difference
-_TINY = 1e-10  # least response whose logarithm is taken
 BOX_PADDING = 1.25  # factor on a person's box, as in mmpose's training and tests
-MIN_BOX_SCORE = 0.3  # of a detected person; mmpose's default
-# Ratio of the blur's width to the heatmap's width: mmpose has 11 cells of 48, 17 of 72.
-HEATMAP_BLUR = 11 / 48
-POSE_BATCH = 8  # people in one run of a model with a free batch size
 MAX_PEOPLE = 10  # in one image
-# Search of the whole image, where no detector gave a box. A person is accepted with FOUND_POINTS
-# points of the body at FOUND_CONFIDENCE. Tuned on the virtual studio.
-FOUND_CONFIDENCE = 0.3
-FOUND_POINTS = 6
-# Two detections are one person if SAME_PERSON_SHARE of the points of the worse one lie within
-# SAME_POINT_SHARE of the person's size. Tuned on the virtual studio.
-SAME_PERSON_SHARE = 0.5
-SAME_POINT_SHARE = 0.05
-_FLOATS = ("tensor(float)", "tensor(float16)")
 
 
 @dataclass(frozen=True)
@@ -124,9 +110,13 @@ class PoseModel:
         return people
 
     def _distinct(self, people: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Confident people among (P, 135, 3), each once, best first, and their boxes (N, 4)."""
-        sure = people[..., 2] >= FOUND_CONFIDENCE * self._full_confidence
-        accepted = sure[:, BODY].sum(1) >= FOUND_POINTS
+        """Confident people among (P, 135, 3), each once, best first, and their boxes (N, 4).
+
+        A person needs six confident points of the body. Two detections are one person if half of
+        the points of the worse one lie within 5 % of the person's size. Tuned on the studio.
+        """
+        sure = people[..., 2] >= 0.3 * self._full_confidence
+        accepted = sure[:, BODY].sum(1) >= 6
         people, sure = people[accepted], sure[accepted]
         if not len(people):
             return people, np.zeros((0, 4))
@@ -135,10 +125,10 @@ class PoseModel:
         best_first = np.argsort(-people[:, BODY, 2].mean(1), kind="stable")
         kept: list[int] = []
         for i in best_first.tolist():
-            near = SAME_POINT_SHARE * np.linalg.norm(high[i] - low[i])
+            near = 0.05 * np.linalg.norm(high[i] - low[i])
             distance = np.linalg.norm(people[kept, :, :2] - people[i, :, :2], axis=-1)
             shared = ((distance < near) & sure[kept]).any(0)
-            if shared[sure[i]].mean() < SAME_PERSON_SHARE:
+            if shared[sure[i]].mean() < 0.5:
                 kept.append(i)
         return people[kept][:MAX_PEOPLE], np.concatenate([low, high - low], 1)[kept][:MAX_PEOPLE]
 
@@ -152,15 +142,12 @@ class PoseModel:
 
     def _batches(self, picture: np.ndarray, crops: list[Crop]) -> Iterator[np.ndarray]:
         """Points (B, K, 3) in the input's pixels."""
-        most = self._model.batch or POSE_BATCH
+        most = self._model.batch or 8
         for start in range(0, len(crops), most):
             part = crops[start : start + most]
             images = np.stack(
                 [self._model.prepared(crop.cut(picture, self._size), "imagenet") for crop in part]
             )
-            missing = (self._model.batch or 0) - len(images)
-            if missing > 0:  # the model has a fixed batch size
-                images = np.concatenate([images, np.repeat(images[-1:], missing, 0)])
             outputs = self._model.run(images)
             yield self._points([outputs[i] for i in self._outputs], len(part))[: len(part)]
 
@@ -178,7 +165,8 @@ class PoseModel:
 
 def person_boxes(instances: list[Instance]) -> np.ndarray:
     """Boxes (N, 4) of x, y, width, height of the people among instances, best first."""
-    people = [i for i in instances if i.label == PERSON_LABEL and i.score >= MIN_BOX_SCORE]
+    # 0.3 is mmpose's default.
+    people = [i for i in instances if i.label == PERSON_LABEL and i.score >= 0.3]
     people.sort(key=lambda instance: -instance.score)
     return np.array([person.box for person in people[:MAX_PEOPLE]]).reshape(-1, 4)
 
@@ -204,7 +192,7 @@ def _simcc_outputs(model: OnnxModel) -> tuple[int, int] | None:
     """Positions of columns and rows among the outputs, by their names or else by their order."""
     if len(model.outputs) != 2:
         return None
-    if any(len(shape) != 3 or kind not in _FLOATS for _, shape, kind in model.outputs):
+    if any(len(shape) != 3 or kind not in FLOATS for _, shape, kind in model.outputs):
         return None
     names = [re.split(r"[^a-z0-9]+", name.lower()) for name, _, _ in model.outputs]
     return (1, 0) if "y" in names[0] or "x" in names[1] else (0, 1)
@@ -215,7 +203,7 @@ def _heatmap_output(model: OnnxModel) -> tuple[int] | None:
     if len(model.outputs) != 1:
         return None
     _, shape, kind = model.outputs[0]
-    if len(shape) != 4 or kind not in _FLOATS:
+    if len(shape) != 4 or kind not in FLOATS:
         return None
     cells = tuple(n for n in shape[2:] if isinstance(n, int))
     if len(cells) == 2 and model.size is not None and not _coarser(cells, model.size):
@@ -304,7 +292,7 @@ def peaks(maps: np.ndarray) -> np.ndarray:
     fine = np.flatnonzero(inside & (maps.max((1, 2)) > 0))
     if not len(fine):
         return places
-    log = np.log(np.maximum(_smooth_around(maps[fine], row[fine], column[fine]), _TINY))
+    log = np.log(np.maximum(_smooth_around(maps[fine], row[fine], column[fine]), 1e-10))
     slope = np.stack([log[:, 2, 3] - log[:, 2, 1], log[:, 3, 2] - log[:, 1, 2]], -1) / 2
     dxx = (log[:, 2, 4] - 2 * log[:, 2, 2] + log[:, 2, 0]) / 4
     dyy = (log[:, 4, 2] - 2 * log[:, 2, 2] + log[:, 0, 2]) / 4
@@ -325,7 +313,8 @@ def _smooth_around(maps: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.
     The blur joins the several maxima that noise causes. Maps are zero beyond the border, as in
     mmpose.
     """
-    reach = max(1, round(HEATMAP_BLUR * min(maps.shape[1:]) / 2 - 0.5))
+    # mmpose blurs over 11 cells of a map of 48, over 17 of 72.
+    reach = max(1, round(11 / 48 * min(maps.shape[1:]) / 2 - 0.5))
     kernel = cv2.getGaussianKernel(2 * reach + 1, 0)[:, 0]  # OpenCV's own deviation for the width
     side = np.arange(2 * (reach + _EDGE) + 1)
     padded = np.pad(maps, ((0, 0), (reach + _EDGE,) * 2, (reach + _EDGE,) * 2))

@@ -32,6 +32,7 @@ from intercap_core.formats.detections.class_names import (
 from intercap_core.formats.detections.coco import MAX_SCORE
 from intercap_core.formats.detections.instance import Instance
 from intercap_core.formats.detections.onnx_model import (
+    FLOATS,
     Fit,
     OnnxModel,
     PixelValues,
@@ -41,10 +42,7 @@ from intercap_core.formats.detections.onnx_model import (
 from intercap_core.geometry.camera import masks
 from intercap_core.inputs.files import quoted
 
-NMS_IOU = 0.7  # default of ultralytics' predictors
-MAX_BOXES = 3000  # of one image that enter non-maximum suppression; 30 times MAX_INSTANCES
 MAX_INSTANCES = 100  # of one image, as in COCO's evaluation
-MASK_PROBABILITY = 0.5  # at the edge of a mask
 
 
 def yolo_instances(
@@ -134,9 +132,7 @@ def rcnn_instances(
             across = (width / (x1 - x0), -x0 * width / (x1 - x0))
             down = (height / (y1 - y0), -y0 * height / (y1 - y0))
         label = names.get(int(classes[k]), f"category {int(classes[k])}")
-        found.append(
-            _instance(label, float(scores[k]), box, mask, across, down, fit.size, MASK_PROBABILITY)
-        )
+        found.append(_instance(label, float(scores[k]), box, mask, across, down, fit.size, 0.5))
     return [instance for instance in found if instance is not None]
 
 
@@ -185,9 +181,10 @@ def _instance(
 def suppressed(corners: np.ndarray, scores: np.ndarray, classes: np.ndarray) -> np.ndarray:
     """Indices (K,) of the boxes (N, 4) that greedy non-maximum suppression keeps, best first.
 
-    A box is removed if a better one of its class overlaps it by more than ``NMS_IOU``.
+    A box is removed if a better one of its class overlaps it by more than 0.7, the default of
+    ultralytics' predictors.
     """
-    order = np.argsort(-scores, kind="stable")[:MAX_BOXES]
+    order = np.argsort(-scores, kind="stable")[: 30 * MAX_INSTANCES]
     boxes, kinds = corners[order], classes[order]
     area = np.prod(np.maximum(boxes[:, 2:] - boxes[:, :2], 0), 1)
     alive, kept = np.ones(len(order), bool), []
@@ -199,23 +196,11 @@ def suppressed(corners: np.ndarray, scores: np.ndarray, classes: np.ndarray) -> 
         high = np.minimum(boxes[i, 2:], boxes[:, 2:])
         common = np.prod(np.maximum(high - low, 0), 1)
         overlap = common / np.maximum(area[i] + area - common, 1e-9)
-        alive &= (overlap <= NMS_IOU) | (kinds != kinds[i])
+        alive &= (overlap <= 0.7) | (kinds != kinds[i])
     return order[kept]
 
 
 Key = TypeVar("Key", bound=Hashable)
-
-SEGMENTATION_BATCH = 4  # images in one run of a model with a free batch size
-MAX_GRID_SIDE = 32_767  # cells of a mask: limit of OpenCV's warps
-# Input of ultralytics' training.
-YOLO_SIDE = 640  # px
-YOLO_STRIDE = 32  # px
-YOLO_GREY = 114  # grey level of the padding
-# Input of the test configurations of detectron2 and maskrcnn-benchmark, px.
-RCNN_SHORT = 800
-RCNN_LONG = 1333
-RCNN_STRIDE = 32
-_FLOATS = ("tensor(float)", "tensor(float16)")
 
 
 @dataclass(frozen=True)
@@ -273,7 +258,7 @@ class Segmenter:
         self, pictures: Iterable[tuple[Key, np.ndarray]]
     ) -> Iterator[tuple[Key, list[Instance]]]:
         """Instances of each picture (H, W, 3) uint8 BGR, best first, in the pictures' order."""
-        most = self._model.batch or (SEGMENTATION_BATCH if self._kind.yolo else 1)
+        most = self._model.batch or (4 if self._kind.yolo else 1)
         waiting: list[tuple[Key, Fit, np.ndarray]] = []
         for key, picture in pictures:
             fit, values = self._prepared(picture)
@@ -289,23 +274,20 @@ class Segmenter:
         size = self._model.size
         if size is None and self._kind.yolo:
             side = _longest_side(self._model.metadata)
-            size = _multiple(own, side / max(own), YOLO_STRIDE)
+            size = _multiple_of_32(own, side / max(own))
         elif size is None and self._kind.values == "rgb":
             size = own  # torchvision's models scale by themselves
         elif size is None:
-            ratio = min(RCNN_SHORT / min(own), RCNN_LONG / max(own))
-            size = _multiple(own, ratio, RCNN_STRIDE)
+            # As the test configurations of detectron2 and maskrcnn-benchmark.
+            size = _multiple_of_32(own, min(800 / min(own), 1333 / max(own)))
         fit = fit_within(own, size, centred=self._kind.yolo)
-        grey = YOLO_GREY if self._kind.yolo else 0
+        grey = 114 if self._kind.yolo else 0  # as in ultralytics' training
         return fit, self._model.fitted(picture, fit, size, self._kind.values, grey)
 
     def _run(
         self, waiting: list[tuple[Key, Fit, np.ndarray]]
     ) -> Iterator[tuple[Key, list[Instance]]]:
         images = np.stack([values for _, _, values in waiting])
-        missing = (self._model.batch or 0) - len(images)
-        if missing > 0:  # the model has a fixed batch size
-            images = np.concatenate([images, np.repeat(images[-1:], missing, 0)])
         outputs = self._model.run(images)
         size = (images.shape[3], images.shape[2])
         for index, (key, fit, _) in enumerate(waiting):
@@ -369,11 +351,11 @@ class Segmenter:
 
 def _is_grid(shape: tuple[int, ...]) -> bool:
     """Whether masks of this height and width can be sampled."""
-    return min(shape) >= 1 and max(shape) <= MAX_GRID_SIDE
+    return min(shape) >= 1 and max(shape) <= 32_767  # limit of OpenCV's warps
 
 
 def _yolo_outputs(model: OnnxModel) -> dict[str, int] | None:
-    if len(model.outputs) != 2 or any(kind not in _FLOATS for _, _, kind in model.outputs):
+    if len(model.outputs) != 2 or any(kind not in FLOATS for _, _, kind in model.outputs):
         return None
     ranks = [len(shape) for _, shape, _ in model.outputs]
     if sorted(ranks) != [3, 4]:
@@ -394,10 +376,10 @@ def _rcnn_outputs(model: OnnxModel) -> dict[str, int] | None:
         return found
     found = {}
     for i, (_, shape, kind) in enumerate(model.outputs):
-        if len(shape) == 2 and kind in _FLOATS:
+        if len(shape) == 2 and kind in FLOATS:
             found.setdefault("boxes", i)
         elif len(shape) == 1:  # the image's size, also of whole numbers, comes last
-            found.setdefault("scores" if kind in _FLOATS else "classes", i)
+            found.setdefault("scores" if kind in FLOATS else "classes", i)
         elif len(shape) in (3, 4):
             found.setdefault("masks", i)
     return found if len(found) == 4 else None
@@ -428,12 +410,12 @@ def _own_names(model: OnnxModel) -> dict[int, str]:
 def _longest_side(metadata: Mapping[str, str]) -> int:
     """The longest side at which a YOLO without a fixed input size was trained."""
     sides = [int(n) for n in re.findall(r"\d{1,5}", metadata.get("imgsz", ""))]
-    return max(sides) if sides and min(sides) > 0 else YOLO_SIDE
+    return max(sides) if sides and min(sides) > 0 else 640  # ultralytics' default
 
 
-def _multiple(size: tuple[int, int], ratio: float, stride: int) -> tuple[int, int]:
-    """The size times ``ratio``, each side rounded up to a multiple of ``stride``."""
-    width, height = (-(-round(n * ratio) // stride) * stride for n in size)
+def _multiple_of_32(size: tuple[int, int], ratio: float) -> tuple[int, int]:
+    """The size times ``ratio``, each side rounded up to a multiple of the networks' stride."""
+    width, height = (-(-round(n * ratio) // 32) * 32 for n in size)
     return width, height
 
 

@@ -21,21 +21,18 @@ from intercap_core.formats.calibration.extrinsics import (
     Extrinsics,
     relate_to_master,
 )
-from intercap_core.formats.calibration.opencv import check_lens
+from intercap_core.formats.calibration.opencv import check_lens, pad_distortion
 from intercap_core.formats.recordings.image_files import AlignedRecording, ImagePair, common_size
 from intercap_core.formats.recordings.source import RecordingLayout
 from intercap_core.geometry.camera.intrinsics import DEFAULT_METRIC_RADIUS, Intrinsics
 from intercap_core.geometry.camera.transforms import is_rigid, rigid
 from intercap_core.inputs.documents import read_json, read_object
-from intercap_core.inputs.files import Unreadable
+from intercap_core.inputs.files import UnreadableFile
 
 MASTER = "k1"
 FRAME_FOLDER = re.compile(r"t(\d{1,6}(?:\.\d{1,6})?)")
 IMAGE_FILE = re.compile(r"k(\d{1,2})\.(color\.(?:jpe?g|png)|depth\.png)", re.IGNORECASE)
 KINECT_FOLDER = re.compile(r"k?(\d{1,2})")
-# Frame rates of Azure Kinects. Names of folders round times to milliseconds, 3 % of a period.
-NOMINAL_FPS = (30.0, 15.0, 5.0)
-FPS_TOLERANCE = 0.05  # relative
 
 
 class BehaveLayout(RecordingLayout):
@@ -105,7 +102,8 @@ def frame_rate(times_us: list[int]) -> float:
     if len(times_us) < 2:
         return 1.0
     fps = 1e6 / float(np.median(np.diff(times_us)))
-    return next((n for n in NOMINAL_FPS if abs(fps / n - 1) < FPS_TOLERANCE), fps)
+    # Rates of Azure Kinects. Names of folders round times to milliseconds, 3 % of a period.
+    return next((n for n in (30.0, 15.0, 5.0) if abs(fps / n - 1) < 0.05), fps)
 
 
 def _images(folder: Path) -> dict[tuple[str, str], Path]:
@@ -184,20 +182,16 @@ def read_lens(calibration: Path, number: int) -> Intrinsics:
     try:
         colour = read_json(path)["color"]
         fx, fy, cx, cy = (float(colour[key]) for key in ("fx", "fy", "cx", "cy"))
-        distortion = np.array(colour["opencv"][4:], np.float64)
+        distortion = pad_distortion(np.array(colour["opencv"][4:], np.float64))
         radius = float(colour.get("metric_radius", 0)) or DEFAULT_METRIC_RADIUS
         size = int(colour["width"]), int(colour["height"])
-        if len(distortion) not in (4, 5, 8) or not np.isfinite([fx, fy, cx, cy, *distortion]).all():
-            raise ValueError
-        padded = np.concatenate([distortion, np.zeros(8 - len(distortion))])
         radius = radius if np.isfinite(radius) else DEFAULT_METRIC_RADIUS
-        lens = Intrinsics(*size, fx, fy, cx, cy, padded, radius)
-    except (Unreadable, KeyError, TypeError, ValueError, OverflowError):
+        return Intrinsics(*size, fx, fy, cx, cy, distortion, radius)
+    except (UnreadableFile, KeyError, TypeError, ValueError, OverflowError):
         raise UserError(
             f"{where}: expected 'color' with width, height, fx, fy, cx, cy and 'opencv' (these "
             "four and 4, 5 or 8 coefficients); get the file from the data set again"
         ) from None
-    return lens
 
 
 def _kinect_folders(folder: Path) -> dict[int, Path]:

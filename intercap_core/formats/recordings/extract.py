@@ -19,10 +19,6 @@ from intercap_core.progress import Progress
 
 log = logging.getLogger(__name__)
 
-COLOUR_BUFFER_BYTES = 4 << 20
-# End of each image that enters the fingerprint: entropy-coded data, which no two images share.
-FINGERPRINT_BYTES = 256
-
 
 @dataclass
 class ExtractedCamera:
@@ -167,9 +163,10 @@ class _Copy:
             return
         self.colour_times.append(image.time_us)
         self.offsets.append(self.offsets[-1] + len(content))
-        self.view.fingerprint = zlib.crc32(content[-FINGERPRINT_BYTES:], self.view.fingerprint)
+        # The end is entropy-coded data, which no two images share.
+        self.view.fingerprint = zlib.crc32(content[-256:], self.view.fingerprint)
         self.buffer += content
-        if len(self.buffer) >= COLOUR_BUFFER_BYTES:
+        if len(self.buffer) >= 4 << 20:
             self._flush()
 
     def _take_depth(self, image: Image) -> None:

@@ -18,7 +18,7 @@ from intercap_core.errors import UserError
 from intercap_core.formats.recordings.source import CameraRecording, Image, RecordingPreview
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera
-from intercap_core.inputs.files import MAX_IMAGE_BYTES, Unreadable, read_bytes
+from intercap_core.inputs.files import MAX_IMAGE_BYTES, UnreadableFile, read_bytes
 
 JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
 PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
@@ -81,8 +81,6 @@ def _orientation(tiff: bytes) -> int:
 
 def encode_jpeg(image: np.ndarray) -> bytes:
     """Encode (H, W, 3) uint8 BGR as JPEG of :data:`JPEG_QUALITY`."""
-    import cv2
-
     done, content = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not done:
         raise ValueError(f"an image of {image.shape} {image.dtype} cannot be stored as JPEG")
@@ -95,8 +93,6 @@ def decode_raw(content: bytes, pixel_format: str, size: tuple[int, int]) -> np.n
     ``pixel_format`` is one of :data:`RAW_FORMATS`. YUV is BT.601 with limited range, as in the
     viewer of the Azure Kinect. Raises ValueError for another number of bytes.
     """
-    import cv2
-
     width, height = size
     shape, code = {
         "NV12": ((height * 3 // 2, width), cv2.COLOR_YUV2BGR_NV12),
@@ -106,11 +102,8 @@ def decode_raw(content: bytes, pixel_format: str, size: tuple[int, int]) -> np.n
     return cv2.cvtColor(np.frombuffer(content, np.uint8).reshape(shape), code)
 
 
-PREVIEWED_FILES = 5  # of each kind, evenly over the recording
-
-
 class DamagedImage(Exception):
-    """The file is no usable image; the message follows its name."""
+    """The file is no usable image or mask; the message follows the file's name."""
 
 
 class ImagePair(NamedTuple):
@@ -124,7 +117,7 @@ class ImagePair(NamedTuple):
 
 def read_colour(path: Path) -> bytes:
     """Content of a complete JPEG or PNG file; raises :class:`DamagedImage` for anything else."""
-    content = _read(path)
+    content = read_content(path)
     if encoded_size(content) is None:
         raise DamagedImage("is no whole JPEG or PNG")
     return content
@@ -135,7 +128,7 @@ def read_depth(path: Path, size: tuple[int, int]) -> np.ndarray:
 
     Raises :class:`DamagedImage` for anything else, and for another ``size`` (width, height).
     """
-    content = _read(path)
+    content = read_content(path)
     _check_depth_head(content, size)
     if not content.endswith(PNG_END):
         raise DamagedImage("is cut off")
@@ -155,10 +148,11 @@ def _check_depth_head(content: bytes, size: tuple[int, int]) -> None:
         raise DamagedImage(f"has {width}x{height} pixels, the colour images {size[0]}x{size[1]}")
 
 
-def _read(path: Path, length: int | None = None) -> bytes:
+def read_content(path: Path, length: int | None = None) -> bytes:
+    """Bytes of an image file, or its first ``length``; raises :class:`DamagedImage`."""
     try:
         return read_bytes(path, MAX_IMAGE_BYTES, head=length)
-    except Unreadable as error:
+    except UnreadableFile as error:
         raise DamagedImage(error.reason) from None
 
 
@@ -166,7 +160,7 @@ def common_size(paths: Iterable[Path]) -> tuple[int, int] | None:
     """Width and height of the first complete image; None if there is none."""
     for path in paths:
         with contextlib.suppress(DamagedImage):
-            size = encoded_size(_read(path))
+            size = encoded_size(read_content(path))
             if size is not None:
                 return size
     return None
@@ -189,11 +183,8 @@ class FilesRecording(CameraRecording):
 
     def preview(self) -> RecordingPreview:
         """Inspect the sizes of all files, and some of the images."""
-        files, size = self.colour_files, None
-        for _, path in files:
-            with contextlib.suppress(DamagedImage):
-                size = encoded_size(read_colour(path))
-                break
+        files = self.colour_files
+        size = common_size(path for _, path in files)
         times = [time_us for time_us, _ in files]
         seconds = (times[-1] - times[0]) * 1e-6 if times else None
         faults = faults_of_files(self._shots, self.camera.depth)
@@ -220,8 +211,8 @@ def faults_of_files(shots: list[ImagePair], lens: Intrinsics | None) -> list[str
                 f"{len(empty)} of {len(paths)} {kind} files are empty (first: {empty[0].name})"
             )
         bad = []
-        looked = np.unique(np.linspace(0, len(paths) - 1, PREVIEWED_FILES).round().astype(int))
-        looked = looked[: len(paths)].tolist()
+        looked = np.unique(np.linspace(0, len(paths) - 1, 5).round().astype(int))
+        looked = looked[: len(paths)].tolist()  # evenly over the recording
         for index in looked:
             try:
                 if kind == "colour":
@@ -255,7 +246,7 @@ def read_pairs(recording: CameraRecording, shots: list[ImagePair]) -> Iterator[I
                 damaged.append(f"{depth.name} {error}")
     without = sum(shot.colour is not None and shot.depth is None for shot in shots)
     if lens is not None and without:
-        recording.notes.append(f"no depth image beside {without} of its colour images")
+        recording.notes.append(f"no depth image with {without} of its colour images")
     if damaged:
         recording.notes.append(f"{len(damaged)} damaged images left out (first: {damaged[0]})")
 
@@ -293,7 +284,7 @@ class AlignedRecording(FilesRecording):
         fault = ""
         for path in (shot.depth for shot in self._shots if shot.depth is not None):
             try:
-                _check_depth_head(_read(path, 32), self._size)
+                _check_depth_head(read_content(path, 32), self._size)
                 return ""
             except DamagedImage as error:
                 fault = fault or f"no depth used: {path.name} {error}"

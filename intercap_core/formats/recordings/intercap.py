@@ -17,21 +17,18 @@ import numpy as np
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import read_extrinsics
-from intercap_core.formats.calibration.opencv import check_lens
+from intercap_core.formats.calibration.opencv import check_lens, pad_distortion
 from intercap_core.formats.recordings.image_files import AlignedRecording, ImagePair, common_size
 from intercap_core.formats.recordings.source import RecordingLayout
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.inputs.documents import read_json
-from intercap_core.inputs.files import Unreadable
+from intercap_core.inputs.files import UnreadableFile
 
 FPS = 30.0  # of the release
 CAMERA_FOLDER = re.compile(r"frames_cam(\d{1,2})", re.IGNORECASE)
 COLOUR_FOLDER = re.compile(r"colou?r", re.IGNORECASE)
 DEPTH_FOLDER = re.compile(r"depth.*", re.IGNORECASE)
 NUMBERED = re.compile(r"(?!\.)\D*(\d{1,9})\.(?:jpe?g|png)", re.IGNORECASE)
-# Share of the image by which a principal point lies off its middle, beyond which it belongs to
-# another resolution. Those of the release lie within 3 %.
-FARTHEST_CENTRE = 0.15
 
 
 def time_of(number: int) -> int:
@@ -132,32 +129,27 @@ def read_lens(path: Path, size: tuple[int, int]) -> Intrinsics:
     """Read a lens from a ``Color*.json`` for images of ``size``, which the file does not state.
 
     ``f`` and ``c`` are focal length and principal point (x, y) in pixels, ``k`` the coefficients
-    k1, k2, p1, p2 and, where there are more, k3 to k6, as OpenCV orders them. Raises UserError for
-    a broken file and for a principal point that belongs to images of another size.
+    k1, k2, p1, p2 and, if there are more, k3 to k6, in OpenCV's order. Raises UserError for a
+    broken file and for a principal point that belongs to images of another size.
     """
     where = f"{path.parent.name}/{path.name}"
     try:
         content: Any = read_json(path)
         focal, centre = (np.array(content[key], np.float64).reshape(2) for key in "fc")
-        k = np.array(content["k"], np.float64).ravel()
-    except (Unreadable, KeyError, TypeError, ValueError, OverflowError):
+        distortion = pad_distortion(np.array(content["k"], np.float64).ravel())
+        fx, fy, cx, cy = (float(value) for value in (*focal, *centre))
+        lens = Intrinsics(*size, fx, fy, cx, cy, distortion)
+    except (UnreadableFile, KeyError, TypeError, ValueError, OverflowError) as error:
+        reason = f" ({error})" if type(error) is ValueError else ""
         raise UserError(
-            f"{where}: expected 'f' and 'c' of two numbers and 'k' of 4, 5 or 8; get the file from "
-            "the release again"
+            f"{where}: expected 'f' and 'c' of two numbers and 'k' of 4, 5 or 8{reason}; get the "
+            "file from the release again"
         ) from None
-    finite = all(np.isfinite(values).all() for values in (focal, centre, k))
-    if len(k) not in (4, 5, 8) or not finite or focal.min() <= 0:
-        raise UserError(
-            f"{where}: 'f', 'c' or 'k' cannot be a lens (f {focal.round(1).tolist()}, "
-            f"c {centre.round(1).tolist()}, "
-            f"{len(k)} coefficients, expected 4, 5 or 8); get the file from the release again"
-        )
-    if (np.abs(centre / size - 0.5) > FARTHEST_CENTRE).any():
+    # The principal points of the release lie within 3 % of the image from its middle.
+    if (np.abs(centre / size - 0.5) > 0.15).any():
         raise UserError(
             f"{where}: the principal point {centre[0]:.0f}, {centre[1]:.0f} is that of images of "
             f"about {2 * centre[0]:.0f}x{2 * centre[1]:.0f}, the colour images have "
             f"{size[0]}x{size[1]}; give the calibration of this resolution"
         )
-    distortion = np.concatenate([k, np.zeros(8 - len(k))])
-    fx, fy, cx, cy = (float(value) for value in (*focal, *centre))
-    return check_lens(Intrinsics(*size, fx, fy, cx, cy, distortion), where)
+    return check_lens(lens, where)

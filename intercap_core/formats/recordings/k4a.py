@@ -50,6 +50,7 @@ from intercap_core.formats.recordings.source import (
 )
 from intercap_core.formats.recordings.video import (
     LATEST_US,
+    demux,
     open_container,
     preview_video,
     segment_end,
@@ -57,13 +58,12 @@ from intercap_core.formats.recordings.video import (
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.inputs.files import quoted, read_bytes
 
-TRACKS = {"COLOR": "K4A_COLOR_TRACK", "DEPTH": "K4A_DEPTH_TRACK", "IMU": "K4A_IMU_TRACK"}
-CALIBRATION_NAME, CALIBRATION_TAG = "calibration.json", "K4A_CALIBRATION_FILE"
+CALIBRATION_NAME = "calibration.json"
 IMU_SAMPLE = struct.Struct("<Q3fQ3f")  # time ns, m/s^2, time ns, rad/s
 LONGEST_DELAY_US = 1_000_000  # of depth or of a subordinate; the SDK allows one frame's period
 
 Kind = Literal["colour", "depth", "imu"]
-_KINDS: dict[str, Kind] = {"COLOR": "colour", "DEPTH": "depth", "IMU": "imu"}
+TRACKS: dict[Kind, str] = {"colour": "COLOR", "depth": "DEPTH", "imu": "IMU"}
 
 
 class Packet(NamedTuple):
@@ -144,27 +144,19 @@ class KinectFile(ClosedOnExit):
         out and counted in ``broken_packets``. A file that was cut off ends early without an error.
         """
         streams = [self._container.streams[index] for index in self._streams]
-        demuxed = self._container.demux(streams)
-        while True:
-            try:
-                packet = next(demuxed)
-            except (StopIteration, av.error.EOFError):
-                return
-            except (av.error.FFmpegError, OSError):
-                self.broken_packets += 1
-                return
+        for packet in demux(self._container, streams, self._count_broken):
             if not packet.size or packet.pts is None or packet.time_base is None:
                 continue  # the end mark of a track
             kind = self._streams[packet.stream_index]
             content = bytes(packet)
-            if not self._is_complete(kind, content):
-                self.broken_packets += 1
-                continue
             time_us = round(packet.pts * packet.time_base * 1_000_000) + self.info.start_offset_us
-            if abs(time_us) > LATEST_US:
-                self.broken_packets += 1
-                continue
-            yield Packet(kind, time_us, content)
+            if self._is_complete(kind, content) and abs(time_us) <= LATEST_US:
+                yield Packet(kind, time_us, content)
+            else:
+                self._count_broken()
+
+    def _count_broken(self) -> None:
+        self.broken_packets += 1
 
     def _is_complete(self, kind: Kind, content: bytes) -> bool:
         if kind == "colour" and self.info.colour_format == "MJPG":
@@ -216,11 +208,11 @@ class KinectFile(ClosedOnExit):
         """Kind of each track by its index: by its tag, else by its name."""
         found: dict[int, Kind] = {}
         candidates = [s for s in self._container.streams if s.type != "attachment"]
-        for name, tag in TRACKS.items():
-            tagged = [s for s in candidates if tag in s.metadata]
+        for kind, name in TRACKS.items():
+            tagged = [s for s in candidates if f"K4A_{name}_TRACK" in s.metadata]
             named = [s for s in candidates if s.metadata.get("title") == name]
             for stream in (tagged or named)[:1]:
-                found[stream.index] = _KINDS[name]
+                found[stream.index] = kind
         return found
 
     def _stream(self, kind: Kind) -> Any:
@@ -292,7 +284,7 @@ class KinectFile(ClosedOnExit):
 
     def _calibration(self) -> bytes:
         attached: list[Any] = [s for s in self._container.streams if s.type == "attachment"]
-        tagged = [s for s in attached if CALIBRATION_TAG in s.metadata]
+        tagged = [s for s in attached if "K4A_CALIBRATION_FILE" in s.metadata]
         named = [s for s in attached if s.metadata.get("filename") == CALIBRATION_NAME]
         for stream in tagged or named:
             return bytes(stream.data)

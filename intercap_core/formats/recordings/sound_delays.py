@@ -18,23 +18,6 @@ from scipy import fft
 
 from intercap_core.formats.recordings.source import SOUND_RATE, Sound
 
-LOWEST_HZ = 150.0  # above hum and handling noise
-HIGHEST_HZ = 3500.0  # below the edge of the resampler's filter
-WINDOWS = 8  # of a track, evenly over it
-# A window is a quarter of the track within these limits. At least a second holds several steps or
-# words; within 10 s clocks drift by at most SMOOTHED_S.
-MIN_WINDOW_S = 1.0
-MAX_WINDOW_S = 10.0
-FEWEST_WINDOWS = 3  # that must agree; two may agree by chance
-SMOOTHED_S = 0.001  # over which power is averaged: clocks of 100 ppm drift by as much in 10 s
-# Times the mean power. The sum over eight samples of unrelated noise (chi square) exceeds it by
-# chance once in 1e10 delays.
-LEAST_PEAK = 8.0
-CLEAR_PEAK = 1.5  # times the next highest power that is not near; tuned on the studio
-NEAR_S = 0.03  # first echoes of a room: 10 m of detour
-AGREE_S = 0.01  # difference up to which windows agree, plus the drift of two clocks
-DRIFT = 1e-4  # relative, of two clocks
-LOOP_S = 0.02  # error of closure of the delays of three cameras; tuned on the studio
 # Standard deviation of one camera's sound against its images. EBU R37 allows the sound of a
 # programme to lead by 40 ms and to lag by 60 ms; the deviation of a uniform distribution over this
 # range is 29 ms. Sound itself takes 3 ms a metre, about 5 ms within a ring of cameras.
@@ -74,7 +57,7 @@ def sound_starts(sounds: Sequence[Sound | None]) -> tuple[np.ndarray, np.ndarray
         solved = _solved(own, group)
         off = {(a, b): abs(solved[a] - solved[b] - d.seconds) for (a, b), d in own.items()}
         worst = max(off, key=lambda pair: off[pair])
-        if off[worst] > LOOP_S:
+        if off[worst] > 0.02:  # closure of three cameras' delays, seconds; tuned on the studio
             del delays[worst]
             continue
         spread = {c: max(d.spread for pair, d in own.items() if c in pair) for c in group}
@@ -87,12 +70,12 @@ def sound_starts(sounds: Sequence[Sound | None]) -> tuple[np.ndarray, np.ndarray
 def delay_between(first: Sound, second: Sound) -> Delay | None:
     """The delay of two tracks; None if it is not certain that they share sounds."""
     short, long = sorted((first, second), key=lambda sound: len(sound.samples))
-    least, most = (round(s * SOUND_RATE) for s in (MIN_WINDOW_S, MAX_WINDOW_S))
-    size = min(max(len(short.samples) // 4, least), most)
+    # A second holds several steps or words; within 10 s two clocks of 100 ppm drift by 1 ms.
+    size = min(max(len(short.samples) // 4, SOUND_RATE), 10 * SOUND_RATE)
     last = len(short.samples) - size
     if last < size:  # fewer than two separate windows cannot disagree
         return None
-    places = np.unique(np.linspace(0, last, WINDOWS).astype(int))
+    places = np.unique(np.linspace(0, last, 8).astype(int))
     nfft = fft.next_fast_len(len(long.samples) + size, real=True)
     whole = fft.rfft(long.samples, nfft)
     lags = [
@@ -102,7 +85,7 @@ def delay_between(first: Sound, second: Sound) -> Delay | None:
         is not None
     ]
     agree = _agreeing(np.array(lags) / SOUND_RATE, len(short.samples) / SOUND_RATE)
-    if len(agree) < max(FEWEST_WINDOWS, len(lags) / 2):
+    if len(agree) < max(3, len(lags) / 2):  # two may agree by chance
         return None
     middle = float(np.median(agree))
     spread = 1.4826 * float(np.median(np.abs(agree - middle)))
@@ -118,22 +101,23 @@ def _lag(window: np.ndarray, whole: np.ndarray, nfft: int, count: int) -> int | 
     cross = whole * np.conj(fft.rfft(window * np.hanning(len(window)), nfft))
     size = np.abs(cross)
     hz = fft.rfftfreq(nfft, 1 / SOUND_RATE)
-    heard = (hz > LOWEST_HZ) & (hz < HIGHEST_HZ) & (size > 0)
+    # Above hum and handling noise, below the edge of the resampler's filter.
+    heard = (hz > 150.0) & (hz < 3500.0) & (size > 0)
     if not heard.any():
         return None
     white = np.zeros_like(cross)
     white[heard] = cross[heard] / size[heard]
     power = fft.irfft(white, nfft) ** 2
-    smooth = round(SMOOTHED_S * SOUND_RATE)
+    smooth = round(0.001 * SOUND_RATE)  # the drift of two clocks of 100 ppm within 10 s
     # Also lags at which the window lies only partly within the other track.
     power = np.roll(power, len(window) - 1)[: count + len(window) - 1]
     power = np.convolve(power, np.ones(smooth) / smooth, mode="same")
     best = int(power.argmax())
-    near = round(NEAR_S * SOUND_RATE)
+    near = round(0.03 * SOUND_RATE)  # first echoes of a room: 10 m of detour
     others = np.concatenate([power[: max(0, best - near)], power[best + near + 1 :]])
-    if not len(others) or power[best] < LEAST_PEAK * others.mean():
-        return None
-    if power[best] < CLEAR_PEAK * others.max():
+    # The mean over eight samples of unrelated noise (chi square) exceeds the average eight times
+    # by chance once in 1e10 delays. The factor to the next highest peak is tuned on the studio.
+    if not len(others) or power[best] < 8.0 * others.mean() or power[best] < 1.5 * others.max():
         return None
     return best - (len(window) - 1)
 
@@ -142,7 +126,7 @@ def _agreeing(delays: np.ndarray, seconds: float) -> np.ndarray:
     """The largest subset of ``delays`` (N,) that agree; ``seconds`` is the track's length."""
     if not len(delays):
         return delays
-    near = np.abs(delays[:, None] - delays) <= AGREE_S + DRIFT * seconds
+    near = np.abs(delays[:, None] - delays) <= 0.01 + 1e-4 * seconds  # clocks drift by 100 ppm
     return delays[near[near.sum(1).argmax()]]
 
 

@@ -10,15 +10,11 @@ import numpy as np
 
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.image_files import ImagePair
-from intercap_core.inputs.files import MAX_TABLE_BYTES, Unreadable, quoted, read_text
+from intercap_core.inputs.files import MAX_TABLE_BYTES, quoted, read_text
 
 SUFFIXES = (".csv", ".txt")
 LATEST_S = 1e11  # beyond all clocks that count seconds; in microseconds it fits into 64 bits
-LONGEST_STEP_S = 5.0  # median step beyond which the unit is not the second
-NUMBER = re.compile(r"\d+(?=\D*$)")  # the last number of a name
 Timestamps = Mapping[str | int, float]  # seconds by name, or by position if lines have no names
-_WHOLE = re.compile(r"[0-9]{1,18}")
-_SPLIT = re.compile(r"[,;\s]+")
 
 
 def find_timestamps(stem: Path) -> Path | None:
@@ -33,15 +29,10 @@ def read_timestamps(path: Path) -> Timestamps:
     Returns the times by name, or by 0, 1, ... if the lines have no names. Raises UserError naming
     file and line for text that is no number, for a repeated name, and for milliseconds.
     """
-    try:
-        lines = read_text(path, MAX_TABLE_BYTES).splitlines()
-    except Unreadable as error:
-        raise UserError(
-            f"{path}: cannot be read as text ({error.reason}); check the file"
-        ) from None
+    lines = read_text(path, MAX_TABLE_BYTES).splitlines()
     times: dict[str | int, float] = {}
     for number, line in enumerate(lines, start=1):
-        fields = [field for field in _SPLIT.split(line.strip().lstrip("#")) if field]
+        fields = [field for field in re.split(r"[,;\s]+", line.strip().lstrip("#")) if field]
         if not fields:
             continue
         try:
@@ -62,7 +53,7 @@ def read_timestamps(path: Path) -> Timestamps:
             raise UserError(f"{path}, line {number}: {seconds:.4g} are no seconds; write seconds")
         times[name] = seconds
     steps = np.abs(np.diff(list(times.values())))
-    if len(steps) and np.median(steps) > LONGEST_STEP_S:
+    if len(steps) and np.median(steps) > 5:  # not even a time lapse is so slow
         raise UserError(
             f"{path}: times are {np.median(steps):.4g} apart, expected seconds, so they are likely "
             "milliseconds or less; write seconds"
@@ -149,7 +140,7 @@ def _by_key(
 
 
 def _number(path: Path) -> int | None:
-    match = NUMBER.search(path.stem)
+    match = re.search(r"\d+(?=\D*$)", path.stem)  # the last number of the name
     return int(match.group()) if match else None
 
 
@@ -167,7 +158,11 @@ def _stated(
             f"{source}: {len(times)} timestamps for {len(coloured)} colour images; write one for "
             "each, or 'name, seconds'"
         )
-    by_number = {int(n): t for n, t in times.items() if isinstance(n, str) and _WHOLE.fullmatch(n)}
+    by_number = {
+        int(name): time
+        for name, time in times.items()
+        if isinstance(name, str) and re.fullmatch(r"[0-9]{1,18}", name)
+    }
     seconds = {}
     for key, files in found.items():
         names = [name for file in files if file is not None for name in (file.name, file.stem)]

@@ -6,8 +6,9 @@ their images are decoded and stored as JPEG.
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ from intercap_core.formats.recordings.source import (
 )
 from intercap_core.formats.recordings.timestamps import Timestamps, pair_images
 from intercap_core.geometry.camera.rig import Camera
-from intercap_core.inputs.files import Unreadable, check_file
+from intercap_core.inputs.files import UnreadableFile, check_file
 
 # FFmpeg would also follow lists of other files or addresses.
 FORMATS = "matroska,webm,mov,mp4,m4a,3gp,3g2,mj2,avi,mpeg,mpegts,mpegvideo"
@@ -43,7 +44,7 @@ MAX_SIDE = 16_384  # px of an image that is decoded
 def open_container(path: Path, **options: str) -> Any:
     """Open a regular file with PyAV.
 
-    Raises Unreadable if it is no regular file, and PyAV's errors if it is no container of
+    Raises UnreadableFile if it is no regular file, and PyAV's errors if it is no container of
     :data:`FORMATS`.
     """
     check_file(path, None)
@@ -54,9 +55,17 @@ def open_container(path: Path, **options: str) -> Any:
     )
 
 
-FIRST_PACKETS = 60  # two seconds, within which an image must decode
-_MATROSKA = "matroska"
-_SEGMENT_ID = b"\x18\x53\x80\x67"
+def demux(container: Any, streams: Any, on_error: Callable[[], None]) -> Iterator[Any]:
+    """Yield packets up to the file's end or its first error, at which ``on_error`` is called."""
+    packets = container.demux(streams)
+    while True:
+        try:
+            yield next(packets)
+        except (StopIteration, av.error.EOFError):
+            return
+        except (av.error.FFmpegError, OSError):
+            on_error()
+            return
 
 
 def preview_video(path: Path, stream_index: int, fps: float) -> RecordingPreview:
@@ -71,7 +80,7 @@ def preview_video(path: Path, stream_index: int, fps: float) -> RecordingPreview
         stated, frames = float(container.duration or 0) / av.time_base, int(stream.frames)
         length = os.path.getsize(path)
         entries = getattr(stream, "index_entries", None) or ()
-        if _MATROSKA in container.format.name:
+        if "matroska" in container.format.name:
             share = _share_of_segment(path, length)
             seconds = stated * share if stated else None
         elif frames and len(entries) == frames:
@@ -95,7 +104,7 @@ def _first_size(container: Any, stream: Any) -> tuple[int, int] | None:
     """Size of the first image that decodes, rotated as the file states."""
     try:
         for number, packet in enumerate(container.demux(stream)):
-            if number > FIRST_PACKETS:
+            if number > 60:  # two seconds, within which an image must decode
                 return None
             if stream.codec_context.name == "mjpeg":
                 size = encoded_size(bytes(packet))
@@ -137,17 +146,13 @@ def segment_end(head: bytes) -> int | None:
 
     ``head`` is the file's beginning. Source: RFC 8794, section 6; RFC 9559, section 5.1.
     """
-    at = head.find(_SEGMENT_ID)
+    at = head.find(b"\x18\x53\x80\x67")  # the id of a Segment
     if at < 0 or at + 5 > len(head):
         return None
     width = 9 - head[at + 4].bit_length()  # of the length that follows the id
     field = head[at + 4 : at + 4 + width]
     stated = int.from_bytes(field, "big") & ((1 << 7 * width) - 1)
     return None if stated == (1 << 7 * width) - 1 else at + 4 + width + stated
-
-
-MAX_SOUND_S = 600.0  # of a track that are read: 19 MB
-JUMP_S = 0.05  # between a packet's time and that of the samples before it, beyond which it is a gap
 
 
 def read_sound(path: Path, first_image_s: float) -> Sound | None:
@@ -159,18 +164,19 @@ def read_sound(path: Path, first_image_s: float) -> Sound | None:
     parts: list[np.ndarray] = []
     start: float | None = None
     count = 0
+    longest = 600.0 * SOUND_RATE  # ten minutes are read: 19 MB
     for time_s, samples in _pieces(path):
         if start is None:
             start = time_s
         gap = round((time_s - start) * SOUND_RATE) - count
-        if gap > JUMP_S * SOUND_RATE:
-            if count + gap > MAX_SOUND_S * SOUND_RATE:
+        if gap > 0.05 * SOUND_RATE:  # a shorter one is jitter of the packets' times
+            if count + gap > longest:
                 break
             parts.append(np.zeros(gap, np.float32))
             count += gap
         parts.append(samples)
         count += len(samples)
-        if count >= MAX_SOUND_S * SOUND_RATE:
+        if count >= longest:
             break
     if start is None or not count:
         return None
@@ -181,7 +187,7 @@ def _pieces(path: Path) -> Iterator[tuple[float, np.ndarray]]:
     """Yield times on the file's clock, seconds, and decoded samples (n,)."""
     try:
         container = open_container(path)
-    except (Unreadable, av.error.FFmpegError, OSError):
+    except (UnreadableFile, av.error.FFmpegError, OSError):
         return
     with container:
         streams: Any = container.streams.audio
@@ -189,7 +195,7 @@ def _pieces(path: Path) -> Iterator[tuple[float, np.ndarray]]:
             return
         resampler = av.AudioResampler(format="flt", layout="mono", rate=SOUND_RATE)
         after = 0.0
-        for frame in _frames(container, streams[0]):
+        for frame in _decode_frames(container, streams[0]):
             after = frame.time if frame.time is not None else after
             if not frame.sample_rate or not abs(after) < LATEST_US * 1e-6:
                 continue
@@ -201,20 +207,10 @@ def _pieces(path: Path) -> Iterator[tuple[float, np.ndarray]]:
                 continue
 
 
-def _frames(container: Any, stream: Any) -> Iterator[Any]:
-    demuxed = container.demux(stream)
-    while True:
-        try:
-            packet = next(demuxed)
-        except (StopIteration, av.error.FFmpegError, OSError):
-            return
-        try:
+def _decode_frames(container: Any, stream: Any) -> Iterator[Any]:
+    for packet in demux(container, stream, lambda: None):
+        with contextlib.suppress(av.error.FFmpegError, OSError):
             yield from packet.decode()
-        except (av.error.FFmpegError, OSError):
-            continue
-
-
-FEW_IMAGES = 0.02  # relative error of a number of images that follows from duration and rate
 
 
 def video_size(path: Path) -> tuple[int, int] | None:
@@ -223,7 +219,7 @@ def video_size(path: Path) -> tuple[int, int] | None:
         with open_container(path) as container:
             context = container.streams.video[0].codec_context
             return (context.width, context.height) if context and context.width else None
-    except (Unreadable, av.error.FFmpegError, OSError, IndexError):
+    except (UnreadableFile, av.error.FFmpegError, OSError, IndexError):
         return None
 
 
@@ -256,7 +252,7 @@ class VideoRecording(CameraRecording):
         """
         try:
             self._container = open_container(path)
-        except Unreadable as error:
+        except UnreadableFile as error:
             raise UserError(f"{path}: cannot be opened as a video ({error.reason})") from error
         except (av.error.FFmpegError, OSError) as error:
             raise UserError(
@@ -302,7 +298,7 @@ class VideoRecording(CameraRecording):
         faults = faults_of_files(self._shots, self.camera.depth)
         if self._times is not None and seen.images is not None:
             stated = len(self._times)
-            if abs(stated - seen.images) > max(1, FEW_IMAGES * stated):
+            if abs(stated - seen.images) > max(1, 0.02 * stated):  # a number from duration and rate
                 faults.append(f"has {stated} timestamps for about {seen.images} images")
         return seen._replace(faults=tuple(faults))
 
@@ -343,15 +339,10 @@ class VideoRecording(CameraRecording):
         return None if self._first_s is None else read_sound(self.source, self._first_s)
 
     def _packets(self) -> Iterator[Any]:
-        demuxed = self._container.demux(self._stream)
-        while True:
-            try:
-                yield next(demuxed)
-            except (StopIteration, av.error.EOFError):
-                return
-            except (av.error.FFmpegError, OSError):
-                self.truncated = True
-                return
+        def cut_off() -> None:
+            self.truncated = True
+
+        return demux(self._container, self._stream, cut_off)
 
     def _copied(self) -> Iterator[tuple[float | None, bytes]]:
         for packet in self._packets():

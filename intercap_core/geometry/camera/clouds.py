@@ -14,7 +14,6 @@ from scipy.ndimage import minimum_filter
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import apply
 
-NEAREST_DEPTH_M = 0.25  # the sensor's own lower limit (NFOV; Azure Kinect DK specification)
 # A point farther behind another point of its colour cell is hidden there. More than the depth
 # change over a cell of a surface seen at 80 degrees, 3 m away.
 HIDDEN_BEHIND_M = 0.05
@@ -122,8 +121,9 @@ def _around(depth: np.ndarray, camera: Camera, index: np.ndarray) -> np.ndarray:
     assert camera.depth is not None and camera.colour_from_depth is not None
     width = camera.depth.width
     baseline = np.abs(camera.colour_from_depth[:2, 3])
+    nearest = 0.25  # metres, the sensor's own lower limit (NFOV; Azure Kinect DK specification)
     pad_x, pad_y = (
-        int(b * f / NEAREST_DEPTH_M) + 4
+        int(b * f / nearest) + 4
         for b, f in zip(baseline, (camera.depth.fx, camera.depth.fy), strict=True)
     )
     rows, columns = np.divmod(index, width)

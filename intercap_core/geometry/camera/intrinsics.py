@@ -11,8 +11,6 @@ import numpy as np
 
 from intercap_core.geometry.camera import projection
 
-RAY_SPACING = 4  # px between the rays of a large image that are computed one by one
-SMALL_IMAGE = 100_000  # px: nothing is gained by interpolating
 DEFAULT_METRIC_RADIUS = 1.7  # default of the Azure Kinect SDK if a calibration states 0
 
 # Rays by size and parameters, shared while a lens holds them: every reader of a recording creates
@@ -112,8 +110,8 @@ class Intrinsics:
         """The ray (height, width, 2) float32 of every pixel: X/Z and Y/Z.
 
         NaN outside the metric radius. Lenses with equal parameters share the table. In a large
-        image whose calibration holds everywhere, every ``RAY_SPACING``-th ray is computed and the
-        others are interpolated by cubic splines, to 1e-4 px.
+        image whose calibration holds everywhere, every fourth ray is computed and the others are
+        interpolated by cubic splines, to 1e-4 px.
         """
         key = (self.width, self.height, self.parameters.tobytes())
         table = _TABLES.get(key)
@@ -123,8 +121,8 @@ class Intrinsics:
 
     def _ray_table(self) -> np.ndarray:
         u, v = np.arange(self.width), np.arange(self.height)
-        coarse_u, coarse_v = (np.linspace(0, n[-1], -(-n[-1] // RAY_SPACING) + 1) for n in (u, v))
-        small = self.width * self.height <= SMALL_IMAGE
+        coarse_u, coarse_v = (np.linspace(0, n[-1], -(-n[-1] // 4) + 1) for n in (u, v))
+        small = self.width * self.height <= 100_000  # nothing is gained by interpolating
         xy = self._rays_at(u, v) if small else self._rays_at(coarse_u, coarse_v)
         if not small and np.isfinite(xy).all():
             from scipy.interpolate import RectBivariateSpline

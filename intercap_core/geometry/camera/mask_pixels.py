@@ -18,8 +18,6 @@ from intercap_core.geometry.camera.transforms import apply
 
 Window = tuple[slice, slice]
 
-_PROBED_M = (0.7, 2.0, 6.0)  # depths at which the window's corners are looked for
-_WINDOW_MARGIN_PX = 6
 _MIN_DEPTH, _MILLIMETRE = np.float32(MIN_DEPTH_M), np.float32(1e-3)
 _ONE, _HALF = np.float32(1), np.float32(0.5)
 _NO_BACKGROUND = np.zeros((0, 0), np.uint16)
@@ -34,11 +32,13 @@ def mask_window(depth: np.ndarray, camera: Camera, mask: Runs) -> Window | None:
     rays = camera.colour.unproject(corners)
     rays = rays[np.isfinite(rays).all(1)]
     depth_from_colour = np.linalg.inv(camera.colour_from_depth)
-    placed = np.concatenate([apply(depth_from_colour, z * rays) for z in _PROBED_M])
+    depths = (0.7, 2.0, 6.0)  # metres, near and far ends of a room
+    placed = np.concatenate([apply(depth_from_colour, z * rays) for z in depths])
     pixels = camera.depth.project(placed)
     height, width = depth.shape
-    x0, y0 = np.floor(pixels.min(0)).astype(int) - _WINDOW_MARGIN_PX
-    x1, y1 = np.ceil(pixels.max(0)).astype(int) + _WINDOW_MARGIN_PX
+    margin = 6  # px
+    x0, y0 = np.floor(pixels.min(0)).astype(int) - margin
+    x1, y1 = np.ceil(pixels.max(0)).astype(int) + margin
     rows = slice(max(int(y0), 0), min(int(y1), height))
     columns = slice(max(int(x0), 0), min(int(x1), width))
     return None if rows.start >= rows.stop or columns.start >= columns.stop else (rows, columns)
@@ -54,12 +54,19 @@ def mask_pixels(
     before_m: float = 0.0,
     every: int = 1,
 ) -> np.ndarray:
-    """Flat pixels (M,), ascending, of one depth image (H, W) mm, within ``window``, that show what
-    the mask, which is not empty, covers.
+    """Find the depth pixels whose surface the mask covers in the colour image.
 
-    A depth pixel counts when the colour pixel that shows the same surface lies in the mask. With a
-    ``background`` (H, W) mm, 0 = not known, only what is ``before_m`` nearer counts, and nothing
-    else hides anything. Every ``every``-th pixel of as many rows is looked at; all of them hide.
+    Returns flat pixels (M,), ascending.
+
+    Args:
+        depth: (H, W) mm.
+        camera: camera with depth.
+        mask: mask of the colour image; not empty.
+        window: rows and columns that are searched.
+        background: (H, W) mm, 0 = unknown. Only pixels that are nearer count, and only they hide
+            others.
+        before_m: distance by which a pixel must be nearer than the background, metres.
+        every: step between the rows and columns of the result. All pixels may hide others.
     """
     assert camera.depth is not None and camera.colour_from_depth is not None
     colour, (rows, columns) = camera.colour, window
@@ -78,7 +85,7 @@ def mask_pixels(
         mask.ends,
         mask.box,
         np.float32(CELL_SPACINGS * spacing),
-        # on the colour grid nothing hides: the pixels are the colour image's
+        # depth on the colour grid hides nothing
         np.float32(np.inf if camera.aligned else HIDDEN_BEHIND_M),
     )
 
@@ -100,16 +107,22 @@ def _mask_pixels(
     cell,
     hidden_m,
 ):
-    """Flat pixels (M,), ascending, of every ``every``-th column of as many rows of a window.
+    """Compute :func:`mask_pixels`; numbers that are not integers are float32.
 
-    ``depth`` (H,W) uint16 mm, part ``rows`` (first, end), ``columns`` (first, end) of it;
-    ``background`` (H,W) mm, or empty: pixels that are not ``before_mm`` nearer do not count, and
-    hide nothing. ``rays`` (H,W,2) of the depth lens, ``pose`` (4,4) colour_from_depth, ``lens``
-    thirteen parameters and ``size`` (height, width) of the colour image; ``ends`` of the mask's
-    runs and its ``box`` x, y, width, height, not empty. What is ``hidden_m`` behind another pixel
-    in one of the cells around, of ``cell`` colour pixels, is hidden. All but integers float32.
+    Args:
+        depth: (H, W) uint16 mm.
+        background: (H, W) mm, or empty.
+        before_mm: pixels that are less than this nearer than the background do not count.
+        rows, columns: first and end of the window.
+        rays: (H, W, 2) of the depth lens.
+        pose: (4, 4) colour_from_depth.
+        lens: 13 parameters of the colour lens.
+        size: height and width of the colour image.
+        ends, box: runs of the mask, and its x, y, width, height.
+        cell: side of a cell of the visibility test, colour pixels.
+        hidden_m: a pixel this far behind another one in a neighbouring cell is hidden.
     """
-    mask = drawn(ends, box, size[0])
+    mask = decode_box(ends, box, size[0])
     across, down = int(size[1] / cell) + 1, int(size[0] / cell) + 1
     # cells around those that the mask touches
     left, top = max(int(box[0] / cell) - 2, 0), max(int(box[1] / cell) - 2, 0)
@@ -170,7 +183,7 @@ def _mask_pixels(
 
 
 @numba.njit(cache=True, nogil=True)
-def drawn(ends, box, height):
+def decode_box(ends, box, height):
     """Return the mask inside its box (w, h), column by column."""
     mask = np.zeros((box[2], box[3]), np.bool_)
     for run in range(1, len(ends), 2):

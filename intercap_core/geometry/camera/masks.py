@@ -15,11 +15,9 @@ import numba
 import numpy as np
 from pycocotools import mask as coco_mask
 
-_FARTHEST_CORNER = 1e5  # px from the image's corner; the C code counts every pixel of an edge
 _FINE, _STRANGE, _CUT, _LONG, _NEGATIVE = range(5)  # results of :func:`_run_ends`
 _ZERO = 48  # first character of the alphabet
 _LONGEST_NUMBER = 7  # characters of 5 bits: enough for a run of 2^34 pixels
-_LONGEST_OUTLINE = 1e6  # px; the C code keeps five points of each, and counts them in 32 bits
 
 
 class Runs:
@@ -56,11 +54,6 @@ class Runs:
         inside = (x >= 0) & (y >= 0) & (x < self.width) & (y < self.height)
         index = np.where(inside, x * np.int64(self.height) + y, 0)
         return inside & (np.searchsorted(self.ends, index, side="right") % 2 == 1)
-
-    def sample_flat(self, index: np.ndarray) -> np.ndarray:
-        """Read the mask at flat pixels (N,), row * width + column; False where negative."""
-        row, column = np.divmod(index, self.width)
-        return self.sample(np.where(index >= 0, column, -1), row)
 
     def decode(self) -> np.ndarray:
         """The whole mask (height, width) bool."""
@@ -131,17 +124,17 @@ def from_polygons(polygons: Sequence[Sequence[float]], height: int, width: int) 
         values = np.asarray(polygon, np.float64)
         if values.ndim != 1 or len(values) < 6 or len(values) % 2 or not np.isfinite(values).all():
             raise ValueError("a polygon is not a list of three or more finite x, y corners")
-        if np.abs(values).max() > _FARTHEST_CORNER:
+        if np.abs(values).max() > 1e5:  # the C code counts every pixel of an edge
             raise ValueError(
                 f"a polygon has a coordinate {values[np.abs(values).argmax()]:.6g}, expected "
                 f"pixels of the image ({width} x {height})"
             )
         corners = values.reshape(-1, 2)
         outline += float(np.abs(corners - np.roll(corners, 1, 0)).max(1).sum())
-        if outline > _LONGEST_OUTLINE:
+        if outline > 1e6:  # the C code keeps five points of each pixel, and counts in 32 bits
             raise ValueError(
-                f"its polygons are more than {_LONGEST_OUTLINE:.0e} px around, expected outlines "
-                "of a shape in the image"
+                "its polygons are more than 1e+06 px around, expected outlines of a shape in the "
+                "image"
             )
     if not polygons:
         return encode(np.zeros((height, width), np.uint8))
@@ -159,14 +152,13 @@ def _parse(rle: bytes) -> np.ndarray:
         raise ValueError("its RLE is empty")
     ends, problem = _run_ends(np.frombuffer(rle, np.uint8))
     if problem != _FINE:
-        raise ValueError(
-            {
-                _STRANGE: "its RLE holds characters that COCO's alphabet does not have",
-                _CUT: "its RLE is cut within a number",
-                _LONG: "its RLE holds a number that is too long",
-                _NEGATIVE: "its RLE holds a run of negative length",
-            }[problem]
-        )
+        reasons = {
+            _STRANGE: "holds characters that COCO's alphabet does not have",
+            _CUT: "is cut within a number",
+            _LONG: "holds a number that is too long",
+            _NEGATIVE: "holds a run of negative length",
+        }
+        raise ValueError(f"its RLE {reasons[problem]}")
     return ends
 
 

@@ -23,9 +23,7 @@ from typing import Any
 
 import numpy as np
 
-NUM_PARAMETERS = 13
 MIN_DEPTH_M = 1e-3  # nearer (or behind) is projected as if at this depth
-_TABLE_SIZE = 1024  # radii tabulated for the start of the inverse
 
 
 def _namespace(array: Any) -> Any:
@@ -146,5 +144,5 @@ def radius_table(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     The inverse of the projection starts from this table.
     """
     q = np.asarray(parameters, np.float64)
-    radii = np.linspace(0.0, q[12], _TABLE_SIZE)
+    radii = np.linspace(0.0, q[12], 1024)
     return radii, np.maximum.accumulate(radii * _radial(radii * radii, q)[0])

@@ -12,10 +12,6 @@ import numpy as np
 
 from intercap_core.geometry.camera.projection import MIN_DEPTH_M
 
-_NEWTON_STEPS = 8
-_CONVERGED = 1e-12  # normalised image plane; 1e-9 px at f = 1000
-_LOST = 1e-9  # a solution that is this far off after all steps is none
-
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def distort(x, y, distortion):
@@ -97,6 +93,7 @@ def unproject(pixels, parameters, radii, distorted_radii):
     where the model has no inverse.
     """
     fx, fy, cx, cy = parameters[0], parameters[1], parameters[2], parameters[3]
+    converged = 1e-12  # normalised image plane; 1e-9 px at f = 1000
     found = np.empty_like(pixels)
     for n in range(len(pixels)):
         xd, yd = (pixels[n, 0] - cx) / fx, (pixels[n, 1] - cy) / fy
@@ -108,18 +105,18 @@ def unproject(pixels, parameters, radii, distorted_radii):
             scale = np.interp(distance, distorted_radii, radii) / distance
         x, y = xd * scale, yd * scale
         off = np.inf
-        for _ in range(_NEWTON_STEPS):
+        for _ in range(8):
             at_x, at_y, xx, xy, yx, yy = distort_with_jacobian(x, y, parameters)
             rx, ry = at_x - xd, at_y - yd
             off = max(abs(rx), abs(ry))
-            if off < _CONVERGED:
+            if off < converged:
                 break
             determinant = xx * yy - xy * yx
             x -= (yy * rx - xy * ry) / determinant
             y -= (xx * ry - yx * rx) / determinant
-        if not off < _CONVERGED:
+        if not off < converged:
             at_x, at_y, xx, xy, yx, yy = distort_with_jacobian(x, y, parameters)
             off = np.sqrt((at_x - xd) ** 2 + (at_y - yd) ** 2)
-        lost = not off < _LOST
+        lost = not off < 1e-9
         found[n, 0], found[n, 1] = (np.nan, np.nan) if lost else (x, y)
     return found

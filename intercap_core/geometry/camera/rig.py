@@ -12,13 +12,7 @@ import numpy as np
 from intercap_core import artefacts
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.transforms import invert
-from intercap_core.schemas import FRAMES, SCENE
-
-# Smallest eigenvalue, per camera, of the normal matrix of the point nearest to all optical axes.
-# Below it the axes count as parallel, and the centre lies this far ahead of the cameras, metres.
-# Tuned on the studio.
-MIN_AXES_EIGENVALUE = 0.05
-PARALLEL_AXES_DISTANCE_M = 2.0
+from intercap_core.schemas import SCENE
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,15 +126,6 @@ class Rig:
         }
 
     @classmethod
-    def from_frames(cls, path: Path) -> Rig:
-        """Read the cameras of a frames artefact, with the extrinsics as they were given.
-
-        Raises UserError as :func:`artefacts.read` does.
-        """
-        with artefacts.read(path, FRAMES) as frames:
-            return cls.from_artefact(frames)
-
-    @classmethod
     def from_scene(cls, path: Path) -> Rig:
         """Read the cameras of a scene artefact, with the refined extrinsics.
 
@@ -179,6 +164,6 @@ def ring_centre(rig: Rig) -> np.ndarray:
     axes, centres = poses[:, :3, 2], poses[:, :3, 3]
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     normal = across.sum(0)
-    if np.linalg.eigvalsh(normal)[0] < MIN_AXES_EIGENVALUE * len(rig):
-        return (centres + PARALLEL_AXES_DISTANCE_M * axes).mean(0)
+    if np.linalg.eigvalsh(normal)[0] < 0.05 * len(rig):  # nearly parallel; tuned on the studio
+        return (centres + 2.0 * axes).mean(0)
     return np.linalg.solve(normal, np.einsum("cij,cj->i", across, centres))

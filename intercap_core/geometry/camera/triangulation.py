@@ -16,14 +16,6 @@ from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply
 
 MIN_PARALLAX_DEG = 4.0  # two rays with a smaller angle between them give no depth
-REFINE_STEPS = 4
-HUBER_PX_AT_1080P = 4.0  # typical standard deviation of good 2D detectors
-PARTNERS = 5  # cameras that each camera is paired with first
-BEST_PARALLAX_DEG = 70.0  # preferred angle between the viewing directions of partners
-# Rays with a smaller angle, or opposite rays, may agree by chance. The cost of this is at most that
-# of two views of full confidence. Six views alternately high and low hardly ever have such pairs.
-CHANCE_PARALLAX_DEG, CHANCE_COST = 25.0, 2.0
-_BLOCK = 20_000  # points at once: bounds memory at some 100 MB with six views
 
 
 @dataclass(frozen=True)
@@ -104,17 +96,17 @@ def midpoints(
 def view_pairs(rig: Rig) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
     """Return pairs of cameras (a, b), a < b: those to try first, and the rest.
 
-    First come each camera's :data:`PARTNERS` whose viewing directions differ from its own by about
-    :data:`BEST_PARALLAX_DEG`. Up to six cameras these are all pairs; beyond, their number grows
-    linearly with the number of cameras.
+    First come each camera and the five cameras whose viewing directions differ from its own by
+    about 70 degrees. Up to six cameras these are all pairs; beyond, their number grows linearly
+    with the number of cameras.
     """
     axes = rig.master_from_colour[:, :3, 2]
     angle = np.degrees(np.arccos(np.clip(axes @ axes.T, -1, 1)))
     first = {
         (min(a, int(b)), max(a, int(b)))
-        for a, row in enumerate(np.abs(angle - BEST_PARALLAX_DEG))
+        for a, row in enumerate(np.abs(angle - 70.0))
         for b in np.argsort(np.where(np.arange(len(rig)) == a, np.inf, row), kind="stable")[
-            : min(PARTNERS, len(rig) - 1)
+            : min(5, len(rig) - 1)
         ]
     }
     every = list(combinations(range(len(rig)), 2))
@@ -143,8 +135,9 @@ def triangulate(
         view_error=np.full((count, views), np.nan),
     )
     wanted = np.flatnonzero((weights > 0).sum(1) >= 2)
-    for start in range(0, len(wanted), _BLOCK):
-        block = wanted[start : start + _BLOCK]
+    size = 20_000  # points at once: bounds memory at some 100 MB with six views
+    for start in range(0, len(wanted), size):
+        block = wanted[start : start + size]
         _triangulate_block(result, block, pixels[block], weights[block], rig, max_error_px)
     return result
 
@@ -160,7 +153,7 @@ def _triangulate_block(
     limit = max_error_px * pixel_scale(rig)
     points = _best_proposal(pixels, weights, rig, limit)
     error = _errors(points, pixels, weights, rig)
-    for _ in range(REFINE_STEPS):
+    for _ in range(4):
         inlier = error < limit
         points = _refined(points, pixels, weights * inlier, rig)
         error = _errors(points, pixels, weights, rig)
@@ -212,10 +205,12 @@ def _agreed_by_chance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return the cost (N,) of a proposal by rays (N, 3) that are nearly parallel.
 
     Two cameras that face each other agree on some point for anything near the line between them.
+    The cost is at most that of two views of full confidence, and 0 beyond 25 degrees. Six views
+    alternately high and low hardly ever have such pairs.
     """
     sine = np.linalg.norm(np.cross(first, second), axis=1)
     sine /= np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
-    return CHANCE_COST * np.maximum(0, 1 - sine / np.sin(np.radians(CHANCE_PARALLAX_DEG)))
+    return 2.0 * np.maximum(0, 1 - sine / np.sin(np.radians(25.0)))
 
 
 def _refined(points: np.ndarray, pixels: np.ndarray, weights: np.ndarray, rig: Rig) -> np.ndarray:
@@ -228,7 +223,7 @@ def _refined(points: np.ndarray, pixels: np.ndarray, weights: np.ndarray, rig: R
     found, by_camera = projection.project_with_jacobian(in_camera, rig.colour_parameters)
     jacobian = by_camera @ rotation  # (n, C, 2, 3)
     residual = found - pixels[rows]
-    huber = HUBER_PX_AT_1080P * pixel_scale(rig)
+    huber = 4.0 * pixel_scale(rig)  # typical standard deviation of good 2D detectors, px at 1080p
     size = np.linalg.norm(residual, axis=-1)
     weight = weights[rows] * np.minimum(1.0, huber / np.maximum(size, 1e-9)) / pixel_scale(rig) ** 2
     weighted = jacobian * weight[..., None, None]

@@ -18,7 +18,6 @@ import trimesh
 from intercap_core.errors import UserError
 from intercap_core.geometry.rigid.mesh_files import colours_of, read_mesh
 
-SAME_PLACE_DECIMALS = 7  # vertices closer than 0.1 micrometre are joined, as in mesh.py
 OUTPUT_SUFFIXES = (".ply", ".obj")
 
 
@@ -165,10 +164,8 @@ def _with_consistent_winding(
 
 
 def _first_at_place(vertices: np.ndarray) -> np.ndarray:
-    """Return the index (V,) of the first vertex at the same place."""
-    _, first, inverse = np.unique(
-        vertices.round(SAME_PLACE_DECIMALS), axis=0, return_index=True, return_inverse=True
-    )
+    """Return the index (V,) of the first vertex at the same place, to 0.1 micrometre."""
+    _, first, inverse = np.unique(vertices.round(7), axis=0, return_index=True, return_inverse=True)
     return first[inverse.reshape(-1)]
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from intercap_core.errors import UserError
 from intercap_core.inputs.arrays import read_arrays, read_pickle
 from intercap_core.inputs.documents import read_json
-from intercap_core.inputs.files import Unreadable, printable, quoted
+from intercap_core.inputs.files import UnreadableFile, printable, quoted
 
 _IDS, _COUNT, _DIGEST = "contact_vertices", "mesh_vertices", "mesh_digest"
 
@@ -99,7 +99,7 @@ def _read(path: Path) -> Any:
         return _from_npz(path)
     try:
         return read_json(path)
-    except Unreadable as error:
+    except UnreadableFile as error:
         raise UserError(
             f"{path}: not a JSON list of vertex ids ({error.reason}); write it as [0, 1, ...]"
         ) from None

@@ -32,9 +32,6 @@ _DIRECTIONS = np.array(
     [[0.83, 0.31, 0.46], [-0.39, 0.77, 0.51], [0.27, -0.43, 0.86], [-0.57, -0.61, -0.55],
      [0.41, 0.53, -0.74]]
 )  # fmt: skip
-# Distances that differ by less, metres, lead to the same point: float32 at an object's size.
-_SAME_PLACE = 1e-6
-VISIBLE_OFFSET_M = 0.001  # a vertex is lifted off its own surface before the ray is cast
 _OPEN3D_CORE = "open3d.cpu.pybind"
 
 
@@ -212,7 +209,7 @@ class SurfacePart:
         way = np.linalg.norm(query - found.points, axis=1)
         depth = np.linalg.norm(query - nearest.points, axis=1)
         faces = self._face[found.faces]
-        below = inside & (way < depth + _SAME_PLACE)
+        below = inside & (way < depth + 1e-6)  # metres: float32 at an object's size
         return below, Closest(found.points, faces, found.barycentric, found.normals)
 
 
@@ -256,7 +253,6 @@ class OcclusionScene:
     """Visibility of a mesh's vertices from cameras, occluded by the mesh itself and by others.
 
     All meshes are in one frame. Build it once for a frame of the capture and query each camera.
-    ``offset_m`` lifts a vertex off its own surface before the ray is cast.
     """
 
     def __init__(
@@ -265,7 +261,6 @@ class OcclusionScene:
         faces: np.ndarray,
         occluders: Sequence[tuple[np.ndarray, np.ndarray]] = (),
         *,
-        offset_m: float = VISIBLE_OFFSET_M,
         threads: int = 0,
     ) -> None:
         self._scene = o3d.t.geometry.RaycastingScene(nthreads=threads)
@@ -276,7 +271,6 @@ class OcclusionScene:
             )
         self._vertices = np.asarray(vertices, np.float64)
         self._normals = vertex_normals(self._vertices, faces)
-        self._offset = offset_m
 
     def visible(self, intrinsics: Intrinsics, camera_from_mesh: np.ndarray) -> np.ndarray:
         """Return whether each vertex (V,) is in the image, faces the camera and is not occluded."""
@@ -287,7 +281,7 @@ class OcclusionScene:
         seen &= intrinsics.sees(self._vertices @ rotation.T + translation)
         ids = np.flatnonzero(seen)
         if len(ids):
-            start = self._vertices[ids] + self._offset * self._normals[ids]
+            start = self._vertices[ids] + 0.001 * self._normals[ids]  # 1 mm off its own surface
             rays = np.concatenate([start, eye - start], 1).astype(np.float32)
             hidden = self._scene.test_occlusions(
                 o3d.core.Tensor.from_numpy(rays), tnear=0.0, tfar=1.0

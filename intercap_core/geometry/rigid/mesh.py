@@ -21,19 +21,8 @@ from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 
 log = logging.getLogger(__name__)
 
-# Sizes of objects that people handle, metres; outside the second pair the file is in another unit.
+# Sizes of objects that people handle, metres.
 HANDLED_MAX_M, HANDLED_MIN_M = 3.0, 0.02
-MAX_EXTENT_M, MIN_EXTENT_M = 5.0, 0.01
-# Of an object's vertices from the origin of its file, metres: scans are as far off as a room is
-# wide, and single precision there ends at micrometres.
-MAX_FROM_ORIGIN_M = 50.0
-# Share of its bounding cube that a body fills; less is a flat sheet with rounding errors.
-MIN_FILLED = 1e-8
-# Share of edges that do not join two faces: a quarter of a lidless box's of few faces; above the
-# limit the faces are loose, and inside and outside mean nothing.
-MAX_OPEN_EDGES = 0.35
-SIMPLIFIED_TOLERANCE_M = 0.0005  # of a vertex from the simplified surface: below the sensor's noise
-PAINT_POINTS = 20000  # of a coloured surface: a few in each patch that a camera can tell apart
 UNITS = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254}
 
 
@@ -109,11 +98,12 @@ class ObjectMesh:
         volumes = np.einsum("ij,ij->i", a - middle, np.cross(b - middle, c - middle))
         return (volumes[:, None] * (0.75 * centroids + 0.25 * middle)).sum(0) / volumes.sum()
 
-    def simplified(self, max_faces: int, tolerance_m: float = SIMPLIFIED_TOLERANCE_M) -> ObjectMesh:
+    def simplified(self, max_faces: int, tolerance_m: float = 0.0005) -> ObjectMesh:
         """Return the object with about ``max_faces`` faces, for rendering and search.
 
         Every vertex stays within ``tolerance_m`` of the simplified surface, with more faces if
-        necessary. Contact vertices are left out. Returns the mesh itself if it is small enough.
+        necessary; the default is below the sensor's noise. Contact vertices are left out. Returns
+        the mesh itself if it is small enough.
         """
         from intercap_core.geometry.rigid.distance import DistanceField, o3d
 
@@ -181,8 +171,9 @@ class Paint:
         visual = mesh.visual
         if visual is None or not visual.defined:
             return None
-        sampled = trimesh.sample.sample_surface(mesh, PAINT_POINTS, seed=0, return_barycentric=True)
-        points, face, weights = sampled[0], sampled[1], sampled[2]
+        points, face, weights = trimesh.sample.sample_surface(
+            mesh, 20_000, seed=0, return_barycentric=True
+        )[:3]
         try:
             colours = _colours(mesh, face, weights)
         except TEXTURE_ERRORS:
@@ -209,7 +200,7 @@ def _colours(mesh: Any, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 def _check_size(path: Path, mesh: trimesh.Trimesh) -> None:
     extent = float(np.ptp(mesh.vertices[np.unique(mesh.faces)], axis=0).max())
-    if extent > MAX_EXTENT_M:
+    if extent > 5.0:
         fitting = [f"{unit} ({scale:g})" for unit, scale in UNITS.items()
                    if HANDLED_MIN_M <= extent * scale <= HANDLED_MAX_M]  # fmt: skip
         unit = f"; it looks like {' or '.join(fitting)}" if fitting else ""
@@ -217,16 +208,16 @@ def _check_size(path: Path, mesh: trimesh.Trimesh) -> None:
             f"{path}: is {extent:.4g} m long, expected {HANDLED_MIN_M} to {HANDLED_MAX_M:g} m"
             f"{unit}: scale it so that its unit is the metre"
         )
-    if extent < MIN_EXTENT_M:
+    if extent < 0.01:
         raise UserError(
             f"{path}: is only {extent:.3g} m long, expected {HANDLED_MIN_M} to {HANDLED_MAX_M:g} m"
             "; scale it so that its unit is the metre"
         )
     away = float(np.abs(mesh.vertices[np.unique(mesh.faces)]).max())
-    if away > MAX_FROM_ORIGIN_M:
+    if away > 50:  # scans are off by a room's width; there, single precision ends at micrometres
         raise UserError(
-            f"{path}: has vertices {away:.4g} m from its origin, expected at most "
-            f"{MAX_FROM_ORIGIN_M:g} m; move the object to its origin, in metres"
+            f"{path}: has vertices {away:.4g} m from its origin, expected at most 50 m; move the "
+            "object to its origin, in metres"
         )
     if not HANDLED_MIN_M <= extent <= HANDLED_MAX_M:
         log.warning(
@@ -238,7 +229,7 @@ def _check_size(path: Path, mesh: trimesh.Trimesh) -> None:
 def _check_volume(path: Path, mesh: trimesh.Trimesh) -> None:
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     volume = float(mesh.volume) if len(mesh.faces) else 0.0
-    if not volume > MIN_FILLED * extent**3:
+    if not volume > 1e-8 * extent**3:  # a flat sheet with rounding errors
         raise UserError(
             f"{path}: encloses {volume:.3g} m^3 at {extent:.3g} m of length, expected a body with "
             "thickness; export a closed surface instead of a flat sheet"
@@ -305,7 +296,7 @@ def _repair(path: Path, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, np.ndar
         edges = np.sort(mesh.edges, axis=1)
         _, count = np.unique(edges, axis=0, return_counts=True)
         open_share = float((count != 2).mean())
-        if open_share > MAX_OPEN_EDGES:
+        if open_share > 0.35:  # loose faces; a lidless box of few faces has a quarter
             raise UserError(
                 f"{path}: {open_share:.0%} of its edges do not join two faces, so it has no "
                 "inside; close the surface (e.g. with MeshLab's or Blender's remesher)"

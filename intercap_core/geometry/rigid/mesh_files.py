@@ -20,7 +20,7 @@ from intercap_core.errors import UserError
 from intercap_core.inputs.files import (
     MAX_IMAGE_BYTES,
     MAX_MODEL_BYTES,
-    Unreadable,
+    UnreadableFile,
     printable,
     read_bytes,
 )
@@ -120,7 +120,7 @@ class _FolderResolver(trimesh.resolvers.Resolver):
         name = Path(str(key).strip().replace("\\", "/")).name
         try:
             return read_bytes(self._folder / name, MAX_IMAGE_BYTES)
-        except Unreadable as error:
+        except UnreadableFile as error:
             raise OSError(str(error)) from None
 
     def keys(self) -> list[str]:

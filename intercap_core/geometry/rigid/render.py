@@ -27,11 +27,6 @@ from intercap_core.geometry.solve.thread_pool import ThreadPool
 NEAR_M = 0.05
 # Bound on the bend of an edge of the projected box in known lenses, pixels.
 BOX_MARGIN_PX = 2
-# An edge of L px bends by at most L^2 times this over the focal length. Chords between any two
-# pixels of Azure Kinects' colour and depth images need at most 0.135.
-BEND = 0.15
-SLACK_PX = 0.1  # rounding of the ray table and of small windows
-LARGE_PX = 6.0  # extent of a triangle from which its edges bound each row
 NO_FACE = -1
 
 
@@ -216,7 +211,9 @@ def _draw(corners, pixels, x0, y0, faces, rays, focal, cull_back, number, depth,
         top = min(pixels[i, 1], pixels[j, 1], pixels[k, 1]) - y0
         bottom = max(pixels[i, 1], pixels[j, 1], pixels[k, 1]) - y0
         extent = max(right - left, bottom - top)
-        slack = SLACK_PX + BEND * extent * extent / focal
+        # 0.1 px of rounding, and the bend of an edge of L px by at most 0.15 L^2 / f: chords
+        # between any two pixels of Azure Kinects' colour and depth images need 0.135 L^2 / f.
+        slack = 0.1 + 0.15 * extent * extent / focal
         u0, u1 = max(left - slack, 0.0), min(right + slack, width - 1.0)
         v0, v1 = max(top - slack, 0.0), min(bottom + slack, height - 1.0)
         if u0 > u1 or v0 > v1:
@@ -226,7 +223,7 @@ def _draw(corners, pixels, x0, y0, faces, rays, focal, cull_back, number, depth,
         n2x, n2y, n2z = cy * az - cz * ay, cz * ax - cx * az, cx * ay - cy * ax
         sx, sy, sz = n0x + n1x + n2x, n0y + n1y + n2y, n0z + n1z + n2z  # the plane's normal
         sign = 1.0 if volume > 0.0 else -1.0
-        narrow = extent > LARGE_PX
+        narrow = extent > 6.0  # px, from which it saves time that the edges bound each row
         if narrow:
             _bound(0, pixels[i], pixels[j], pixels[k], x0, y0, slack, bounds)
             _bound(1, pixels[j], pixels[k], pixels[i], x0, y0, slack, bounds)

@@ -14,7 +14,6 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-LEAF_FACES = 4  # at most, on the tree's last level
 _ROUNDING = 1e-6  # metres, of distances in single precision
 
 
@@ -28,7 +27,7 @@ class SurfaceTree:
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
         faces = np.asarray(faces, np.int64)
         centroids = np.asarray(vertices, np.float32)[faces].mean(axis=1)
-        self._levels = max(0, int(np.ceil(np.log2(len(faces) / LEAF_FACES))))
+        self._levels = max(0, int(np.ceil(np.log2(len(faces) / 4))))  # at most four a leaf
         self._corners = faces[_ordered(centroids, self._levels)].astype(np.int32)
         self.closed = _closed(faces)
 

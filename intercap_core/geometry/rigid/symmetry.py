@@ -15,7 +15,6 @@ import numpy as np
 from intercap_core.entries import Symmetry
 from intercap_core.geometry.camera.transforms import rigid, rotation_exp
 
-MAX_DISCRETE = 128  # elements of a symmetry group; the icosahedron's rotation group has 60
 SAME_TRANSFORM = 1e-3  # per entry; transforms that differ by less are equal: tables have 4 digits
 
 
@@ -156,10 +155,9 @@ def _closure(generators: np.ndarray) -> np.ndarray:
         if any(np.abs(candidate - known).max() < SAME_TRANSFORM for known in elements):
             continue
         elements.append(candidate)
-        if len(elements) > MAX_DISCRETE:
+        if len(elements) > 128:  # the icosahedron's rotation group has 60
             raise ValueError(
-                f"the discrete elements generate more than {MAX_DISCRETE} motions; check that "
-                "they form a group"
+                "the discrete elements generate more than 128 motions; check that they form a group"
             )
         queue += [candidate @ generator for generator in generators]
     return np.array(elements)

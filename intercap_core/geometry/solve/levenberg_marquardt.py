@@ -20,10 +20,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-_DAMPING_UP = 8.0
-_DAMPING_DOWN = 0.2
 _DAMPING_RANGE = (1e-8, 1e8)
-_SHARED_SLACK = 100  # shared parameters count as settled within this many step tolerances
 
 
 class NormalEquations(NamedTuple):
@@ -88,8 +85,9 @@ def minimise(
     A step is damped by ``damping`` times the Hessian's diagonal (Marquardt 1963), more in frames
     whose last step failed. A frame has converged when its accepted step is below
     ``step_tolerance`` in every parameter, or lowers its cost by less than ``cost_tolerance`` of it;
-    tied frames converge together. The factorisations are in float64 whatever the type of the
-    parameters. A frame whose Hessian cannot be factorised stays where it is under growing damping.
+    tied frames converge together, when the shared step is also below 100 ``step_tolerance``. The
+    factorisations are in float64 whatever the type of the parameters. A frame whose Hessian cannot
+    be factorised stays where it is under growing damping.
     """
     count, device = own.shape[0], own.device
     own = own.clone()
@@ -117,7 +115,7 @@ def minimise(
             good &= new.double().sum() <= before.double().sum()
         small = (step.abs() < step_tolerance).all(1)
         small |= before - new <= cost_tolerance * before.abs()
-        lam[index] *= torch.where(good, _DAMPING_DOWN, _DAMPING_UP)
+        lam[index] *= torch.where(good, 0.2, 8.0)
         lam.clamp_(*_DAMPING_RANGE)
         stuck = lam[index] >= _DAMPING_RANGE[1]
         if len(y):
@@ -125,7 +123,7 @@ def minimise(
                 own, y, cost = trial, trial_y, new
                 stale[:] = True
                 settled = bool((small | ~good).all()) and bool(
-                    (shared_step.abs() < _SHARED_SLACK * step_tolerance).all()
+                    (shared_step.abs() < 100 * step_tolerance).all()
                 )
                 converged[:], done[:] = settled, settled
             done |= stuck.all()

@@ -6,13 +6,6 @@ import numpy as np
 
 from intercap_core.geometry.camera.transforms import rotation_log
 
-MAX_GAP_S = 0.25  # no velocity is computed across longer gaps
-EVEN = 0.2  # relative difference of time steps up to which the fourth-order term applies
-LIMIT = 2.0  # largest velocity in units of the slower one-sided difference; more is a jump
-# Fastest thrown or kicked object; anything faster is a jump of the track.
-MAX_SPEED_M_S = 8.0
-MAX_TURN_RAD_S = 20.0
-
 
 def filled_linearly(values: np.ndarray, at: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Return values (T, D) with rows that are not ``known`` (T,) interpolated linearly.
@@ -39,7 +32,7 @@ def limited_velocity(
     The differences are of fourth order where two positions on each side are known, because hands
     reverse within a few frames: of a motion at 2 Hz recorded at 15 frames a second, second order
     recovers 89 % and fourth order 98 %. One wrong position between correct ones enlarges one of its
-    neighbours' one-sided differences. Therefore no velocity is longer than ``LIMIT`` times the
+    neighbours' one-sided differences. Therefore no velocity is longer than twice the
     shorter of the two (van Leer's slope limiter, 1977, for vectors), nor than ``max_speed``.
     Positions that are not ``known`` (T, ...) have velocity 0 and are ignored as neighbours. With
     one known neighbour the one-sided difference is used.
@@ -57,7 +50,7 @@ def limited_rate(
     if len(times) < 2:
         return np.zeros((len(times), *change.shape[1:]))
     step = np.diff(times).reshape(-1, *[1] * (change.ndim - 1))
-    both = known[1:] & known[:-1] & (step[..., 0] < MAX_GAP_S)
+    both = known[1:] & known[:-1] & (step[..., 0] < 0.25)  # seconds; a longer step is a gap
     slope = np.where(both[..., None], change, 0) / step
     none, still = np.zeros((1, *both.shape[1:]), bool), np.zeros((1, *slope.shape[1:]))
     ahead, behind = np.concatenate([slope, still]), np.concatenate([still, slope])
@@ -65,7 +58,7 @@ def limited_rate(
     after, before = np.concatenate([step, step[-1:]]), np.concatenate([step[:1], step])
     central = (before * ahead + after * behind) / (before + after)
     central = central + _fourth_order(slope, both, step)
-    longest = LIMIT * np.minimum(_length(ahead), _length(behind))
+    longest = 2.0 * np.minimum(_length(ahead), _length(behind))
     central = _shortened(central, longest)
     two = (has_ahead & has_behind)[..., None]
     return _shortened(np.where(two, central, ahead + behind), max_speed)
@@ -74,7 +67,8 @@ def limited_rate(
 def rigid_velocity(poses: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Return angular velocity (rad/s) and velocity of the origin (m/s): (T, 6).
 
-    Zero where nothing is known; limited, so that a single jump hardly affects its neighbours.
+    Zero where nothing is known; limited, so that a single jump hardly affects its neighbours, and
+    to 20 rad/s and 8 m/s, the speed of the fastest thrown or kicked objects.
 
     Args:
         poses: (T, 4, 4) master_from_object.
@@ -84,9 +78,9 @@ def rigid_velocity(poses: np.ndarray, known: np.ndarray, times: np.ndarray) -> n
     if len(poses) < 2:
         return np.zeros((len(poses), 6))
     turns = rotation_log(poses[1:, :3, :3] @ poses[:-1, :3, :3].transpose(0, 2, 1))
-    turn = limited_rate(turns, times, max_speed=MAX_TURN_RAD_S, known=known)
+    turn = limited_rate(turns, times, max_speed=20.0, known=known)
     shifts = np.diff(poses[:, :3, 3], axis=0)
-    shift = limited_rate(shifts, times, max_speed=MAX_SPEED_M_S, known=known)
+    shift = limited_rate(shifts, times, max_speed=8.0, known=known)
     return np.concatenate([turn, shift], axis=1)
 
 
@@ -102,7 +96,7 @@ def _fourth_order(slope: np.ndarray, both: np.ndarray, step: np.ndarray) -> np.n
         known = both[:-3] & both[1:-2] & both[2:-1] & both[3:]
         widest = np.maximum.reduce([step[k : len(step) - 3 + k] for k in range(4)])
         narrowest = np.minimum.reduce([step[k : len(step) - 3 + k] for k in range(4)])
-        even = widest < (1 + EVEN) * narrowest
+        even = widest < 1.2 * narrowest
         result[2:-2] = np.where(known[..., None] & even, (two + three - one - four) / 12, 0)
     return result
 

@@ -13,8 +13,7 @@ from intercap_core.errors import UserError
 from intercap_core.formats.released import (
     INTERCAP,
     Results,
-    check_metres,
-    check_radians,
+    check_range,
     intercap_file,
 )
 from intercap_core.inputs.arrays import read_arrays, read_pickle
@@ -46,10 +45,10 @@ def read_results(path: Path) -> Results:
         translation = _array(values, "ob_trans", path, 3, total)
         some = np.isfinite(vectors).all(axis=1)
         rotation[some] = Rotation.from_rotvec(vectors[some]).as_matrix()
-    check_metres(path, "transl", transl)
-    check_metres(path, "ob_trans", translation)
+    check_range(path, "transl", transl)
+    check_range(path, "ob_trans", translation)
     for name, turn in turns.items():
-        check_radians(path, name, turn)
+        check_range(path, name, turn)
     hand_poses = hands[0], hands[1]
     return Results(
         path, turns, hand_poses, transl, betas, expression, rotation, translation, path.name

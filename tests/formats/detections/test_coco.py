@@ -134,7 +134,7 @@ def test_labels_scores_boxes_and_order(tmp_path):
         ({"category_name": "\ud800"}, "not valid text"),
     ],
 )
-def test_wrong_entries_are_left_out_and_named(tmp_path, change, words):
+def test_wrong_entries_are_left_out_with_a_reason(tmp_path, change, words):
     result = read(tmp_path, [ENTRY, ENTRY | change, ENTRY])
     assert len(instances(result, 7)) == 2 and result.entries == 3
     (fault,) = result.faults
@@ -158,7 +158,7 @@ def test_wrong_entries_are_left_out_and_named(tmp_path, change, words):
         '{"annotations": [], "categories": [{"id": 1, "name": "a"}, {"id": 1, "name": "b"}]}',
     ],
 )
-def test_wrong_files_are_told(tmp_path, content):
+def test_wrong_files_are_refused(tmp_path, content):
     with pytest.raises(UnreadableDetections):
         read(tmp_path, content)
 
@@ -238,7 +238,7 @@ RLE_TEXT = {"size": SIZE, "counts": RLE.decode()}
         ),
     ],
 )  # fmt: skip
-def test_what_detectors_write(tmp_path, content, key, label, score, options):
+def test_formats_of_detectors(tmp_path, content, key, label, score, options):
     result = read(tmp_path, content, **options)
     ((found, instance),) = result.results
     assert not result.faults and found == key
@@ -266,7 +266,7 @@ KEYS = ("image_id", "category_id", "category_name", "score", "bbox", "box", "seg
     ),
     st.dictionaries(st.sampled_from(("size", "counts", "x", "y")), JSON_VALUES),
 )
-def test_any_json_is_read_or_told(changes, whole, segmentation):
+def test_any_json_is_read_or_refused(changes, whole, segmentation):
     entries = [ENTRY | changes, ENTRY | {"segmentation": segmentation}, changes]
     form = CandidateForm((WIDTH, HEIGHT), COCO_NAMES, 0.0)
     try:

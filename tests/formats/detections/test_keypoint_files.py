@@ -83,14 +83,14 @@ def test_files_named_after_the_images_follow_them(tmp_path):
     assert "1 results in" in found.notes[0] and "shot_9.jpg" in found.notes[0]
 
 
-def test_openpose_files_that_hold_what_others_write_are_read_too(tmp_path):
+def test_openpose_files_may_hold_other_layouts(tmp_path):
     write(tmp_path / "k1" / "0_keypoints.json", openpose(10, 20))
     write(tmp_path / "k1" / "1_keypoints.json", [whole(30)])
     write(tmp_path / "k1" / "2_keypoints.json", {"people": []})
     assert noses(read(tmp_path)) == {0: [10, 20], 1: [30], 2: []}
 
 
-def test_a_camera_without_files_is_told(tmp_path):
+def test_a_camera_without_files_is_noted(tmp_path):
     found = read(tmp_path)
     assert found.by_image == {} and f"{tmp_path.name}/k1.json" in found.notes[0]
     (tmp_path / "k1").mkdir()
@@ -112,7 +112,7 @@ def test_cut_files_and_other_layouts_are_left_out(tmp_path):
     assert str(tmp_path) not in " ".join(found.notes), "artefacts know no absolute paths"
 
 
-def test_a_cut_file_of_all_images_is_a_camera_without_keypoints(tmp_path):
+def test_a_cut_file_leaves_the_camera_without_keypoints(tmp_path):
     write(tmp_path / "k1.json", "[{")
     found = read(tmp_path)
     assert found.by_image == {} and "k1.json is not valid JSON" in found.notes[0]
@@ -136,7 +136,7 @@ def test_people_of_another_length_are_left_out_of_a_file(tmp_path):
         ("k1/0.json", [{"keypoints": [1.0] * 150}], "has 50 keypoints"),
     ],
 )
-def test_keypoints_none_of_which_can_be_used_are_refused(tmp_path, name, content, words):
+def test_keypoints_without_a_usable_person_are_refused(tmp_path, name, content, words):
     write(tmp_path / name, content)
     with pytest.raises(
         UserError, match=r"none of camera k1's keypoints can be used: \S*.json.*" + words
@@ -151,7 +151,7 @@ def test_two_files_of_one_image_are_refused(tmp_path):
         read(tmp_path)
 
 
-def test_openpose_files_are_matched_by_number_and_hidden_files_ignored(tmp_path):
+def test_openpose_files_are_matched_by_number(tmp_path):
     write(tmp_path / "k1" / "k1_000000000002_keypoints.json", openpose(10))
     write(tmp_path / "k1" / "00003_keypoints.json", openpose(20))
     write(tmp_path / "k1" / "._00001_keypoints.json", "no JSON")
@@ -174,12 +174,12 @@ def changed(**points) -> np.ndarray:
         (-0.6, 5, 0.9), (1919.6, 5, 0.9), (5, 1079.6, 0.9), (1e30, 5, 0.9),
     ],
 )  # fmt: skip
-def test_points_that_cannot_be_true_are_not_seen(values):
+def test_impossible_points_are_not_seen(values):
     (person,) = KeypointCleaner(SIZE).clean(changed(nose=values))
     assert (person[0] == 0).all() and (person[1:, 2] == 0.5).all() and person.dtype == np.float32
 
 
-def test_points_on_the_edge_stay_and_those_beyond_are_counted():
+def test_points_beyond_the_edge_are_removed_and_counted():
     kept = changed(nose=(-0.5, 1079.4, 0.9), neck=(1919.4, 0, 0.9), mid_hip=(2000, 5, 0.9))
     values = KeypointCleaner(SIZE)
     (person,) = values.clean(kept)
@@ -206,7 +206,7 @@ def test_confidence_is_cut_and_scaled():
 
 
 @pytest.mark.parametrize("value", [0.0, None])
-def test_a_look_before_a_run_tells_of_people_without_points(tmp_path, value):
+def test_the_preview_notes_people_without_points(tmp_path, value):
     empty = whole(image_id=0) | {"keypoints": [value] * 399}
     look = partial(preview_keypoints, tmp_path, "k1", size=SIZE, full_confidence=1.0)
     write(tmp_path / "k1.json", [empty, empty])
@@ -227,7 +227,7 @@ def test_people_of_zeros_or_of_shares_are_nobody():
     assert KeypointCleaner(SIZE).clean(np.zeros((0, 135, 3))).shape == (0, 135, 3)
 
 
-def test_what_is_changed_is_told_with_the_camera(tmp_path):
+def test_changed_points_are_noted_with_the_camera(tmp_path):
     entry = whole(100, image_id=0)
     entry["keypoints"][0], entry["keypoints"][5] = 5000.0, 7.0
     write(tmp_path / "k1.json", [entry])

@@ -107,11 +107,11 @@ def test_mediapipe_itself_calls_the_points_so(python):
     assert {*tool.COCO_BODY, *tool.FEET.values()} <= {*names["pose"]}
     parts = {"cmc": "1", "mcp": "2", "ip": "3", "tip": "_tip"}
     fingers = {"mcp": "1", "pip": "2", "dip": "3", "tip": "_tip"}
-    told = ["hand_wrist"]
+    expected = ["hand_wrist"]
     for name in names["hand"][1:]:
         finger, _, joint = name.replace("_finger", "").partition("_")
-        told.append(finger + (parts if finger == "thumb" else fingers)[joint])
-    assert [f"left_{name}" for name in told] == list(coco.LEFT)
+        expected.append(finger + (parts if finger == "thumb" else fingers)[joint])
+    assert [f"left_{name}" for name in expected] == list(coco.LEFT)
     for points, contour in (
         (tool.JAW, "FACE_OVAL"), (tool.RIGHT_BROW, "RIGHT_EYEBROW"), (tool.LEFT_EYE, "LEFT_EYE"),
         (tool.LEFT_BROW, "LEFT_EYEBROW"), (tool.RIGHT_EYE, "RIGHT_EYE"), (tool.OUTER_LIPS, "LIPS"),
@@ -125,12 +125,7 @@ def test_images_without_anybody_are_looked_at(python, tmp_path):
     cv2.imwrite(str(tmp_path / "k1" / "a_1.png"), np.full((90, 160, 3), 90, np.uint8))
     (tmp_path / "k1" / "a_2.png").write_bytes(b"no image")
     out = tmp_path / "keypoints" / "k1.json"
-    command = [
-        python,
-        str(ROOT / "tools" / "mediapipe_keypoints.py"),
-        str(tmp_path / "k1"),
-        str(out),
-    ]
+    command = [python, str(ROOT / "tools/mediapipe_keypoints.py"), str(tmp_path / "k1"), str(out)]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "somebody in 0 of 1 images" in done.stderr and "a_2.png: cannot be read" in done.stderr

@@ -27,16 +27,10 @@ def around(places: np.ndarray, label: str = "person", score: float = 0.9) -> Ins
     return Instance(label, score, (*low, *(high - low)), b"")
 
 
-def model(tmp_path, **options) -> PoseModel:
-    full = options.get("gain", 1.0)
-    path = tiny_pose.simcc(tmp_path / "pose.onnx", **options)
-    return PoseModel.load(DetectionsSettings(keypoint_model=path, keypoint_full_confidence=full))
-
-
-def map_model(tmp_path, **options) -> PoseModel:
+def model(tmp_path, kind: str = "simcc", **options) -> PoseModel:
     settings = {"keypoint_full_confidence": options.get("gain", 1.0),
                 "keypoint_heatmap_grid": options.get("grid", "msra")}  # fmt: skip
-    path = tiny_pose.heatmaps(tmp_path / "maps.onnx", **options)
+    path = getattr(tiny_pose, kind)(tmp_path / "pose.onnx", **options)
     return PoseModel.load(DetectionsSettings(keypoint_model=path, **settings))
 
 
@@ -48,38 +42,27 @@ def apart(people: np.ndarray, places: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize(
-    "options",
-    [{}, {"size": (288, 384)}, {"batch": 1}, {"batch": 3}, {"names": ("simcc_y", "simcc_x")},
-     {"names": ("x", "y")}, {"gain": 5.0}, {"split": (1, 1)}],
-    ids=["192x256", "288x384", "one", "three", "rows first", "short names", "raw", "whole bins"],
+    ("kind", "options"),
+    [("simcc", {}), ("simcc", {"size": (288, 384)}), ("simcc", {"batch": 1}),
+     ("simcc", {"batch": 3}), ("simcc", {"names": ("simcc_y", "simcc_x")}), ("simcc", {"names": ("x", "y")}),
+     ("simcc", {"gain": 5.0}), ("simcc", {"split": (1, 1)}),
+     ("heatmaps", {}), ("heatmaps", {"size": (288, 384)}), ("heatmaps", {"batch": 1}),
+     ("heatmaps", {"batch": 3}), ("heatmaps", {"grid": "udp"}), ("heatmaps", {"gain": 5.0}),
+     ("heatmaps", {"stride": (2, 2)})],
 )  # fmt: skip
-def test_people_in_their_boxes(tmp_path, options):
+def test_people_in_their_boxes(tmp_path, kind, options):
     image = tiny_pose.picture(SIZE, [LEFT, RIGHT])
-    pose = model(tmp_path, **options)
-    both = [around(LEFT, score=0.5), around(RIGHT), around(LEFT, "chair"), around(LEFT, score=0.2)]
-    people = pose.find(image, both)
+    boxes = [around(LEFT, score=0.5), around(RIGHT), around(LEFT, "chair"), around(LEFT, score=0.2)]
+    people = model(tmp_path, kind, **options).find(image, boxes)
     assert people.shape == (2, 135, 3)
-    for one, places in zip(people, (RIGHT, LEFT), strict=True):
-        assert apart(one[None], places) < 1.6, "a pixel of the input, of 1.3 of the image"
-        assert (one[SEEN, 2] > 0.5 * options.get("gain", 1)).all()
+    # SimCC: a pixel of the input, 1.3 of the image. Heatmaps: a fifth of a cell of 5.4 px.
+    limit = 1.6 if kind == "simcc" else 1.0
+    for person, places in zip(people, (RIGHT, LEFT), strict=True):
+        assert apart(person[None], places) < limit
+        assert (person[SEEN, 2] > 0.5 * options.get("gain", 1)).all()
 
 
-@pytest.mark.parametrize(
-    "options",
-    [{}, {"size": (288, 384)}, {"batch": 1}, {"batch": 3}, {"grid": "udp"}, {"gain": 5.0},
-     {"stride": (2, 2)}],
-    ids=["192x256", "288x384", "one", "three", "udp", "raw", "fine"],
-)  # fmt: skip
-def test_people_in_their_boxes_by_heatmaps(tmp_path, options):
-    image = tiny_pose.picture(SIZE, [LEFT, RIGHT])
-    people = map_model(tmp_path, **options).find(image, [around(LEFT, score=0.5), around(RIGHT)])
-    assert people.shape == (2, 135, 3)
-    for one, places in zip(people, (RIGHT, LEFT), strict=True):
-        assert apart(one[None], places) < 1.0, "a fifth of a cell, of 5.4 pixels of the image"
-        assert (one[SEEN, 2] > 0.5 * options.get("gain", 1)).all()
-
-
-def test_the_grid_that_a_model_was_not_trained_with_is_off_by_half_a_cell(tmp_path):
+def test_the_wrong_heatmap_grid_shifts_points_by_half_a_cell(tmp_path):
     """What the setting is for: up to 0.75 of a cell at the far edge."""
     image = tiny_pose.picture(SIZE, [LEFT])
     for grid, other in (("msra", "udp"), ("udp", "msra")):
@@ -88,18 +71,11 @@ def test_the_grid_that_a_model_was_not_trained_with_is_off_by_half_a_cell(tmp_pa
         assert 2.0 < apart(PoseModel.load(settings).find(image, [around(LEFT)]), LEFT) < 4.5
 
 
-def test_heatmaps_without_a_box_and_with_nobody(tmp_path):
-    pose = map_model(tmp_path)
-    assert apart(pose.find(tiny_pose.picture(SIZE, [RIGHT]), []), RIGHT) < 1.0
-    assert pose.find(tiny_pose.picture(SIZE, []), []).shape == (0, 135, 3)
-    (ghost,) = pose.find(tiny_pose.picture(SIZE, []), [around(LEFT)])
-    assert (ghost[:, 2] == 0).all()
-
-
+@pytest.mark.parametrize("kind", ["simcc", "heatmaps"])
 @pytest.mark.parametrize("places", [LEFT, RIGHT, tiny_pose.person((115, 20), 330)])
-def test_without_a_box_the_whole_image_is_looked_through(tmp_path, places):
+def test_without_boxes_the_whole_image_is_searched(tmp_path, places, kind):
     image = tiny_pose.picture(SIZE, [places])
-    people = model(tmp_path).find(image, [around(places, "chair")])
+    people = model(tmp_path, kind).find(image, [around(places, "chair")])
     assert apart(people, places) < 1.6
 
 
@@ -112,14 +88,15 @@ def test_two_people_without_boxes_are_found_once_each(tmp_path):
         assert apart(people[index][None], places) < 1.6
 
 
-def test_nobody_is_found_where_nobody_is(tmp_path):
-    pose = model(tmp_path)
+@pytest.mark.parametrize("kind", ["simcc", "heatmaps"])
+def test_nobody_is_found_in_an_empty_image(tmp_path, kind):
+    pose = model(tmp_path, kind)
     assert pose.find(tiny_pose.picture(SIZE, []), []).shape == (0, 135, 3)
     (ghost,) = pose.find(tiny_pose.picture(SIZE, []), [around(LEFT)])
-    assert (ghost[:, 2] == 0).all(), "a detector's person of whom nothing is seen"
+    assert (ghost[:, 2] == 0).all(), "a detected box without a visible person"
 
 
-def test_somebody_cut_by_the_edge_keeps_what_is_seen(tmp_path):
+def test_a_person_cut_by_the_edge_keeps_visible_points(tmp_path):
     places = tiny_pose.person((20.0, 40.0), 250)
     image = tiny_pose.picture(SIZE, [places])
     (found,) = model(tmp_path).find(image, [around(places)])
@@ -129,7 +106,7 @@ def test_somebody_cut_by_the_edge_keeps_what_is_seen(tmp_path):
 
 
 @pytest.mark.parametrize("size", [(192, 256), (288, 384), (256, 256)])
-def test_pieces_are_mmposes(size):
+def test_crops_are_those_of_mmpose(size):
     """Its own words: centre and size of the box, a quarter larger, widened to the input's shape; a
     point is at ``place / input size * size + centre - size / 2``."""
     rng = np.random.default_rng(0)
@@ -160,28 +137,20 @@ def test_tiles_cover_the_image(size):
     assert (steps <= boxes[0, 2:][int(size[0] < 0.75 * size[1])] / 2 + 1e-9).all()
 
 
-def test_the_best_people_of_a_crowd_are_looked_at():
+def test_the_best_boxes_of_a_crowd_are_used():
     crowd = [around(LEFT + 5 * n, score=0.3 + n / 50) for n in range(20)]
     boxes = person_boxes(crowd)
     assert len(boxes) == 10 and boxes[0, 0] == crowd[-1].box[0]
     assert person_boxes([around(LEFT, score=0.29), around(LEFT, "cup")]).shape == (0, 4)
 
 
-def test_body_models_are_taken_and_others_refused(tmp_path):
+@pytest.mark.parametrize("kind", ["simcc", "heatmaps"])
+def test_body_models_are_used_and_other_layouts_refused(tmp_path, kind):
     image = tiny_pose.picture(SIZE, [LEFT])
-    (body,) = model(tmp_path, layout=BODY).find(image, [around(LEFT)])
+    (body,) = model(tmp_path, kind, layout=BODY).find(image, [around(LEFT)])
     assert body[KEYPOINT_NAMES.index("left_knee"), 2] > 0.5 and (body[25:, 2] == 0).all()
     with pytest.raises(UserError, match="has 21 keypoints, expected one of 17, 23, 26, 133, 134"):
-        model(tmp_path, layout=tuple(tiny_pose.NAMES[:21]))
-
-
-def test_heatmaps_of_other_points_or_shapes_are_told(tmp_path):
-    (body,) = map_model(tmp_path, layout=BODY).find(tiny_pose.picture(SIZE, [LEFT]), [around(LEFT)])
-    assert body[KEYPOINT_NAMES.index("left_knee"), 2] > 0.5 and (body[25:, 2] == 0).all()
-    with pytest.raises(UserError, match="has 21 keypoints, expected one of 17, 23, 26, 133, 134"):
-        map_model(tmp_path, layout=tuple(tiny_pose.NAMES[:21]))
-    with pytest.raises(UserError, match=r"\['batch', 133, 32, 48\].* not those of a pose"):
-        map_model(tmp_path, stride=(4, 8))
+        model(tmp_path, kind, layout=tuple(tiny_pose.NAMES[:21]))
 
 
 @pytest.mark.parametrize(
@@ -191,16 +160,17 @@ def test_heatmaps_of_other_points_or_shapes_are_told(tmp_path):
         (lambda p: tiny_onnx.yolo(p, (160, 160), {}), "are not those of a pose model"),
         (lambda p: p.write_text("no model"), "is no ONNX model that can be run"),
         (lambda p: None, "cannot be read .No such file"),
+        (lambda p: tiny_pose.heatmaps(p, stride=(4, 8)), r"133, 32, 48\].* not those of a pose"),
     ],
 )
-def test_models_of_another_kind_are_told(tmp_path, make, words):
+def test_models_of_another_kind_are_refused(tmp_path, make, words):
     path = tmp_path / "pose.onnx"
     make(path)
     with pytest.raises(UserError, match=words):
         PoseModel.load(DetectionsSettings(keypoint_model=path))
 
 
-def test_bins_that_differ_are_told(tmp_path):
+def test_unequal_bins_are_refused(tmp_path):
     pose = model(tmp_path, split=(2, 3))
     with pytest.raises(UserError, match=r"\[1, 133, 384\]; \[1, 133, 768\].* not those of a pose"):
         pose.find(tiny_pose.picture(SIZE, []), [around(LEFT)])

@@ -14,6 +14,7 @@ tiny_onnx = pytest.importorskip("tests.helpers.tiny_onnx", exc_type=ImportError)
 
 from intercap_core.config import DetectionsSettings  # noqa: E402
 from intercap_core.errors import UserError  # noqa: E402
+from intercap_core.formats.detections.class_names import read_label_map  # noqa: E402
 from intercap_core.formats.detections.onnx_model import OnnxModel, fit_within, parse_names  # noqa: E402
 from intercap_core.formats.detections.onnx_segmentation import Segmenter, suppressed  # noqa: E402
 from intercap_core.geometry.camera import masks  # noqa: E402
@@ -82,7 +83,7 @@ def test_masks_over_the_whole_image_are_exact(tmp_path):
         )
 
 
-def test_class_names_from_a_file_and_scores_that_are_too_low(tmp_path):
+def test_class_names_from_a_file_and_the_least_score(tmp_path):
     labels = tmp_path / "names.txt"
     labels.write_text("red thing\nblue thing\n")
     settings = DetectionsSettings(
@@ -93,7 +94,7 @@ def test_class_names_from_a_file_and_scores_that_are_too_low(tmp_path):
     assert [i.label for i in found(settings, [picture()[0]])[0]] == ["red thing"]
 
 
-def test_the_way_that_pixels_go_in_can_be_said(tmp_path):
+def test_the_pixel_values_of_the_input_can_be_set(tmp_path):
     model = tiny_onnx.mask_rcnn(tmp_path / "model.onnx", "torchvision")
     settings = DetectionsSettings(segmentation_model=model, segmentation_input="bgr255")
     image, shapes = picture()
@@ -137,10 +138,6 @@ def test_overlapping_boxes_of_one_class_leave_the_best():
     assert kept.tolist() == [1, 2, 3]
 
 
-def _no_model(path):
-    path.write_bytes(b"not a model")
-
-
 def _cut(path):
     tiny_onnx.yolo(path, (160, 160), NAMES)
     path.write_bytes(path.read_bytes()[:300])
@@ -149,13 +146,13 @@ def _cut(path):
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (_no_model, "no ONNX model"),
+        (lambda path: path.write_bytes(b"not a model"), "no ONNX model"),
         (_cut, "no ONNX model"),
         (tiny_onnx.thresholder, "no kind that is known"),
         (lambda path: tiny_onnx.yolo(path, (160, 160), {"task": "detect"}), "model for 'detect'"),
     ],
 )
-def test_models_that_cannot_be_used_are_told(tmp_path, make, words):
+def test_unusable_models_are_refused(tmp_path, make, words):
     path = tmp_path / "model.onnx"
     make(path)
     with pytest.raises(UserError, match=words) as caught:
@@ -163,7 +160,7 @@ def test_models_that_cannot_be_used_are_told(tmp_path, make, words):
     assert str(path) in str(caught.value)
 
 
-def test_a_device_that_is_not_there_is_told(tmp_path):
+def test_a_missing_device_is_refused(tmp_path):
     import onnxruntime
 
     if "CUDAExecutionProvider" in onnxruntime.get_available_providers():
@@ -198,8 +195,6 @@ def test_without_the_runtime_the_extra_is_named(tmp_path, monkeypatch):
     ],
 )
 def test_label_maps(tmp_path, name, text, names):
-    from intercap_core.formats.detections.class_names import read_label_map
-
     (tmp_path / name).write_text(text)
     assert read_label_map(tmp_path / name) == names
 
@@ -218,9 +213,7 @@ def test_label_maps(tmp_path, name, text, names):
         ("a.txt", "c" * 500),
     ],
 )
-def test_wrong_label_maps_are_named(tmp_path, name, text):
-    from intercap_core.formats.detections.class_names import read_label_map
-
+def test_wrong_label_maps_are_refused(tmp_path, name, text):
     (tmp_path / name).write_text(text)
     with pytest.raises(UserError, match="is no list of classes"):
         read_label_map(tmp_path / name)

@@ -9,12 +9,8 @@ from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.formats.detections.coco import UnreadableDetections
 from intercap_core.formats.detections.keypoints.openpose import READER
 
-COUNTS = {
-    "pose_keypoints_2d": 25,
-    "hand_left_keypoints_2d": 21,
-    "hand_right_keypoints_2d": 21,
-    "face_keypoints_2d": 70,
-}
+COUNTS = {"pose_keypoints_2d": 25, "hand_left_keypoints_2d": 21, "hand_right_keypoints_2d": 21,
+          "face_keypoints_2d": 70}  # fmt: skip
 
 
 def person(base: float = 0.0) -> dict[str, list[float]]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -9,7 +12,6 @@ from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.formats.detections.coco import ImageKey, UnreadableDetections
 from intercap_core.formats.detections.keypoints import (
     KeypointLayout,
-    PeopleFile,
     find_layout,
     layouts,
     read_people,
@@ -53,8 +55,7 @@ MMPOSE = {
 }
 
 
-def people_of(content, *, one_image: bool = False) -> PeopleFile:
-    return read_people(content, one_image=one_image)
+people_of = partial(read_people, one_image=False)
 
 
 def only(content, **options) -> np.ndarray:
@@ -68,14 +69,8 @@ def test_every_layout_names_known_points_once():
     for layout in layouts().values():
         assert len(layout.points) == len(set(layout.points))
         assert set(layout.points) - set(KEYPOINT_NAMES) <= {"head", "middle_of_shoulders"}
-    assert sorted(len(layout.points) for layout in layouts().values()) == [
-        17,
-        23,
-        26,
-        133,
-        134,
-        136,
-    ]
+    counts = sorted(len(layout.points) for layout in layouts().values())
+    assert counts == [17, 23, 26, 133, 134, 136]
     assert set(KEYPOINT_NAMES) - set(WHOLE_BODY) == {"neck", "mid_hip"}
 
 
@@ -115,7 +110,7 @@ def test_files_of_one_image_need_not_name_it():
     assert people_of([], one_image=True).results == []
 
 
-def test_frames_without_anybody_are_spoken_of():
+def test_frames_without_people_are_listed():
     video = [{"frame_id": n, "instances": [MMPOSE] * (n == 1)} for n in range(3)]
     found = people_of(video)
     assert found.images == [ImageKey(n, None) for n in range(3)]
@@ -134,7 +129,7 @@ def test_alphapose_names_its_images():
         np.testing.assert_allclose(person[AT(name)], points(136)[number], err_msg=name)
 
 
-def test_dwposes_own_order_is_the_same_person():
+def test_dwpose_order_gives_the_same_person():
     """As its tools make it of COCO-WholeBody's: the neck inserted, then sorted."""
     whole = points()
     sorted_ = np.insert(whole, 17, whole[[5, 6]].mean(0), axis=0)
@@ -179,7 +174,7 @@ def test_body_models_leave_hands_and_face_unseen():
     assert (person[:, 2] > 0).sum() == 17 and (person[25:] == 0).all()
 
 
-def test_nan_and_none_stay_what_they_are():
+def test_nan_and_none_stay_nan():
     values = flat(points())
     values[3], values[7] = float("nan"), None
     person = only([WHOLE | {"keypoints": values}])
@@ -204,9 +199,7 @@ def test_nan_and_none_stay_what_they_are():
         ({"keypoints": flat(points())}, "image_id must be the whole number"),
     ],
 )
-def test_people_that_cannot_be_used_are_told_and_the_rest_counts(entry, words):
-    import re
-
+def test_unusable_people_are_reported_and_left_out(entry, words):
     found = people_of([entry, WHOLE])
     assert len(found.results) == 1 and found.entries == 2 and len(found.faulty) == 1
     (fault,) = found.faults
@@ -218,6 +211,6 @@ def test_people_that_cannot_be_used_are_told_and_the_rest_counts(entry, words):
     [None, 3, "x", {}, {"bodies": []}, {"annotations": {}}, {"images": 3, "annotations": []},
      [{"frame_id": "a", "instances": []}], [{"frame_id": 0, "instances": 3}]],
 )  # fmt: skip
-def test_files_of_another_layout_are_told(content):
+def test_files_of_another_layout_are_refused(content):
     with pytest.raises(UnreadableDetections):
         people_of(content)

@@ -1,4 +1,4 @@
-"""Recordings with faults: what is survived, how, and in which words."""
+"""Kinect recordings with faults: which images remain, and the notes."""
 
 from __future__ import annotations
 
@@ -43,11 +43,6 @@ def with_clock(camera: int, tick_from: int, clock_us: int):
         record(folder, camera, range(TICKS), clock_us=0, times_us=time)
 
     return fault
-
-
-def all_reset(folder: Path) -> None:
-    for camera in range(3):
-        with_clock(camera, 4, 1_000_000)(folder)
 
 
 def one_wrong_time(folder: Path) -> None:
@@ -107,7 +102,7 @@ def stays(missing=(), depth=True, count=TICKS):
         (one_wrong_time, 1, "1 images with device times out of order", stays(missing=[5])),
     ],
 )  # fmt: skip
-def test_one_camera_at_fault_costs_no_other(capture, fault, camera, words, kept):
+def test_a_faulty_camera_does_not_affect_the_others(capture, fault, camera, words, kept):
     fault(capture.recordings)
     output = run(capture)
     assert words in notes_of(output)[f"k{camera + 1}"]
@@ -132,8 +127,9 @@ def test_one_camera_at_fault_costs_no_other(capture, fault, camera, words, kept)
             assert not frames.depth_available[:, camera].any()
 
 
-def test_when_all_clocks_are_reset_the_longer_part_is_kept(capture):
-    all_reset(capture.recordings)
+def test_if_all_clocks_reset_the_longer_epoch_is_kept(capture):
+    for camera in range(3):
+        with_clock(camera, 4, 1_000_000)(capture.recordings)
     output = run(capture)
     for note in notes_of(output).values():
         assert note.count("4 images outside the stretch of 8") == 1
@@ -143,7 +139,7 @@ def test_when_all_clocks_are_reset_the_longer_part_is_kept(capture):
 
 
 @pytest.mark.parametrize("fault", [cut_short, overwritten_middle])
-def test_a_damaged_file_gives_what_can_be_read(capture, fault):
+def test_a_damaged_file_gives_its_readable_images(capture, fault):
     fault(capture.recordings)
     output = run(capture)
     assert notes_of(output)["k2"] != "" and notes_of(output)["k1"] == ""
@@ -164,13 +160,13 @@ def test_a_master_on_another_clock_leaves_the_others(capture):
         assert frames.num_sets == TICKS and frames.available[:, 1:].all()
 
 
-def test_hidden_files_of_other_systems_are_passed_over(capture):
+def test_hidden_files_are_ignored(capture):
     (capture.recordings / "._k2.mkv").write_bytes(b"\0\5\x16\7")
     with Frames.open(run(capture)) as frames:
         assert frames.rig.names == ("k1", "k2", "k3") and frames.available.all()
 
 
-def test_a_moment_that_no_camera_has_is_noted(capture):
+def test_a_gap_of_all_cameras_is_noted(capture):
     for camera in range(3):
         record(capture.recordings, camera, [t for t in range(TICKS) if t not in (5, 6, 9)])
     output = run(capture)
@@ -180,7 +176,7 @@ def test_a_moment_that_no_camera_has_is_noted(capture):
         assert frames.num_sets == TICKS - 3 and frames.available.all()
 
 
-def test_a_clock_that_runs_away_is_followed_and_noted(capture):
+def test_a_drifting_clock_is_followed_and_noted(capture):
     def time(tick: int) -> int:
         return 3_000_000 + round(tick * PERIOD_US * 1.008)
 
@@ -191,7 +187,7 @@ def test_a_clock_that_runs_away_is_followed_and_noted(capture):
         assert frames.available.all()
 
 
-def test_a_clock_that_is_off_by_more_than_the_window_is_told(capture):
+def test_a_clock_off_by_more_than_the_window_is_noted(capture):
     record(capture.recordings, 2, range(TICKS), clock_us=3_012_000)
     output = run(capture)
     expected = "12 images fit no frame set: their device times are 12.3 ms from the nearest one"
@@ -235,7 +231,7 @@ def test_epochs(times, expected):
     assert split_into_epochs(np.array(times)).tolist() == expected
 
 
-def test_the_stretch_in_the_others_time_wins_over_the_longer_one():
+def test_the_epoch_that_overlaps_the_others_is_chosen():
     times = np.array([0, 1, 2, 3, 4, -9, -8, -7])
     stretch = split_into_epochs(times)
     assert choose_epoch(times, stretch, np.arange(-12, -6), 0.5) == 1

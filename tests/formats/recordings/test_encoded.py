@@ -49,7 +49,7 @@ def test_size_of_whole_files(suffix, options):
 
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize("orientation", range(10))
-def test_size_is_that_of_the_image_as_opencv_turns_it(orientation, order):
+def test_size_follows_the_exif_orientation(orientation, order):
     jpeg = cv2.imencode(".jpg", picture())[1].tobytes()
     turned = with_exif(jpeg, orientation, order)
     decoded = cv2.imdecode(np.frombuffer(turned, np.uint8), cv2.IMREAD_COLOR)

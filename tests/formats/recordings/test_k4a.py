@@ -61,18 +61,6 @@ def test_real_depth_equals_an_independent_parse_in_every_pixel(real_recording):
     assert np.mean(images[0] > 0) > 0.2 and 300 < np.median(images[0][images[0] > 0]) < 6000
 
 
-def test_real_depth_equals_what_ffmpeg_decodes(real_recording):
-    with av.open(str(real_recording)) as container:
-        stream = next(s for s in container.streams if s.metadata.get("title") == "DEPTH")
-        decoded = [f.to_ndarray(format="gray16le") for f in container.decode(stream)]
-    with KinectFile(real_recording) as recording:
-        images = [
-            recording.depth_image(p.content) for p in recording.packets() if p.kind == "depth"
-        ]
-    assert len(images) == len(decoded)
-    assert all(np.array_equal(a, b) for a, b in zip(images, decoded, strict=True))
-
-
 def test_real_colour_times_and_head(real_recording):
     raw = blocks(real_recording.read_bytes())
     with KinectFile(real_recording) as recording:
@@ -135,7 +123,7 @@ def test_device_time_is_block_time_plus_start_offset(tmp_path):
     ]
 
 
-def test_a_cut_file_gives_its_whole_images_and_says_so(tmp_path):
+def test_a_cut_file_gives_its_complete_images(tmp_path):
     whole = write(tmp_path / "whole.mkv").read_bytes()
     expected = read(tmp_path / "whole.mkv")
     cut = tmp_path / "cut.mkv"
@@ -150,7 +138,7 @@ def test_a_cut_file_gives_its_whole_images_and_says_so(tmp_path):
     assert counts == sorted(counts) and 0 < counts[0] < counts[-1] <= 10
 
 
-def test_a_recorder_that_was_killed_leaves_a_readable_file(tmp_path):
+def test_an_unfinished_file_is_readable(tmp_path):
     """Without the final patch the length is unknown and there is no index."""
     path = write(tmp_path / "k1.mkv")
     expected = read(path)
@@ -183,35 +171,6 @@ def test_a_damaged_jpeg_is_left_out_and_counted(tmp_path):
         assert recording.broken_packets == 2
 
 
-def missing(path: Path, whole: bytes) -> None:
-    pass
-
-
-def empty(path: Path, whole: bytes) -> None:
-    path.write_bytes(b"")
-
-
-def text(path: Path, whole: bytes) -> None:
-    path.write_text("these are not the images you are looking for\n" * 100)
-
-
-def head_only(path: Path, whole: bytes) -> None:
-    path.write_bytes(whole[:30])
-
-
-def folder(path: Path, whole: bytes) -> None:
-    path.mkdir()
-
-
-def no_calibration(path: Path, whole: bytes) -> None:
-    write(path, calibration_json=None)
-
-
-def no_colour(path: Path, whole: bytes) -> None:
-    renamed = whole.replace(b"COLOR", b"COL0R").replace(b"K4A_COLOR", b"K4A_COL0R")
-    path.write_bytes(renamed)
-
-
 def another_video(path: Path, whole: bytes) -> None:
     with av.open(str(path), "w", format="matroska") as container:
         stream = container.add_stream("mpeg4", rate=30)
@@ -224,17 +183,17 @@ def another_video(path: Path, whole: bytes) -> None:
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (missing, "cannot be read"),
-        (empty, "is empty"),
-        (text, "not a Matroska file"),
-        (head_only, "cannot be opened"),
-        (folder, "cannot be read"),
-        (no_calibration, "holds no calibration.json"),
-        (no_colour, "no COLOR track"),
+        (lambda path, whole: None, "cannot be read"),
+        (lambda path, whole: path.write_bytes(b""), "is empty"),
+        (lambda path, whole: path.write_text("no images\n" * 500), "not a Matroska file"),
+        (lambda path, whole: path.write_bytes(whole[:30]), "cannot be opened"),
+        (lambda path, whole: path.mkdir(), "cannot be read"),
+        (lambda path, whole: write(path, calibration_json=None), "holds no calibration.json"),
+        (lambda path, whole: path.write_bytes(whole.replace(b"COLOR", b"COL0R")), "no COLOR track"),
         (another_video, "no COLOR track"),
     ],
 )
-def test_bad_files_are_told_in_one_sentence(tmp_path, make, words):
+def test_unusable_files_are_refused(tmp_path, make, words):
     whole = write(tmp_path / "whole.mkv").read_bytes()
     path = tmp_path / "k1.mkv"
     make(path, whole)

@@ -53,6 +53,11 @@ def raw_bytes(image: np.ndarray, colour_format: str) -> bytes:
     return packed.tobytes()
 
 
+def write(folder: Path, **options) -> MkvWriter:
+    usual = dict(colour_mode="720P", depth_mode=None, fps=30, serial="1")
+    return MkvWriter(folder / "k1.mkv", calibration_json=CALIBRATION, **(usual | options))
+
+
 def open_written(folder: Path) -> CameraRecording:
     write_rig_file(folder / "rig.json", Extrinsics("k1", {"k1": np.eye(4)}))
     entry = SequenceEntry(
@@ -70,10 +75,7 @@ def read(folder: Path) -> tuple[CameraRecording, list[Image]]:
 def test_every_depth_mode(tmp_path, mode):
     width, height = DEPTH_MODES[mode].size
     depth = np.random.default_rng(0).integers(0, 5000, (height, width), dtype=np.uint16)
-    with MkvWriter(
-        tmp_path / "k1.mkv", calibration_json=CALIBRATION, colour_mode="720P", depth_mode=mode,
-        fps=5, serial="1",
-    ) as writer:  # fmt: skip
+    with write(tmp_path, depth_mode=mode, fps=5) as writer:
         writer.write_depth(depth, 100)
     recording, images = read(tmp_path)
     assert [(i.kind, i.time_us) for i in images] == [("depth", 100)]
@@ -92,10 +94,7 @@ def test_every_depth_mode(tmp_path, mode):
 def test_every_colour_mode_is_copied(tmp_path, mode):
     width, height = COLOUR_MODES[mode].size
     jpeg = cv2.imencode(".jpg", np.zeros((height, width, 3), np.uint8))[1].tobytes()
-    with MkvWriter(
-        tmp_path / "k1.mkv", calibration_json=CALIBRATION, colour_mode=mode, depth_mode=None,
-        fps=30, serial="1",
-    ) as writer:  # fmt: skip
+    with write(tmp_path, colour_mode=mode) as writer:
         writer.write_colour(jpeg, 0)
     recording, images = read(tmp_path)
     assert images == [Image("colour", 0, jpeg)] and recording.notes == []
@@ -114,10 +113,7 @@ def test_raw_colour_is_stored_as_jpeg_with_a_note(tmp_path, colour_format, mode)
     width, height = COLOUR_MODES[mode].size
     image = picture(width, height)
     raw = raw_bytes(image, colour_format)
-    with MkvWriter(
-        tmp_path / "k1.mkv", calibration_json=CALIBRATION, colour_mode=mode, depth_mode=None,
-        fps=30, serial="1", colour_format=colour_format,
-    ) as writer:  # fmt: skip
+    with write(tmp_path, colour_mode=mode, colour_format=colour_format) as writer:
         writer.write_colour(raw, 0)
         writer.write_colour(raw[:-2], 40_000)  # cut short
         writer.write_colour(raw, 80_000)
@@ -133,10 +129,7 @@ def test_raw_colour_is_stored_as_jpeg_with_a_note(tmp_path, colour_format, mode)
 
 def test_passive_infrared_is_no_depth(tmp_path):
     path = tmp_path / "k1.mkv"
-    with MkvWriter(
-        path, calibration_json=CALIBRATION, colour_mode="720P", depth_mode="WFOV_UNBINNED",
-        fps=30, serial="1", with_ir=True,
-    ) as writer:  # fmt: skip
+    with write(tmp_path, depth_mode="WFOV_UNBINNED", with_ir=True) as writer:
         writer.write_ir(np.ones((1024, 1024), np.uint16), 0)
     content = path.read_bytes()
     assert content.count(b"WFOV_UNBINNED") == 1
@@ -147,19 +140,16 @@ def test_passive_infrared_is_no_depth(tmp_path):
 
 def test_an_unknown_codec_is_named(tmp_path):
     path = tmp_path / "k1.mkv"
-    with MkvWriter(
-        path, calibration_json=CALIBRATION, colour_mode="720P", depth_mode=None, fps=30, serial="1"
-    ) as writer:
+    with write(tmp_path) as writer:
         writer.write_colour(bytes(100), 0)
     path.write_bytes(path.read_bytes().replace(b"MJPG\0", b"Y800\0"))
     with pytest.raises(UserError, match="recorded as Y800, expected MJPG, NV12"):
         read(tmp_path)
 
 
-def test_the_real_recording(tmp_path, real_recording):
+def test_a_real_recording(tmp_path, real_recording):
     (tmp_path / "k1.mkv").symlink_to(real_recording)
     recording, images = read(tmp_path)
-    kinds = [image.kind for image in images]
-    assert (kinds.count("colour"), kinds.count("depth")) == (1, 1)
+    assert sorted(image.kind for image in images) == ["colour", "depth"]
     assert recording.notes == [] and not recording.truncated
     assert recording.serial == "001514394512" and recording.gravity[1] > 0.8

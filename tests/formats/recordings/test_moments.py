@@ -27,7 +27,7 @@ def image_of() -> np.ndarray:
     return images_of_moments(slip, np.ones((SETS, 3), bool))
 
 
-def test_a_slipped_image_is_read_at_the_moment_that_it_shows(capture, image_of):
+def test_a_slipped_image_is_read_at_the_moment_it_shows(capture, image_of):
     assert image_of[:, 1].tolist() == [0, 1, 2, -1, -1]
     with Frames.open(capture.paths["frames"]) as images:
         shown = images.showing(np.roll(image_of, 1, axis=0))

@@ -35,7 +35,7 @@ FILES = [
         ("plain", {"left", "left/depth", "right", "right/colour", "top.mp4", "k1.mkv"}),
     ],
 )
-def test_folders_stand_for_their_images(tmp_path, layout, watched):
+def test_folders_are_watched_instead_of_their_images(tmp_path, layout, watched):
     for name in FILES:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()
@@ -46,7 +46,7 @@ def test_folders_stand_for_their_images(tmp_path, layout, watched):
 
 
 @pytest.mark.parametrize("layout", get_args(LayoutName))
-def test_every_layout_tells_what_is_missing(tmp_path, layout):
+def test_every_layout_names_the_missing_folder(tmp_path, layout):
     assert layout in INPUTS
     with pytest.raises(UserError, match="no such folder of recordings"):
         open_layout(entry(tmp_path / "none", layout))

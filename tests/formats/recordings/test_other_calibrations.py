@@ -52,7 +52,7 @@ def read(folder: Path, row: SequenceEntry) -> Frames:
     return Frames.open(folder / "frames.h5")
 
 
-def test_easymocap_without_sizes_takes_those_of_the_images(recording):
+def test_easymocap_without_sizes_uses_those_of_the_images(recording):
     with read(recording, entry(recording, written.write_easymocap(recording, VIEWS))) as source:
         assert source.rig.names == ("a", "b") and source.present.all() and source.num_sets == 3
         assert (source.rig[1].colour.width, source.rig[1].colour.height) == SIZE
@@ -62,7 +62,7 @@ def test_easymocap_without_sizes_takes_those_of_the_images(recording):
 
 
 @pytest.mark.parametrize("axis", ["x", "-x", "y", "-y", "z", "-z"])
-def test_up_and_floor_are_brought_to_the_master(recording, axis):
+def test_up_and_floor_are_in_the_frame_of_the_master(recording, axis):
     path = written.write_colmap(recording, VIEWS, metres=0.25, binary=True)
     row = entry(recording, path, calibration_scale=0.25, calibration_up=axis, calibration_floor=0.3)
     up = np.eye(3)["xyz".index(axis[-1])] * (-1 if axis[0] == "-" else 1)
@@ -94,7 +94,7 @@ def test_a_scale_for_a_form_in_metres_is_refused(tmp_path, layout):
         open_layout(row)
 
 
-def test_columns_that_make_no_sense(tmp_path):
+def test_impossible_columns_are_refused(tmp_path):
     for columns, words in (
         ({"calibration_floor": 0.0}, "without calibration_up"),
         ({"calibration_up": "up"}, "calibration_up"),

@@ -92,6 +92,11 @@ def capture(tmp_path) -> SequenceEntry:
     )  # fmt: skip
 
 
+def remove_images(capture: SequenceEntry, pattern: str) -> None:
+    for path in capture.recordings.glob(pattern):
+        path.unlink()
+
+
 def run(capture: SequenceEntry) -> Path:
     output = capture.recordings.parent / "out" / "frames.h5"
     stage.run(sequence=capture, output=output, settings=FramesSettings())
@@ -103,7 +108,7 @@ def notes_of(path: Path) -> dict[str, str]:
         return dict(zip(frames.text("camera_names"), frames.text("note"), strict=True))
 
 
-def test_files_come_out_as_they_are(capture):
+def test_images_are_copied_unchanged(capture):
     output = run(capture)
     assert notes_of(output) == {"left": "", "right": "", "top": "has no depth"}
     with Frames.open(output) as frames:
@@ -130,8 +135,7 @@ def test_files_come_out_as_they_are(capture):
 def test_missing_numbers_are_gaps(capture):
     (capture.recordings / "top" / "00003.png").unlink()
     (capture.recordings / "left" / "depth" / "00002.png").unlink()
-    for path in capture.recordings.rglob("00005.*"):
-        path.unlink()
+    remove_images(capture, "**/00005.*")
     output = run(capture)
     with Frames.open(output) as frames:
         assert frames.num_sets == 7
@@ -143,7 +147,7 @@ def test_missing_numbers_are_gaps(capture):
     assert "no camera has an image for 1 periods in 1 places" in notes["left"]
 
 
-def test_hidden_files_of_other_systems_are_passed_over(capture):
+def test_hidden_files_are_ignored(capture):
     (capture.recordings / "left" / "._00003.jpg").write_bytes(b"\0\5\x16\7")
     (capture.recordings / "left" / "depth" / "._00003.png").write_bytes(b"\0\5\x16\7")
     output = run(capture)
@@ -172,8 +176,7 @@ def test_timestamps_override_numbers(capture):
 @pytest.mark.parametrize("suffix", ["avi", "mkv", "mov", "mp4"])
 def test_packets_of_an_mjpeg_video_are_copied(capture, suffix):
     path = capture.recordings / f"top.{suffix}"
-    for image in (capture.recordings / "top").iterdir():
-        image.unlink()
+    remove_images(capture, "top/*")
     write_video(path, 2, 8, "mjpeg")
     with av.open(str(path)) as container:
         packets = [bytes(p) for p in container.demux(video=0) if p.size]
@@ -188,9 +191,8 @@ def test_packets_of_an_mjpeg_video_are_copied(capture, suffix):
 @pytest.mark.parametrize(
     ("suffix", "codec"), [("mp4", "h264"), ("mkv", "h264"), ("avi", "mpeg4"), ("webm", "libvpx")]
 )
-def test_other_videos_are_stored_as_jpeg_with_a_note(capture, suffix, codec):
-    for image in (capture.recordings / "top").iterdir():
-        image.unlink()
+def test_other_codecs_are_stored_as_jpeg_with_a_note(capture, suffix, codec):
+    remove_images(capture, "top/*")
     path = capture.recordings / f"top.{suffix}"
     options = {"bf": "2"} if codec == "h264" else {}
     try:
@@ -209,8 +211,7 @@ def test_other_videos_are_stored_as_jpeg_with_a_note(capture, suffix, codec):
 
 
 def test_a_camera_of_half_the_rate_is_in_every_second_set(capture):
-    for image in (capture.recordings / "top").iterdir():
-        image.unlink()
+    remove_images(capture, "top/*")
     half = Fraction(FPS, 2)
     write_video(capture.recordings / "top.mp4", 2, 4, "mjpeg", fps=half)
     output = run(capture)
@@ -223,7 +224,7 @@ def test_a_camera_of_half_the_rate_is_in_every_second_set(capture):
         assert not read["truncated"].any()  # its last image is a set before the last
 
 
-def test_a_master_of_half_the_rate_leaves_images_out_and_says_so(capture):
+def test_a_slow_master_leaves_images_out_with_a_note(capture):
     for number in range(1, 8, 2):
         (capture.recordings / "left" / f"{number:05d}.jpg").unlink()
     with Frames.open(run(capture)) as frames:  # the stated rate: sets of the others between
@@ -240,7 +241,7 @@ def test_a_master_of_half_the_rate_leaves_images_out_and_says_so(capture):
     assert "max_skew_ms" not in note
 
 
-def test_uneven_images_are_in_the_sets_of_their_times_and_told(capture):
+def test_uneven_image_times_are_kept_and_noted(capture):
     stamps = np.arange(8) / FPS + np.tile([0.0, 0.006], 4)
     times = "".join(f"{number:05d}, {time:.6f}\n" for number, time in enumerate(stamps))
     (capture.recordings / "right" / "timestamps.csv").write_text(times)
@@ -252,19 +253,17 @@ def test_uneven_images_are_in_the_sets_of_their_times_and_told(capture):
     assert "varies" not in notes_of(output)["left"]
 
 
-def test_a_video_beside_a_folder_of_depth(capture):
-    for image in (capture.recordings / "left").glob("*.jpg"):
-        image.unlink()
+def test_a_video_with_a_folder_of_depth(capture):
+    remove_images(capture, "left/*.jpg")
     write_video(capture.recordings / "left.mp4", 0, 8, "mpeg4")
     with Frames.open(run(capture)) as frames:
         assert frames.available.all() and frames.depth_available[:, :2].all()
         assert np.array_equal(frames.depth(6, 0), depth_of(0, 6))
 
 
-def test_a_phones_video_is_turned_as_viewers_turn_it(capture):
+def test_a_rotated_video_is_turned_upright(capture):
     path = capture.recordings / "top.mp4"
-    for image in (capture.recordings / "top").iterdir():
-        image.unlink()
+    remove_images(capture, "top/*")
     write_video(path, 2, 8, "mpeg4")
     content = bytearray(path.read_bytes())
     matrix = content.index(b"tkhd") + 4 + 40  # version, times, id, duration, layer, volume
@@ -281,59 +280,29 @@ def test_a_phones_video_is_turned_as_viewers_turn_it(capture):
         assert np.abs(frames.colour(0, 2).astype(int) - expected).mean() < 3
 
 
-def test_same_files_same_bytes(capture):
-    write_video(capture.recordings / "left.mp4", 0, 8, "mpeg4")
-    for image in (capture.recordings / "left").glob("*.jpg"):
-        image.unlink()
-    first = run(capture).read_bytes()
-    assert run(capture).read_bytes() == first
-
-
 def other_resolution(capture):
-    content = calibrated(top=lens((128, 96)))
-    capture.calibration.write_text(json.dumps(content))
+    capture.calibration.write_text(json.dumps(calibrated(top=lens((128, 96)))))
 
 
-def recorded_twice(capture):
-    write_video(capture.recordings / "top.mp4", 2, 8, "mpeg4")
+def top_video(name: str, change=None):
+    """Replace the images of the top camera by a video."""
+
+    def fault(capture):
+        remove_images(capture, "top/*")
+        path = capture.recordings / name
+        write_video(path, 2, 8, "mjpeg")
+        path.write_bytes(change(path.read_bytes()))
+
+    return fault
 
 
-def broken_video(capture):
-    for image in (capture.recordings / "top").iterdir():
-        image.unlink()
-    (capture.recordings / "top.mp4").write_bytes(b"no video")
-
-
-def unknown_codec(capture):
-    for image in (capture.recordings / "top").iterdir():
-        image.unlink()
-    path = capture.recordings / "top.avi"
-    write_video(path, 2, 8, "mjpeg")
-    path.write_bytes(path.read_bytes().replace(b"MJPG", b"ZZZZ"))
-
-
-def too_few_timestamps(capture):
-    (capture.recordings / "top" / "timestamps.txt").write_text("1.0\n2.0\n")
-
-
-def milliseconds(capture):
-    text = "\n".join(str(40 * t) for t in range(8))
-    (capture.recordings / "top" / "timestamps.txt").write_text(text)
+def timestamps(text: str):
+    return lambda capture: (capture.recordings / "top" / "timestamps.txt").write_text(text)
 
 
 def one_huge_time(capture):
-    for image in sorted((capture.recordings / "top").iterdir())[1:]:
-        image.unlink()
-    (capture.recordings / "top" / "timestamps.txt").write_text("1700000000000000000\n")
-
-
-def not_a_number(capture):
-    (capture.recordings / "top" / "timestamps.txt").write_text("1.0\nnoon\n")
-
-
-def unnamed_image(capture):
-    text = "".join(f"{t:05d}.png {t / FPS}\n" for t in range(7))
-    (capture.recordings / "top" / "timestamps.txt").write_text(text)
+    remove_images(capture, "top/0000[1-7]*")
+    timestamps("1700000000000000000\n")(capture)
 
 
 def times_as_names(capture):
@@ -346,17 +315,22 @@ def times_as_names(capture):
     [
         (times_as_names, "the numbers in the names are likely times, or time_offset"),
         (other_resolution, "colour images are 64x48, the calibration of camera top is for 128x96"),
-        (recorded_twice, "camera top is recorded as top.mp4 and top/"),
-        (broken_video, "top.mp4: cannot be opened as a video"),
-        (unknown_codec, "top.avi: holds no video that can be decoded"),
-        (too_few_timestamps, "top: 2 timestamps for 8 colour images"),
-        (milliseconds, "timestamps.txt: times are 40 apart, expected seconds"),
+        (lambda capture: write_video(capture.recordings / "top.mp4", 2, 8, "mjpeg"),
+         "camera top is recorded as top.mp4 and top/"),
+        (top_video("top.mp4", lambda content: b"no video"),
+         "top.mp4: cannot be opened as a video"),
+        (top_video("top.avi", lambda content: content.replace(b"MJPG", b"ZZZZ")),
+         "top.avi: holds no video that can be decoded"),
+        (timestamps("1.0\n2.0\n"), "top: 2 timestamps for 8 colour images"),
+        (timestamps("\n".join(str(40 * t) for t in range(8))),
+         "timestamps.txt: times are 40 apart, expected seconds"),
         (one_huge_time, "timestamps.txt, line 1: 1.7e+18 are no seconds; write seconds"),
-        (not_a_number, "timestamps.txt, line 2: found 'noon'"),
-        (unnamed_image, "top: 1 images have no timestamp (first: 00007.png)"),
+        (timestamps("1.0\nnoon\n"), "timestamps.txt, line 2: found 'noon'"),
+        (timestamps("".join(f"{t:05d}.png {t / FPS}\n" for t in range(7))),
+         "top: 1 images have no timestamp (first: 00007.png)"),
     ],
-)
-def test_a_camera_that_cannot_be_used_is_set_aside(capture, fault, words):
+)  # fmt: skip
+def test_an_unusable_camera_is_excluded_with_a_note(capture, fault, words):
     fault(capture)
     output = run(capture)
     assert words in notes_of(output)["top"]
@@ -413,7 +387,7 @@ def test_rigs_of_one_camera_and_of_sixteen(tmp_path, count):
         assert not frames.depth_available.any()
 
 
-def test_a_rig_whose_times_nobody_says_is_refused(capture):
+def test_a_recording_without_times_is_refused(capture):
     content = calibrated()
     del content["fps"]
     capture.calibration.write_text(json.dumps(content))

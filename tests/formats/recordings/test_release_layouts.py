@@ -55,13 +55,9 @@ def depth_at(t: int, c: int) -> np.ndarray:
 
 def entry(layout: str, recordings: Path, calibration: Path) -> SequenceEntry:
     return SequenceEntry(
-        sequence="s",
-        subject="a",
-        object="b",
-        layout=layout,
-        recordings=recordings,
+        sequence="s", subject="a", object="b", layout=layout, recordings=recordings,
         calibration=calibration,
-    )
+    )  # fmt: skip
 
 
 @pytest.fixture
@@ -93,7 +89,7 @@ def cam(sequence: SequenceEntry, number: int) -> Path:
     return sequence.recordings / f"Frames_Cam{number}"
 
 
-def test_release_images_are_copied_and_the_number_is_the_time(release):
+def test_release_images_have_the_time_of_their_number(release):
     with Frames.open(run(release)) as frames:
         assert (frames.num_sets, frames.fps, frames.master) == (5, 30.0, "k1")
         assert np.allclose(frames.time_s, np.array(NUMBERS) / 30, atol=1e-6)
@@ -106,7 +102,8 @@ def test_release_images_are_copied_and_the_number_is_the_time(release):
 
 def test_release_cameras_are_as_calibrated(release):
     made, _ = rig_of(3)
-    rig = Rig.from_frames(run(release))
+    with Frames.open(run(release)) as frames:
+        rig = frames.rig
     assert rig.names == ("k1", "k2", "k3")
     for camera, expected in zip(rig, made, strict=True):
         assert np.allclose(camera.colour.parameters, expected.colour.parameters)
@@ -133,8 +130,8 @@ def test_behave_images_times_and_cameras(behave):
         assert np.allclose(apply(camera.master_from_colour, points), apply(truth, points))
 
 
-def test_behave_sets_stand_on_the_clock_of_the_folders(behave):
-    """What was found elsewhere for these folders is told by it, also where the first is dropped."""
+def test_behave_sets_keep_the_time_of_their_folders(behave):
+    """Also if the first set is dropped."""
     with Frames.open(run(behave)) as frames:
         assert frames.first_set_s == pytest.approx(3.0)
     output = behave.recordings.parent / "dropped.h5"
@@ -187,17 +184,9 @@ def kinect_frames(tmp_path_factory) -> Path:
         image = np.full((size[1], size[0], 3), 60 * index, np.uint8)
         millimetres = np.rint(room_depth(camera, zup_from_master, FURNITURE) * 1000)
         with MkvWriter(
-            folder / f"{camera.name}.mkv",
+            folder / f"{camera.name}.mkv", fps=15, serial=str(index), **modes,
             calibration_json=write_calibration(camera, serial=str(index), **modes),
-            **modes,
-            fps=15,
-            serial=str(index),
-            start_offset_ns=0,
-            depth_delay_ns=0,
-            wired_sync_mode="STANDALONE",
-            subordinate_delay_ns=0,
-            with_imu=False,
-        ) as writer:
+        ) as writer:  # fmt: skip
             for tick in range(2):
                 writer.write_colour(cv2.imencode(".jpg", image)[1].tobytes(), 66_666 * tick)
                 writer.write_depth(millimetres.astype(np.uint16), 66_666 * tick)
@@ -207,7 +196,7 @@ def kinect_frames(tmp_path_factory) -> Path:
 
 
 @pytest.mark.parametrize("layout", ["intercap", "behave"])
-def test_clouds_of_a_released_copy_lie_on_those_of_the_recording(kinect_frames, tmp_path, layout):
+def test_a_released_copy_gives_the_clouds_of_the_recording(kinect_frames, tmp_path, layout):
     with Frames.open(kinect_frames) as original:
         folders = convert_frames(original, tmp_path, layout, range(2))
         clouds = [
@@ -234,104 +223,73 @@ def off_surface(points: np.ndarray, cloud: np.ndarray) -> np.ndarray:
     return np.abs(((points - centre[:, 0]) * normal).sum(axis=1))
 
 
-def missing_images(sequence):
-    (cam(sequence, 2) / "color" / "00001.jpg").unlink()
-    (cam(sequence, 2) / "depth" / "00002.png").unlink()
+def remove(*names: str):
+    """Remove files and folders below the recordings."""
+
+    def edit(sequence):
+        for name in names:
+            path = sequence.recordings / name
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+    return edit
 
 
-def missing_camera(sequence):
-    shutil.rmtree(cam(sequence, 2))
+def overwrite(pattern: str, content):
+    """Write bytes, an image, or a function of the file's bytes, to files below the recordings."""
+
+    def edit(sequence):
+        for path in sequence.recordings.glob(pattern):
+            if isinstance(content, np.ndarray):
+                cv2.imwrite(str(path), content)
+            else:
+                path.write_bytes(
+                    content if isinstance(content, bytes) else content(path.read_bytes())
+                )
+
+    return edit
 
 
-def no_depth_folder(sequence):
-    shutil.rmtree(cam(sequence, 2) / "depth")
+def set_lens(**entries):
+    """Set entries of the second camera's lens; None removes one."""
+
+    def edit(sequence):
+        path = sequence.calibration / "Color_2.json"
+        content = json.loads(path.read_text()) | entries
+        path.write_text(json.dumps({key: v for key, v in content.items() if v is not None}))
+
+    return edit
 
 
-def cut_depth(sequence):
-    path = cam(sequence, 2) / "depth" / "00001.png"
-    path.write_bytes(path.read_bytes()[:-40])
-
-
-def damaged_depth(sequence):
-    path = cam(sequence, 2) / "depth" / "00001.png"
-    content = bytearray(path.read_bytes())
-    content[50:60] = bytes(10)
-    path.write_bytes(bytes(content))
-
-
-def empty_colour(sequence):
-    (cam(sequence, 2) / "color" / "00004.jpg").write_bytes(b"")
-
-
-def depth_of_8_bits(sequence):
-    for path in (cam(sequence, 2) / "depth").glob("*.png"):
-        cv2.imwrite(str(path), np.full((LENS.height, LENS.width), 100, np.uint8))
-
-
-def one_depth_of_8_bits(sequence):
-    path = cam(sequence, 2) / "depth" / "00001.png"
-    cv2.imwrite(str(path), np.full((LENS.height, LENS.width), 100, np.uint8))
-
-
-def depth_in_its_own_size(sequence):
-    for path in (cam(sequence, 2) / "depth").glob("*.png"):
-        cv2.imwrite(str(path), np.full((64, 80), 1000, np.uint16))
-
-
-def colour_of_another_size(sequence):
-    for path in (cam(sequence, 2) / "color").glob("*.jpg"):
-        path.write_bytes(cv2.imencode(".jpg", np.zeros((72, 128, 3), np.uint8))[1].tobytes())
-
-
-def no_colour_folder(sequence):
-    shutil.rmtree(cam(sequence, 2) / "color")
-
-
-def lens_without_focal_length(sequence):
-    path = sequence.calibration / "Color_2.json"
-    content = json.loads(path.read_text())
-    del content["f"]
-    path.write_text(json.dumps(content))
-
-
-def lens_with_six_coefficients(sequence):
-    path = sequence.calibration / "Color_2.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "k": [0.0] * 6}))
-
-
-def depth_all_zero(sequence):
-    for path in (cam(sequence, 2) / "depth").glob("*.png"):
-        cv2.imwrite(str(path), np.zeros((LENS.height, LENS.width), np.uint16))
-
-
+COLOUR_2, DEPTH_2 = "Frames_Cam2/color", "Frames_Cam2/depth"
+GREY = np.full((LENS.height, LENS.width), 100, np.uint8)
 # what is broken, the words of the note, whether k2 stays, how many of its images, has it depth
 SURVIVED = [
-    (missing_images, "no image in 1 frame sets", True, 4, True),
-    (missing_images, "no depth image beside 1 of its colour images", True, 4, True),
-    (missing_camera, "no recording of k2", False, 0, False),
-    (no_depth_folder, "has no depth", True, 5, False),
-    (cut_depth, "1 damaged images left out (first: 00001.png is cut off)", True, 5, True),
-    (damaged_depth, "00001.png does not decode", True, 5, True),
-    (empty_colour, "00004.jpg is no whole JPEG", True, 4, True),
-    (depth_of_8_bits, "no depth used: 00000.png is no 16-bit grey PNG (8 bits", True, 5, False),
-    (one_depth_of_8_bits, "00001.png is no 16-bit grey PNG", True, 5, True),
-    (depth_in_its_own_size, "has 80x64 pixels, the colour images 192x108", True, 5, False),
-    (colour_of_another_size, "the colour images have 128x72", False, 0, False),
-    (no_colour_folder, "no readable color/<number>.jpg", False, 0, False),
-    (lens_without_focal_length, "calibration_first/Color_2.json: expected 'f'", False, 0, False),
-    (lens_with_six_coefficients, "6 coefficients", False, 0, False),
-    (depth_all_zero, "depth is zero in all 5 images", True, 5, False),
-]
+    (remove(f"{COLOUR_2}/00001.jpg"), "no image in 1 frame sets", True, 4, True),
+    (remove(f"{DEPTH_2}/00002.png"), "no depth image with 1 of its colour images", True, 5, True),
+    (remove("Frames_Cam2"), "no recording of k2", False, 0, False),
+    (remove(DEPTH_2), "has no depth", True, 5, False),
+    (overwrite(f"{DEPTH_2}/00001.png", lambda content: content[:-40]),
+     "1 damaged images left out (first: 00001.png is cut off)", True, 5, True),
+    (overwrite(f"{DEPTH_2}/00001.png", lambda content: content[:50] + bytes(10) + content[60:]),
+     "00001.png does not decode", True, 5, True),
+    (overwrite(f"{COLOUR_2}/00004.jpg", b""), "00004.jpg is no whole JPEG", True, 4, True),
+    (overwrite(f"{DEPTH_2}/*.png", GREY),
+     "no depth used: 00000.png is no 16-bit grey PNG (8 bits", True, 5, False),
+    (overwrite(f"{DEPTH_2}/00001.png", GREY), "00001.png is no 16-bit grey PNG", True, 5, True),
+    (overwrite(f"{DEPTH_2}/*.png", np.full((64, 80), 1000, np.uint16)),
+     "has 80x64 pixels, the colour images 192x108", True, 5, False),
+    (overwrite(f"{COLOUR_2}/*.jpg", np.zeros((72, 128, 3), np.uint8)),
+     "the colour images have 128x72", False, 0, False),
+    (remove(COLOUR_2), "no readable color/<number>.jpg", False, 0, False),
+    (set_lens(f=None), "calibration_first/Color_2.json: expected 'f'", False, 0, False),
+    (set_lens(k=[0.0] * 6), "6 coefficients", False, 0, False),
+    (overwrite(f"{DEPTH_2}/*.png", np.zeros((LENS.height, LENS.width), np.uint16)),
+     "depth is zero in all 5 images", True, 5, False),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("fault", "words", "present", "images", "depth"),
-    SURVIVED,
-    ids=[f"{case[0].__name__}-{index}" for index, case in enumerate(SURVIVED)],
-)
-def test_a_faulty_release_folder_is_survived_and_named(
-    release, fault, words, present, images, depth
-):
+@pytest.mark.parametrize(("fault", "words", "present", "images", "depth"), SURVIVED)
+def test_faults_of_release_folders_are_noted(release, fault, words, present, images, depth):
     fault(release)
     output = run(release)
     notes = notes_of(output)
@@ -344,25 +302,12 @@ def test_a_faulty_release_folder_is_survived_and_named(
         assert frames.depth_available[:, [0, 2]].all()
 
 
-def test_depth_folders_of_other_names_are_found_and_the_aligned_one_is_taken(release):
+def test_the_aligned_one_of_several_depth_folders_is_used(release):
     for number, name in ((1, "Depth"), (2, "depth_aligned"), (3, "DEPTH_raw")):
         (cam(release, number) / "depth").rename(cam(release, number) / name)
     (cam(release, 2) / "depth").mkdir()
     with Frames.open(run(release)) as frames:
         assert frames.depth_available.all()
-
-
-def calibration_is_a_file(sequence):
-    return sequence.model_copy(update={"calibration": sequence.calibration / "Color.json"})
-
-
-def calibration_without_master(sequence):
-    (sequence.calibration / "Color.json").unlink()
-
-
-def no_camera_folders(sequence):
-    for number in (1, 2, 3):
-        shutil.rmtree(cam(sequence, number))
 
 
 def calibration_of_another_resolution(sequence):
@@ -371,38 +316,34 @@ def calibration_of_another_resolution(sequence):
         path.write_text(json.dumps({**content, "c": [959.0, 540.0], "f": [913.0, 913.0]}))
 
 
+def calibration_is_a_file(sequence):
+    return sequence.model_copy(update={"calibration": sequence.calibration / "Color.json"})
+
+
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
         (calibration_is_a_file, "needs a folder of Color.json"),
-        (calibration_without_master, "holds no Color.json"),
-        (no_camera_folders, "no recording of k1"),
+        (lambda s: (s.calibration / "Color.json").unlink(), "holds no Color.json"),
+        (remove("Frames_Cam1", "Frames_Cam2", "Frames_Cam3"), "no recording of k1"),
         (calibration_of_another_resolution, "give the calibration of this resolution"),
     ],
 )
-def test_a_release_folder_that_cannot_be_used_fails_in_one_sentence(release, fault, words):
+def test_unusable_release_folders_are_refused(release, fault, words):
     with pytest.raises(UserError, match=words):
         run(fault(release) or release)
 
 
-def test_hidden_files_of_other_systems_are_passed_over(release):
+def test_hidden_files_are_ignored(release):
     for folder in cam(release, 2).iterdir():
         (folder / "._00001.png").write_bytes(b"\0\5\x16\7")
     assert notes_of(run(release))["k2"] == ""
 
 
-def test_one_number_twice_sets_the_camera_aside(release):
+def test_a_repeated_number_excludes_the_camera(release):
     folder = cam(release, 2) / "color"
     shutil.copy(folder / "00001.jpg", folder / "1.jpg")
     assert "image 1 is there twice, as 00001.jpg and 1.jpg" in notes_of(run(release))["k2"]
-
-
-def no_pose_of_a_kinect(sequence):
-    shutil.rmtree(sequence.calibration / "2")
-
-
-def no_lens_of_a_kinect(sequence):
-    shutil.rmtree(sequence.calibration.parents[1] / "intrinsics" / "2")
 
 
 def lens_of_another_resolution(sequence):
@@ -412,20 +353,17 @@ def lens_of_another_resolution(sequence):
     path.write_text(json.dumps(content))
 
 
-def frame_without_images_of_a_kinect(sequence):
-    (sequence.recordings / "t0004.000" / "k2.color.jpg").unlink()
-
-
 @pytest.mark.parametrize(
     ("fault", "words", "present"),
     [
-        (no_pose_of_a_kinect, "no pose in config", False),
-        (no_lens_of_a_kinect, "no intrinsics/2/calibration.json", False),
+        (lambda s: shutil.rmtree(s.calibration / "2"), "no pose in config", False),
+        (lambda s: shutil.rmtree(s.calibration.parents[1] / "intrinsics" / "2"),
+         "no intrinsics/2/calibration.json", False),
         (lens_of_another_resolution, "are for 2048x1536, its colour images have 192x108", False),
-        (frame_without_images_of_a_kinect, "no image in 1 frame sets", True),
+        (remove("t0004.000/k2.color.jpg"), "no image in 1 frame sets", True),
     ],
-)
-def test_a_faulty_behave_folder_is_survived_and_named(behave, fault, words, present):
+)  # fmt: skip
+def test_faults_of_behave_folders_are_noted(behave, fault, words, present):
     fault(behave)
     output = run(behave)
     assert words in notes_of(output)["k2"]
@@ -433,54 +371,42 @@ def test_a_faulty_behave_folder_is_survived_and_named(behave, fault, words, pres
         assert frames.present[list(frames.rig.names).index("k2")] == present
 
 
-def no_master_pose(sequence):
-    shutil.rmtree(sequence.calibration / "1")
+def set_pose(**entries):
+    def edit(sequence):
+        path = sequence.calibration / "2" / "config.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | entries))
+
+    return edit
 
 
-def rotation_that_is_none(sequence):
-    path = sequence.calibration / "2" / "config.json"
-    path.write_text(json.dumps({"rotation": [1.0] * 9, "translation": [0, 0, 0]}))
-
-
-def pose_in_millimetres(sequence):
-    path = sequence.calibration / "2" / "config.json"
-    content = json.loads(path.read_text())
-    path.write_text(json.dumps({**content, "translation": [2000.0, 0, 0]}))
-
-
-def no_frame_folders(sequence):
-    for path in sequence.recordings.glob("t*"):
-        shutil.rmtree(path)
-
-
-def two_folders_of_one_time(sequence):
+def copy_first_folder(sequence):
     shutil.copytree(sequence.recordings / "t0003.000", sequence.recordings / "t3")
 
 
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
-        (no_master_pose, "no 1/config.json"),
-        (rotation_that_is_none, "2/config.json: expected a rotation matrix"),
-        (pose_in_millimetres, "translation of 2000 m"),
-        (no_frame_folders, "no frame folders"),
-        (two_folders_of_one_time, "t0003.000 and t3 have one time"),
+        (lambda s: shutil.rmtree(s.calibration / "1"), "no 1/config.json"),
+        (set_pose(rotation=[1.0] * 9), "2/config.json: expected a rotation matrix"),
+        (set_pose(translation=[2000.0, 0, 0]), "translation of 2000 m"),
+        (remove(*(f"t{time}" for time in TIMES)), "no frame folders"),
+        (copy_first_folder, "t0003.000 and t3 have one time"),
     ],
 )
-def test_a_behave_folder_that_cannot_be_used_fails_in_one_sentence(behave, fault, words):
+def test_unusable_behave_folders_are_refused(behave, fault, words):
     fault(behave)
     with pytest.raises(UserError, match=words):
         run(behave)
 
 
 @pytest.mark.parametrize("layout", ["release", "behave"])
-def test_same_folders_same_bytes(layout, request):
+def test_frames_artefact_is_reproducible(layout, request):
     sequence = request.getfixturevalue(layout)
     first = run(sequence).read_bytes()
     assert run(sequence).read_bytes() == first
 
 
-def test_release_folders_with_every_other_image_are_slower(tmp_path):
+def test_every_other_image_halves_the_frame_rate(tmp_path):
     rig, _ = rig_of(2)
     folders = write_intercap(tmp_path, rig, numbers=[4, 6, 8, 12], colour=jpeg_at, depth=depth_at)
     with Frames.open(run(entry("intercap", *folders))) as frames:

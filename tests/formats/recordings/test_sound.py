@@ -111,7 +111,7 @@ def beat(seconds: float) -> np.ndarray:
     ],
     ids=["silence", "one silent", "unrelated", "other steps", "hum", "beat", "short", "empty"],
 )
-def test_what_says_nothing(pair: Callable[[], tuple[np.ndarray, np.ndarray]]):
+def test_no_delay_without_a_clear_common_sound(pair: Callable[[], tuple[np.ndarray, np.ndarray]]):
     first, second = pair()
     assert delay_between(track(first), track(second)) is None
 
@@ -163,7 +163,7 @@ def write_video(
     ("name", "codec"), [("a.mp4", "aac"), ("a.mov", "pcm_s16le"), ("a.mkv", "flac")]
 )
 @pytest.mark.parametrize("begins", [0.0, 0.6])
-def test_the_sound_of_a_file_is_on_the_clock_of_its_images(tmp_path, name, codec, begins):
+def test_sound_and_images_share_a_clock(tmp_path, name, codec, begins):
     """A click 1 s into the sound."""
     samples = np.random.default_rng(1).normal(0, 1e-4, 48_000)
     samples[16_000:16_080] = 0.8 * np.sin(np.arange(80))
@@ -185,7 +185,7 @@ def test_files_without_sound(tmp_path):
     assert read_sound(tmp_path / "missing.mp4", 0.0) is None
 
 
-def test_a_file_whose_sound_is_damaged_still_reads(tmp_path):
+def test_damaged_sound_is_read_in_part(tmp_path):
     path = tmp_path / "a.mkv"
     write_video(path, np.random.default_rng(1).normal(0, 0.2, 48_000), codec="pcm_s16le")
     content = bytearray(path.read_bytes())
@@ -199,7 +199,7 @@ def test_a_file_whose_sound_is_damaged_still_reads(tmp_path):
     assert sound is None or len(sound.samples) < 3.2 * SOUND_RATE
 
 
-def test_frames_say_when_cameras_started_by_their_sound(tmp_path):
+def test_frames_hold_the_starts_by_sound(tmp_path):
     """The right one was started 0.7 s after the left one."""
     write_rig(tmp_path, SIZE, 60.0)
     sound = signal.resample_poly(steps(4, 6.0), 2, 1)
@@ -220,7 +220,7 @@ def test_frames_say_when_cameras_started_by_their_sound(tmp_path):
     assert (tmp_path / "frames.h5").read_bytes() == before
 
 
-def test_frames_of_videos_without_sound_say_nothing(tmp_path):
+def test_frames_of_silent_videos_hold_no_starts(tmp_path):
     write_rig(tmp_path, SIZE, 60.0)
     for name in ("left", "right"):
         (tmp_path / "recordings" / name).rmdir()
@@ -234,7 +234,7 @@ def test_frames_of_videos_without_sound_say_nothing(tmp_path):
         assert source.sound_starts == {}
 
 
-def test_first_images_are_told_on_the_clock_of_the_sets(tmp_path):
+def test_first_images_are_on_the_clock_of_the_sets(tmp_path):
     """By a file of times; the right camera's first image is 0.3 s later."""
     write_rig(tmp_path, SIZE, 60.0)
     for name, first in (("left", 5.0), ("right", 5.3)):

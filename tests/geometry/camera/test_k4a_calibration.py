@@ -118,10 +118,3 @@ def test_real_device_has_its_colour_lens_32_mm_beside_the_depth_lens(real_calibr
 def test_broken_calibrations_are_refused(content, words):
     with pytest.raises(UserError, match=words):
         read(content)
-
-
-def test_unknown_modes_are_refused():
-    with pytest.raises(UserError, match="colour mode '8K' is not one of 720P"):
-        read(make_calibration(), colour_mode="8K")
-    with pytest.raises(UserError, match="depth mode 'PASSIVE_IR'"):
-        read(make_calibration(), depth_mode="PASSIVE_IR")

@@ -61,7 +61,7 @@ def test_pixels_are_those_of_the_plain_lookup(
     chosen = np.zeros(depth.shape, bool)
     chosen[20:271:every, 30:301:every] = True
     lookup = colour_lookup(before, camera, np.flatnonzero(chosen & (before > 0)))
-    shown = mask.sample_flat(lookup.colour_index) & ~lookup.hidden
+    shown = lookup.sample(mask.decode())
     np.testing.assert_array_equal(found, lookup.depth_index[shown])
     assert len(found) > 3000
     if camera is BESIDE:
@@ -76,7 +76,7 @@ def test_nothing_of_the_mask_is_outside_its_window(camera: Camera) -> None:
     assert window is not None
     found = mask_pixels(depth, camera, mask, window)
     lookup = colour_lookup(depth, camera)
-    shown = mask.sample_flat(lookup.colour_index) & ~lookup.hidden
+    shown = lookup.sample(mask.decode())
     np.testing.assert_array_equal(found, lookup.depth_index[shown])
     height, width = camera.colour.height, camera.colour.width
     nothing = Runs(encode(np.zeros((height, width), bool)), height, width)

@@ -40,10 +40,6 @@ def test_everything_read_from_runs_agrees_with_the_decoded_mask(seed):
     )
     y, x = np.mgrid[-2 : HEIGHT + 2, -2 : WIDTH + 2]
     np.testing.assert_array_equal(runs.sample(x, y), np.pad(mask, 2))
-    flat = np.array([-1, 0, 17, HEIGHT * WIDTH - 1])
-    np.testing.assert_array_equal(
-        runs.sample_flat(flat), np.where(flat >= 0, mask.ravel()[flat], False)
-    )
 
 
 @pytest.mark.parametrize("seed", range(4))

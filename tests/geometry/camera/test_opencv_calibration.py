@@ -201,7 +201,7 @@ def change(path: str, value: object):
         (change("cameras", ...), "expected 'cameras'"),
         (change("master", "front"), "master 'front' is none of the cameras"),
         (change("master", []), "is none of the cameras"),
-        (change("fps", -3), "fps is -3, expected one positive"),
+        (change("fps", -3), "fps is -3, expected 0.05 to 10000"),
         (change("cameras.left.camera_matrix", ...), "camera 'left': has no camera_matrix"),
         (change("cameras.left.distortion_coefficients", ...), "has no distortion_coefficients"),
         (change("cameras.left.camera_matrix", [[1, 2], [3, 4]]), "camera_matrix is no"),
