@@ -40,9 +40,9 @@ from intercap_core.geometry.camera import masks
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.studio.calibration import write_calibration
+from tests.formats.calibration.test_opencv_calibration import example, write_node
+from tests.formats.calibration.test_other_tools import FORMS, RECORDED, VIEWS
 from tests.fuzz.plausible import IMAGE_SIZE, Kind, Notes, within
-from tests.geometry.camera.test_calibration_files import FORMS, RECORDED, VIEWS
-from tests.geometry.camera.test_opencv_calibration import example, write_node
 from tests.helpers import tiny_onnx, tiny_pose
 from tests.helpers.kinect_files import MODES, make_camera, pose_of, record
 from tests.helpers.release_folders import write_behave, write_intercap

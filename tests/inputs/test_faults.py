@@ -1,4 +1,4 @@
-"""Single faults of files: each is refused in one sentence that names the file and the place."""
+"""Single faults of files are refused by file and place."""
 
 from __future__ import annotations
 

@@ -87,10 +87,8 @@ def test_the_project_written_is_ready_to_run(release):
     row = project.sequences["Date03_Sub01_stool_sit"]
     assert (row.subject, row.object, row.layout) == ("Sub01", "stool", "behave")
     assert row.calibration == Path("BEHAVE/calibs/Date03/config")
-    assert {n: s.gender for n, s in project.subjects.items()} == {
-        "Sub01": "male",
-        "Sub02": "female",
-    }
+    genders = {name: subject.gender for name, subject in project.subjects.items()}
+    assert genders == {"Sub01": "male", "Sub02": "female"}
     assert project.objects["stool"].mesh.name == "stool_f1000.ply"
     assert project.objects["stool"].labels == ("stool",)
     assert [str(fault) for fault in faults_of_sequences(project)] == []
@@ -98,7 +96,7 @@ def test_the_project_written_is_ready_to_run(release):
         frames_stage.run(sequence=entry, output=Path(f"{name}.h5"), settings=project.config.frames)
 
 
-def test_the_data_sets_own_results_are_named_where_they_are_asked_for(release):
+def test_the_data_sets_results_are_named_on_request(release):
     folder = release / "sequences" / SEQUENCES[0]
     registered = folder / "t0002.000" / PERSON_MESH
     registered.parent.mkdir(parents=True)
@@ -119,7 +117,7 @@ def test_the_data_sets_own_results_are_named_where_they_are_asked_for(release):
     assert isinstance(done.exception, UserError) and "no such folder" in str(done.exception)
 
 
-def test_what_is_not_whole_is_left_out_and_told(release):
+def test_incomplete_sequences_are_left_out_with_a_remark(release):
     shutil.rmtree(release / "calibs" / "Date01")
     for path in (release / "sequences" / "Date03_Sub01_stool_sit").glob("t*"):
         shutil.rmtree(path)
@@ -128,7 +126,7 @@ def test_what_is_not_whole_is_left_out_and_told(release):
     assert "there is no calibs/Date01/config" in str(done.exception)
 
 
-def test_options_of_the_other_layout_and_unknown_layouts_are_refused(release):
+def test_options_of_other_layouts_are_refused(release):
     done = write("--meshes", "BEHAVE/objects")
     assert isinstance(done.exception, UserError) and "--meshes" in str(done.exception)
     done = CliRunner().invoke(app, ["tables", "kinect", "BEHAVE", "--output", "x"])

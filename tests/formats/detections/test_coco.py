@@ -7,8 +7,6 @@ import re
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from intercap_core.formats.detections.class_names import COCO_NAMES, COCO_NAMES_FROM_0
 from intercap_core.formats.detections.coco import (
@@ -245,36 +243,3 @@ def test_formats_of_detectors(tmp_path, content, key, label, score, options):
     assert (instance.label, instance.score) == (label, score)
     assert instance.box == (10, 4, 12, 5)
     np.testing.assert_array_equal(masks.decode(instance.rle, HEIGHT, WIDTH), MASK)
-
-
-JSON_VALUES = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
-    lambda inner: (
-        st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=3)
-    ),
-    max_leaves=6,
-)
-KEYS = ("image_id", "category_id", "category_name", "score", "bbox", "box", "segmentation",
-        "segments", "file_name", "label", "class")  # fmt: skip
-
-
-@settings(max_examples=60, deadline=None)
-@given(
-    st.dictionaries(st.sampled_from(KEYS), JSON_VALUES, max_size=4),
-    st.dictionaries(
-        st.sampled_from(("images", "categories", "img_width", "img_height")), JSON_VALUES
-    ),
-    st.dictionaries(st.sampled_from(("size", "counts", "x", "y")), JSON_VALUES),
-)
-def test_any_json_is_read_or_refused(changes, whole, segmentation):
-    entries = [ENTRY | changes, ENTRY | {"segmentation": segmentation}, changes]
-    form = CandidateForm((WIDTH, HEIGHT), COCO_NAMES, 0.0)
-    try:
-        found = parse_candidates({"annotations": [*entries, ENTRY]} | whole, form)
-    except UnreadableDetections:
-        return
-    assert len(found.results) + len(found.faults) == found.entries
-    for _, instance in found.results:
-        masks.Runs(instance.rle, HEIGHT, WIDTH)
-        assert np.isfinite(instance.box).all() and np.isfinite(instance.score)
-        instance.label.encode()

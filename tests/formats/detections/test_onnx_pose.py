@@ -44,7 +44,8 @@ def apart(people: np.ndarray, places: np.ndarray) -> float:
 @pytest.mark.parametrize(
     ("kind", "options"),
     [("simcc", {}), ("simcc", {"size": (288, 384)}), ("simcc", {"batch": 1}),
-     ("simcc", {"batch": 3}), ("simcc", {"names": ("simcc_y", "simcc_x")}), ("simcc", {"names": ("x", "y")}),
+     ("simcc", {"batch": 3}), ("simcc", {"names": ("simcc_y", "simcc_x")}),
+     ("simcc", {"names": ("x", "y")}),
      ("simcc", {"gain": 5.0}), ("simcc", {"split": (1, 1)}),
      ("heatmaps", {}), ("heatmaps", {"size": (288, 384)}), ("heatmaps", {"batch": 1}),
      ("heatmaps", {"batch": 3}), ("heatmaps", {"grid": "udp"}), ("heatmaps", {"gain": 5.0}),

@@ -10,24 +10,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
 
 from intercap_core import artefacts
 from intercap_core.config import FramesSettings
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
-from intercap_core.formats.calibration.extrinsics import Extrinsics, write_rig_file
-from intercap_core.formats.calibration.k4a import COLOUR_MODES, DEPTH_MODES
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.clouds import master_points
-from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.schemas import FRAMES
 from intercap_core.stages import frames as stage
-from intercap_core.studio.calibration import write_calibration
-from intercap_core.studio.mkv import MkvWriter
-from tests.helpers.release_folders import convert_frames, write_behave, write_intercap
+from tests.helpers.release_folders import write_behave, write_intercap
 from tests.helpers.synthetic_capture import COLOUR, FURNITURE, ring, room_depth, to_millimetres
 
 LENS = COLOUR.scaled(0.1)
@@ -168,59 +162,6 @@ def test_clouds_of_all_cameras_lie_on_one_room(tmp_path, layout):
             points = apply(zup_from_frame, master_points(frames.depth(0, c), camera).points)
             low = (np.abs(points[:, 2]) < 0.03) & (np.abs(points[:, :2]) < 3.4).all(1)
             assert low.sum() > 1000 and np.percentile(np.abs(points[low, 2]), 90) < 0.001
-
-
-@pytest.fixture(scope="module")
-def kinect_frames(tmp_path_factory) -> Path:
-    """The room recorded by two Kinects, as the layout ``k4a`` reads it."""
-    folder = tmp_path_factory.mktemp("kinects")
-    modes = dict(colour_mode="720P", depth_mode="NFOV_2X2BINNED")
-    size, depth_size = COLOUR_MODES["720P"].size, DEPTH_MODES["NFOV_2X2BINNED"].size
-    colour = Intrinsics(*size, 612.0, 611.0, 639.5, 366.0, COLOUR.distortion)
-    depth = Intrinsics(*depth_size, 252.0, 252.0, 160.0, 150.0)
-    rig, zup_from_master = ring(2)
-    rig = Rig(tuple(replace(camera, colour=colour, depth=depth) for camera in rig))
-    for index, camera in enumerate(rig):
-        image = np.full((size[1], size[0], 3), 60 * index, np.uint8)
-        millimetres = np.rint(room_depth(camera, zup_from_master, FURNITURE) * 1000)
-        with MkvWriter(
-            folder / f"{camera.name}.mkv", fps=15, serial=str(index), **modes,
-            calibration_json=write_calibration(camera, serial=str(index), **modes),
-        ) as writer:  # fmt: skip
-            for tick in range(2):
-                writer.write_colour(cv2.imencode(".jpg", image)[1].tobytes(), 66_666 * tick)
-                writer.write_depth(millimetres.astype(np.uint16), 66_666 * tick)
-    poses = {camera.name: camera.master_from_colour for camera in rig}
-    write_rig_file(folder / "rig.json", Extrinsics("k1", poses))
-    return run(entry("k4a", folder, folder / "rig.json"))
-
-
-@pytest.mark.parametrize("layout", ["intercap", "behave"])
-def test_a_released_copy_gives_the_clouds_of_the_recording(kinect_frames, tmp_path, layout):
-    with Frames.open(kinect_frames) as original:
-        folders = convert_frames(original, tmp_path, layout, range(2))
-        clouds = [
-            master_points(original.depth(1, c), camera).points
-            for c, camera in enumerate(original.rig)
-        ]
-        jpegs = [original.colour_jpeg(1, c) for c in range(2)]
-        master = 0 if layout == "intercap" else 1
-        frame_from_master = original.rig[master].colour_from_master
-    with Frames.open(run(entry(layout, *folders))) as copy:
-        assert copy.num_sets == 2
-        for c, camera in enumerate(copy.rig):
-            assert copy.colour_jpeg(1, c) == jpegs[c]
-            points = master_points(copy.depth(1, c), camera).points[::97]
-            distance = off_surface(points, apply(frame_from_master, clouds[c]))
-            assert np.median(distance) < 0.0015 and np.percentile(distance, 90) < 0.006
-
-
-def off_surface(points: np.ndarray, cloud: np.ndarray) -> np.ndarray:
-    """Distance (N,) of points from the plane through the nearest points of a cloud."""
-    near = cloud[cKDTree(cloud).query(points, k=8)[1]].astype(np.float64)
-    centre = near.mean(axis=1, keepdims=True)
-    normal = np.linalg.svd(near - centre)[2][:, -1]
-    return np.abs(((points - centre[:, 0]) * normal).sum(axis=1))
 
 
 def remove(*names: str):

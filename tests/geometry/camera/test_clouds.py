@@ -53,7 +53,7 @@ def truly_hidden(points: np.ndarray) -> np.ndarray:
     return (points[:, 2] > PANEL_M + 0.01) & (np.abs(crossing[:, :2]) <= PANEL_HALF_M).all(-1)
 
 
-def test_points_lie_on_the_surface_and_reproject_to_their_pixels():
+def test_points_reproject_to_their_pixels():
     depth = wall_with_panel()
     depth[:40] = 0
     points, index = depth_points(depth, CAMERA)
@@ -73,7 +73,7 @@ def test_master_points_follow_the_chain_of_poses():
     assert np.allclose(CAMERA.depth_from_master @ CAMERA.master_from_depth, np.eye(4))
 
 
-def test_invalid_pixels_and_those_outside_the_lens_are_left_out():
+def test_pixels_without_a_ray_are_left_out():
     depth = np.zeros((DEPTH.height, DEPTH.width), np.uint16)
     depth[10, 20] = 900
     assert depth_points(depth, CAMERA, np.array([0, 6420])).depth_index.tolist() == [6420]
@@ -84,7 +84,7 @@ def test_invalid_pixels_and_those_outside_the_lens_are_left_out():
     assert 0 < len(points) < 1024 * 1024
 
 
-def test_lookup_points_at_the_colour_pixel_that_shows_the_surface():
+def test_lookup_finds_the_colour_pixel_of_the_surface():
     depth = wall_with_panel()
     lookup = colour_lookup(depth, CAMERA)
     points = depth_points(depth, CAMERA).points.astype(np.float64)
@@ -112,7 +112,7 @@ def test_hidden_points_are_those_behind_the_panel():
     assert wrong < 3 * edge
 
 
-def test_a_subset_gets_the_answers_of_the_whole_image():
+def test_a_subset_equals_the_whole_image():
     depth = wall_with_panel()
     whole = colour_lookup(depth, CAMERA)
     subset = whole.depth_index[(whole.depth_index // 640 > 200) & (whole.depth_index % 640 > 300)][
@@ -124,7 +124,7 @@ def test_a_subset_gets_the_answers_of_the_whole_image():
     assert np.array_equal(part.hidden, whole.hidden[at])
 
 
-def test_a_colour_mask_lands_on_the_depth_pixels_of_the_panel():
+def test_a_colour_mask_covers_the_depth_of_the_panel():
     depth = wall_with_panel()
     panel = depth == PANEL_M * 1000
     rays = COLOUR.rays.astype(np.float64)
@@ -145,7 +145,7 @@ def test_an_image_of_another_size_is_refused():
         depth_points(np.zeros((10, 10), np.uint16), CAMERA)
 
 
-def test_depth_on_the_colour_grid_is_looked_up_at_its_own_pixel():
+def test_aligned_depth_uses_its_own_pixel():
     rig, zup_from_master = ring(count=1)
     lens = rig[0].colour.scaled(0.1)
     camera = replace(rig[0], colour=lens, depth=lens, colour_from_depth=np.eye(4))

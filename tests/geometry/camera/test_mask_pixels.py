@@ -1,4 +1,4 @@
-"""The pixels of a mask are those that the plain look-up of the colour image finds."""
+"""Depth pixels of a mask against the plain look-up of the colour image."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_pixels_are_those_of_the_plain_lookup(
 
 
 @pytest.mark.parametrize("camera", [BESIDE, ALIGNED], ids=["beside", "aligned"])
-def test_nothing_of_the_mask_is_outside_its_window(camera: Camera) -> None:
+def test_the_window_holds_all_pixels_of_the_mask(camera: Camera) -> None:
     depth, _ = _scene()
     mask = _mask(camera)
     window = mask_window(depth, camera, mask)

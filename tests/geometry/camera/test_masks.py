@@ -26,7 +26,7 @@ def blob(seed: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_everything_read_from_runs_agrees_with_the_decoded_mask(seed):
+def test_runs_agree_with_the_decoded_mask(seed):
     mask = blob(seed)
     rle = masks.encode(mask)
     runs = masks.Runs(rle, HEIGHT, WIDTH)
@@ -43,7 +43,7 @@ def test_everything_read_from_runs_agrees_with_the_decoded_mask(seed):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_runs_of_large_images_are_those_of_the_peer(seed):
+def test_runs_of_large_images_equal_pycocotools(seed):
     height, width = 1536, 2048
     rng = np.random.default_rng(seed)
     mask = np.zeros((height, width), bool)
@@ -59,7 +59,7 @@ def test_the_runs_of_large_images_are_those_of_the_peer(seed):
     )
 
 
-def test_uncompressed_counts_and_polygons_become_the_same_masks_as_the_peers():
+def test_counts_and_polygons_equal_pycocotools():
     mask = blob(1)
     changes = np.flatnonzero(np.diff(mask.T.ravel().astype(int), prepend=0))
     counts = np.diff([0, *changes, mask.size]).tolist()
@@ -83,14 +83,14 @@ def test_uncompressed_counts_and_polygons_become_the_same_masks_as_the_peers():
         (masks.encode(np.ones((HEIGHT, WIDTH + 1))), "expected 1961"),
     ],
 )
-def test_strings_that_are_no_mask_of_the_image(rle, words):
+def test_wrong_rle_strings_are_refused(rle, words):
     with pytest.raises(ValueError, match=words):
         masks.Runs(rle, HEIGHT, WIDTH)
 
 
 @given(st.binary(max_size=40))
 @settings(max_examples=300, deadline=None)
-def test_any_bytes_either_fill_the_image_or_are_refused(rle):
+def test_any_bytes_fill_the_image_or_are_refused(rle):
     try:
         runs = masks.Runs(rle, 4, 5)
     except ValueError:
@@ -103,19 +103,19 @@ def test_any_bytes_either_fill_the_image_or_are_refused(rle):
     "counts",
     [[3, "a"], [1.5, 1], [-1, 21], [3, 4], [[1], [2]], [2**63, 2**63 + 20], [10**400]],
 )
-def test_uncompressed_counts_that_are_wrong(counts):
+def test_wrong_counts_are_refused(counts):
     with pytest.raises(ValueError):
         masks.from_counts(counts, 4, 5)
 
 
 @pytest.mark.parametrize("polygon", [[1, 2, 3, 4], [1, 2, 3, 4, 5, np.nan], [1, 2, 3, 4, 5, 6, 7]])
-def test_polygons_that_are_wrong(polygon):
+def test_wrong_polygons_are_refused(polygon):
     with pytest.raises(ValueError, match="corners"):
         masks.from_polygons([polygon], 4, 5)
 
 
 @pytest.mark.parametrize("value", [1e9, -1e9, 1e300, 100001.0])
-def test_polygons_far_outside_the_image(value):
+def test_polygons_far_outside_are_refused(value):
     with pytest.raises(ValueError, match="pixels of the image"):
         masks.from_polygons([[1, 2, value, 4, 5, 6]], 4, 5)
 

@@ -1,4 +1,4 @@
-"""Projection against OpenCV, against its own inverse and against finite differences."""
+"""Projection against OpenCV, its inverse and finite differences, in numpy, torch and kernels."""
 
 from __future__ import annotations
 
@@ -8,7 +8,17 @@ import pytest
 import torch
 
 from intercap_core.geometry.camera.intrinsics import Intrinsics
-from intercap_core.geometry.camera.projection import project
+from intercap_core.geometry.camera.projection import (
+    MIN_DEPTH_M,
+    inside_model,
+    project,
+    project_with_jacobian,
+)
+from intercap_core.geometry.camera.projection_kernels import (
+    distort,
+    project_point,
+    project_point_with_jacobian,
+)
 
 # A colour and a depth lens with strong distortion of both radial and tangential kind.
 COLOUR = Intrinsics(
@@ -35,14 +45,14 @@ def random_points(count: int = 400, seed: int = 1) -> np.ndarray:
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_projection_is_opencvs(lens):
+def test_projection_equals_opencv(lens):
     points = points_in_view(lens)
     expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), lens.matrix, lens.distortion)
     assert np.abs(lens.project(points) - expected[:, 0]).max() < 1e-9
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_unprojection_inverts_projection_over_the_whole_image_and_beyond(lens):
+def test_unprojection_inverts_projection(lens):
     x = np.linspace(-2.0 * lens.width, 3.0 * lens.width, 60)
     y = np.linspace(-2.0 * lens.height, 3.0 * lens.height, 60)
     pixels = np.stack(np.meshgrid(x, y), -1)
@@ -71,7 +81,7 @@ def test_jacobian_matches_finite_differences(lens, points):
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_torch_gives_what_numpy_gives_and_what_autograd_gives(lens):
+def test_torch_equals_numpy_and_autograd(lens):
     points = random_points().reshape(20, 20, 3)
     points[0, 0] = 0, 0, 1  # on the axis, where a square root would have no derivative
     pixels, jacobian = lens.project_with_jacobian(points)
@@ -84,7 +94,7 @@ def test_torch_gives_what_numpy_gives_and_what_autograd_gives(lens):
         assert np.allclose(gradient.numpy(), jacobian[..., axis, :], rtol=1e-6, atol=1e-6)
 
 
-def test_parameters_of_several_cameras_broadcast_over_time_camera_and_point():
+def test_parameters_of_several_cameras_broadcast():
     points = random_points(120).reshape(4, 3, 10, 3)
     parameters = np.stack([lens.parameters for lens in LENSES])[:, None]
     together = project(points, parameters)
@@ -119,7 +129,7 @@ def test_a_crop_shifts_and_a_scale_keeps_the_edges():
     assert np.allclose(half.project(points), (pixels + 0.5) / 2 - 0.5)
 
 
-def test_ray_table_holds_every_pixels_ray_and_nan_outside_the_radius():
+def test_the_ray_table_is_nan_outside_the_radius():
     table = DEPTH.rays
     assert table.shape == (576, 640, 2) and table.dtype == np.float32
     assert np.allclose(table[123, 456], DEPTH.unproject(np.array([456.0, 123.0]))[:2], atol=1e-6)
@@ -129,7 +139,7 @@ def test_ray_table_holds_every_pixels_ray_and_nan_outside_the_radius():
 
 
 @pytest.mark.parametrize("lens", [*LENSES, COLOUR.scaled(2.0), COLOUR.cropped(300, 7, 1001, 902)])
-def test_interpolated_rays_of_a_large_image_project_to_their_pixels(lens):
+def test_interpolated_rays_project_to_their_pixels(lens):
     v, u = np.mgrid[0 : lens.height : 7, 0 : lens.width : 11]
     xy = lens.rays[v, u].astype(np.float64)
     rays = np.concatenate([xy, np.ones((*xy.shape[:2], 1))], -1)
@@ -152,3 +162,75 @@ def test_impossible_lenses_are_refused(change):
     values = dict(width=4, height=4, fx=1.0, fy=1.0, cx=0.0, cy=0.0) | change
     with pytest.raises(ValueError):
         Intrinsics(**values)
+
+
+STEP_M = 1e-7
+
+
+def random_lens(seed: int) -> np.ndarray:
+    """Parameters (13,) scattered about those of a wide depth or a colour lens."""
+    rng = np.random.default_rng(seed)
+    focal = rng.uniform(300, 1200, 2)
+    centre = rng.uniform(200, 1000, 2)
+    colour = np.array([0.33, -2.489, -1.6e-4, -1.3e-4, 1.454, 0.209, -2.303, 1.375])
+    wide = np.array([0.548, -0.021, 2.1e-5, -7.2e-5, -0.0027, 0.89, 0.086, -0.0139])
+    distortion = (colour, wide)[seed % 2] * rng.uniform(0.95, 1.05, 8)
+    distortion[2:4] += rng.normal(0, 1e-3, 2)
+    return np.array([*focal, *centre, *distortion, rng.uniform(0.6, 0.8)])
+
+
+def scattered_points(seed: int, count: int = 300) -> np.ndarray:
+    """Points all around the camera; some on the axis, at the nearest depth and behind."""
+    points = np.random.default_rng(seed).uniform([-3, -3, -0.5], [3, 3, 3.0], (count, 3))
+    points[: count // 3, :2] *= 0.3  # so that many are within the radius
+    points[0] = 0, 0, 1
+    points[1] = 0.1, -0.2, -1
+    points[2] = 1e-4, 2e-4, MIN_DEPTH_M
+    points[3] = 1e-4, 2e-4, MIN_DEPTH_M / 2
+    return points
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_compiled_kernels_equal_numpy(seed):
+    lens, points = random_lens(seed), scattered_points(seed)
+    covered = inside_model(points, lens)
+    assert 20 < covered.sum() < len(points) - 20
+    pixels, jacobian = project_with_jacobian(points, lens)
+    compiled = np.array([project_point_with_jacobian(*point, lens) for point in points])
+    np.testing.assert_allclose(compiled[:, :2], pixels, rtol=1e-12, atol=1e-9)
+    np.testing.assert_allclose(compiled[:, 2:].reshape(-1, 2, 3), jacobian, rtol=1e-11, atol=1e-9)
+    alone = np.array([project_point(*point, lens) for point in points])
+    np.testing.assert_allclose(alone, pixels, rtol=1e-12, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_compiled_jacobian_matches_finite_differences(seed):
+    lens, points = random_lens(seed), scattered_points(seed)
+    x, y, z = points.T
+    radius = np.hypot(x, y) / np.maximum(z, MIN_DEPTH_M)
+    # Not within a step of a kink: the metric radius, the nearest depth.
+    smooth = (np.abs(z - MIN_DEPTH_M) > 1e-2) & (np.abs(radius - lens[12]) > 1e-3)
+    points = points[smooth]
+    jacobian = np.array([project_point_with_jacobian(*p, lens)[2:] for p in points])
+    numeric = np.empty((len(points), 2, 3))
+    for axis, offset in enumerate(STEP_M * np.eye(3)):
+        after = np.array([project_point(*p, lens) for p in points + offset])
+        before = np.array([project_point(*p, lens) for p in points - offset])
+        numeric[..., axis] = (after - before) / (2 * STEP_M)
+    scale = np.abs(numeric).max(axis=(1, 2), keepdims=True) + 1.0
+    assert (np.abs(jacobian.reshape(-1, 2, 3) - numeric) / scale).max() < 1e-5
+    behind = points[:, 2] < MIN_DEPTH_M
+    assert behind.any() and not jacobian[behind][:, [2, 5]].any()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_single_precision_stays_single(seed):
+    lens, points = random_lens(seed), scattered_points(seed)
+    points = points[inside_model(points, lens)].astype(np.float32)
+    single = lens.astype(np.float32)
+    expected = project(points, single)
+    for point, pixel in zip(points, expected, strict=True):
+        inverse = np.float32(1) / point[2]
+        xd, yd = distort(point[0] * inverse, point[1] * inverse, tuple(single[4:12]))
+        found = single[:2] * np.array([xd, yd], np.float32) + single[2:4]
+        assert np.array_equal(found, pixel)

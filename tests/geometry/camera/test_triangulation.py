@@ -1,4 +1,4 @@
-"""Triangulation against points that are known, with views that lie."""
+"""Triangulation of known points, with wrong views."""
 
 from __future__ import annotations
 
@@ -41,22 +41,22 @@ def test_exact_pixels_give_exact_points():
 
 
 @pytest.mark.parametrize("wrong", [1, 2, 3])
-def test_views_that_lie_are_left_out(wrong):
+def test_wrong_views_are_outliers(wrong):
     rng = np.random.default_rng(wrong)
     points = cloud(300, seed=wrong)
     pixels = reproject(points, RIG) + rng.normal(0, 2, (300, 6, 2))
-    liars = np.argsort(rng.random((300, 6)), axis=1)[:, :wrong]
+    wrong_views = np.argsort(rng.random((300, 6)), axis=1)[:, :wrong]
     rows = np.arange(300)[:, None]
-    pixels[rows, liars] += rng.uniform(80, 200, (300, wrong, 2)) * rng.choice(
+    pixels[rows, wrong_views] += rng.uniform(80, 200, (300, wrong, 2)) * rng.choice(
         [-1, 1], (300, wrong, 2)
     )
     found = triangulate(pixels, np.ones((300, 6)), RIG, max_error_px=20)
     error = np.linalg.norm(found.points - points, axis=1)
     assert np.median(error) < 0.008 and (error < 0.05).mean() > 0.98
-    assert found.inlier[rows, liars].mean() < 0.02
+    assert found.inlier[rows, wrong_views].mean() < 0.02
 
 
-def test_cameras_that_face_each_other_agree_by_chance():
+def test_facing_cameras_agree_by_chance():
     """Two views show points near the line between two cameras; the camera opposite lies, of points
     farther along the first one's rays."""
     facing = Rig(tuple(RIG[c] for c in (0, 3, 1)))
@@ -86,7 +86,7 @@ def test_too_few_views_give_no_point():
     assert np.isnan(found.error[[0, 1, 3]]).all() and np.isnan(found.view_error[0]).all()
 
 
-def test_small_images_are_judged_by_their_own_pixels():
+def test_limits_scale_with_the_image_size():
     half = type(RIG)(tuple(
         type(c)(c.name, c.colour.scaled(0.5), c.depth, c.colour_from_depth, c.master_from_colour)
         for c in RIG
@@ -98,7 +98,7 @@ def test_small_images_are_judged_by_their_own_pixels():
     assert not found.inlier[:, 0].any() and found.inlier[:, 1:].all()
 
 
-def test_partners_are_an_involution_and_limbs_come_in_pairs():
+def test_partners_are_an_involution():
     np.testing.assert_array_equal(PARTNER[PARTNER], np.arange(135))
     for limb in LIMBS:
         np.testing.assert_array_equal(np.sort(PARTNER[limb]), np.sort(limb))

@@ -1,4 +1,4 @@
-"""Holes of meshes: found, closed where that is honest, refused where it is not."""
+"""Holes of meshes are found, closed if they are small, and refused otherwise."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_small_holes_are_closed(tmp_path: Path, mesh: trimesh.Trimesh, holes: in
     assert source.read_bytes() == before
 
 
-def test_a_flat_cover_is_right_where_a_flat_wall_was(tmp_path: Path) -> None:
+def test_a_flat_cover_restores_a_flat_wall(tmp_path: Path) -> None:
     lidless_box().export(tmp_path / "box.ply")
     done = close_mesh(tmp_path / "box.ply", tmp_path / "whole.ply", widest_m=0.4, share=0.1)
     (hole,) = done.closed
@@ -98,7 +98,7 @@ def test_a_flat_cover_is_right_where_a_flat_wall_was(tmp_path: Path) -> None:
         (lambda path: None, "out.ply", "there is no such mesh"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_closed_is_refused(tmp_path: Path, make, output: str, says: str) -> None:
+def test_unsuitable_meshes_are_refused(tmp_path: Path, make, output: str, says: str) -> None:
     source = tmp_path / "mesh.ply"
     make(source)
     files = {path: path.read_bytes() for path in tmp_path.iterdir()}

@@ -1,4 +1,7 @@
-"""Signed distances against closed forms."""
+"""Signed distances against closed forms, and the import of Open3D's core."""
+
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -59,8 +62,7 @@ def box_without_its_lid() -> tuple[trimesh.Trimesh, DistanceField]:
     return box, DistanceField(box.vertices, box.faces[kept], watertight=False)
 
 
-def test_points_outside_a_mesh_with_holes_are_never_inside():
-    """Rays that leave through the hole used to vote points a decimetre above it inside."""
+def test_points_outside_an_open_mesh_are_not_inside():
     box, field = box_without_its_lid()
     rng = np.random.default_rng(5)
     points = rng.uniform(-0.5, 0.5, size=(20000, 3))
@@ -71,8 +73,8 @@ def test_points_outside_a_mesh_with_holes_are_never_inside():
     np.testing.assert_array_less(solid.signed_distance(points[outside]) - 1e-6, away)
 
 
-def test_nothing_is_deeper_in_a_holed_mesh_than_in_the_closed_one():
-    """Below the missing lid the nearest face is a side, the way out is up."""
+def test_an_open_mesh_is_not_deeper_than_the_closed_one():
+    """Below the missing lid the nearest face is a side, but the boundary is the lid."""
     box, field = box_without_its_lid()
     rng = np.random.default_rng(6)
     points = rng.uniform(-0.5, 0.5, size=(4000, 3)) * box.extents
@@ -102,7 +104,7 @@ def test_a_tenth_of_the_faces_may_be_missing():
     np.testing.assert_allclose(found, true, atol=0.006)
 
 
-def test_a_part_that_is_all_of_a_surface_is_that_surface():
+def test_a_part_of_all_vertices_is_the_surface():
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.11)
     field = DistanceField(ball.vertices, ball.faces)
     part = SurfacePart(field, ball.vertices, ball.faces, np.arange(len(ball.vertices)))
@@ -114,7 +116,7 @@ def test_a_part_that_is_all_of_a_surface_is_that_surface():
 
 
 def test_distances_to_the_top_of_a_box():
-    """Of what is inside only what is nearest to the top is below it."""
+    """Only points inside that are nearest to the top are below it."""
     half = np.array([0.2, 0.1, 0.05])
     box = trimesh.creation.box(2 * half)
     top = np.flatnonzero(box.vertices[:, 2] > 0)
@@ -134,7 +136,7 @@ def test_distances_to_the_top_of_a_box():
     )
 
 
-def test_a_vertex_without_a_face_of_its_own_part_stands_for_those_around_it():
+def test_a_single_vertex_spans_the_faces_around_it():
     box = trimesh.creation.box((0.2, 0.2, 0.2))
     field = DistanceField(box.vertices, box.faces)
     part = SurfacePart(field, box.vertices, box.faces, np.array([5]))
@@ -146,3 +148,29 @@ def test_a_vertex_without_a_face_of_its_own_part_stands_for_those_around_it():
     assert around[found.faces].all()
     with pytest.raises(ValueError, match="no face"):
         SurfacePart(field, box.vertices, np.asarray(box.faces)[~around], np.array([5]))
+
+
+def _run(code: str) -> str:
+    return subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout.strip()
+
+
+def test_stages_import_only_the_core_of_open3d():
+    heavy = "{'sklearn', 'pandas', 'dash', 'matplotlib', 'torch', 'open3d'}"
+    code = "import sys, intercap_core.stages.object_track, intercap_core.geometry.rigid.distance;"
+    assert _run(f"{code} print(sorted({heavy} & set(sys.modules)))") == "[]"
+
+
+def test_open3d_may_be_imported_before_or_after_its_core():
+    after = (
+        "from intercap_core.geometry.rigid.distance import o3d as ours; import open3d;"
+        "print(ours.core.Tensor is open3d.core.Tensor,"
+        " open3d.t.geometry.RaycastingScene is ours.t.geometry.RaycastingScene)"
+    )
+    assert _run(after) == "True True"
+    before = (
+        "import open3d; from intercap_core.geometry.rigid.distance import o3d as ours;"
+        "print(ours.core.Tensor is open3d.core.Tensor)"
+    )
+    assert _run(before) == "True"

@@ -1,4 +1,4 @@
-"""Bad meshes and lists get one sentence that names the file and the next step."""
+"""Meshes with faults are repaired or refused, and so are lists of contact vertices."""
 
 import io
 import json
@@ -30,92 +30,60 @@ def _ball(subdivisions=3):
     return trimesh.creation.icosphere(subdivisions=subdivisions, radius=0.11)
 
 
-def _no_faces(path):
-    trimesh.PointCloud(_ball().vertices).export(path)
-    return path
-
-
-def _not_a_number(path):
+def _scaled(factor):
     ball = _ball()
-    ball.vertices[7, 1] = np.nan
-    return _write(ball, path)
+    ball.apply_scale(factor)
+    return ball
 
 
-def _millimetres(path):
+def _changed(vertices=None, faces=None):
     ball = _ball()
-    ball.apply_scale(1000)
-    return _write(ball, path)
+    if vertices is not None:
+        ball.vertices = vertices(ball.vertices.copy())
+    faces = ball.faces if faces is None else faces(ball.faces.copy())
+    return trimesh.Trimesh(ball.vertices, faces, process=False)
 
 
-def _centimetres(path):
-    ball = _ball()
-    ball.apply_scale(100)
-    return _write(ball, path)
-
-
-def _all_faces_without_area(path):
-    ball = _ball()
-    ball.faces[:, 2] = ball.faces[:, 1]
-    return _write(trimesh.Trimesh(ball.vertices, ball.faces, process=False), path)
-
-
-def _empty(path):
-    path.write_bytes(b"")
-    return path
-
-
-def _no_vertices(path):
-    path.write_text(
-        "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\n"
-        "property float z\nelement face 0\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    return path
-
-
-def _tiny(path):
-    ball = _ball()
-    ball.apply_scale(0.001)
-    return _write(ball, path)
-
-
-def _half_open(path):
+def _half_open():
     ball = _ball()
     soup = ball.vertices[ball.faces[::2]].reshape(-1, 3)
-    loose = trimesh.Trimesh(soup, np.arange(len(soup)).reshape(-1, 3), process=False)
-    return _write(loose, path)
+    return trimesh.Trimesh(soup, np.arange(len(soup)).reshape(-1, 3), process=False)
 
 
-def _flat(path):
-    ball = _ball()
-    ball.vertices[:, 2] *= 1e-9
-    return _write(ball, path)
+def _not_a_number(vertices):
+    vertices[7, 1] = np.nan
+    return vertices
 
 
-def _garbage(path):
-    path.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 9\nend_header\n1 2")
-    return path
+NO_VERTICES = (
+    b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\n"
+    b"property float z\nelement face 0\nproperty list uchar int vertex_indices\nend_header\n"
+)
 
 
 @pytest.mark.parametrize(
-    ("make", "words"),
+    ("content", "words"),
     [
-        (lambda path: path, "no such mesh"),
-        (_no_faces, "0 faces"),
-        (_not_a_number, "vertex 7 is not a number"),
-        (_millimetres, r"220 m long.*millimetres \(0\.001\)"),
-        (_centimetres, r"22 m long.*centimetres \(0\.01\)"),
-        (_all_faces_without_area, "encloses"),
-        (_empty, "not a readable mesh|0 faces"),
-        (_no_vertices, "0 faces|not a readable mesh"),
-        (_tiny, "unit is the metre"),
-        (_half_open, "no inside"),
-        (_flat, "flat sheet"),
-        (_garbage, "export"),
+        (None, "no such mesh"),
+        (trimesh.PointCloud(_ball().vertices), "0 faces"),
+        (_changed(vertices=_not_a_number), "vertex 7 is not a number"),
+        (_scaled(1000), r"220 m long.*millimetres \(0\.001\)"),
+        (_scaled(100), r"22 m long.*centimetres \(0\.01\)"),
+        (_changed(faces=lambda faces: faces[:, [0, 1, 1]]), "encloses"),
+        (b"", "not a readable mesh|0 faces"),
+        (NO_VERTICES, "0 faces|not a readable mesh"),
+        (_scaled(0.001), "unit is the metre"),
+        (_half_open(), "no inside"),
+        (_changed(vertices=lambda vertices: vertices * (1, 1, 1e-9)), "flat sheet"),
+        (b"ply\nformat ascii 1.0\nelement vertex 9\nend_header\n1 2", "export"),
     ],
 )
-def test_bad_meshes_are_refused(tmp_path, make, words):
+def test_bad_meshes_are_refused(tmp_path, content, words):
     path = tmp_path / "thing.ply"
-    make(path)
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content is not None:
+        content.export(path)
     with pytest.raises(UserError, match=words) as caught:
         ObjectMesh.load(_entry(path))
     assert str(path) in str(caught.value)
@@ -123,8 +91,7 @@ def test_bad_meshes_are_refused(tmp_path, make, words):
 
 @pytest.mark.parametrize(("scale", "doubted"), [(0.05, True), (1, False), (20, True)])
 def test_unusual_sizes_are_reported_and_used(tmp_path, caplog, scale, doubted):
-    ball = _ball()
-    ball.apply_scale(scale)
+    ball = _scaled(scale)
     with caplog.at_level(logging.WARNING):
         mesh = ObjectMesh.load(_entry(_write(ball, tmp_path / "thing.ply")))
     assert mesh.diameter == pytest.approx(0.22 * scale, rel=1e-3)
@@ -168,9 +135,7 @@ def test_vertices_without_a_face_do_not_count(tmp_path, caplog, stray):
 
 
 def test_faces_without_area_are_left_out(tmp_path, caplog):
-    ball = _ball()
-    faces = np.concatenate([ball.faces, [[0, 0, 1], [5, 7, 7]]])
-    ball = trimesh.Trimesh(ball.vertices, faces, process=False)
+    ball = _changed(faces=lambda faces: np.concatenate([faces, [[0, 0, 1], [5, 7, 7]]]))
     with caplog.at_level(logging.WARNING):
         mesh = ObjectMesh.load(_entry(_write(ball, tmp_path / "thing.ply")))
     assert mesh.watertight and len(mesh.faces) == len(_ball().faces)
@@ -218,30 +183,6 @@ def test_small_faults_are_repaired(tmp_path, caplog, harm):
     assert distance.min(1).max() < 1e-6, "contact vertices follow the joined vertices"
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("[1, 2, 100000]", "names vertex 100000"),
-        ("[-1]", "names vertex -1"),
-        ("[]", "not a list"),
-        ('{"a": 1}', "not a list"),
-        ("[0.5]", "not a list"),
-        ("[[1], [2, 3]]", "not a list"),
-        ("[1, 2", "not a JSON list"),
-        ("", "not a JSON list"),
-        ("[1, Infinity]", "not a list"),
-        ('["a"]', "not a list"),
-    ],
-)
-def test_bad_contact_lists_are_refused(tmp_path, text, words):
-    mesh = _write(_ball(), tmp_path / "thing.ply")
-    contact = tmp_path / "thing.contact.json"
-    contact.write_text(text)
-    with pytest.raises(UserError, match=words) as caught:
-        ObjectMesh.load(_entry(mesh, contact_vertices=contact))
-    assert str(contact) in str(caught.value)
-
-
 @pytest.mark.parametrize("suffix", ["json", "npz"])
 def test_a_list_of_another_mesh_is_refused(tmp_path, suffix):
     """A changed mesh is detected by its number of vertices and their coordinates."""
@@ -273,6 +214,16 @@ def _npz(**arrays):
 @pytest.mark.parametrize(
     ("name", "data", "words"),
     [
+        ("c.json", b"[1, 2, 100000]", "names vertex 100000"),
+        ("c.json", b"[-1]", "names vertex -1"),
+        ("c.json", b"[]", "not a list"),
+        ("c.json", b'{"a": 1}', "not a list"),
+        ("c.json", b"[0.5]", "not a list"),
+        ("c.json", b"[[1], [2, 3]]", "not a list"),
+        ("c.json", b"[1, 2", "not a JSON list"),
+        ("c.json", b"", "not a JSON list"),
+        ("c.json", b"[1, Infinity]", "not a list"),
+        ("c.json", b'["a"]', "not a list"),
         ("c.npz", b"no archive", "not a readable .npz"),
         ("c.npz", _npz(contact_vertices=np.arange(9))[:-30], "not a readable .npz"),
         ("c.npz", _npz(), "not a readable .npz"),
@@ -283,7 +234,7 @@ def _npz(**arrays):
         ("c.pkl", pickle.dumps(3), "not a list"),
     ],
 )
-def test_bad_contact_archives_are_refused(tmp_path, name, data, words):
+def test_bad_contact_lists_are_refused(tmp_path, name, data, words):
     mesh = _write(_ball(), tmp_path / "thing.ply")
     contact = tmp_path / name
     contact.write_bytes(data)

@@ -1,4 +1,4 @@
-"""The committed meshes are what their names say: closed, of true size, touched where people do."""
+"""The committed meshes: closed, of true size, with plausible contact vertices."""
 
 import numpy as np
 import pytest
@@ -102,7 +102,7 @@ def test_cup_is_hollow_and_its_handle_has_a_gap(objects):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_true_mesh_differs_as_little_as_it_says(objects, name):
+def test_the_true_mesh_differs_slightly(objects, name):
     entry, mesh = catalogue()[name], objects[name]
     vertices, faces, colours = true_mesh(entry, 5)
     again = true_mesh(entry, 5)
@@ -125,7 +125,7 @@ def _best_scale(mesh, vertices):
     return np.linalg.norm(vertices[: len(mesh.vertices)], axis=1).mean() / tracked
 
 
-def test_committed_meshes_are_what_the_tool_builds(monkeypatch):
+def test_committed_meshes_equal_those_of_the_tool(monkeypatch):
     pytest.importorskip("manifold3d")
     monkeypatch.syspath_prepend(str(CONFIG.parent / "tools"))
     import build_objects

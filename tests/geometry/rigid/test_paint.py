@@ -61,7 +61,7 @@ def test_a_texture_is_finer_than_its_mesh(tmp_path):
     assert (paint.colours[(x > 0.55) & (y < 0.45)] == (250, 250, 0)).all()
 
 
-def test_no_colours_and_one_colour_are_none(tmp_path):
+def test_one_colour_counts_as_none(tmp_path):
     box = trimesh.creation.box((0.2, 0.2, 0.2))
     box.export(tmp_path / "bare.obj", include_normals=False)
     assert Paint.load(tmp_path / "bare.obj", any_mesh()) is None
@@ -71,7 +71,7 @@ def test_no_colours_and_one_colour_are_none(tmp_path):
 
 
 @pytest.mark.parametrize("texture", ["missing.png", "notes.txt"])
-def test_a_texture_that_is_not_there_or_no_image_is_none(tmp_path, texture):
+def test_an_unreadable_texture_counts_as_none(tmp_path, texture):
     box = trimesh.creation.box((0.2, 0.2, 0.2))
     (tmp_path / "notes.txt").write_text("no image")
     (tmp_path / "box.mtl").write_text(f"newmtl a\nmap_Kd {texture}\n")

@@ -6,10 +6,17 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from intercap_core.errors import UserError
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.rigid.distance import OcclusionScene
-from intercap_core.geometry.rigid.render import render, render_scene
-from intercap_core.geometry.rigid.shots import Drawable
+from intercap_core.geometry.rigid.render import (
+    Renderer,
+    default_renderer,
+    open_renderer,
+    render,
+    render_scene,
+)
+from intercap_core.geometry.rigid.shots import Drawable, Shot, Surface
 
 PINHOLE = Intrinsics(640, 576, 504.0, 505.0, 321.3, 287.6)
 LENS = Intrinsics(  # a Kinect's colour lens at half size: strong rational distortion
@@ -126,15 +133,6 @@ def test_out_of_view_and_behind():
     assert partly.mask.any() and partly.x0 + partly.mask.shape[1] == PINHOLE.width
 
 
-def test_rendering_repeats_exactly(objects):
-    mesh = objects["chair"]
-    images = [
-        render(mesh.vertices, mesh.faces, LENS, _pose((0, 0, 2), (0, 1, 0))) for _ in range(2)
-    ]
-    assert np.array_equal(images[0].depth, images[1].depth)
-    assert np.array_equal(images[0].face, images[1].face)
-
-
 def test_visible_vertices_of_a_sphere_and_behind_a_screen():
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.1)
     vertices = np.asarray(ball.vertices)
@@ -151,3 +149,55 @@ def test_visible_vertices_of_a_sphere_and_behind_a_screen():
     assert not behind[vertices[:, 0] < -0.003].any()
     right = clear & (vertices[:, 0] > 0.003)
     np.testing.assert_array_equal(behind[right], seen[right])
+
+
+def _shots(count: int, seed: int = 0) -> list[Shot]:
+    """Two lenses, poses all around; the last three partly, and wholly, out of view."""
+    rng = np.random.default_rng(seed)
+    shots = []
+    for number in range(count):
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.random(rng=rng).as_matrix()
+        pose[:3, 3] = rng.uniform((-0.4, -0.3, 1.2), (0.4, 0.3, 2.6))
+        shots.append(Shot(LENS if number % 2 else PINHOLE, pose))
+    shots[-1].camera_from_mesh[:3, 3] = 0, 0, -2
+    shots[-2].camera_from_mesh[:3, 3] = 6, 0, 2
+    shots[-3].camera_from_mesh[:3, 3] = 0.9, 0.5, 1.5
+    return shots
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_batches_equal_single_images(objects, threads):
+    mesh, shots = objects["stool"], _shots(9)
+    images = Renderer(threads).draw(Surface.of(mesh), shots, margin_px=3)
+    for shot, image in zip(shots, images, strict=True):
+        one = render(mesh.vertices, mesh.faces, shot.lens, shot.camera_from_mesh, margin_px=3)
+        assert (image.x0, image.y0, image.area) == (one.x0, one.y0, one.mask.sum())
+        for name in ("depth", "face", "body"):
+            np.testing.assert_array_equal(getattr(image, name), getattr(one, name))
+    assert images[-3].area > 0 and images[-2].area == 0 and images[-1].area == 0
+
+
+def test_visible_vertices_of_a_batch(objects):
+    renderer = Renderer()
+    mesh, shots = objects["stool"], _shots(6, seed=5)
+    seen = renderer.visible(Surface.of(mesh), shots)
+    rays = OcclusionScene(mesh.vertices, mesh.faces)
+    for shot, found in zip(shots, seen, strict=True):
+        expected = rays.visible(shot.lens, shot.camera_from_mesh)
+        assert (found != expected).mean() < 0.002
+    assert 0.1 < seen[0].mean() < 0.6 and not seen[-1].any()
+
+
+def test_a_gpu_is_refused():
+    assert open_renderer("cpu", threads=2).pool.threads == 2
+    assert open_renderer("auto", threads=1).pool.threads == 1
+    with pytest.raises(UserError, match=r"set object_track\.render_on: cpu"):
+        open_renderer("cuda")
+
+
+def test_threads_of_the_job(monkeypatch):
+    default_renderer.cache_clear()
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    assert default_renderer().pool.threads == 2
+    default_renderer.cache_clear()

@@ -20,7 +20,7 @@ def _bumpy(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("reach", [0.02, 0.1, 10.0])
-def test_distances_are_those_of_other_libraries_up_to_the_reach(reach: float) -> None:
+def test_distances_equal_other_libraries_up_to_the_reach(reach: float) -> None:
     vertices, faces = _bumpy()
     points = np.random.default_rng(1).uniform(-0.6, 0.6, (3000, 3))
     found = SurfaceTree(vertices, faces).shaped(vertices).distance(points, reach)
@@ -86,7 +86,7 @@ def _asked(kind: str) -> np.ndarray:
 @pytest.mark.parametrize("kind", ["scattered", "neighbours", "grid"])
 @pytest.mark.parametrize("mesh", [_bumpy, _pair, _box])
 @pytest.mark.parametrize(("reach", "deepest"), [(0.1, 0.25), (0.005, 0.25), (2.0, 2.0)])
-def test_signed_distances_are_those_of_embree(mesh, kind: str, reach: float, deepest: float):
+def test_signed_distances_equal_embree(mesh, kind: str, reach: float, deepest: float):
     vertices, faces = mesh()
     points = _asked(kind)
     tree, peer = SurfaceTree(vertices, faces), DistanceField(vertices, faces)
@@ -110,7 +110,7 @@ def test_the_inside_of_another_shape_of_the_mesh() -> None:
     assert found[some] == pytest.approx(peer, abs=1e-6)
 
 
-def test_points_that_are_no_numbers_are_out_of_reach() -> None:
+def test_points_that_are_not_finite_are_out_of_reach() -> None:
     vertices, faces = _box()
     points = np.array([[0.0, 0, 0], [np.nan, 0, 0], [0, 0, 0.1], [0, np.inf, 0], [0, 0, 0.4]])
     found = SurfaceTree(vertices, faces).shaped(vertices).signed_distance(points, 0.2, 0.3)
@@ -124,7 +124,7 @@ def test_a_mesh_with_a_hole_is_not_closed() -> None:
 
 @pytest.mark.parametrize("mesh", [_bumpy, _pair, _box])
 @pytest.mark.parametrize("kind", ["scattered", "neighbours", "grid"])
-def test_ways_are_blocked_where_rays_of_embree_are(mesh, kind: str) -> None:
+def test_blocked_segments_equal_rays_of_embree(mesh, kind: str) -> None:
     vertices, faces = mesh()
     starts = _asked(kind)
     ends = np.random.default_rng(8).uniform(-0.7, 0.7, starts.shape)

@@ -104,8 +104,8 @@ def test_equivalent_poses_move_points_by_group_elements():
                 assert np.abs(group.discrete - element).max((1, 2)).min() < 1e-9
 
 
-def test_rotations_in_single_precision_have_an_equivalent(group):
-    """A pose that a hand carried through many frames is a rotation to some 1e-6."""
+def test_rounded_rotations_have_an_equivalent(group):
+    """Integrated poses are rotations to about 1e-6."""
     rng = np.random.default_rng(3)
     pose, reference = np.eye(4), np.eye(4)
     pose[:3, :3], reference[:3, :3] = Rotation.random(2, rng=rng).as_matrix()
@@ -131,7 +131,7 @@ def test_impossible_groups_are_refused(symmetry, words):
 
 
 @pytest.mark.parametrize("fold", [3, 6, 8, 12])
-def test_tables_that_carry_four_digits_give_the_exact_group(fold):
+def test_tables_of_four_digits_give_the_exact_group(fold):
     angle = 2 * np.pi / fold
     turn = np.eye(4)
     turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]

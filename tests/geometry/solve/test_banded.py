@@ -42,7 +42,7 @@ def test_solution_matches_the_dense_solve(bandwidth: int) -> None:
 
 
 @pytest.mark.parametrize("bandwidth", [0, 1, 2, 3])
-def test_a_factor_in_the_matrix_s_own_memory_is_the_same(bandwidth: int) -> None:
+def test_factorising_in_place_gives_the_same_factor(bandwidth: int) -> None:
     system, _ = _system(bandwidth)
     before = system.bands.clone()
     apart = system.factorise()

@@ -55,7 +55,7 @@ class Exponentials:
         )
 
 
-def test_independent_frames_converge_each_at_its_own_pace() -> None:
+def test_independent_frames_converge_separately() -> None:
     start = torch.tensor([[-1.2, 1.0], [1.0, 1.0], [3.0, -4.0], [0.0, 0.0]], dtype=torch.float64)
     problem = Rosenbrock()
     found = minimise(problem, start, max_trials=80, cost_tolerance=0, step_tolerance=1e-9)

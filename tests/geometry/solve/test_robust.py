@@ -35,7 +35,7 @@ def test_an_outlier_stops_pulling() -> None:
     assert (geman_mcclure(far, 1.0).weight * far.sqrt()).item() < 1e-6
 
 
-def test_the_weight_is_the_same_of_tensors_arrays_and_inside_a_kernel() -> None:
+def test_weights_of_tensors_arrays_and_kernels_are_equal() -> None:
     squared = np.array([0.0, 0.5, 4.0, 1e6])
     expected = geman_mcclure(torch.from_numpy(squared), 3.0).weight.numpy()
     np.testing.assert_allclose(geman_mcclure_weight(squared, 3.0), expected, rtol=1e-15)

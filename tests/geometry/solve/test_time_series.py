@@ -14,7 +14,7 @@ from intercap_core.geometry.solve.time_series import (
 )
 
 
-def test_gaps_are_straight_and_ends_are_held():
+def test_gaps_are_linear_and_ends_constant():
     values = np.array([[np.nan, 0], [1, 10], [np.nan, 0], [np.nan, 0], [4, 40], [np.nan, 0]])
     at = np.array([0.0, 1.0, 1.5, 3.0, 4.0, 9.0])
     known = np.array([False, True, False, False, True, False])
@@ -23,7 +23,7 @@ def test_gaps_are_straight_and_ends_are_held():
     assert np.isnan(values[0, 0])  # the argument is untouched
 
 
-def test_nothing_known_or_nothing_missing_changes_nothing():
+def test_complete_or_unknown_values_are_unchanged():
     values = np.arange(6.0).reshape(3, 2)
     for known in (np.zeros(3, bool), np.ones(3, bool)):
         assert np.array_equal(filled_linearly(values, np.arange(3), known), values)
@@ -41,7 +41,7 @@ def test_a_parabola_has_its_exact_slope_inside():
     assert np.abs(found - (v + a * TIMES[:, None])).max() < 0.05
 
 
-def test_a_hand_that_waves_keeps_its_speed():
+def test_fast_oscillation_keeps_its_speed():
     times = np.arange(60) / 15
     rate = 2 * np.pi * 2
     found = limited_velocity(np.sin(rate * times)[:, None], times, max_speed=100)
@@ -50,7 +50,7 @@ def test_a_hand_that_waves_keeps_its_speed():
     assert (found / true)[2:-2][fast[2:-2]].mean() > 0.97
 
 
-def test_one_wrong_position_does_not_throw_its_neighbours():
+def test_one_outlier_hardly_affects_its_neighbours():
     positions = np.outer(TIMES, [1.0, 0.0])
     positions[3] += [0.0, 5.0]
     found = limited_velocity(positions, TIMES, max_speed=100)
@@ -59,7 +59,7 @@ def test_one_wrong_position_does_not_throw_its_neighbours():
     assert np.allclose(found[3], [1.0, 0.0], atol=1.5), "the jump there and back cancels"
 
 
-def test_speed_is_bounded_and_unknown_positions_have_no_say():
+def test_speed_is_limited_and_unknown_positions_ignored():
     positions = np.outer(TIMES, [50.0, 0.0])[:, None].repeat(2, 1)
     known = np.ones((len(TIMES), 2), bool)
     known[3, 1] = False
@@ -69,7 +69,7 @@ def test_speed_is_bounded_and_unknown_positions_have_no_say():
     assert np.allclose(found[[2, 4], 1], [8, 0]) and not found[3, 1].any()
 
 
-def test_nothing_to_differ_from():
+def test_single_samples_have_no_velocity():
     assert not limited_velocity(np.ones((1, 3)), np.zeros(1), max_speed=1).any()
     apart = limited_velocity(np.array([[0.0], [1.0]]), np.array([0.0, 5.0]), max_speed=1)
     assert not apart.any()
@@ -91,7 +91,7 @@ def test_no_other_sequence_costs_less(length, states, ends):
     assert tuple(found) == best
 
 
-def test_a_detour_is_not_worth_its_way_back():
+def test_transition_costs_outweigh_a_short_detour():
     stay_or_go = np.array([[0.0, 2.0], [2.0, 0.0]])
     own = np.array([0.0, 3.0]), np.array([3.0, 0.0]), np.array([0.0, 3.0])
     steps = np.stack([stay_or_go + cost for cost in own[1:]])

@@ -1,4 +1,4 @@
-"""Calibrations of other tools: each in its own written form, and what is wrong with some."""
+"""Calibrations of other tools: each form, values by hand, and broken files."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ def test_colmap_by_hand(tmp_path):
     np.testing.assert_allclose(lens.project(np.array([x, y, 1.0])), expected, atol=1e-9)
 
 
-def test_cameras_of_images_are_found_in_their_paths(tmp_path):
+def test_the_path_of_an_image_names_its_camera(tmp_path):
     written.write_colmap(tmp_path, VIEWS, metres=1.0, binary=True, image="shots/{}/0001.jpg")
     assert set(read_calibration(tmp_path, RECORDED, scale=1.0).cameras) == set(VIEWS)
     written.write_colmap(tmp_path, VIEWS, metres=1.0, binary=True, image="{}.jpg")
@@ -262,7 +262,7 @@ def test_broken_files_are_refused(tmp_path, form, fault, words):
 
 
 @pytest.mark.parametrize("form", ["anipose", "colmap-text", "colmap-binary", "nerfstudio"])
-def test_without_a_unit_a_scale_must_be_stated(tmp_path, form):
+def test_files_without_a_unit_need_a_scale(tmp_path, form):
     write, scale = FORMS[form]
     path = write(tmp_path)
     with pytest.raises(UserError, match="state metres for one of its units in column calibration_"):
@@ -273,7 +273,7 @@ def test_without_a_unit_a_scale_must_be_stated(tmp_path, form):
         read_calibration(path, RECORDED, scale=scale / 1000)
 
 
-def test_millimetres_where_metres_are_usual(tmp_path):
+def test_millimetres_need_a_scale(tmp_path):
     path = written.write_anipose(tmp_path, VIEWS)
     path.write_text(path.read_text().replace("translation", "fisheye = false\ntranslation"))
     with pytest.raises(UserError, match=r"state the unit in column calibration_scale.*0\.001"):
@@ -281,13 +281,12 @@ def test_millimetres_where_metres_are_usual(tmp_path):
     assert set(read_calibration(path, RECORDED, scale=0.001).cameras) == set(VIEWS)
 
 
-def test_names_that_are_none_of_the_recordings(tmp_path):
+def test_cameras_without_recordings_are_refused(tmp_path):
     path = written.write_pose2sim(tmp_path, VIEWS)
     with pytest.raises(UserError, match="left, front, right, the recordings are of k1, k2: none"):
         read_calibration(path, RecordedCameras(("k1", "k2")))
-    tables = RecordedCameras(
-        ("cam_0", "cam_1", "cam_2")
-    )  # Anipose's tables serve where its names do not
+    # The names of Anipose's tables are used if the recordings have them.
+    tables = RecordedCameras(("cam_0", "cam_1", "cam_2"))
     anipose = read_calibration(written.write_anipose(tmp_path, VIEWS), tables, scale=0.001)
     assert list(anipose.cameras) == ["cam_0", "cam_1", "cam_2"]
 
@@ -298,7 +297,7 @@ def test_easymocap_without_any_size(tmp_path):
         read_calibration(path, RecordedCameras(("left",)))
 
 
-def test_parts_and_doubtful_folders(tmp_path):
+def test_parts_and_ambiguous_folders_are_refused(tmp_path):
     written.write_easymocap(tmp_path, VIEWS)
     with pytest.raises(UserError, match="is a part of a calibration; name its folder"):
         read_calibration(tmp_path / "intri.yml", RECORDED)

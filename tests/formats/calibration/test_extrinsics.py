@@ -1,4 +1,4 @@
-"""Rig files and release folders: every way one can be wrong is told in one sentence."""
+"""Rig files and release folders with faults are refused by file and camera."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_a_byte_order_mark_is_skipped(tmp_path: Path) -> None:
         (_rig(name="k2\n"), "rename"),
     ],
 )
-def test_wrong_rig_files_are_named(tmp_path: Path, content: str | bytes, words: str) -> None:
+def test_wrong_rig_files_are_refused(tmp_path: Path, content: str | bytes, words: str) -> None:
     path = tmp_path / "rig.json"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
     with pytest.raises(UserError, match=words) as caught:
@@ -73,7 +73,7 @@ def test_wrong_rig_files_are_named(tmp_path: Path, content: str | bytes, words: 
         ({"R": [0, 0, 0], "T": [0, 1500, 0]}, "1500 m.*millimetres"),
     ],
 )
-def test_wrong_release_files_are_named(tmp_path: Path, content: object, words: str) -> None:
+def test_wrong_release_files_are_refused(tmp_path: Path, content: object, words: str) -> None:
     (tmp_path / "Color.json").write_text('{"R": [0, 0, 0], "T": [0, 0, 0]}')
     (tmp_path / "Color_2.json").write_text(json.dumps(content))
     with pytest.raises(UserError, match=words) as caught:

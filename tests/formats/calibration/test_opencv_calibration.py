@@ -123,15 +123,6 @@ def folds(size, matrix, coefficients) -> bool:
     return edge < 1.15 * corner
 
 
-def undistorted(pixels, matrix, coefficients):
-    """OpenCV's own inverse, iterated to the end: another function before version 5."""
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
-    iterate = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
-    eye = np.eye(3)
-    points = iterate(pixels[:, None], matrix, coefficients, R=eye, P=eye, criteria=criteria)
-    return points.reshape(-1, 2)
-
-
 @pytest.mark.parametrize("count", [4, 5, 8])
 def test_lenses_agree_with_opencv_over_the_whole_image(count):
     rng = np.random.default_rng(count)
@@ -150,11 +141,6 @@ def test_lenses_agree_with_opencv_over_the_whole_image(count):
         assert np.abs(projected - pixels).max() < 1e-3  # OpenCV agrees with our inverse
         assert np.abs(lens.project(rays * 1.7) - pixels).max() < 1e-6
         assert lens.sees(rays * 1.7).all()
-        theirs = undistorted(pixels, matrix, coefficients)
-        again = lens.project(np.concatenate([theirs, np.ones((len(theirs), 1))], axis=1))
-        converged = np.abs(again - pixels).max(axis=1) < 1e-3
-        assert converged.mean() > 0.9  # their iteration diverges in some corners, ours does not
-        assert np.abs(theirs - rays[:, :2])[converged].max() * matrix[0, 0] < 2e-3
 
 
 def test_a_lens_ends_where_its_distortion_turns_back():
@@ -237,7 +223,7 @@ def test_broken_files_are_refused(tmp_path, content, fault, words):
         ("rig.yaml", "cameras: !!python/object:os.system {}", "not valid JSON or YAML"),
     ],
 )
-def test_files_that_are_none(tmp_path, name, text, words):
+def test_files_without_a_calibration_are_refused(tmp_path, name, text, words):
     (tmp_path / name).write_text(text)
     with pytest.raises(UserError, match=words):
         read_opencv_calibration(tmp_path / name)

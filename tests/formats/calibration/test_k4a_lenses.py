@@ -52,7 +52,7 @@ def test_order_of_the_lens_parameters_and_default_radius():
 
 
 @pytest.mark.parametrize("mode", COLOUR_MODES)
-def test_a_centred_colour_lens_is_centred_in_every_mode(mode):
+def test_a_centred_lens_is_centred_in_every_mode(mode):
     lens = read(make_calibration(), colour_mode=mode).colour
     assert (lens.cx, lens.cy) == ((lens.width - 1) / 2, (lens.height - 1) / 2)
     full_height = lens.width * 3 // 4  # every mode is cut from a 4:3 image
@@ -94,7 +94,7 @@ def test_real_lenses_project_as_opencv_and_invert(real_calibration, colour_mode,
         assert np.abs(peer[:, 0] - pixels[covered]).max() < 1e-6
 
 
-def test_real_device_has_its_colour_lens_32_mm_beside_the_depth_lens(real_calibration):
+def test_lenses_of_a_real_device_are_32_mm_apart(real_calibration):
     camera = read(real_calibration)
     assert np.linalg.norm(camera.colour_from_depth[:3, 3]) == pytest.approx(0.032, abs=0.002)
     assert camera.depth.metric_radius == pytest.approx(1.74, abs=1e-4)
