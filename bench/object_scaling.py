@@ -34,7 +34,7 @@ from intercap_core.geometry.rigid.render import Renderer
 from intercap_core.geometry.rigid.shots import Shot, Surface
 from intercap_core.object_track.fit import MotionPrior, fit_pose
 from intercap_core.object_track.reduced_mask import EMPTY, ReducedMask, reduced_lens
-from intercap_core.object_track.view import Candidate, FitContext, View, ViewGeometry
+from intercap_core.object_track.view import FitContext, MaskCandidate, View, ViewGeometry
 
 VIEWS = (1, 2, 4, 6, 12, 16)
 FACES = (150, 600, 2400, 10_000)
@@ -156,7 +156,7 @@ def _view(mesh: ObjectMesh, geometry: ViewGeometry, pose: np.ndarray) -> View:
     depth = np.zeros((lens.height, lens.width), np.float32)
     depth[drawn.window] = drawn.depth
     mask = ReducedMask(silhouette.x0, silhouette.y0, silhouette.mask)
-    return View(geometry, depth, EMPTY, (Candidate(0, mesh.name, 1.0, mask),))
+    return View(geometry, depth, EMPTY, (MaskCandidate(0, mesh.name, 1.0, mask),))
 
 
 def _shots(scene: Scene, count: int) -> list[Shot]:

@@ -19,7 +19,7 @@ from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply, rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.render import open_renderer
-from intercap_core.object_track.fit import Fit, MotionPrior, assess_all, fit_pose
+from intercap_core.object_track.fit import FittedPose, MotionPrior, assess_all, fit_pose
 from intercap_core.object_track.likelihood import SEEN_LOG_RATIO
 from intercap_core.object_track.recording import TRACKING_FACES, ObjectRecording
 from intercap_core.object_track.view import FitContext, View
@@ -99,14 +99,14 @@ def _fitted(
     start: np.ndarray,
     settings: ObjectTrackSettings,
     labels: tuple[str, ...],
-) -> Fit:
+) -> FittedPose:
     """Fit from ``start`` (4, 4); if the images do not support the result, also from poses around.
 
     Returns the fit with the highest likelihood.
     """
     context = FitContext.from_settings(mesh, labels, settings, open_renderer("cpu"))
 
-    def fitted(pose: np.ndarray) -> Fit:
+    def fitted(pose: np.ndarray) -> FittedPose:
         return fit_pose(context, views, pose, prior=MotionPrior(pose))
 
     best = fitted(start)

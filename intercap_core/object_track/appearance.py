@@ -19,22 +19,13 @@ import numpy as np
 
 from intercap_core.geometry.rigid.mesh import Paint
 
-STEEP_COSINE = 0.3  # between surface and ray, below which a pixel mixes patches
-COLOUR_SAMPLES = 2.0  # independent samples of a view's colours at most
-COLOUR_HALF_SAMPLES_PX = 60  # pixels at which half of them count
-# Standard deviations in logarithms of light.
-EXPOSURE_SIGMA = 0.1  # of a view's exposure and white balance from frame to frame
-GAIN_SIGMA = 0.15  # of a camera's gain
-SHADING_SIGMA = 0.4  # of the light from one side relative to the other
-# Of measured colours at least: shadows and lamps change the brightness more than the two ratios.
+COLOUR_SAMPLES = 2.0  # independent samples of a view's colours at most; tuned on the studio
+# Standard deviations of measured colours at least, in logarithms of light: shadows and lamps change
+# the brightness more than the two ratios. Tuned on the studio.
 COLOUR_MIN_SIGMA = np.array([0.25, 0.08, 0.08])
-COLOUR_RANGE = 2.0  # from white to black paint
-COLOURED_SHARE = 0.5  # of the noise's variance that the variance of the colours must exceed
-COLOUR_COST_MAX = 4.5  # three standard deviations: an occluder, a highlight
-LEARNING_STEPS = 4  # alternations of colours and gains
-PAINT_EXPLAINS = 0.5  # share of the colours' variance that the mesh's own colours must explain
 
-LEVELS_USED = slice(10, 251)  # darker grey levels are noise, brighter ones are saturated
+# Grey levels; darker ones are noise, brighter ones are saturated. Tuned on the studio.
+LEVELS_USED = slice(10, 251)
 
 
 def linear(levels: np.ndarray) -> np.ndarray:
@@ -43,9 +34,14 @@ def linear(levels: np.ndarray) -> np.ndarray:
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
 
-LIGHT = np.full(256, np.nan)
-"""Logarithms of light of grey levels, NaN outside of ``LEVELS_USED``."""
-LIGHT[LEVELS_USED] = np.log(linear(np.arange(256)[LEVELS_USED]))
+def _log_light() -> np.ndarray:
+    result = np.full(256, np.nan)
+    result[LEVELS_USED] = np.log(linear(np.arange(256)[LEVELS_USED]))
+    return result
+
+
+LIGHT = _log_light()
+"""(256,) logarithms of light of the grey levels, NaN outside of ``LEVELS_USED``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,13 +87,13 @@ class Appearance:
             size: size of a patch, metres.
         """
         self.sightings = tuple(sightings)
-        self._patches = np.unique(np.concatenate([one.patch for one in sightings]))
+        self._patches = np.unique(np.concatenate([s.patch for s in sightings]))
         self._gain = np.zeros((views, 3))
-        every = np.concatenate([one.colour for one in sightings])
+        every = np.concatenate([s.colour for s in sightings])
         self._average = np.median(every, axis=0)
         self._spread = np.maximum(every.var(0), COLOUR_MIN_SIGMA**2)
         self._noise = self._spread.copy()
-        self._frames = np.array([one.frame for one in sightings])
+        self._frames = np.array([s.frame for s in sightings])
         count = len(self._patches)
         self._totals = np.zeros((len(sightings), count, 3))
         self._looks = np.zeros((len(sightings), count))
@@ -107,7 +103,7 @@ class Appearance:
     @property
     def is_coloured(self) -> bool:
         """Whether the object has more than one colour."""
-        return bool((self._spread > COLOURED_SHARE * self._noise).any())
+        return bool((self._spread > 0.5 * self._noise).any())
 
     def log_ratio(self, seen: SurfaceColours, apart: int) -> float:
         """Return the log-likelihood ratio of a pose, nats.
@@ -122,23 +118,24 @@ class Appearance:
 
     def _learn(self) -> None:
         """Estimate colours, gains of the cameras, and the noise of both in turns."""
-        views = np.concatenate([one.view for one in self.sightings])
+        gain_sigma = 0.15  # of a camera's gain, logarithm of light
+        views = np.concatenate([s.view for s in self.sightings])
         cameras = np.unique(views)
-        for _ in range(LEARNING_STEPS):
+        for _ in range(4):
             plain = [
-                self._unshaded(one, one.colour - self._gain[one.view] - self._average)
-                for one in self.sightings
+                self._unshaded(s, s.colour - self._gain[s.view] - self._average)
+                for s in self.sightings
             ]
             self._add_up(plain)
             left = []
-            for one in self.sightings:
-                at, _ = self._find(one.patch)
-                known = self._known(self._frames != one.frame)
-                colour = one.colour - self._gain[one.view] - known.mean[at]
-                left.append(self._unshaded(one, colour))
+            for seen in self.sightings:
+                at, _ = self._find(seen.patch)
+                known = self._known(self._frames != seen.frame)
+                colour = seen.colour - self._gain[seen.view] - known.mean[at]
+                left.append(self._unshaded(seen, colour))
             residual = np.concatenate(left)
             # a camera may have seen one side only: its gain is not what may be colour
-            share = GAIN_SIGMA**2 / (GAIN_SIGMA**2 + self._noise)
+            share = gain_sigma**2 / (gain_sigma**2 + self._noise)
             for camera in cameras:
                 left_over = residual[views == camera] + self._gain[camera]
                 self._gain[camera] = share * np.median(left_over, axis=0)
@@ -155,12 +152,12 @@ class Appearance:
         average.
         """
         count = len(self._patches)
-        for number, (one, colour) in enumerate(zip(self.sightings, plain, strict=True)):
-            at, _ = self._find(one.patch)
-            weight = np.bincount(at, one.pixels, count)
+        for number, (seen, colour) in enumerate(zip(self.sightings, plain, strict=True)):
+            at, _ = self._find(seen.patch)
+            weight = np.bincount(at, seen.pixels, count)
             self._looks[number] = weight > 0
             for channel in range(3):
-                own = np.bincount(at, one.pixels * (self._average + colour)[:, channel], count)
+                own = np.bincount(at, seen.pixels * (self._average + colour)[:, channel], count)
                 self._totals[number, :, channel] = own / np.maximum(weight, 1e-9)
 
     def _known(self, frames: np.ndarray) -> _PatchColours:
@@ -181,6 +178,9 @@ class Appearance:
 
         Ridge regression on the normals: light from one side, and the exposure of each view.
         """
+        # standard deviations, logarithms of light: exposure and white balance of a view from frame
+        # to frame, and light from one side relative to the other
+        exposure_sigma, shading_sigma = 0.1, 0.4
         result = colour.copy()
         starts = np.flatnonzero(np.diff(seen.view, prepend=-1))
         for start, stop in zip(starts, [*starts[1:], len(seen.view)], strict=True):
@@ -188,7 +188,7 @@ class Appearance:
             # patches of a view err together: a view of one side only must keep its colour
             weight = COLOUR_SAMPLES * seen.pixels[own, None] / seen.pixels[own].sum()
             light = np.concatenate(
-                [np.full((stop - start, 1), EXPOSURE_SIGMA), SHADING_SIGMA * seen.normal[own]], 1
+                [np.full((stop - start, 1), exposure_sigma), shading_sigma * seen.normal[own]], 1
             )
             for channels, design in ((slice(0, 1), light), (slice(1, 3), light[:, :1])):
                 noise = self._noise[channels].mean()
@@ -207,13 +207,13 @@ class Appearance:
         own = self._unshaded(seen, colour - mean)
         common = self._spread + self._noise
         ratio = _cost(any_, common) - _cost(own, variance)
-        found = 0.0
+        total = 0.0
         for camera in np.unique(seen.view):
             here = seen.view == camera
             pixels = float(seen.pixels[here].sum())
-            samples = COLOUR_SAMPLES * pixels / (pixels + COLOUR_HALF_SAMPLES_PX)
-            found += samples * float(seen.pixels[here] @ ratio[here]) / pixels
-        return found
+            samples = COLOUR_SAMPLES * pixels / (pixels + 60)
+            total += samples * float(seen.pixels[here] @ ratio[here]) / pixels
+        return total
 
     def _compare(self, paint: Paint, size: float) -> _PatchColours | None:
         """Return the mesh's own colours of the patches if they explain the learnt ones."""
@@ -236,8 +236,9 @@ class Appearance:
         mean[there] += np.median(learnt[there] - mean[there], axis=0)
         off = _mean_square(learnt[there] - mean[there])
         square = _mean_square(learnt[there] - self._average)
-        # all channels together, as paint of another copy may match in one by chance
-        if (off / self._noise).sum() > (1 - PAINT_EXPLAINS) * (square / self._noise).sum():
+        # They must explain half of the variance of all channels together, because the paint of
+        # another copy may match in one channel by chance.
+        if (off / self._noise).sum() > 0.5 * (square / self._noise).sum():
             return None
         variance = np.where(there[:, None], off, self._spread)
         return _PatchColours(mean, variance)
@@ -245,13 +246,14 @@ class Appearance:
 
 def _cost(residual: np.ndarray, variance: np.ndarray) -> np.ndarray:
     """Return minus log-likelihoods (N,) of residuals (N, 3) up to a constant, bounded."""
-    cost = np.minimum(0.5 * residual**2 / variance, COLOUR_COST_MAX)
+    # at most three standard deviations: an occluder, a highlight
+    cost = np.minimum(0.5 * residual**2 / variance, 4.5)
     return (cost + 0.5 * np.log(variance)).sum(1)
 
 
 def _mean_square(residual: np.ndarray) -> np.ndarray:
-    """Return the mean square (3,) of residuals (N, 3), each bounded by ``COLOUR_RANGE``."""
-    return (np.clip(residual, -COLOUR_RANGE, COLOUR_RANGE) ** 2).mean(0)
+    """Return the mean square (3,) of residuals (N, 3), each bounded by 2: from white to black."""
+    return (np.clip(residual, -2.0, 2.0) ** 2).mean(0)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -274,29 +276,17 @@ def patch_of(point, normal, size):
 @numba.njit(cache=True, nogil=True)
 def patches_of(points, normals, size):
     """Return :func:`patch_of` of points (N, 3): (N,) int64."""
-    found = np.empty(len(points), np.int64)
+    patches = np.empty(len(points), np.int64)
     for i in range(len(points)):
-        found[i] = patch_of(points[i], normals[i], size)
-    return found
+        patches[i] = patch_of(points[i], normals[i], size)
+    return patches
 
 
 @numba.njit(cache=True, nogil=True)
 def seen_patches(
-    depth,
-    face,
-    x0,
-    y0,
-    mask,
-    mx,
-    my,
-    rays,
-    picture,
-    light,
-    object_from_camera,
-    face_normals,
-    size,
-    steep,
-):
+    depth, face, x0, y0, mask, mx, my, rays, picture, light,
+    object_from_camera, face_normals, size, steep,
+):  # fmt: skip
     """Return the patches of all pixels that show the object, with faces and colours.
 
     A pixel counts if it and its neighbours lie in the rendering and in the candidate's mask.
@@ -316,7 +306,7 @@ def seen_patches(
         Patches (n,), faces (n,) and colours (n, 3): brightness, red to green and blue to green.
     """
     height, width = face.shape
-    found = np.empty(height * width, np.int64)
+    patches = np.empty(height * width, np.int64)
     faces = np.empty(height * width, np.int64)
     colours = np.empty((height * width, 3))
     point = np.empty(3)
@@ -354,8 +344,8 @@ def seen_patches(
                 length += along * along
             if across < steep * np.sqrt(length):
                 continue
-            found[count], faces[count] = patch_of(point, face_normals[f], size), f
+            patches[count], faces[count] = patch_of(point, face_normals[f], size), f
             colours[count, 0] = (blue + green + red) / 3
             colours[count, 1], colours[count, 2] = red - green, blue - green
             count += 1
-    return found[:count], faces[:count], colours[:count]
+    return patches[:count], faces[:count], colours[:count]

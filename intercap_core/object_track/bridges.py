@@ -25,7 +25,7 @@ from intercap_core.object_track.decoder import (
     mode_log_ratios,
     pose_distances,
 )
-from intercap_core.object_track.fit import FIT_ROUNDS, Fit, MotionPrior
+from intercap_core.object_track.fit import FIT_ROUNDS, FittedPose, MotionPrior
 from intercap_core.object_track.given_poses import UNSEEN_S
 from intercap_core.object_track.likelihood import CONTRADICTED_LOG_RATIO
 from intercap_core.object_track.motion import estimate_hand_motions, unwrap_symmetry
@@ -35,9 +35,6 @@ from intercap_core.object_track.observer import Observer
 # off by more. Tuned on the studio.
 UNSURE_M = 0.035
 UNSURE_RAD = np.radians(15)
-# Nats by which a path in a hand must be likelier than any different path to be sure: odds of seven
-# to one. A longer free motion costs 3 more even if nobody sees anything.
-CARRIED_LOG_RATIO = 2.0
 
 
 @dataclass(frozen=True)
@@ -164,17 +161,28 @@ class FilledTrack:
     images: np.ndarray
     """(T, 6, 6) information of the images in the same frames."""
     pull: np.ndarray
-    """(T, 6) J'r of the hand; the images pull as much in the opposite direction."""
+    """(T, 6) J'r of the hand; that of the images is the opposite, as their sum is minimal."""
     sure: np.ndarray
     """(T,) lost frames through which a hand surely carried the object."""
+
+    def evidence(self, share: float, noise: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return information (T, 6, 6) and gradient (T, 6) of hand and images together.
+
+        Args:
+            share: independent observations per frame: the hand's evidence in successive frames is
+                as good as one observation.
+            noise: factor of the stated variance of the images.
+        """
+        hand = share * self.hand
+        return hand + self.images / noise, self.pull * (share - 1 / noise)
 
 
 def fill_lost(observer: Observer, poses: np.ndarray, lost: np.ndarray) -> FilledTrack:
     """Fill in the lost frames of a track by the likeliest path between known frames.
 
-    A hand surely carried the object if no different path is nearly as likely, the images do not
-    contradict it, and the gap is short. Known poses are replaced by equivalent ones that follow
-    each other.
+    A hand surely carried the object if the odds against any different path are above seven to one
+    (2 nats), the images do not contradict it, and the gap is short. Known poses are replaced by
+    equivalent ones that follow each other.
 
     Args:
         observer: the recording.
@@ -213,7 +221,7 @@ def fill_lost(observer: Observer, poses: np.ndarray, lost: np.ndarray) -> Filled
         ]
         if (
             held.any()
-            and total[best] - max(rivals, default=-np.inf) > CARRIED_LOG_RATIO
+            and total[best] - max(rivals, default=-np.inf) > 2.0
             and seen[best] > CONTRADICTED_LOG_RATIO
             and times[b] - times[a] < UNSEEN_S
         ):
@@ -223,7 +231,7 @@ def fill_lost(observer: Observer, poses: np.ndarray, lost: np.ndarray) -> Filled
     return FilledTrack(track, hand, images, pull, sure)
 
 
-def _path_log_ratio(pose: np.ndarray, information: np.ndarray, fit: Fit) -> float:
+def _path_log_ratio(pose: np.ndarray, information: np.ndarray, fit: FittedPose) -> float:
     """Return the images' log-likelihood ratio of a fit, less its deviation from the path.
 
     ``pose`` (4, 4) and ``information`` (6, 6) are those of the path. The straight path is not
@@ -241,7 +249,7 @@ def _is_different(mesh: ObjectMesh, one: Bridge, two: Bridge) -> bool:
     return any(turn[0, 0] > UNSURE_RAD or shift[0, 0] > UNSURE_M for turn, shift in pairs)
 
 
-def _fit_path(observer: Observer, path: Bridge) -> list[Fit]:
+def _fit_path(observer: Observer, path: Bridge) -> list[FittedPose]:
     """Compare a path with the images; poses in a hand are fitted, with the hand as prior."""
     motion = rigid_velocity(
         path.poses, np.ones(len(path.frames), bool), observer.times[path.frames]

@@ -14,29 +14,18 @@ from dataclasses import replace
 import numpy as np
 
 from intercap_core.geometry.rigid.shots import Shot, Surface
-from intercap_core.object_track.appearance import (
-    LIGHT,
-    STEEP_COSINE,
-    Appearance,
-    SurfaceColours,
-    seen_patches,
-)
+from intercap_core.object_track.appearance import LIGHT, Appearance, SurfaceColours, seen_patches
 from intercap_core.object_track.decoder import HIDDEN, Decoded, decode_given, mix_decisions
 from intercap_core.object_track.evidence import ERROR_LASTING_S
-from intercap_core.object_track.fit import Fit, seen_by
+from intercap_core.object_track.fit import FittedPose, seen_by
 from intercap_core.object_track.hypotheses import RIVAL_PROBABILITY, Hypotheses
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.proposals import KEY_FRAME_S
 from intercap_core.object_track.view_report import ASSESS_MIN_OVERLAP, choose_candidate
 
-PATCHES_ACROSS = 12  # patches per diameter: a centimetre of a cup, two pixels at 3 m
-LEARNING_FRAMES = 12  # frames from which colours are learnt, at most ...
-LEARNING_FRAMES_MIN = 3  # ... and at least
-PAINT_LOOKS = 3  # independent observations by the mesh's own colours, in all frames together
-GAUGES = 3  # poses of one frame relative to which colours are learnt
-WEAK_GAUGE = 0.05  # probability of such a pose below which it may lack certain frames
-SURE_PROBABILITY = 0.8  # of a pose, given that of one frame, from which colours are learnt
-COLOUR_EVERY_S = 1 / 15  # frames nearer than this show the same colours
+PATCHES_ACROSS = (
+    12  # per diameter: patches of a cup are 1 cm, two pixels at 3 m; tuned on the studio
+)
 
 
 class ColourDecision:
@@ -65,13 +54,15 @@ class ColourDecision:
         if self._observer.pictures is None or not sure[first]:
             return decoded
         own = decoded.probability[first][:-1]
-        gauges = [int(k) for k in np.argsort(-own)[:GAUGES] if own[k] > RIVAL_PROBABILITY]
+        # colours are learnt relative to the likeliest poses of one frame
+        gauges = [int(k) for k in np.argsort(-own)[:3] if own[k] > RIVAL_PROBABILITY]
         relative = {k: decode_given(emissions, steps, first, k, self._absent) for k in gauges}
         rivals = self._ambiguous(list(relative.values()))
         if not gauges or (not rivals and (self._observer.paint is None or len(gauges) == 1)):
             return decoded
         learnt = {k: self._learn(result) for k, result in relative.items()}
-        if any(learnt[k] is None and own[k] > WEAK_GAUGE for k in gauges):
+        # an unlikely pose may have too few certain frames to learn from
+        if any(learnt[k] is None and own[k] > 0.05 for k in gauges):
             return decoded
         results = []
         for k, colours in learnt.items():
@@ -87,7 +78,7 @@ class ColourDecision:
 
         Frames that are near others are skipped. The same hypotheses are compared in all results.
         """
-        every = self._observer.frames_in(COLOUR_EVERY_S)
+        every = self._observer.frames_in(1 / 15)  # nearer frames show the same colours
         rivals = {}
         for t in range(0, len(relative[0].path) if relative else 0, every):
             likely = np.array(
@@ -105,13 +96,12 @@ class ColourDecision:
         certain = [
             t
             for t in range(0, len(decoded.path), self._observer.frames_in(KEY_FRAME_S))
-            if decoded.path[t] != HIDDEN
-            and decoded.probability[t][decoded.path[t]] > SURE_PROBABILITY
+            if decoded.path[t] != HIDDEN and decoded.probability[t][decoded.path[t]] > 0.8
         ]
-        some = np.linspace(0, len(certain) - 1, min(len(certain), LEARNING_FRAMES)).round()
+        some = np.linspace(0, len(certain) - 1, min(len(certain), 12)).round()
         seen = [self._colours(certain[i], decoded.path[certain[i]]) for i in some.astype(int)]
         kept = [colours for colours in seen if colours is not None]
-        if len(kept) < LEARNING_FRAMES_MIN:
+        if len(kept) < 3:
             return None
         views = len(self._observer.views(kept[0].frame))
         return Appearance(kept, views, self._observer.paint, self._size)
@@ -119,15 +109,12 @@ class ColourDecision:
     def _paint_log_ratio(self, learnt: Appearance) -> float:
         """Return the evidence of the mesh's own colours for the poses of the learnt frames, nats.
 
-        Wrong colours are wrong in all frames, so all frames count as a few observations.
+        Wrong colours are wrong in all frames, so all frames count as three observations.
         """
-        return PAINT_LOOKS * float(np.mean([learnt.paint_log_ratio(s) for s in learnt.sightings]))
+        return 3 * float(np.mean([learnt.paint_log_ratio(s) for s in learnt.sightings]))
 
     def _add_colours(
-        self,
-        emissions: Sequence[np.ndarray],
-        learnt: Appearance,
-        rivals: Mapping[int, np.ndarray],
+        self, emissions: Sequence[np.ndarray], learnt: Appearance, rivals: Mapping[int, np.ndarray]
     ) -> list[np.ndarray]:
         """Return the emissions with the evidence of the learnt colours in ambiguous frames."""
         apart = self._observer.frames_in(ERROR_LASTING_S)
@@ -152,7 +139,7 @@ class ColourDecision:
             self._seen[t, k] = self._measure(t, self._hypotheses.fits[t][k])
         return self._seen[t, k]
 
-    def _measure(self, t: int, fit: Fit) -> SurfaceColours | None:
+    def _measure(self, t: int, fit: FittedPose) -> SurfaceColours | None:
         observer, mesh = self._observer, self._observer.mesh
         assert observer.pictures is not None
         if self._pictures is None or self._pictures[0] != t:
@@ -164,6 +151,7 @@ class ColourDecision:
             for view, pose in zip(views, poses, strict=True)
         ]
         renderings = observer.context.renderer.draw(Surface.of(mesh), shots)
+        steep_cosine = 0.3  # between surface and ray; below, a pixel mixes patches
         parts = []
         for number, (view, shot, drawn) in enumerate(zip(views, shots, renderings, strict=True)):
             picture = pictures[number]
@@ -174,7 +162,7 @@ class ColourDecision:
                 drawn.depth, drawn.face, drawn.x0, drawn.y0,
                 candidate.mask.mask, candidate.mask.x0, candidate.mask.y0,
                 shot.lens.rays, picture, LIGHT, np.linalg.inv(shot.camera_from_mesh),
-                mesh.face_normals, self._size, STEEP_COSINE,
+                mesh.face_normals, self._size, steep_cosine,
             )  # fmt: skip
             if len(patch):
                 normals = mesh.face_normals[face] @ poses[number][:3, :3].T
@@ -183,14 +171,8 @@ class ColourDecision:
             return None
         number, patch, colour, normal, pixels = zip(*parts, strict=True)
         of_view = np.repeat(number, [len(p) for p in patch])
-        return SurfaceColours(
-            t,
-            np.concatenate(patch),
-            np.concatenate(colour),
-            np.concatenate(normal),
-            of_view,
-            np.concatenate(pixels),
-        )
+        patch, colour, normal, pixels = map(np.concatenate, (patch, colour, normal, pixels))
+        return SurfaceColours(t, patch, colour, normal, of_view, pixels)
 
 
 def _average_by_patch(

@@ -1,9 +1,9 @@
 """Decision between the hypotheses of all frames by a hidden Markov model.
 
 The states of a frame are its hypotheses, each in every mode of motion (at rest, free, in a hand),
-and two states without a hypothesis: the object is hidden, or it has left. Modes last and change
-seldom. The most likely step of a mode has log-probability 0 whatever the mode's width, because
-poses are a few hypotheses and not densities.
+and two states without a hypothesis: the object is hidden, or it has left. Modes seldom change. The
+most likely step of a mode has log-probability 0 whatever its standard deviation, because the states
+are a few hypotheses and not a density.
 
 Probabilities come from the forward-backward algorithm, the most likely sequence from the Viterbi
 algorithm (Rabiner, Proceedings of the IEEE 77(2), 1989).
@@ -22,8 +22,6 @@ from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.motion import HandMotion
 
 # Standard deviations of the motion between frames; tuned on the studio, as all values below.
-MOVING_M_S = 2.5  # free motion: a swing, a kick
-MOVING_TURN_RAD_S = 7.0
 STANDING_M = 0.015  # fits of an object at rest
 STANDING_RAD = np.radians(8)
 HELD_M = 0.02  # in a hand: fits and joints ...
@@ -32,22 +30,18 @@ HELD_M_S = 0.3  # ... and slipping
 HELD_RAD_S = 1.0
 # Costs are minus log-likelihoods, nats.
 FREE_COST_S = 30.0  # of free motion per second: rest and hands explain most recordings
-FREE_LASTING_S = 0.1  # the longest time that it costs: the object may have rested meanwhile
 MODE_CHANGES_S = 1.0  # changes from one mode of motion to another per second
 JUMP_COST = 10.0  # of a step that no motion explains
-VANISH_COST = 7.0  # of going out of sight
-APPEAR_COST = 7.0  # of coming into sight
+VANISH_COST = 7.0  # of going out of sight, and of coming into sight
 LEAVE_COST = 4.0  # of leaving the room or coming back, in addition
 # Cost of going out of reach between two sure frames, and of coming back: clutter is anywhere in a
 # room, of which the reachable part is a hundredth.
 EXCURSION_COST = 5.0
-REACH_M = 0.2  # reach: error of either pose ...
-REACH_M_S = 4.0  # ... and the speed of a thrown object
+REACH_M = 0.2  # error of either pose of two that can be reached from each other
 
 FIRST_HAND = 2  # modes of motion: rest, free, then each hand
 HIDDEN = -1  # in paths: no hypothesis is true
 _CERTAIN = 1e4  # nats, far more than the evidence of all frames
-_LEAST = -600.0  # nats of a frame, so that the exponential is not zero
 
 
 def step_costs(
@@ -74,18 +68,18 @@ def step_costs(
             M = 2 + H. The last state of either frame is that no hypothesis is true.
     """
     modes = FIRST_HAND + len(hands)
-    found = np.zeros((modes, modes, len(before) + 1, len(after) + 1))
-    found[..., :-1, -1], found[..., -1, :-1] = -VANISH_COST, -APPEAR_COST
+    steps = np.zeros((modes, modes, len(before) + 1, len(after) + 1))
+    steps[..., :-1, -1] = steps[..., -1, :-1] = -VANISH_COST
     if not (len(before) and len(after)):
-        return found
+        return steps
     own = mode_log_ratios(mesh, before, after, seconds, hands, free_cost_s)
     changes = np.full((modes, modes), np.log(-np.expm1(-MODE_CHANGES_S * seconds)))
     np.fill_diagonal(changes, 0.0)
     # one of the modes that are possible from a pose is true
     possible = np.where(np.isfinite(own).any(2), 0.0, -np.inf)
     share = changes[:, :, None] - logsumexp(changes[:, :, None] + possible, axis=1, keepdims=True)
-    found[..., :-1, :-1] = share[..., None] + own
-    return found
+    steps[..., :-1, :-1] = share[..., None] + own
+    return steps
 
 
 def mode_log_ratios(
@@ -98,10 +92,12 @@ def mode_log_ratios(
 ) -> np.ndarray:
     """Return log-probabilities (M, K, L) of the steps between poses in each mode of motion."""
     turn, shift = pose_distances(mesh, before, after)
-    moved = (turn / (MOVING_TURN_RAD_S * seconds)) ** 2 + (shift / (MOVING_M_S * seconds)) ** 2
+    rad_s, m_s = 7.0, 2.5  # free motion: a swing, a kick
+    moved = (turn / (rad_s * seconds)) ** 2 + (shift / (m_s * seconds)) ** 2
+    # free motion costs for 0.1 s at most: the object may have rested meanwhile
     ways = [
         -0.5 * ((turn / STANDING_RAD) ** 2 + (shift / STANDING_M) ** 2),
-        -np.minimum(0.5 * moved, JUMP_COST) - free_cost_s * min(seconds, FREE_LASTING_S),
+        -np.minimum(0.5 * moved, JUMP_COST) - free_cost_s * min(seconds, 0.1),
         *(_hand_log_ratios(mesh, before, after, seconds, hand) for hand in hands),
     ]
     return np.array(ways)
@@ -119,9 +115,9 @@ def _hand_log_ratios(
     # an error of the hand's turn moves what is far from it
     arm = np.linalg.norm(centres - hand.start, axis=1)
     shift_sigma = np.sqrt(HELD_M**2 + (HELD_M_S * seconds) ** 2 + (arm * turn_sigma) ** 2)
-    found = -0.5 * ((turn / turn_sigma) ** 2 + (shift / shift_sigma[:, None]) ** 2)
-    found[~hand.reaches(centres, mesh.diameter / 2)] = -np.inf
-    return found
+    ratio = -0.5 * ((turn / turn_sigma) ** 2 + (shift / shift_sigma[:, None]) ** 2)
+    ratio[~hand.reaches(centres, mesh.diameter / 2)] = -np.inf
+    return ratio
 
 
 def pose_distances(
@@ -160,19 +156,19 @@ def find_excursions(
     """
 
     def reaches(a: np.ndarray, b: np.ndarray, seconds: float) -> np.ndarray:
-        return np.linalg.norm(a - b, axis=-1) < REACH_M + REACH_M_S * seconds
+        return np.linalg.norm(a - b, axis=-1) < REACH_M + 4.0 * seconds  # m/s: it is thrown
 
     known = np.flatnonzero(sure).tolist()
     places = np.array([centres[t][path[t]] for t in known]).reshape(-1, 3)
-    found = [np.zeros(len(own), bool) for own in centres]
+    away = [np.zeros(len(own), bool) for own in centres]
     for i, (u, v) in enumerate(pairwise(known)):
         if v > u + 1 and reaches(places[i], places[i + 1], times[v] - times[u]):
             for t in range(u + 1, v):
-                found[t] = ~(
+                away[t] = ~(
                     reaches(centres[t], places[i], times[t] - times[u])
                     & reaches(centres[t], places[i + 1], times[v] - times[t])
                 )
-    return found
+    return away
 
 
 def add_excursion_costs(
@@ -274,7 +270,8 @@ def _forward_backward(
         The probability of each state [T], and the log-likelihood of all frames.
     """
     moves = [np.exp(way) for way in ways]
-    seen = [np.exp(np.maximum(value - value.max(), _LEAST)) for value in values]
+    # exp(-600) is the least, so that no state becomes impossible
+    seen = [np.exp(np.maximum(value - value.max(), -600.0)) for value in values]
     evidence = float(sum(value.max() for value in values))
     ahead: list[np.ndarray] = []
     for t, own in enumerate(seen):
@@ -286,7 +283,7 @@ def _forward_backward(
         before = move @ (behind[-1] * own)
         behind.append(before / before.max())
     both = [a * b for a, b in zip(ahead, reversed(behind), strict=True)]
-    return [one / one.sum() for one in both], evidence
+    return [own / own.sum() for own in both], evidence
 
 
 def decode_given(
@@ -300,18 +297,18 @@ def decode_given(
     known = list(emissions)
     known[frame] = np.full(len(known[frame]), -_CERTAIN)
     known[frame][state] = emissions[frame][state] + _CERTAIN
-    found = decode(known, steps, absent)
-    return replace(found, evidence=found.evidence - _CERTAIN)
+    decoded = decode(known, steps, absent)
+    return replace(decoded, evidence=decoded.evidence - _CERTAIN)
 
 
-def mix_decisions(found: Sequence[Decoded]) -> Decoded:
+def mix_decisions(results: Sequence[Decoded]) -> Decoded:
     """Average results that exclude each other, weighted by their evidence."""
-    evidence = np.array([one.evidence for one in found])
+    evidence = np.array([result.evidence for result in results])
     share = np.exp(evidence - logsumexp(evidence))
     probability = [
         np.einsum("n,nk->k", share, np.array(every))
-        for every in zip(*(one.probability for one in found), strict=True)
+        for every in zip(*(result.probability for result in results), strict=True)
     ]
-    gone = share @ np.array([one.gone for one in found])
-    path = found[int(share.argmax())].path
+    gone = share @ np.array([result.gone for result in results])
+    path = results[int(share.argmax())].path
     return Decoded(path, probability, gone, float(logsumexp(evidence)))

@@ -28,15 +28,12 @@ TURN_SCALE = np.repeat([np.sqrt(COMMON_TURN_VARIANCE / COMMON_ERROR_VARIANCE), 1
 # Duration of errors of masks: frames within it are one independent observation. Tuned on the
 # studio.
 ERROR_LASTING_S = 0.3
-# Least variance of the views' errors over the stated one: a few views may agree by chance. Tuned on
-# the studio.
-MIN_NOISE_VARIANCE = 0.05
 # Standard deviations (rad, metres) of an unobserved pose: a uniform angle; a room.
 UNKNOWN_SIGMA = np.repeat([np.pi / np.sqrt(3), 1.0], 3)
 
 
 @dataclass(frozen=True)
-class PoseEvidence:
+class ImageEvidence:
     """Evidence of V views on small motions (turn on the left, shift) of a pose, without a prior.
 
     J'J and J'r are weighted in units of one standard deviation, zero for a view without evidence.
@@ -53,10 +50,15 @@ class PoseEvidence:
     reports: tuple[ViewReport, ...]
     """Agreement of each view with the pose."""
 
+    @property
+    def log_ratio(self) -> float:
+        """Log-likelihood ratio of all views, nats (:mod:`.likelihood`)."""
+        return sum(view.log_ratio for view in self.reports)
+
 
 def evidence_at(
     context: FitContext, views: list[View], pose: np.ndarray, twist: np.ndarray | None = None
-) -> PoseEvidence:
+) -> ImageEvidence:
     """Evaluate the evidence of the images at ``pose`` (4, 4) with the last robust scales."""
     fits = view_fits(context, views, pose, twist)
 
@@ -69,13 +71,8 @@ def evidence_at(
     by_view = context.renderer.pool.map(terms, fits)
     depth = [np.array(part) for part in zip(*(terms[0] for terms in by_view), strict=True)]
     contour = [np.array(part) for part in zip(*(terms[1] for terms in by_view), strict=True)]
-    return PoseEvidence(
-        depth[0] + contour[0],
-        depth[1] + contour[1],
-        depth[0],
-        depth[1],
-        tuple(report for *_, report in by_view),
-    )
+    reports = tuple(report for *_, report in by_view)
+    return ImageEvidence(depth[0] + contour[0], depth[1] + contour[1], *depth, reports)
 
 
 def report_at(
@@ -87,7 +84,7 @@ def report_at(
     return fit.report(REPORT_CONTOUR_PX)
 
 
-def views_noise(evidences: Sequence[PoseEvidence]) -> float:
+def views_noise(evidences: Sequence[ImageEvidence]) -> float:
     """Estimate the factor of the stated variance from how far the gradients of the views disagree.
 
     At the minimum each view v of a frame still has a gradient g_v. If its errors are independent
@@ -104,7 +101,8 @@ def views_noise(evidences: Sequence[PoseEvidence]) -> float:
         squares += float(np.einsum("vi,ij,vj->", gradient, inverse, gradient))
         freedom += float((6 * share * (1 - share)).sum())
     apart = squares / freedom if freedom > 1 else 1.0
-    return float(np.clip(apart, MIN_NOISE_VARIANCE / COMMON_ERROR_VARIANCE, 1.0))
+    # a few views may agree by chance, so the total variance is at least 0.05 of the stated one
+    return float(np.clip(apart, 0.05 / COMMON_ERROR_VARIANCE, 1.0))
 
 
 def free_turns(mesh: ObjectMesh, pose: np.ndarray) -> np.ndarray:
@@ -164,9 +162,7 @@ class FrameEvidence:
         poses = self.poses.copy()
         poses[:, :3, 3] += poses[:, :3, :3] @ centre
         return FrameEvidence(
-            poses,
-            back @ self.information @ to_origin,
-            np.einsum("tij,tj->ti", back, self.gradient),
+            poses, back @ self.information @ to_origin, np.einsum("tij,tj->ti", back, self.gradient)
         )
 
     @property
@@ -184,11 +180,6 @@ def steps_about_point(arms: np.ndarray) -> np.ndarray:
     x, y, z = arms.T
     result = np.tile(np.eye(6), (len(arms), 1, 1))
     result[:, 3:, :3] = np.stack(
-        [
-            np.stack([0 * x, -z, y], 1),
-            np.stack([z, 0 * x, -x], 1),
-            np.stack([-y, x, 0 * x], 1),
-        ],
-        1,
+        [np.stack([0 * x, -z, y], 1), np.stack([z, 0 * x, -x], 1), np.stack([-y, x, 0 * x], 1)], 1
     )
     return result

@@ -17,26 +17,12 @@ from intercap_core.object_track.view import FitContext, View
 from intercap_core.object_track.view_fit import NormalEquations, ViewFit, shots_of
 from intercap_core.object_track.view_report import ViewReport, quick_report
 
-# Standard deviations of the pose around a prediction without a stated one; tuned on the studio.
-PRIOR_SIGMA_M = 0.06
-PRIOR_SIGMA_RAD = float(np.radians(15))
 # Geman-McClure scales, first and last: from the error of a start to a few standard deviations of
 # the noise. Metres; pixels at full resolution. Tuned on the studio.
 DEPTH_SCALES_M = (0.050, 0.012)
 CONTOUR_SCALES_PX = (30.0, 6.0)
-REPORT_CONTOUR_PX = 4.0 * CONTOUR_SCALES_PX[1]  # scale of the residuals that a report includes
+REPORT_CONTOUR_PX = 4.0 * CONTOUR_SCALES_PX[1]  # scale of the residuals in a report, pixels
 FIT_ROUNDS = (4, 5)  # Gauss-Newton steps at most after each choice of candidates
-# A step this small is a quarter of a pixel: the next steps use the same renderings, whose residuals
-# are linear in so small a motion.
-REDRAWN_M = 1.5e-3
-REDRAWN_RAD = np.radians(0.3)
-# An object that moves less than this until a view exposes is rendered once for all views.
-UNMOVED_M = 4e-4
-UNMOVED_RAD = np.radians(0.08)
-# A view without a candidate supports a pose if at least this many visible pixels agree in depth by
-# more than this; tuned on the studio.
-SUPPORTING_PX = 36
-SUPPORTING_AGREEMENT = 0.5
 
 
 @dataclass(frozen=True)
@@ -48,14 +34,14 @@ class MotionPrior:
 
     pose: np.ndarray
     """(4, 4) master_from_object."""
-    sigma_m: float = PRIOR_SIGMA_M
-    """Standard deviation of the translation along each axis."""
-    sigma_rad: float = PRIOR_SIGMA_RAD
-    """Standard deviation of the turn about each axis."""
+    sigma_m: float = 0.06  # tuned on the studio, as the next
+    """Standard deviation of the translation along each axis, metres."""
+    sigma_rad: float = float(np.radians(15))
+    """Standard deviation of the turn about each axis, radians."""
 
 
 @dataclass(frozen=True)
-class Fit:
+class FittedPose:
     """A fitted or assessed pose."""
 
     pose: np.ndarray
@@ -80,10 +66,9 @@ class Fit:
 
     @property
     def support(self) -> int:
-        """Number of views with a candidate, or whose depth agrees with what is visible."""
+        """Number of views with a candidate, or whose depth agrees in enough visible pixels."""
         return sum(
-            not np.isnan(view.overlap)
-            or (view.visible_px >= SUPPORTING_PX and view.depth_agreement > SUPPORTING_AGREEMENT)
+            not np.isnan(view.overlap) or (view.visible_px >= 36 and view.depth_agreement > 0.5)
             for view in self.views
         )
 
@@ -97,7 +82,7 @@ def fit_pose(
     rounds: tuple[int, ...] = FIT_ROUNDS,
     start_scale: float = 1.0,
     twist: np.ndarray | None = None,
-) -> Fit:
+) -> FittedPose:
     """Fit the pose (4, 4) to all views, starting from ``pose``.
 
     The pivot of the rotation is the origin of the mesh. To first order in the motion until a view
@@ -139,14 +124,17 @@ def fit_pose(
             done = settled and _is_below(step - last, 5e-4, np.radians(0.1))
             if done:
                 break
-            if _is_below(step, REDRAWN_M, REDRAWN_RAD):
+            # a quarter of a pixel: residuals are linear in the step, no new renderings are needed
+            if _is_below(step, 1.5e-3, np.radians(0.3)):
                 last = step
             else:
                 last, drawn_pose = np.zeros(6), pose
-                _look(context, views, fits, seen_by(drawn_pose, views, twist))
+                seen = seen_by(drawn_pose, views, twist)
+                for fit, own, drawn in zip(fits, seen, _draw(context, views, seen), strict=True):
+                    fit.see(own, drawn)
     reports = pool.map(lambda fit: fit.report(REPORT_CONTOUR_PX), fits)
     covariance = np.linalg.inv(information + 1e-9 * np.eye(6))
-    return Fit(pose, covariance, tuple(reports), np.zeros(6) if twist is None else twist)
+    return FittedPose(pose, covariance, tuple(reports), np.zeros(6) if twist is None else twist)
 
 
 def _step(
@@ -185,14 +173,6 @@ def view_fits(
     ]
 
 
-def _look(
-    context: FitContext, views: list[View], fits: list[ViewFit], seen: list[np.ndarray]
-) -> None:
-    """Render what each view sees and show it to the fits of the views."""
-    for fit, pose, drawn in zip(fits, seen, _draw(context, views, seen), strict=True):
-        fit.see(pose, drawn)
-
-
 def _draw(context: FitContext, views: list[View], seen: list[np.ndarray]) -> list[list[Rendering]]:
     """Render each view's pose, in the order of :func:`.view_fit.shots_of`."""
     shots = [shots_of(view, pose) for view, pose in zip(views, seen, strict=True)]
@@ -202,11 +182,8 @@ def _draw(context: FitContext, views: list[View], seen: list[np.ndarray]) -> lis
 
 
 def assess_all(
-    context: FitContext,
-    views: list[View],
-    poses: np.ndarray,
-    twists: np.ndarray | None = None,
-) -> list[Fit]:
+    context: FitContext, views: list[View], poses: np.ndarray, twists: np.ndarray | None = None
+) -> list[FittedPose]:
     """Compare poses (N, 4, 4) with all views without changing them.
 
     ``twists`` (N, 6) are the motions of the object as in :func:`fit_pose`. Covariances are NaN.
@@ -227,7 +204,7 @@ def assess_all(
     unknown = np.full((6, 6), np.nan)
     count = len(views)
     return [
-        Fit(pose, unknown, tuple(reports[i * count : (i + 1) * count]), twist)
+        FittedPose(pose, unknown, tuple(reports[i * count : (i + 1) * count]), twist)
         for i, (pose, twist) in enumerate(zip(poses, motions, strict=True))
     ]
 
@@ -249,13 +226,14 @@ def _limited(step: np.ndarray) -> np.ndarray:
 def seen_by(pose: np.ndarray, views: list[View], twist: np.ndarray | None) -> list[np.ndarray]:
     """Return the pose (4, 4) at the exposure of each view.
 
-    ``twist`` (6,) is the motion of the object per second. If the object hardly moves until then,
-    all views share the array ``pose``.
+    ``twist`` (6,) is the motion of the object per second. Views until whose exposure the object
+    moves by less than 0.4 mm and 0.08 degrees share the array ``pose``, and so one rendering.
     """
     if twist is None:
         return [pose] * len(views)
     steps = np.array([view.geometry.time_offset_s for view in views])[:, None] * twist
-    moves = (np.abs(steps[:, :3]).max(1) > UNMOVED_RAD) | (np.abs(steps[:, 3:]).max(1) > UNMOVED_M)
+    moves = np.abs(steps[:, :3]).max(1) > np.radians(0.08)
+    moves |= np.abs(steps[:, 3:]).max(1) > 4e-4
     if not moves.any():
         return [pose] * len(views)
     later = apply_step(np.broadcast_to(pose, (len(views), 4, 4)), steps)

@@ -6,23 +6,22 @@ object is not seen, the pose is carried on from there with deviations that grow 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from intercap_core.geometry.camera.transforms import step_between
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.decoder import pose_distances
-from intercap_core.object_track.evidence import TURN_SCALE
-from intercap_core.object_track.fit import Fit, MotionPrior
+from intercap_core.object_track.evidence import TURN_SCALE, FrameEvidence
+from intercap_core.object_track.fit import FittedPose, MotionPrior
 from intercap_core.object_track.likelihood import SEEN_LOG_RATIO
 from intercap_core.object_track.motion import GROWTH_LOST_M_S, GROWTH_LOST_RAD_S
 from intercap_core.object_track.turns import SAME_POSE_DEG, SAME_POSE_M
 
-UNSEEN_S = 0.8  # time for which an object is followed without being seen
-GIVEN_SIGMAS = 3.0  # stated standard deviations within which a pose agrees with an annotated one
-VIEW_SHOWS_LOG_RATIO = SEEN_LOG_RATIO / 2  # of one view that shows the object, nats
+UNSEEN_S = 0.8  # for which an object is followed without being seen; tuned on the studio
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,11 +48,11 @@ class GivenPose:
         return np.asarray((turn[0] / self.sigma_rad) ** 2 + (shift[0] / self.sigma_m) ** 2)
 
     def holds(self, mesh: ObjectMesh, pose: np.ndarray) -> bool:
-        """Return whether a pose (4, 4) agrees with this one within its uncertainty."""
+        """Return whether a pose (4, 4) agrees with this one within three standard deviations."""
         turn, shift = self.distance(mesh, pose)
         return (
-            shift < GIVEN_SIGMAS * self.sigma_m + SAME_POSE_M
-            and turn < GIVEN_SIGMAS * self.sigma_rad + np.radians(SAME_POSE_DEG)
+            shift < 3.0 * self.sigma_m + SAME_POSE_M
+            and turn < 3.0 * self.sigma_rad + np.radians(SAME_POSE_DEG)
         )
 
     def distance(self, mesh: ObjectMesh, pose: np.ndarray) -> tuple[float, float]:
@@ -72,14 +71,8 @@ class GivenEvidence:
     """(T, 6, 6) J'J, zero in frames without evidence."""
     carried: np.ndarray
     """(T,) bool, unseen frames that are connected to an annotated one by unseen frames."""
-    given: Sequence[GivenPose] = ()
-    """The annotated poses."""
-
-    @classmethod
-    def none(cls, poses: np.ndarray) -> GivenEvidence:
-        """Return no evidence on T poses (T, 4, 4)."""
-        count = len(poses)
-        return cls(poses, np.zeros((count, 6, 6)), np.zeros(count, bool))
+    given: Sequence[GivenPose]
+    """The annotated poses; without any, all information is zero."""
 
     @classmethod
     def of(
@@ -90,11 +83,12 @@ class GivenEvidence:
         unseen: np.ndarray,
         times: np.ndarray,
     ) -> GivenEvidence:
-        """Return the evidence of annotated poses beside a track.
+        """Return the evidence of annotated poses on a track.
 
-        In carried frames the poses of the track are the observation. Their deviations grow with the
-        time since the nearest annotated frame. All carried frames of one annotated pose together
-        count as one observation, since they depend on one unknown velocity.
+        In an annotated frame the annotated pose is the observation, in a carried frame the pose of
+        the track. The standard deviations of the latter grow with the time since the nearest
+        annotated frame. All carried frames of one annotated pose together count as one observation,
+        since they depend on one unknown velocity.
 
         Args:
             mesh: the object.
@@ -103,27 +97,23 @@ class GivenEvidence:
             unseen: (T,) frames whose images do not show the object.
             times: (T,) seconds.
         """
-        result = cls.none(poses.copy())
-        for pose in given:
-            t = pose.frame
-            result.reference[t] = mesh.symmetry.nearest_equivalent_pose(pose.pose, poses[t])
-            result.information[t] = _information(
-                mesh, result.reference[t], pose.sigma_m, pose.sigma_rad
-            )
-        since = seconds_since([pose.frame for pose in given], unseen, times)
-        result.carried[:] = unseen & np.isfinite(since)
-        frames = np.flatnonzero(result.carried & (since > 0)).tolist()
+        reference, information = poses.copy(), np.zeros((len(poses), 6, 6))
+        annotated = {pose.frame: pose for pose in given}
+        for t, pose in annotated.items():
+            reference[t] = mesh.symmetry.nearest_equivalent_pose(pose.pose, poses[t])
+        since = seconds_since(list(annotated), unseen, times)
         nearest = {
-            t: min(given, key=lambda pose: abs(times[pose.frame] - times[t])) for t in frames
+            t: annotated.get(t) or min(given, key=lambda pose: abs(times[pose.frame] - times[t]))
+            for t in np.flatnonzero(np.isfinite(since)).tolist()
         }
+        carried_from = Counter(pose for t, pose in nearest.items() if since[t] > 0)
         for t, pose in nearest.items():
-            result.information[t] = _information(
-                mesh,
-                poses[t],
-                pose.sigma_m + GROWTH_LOST_M_S * since[t],
-                pose.sigma_rad + GROWTH_LOST_RAD_S * since[t],
-            ) / sum(other is pose for other in nearest.values())
-        return replace(result, given=tuple(given))
+            sigma_m = pose.sigma_m + GROWTH_LOST_M_S * since[t]
+            sigma_rad = pose.sigma_rad + GROWTH_LOST_RAD_S * since[t]
+            information[t] = _information(mesh, reference[t], sigma_m, sigma_rad)
+            if since[t] > 0:
+                information[t] /= carried_from[pose]
+        return cls(reference, information, unseen & np.isfinite(since), given)
 
     def exclude_from_rests(
         self, mesh: ObjectMesh, poses: np.ndarray, segment: np.ndarray
@@ -153,9 +143,11 @@ class GivenEvidence:
                 result |= rest & stated
         return result
 
-    def gradient(self, poses: np.ndarray) -> np.ndarray:
-        """Return J'r (T, 6) at ``poses`` (T, 4, 4)."""
-        return np.einsum("tij,tj->ti", self.information, step_between(self.reference, poses))
+    def at(self, poses: np.ndarray) -> FrameEvidence:
+        """Return the quadratic forms about ``poses`` (T, 4, 4)."""
+        away = step_between(self.reference, poses)
+        gradient = np.einsum("tij,tj->ti", self.information, away)
+        return FrameEvidence(poses, self.information, gradient)
 
 
 def seconds_since(frames: Sequence[int], unseen: np.ndarray, times: np.ndarray) -> np.ndarray:
@@ -180,7 +172,7 @@ def seconds_since(frames: Sequence[int], unseen: np.ndarray, times: np.ndarray) 
 
 
 def flag_edges(
-    fits: Sequence[Fit], unseen: np.ndarray, frames: Sequence[int], times: np.ndarray
+    fits: Sequence[FittedPose], unseen: np.ndarray, frames: Sequence[int], times: np.ndarray
 ) -> np.ndarray:
     """Find frames (T,) next to unseen ones, near annotated ``frames``, that only one view shows.
 
@@ -195,9 +187,11 @@ def flag_edges(
     """
     since = np.abs(times[:, None] - times[list(frames)]).min(1, initial=np.inf)
     padded = np.pad(unseen, 1)
-    beside = padded[:-2] | padded[2:]
-    few = [sum(view.log_ratio > VIEW_SHOWS_LOG_RATIO for view in fit.views) < 2 for fit in fits]
-    return np.asarray((since > 0) & (since < UNSEEN_S) & beside & ~unseen & few)
+    at_edge = ~unseen & (padded[:-2] | padded[2:])
+    in_one_view = [
+        sum(view.log_ratio > SEEN_LOG_RATIO / 2 for view in fit.views) < 2 for fit in fits
+    ]
+    return np.asarray((since > 0) & (since < UNSEEN_S) & at_edge & in_one_view)
 
 
 def _information(

@@ -23,30 +23,19 @@ from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.camera.triangulation import midpoints
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.object_silhouette import rim_mask
-from intercap_core.object_track.view import Candidate, View
+from intercap_core.object_track.view import MaskCandidate, View
 
-OUTLINE_CUT_PX = 2  # reduced pixels from a person or the image's edge, where masks may be cut off
 OUTLINE_DIRECTIONS = 16  # image directions in which the support function is sampled
-OUTLINE_MIN_DEPTH_M = 0.1  # smaller depths are clamped to keep divisions finite
-# A candidate is the person if more than the first share of its pixels is on the person and it has
-# the label or covers more than the second share of the person. Tuned on the studio, as all sizes
-# and priors below.
-ON_PERSON_SHARE = 0.6
-PERSON_SIZED_SHARE = 0.3
-LOCATED_MIN_POINTS = 15  # of a candidate's cloud, or pixels of its mask
-CLOUD_MAX_SPREAD = 0.75  # of the diameter, from a candidate's centre to its points
-SAME_OBJECT_SHARE = 0.6  # of the diameter: distance of measured centres of one object's two sides
-GROUP_SLACK_M = 0.03  # added to all sizes that groups are tested by
-RAY_MISS_SHARE = 0.35  # of the diameter: distance of a ray through a mask's middle from the object
-# Width of a mask over the diameter at the object's distance: seen end on or half hidden; smeared.
-OUTLINE_MIN_WIDTH = 0.12
-OUTLINE_MAX_WIDTH = 1.25
-OTHER_LABEL_PRIOR = 0.5  # of a candidate with the label of another class; detectors err
-NO_LABEL_PRIOR = 0.8  # of a candidate without a label
-SHARED_CANDIDATES = 0.5  # groups that share more than this with a better one are duplicates
+LOCATED_MIN_POINTS = 15  # of a candidate's point cloud, or pixels of its mask; tuned on the studio
 
-_ANGLES = 2 * np.pi * np.arange(OUTLINE_DIRECTIONS) / OUTLINE_DIRECTIONS
-_COMPASS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], 1)
+
+def _unit_circle(count: int) -> np.ndarray:
+    angles = 2 * np.pi * np.arange(count) / count
+    return np.stack([np.cos(angles), np.sin(angles)], 1)
+
+
+_COMPASS = _unit_circle(OUTLINE_DIRECTIONS)
+"""(D, 2) unit vectors of the image directions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +54,7 @@ class MaskOutline:
     """(4, 4) of the camera."""
 
     @classmethod
-    def of(cls, view: View, candidate: Candidate) -> MaskOutline | None:
+    def of(cls, view: View, candidate: MaskCandidate) -> MaskOutline | None:
         """Compute the outline of a candidate's mask; None if all of it is cut off."""
         mask, lens = candidate.mask, view.geometry.lens
         row, column = np.nonzero(rim_mask(np.pad(mask.mask, 1)))
@@ -98,13 +87,13 @@ class MaskOutline:
         return ray / np.linalg.norm(ray)
 
 
-def _is_cut_off(view: View, candidate: Candidate, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return whether the mask's pixels x, y (N,) lie beside a person or the image's edge."""
-    lens = view.geometry.lens
-    cut = (x < OUTLINE_CUT_PX) | (y < OUTLINE_CUT_PX)
-    cut |= (x >= lens.width - OUTLINE_CUT_PX) | (y >= lens.height - OUTLINE_CUT_PX)
-    for dx in range(-OUTLINE_CUT_PX, OUTLINE_CUT_PX + 1):
-        for dy in range(-OUTLINE_CUT_PX, OUTLINE_CUT_PX + 1):
+def _is_cut_off(view: View, candidate: MaskCandidate, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return whether mask pixels x, y (N,) are within 2 px of a person or the image's edge."""
+    lens, near = view.geometry.lens, 2
+    cut = (x < near) | (y < near)
+    cut |= (x >= lens.width - near) | (y >= lens.height - near)
+    for dx in range(-near, near + 1):
+        for dy in range(-near, near + 1):
             other = view.person.sample(x + dx, y + dy)
             cut |= other & ~candidate.mask.sample(x + dx, y + dy)
     return cut
@@ -120,27 +109,28 @@ def hull_vertices(mesh: ObjectMesh) -> np.ndarray:
 def outline_residuals(
     outline: MaskOutline, hull: np.ndarray, rotation: np.ndarray, translation: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute how far the object extends beyond the mask (N, D), metres, and the Jacobian (N, D,
-    6).
-
-    The columns are a turn, then a shift, of the object in its own frame: pose <- pose * exp(step).
-    Directions in which the mask is cut off are zero.
+    """Compute how far the object extends beyond a mask, and the Jacobian.
 
     Args:
         outline: of the mask.
         hull: (H, 3) vertices of the convex hull, object frame.
         rotation, translation: (N, 3, 3) and (N, 3) of master_from_object.
+
+    Returns:
+        residual: (N, D) metres, zero in directions in which the mask is cut off.
+        jacobian: (N, D, 6) by the step (turn, shift) in the object frame: pose <- pose * exp(step).
     """
     pose = outline.colour_from_master
     turned = pose[:3, :3] @ rotation
     placed = translation @ pose[:3, :3].T + pose[:3, 3]
     points = np.einsum("nij,hj->nhi", turned, hull) + placed[:, None]
-    z = np.maximum(points[..., 2], OUTLINE_MIN_DEPTH_M)
+    least_m = 0.1  # depth of points near and behind the camera, so that divisions stay finite
+    z = np.maximum(points[..., 2], least_m)
     flat = points[..., :2] / z[..., None]
     reach = flat @ _COMPASS.T  # (N, H, D)
     ends = reach.argmax(1)
     number = np.arange(len(rotation))[:, None]
-    distance = np.maximum(placed[:, 2], OUTLINE_MIN_DEPTH_M)[:, None]
+    distance = np.maximum(placed[:, 2], least_m)[:, None]
     residual = (np.take_along_axis(reach, ends[:, None], 1)[:, 0] - outline.support) * distance
     towards = np.broadcast_to(_COMPASS, (len(rotation), OUTLINE_DIRECTIONS, 2))
     along = -(towards * flat[number, ends]).sum(-1, keepdims=True)
@@ -157,7 +147,7 @@ class LocatedCandidate:
 
     view: int
     """Number of the view."""
-    candidate: Candidate
+    candidate: MaskCandidate
     """The candidate."""
     label_prior: float
     """1 with one of the object's labels, less otherwise."""
@@ -170,30 +160,27 @@ class LocatedCandidate:
 
     @cached_property
     def outline(self) -> MaskOutline | None:
-        """MaskOutline of the candidate, None if all of it is cut off; computed on request."""
+        """Outline of the mask, None if all of it is cut off; computed on request."""
         return MaskOutline.of(self.image, self.candidate)
 
     def away(self, point: np.ndarray, diameter: float) -> float:
         """Return the distance of the candidate from a point (3,).
 
-        The unit is the largest distance within one object.
+        The unit is the largest distance within one object; infinite if the mask's width is not that
+        of the object at the point.
         """
-        if self.centre is not None:
-            return float(np.linalg.norm(self.centre - point)) / (
-                SAME_OBJECT_SHARE * diameter + GROUP_SLACK_M
-            )
+        slack_m = 0.03  # added to all sizes; tuned on the studio, as the shares below
+        if self.centre is not None:  # two sides of one object are 0.6 of its diameter apart
+            return float(np.linalg.norm(self.centre - point)) / (0.6 * diameter + slack_m)
         outline = self.outline
         assert outline is not None
         towards = point - outline.eye
         along = float(towards @ outline.ray)
-        if (
-            not OUTLINE_MIN_WIDTH * diameter
-            < outline.extent * along
-            < OUTLINE_MAX_WIDTH * diameter + GROUP_SLACK_M
-        ):
+        # from seen end on or half hidden to smeared by motion
+        if not 0.12 * diameter < outline.extent * along < 1.25 * diameter + slack_m:
             return np.inf
         across = float(np.linalg.norm(towards - along * outline.ray))
-        return across / (RAY_MISS_SHARE * diameter + GROUP_SLACK_M)
+        return across / (0.35 * diameter + slack_m)
 
 
 Group = list[LocatedCandidate]
@@ -265,67 +252,68 @@ def _distinct_groups(groups: list[Group], limit: int) -> list[Group]:
             break
         members = {(s.view, s.candidate.index) for s in group}
         known = [{(s.view, s.candidate.index) for s in other} for other in kept]
-        if all(len(members & other) <= SHARED_CANDIDATES * len(members) for other in known):
+        if all(len(members & other) <= 0.5 * len(members) for other in known):
             kept.append(group)
     return kept
 
 
 def _ray_crossings(outlined: list[LocatedCandidate], diameter: float) -> list[np.ndarray]:
     """Find points (3,) where the rays of two views meet and both masks have the object's size."""
-    found = []
+    points = []
     for a, b in combinations(outlined, 2):
         if a.view == b.view:
             continue
         assert a.outline is not None and b.outline is not None
         point, _ = midpoints(a.outline.ray, b.outline.ray, a.outline.eye, b.outline.eye)
         if np.isfinite(point).all() and max(s.away(point, diameter) for s in (a, b)) < 1:
-            found.append(point)
-    return found
+            points.append(point)
+    return points
 
 
-def _possible_candidates(view: View) -> list[Candidate]:
+def _possible_candidates(view: View) -> list[MaskCandidate]:
     """Return the candidates of a view that are not the person.
 
-    Labels may be wrong, so none is left out for its label alone. An object that is held in front of
-    the body may lie in the person's mask.
+    A candidate is the person if most of it lies on the person and it is labelled or as large as a
+    person. Either alone is not enough: labels may be wrong, and an object that is held in front of
+    the body lies in the person's mask.
     """
-    found = []
+    possible = []
     for candidate in view.candidates:
         mask = candidate.mask
         if mask.area:
             person = view.person.window(mask.x0, mask.y0, *mask.mask.shape)
-            on_person = (person & mask.mask).sum() > ON_PERSON_SHARE * mask.area
-            large = (
-                candidate.label == PERSON_LABEL or mask.area > PERSON_SIZED_SHARE * view.person.area
-            )
+            on_person = (person & mask.mask).sum() > 0.6 * mask.area
+            large = candidate.label == PERSON_LABEL or mask.area > 0.3 * view.person.area
             if not (on_person and large):
-                found.append(candidate)
-    return found
+                possible.append(candidate)
+    return possible
 
 
 def _label_prior(label: str, labels: tuple[str, ...]) -> float:
     if label == "":
-        return NO_LABEL_PRIOR
-    return 1.0 if label in labels or (not labels and label != PERSON_LABEL) else OTHER_LABEL_PRIOR
+        return 0.8
+    # detectors err, so the label of another class does not exclude a candidate
+    return 1.0 if label in labels or (not labels and label != PERSON_LABEL) else 0.5
 
 
 def _locate_by_outline(views: list[View], labels: tuple[str, ...]) -> list[LocatedCandidate]:
     """Locate the candidates of views without depth by their outlines."""
-    found = []
+    result = []
     for number, view in enumerate(views):
         for candidate in _possible_candidates(view) if view.depth is None else ():
             label_prior = _label_prior(candidate.label, labels)
             located = LocatedCandidate(number, candidate, label_prior, np.zeros((0, 3)), None, view)
             if candidate.mask.area >= LOCATED_MIN_POINTS and located.outline is not None:
-                found.append(located)
-    return found
+                result.append(located)
+    return result
 
 
 def _locate_by_depth(
     views: list[View], diameter: float, labels: tuple[str, ...]
 ) -> list[LocatedCandidate]:
     """Locate the candidates of views with depth by their points."""
-    found = []
+    most_m = 0.75 * diameter  # from a candidate's centre to its points; tuned on the studio
+    result = []
     for number, view in enumerate(views):
         geometry = view.geometry
         if view.depth is None or geometry.depth_lens is None:
@@ -346,14 +334,14 @@ def _locate_by_depth(
             if len(inside) < LOCATED_MIN_POINTS:
                 continue
             z = depth[inside]
-            inside = inside[np.abs(z - np.median(z)) < CLOUD_MAX_SPREAD * diameter]
+            inside = inside[np.abs(z - np.median(z)) < most_m]
             if len(inside) < LOCATED_MIN_POINTS:
                 continue  # two surfaces, with the middle between them
             points = apply(camera.master_from_depth, local[inside]).astype(np.float64)
             centre = np.median(points, axis=0)
             spread = np.percentile(np.linalg.norm(points - centre, axis=1), 90)
-            if spread > CLOUD_MAX_SPREAD * diameter:
+            if spread > most_m:
                 continue
             label_prior = _label_prior(candidate.label, labels)
-            found.append(LocatedCandidate(number, candidate, label_prior, points, centre, view))
-    return found
+            result.append(LocatedCandidate(number, candidate, label_prior, points, centre, view))
+    return result

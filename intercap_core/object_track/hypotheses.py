@@ -20,7 +20,7 @@ from intercap_core.object_track.decoder import (
     Decoded,
     pose_distances,
 )
-from intercap_core.object_track.fit import FIT_ROUNDS, Fit, MotionPrior
+from intercap_core.object_track.fit import FIT_ROUNDS, FittedPose, MotionPrior
 from intercap_core.object_track.given_poses import UNSEEN_S, GivenPose
 from intercap_core.object_track.likelihood import CONTRADICTED_LOG_RATIO, SEEN_LOG_RATIO
 from intercap_core.object_track.motion import (
@@ -30,23 +30,13 @@ from intercap_core.object_track.motion import (
     unwrap_symmetry,
 )
 from intercap_core.object_track.observer import Observer
-from intercap_core.object_track.turns import same_pose
+from intercap_core.object_track.turns import distinct_poses, same_pose
 
-# A fit that ends this many standard deviations of its prior away is repeated with a prior this many
-# times as wide: the object started to move or stopped.
-PRIOR_CONTRADICTED = 1.5
-PRIOR_WIDENED = 4.0
 BASIN = (0.04, 15.0)  # metres and degrees within which all fits lead to one pose
 MAX_HYPOTHESES = 12  # of a frame: turns of a mug with a hidden handle, 30 degrees apart
-CROWDED = (0.04, 20.0)  # metres and degrees; of too many hypotheses, one this near to another goes
-# A moving object is fitted again if its motion until a view exposes changes by this.
-MOTION_CHANGED_M = 0.003
-MOTION_CHANGED_RAD = np.radians(0.5)
-RIVAL_PROBABILITY = 0.01  # hypotheses below are not considered further
+RIVAL_PROBABILITY = 0.01  # of a hypothesis, below which it is not considered further
 RIVAL_LOG_RATIO = 5.0  # nats of independent evidence below the best, up to which to follow
-UPRIGHT_LOG_RATIO = (
-    2.0  # nats times the cosine of the angle to the standing pose; tuned on the studio
-)
+UPRIGHT_LOG_RATIO = 2.0  # nats times the cosine of the angle to the standing pose; tuned on studio
 # Nats of one frame for its annotated pose, and for all poses within reach of it. The latter is the
 # cost of a jump there and back for that frame alone.
 ANNOTATION_LOG_RATIO = 10.0
@@ -77,7 +67,7 @@ class Prior:
                 result |= near
         return result
 
-    def weigh(self, t: int, fits: list[Fit]) -> np.ndarray:
+    def weigh(self, t: int, fits: list[FittedPose]) -> np.ndarray:
         """Return the evidence (K,) for hypotheses of frame t relative to none being true, nats.
 
         Hypotheses that explain one object share the prior of its place
@@ -105,7 +95,7 @@ class Prior:
         return result
 
 
-def group_by_candidates(fits: list[Fit]) -> np.ndarray:
+def group_by_candidates(fits: list[FittedPose]) -> np.ndarray:
     """Number (K,) the objects that the hypotheses of a frame explain.
 
     Hypotheses that mostly choose the same candidates explain the same object.
@@ -136,7 +126,7 @@ class Hypotheses:
         self._prior = prior
         self._times = observer.times
         self._patience = observer.frames_in(UNSEEN_S)
-        self.fits: list[list[Fit]] = [[] for _ in range(observer.count)]
+        self.fits: list[list[FittedPose]] = [[] for _ in range(observer.count)]
 
     def known(self, t: int, pose: np.ndarray) -> int | None:
         """Return the hypothesis of frame t at this pose (4, 4), if any."""
@@ -158,7 +148,7 @@ class Hypotheses:
         """Return whether the images of frame t support any of its hypotheses."""
         return any(fit.log_ratio > SEEN_LOG_RATIO for fit in self.fits[t])
 
-    def add(self, t: int, fit: Fit) -> None:
+    def add(self, t: int, fit: FittedPose) -> None:
         """Add a hypothesis to frame t.
 
         The likelier of two at one pose is kept. Of too many hypotheses one is dropped so that
@@ -174,21 +164,21 @@ class Hypotheses:
             own[k] = fit
 
     def _most_redundant(self, t: int) -> int:
-        """Return the least likely hypothesis of frame t.
+        """Return the hypothesis of frame t to drop.
 
-        First among those that the images do not support, then among those that have a likelier one
-        close by, then among all.
+        The least likely one, first among those that the images do not support, then among those
+        with a likelier one within 4 cm and 20 degrees, then among all.
         """
         own, mesh = self.fits[t], self._observer.mesh
         order = [int(k) for k in np.argsort(self._prior.weigh(t, own))]
         if own[order[0]].log_ratio < SEEN_LOG_RATIO < own[order[-1]].log_ratio:
             return order[0]
         for i, k in enumerate(order):
-            if any(same_pose(mesh, own[k].pose, own[j].pose, CROWDED) for j in order[i + 1 :]):
+            if any(same_pose(mesh, own[k].pose, own[j].pose, (0.04, 20)) for j in order[i + 1 :]):
                 return k
         return order[0]
 
-    def follow(self, t: int, fit: Fit) -> None:
+    def follow(self, t: int, fit: FittedPose) -> None:
         """Add a fit of frame t and follow it through the frames before and after.
 
         It ends where it meets a known hypothesis, is unseen for long or is hopelessly worse than
@@ -221,9 +211,8 @@ class Hypotheses:
             for k, fit in enumerate(self.fits[t]):
                 twist = shift_twist(motion[t], poses[t, :3, 3], fit.pose[:3, 3])
                 turn, shift = np.abs(twist - fit.twist).reshape(2, 3).max(1) * late
-                if decoded.probability[t][k] < RIVAL_PROBABILITY or (
-                    turn < MOTION_CHANGED_RAD and shift < MOTION_CHANGED_M
-                ):
+                unchanged = turn < np.radians(0.5) and shift < 0.003
+                if unchanged or decoded.probability[t][k] < RIVAL_PROBABILITY:
                     continue
                 prior = MotionPrior(fit.pose)
                 again = self._observer.fit(t, fit.pose, prior, FIT_ROUNDS, twist=twist)
@@ -236,10 +225,9 @@ class Hypotheses:
 
     def _merge_equal(self, t: int) -> None:
         """Keep the likeliest of several hypotheses of frame t that have become one pose."""
-        left, self.fits[t] = sorted(self.fits[t], key=lambda fit: -fit.log_ratio), []
-        for fit in left:
-            if self.known(t, fit.pose) is None:
-                self.fits[t].append(fit)
+        fits = sorted(self.fits[t], key=lambda fit: -fit.log_ratio)
+        distinct = distinct_poses(self._observer.mesh, [fit.pose for fit in fits])
+        self.fits[t] = [fits[k] for k in distinct]
 
     def _follow(self, last: int, pose: np.ndarray, frames: Iterable[int]) -> None:
         before = now = pose
@@ -272,23 +260,25 @@ class Hypotheses:
 
         Predictions are constant velocity, the pose of frame ``last``, and with each hand.
         """
-        starts = [extrapolate(before, now)]
-        for pose in (now, *self._observer.carried(last, t, now)):
-            if not any(same_pose(self._observer.mesh, pose, other, BASIN) for other in starts):
-                starts.append(pose)
+        poses = np.array([extrapolate(before, now), now, *self._observer.carried(last, t, now)])
+        starts = poses[distinct_poses(self._observer.mesh, poses, BASIN)]
         if len(starts) == 1:
             return starts[0]
-        rates = step_between(now, np.array(starts)) / (self._times[t] - self._times[last])
-        assessed = self._observer.assess_all(t, np.array(starts), twists=rates)
+        rates = step_between(now, starts) / (self._times[t] - self._times[last])
+        assessed = self._observer.assess_all(t, starts, twists=rates)
         return max(assessed, key=lambda fit: fit.log_ratio).pose
 
-    def _fit(self, t: int, start: np.ndarray, prior: MotionPrior, twist: np.ndarray) -> Fit:
-        """Fit frame t from ``start`` (4, 4), with a wider prior if the images contradict it."""
+    def _fit(self, t: int, start: np.ndarray, prior: MotionPrior, twist: np.ndarray) -> FittedPose:
+        """Fit frame t from ``start`` (4, 4).
+
+        A fit that ends 1.5 standard deviations of its prior away is repeated with a prior that is
+        four times as wide: the object started to move or stopped.
+        """
         fit = self._observer.fit(t, start, prior, twist=twist)
         step = np.abs(step_between(prior.pose, fit.pose))
-        limit = np.repeat([prior.sigma_rad, prior.sigma_m], 3) * PRIOR_CONTRADICTED
+        limit = np.repeat([prior.sigma_rad, prior.sigma_m], 3) * 1.5
         if fit.log_ratio < SEEN_LOG_RATIO or (step < limit).all():
             return fit
-        wide = (PRIOR_WIDENED * prior.sigma_m, PRIOR_WIDENED * prior.sigma_rad)
-        again = self._observer.fit(t, fit.pose, MotionPrior(prior.pose, *wide), twist=twist)
+        wide = MotionPrior(prior.pose, 4.0 * prior.sigma_m, 4.0 * prior.sigma_rad)
+        again = self._observer.fit(t, fit.pose, wide, twist=twist)
         return again if again.log_ratio > fit.log_ratio else fit

@@ -21,31 +21,21 @@ import numpy as np
 from intercap_core.geometry.camera.projection_kernels import project_point
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.shots import Rendering
-from intercap_core.object_track.object_silhouette import nearest, rim_pixels
+from intercap_core.object_track.object_depth import rotated_normal
+from intercap_core.object_track.object_silhouette import nearest, rim_pixels, transform_point
 from intercap_core.object_track.reduced_mask import EMPTY
-from intercap_core.object_track.view import Candidate, FitContext, View
+from intercap_core.object_track.view import FitContext, MaskCandidate, View
 
 # Thresholds of log-likelihood ratios of all views of a frame, nats.
 SEEN_LOG_RATIO = 3.0  # the images show the object
 SEARCH_GOOD_LOG_RATIO = 25.0  # good enough to stop searching the frame; tuned on the studio
 CONTRADICTED_LOG_RATIO = -6.0  # the images contradict the pose
 
-CONTOUR_SIGMA_PX = 2.0  # of a detector's contour, pixels at full resolution; tuned on the studio
-DEPTH_HALF_SAMPLES_PX = 120  # pixels at which depth counts half of its samples; tuned on the studio
-VIEW_SAMPLES = 4.0  # independent samples of a view's depth, or outline, at most; tuned on studio
-OUTLINE_HALF_SAMPLES_PX = 60  # pixels at which an outline counts half of them
-DEPTH_LIKELY_SIGMA_M = (
-    0.008  # of depth from the mesh: sensor, calibration, mesh; tuned on the studio
-)
-BACKGROUND_M = 0.025  # distance from the room's surface at which depth shows the room: 3 sigma
-CLUTTER_RANGE_M = 0.3  # other surfaces are measured uniformly within this range of the object
-LOG_SEEN_PAST = float(np.log(0.03))  # share of pixels beside the surface: flying pixels, edges
-LOG_HIDDEN = float(np.log(0.15))  # share of pixels that something other than a person hides
+# All values below are tuned on the studio.
+CONTOUR_SIGMA_PX = 2.0  # of a detector's contour, pixels at full resolution
+DEPTH_HALF_SAMPLES_PX = 120  # pixels at which depth counts half of its samples
+VIEW_SAMPLES = 4.0  # independent samples of a view's depth, or outline, at most
 LOG_MISSED = float(np.log(0.1))  # how often a detector misses an object that is fully visible
-MISSED_HALF_PX = 300  # visible pixels at which half of LOG_MISSED counts
-# Costs of an outline are means of half a squared normalised distance.
-MASK_AGREES = 2.0  # cost at which a mask is no evidence: such outlines occur nearby by chance
-OUTLINE_COST_MAX = 4.5  # largest cost of a pixel: three standard deviations
 LABEL_LOG_RATIO = 1.0  # of a candidate with the object's label, nats; minus this with another label
 
 
@@ -55,7 +45,7 @@ def log_ratio(
     pose: np.ndarray,
     silhouette: Rendering,
     drawn_depth: Rendering | None,
-    candidate: Candidate | None,
+    candidate: MaskCandidate | None,
     visible_px: int,
 ) -> float:
     """Return the log-likelihood ratio of a pose in one view, nats.
@@ -69,12 +59,12 @@ def log_ratio(
         candidate: candidate with the largest overlap, if any.
         visible_px: rendered pixels that are not occluded.
     """
-    found = 0.0
+    ratio = 0.0
     if drawn_depth is not None:
-        found += _depth(context.mesh, view, pose, drawn_depth, candidate)
+        ratio += _depth(context.mesh, view, pose, drawn_depth, candidate)
     if view.detected:
-        found += _mask(view, silhouette, candidate, visible_px, context.labels)
-    return found
+        ratio += _mask(view, silhouette, candidate, visible_px, context.labels)
+    return ratio
 
 
 def _depth(
@@ -82,7 +72,7 @@ def _depth(
     view: View,
     pose: np.ndarray,
     drawn: Rendering,
-    candidate: Candidate | None,
+    candidate: MaskCandidate | None,
 ) -> float:
     geometry = view.geometry
     assert view.depth is not None and geometry.depth_lens is not None
@@ -90,13 +80,19 @@ def _depth(
     assert colour_from_depth is not None
     person = view.person
     mask = candidate.mask if candidate is not None else EMPTY
+    likely_sigma_m = 0.008  # of depth from the mesh: sensor, calibration, mesh
+    background_m = 0.025  # three standard deviations of depth from the empty room
+    clutter_m = 0.3  # other surfaces are measured uniformly within this range of the object
+    # share of pixels that see past the object (flying pixels, edges), and of pixels that something
+    # other than a person hides
+    log_past, log_hidden = float(np.log(0.03)), float(np.log(0.15))
     total, count = depth_log_ratio(
         drawn.depth, drawn.face, drawn.x0, drawn.y0, view.depth, view.background,
         geometry.depth_lens.rays, mesh.face_normals,
         geometry.depth_from_master[:3, :3] @ pose[:3, :3],
         np.asarray(colour_from_depth), geometry.lens.parameters,
         person.mask, person.x0, person.y0, mask.mask, mask.x0, mask.y0,
-        DEPTH_LIKELY_SIGMA_M, BACKGROUND_M, CLUTTER_RANGE_M, LOG_SEEN_PAST, LOG_HIDDEN,
+        likely_sigma_m, background_m, clutter_m, log_past, log_hidden,
     )  # fmt: skip
     return VIEW_SAMPLES * total / (count + DEPTH_HALF_SAMPLES_PX)
 
@@ -104,11 +100,11 @@ def _depth(
 def _mask(
     view: View,
     silhouette: Rendering,
-    candidate: Candidate | None,
+    candidate: MaskCandidate | None,
     visible_px: int,
     labels: tuple[str, ...],
 ) -> float:
-    missed = LOG_MISSED * visible_px / (visible_px + MISSED_HALF_PX)
+    missed = LOG_MISSED * visible_px / (visible_px + 300)
     if candidate is None:
         return missed
     lens, step = view.geometry.lens, view.geometry.step
@@ -116,40 +112,22 @@ def _mask(
     cost, count = outline_cost(
         silhouette.face, silhouette.x0, silhouette.y0, mask.mask, mask.x0, mask.y0,
         person.mask, person.x0, person.y0, lens.width, lens.height,
-        max(CONTOUR_SIGMA_PX / step, 1.0), OUTLINE_COST_MAX,
+        max(CONTOUR_SIGMA_PX / step, 1.0), 4.5,
     )  # fmt: skip
-    samples = VIEW_SAMPLES * count / (count + OUTLINE_HALF_SAMPLES_PX)
+    samples = VIEW_SAMPLES * count / (count + 60)
     named = 0.0
     if labels and candidate.label:
         named = LABEL_LOG_RATIO if candidate.label in labels else -LABEL_LOG_RATIO
-    return max(samples * (MASK_AGREES - cost) + named, missed)
+    # a mask at the cost 2 is no evidence: such outlines occur nearby by chance
+    return max(samples * (2.0 - cost) + named, missed)
 
 
 @numba.njit(cache=True, nogil=True)
 def depth_log_ratio(
-    rendered,
-    face,
-    x0,
-    y0,
-    measured,
-    background,
-    rays,
-    face_normals,
-    rotation,
-    colour_from_depth,
-    colour,
-    person,
-    px,
-    py,
-    mask,
-    mx,
-    my,
-    sigma,
-    background_m,
-    clutter_m,
-    log_past,
-    log_hidden,
-):
+    rendered, face, x0, y0, measured, background, rays, face_normals, rotation,
+    colour_from_depth, colour, person, px, py, mask, mx, my,
+    sigma, background_m, clutter_m, log_past, log_hidden,
+):  # fmt: skip
     """Sum log p(depth | object there) - log p(depth | not there) over a rendering's pixels.
 
     Outside of the mask, pixels that a person explains are no evidence, and pixels that the
@@ -164,7 +142,8 @@ def depth_log_ratio(
         colour_from_depth, colour: (4, 4), and (13,) parameters of the colour lens.
         person, mask: masks with their first pixels (px, py), (mx, my) in the colour image.
         sigma: standard deviation of depth from the surface, metres.
-        background_m, clutter_m: constants of this module.
+        background_m: largest difference from the empty room at which depth shows the room, metres.
+        clutter_m: range in which other surfaces are measured uniformly, metres.
         log_past, log_hidden: log-probabilities of background and occlusion at a pixel.
 
     Returns:
@@ -172,7 +151,6 @@ def depth_log_ratio(
     """
     total, count = 0.0, 0
     agrees = np.log(clutter_m / (sigma * np.sqrt(2 * np.pi)))
-    to_colour = colour_from_depth
     for v in range(rendered.shape[0]):
         for u in range(rendered.shape[1]):
             f = face[v, u]
@@ -184,32 +162,24 @@ def depth_log_ratio(
             count += 1
             gap = z - rendered[v, u]
             rx, ry = rays[y0 + v, x0 + u, 0], rays[y0 + v, x0 + u, 1]
-            nx, ny, nz = face_normals[f, 0], face_normals[f, 1], face_normals[f, 2]
-            cx = rotation[0, 0] * nx + rotation[0, 1] * ny + rotation[0, 2] * nz
-            cy = rotation[1, 0] * nx + rotation[1, 1] * ny + rotation[1, 2] * nz
-            cz = rotation[2, 0] * nx + rotation[2, 1] * ny + rotation[2, 2] * nz
-            across = gap * (cx * rx + cy * ry + cz) / sigma
-            found = agrees - 0.5 * across * across
-            if gap > 0 and found <= 0:
-                total += max(found, log_past)
+            nx, ny, nz = rotated_normal(face_normals, f, rotation)
+            across = gap * (nx * rx + ny * ry + nz) / sigma
+            shown = agrees - 0.5 * across * across
+            if gap > 0 and shown <= 0:
+                total += max(shown, log_past)
                 continue
-            x, y = rx * z, ry * z
-            column, row = project_point(
-                to_colour[0, 0] * x + to_colour[0, 1] * y + to_colour[0, 2] * z + to_colour[0, 3],
-                to_colour[1, 0] * x + to_colour[1, 1] * y + to_colour[1, 2] * z + to_colour[1, 3],
-                to_colour[2, 0] * x + to_colour[2, 1] * y + to_colour[2, 2] * z + to_colour[2, 3],
-                colour,
-            )
+            cx, cy, cz = transform_point(colour_from_depth, rx * z, ry * z, z)
+            column, row = project_point(cx, cy, cz, colour)
             x, y = int(np.rint(column)), int(np.rint(row))
             i, j = x - mx, y - my
             own = 0 <= i < mask.shape[1] and 0 <= j < mask.shape[0] and mask[j, i]
             i, j = x - px, y - py
             if own:
-                total += max(found, log_hidden)
+                total += max(shown, log_hidden)
             elif not (0 <= i < person.shape[1] and 0 <= j < person.shape[0] and person[j, i]):
                 known = background[y0 + v, x0 + u] if background.size else np.float32(0.0)
-                if found < 0 or known <= 0 or abs(known - z) > background_m:
-                    total += max(found, log_hidden)
+                if shown < 0 or known <= 0 or abs(known - z) > background_m:
+                    total += max(shown, log_hidden)
     return total, count
 
 

@@ -12,19 +12,14 @@ from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 from intercap_core.object_track.fit import MotionPrior
 
-# An object that moves less per frame rests, and no motion is predicted. Above the jitter of fits;
-# tuned on the studio, as the next values.
-STILL_M = 0.004
-STILL_RAD = np.radians(1.5)
-# Standard deviation of the change of the velocity from one frame to the next.
+# Standard deviation of the change of the velocity from one frame to the next; tuned on the studio,
+# as the next ones.
 ONSET_M_S = 0.6
 ONSET_RAD_S = np.radians(60)
-ONSET_STEP_SHARE = 0.5  # standard deviation relative to the last step, which may stop or double
 # Standard deviation added per second without observation.
 GROWTH_LOST_M_S = 1.2
 GROWTH_LOST_RAD_S = np.radians(240)
 HOLDING_REACH_M = 0.20  # from a wrist to the surface of a held object: a hand's length (anatomy)
-PALM_MIN_SINE = 0.1  # sine of the angle of a palm's two edges, usually 0.3
 
 _HANDS = [
     [KEYPOINT_NAMES.index(f"{side}_{name}") for name in ("elbow", "wrist", "index1", "pinky1")]
@@ -34,28 +29,27 @@ _HANDS = [
 
 
 def extrapolate(before: np.ndarray, now: np.ndarray) -> np.ndarray:
-    """Predict the next pose at constant velocity; the last pose if the object rests."""
+    """Predict the next pose (4, 4) at constant velocity from the last two.
+
+    Shifts of at most 4 mm and turns of at most 1.5 degrees are jitter of fits and not continued.
+    """
     shift = now[:3, 3] - before[:3, 3]
     turn = Rotation.from_matrix(now[:3, :3] @ before[:3, :3].T)
     predicted = now.copy()
-    if np.linalg.norm(shift) > STILL_M:
+    if np.linalg.norm(shift) > 0.004:
         predicted[:3, 3] += shift
-    if turn.magnitude() > STILL_RAD:
+    if turn.magnitude() > np.radians(1.5):
         predicted[:3, :3] = turn.as_matrix() @ now[:3, :3]
     return predicted
 
 
 def predict_prior(
-    before: np.ndarray,
-    now: np.ndarray,
-    predicted: np.ndarray,
-    step_s: float,
-    unseen_s: float = 0.0,
+    before: np.ndarray, now: np.ndarray, predicted: np.ndarray, step_s: float, unseen_s: float = 0.0
 ) -> MotionPrior:
     """Return the prior around a prediction: the object may start to move, turn or stop.
 
-    The deviations are those of an onset of motion from rest, half of the last step, and a growth
-    with the time without observation.
+    Its standard deviations are the sum of an onset of motion from rest, half of the last step
+    (which may stop or double), and a growth with the time without observation.
 
     Args:
         before, now: last two poses (4, 4).
@@ -67,8 +61,8 @@ def predict_prior(
     turn = float(Rotation.from_matrix(now[:3, :3] @ before[:3, :3].T).magnitude())
     return MotionPrior(
         predicted,
-        ONSET_M_S * step_s + ONSET_STEP_SHARE * shift + unseen_s * GROWTH_LOST_M_S,
-        ONSET_RAD_S * step_s + ONSET_STEP_SHARE * turn + unseen_s * GROWTH_LOST_RAD_S,
+        ONSET_M_S * step_s + 0.5 * shift + unseen_s * GROWTH_LOST_M_S,
+        ONSET_RAD_S * step_s + 0.5 * turn + unseen_s * GROWTH_LOST_RAD_S,
     )
 
 
@@ -94,10 +88,10 @@ class HandMotion:
 
     def carry(self, poses: np.ndarray) -> np.ndarray:
         """Return the poses (..., 4, 4) of a held object after the motion."""
-        found = poses.copy()
-        found[..., :3, :3] = self.turn @ poses[..., :3, :3]
-        found[..., :3, 3] = (poses[..., :3, 3] - self.start) @ self.turn.T + self.end
-        return found
+        result = poses.copy()
+        result[..., :3, :3] = self.turn @ poses[..., :3, :3]
+        result[..., :3, 3] = (poses[..., :3, 3] - self.start) @ self.turn.T + self.end
+        return result
 
 
 def estimate_hand_motions(joints: np.ndarray) -> list[HandMotion | None]:
@@ -106,19 +100,19 @@ def estimate_hand_motions(joints: np.ndarray) -> list[HandMotion | None]:
     A hand turns like its palm, or like the forearm if the palm is not seen in both frames.
     ``joints`` (2, K, 3) are those of the person, NaN where unknown.
     """
-    found: list[HandMotion | None] = []
+    motions: list[HandMotion | None] = []
     for elbow, wrist, index, pinky in _HANDS:
         start, end = joints[:, wrist]
         if not (np.isfinite(start).all() and np.isfinite(end).all()):
-            found.append(None)
+            motions.append(None)
             continue
         palms = [_palm(own[index] - own[wrist], own[pinky] - own[wrist]) for own in joints]
         if palms[0] is None or palms[1] is None:
             turn = _between(start - joints[0, elbow], end - joints[1, elbow])
         else:
             turn = palms[1] @ palms[0].T
-        found.append(HandMotion(turn, start, end))
-    return found
+        motions.append(HandMotion(turn, start, end))
+    return motions
 
 
 def unwrap_symmetry(symmetry: SymmetryGroup, poses: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -155,22 +149,22 @@ def carry_in_hands(
         centre: (3,) of the object in this frame, metres.
         radius: of the object, metres.
     """
-    found = [
+    poses = [
         hand.carry(now)
         for hand in estimate_hand_motions(joints)
         if hand is not None and hand.reaches(centre, radius)
     ]
-    return np.array(found).reshape(-1, 4, 4)
+    return np.array(poses).reshape(-1, 4, 4)
 
 
 def _palm(index: np.ndarray, pinky: np.ndarray) -> np.ndarray | None:
-    """Return the axes (3, 3), in columns, of a palm from its directions (3,) to the knuckles.
+    """Return the axes (3, 3), in columns, of a palm from the directions (3,) to its knuckles.
 
-    None if the directions are unknown or parallel.
+    None if the directions are unknown or parallel: the sine of their angle is usually 0.3.
     """
     normal = np.cross(index, pinky)
     size = float(np.linalg.norm(normal))
-    if not size > PALM_MIN_SINE * float(np.linalg.norm(index) * np.linalg.norm(pinky)):
+    if not size > 0.1 * float(np.linalg.norm(index) * np.linalg.norm(pinky)):
         return None
     along, normal = index / np.linalg.norm(index), normal / size
     return np.stack([along, np.cross(normal, along), normal], axis=1)

@@ -38,19 +38,9 @@ def residuals(
 
 @numba.njit(cache=True, nogil=True)
 def normal_equations(
-    rendered,
-    face,
-    shift,
-    measured,
-    points,
-    trust,
-    face_normals,
-    rotation,
-    origin,
-    eye,
-    gate,
-    scale,
-):
+    rendered, face, shift, measured, points, trust,
+    face_normals, rotation, origin, eye, gate, scale,
+):  # fmt: skip
     """Sum the depth term over a rendering: J'WJ (6, 6), J'Wr (6,) and the number of pixels used.
 
     Columns as in :func:`residuals`; all lengths in metres.
@@ -80,7 +70,7 @@ def normal_equations(
             if not np.abs(measured[y, x] - here) < gate:
                 continue
             count += 1
-            nx, ny, nz = _rotated_normal(face_normals, f, rotation)
+            nx, ny, nz = rotated_normal(face_normals, f, rotation)
             px, py, pz = points[y, x, 0], points[y, x, 1], points[y, x, 2]
             # the rendered point lies on the same ray: eye + (p - eye) * rendered / measured
             short = 1.0 - here / measured[y, x]
@@ -123,17 +113,12 @@ def matches(rendered, face, shift, measured, points, face_normals, rotation, eye
             if f < 0 or measured[y, x] <= 0:
                 continue
             here = np.float64(rendered[v, u])
-            nx, ny, nz = _rotated_normal(face_normals, f, rotation)
+            nx, ny, nz = rotated_normal(face_normals, f, rotation)
+            px, py, pz = points[y, x, 0], points[y, x, 1], points[y, x, 2]
             short = 1.0 - here / measured[y, x]
             gap[count] = measured[y, x] - here
-            across[count] = np.abs(
-                short
-                * (
-                    nx * (points[y, x, 0] - eye[0])
-                    + ny * (points[y, x, 1] - eye[1])
-                    + nz * (points[y, x, 2] - eye[2])
-                )
-            )
+            along = nx * (px - eye[0]) + ny * (py - eye[1]) + nz * (pz - eye[2])
+            across[count] = np.abs(short * along)
             where[count, 0], where[count, 1] = x, y
             count += 1
     return gap[:count], across[:count], where[:count]
@@ -168,14 +153,15 @@ def agreement(rendered, face, x0, y0, measured, rays, face_normals, rotation, fr
             gap = np.float64(depth) - rendered[v, u]
             if gap > -free_m:
                 free += 1
-                nx, ny, nz = _rotated_normal(face_normals, f, rotation)
+                nx, ny, nz = rotated_normal(face_normals, f, rotation)
                 r = gap * (nx * rays[y0 + v, x0 + u, 0] + ny * rays[y0 + v, x0 + u, 1] + nz)
                 total += scale * scale / (scale * scale + r * r)
     return compared, free, total
 
 
 @numba.njit(cache=True, nogil=True)
-def _rotated_normal(face_normals, f, rotation):
+def rotated_normal(face_normals, f, rotation):
+    """Rotate the normal of face number ``f``."""
     x, y, z = face_normals[f, 0], face_normals[f, 1], face_normals[f, 2]
     return (
         rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z,

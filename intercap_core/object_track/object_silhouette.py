@@ -23,8 +23,6 @@ from intercap_core.geometry.camera.projection_kernels import (
     project_point_with_jacobian,
 )
 
-_CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
-
 
 def rim_mask(mask: np.ndarray) -> np.ndarray:
     """Return the pixels of a mask (h, w) that touch its outside, (h, w) bool.
@@ -32,7 +30,8 @@ def rim_mask(mask: np.ndarray) -> np.ndarray:
     The mask is assumed to continue beyond the window: a silhouette that the image's edge cuts off
     has no contour there.
     """
-    eroded = cv2.erode(mask.astype(np.uint8), _CROSS, borderType=cv2.BORDER_REPLICATE)
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    eroded = cv2.erode(mask.astype(np.uint8), cross, borderType=cv2.BORDER_REPLICATE)
     return mask & (eroded == 0)
 
 
@@ -56,9 +55,8 @@ def residuals(
         origin: (3,) translation of the object, master frame.
     """
     rotation = camera_from_master[:3, :3]
-    projected, by_point = lens.project_with_jacobian(
-        points @ rotation.T + camera_from_master[:3, 3]
-    )
+    in_camera = points @ rotation.T + camera_from_master[:3, 3]
+    projected, by_point = lens.project_with_jacobian(in_camera)
     offset = projected - targets
     distance = np.linalg.norm(offset, axis=1)
     direction = offset / np.maximum(distance, 1e-9)[:, None]
@@ -119,17 +117,7 @@ def nearest(pixels, starts, x, y, limit):
 
 @numba.njit(cache=True, nogil=True)
 def correspondences(
-    face,
-    corner,
-    inside,
-    person,
-    window,
-    contour,
-    mask_rim,
-    mask_starts,
-    background,
-    limit,
-    least,
+    face, corner, inside, person, window, contour, mask_rim, mask_starts, background, limit, least
 ):
     """Match rim pixels of the render with contour pixels of the mask.
 
@@ -204,7 +192,7 @@ def sees_past(at, depth, corner, rays, depth_from_colour, lens, measured, place,
     clear = np.ones(at.shape[0], np.bool_)
     for i in range(at.shape[0]):
         x, y, z = _on_ray(at[i], depth, corner, rays)
-        px, py, pz = _transform(depth_from_colour, x, y, z)
+        px, py, pz = transform_point(depth_from_colour, x, y, z)
         u, v = project_point(px, py, pz, lens)
         column, row = int(np.rint(u)) - place[0], int(np.rint(v)) - place[1]
         if 0 <= column < measured.shape[1] and 0 <= row < measured.shape[0]:
@@ -215,15 +203,7 @@ def sees_past(at, depth, corner, rays, depth_from_colour, lens, measured, place,
 
 @numba.njit(cache=True, nogil=True)
 def normal_equations(
-    at,
-    target,
-    depth,
-    corner,
-    rays,
-    parameters,
-    master_from_colour,
-    origin,
-    scale,
+    at, target, depth, corner, rays, parameters, master_from_colour, origin, scale
 ):
     """Sum the silhouette term: J'WJ (6, 6), J'Wr (6,) and the residuals (N,) in pixels.
 
@@ -252,7 +232,7 @@ def normal_equations(
         ax = turn[0, 0] * cx + turn[0, 1] * cy + turn[0, 2] * cz
         ay = turn[1, 0] * cx + turn[1, 1] * cy + turn[1, 2] * cz
         az = turn[2, 0] * cx + turn[2, 1] * cy + turn[2, 2] * cz
-        mx, my, mz = _transform(master_from_colour, x, y, z)
+        mx, my, mz = transform_point(master_from_colour, x, y, z)
         ox, oy, oz = mx - origin[0], my - origin[1], mz - origin[2]
         row[0], row[1], row[2] = oy * az - oz * ay, oz * ax - ox * az, ox * ay - oy * ax
         row[3], row[4], row[5] = ax, ay, az
@@ -278,7 +258,8 @@ def _on_ray(pixel, depth, corner, rays):
 
 
 @numba.njit(cache=True, nogil=True)
-def _transform(transform, x, y, z):
+def transform_point(transform, x, y, z):
+    """Apply a transform (4, 4) to a point."""
     return (
         transform[0, 0] * x + transform[0, 1] * y + transform[0, 2] * z + transform[0, 3],
         transform[1, 0] * x + transform[1, 1] * y + transform[1, 2] * z + transform[1, 3],

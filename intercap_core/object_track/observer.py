@@ -13,18 +13,14 @@ from intercap_core.config import ObjectTrackSettings
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh import ObjectMesh, Paint
 from intercap_core.geometry.rigid.render import open_renderer
-from intercap_core.object_track.evidence import ERROR_LASTING_S, PoseEvidence, evidence_at
-from intercap_core.object_track.fit import Fit, MotionPrior, assess_all, fit_pose
+from intercap_core.object_track.evidence import ERROR_LASTING_S, ImageEvidence, evidence_at
+from intercap_core.object_track.fit import FittedPose, MotionPrior, assess_all, fit_pose
 from intercap_core.object_track.motion import carry_in_hands
 from intercap_core.object_track.places import Places
 from intercap_core.object_track.recording import ViewCache
 from intercap_core.object_track.search import SearchLimits, rank_frames, search_pose
 from intercap_core.object_track.view import FitContext, View
 from intercap_core.progress import Progress
-
-PASS_ROUNDS = (3, 3)  # as FIT_ROUNDS, if the start is the pose of a neighbouring frame
-PASS_SCALE = 0.5  # of the first robust scales in that case
-SEARCH_RADIUS_M = 0.75  # around known positions: what a hand moves meanwhile
 
 Pictures = Callable[[int], list[np.ndarray | None]]
 """Returns the reduced colour images (h, w, 3) uint8 BGR of frame t, None where there is none."""
@@ -121,23 +117,20 @@ class Observer:
         rotations: np.ndarray | None = None,
         places: np.ndarray | None = None,
         motion: tuple[np.ndarray, np.ndarray] | None = None,
-    ) -> list[Fit]:
+    ) -> list[FittedPose]:
         """Search the pose of frame t.
 
         Args:
             t: frame.
             rotations, motion: as in :class:`.search.SearchLimits`.
-            places: (M, 3) positions near which to search; None = everywhere.
+            places: (M, 3) positions within 75 cm of which to search; None = everywhere.
 
         Returns:
             Fitted hypotheses, the likeliest first.
         """
 
         def place_prior(place: np.ndarray) -> float:
-            if (
-                places is not None
-                and np.linalg.norm(places - place, axis=1).min() > SEARCH_RADIUS_M
-            ):
+            if places is not None and np.linalg.norm(places - place, axis=1).min() > 0.75:
                 return 0.0
             return self.places.prior(t, place)
 
@@ -149,27 +142,23 @@ class Observer:
         t: int,
         pose: np.ndarray,
         prior: MotionPrior | None,
-        rounds: tuple[int, ...] = PASS_ROUNDS,
-        scale: float = PASS_SCALE,
+        rounds: tuple[int, ...] = (3, 3),
+        scale: float = 0.5,
         mesh: ObjectMesh | None = None,
         twist: np.ndarray | None = None,
-    ) -> Fit:
-        """Fit the pose (4, 4) of frame t from a start that is nearly right.
+    ) -> FittedPose:
+        """Fit the pose (4, 4) of frame t.
 
-        ``mesh`` replaces the object's own; the other arguments are those of :func:`.fit.fit_pose`.
+        Arguments are those of :func:`.fit.fit_pose`, with defaults for a start at the pose of a
+        neighbouring frame. ``mesh`` replaces the object's own.
         """
         self._progress.step()
         return fit_pose(
-            self._context_of(mesh),
-            self.views(t),
-            pose,
-            prior=prior,
-            rounds=rounds,
-            start_scale=scale,
-            twist=twist,
-        )
+            self._context_of(mesh), self.views(t), pose,
+            prior=prior, rounds=rounds, start_scale=scale, twist=twist,
+        )  # fmt: skip
 
-    def evidence(self, t: int, pose: np.ndarray, twist: np.ndarray) -> PoseEvidence:
+    def evidence(self, t: int, pose: np.ndarray, twist: np.ndarray) -> ImageEvidence:
         """Evaluate the evidence of frame t on a pose (4, 4) that moves by ``twist`` (6,)."""
         return evidence_at(self.context, self.views(t), pose, twist)
 
@@ -186,7 +175,7 @@ class Observer:
         pose: np.ndarray,
         mesh: ObjectMesh | None = None,
         twist: np.ndarray | None = None,
-    ) -> Fit:
+    ) -> FittedPose:
         """Compare a pose (4, 4) with frame t without a fit; arguments as in :meth:`fit`."""
         return self.assess_all(t, pose[None], mesh, None if twist is None else twist[None])[0]
 
@@ -196,7 +185,7 @@ class Observer:
         poses: np.ndarray,
         mesh: ObjectMesh | None = None,
         twists: np.ndarray | None = None,
-    ) -> list[Fit]:
+    ) -> list[FittedPose]:
         """Compare many poses (N, 4, 4), moving by ``twists`` (N, 6), with frame t at once."""
         return assess_all(self._context_of(mesh), self.views(t), poses, twists)
 

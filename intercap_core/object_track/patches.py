@@ -12,15 +12,14 @@ import numpy as np
 
 from intercap_core.geometry.camera.projection_kernels import project_point
 from intercap_core.geometry.rigid.shots import Rendering
-from intercap_core.object_track.object_silhouette import rim_pixels
+from intercap_core.object_track.object_silhouette import rim_pixels, transform_point
 from intercap_core.object_track.reduced_mask import ReducedMask
 from intercap_core.object_track.view import View
 
-# The pose may move this far before measured points leave the patch: farther than the first robust
+# Metres that the pose may move before measured points leave the patch: more than the first robust
 # scale of a fit.
 PATCH_MARGIN_M = 0.08
-# Weight of a depth pixel at the rendered depth outside of the candidate; tuned on the studio.
-OUTSIDE_MASK_WEIGHT = 0.3
+OUTSIDE_MASK_WEIGHT = 0.3  # of depth pixels outside of the candidate; tuned on the studio
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,11 +64,6 @@ class DepthPatch:
         )  # fmt: skip
         return cls(left, top, depth, points, trust, on_person)
 
-    @property
-    def place(self) -> tuple[int, int]:
-        """First pixel (x, y) in the reduced depth image."""
-        return self.x0, self.y0
-
 
 @dataclass(frozen=True, eq=False)
 class ContourPatch:
@@ -106,21 +100,12 @@ class ContourPatch:
             return None
         return cls(left, top, inside, person, border, starts, _own(border, person))
 
-    @property
-    def place(self) -> tuple[int, int]:
-        """First pixel (x, y) in the reduced colour image."""
-        return self.x0, self.y0
-
     def holds(self, image: Rendering) -> bool:
         """Return whether a rendering lies inside the window."""
-        height, width = self.inside.shape
-        own_height, own_width = image.face.shape
-        return (
-            image.x0 >= self.x0
-            and image.y0 >= self.y0
-            and image.x0 + own_width <= self.x0 + width
-            and image.y0 + own_height <= self.y0 + height
-        )
+        height, width = image.face.shape
+        left, top = image.x0 - self.x0, image.y0 - self.y0
+        fits_in_width = 0 <= left <= self.inside.shape[1] - width
+        return fits_in_width and 0 <= top <= self.inside.shape[0] - height
 
 
 def _pixels_per_metre(rendering: Rendering, focal: float) -> float:
@@ -159,22 +144,9 @@ def _own(border, person):
 
 @numba.njit(cache=True, nogil=True)
 def _lift(
-    image,
-    rays,
-    left,
-    top,
-    right,
-    bottom,
-    colour_from_depth,
-    master_from_depth,
-    colour,
-    mask,
-    mx,
-    my,
-    person,
-    px,
-    py,
-):
+    image, rays, left, top, right, bottom, colour_from_depth, master_from_depth, colour,
+    mask, mx, my, person, px, py,
+):  # fmt: skip
     """Compute depth, points, trust and on_person of a :class:`DepthPatch`.
 
     Masks are given with their first pixels, in pixels of the reduced colour lens with parameters
@@ -185,7 +157,6 @@ def _lift(
     points = np.zeros((height, width, 3), np.float32)
     trust = np.full((height, width), np.float32(OUTSIDE_MASK_WEIGHT), np.float32)
     on_person = np.zeros((height, width), np.bool_)
-    to_colour, to_master = colour_from_depth, master_from_depth
     for v in range(height):
         for u in range(width):
             z = np.float64(image[top + v, left + u])
@@ -194,19 +165,10 @@ def _lift(
                 continue
             x, y = ray_x * z, ray_y * z
             depth[v, u] = z
-            for axis in range(3):
-                points[v, u, axis] = (
-                    to_master[axis, 0] * x
-                    + to_master[axis, 1] * y
-                    + to_master[axis, 2] * z
-                    + to_master[axis, 3]
-                )
-            column, row = project_point(
-                to_colour[0, 0] * x + to_colour[0, 1] * y + to_colour[0, 2] * z + to_colour[0, 3],
-                to_colour[1, 0] * x + to_colour[1, 1] * y + to_colour[1, 2] * z + to_colour[1, 3],
-                to_colour[2, 0] * x + to_colour[2, 1] * y + to_colour[2, 2] * z + to_colour[2, 3],
-                colour,
-            )
+            at_x, at_y, at_z = transform_point(master_from_depth, x, y, z)
+            points[v, u, 0], points[v, u, 1], points[v, u, 2] = at_x, at_y, at_z
+            cx, cy, cz = transform_point(colour_from_depth, x, y, z)
+            column, row = project_point(cx, cy, cz, colour)
             i, j = int(np.rint(column)), int(np.rint(row))
             if 0 <= i - mx < mask.shape[1] and 0 <= j - my < mask.shape[0] and mask[j - my, i - mx]:
                 trust[v, u] = 1.0

@@ -18,31 +18,17 @@ from intercap_core.object_track.groups import find_groups, locate_group
 from intercap_core.object_track.likelihood import SEARCH_GOOD_LOG_RATIO
 from intercap_core.object_track.view import View
 
-# Distance from the nearest joint to the object's surface, metres; tuned on the studio, as all
-# values below.
-AT_HAND_M = 0.10  # within reach
-OUT_OF_REACH_M = 0.45
-# Quantile over frames of the distance to the person that counts as their approach: nobody is near
-# the object all the time.
-NEAREST_QUANTILE = 0.1
-SURVEYED_FRAMES = 12  # surveyed before tracking, spread over the recording
-SURVEYED_GROUPS = 6  # groups of candidates in each of them
-# Positions within this distance are one place: views see different sides of an object.
-SAME_PLACE_SHARE = 0.3  # of the diameter
-SAME_PLACE_M = 0.05  # added
+# All values are tuned on the studio.
 # Shares of the surveyed frames in which a place is occupied.
 ALWAYS_PRESENT = 0.85
 SOMETIMES_PRESENT = 0.5
 MOVED_PRIOR = 0.8  # prior of an object that was not in its place all the time
 MIN_PLACE_PRIOR = 0.1  # prior of an object that stands far from the person all the time
-MAX_PLACE_PRIOR = 1 - 1e-6  # keeps log-odds finite
 UNHANDLED_LOG_RATIO = 10.0  # nats of a frame against an object that moves with nobody near
 RIVAL_FRAMES = 2  # frames with the place occupied while the object is elsewhere: another object
 # Largest evidence, nats, that a similar object takes off the evidence for the object in its place:
 # a part of furniture, not a twin that the track may have mistaken.
 CLUTTER_LOG_RATIO = 10.0
-
-_BODY_AND_HANDS = slice(0, 67)  # of the 135 keypoints, without the face
 
 
 @dataclass(eq=False)
@@ -58,9 +44,7 @@ class OccupiedPlace:
 
 
 class Places:
-    """Places where candidates were seen, each with the prior that the object there is the tracked
-    one.
-    """
+    """Places where candidates were seen, with the prior that the tracked object is there."""
 
     def __init__(
         self, mesh: ObjectMesh, standing: list[OccupiedPlace], joints: np.ndarray | None
@@ -73,8 +57,8 @@ class Places:
             joints: (T, K, 3) of the person, master frame, NaN where unknown; None without a person.
         """
         self._reach = 0.5 * mesh.radius
-        self._same = SAME_PLACE_SHARE * mesh.diameter + SAME_PLACE_M
-        self._joints = None if joints is None else joints[:, _BODY_AND_HANDS]
+        self._same = _same_place_m(mesh)
+        self._joints = None if joints is None else joints[:, :67]  # body and hands, no face
         self._standing = [(s, self._standing_prior(s)) for s in standing]
         self._clutter: list[tuple[np.ndarray, dict[int, float]]] = []
         self._others: list[np.ndarray] = []
@@ -100,13 +84,12 @@ class Places:
         Returns:
             The places, and the surveyed frames with candidates, the most promising first.
         """
-        frames = sorted({int(t) for t in np.linspace(0, count - 1, SURVEYED_FRAMES).round()})
+        frames = sorted({int(t) for t in np.linspace(0, count - 1, 12).round()})
         seen = []
         for t in frames:
-            groups = find_groups(mesh, load(t), labels, limit=SURVEYED_GROUPS)
+            groups = find_groups(mesh, load(t), labels, limit=6)
             seen.append([(locate_group(g), sum(s.label_prior for s in g)) for g in groups])
-        same = SAME_PLACE_SHARE * mesh.diameter + SAME_PLACE_M
-        places = cls(mesh, _cluster_places(frames, seen, same), joints)
+        places = cls(mesh, _cluster_places(frames, seen, _same_place_m(mesh)), joints)
         best = [
             max((value * places.prior(t, place) for place, value in here), default=0.0)
             for t, here in zip(frames, seen, strict=True)
@@ -115,13 +98,11 @@ class Places:
         return places, [frames[i] for i in order if best[i] > 0]
 
     def prior(self, t: int, place: np.ndarray) -> float:
-        """Return the prior, 0.1 to 1, that an object at ``place`` (3,) in frame t is the tracked
-        one.
-        """
-        found = self._nearest(place)
-        if found is None:
+        """Return the prior, 0.1 to 1, that the tracked object is at ``place`` (3,) in frame t."""
+        nearest = self._nearest(place)
+        if nearest is None:
             return max(MOVED_PRIOR, _closeness(self._gaps(place, slice(t, t + 1))))
-        standing, place_prior = found
+        standing, place_prior = nearest
         return MIN_PLACE_PRIOR if len(standing.rival_frames) >= RIVAL_FRAMES else place_prior
 
     def weigh(self, t: int, place: np.ndarray, ratio: float, share: float) -> float:
@@ -143,11 +124,11 @@ class Places:
         if any(np.linalg.norm(other - place) < self._same for other in self._others):
             return min(ratio, 0.0) - CLUTTER_LOG_RATIO
         ratio -= self._clutter_ratio(place)
-        found = self._nearest(place)
-        if found is None or found[0].share < SOMETIMES_PRESENT:
+        nearest = self._nearest(place)
+        if nearest is None or nearest[0].share < SOMETIMES_PRESENT:
             gaps = self._gaps(place, slice(t, t + 1))
             return ratio - (UNHANDLED_LOG_RATIO * (1 - _closeness(gaps)) if len(gaps) else 0.0)
-        prior = min(self.prior(t, place), MAX_PLACE_PRIOR)
+        prior = min(self.prior(t, place), 1 - 1e-6)
         return min(ratio, float(np.log(prior / (1 - prior))) / share)
 
     def _nearest(self, place: np.ndarray) -> tuple[OccupiedPlace, float] | None:
@@ -173,10 +154,10 @@ class Places:
             object_at: (3,) position of the tracked object.
             ratio: log-likelihood ratio of the images for the similar object, nats.
         """
-        found = self._nearest(place)
-        apart = found is not None and np.linalg.norm(found[0].place - object_at) >= self._same
-        if found is not None and apart and ratio > SEARCH_GOOD_LOG_RATIO:
-            found[0].rival_frames.add(t)
+        nearest = self._nearest(place)
+        apart = nearest is not None and np.linalg.norm(nearest[0].place - object_at) >= self._same
+        if nearest is not None and apart and ratio > SEARCH_GOOD_LOG_RATIO:
+            nearest[0].rival_frames.add(t)
         likeness = self._clutter_at(place)
         if np.linalg.norm((place if likeness is None else likeness[0]) - object_at) < self._same:
             return
@@ -208,10 +189,10 @@ class Places:
 
         It is no evidence for the tracked object there.
         """
-        found = self._clutter_at(place)
-        if found is None or len(found[1]) < RIVAL_FRAMES:
+        clutter = self._clutter_at(place)
+        if clutter is None or len(clutter[1]) < RIVAL_FRAMES:
             return 0.0
-        return min(float(np.mean(list(found[1].values()))), CLUTTER_LOG_RATIO)
+        return min(float(np.mean(list(clutter[1].values()))), CLUTTER_LOG_RATIO)
 
     def _standing_prior(self, standing: OccupiedPlace) -> float:
         handled = _closeness(self._gaps(standing.place, slice(None)))
@@ -229,15 +210,21 @@ class Places:
         return np.maximum(nearest[np.isfinite(nearest)] - self._reach, 0.0)
 
 
+def _same_place_m(mesh: ObjectMesh) -> float:
+    """Return the distance within which positions are one place: views see different sides."""
+    return 0.3 * mesh.diameter + 0.05
+
+
 def _closeness(gaps: np.ndarray) -> float:
     """Return the prior from distances (N,) to the person, metres.
 
-    It is 1 within reach and 0.1 far away or if no distance is known.
+    It is 1 within reach and 0.1 out of reach or if no distance is known. The approach is the lowest
+    tenth of the distances, because nobody is near the object all the time.
     """
-    gap = float(np.quantile(gaps, NEAREST_QUANTILE)) if len(gaps) else np.inf
-    return float(
-        np.clip((OUT_OF_REACH_M - gap) / (OUT_OF_REACH_M - AT_HAND_M), MIN_PLACE_PRIOR, 1.0)
-    )
+    at_hand_m, out_of_reach_m = 0.10, 0.45
+    gap = float(np.quantile(gaps, 0.1)) if len(gaps) else np.inf
+    share = (out_of_reach_m - gap) / (out_of_reach_m - at_hand_m)
+    return float(np.clip(share, MIN_PLACE_PRIOR, 1.0))
 
 
 def _cluster_places(
@@ -249,7 +236,7 @@ def _cluster_places(
     frame = np.array([t for t, _ in every], int)
     free = np.ones(len(every), bool)
     looked = sum(1 for here in seen if here)
-    found: list[OccupiedPlace] = []
+    occupied: list[OccupiedPlace] = []
     while free.any():
         together = (np.linalg.norm(places[:, None] - places, axis=-1) < same) & free
         counts = np.array([len(set(frame[row])) for row in together])
@@ -257,6 +244,6 @@ def _cluster_places(
         if counts[best] < 2:
             break
         members = together[best]
-        found.append(OccupiedPlace(places[members].mean(0), counts[best] / max(looked, 1)))
+        occupied.append(OccupiedPlace(places[members].mean(0), counts[best] / max(looked, 1)))
         free &= ~members
-    return found
+    return occupied

@@ -10,31 +10,17 @@ import numpy as np
 
 from intercap_core.geometry.camera.transforms import apply_step, rotation_exp, step_between
 from intercap_core.object_track.decoder import HIDDEN, Decoded
-from intercap_core.object_track.fit import FIT_ROUNDS, Fit, MotionPrior
+from intercap_core.object_track.fit import FIT_ROUNDS, FittedPose, MotionPrior
 from intercap_core.object_track.given_poses import GivenPose
 from intercap_core.object_track.hypotheses import BASIN, RIVAL_LOG_RATIO, Hypotheses, Prior
 from intercap_core.object_track.likelihood import SEARCH_GOOD_LOG_RATIO, SEEN_LOG_RATIO
 from intercap_core.object_track.motion import shift_twist
 from intercap_core.object_track.observer import Observer
-from intercap_core.object_track.turns import find_near_symmetries, same_pose
+from intercap_core.object_track.turns import distinct_poses, find_near_symmetries
 
-SEED_SEARCHES = 3  # frames searched for the start; more while nothing is found
-SEED_SEARCHES_MAX = 10
-SEED_SURE_LOG_RATIO = 40.0  # nats at which the search for the start ends
-SEARCHES_MIN = 6  # frames searched with all rotations ...
-SEARCH_EVERY_S = 0.5  # ... and one more in this time
-RUN_SEARCHED_S = 0.2  # a visible run of this length is searched in one of its frames
-NEAR_FRAMES_S = 0.3  # time to frames whose poses start the search of an uncertain frame
-NEAR_FITTED = 3  # of these starts that are fitted, until one is good
-NEAR_TURN_SEARCH_RAD = np.radians(35)  # turn of the rotations around these starts
-TURNS_FOLLOWED = 2  # near symmetries of a key frame
+SEED_SURE_LOG_RATIO = 40.0  # nats at which the search for a frame to start from ends
 KEY_FRAME_S = 0.2  # time between the frames in which near symmetries and colours are compared
-ANNOTATION_FRAMES = 5  # error of the frame number of an annotation
 DOUBTFUL_PROBABILITY = 0.9  # of the chosen hypothesis, below which a frame is uncertain
-# Shares of the usual weight below which more is searched near a pose, and elsewhere too; tuned on
-# the studio.
-DOUBTFUL_SHARE = 0.5
-HIDDEN_SHARE = 0.25
 # Log-likelihood ratio at which the images of a frame clearly contradict an annotated pose: two or
 # three views see past the object. An occluded frame reaches -6, and so does chance. Tuned on five
 # objects of the studio at noise 2 with two cameras.
@@ -55,19 +41,19 @@ class Proposals:
         self._hypotheses = hypotheses
         self._prior = prior
         self._times = observer.times
-        self._reach = observer.frames_in(NEAR_FRAMES_S)
+        self._reach = observer.frames_in(0.3)
         self._searched: set[int] = set()
         self._searched_near_annotated: set[int] = set()
         self._searched_nearby: set[int] = set()
 
     def start(self) -> int:
-        """Search the most promising frames and follow what is found.
+        """Search the three most promising frames, more while none shows the object, ten at most.
 
-        Returns the best frame. Raises NotFound if nothing is found.
+        All hypotheses are followed. Returns the best frame; raises NotFound if there is none.
         """
-        results: list[tuple[float, int, list[Fit]]] = []
+        results: list[tuple[float, int, list[FittedPose]]] = []
         for tried, t in enumerate(self._observer.frames_to_search()):
-            if tried >= SEED_SEARCHES_MAX or (tried >= SEED_SEARCHES and results):
+            if tried >= 10 or (tried >= 3 and results):
                 break
             self._searched.add(t)
             fits = self._observer.search(t)
@@ -105,18 +91,17 @@ class Proposals:
                 fits.append(own)
         if not fits:
             return self._find_in_neighbours(given)
-        self._take(given, fits)
+        self._accept(given, fits)
         return given
 
     def _find_in_neighbours(self, given: GivenPose) -> GivenPose | None:
         """Follow the annotated pose in the neighbouring frame that shows it, if any."""
         t, pose = given.frame, given.pose
-        near = range(
-            max(t - ANNOTATION_FRAMES, 0), min(t + ANNOTATION_FRAMES + 1, self._observer.count)
-        )
-        best: tuple[int, Fit] | None = None
+        # the frame number of an annotation may be off by five
+        near = range(max(t - 5, 0), min(t + 6, self._observer.count))
+        best: tuple[int, FittedPose] | None = None
         for u in sorted(near, key=lambda u: abs(u - t)):
-            fit = self._observer.fit(u, pose, MotionPrior(pose), rounds=FIT_ROUNDS, scale=1.0)
+            fit = self._observer.fit(u, pose, MotionPrior(pose), FIT_ROUNDS, 1.0)
             if best is None or fit.log_ratio > best[1].log_ratio + RIVAL_LOG_RATIO:
                 best = u, fit
             if best[1].log_ratio > SEED_SURE_LOG_RATIO:
@@ -124,10 +109,10 @@ class Proposals:
         if best is None or best[1].log_ratio < SEEN_LOG_RATIO or best[0] in self._prior.given:
             return None
         shown = replace(given, frame=best[0], pose=best[1].pose)
-        self._take(shown, [best[1]])
+        self._accept(shown, [best[1]])
         return shown
 
-    def _take(self, given: GivenPose, fits: list[Fit]) -> None:
+    def _accept(self, given: GivenPose, fits: list[FittedPose]) -> None:
         """Follow the fits of an annotated frame; the first one claims its place."""
         t = given.frame
         self._prior.given[t] = given
@@ -141,9 +126,12 @@ class Proposals:
     def search_uncertain(self, decoded: Decoded) -> bool:
         """Search the uncertain frames; returns whether a hypothesis is new.
 
-        First with the rotations of neighbouring frames, outwards from sure frames; with all
-        rotations once in each visible run and near annotated poses; then in some frames with all
-        rotations.
+        1. From the poses of neighbouring frames, outwards from sure frames.
+        2. With all rotations, once in each visible run and near annotated poses.
+        3. If nothing is new, with all rotations in some frames: six, and one more each 0.5 s.
+
+        A frame is uncertain if its hypothesis is improbable or has less than half of the weight
+        that is usual in this recording.
         """
         fits = self._hypotheses.fits
         ratio, sure = np.zeros(len(fits)), np.zeros(len(fits))
@@ -151,7 +139,7 @@ class Proposals:
             ratio[t] = 0.0 if k == HIDDEN else self._prior.weigh(t, fits[t])[k]
             sure[t] = decoded.probability[t][k]
         usual = float(np.median(ratio[ratio > 0])) if (ratio > 0).any() else 0.0
-        poor = DOUBTFUL_SHARE * usual
+        poor = 0.5 * usual
         doubt = (ratio < poor) | (sure < DOUBTFUL_PROBABILITY) | (decoded.path == HIDDEN)
         known = {int(t): fits[t][decoded.path[t]].pose for t in np.flatnonzero(~doubt)}
         new = False
@@ -161,16 +149,16 @@ class Proposals:
                 new |= self._search_nearby(t, known)
         near = self._prior.near_annotated(decoded.path == HIDDEN)
         new |= self._search_near_annotated([t for t in waiting if near[t]], known)
-        most = SEARCHES_MIN + int((self._times[-1] - self._times[0]) / SEARCH_EVERY_S)
+        every_s = 0.5
+        most = 6 + int((self._times[-1] - self._times[0]) / every_s)
         for t in self._unsearched_runs(decoded.path, ratio)[: max(most - len(self._searched), 0)]:
             self._searched.add(t)
             new |= self._follow(t, self._observer.search(t))
         if new:
             return True
-        apart = self._observer.frames_in(SEARCH_EVERY_S) // 2
+        apart = self._observer.frames_in(every_s) // 2
         # a hidden pose that motion makes sure is not elsewhere
-        open_ = (sure < DOUBTFUL_PROBABILITY) | (ratio < HIDDEN_SHARE * usual)
-        waiting = [t for t in waiting if open_[t]]
+        waiting = [t for t in waiting if sure[t] < DOUBTFUL_PROBABILITY or ratio[t] < 0.25 * usual]
         while len(self._searched) < most and not new:
             waiting = [
                 t
@@ -188,8 +176,7 @@ class Proposals:
     def _search_near_annotated(self, frames: list[int], known: dict[int, np.ndarray]) -> bool:
         """Search ``frames`` near annotated poses once, around the nearest ``known`` poses.
 
-        All rotations are tried; returns whether a hypothesis is new. The annotation makes it worth
-        the time.
+        All rotations are tried. Returns whether a hypothesis is new.
         """
         new = False
         for t in frames:
@@ -206,7 +193,7 @@ class Proposals:
         self._searched_nearby -= {t + step for t in changed for step in near}
 
     def _unsearched_runs(self, path: np.ndarray, ratio: np.ndarray) -> list[int]:
-        """Return the likeliest frame of every longer visible run without a searched frame.
+        """Return the likeliest frame of every visible run of 0.2 s without a searched frame.
 
         An object that reappears may have turned out of sight.
         """
@@ -215,8 +202,7 @@ class Proposals:
         return [
             int(run[ratio[run].argmax()])
             for run in runs
-            if len(run) * self._observer.step_s >= RUN_SEARCHED_S
-            and not self._searched & set(run.tolist())
+            if len(run) * self._observer.step_s >= 0.2 and not self._searched & set(run.tolist())
         ]
 
     def _search_nearby(self, t: int, known: dict[int, np.ndarray]) -> bool:
@@ -229,25 +215,19 @@ class Proposals:
             return False
         self._searched_nearby.add(t)
         assessed = self._observer.assess_all(t, starts, twists=rates)
-        fits: list[Fit] = []
-        tried: list[np.ndarray] = []
-        for start in sorted(assessed, key=lambda fit: -fit.log_ratio):
-            if len(tried) == NEAR_FITTED or any(
-                same_pose(self._observer.mesh, start.pose, other, BASIN) for other in tried
-            ):
-                continue
-            tried.append(start.pose)
-            prior = MotionPrior(start.pose)
-            fits.append(
-                self._observer.fit(t, start.pose, prior, FIT_ROUNDS, 1.0, twist=start.twist)
-            )
+        assessed.sort(key=lambda fit: -fit.log_ratio)
+        mesh, fits = self._observer.mesh, []
+        for k in distinct_poses(mesh, [fit.pose for fit in assessed], BASIN, count=3):
+            pose, twist = assessed[k].pose, assessed[k].twist
+            prior = MotionPrior(pose)
+            fits.append(self._observer.fit(t, pose, prior, FIT_ROUNDS, 1.0, twist=twist))
             if fits[-1].log_ratio > SEARCH_GOOD_LOG_RATIO:
                 break
         best = max(fits, key=lambda fit: fit.log_ratio)
         if best.log_ratio < SEARCH_GOOD_LOG_RATIO:
-            turns = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]) * NEAR_TURN_SEARCH_RAD
+            turns = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]) * np.radians(35)
             around = rotation_exp(turns)[:, None] @ starts[None, :, :3, :3]
-            places = [self._observer.mesh.centre_at(start) for start in starts]
+            places = [mesh.centre_at(start) for start in starts]
             motion = best.twist, best.pose[:3, 3]
             fits += self._observer.search(t, around.reshape(-1, 3, 3), np.array(places), motion)
         return self._follow(t, fits)
@@ -314,14 +294,14 @@ class Proposals:
             fits = self._observer.assess_all(t, poses, twists=rates)
             fits = [fit for fit in fits if fit.log_ratio > own.log_ratio - RIVAL_LOG_RATIO]
             fits.sort(key=lambda fit: -fit.log_ratio)
-            for other in fits[:TURNS_FOLLOWED]:
+            for other in fits[:2]:
                 if self._hypotheses.known(t, other.pose) is None:
                     prior = MotionPrior(other.pose)
                     fit = self._observer.fit(t, other.pose, prior, twist=other.twist)
                     new |= self._follow(t, [fit])
         return new
 
-    def _follow(self, t: int, fits: list[Fit]) -> bool:
+    def _follow(self, t: int, fits: list[FittedPose]) -> bool:
         """Follow those of the fits of frame t that may be true; returns whether one is new."""
         own = self._hypotheses.fits[t]
         weights = self._prior.weigh(t, [*fits, *own])

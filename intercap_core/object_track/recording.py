@@ -19,30 +19,16 @@ from intercap_core.geometry.camera.rig import Rig
 from intercap_core.object_track.view import View, ViewGeometry, camera_distances
 from intercap_core.schemas import PERSON, SCENE
 
-TRACKING_FACES = 600  # of the rendered mesh; within 0.5 mm of the full mesh
-VIEW_CACHE_BYTES = 800_000_000  # 90 frame sets of six unreduced depth images, 360 of a suitcase's
-# A candidate is kept if its extent is within these shares of the object's diameter: partly hidden,
-# or with something that the object touches. Tuned on the studio.
-CANDIDATE_MIN_EXTENT = 0.25
-CANDIDATE_MAX_EXTENT = 1.4
-CANDIDATE_SLACK_M = 0.05  # added to the largest extent
+TRACKING_FACES = 600  # of the rendered mesh; measured within 0.5 mm of the full mesh
 
 log = logging.getLogger(__name__)
-
-_DECODED_BY: dict[int, Literal[1, 2, 4]] = {2: 2, 4: 4}
-"""Reduction that the image decoder applies, by the step of the reduced grid."""
 
 
 class ObjectRecording:
     """Views, pictures and labels of every moment of a recording."""
 
     def __init__(
-        self,
-        frames: Frames,
-        detections: Detections,
-        scene: Path,
-        person: Path,
-        diameter_m: float,
+        self, frames: Frames, detections: Detections, scene: Path, person: Path, diameter_m: float
     ) -> None:
         """Open the views of a recording.
 
@@ -108,14 +94,14 @@ class ObjectRecording:
 
         Images are on the reduced grid; None if there is no readable image.
         """
-        found: list[np.ndarray | None] = []
+        pictures: list[np.ndarray | None] = []
         for c, geometry in zip(self.cameras, self.geometry, strict=True):
-            image = self._picture(t, c, _DECODED_BY.get(geometry.step, 1))
             step = geometry.step
+            image = self._picture(t, c, 4 if step == 4 else 2 if step == 2 else 1)
             if image is not None and image.shape[:2] != (geometry.lens.height, geometry.lens.width):
                 image = image[::step, ::step]
-            found.append(image)
-        return found
+            pictures.append(image)
+        return pictures
 
     def _picture(self, t: int, c: int, reduction: Literal[1, 2, 4]) -> np.ndarray | None:
         """Decode an image at reduced size, or in full if its size is unexpected."""
@@ -130,13 +116,13 @@ class ObjectRecording:
             return None
 
     def _candidates(self, t: int, c: int) -> list[Candidate]:
-        """Return the candidates that the object may be by their size, where that is known."""
-        low, high = (
-            CANDIDATE_MIN_EXTENT * self._diameter_m,
-            CANDIDATE_MAX_EXTENT * self._diameter_m + CANDIDATE_SLACK_M,
-        )
-        found = self._detections.candidates(t, c)
-        return [one for one in found if not (one.extent_m < low or one.extent_m > high)]
+        """Return the candidates that have the object's size, or whose size is unknown.
+
+        They may be partly hidden, or include something that the object touches.
+        """
+        low, high = 0.25 * self._diameter_m, 1.4 * self._diameter_m + 0.05  # tuned on the studio
+        candidates = self._detections.candidates(t, c)
+        return [item for item in candidates if not (item.extent_m < low or item.extent_m > high)]
 
     def labels(self) -> list[list[list[str]]]:
         """Return the labels [T][usable cameras][candidates]."""
@@ -147,11 +133,12 @@ class ObjectRecording:
 
 
 class ViewCache:
-    """Calls ``load(t)`` for the views of frame t once, and again only after they were evicted."""
+    """Least recently used cache of the views of frames.
 
-    def __init__(
-        self, load: Callable[[int], list[View]], max_bytes: int = VIEW_CACHE_BYTES
-    ) -> None:
+    ``max_bytes`` holds 90 frame sets of six unreduced depth images, 360 of a suitcase's.
+    """
+
+    def __init__(self, load: Callable[[int], list[View]], max_bytes: int = 800_000_000) -> None:
         self._load = load
         self._max_bytes = max_bytes
         self._kept: OrderedDict[int, list[View]] = OrderedDict()
@@ -161,25 +148,17 @@ class ViewCache:
     def __call__(self, t: int) -> list[View]:
         """Return the views of frame t, one per camera. One thread loads at a time."""
         with self._lock:
-            return self._get(t)
+            if t in self._kept:
+                self._kept.move_to_end(t)
+                return self._kept[t]
+            self._kept[t] = self._load(t)
+            self._bytes += sum(view.nbytes for view in self._kept[t])
+            while self._bytes > self._max_bytes and len(self._kept) > 1:
+                _, oldest = self._kept.popitem(last=False)
+                self._bytes -= sum(view.nbytes for view in oldest)
+            return self._kept[t]
 
     def kept(self, t: int) -> list[View] | None:
         """Return the views of frame t if they are cached; nothing is loaded or evicted."""
         with self._lock:
             return self._kept.get(t)
-
-    def _get(self, t: int) -> list[View]:
-        if t in self._kept:
-            self._kept.move_to_end(t)
-            return self._kept[t]
-        views = self._load(t)
-        self._kept[t] = views
-        self._bytes += _size(views)
-        while self._bytes > self._max_bytes and len(self._kept) > 1:
-            _, oldest = self._kept.popitem(last=False)
-            self._bytes -= _size(oldest)
-        return views
-
-
-def _size(views: list[View]) -> int:
-    return sum(view.nbytes for view in views)

@@ -14,11 +14,7 @@ import numba
 import numpy as np
 
 from intercap_core.geometry.camera.intrinsics import Intrinsics
-
-MASK_BORDER_PX = 6.0  # difference of two masks of one person at their borders, pixels at full
-# resolution; tuned on the studio, as the two shares below
-BLOB_PERSON_SHARE = 0.25  # of the person's pixels; a candidate with more contains the person
-BLOB_MIN_REST_SHARE = 0.01  # of the candidate's pixels that have to remain without the person
+from intercap_core.geometry.camera.masks import Runs
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,9 +46,9 @@ class ReducedMask:
         inside = (
             (column >= 0) & (row >= 0) & (column < self.mask.shape[1]) & (row < self.mask.shape[0])
         )
-        found = np.zeros(len(x), bool)
-        found[inside] = self.mask[row[inside], column[inside]]
-        return found
+        values = np.zeros(len(x), bool)
+        values[inside] = self.mask[row[inside], column[inside]]
+        return values
 
     @cached_property
     def area(self) -> int:
@@ -84,50 +80,22 @@ def decode(rle: bytes, lens: Intrinsics, step: int) -> ReducedMask:
     """
     if not rle:
         return EMPTY
-    runs = _counts(np.frombuffer(rle, np.uint8))
-    if runs.sum() != lens.width * lens.height:
-        raise ValueError(
-            f"a mask of {runs.sum()} pixels does not fit an image of {lens.width} x {lens.height}"
-        )
-    left, right, top, bottom = _bounds(runs, lens.height, step)
+    ends = Runs(rle, lens.height, lens.width).ends
+    left, right, top, bottom = _bounds(ends, lens.height, step)
     if left > right or top > bottom:
         return EMPTY
     mask = np.zeros((bottom - top + 1, right - left + 1), np.bool_)
-    _fill(runs, lens.height, step, left, top, mask)
+    _fill(ends, lens.height, step, left, top, mask)
     return ReducedMask(left, top, mask)
 
 
 @numba.njit(cache=True, nogil=True)
-def _counts(text: np.ndarray) -> np.ndarray:
-    """Decode the run lengths, zeros first (format of pycocotools' maskApi.c)."""
-    counts = np.empty(len(text), np.int64)
-    number = 0
-    position = 0
-    while position < len(text):
-        value, shift, more = np.int64(0), 0, True
-        while more and position < len(text):
-            bits = np.int64(text[position]) - 48
-            value |= (bits & 0x1F) << shift
-            more = (bits & 0x20) != 0
-            position += 1
-            shift += 5
-            if not more and bits & 0x10:
-                value |= np.int64(-1) << shift
-        if number > 2:
-            value += counts[number - 2]
-        counts[number] = value
-        number += 1
-    return counts[:number]
-
-
-@numba.njit(cache=True, nogil=True)
-def _bounds(runs: np.ndarray, height: int, step: int) -> tuple[int, int, int, int]:
+def _bounds(ends: np.ndarray, height: int, step: int) -> tuple[int, int, int, int]:
     """Return left, right, top, bottom (inclusive) of the reduced pixels set."""
     left, right, top, bottom = 1 << 30, -1, 1 << 30, -1
-    start = 0
-    for i in range(len(runs)):
-        end = start + runs[i]
-        if i % 2 == 1 and runs[i] > 0:
+    for i in range(1, len(ends), 2):
+        start, end = ends[i - 1], ends[i]
+        if end > start:
             for column in range(start // height, (end - 1) // height + 1):
                 if column % step:
                     continue
@@ -137,17 +105,15 @@ def _bounds(runs: np.ndarray, height: int, step: int) -> tuple[int, int, int, in
                 if first <= last:
                     left, right = min(left, column // step), max(right, column // step)
                     top, bottom = min(top, first), max(bottom, last)
-        start = end
     return left, right, top, bottom
 
 
 @numba.njit(cache=True, nogil=True)
-def _fill(runs: np.ndarray, height: int, step: int, left: int, top: int, mask: np.ndarray) -> None:
+def _fill(ends: np.ndarray, height: int, step: int, left: int, top: int, mask: np.ndarray) -> None:
     """Set the pixels of the runs in ``mask``, whose first pixel is (left, top)."""
-    start = 0
-    for i in range(len(runs)):
-        end = start + runs[i]
-        if i % 2 == 1 and runs[i] > 0:
+    for i in range(1, len(ends), 2):
+        start, end = ends[i - 1], ends[i]
+        if end > start:
             for column in range(start // height, (end - 1) // height + 1):
                 if column % step:
                     continue
@@ -155,7 +121,6 @@ def _fill(runs: np.ndarray, height: int, step: int, left: int, top: int, mask: n
                 last = min(end - 1 - column * height, height - 1)
                 for row in range((first + step - 1) // step, last // step + 1):
                     mask[row - top, column // step - left] = True
-        start = end
 
 
 def remove_person(mask: ReducedMask, person: ReducedMask, step: int) -> ReducedMask | None:
@@ -175,17 +140,18 @@ def remove_person(mask: ReducedMask, person: ReducedMask, step: int) -> ReducedM
     if not mask.area or not person.area:
         return None
     here = person.window(mask.x0, mask.y0, *mask.mask.shape)
-    if (here & mask.mask).sum() < BLOB_PERSON_SHARE * person.area:
+    if (here & mask.mask).sum() < 0.25 * person.area:
         return None
     rest = (mask.mask & ~here).astype(np.uint8)
-    size = max(3, 2 * round(0.5 * MASK_BORDER_PX / step) + 1)
+    border_px = 6.0  # difference of two masks of one person at their borders, at full resolution
+    size = max(3, 2 * round(0.5 * border_px / step) + 1)
     opened = cv2.morphologyEx(rest, cv2.MORPH_OPEN, np.ones((size, size), np.uint8))
     count, parts, sizes, _ = cv2.connectedComponentsWithStats(opened)
     if count < 2:
         return None
     largest = 1 + int(sizes[1:, cv2.CC_STAT_AREA].argmax())
     left, top, width, height, area = sizes[largest]
-    if area < BLOB_MIN_REST_SHARE * mask.area:
+    if area < 0.01 * mask.area:
         return None
     kept = parts[top : top + height, left : left + width] == largest
     return ReducedMask(mask.x0 + int(left), mask.y0 + int(top), kept)

@@ -19,16 +19,7 @@ BLIP_FRAMES = 2  # within these an object cannot move away and back: a tenth of 
 MAX_REST_FRAMES = 900  # tested against one pose
 # Costs are minus log-likelihoods of one independent observation.
 MOVING_COST = 9.0  # of a pose of its own: six numbers, each of which must differ from noise
-UNSEEN_MOVING_COST = 1.0  # of a frame without evidence
 REST_COST = 8.0  # of one more rest: its pose, its begin and its end
-CUT_REST_COST = 5.0  # of a rest that the recording's begin or end cuts
-CUT_LONGER = 0.9  # of MOVING_COST, by which a longer cut rest costs more, up to REST_COST
-REST_MAX_DISTANCE = np.repeat([0.35, 0.10], 3)  # rad, metres: farther away no rest is tested
-REST_VARIANCE_BOUNDS = (0.5, 2.0)  # of the measured variance at rest over the stated one
-# Squared normalised distances (chi square with 6 degrees of freedom: mean 6, 95 % below 12.6).
-REST_EDGE_SQUARED = 9.0  # of a first or last frame of a rest that has already moved
-BLIP_SAME_SQUARED = 10.0  # of equal poses
-BLIP_APART_SQUARED = 25.0  # of different poses
 
 
 def find_rests(evidence: FrameEvidence, times: np.ndarray, centre: np.ndarray) -> np.ndarray:
@@ -61,7 +52,7 @@ def find_rests(evidence: FrameEvidence, times: np.ndarray, centre: np.ndarray) -
         segments, spread = _partition(poses, information, seen, share / wander, share, shortest)
         if spread is None:
             break
-        wander = float(np.clip(wander * spread, *REST_VARIANCE_BOUNDS))
+        wander = float(np.clip(wander * spread, 0.5, 2.0))
     information = information / wander
     return _merge(_trim(segments, poses, information), poses, information * share, seen)
 
@@ -88,7 +79,7 @@ def _partition(
             rest.
     """
     count = len(poses)
-    moving = np.where(seen, MOVING_COST, UNSEEN_MOVING_COST) * share
+    moving = np.where(seen, MOVING_COST, 1.0) * share
     best_rest, best_move = np.full(count + 1, np.inf), np.full(count + 1, np.inf)
     best_rest[0] = best_move[0] = 0.0
     began = np.zeros(count + 1, int)
@@ -107,8 +98,9 @@ def _partition(
         # than to move in its last frames
         length = ends - a
         cut = (a == 0) | (ends == count)
-        longer = np.maximum(length - shortest + 1, 0) * MOVING_COST * share * CUT_LONGER
-        own = np.where(cut, np.minimum(CUT_REST_COST + longer, REST_COST), REST_COST)
+        # a rest that the recording's begin or end cuts costs less, the less the shorter it is
+        longer = np.maximum(length - shortest + 1, 0) * MOVING_COST * share * 0.9
+        own = np.where(cut, np.minimum(5.0 + longer, REST_COST), REST_COST)
         cost = best_move[a] + own + 0.5 * weight * spread
         least = np.where(cut, (shortest + 1) // 2, shortest)
         better = (cost < best_rest[ends]) & (length >= least)
@@ -135,12 +127,13 @@ def _partition(
 
 
 def _spread(poses: np.ndarray, information: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Return squared normalised distances (L,) of the first 1, 2, ... frames from their common
-    pose.
+    """Return squared normalised distances (L,) of the first 1, 2, ... frames from their mean pose.
+
+    L ends at the first frame that is too far away for a rest: 0.35 rad or 10 cm.
     """
     offset = step_between(np.broadcast_to(poses[0], poses.shape), poses)
     offset[~seen] = 0
-    far = (np.abs(offset) > REST_MAX_DISTANCE).any(1)
+    far = (np.abs(offset) > np.repeat([0.35, 0.10], 3)).any(1)
     count = int(far.argmax()) if far.any() else len(poses)
     offset, information = offset[:count], information[:count]
     weighted_offset = np.einsum("tij,tj->ti", information, offset)
@@ -164,7 +157,7 @@ def _trim(segments: np.ndarray, poses: np.ndarray, information: np.ndarray) -> n
         common = np.linalg.solve(information[rest].sum(0) + 1e-9 * np.eye(6), gradient)
         off = (
             np.einsum("ti,tij,tj->t", offset - common, information[rest], offset - common)
-            > REST_EDGE_SQUARED
+            > 9.0  # chi square with 6 degrees of freedom: mean 6, 95 % below 12.6
         )
         # frames without evidence at the ends do not count as resting
         inside = np.flatnonzero(~off & (np.trace(information[rest], axis1=1, axis2=2) > 0))
@@ -204,7 +197,8 @@ def _merge(
 def _remove_blips(poses: np.ndarray, information: np.ndarray) -> np.ndarray:
     """Return the information (T, 6, 6), zero for outliers.
 
-    An outlier is one or two frames at another pose between frames at equal ones.
+    An outlier is one or two frames at another pose between frames at equal ones, by chi square with
+    6 degrees of freedom.
     """
     result = information.copy()
     for width in range(1, BLIP_FRAMES + 1):
@@ -212,9 +206,9 @@ def _remove_blips(poses: np.ndarray, information: np.ndarray) -> np.ndarray:
         if not len(inner):
             break
         before, after = inner - 1, inner + width
-        same = _squared_distance(poses, information, before, after) < BLIP_SAME_SQUARED
+        same = _squared_distance(poses, information, before, after) < 10.0
         for k in range(width):
-            same &= _squared_distance(poses, information, before, inner + k) > BLIP_APART_SQUARED
+            same &= _squared_distance(poses, information, before, inner + k) > 25.0
         for k in range(width):
             result[inner[same] + k] = 0
     return result

@@ -22,7 +22,7 @@ from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.solve.robust import geman_mcclure_weight
-from intercap_core.object_track.fit import Fit, assess_all, fit_pose
+from intercap_core.object_track.fit import FittedPose, assess_all, fit_pose
 from intercap_core.object_track.groups import (
     Group,
     find_groups,
@@ -32,31 +32,13 @@ from intercap_core.object_track.groups import (
 )
 from intercap_core.object_track.likelihood import SEARCH_GOOD_LOG_RATIO, SEEN_LOG_RATIO
 from intercap_core.object_track.motion import shift_twist
-from intercap_core.object_track.turns import axis_turns, rotation_grid, same_pose
+from intercap_core.object_track.turns import axis_turns, distinct_poses, rotation_grid
 from intercap_core.object_track.view import FitContext, View
 
-ALIGNED_POINTS = 150  # of all views together
-ICP_STEPS = 6
-ICP_KEPT = {1: 96, 3: 48}  # step after which only so many rotations continue
-ICP_SCALES_M = (0.08, 0.015)  # first and last Geman-McClure scale: error of the grid, noise
-# A measured point cannot lie on a face that looks away from the camera. Its weight, and its least
-# residual in metres; tuned on the studio.
-FACING_AWAY_WEIGHT = 0.1
-FACING_AWAY_MIN_M = 0.01
-ICP_MAX_RESIDUAL_M = 0.05  # larger residuals count as this
-OUTLINE_ALIGNED_VIEWS = (
-    2  # in groups of up to so many views, outlines of views with depth count too
-)
-# Poses rendered after the alignment, and fitted after that.
-FULL_SEARCH = (16, 3)  # with all rotations
-NEAR_SEARCH = (6, 2)  # with given rotations
-SEARCH_MIN_OVERLAP = 0.2  # largest ``min_overlap`` of a fit to a searched pose
+ICP_MAX_RESIDUAL_M = 0.05  # larger residuals of the alignment count as this; tuned on the studio
 # Nats by which a start may be worse than a fit and still lead to a rival of it: a fit gains up to
 # 15 nats, measured on the studio (bottle to chair).
 HOPELESS_LOG_RATIO = 15.0
-AXIS_TURN_STEPS = 12  # turns of the best pose about each axis that are compared with it
-TURNS_FITTED = 3  # of them
-TRUSTED_PLACE = 0.5  # prior of a position whose good pose ends the search; tuned on the studio
 
 
 @dataclass(frozen=True)
@@ -75,7 +57,7 @@ class SearchLimits:
 
 def search_pose(
     context: FitContext, field: DistanceField, views: list[View], limits: SearchLimits
-) -> list[Fit]:
+) -> list[FittedPose]:
     """Search the pose of a frame set.
 
     Args:
@@ -88,18 +70,18 @@ def search_pose(
         Fitted hypotheses, the likeliest first; empty if nothing is detected.
     """
     mesh = context.mesh
-    fit_context = replace(context, min_overlap=min(context.min_overlap, SEARCH_MIN_OVERLAP))
+    fit_context = replace(context, min_overlap=min(context.min_overlap, 0.2))
 
-    def fit_starts(starts: list[Fit], best: float = SEEN_LOG_RATIO) -> list[Fit]:
+    def fit_starts(starts: list[FittedPose], best: float = SEEN_LOG_RATIO) -> list[FittedPose]:
         """Fit the starts that are not hopeless compared with the ``best`` log-likelihood ratio."""
-        fits: list[Fit] = []
+        fits: list[FittedPose] = []
         for start in starts:
             best = max([best, *(fit.log_ratio for fit in fits)])
             if start.log_ratio > best - HOPELESS_LOG_RATIO:
                 fits.append(fit_pose(fit_context, views, start.pose, twist=start.twist))
         return fits
 
-    def compare(poses: np.ndarray) -> list[Fit]:
+    def compare(poses: np.ndarray) -> list[FittedPose]:
         """Compare poses (N, 4, 4) with the views; the likeliest first."""
         twists = None
         if limits.motion is not None:
@@ -107,29 +89,26 @@ def search_pose(
         return sorted(assess_all(context, views, poses, twists), key=lambda fit: -fit.log_ratio)
 
     rotations = limits.rotations
-    number_compared, number_fitted = FULL_SEARCH if rotations is None else NEAR_SEARCH
+    number_compared, number_fitted = (16, 3) if rotations is None else (6, 2)
     if rotations is None:
         rotations = rotation_grid(mesh.symmetry, limits.up)
     prior = limits.place_prior
-    fits: list[Fit] = []
+    fits: list[FittedPose] = []
     for group in find_groups(mesh, views, context.labels, prior):
         poses = align(mesh, field, group, views, rotations)
-        of_group = fit_starts(compare(_distinct(mesh, poses, number_compared))[:number_fitted])
+        poses = poses[distinct_poses(mesh, poses, count=number_compared)]
+        of_group = fit_starts(compare(poses)[:number_fitted])
         fits += of_group
-        trusted = prior is None or prior(locate_group(group)) > TRUSTED_PLACE
+        trusted = prior is None or prior(locate_group(group)) > 0.5
         if trusted and any(fit.log_ratio > SEARCH_GOOD_LOG_RATIO for fit in of_group):
             break
     fits.sort(key=lambda fit: -fit.log_ratio)
     if fits and limits.rotations is None and not mesh.symmetry.sphere:
         # a mug looks much the same with its handle elsewhere, a box from its back
-        turned = compare(fits[0].pose @ axis_turns(mesh, AXIS_TURN_STEPS))[:TURNS_FITTED]
+        turned = compare(fits[0].pose @ axis_turns(mesh, steps=12))[:3]
         fits += fit_starts(turned, fits[0].log_ratio)
         fits.sort(key=lambda fit: -fit.log_ratio)
-    kept: list[Fit] = []
-    for fit in fits:
-        if not any(same_pose(mesh, fit.pose, other.pose) for other in kept):
-            kept.append(fit)
-    return kept
+    return [fits[k] for k in distinct_poses(mesh, [fit.pose for fit in fits])]
 
 
 def rank_frames(labels_by_view: list[list[list[str]]], labels: tuple[str, ...]) -> list[int]:
@@ -165,17 +144,6 @@ def rank_frames(labels_by_view: list[list[list[str]]], labels: tuple[str, ...]) 
     return order
 
 
-def _distinct(mesh: ObjectMesh, poses: np.ndarray, count: int) -> np.ndarray:
-    """Return the first ``count`` poses (N, 4, 4) that differ from all before."""
-    kept: list[np.ndarray] = []
-    for pose in poses:
-        if not any(same_pose(mesh, pose, other) for other in kept):
-            kept.append(pose)
-            if len(kept) == count:
-                break
-    return np.array(kept)
-
-
 def align(
     mesh: ObjectMesh,
     field: DistanceField,
@@ -195,7 +163,7 @@ def align(
         Poses (M, 4, 4), the best first.
     """
     cloud, eyes = _cloud(group, views)
-    few = len(group) <= OUTLINE_ALIGNED_VIEWS
+    few = len(group) <= 2
     shapes = [s.outline for s in group if (few or s.centre is None) and s.outline]
     hull = hull_vertices(mesh) if shapes else np.zeros((0, 3))
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
@@ -203,7 +171,9 @@ def align(
     middle = (area[:, None] * (a + b + c) / 3).sum(0) / area.sum()
     rotation = rotations.copy()
     translation = locate_group(group) - rotation @ middle
-    scales = [*np.geomspace(*ICP_SCALES_M, ICP_STEPS), ICP_SCALES_M[-1]]
+    # Geman-McClure scales, metres: from the error of the grid to the noise
+    scales = [*np.geomspace(0.08, 0.015, 6), 0.015]
+    survivors = {1: 96, 3: 48}  # rotations that continue after a step
     residual = np.zeros(len(rotation))
     for number, scale in enumerate(scales):
         few_points = slice(None, None, 3 if number < 2 else 1)
@@ -234,18 +204,18 @@ def align(
         translation = translation + np.einsum("nij,nj->ni", rotation, step[:, 3:])
         rotation = rotation @ Rotation.from_rotvec(step[:, :3]).as_matrix()
         order = np.argsort(residual, kind="stable")
-        if number in ICP_KEPT:
-            order = order[: ICP_KEPT[number]]
+        if number in survivors:
+            order = order[: survivors[number]]
         rotation, translation = rotation[order], translation[order]
     return rigid(rotation, translation)
 
 
 def _cloud(group: Group, views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (P, 3), equally many of each view, and the camera centre of each (P, 3)."""
+    """Return 150 points (P, 3), equally many of each view, and the camera centre of each (P, 3)."""
     measured = [s for s in group if len(s.points)]
     if not measured:
         return np.zeros((0, 3)), np.zeros((0, 3))
-    share = ALIGNED_POINTS // len(measured)
+    share = 150 // len(measured)
     parts = [
         s.points[np.linspace(0, len(s.points) - 1, min(share, len(s.points))).astype(int)]
         for s in measured
@@ -273,11 +243,10 @@ def _to_points(
     along = (gap * normals).sum(-1)
     distance = np.linalg.norm(gap, axis=-1)
     to_eye = np.einsum("nji,npj->npi", rotation, (eyes - cloud)[None])
+    # a measured point cannot lie on a face that looks away from the camera
     facing = (to_eye * normals).sum(-1) > 0
-    weight = geman_mcclure_weight(distance**2, scale) * np.where(facing, 1.0, FACING_AWAY_WEIGHT)
-    cost = np.minimum(
-        np.where(facing, distance, np.maximum(distance, FACING_AWAY_MIN_M)), ICP_MAX_RESIDUAL_M
-    )
+    weight = geman_mcclure_weight(distance**2, scale) * np.where(facing, 1.0, 0.1)
+    cost = np.minimum(np.where(facing, distance, np.maximum(distance, 0.01)), ICP_MAX_RESIDUAL_M)
     jacobian = np.concatenate([np.cross(local, normals), normals], -1)
     weighted = jacobian * weight[..., None]
     hessian = np.einsum("npi,npj->nij", weighted, jacobian)

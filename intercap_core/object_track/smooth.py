@@ -22,13 +22,6 @@ ACCELERATION_M_S2 = 6.0
 ACCELERATION_RAD_S2 = 20.0
 IMPACT_SIGMAS = 3.0  # standard deviations of an acceleration beyond which it is an impact
 OUTLIER_SIGMAS = 5.0  # evidence this many standard deviations away counts a quarter
-SMOOTH_STEPS = 12  # Gauss-Newton steps at most
-SMOOTH_CONVERGED = np.repeat([1e-5, 1e-6], 3)  # rad, metres
-TYPICAL_REACH_M = 0.03  # frames of a rest farther apart do not show one place
-TYPICAL_SLACK = 0.1  # of the largest cost, within which the frame with most evidence is typical
-INVERTED_NODES = 64  # nodes that are inverted at once
-INVERTED_MARGIN = 40  # neighbouring nodes that matter to them
-
 BAND = 2  # nodes before to which an acceleration couples a node
 
 
@@ -62,7 +55,7 @@ def smooth(
     state = _remove_blips(state, times)[first]
     bands = np.zeros((0, 0, 0, 0))
     given = stated.about(centre) if stated is not None else None
-    for _ in range(SMOOTH_STEPS):
+    for _ in range(12):
         offset = step_between(evidence.poses, state[node])
         distance = np.einsum("ti,tij,tj->t", offset - own, information, offset - own)
         weight = share * geman_mcclure_weight(distance, OUTLIER_SIGMAS)
@@ -79,13 +72,12 @@ def smooth(
             force = given.gradient + np.einsum("tij,tj->ti", given.information, offset)
             np.add.at(gradient, node, force)
         _add_motion(state, node, times, bands, gradient)
-        matrix = cholesky_banded(_banded(bands), lower=True, check_finite=False)
-        step = -cho_solve_banded((matrix, True), gradient.ravel(), check_finite=False).reshape(
-            -1, 6
-        )
+        factor = cholesky_banded(_banded(bands), lower=True, check_finite=False)
+        step = -cho_solve_banded((factor, True), gradient.ravel(), check_finite=False)
+        step = step.reshape(-1, 6)
         step /= np.maximum(1.0, np.linalg.norm(step[:, :3], axis=1, keepdims=True) / 0.5)
         state = apply_step(state, step)
-        if (np.abs(step) < SMOOTH_CONVERGED).all():
+        if (np.abs(step) < np.repeat([1e-5, 1e-6], 3)).all():  # rad, metres
             break
     covariance = _covariance(_banded(bands), count)[node]
     poses = state[node]
@@ -101,18 +93,19 @@ def _typical_frames(evidence: FrameEvidence, node: np.ndarray) -> np.ndarray:
     A robust fit that starts at the one wrong frame of a rest would stay there. ``node`` (T,) as in
     :func:`smooth`.
     """
+    reach_m = 0.03  # frames of a rest farther apart do not show one place; tuned on the studio
     weight = np.sqrt(np.trace(evidence.information, axis1=1, axis2=2))
     place = evidence.poses[:, :3, 3]
-    found = np.zeros(int(node[-1]) + 1, int)
+    typical = np.zeros(int(node[-1]) + 1, int)
     for number, members in enumerate(
         np.split(np.arange(len(node)), np.flatnonzero(np.diff(node)) + 1)
     ):
         apart = np.linalg.norm(place[members, None] - place[members], axis=-1)
-        cost = np.minimum(apart, TYPICAL_REACH_M) @ weight[members]
-        slack = TYPICAL_SLACK * TYPICAL_REACH_M * weight[members].sum()
+        cost = np.minimum(apart, reach_m) @ weight[members]
+        slack = 0.1 * reach_m * weight[members].sum()
         near = np.flatnonzero(cost <= cost.min() + slack)
-        found[number] = members[near[weight[members][near].argmax()]]
-    return found
+        typical[number] = members[near[weight[members][near].argmax()]]
+    return typical
 
 
 def _remove_blips(poses: np.ndarray, times: np.ndarray) -> np.ndarray:
@@ -164,14 +157,14 @@ def _add_motion(
     # derivatives of the residual by the steps of a, b and c
     parts = np.zeros((3, len(a), 6, 6))
     eye = np.eye(3)
-    one, two = (eye / before[..., None]), (eye / after[..., None])
+    rate_before, rate_after = (eye / before[..., None]), (eye / after[..., None])
     for rows, sigma, by in (
         (np.s_[:, :3, :3], ACCELERATION_RAD_S2, (to_b, to_c)),
         (np.s_[:, 3:, 3:], ACCELERATION_M_S2, (eye, eye)),
     ):
-        parts[0][rows] = one @ by[0] / (mean[..., None] * sigma)
-        parts[1][rows] = -(one + two @ by[1]) / (mean[..., None] * sigma)
-        parts[2][rows] = two / (mean[..., None] * sigma)
+        parts[0][rows] = rate_before @ by[0] / (mean[..., None] * sigma)
+        parts[1][rows] = -(rate_before + rate_after @ by[1]) / (mean[..., None] * sigma)
+        parts[2][rows] = rate_after / (mean[..., None] * sigma)
     weight = np.ones_like(residual)
     for part in (np.s_[:, :3], np.s_[:, 3:]):
         size = (residual[part] ** 2).sum(1, keepdims=True)
@@ -200,11 +193,14 @@ def _banded(bands: np.ndarray) -> np.ndarray:
 
 
 def _covariance(banded: np.ndarray, count: int) -> np.ndarray:
-    """Return the diagonal blocks (N, 6, 6) of the inverse, for which far nodes do not matter."""
-    found = np.zeros((count, 6, 6))
-    for start in range(0, count, INVERTED_NODES):
-        stop = min(start + INVERTED_NODES, count)
-        low, high = max(start - INVERTED_MARGIN, 0), min(stop + INVERTED_MARGIN, count)
+    """Return the diagonal blocks (N, 6, 6) of the inverse.
+
+    64 nodes are inverted at a time, with the 40 before and after that matter to them.
+    """
+    covariance = np.zeros((count, 6, 6))
+    for start in range(0, count, 64):
+        stop = min(start + 64, count)
+        low, high = max(start - 40, 0), min(stop + 40, count)
         part = banded[:, 6 * low : 6 * high].copy()
         for diagonal in range(1, len(part)):
             part[diagonal, part.shape[1] - diagonal :] = 0
@@ -215,5 +211,5 @@ def _covariance(banded: np.ndarray, count: int) -> np.ndarray:
         inverse = cho_solve_banded((factor, True), columns, check_finite=False)[wanted]
         blocks = inverse.reshape(stop - start, 6, stop - start, 6)
         index = np.arange(stop - start)
-        found[start:stop] = blocks[index, :, index]
-    return found
+        covariance[start:stop] = blocks[index, :, index]
+    return covariance

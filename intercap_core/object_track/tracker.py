@@ -26,7 +26,7 @@ from intercap_core.object_track.decoder import (
     find_excursions,
     step_costs,
 )
-from intercap_core.object_track.fit import Fit
+from intercap_core.object_track.fit import FittedPose
 from intercap_core.object_track.given_poses import GivenPose
 from intercap_core.object_track.hypotheses import Hypotheses, Prior, group_by_candidates
 from intercap_core.object_track.likelihood import SEEN_LOG_RATIO
@@ -36,16 +36,9 @@ from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.proposals import DOUBTFUL_PROBABILITY, NotFound, Proposals
 from intercap_core.object_track.whole import FrameResult, FrameStatus, WholeTrack, flag_frames
 
-SEARCH_ROUNDS = 15  # of decision and search, at most
-MOTION_ROUNDS = 3  # of fits of the moving object, at most
 # Having left is likelier than being hidden from all cameras by this, nats of an independent
 # observation: after about two seconds. Tuned on the studio, as all values below.
 ABSENT_LOG_RATIO = 1.0
-# Hypotheses farther apart are different poses.
-APART_M = 0.05
-APART_RAD = np.radians(20)
-LOST_PROBABILITY = 0.5  # of no hypothesis, above which a frame is lost
-GONE_PROBABILITY = 0.5  # of having left, above which a lost frame is gone
 AMBIGUOUS_PROBABILITY = 0.2  # of different poses, above which a frame is ambiguous
 # Nats of all believed frames, as independent observations, below which there is no object. False
 # detections reach 8; the least of real objects (a cup behind a hand without depth) is about 25.
@@ -64,13 +57,13 @@ class Track:
     """Whether poses were annotated."""
     evidence: float
     """Log-likelihood ratio of all believed frames as independent observations, nats."""
-    borne_out: bool = True
+    agrees: bool = True
     """Whether the track agrees with an annotated pose, if there is one."""
     doubts: tuple[str, ...] = ()
     """Warnings about the mesh and annotated poses."""
 
     @property
-    def of_nothing(self) -> bool:
+    def shows_nothing(self) -> bool:
         """Whether the images show no object at all; never if poses are annotated."""
         return not self.annotated and self.evidence < NOTHING_LOG_RATIO
 
@@ -102,13 +95,12 @@ class Tracker:
 
         Raises NotFound if no frame shows a possible object.
         """
-        accepted = [self._proposals.add_annotated(given) for given in annotated]
-        placed = [given for given in accepted if given is not None]
-        seed = self._start([given.frame for given in placed])
+        used = [self._proposals.add_annotated(given) for given in annotated]
+        seed = self._start([given.frame for given in used if given is not None])
         decoded = self._search(self._decode())
         if self._proposals.add_near_symmetries(decoded):
             decoded = self._decode()
-        for _ in range(MOTION_ROUNDS):
+        for _ in range(3):
             changed = self._hypotheses.refit_moving(decoded)
             if not changed:
                 break
@@ -118,15 +110,16 @@ class Tracker:
         if (decoded.path == HIDDEN).all():
             raise NotFound
         frames = self._results(decoded)
-        held = [
-            given
-            for given, taken in zip(annotated, accepted, strict=True)
-            if taken is given and given.holds(self._mesh, frames[given.frame].fit.pose)
-        ]
-        final = flag_frames(self._mesh, WholeTrack(self._observer).refine(frames, held))
+
+        def agrees(given: GivenPose, frames: list[FrameResult]) -> bool:
+            return given.holds(self._mesh, frames[given.frame].fit.pose)
+
+        pairs = list(zip(annotated, used, strict=True))
+        agreeing = [given for given, own in pairs if own is given and agrees(given, frames)]
+        final = flag_frames(self._mesh, WholeTrack(self._observer).refine(frames, agreeing))
         doubts = [
-            describe_contradiction(self._mesh, given, taken, final[given.frame])
-            for given, taken in zip(annotated, accepted, strict=True)
+            describe_contradiction(self._mesh, given, own, final[given.frame])
+            for given, own in pairs
         ]
         doubts += mesh_doubts(self._observer, final)
         return Track(
@@ -134,8 +127,7 @@ class Tracker:
             seed,
             bool(annotated),
             self._evidence(final),
-            not annotated
-            or any(given.holds(self._mesh, final[given.frame].fit.pose) for given in placed),
+            not annotated or any(agrees(own, final) for own in used if own is not None),
             tuple(filter(None, doubts)),
         )
 
@@ -163,7 +155,7 @@ class Tracker:
 
     def _search(self, decoded: Decoded) -> Decoded:
         """Search uncertain frames and decide again until nothing new is found."""
-        for _ in range(SEARCH_ROUNDS):
+        for _ in range(15):
             if not self._proposals.search_uncertain(decoded):
                 break
             decoded = self._decode()
@@ -234,22 +226,19 @@ class Tracker:
         for t, (own, k) in enumerate(zip(self._hypotheses.fits, decoded.path, strict=True)):
             probability = decoded.probability[t]
             if k == HIDDEN:
-                gone = decoded.gone[t] > GONE_PROBABILITY
-                status = FrameStatus.GONE if gone else FrameStatus.LOST
+                status = FrameStatus.GONE if decoded.gone[t] > 0.5 else FrameStatus.LOST
                 result.append(FrameResult(self._guess(t), status, probability=0.0))
                 continue
             symmetry, pose = self._mesh.symmetry, own[k].pose
             poses = np.array([symmetry.nearest_equivalent_pose(fit.pose, pose) for fit in own])
             steps = step_between(np.broadcast_to(pose, poses.shape), poses)
             centres = np.array([self._mesh.centre_at(pose) for pose in poses])
-            far = np.linalg.norm(steps[:, :3], axis=1) > APART_RAD
-            far |= np.linalg.norm(centres - centres[k], axis=1) > APART_M
+            # hypotheses farther apart are different poses
+            far = np.linalg.norm(steps[:, :3], axis=1) > np.radians(20)
+            far |= np.linalg.norm(centres - centres[k], axis=1) > 0.05
             other = float(probability[:-1][far].sum())
             overlap = own[k].mean_overlap
-            lost = (
-                probability[-1] > LOST_PROBABILITY
-                or 0 < overlap < self._observer.settings.lost_overlap
-            )
+            lost = probability[-1] > 0.5 or 0 < overlap < self._observer.settings.lost_overlap
             rivals = np.where(far, probability[:-1], 0.0) * (other > AMBIGUOUS_PROBABILITY / 2)
             result.append(
                 FrameResult(
@@ -262,13 +251,13 @@ class Tracker:
             )
         return result
 
-    def _guess(self, t: int) -> Fit:
+    def _guess(self, t: int) -> FittedPose:
         """Return the likeliest pose of the nearest frame with hypotheses, compared with frame t."""
         fits = self._hypotheses.fits
         u = min((u for u, own in enumerate(fits) if own), key=lambda u: abs(u - t))
         weights = self._prior.weigh(u, fits[u])
         assessed = self._observer.assess(t, fits[u][int(weights.argmax())].pose)
-        return Fit(assessed.pose, np.eye(6), assessed.views)
+        return FittedPose(assessed.pose, np.eye(6), assessed.views)
 
 
 def _sure_frames(decoded: Decoded) -> np.ndarray:
@@ -282,14 +271,14 @@ def _sure_frames(decoded: Decoded) -> np.ndarray:
 
 
 def describe_contradiction(
-    mesh: ObjectMesh, given: GivenPose, taken: GivenPose | None, frame: FrameResult
+    mesh: ObjectMesh, given: GivenPose, used: GivenPose | None, frame: FrameResult
 ) -> str:
     """Return a warning if the track contradicts an annotated pose, else an empty string.
 
     Args:
         mesh: the object.
         given: the annotated pose.
-        taken: the pose as it was used, in its own or in another frame; None = it was not used.
+        used: the pose as it was used, in its own or in another frame; None = it was not used.
         frame: final result of the annotated frame.
     """
     turn, shift = given.distance(mesh, frame.fit.pose)
@@ -299,9 +288,9 @@ def describe_contradiction(
     )
     if not frame.lost and given.holds(mesh, frame.fit.pose):
         return ""
-    if taken is not None and taken.frame != given.frame:
+    if used is not None and used.frame != given.frame:
         return (
-            f"{subject}: the images show the object there in frame {taken.frame}; correct its frame"
+            f"{subject}: the images show the object there in frame {used.frame}; correct its frame"
         )
     if frame.lost:
         return f"{subject}: the images contradict it, and show the object nowhere; correct it"

@@ -6,6 +6,8 @@ half a turn. The tracker follows such turns as hypotheses (:mod:`.proposals`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -15,21 +17,10 @@ from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 from intercap_core.geometry.solve.robust import geman_mcclure_weight
 
-GRID_ROTATIONS = 240  # of a trivial group: about 40 degrees apart, inside the fit's basin
-GRID_SPACING_DEG = 12.0  # equivalent rotations nearer than this are duplicates; twice for an axis
-UPRIGHT_TURNS = 24  # rotations of the standing pose about the vertical, 15 degrees apart
 SAME_POSE_M = 0.02  # poses within this distance ...
-SAME_POSE_DEG = 12.0  # ... and angle are one hypothesis
-SAME_AXIS_COSINE = float(np.cos(np.radians(10)))  # of axes that are equal
-NEAR_TURN_STEPS = 12  # tried angles per full turn about an axis
-NEAR_TURN_POINTS = 200  # surface points that are compared
-NEAR_TURN_POINT_WEIGHT = 0.05  # of point-to-point residuals relative to point-to-plane residuals
-# A surface point is clearly displaced if it is farther from the surface than these; tuned on the
-# studio.
-NEAR_TURN_FAR_M = 0.003
-NEAR_TURN_FAR_SHARE = 0.01  # of the diameter
-NEAR_TURN_CHANGED_SHARE = 0.3  # turns that displace fewer points are near symmetries
-NEAR_TURN_DISTINCT_DEG = 45.0  # half turns nearer than this are duplicates
+SAME_POSE_DEG = 12.0  # ... and angle are one hypothesis; tuned on the studio
+# Share of the surface that a turn may clearly displace to be a near symmetry; tuned on the studio.
+NEAR_TURN_CHANGED_SHARE = 0.3
 
 
 def find_near_symmetries(mesh: ObjectMesh, field: DistanceField) -> np.ndarray:
@@ -38,13 +29,12 @@ def find_near_symmetries(mesh: ObjectMesh, field: DistanceField) -> np.ndarray:
     These are all angles about an axis of near symmetry, and single angles that map the surface onto
     itself. Elements of the symmetry group are left out. ``field`` is the mesh's distance field.
     """
-    found = [np.eye(4)]
+    kept = [np.eye(4)]
     if mesh.symmetry.sphere:
-        return found[0][None]
-    half = NEAR_TURN_STEPS // 2
+        return np.array(kept)
+    steps = 12  # tried angles per full turn about an axis
     # the first angle is small, to catch a slow slide along a near symmetry
-    fine = np.pi / NEAR_TURN_STEPS
-    angles = np.array([fine, *(2 * np.pi * np.arange(1, half + 1) / NEAR_TURN_STEPS)])
+    angles = np.array([np.pi / steps, *(2 * np.pi * np.arange(1, steps // 2 + 1) / steps)])
     axes = object_axes(mesh)
     rotations = Rotation.from_rotvec((axes[:, None] * angles[:, None]).reshape(-1, 3)).as_matrix()
     placed, shares = _align_turned(mesh, field, rotations)
@@ -56,7 +46,7 @@ def find_near_symmetries(mesh: ObjectMesh, field: DistanceField) -> np.ndarray:
         turns = [*about[1:], *(np.linalg.inv(turn) for turn in about[-2:0:-1])]
         changed = np.array([0.0, *share, *share[-2::-1]])
         if changed.max() < NEAR_TURN_CHANGED_SHARE and mesh.symmetry.axis is None:
-            found += [about[0], np.linalg.inv(about[0]), *turns]
+            kept += [about[0], np.linalg.inv(about[0]), *turns]
             continue
         least = (
             (changed <= np.roll(changed, 1))
@@ -64,10 +54,9 @@ def find_near_symmetries(mesh: ObjectMesh, field: DistanceField) -> np.ndarray:
             & (changed < NEAR_TURN_CHANGED_SHARE)
         )
         flips += [turn for turn, is_least in zip(turns, least[1:], strict=True) if is_least]
-    kept = found
     for turn in flips:
         known = np.array(kept)[:, :3, :3]
-        if mesh.symmetry.rotation_error_deg(known, turn[:3, :3]).min() > NEAR_TURN_DISTINCT_DEG:
+        if mesh.symmetry.rotation_error_deg(known, turn[:3, :3]).min() > 45:
             kept.append(turn)
     return np.array(kept)
 
@@ -100,10 +89,11 @@ def _align_turned(
         normals = closest.normals.reshape(at.shape)
         weight = geman_mcclure_weight((gap**2).sum(-1), scale)[..., None]
         # point to plane; a little point to point, for directions that no plane constrains
-        little = NEAR_TURN_POINT_WEIGHT * weight.sum(1)
+        point_weight = 0.05
+        little = point_weight * weight.sum(1)
         matrix = (normals * weight).transpose(0, 2, 1) @ normals + little[:, None] * np.eye(3)
         pull = (weight * (normals * (normals * gap).sum(-1, keepdims=True))).sum(1)
-        pull += NEAR_TURN_POINT_WEIGHT * (weight * gap).sum(1)
+        pull += point_weight * (weight * gap).sum(1)
         shift = shift + np.linalg.solve(matrix, pull[..., None])[..., 0]
     distance = field.distance((turned + shift[:, None]).reshape(-1, 3)).reshape(len(rotations), -1)
     return rigid(rotations, shift), (distance > far).mean(1)
@@ -111,17 +101,18 @@ def _align_turned(
 
 def _far(mesh: ObjectMesh) -> float:
     """Return the distance from the surface at which a point is clearly displaced, metres."""
-    return max(NEAR_TURN_FAR_M, NEAR_TURN_FAR_SHARE * mesh.diameter)
+    return max(0.003, 0.01 * mesh.diameter)
 
 
 def _surface(mesh: ObjectMesh) -> np.ndarray:
-    """Sample points (N, 3) evenly on the surface."""
+    """Sample 200 points (N, 3) evenly on the surface."""
+    count = 200
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1).cumsum()
     rng = np.random.default_rng(0)
-    at = (np.arange(NEAR_TURN_POINTS) + 0.5) / NEAR_TURN_POINTS * area[-1]
+    at = (np.arange(count) + 0.5) / count * area[-1]
     face = np.searchsorted(area, at)
-    u, v = rng.random((2, NEAR_TURN_POINTS, 1))
+    u, v = rng.random((2, count, 1))
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
     return a[face] + u * (b - a)[face] + v * (c - a)[face]
 
@@ -133,41 +124,40 @@ def axis_turns(mesh: ObjectMesh, steps: int) -> np.ndarray:
     of the symmetry group are left out.
     """
     centre = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
-    found = []
+    turns = []
     for axis in object_axes(mesh):
         for angle in 2 * np.pi * np.arange(1, steps) / steps:
             turn = np.eye(4)
             turn[:3, :3] = Rotation.from_rotvec(angle * axis).as_matrix()
             turn[:3, 3] = centre - turn[:3, :3] @ centre
             if not same_pose(mesh, turn, np.eye(4)):
-                found.append(turn)
-    return np.array(found).reshape(-1, 4, 4)
+                turns.append(turn)
+    return np.array(turns).reshape(-1, 4, 4)
 
 
 def object_axes(mesh: ObjectMesh) -> np.ndarray:
     """Return unit vectors (N, 3): the axes of the object's frame and its other principal axes."""
     _, principal = np.linalg.eigh(np.cov(mesh.vertices.T))
-    new = np.abs(principal).max(0) < SAME_AXIS_COSINE  # a handle tilts them
+    # a handle tilts the principal axes by some degrees; within 10 they count as the frame's
+    new = np.abs(principal).max(0) < float(np.cos(np.radians(10)))
     return np.concatenate([np.eye(3), principal[:, new]], 1).T
 
 
 def rotation_grid(symmetry: SymmetryGroup, up: np.ndarray | None) -> np.ndarray:
     """Return rotations (N, 3, 3) that cover SO(3) modulo the symmetry group.
 
-    If the vertical ``up`` (3,) is known, the grid is denser among standing poses.
+    Those of a trivial group are 40 degrees apart, inside the fit's basin. If the vertical ``up``
+    (3,) is known, standing poses 15 degrees apart come first.
     """
     if symmetry.sphere:
         return np.eye(3)[None]
-    spread = 2 if symmetry.axis is not None else 1
-    grid = _super_fibonacci(GRID_ROTATIONS)
+    grid = _super_fibonacci(240)
     if up is not None:
-        turns = Rotation.from_rotvec(
-            np.outer(2 * np.pi * np.arange(UPRIGHT_TURNS) / UPRIGHT_TURNS, (0, 0, 1))
-        ).as_matrix()
-        grid = np.concatenate([_standing(up) @ turns, grid])
-    # keep one of each set of equivalent rotations
+        turns = np.outer(2 * np.pi * np.arange(24) / 24, (0, 0, 1))
+        grid = np.concatenate([_standing(up) @ Rotation.from_rotvec(turns).as_matrix(), grid])
+    # of rotations that the group makes equivalent to a few degrees, keep the first
     kept: list[np.ndarray] = []
-    spacing = GRID_SPACING_DEG * spread
+    spacing = 12.0 if symmetry.axis is None else 24.0
     for rotation in grid:
         if (
             symmetry.trivial
@@ -188,6 +178,22 @@ def same_pose(
     angle = float(mesh.symmetry.rotation_error_deg(a[:3, :3], b[:3, :3]))
     shift = float(np.linalg.norm(mesh.centre_at(a) - mesh.centre_at(b)))
     return shift < limits[0] and angle < limits[1]
+
+
+def distinct_poses(
+    mesh: ObjectMesh,
+    poses: Sequence[np.ndarray],
+    limits: tuple[float, float] = (SAME_POSE_M, SAME_POSE_DEG),
+    count: int | None = None,
+) -> list[int]:
+    """Return the first ``count`` poses (4, 4) that differ from all before, by their numbers."""
+    kept: list[int] = []
+    for k, pose in enumerate(poses):
+        if len(kept) == count:
+            break
+        if not any(same_pose(mesh, pose, poses[other], limits) for other in kept):
+            kept.append(k)
+    return kept
 
 
 def _super_fibonacci(count: int) -> np.ndarray:

@@ -21,12 +21,7 @@ from intercap_core.object_track.reduced_mask import (
     remove_person,
 )
 
-TYPICAL_DISTANCE_M = 2.5  # of the object from a camera of a capture ring, if nothing is known
-# The object is compared at about this many pixels across. More cost time and carry no more
-# information, since neighbouring pixels of a mask or a depth image err together.
-REDUCED_SILHOUETTE_PX = 80
-REDUCED_DEPTH_PX = 60
-MAX_REDUCTION = 4  # every n-th pixel at most
+TYPICAL_DISTANCE_M = 2.5  # of the object from a camera of a capture ring, if unknown; studio
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +54,9 @@ class ViewGeometry:
     ) -> ViewGeometry:
         """Choose the reduction by the apparent size of the object.
 
+        The object is compared at about 80 pixels across in colour and 60 in depth. More cost time
+        and carry no more information, since neighbouring pixels of an image err together.
+
         Args:
             camera: the camera.
             diameter_m: diameter of the object, metres.
@@ -67,8 +65,8 @@ class ViewGeometry:
             distance_m: usual distance of the object from the camera, metres.
         """
         angle = diameter_m / distance_m
-        step = _step(camera.colour.fx, angle, REDUCED_SILHOUETTE_PX)
-        depth_step = _step(camera.depth.fx, angle, REDUCED_DEPTH_PX) if camera.depth else 1
+        step = _step(camera.colour.fx, angle, 80)
+        depth_step = _step(camera.depth.fx, angle, 60) if camera.depth else 1
         return cls(
             camera,
             reduced_lens(camera.colour, step),
@@ -132,11 +130,11 @@ def camera_distances(cameras: Sequence[Camera], joints: np.ndarray) -> list[floa
 
 
 def _step(focal_px: float, angle: float, wanted_px: int) -> int:
-    return int(np.clip(round(focal_px * angle / wanted_px), 1, MAX_REDUCTION))
+    return int(np.clip(round(focal_px * angle / wanted_px), 1, 4))
 
 
 @dataclass(frozen=True, eq=False)
-class Candidate:
+class MaskCandidate:
     """One segmentation candidate of an image."""
 
     index: int
@@ -160,7 +158,7 @@ class View:
     """
     person: ReducedMask
     """Mask of the person."""
-    candidates: tuple[Candidate, ...]
+    candidates: tuple[MaskCandidate, ...]
     """Candidates, each with its reduced mask."""
     detected: bool = True
     """Whether candidates are known for this image, so that their absence is evidence."""
@@ -214,7 +212,7 @@ class View:
         depth = None if depth_mm is None else geometry.reduced_depth(depth_mm)
         colour, step = geometry.camera.colour, geometry.step
         found = tuple(
-            Candidate(index, label, score, decode(rle, colour, step))
+            MaskCandidate(index, label, score, decode(rle, colour, step))
             for index, label, score, rle in candidates
         )
         person = decode(person_rle, colour, step) if person_rle else EMPTY

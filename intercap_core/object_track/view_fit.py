@@ -8,9 +8,8 @@ samples:
     lambda_segm = trust CONTOUR_SAMPLES / m / CONTOUR_SIGMA_PX^2
 
 for each of n depth pixels and m contour pixels (of the mask's contour or of the render's rim,
-whichever has more). ``trust`` of a mask grows from CONTOUR_TRUST_MIN to 1 with its overlap with the
-render. The residuals are in :mod:`intercap_core.object_track.object_depth` and
-:mod:`intercap_core.object_track.object_silhouette`.
+whichever has more). ``trust`` of a mask grows from 0.1 to 1 with its overlap with the render.
+Residuals are in :mod:`.object_depth` and :mod:`.object_silhouette`.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from intercap_core.object_track import object_depth, object_silhouette
 from intercap_core.object_track.likelihood import CONTOUR_SIGMA_PX, DEPTH_HALF_SAMPLES_PX, log_ratio
 from intercap_core.object_track.patches import ContourPatch, DepthPatch
 from intercap_core.object_track.reduced_mask import EMPTY
-from intercap_core.object_track.view import Candidate, FitContext, View
+from intercap_core.object_track.view import FitContext, MaskCandidate, View
 from intercap_core.object_track.view_report import (
     FREE_SPACE_M,
     MIN_RENDERED_PX,
@@ -42,14 +41,7 @@ CONTOUR_SAMPLES = 3.0
 # Kinect's data sheet states a systematic error below 11 mm + 0.1 % of the distance; half of that
 # bound is a guess of its standard deviation.
 DEPTH_SIGMA_M = 0.005
-# The contour's weight grows from the least to 1 over this range of the overlap (IoU) of candidate
-# and render; tuned on the studio.
-CONTOUR_TRUST_OVERLAP = 0.3
-CONTOUR_TRUST_RANGE = 0.4
-CONTOUR_TRUST_MIN = 0.1
 GATE_SCALES = 2.5  # matches beyond this many robust scales weigh below 2 % and are left out
-MIN_CONTOUR_MATCHES = 3  # contours with fewer matches are not used
-REPORT_DEPTH_M = 0.1  # pixels farther from the render show something else; for reports only
 
 NormalEquations = tuple[np.ndarray, np.ndarray]
 """J'WJ (6, 6) and J'Wr (6,), in units of one standard deviation."""
@@ -74,15 +66,11 @@ class ViewFit:
     """
 
     def __init__(
-        self,
-        context: FitContext,
-        view: View,
-        pose: np.ndarray,
-        drawn: list[Rendering],
+        self, context: FitContext, view: View, pose: np.ndarray, drawn: list[Rendering]
     ) -> None:
         self._context = context
         self._view = view
-        self._candidate: Candidate | None = None
+        self._candidate: MaskCandidate | None = None
         self._contour_patch: ContourPatch | None = None
         self._depth_patch: DepthPatch | None = None
         self.see(pose, drawn)
@@ -100,23 +88,20 @@ class ViewFit:
 
     def choose_again(self) -> bool:
         """Choose the candidate at the current pose again; returns whether it changed."""
-        best = self._best_candidate()
-        if best is self._candidate:
+        if self._best_candidate() is self._candidate:
             return False
-        self._candidate = best
-        self._cut()
+        self.choose()
         return True
 
-    def _best_candidate(self) -> Candidate | None:
+    def _best_candidate(self) -> MaskCandidate | None:
         context = self._context
         return choose_candidate(self._view, self._silhouette, context.min_overlap, context.labels)
 
     def _cut(self) -> None:
         mask = self._candidate.mask if self._candidate else EMPTY
         overlap = mask_overlap(self._silhouette, mask, self._view.person)
-        self._contour_trust = float(
-            np.clip((overlap - CONTOUR_TRUST_OVERLAP) / CONTOUR_TRUST_RANGE, CONTOUR_TRUST_MIN, 1.0)
-        )
+        # from an IoU of 0.34 to one of 0.7; tuned on the studio
+        self._contour_trust = float(np.clip((overlap - 0.3) / 0.4, 0.1, 1.0))
         self._contour_patch = self._depth_patch = None
         if self._candidate is not None:
             self._contour_patch = ContourPatch.cut(self._view, mask, self._silhouette)
@@ -142,19 +127,11 @@ class ViewFit:
         if patch is None or drawn is None:
             return np.zeros((6, 6)), np.zeros(6)
         hessian, gradient, count = object_depth.normal_equations(
-            drawn.depth,
-            drawn.face,
-            (drawn.x0 - patch.x0, drawn.y0 - patch.y0),
-            patch.depth,
-            patch.points,
-            patch.trust,
-            self._context.mesh.face_normals,
-            self._pose[:3, :3],
-            self._pose[:3, 3],
-            self._view.geometry.master_from_depth[:3, 3],
-            GATE_SCALES * scale_m,
-            scale_m,
-        )
+            drawn.depth, drawn.face, (drawn.x0 - patch.x0, drawn.y0 - patch.y0),
+            patch.depth, patch.points, patch.trust, self._context.mesh.face_normals,
+            self._pose[:3, :3], self._pose[:3, 3],
+            self._view.geometry.master_from_depth[:3, 3], GATE_SCALES * scale_m, scale_m,
+        )  # fmt: skip
         if count < MIN_RENDERED_PX:
             return np.zeros((6, 6)), np.zeros(6)
         samples = DEPTH_SAMPLES * count / (count + DEPTH_HALF_SAMPLES_PX)
@@ -173,46 +150,23 @@ class ViewFit:
         scale = scale_px / geometry.step
         corner = (drawn.x0, drawn.y0)
         at, target, missed, rim_size = object_silhouette.correspondences(
-            drawn.face,
-            corner,
-            patch.inside,
-            patch.person,
-            patch.place,
-            patch.contour,
-            patch.rim,
-            patch.starts,
-            background,
-            GATE_SCALES * scale,
-            MIN_RENDERED_PX,
-        )
+            drawn.face, corner, patch.inside, patch.person, (patch.x0, patch.y0), patch.contour,
+            patch.rim, patch.starts, background, GATE_SCALES * scale, MIN_RENDERED_PX,
+        )  # fmt: skip
         measured, lens = self._depth_patch, geometry.depth_lens
         if measured is not None and lens is not None and missed < len(at):
             clear = object_silhouette.sees_past(
-                at[missed:],
-                drawn.depth,
-                corner,
-                geometry.lens.rays,
-                geometry.depth_from_colour,
-                lens.parameters,
-                measured.depth,
-                measured.place,
-                FREE_SPACE_M,
-            )
+                at[missed:], drawn.depth, corner, geometry.lens.rays, geometry.depth_from_colour,
+                lens.parameters, measured.depth, (measured.x0, measured.y0), FREE_SPACE_M,
+            )  # fmt: skip
             kept = np.concatenate([np.ones(missed, bool), clear])
             at, target = at[kept], target[kept]
-        if len(at) < MIN_CONTOUR_MATCHES:
+        if len(at) < 3:
             return nothing
         hessian, gradient, residuals = object_silhouette.normal_equations(
-            at,
-            target,
-            drawn.depth,
-            corner,
-            geometry.lens.rays,
-            geometry.lens.parameters,
-            geometry.master_from_colour,
-            self._pose[:3, 3],
-            scale,
-        )
+            at, target, drawn.depth, corner, geometry.lens.rays, geometry.lens.parameters,
+            geometry.master_from_colour, self._pose[:3, 3], scale,
+        )  # fmt: skip
         # normalised by the whole rim: a few outlier pixels weigh less than a rim that is off all
         # around
         samples = CONTOUR_SAMPLES / max(len(patch.contour), rim_size)
@@ -232,30 +186,20 @@ class ViewFit:
         patch, drawn = self._depth_patch, self._drawn_depth
         if patch is not None and drawn is not None:
             gap, across, where = object_depth.matches(
-                drawn.depth,
-                drawn.face,
-                (drawn.x0 - patch.x0, drawn.y0 - patch.y0),
-                patch.depth,
-                patch.points,
-                self._context.mesh.face_normals,
-                self._pose[:3, :3],
-                view.geometry.master_from_depth[:3, 3],
-            )
+                drawn.depth, drawn.face, (drawn.x0 - patch.x0, drawn.y0 - patch.y0),
+                patch.depth, patch.points, self._context.mesh.face_normals,
+                self._pose[:3, :3], view.geometry.master_from_depth[:3, 3],
+            )  # fmt: skip
             column, row = where.T
-            mine = (patch.trust[row, column] == 1.0) & (np.abs(gap) < REPORT_DEPTH_M)
-            if mine.sum() >= MIN_RENDERED_PX:
-                depth_residual = float(np.median(across[mine]))
+            # pixels that are farther from the render show something else
+            own = (patch.trust[row, column] == 1.0) & (np.abs(gap) < 0.1)
+            if own.sum() >= MIN_RENDERED_PX:
+                depth_residual = float(np.median(across[own]))
             agreement, free = depth_agreement(gap, across, patch.on_person[row, column])
             visible = count_unoccluded(image, visible, free, len(gap))
         number = self._candidate.index if self._candidate is not None else -1
         ratio = log_ratio(
-            self._context,
-            view,
-            self._pose,
-            image,
-            self._drawn_depth,
-            self._candidate,
-            visible,
+            self._context, view, self._pose, image, self._drawn_depth, self._candidate, visible
         )
         return ViewReport(
             number, overlap, depth_residual, contour, visible, agreement, view.detected, ratio

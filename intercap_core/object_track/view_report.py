@@ -14,29 +14,31 @@ from intercap_core.geometry.rigid.shots import Rendering
 from intercap_core.object_track import object_depth
 from intercap_core.object_track.likelihood import log_ratio
 from intercap_core.object_track.reduced_mask import ReducedMask
-from intercap_core.object_track.view import Candidate, FitContext, View
+from intercap_core.object_track.view import FitContext, MaskCandidate, View
 
+# Tuned on the studio.
 MIN_RENDERED_PX = 12  # renderings with fewer pixels are not compared
-LIKELY_LABEL_BONUS = 0.05  # of overlap: breaks ties between candidates; tuned on the studio
-FREE_SPACE_M = 0.03  # depth this much behind (nearer than) the render is background (an occluder);
-# above the sensor's systematic error and that of the pose, tuned on the studio
+# Depth this much behind (nearer than) the render is background (an occluder): above the sensor's
+# systematic error and that of the pose.
+FREE_SPACE_M = 0.03
 AGREEMENT_SCALE_M = 0.010  # a pixel this far off agrees by half: Azure Kinect's systematic error
 ASSESS_MIN_OVERLAP = 0.1  # smallest IoU of a candidate that an unfitted pose is compared with
 
 
 def choose_candidate(
     view: View, predicted: Rendering, min_overlap: float, labels: tuple[str, ...]
-) -> Candidate | None:
+) -> MaskCandidate | None:
     """Choose the candidate with the largest overlap with the visible render.
 
-    The object's labels break ties. Returns None if no overlap reaches ``min_overlap``.
+    One of the object's labels adds 0.05, which breaks ties. Returns None if no overlap reaches
+    ``min_overlap``.
     """
     best, best_rank = None, 0.0
     if predicted.area < MIN_RENDERED_PX:
         return None
     for candidate in view.candidates:
         overlap = mask_overlap(predicted, candidate.mask, view.person)
-        rank = overlap + (LIKELY_LABEL_BONUS if candidate.label in labels else 0.0)
+        rank = overlap + (0.05 if candidate.label in labels else 0.0)
         if overlap >= min_overlap and rank > best_rank:
             best, best_rank = candidate, rank
     return best
@@ -134,17 +136,10 @@ def quick_report(
     geometry = view.geometry
     if view.depth is not None and drawn_depth is not None and geometry.depth_lens is not None:
         compared, free, total = object_depth.agreement(
-            drawn_depth.depth,
-            drawn_depth.face,
-            drawn_depth.x0,
-            drawn_depth.y0,
-            view.depth,
-            geometry.depth_lens.rays,
-            context.mesh.face_normals,
-            geometry.depth_from_master[:3, :3] @ pose[:3, :3],
-            FREE_SPACE_M,
-            AGREEMENT_SCALE_M,
-        )
+            drawn_depth.depth, drawn_depth.face, drawn_depth.x0, drawn_depth.y0,
+            view.depth, geometry.depth_lens.rays, context.mesh.face_normals,
+            geometry.depth_from_master[:3, :3] @ pose[:3, :3], FREE_SPACE_M, AGREEMENT_SCALE_M,
+        )  # fmt: skip
         if free >= MIN_RENDERED_PX:
             agreement = total / free
         visible = count_unoccluded(silhouette, visible, free, compared)

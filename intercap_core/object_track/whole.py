@@ -1,9 +1,11 @@
 """Refinement of the decided track over all frames: rest, smoothness, covariance and flags.
 
-The status of a frame (:class:`FrameStatus`) says what its pose rests on. Lost frames are filled in
-(:mod:`.bridges`), the images are evaluated at the poses, rest segments are found (:mod:`.rest`) and
-the most probable track is solved for (:mod:`.smooth`), together with annotated poses
-(:mod:`.given_poses`).
+1. Lost frames are filled in between known ones (:mod:`.bridges`).
+2. The images are evaluated at the poses, as quadratic forms (:mod:`.evidence`); annotated poses are
+   further quadratic forms (:mod:`.given_poses`).
+3. Rest segments are found (:mod:`.rest`), and the most probable track is solved for
+   (:mod:`.smooth`).
+4. The status of a frame (:class:`FrameStatus`) says what its pose rests on.
 """
 
 from __future__ import annotations
@@ -24,12 +26,12 @@ from intercap_core.object_track.evidence import (
     TURN_SCALE,
     UNKNOWN_SIGMA,
     FrameEvidence,
-    PoseEvidence,
+    ImageEvidence,
     free_turns,
     views_noise,
     without_turns,
 )
-from intercap_core.object_track.fit import Fit
+from intercap_core.object_track.fit import FittedPose
 from intercap_core.object_track.given_poses import (
     GivenEvidence,
     GivenPose,
@@ -42,16 +44,6 @@ from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.proposals import DENIED_LOG_RATIO
 from intercap_core.object_track.rest import find_rests
 from intercap_core.object_track.smooth import smooth
-
-REST_FRAMES_REEVALUATED = 12  # frames of a rest whose images are evaluated again
-# Nats that a pose loses by smoothing so that the decided pose fitted its frame only by chance.
-UNDONE_LOG_RATIO = 10.0
-REEVALUATED_LOG_RATIO = 2.0  # nats that the evidence at a smoothed pose may be lower to replace it
-# Standard deviation of the centre up to which a pose is carried from annotated ones. Beyond, the
-# joint fit bridges a lost object as well. Tuned on the studio, as the next two.
-CARRIED_M = 0.15
-BRIDGED_S = 0.3  # a gap between equal poses shorter than this is filled with them
-FREE_AXIS_SIGMA_RAD = np.radians(25)  # standard deviation of a turn that was not observed
 
 
 class FrameStatus(IntEnum):
@@ -73,7 +65,7 @@ class FrameStatus(IntEnum):
 class FrameResult:
     """One frame of the track."""
 
-    fit: Fit
+    fit: FittedPose
     """Pose, covariance and agreement with the views."""
     status: FrameStatus = FrameStatus.SEEN
     """What the pose rests on."""
@@ -110,14 +102,14 @@ def flag_frames(mesh: ObjectMesh, frames: list[FrameResult]) -> list[FrameResult
     """Flag the frames (T) of a refined track by their covariance.
 
     A frame is lost if its position is uncertain, and ambiguous if its turn is. A carried frame is
-    ambiguous if either is uncertain, and lost if its position is as good as unknown. The first
-    frame after lost ones is recovered.
+    ambiguous if either is uncertain, and lost beyond 15 cm: the joint fit bridges it as well. The
+    first frame after lost ones is recovered.
     """
     result: list[FrameResult] = []
     for frame in frames:
         # other hypotheses count by their probability, not by their distance
         shift, turn = _deviations(mesh, frame.fit.pose, frame.fit.covariance)
-        lost = frame.lost or shift > (CARRIED_M if frame.carried else UNSURE_M)
+        lost = frame.lost or shift > (0.15 if frame.carried else UNSURE_M)
         unsure = frame.ambiguous or turn > UNSURE_RAD or shift > UNSURE_M
         result.append(
             replace(
@@ -157,16 +149,18 @@ def _largest_deviation(covariance: np.ndarray) -> float:
 class _SmoothedTrack:
     """The solution over all frames, before its status is decided."""
 
-    fits: list[Fit]
+    fits: list[FittedPose]
     """Pose, covariance and agreement with the views of each frame."""
     segment: np.ndarray
     """(T,) number of the rest segment, -1 while the object moves."""
     free_axis: np.ndarray
     """(T, 3) axes about which a turn was not observed."""
-    status: np.ndarray
-    """(T,) SEEN, BRIDGED in a hand, or LOST: also frames that end far from what they show."""
+    lost: np.ndarray
+    """(T,) lost frames, and frames that end far from the pose that their images show."""
+    in_hand: np.ndarray
+    """(T,) lost frames through which a hand surely carried the object."""
     carried: np.ndarray
-    """(T,) frames that annotated poses lead to through unseen ones."""
+    """(T,) unseen frames that are connected to an annotated one by unseen frames."""
 
     @property
     def poses(self) -> np.ndarray:
@@ -197,11 +191,9 @@ class WholeTrack:
             given: annotated poses that the decided frames agree with.
 
         Returns:
-            The frames with the refined poses. A lost frame is found if its filled-in pose is
-            supported by the images, if a hand surely carried the object, or if it lies between
-            equal poses for a moment. A frame becomes lost if smoothing moves it far from its own
-            evidence, or if the images contradict its pose. Carried frames are ambiguous except the
-            annotated ones; so are frames beside them in which one view alone shows the object.
+            The frames with refined pose, covariance and status. Ambiguous are also carried frames
+            without an annotated pose, and frames beside them in which one view alone shows the
+            object.
         """
         fits = [frame.fit for frame in frames]
         lost = np.array([frame.lost for frame in frames])
@@ -236,29 +228,30 @@ class WholeTrack:
         ratio = smoothed.log_ratios
         unseen = ratio < SEEN_LOG_RATIO
         carried = smoothed.carried & unseen
-        # a decided pose may have fitted its frame and not the motion through it
-        undone = unseen & (ratio < decided - UNDONE_LOG_RATIO)
-        contradicted = undone | (ratio < CONTRADICTED_LOG_RATIO)
+        # a decided pose that lost 10 nats by smoothing fitted its frame only by chance
+        contradicted = (unseen & (ratio < decided - 10)) | (ratio < CONTRADICTED_LOG_RATIO)
         contradicted &= ~carried | (ratio < DENIED_LOG_RATIO)
-        status = np.where(unseen, smoothed.status, FrameStatus.SEEN)
-        status[contradicted] = FrameStatus.LOST
-        in_place = self._between_equal_poses(smoothed.poses, status != FrameStatus.SEEN)
-        status[in_place & (status == FrameStatus.LOST)] = FrameStatus.BRIDGED
-        status[carried] = FrameStatus.CARRIED
-        status[contradicted] = FrameStatus.LOST
-        return status
+        seen = ~contradicted & (~unseen | ~smoothed.lost)
+        bridged = smoothed.in_hand | self._between_equal_poses(smoothed.poses, ~seen)
+        rules = {
+            FrameStatus.LOST: contradicted,
+            FrameStatus.CARRIED: carried,
+            FrameStatus.SEEN: seen,
+            FrameStatus.BRIDGED: bridged,
+        }
+        return np.select([*rules.values()], [*rules], FrameStatus.LOST)
 
     def _between_equal_poses(self, poses: np.ndarray, lost: np.ndarray) -> np.ndarray:
-        """Find frames (T,) in short gaps between equal poses: the object stayed in place."""
+        """Find frames (T,) in gaps of 0.3 s between equal poses: the object stayed in place."""
         result = np.zeros(len(lost), bool)
         for a, b in pairwise(np.flatnonzero(~lost).tolist()):
-            if b - a > 1 and self._times[b] - self._times[a] < BRIDGED_S:
+            if b - a > 1 and self._times[b] - self._times[a] < 0.3:
                 turn, shift = pose_distances(self._mesh, poses[[a]], poses[[b]])
                 result[a + 1 : b] = shift[0, 0] < UNSURE_M and turn[0, 0] < UNSURE_RAD
         return result
 
     def _smooth(
-        self, fits: list[Fit], lost: np.ndarray, given: Sequence[GivenPose]
+        self, fits: list[FittedPose], lost: np.ndarray, given: Sequence[GivenPose]
     ) -> _SmoothedTrack:
         """Solve for the track, evaluate the images at the solution, and solve again."""
         count = len(fits)
@@ -272,7 +265,8 @@ class WholeTrack:
             None if blind[t] else self._observer.evidence(t, poses[t], motion[t])
             for t in range(count)
         ]
-        stated = self._given_evidence(given, poses, evidence)
+        unseen = np.array([own is None or own.log_ratio < SEEN_LOG_RATIO for own in evidence])
+        stated = GivenEvidence.of(self._mesh, given, poses, unseen, self._times)
         evaluated = poses.copy()
         track, covariance, segment = self._solve(evaluated, evidence, filled, stated, poses)
         motion = rigid_velocity(track, np.ones(count, bool), self._times)
@@ -281,10 +275,8 @@ class WholeTrack:
         for t in reversed(self._frames_to_reevaluate(segment)):
             again = self._observer.evidence(t, track[t], motion[t])
             before = evidence[t]
-            least = SEEN_LOG_RATIO
-            if before is not None:
-                least = _log_ratio(before) - REEVALUATED_LOG_RATIO
-            if _log_ratio(again) > least:
+            least = SEEN_LOG_RATIO if before is None else before.log_ratio - 2.0
+            if again.log_ratio > least:
                 evidence[t], evaluated[t] = again, track[t]
         track, covariance, segment = self._solve(evaluated, evidence, filled, stated, track)
         covariance *= np.outer(TURN_SCALE, TURN_SCALE)
@@ -298,24 +290,14 @@ class WholeTrack:
             views = own.reports if own else fit.views
             if moved_off[t]:
                 views = self._observer.assess(t, track[t], twist=motion[t]).views
-            result.append(Fit(track[t], covariance[t], views, motion[t]))
-        status = np.where(lost | (known & (shift > UNSURE_M)), FrameStatus.LOST, FrameStatus.SEEN)
-        status[filled.sure] = FrameStatus.BRIDGED
-        return _SmoothedTrack(result, segment, free_axis, status, stated.carried)
-
-    def _given_evidence(
-        self, given: Sequence[GivenPose], poses: np.ndarray, evidence: list[PoseEvidence | None]
-    ) -> GivenEvidence:
-        """Return the evidence of annotated poses beside ``poses`` (T, 4, 4)."""
-        if not given:
-            return GivenEvidence.none(poses)
-        unseen = np.array([own is None or _log_ratio(own) < SEEN_LOG_RATIO for own in evidence])
-        return GivenEvidence.of(self._mesh, given, poses, unseen, self._times)
+            result.append(FittedPose(track[t], covariance[t], views, motion[t]))
+        lost = lost | (known & (shift > UNSURE_M))
+        return _SmoothedTrack(result, segment, free_axis, lost, filled.sure, stated.carried)
 
     def _solve(
         self,
         evaluated: np.ndarray,
-        evidence: list[PoseEvidence | None],
+        evidence: list[ImageEvidence | None],
         filled: FilledTrack,
         stated: GivenEvidence,
         start: np.ndarray,
@@ -345,26 +327,19 @@ class WholeTrack:
         same = (segment[1:] == segment[:-1]) & (segment[1:] >= 0)
         node = np.concatenate([[0], np.cumsum(~same)])
         unseen = [own is None for own in evidence]
-        # the hand's evidence in successive frames is as good as one observation
-        share = self._observer.share
-        hand = share * filled.hand
-        information[unseen] = (hand + filled.images / noise)[unseen]
-        gradient[unseen] = filled.pull[unseen] * (share - 1 / noise)
+        in_hand, pull = filled.evidence(self._observer.share, noise)
+        information[unseen], gradient[unseen] = in_hand[unseen], pull[unseen]
         combined = self._without_symmetry(FrameEvidence(evaluated, information, gradient))
-        given = None
-        if stated.given:
-            given = self._without_symmetry(
-                FrameEvidence(evaluated, stated.information, stated.gradient(evaluated))
-            )
+        given = self._without_symmetry(stated.at(evaluated))
         poses, covariance = smooth(combined, start, node, self._times, centre, given)
         return poses, covariance, segment
 
     def _frames_to_reevaluate(self, segment: np.ndarray) -> list[int]:
-        """Return all moving frames and a few of each rest."""
+        """Return all moving frames and 12 of each rest."""
         frames = list(np.flatnonzero(segment < 0))
         for number in range(segment.max(initial=-1) + 1):
             rest = np.flatnonzero(segment == number)
-            some = np.linspace(0, len(rest) - 1, min(REST_FRAMES_REEVALUATED, len(rest)))
+            some = np.linspace(0, len(rest) - 1, min(12, len(rest)))
             frames += list(rest[some.round().astype(int)])
         return sorted(map(int, frames))
 
@@ -391,10 +366,6 @@ class WholeTrack:
                 axes[t] = steps[0, :3]
                 continue
             variance, vectors = np.linalg.eigh(covariance[t][:3, :3])
-            if variance[-1] > FREE_AXIS_SIGMA_RAD**2:
+            if variance[-1] > np.radians(25) ** 2:
                 axes[t] = vectors[:, -1]
         return axes
-
-
-def _log_ratio(evidence: PoseEvidence) -> float:
-    return sum(view.log_ratio for view in evidence.reports)

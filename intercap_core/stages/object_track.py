@@ -122,7 +122,7 @@ def _absence(track: Track) -> str:
     believed = sum(not frame.lost for frame in track.frames)
     if believed == 0:
         return "its track is lost in every frame"
-    if track.of_nothing:
+    if track.shows_nothing:
         return (
             f"the track in {believed} of {len(track.frames)} frames is not believed, as all images "
             f"together hardly show it ({track.evidence:.0f} nats, expected "
@@ -187,7 +187,7 @@ def _seed_source(track: Track | None) -> str:
         return SOURCE_NONE
     if not track.annotated:
         return "search"
-    return "annotated" if track.borne_out else "annotated against the images"
+    return "annotated" if track.agrees else "annotated against the images"
 
 
 def _warn_if_unsound(track: Track, sequence: str) -> None:

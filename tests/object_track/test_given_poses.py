@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core.object_track.bridges import UNSURE_M
 from intercap_core.object_track.evidence import TURN_SCALE
-from intercap_core.object_track.fit import Fit
+from intercap_core.object_track.fit import FittedPose
 from intercap_core.object_track.given_poses import (
     GivenEvidence,
     GivenPose,
@@ -77,13 +77,12 @@ def test_evidence_has_stated_deviations_that_grow_with_time(suitcase):
     later = to_centre @ (np.linalg.inv(found.information[2]) * scale) @ to_centre.T
     np.testing.assert_allclose(np.diag(later), (0.01 + GROWTH_LOST_M_S) ** 2, rtol=1e-6)
     # the gradient leads back to the annotated pose
-    step = np.linalg.solve(found.information[1], -found.gradient(poses)[1])
+    step = np.linalg.solve(found.information[1], -found.at(poses).gradient[1])
     np.testing.assert_allclose(step, [0, 0, 0, 0.03, 0, 0], atol=1e-9)
 
 
 @pytest.mark.parametrize(
-    ("x", "seen", "excluded"),
-    [(0.0, True, []), (0.3, True, [2, 3]), (0.0, False, [0, 1, 2, 3, 4])],
+    ("x", "seen", "excluded"), [(0.0, True, []), (0.3, True, [2, 3]), (0.0, False, [0, 1, 2, 3, 4])]
 )
 def test_unseen_or_contradicted_rests_are_excluded(suitcase, x, seen, excluded):
     poses, segment = np.tile(at(), (6, 1, 1)), np.array([0, 0, 0, 0, 0, -1])
@@ -95,7 +94,7 @@ def test_unseen_or_contradicted_rests_are_excluded(suitcase, x, seen, excluded):
 
 def frame(pose: np.ndarray, status: FrameStatus, sigma_m: float = 0.001) -> FrameResult:
     covariance = np.diag(np.repeat([1e-6, sigma_m**2], 3))
-    return FrameResult(Fit(pose, covariance, ()), status)
+    return FrameResult(FittedPose(pose, covariance, ()), status)
 
 
 @pytest.mark.parametrize(
@@ -120,7 +119,7 @@ def test_single_views_beside_unseen_frames_are_flagged():
     report = ViewReport(0, 0.9, 0.002, 1.0, 500, 0.95)
     ratios = [(9, 9), (9, 0), (0, 0), (9, 9), (0, 9), (9, 0), (9, -2), (0, 0), (5, -1)]
     fits = [
-        Fit(at(), np.eye(6), tuple(replace(report, log_ratio=float(nats)) for nats in both))
+        FittedPose(at(), np.eye(6), tuple(replace(report, log_ratio=float(nats)) for nats in both))
         for both in ratios
     ]
     unseen = np.isin(np.arange(9), [2, 7])
@@ -220,7 +219,7 @@ def test_images_are_believed_more_than_a_contradicted_pose(suitcase, capture, im
     assert errors_of(suitcase, found, capture.poses)[0].max() < 0.005
     (doubt,) = (text for text in found.doubts if "frame 1 " in text)
     assert "annotated pose" in doubt and "correct it" in doubt
-    assert found.annotated and not found.borne_out
+    assert found.annotated and not found.agrees
 
 
 def test_annotated_poses_of_seen_frames_change_nothing(capture, images):
@@ -239,5 +238,5 @@ def test_a_pose_of_another_frame_is_found_in_its_own(suitcase):
     """Five frames off while the object moves by 7 cm a frame."""
     capture = ObjectCapture.make(suitcase, 6, speed=0.07, turn_deg=4)
     track = track_of(capture, annotate(5, capture.poses[0]))
-    assert track.annotated and track.borne_out
+    assert track.annotated and track.agrees
     assert errors_of(suitcase, track, capture.poses)[0].max() < 0.004

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.geometry.camera.transforms import apply_step, step_between
 from intercap_core.object_track.decoder import Decoded
-from intercap_core.object_track.fit import Fit, seen_by
+from intercap_core.object_track.fit import FittedPose, seen_by
 from intercap_core.object_track.hypotheses import MAX_HYPOTHESES, Hypotheses, Prior
 from intercap_core.object_track.motion import (
     carry_in_hands,
@@ -193,10 +193,10 @@ def test_of_too_many_hypotheses_isolated_turns_are_kept(swung, observer):
     hypotheses = hypotheses_of(observer_of(swung, [observer.views(0)], up=None, times=np.zeros(1)))
     nothing = replace(observer.assess(0, swung.poses[0]).views[0], log_ratio=0.0)
 
-    def turned(degrees: float, nats: float) -> Fit:
+    def turned(degrees: float, nats: float) -> FittedPose:
         pose = swung.poses[0].copy()
         pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("z", degrees, degrees=True).as_matrix()
-        return Fit(pose, np.eye(6), (replace(nothing, log_ratio=nats),))
+        return FittedPose(pose, np.eye(6), (replace(nothing, log_ratio=nats),))
 
     for number in range(MAX_HYPOTHESES):
         hypotheses.add(0, turned(30.0 * number, 20.0 - number))

@@ -10,7 +10,7 @@ import pytest
 
 from intercap_core.config import ObjectTrackSettings
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.object_track.fit import Fit
+from intercap_core.object_track.fit import FittedPose
 from intercap_core.object_track.given_poses import GivenPose
 from intercap_core.object_track.hypotheses import (
     ANNOTATED_LOG_RATIO,
@@ -118,11 +118,13 @@ def test_evidence_of_clutter_is_subtracted(bottle):
     assert places.weigh(3, APART, 7.0, 0.2) == 7.0
 
 
-def fit_of(mesh: ObjectMesh, place: np.ndarray, ratio: float, candidate: int, up: int = 1) -> Fit:
+def fit_of(
+    mesh: ObjectMesh, place: np.ndarray, ratio: float, candidate: int, up: int = 1
+) -> FittedPose:
     pose = np.diag([1.0, up, up, 1.0])
     pose[:3, 3] = place - pose[:3, :3] @ mesh.centre_of_mass
     view = replace(REPORT, candidate=candidate, log_ratio=ratio / 4)
-    return Fit(pose, np.eye(6), (view,) * 4)
+    return FittedPose(pose, np.eye(6), (view,) * 4)
 
 
 def prior_of(mesh: ObjectMesh, up: np.ndarray | None = None) -> Prior:

@@ -135,9 +135,9 @@ def test_an_object_that_is_never_there_is_not_found(suitcase):
 
 
 def test_a_track_with_little_evidence_is_of_nothing_unless_annotated():
-    assert Track([], 0, False, 11.0).of_nothing
-    assert not Track([], 0, False, 13.0).of_nothing
-    assert not Track([], 0, True, 11.0).of_nothing
+    assert Track([], 0, False, 11.0).shows_nothing
+    assert not Track([], 0, False, 13.0).shows_nothing
+    assert not Track([], 0, True, 11.0).shows_nothing
 
 
 @pytest.fixture(scope="module")

@@ -42,7 +42,7 @@ def test_reduced_masks_equal_every_nth_pixel(step):
 
 
 def test_a_mask_of_another_size_is_refused():
-    with pytest.raises(ValueError, match="does not fit"):
+    with pytest.raises(ValueError, match="its runs hold 25 pixels"):
         decode(encode(np.ones((5, 5), bool)), COLOUR, 2)
 
 

@@ -36,7 +36,7 @@ from intercap_core.joint.state import OBJECT, State
 from intercap_core.joint.terms.term import Equation, JointTerm
 from intercap_core.object_track.evidence import (
     UNKNOWN_SIGMA,
-    PoseEvidence,
+    ImageEvidence,
     evidence_at,
     free_turns,
     report_at,
@@ -105,7 +105,7 @@ class ObjectImages:
 
     def look(
         self, frames: Sequence[int], poses: np.ndarray, twists: np.ndarray
-    ) -> dict[int, PoseEvidence]:
+    ) -> dict[int, ImageEvidence]:
         """Evidence of each of ``frames`` about its pose.
 
         Turns about the axes of a round object have no evidence, although its facets show some.
@@ -141,7 +141,7 @@ class ObjectImages:
 
         return dict(zip(shown, self._threads.map(report, shown), strict=True))
 
-    def _look(self, t: int, pose: np.ndarray, twist: np.ndarray) -> PoseEvidence:
+    def _look(self, t: int, pose: np.ndarray, twist: np.ndarray) -> ImageEvidence:
         views = [
             view.through(geometry)
             for view, geometry in zip(self._views(t), self._geometry, strict=True)
@@ -152,7 +152,7 @@ class ObjectImages:
         contour = without_turns(
             found.information - found.of_depth, found.gradient - found.depth_gradient, turns
         )
-        return PoseEvidence(
+        return ImageEvidence(
             depth[0] + contour[0], depth[1] + contour[1], depth[0], depth[1], found.reports
         )
 
@@ -219,8 +219,8 @@ class ObjectImagesData(JointTerm):
         self._matrix = tracked.information
         self._gradient = np.zeros((len(tracked.seen), 6))
         self._by_cameras: dict[int, _ByCameras] = {}
-        self._evidence: dict[int, PoseEvidence] = {}  # of the last refresh, by frame
-        self._agreeing: dict[int, PoseEvidence] = {}  # that does not contradict its pose
+        self._evidence: dict[int, ImageEvidence] = {}  # of the last refresh, by frame
+        self._agreeing: dict[int, ImageEvidence] = {}  # that does not contradict its pose
         self._noise = 1.0
 
     def take_cameras(self, cameras: Cameras) -> None:
@@ -255,7 +255,7 @@ class ObjectImagesData(JointTerm):
         wrong[[t for t, evidence in looked.items() if _contradicts(evidence)]] = True
         return wrong
 
-    def _look(self, poses: np.ndarray) -> dict[int, PoseEvidence]:
+    def _look(self, poses: np.ndarray) -> dict[int, ImageEvidence]:
         """Evidence of the tracked frames at these poses (T, 4, 4)."""
         frames = np.flatnonzero(self._tracked.seen).tolist()
         return self._images.look(frames, poses, self._motion(poses))
@@ -267,7 +267,7 @@ class ObjectImagesData(JointTerm):
         motion[tracked.resting] = 0
         return motion
 
-    def _take(self, t: int, evidence: PoseEvidence) -> None:
+    def _take(self, t: int, evidence: ImageEvidence) -> None:
         """Set the quadratic form of frame ``t``."""
         form = self._form(t, evidence.information.sum(0), evidence.gradient.sum(0))
         self._matrix[t], self._gradient[t] = form.matrix, form.slope
@@ -318,7 +318,7 @@ class ObjectImagesData(JointTerm):
     def _seen_by(
         self,
         t: int,
-        evidence: PoseEvidence,
+        evidence: ImageEvidence,
         weight: float,
         mesh: np.ndarray,
         gradient: np.ndarray,
@@ -401,6 +401,6 @@ def _equations(
     return matrix, bent + slope, energy.sum(axis=1)
 
 
-def _contradicts(evidence: PoseEvidence) -> bool:
+def _contradicts(evidence: ImageEvidence) -> bool:
     """Whether the images contradict the object's pose."""
     return sum(view.log_ratio for view in evidence.reports) < CONTRADICTED_LOG_RATIO
