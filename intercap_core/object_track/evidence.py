@@ -72,7 +72,7 @@ def evidence_at(
     depth = [np.array(part) for part in zip(*(terms[0] for terms in by_view), strict=True)]
     contour = [np.array(part) for part in zip(*(terms[1] for terms in by_view), strict=True)]
     reports = tuple(report for *_, report in by_view)
-    return ImageEvidence(depth[0] + contour[0], depth[1] + contour[1], *depth, reports)
+    return ImageEvidence(depth[0] + contour[0], depth[1] + contour[1], depth[0], depth[1], reports)
 
 
 def report_at(
@@ -177,9 +177,6 @@ def steps_about_point(arms: np.ndarray) -> np.ndarray:
 
     The second point lies ``arms`` (T, 3) before the first, so its shift gains turn x -arm.
     """
-    x, y, z = arms.T
     result = np.tile(np.eye(6), (len(arms), 1, 1))
-    result[:, 3:, :3] = np.stack(
-        [np.stack([0 * x, -z, y], 1), np.stack([z, 0 * x, -x], 1), np.stack([-y, x, 0 * x], 1)], 1
-    )
+    result[:, 3:, :3] = np.cross(np.eye(3), arms[:, None])
     return result

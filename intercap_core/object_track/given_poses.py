@@ -15,7 +15,7 @@ import numpy as np
 from intercap_core.geometry.camera.transforms import step_between
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.decoder import pose_distances
-from intercap_core.object_track.evidence import TURN_SCALE, FrameEvidence
+from intercap_core.object_track.evidence import TURN_SCALE, FrameEvidence, steps_about_point
 from intercap_core.object_track.fit import FittedPose, MotionPrior
 from intercap_core.object_track.likelihood import SEEN_LOG_RATIO
 from intercap_core.object_track.motion import GROWTH_LOST_M_S, GROWTH_LOST_RAD_S
@@ -202,8 +202,7 @@ def _information(
     ``sigma_m`` and ``sigma_rad`` are the deviations of its centre and its turn.
     """
     arm = pose[:3, :3] @ mesh.centre_of_mass
-    to_centre = np.eye(6)
-    to_centre[3:, :3] = np.cross(np.eye(3), arm).T  # shift of the centre by a turn
+    to_centre = steps_about_point(-arm[None])[0]
     own = np.repeat([sigma_rad, sigma_m], 3) ** -2.0
     stated = to_centre.T @ (own[:, None] * to_centre)
     return np.asarray(stated * np.outer(TURN_SCALE, TURN_SCALE))

@@ -144,10 +144,6 @@ class Hypotheses:
         """Return the weight of the likeliest hypothesis of frame t, nats, at least 0."""
         return float(self._prior.weigh(t, self.fits[t]).max(initial=0.0))
 
-    def shown(self, t: int) -> bool:
-        """Return whether the images of frame t support any of its hypotheses."""
-        return any(fit.log_ratio > SEEN_LOG_RATIO for fit in self.fits[t])
-
     def add(self, t: int, fit: FittedPose) -> None:
         """Add a hypothesis to frame t.
 

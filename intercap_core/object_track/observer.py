@@ -18,7 +18,7 @@ from intercap_core.object_track.fit import FittedPose, MotionPrior, assess_all, 
 from intercap_core.object_track.motion import carry_in_hands
 from intercap_core.object_track.places import Places
 from intercap_core.object_track.recording import ViewCache
-from intercap_core.object_track.search import SearchLimits, rank_frames, search_pose
+from intercap_core.object_track.search import rank_frames, search_pose
 from intercap_core.object_track.view import FitContext, View
 from intercap_core.progress import Progress
 
@@ -122,7 +122,7 @@ class Observer:
 
         Args:
             t: frame.
-            rotations, motion: as in :class:`.search.SearchLimits`.
+            rotations, motion: as in :func:`.search.search_pose`.
             places: (M, 3) positions within 75 cm of which to search; None = everywhere.
 
         Returns:
@@ -134,8 +134,10 @@ class Observer:
                 return 0.0
             return self.places.prior(t, place)
 
-        limits = SearchLimits(self.up, place_prior, rotations, motion)
-        return search_pose(self.context, self.field, self.views(t), limits)
+        return search_pose(
+            self.context, self.field, self.views(t),
+            up=self.up, place_prior=place_prior, rotations=rotations, motion=motion,
+        )  # fmt: skip
 
     def fit(
         self,

@@ -121,7 +121,7 @@ class Places:
         Returns:
             Nats.
         """
-        if any(np.linalg.norm(other - place) < self._same for other in self._others):
+        if self._index(self._others, place) is not None:
             return min(ratio, 0.0) - CLUTTER_LOG_RATIO
         ratio -= self._clutter_ratio(place)
         nearest = self._nearest(place)
@@ -133,9 +133,14 @@ class Places:
 
     def _nearest(self, place: np.ndarray) -> tuple[OccupiedPlace, float] | None:
         """Return the known place at ``place`` (3,) and its prior, if any."""
-        away = [float(np.linalg.norm(s.place - place)) for s, _ in self._standing]
+        index = self._index([s.place for s, _ in self._standing], place)
+        return None if index is None else self._standing[index]
+
+    def _index(self, places: list[np.ndarray], place: np.ndarray) -> int | None:
+        """Return the number of the nearest of ``places`` that is the same place, if any."""
+        away = [float(np.linalg.norm(other - place)) for other in places]
         nearest = int(np.argmin(away)) if away else 0
-        return self._standing[nearest] if away and away[nearest] < self._same else None
+        return nearest if away and away[nearest] < self._same else None
 
     def claim(self, place: np.ndarray) -> None:
         """Mark the object at ``place`` (3,) as the tracked one, wherever the person is."""
@@ -158,20 +163,19 @@ class Places:
         apart = nearest is not None and np.linalg.norm(nearest[0].place - object_at) >= self._same
         if nearest is not None and apart and ratio > SEARCH_GOOD_LOG_RATIO:
             nearest[0].rival_frames.add(t)
-        likeness = self._clutter_at(place)
-        if np.linalg.norm((place if likeness is None else likeness[0]) - object_at) < self._same:
+        clutter = self._clutter_at(place) or (place, {})
+        if np.linalg.norm(clutter[0] - object_at) < self._same:
             return
-        if likeness is None:
-            likeness = (place, {})
-            self._clutter.append(likeness)
-        likeness[1][t] = max(ratio, likeness[1].get(t, 0.0))
+        if not clutter[1]:
+            self._clutter.append(clutter)
+        clutter[1][t] = max(ratio, clutter[1].get(t, 0.0))
 
     def exclude(self, place: np.ndarray) -> None:
         """Exclude ``place`` (3,) in all frames.
 
         The images show an object there in a frame whose annotated pose is elsewhere.
         """
-        if not any(np.linalg.norm(other - place) < self._same for other in self._others):
+        if self._index(self._others, place) is None:
             self._others.append(place)
 
     def clear_rivals(self) -> None:
@@ -180,9 +184,8 @@ class Places:
 
     def _clutter_at(self, place: np.ndarray) -> tuple[np.ndarray, dict[int, float]] | None:
         """Return the recorded clutter at ``place`` (3,), if any."""
-        away = [float(np.linalg.norm(seen_at - place)) for seen_at, _ in self._clutter]
-        nearest = int(np.argmin(away)) if away else 0
-        return self._clutter[nearest] if away and away[nearest] < self._same else None
+        index = self._index([seen_at for seen_at, _ in self._clutter], place)
+        return None if index is None else self._clutter[index]
 
     def _clutter_ratio(self, place: np.ndarray) -> float:
         """Return the evidence, nats, of a similar object that stays at ``place`` (3,).

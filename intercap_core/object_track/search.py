@@ -12,7 +12,7 @@ points. Weights are Geman-McClure with a scale that shrinks from the error of th
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -41,22 +41,15 @@ ICP_MAX_RESIDUAL_M = 0.05  # larger residuals of the alignment count as this; tu
 HOPELESS_LOG_RATIO = 15.0
 
 
-@dataclass(frozen=True)
-class SearchLimits:
-    """What is known about the pose before a search."""
-
-    up: np.ndarray | None = None
-    """(3,) vertical in the master frame: standing poses are tried more finely."""
-    place_prior: Callable[[np.ndarray], float] | None = None
-    """Prior, 0 to 1, of a position (3,)."""
-    rotations: np.ndarray | None = None
-    """(N, 3, 3) rotations to try instead of the whole grid."""
-    motion: tuple[np.ndarray, np.ndarray] | None = None
-    """Twist (6,) of the object per second, and the point (3,) that moves by it."""
-
-
 def search_pose(
-    context: FitContext, field: DistanceField, views: list[View], limits: SearchLimits
+    context: FitContext,
+    field: DistanceField,
+    views: list[View],
+    *,
+    up: np.ndarray | None = None,
+    place_prior: Callable[[np.ndarray], float] | None = None,
+    rotations: np.ndarray | None = None,
+    motion: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> list[FittedPose]:
     """Search the pose of a frame set.
 
@@ -64,7 +57,10 @@ def search_pose(
         context: object and settings.
         field: distance field of the mesh.
         views: views of the frame set.
-        limits: what is known about the pose.
+        up: (3,) vertical in the master frame: standing poses are tried more finely.
+        place_prior: prior, 0 to 1, of a position (3,).
+        rotations: (N, 3, 3) rotations to try; None = a grid of all.
+        motion: twist (6,) of the object per second, and the point (3,) that moves by it.
 
     Returns:
         Fitted hypotheses, the likeliest first; empty if nothing is detected.
@@ -84,26 +80,25 @@ def search_pose(
     def compare(poses: np.ndarray) -> list[FittedPose]:
         """Compare poses (N, 4, 4) with the views; the likeliest first."""
         twists = None
-        if limits.motion is not None:
-            twists = np.array([shift_twist(*limits.motion, pose[:3, 3]) for pose in poses])
+        if motion is not None:
+            twists = np.array([shift_twist(*motion, pose[:3, 3]) for pose in poses])
         return sorted(assess_all(context, views, poses, twists), key=lambda fit: -fit.log_ratio)
 
-    rotations = limits.rotations
-    number_compared, number_fitted = (16, 3) if rotations is None else (6, 2)
+    everywhere = rotations is None
+    number_compared, number_fitted = (16, 3) if everywhere else (6, 2)
     if rotations is None:
-        rotations = rotation_grid(mesh.symmetry, limits.up)
-    prior = limits.place_prior
+        rotations = rotation_grid(mesh.symmetry, up)
     fits: list[FittedPose] = []
-    for group in find_groups(mesh, views, context.labels, prior):
+    for group in find_groups(mesh, views, context.labels, place_prior):
         poses = align(mesh, field, group, views, rotations)
         poses = poses[distinct_poses(mesh, poses, count=number_compared)]
         of_group = fit_starts(compare(poses)[:number_fitted])
         fits += of_group
-        trusted = prior is None or prior(locate_group(group)) > 0.5
+        trusted = place_prior is None or place_prior(locate_group(group)) > 0.5
         if trusted and any(fit.log_ratio > SEARCH_GOOD_LOG_RATIO for fit in of_group):
             break
     fits.sort(key=lambda fit: -fit.log_ratio)
-    if fits and limits.rotations is None and not mesh.symmetry.sphere:
+    if fits and everywhere and not mesh.symmetry.sphere:
         # a mug looks much the same with its handle elsewhere, a box from its back
         turned = compare(fits[0].pose @ axis_turns(mesh, steps=12))[:3]
         fits += fit_starts(turned, fits[0].log_ratio)

@@ -144,7 +144,7 @@ class Tracker:
         search, else the first annotated one. Raises NotFound if there is none.
         """
         for t in annotated:
-            if self._hypotheses.shown(t):
+            if any(fit.log_ratio > SEEN_LOG_RATIO for fit in self._hypotheses.fits[t]):
                 return t
         try:
             return self._proposals.start()

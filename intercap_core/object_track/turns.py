@@ -182,7 +182,7 @@ def same_pose(
 
 def distinct_poses(
     mesh: ObjectMesh,
-    poses: Sequence[np.ndarray],
+    poses: Sequence[np.ndarray] | np.ndarray,
     limits: tuple[float, float] = (SAME_POSE_M, SAME_POSE_DEG),
     count: int | None = None,
 ) -> list[int]:

@@ -201,6 +201,4 @@ class ViewFit:
         ratio = log_ratio(
             self._context, view, self._pose, image, self._drawn_depth, self._candidate, visible
         )
-        return ViewReport(
-            number, overlap, depth_residual, contour, visible, agreement, view.detected, ratio
-        )
+        return ViewReport(number, overlap, depth_residual, contour, visible, agreement, ratio)

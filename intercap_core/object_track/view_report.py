@@ -112,8 +112,6 @@ class ViewReport:
     """Rendered pixels that are not occluded."""
     depth_agreement: float
     """Agreement of the unoccluded depth, 0 to 1; NaN without depth."""
-    detected: bool = True
-    """Whether candidates are known for this image."""
     log_ratio: float = 0.0
     """Log-likelihood ratio, nats (:mod:`.likelihood`)."""
 
@@ -146,7 +144,7 @@ def quick_report(
     number = candidate.index if candidate else -1
     nothing = float("nan")
     ratio = log_ratio(context, view, pose, silhouette, drawn_depth, candidate, visible)
-    return ViewReport(number, overlap, nothing, nothing, visible, agreement, view.detected, ratio)
+    return ViewReport(number, overlap, nothing, nothing, visible, agreement, ratio)
 
 
 def depth_agreement(

@@ -28,6 +28,7 @@ from intercap_core.object_track.evidence import (
     FrameEvidence,
     ImageEvidence,
     free_turns,
+    steps_about_point,
     views_noise,
     without_turns,
 )
@@ -128,8 +129,7 @@ def _deviations(mesh: ObjectMesh, pose: np.ndarray, covariance: np.ndarray) -> t
     Turns about the axis of a continuous symmetry do not count.
     """
     arm = pose[:3, :3] @ mesh.centre_of_mass
-    about = np.cross(np.eye(3), arm)  # row i: shift of the centre by a turn about axis i
-    to_centre = np.concatenate([about.T, np.eye(3)], axis=1)
+    to_centre = steps_about_point(-arm[None])[0, 3:]
     shift = to_centre @ covariance @ to_centre.T
     turn = covariance[:3, :3]
     if mesh.symmetry.sphere:
@@ -161,16 +161,6 @@ class _SmoothedTrack:
     """(T,) lost frames through which a hand surely carried the object."""
     carried: np.ndarray
     """(T,) unseen frames that are connected to an annotated one by unseen frames."""
-
-    @property
-    def poses(self) -> np.ndarray:
-        """Poses (T, 4, 4)."""
-        return np.array([fit.pose for fit in self.fits])
-
-    @property
-    def log_ratios(self) -> np.ndarray:
-        """Log-likelihood ratios (T,) of the images, nats."""
-        return np.array([fit.log_ratio for fit in self.fits])
 
 
 class WholeTrack:
@@ -225,14 +215,15 @@ class WholeTrack:
 
         ``decided`` (T,) are the log-likelihood ratios of the decided poses before smoothing.
         """
-        ratio = smoothed.log_ratios
+        ratio = np.array([fit.log_ratio for fit in smoothed.fits])
+        poses = np.array([fit.pose for fit in smoothed.fits])
         unseen = ratio < SEEN_LOG_RATIO
         carried = smoothed.carried & unseen
         # a decided pose that lost 10 nats by smoothing fitted its frame only by chance
         contradicted = (unseen & (ratio < decided - 10)) | (ratio < CONTRADICTED_LOG_RATIO)
         contradicted &= ~carried | (ratio < DENIED_LOG_RATIO)
         seen = ~contradicted & (~unseen | ~smoothed.lost)
-        bridged = smoothed.in_hand | self._between_equal_poses(smoothed.poses, ~seen)
+        bridged = smoothed.in_hand | self._between_equal_poses(poses, ~seen)
         rules = {
             FrameStatus.LOST: contradicted,
             FrameStatus.CARRIED: carried,

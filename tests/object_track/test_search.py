@@ -14,7 +14,7 @@ from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 from intercap_core.object_track.fit import assess_all
-from intercap_core.object_track.search import SearchLimits, rank_frames, search_pose
+from intercap_core.object_track.search import rank_frames, search_pose
 from intercap_core.object_track.turns import find_near_symmetries, rotation_grid
 from tests.geometry.rigid.conftest import catalogue
 
@@ -24,15 +24,15 @@ def field_of(mesh: ObjectMesh) -> DistanceField:
 
 
 def test_search_finds_the_pose_without_a_start(context, capture, views):
-    mesh, limits = context.mesh, SearchLimits(capture.master_from_room[:3, 2])
-    best, *others = search_pose(context, field_of(mesh), views, limits)
+    mesh, up = context.mesh, capture.master_from_room[:3, 2]
+    best, *others = search_pose(context, field_of(mesh), views, up=up)
     assert np.linalg.norm(best.pose[:3, 3] - capture.poses[0][:3, 3]) < 0.003
     assert mesh.symmetry.rotation_error_deg(best.pose[:3, :3], capture.poses[0][:3, :3]) < 1
     (truth,) = assess_all(context, views, capture.poses[:1])
     assert truth.log_ratio == pytest.approx(best.log_ratio, abs=3)
     assert all(other.log_ratio < best.log_ratio for other in others)
     empty = [replace(view, candidates=()) for view in views]
-    assert search_pose(context, field_of(mesh), empty, SearchLimits()) == []
+    assert search_pose(context, field_of(mesh), empty) == []
 
 
 def test_the_rotation_grid_has_no_gap():
