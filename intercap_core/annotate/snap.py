@@ -104,7 +104,9 @@ def _fitted(
 
     Returns the fit with the highest likelihood.
     """
-    context = FitContext.from_settings(mesh, labels, settings, open_renderer("cpu"))
+    context = FitContext(
+        mesh, labels, settings.min_overlap, settings.background_term, open_renderer("cpu")
+    )
 
     def fitted(pose: np.ndarray) -> FittedPose:
         return fit_pose(context, views, pose, prior=MotionPrior(pose))

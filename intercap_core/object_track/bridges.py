@@ -1,8 +1,8 @@
-"""Poses of lost frames between known ones: in the hand that held the object, or on a straight path.
+"""Poses of lost frames between known ones: in the hand that carries the object, or straight.
 
-A held object is often hidden: by the hand, by the head, by the body. A hand that carries the object
-from where it was last seen to where it is next seen held it in between. Of the possible paths the
-one is taken that motion and images together make the likeliest.
+The object is often hidden by the hand that carries it, by the head or by the body. A hand may have
+carried it if it leads from the last known pose to the next one. Of all possible paths, the one with
+the highest likelihood of motion and images is used.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from intercap_core.geometry.camera.transforms import apply_step, step_between
+from intercap_core.geometry.camera.transforms import apply_step, rigid, step_between
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.solve.time_series import rigid_velocity
 from intercap_core.object_track.decoder import (
@@ -101,12 +101,12 @@ class Gap:
         return result
 
     def _straight(self, end: np.ndarray) -> np.ndarray:
-        """Return poses (N, 4, 4) on the straight path to ``end`` (4, 4)."""
-        poses = self.poses[self.before : self.after + 1].copy()
-        poses[-1] = end
-        known = np.zeros(len(poses), bool)
-        known[[0, -1]] = True
-        return interpolate_poses(poses, known)[1:-1]
+        """Return poses (N, 4, 4) by the shortest turn and the straight line to ``end`` (4, 4)."""
+        ends, last = np.stack([self.poses[self.before], end]), self.after - self.before
+        frames = np.arange(1, last)
+        turns = Slerp([0, last], Rotation.from_matrix(ends[:, :3, :3]))(frames).as_matrix()
+        line = [np.interp(frames, [0, last], ends[:, k, 3]) for k in range(3)]
+        return rigid(turns, np.stack(line, axis=1))
 
     def _in_hand(self, hand: int, t: int, end: np.ndarray) -> np.ndarray | None:
         """Return the pose (4, 4) of frame ``t`` as the hand carries it from both sides.
@@ -130,24 +130,6 @@ class Gap:
         )
         turn, shift = np.hypot(HELD_RAD, HELD_RAD_S * nearer), np.hypot(HELD_M, HELD_M_S * nearer)
         return np.diag(np.repeat([turn, shift], 3) ** -2.0)
-
-
-def interpolate_poses(poses: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Fill in the poses (T, 4, 4) of frames that are not ``known`` (T,).
-
-    Shortest turn and straight line between known neighbours, constant at the ends.
-    """
-    at = np.flatnonzero(known)
-    if not len(at) or len(at) == len(known):
-        return poses.copy()
-    frames = np.clip(np.arange(len(known)), at[0], at[-1])
-    result = np.tile(np.eye(4), (len(known), 1, 1))
-    result[:, :3, 3] = np.stack([np.interp(frames, at, poses[at, k, 3]) for k in range(3)], axis=1)
-    result[:, :3, :3] = poses[at[0], :3, :3]
-    if len(at) > 1:
-        result[:, :3, :3] = Slerp(at, Rotation.from_matrix(poses[at, :3, :3]))(frames).as_matrix()
-    result[at] = poses[at]
-    return result
 
 
 @dataclass(frozen=True)
@@ -198,21 +180,21 @@ def fill_lost(observer: Observer, poses: np.ndarray, lost: np.ndarray) -> Filled
             continue
         paths = Gap(observer.mesh, track, times, observer.joints, a, b).bridges()
         fits = [_fit_path(observer, path) for path in paths] if len(paths) > 1 else []
-        seen = np.array(
+        by_images = np.array(
             [
                 observer.share * sum(map(_path_log_ratio, path.poses, path.information, own))
                 for path, own in zip(paths, fits, strict=False)
             ]
         )
-        total = seen + [path.log_ratio for path in paths] if len(paths) > 1 else np.zeros(1)
+        total = by_images + [path.log_ratio for path in paths] if len(paths) > 1 else np.zeros(1)
         best = int(total.argmax())
         path = paths[best]
         track[a + 1 : b] = [fit.pose for fit in fits[best]] if fits else path.poses
         track[b] = path.end
         track[b:] = unwrap_symmetry(symmetry, track[b:], known[b:])
-        held = np.any(path.information, axis=(1, 2))
+        in_hand = np.any(path.information, axis=(1, 2))
         for i, t in enumerate(path.frames):
-            if held[i]:
+            if in_hand[i]:
                 hand[t] = path.information[i]
                 images[t] = np.linalg.inv(fits[best][i].covariance) - path.information[i]
                 pull[t] = path.information[i] @ step_between(path.poses[i], track[t])
@@ -220,12 +202,12 @@ def fill_lost(observer: Observer, poses: np.ndarray, lost: np.ndarray) -> Filled
             total[i] for i, other in enumerate(paths) if _is_different(observer.mesh, path, other)
         ]
         if (
-            held.any()
+            in_hand.any()
             and total[best] - max(rivals, default=-np.inf) > 2.0
-            and seen[best] > CONTRADICTED_LOG_RATIO
+            and by_images[best] > CONTRADICTED_LOG_RATIO
             and times[b] - times[a] < UNSEEN_S
         ):
-            sure[path.frames] = held
+            sure[path.frames] = in_hand
     first, last = np.flatnonzero(known)[[0, -1]] if known.any() else (0, count - 1)
     track[:first], track[last + 1 :] = track[first], track[last]
     return FilledTrack(track, hand, images, pull, sure)
@@ -241,10 +223,10 @@ def _path_log_ratio(pose: np.ndarray, information: np.ndarray, fit: FittedPose) 
     return fit.log_ratio - 0.5 * float(step @ information @ step)
 
 
-def _is_different(mesh: ObjectMesh, one: Bridge, two: Bridge) -> bool:
+def _is_different(mesh: ObjectMesh, path: Bridge, other: Bridge) -> bool:
     """Return whether two paths lead to different poses in some frame."""
     pairs = [
-        pose_distances(mesh, p[None], q[None]) for p, q in zip(one.poses, two.poses, strict=True)
+        pose_distances(mesh, p[None], q[None]) for p, q in zip(path.poses, other.poses, strict=True)
     ]
     return any(turn[0, 0] > UNSURE_RAD or shift[0, 0] > UNSURE_M for turn, shift in pairs)
 

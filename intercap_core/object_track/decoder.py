@@ -59,7 +59,7 @@ def step_costs(
         before: (K, 4, 4) poses.
         after: (L, 4, 4) poses.
         seconds: time between the frames.
-        hands: motions of the H hands, None where unknown. A hand must be near enough to hold the
+        hands: motions of the H hands, None if unknown. A hand must be near enough to hold the
             object.
         free_cost_s: cost of free motion, nats per second.
 

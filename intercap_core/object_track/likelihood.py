@@ -187,7 +187,7 @@ def depth_log_ratio(
 def outline_cost(face, x0, y0, mask, mx, my, person, px, py, width, height, sigma, most):
     """Compare the outlines of a rendering and a mask.
 
-    Pixels where a person beside the mask or the edge of the image ends the outline do not count.
+    Pixels where a person next to the mask or the edge of the image ends the outline do not count.
     All windows are given with their first pixels in the image.
 
     Args:

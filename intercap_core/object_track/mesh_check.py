@@ -148,25 +148,20 @@ def _scale_doubt(observer: Observer, frames: list[FrameResult], believed: list[i
     if not surest:
         return []
 
-    def fitted_ratio(mesh: ObjectMesh) -> float:
-        fits = [frames[t].fit for t in surest]
-        again = [
-            observer.fit(t, fit.pose, None, mesh=mesh, twist=fit.twist)
-            for t, fit in zip(surest, fits, strict=True)
-        ]
+    fits = {t: frames[t].fit for t in surest}
+
+    def fitted_ratio(observer: Observer) -> float:
+        again = [observer.fit(t, fit.pose, None, twist=fit.twist) for t, fit in fits.items()]
         return float(np.mean([fit.log_ratio for fit in again]))
 
-    believed_ratio = float(np.mean([frames[t].fit.log_ratio for t in surest]))
+    believed_ratio = float(np.mean([fit.log_ratio for fit in fits.values()]))
     gains = {}
     for scale in (0.9, 1.1):
-        other = scale_mesh(observer.mesh, scale)
+        scaled = observer.with_mesh(scale_mesh(observer.mesh, scale))
         # A mesh that is 10 nats worse before its fit is not fitted: the size is right.
-        assessed = [
-            observer.assess(t, frames[t].fit.pose, other, frames[t].fit.twist).log_ratio
-            for t in surest
-        ]
+        assessed = [scaled.assess(t, fit.pose, fit.twist).log_ratio for t, fit in fits.items()]
         if np.mean(assessed) > believed_ratio - 10:
-            gains[scale] = fitted_ratio(other) - fitted_ratio(observer.mesh)
+            gains[scale] = fitted_ratio(scaled) - fitted_ratio(observer)
     # Nats per frame, measured on the studio: a tenth costs most objects 20. Masks that are too
     # small in all views make a bottle look a tenth smaller by 6.
     if max(gains.values(), default=0.0) < 8:

@@ -44,7 +44,7 @@ def residuals(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute contour distances |projection - target| (N,) in pixels and their Jacobian (N, 6).
 
-    The derivative is taken along the line between the two points, zero where they coincide. Motion
+    The derivative is taken along the line between the two points, zero if they coincide. Motion
     and columns as in :func:`.object_depth.residuals`.
 
     Args:
@@ -196,8 +196,7 @@ def sees_past(at, depth, corner, rays, depth_from_colour, lens, measured, place,
         u, v = project_point(px, py, pz, lens)
         column, row = int(np.rint(u)) - place[0], int(np.rint(v)) - place[1]
         if 0 <= column < measured.shape[1] and 0 <= row < measured.shape[0]:
-            found = measured[row, column]
-            clear[i] = not (0 < found < pz + free_m)
+            clear[i] = not (0 < measured[row, column] < pz + free_m)
     return clear
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -23,7 +24,7 @@ from intercap_core.object_track.view import FitContext, View
 from intercap_core.progress import Progress
 
 Pictures = Callable[[int], list[np.ndarray | None]]
-"""Returns the reduced colour images (h, w, 3) uint8 BGR of frame t, None where there is none."""
+"""Returns the reduced colour images (h, w, 3) uint8 BGR of frame t, None without an image."""
 
 log = logging.getLogger(__name__)
 
@@ -60,8 +61,9 @@ class Observer:
     def __post_init__(self) -> None:
         self.views = ViewCache(self.load)
         self._progress = Progress(log, f"{self.mesh.name}: fitted", None, "poses")
-        self.context = FitContext.from_settings(
-            self.mesh, self.labels, self.settings, open_renderer(self.settings.render_on)
+        settings, renderer = self.settings, open_renderer(self.settings.render_on)
+        self.context = FitContext(
+            self.mesh, self.labels, settings.min_overlap, settings.background_term, renderer
         )
 
     @property
@@ -146,17 +148,16 @@ class Observer:
         prior: MotionPrior | None,
         rounds: tuple[int, ...] = (3, 3),
         scale: float = 0.5,
-        mesh: ObjectMesh | None = None,
         twist: np.ndarray | None = None,
     ) -> FittedPose:
         """Fit the pose (4, 4) of frame t.
 
         Arguments are those of :func:`.fit.fit_pose`, with defaults for a start at the pose of a
-        neighbouring frame. ``mesh`` replaces the object's own.
+        neighbouring frame.
         """
         self._progress.step()
         return fit_pose(
-            self._context_of(mesh), self.views(t), pose,
+            self.context, self.views(t), pose,
             prior=prior, rounds=rounds, start_scale=scale, twist=twist,
         )  # fmt: skip
 
@@ -171,25 +172,18 @@ class Observer:
         centre, radius = self.mesh.centre_at(pose), self.mesh.diameter / 2
         return carry_in_hands(self.joints[[t, u]], pose, centre, radius)
 
-    def assess(
-        self,
-        t: int,
-        pose: np.ndarray,
-        mesh: ObjectMesh | None = None,
-        twist: np.ndarray | None = None,
-    ) -> FittedPose:
+    def assess(self, t: int, pose: np.ndarray, twist: np.ndarray | None = None) -> FittedPose:
         """Compare a pose (4, 4) with frame t without a fit; arguments as in :meth:`fit`."""
-        return self.assess_all(t, pose[None], mesh, None if twist is None else twist[None])[0]
+        return self.assess_all(t, pose[None], None if twist is None else twist[None])[0]
 
     def assess_all(
-        self,
-        t: int,
-        poses: np.ndarray,
-        mesh: ObjectMesh | None = None,
-        twists: np.ndarray | None = None,
+        self, t: int, poses: np.ndarray, twists: np.ndarray | None = None
     ) -> list[FittedPose]:
         """Compare many poses (N, 4, 4), moving by ``twists`` (N, 6), with frame t at once."""
-        return assess_all(self._context_of(mesh), self.views(t), poses, twists)
+        return assess_all(self.context, self.views(t), poses, twists)
 
-    def _context_of(self, mesh: ObjectMesh | None) -> FitContext:
-        return self.context if mesh is None else replace(self.context, mesh=mesh)
+    def with_mesh(self, mesh: ObjectMesh) -> Observer:
+        """Return the same recording with another mesh that is fitted and compared."""
+        other = copy(self)
+        other.mesh, other.context = mesh, replace(self.context, mesh=mesh)
+        return other

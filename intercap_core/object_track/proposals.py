@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection
 from dataclasses import replace
 
 import numpy as np
@@ -182,7 +181,8 @@ class Proposals:
         for t in frames:
             if t not in self._searched | self._searched_near_annotated:
                 self._searched_near_annotated.add(t)
-                poses = [known[u] for u in _neighbours(t, known)]
+                before, after = [u for u in known if u < t], [u for u in known if u > t]
+                poses = [known[u] for u in (*before[-1:], *after[:1])]
                 places = np.array([self._observer.mesh.centre_at(pose) for pose in poses])
                 new |= self._follow(t, self._observer.search(t, places=places if poses else None))
         return new
@@ -312,9 +312,3 @@ class Proposals:
                 self._hypotheses.follow(t, fit)
                 new = True
         return new
-
-
-def _neighbours(t: int, known: Collection[int]) -> list[int]:
-    """Return the nearest ``known`` frames before and after frame t."""
-    before, after = [u for u in known if u < t], [u for u in known if u > t]
-    return [*([max(before)] if before else []), *([min(after)] if after else [])]

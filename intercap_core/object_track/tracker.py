@@ -140,8 +140,8 @@ class Tracker:
     def _start(self, annotated: list[int]) -> int:
         """Return the frame to start from.
 
-        The first of the ``annotated`` frames that shows the object, else one that is found by a
-        search, else the first annotated one. Raises NotFound if there is none.
+        The first of the ``annotated`` frames that shows the object, else the result of a search,
+        else the first annotated frame. Raises NotFound if there is none.
         """
         for t in annotated:
             if any(fit.log_ratio > SEEN_LOG_RATIO for fit in self._hypotheses.fits[t]):
@@ -154,7 +154,7 @@ class Tracker:
             return annotated[0]
 
     def _search(self, decoded: Decoded) -> Decoded:
-        """Search uncertain frames and decide again until nothing new is found."""
+        """Search uncertain frames and decide again until no hypothesis is new."""
         for _ in range(15):
             if not self._proposals.search_uncertain(decoded):
                 break

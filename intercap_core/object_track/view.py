@@ -8,7 +8,6 @@ from functools import cached_property
 
 import numpy as np
 
-from intercap_core.config import ObjectTrackSettings
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.rigid.mesh import ObjectMesh
@@ -211,18 +210,18 @@ class View:
         """
         depth = None if depth_mm is None else geometry.reduced_depth(depth_mm)
         colour, step = geometry.camera.colour, geometry.step
-        found = tuple(
+        whole = tuple(
             MaskCandidate(index, label, score, decode(rle, colour, step))
             for index, label, score, rle in candidates
         )
         person = decode(person_rle, colour, step) if person_rle else EMPTY
         parts = tuple(
             replace(candidate, mask=part)
-            for candidate in found
+            for candidate in whole
             if (part := remove_person(candidate.mask, person, step)) is not None
         )
         room = np.zeros((0, 0), np.float32) if background is None else background
-        return cls(geometry, depth, person, found + parts, detected, room)
+        return cls(geometry, depth, person, whole + parts, detected, room)
 
 
 @dataclass(frozen=True)
@@ -239,14 +238,3 @@ class FitContext:
     """Whether fits penalise render over known background (beyond the paper)."""
     renderer: Renderer = field(default_factory=default_renderer)
     """Draws the mesh, and runs the views in parallel."""
-
-    @classmethod
-    def from_settings(
-        cls,
-        mesh: ObjectMesh,
-        labels: tuple[str, ...],
-        settings: ObjectTrackSettings,
-        renderer: Renderer,
-    ) -> FitContext:
-        """Take overlap and background term from the settings of stage ``object_track``."""
-        return cls(mesh, labels, settings.min_overlap, settings.background_term, renderer)

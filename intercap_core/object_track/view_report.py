@@ -13,7 +13,7 @@ import numpy as np
 from intercap_core.geometry.rigid.shots import Rendering
 from intercap_core.object_track import object_depth
 from intercap_core.object_track.likelihood import log_ratio
-from intercap_core.object_track.reduced_mask import ReducedMask
+from intercap_core.object_track.reduced_mask import EMPTY, ReducedMask
 from intercap_core.object_track.view import FitContext, MaskCandidate, View
 
 # Tuned on the studio.
@@ -48,10 +48,7 @@ def mask_overlap(image: Rendering, mask: ReducedMask, person: ReducedMask) -> fl
     """Return the IoU of a mask and the part of a render that no person outside the mask hides."""
     if not image.meets(mask.x0, mask.y0, *mask.mask.shape):
         return 0.0
-    visible, common = _compare(
-        image.face, image.x0, image.y0, person.mask, person.x0, person.y0, mask.mask, mask.x0,
-        mask.y0,
-    )  # fmt: skip
+    visible, common = _compare(*_window(image), *_window(person), *_window(mask))
     return common / max(1, visible + mask.area - common)
 
 
@@ -59,8 +56,13 @@ def visible_pixels(image: Rendering, person: ReducedMask) -> int:
     """Count the pixels of a render that no person hides."""
     if not image.meets(person.x0, person.y0, *person.mask.shape):
         return image.area
-    hidden = _covered(image.face, image.x0, image.y0, person.mask, person.x0, person.y0)
-    return image.area - hidden
+    return int(_compare(*_window(image), *_window(person), *_window(EMPTY))[0])
+
+
+def _window(image: Rendering | ReducedMask) -> tuple[np.ndarray, int, int]:
+    """Return the faces or the mask in the window, and its first pixel."""
+    pixels = image.face if isinstance(image, Rendering) else image.mask
+    return pixels, image.x0, image.y0
 
 
 @numba.njit(cache=True, nogil=True)
@@ -83,17 +85,6 @@ def _compare(face, x0, y0, person, px, py, mask, mx, my):
             ):
                 visible += 1
     return visible, common
-
-
-@numba.njit(cache=True, nogil=True)
-def _covered(face, x0, y0, mask, mx, my):
-    """Count the rendered pixels in the mask."""
-    count = 0
-    for y in range(max(y0, my), min(y0 + face.shape[0], my + mask.shape[0])):
-        for x in range(max(x0, mx), min(x0 + face.shape[1], mx + mask.shape[1])):
-            if face[y - y0, x - x0] >= 0 and mask[y - my, x - mx]:
-                count += 1
-    return count
 
 
 @dataclass(frozen=True)

@@ -182,7 +182,7 @@ class WholeTrack:
 
         Returns:
             The frames with refined pose, covariance and status. Ambiguous are also carried frames
-            without an annotated pose, and frames beside them in which one view alone shows the
+            without an annotated pose, and frames next to them in which only one view shows the
             object.
         """
         fits = [frame.fit for frame in frames]

@@ -8,13 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.object_track.bridges import (
-    Bridge,
-    FilledTrack,
-    Gap,
-    fill_lost,
-    interpolate_poses,
-)
+from intercap_core.object_track.bridges import Bridge, FilledTrack, Gap, fill_lost
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.whole import FrameResult, FrameStatus, WholeTrack
 from tests.helpers.object_capture import ObjectCapture
@@ -79,14 +73,14 @@ def test_frames_without_the_hand_are_on_the_straight_path(suitcase, arc):
     assert len(bridges_of(suitcase, arc, joints)) == 1
 
 
-def test_interpolation_is_shortest_and_constant_at_the_ends():
-    poses = np.tile(np.eye(4), (6, 1, 1))
-    poses[:, :3, 3] = [[9, 9, 9], [0.0, 0, 0], [9, 9, 9], [9, 9, 9], [0.3, 0, 0], [9, 9, 9]]
-    poses[4, :3, :3] = Rotation.from_euler("z", 90, degrees=True).as_matrix()
-    found = interpolate_poses(poses, np.array([False, True, False, False, True, False]))
-    np.testing.assert_allclose(found[:, 0, 3], [0, 0, 0.1, 0.2, 0.3, 0.3])
-    angle = Rotation.from_matrix(found[:, :3, :3]).magnitude()
-    np.testing.assert_allclose(np.degrees(angle), [0, 0, 30, 60, 90, 90])
+def test_a_straight_path_is_the_shortest_turn_and_line(suitcase):
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[3, :3, 3] = [0.3, 0, 0]
+    poses[3, :3, :3] = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    (path,) = Gap(suitcase, poses, np.arange(4.0), None, 0, 3).bridges()
+    np.testing.assert_allclose(path.poses[:, 0, 3], [0.1, 0.2])
+    angle = Rotation.from_matrix(path.poses[:, :3, :3]).magnitude()
+    np.testing.assert_allclose(np.degrees(angle), [30, 60])
 
 
 def filled_of(

@@ -58,32 +58,30 @@ def test_it_equals_the_sum_over_all_sequences(modes: int) -> None:
     found = decode(emissions, steps, 0.3)
     states = [[*product(range(n), range(modes)), ("hidden", 0), ("gone", 0)] for n in counts]
 
-    def emission(t: int, what: int | str) -> float:
-        return (
-            {"hidden": 0.0, "gone": 0.3}.get(what) if isinstance(what, str) else emissions[t][what]
-        )
+    def emission(t: int, k: int | str) -> float:
+        return emissions[t][k] if isinstance(k, int) else {"hidden": 0.0, "gone": 0.3}[k]
 
-    def step_of(t: int, one: tuple, two: tuple) -> float:
-        if one[0] == two[0] == "gone":
+    def step_of(t: int, before: tuple, after: tuple) -> float:
+        if before[0] == after[0] == "gone":
             return 0.0
-        at = [-1 if isinstance(what, str) else what for what, _ in (one, two)]
-        between = (one[1], two[1]) if min(at) >= 0 else (0, 0)
-        log = steps[t][(*between, *at)] - LEAVE_COST * ("gone" in (one[0], two[0]))
+        at = [k if isinstance(k, int) else -1 for k, _ in (before, after)]
+        between = (before[1], after[1]) if min(at) >= 0 else (0, 0)
+        log = steps[t][(*between, *at)] - LEAVE_COST * ("gone" in (before[0], after[0]))
         return log - np.log(modes) * (at[1] >= 0 > at[0])
 
     likely = {}
     for sequence in product(*states):
-        log = sum(emission(t, what) for t, (what, _) in enumerate(sequence))
+        log = sum(emission(t, k) for t, (k, _) in enumerate(sequence))
         log -= LEAVE_COST * sum(sequence[t][0] == "gone" for t in (0, -1))
         log -= np.log(modes) * (not isinstance(sequence[0][0], str))
         log += sum(step_of(t, *pair) for t, pair in enumerate(pairwise(sequence)))
         likely[sequence] = log
     total = np.logaddexp.reduce(list(likely.values()))
     assert found.evidence == pytest.approx(total)
-    best = max(likely, key=lambda one: likely[one])
-    assert found.path.tolist() == [HIDDEN if isinstance(what, str) else what for what, _ in best]
+    best = max(likely, key=likely.__getitem__)
+    assert found.path.tolist() == [k if isinstance(k, int) else HIDDEN for k, _ in best]
     for t, n in enumerate(counts):
-        share = {what: 0.0 for what in (*range(n), "hidden", "gone")}
+        share = {k: 0.0 for k in (*range(n), "hidden", "gone")}
         for sequence, log in likely.items():
             share[sequence[t][0]] += np.exp(log - total)
         expected = [*(share[k] for k in range(n)), share["hidden"] + share["gone"]]
@@ -124,6 +122,7 @@ def test_each_mode_of_motion_has_its_cost(cup: ObjectMesh) -> None:
     assert rest[2] < -1000
     assert free[0] == pytest.approx(stays - FREE_COST_S / 15)
     assert free[2] == pytest.approx(stays - JUMP_COST - FREE_COST_S / 15)  # any, at some cost
+    assert mode_log_ratios(cup, here, there, 1 / 15, [], 0.0)[1, 0, 2] == pytest.approx(-JUMP_COST)
     assert (right == -np.inf).all() and (left == -np.inf).all()
     assert every[0, 1, 0, 0] == pytest.approx(free[0] + np.log(change))
     hand = HandMotion(np.eye(3), np.array([0.1, 0, 0]), np.array([1.1, 0, 0]))
@@ -135,18 +134,14 @@ def test_each_mode_of_motion_has_its_cost(cup: ObjectMesh) -> None:
     assert (step_costs(cup, here, there, 1 / 15, [None, away])[:, 3, :-1, :-1] == -np.inf).all()
 
 
-@pytest.mark.parametrize("hands", [1, 2])
-@pytest.mark.parametrize("fps", [5, 15, 30])
-def test_more_modes_do_not_raise_the_evidence(cup: ObjectMesh, hands: int, fps: int) -> None:
-    """An object at rest beside hands that do not move may be held as well."""
+@pytest.mark.parametrize("fps", [5, 30])
+def test_more_modes_do_not_raise_the_evidence(cup: ObjectMesh, fps: int) -> None:
+    """An object at rest near hands that do not move may be held as well."""
     still = HandMotion(np.eye(3), np.array([0.1, 0, 0]), np.array([0.1, 0, 0]))
     here, count = poses_of([0.0]), 3 * fps
-
-    def evidence(beside: int) -> float:
-        step = step_costs(cup, here, here, 1 / fps, [still] * beside)
-        return decode([np.zeros(1)] * (count + 1), [step] * count).evidence
-
-    assert evidence(hands) == pytest.approx(evidence(0), abs=0.1)
+    steps = [step_costs(cup, here, here, 1 / fps, [still] * hands) for hands in range(3)]
+    none, *some = (decode([np.zeros(1)] * (count + 1), [s] * count).evidence for s in steps)
+    assert some == pytest.approx([none] * 2, abs=0.1)
 
 
 @pytest.mark.parametrize("fps", [1, 5, 30])
@@ -212,32 +207,22 @@ def test_a_held_object_turns_about_the_wrist(cup: ObjectMesh) -> None:
 def test_it_is_hidden_for_a_second_and_gone_after_five(cup: ObjectMesh) -> None:
     here = poses_of([0.0])
 
-    def after(seconds: float) -> tuple[list[int], float]:
+    def gone_after(seconds: float) -> float:
         unseen = round(15 * seconds)
         poses = [here] * 9 + [here[:0]] * unseen + [here] * 9
         emissions = [np.full(len(own), 4.0) for own in poses]
         steps = [step_costs(cup, a, b, 1 / 15, NO_HAND) for a, b in pairwise(poses)]
         found = decode(emissions, steps, ABSENT_LOG_RATIO * 1 / 15 / ERROR_LASTING_S)
         assert (found.path[9:-9] == HIDDEN).all() and (found.path[:9] == 0).all()
-        return found.path.tolist(), float(found.gone[9 + unseen // 2])
+        return float(found.gone[9 + unseen // 2])
 
-    assert after(1.0)[1] < 0.2
-    assert after(5.0)[1] > 0.9
+    assert gone_after(1.0) < 0.2 and gone_after(5.0) > 0.9
 
 
 def test_turns_of_a_symmetry_are_no_motion() -> None:
     bottle = ObjectMesh.load(catalogue()["bottle"])
     spun = step_costs(bottle, poses_of([0.0]), poses_of([0.0], 120), 1 / 15, NO_HAND)
     assert spun[0, 0, 0, 0] == pytest.approx(-np.log(2 - np.exp(-MODE_CHANGES_S / 15)))
-
-
-def test_equal_evidence_gives_equal_probabilities(cup: ObjectMesh) -> None:
-    """A handle left or right: both hypotheses stay equally probable."""
-    both = np.concatenate([poses_of([0.0], 60), poses_of([0.0], -60)])
-    steps = [step_costs(cup, both, both, 1 / 15, NO_HAND)] * 7
-    found = decode([np.array([6.0, 6.0])] * 8, steps)
-    for own in found.probability:
-        assert own[:2] == pytest.approx([0.5, 0.5], abs=1e-2)
 
 
 def test_excursions_between_sure_frames_cost_twice() -> None:
@@ -258,11 +243,3 @@ def test_excursions_between_sure_frames_cost_twice() -> None:
     ]
     far = [*centres[:4], clutter]  # sure frames that contradict each other say nothing
     assert not any(own.any() for own in find_excursions(far, np.zeros(5, int), sure, times))
-
-
-def test_the_cost_of_free_motion_is_an_argument(cup):
-    here, there = np.eye(4)[None], np.eye(4)[None].copy()
-    there[0, 0, 3] = 0.1
-    usual = mode_log_ratios(cup, here, there, 1 / 15, [])
-    free = mode_log_ratios(cup, here, there, 1 / 15, [], 0.0)
-    assert free[0] == usual[0] and free[1] - usual[1] == pytest.approx(FREE_COST_S / 15)

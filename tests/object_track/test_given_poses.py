@@ -205,33 +205,19 @@ def test_one_annotated_pose_is_carried_both_ways(suitcase, swinging, hidden):
 
 
 def test_it_is_carried_for_a_while_after_the_last_seen_frame(suitcase):
-    capture = Still.make(suitcase, 10, cameras=3)
-    given = annotate(6, disturb(capture.poses[6], 1))
-    found = track_of(capture, given, images=images_of(capture, range(3, 10)))
-    assert {5, 6, 7} <= set(frames_with(found, "carried"))
-    assert errors_of(suitcase, found, capture.poses)[0][5:8].max() < 0.03
-
-
-def test_images_are_believed_more_than_a_contradicted_pose(suitcase, capture, images):
-    wrong = capture.poses[1].copy()
-    wrong[:3, 3] += capture.master_from_room[:3, :3] @ (0.1, -0.9, 0.3)
-    found = track_of(capture, annotate(1, wrong), images=images)
-    assert errors_of(suitcase, found, capture.poses)[0].max() < 0.005
-    (doubt,) = (text for text in found.doubts if "frame 1 " in text)
-    assert "annotated pose" in doubt and "correct it" in doubt
-    assert found.annotated and not found.agrees
+    capture = Still.make(suitcase, 8, cameras=3)
+    given = annotate(5, disturb(capture.poses[5], 1))
+    found = track_of(capture, given, images=images_of(capture, range(2, 8)))
+    assert {4, 5, 6} <= set(frames_with(found, "carried"))
+    assert errors_of(suitcase, found, capture.poses)[0][4:7].max() < 0.03
 
 
 def test_annotated_poses_of_seen_frames_change_nothing(capture, images):
-    alone = track_of(capture, images=images)
     given = [annotate(t, disturb(capture.poses[t], t)) for t in (1, 3)]
-    found = track_of(capture, *given, images=images)
+    alone, found = track_of(capture, images=images), track_of(capture, *given, images=images)
     assert not frames_with(found, "carried") and not found.doubts and found.seed_frame == 1
-    apart = [
-        np.linalg.norm(a.fit.pose[:3, 3] - b.fit.pose[:3, 3])
-        for a, b in zip(alone.frames, found.frames, strict=True)
-    ]
-    assert max(apart) < 0.001
+    poses = np.array([frame.fit.pose for frame in alone.frames])
+    assert errors_of(capture.mesh, found, poses)[0].max() < 0.001
 
 
 def test_a_pose_of_another_frame_is_found_in_its_own(suitcase):

@@ -82,7 +82,9 @@ class ObjectImages:
             self._threads = threads
         self.mesh, self.cameras = mesh.simplified(TRACKING_FACES), recording.cameras
         renderer = open_renderer(settings.render_on, threads=1)
-        self._context = FitContext.from_settings(self.mesh, labels, settings, renderer)
+        self._context = FitContext(
+            self.mesh, labels, settings.min_overlap, settings.background_term, renderer
+        )
         self.count = recording.count
 
     def take_cameras(self, cameras: Cameras) -> None:
