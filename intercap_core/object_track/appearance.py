@@ -18,6 +18,7 @@ import numba
 import numpy as np
 
 from intercap_core.geometry.rigid.mesh import Paint
+from intercap_core.object_track.reduced_mask import covers
 
 COLOUR_SAMPLES = 2.0  # independent samples of a view's colours at most; tuned on the studio
 # Standard deviations of measured colours at least, in logarithms of light: shadows and lamps change
@@ -323,11 +324,8 @@ def seen_patches(
                 continue
             inside = True
             for a, b in ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)):
-                j, i = v + a + y0 - my, u + b + x0 - mx
-                if face[v + a, u + b] < 0 or not (
-                    0 <= j < mask.shape[0] and 0 <= i < mask.shape[1] and mask[j, i]
-                ):
-                    inside = False
+                i, j = u + b + x0 - mx, v + a + y0 - my
+                inside &= face[v + a, u + b] >= 0 and covers(mask, i, j)
             if not inside:
                 continue
             z = depth[v, u]

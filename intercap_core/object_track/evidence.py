@@ -65,7 +65,7 @@ def evidence_at(
     def terms(fit: ViewFit) -> tuple[NormalEquations, NormalEquations, ViewReport]:
         fit.choose()
         depth = fit.depth_terms(DEPTH_SCALES_M[1])
-        contour = fit.contour_terms(CONTOUR_SCALES_PX[1], context.background_term)
+        contour = fit.contour_terms(CONTOUR_SCALES_PX[1], context.background_term)[:2]
         return depth, contour, fit.report(REPORT_CONTOUR_PX)
 
     by_view = context.renderer.pool.map(terms, fits)

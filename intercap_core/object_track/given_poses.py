@@ -16,7 +16,7 @@ from intercap_core.geometry.camera.transforms import step_between
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.decoder import pose_distances
 from intercap_core.object_track.evidence import TURN_SCALE, FrameEvidence, steps_about_point
-from intercap_core.object_track.fit import FittedPose, MotionPrior
+from intercap_core.object_track.fit import FittedPose
 from intercap_core.object_track.likelihood import SEEN_LOG_RATIO
 from intercap_core.object_track.motion import GROWTH_LOST_M_S, GROWTH_LOST_RAD_S
 from intercap_core.object_track.turns import SAME_POSE_DEG, SAME_POSE_M
@@ -36,11 +36,6 @@ class GivenPose:
     """Standard deviation of the centre along each axis, metres."""
     sigma_rad: float
     """Standard deviation of the turn about each axis, radians."""
-
-    @property
-    def prior(self) -> MotionPrior:
-        """The pose as the prior of a fit."""
-        return MotionPrior(self.pose, self.sigma_m, self.sigma_rad)
 
     def squared_distances(self, mesh: ObjectMesh, poses: np.ndarray) -> np.ndarray:
         """Return squared distances (K,) of poses (K, 4, 4), in standard deviations."""

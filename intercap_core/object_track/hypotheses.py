@@ -215,15 +215,11 @@ class Hypotheses:
                 if again.log_ratio > fit.log_ratio:
                     self.fits[t][k] = again
                     changed.add(t)
-            if t in changed:
-                self._merge_equal(t)
+            if t in changed:  # of hypotheses that have become one pose, the likeliest stays
+                fits = sorted(self.fits[t], key=lambda fit: -fit.log_ratio)
+                distinct = distinct_poses(self._observer.mesh, [fit.pose for fit in fits])
+                self.fits[t] = [fits[k] for k in distinct]
         return changed
-
-    def _merge_equal(self, t: int) -> None:
-        """Keep the likeliest of several hypotheses of frame t that have become one pose."""
-        fits = sorted(self.fits[t], key=lambda fit: -fit.log_ratio)
-        distinct = distinct_poses(self._observer.mesh, [fit.pose for fit in fits])
-        self.fits[t] = [fits[k] for k in distinct]
 
     def _follow(self, last: int, pose: np.ndarray, frames: Iterable[int]) -> None:
         before = now = pose

@@ -23,7 +23,7 @@ from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.shots import Rendering
 from intercap_core.object_track.object_depth import rotated_normal
 from intercap_core.object_track.object_silhouette import nearest, rim_pixels, transform_point
-from intercap_core.object_track.reduced_mask import EMPTY
+from intercap_core.object_track.reduced_mask import EMPTY, covers
 from intercap_core.object_track.view import FitContext, MaskCandidate, View
 
 # Thresholds of log-likelihood ratios of all views of a frame, nats.
@@ -171,12 +171,9 @@ def depth_log_ratio(
             cx, cy, cz = transform_point(colour_from_depth, rx * z, ry * z, z)
             column, row = project_point(cx, cy, cz, colour)
             x, y = int(np.rint(column)), int(np.rint(row))
-            i, j = x - mx, y - my
-            own = 0 <= i < mask.shape[1] and 0 <= j < mask.shape[0] and mask[j, i]
-            i, j = x - px, y - py
-            if own:
+            if covers(mask, x - mx, y - my):
                 total += max(shown, log_hidden)
-            elif not (0 <= i < person.shape[1] and 0 <= j < person.shape[0] and person[j, i]):
+            elif not covers(person, x - px, y - py):
                 known = background[y0 + v, x0 + u] if background.size else np.float32(0.0)
                 if shown < 0 or known <= 0 or abs(known - z) > background_m:
                     total += max(shown, log_hidden)
@@ -212,13 +209,8 @@ def outline_cost(face, x0, y0, mask, mx, my, person, px, py, width, height, sigm
             u, v = x - margin, y - margin
             if 0 <= u < w and 0 <= v < h:
                 drawn[y, x] = face[v, u] >= 0
-            i, j = x + left - mx, y + top - my
-            if 0 <= i < mask.shape[1] and 0 <= j < mask.shape[0] and mask[j, i]:
-                inside[y, x] = True
-            else:
-                i, j = x + left - px, y + top - py
-                if 0 <= i < person.shape[1] and 0 <= j < person.shape[0]:
-                    other[y, x] = person[j, i]
+            inside[y, x] = covers(mask, x + left - mx, y + top - my)
+            other[y, x] = not inside[y, x] and covers(person, x + left - px, y + top - py)
     edge, edge_starts = rim_pixels(drawn)
     border, border_starts = rim_pixels(inside)
     limit = sigma * np.sqrt(2 * most)

@@ -80,14 +80,7 @@ def normal_equations(
             row[3], row[4], row[5] = -nx, -ny, -nz
             robust = scale * scale / (scale * scale + residual * residual)
             weight = trust[y, x] * robust * robust
-            for i in range(6):
-                weighted = weight * row[i]
-                gradient[i] += weighted * residual
-                for j in range(i, 6):
-                    hessian[i, j] += weighted * row[j]
-    for i in range(6):
-        for j in range(i):
-            hessian[i, j] = hessian[j, i]
+            add_row(hessian, gradient, row, residual, weight)
     return hessian, gradient, count
 
 
@@ -157,6 +150,17 @@ def agreement(rendered, face, x0, y0, measured, rays, face_normals, rotation, fr
                 r = gap * (nx * rays[y0 + v, x0 + u, 0] + ny * rays[y0 + v, x0 + u, 1] + nz)
                 total += scale * scale / (scale * scale + r * r)
     return compared, free, total
+
+
+@numba.njit(cache=True, nogil=True)
+def add_row(hessian, gradient, row, residual, weight):
+    """Add a weighted row (6,) of the Jacobian to J'WJ (6, 6) and J'Wr (6,)."""
+    for i in range(6):
+        weighted = weight * row[i]
+        gradient[i] += weighted * residual
+        for j in range(i, 6):
+            hessian[i, j] += weighted * row[j]
+            hessian[j, i] = hessian[i, j]
 
 
 @numba.njit(cache=True, nogil=True)

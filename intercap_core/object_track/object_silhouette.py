@@ -22,6 +22,7 @@ from intercap_core.geometry.camera.projection_kernels import (
     project_point,
     project_point_with_jacobian,
 )
+from intercap_core.object_track.object_depth import add_row
 
 
 def rim_mask(mask: np.ndarray) -> np.ndarray:
@@ -155,9 +156,7 @@ def correspondences(
         if not drawn[y, x]:
             index = nearest(edge, starts, x, y, limit)
             if index >= 0:
-                for axis in range(2):
-                    at[count, axis] = edge[index, axis] + window[axis]
-                    target[count, axis] = contour[i, axis] + window[axis]
+                at[count], target[count] = edge[index], contour[i]
                 count += 1
     missed = count
     if background:
@@ -166,10 +165,12 @@ def correspondences(
             if not inside[y, x] and not person[y, x]:
                 index = nearest(mask_rim, mask_starts, x, y, limit)
                 if index >= 0:
-                    for axis in range(2):
-                        at[count, axis] = edge[i, axis] + window[axis]
-                        target[count, axis] = mask_rim[index, axis] + window[axis]
+                    at[count], target[count] = edge[i], mask_rim[index]
                     count += 1
+    for i in range(count):
+        for axis in range(2):
+            at[i, axis] += window[axis]
+            target[i, axis] += window[axis]
     return at[:count], target[:count], missed, edge.shape[0]
 
 
@@ -237,14 +238,7 @@ def normal_equations(
         row[3], row[4], row[5] = ax, ay, az
         robust = scale * scale / (scale * scale + residual * residual)
         weight = robust * robust
-        for j in range(6):
-            weighted = weight * row[j]
-            gradient[j] += weighted * residual
-            for k in range(j, 6):
-                hessian[j, k] += weighted * row[k]
-    for j in range(6):
-        for k in range(j):
-            hessian[j, k] = hessian[k, j]
+        add_row(hessian, gradient, row, residual, weight)
     return hessian, gradient, residuals
 
 

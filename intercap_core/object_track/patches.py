@@ -13,7 +13,7 @@ import numpy as np
 from intercap_core.geometry.camera.projection_kernels import project_point
 from intercap_core.geometry.rigid.shots import Rendering
 from intercap_core.object_track.object_silhouette import rim_pixels, transform_point
-from intercap_core.object_track.reduced_mask import ReducedMask
+from intercap_core.object_track.reduced_mask import ReducedMask, covers
 from intercap_core.object_track.view import View
 
 # Metres that the pose may move before measured points leave the patch: more than the first robust
@@ -170,13 +170,9 @@ def _lift(
             cx, cy, cz = transform_point(colour_from_depth, x, y, z)
             column, row = project_point(cx, cy, cz, colour)
             i, j = int(np.rint(column)), int(np.rint(row))
-            if 0 <= i - mx < mask.shape[1] and 0 <= j - my < mask.shape[0] and mask[j - my, i - mx]:
+            if covers(mask, i - mx, j - my):
                 trust[v, u] = 1.0
-            elif (
-                0 <= i - px < person.shape[1]
-                and 0 <= j - py < person.shape[0]
-                and person[j - py, i - px]
-            ):
+            elif covers(person, i - px, j - py):
                 trust[v, u] = 0.0
                 on_person[v, u] = True
     return depth, points, trust, on_person

@@ -85,7 +85,8 @@ class Proposals:
         wide = self._observer.fit(t, pose, MotionPrior(pose), FIT_ROUNDS, 1.0)
         fits = [wide] if wide.log_ratio > SEEN_LOG_RATIO else []
         if not fits or not given.holds(self._observer.mesh, wide.pose):
-            own = self._observer.fit(t, pose, given.prior, FIT_ROUNDS)
+            prior = MotionPrior(pose, given.sigma_m, given.sigma_rad)
+            own = self._observer.fit(t, pose, prior, FIT_ROUNDS)
             if own.log_ratio > DENIED_LOG_RATIO:
                 fits.append(own)
         if not fits:

@@ -56,6 +56,12 @@ class ReducedMask:
         return int(np.count_nonzero(self.mask))
 
 
+@numba.njit(cache=True, nogil=True)
+def covers(mask, x, y):
+    """Return whether pixel (x, y) of a mask (h, w) is set; False outside of the window."""
+    return 0 <= x < mask.shape[1] and 0 <= y < mask.shape[0] and mask[y, x]
+
+
 EMPTY = ReducedMask(0, 0, np.zeros((0, 0), bool))
 
 

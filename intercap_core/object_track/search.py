@@ -117,16 +117,11 @@ def rank_frames(labels_by_view: list[list[list[str]]], labels: tuple[str, ...]) 
         labels: detector classes of the object.
     """
     count = len(labels_by_view)
-    support = np.array(
-        [
-            sum(
-                any((label in labels) if labels else (label != PERSON_LABEL) for label in view)
-                for view in frame
-            )
-            for frame in labels_by_view
-        ],
-        float,
-    )
+
+    def is_likely(label: str) -> bool:
+        return label in labels if labels else label != PERSON_LABEL
+
+    support = np.array([sum(any(map(is_likely, v)) for v in frame) for frame in labels_by_view])
     order: list[int] = []
     distance = np.full(count, float(count))
     rest = np.ones(count, bool)

@@ -113,13 +113,8 @@ class ViewFit:
     ) -> NormalEquations:
         """Return both terms of equation 1, weighted; ``contour_scale_px`` is at full resolution."""
         h_depth, g_depth = self.depth_terms(depth_scale_m)
-        h_contour, g_contour = self.contour_terms(contour_scale_px, background)
+        h_contour, g_contour, _ = self.contour_terms(contour_scale_px, background)
         return h_depth + h_contour, g_depth + g_contour
-
-    def contour_terms(self, scale_px: float, background: bool) -> NormalEquations:
-        """Return the weighted silhouette term; ``scale_px`` is at full resolution."""
-        hessian, gradient, _ = self._contour_terms(scale_px, background)
-        return hessian, gradient
 
     def depth_terms(self, scale_m: float) -> NormalEquations:
         """Return the weighted depth term."""
@@ -138,10 +133,13 @@ class ViewFit:
         weight = samples / count / DEPTH_SIGMA_M**2
         return weight * hessian, weight * gradient
 
-    def _contour_terms(
+    def contour_terms(
         self, scale_px: float, background: bool
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the silhouette term and its residuals (N,) in pixels of the reduced image."""
+        """Return the weighted silhouette term and its residuals (N,), reduced pixels.
+
+        ``scale_px`` is at full resolution.
+        """
         nothing = np.zeros((6, 6)), np.zeros(6), np.zeros(0)
         patch, drawn, geometry = self._contour_patch, self._silhouette, self._view.geometry
         # outside of the window only depth is used, until the window is cut again
@@ -179,7 +177,7 @@ class ViewFit:
         overlap = contour = float("nan")
         if self._candidate is not None:
             overlap = mask_overlap(image, self._candidate.mask, view.person)
-            _, _, residuals = self._contour_terms(contour_scale_px, True)
+            _, _, residuals = self.contour_terms(contour_scale_px, True)
             contour = float(np.median(residuals)) * view.geometry.step if len(residuals) else 0.0
         visible = visible_pixels(image, view.person)
         depth_residual = agreement = float("nan")

@@ -13,7 +13,7 @@ import numpy as np
 from intercap_core.geometry.rigid.shots import Rendering
 from intercap_core.object_track import object_depth
 from intercap_core.object_track.likelihood import log_ratio
-from intercap_core.object_track.reduced_mask import EMPTY, ReducedMask
+from intercap_core.object_track.reduced_mask import EMPTY, ReducedMask, covers
 from intercap_core.object_track.view import FitContext, MaskCandidate, View
 
 # Tuned on the studio.
@@ -75,14 +75,10 @@ def _compare(face, x0, y0, person, px, py, mask, mx, my):
             if face[v, u] < 0:
                 continue
             x = u + x0
-            if 0 <= own < mask.shape[0] and 0 <= x - mx < mask.shape[1] and mask[own, x - mx]:
+            if covers(mask, x - mx, own):
                 visible += 1
                 common += 1
-            elif not (
-                0 <= other < person.shape[0]
-                and 0 <= x - px < person.shape[1]
-                and person[other, x - px]
-            ):
+            elif not covers(person, x - px, other):
                 visible += 1
     return visible, common
 
