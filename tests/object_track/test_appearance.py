@@ -20,7 +20,7 @@ from intercap_core.object_track.view import View
 from tests.helpers.object_capture import ObjectCapture
 from tests.object_track.scenes import images_of, mesh_of, observer_of
 
-FRAMES, OPEN = 10, 5
+FRAMES, OPEN = 8, 5
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # a near symmetry of a toolbox
 GAINS = np.array([[1.0, 1.0, 1.0], [0.8, 0.9, 0.95], [1.1, 1.0, 0.9], [0.9, 1.05, 1.0]])
 Paints = Callable[[np.ndarray], np.ndarray]
