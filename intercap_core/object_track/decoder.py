@@ -44,7 +44,7 @@ HIDDEN = -1  # in paths: no hypothesis is true
 _CERTAIN = 1e4  # nats, far more than the evidence of all frames
 
 
-def step_costs(
+def step_log_ratios(
     mesh: ObjectMesh,
     before: np.ndarray,
     after: np.ndarray,
@@ -95,12 +95,12 @@ def mode_log_ratios(
     rad_s, m_s = 7.0, 2.5  # free motion: a swing, a kick
     moved = (turn / (rad_s * seconds)) ** 2 + (shift / (m_s * seconds)) ** 2
     # free motion costs for 0.1 s at most: the object may have rested meanwhile
-    ways = [
+    ratios = [
         -0.5 * ((turn / STANDING_RAD) ** 2 + (shift / STANDING_M) ** 2),
         -np.minimum(0.5 * moved, JUMP_COST) - free_cost_s * min(seconds, 0.1),
         *(_hand_log_ratios(mesh, before, after, seconds, hand) for hand in hands),
     ]
-    return np.array(ways)
+    return np.array(ratios)
 
 
 def _hand_log_ratios(
@@ -208,81 +208,81 @@ def decode(
 
     Args:
         emissions: [T] (K_t,) log-likelihoods of the hypotheses, relative to that none is true.
-        steps: [T - 1] (M, M, K_t + 1, K_t+1 + 1) of :func:`step_costs`. Hidden states have no mode;
-            the entries of the first mode count for them.
+        steps: [T - 1] (M, M, K_t + 1, K_t+1 + 1) of :func:`step_log_ratios`. Hidden states have no
+            mode; the entries of the first mode count for them.
         absent: nats per frame by which having left is likelier than being hidden. An object in the
             room is seldom hidden from all cameras for long.
     """
     modes = len(steps[0]) if steps else 1
-    values = [np.append(np.repeat(own, modes), [0.0, absent]) for own in emissions]
-    values[0][:-2] -= np.log(modes)
+    states = [np.append(np.repeat(own, modes), [0.0, absent]) for own in emissions]
+    states[0][:-2] -= np.log(modes)
     for end in (0, -1):
-        values[end][-1] -= LEAVE_COST
-    ways = [_state_steps(step) for step in steps]
-    path = np.array(_viterbi(values, ways)) // modes
+        states[end][-1] -= LEAVE_COST
+    transitions = [_transitions(step) for step in steps]
+    path = np.array(_viterbi(states, transitions)) // modes
     path[path >= [len(own) for own in emissions]] = HIDDEN
-    shares, evidence = _forward_backward(values, ways)
+    posterior, evidence = _forward_backward(states, transitions)
     return Decoded(
         path,
-        [np.append(own[:-2].reshape(-1, modes).sum(1), own[-2] + own[-1]) for own in shares],
-        np.array([own[-1] for own in shares]),
+        [np.append(own[:-2].reshape(-1, modes).sum(1), own[-2] + own[-1]) for own in posterior],
+        np.array([own[-1] for own in posterior]),
         evidence,
     )
 
 
-def _state_steps(step: np.ndarray) -> np.ndarray:
-    """Return log-probabilities (K * M + 2, L * M + 2) between the states of two frames.
+def _transitions(step: np.ndarray) -> np.ndarray:
+    """Return log-probabilities (K * M + 2, L * M + 2) of the transitions between two frames.
 
     States are ordered by hypothesis, then mode; the last two are hidden and gone.
     """
     modes, count, following = len(step), step.shape[2] - 1, step.shape[3] - 1
-    ways = np.empty((count * modes + 2, following * modes + 2))
+    log = np.empty((count * modes + 2, following * modes + 2))
     between = step[:, :, :-1, :-1].transpose(2, 0, 3, 1)
-    ways[:-2, :-2] = between.reshape(count * modes, following * modes)
-    ways[:-2, -2] = np.repeat(step[0, 0, :-1, -1], modes)
-    ways[-2, :-2] = np.repeat(step[0, 0, -1, :-1], modes) - np.log(modes)
-    ways[-2, -2] = step[0, 0, -1, -1]
-    ways[:-1, -1] = ways[:-1, -2] - LEAVE_COST
-    ways[-1, :-1] = ways[-2, :-1] - LEAVE_COST
-    ways[-1, -1] = 0.0
-    return ways
+    log[:-2, :-2] = between.reshape(count * modes, following * modes)
+    log[:-2, -2] = np.repeat(step[0, 0, :-1, -1], modes)
+    log[-2, :-2] = np.repeat(step[0, 0, -1, :-1], modes) - np.log(modes)
+    log[-2, -2] = step[0, 0, -1, -1]
+    log[:-1, -1] = log[:-1, -2] - LEAVE_COST
+    log[-1, :-1] = log[-2, :-1] - LEAVE_COST
+    log[-1, -1] = 0.0
+    return log
 
 
-def _viterbi(values: Sequence[np.ndarray], ways: Sequence[np.ndarray]) -> list[int]:
+def _viterbi(emissions: Sequence[np.ndarray], transitions: Sequence[np.ndarray]) -> list[int]:
     """Return the most likely sequence of states [T] (Viterbi)."""
-    best, came = values[0], []
-    for way, value in zip(ways, values[1:], strict=True):
-        reach = best[:, None] + way
-        came.append(reach.argmax(0))
-        best = reach.max(0) + value
-    chosen = [int(best.argmax())]
-    for back in reversed(came):
-        chosen.append(int(back[chosen[-1]]))
-    return chosen[::-1]
+    best, predecessors = emissions[0], []
+    for transition, emission in zip(transitions, emissions[1:], strict=True):
+        score = best[:, None] + transition
+        predecessors.append(score.argmax(0))
+        best = score.max(0) + emission
+    path = [int(best.argmax())]
+    for predecessor in reversed(predecessors):
+        path.append(int(predecessor[path[-1]]))
+    return path[::-1]
 
 
 def _forward_backward(
-    values: Sequence[np.ndarray], ways: Sequence[np.ndarray]
+    emissions: Sequence[np.ndarray], transitions: Sequence[np.ndarray]
 ) -> tuple[list[np.ndarray], float]:
     """Run the forward-backward algorithm.
 
     Returns:
         The probability of each state [T], and the log-likelihood of all frames.
     """
-    moves = [np.exp(way) for way in ways]
+    matrices = [np.exp(transition) for transition in transitions]
     # exp(-600) is the least, so that no state becomes impossible
-    seen = [np.exp(np.maximum(value - value.max(), -600.0)) for value in values]
-    evidence = float(sum(value.max() for value in values))
-    ahead: list[np.ndarray] = []
-    for t, own in enumerate(seen):
-        now = own if t == 0 else (ahead[-1] @ moves[t - 1]) * own
-        evidence += float(np.log(now.sum()))
-        ahead.append(now / now.sum())
-    behind = [np.ones(len(seen[-1]))]
-    for move, own in zip(reversed(moves), reversed(seen[1:]), strict=True):
-        before = move @ (behind[-1] * own)
-        behind.append(before / before.max())
-    both = [a * b for a, b in zip(ahead, reversed(behind), strict=True)]
+    likelihoods = [np.exp(np.maximum(own - own.max(), -600.0)) for own in emissions]
+    evidence = float(sum(own.max() for own in emissions))
+    forward: list[np.ndarray] = []
+    for t, likelihood in enumerate(likelihoods):
+        alpha = likelihood if t == 0 else (forward[-1] @ matrices[t - 1]) * likelihood
+        evidence += float(np.log(alpha.sum()))
+        forward.append(alpha / alpha.sum())
+    backward = [np.ones(len(likelihoods[-1]))]
+    for matrix, likelihood in zip(reversed(matrices), reversed(likelihoods[1:]), strict=True):
+        beta = matrix @ (backward[-1] * likelihood)
+        backward.append(beta / beta.max())
+    both = [alpha * beta for alpha, beta in zip(forward, reversed(backward), strict=True)]
     return [own / own.sum() for own in both], evidence
 
 

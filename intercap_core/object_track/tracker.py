@@ -24,7 +24,7 @@ from intercap_core.object_track.decoder import (
     add_excursion_costs,
     decode,
     find_excursions,
-    step_costs,
+    step_log_ratios,
 )
 from intercap_core.object_track.fit import FittedPose
 from intercap_core.object_track.given_poses import GivenPose
@@ -166,14 +166,14 @@ class Tracker:
         times, fits = self._observer.times, self._hypotheses.fits
         weights = [self._prior.weigh(t, own) for t, own in enumerate(fits)]
         poses = [np.array([fit.pose for fit in own]).reshape(-1, 4, 4) for own in fits]
-        steps = self._step_costs(poses, np.full(len(poses) - 1, FREE_COST_S))
+        steps = self._step_log_ratios(poses, np.full(len(poses) - 1, FREE_COST_S))
         self._emissions = [self._observer.share * weight for weight in weights]
         decoded = decode(self._emissions, steps, self._absent)
         # near annotated poses of a hidden object the usual motions explain nothing
         near = self._prior.near_annotated(decoded.path == HIDDEN)
         if near.any():
             free = np.where(near[1:] | near[:-1], 0.0, FREE_COST_S)
-            steps = self._step_costs(poses, free)
+            steps = self._step_log_ratios(poses, free)
             decoded = decode(self._emissions, steps, self._absent)
         centres = [np.array([self._mesh.centre_at(p) for p in own]).reshape(-1, 3) for own in poses]
         away = find_excursions(centres, decoded.path, _sure_frames(decoded), times)
@@ -182,13 +182,13 @@ class Tracker:
         self._update_places(decoded, centres)
         return decoded
 
-    def _step_costs(self, poses: list[np.ndarray], free: np.ndarray) -> list[np.ndarray]:
+    def _step_log_ratios(self, poses: list[np.ndarray], free: np.ndarray) -> list[np.ndarray]:
         """Return the steps [T - 1] between the poses [T] (K, 4, 4) of the hypotheses.
 
         ``free`` (T - 1,) is the cost of free motion, nats per second.
         """
         return [
-            step_costs(
+            step_log_ratios(
                 self._mesh, poses[t], poses[t + 1], float(gap), self._hands[t], float(free[t])
             )
             for t, gap in enumerate(np.diff(self._observer.times))

@@ -25,7 +25,7 @@ from intercap_core.object_track.decoder import (
     decode,
     find_excursions,
     mode_log_ratios,
-    step_costs,
+    step_log_ratios,
 )
 from intercap_core.object_track.evidence import ERROR_LASTING_S
 from intercap_core.object_track.motion import HandMotion
@@ -102,7 +102,7 @@ def test_a_single_frame_and_frames_without_hypotheses() -> None:
 def test_only_a_lasting_preference_pays_for_a_jump(cup: ObjectMesh) -> None:
     """Two poses half a turn apart; the images prefer the second from frame 6 on."""
     both = np.concatenate([poses_of([0.0]), poses_of([0.0], 180)])
-    steps = [step_costs(cup, both, both, 1 / 15, NO_HAND)] * 9
+    steps = [step_log_ratios(cup, both, both, 1 / 15, NO_HAND)] * 9
 
     def path(gain: float) -> list[int]:
         emissions = [np.array([5.0, 5.0 - gain])] * 6 + [np.array([5.0, 5.0 + gain])] * 4
@@ -114,7 +114,7 @@ def test_only_a_lasting_preference_pays_for_a_jump(cup: ObjectMesh) -> None:
 
 def test_each_mode_of_motion_has_its_cost(cup: ObjectMesh) -> None:
     here, there = poses_of([0.0]), poses_of([0.0, 0.02, 1.0])
-    every = step_costs(cup, here, there, 1 / 15, NO_HAND)
+    every = step_log_ratios(cup, here, there, 1 / 15, NO_HAND)
     rest, free, right, left = np.diagonal(every)[0, :-1].T  # in the mode of the step before
     change = 1 - np.exp(-MODE_CHANGES_S / 15)
     stays = -np.log(1 + change)  # of two that are possible
@@ -126,12 +126,14 @@ def test_each_mode_of_motion_has_its_cost(cup: ObjectMesh) -> None:
     assert (right == -np.inf).all() and (left == -np.inf).all()
     assert every[0, 1, 0, 0] == pytest.approx(free[0] + np.log(change))
     hand = HandMotion(np.eye(3), np.array([0.1, 0, 0]), np.array([1.1, 0, 0]))
-    carried = step_costs(cup, here, there, 1 / 15, [None, hand])
+    carried = step_log_ratios(cup, here, there, 1 / 15, [None, hand])
     assert (carried[:, 2, 0, :-1] == -np.inf).all()
     assert carried[3, 3, 0, 2] == pytest.approx(-np.log(1 + 2 * change))
     assert carried[3, 3, 0, 0] < -10
     away = HandMotion(np.eye(3), np.array([0.6, 0, 0]), np.array([1.6, 0, 0]))
-    assert (step_costs(cup, here, there, 1 / 15, [None, away])[:, 3, :-1, :-1] == -np.inf).all()
+    assert (
+        step_log_ratios(cup, here, there, 1 / 15, [None, away])[:, 3, :-1, :-1] == -np.inf
+    ).all()
 
 
 @pytest.mark.parametrize("fps", [5, 30])
@@ -139,7 +141,7 @@ def test_more_modes_do_not_raise_the_evidence(cup: ObjectMesh, fps: int) -> None
     """An object at rest near hands that do not move may be held as well."""
     still = HandMotion(np.eye(3), np.array([0.1, 0, 0]), np.array([0.1, 0, 0]))
     here, count = poses_of([0.0]), 3 * fps
-    steps = [step_costs(cup, here, here, 1 / fps, [still] * hands) for hands in range(3)]
+    steps = [step_log_ratios(cup, here, here, 1 / fps, [still] * hands) for hands in range(3)]
     none, *some = (decode([np.zeros(1)] * (count + 1), [s] * count).evidence for s in steps)
     assert some == pytest.approx([none] * 2, abs=0.1)
 
@@ -153,7 +155,8 @@ def test_an_object_moved_across_a_gap_is_the_same(cup: ObjectMesh, fps: int, gap
     seconds[5] += gap_s
     poses = [poses_of([x]) for x in places]
     steps = [
-        step_costs(cup, a, b, gap, []) for (a, b), gap in zip(pairwise(poses), seconds, strict=True)
+        step_log_ratios(cup, a, b, gap, [])
+        for (a, b), gap in zip(pairwise(poses), seconds, strict=True)
     ]
     share = min(1.0, 1 / fps / ERROR_LASTING_S)
     found = decode([np.array([30.0 * share])] * 12, steps, share * ABSENT_LOG_RATIO)
@@ -173,7 +176,7 @@ def test_a_turning_hand_carries_it_through_hidden_frames(cup: ObjectMesh) -> Non
     held = [both[:1] if t < 3 else both for t, both in enumerate(held)]
     for t, (a, b) in enumerate(pairwise(held)):
         turn = Rotation.from_euler("z", turns[t + 1] - turns[t], degrees=True).as_matrix()
-        steps.append(step_costs(cup, a, b, 1 / 15, [HandMotion(turn, wrist, wrist), None]))
+        steps.append(step_log_ratios(cup, a, b, 1 / 15, [HandMotion(turn, wrist, wrist), None]))
     seen = [4.0 if t < 3 or t > 11 else 0.0 for t in range(len(turns))]
     emissions = [np.full(len(own), nats) for own, nats in zip(held, seen, strict=True)]
     emissions[12][1] += 1.0  # a little for the wrong one
@@ -193,7 +196,7 @@ def test_a_held_object_turns_about_the_wrist(cup: ObjectMesh) -> None:
     with_it = np.eye(4)[None].copy()
     with_it[0, :3, :3], with_it[0, :3, 3] = turn, turn @ (-wrist) + end
     after = np.concatenate([with_it, before])
-    every = step_costs(cup, before, after, 1 / 15, [HandMotion(turn, wrist, end), None])
+    every = step_log_ratios(cup, before, after, 1 / 15, [HandMotion(turn, wrist, end), None])
     held = every[2, 2, 0, :-1] + np.log(1 + 2 * (1 - np.exp(-MODE_CHANGES_S / 15)))
     assert held[0] == pytest.approx(0, abs=1e-9)
     # what stays behind is off by the turn, and by the shift as far as the turn is known
@@ -211,7 +214,7 @@ def test_it_is_hidden_for_a_second_and_gone_after_five(cup: ObjectMesh) -> None:
         unseen = round(15 * seconds)
         poses = [here] * 9 + [here[:0]] * unseen + [here] * 9
         emissions = [np.full(len(own), 4.0) for own in poses]
-        steps = [step_costs(cup, a, b, 1 / 15, NO_HAND) for a, b in pairwise(poses)]
+        steps = [step_log_ratios(cup, a, b, 1 / 15, NO_HAND) for a, b in pairwise(poses)]
         found = decode(emissions, steps, ABSENT_LOG_RATIO * 1 / 15 / ERROR_LASTING_S)
         assert (found.path[9:-9] == HIDDEN).all() and (found.path[:9] == 0).all()
         return float(found.gone[9 + unseen // 2])
@@ -221,7 +224,7 @@ def test_it_is_hidden_for_a_second_and_gone_after_five(cup: ObjectMesh) -> None:
 
 def test_turns_of_a_symmetry_are_no_motion() -> None:
     bottle = ObjectMesh.load(catalogue()["bottle"])
-    spun = step_costs(bottle, poses_of([0.0]), poses_of([0.0], 120), 1 / 15, NO_HAND)
+    spun = step_log_ratios(bottle, poses_of([0.0]), poses_of([0.0], 120), 1 / 15, NO_HAND)
     assert spun[0, 0, 0, 0] == pytest.approx(-np.log(2 - np.exp(-MODE_CHANGES_S / 15)))
 
 
