@@ -56,7 +56,7 @@ _HEAD_PX, _INK = 24, (52, 44, 40)
 def draw_pictures(project: Project, paths: Paths, folder: Path) -> list[Path]:
     """Draw the pictures that the computed variants allow into ``folder``; returns their paths.
 
-    Raises UserError where matplotlib is not installed.
+    Raises UserError if matplotlib is not installed.
     """
     figure = figure_class()
     folder.mkdir(parents=True, exist_ok=True)
@@ -310,7 +310,7 @@ def ablate(
 ) -> tuple[Paths, dict[str, Figures]]:
     """Compute all variants; returns their artefacts, and figures by variant.
 
-    The last entry of the figures is that of the sequential fits. Raises UserError where a sequence
+    The last entry of the figures is that of the sequential fits. Raises UserError if a sequence
     or variant is unknown, or has no truth or artefacts.
     """
     plain = load_project(settings)

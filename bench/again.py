@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Collection, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 
-from bench.replay import file_digest
 from intercap_core.errors import UserError
 from intercap_core.pipeline.code_digest import code_digest
 from intercap_core.pipeline.step import run_step
@@ -46,29 +46,52 @@ def compute_once(
     stage: str, project: Project, sequence: str, paths: Mapping[str, Path], output: Path
 ) -> Path:
     """Compute ``output`` from the artefacts ``paths`` unless it is up to date by content."""
-    key, content = output.with_suffix(".key"), _content(stage, project, sequence, paths)
+    key, content = output.with_suffix(".key"), _content((stage,), project, sequence, paths)
     if not (output.exists() and key.exists() and key.read_text() == content):
-        key.unlink(missing_ok=True)  # a run that is ended here leaves no key beside another content
+        key.unlink(missing_ok=True)  # an interrupted run must not leave an old key
         inputs = {name: paths[name] for name in STAGES[stage].reads}
         run_step(stage, project, sequence, inputs=inputs, output=output)
         key.write_text(content)
     return output
 
 
-def _content(stage: str, project: Project, sequence: str, paths: Mapping[str, Path]) -> str:
-    """Digest of all inputs of a stage's artefact."""
-    state = hashlib.sha256(code_digest(f"stages.{stage}").encode())
+def content_of(stages: Sequence[str], project: Project, sequence: str) -> str:
+    """Checksum of all inputs of stages that are replayed in order from a run's artefacts."""
+    return _content(stages, project, sequence, artefacts_of(project, sequence), with_truth=True)
+
+
+def _content(
+    stages: Sequence[str],
+    project: Project,
+    sequence: str,
+    paths: Mapping[str, Path],
+    *,
+    with_truth: bool = False,
+) -> str:
+    state = hashlib.sha256()
+    for stage in stages:
+        state.update(code_digest(f"stages.{stage}").encode())
     state.update(project.config.model_dump_json(exclude={"studio", "report", "export"}).encode())
     state.update(repr(project.annotation(sequence)).encode())
     row = project.sequences[sequence]
     entry = project.objects[row.object]
     for described in (entry, project.subjects[row.subject]):
         state.update(described.model_dump_json().encode())
-    files = [paths[name] for name in STAGES[stage].reads]
+    reads = dict.fromkeys(name for stage in stages for name in STAGES[stage].reads)
+    files = [paths[name] for name in reads if name not in stages]
     models, gender = project.config.body_models, project.subjects[row.subject].gender
     files += [entry.mesh, entry.contact_vertices, models.of(gender), models.vposer]
     files += project.config.joint.lemo_files or ()
-    for path in [*files, *([row.truth] if stage == "metrics" else [])]:
+    if with_truth or "metrics" in stages:
+        files.append(row.truth)
+    for path in files:
         if path is not None:
-            state.update(file_digest(path))
+            state.update(_file_digest(path, path.stat().st_mtime_ns))
     return state.hexdigest()
+
+
+@cache
+def _file_digest(path: Path, changed_ns: int) -> bytes:
+    """SHA-256 of a file, cached in the process until the file changes."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").digest()

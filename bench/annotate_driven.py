@@ -408,7 +408,7 @@ def opened(settings: Path, sequence: str, cores: int) -> Iterator[Hand]:
 def made_plain(project: Project, cores: int) -> None:
     """Compute the results of both recordings without annotations.
 
-    Raises UserError where annotations are outside the results folder, as a user's would be.
+    Raises UserError if annotations are outside the results folder, as a user's would be.
     """
     wanted = []
     for name in (OBJECT, CONTACT):

@@ -221,7 +221,7 @@ def steps_ms(page: Page, steps: int, key: str = "ArrowRight") -> np.ndarray:
 def served_page(settings: Path, sequence: str, cores: int = 0) -> Iterator[Visit]:
     """The sequence's page in a browser, ready, with a server process of its own.
 
-    Raises UserError where the server does not start.
+    Raises UserError if the server does not start.
     """
     from tests.helpers.browser import visit
 

@@ -112,10 +112,7 @@ def fit_by_lbfgs(
     for number, stage in enumerate(stages):
         energy.enter(stage, free.full(x.detach()))
         optimiser = torch.optim.LBFGS(
-            [x],
-            max_iter=ITERATIONS,
-            history_size=HISTORY,
-            line_search_fn="strong_wolfe",
+            [x], max_iter=ITERATIONS, history_size=HISTORY, line_search_fn="strong_wolfe"
         )
 
         def closure(number: int = number, optimiser: torch.optim.Optimizer = optimiser) -> Tensor:
@@ -183,11 +180,7 @@ class Energy:
     """Equation 2 of one frame as a function of a parameter vector (1, P), in torch."""
 
     def __init__(
-        self,
-        model: BodyModel,
-        seen: Observations,
-        t: int,
-        cloud: PersonCloud | None,
+        self, model: BodyModel, seen: Observations, t: int, cloud: PersonCloud | None
     ) -> None:
         def tensor(values: np.ndarray) -> Tensor:
             return torch.as_tensor(values, dtype=model.dtype, device=model.device)

@@ -16,16 +16,16 @@ only and is not measured.
 
 from __future__ import annotations
 
-import os
+import statistics
+import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-os.environ.setdefault("OMP_NUM_THREADS", "2")  # read when the libraries start
+from bench.timing import THREADS, first_as_good  # before the numerical libraries
 
-import statistics
-import tempfile
-from collections.abc import Callable
+# isort: split
 
 import numpy as np
 import torch
@@ -47,11 +47,8 @@ from intercap_core.body_fit.start import place_trunk
 from intercap_core.errors import UserError
 from intercap_core.project import load_project
 
-THREADS = int(os.environ["OMP_NUM_THREADS"])
 FRAMES = 6
 RECIPE_FRAMES = 2  # frames fitted by the whole recipe, which is slow
-AS_GOOD = 1.02  # factor of our error below which the recipe counts as equally accurate
-NEAR_BEST = 1.05  # factor of a frame's smallest error that counts as the best
 SPARSE = 10  # every tenth vertex is evaluated along the recipe's path
 
 
@@ -131,21 +128,11 @@ def until(clip: BodyClip, fits: list[FrameFit], first: int, wanted: np.ndarray) 
     for t, fit in enumerate(fits, first):
         path = fit.vectors[fit.best]
         pve = clip.errors(path, np.full(len(path), t), step=SPARSE)
-        e, is_as_good = moment(pve, wanted[t])
+        e, is_as_good = first_as_good(pve, wanted[t])
         seconds.append(fit.seconds[e])
         errors.append(clip.errors(path[e : e + 1], np.array([t])))
         reached.append(is_as_good)
     return Run(float(np.mean(seconds)), np.concatenate(errors)), all(reached)
-
-
-def moment(pve: np.ndarray, wanted: float) -> tuple[int, bool]:
-    """Index of the first evaluation whose error (E,) reaches ``wanted``, else nearly its smallest.
-
-    The second value tells which of the two it is.
-    """
-    if pve.min() <= AS_GOOD * wanted:
-        return int(np.argmax(pve <= AS_GOOD * wanted)), True
-    return int(np.argmax(pve <= NEAR_BEST * pve.min())), False
 
 
 def measure(settings: Path, output: Path, frames: int) -> None:
@@ -249,7 +236,7 @@ def forward_times() -> dict[str, float]:
     """Median milliseconds by name, forward and with the gradient of a sum over the vertices.
 
     All pose the open body with 10 + 10 shape directions and random pose blend shapes, as many as in
-    a licensed file. Raises ValueError where the vertices of a package differ from ours.
+    a licensed file. Raises ValueError if the vertices of a package differ from ours.
     """
     with tempfile.TemporaryDirectory() as folder:
         full, short = write_files(Path(folder))

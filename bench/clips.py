@@ -77,7 +77,7 @@ class ObjectClip:
     def load(cls, project: Project, sequence: str, count: int) -> ObjectClip:
         """``count`` frame sets from the first in which two cameras truly see the object.
 
-        Raises UserError where the sequence has no truth or an artefact is missing.
+        Raises UserError if the sequence has no truth or an artefact is missing.
         """
         row = project.sequences[sequence]
         if row.truth is None:
@@ -183,7 +183,7 @@ class BodyClip:
     def load(cls, project: Project, sequence: str) -> BodyClip:
         """All frame sets of a sequence.
 
-        Raises UserError where it has no truth for this body model or an artefact is missing.
+        Raises UserError if it has no truth for this body model or an artefact is missing.
         """
         row = project.sequences[sequence]
         gender = project.subjects[row.subject].gender
@@ -287,7 +287,7 @@ class JointClip:
     def load(cls, project: Project, sequence: str) -> JointClip:
         """All frame sets of a sequence.
 
-        Raises UserError where it has no truth for its body model, an artefact is missing or a frame
+        Raises UserError if it has no truth for its body model, an artefact is missing or a frame
         has no person.
         """
         row = project.sequences[sequence]

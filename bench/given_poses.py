@@ -35,7 +35,7 @@ from intercap_core.stage_list import STAGES
 from intercap_core.stages import object_track
 
 OFF_M, OFF_DEGREES = 0.01, 5.0
-_COLUMNS = ("lost", "unseen", "mm", "p95", "deg", "there mm", "p95", "deg", "carried", "said lost")
+_COLUMNS = ("lost", "unseen", "mm", "p95", "deg", "there mm", "p95", "deg", "carried", "flagged")
 
 
 def main() -> None:

@@ -30,9 +30,8 @@ import torch
 from torch import Tensor
 
 from bench.clips import JointClip
-from bench.object_baseline import COVERED, Crops, Project
+from bench.object_baseline import Crops, ObjectImages
 from bench.object_baseline import Recipe as ObjectRecipe
-from bench.soft_rasteriser import OverdrawRasteriser, Pixels
 from intercap_core.body.joints import JOINT_INDEX, NUM_JOINTS
 from intercap_core.body.kinematics import rotation_from_axis_angle
 from intercap_core.geometry.camera.transforms import rigid
@@ -68,7 +67,7 @@ class Energy:
     def __init__(self, clip: JointClip) -> None:
         self._clip = clip
         self.geometry = RigidAndSkin(clip.geometry, clip.start)
-        self._images = ObjectImages(clip)
+        self._images = object_images(clip)
         self._index = torch.arange(len(clip))
         self._contact = contact_weights(clip.geometry, clip.touching)
 
@@ -90,7 +89,7 @@ class Energy:
         at_patch = torch.as_tensor(clip.geometry.skin.patch)
         found = {
             "body_data": problem.cost(posed.body, shared, self._index).sum(),
-            "object_data": OBJECT_WEIGHT * self._images(posed),
+            "object_data": OBJECT_WEIGHT * self._images(posed.rotation, posed.translation),
             "contact": settings.contact_weight * contact(distance[:, at_patch], self._contact),
             "penetration": settings.penetration_weight * penetration(distance, clip.geometry),
             "body_motion": settings.body_smoothness * body_motion(posed.joints, clip.fps),
@@ -176,53 +175,15 @@ class RigidAndSkin:
         )  # fmt: skip
 
 
-class ObjectImages:
-    """E_O: equation 1 of all frames and views, drawn as one image."""
-
-    def __init__(self, clip: JointClip) -> None:
-        mesh, start = clip.tracked, clip.start
-        poses = rigid(start.rotation, start.translation)
-        frames, found = [], []
-        for t, (views, pose) in enumerate(zip(clip.views, poses, strict=True)):
-            crops = Crops.cut(mesh, views, pose, clip.object_settings.min_overlap, clip.labels)
-            if crops is not None:
-                found.append(crops)
-                frames += [t] * len(crops.lens)
-        self._recipe, self._frame = ObjectRecipe(), torch.tensor(frames)
-        self._empty = not found
-        if self._empty:
-            return
-        first = np.cumsum([0, *(len(crops.lens) for crops in found)])
-        pixels = Pixels(
-            np.concatenate([c.pixels.view + n for c, n in zip(found, first, strict=False)]),
-            np.concatenate([c.pixels.x for c in found]),
-            np.concatenate([c.pixels.y for c in found]),
-            np.concatenate([c.pixels.sizes for c in found]),
-        )
-
-        def tensor(values: list[np.ndarray]) -> Tensor:
-            return torch.as_tensor(np.concatenate(values).astype(np.float32))
-
-        camera = tensor([c.camera_from_master for c in found])
-        self._rotation, self._shift = camera[:, :3, :3], camera[:, None, :3, 3]
-        self._lens = tensor([c.lens for c in found])[:, None]
-        self._depth = tensor([c.depth for c in found])
-        self._vertices = mesh.vertices
-        self._draw = OverdrawRasteriser(mesh.faces, len(mesh.vertices), pixels)
-
-    def __call__(self, posed: Posed) -> Tensor:
-        """The sum over frames, in squared pixels of silhouette."""
-        if self._empty:
-            return posed.translation.new_zeros(())
-        points = posed.of_object(self._vertices)[self._frame]
-        local = points @ self._rotation.mT + self._shift
-        coverage, depth = self._draw(Project.apply(local, self._lens), local[..., 2])
-        drawn = (self._depth > 0) & (coverage.detach() > COVERED)
-        squared = torch.where(drawn, depth - self._depth, torch.zeros_like(depth)) ** 2
-        scale = self._recipe.depth_scale_m
-        if scale is not None:
-            squared = geman_mcclure(squared, scale).rho
-        return ((1 - coverage) ** 2).sum() + self._recipe.depth_weight * squared.sum()
+def object_images(clip: JointClip) -> ObjectImages:
+    """E_O with the crops that are chosen at the sequential fits."""
+    poses = rigid(clip.start.rotation, clip.start.translation)
+    crops = {
+        t: Crops.cut(clip.tracked, views, pose, clip.object_settings.min_overlap, clip.labels)
+        for t, (views, pose) in enumerate(zip(clip.views, poses, strict=True))
+    }
+    seen = {t: crop for t, crop in crops.items() if crop is not None}
+    return ObjectImages(clip.tracked, seen, ObjectRecipe())
 
 
 def contact_weights(geometry: Geometry, touching: np.ndarray) -> Tensor:

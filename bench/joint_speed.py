@@ -13,13 +13,13 @@ to 300 and 1,000 frames. Adds figures with keys ``joint.<measure>`` to the outpu
 from __future__ import annotations
 
 import json
-import os
 import tempfile
 import time
 from pathlib import Path
 
-os.environ.setdefault("OMP_NUM_THREADS", "2")  # read when the libraries start
+from bench.timing import AS_GOOD, THREADS, first_as_good  # before the numerical libraries
 
+# isort: split
 import numpy as np
 import torch
 from rich.console import Console
@@ -34,9 +34,7 @@ from intercap_core.pipeline.step import run_step
 from intercap_core.project import Project, load_project
 from intercap_core.stage_list import STAGES
 
-THREADS = int(os.environ["OMP_NUM_THREADS"])
 LONG = (300, 1000)  # frames
-AS_GOOD = 1.02  # factor of our error below which a state counts as equally accurate
 
 
 def ours(project: Project, sequence: str) -> tuple[float, State]:
@@ -47,16 +45,6 @@ def ours(project: Project, sequence: str) -> tuple[float, State]:
         begin = time.perf_counter()
         run_step("joint", project, sequence, inputs=inputs, output=output)
         return time.perf_counter() - begin, read_state(output)
-
-
-def moment(errors: np.ndarray, wanted: float) -> tuple[int, bool]:
-    """Index of the first state whose error (R,) reaches ``wanted``, else of the best state.
-
-    The second value tells which of the two it is. State 0 is the common start and is excluded.
-    """
-    own = errors[1:]
-    near = own <= AS_GOOD * wanted
-    return (1 + int(near.argmax()), True) if near.any() else (1 + int(own.argmin()), False)
 
 
 def measure(settings: Path, output: Path, steps: int) -> None:
@@ -75,7 +63,10 @@ def measure(settings: Path, output: Path, steps: int) -> None:
     seconds = (first + again) / 2
     found = [clip.errors(one) for one in recipe.states]
     start, end, reached = clip.errors(clip.start), found[-1], clip.errors(state)
-    at, is_as_good = moment(np.array([one.mean for one in found]), reached.mean)
+    # state 0 is the common start
+    means = np.array([one.mean for one in found[1:]])
+    at, is_as_good = first_as_good(means, reached.mean, near_best=1.0)
+    at += 1
     memory = {
         f"peak_memory_{count}_mb": peak_memory_mb(settings, project, sequence, count)
         for count in LONG

@@ -16,19 +16,22 @@ Differences from that code:
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from bench.soft_rasteriser import OverdrawRasteriser, Pixels, Rasteriser, SoftRasteriser
+from bench.rasteriser import OverdrawRasteriser, Pixels
+from intercap_core.body.kinematics import rotation_from_axis_angle
 from intercap_core.geometry.camera.projection import project_with_jacobian
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.render import render
 from intercap_core.geometry.rigid.shots import Rendering
+from intercap_core.geometry.solve.robust import geman_mcclure
 from intercap_core.object_track.reduced_mask import ReducedMask
 from intercap_core.object_track.view import View
 
@@ -48,7 +51,6 @@ class Recipe:
     learning_rate_rad: float = 1e-3
     depth_weight: float = 1e4  # lambda_depth over lambda_segm, per m^2
     depth_scale_m: float | None = 0.05  # of Geman-McClure; None for equation 1's squares
-    rasteriser: Literal["overdraw", "soft"] = "overdraw"
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +79,7 @@ def fit_by_adam(
     crops = Crops.cut(mesh, views, pose, min_overlap, labels)
     if crops is None:
         return FrameFit(pose[None], np.zeros(1))
-    energy = Energy(mesh, crops, pose, recipe)
+    images, start = ObjectImages(mesh, {0: crops}, recipe), torch.tensor(pose[:3, :3]).float()
     turn = torch.zeros(3, requires_grad=True)
     place = torch.tensor(pose[:3, 3], dtype=torch.float32, requires_grad=True)
     adam = torch.optim.Adam(
@@ -90,7 +92,7 @@ def fit_by_adam(
     path, seconds = [np.append(np.zeros(3), pose[:3, 3])], [0.0]
     for _ in range(steps):
         adam.zero_grad()
-        energy(turn, place).backward()
+        images(rotation_from_axis_angle(turn[None]) @ start, place[None]).backward()
         adam.step()
         path.append(np.append(turn.detach().numpy(), place.detach().numpy()))
         seconds.append(time.perf_counter() - begin)
@@ -118,7 +120,7 @@ class Crops:
         min_overlap: float,
         labels: tuple[str, ...],
     ) -> Crops | None:
-        """Crop the views to the candidates chosen at ``pose``; None where no view has one."""
+        """Crop the views to the candidates chosen at ``pose``; None if no view has one."""
         found: list[tuple[Any, ...]] = []
         for view in views:
             lens, camera = view.geometry.lens, view.geometry.camera
@@ -193,43 +195,49 @@ def registered_depth(
     return image
 
 
-class Energy:
-    """Equation 1 of one frame as a function of turn (3,) and translation (3,), in torch.
+class ObjectImages:
+    """Equation 1 of T frames with V views in all, in torch; all views are drawn as one image.
 
-    sum over mask pixels of (1 - coverage)^2 and, where measured and drawn, depth_weight times the
+    The sum over mask pixels of (1 - coverage)^2 and, if measured and drawn, depth_weight times the
     squared difference of depths.
     """
 
-    def __init__(self, mesh: ObjectMesh, crops: Crops, pose: np.ndarray, recipe: Recipe) -> None:
-        def tensor(values: np.ndarray) -> torch.Tensor:
-            return torch.as_tensor(np.asarray(values, np.float32))
+    def __init__(self, mesh: ObjectMesh, crops: Mapping[int, Crops], recipe: Recipe) -> None:
+        """``crops`` by frame; frames without views are omitted."""
 
-        self._recipe = recipe
-        # turned by the frame's start, not moved
-        self._vertices = tensor(mesh.vertices @ pose[:3, :3].T)
-        self._rotation = tensor(crops.camera_from_master[:, :3, :3])
-        self._shift = tensor(crops.camera_from_master[:, None, :3, 3])
-        self._lens = tensor(crops.lens[:, None])
-        self._depth = tensor(crops.depth)
-        self._known = self._depth > 0
-        self._rasteriser: Rasteriser
-        if recipe.rasteriser == "soft":
-            self._rasteriser = SoftRasteriser(mesh.faces, crops.pixels)
-        else:
-            self._rasteriser = OverdrawRasteriser(mesh.faces, len(mesh.vertices), crops.pixels)
+        def tensor(values: list[np.ndarray]) -> torch.Tensor:
+            return torch.as_tensor(np.concatenate(values).astype(np.float32))
 
-    def __call__(self, turn: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
-        """The energy, a scalar, differentiable."""
-        points = self._vertices @ rotation_matrix(turn).T + place
-        local = torch.matmul(points, self._rotation.mT) + self._shift  # (V, N, 3)
-        coverage, depth = self._rasteriser(Project.apply(local, self._lens), local[..., 2])
-        silhouette = ((1 - coverage) ** 2).sum()
-        drawn = self._known & (coverage.detach() > COVERED)
-        squared = torch.where(drawn, depth - self._depth, torch.zeros_like(depth)) ** 2
+        self._recipe, self._empty, views = recipe, not crops, list(crops.values())
+        if self._empty:
+            return
+        self._frame = torch.tensor([t for t, crop in crops.items() for _ in crop.lens])
+        first = np.cumsum([0, *(len(crop.lens) for crop in views)])
+        pixels = Pixels(
+            np.concatenate([c.pixels.view + n for c, n in zip(views, first, strict=False)]),
+            np.concatenate([c.pixels.x for c in views]),
+            np.concatenate([c.pixels.y for c in views]),
+            np.concatenate([c.pixels.sizes for c in views]),
+        )
+        camera = tensor([c.camera_from_master for c in views])
+        self._rotation, self._shift = camera[:, :3, :3], camera[:, None, :3, 3]
+        self._lens = tensor([c.lens for c in views])[:, None]
+        self._depth = tensor([c.depth for c in views])
+        self._vertices = torch.as_tensor(mesh.vertices.astype(np.float32))
+        self._draw = OverdrawRasteriser(mesh.faces, len(mesh.vertices), pixels)
+
+    def __call__(self, rotation: torch.Tensor, translation: torch.Tensor) -> torch.Tensor:
+        """The energy, differentiable, of poses (T, 3, 3) and (T, 3), master_from_object."""
+        if self._empty:
+            return translation.new_zeros(())
+        points = self._vertices @ rotation.mT + translation[:, None]
+        local = points[self._frame] @ self._rotation.mT + self._shift  # (V, N, 3)
+        coverage, depth = self._draw(Project.apply(local, self._lens), local[..., 2])
+        drawn = (self._depth > 0) & (coverage.detach() > COVERED)
+        squared = torch.where(drawn, depth - self._depth, 0) ** 2
         if self._recipe.depth_scale_m is not None:
-            scale = self._recipe.depth_scale_m**2
-            squared = scale * squared / (squared + scale)
-        return silhouette + self._recipe.depth_weight * squared.sum()
+            squared = geman_mcclure(squared, self._recipe.depth_scale_m).rho
+        return ((1 - coverage) ** 2).sum() + self._recipe.depth_weight * squared.sum()
 
 
 class Project(torch.autograd.Function):
@@ -245,17 +253,3 @@ class Project(torch.autograd.Function):
     def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor, None]:
         (jacobian,) = ctx.saved_tensors
         return torch.einsum("vni,vnij->vnj", gradients[0], jacobian), None
-
-
-def rotation_matrix(vector: torch.Tensor) -> torch.Tensor:
-    """Rodrigues' formula: rotation vector (3,) to matrix (3, 3)."""
-    squared = (vector * vector).sum() + 1e-12
-    angle = squared.sqrt()
-    x, y, z = vector.unbind()
-    none = torch.zeros_like(x)
-    cross = torch.stack([none, -z, y, z, none, -x, -y, x, none]).reshape(3, 3)
-    return (
-        torch.eye(3, dtype=vector.dtype)
-        + torch.sin(angle) / angle * cross
-        + (1 - torch.cos(angle)) / squared * (cross @ cross)
-    )

@@ -1,31 +1,19 @@
-"""How a fit of the object's pose grows with views, faces, pixels and threads; what drawing costs.
+"""Time of a fit of the object's pose by views, faces, pixels and threads, and of drawing.
 
-    python -m bench.object_scaling [object] [--output results/bench.json]
-
-Wants no recording: a ring of Kinects sees the object of config/objects.yaml 2.2 m away, its masks
-and depth are drawn, and a frame is fitted from 2 cm and 5 degrees off. Each figure is the least of
-several runs, so that what else the machine does counts little.
+No recording is needed: a ring of Kinects sees the object from 2.2 m, its masks and depth are
+drawn, and one frame is fitted from 2 cm and 5 degrees off. Each figure is the least of several
+runs. Part of :mod:`bench.object_speed`.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
-
-os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
-import yaml
 from scipy.spatial.transform import Rotation
 
-from bench.command import exit_on_user_error
-from intercap_core.entries import ObjectEntry
-from intercap_core.errors import UserError
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import apply_step, rigid
@@ -178,35 +166,3 @@ def _least_ms(work: Callable[[], object]) -> float:
         work()
         seconds.append(time.perf_counter() - begin)
     return round(1e3 * min(seconds), 3)
-
-
-def main() -> None:
-    """Read the command line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("object", nargs="?", default="suitcase")
-    parser.add_argument("--objects", type=Path, default=Path("config/objects.yaml"))
-    parser.add_argument("--output", type=Path)
-    arguments = parser.parse_args()
-    with exit_on_user_error():
-        mesh = _load(arguments.objects, arguments.object)
-    figures = tracking_scaling(mesh)
-    for key, value in figures.items():
-        print(f"{key:28s} {value:9.3f}")
-    if arguments.output is not None:
-        path = arguments.output
-        known = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-        known |= {f"object.{key}": value for key, value in figures.items()}
-        path.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
-
-
-def _load(path: Path, name: str) -> ObjectMesh:
-    entries = yaml.safe_load(path.read_text(encoding="utf-8"))
-    if name not in entries:
-        raise UserError(f"{path}: no object {name!r}; it has {', '.join(entries)}")
-    entry = ObjectEntry.model_validate({"name": name, **entries[name]})
-    place = {"mesh": path.parent / entry.mesh, "contact_vertices": None}
-    return ObjectMesh.load(entry.model_copy(update=place))
-
-
-if __name__ == "__main__":
-    main()

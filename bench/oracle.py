@@ -83,11 +83,7 @@ def write_true_scene(scene: Path, truth: Path, output: Path, *, biases: bool, he
             known = slice(None) if biases else slice(0, BIAS)
             covariance[:, known] = 0
             covariance[:, :, :, known] = 0
-        new = {
-            "master_from_colour": poses,
-            "depth_bias": bias,
-            "camera_covariance": covariance,
-        }
+        new = {"master_from_colour": poses, "depth_bias": bias, "camera_covariance": covariance}
         keys, attributes = found.keys(), {n: found.attributes[n] for n in SCENE.attributes}
         digest = str(found.attributes["settings_digest"])
         with artefacts.write(output, SCENE, settings_digest=digest, **attributes) as writer:
@@ -249,7 +245,7 @@ def consult(
 ) -> Found:
     """Compute the variants, ``cores`` sequences at a time; returns their metrics.
 
-    Raises UserError where a sequence or variant is unknown, or has no truth or artefacts.
+    Raises UserError if a sequence or variant is unknown, or has no truth or artefacts.
     """
     project = load_project(settings)
     names = list(sequences or project.sequences)

@@ -36,7 +36,7 @@ JOBS = re.compile(r"^total\s+(\d+)", re.MULTILINE)
 def measure(settings: Path, output: Path, count: int) -> None:
     """Print ``scale.*`` and add them to the JSON ``output``.
 
-    Raises UserError where no sequence of the project is completely computed.
+    Raises UserError if no sequence of the project is completely computed.
     """
     source = load_project(settings)
     computed = [n for n in source.sequences if source.artefact(n, "summary").is_file()]

@@ -33,7 +33,7 @@ LOAD_TIMEOUT_S = 120.0
 def measure(settings: Path, output: Path, count: int) -> None:
     """Print ``dataset.*`` and add them to the JSON ``output``.
 
-    Raises UserError where no sequence of the project is completely computed.
+    Raises UserError if no sequence of the project is completely computed.
     """
     from bench.command import add_figures
 

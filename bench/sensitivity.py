@@ -1,231 +1,192 @@
-"""Errors of a stage with half and with double the value of one of its constants.
+"""Effect of half and of double the value of each constant of a stage's package.
 
-    python -m bench.sensitivity [SETTINGS] [--constants object_track.JUMP_COST ...]
-        [--sequences ...] [--output docs/sensitivity.md]
+    python -m bench.sensitivity [SETTINGS] --constants object_track scene.slips:MIN_GAIN
+        [--sequences NAME ...] [--stage NAME] [--jobs 2] [--known results/sensitivity.json]
 
-The stage is replayed from the project's stored artefacts into a temporary folder, each value in a
-separate process; no file of the project is overwritten. The figures are errors against the truth of
-virtual recordings. Results are cached by content in ``results/sensitivity.json``, so an interrupted
-run continues.
+``--constants`` names packages, modules, ``package.NAME`` or ``package.module:NAME``. For each
+value the package's stage is replayed from stored artefacts of virtual recordings, in a process of
+its own and a temporary folder; no file of the project is overwritten. Printed are the errors
+against truth that change by 2 % or more, and last the constants without any effect on the stage's
+arrays. Shares stay below 1 and integers stay integers. Outcomes are stored in ``--known`` by
+content, so an interrupted run continues.
+
+Short recordings of one studio show which constants matter, not which value is best: a constant
+without effect here may still decide on another recording.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
+import json
 import os
-import textwrap
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, replace
 from pathlib import Path
+from threading import Lock
 
-from bench.changed_constant import Constant, find_constant
+from bench.again import check_run, content_of
+from bench.changed_constant import Constant, find_constants
 from bench.command import exit_on_user_error
-from bench.replay import STAGES, Outcome, Replays, Run
+from bench.replay import IMAGES_ONLY, Outcome, Task
+from bench.stage_figures import FLAGS, STAGES_WITH_FIGURES
 from intercap_core.errors import UserError
+from intercap_core.kernel_cache import kernel_modules
+from intercap_core.project import load_project
 
 SETTINGS = Path("config/demo/config.yaml")
 SEQUENCES = ("cup_drink_s02", "stool_sit_s01")  # three seconds each, of `make demo`
 FACTORS = (0.5, 2.0)
-CHANGED = 0.02  # of a figure: the table is silent about what changes less
-KNOWN = Path("results/sensitivity.json")
-INTRODUCTION = """\
-Written by `python -m bench.sensitivity --output docs/sensitivity.md`: each constant's stage is
-replayed from stored artefacts with another value, over {sequences} of `{settings}`, and held to the
-truth of these virtual recordings. Integers stay integers, shares stay below 1, and of a ratio its
-distance from 1 is halved and doubled. A figure is named where it changes by {percent} % and more;
-"the same" means to the last digit. `flagged` counts frames that the stage does not trust (of
-`scene`: weak pairs of cameras and notes), as a change. Of `segmentation` the object's track is
-measured, without a detector's candidates. Short recordings of one studio show which constants
-matter, not which value is best: what changes nothing here may still decide on a real recording.
-"""
+CHANGED = 0.02  # relative change of a figure from which it is printed
 
 
-@dataclass(frozen=True)
-class Probe:
-    """A constant to change, what it decides, and the number that it is an excess over.
+def task_of(constant: Constant, stage: str | None, settings: Path, sequences: list[str]) -> Task:
+    """The unchanged replay that a constant is compared with.
 
-    A ratio of 1.15 that stands for "clearly better" is an excess of 0.15 over 1: ``around`` is 1.
+    Raises UserError if the constant's package has no stage and ``stage`` is None.
     """
-
-    name: str
-    decides: str = ""
-    around: float = 0.0
-
-
-# Those that look riskiest on real recordings: thresholds of decisions and trusted deviations that
-# were chosen on virtual recordings.
-RISKIEST = (
-    Probe("object_track.ALWAYS_PRESENT", "a candidate that is always there is furniture"),
-    Probe("object_track.SOMETIMES_PRESENT", "one that is there for a while only is not"),
-    Probe("object_track.RIVAL_FRAMES", "frames that make what stands elsewhere another thing"),
-    Probe("object_track.VIEW_SAMPLES", "how much a view says"),
-    Probe("object_track.RIVAL_LOG_RATIO", "hypotheses that are followed"),
-    Probe("object_track.AMBIGUOUS_PROBABILITY", "when a rival pose makes a frame ambiguous"),
-    Probe("object_track.JUMP_COST", "what a step that no motion explains costs"),
-    Probe("object_track.MODE_CHANGES_S", "how often rest, a hand and free motion change"),
-    Probe("object_track.FREE_COST_S", "what free motion costs"),
-    Probe("object_track.HELD_RAD", "how far a hold turns in the palm"),
-    Probe("object_track.ONSET_RAD_S", "how far a hypothesis may turn from frame to frame"),
-    Probe("object_track.VANISH_COST", "what going out of sight costs"),
-    Probe("object_track.UNHANDLED_LOG_RATIO", "against what moves with nobody near"),
-    Probe("object_track.COMMON_ERROR_VARIANCE", "what views err together, in the covariance"),
-    Probe("object_track.COMMON_TURN_VARIANCE", "the same of turns"),
-    Probe("object_track.SEEN_LOG_RATIO", "when a pose is seen"),
-    Probe("object_track.DEPTH_SIGMA_M", "trust in one view's depth"),
-    Probe("person.CHANGE_COST", "when a body turns about"),
-    Probe("person.MUCH_BETTER", "when a limb's sides are exchanged"),
-    Probe("person.EXCHANGED_VIEW_COST", "what each exchanged view costs"),
-    Probe("person.SAME_PERSON_GAP_M", "which people of two views are one"),
-    Probe(
-        "person.segmentation.depth_candidates:PERSON_MARGINS", "what is the person, and no object"
-    ),
-    Probe("person.segmentation.foreground:GONE_SHARE", "what gives way and is no background"),
-    Probe("person.segmentation.depth_candidates:FLOOR_M", "what is the floor"),
-    Probe("scene.MIN_SLIP_GAIN", "when a camera slipped, beyond doubt"),
-    Probe("scene.CLEAR_SLIP_GAIN", "slipped, rather than late throughout"),
-    Probe("scene.SURFACE_SIGMA_FLOOR_M", "trust in surfaces between cameras"),
-    Probe("body_fit.PERSISTENCE", "keypoint errors that last"),
-    Probe("body_fit.CLOUD_HUBER_M", "outliers of the cloud"),
-    Probe("body_fit.LARGEST_SIGMA_M", "when a part is undetermined"),
-    Probe("body_fit.MIRRORED_SIGMA_M", "how far a limb of one view may lean"),
-    Probe("joint.CONTACT_SIGMA", "how close touching is"),
-    Probe("joint.PENETRATION_SIGMA", "how deep sinking in may be"),
-    Probe("joint.BODY_ACCELERATION", "how fast bodies start and stop"),
-    Probe("joint.OBJECT_DRIFT", "trust in the sequential track"),
-)
+    _, package, *rest = constant.module.split(".")
+    if stage is None and package == "person" and rest[:1] == ["segmentation"]:
+        stages: tuple[str, ...] = ("person", "object_track")
+        return Task(str(settings), tuple(sequences), stages, IMAGES_ONLY)
+    stage = stage or package
+    if stage not in STAGES_WITH_FIGURES:
+        raise UserError(
+            f"{constant.label}: package {package!r} has no stage of its own; choose one with "
+            f"--stage, of {', '.join(STAGES_WITH_FIGURES)}"
+        )
+    return Task(str(settings), tuple(sequences), (stage,), {})
 
 
-def probe(replays: Replays, probes: Sequence[Probe]) -> str:
-    """Replay all probes; returns the tables as Markdown."""
-    constants = [find_constant(p.name) for p in probes]
-    for constant in constants:
-        if constant.room not in STAGES:
-            known = ", ".join(STAGES)
-            raise UserError(f"{constant.label}: its room has no stage to replay; rooms: {known}")
-    rooms = sorted({c.room for c in constants})
-    runs = [Run(room) for room in rooms]
-    for one, constant in zip(probes, constants, strict=True):
-        runs += [Run(constant.room, constant, factor, one.around) for factor in FACTORS]
-    outcomes = replays.of(runs)
-    usual = dict(zip(rooms, outcomes, strict=False))
-    pairs = [outcomes[at : at + 2] for at in range(len(rooms), len(outcomes), 2)]
-    rows = [
-        _Row(constant, one, usual[constant.room], *pair)
-        for one, constant, pair in zip(probes, constants, pairs, strict=True)
-    ]
-    return markdown(usual, rows)
+class Replays:
+    """Runs tasks in processes and stores their outcomes in a JSON file."""
+
+    def __init__(self, path: Path, jobs: int) -> None:
+        self._path, self._jobs, self._lock = path, jobs, Lock()
+        self._known = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+        self._kernels = kernel_modules()
+        self._contents: dict[str, str] = {}
+
+    def run(self, tasks: Sequence[Task]) -> list[Outcome]:
+        """Outcomes of tasks; unknown ones are computed in parallel."""
+        keys = [self._key(task) for task in tasks]
+        with ThreadPoolExecutor(self._jobs) as pool:
+            return list(pool.map(self._outcome, tasks, keys))
+
+    def _key(self, task: Task) -> str:
+        """Checksum of the code, settings and artefacts that a task reads, and of its change."""
+        same = json.dumps(asdict(replace(task, constant=None, factor=1.0, unchanged="")))
+        if same not in self._contents:
+            project = load_project(Path(task.settings), dict(task.overrides))
+            check_run(project, task.sequences, task.stages)
+            contents = [content_of(task.stages, project, name) for name in task.sequences]
+            self._contents[same] = "".join([same, *contents])
+        text = f"{self._contents[same]}{task.constant}{task.factor}"
+        return hashlib.sha256(text.encode()).hexdigest()[:24]
+
+    def _outcome(self, task: Task, key: str) -> Outcome:
+        if key not in self._known:
+            outcome = self._start(task)
+            with self._lock:
+                self._known[key] = asdict(outcome)
+                self._path.parent.mkdir(parents=True, exist_ok=True)
+                self._path.write_text(json.dumps(self._known, indent=1) + "\n", encoding="utf-8")
+            name = task.constant.label if task.constant else f"{task.stages[-1]}, unchanged"
+            print(f"{name} times {task.factor:g}: {outcome.seconds:.0f} s", file=sys.stderr)
+        return Outcome(**self._known[key])
+
+    def _start(self, task: Task) -> Outcome:
+        environment = os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+        with tempfile.TemporaryDirectory() as folder:
+            # numba's cache does not notice that a value which was compiled into a kernel changed
+            if task.constant is not None and task.constant.module in self._kernels:
+                environment["NUMBA_CACHE_DIR"] = folder
+            output = Path(folder) / "outcome.json"
+            process = subprocess.run(
+                [sys.executable, "-m", "bench.replay", json.dumps(asdict(task)), str(output)],
+                env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+            )  # fmt: skip
+            if process.returncode:
+                last = (process.stderr.strip().splitlines() or ["no message"])[-1]
+                return Outcome("", "", "", {}, 0.0, last)
+            return Outcome(**json.loads(output.read_text(encoding="utf-8")))
 
 
-@dataclass(frozen=True)
-class _Row:
-    constant: Constant
-    probe: Probe
-    usual: Outcome
-    half: Outcome
-    double: Outcome
+def changes(unchanged: Outcome, other: Outcome) -> dict[str, tuple[float, float, float]]:
+    """Figures that differ by 2 % or more, and changed numbers of flagged frames.
 
-    @property
-    def worst(self) -> float:
-        """The largest relative change of a figure; infinite where a stage failed."""
-        if self.half.failure or self.double.failure:
-            return float("inf")
-        every = (changes(self.usual, self.half), changes(self.usual, self.double))
-        return max((abs(share) for found in every for _, _, share in found.values()), default=0.0)
-
-
-def changes(usual: Outcome, other: Outcome) -> dict[str, tuple[float, float, float]]:
-    """Figures, without flags, that differ by 2 % or more: before, after, relative change."""
+    Returns value before, value after and relative change by the figure's name.
+    """
     found = {}
-    for name, before in usual.figures.items():
+    for name, before in unchanged.figures.items() if other.figures else ():
         after = other.figures.get(name, float("nan"))
         share = (after - before) / max(abs(before), 1e-9) if after != before else 0.0
-        if name != "flagged" and not abs(share) < CHANGED:
+        if after != before and (name == FLAGS or not abs(share) < CHANGED):
             found[name] = (before, after, share)
     return found
 
 
-def markdown(usual: Mapping[str, Outcome], rows: Sequence[_Row]) -> str:
-    """Table of the unchanged figures, and table of the constants, most sensitive first."""
-    lines = ["| room | figures as the code is | flagged | s |", "|---|---|---|---|"]
-    for room, outcome in usual.items():
-        text = ", ".join(
-            f"{name} {_number(value)}"
-            for name, value in outcome.figures.items()
-            if name != "flagged"
-        )
-        lines.append(
-            f"| {room} | {text or outcome.failure} | {outcome.figures.get('flagged', 0):.0f} "
-            f"| {outcome.seconds:.0f} |"
-        )
-    lines += [
-        "",
-        "| constant | decides | value | half: figures | flagged | s | double: figures | flagged "
-        "| s |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
-    for row in sorted(rows, key=lambda row: -row.worst):
-        cells = [f"`{row.constant.label}`", row.probe.decides, row.half.value]
-        for outcome in (row.half, row.double):
-            cells += [
-                _changes_text(row.usual, outcome),
-                _flags(row.usual, outcome),
-                f"{outcome.seconds:.0f}",
-            ]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
-
-
-def _changes_text(usual: Outcome, outcome: Outcome) -> str:
-    if outcome.failure:
-        return f"{outcome.changed}: fails, {outcome.failure}"
-    found = changes(usual, outcome)
-    text = ", ".join(f"{name} {_number(a)} → {_number(b)}" for name, (a, b, _) in found.items())
-    if text:
-        return f"{outcome.changed}: {text}"
-    same = {k: v for k, v in outcome.figures.items()} == dict(usual.figures)
-    return f"{outcome.changed}: {'the same' if same else 'less than 2 %'}"
-
-
-def _flags(usual: Outcome, outcome: Outcome) -> str:
-    change = outcome.figures.get("flagged", 0) - usual.figures.get("flagged", 0)
-    return f"{change:+.0f}" if change else "="
-
-
-def _number(value: float) -> str:
-    return f"{value:.3g}"
-
-
-def page(settings: Path, sequences: Sequence[str], tables: str) -> str:
-    """The tables with an introduction for readers."""
-    words = INTRODUCTION.format(
-        sequences=" and ".join(sequences), settings=settings, percent=f"{100 * CHANGED:g}"
-    )
-    return f"# Constants, halved and doubled\n\n{textwrap.fill(words, 100)}\n\n{tables}"
+def report(
+    constants: Sequence[Constant],
+    unchanged: Sequence[Outcome],
+    changed: Sequence[Sequence[Outcome]],
+) -> str:
+    """Table of the constants, most sensitive first, and the list of those without effect."""
+    rows, without_effect = [], []
+    for constant, usual, pair in zip(constants, unchanged, changed, strict=True):
+        if all(outcome.checksum == usual.checksum for outcome in pair):
+            without_effect.append(f"{constant.label} = {pair[0].before}")
+            continue
+        cells, most = [], 0.0
+        for outcome in pair:
+            found = changes(usual, outcome)
+            most = max([most, *(abs(s) for key, (*_, s) in found.items() if key != FLAGS)])
+            text = ", ".join(f"{key} {a:.3g} → {b:.3g}" for key, (a, b, _) in found.items())
+            if outcome.failure:
+                text, most = f"fails: {outcome.failure}", float("inf")
+            elif not text:
+                same = outcome.checksum == usual.checksum
+                text = "no effect" if same else f"less than {100 * CHANGED:g} %"
+            cells.append(f"{outcome.after}: {text}" if outcome.after else text)
+        value = next((outcome.before for outcome in pair if outcome.before), "")
+        rows.append((most, f"| `{constant.label}` | {value} | {' | '.join(cells)} |"))
+    lines = ["| constant | value | half | double |", "|---|---|---|---|"]
+    lines += [line for _, line in sorted(rows, key=lambda row: -row[0])]
+    return "\n".join([*lines, "", f"without effect: {len(without_effect)}", *without_effect])
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Read the command line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    """Read the command line, replay and print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("settings", type=Path, nargs="?", default=SETTINGS)
-    parser.add_argument("--constants", nargs="+", metavar="ROOM.NAME", help="default: the riskiest")
-    parser.add_argument("--sequences", nargs="+", help=f"default: {', '.join(SEQUENCES)}")
-    parser.add_argument("--output", type=Path, help="Markdown file for the tables")
-    parser.add_argument("--known", type=Path, default=KNOWN, help="JSON of what is known already")
+    parser.add_argument("--constants", nargs="+", required=True, metavar="PACKAGE[.NAME]")
+    parser.add_argument("--sequences", nargs="+", default=list(SEQUENCES))
+    parser.add_argument("--stage", help="default: that of the constant's package")
+    parser.add_argument("--known", type=Path, default=Path("results/sensitivity.json"))
     parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1))
     options = parser.parse_args(arguments)
     with exit_on_user_error():
-        sequences = options.sequences or list(SEQUENCES)
-        replays = Replays(options.settings, sequences, options.known, options.jobs)
-        table = probe(replays, [_probe_of(name) for name in options.constants or []] or RISKIEST)
-    print(table)
-    if options.output:
-        text = page(options.settings, sequences, table)
-        options.output.write_text(text, encoding="utf-8")
-
-
-def _probe_of(name: str) -> Probe:
-    """The listed probe of that name, or a default probe."""
-    return next((p for p in RISKIEST if p.name == name), Probe(name))
+        constants = [one for name in options.constants for one in find_constants(name)]
+        tasks = [task_of(c, options.stage, options.settings, options.sequences) for c in constants]
+        replays = Replays(options.known, options.jobs)
+        distinct = list({task.stages: task for task in tasks}.values())
+        usual = dict(zip([task.stages for task in distinct], replays.run(distinct), strict=True))
+        if failures := [outcome.failure for outcome in usual.values() if outcome.failure]:
+            raise UserError(f"the unchanged code cannot be replayed: {failures[0]}")
+        values = [
+            replace(task, constant=constant, factor=factor, unchanged=usual[task.stages].checksum)
+            for task, constant in zip(tasks, constants, strict=True)
+            for factor in FACTORS
+        ]
+        outcomes = replays.run(values)
+        pairs = [outcomes[at : at + 2] for at in range(0, len(outcomes), 2)]
+        print(report(constants, [usual[task.stages] for task in tasks], pairs))
 
 
 if __name__ == "__main__":

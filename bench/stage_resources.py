@@ -58,7 +58,7 @@ def there_and_back(frames: int, count: int) -> np.ndarray:
 def lengthen(source: Path, stage: str, output: Path, count: int) -> None:
     """Write the artefact of ``stage`` with ``count`` frames.
 
-    Raises UserError where the source has fewer than two frames.
+    Raises UserError if the source has fewer than two frames.
     """
     schema = getattr(schemas, stage.upper())
     with artefacts.read(source, schema) as read:
@@ -144,7 +144,7 @@ def _runs(starts: np.ndarray, lengths: np.ndarray) -> np.ndarray:
 def peak_memory_mb(settings: Path, project: Project, sequence: str, count: int) -> float:
     """Peak resident memory of the joint stage on ``count`` frames, in a separate process.
 
-    Raises UserError where the stage fails.
+    Raises UserError if the stage fails.
     """
     with tempfile.TemporaryDirectory(dir=project.results) as folder:
         for stage in STAGES["joint"].reads:

@@ -1,4 +1,4 @@
-"""The baseline's differentiable rasterisers: gradients, coverage, and views side by side."""
+"""The baseline's differentiable rasteriser: gradients, coverage, several views."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import trimesh
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from bench.soft_rasteriser import OverdrawRasteriser, Pixels, Rasteriser, SoftRasteriser
+from bench.rasteriser import OverdrawRasteriser, Pixels
 
 SIZES = np.array([[64, 60], [58, 64]])
 FOCAL = 200.0
@@ -36,16 +36,13 @@ def _every_pixel(sizes: np.ndarray) -> Pixels:
     return Pixels(view, x, y, sizes)
 
 
-def _make(kind: str, vertices: np.ndarray, faces: np.ndarray, pixels: Pixels) -> Rasteriser:
-    if kind == "soft":
-        return SoftRasteriser(faces, pixels)
+def _make(vertices: np.ndarray, faces: np.ndarray, pixels: Pixels) -> OverdrawRasteriser:
     pytest.importorskip("deodr")
     return OverdrawRasteriser(faces, len(vertices), pixels)
 
 
-@pytest.mark.parametrize("kind", ["soft", "overdraw"])
 @pytest.mark.parametrize("channel", [0, 1], ids=["coverage", "depth"])
-def test_gradient_by_finite_differences(kind: str, channel: int) -> None:
+def test_gradient_by_finite_differences(channel: int) -> None:
     """Of smoothly weighted sums over the images, along motions of all corners and depths.
 
     Depth is weighted by coverage: alone it jumps where the first triangle's reach begins.
@@ -53,7 +50,7 @@ def test_gradient_by_finite_differences(kind: str, channel: int) -> None:
     vertices, faces = _box()
     corners, depth = _projected(vertices)
     pixels = _every_pixel(SIZES)
-    draw = _make(kind, vertices, faces, pixels)
+    draw = _make(vertices, faces, pixels)
     rng = np.random.default_rng(3)
     noise = [gaussian_filter(rng.normal(size=(height, width)), 3) for width, height in SIZES]
     weights = torch.tensor(np.concatenate([image.ravel() for image in noise]))
@@ -79,14 +76,13 @@ def test_gradient_by_finite_differences(kind: str, channel: int) -> None:
         assert analytic == pytest.approx(float(ahead - behind) / (2 * step), rel=1e-3, abs=1e-3)
 
 
-@pytest.mark.parametrize("kind", ["soft", "overdraw"])
-def test_coverage_and_depth_of_a_facing_square(kind: str) -> None:
+def test_coverage_and_depth_of_a_facing_square() -> None:
     """A box's front 1.9 m away: its area in pixels but for the soft edge, its depth inside."""
     vertices, faces = _box()
     points = vertices + np.array([0, 0, 2.0])
     corners = torch.tensor(points[None, :, :2] / points[None, :, 2:] * FOCAL + 32)
     pixels = _every_pixel(np.array([[64, 64]]))
-    draw = _make(kind, vertices, faces, pixels)
+    draw = _make(vertices, faces, pixels)
     coverage, depth = draw(corners, torch.tensor(points[None, :, 2]))
     width, height = np.array([0.5, 0.3]) / 1.9 * FOCAL
     perimeter = 2 * (width + height)
@@ -98,14 +94,13 @@ def test_coverage_and_depth_of_a_facing_square(kind: str) -> None:
     assert float(coverage[outside].max()) < 1e-3
 
 
-@pytest.mark.parametrize("kind", ["soft", "overdraw"])
-def test_views_together_equal_each_alone(kind: str) -> None:
+def test_views_together_equal_each_alone() -> None:
     vertices, faces = _box()
     corners, depth = _projected(vertices)
     pixels = _every_pixel(SIZES)
-    together = _make(kind, vertices, faces, pixels)(corners, depth)
+    together = _make(vertices, faces, pixels)(corners, depth)
     for view in range(2):
-        one = _make(kind, vertices, faces, _every_pixel(SIZES[view : view + 1]))
+        one = _make(vertices, faces, _every_pixel(SIZES[view : view + 1]))
         alone = one(corners[view : view + 1], depth[view : view + 1])
         mine = pixels.view == view
         for a, b in zip(together, alone, strict=True):

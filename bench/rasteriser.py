@@ -1,23 +1,17 @@
 """Differentiable silhouettes and depths of a mesh in several views at once, for the baseline.
 
-Two rasterisers with one interface: ``SoftRasteriser``, plain torch, after Liu et al., Soft
-Rasterizer, ICCV 2019 (sigmoid of the signed squared distance to each triangle, product over
-triangles, softmax over depth); and ``OverdrawRasteriser``, the compiled DEODR (BSD 2-clause), which
-blends only along the silhouette (de La Gorce et al., PAMI 2011). Both are asked for a list of
-pixels only: equation 1 counts no others.
+Drawn by the compiled DEODR (BSD 2-clause), which blends only along the silhouette (de La Gorce et
+al., PAMI 2011). Only the requested pixels are returned: equation 1 counts no others.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
 
-SIGMA_PX2 = 0.3  # of the sigmoid over squared distance: an edge some 1 px wide, as in the paper
-REACH_PX = 2.0  # sigmoid(-4 / 0.3) is nothing
-GAMMA_M = 0.005  # of the softmax over depth
 OVERDRAW_PX = 1.0  # width of DEODR's blended edge
 
 
@@ -35,104 +29,13 @@ class Pixels:
     """(V, 2) width and height."""
 
 
-class Rasteriser(Protocol):
-    """Differentiable drawing of corners (V, N, 2), px in each tile, with depth (V, N), metres.
-
-    Returns coverage (P,) in [0, 1] and depth (P,), metres, of the pixels. Depth is meaningless
-    where
-    coverage is small.
-    """
-
-    def __call__(
-        self, corners: torch.Tensor, depth: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]: ...
-
-
-class SoftRasteriser:
-    """Soft Rasterizer in torch over pairs of a pixel and a triangle whose box holds it."""
-
-    def __init__(self, faces: np.ndarray, pixels: Pixels) -> None:
-        """``faces`` (F, 3) of the mesh, seen in every view."""
-        self._faces = torch.as_tensor(np.asarray(faces, np.int64))
-        self._sizes = torch.as_tensor(pixels.sizes)
-        width, height = pixels.sizes.max(0)
-        self._slot = torch.full((len(pixels.sizes), int(height), int(width)), -1)
-        self._count = len(pixels.view)
-        at = tuple(torch.as_tensor(v) for v in (pixels.view, pixels.y, pixels.x))
-        self._slot[at] = torch.arange(self._count)
-        self._place = torch.as_tensor(np.stack([pixels.x, pixels.y], 1))
-
-    def __call__(
-        self, corners: torch.Tensor, depth: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """See :class:`Rasteriser`."""
-        triangle, slot = self._pairs(corners.detach())
-        count = len(self._faces)
-        view, face = triangle // count, triangle % count
-        vertex = self._faces[face] + (view * corners.shape[1])[:, None]  # (K, 3)
-        a, b, c = corners.reshape(-1, 2)[vertex].unbind(1)
-        at = self._place[slot].to(corners.dtype)
-        none = corners.new_zeros(self._count)
-        # twice the areas opposite to a, b, c: barycentric coordinates, and inside or not
-        areas = torch.stack(
-            [_cross(b - at, c - at), _cross(c - at, a - at), _cross(a - at, b - at)]
-        )
-        whole = areas.sum(0)
-        whole = torch.where(whole.abs() < 1e-6, torch.full_like(whole, 1e-6), whole)
-        weights = areas / whole
-        inside = (weights >= 0).all(0)
-        apart = torch.stack([_to_edge(at, a, b), _to_edge(at, b, c), _to_edge(at, c, a)]).amin(0)
-        logit = torch.where(inside, apart, -apart) / SIGMA_PX2
-        clear = none.index_add(0, slot, -torch.nn.functional.softplus(logit))
-        # perspective: 1 / z is linear in the image; outside, the nearest point's as SoftRas does
-        weights = weights.clamp(0, 1)
-        weights = weights / weights.sum(0)
-        inverse = (weights / depth.reshape(-1)[vertex].T).sum(0)
-        z = 1 / inverse
-        score = torch.nn.functional.logsigmoid(logit) - z / GAMMA_M
-        best = torch.full_like(none, -torch.inf)
-        best = best.scatter_reduce(0, slot, score.detach(), "amax")
-        share = torch.exp(score - best[slot])
-        total = none.index_add(0, slot, share)
-        mean = none.index_add(0, slot, share * z)
-        return 1 - torch.exp(clear), mean / total.clamp(min=1)
-
-    def _pairs(self, corners: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Triangles (K,) = view * F + face and wanted pixels (K,) within their reach."""
-        boxes = corners[:, self._faces]  # (V, F, 3, 2)
-        first = (boxes.amin(2) - REACH_PX).ceil().clamp(min=0)
-        last = torch.minimum((boxes.amax(2) + REACH_PX).floor(), self._sizes[:, None] - 1)
-        span = (last - first + 1).clamp(min=0).long().reshape(-1, 2)
-        first = first.long().reshape(-1, 2)
-        area = span.prod(1)
-        triangle = torch.repeat_interleave(torch.arange(len(area)), area)
-        within = torch.arange(len(triangle)) - (area.cumsum(0) - area)[triangle]
-        width = span[triangle, 0]
-        x, y = first[triangle, 0] + within % width, first[triangle, 1] + within // width
-        slot = self._slot[triangle // len(self._faces), y, x]
-        wanted = slot >= 0
-        return triangle[wanted], slot[wanted]
-
-
-def _cross(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-
-
-def _to_edge(at: torch.Tensor, start: torch.Tensor, end: torch.Tensor) -> torch.Tensor:
-    """Squared distance (K,) of points (K, 2) from segments."""
-    along, offset = end - start, at - start
-    length = (along * along).sum(1).clamp(min=1e-12)
-    part = ((offset * along).sum(1) / length).clamp(0, 1)
-    away = offset - part[:, None] * along
-    return (away * away).sum(1)
-
-
 class OverdrawRasteriser:
     """DEODR on one image that holds all tiles one below the other.
 
-    Coverage and depth are drawn as colours; depth is interpolated linearly in the image. The mesh
-    must
-    be closed, with outward faces.
+    Draws corners (V, N, 2), px in each tile, with depth (V, N), metres; returns coverage (P,) in
+    [0, 1] and depth (P,), metres, of the pixels. Depth is meaningless where coverage is small. Both
+    are drawn as colours; depth is interpolated linearly in the image. The mesh must be closed, with
+    outward faces.
     """
 
     def __init__(self, faces: np.ndarray, vertices: int, pixels: Pixels) -> None:
@@ -172,7 +75,7 @@ class OverdrawRasteriser:
     def __call__(
         self, corners: torch.Tensor, depth: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """See :class:`Rasteriser`."""
+        """Coverage and depth of the pixels, differentiable."""
         coverage, weighted = _Overdraw.apply(corners, depth, self)
         return coverage, weighted / coverage.clamp(min=1e-3)
 
