@@ -1,4 +1,4 @@
-"""Azure Kinect calibration JSON of a camera: the inverse of :mod:`..camera.k4a_calibration`."""
+"""Azure Kinect calibration JSON of a camera: the inverse of :mod:`formats.calibration.k4a`."""
 
 from __future__ import annotations
 
@@ -24,13 +24,12 @@ from intercap_core.geometry.camera.rig import Camera
 # of tilt: its x is the camera's -z, its y the camera's -x, its z the camera's y (down).
 ACCELEROMETER_FROM_DEPTH = np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]])
 GYROSCOPE = "CALIBRATION_InertialSensorType_Gyro"
-_SENSOR = (4096, 3072)
 
 
 def write_calibration(camera: Camera, *, colour_mode: str, depth_mode: str, serial: str) -> bytes:
     """Return the calibration JSON of ``camera`` as its device would hold it.
 
-    Raises ValueError where the camera has no depth or a lens does not have its mode's image size.
+    Raises ValueError if the camera has no depth, or a lens has another image size than its mode.
     """
     if camera.depth is None or camera.colour_from_depth is None:
         raise ValueError(f"camera {camera.name} has no depth")
@@ -42,7 +41,7 @@ def write_calibration(camera: Camera, *, colour_mode: str, depth_mode: str, seri
             COLOUR_MODES[colour_mode],
             COLOUR_LOCATION,
             camera.colour_from_depth,
-            _SENSOR,
+            (4096, 3072),
         ),
     ]
     inertial = [_inertial(kind) for kind in (GYROSCOPE, ACCELEROMETER)]
@@ -63,11 +62,7 @@ def write_calibration(camera: Camera, *, colour_mode: str, depth_mode: str, seri
 
 
 def _lens(
-    lens: Intrinsics,
-    mode: Mode,
-    location: str,
-    pose: np.ndarray,
-    sensor: tuple[int, int],
+    lens: Intrinsics, mode: Mode, location: str, pose: np.ndarray, sensor: tuple[int, int]
 ) -> dict[str, Any]:
     if (lens.width, lens.height) != mode.size:
         raise ValueError(f"a {lens.width}x{lens.height} lens in a mode of {mode.size}")

@@ -31,15 +31,6 @@ from intercap_core.studio.skeleton import turn, unit
 from intercap_core.studio.stage import StageState, StudioStage
 
 CONTACT_M = 0.0045  # skin this near to the object touches it
-# A view sees the object if it shows this many pixels and this share of it
-SEEN_PIXELS = 40
-SEEN_SHARE = 0.05
-OFF_SURFACE_M = 0.001  # visibility rays start this far outside the surface
-ABOVE_SOLE_M = 0.03  # rays down to the support of a sole start this far above it
-# Largest errors of an annotation
-ANNOTATION_ERROR_M = 0.010
-ANNOTATION_ERROR_DEG = 5.0
-ANNOTATION_ERROR_FRAMES = 5
 
 
 def write_truth(
@@ -61,7 +52,8 @@ def write_truth(
     body_visible, object_visible = visible(stage, moment)
     seen = np.stack([camera.object_pixels for camera in recorded], 1)
     whole = np.stack([camera.object_whole for camera in recorded], 1)
-    views = (seen >= SEEN_PIXELS) & (seen >= SEEN_SHARE * np.maximum(whole, 1))
+    # a view sees the object if it shows 40 pixels and 5 % of it
+    views = (seen >= 40) & (seen >= 0.05 * np.maximum(whole, 1))
     normal = master[:3, 2]
     with artefacts.write(
         path,
@@ -139,7 +131,7 @@ def support_height(stage: StudioStage, moment: StageState) -> np.ndarray:
     result = np.zeros((len(moment.body), 2))
     for t, points in enumerate(stage.subject.on_fitted_topology(moment.body)):
         for side, foot in enumerate(("left_foot", "right_foot")):
-            start = points[regions[foot]] + (0, 0, ABOVE_SOLE_M)
+            start = points[regions[foot]] + (0, 0, 0.03)
             down = np.broadcast_to([0.0, 0.0, -1.0], start.shape)
             rays = np.concatenate([start, down], 1).astype(np.float32)
             far = scene.cast_rays(o3d.core.Tensor.from_numpy(rays))["t_hit"].numpy()
@@ -173,7 +165,7 @@ def visible(stage: StudioStage, moment: StageState) -> tuple[np.ndarray, np.ndar
             ids = np.flatnonzero(~result[t] & ((to_eye * normals).sum(1) > 0))
             local = (points[ids] - place[:3, 3]) @ place[:3, :3]
             ids = ids[np.asarray(camera.colour.sees(local))]
-            start = points[ids] + OFF_SURFACE_M * normals[ids]
+            start = points[ids] + 0.001 * normals[ids]
             rays = np.concatenate([start, place[:3, 3] - start], 1).astype(np.float32)
             hidden = scene.test_occlusions(o3d.core.Tensor.from_numpy(rays), tnear=0.0, tfar=1.0)
             result[t, ids] = ~hidden.numpy()
@@ -194,17 +186,17 @@ def erring_annotation(
         padded = np.concatenate([[False], contact[:, region], [False]]).astype(int)
         starts, ends = np.flatnonzero(np.diff(padded) > 0), np.flatnonzero(np.diff(padded) < 0)
         for start, end in zip(starts, ends, strict=True):
-            reach = round(ANNOTATION_ERROR_FRAMES * scale)
+            reach = round(5 * scale)
             first = int(np.clip(start + rng.integers(-reach, reach + 1), 0, stage.frames - 1))
             last = int(np.clip(end + rng.integers(-reach, reach + 1), first + 1, stage.frames))
             intervals.append({"part": name, "start": first, "end": last})
     frame = int(rng.integers(0, max(1, stage.frames // 5)))
     pose = stage.rig.master_from_stage @ moment.stage_from_object[frame]
-    rotation = turn(np.radians(off(ANNOTATION_ERROR_DEG))) @ pose[:3, :3]
+    rotation = turn(np.radians(off(5.0))) @ pose[:3, :3]
     floor = []
     for angle in np.arange(4) * np.pi / 2 + rng.uniform(0, 1):
         point = np.array([1.2 * np.cos(angle), 1.2 * np.sin(angle), 0.0])
-        floor.append((stage.to_master(point) + off(ANNOTATION_ERROR_M)).round(5).tolist())
+        floor.append((stage.to_master(point) + off(0.010)).round(5).tolist())
     if not stage.prop:
         return {"floor": floor}
     return {
@@ -212,15 +204,14 @@ def erring_annotation(
         "object_pose": {
             "frame": frame,
             "rotation_vector": Rotation.from_matrix(rotation).as_rotvec().round(6).tolist(),
-            "translation": (pose[:3, 3] + off(ANNOTATION_ERROR_M)).round(6).tolist(),
+            "translation": (pose[:3, 3] + off(0.010)).round(6).tolist(),
         },
         "floor": floor,
     }
 
 
 def erring_starts(stage: StudioStage, sigma: float) -> dict[str, Any]:
-    """Stated time of each camera's first image on a clock of the day, with errors of ``sigma`` s.
-    Stated time of each camera's first image on a clock of the day, with errors of ``sigma`` s."""
+    """Stated times of the cameras' first images, with errors of ``sigma`` seconds."""
     rng = stage.noise.rng("stated starts")
     clock = float(rng.uniform(0, 86_400))
     starts = {}
@@ -284,14 +275,7 @@ def make_capture(
         progress.step()
     folder.write_calibration(stage.rig.claimed, settings.fps)
     moment = stage.at(stage.set_times)
-    contact = write_truth(
-        output / "truth.h5",
-        stage,
-        moment,
-        sequence,
-        capture,
-        recorded,
-    )
+    contact = write_truth(output / "truth.h5", stage, moment, sequence, capture, recorded)
     annotation = erring_annotation(stage, moment, contact) if capture.annotate else {}
     if capture.states_starts is not None:
         annotation |= erring_starts(stage, capture.states_starts)

@@ -18,10 +18,6 @@ from intercap_core.config import StudioCapture, StudioFault
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera, Rig
 
-# Corners of one surface differ by less than this share of their depth: two pixels of the wide
-# binned image (0.23 degrees apart) on a surface that is 85 degrees off the ray.
-STEEPEST = 0.0469
-
 
 class Aligner:
     """Aligns depth images of one device by its own calibration."""
@@ -50,6 +46,11 @@ class Aligner:
         aligned = np.full((self._lens.height, self._lens.width), np.inf, np.float32)
         _warp(pixels, z, aligned)
         return np.where(np.isfinite(aligned), np.rint(aligned * 1000), 0).astype(np.uint16)
+
+
+# Corners of one surface differ by less than this share of their depth: two pixels of the wide
+# binned image (0.23 degrees apart) on a surface that is 85 degrees off the ray.
+STEEPEST = 0.0469
 
 
 @numba.njit(cache=True)
@@ -97,7 +98,6 @@ def _triangle(a, b, c, za, zb, zc, aligned):
 
 
 SOUND_RATE = 16_000  # samples a second
-WRONG_SIZE = 1.5  # image size of a wrong calibration, relative to the recording
 SWAPPED = (3, 4)  # cameras 4 and 5 of InterCap's release
 
 
@@ -178,25 +178,20 @@ class CaptureFolder(ABC):
         """Also write keypoints next to the images, if the layout has them there."""
 
     def add_masks(  # noqa: B027
-        self,
-        camera: str,
-        t: int,
-        fps: int,
-        candidates: list[dict[str, Any]],
-        label: str,
+        self, camera: str, t: int, fps: int, candidates: list[dict[str, Any]], label: str
     ) -> None:
         """Also write masks of person and object, COCO label ``label``, next to the images."""
 
     def lenses(self, claimed: Rig) -> list[Intrinsics]:
         """Return the colour lenses of the calibration, with the faults of the capture."""
-        found = [camera.colour for camera in claimed]
+        lenses = [camera.colour for camera in claimed]
         if "swapped_lenses" in self.capture.faults:
             a, b = SWAPPED
-            found[a], found[b] = found[b], found[a]
+            lenses[a], lenses[b] = lenses[b], lenses[a]
         if "wrong_resolution" in self.broken:
             at = self.broken["wrong_resolution"]
-            found[at] = found[at].scaled(WRONG_SIZE)
-        return found
+            lenses[at] = lenses[at].scaled(1.5)
+        return lenses
 
 
 class ImageFiles(CameraFiles):

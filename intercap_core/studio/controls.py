@@ -6,12 +6,13 @@ Everything is a smooth function of time in seconds, vectorised over moments (N,)
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
+from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.studio.skeleton import blend
 
 
@@ -32,29 +33,39 @@ def plateau(times: np.ndarray, start: float, full: float, wane: float, end: floa
     return ramp(times, start, full) - ramp(times, wane, end)
 
 
-@dataclass(frozen=True)
+def bisect(
+    low: float, high: float, steps: int, is_below: Callable[[float], bool]
+) -> tuple[float, float]:
+    """Bounds, halved ``steps`` times, of the value from which ``is_below`` is false."""
+    for _ in range(steps):
+        middle = (low + high) / 2
+        if is_below(middle):
+            low = middle
+        else:
+            high = middle
+    return low, high
+
+
 class Wander:
-    """Involuntary motion: a sum of slow sines with random phases."""
+    """Involuntary motion: a sum of slow sines with random phases.
 
-    channels: int
-    size: float
-    """RMS of each channel, in the caller's unit."""
-    rng: np.random.Generator
-    frequencies: tuple[float, ...] = (0.23, 0.41, 0.67, 1.13)
-    """Hz."""
-    _phase: np.ndarray = field(init=False, repr=False)
-    _weight: np.ndarray = field(init=False, repr=False)
+    Args:
+        channels: number of independent values.
+        size: RMS of each value, in the caller's unit.
+    """
 
-    def __post_init__(self) -> None:
-        shape = (self.channels, len(self.frequencies))
-        object.__setattr__(self, "_phase", self.rng.uniform(0, 2 * np.pi, shape))
-        weight = self.rng.uniform(0.5, 1.5, shape) / np.array(self.frequencies)
+    frequencies = np.array((0.23, 0.41, 0.67, 1.13))  # Hz
+
+    def __init__(self, channels: int, size: float, rng: np.random.Generator) -> None:
+        shape = (channels, len(self.frequencies))
+        self._phase = rng.uniform(0, 2 * np.pi, shape)
+        weight = rng.uniform(0.5, 1.5, shape) / self.frequencies
         weight /= np.linalg.norm(weight, axis=1, keepdims=True)
-        object.__setattr__(self, "_weight", weight * np.sqrt(2) * self.size)
+        self._weight = weight * np.sqrt(2) * size
 
     def __call__(self, times: np.ndarray) -> np.ndarray:
         """(N,) -> (N, channels)."""
-        angle = 2 * np.pi * np.asarray(times)[:, None, None] * np.array(self.frequencies)
+        angle = 2 * np.pi * np.asarray(times)[:, None, None] * self.frequencies
         return (np.sin(angle + self._phase) * self._weight).sum(-1)
 
 
@@ -66,6 +77,16 @@ class WristPose:
     """(N, 3)."""
     rotation: np.ndarray
     """(N, 3, 3) stage_from_rest."""
+
+    @property
+    def matrices(self) -> np.ndarray:
+        """(N, 4, 4)."""
+        return rigid(self.rotation, self.position)
+
+    @classmethod
+    def of(cls, matrices: np.ndarray) -> WristPose:
+        """From (N, 4, 4)."""
+        return cls(matrices[:, :3, 3], matrices[:, :3, :3])
 
     @classmethod
     def still(cls, transform: np.ndarray, count: int) -> WristPose:

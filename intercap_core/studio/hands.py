@@ -15,12 +15,12 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.geometry.rigid.distance import DistanceField
+from intercap_core.studio.controls import bisect
 from intercap_core.studio.skeleton import PuppetSkeleton, turn, unit
 from intercap_core.studio.subjects import Subject
 
 FINGERS = ("index", "middle", "pinky", "ring", "thumb")  # in the order of the joints
 THUMB = FINGERS.index("thumb")
-TISSUE_M = 0.0012  # a finger closes until its skin is pressed in by this much
 # Largest flexion of MCP, PIP, DIP, and of the thumb's CMC, MCP, IP, degrees (AAOS tables)
 LIMITS = {"finger": (85.0, 100.0, 65.0), "thumb": (35.0, 50.0, 65.0)}
 
@@ -66,7 +66,6 @@ class Hand:
     """One hand of a subject: ``side`` 0 left, 1 right."""
 
     scan_deg = 5.0  # step at which flexion is scanned for contact
-    bisections = 8  # of the flexion at contact
 
     def __init__(self, subject: Subject, side: int) -> None:
         self.side = side
@@ -138,14 +137,18 @@ class Hand:
         limits: dict[str, tuple[float, float, float]],
         surface: DistanceField,
         object_from_wrist: np.ndarray,
-        tissue: float = TISSUE_M,
+        tissue: float = 0.0012,
         fingers: tuple[int, ...] = (1, 3, 0, 2, THUMB),
     ) -> tuple[HandShape, np.ndarray]:
         """Flex joint after joint until the skin meets the object or the limit is reached.
 
-        ``object_from_wrist`` (4, 4) takes the hand's rest frame at the wrist to the object's;
-        ``fingers`` are closed, in this order. Returns the shape and the least signed distance
-        (5,) of each finger.
+        Args:
+            object_from_wrist: (4, 4) from the hand's rest frame at the wrist.
+            tissue: depth to which the skin is pressed in, metres.
+            fingers: the fingers that are closed, in this order.
+
+        Returns:
+            The shape, and the least signed distance (5,) of each finger.
         """
         flexion = start.flexion.copy()
         for f in fingers:
@@ -154,10 +157,7 @@ class Hand:
                 moved = self.moved[f][j]
 
                 def least(
-                    angles: np.ndarray,
-                    f: int = f,
-                    j: int = j,
-                    moved: np.ndarray = moved,
+                    angles: np.ndarray, f: int = f, j: int = j, moved: np.ndarray = moved
                 ) -> np.ndarray:
                     trial = np.tile(flexion[f], (len(angles), 1))
                     trial[:, j] = angles
@@ -176,13 +176,9 @@ class Hand:
                     continue
                 low = angles[max(hits[0] - 1, 0)]
                 high = angles[hits[0]] if hits[0] else low
-                for _ in range(self.bisections):
-                    middle = (low + high) / 2
-                    if least(np.array([middle]))[0] < -tissue:
-                        high = middle
-                    else:
-                        low = middle
-                flexion[f, j] = low
+                flexion[f, j], _ = bisect(
+                    low, high, 8, lambda angle: not least(np.array([angle]))[0] < -tissue
+                )
         closed = replace(start, flexion=flexion)
         skin = self.skin(self.local(closed)[None])
         gaps = [

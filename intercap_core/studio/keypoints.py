@@ -70,12 +70,7 @@ class Detector:
         return cls(noise, frames, direction * size[:, None] * noise.scale)
 
     def detect(
-        self,
-        camera: Camera,
-        points: np.ndarray,
-        axes: np.ndarray,
-        hidden: np.ndarray,
-        *who: str,
+        self, camera: Camera, points: np.ndarray, axes: np.ndarray, hidden: np.ndarray, *who: str
     ) -> np.ndarray:
         """Keypoints (T, 135, 3) x, y, confidence of one person in one camera.
 
@@ -133,10 +128,7 @@ class Detector:
         return (camera.colour.fx / np.maximum(depth, 0.3))[:, None, None]
 
     def _confidence(
-        self,
-        rng: np.random.Generator,
-        error: np.ndarray,
-        hidden: np.ndarray,
+        self, rng: np.random.Generator, error: np.ndarray, hidden: np.ndarray
     ) -> np.ndarray:
         """Confidence (T, 135) in [0, 1], which decreases with the error."""
         size = np.linalg.norm(error, axis=-1)
@@ -148,10 +140,7 @@ class Detector:
         return np.clip(confidence, 0.02, 0.98)
 
     def _swapped(
-        self,
-        rng: np.random.Generator,
-        pixels: np.ndarray,
-        confidence: np.ndarray,
+        self, rng: np.random.Generator, pixels: np.ndarray, confidence: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Exchange left and right of the whole body or of the legs for short periods."""
         chance = np.full((self.frames, 2), self.swap_probability)
@@ -209,11 +198,11 @@ class Detector:
             rng, self.frames, one * self.miss_probability, common, self.miss_s, 0.0
         )[:, 0]
         seen = (passer_by[:, BODY, 2] > 0) & ~hidden[:, BODY]
-        found = (seen.sum(1) >= self.fewest_visible) & ~missed
+        detected = (seen.sum(1) >= self.fewest_visible) & ~missed
         result = []
         for t, have in enumerate(people):
             place = int(rng.integers(len(have) + 1))
-            result.append([*have[:place], passer_by[t], *have[place:]] if found[t] else have)
+            result.append([*have[:place], passer_by[t], *have[place:]] if detected[t] else have)
         return result
 
 

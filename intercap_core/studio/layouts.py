@@ -8,6 +8,7 @@ In the table of sequences, ``recordings`` is the capture's folder and ``calibrat
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -36,9 +37,7 @@ from intercap_core.studio.capture_folder import (
 from intercap_core.studio.mkv import MkvWriter
 from intercap_core.studio.rig import STAGGER_S
 
-RELEASE_FPS = 30  # the number in the name of an image of InterCap's counts periods of this rate
 BEHAVE_DATE = "Date01"
-MICROSECOND = Fraction(1, 1_000_000)
 
 
 class KinectFolder(CaptureFolder):
@@ -117,23 +116,26 @@ class ReleaseFolder(CaptureFolder):
 
     def write_calibration(self, claimed: Rig, fps: int) -> None:
         """Write ``Color.json``, ``Color_2.json``, ...: x_camera = R x_world + T."""
-        folder = self.path / self.calibration
-        folder.mkdir()
-        for index, (camera, lens) in enumerate(zip(claimed, self.lenses(claimed), strict=True)):
-            pose = camera.colour_from_master
-            content = {
-                "f": [lens.fx, lens.fy],
-                "c": [lens.cx, lens.cy],
-                "k": lens.distortion.tolist(),
-                "R": Rotation.from_matrix(pose[:3, :3]).as_rotvec().tolist(),
-                "T": pose[:3, 3].tolist(),
-            }
-            name = "Color.json" if index == 0 else f"Color_{index + 1}.json"
-            (folder / name).write_text(json.dumps(content, indent=1) + "\n")
+        write_intercap_calibration(self.path / self.calibration, claimed, self.lenses(claimed))
+
+
+def write_intercap_calibration(folder: Path, rig: Rig, lenses: Sequence[Intrinsics]) -> None:
+    """Write the files of the lenses and poses of InterCap's release."""
+    for index, (camera, lens) in enumerate(zip(rig, lenses, strict=True), start=1):
+        pose = camera.colour_from_master
+        content = {
+            "f": [lens.fx, lens.fy],
+            "c": [lens.cx, lens.cy],
+            "k": lens.distortion.tolist(),
+            "R": Rotation.from_matrix(pose[:3, :3]).as_rotvec().tolist(),
+            "T": pose[:3, 3].tolist(),
+        }
+        _write_json(folder / (f"Color_{index}.json" if index > 1 else "Color.json"), content)
 
 
 def _release_number(t: int, fps: int) -> int:
-    return t * RELEASE_FPS // fps
+    """InterCap's image numbers count periods of 30 Hz."""
+    return t * 30 // fps
 
 
 class BehaveFolder(CaptureFolder):
@@ -155,39 +157,41 @@ class BehaveFolder(CaptureFolder):
 
     def write_calibration(self, claimed: Rig, fps: int) -> None:
         """Write ``<n>/config.json`` (camera to world) and ``intrinsics/<n>/calibration.json``."""
-        for camera, lens in zip(claimed, self.lenses(claimed), strict=True):
-            number, pose = camera.name[1:], camera.master_from_colour
-            rotation, shift = pose[:3, :3].ravel().tolist(), pose[:3, 3].tolist()
-            _write_json(
-                self.path / self.calibration / number / "config.json",
-                {"rotation": rotation, "translation": shift},
-            )
-            numbers = [lens.fx, lens.fy, lens.cx, lens.cy]
-            colour = dict(zip(("fx", "fy", "cx", "cy"), numbers, strict=True))
-            colour |= {"width": lens.width, "height": lens.height}
-            content = {"color": colour | {"opencv": [*numbers, *lens.distortion.tolist()]}}
-            _write_json(self.path / "calibs" / "intrinsics" / number / "calibration.json", content)
+        write_behave_calibration(self.path / "calibs", claimed, self.lenses(claimed))
 
     def add_keypoints(self, camera: str, t: int, fps: int, content: str) -> None:
         """Write ``k<n>.color.json``."""
         (_behave_frame(self.path, t, fps) / f"{camera}.color.json").write_text(content)
 
     def add_masks(
-        self,
-        camera: str,
-        t: int,
-        fps: int,
-        candidates: list[dict[str, Any]],
-        label: str,
+        self, camera: str, t: int, fps: int, candidates: list[dict[str, Any]], label: str
     ) -> None:
         """Write ``k<n>.person_mask.jpg`` and ``k<n>.obj_rend_mask.jpg``: the first candidate of
         each."""
-        for wanted, kind in (("person", "person_mask"), (label, "obj_rend_mask")):
-            found = next((c for c in candidates if c["category"] == wanted), None)
-            if found is not None:
-                mask = 255 * coco.decode(found["segmentation"])
+        for category, kind in (("person", "person_mask"), (label, "obj_rend_mask")):
+            first = next((c for c in candidates if c["category"] == category), None)
+            if first is not None:
+                mask = 255 * coco.decode(first["segmentation"])
                 path = _behave_frame(self.path, t, fps) / f"{camera}.{kind}.jpg"
                 path.write_bytes(cv2.imencode(".jpg", mask)[1].tobytes())
+
+
+def write_behave_calibration(
+    folder: Path, rig: Rig, lenses: Sequence[Intrinsics], date: str = BEHAVE_DATE
+) -> None:
+    """Write the folder ``calibs`` of BEHAVE for cameras k0, k1, ...; the world is the master."""
+    for camera, lens in zip(rig, lenses, strict=True):
+        number, pose = camera.name[1:], camera.master_from_colour
+        extrinsics = {
+            "rotation": pose[:3, :3].ravel().tolist(),
+            "translation": pose[:3, 3].tolist(),
+        }
+        _write_json(folder / date / "config" / number / "config.json", extrinsics)
+        numbers = [lens.fx, lens.fy, lens.cx, lens.cy]
+        colour = dict(zip(("fx", "fy", "cx", "cy"), numbers, strict=True))
+        colour |= {"width": lens.width, "height": lens.height}
+        content = {"color": colour | {"opencv": [*numbers, *lens.distortion.tolist()]}}
+        _write_json(folder / "intrinsics" / number / "calibration.json", content)
 
 
 def _behave_frame(folder: Path, t: int, fps: int) -> Path:
@@ -235,15 +239,14 @@ class _PlainFiles(ImageFiles):
         super().__init__(
             lambda frame: (folder / f"{frame.t:06d}.jpg", folder / "depth" / f"{frame.t:06d}.png")
         )
-        self._folder = folder
-        self._times: list[str] = []
+        self._path, self._times = folder / "timestamps.csv", list[str]()
 
     def write(self, frame: DeviceFrame) -> None:
         super().write(frame)
         self._times.append(f"{frame.t:06d}, {frame.time_us / 1e6:.6f}\n")
 
     def close(self) -> None:
-        (self._folder / "timestamps.csv").write_text("".join(self._times))
+        self._path.write_text("".join(self._times))
 
 
 class _PlainVideo(ImageFiles):
@@ -251,14 +254,11 @@ class _PlainVideo(ImageFiles):
 
     def __init__(self, folder: Path, device: Device) -> None:
         super().__init__(lambda frame: (None, folder / "depth" / f"{len(self._times):06d}.png"))
-        self._folder, self._first_us = folder, device.first_us
-        self._times: list[str] = []
+        self._path, self._times = folder.with_name(f"{folder.name}_timestamps.csv"), list[str]()
+        self._first_us, lens = device.first_us, device.camera.colour
         self._container = av.open(str(folder.with_suffix(".mp4")), "w")
         self._stream = self._container.add_stream("mjpeg", rate=device.fps)
-        self._stream.width, self._stream.height = (
-            device.camera.colour.width,
-            device.camera.colour.height,
-        )
+        self._stream.width, self._stream.height = lens.width, lens.height
         self._stream.pix_fmt = "yuvj420p"
         if device.sound is not None:
             self._write_sound(device.sound)
@@ -266,7 +266,7 @@ class _PlainVideo(ImageFiles):
     def write(self, frame: DeviceFrame) -> None:
         super().write(frame)
         packet = av.Packet(frame.jpeg)
-        packet.stream, packet.time_base = self._stream, MICROSECOND
+        packet.stream, packet.time_base = self._stream, Fraction(1, 1_000_000)
         packet.pts = packet.dts = frame.time_us - self._first_us
         self._container.mux(packet)
         self._times.append(f"{frame.time_us / 1e6:.6f}\n")
@@ -281,8 +281,7 @@ class _PlainVideo(ImageFiles):
 
     def close(self) -> None:
         self._container.close()
-        times = self._folder.with_name(f"{self._folder.name}_timestamps.csv")
-        times.write_text("".join(self._times))
+        self._path.write_text("".join(self._times))
 
 
 def _opencv(lens: Intrinsics) -> dict[str, object]:

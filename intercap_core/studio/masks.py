@@ -94,11 +94,7 @@ class CameraMasks:
     margin_px = 12  # room around a mask for a border that moves outward
 
     def __init__(
-        self,
-        network: MaskSimulator,
-        name: str,
-        clutter: np.ndarray | None,
-        size: tuple[int, int],
+        self, network: MaskSimulator, name: str, clutter: np.ndarray | None, size: tuple[int, int]
     ) -> None:
         noise, frames = network.noise, network.frames
         self.network, self.noise, self.size = network, noise, size
@@ -159,7 +155,7 @@ class CameraMasks:
 
     def candidates(self, t: int, truth: Labels) -> list[dict[str, Any]]:
         """COCO results of set ``t`` without image_id, in random order."""
-        found: list[tuple[str, dict[str, Any], float]] = []
+        instances: list[tuple[str, dict[str, Any], float]] = []
         person = self._bordered(truth, BODY, t)
         prop = self._bordered(truth, OBJECT, t)
         score = 0.72 + 0.12 * self._score[t]
@@ -168,11 +164,11 @@ class CameraMasks:
             if self._score[t, 3] > 0:
                 prop = None
         if person is not None and not self._person_missed[t]:
-            found.append(("person", self._rle(person, truth), score[0] + 0.15))
+            instances.append(("person", self._rle(person, truth), score[0] + 0.15))
         if self.network.passer_by and not self._other_missed[t]:
             other = self._bordered(truth, PASSER_BY, t)
             if other is not None:
-                found.append(
+                instances.append(
                     ("person", self._rle(other, truth), 0.87 + 0.12 * self._other_score[t])
                 )
         missed = self.miss_free + (self.miss_hidden - self.miss_free) * (1 - truth.visible) ** 2
@@ -183,12 +179,14 @@ class CameraMasks:
         if prop is not None and rank > threshold:
             if self._split[t]:
                 prop = self._half(prop, t)
-            found.append((self._object_label(t), self._rle(prop, truth), score[1]))
+            instances.append((self._object_label(t), self._rle(prop, truth), score[1]))
         for k, (label, rle) in enumerate(self._standing(truth)):
             if self._clutter_on[t, k] and coco.area(rle):
-                found.append((label, rle, score[4 + k] - 0.08))
-        order = self.noise.detector_rng("mask order", t, truth.x0, truth.y0).permutation(len(found))
-        return [self._result(*found[i]) for i in order]
+                instances.append((label, rle, score[4 + k] - 0.08))
+        order = self.noise.detector_rng("mask order", t, truth.x0, truth.y0).permutation(
+            len(instances)
+        )
+        return [self._result(*instances[i]) for i in order]
 
     def _standing(self, truth: Labels) -> list[tuple[str, dict[str, Any]]]:
         """Static false instances, first the unoccluded part of the object's twin."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import struct
 from pathlib import Path
-from typing import IO, Literal, Required, TypedDict, Unpack
+from typing import IO, Literal
 
 import numpy as np
 
@@ -56,28 +56,6 @@ def _text(number: int, value: str) -> bytes:
     return _element(number, value.encode())
 
 
-class MkvOptions(TypedDict, total=False):
-    """Options of a recording."""
-
-    calibration_json: Required[bytes | None]
-    """The device's calibration; None leaves the attachment out."""
-    colour_mode: Required[str]
-    """Key of ``COLOUR_MODES``."""
-    depth_mode: Required[str | None]
-    """Key of ``DEPTH_MODES``; None leaves the depth track out."""
-    fps: Required[int]
-    serial: Required[str]
-    start_offset_ns: int
-    """Device time at which the file's clock starts; default 0."""
-    depth_delay_ns: int
-    wired_sync_mode: WiredSyncMode
-    subordinate_delay_ns: int
-    with_ir: bool
-    with_imu: bool
-    colour_format: ColourFormat
-    """Default MJPG."""
-
-
 class MkvWriter:
     """Writes one camera's recording, in order of time, with memory for one cluster only.
 
@@ -86,19 +64,40 @@ class MkvWriter:
     images of another size and for times before the start or more than a cluster back.
     """
 
-    def __init__(self, path: Path, **options: Unpack[MkvOptions]) -> None:
-        colour_mode, depth_mode = options["colour_mode"], options["depth_mode"]
-        fps, start_offset_ns = options["fps"], options.get("start_offset_ns", 0)
-        with_ir, with_imu = options.get("with_ir", False), options.get("with_imu", False)
+    def __init__(
+        self,
+        path: Path,
+        *,
+        calibration_json: bytes | None,
+        colour_mode: str,
+        depth_mode: str | None,
+        fps: int,
+        serial: str,
+        start_offset_ns: int = 0,
+        depth_delay_ns: int = 0,
+        wired_sync_mode: WiredSyncMode = "STANDALONE",
+        subordinate_delay_ns: int = 0,
+        with_ir: bool = False,
+        with_imu: bool = False,
+        colour_format: ColourFormat = "MJPG",
+    ) -> None:
+        """Open a recording.
+
+        Args:
+            calibration_json: the device's calibration; None omits the attachment.
+            colour_mode: key of ``COLOUR_MODES``.
+            depth_mode: key of ``DEPTH_MODES``; None omits the depth track.
+            start_offset_ns: device time at which the file's clock starts.
+        """
         if fps not in KINECT_RATES:
             raise ValueError(f"fps is {fps}, the device records at 5, 15 or 30")
         if start_offset_ns % TIMECODE_SCALE_NS:
             raise ValueError(f"start_offset_ns {start_offset_ns} is not a whole microsecond")
-        self._colour_format = options.get("colour_format", "MJPG")
+        self._colour_format = colour_format
         self._colour_size = COLOUR_MODES[colour_mode].size
         self._depth_size = DEPTH_MODES[depth_mode].size if depth_mode else None
         self._start_us = start_offset_ns // TIMECODE_SCALE_NS
-        self._serial = options["serial"]
+        self._serial = serial
         names = ["COLOR"] + ["DEPTH"] * bool(depth_mode) + ["IR"] * with_ir + ["IMU"] * with_imu
         self._tracks = {name: number for number, name in enumerate(names, start=1)}
         self._cluster_us: int | None = None
@@ -107,26 +106,22 @@ class MkvWriter:
         self._cues: list[bytes] = []
         self._last_us = 0
 
-        calibration = options["calibration_json"]
-        sync = options.get("wired_sync_mode", "STANDALONE")
-        tags = self._tags(colour_mode, depth_mode, calibration is not None)
-        tags["K4A_DEPTH_DELAY_NS"] = (str(options.get("depth_delay_ns", 0)), "")
-        tags["K4A_WIRED_SYNC_MODE"] = (sync, "")
-        if sync == "SUBORDINATE":
-            tags["K4A_SUBORDINATE_DELAY_NS"] = (str(options.get("subordinate_delay_ns", 0)), "")
+        tags = self._tags(colour_mode, depth_mode, calibration_json is not None)
+        tags["K4A_DEPTH_DELAY_NS"] = (str(depth_delay_ns), "")
+        tags["K4A_WIRED_SYNC_MODE"] = (wired_sync_mode, "")
+        if wired_sync_mode == "SUBORDINATE":
+            tags["K4A_SUBORDINATE_DELAY_NS"] = (str(subordinate_delay_ns), "")
         tags["K4A_DEVICE_SERIAL_NUMBER"] = (self._serial, "")
         tags["K4A_START_OFFSET_NS"] = (str(start_offset_ns), "")
 
         self._file: IO[bytes] = open(path, "wb")  # noqa: SIM115 - closed by close()
-        self._write_head(fps, calibration, tags)
+        self._write_head(fps, calibration_json, tags)
 
     def __enter__(self) -> MkvWriter:
         return self
 
     def __exit__(self, *error: object) -> None:
         self.close()
-
-    # --- what goes in -----------------------------------------------------------------------
 
     def write_colour(self, image: bytes, device_time_us: int) -> None:
         """Add one JPEG image, or the bytes of a raw one where ``colour_format`` is raw."""
@@ -141,10 +136,7 @@ class MkvWriter:
         self._write_image("IR", infrared, device_time_us)
 
     def write_imu(
-        self,
-        acceleration: np.ndarray,
-        angular_velocity: np.ndarray,
-        device_time_us: int,
+        self, acceleration: np.ndarray, angular_velocity: np.ndarray, device_time_us: int
     ) -> None:
         """Add one sample: m/s^2 (3,) and rad/s (3,), both in their sensor's axes."""
         time_ns = device_time_us * 1000
@@ -177,18 +169,13 @@ class MkvWriter:
         self._patch(self._duration_at, struct.pack(">d", float(self._last_us)))
         self._file.close()
 
-    # --- the file's head --------------------------------------------------------------------
-
     def _uid(self, name: str) -> int:
         """A track's or attachment's id: random-looking, never 0, the same for the same device."""
         digest = hashlib.sha256(f"{self._serial}/{name}".encode()).digest()
         return int.from_bytes(digest[:7], "big") | 1
 
     def _tags(
-        self,
-        colour_mode: str,
-        depth_mode: str | None,
-        calibrated: bool,
+        self, colour_mode: str, depth_mode: str | None, calibrated: bool
     ) -> dict[str, tuple[str, str]]:
         """Tags of tracks and attachment: name -> (value, what it is about)."""
         tags = {
@@ -209,10 +196,7 @@ class MkvWriter:
         return tags
 
     def _write_head(
-        self,
-        fps: int,
-        calibration: bytes | None,
-        tags: dict[str, tuple[str, str]],
+        self, fps: int, calibration: bytes | None, tags: dict[str, tuple[str, str]]
     ) -> None:
         ebml = (
             _unsigned(0x4286, 1)  # EBMLVersion
@@ -288,8 +272,6 @@ class MkvWriter:
             target = _text(0x63CA, "ATTACHMENT") + _unsigned(0x63C6, self._uid(about))
         simple = _text(0x45A3, name) + _text(0x4487, value)
         return _element(0x7373, _element(0x63C0, target) + _element(0x67C8, simple))
-
-    # --- blocks -----------------------------------------------------------------------------
 
     def _write_image(self, name: str, image: np.ndarray, device_time_us: int) -> None:
         expected = self._depth_size and self._depth_size[::-1]

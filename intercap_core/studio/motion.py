@@ -12,8 +12,8 @@ from itertools import pairwise
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from intercap_core.body.joints import JOINT_INDEX
-from intercap_core.studio.controls import Footwork, WristPose, ramp
+from intercap_core.body.joints import JOINT_INDEX, PARENTS
+from intercap_core.studio.controls import Footwork, WristPose, bisect, ramp
 from intercap_core.studio.hands import RELAXED, Hand, HandShape, part_of
 from intercap_core.studio.skeleton import (
     PuppetSkeleton,
@@ -122,8 +122,6 @@ class Puppet:
         self.thigh_height = [_thigh_height(subject, side) for side in (0, 1)]
         self.stand = self.stand_share * self.leg + float(self.ankle_height.min()) + self.hip_drop
 
-    # --- the parts of a pose ---------------------------------------------------------------
-
     def trunk(self, trunk: Trunk) -> np.ndarray:
         """World rotations (N, 55, 3, 3) with the trunk and head set, limbs hanging on them."""
         count = len(trunk.pelvis)
@@ -196,41 +194,33 @@ class Puppet:
             world[:, _J[names[0]]], world[:, _J[names[1]]] = upper, lower
             world[:, _J[names[2]]], world[:, _J[f"{name}_foot"]] = foot, toes
 
-    def arm_root(self, world: np.ndarray, pelvis: np.ndarray, side: int) -> np.ndarray:
-        """Shoulder joint (N, 3)."""
-        chain = ("pelvis", "spine1", "spine2", "spine3", f"{SIDES[side]}_collar",
-                 f"{SIDES[side]}_shoulder")  # fmt: skip
-        at = pelvis
+    def joint(self, world: np.ndarray, pelvis: np.ndarray, name: str) -> np.ndarray:
+        """A joint (N, 3) from rotations (N, 55, 3, 3) of its ancestors and the pelvis (N, 3)."""
+        chain = [_J[name]]
+        while chain[0] != _J["pelvis"]:
+            chain.insert(0, PARENTS[chain[0]])
+        at, rest = pelvis, self.skeleton.rest
         for a, b in pairwise(chain):
-            at = at + world[:, _J[a]] @ self.skeleton.bone(a, b)
+            at = at + world[:, a] @ (rest[b] - rest[a])
         return at
 
-    def joint_on_trunk(self, world: np.ndarray, pelvis: np.ndarray, name: str) -> np.ndarray:
-        """A joint of spine, neck or head (N, 3)."""
-        chain = ["pelvis", "spine1", "spine2", "spine3", "neck", "head"]
-        chain = chain[: chain.index(name) + 1]
-        at = pelvis
-        for a, b in pairwise(chain):
-            at = at + world[:, _J[a]] @ self.skeleton.bone(a, b)
-        return at
+    def shoulder(self, world: np.ndarray, pelvis: np.ndarray, side: int) -> np.ndarray:
+        """Shoulder joint (N, 3)."""
+        return self.joint(world, pelvis, f"{SIDES[side]}_shoulder")
 
     def idle_wrist(
-        self,
-        world: np.ndarray,
-        pelvis: np.ndarray,
-        side: int,
-        swing: np.ndarray,
+        self, world: np.ndarray, pelvis: np.ndarray, side: int, swing: np.ndarray
     ) -> WristPose:
         """The wrist of an arm that hangs and swings by ``swing`` (N,) metres forward."""
         sign = (1.0, -1.0)[side]
         # where the chest's left is: its front may point down and back in a deep stoop
         base = facing(np.arctan2(-world[:, 9, 0, 0], world[:, 9, 1, 0]))
         left, up, forward = base[..., 0], base[..., 1], base[..., 2]
-        shoulder = self.arm_root(world, pelvis, side)
+        shoulder = self.shoulder(world, pelvis, side)
         reach = 0.955 * self.arms[side]
         # clear of the hips
-        beside = self.girth + self.hand_half_m - sign * ((shoulder - pelvis) * left).sum(1)
-        out = np.clip(beside, 0.085, 0.6 * reach)
+        aside = self.girth + self.hand_half_m - sign * ((shoulder - pelvis) * left).sum(1)
+        out = np.clip(aside, 0.085, 0.6 * reach)
         down = np.sqrt((0.97 * reach) ** 2 - out**2)
         position = shoulder + sign * out[:, None] * left - down[:, None] * up
         position += (0.05 + swing)[:, None] * forward
@@ -254,7 +244,7 @@ class Puppet:
             world = self.trunk(current)
             base = facing(trunk.heading)
             for side, (target, weight) in targets.items():
-                shoulder = self.arm_root(world, trunk.pelvis, side)
+                shoulder = self.shoulder(world, trunk.pelvis, side)
                 way = target.position - shoulder
                 excess = np.linalg.norm(way, axis=1) - self.arm_reach * self.arms[side]
                 excess = weight * 0.5 * (excess + np.sqrt(excess**2 + 0.01**2))
@@ -274,7 +264,7 @@ class Puppet:
     ) -> None:
         """Set one arm for a wrist pose, in place; ``raised`` (N,) lifts the elbow outward."""
         name, sign = SIDES[side], (1.0, -1.0)[side]
-        shoulder = self.arm_root(world, pelvis, side)
+        shoulder = self.shoulder(world, pelvis, side)
         chest = world[:, _J["spine3"]]
         raised = np.broadcast_to(raised, len(pelvis))[:, None]
         # the elbow points back under a hanging arm, down and out before the chest
@@ -323,10 +313,7 @@ class Puppet:
             world[:, hand.first + joint] = world[:, parent] @ local[:, joint]
 
     def finger_track(
-        self,
-        side: int,
-        start: HandShape,
-        keys: list[tuple[np.ndarray, HandShape]],
+        self, side: int, start: HandShape, keys: list[tuple[np.ndarray, HandShape]]
     ) -> np.ndarray:
         """Rotation vectors (N, 15, 3): from ``start`` to each shape in turn by its share (N,)."""
         hand = self.hands[side]
@@ -368,14 +355,11 @@ class Foot:
     ) -> np.ndarray:
         """The place (5,) moved along ``way`` (5,) until the skin is ``gap`` metres off by
         ``distance`` of skin (n, 3)."""
-        low, high = 0.0, 1.0
-        for _ in range(18):
-            middle = (low + high) / 2
-            if distance(self.skin((place + middle * way)[None])[0]) < gap:
-                low = middle
-            else:
-                high = middle
-        return place + high * way
+
+        def is_too_near(share: float) -> bool:
+            return distance(self.skin((place + share * way)[None])[0]) < gap
+
+        return place + bisect(0.0, 1.0, 18, is_too_near)[1] * way
 
 
 def moved(place: np.ndarray, x: float, y: float, z: float, pitch: float = 0.0) -> np.ndarray:

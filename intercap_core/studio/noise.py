@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-FAMILY_B_SLOWER = 1.7  # correlation times of family "b" against those of family "a"
 _QUANTILES = ndtri((np.arange(1 << 16) + 0.5) / (1 << 16)).astype(np.float32)
 
 
@@ -43,15 +42,11 @@ class NoiseSource:
         return self.rng(*name, self.redrawn) if self.redrawn else self.rng(*name)
 
     def process(
-        self,
-        rng: np.random.Generator,
-        frames: int,
-        channels: int,
-        correlation_s: float,
+        self, rng: np.random.Generator, frames: int, channels: int, correlation_s: float
     ) -> np.ndarray:
         """(frames, channels): zero mean, unit variance, correlated over ``correlation_s``."""
         if self.family == "b":
-            correlation_s *= FAMILY_B_SLOWER
+            correlation_s *= 1.7
             return self.tails(self._first_order(rng, frames, channels, correlation_s))
         lag = max(correlation_s * self.fps, 1e-3)
         margin = int(np.ceil(3 * lag))
@@ -64,11 +59,7 @@ class NoiseSource:
         ).reshape(frames, channels)
 
     def _first_order(
-        self,
-        rng: np.random.Generator,
-        frames: int,
-        channels: int,
-        correlation_s: float,
+        self, rng: np.random.Generator, frames: int, channels: int, correlation_s: float
     ) -> np.ndarray:
         keep = np.exp(-1 / max(correlation_s * self.fps, 1e-3))
         steps = rng.normal(size=(frames, channels))

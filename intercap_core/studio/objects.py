@@ -16,20 +16,16 @@ from intercap_core.entries import ObjectEntry
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh_files import load_mesh
 
-SCALE_ERROR = 0.005  # of the true size, larger or smaller
 # RMS of the smooth displacement along the normal, in parts of the object's radius (root mean square
 # distance of its surface from its origin): 0.3 mm of a cup, 0.7 of a football, 1.4 of a suitcase,
 # 1.9 of a chair. Waves are as long as the radius says, so a cup is no more crumpled than a chair.
 SURFACE_ERROR = 0.006
-WAVELENGTHS = (0.25, 0.9)  # of the surface error, in parts of the object's radius
 WAVES = 48
 
 
 PAINTS = ((0.92, 0.91, 0.88), (0.13, 0.13, 0.14), (0.70, 0.12, 0.13), (0.11, 0.28, 0.60),
           (0.84, 0.42, 0.17), (0.16, 0.46, 0.31), (0.88, 0.76, 0.24),
           (0.50, 0.51, 0.53))  # fmt: skip
-PRINTS = (3, 7)  # number of spots on a printed object, the end excluded
-PRINT_RADIUS = (0.15, 0.45)  # of a spot, in parts of the object's radius
 
 
 @dataclass(frozen=True)
@@ -81,16 +77,13 @@ def true_mesh(entry: ObjectEntry, seed: int) -> tuple[np.ndarray, np.ndarray, np
     faces = np.asarray(source.faces, np.int64)
     colours = np.asarray(source.visual.vertex_colors, np.float64)[:, :3]
     vertices, faces, colours = _split_edges(vertices, faces, colours, rng)
-    scale = 1 + SCALE_ERROR * rng.choice((-1, 1))
+    scale = 1 + 0.005 * rng.choice((-1, 1))
     vertices = scale * (vertices + _smooth_displacement(vertices, faces, rng))
     return vertices, faces.astype(np.int32), np.round(colours).astype(np.uint8)
 
 
 def _split_edges(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    colours: np.ndarray,
-    rng: np.random.Generator,
+    vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Split each edge between 30 and 70 % of its length, each triangle into four."""
     corners = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
@@ -108,9 +101,7 @@ def _split_edges(
 
 
 def _smooth_displacement(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    rng: np.random.Generator,
+    vertices: np.ndarray, faces: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
     """A random smooth vector field (V, 3) without rigid motion, in metres.
 
@@ -126,7 +117,7 @@ def _smooth_displacement(
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
 
     radius = np.sqrt(weight @ (vertices**2).sum(1))
-    wavelength = radius * rng.uniform(*WAVELENGTHS, WAVES)
+    wavelength = radius * rng.uniform(0.25, 0.9, WAVES)
     direction = rng.normal(size=(WAVES, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     phase = vertices @ (2 * np.pi * direction / wavelength[:, None]).T
@@ -146,10 +137,7 @@ NEAR_M = 0.01  # points farther from the object's box are not tested
 
 
 def press_out(
-    points: np.ndarray,
-    surface: DistanceField,
-    stage_from_object: np.ndarray,
-    bounds: np.ndarray,
+    points: np.ndarray, surface: DistanceField, stage_from_object: np.ndarray, bounds: np.ndarray
 ) -> np.ndarray:
     """Move points (N, 3) of the stage that are inside the object to its surface.
 
@@ -191,11 +179,11 @@ def object_colours(
     if look == "mesh":
         return colours
     first, *others = np.array(PAINTS)[rng.permutation(len(PAINTS))]
-    found = np.tile(first, (len(vertices), 1))
+    painted = np.tile(first, (len(vertices), 1))
     if look == "printed":
         radius = np.linalg.norm(vertices - vertices.mean(0), axis=1).max()
-        for paint in others[: rng.integers(*PRINTS)]:
+        for paint in others[: rng.integers(3, 7)]:
             middle = vertices[rng.integers(len(vertices))]
-            reach = radius * rng.uniform(*PRINT_RADIUS)
-            found[np.linalg.norm(vertices - middle, axis=1) < reach] = paint
-    return found
+            reach = radius * rng.uniform(0.15, 0.45)
+            painted[np.linalg.norm(vertices - middle, axis=1) < reach] = paint
+    return painted

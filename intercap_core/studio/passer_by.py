@@ -18,11 +18,6 @@ from intercap_core.studio.room import FLOOR_HALF_M, Room
 from intercap_core.studio.subjects import Subject, body_colours, subject_names
 
 CELL_M = 0.05  # grid of the floor plan
-# Obstacles are points above the floor and inside the walls
-FLOOR_UP_M = 0.03
-WALLS_BEYOND_M = 2.8
-OTHER_COLOURS = 0.25  # least RGB distance of the mean colours of both persons' clothes
-_CORNERS = np.array([[a, b, 4 - a - b] for a in range(5) for b in range(5 - a)]) / 4
 
 
 @dataclass(frozen=True)
@@ -203,11 +198,12 @@ class PasserBy:
 
 
 def _obstacles(room: Room) -> np.ndarray:
-    """Floor points (N, 2) of furniture, on a grid."""
+    """Floor points (N, 2), on a grid, of surfaces above the floor and inside the walls."""
+    shares = np.array([[a, b, 4 - a - b] for a in range(5) for b in range(5 - a)]) / 4
     corners = room.vertices[room.faces]
-    points = np.einsum("sk,fkc->fsc", _CORNERS, corners).reshape(-1, 3)
-    standing = points[:, 2] > FLOOR_UP_M
-    inside = np.linalg.norm(points[:, :2], axis=1) < WALLS_BEYOND_M
+    points = np.einsum("sk,fkc->fsc", shares, corners).reshape(-1, 3)
+    standing = points[:, 2] > 0.03
+    inside = np.linalg.norm(points[:, :2], axis=1) < 2.8
     cells = np.round(points[standing & inside, :2] / CELL_M).astype(int)
     return CELL_M * np.unique(cells, axis=0)
 
@@ -226,5 +222,5 @@ def _other_colours(noise: NoiseSource, passer_by: Subject, subject: Subject) -> 
     dressed = passer_by.clothing > 0.001
     drawn = [body_colours(passer_by, rng) for _ in range(8)]
     away = [float(np.linalg.norm(colours[dressed].mean(0) - worn)) for colours in drawn]
-    far = next((k for k, distance in enumerate(away) if distance > OTHER_COLOURS), None)
+    far = next((k for k, distance in enumerate(away) if distance > 0.25), None)
     return drawn[int(np.argmax(away)) if far is None else far]

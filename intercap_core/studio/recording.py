@@ -147,10 +147,10 @@ class Kinect:
                 truth = Labels(
                     cast.identity, cast.x0, cast.y0, size, seen[t] / max(whole[t], 1), blur[t]
                 )
-                found = masks.candidates(t, truth)
-                folder.add_masks(name, t, stage.fps, found, segmenter.label)
+                results = masks.candidates(t, truth)
+                folder.add_masks(name, t, stage.fps, results, segmenter.label)
                 image = folder.image_number(t, order, stage.fps)
-                candidates += [{"image_id": image, **result} for result in found]
+                candidates += [{"image_id": image, **result} for result in results]
         path = folder.path / "candidates" / f"{name}.json"
         path.parent.mkdir(exist_ok=True)
         path.write_text(json.dumps(candidates, separators=(",", ":")) + "\n")

@@ -23,9 +23,6 @@ from intercap_core.studio.noise import gaussian
 from intercap_core.studio.room import Room
 
 BODY, OBJECT, PASSER_BY = 1, 2, 3  # what an identity image holds; 0 is the room
-BOX_MARGIN_PX = 1  # of the window around moving surfaces
-AMBIENT = 0.42  # light from all directions
-VOID = 0.04  # grey level beyond the room
 # Directions to the lamps and their strength: two ceiling lamps
 LAMPS = (((0.45, 0.3, 0.85), 0.42), ((-0.6, -0.25, 0.75), 0.30))
 CAMERA_GAMMA = 2.2  # grey levels are linear light to the power 1 / 2.2, as nearly in sRGB
@@ -92,7 +89,7 @@ def scene_of(*meshes: tuple[np.ndarray, np.ndarray]) -> o3d.t.geometry.Raycastin
 
 def shade(normals: np.ndarray) -> np.ndarray:
     """Factor (...,) of the grey levels of surfaces with unit normals (..., 3)."""
-    light = np.full(normals.shape[:-1], AMBIENT, np.float32)
+    light = np.full(normals.shape[:-1], 0.42, np.float32)  # from all directions
     for direction, strength in LAMPS:
         lamp = np.array(direction, np.float32) / np.float32(np.linalg.norm(direction))
         light += np.float32(strength) * np.maximum(normals @ lamp, 0)
@@ -103,12 +100,7 @@ class RoomView:
     """Rays of one lens, and its image of the empty room."""
 
     def __init__(
-        self,
-        lens: Intrinsics,
-        stage_from_camera: np.ndarray,
-        room: Room,
-        *,
-        coloured: bool,
+        self, lens: Intrinsics, stage_from_camera: np.ndarray, room: Room, *, coloured: bool
     ) -> None:
         self.lens = lens
         self.camera_from_stage = np.linalg.inv(stage_from_camera)
@@ -117,7 +109,7 @@ class RoomView:
         shape = (lens.height, lens.width)
         self.depth = np.full(shape, np.inf, np.float32)
         self.normal = np.zeros((*shape, 3), np.float32)
-        self.colour = np.full((*shape, 3) if coloured else (0, 0, 3), VOID, np.float32)
+        self.colour = np.full((*shape, 3) if coloured else (0, 0, 3), 0.04, np.float32)
         self.material = np.full(shape, -1, np.int16)
         room_scene = scene_of((room.vertices, room.faces))
         facing = _facing(room, self.eye)
@@ -161,9 +153,7 @@ class RoomView:
 
     def cast(self, surfaces: Sequence[MovingSurface]) -> Cast:
         """Draw ``surfaces`` over the room."""
-        drawn = render_scene(
-            [self._drawable(s) for s in surfaces], self.lens, margin_px=BOX_MARGIN_PX
-        )
+        drawn = render_scene([self._drawable(s) for s in surfaces], self.lens, margin_px=1)
         nearer = drawn.mask & (drawn.depth < self.depth[drawn.window])
         kinds = np.array([surface.kind for surface in surfaces], np.uint8)
         identity = np.where(nearer, kinds[drawn.body], 0).astype(np.uint8)
@@ -251,10 +241,7 @@ def _facing(room: Room, eye: np.ndarray) -> np.ndarray:
 
 
 def _room_colours(
-    room: Room,
-    points: np.ndarray,
-    face: np.ndarray,
-    facing: np.ndarray,
+    room: Room, points: np.ndarray, face: np.ndarray, facing: np.ndarray
 ) -> np.ndarray:
     """Colours (N, 3) of points of the empty room on faces (N,), not yet shaded."""
     colours = np.empty((len(points), 3), np.float32)

@@ -17,67 +17,9 @@ from intercap_core.geometry.camera.transforms import invert, rigid
 from intercap_core.studio.noise import NoiseSource
 from intercap_core.studio.skeleton import turn, unit
 
-
-@dataclass(frozen=True)
-class RingLayout:
-    """Places of the cameras."""
-
-    radius_m: float = 2.55
-    """Distance from the middle."""
-    radius_spread_m: float = 0.2
-    """Random deviation, at most."""
-    heights_m: tuple[float, float] = (1.05, 2.05)
-    """Alternating heights."""
-    height_spread_m: float = 0.08
-    """Random deviation, at most."""
-    aim_height_m: float = 0.85
-    """Height above the middle at which the cameras look."""
-    colour_from_depth_m: tuple[float, float, float] = (-0.0320, -0.0021, 0.0039)
-    """Translation, as in real devices' calibrations."""
-    depth_tilt_deg: float = 5.6
-    """The depth camera looks down relative to the colour camera, as in real devices."""
-
-
-RING = RingLayout()
-
-
 # Delay of each subordinate, so that the lasers do not interfere (Azure Kinect documentation)
 STAGGER_S = 160e-6
-
-
-@dataclass(frozen=True)
-class RigErrors:
-    """Errors of a rig at noise 1."""
-
-    extrinsic_m: float = 0.010
-    """Camera position in the rig file."""
-    extrinsic_deg: float = 0.5
-    """Camera orientation in the rig file."""
-    focal: float = 3e-4
-    """Relative, of the devices' own calibration; standard deviation."""
-    centre_px: float = 0.25
-    """Principal point at 1080p, standard deviation."""
-    max_offset_s: float = 0.008
-    """Exposure relative to the device time, at most."""
-    slipping_cameras: int = 2
-    """Cameras that lose frames or deliver late ones."""
-    slipped_frames: tuple[int, int] = (1, 4)
-    """Fewest and most frames of a slip."""
-    slip_sets: tuple[int, int] = (5, 20)
-    """Sets until a silent slip is over."""
-    slip_stays: float = 0.3
-    """Share of the silent slips that last to the end."""
-    clock_jitter_s: float = 100e-6
-    """Standard deviation of a subordinate's device times."""
-    max_jitter: float = 3.0
-    """Largest jitter, in standard deviations."""
-    depth_gaps: tuple[int, int] = (1, 3)
-    """Fewest and most episodes without depth, in one camera."""
-    depth_gap_sets: tuple[int, int] = (1, 3)
-    """Fewest and most sets of such an episode."""
-
-
-ERRORS = RigErrors()
+MAX_OFFSET_S = 0.008  # of the exposure relative to the device time, at noise 1
 
 
 @dataclass(frozen=True)
@@ -129,10 +71,10 @@ def build_rig(
         )
         true.append(camera)
         error = np.eye(4)
-        if index:
+        if index:  # 0.5 degrees and 10 mm at noise 1
             error = rigid(
-                turn(unit(rng.normal(size=3)) * np.radians(ERRORS.extrinsic_deg) * noise),
-                unit(rng.normal(size=3)) * ERRORS.extrinsic_m * noise,
+                turn(unit(rng.normal(size=3)) * np.radians(0.5) * noise),
+                unit(rng.normal(size=3)) * 0.010 * noise,
             )
         assert camera.depth is not None
         claimed.append(
@@ -143,10 +85,10 @@ def build_rig(
                 master_from_colour=_about_centre(camera.master_from_colour, error),
             )
         )
-    offset = rng.uniform(-ERRORS.max_offset_s, ERRORS.max_offset_s, cameras) * noise
-    offset = np.clip(offset, -2 * ERRORS.max_offset_s, 2 * ERRORS.max_offset_s)
+    offset = rng.uniform(-MAX_OFFSET_S, MAX_OFFSET_S, cameras) * noise
+    offset = np.clip(offset, -2 * MAX_OFFSET_S, 2 * MAX_OFFSET_S)
     offset -= offset[0]  # the sets' times are the master's
-    offset = np.clip(offset, -ERRORS.max_offset_s * noise, ERRORS.max_offset_s * noise)
+    offset = np.clip(offset, -MAX_OFFSET_S * noise, MAX_OFFSET_S * noise)
     missing, slip = _slips(rng, capture.frames, settings)
     return StudioRig(
         Rig(tuple(true)),
@@ -184,12 +126,10 @@ def _ring(rng: np.random.Generator, cameras: int) -> list[np.ndarray]:
     first = rng.uniform(0, 2 * np.pi)
     for index in range(cameras):
         azimuth = first + 2 * np.pi * index / cameras + np.radians(rng.uniform(-5, 5))
-        radius = RING.radius_m + rng.uniform(-RING.radius_spread_m, RING.radius_spread_m)
-        height = RING.heights_m[index % 2] + rng.uniform(
-            -RING.height_spread_m, RING.height_spread_m
-        )
+        radius = 2.55 + rng.uniform(-0.2, 0.2)
+        height = (1.05, 2.05)[index % 2] + rng.uniform(-0.08, 0.08)
         eye = np.array([radius * np.cos(azimuth), radius * np.sin(azimuth), height])
-        aim = np.array([0, 0, RING.aim_height_m]) + rng.normal(0, 0.05, 3)
+        aim = np.array([0, 0, 0.85]) + rng.normal(0, 0.05, 3)
         forward = unit(aim - eye)
         right = unit(np.cross(forward, [0, 0, 1.0]))
         rotation = np.stack([right, np.cross(forward, right), forward], 1)
@@ -250,14 +190,15 @@ def _in_mode(lens: Intrinsics, mode: Mode, other: Mode) -> Intrinsics:
 
 
 def _colour_from_depth(rng: np.random.Generator) -> np.ndarray:
-    tilt = np.array([np.radians(-RING.depth_tilt_deg), 0, 0]) + np.radians(rng.normal(0, 0.25, 3))
-    return rigid(turn(tilt), np.array(RING.colour_from_depth_m) + rng.normal(0, 2e-4, 3))
+    """As in real devices' calibrations, the depth camera looks down by 5.6 degrees."""
+    tilt = np.array([np.radians(-5.6), 0, 0]) + np.radians(rng.normal(0, 0.25, 3))
+    return rigid(turn(tilt), np.array([-0.0320, -0.0021, 0.0039]) + rng.normal(0, 2e-4, 3))
 
 
 def _recalibrated(lens: Intrinsics, rng: np.random.Generator, noise: float) -> Intrinsics:
     """The lens with the errors of the device's own calibration."""
-    focal = 1 + rng.normal(0, ERRORS.focal) * noise
-    centre = rng.normal(0, ERRORS.centre_px, 2) * noise * lens.width / 1920
+    focal = 1 + rng.normal(0, 3e-4) * noise
+    centre = rng.normal(0, 0.25, 2) * noise * lens.width / 1920  # px at 1080p
     return replace(
         lens, fx=lens.fx * focal, fy=lens.fy * focal, cx=lens.cx + centre[0], cy=lens.cy + centre[1]
     )
@@ -276,13 +217,14 @@ def _slips(
     others = np.arange(1, cameras)
     if len(others) == 0 or frames < 8 or settings.noise == 0:
         return tuple(frozenset(m) for m in missing), slip
-    for camera in rng.permutation(others)[: ERRORS.slipping_cameras]:
-        length = int(rng.integers(ERRORS.slipped_frames[0], ERRORS.slipped_frames[1] + 1))
+    for camera in rng.permutation(others)[:2]:
+        length = int(rng.integers(1, 5))
         first = max(2, length)  # nothing is shown that was before the recording
         start = int(rng.integers(first, max(first + 1, frames - length - 2)))
         if settings.slips == "silent":
-            end = start + int(rng.integers(*ERRORS.slip_sets))
-            slip[start : frames if rng.random() < ERRORS.slip_stays else end, camera] = length
+            end = start + int(rng.integers(5, 20))
+            stays = rng.random() < 0.3  # to the end of the recording
+            slip[start : frames if stays else end, camera] = length
         else:
             missing[camera].update(range(start, min(frames, start + length)))
     late, early = rng.permutation(others)[[0, -1]]
@@ -316,14 +258,14 @@ class Failures:
         jitter = np.zeros((frames, cameras))
         empty, away = np.zeros((2, frames, cameras), bool)
         rng = noise.rng("clocks")
-        steps = np.clip(rng.normal(size=(frames, cameras)), -ERRORS.max_jitter, ERRORS.max_jitter)
-        jitter[:, 1:] = steps[:, 1:] * ERRORS.clock_jitter_s * noise.scale
+        steps = np.clip(rng.normal(size=(frames, cameras)), -3, 3)
+        jitter[:, 1:] = steps[:, 1:] * 100e-6 * noise.scale
         rng = noise.rng("depth gaps")
         if noise.scale > 0 and cameras > 1 and frames >= 8:
             camera = int(rng.integers(1, cameras))
-            for _ in range(int(rng.integers(ERRORS.depth_gaps[0], ERRORS.depth_gaps[1] + 1))):
+            for _ in range(int(rng.integers(1, 4))):
                 start = int(rng.integers(0, frames - 1))
-                length = int(rng.integers(ERRORS.depth_gap_sets[0], ERRORS.depth_gap_sets[1] + 1))
+                length = int(rng.integers(1, 4))
                 which = empty if rng.random() < 0.5 else away
                 which[start : start + length, camera] = True
         away |= not capture.depth

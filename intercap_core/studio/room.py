@@ -8,39 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import cv2
 import numpy as np
 
 FLOOR_HALF_M = 6.0  # half the side of the floor
-
-
-@dataclass(frozen=True)
-class RoomLayout:
-    """Sizes and places in a room, metres."""
-
-    wall_height: float = 2.7
-    wall_distance: tuple[float, float] = (3.0, 3.7)
-    """From the middle."""
-    twin_scale: tuple[float, ...] = (0.87, 0.94, 1.07, 1.15)
-    """Sizes of another object of the object's class, relative to the object."""
-    twin_distance: tuple[float, float] = (1.5, 1.75)
-    """From the middle."""
-    low: float = 0.35
-    """A lower twin stands on a box."""
-    stand: tuple[float, float] = (0.45, 0.75)
-    """Height of that box."""
-    pillar_distance: tuple[float, float] = (1.2, 1.5)
-    """From the hidden place."""
-    pillar_half: tuple[float, float] = (0.03, 0.05)
-    """Half the thickness."""
-    pillar_height: float = 1.9
-    pillars: int = 3
-    """Largest number."""
-
-
-LAYOUT = RoomLayout()
 
 
 @dataclass(frozen=True)
@@ -65,13 +38,8 @@ class Box:
         return Box(tuple(low), tuple(high), self.heading + float(turned), self.material)
 
 
-class Twin(NamedTuple):
-    """Another object of the object's class."""
-
-    vertices: np.ndarray
-    faces: np.ndarray
-
-
+Mesh = tuple[np.ndarray, np.ndarray]  # vertices (V, 3) and faces (F, 3)
+FLOOR = np.array([[x, y, 0.0] for x in (-1, 1) for y in (-1, 1)]) * FLOOR_HALF_M
 Furnishing = Literal["furnished", "sparse", "bare"]
 
 
@@ -97,7 +65,7 @@ def build_room(
     eyes: np.ndarray,
     *,
     furnishing: Furnishing,
-    twin: Twin | None = None,
+    twin: Mesh | None = None,
     hidden: np.ndarray | None = None,
 ) -> Room:
     """Make a room around the stage with the script's ``furniture``.
@@ -109,8 +77,7 @@ def build_room(
         twin: another object of the class that stands in the room.
         hidden: (2,) place that a few pillars hide from some cameras.
     """
-    boxes = list(furniture)
-    twins: list[Twin] = []
+    boxes, mesh = list(furniture), None
     if furnishing == "sparse":
         boxes += [_lowered(piece) for piece in _pieces(rng, eyes)[1:3]]
     elif furnishing == "furnished":
@@ -118,28 +85,20 @@ def build_room(
         if hidden is not None:
             boxes += _pillars(rng, eyes, hidden)
         if twin is not None:
-            stand, twin_mesh = _twin(rng, eyes, twin)
+            stand, mesh = _twin(rng, eyes, *twin)
             boxes += stand
-            twins.append(twin_mesh)
-    names = list(dict.fromkeys(["floor", *(box.material for box in boxes)]))
-    names += ["distractor"] * len(twins)
-    vertices = [np.array([[x, y, 0.0] for x in (-1, 1) for y in (-1, 1)]) * FLOOR_HALF_M]
-    faces, material = [np.array([[0, 2, 1], [1, 2, 3]])], [np.zeros(2, int)]
-    count = 4
-    for box in boxes:
-        corners, triangles = _box_mesh(box)
-        vertices.append(corners)
-        faces.append(triangles + count)
-        material.append(np.full(len(triangles), names.index(box.material)))
-        count += len(corners)
-    for twin_mesh in twins:
-        vertices.append(twin_mesh.vertices)
-        faces.append(twin_mesh.faces + count)
-        material.append(np.full(len(twin_mesh.faces), names.index("distractor")))
-        count += len(twin_mesh.vertices)
-    looks = tuple(_look(name, rng) for name in names)
-    distractor = names.index("distractor") if "distractor" in names else -1
-    return Room(np.vstack(vertices), np.vstack(faces), np.concatenate(material), looks, distractor)
+    surfaces = [("floor", FLOOR, np.array([[0, 2, 1], [1, 2, 3]]))]
+    surfaces += [(box.material, *_box_mesh(box)) for box in boxes]
+    surfaces += [("distractor", *mesh)] if mesh is not None else []
+    names = list(dict.fromkeys(name for name, _, _ in surfaces))
+    first = np.cumsum([0, *(len(vertices) for _, vertices, _ in surfaces)])
+    return Room(
+        np.vstack([vertices for _, vertices, _ in surfaces]),
+        np.vstack([faces + start for (*_, faces), start in zip(surfaces, first, strict=False)]),
+        np.concatenate([np.full(len(faces), names.index(name)) for name, _, faces in surfaces]),
+        tuple(_look(name, rng) for name in names),
+        names.index("distractor") if mesh is not None else -1,
+    )
 
 
 def _lowered(box: Box) -> Box:
@@ -151,12 +110,10 @@ def _walls(rng: np.random.Generator) -> list[Box]:
     walls = []
     heading = rng.uniform(0, 2 * np.pi)
     for turn_by in (0, np.pi / 2, np.pi)[: int(rng.integers(2, 4))]:
-        far = rng.uniform(*LAYOUT.wall_distance)
+        far = rng.uniform(3.0, 3.7)
         angle = heading + turn_by
         x, y = far * np.cos(angle), far * np.sin(angle)
-        walls.append(
-            Box((x - 0.05, y - 4.0, 0.0), (x + 0.05, y + 4.0, LAYOUT.wall_height), angle, "wall")
-        )
+        walls.append(Box((x - 0.05, y - 4.0, 0.0), (x + 0.05, y + 4.0, 2.7), angle, "wall"))
         px, py = (far - 0.06) * np.cos(angle), (far - 0.06) * np.sin(angle)
         side = rng.uniform(-1.2, 1.2)
         px, py = px - side * np.sin(angle), py + side * np.cos(angle)
@@ -194,35 +151,37 @@ def _between(eyes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return azimuths + gaps / 2, gaps
 
 
-def _twin(rng: np.random.Generator, eyes: np.ndarray, twin: Twin) -> tuple[list[Box], Twin]:
+def _twin(
+    rng: np.random.Generator, eyes: np.ndarray, vertices: np.ndarray, faces: np.ndarray
+) -> tuple[list[Box], Mesh]:
     """The twin at another scale, and the box on which it stands."""
     between, gaps = _between(eyes)
     gap = int(rng.integers(len(between)))
     angle = between[gap] + gaps[gap] * rng.uniform(-0.2, 0.2)
-    far, heading = rng.uniform(*LAYOUT.twin_distance), rng.uniform(0, 2 * np.pi)
-    points = rng.choice(LAYOUT.twin_scale) * twin.vertices
+    far, heading = rng.uniform(1.5, 1.75), rng.uniform(0, 2 * np.pi)
+    points = rng.choice((0.87, 0.94, 1.07, 1.15)) * vertices
     x, y = far * np.cos(angle), far * np.sin(angle)
     stand = []
     height = 0.0
-    if np.ptp(points[:, 2]) < LAYOUT.low:
-        height = rng.uniform(*LAYOUT.stand)
+    if np.ptp(points[:, 2]) < 0.35:
+        height = rng.uniform(0.45, 0.75)
         half = 0.03 + np.abs(points[:, :2]).max()
         stand.append(Box((x - half, y - half, 0), (x + half, y + half, height), angle, "cardboard"))
     cos, sin = np.cos(heading), np.sin(heading)
     turned = points @ np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]).T
     place = np.array([x, y, height - points[:, 2].min()])
-    return stand, Twin(turned + place, twin.faces)
+    return stand, (turned + place, faces)
 
 
 def _pillars(rng: np.random.Generator, eyes: np.ndarray, place: np.ndarray) -> list[Box]:
     """Pillars that hide ``place`` (2,) from some of the cameras."""
-    count = min(int(rng.integers(1, LAYOUT.pillars + 1)), len(eyes) // 2)
+    count = min(int(rng.integers(1, 4)), len(eyes) // 2)
     pillars = []
     for eye in eyes[rng.permutation(len(eyes))[:count]]:
         towards = eye - place
-        far, half = rng.uniform(*LAYOUT.pillar_distance), rng.uniform(*LAYOUT.pillar_half)
+        far, half = rng.uniform(1.2, 1.5), rng.uniform(0.03, 0.05)
         x, y = place + towards / np.linalg.norm(towards) * far
-        low, high = (x - half, y - half, 0.0), (x + half, y + half, LAYOUT.pillar_height)
+        low, high = (x - half, y - half, 0.0), (x + half, y + half, 1.9)
         pillars.append(Box(low, high, float(np.arctan2(towards[1], towards[0])), "wood"))
     return pillars
 

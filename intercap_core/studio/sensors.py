@@ -18,24 +18,13 @@ from intercap_core.studio.noise import NoiseSource, gaussian
 from intercap_core.studio.render import Cast, RoomView
 from intercap_core.studio.stage import StudioStage
 
-
-@dataclass(frozen=True)
-class DepthMode:
-    """Limits of a depth mode, slightly beyond the data sheet's."""
-
-    near_m: float
-    """Nearest measured distance."""
-    far_m: float
-    """Farthest measured distance."""
-    noise: float
-    """Noise relative to the narrow unbinned mode."""
-
-
+# Nearest and farthest distance of a depth mode, metres, slightly beyond the data sheet's, and its
+# noise relative to the first
 LIMITS = {
-    "NFOV_UNBINNED": DepthMode(0.45, 4.3, 1.0),
-    "NFOV_2X2BINNED": DepthMode(0.45, 6.0, 0.7),
-    "WFOV_2X2BINNED": DepthMode(0.23, 3.2, 1.2),
-    "WFOV_UNBINNED": DepthMode(0.23, 2.5, 2.0),
+    "NFOV_UNBINNED": (0.45, 4.3, 1.0),
+    "NFOV_2X2BINNED": (0.45, 6.0, 0.7),
+    "WFOV_2X2BINNED": (0.23, 3.2, 1.2),
+    "WFOV_UNBINNED": (0.23, 2.5, 2.0),
 }
 
 
@@ -55,11 +44,7 @@ class DepthSensor:
     dark = 0.10  # surfaces below this albedo get holes
 
     def __init__(
-        self,
-        view: RoomView,
-        noise: NoiseSource,
-        name: str,
-        mode: str = "NFOV_UNBINNED",
+        self, view: RoomView, noise: NoiseSource, name: str, mode: str = "NFOV_UNBINNED"
     ) -> None:
         self.view, self._noise, self._limits = view, noise, LIMITS[mode]
         rng = noise.rng("depth", name)
@@ -108,13 +93,14 @@ class DepthSensor:
         sigma *= np.float32(self.noise_per_m2)
         sigma += np.float32(self.noise_m)
         error *= sigma
-        error *= np.float32(self._limits.noise)
+        near, far, mode_noise = self._limits
+        error *= np.float32(mode_noise)
         phase = depth * np.float32(2 * np.pi / self.ripple_period_m) + np.float32(self._ripple)
         error += np.float32(self.ripple_m) * np.sin(phase)
         error *= scale
         error += depth
         error += np.float32(self.bias)
-        invalid |= (error <= self._limits.near_m) | (error >= self._limits.far_m)
+        invalid |= (error <= near) | (error >= far)
         error[invalid] = 0
         return np.rint(error * 1000).astype(np.uint16)
 
@@ -135,10 +121,7 @@ class DepthSensor:
 
 
 def _blotches(
-    rng: np.random.Generator,
-    shape: tuple[int, ...],
-    size: float,
-    contrast: float,
+    rng: np.random.Generator, shape: tuple[int, ...], size: float, contrast: float
 ) -> np.ndarray:
     """Smooth random values in [0, 1] (H, W) that change over ``size`` pixels."""
     smooth = cv2.GaussianBlur(gaussian(rng, shape), (0, 0), size)
@@ -154,39 +137,9 @@ def _field(lens: Intrinsics, mode: str) -> np.ndarray:
     return lit & np.isfinite(lens.rays[..., 0])
 
 
-@dataclass(frozen=True)
-class Acoustics:
-    """Sounds, room and microphones."""
-
-    speed_m_s: float = 343.0
-    """Speed of sound in air at 20 °C."""
-    before_s: float = 3.0
-    """Sounds start before the first set and end after the last."""
-    step_every_s: tuple[float, float] = (0.4, 0.8)
-    """Interval between steps."""
-    step_s: float = 0.05
-    """Duration of a step."""
-    syllable_every_s: tuple[float, float] = (0.15, 0.6)
-    """Interval between syllables."""
-    syllable_s: tuple[float, float] = (0.08, 0.25)
-    """Duration of a syllable."""
-    voice_hz: tuple[float, float] = (250.0, 3000.0)
-    """Band of the voice."""
-    mouth_m: float = 0.6
-    """Height of the mouth above the pelvis."""
-    reverberation_s: tuple[float, float] = (0.25, 0.6)
-    """Time for a fall by 60 dB, in furnished and in bare rooms."""
-    room_level: tuple[float, float] = (0.5, 1.2)
-    """Energy of the reverberation relative to the direct sound."""
-    noise_db: tuple[float, float] = (5.0, 20.0)
-    """Level of the sound above the device's noise."""
-    max_latency_s: float = 0.04
-    """Of a device's sound relative to its images."""
-    loudest: float = 0.5
-    """Largest sample."""
-
-
-ACOUSTICS = Acoustics()
+MAX_LATENCY_S = 0.04  # of a device's sound relative to its images
+BEFORE_S = 3.0  # sounds start before the first set and end after the last
+REVERBERATION_S = (0.25, 0.6)  # time of a fall by 60 dB, in furnished and in bare rooms
 
 
 @dataclass(frozen=True)
@@ -205,34 +158,31 @@ def heard(stage: StudioStage, index: int, first_s: float, seconds: float) -> np.
     """
     rng = stage.noise.rng("microphone", stage.rig.true.names[index])
     eye = (invert(stage.rig.master_from_stage) @ stage.rig.true[index].master_from_colour)[:3, 3]
-    latency = rng.uniform(-ACOUSTICS.max_latency_s, ACOUSTICS.max_latency_s) * min(
-        1.0, stage.noise.scale
-    )
+    latency = rng.uniform(-MAX_LATENCY_S, MAX_LATENCY_S) * min(1.0, stage.noise.scale)
     count = round(seconds * RATE)
-    lead = round(max(ACOUSTICS.reverberation_s) * RATE)  # reverberation of earlier sounds
+    lead = round(max(REVERBERATION_S) * RATE)  # reverberation of earlier sounds
     direct = np.zeros(lead + count)
     for event in _events(stage):
         far = max(0.3, float(np.linalg.norm(event.place - eye)))
-        start = lead + round((event.time_s + far / ACOUSTICS.speed_m_s + latency - first_s) * RATE)
+        travel = far / 343.0  # m/s, speed of sound at 20 °C
+        start = lead + round((event.time_s + travel + latency - first_s) * RATE)
         there = slice(max(0, start), max(0, min(len(direct), start + len(event.samples))))
         if there.start < there.stop:
             direct[there] += event.samples[there.start - start : there.stop - start] / far
     sound = signal.fftconvolve(direct, _room(stage, rng))[lead : lead + count]
     power = float((sound**2).mean())
-    noise = np.sqrt(power * 10 ** (-rng.uniform(*ACOUSTICS.noise_db) / 10)) if power > 0 else 1e-4
+    noise = np.sqrt(power * 10 ** (-rng.uniform(5.0, 20.0) / 10)) if power > 0 else 1e-4  # dB
     sound += rng.normal(0, noise, count)
-    return (ACOUSTICS.loudest * sound / max(np.abs(sound).max(initial=0.0), 1e-9)).astype(
-        np.float32
-    )
+    return (0.5 * sound / max(np.abs(sound).max(initial=0.0), 1e-9)).astype(np.float32)
 
 
 def _room(stage: StudioStage, rng: np.random.Generator) -> np.ndarray:
     """Impulse response of the room between this device and a person in the middle."""
-    fall = stage.noise.rng("reverberation").uniform(*ACOUSTICS.reverberation_s)
+    fall = stage.noise.rng("reverberation").uniform(*REVERBERATION_S)
     times = np.arange(round(fall * RATE)) / RATE
     tail = rng.normal(size=len(times)) * 10 ** (-3 * times / fall)
     tail[: round(0.002 * RATE)] = 0
-    tail *= np.sqrt(rng.uniform(*ACOUSTICS.room_level) / (tail**2).sum())
+    tail *= np.sqrt(rng.uniform(0.5, 1.2) / (tail**2).sum())  # energy, of the direct sound's
     tail[0] = 1.0
     return tail
 
@@ -250,19 +200,19 @@ def _events(stage: StudioStage) -> list[_Event]:
     def person(time_s: float) -> np.ndarray:
         return np.array([np.interp(time_s, stage.set_times, axis) for axis in pelvis.T])
 
-    events, end = [], stage.duration + ACOUSTICS.before_s
-    time_s = -ACOUSTICS.before_s
-    while (time_s := time_s + rng.uniform(*ACOUSTICS.step_every_s)) < end:
-        count = round(ACOUSTICS.step_s * RATE)
+    events, end = [], stage.duration + BEFORE_S
+    time_s = -BEFORE_S
+    while (time_s := time_s + rng.uniform(0.4, 0.8)) < end:
+        count = round(0.05 * RATE)
         burst = rng.normal(size=count) * np.exp(-np.arange(count) / (0.2 * count))
         events.append(
             _Event(time_s, rng.uniform(0.3, 1.0) * burst, person(time_s) * np.array([1, 1, 0]))
         )
-    voice = signal.butter(2, ACOUSTICS.voice_hz, "bandpass", fs=RATE, output="sos")
-    time_s = -ACOUSTICS.before_s
-    while (time_s := time_s + rng.uniform(*ACOUSTICS.syllable_every_s)) < end:
-        count = round(rng.uniform(*ACOUSTICS.syllable_s) * RATE)
+    voice = signal.butter(2, (250.0, 3000.0), "bandpass", fs=RATE, output="sos")
+    time_s = -BEFORE_S
+    while (time_s := time_s + rng.uniform(0.15, 0.6)) < end:
+        count = round(rng.uniform(0.08, 0.25) * RATE)
         syllable = signal.sosfilt(voice, rng.normal(size=count)) * np.hanning(count)
-        mouth = person(time_s) + np.array([0, 0, ACOUSTICS.mouth_m])
+        mouth = person(time_s) + np.array([0, 0, 0.6])  # above the pelvis
         events.append(_Event(time_s, rng.uniform(0.3, 1.0) * syllable, mouth))
     return events

@@ -48,10 +48,7 @@ def frame(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def carry(
-    from_first: np.ndarray,
-    from_second: np.ndarray,
-    to_first: np.ndarray,
-    to_second: np.ndarray,
+    from_first: np.ndarray, from_second: np.ndarray, to_first: np.ndarray, to_second: np.ndarray
 ) -> np.ndarray:
     """Rotations that take one pair of directions to another (the second as far as possible)."""
     return frame(to_first, to_second) @ np.swapaxes(frame(from_first, from_second), -1, -2)
@@ -112,10 +109,7 @@ class PuppetSkeleton:
         second = unit(along * distance[:, None] - first * a)
         # the joint bends about this axis: from the upper bone's direction to the lower one's
         hinge = np.cross(out, along)
-        return (
-            carry(upper, rest_hinge, first, hinge),
-            carry(lower, rest_hinge, second, hinge),
-        )
+        return (carry(upper, rest_hinge, first, hinge), carry(lower, rest_hinge, second, hinge))
 
 
 def twist_angle(rotation: np.ndarray, axis: np.ndarray) -> np.ndarray:

@@ -25,13 +25,10 @@ from intercap_core.studio.noise import NoiseSource
 from intercap_core.studio.objects import TrueObject, object_colours, press_out, true_mesh
 from intercap_core.studio.passer_by import PasserBy, Passing
 from intercap_core.studio.rig import Failures, StudioRig, build_rig, started_apart
-from intercap_core.studio.room import Furnishing, Twin, build_room
+from intercap_core.studio.room import Furnishing, build_room
 from intercap_core.studio.subjects import Subject, build_names, in_heavy_shoes, subject_names
 
-BARE_ROOM_SHARE = 0.2  # of the captures with room: random
-OFF_CENTRE_M = 0.12  # standard deviation of the action from the ring's middle
 LOOKS = ("mesh", "plain", "printed")  # equally likely
-SMALL_M = 0.35  # pillars may hide smaller objects
 
 
 ANY_LAYOUT = frozenset({"dead_half", "no_depth", "zero_depth", "no_overlap"})
@@ -62,10 +59,7 @@ class StudioStage:
     """
 
     def __init__(
-        self,
-        capture: StudioCapture,
-        settings: StudioSettings,
-        entry: ObjectEntry | None,
+        self, capture: StudioCapture, settings: StudioSettings, entry: ObjectEntry | None
     ) -> None:
         check_capture(capture, settings, None if entry is None else entry.name)
         self.depth_mode, self.has_depth = settings.depth_mode, capture.depth
@@ -99,7 +93,7 @@ class StudioStage:
         self.every = [capture.every.get(name, 1) for name in self.rig.true.names]
         self.failures = Failures.draw(self.noise, capture, settings.cameras)
         furniture = [box.moved(self.stage_from_script) for box in self.interaction.furniture]
-        is_bare = bool(rng.random() < BARE_ROOM_SHARE)
+        is_bare = bool(rng.random() < 0.2)  # with room: random
         by_chance: Furnishing = "bare" if is_bare else "furnished"
         self.furnishing = by_chance if capture.room == "random" else capture.room
         eyes = invert(self.rig.master_from_stage) @ self.rig.true.master_from_colour
@@ -108,8 +102,8 @@ class StudioStage:
             furniture,
             eyes[:, :2, 3],
             furnishing=self.furnishing,
-            twin=Twin(corners, self.prop.faces) if self.prop else None,
-            hidden=self._highlight() if self.prop and size < SMALL_M else None,
+            twin=(corners, self.prop.faces) if self.prop else None,
+            hidden=self._highlight() if self.prop and size < 0.35 else None,  # metres
         )
         self.passer_by = None
         if capture.passer_by != "nobody":
@@ -122,10 +116,7 @@ class StudioStage:
         by_chance = LOOKS[rng.integers(len(LOOKS))]
         look = by_chance if capture.look == "random" else capture.look
         return TrueObject(
-            entry.name,
-            vertices,
-            faces,
-            object_colours(look, vertices, colours / 255.0, rng),
+            entry.name, vertices, faces, object_colours(look, vertices, colours / 255.0, rng)
         )
 
     def _passer_by(self, eyes: np.ndarray, *, stands: bool) -> PasserBy:
@@ -186,12 +177,7 @@ class StudioStage:
         order = [4, 0, 1, 3, 2]  # thumb, index, middle, ring, little finger
         tips = posed.tips[:, [*order, *(5 + i for i in order)]]
         return StageState(
-            body,
-            clothed,
-            posed.joints,
-            tips,
-            world[:, JOINT_INDEX["pelvis"]],
-            stage_from_object,
+            body, clothed, posed.joints, tips, world[:, JOINT_INDEX["pelvis"]], stage_from_object
         )
 
     def keypoints(self, moment: StageState | Passing) -> np.ndarray:
@@ -212,91 +198,97 @@ def check_capture(
     capture: StudioCapture, settings: StudioSettings, object_name: str | None
 ) -> None:
     """Raise UserError for a capture that the studio cannot play."""
-    kind = interaction_named(capture.interaction)
-    if (object_name or "") != kind.object_class:
-        needed = f"object {kind.object_class!r}" if kind.object_class else "no object"
-        found = "none" if object_name is None else repr(object_name)
-        raise UserError(
-            f"studio: interaction {capture.interaction!r} needs {needed}, the sequence has "
-            f"{found}; correct the sequence's object"
-        )
-    if capture.shoes != "plain" and kind.feet_meet_object:
-        raise UserError(
-            f"studio: in interaction {capture.interaction!r} bare soles meet the object, "
-            f"'shoes' is {capture.shoes!r}; set shoes: plain or another interaction"
-        )
-    if settings.fps > max(KINECT_RATES) and capture.layout != "plain":
-        raise UserError(
-            f"studio: recordings of layout {capture.layout!r} have at most "
-            f"{max(KINECT_RATES)} frames a second, 'fps' is {settings.fps}; set "
-            "layout: plain or another fps"
-        )
-    people = (*subject_names(), *build_names())
-    if capture.subject not in people:
-        raise UserError(
-            f"studio: no subject {capture.subject!r}, there are {', '.join(people)}; "
-            "correct 'subject' of the capture"
-        )
-    if capture.video and capture.layout != "plain":
-        raise UserError(
-            f"studio: recordings of layout {capture.layout!r} are no videos; take 'video' out or "
-            "set layout: plain"
-        )
-    if capture.sound and not capture.video:
-        raise UserError(
-            "studio: only videos carry sound; take 'sound' out or set video: true and layout: plain"
-        )
+    kind, people = interaction_named(capture.interaction), (*subject_names(), *build_names())
+    layout, wanted = capture.layout, kind.object_class
+    for is_wrong, text in (
+        (
+            (object_name or "") != wanted,
+            f"interaction {capture.interaction!r} needs "
+            f"{f'object {wanted!r}' if wanted else 'no object'}, the sequence has "
+            f"{repr(object_name) if object_name else 'none'}; correct the sequence's object",
+        ),
+        (
+            capture.shoes != "plain" and kind.feet_meet_object,
+            f"in interaction {capture.interaction!r} bare soles meet the object, 'shoes' is "
+            f"{capture.shoes!r}; set shoes: plain or another interaction",
+        ),
+        (
+            settings.fps > max(KINECT_RATES) and layout != "plain",
+            f"recordings of layout {layout!r} have at most {max(KINECT_RATES)} frames a second, "
+            f"'fps' is {settings.fps}; set layout: plain or another fps",
+        ),
+        (
+            capture.subject not in people,
+            f"no subject {capture.subject!r}, there are {', '.join(people)}; correct 'subject' of "
+            "the capture",
+        ),
+        (
+            capture.video and layout != "plain",
+            f"recordings of layout {layout!r} are no videos; take 'video' out or set layout: plain",
+        ),
+        (
+            capture.sound and not capture.video,
+            "only videos carry sound; take 'sound' out or set video: true and layout: plain",
+        ),
+    ):
+        if is_wrong:
+            raise UserError(f"studio: {text}")
     _check_rates(capture, settings)
-    check_faults(
-        capture.faults, layout=capture.layout, cameras=settings.cameras, frames=capture.frames
-    )
+    check_faults(capture.faults, layout=layout, cameras=settings.cameras, frames=capture.frames)
 
 
 def _check_rates(capture: StudioCapture, settings: StudioSettings) -> None:
     """Raise UserError if a camera cannot record every n-th frame set."""
     names = camera_names(capture.layout, settings.cameras)
+    rates = KINECT_RATES if capture.layout == "k4a" else range(1, settings.fps)
     for name, every in capture.every.items():
-        if name not in names:
-            raise UserError(
-                f"studio: 'every' names camera {name!r}, the cameras are {', '.join(names)}; "
-                "correct it"
-            )
-        if capture.layout not in ("plain", "k4a"):
-            raise UserError(
-                f"studio: cameras of layout {capture.layout!r} all have one rate; take 'every' out "
-                "or set layout: plain"
-            )
-        rates = KINECT_RATES if capture.layout == "k4a" else range(1, settings.fps)
-        if settings.fps % every or settings.fps // every not in rates:
-            raise UserError(
-                f"studio: camera {name!r} would have {settings.fps / every:g} frames a second, "
-                f"expected one of {', '.join(map(str, KINECT_RATES))} or, in layout plain, a whole "
-                "number; correct 'every'"
-            )
+        for is_wrong, text in (
+            (
+                name not in names,
+                f"'every' names camera {name!r}, the cameras are {', '.join(names)}; correct it",
+            ),
+            (
+                capture.layout not in ("plain", "k4a"),
+                f"cameras of layout {capture.layout!r} all have one rate; take 'every' out or set "
+                "layout: plain",
+            ),
+            (
+                settings.fps % every or settings.fps // every not in rates,
+                f"camera {name!r} would have {settings.fps / every:g} frames a second, expected "
+                f"one of {', '.join(map(str, KINECT_RATES))} or, in layout plain, a whole number; "
+                "correct 'every'",
+            ),
+        ):
+            if is_wrong:
+                raise UserError(f"studio: {text}")
 
 
 def check_faults(faults: Sequence[str], *, layout: LayoutName, cameras: int, frames: int) -> None:
     """Raise UserError for faults that a capture cannot have."""
-    strange = set(faults) - ANY_LAYOUT - FOLDERS[layout].own_faults
-    if strange:
-        raise UserError(
-            f"studio: recordings of layout {layout!r} cannot have fault {min(strange)}; take the "
-            "fault out or choose another layout"
-        )
-    if "swapped_lenses" in faults and cameras <= max(SWAPPED):
-        raise UserError(
-            f"studio: fault swapped_lenses is of cameras 4 and 5, 'cameras' is {cameras}; use more"
-        )
-    if faults and cameras < 2:
-        raise UserError(
-            f"studio: faults {', '.join(faults)} need a second camera, 'cameras' is {cameras}; "
-            "use more cameras or no faults"
-        )
-    if {"dead_half", "backwards_clock"} & set(faults) and frames < 4:
-        raise UserError(
-            f"studio: faults dead_half and backwards_clock need 4 frames, 'frames' is {frames}; "
-            "make the capture longer or take the fault out"
-        )
+    foreign = set(faults) - ANY_LAYOUT - FOLDERS[layout].own_faults
+    for is_wrong, text in (
+        (
+            foreign,
+            f"recordings of layout {layout!r} cannot have fault {min(foreign, default='')}; take "
+            "the fault out or choose another layout",
+        ),
+        (
+            "swapped_lenses" in faults and cameras <= max(SWAPPED),
+            f"fault swapped_lenses is of cameras 4 and 5, 'cameras' is {cameras}; use more",
+        ),
+        (
+            faults and cameras < 2,
+            f"faults {', '.join(faults)} need a second camera, 'cameras' is {cameras}; use more "
+            "cameras or no faults",
+        ),
+        (
+            {"dead_half", "backwards_clock"} & set(faults) and frames < 4,
+            f"faults dead_half and backwards_clock need 4 frames, 'frames' is {frames}; make the "
+            "capture longer or take the fault out",
+        ),
+    ):
+        if is_wrong:
+            raise UserError(f"studio: {text}")
 
 
 def _placed(rng: np.random.Generator, centre: tuple[float, float]) -> np.ndarray:
@@ -305,5 +297,5 @@ def _placed(rng: np.random.Generator, centre: tuple[float, float]) -> np.ndarray
     cos, sin = np.cos(heading), np.sin(heading)
     place = np.eye(4)
     place[:2, :2] = [[cos, -sin], [sin, cos]]
-    place[:2, 3] = rng.normal(0, OFF_CENTRE_M, 2) - place[:2, :2] @ centre
+    place[:2, 3] = rng.normal(0, 0.12, 2) - place[:2, :2] @ centre
     return place

@@ -31,7 +31,6 @@ _DRIVERS = tuple(
 _TIP_JOINTS = [*range(27, 40, 3), *range(42, 55, 3)]
 _PARENTS = np.array(PARENTS)
 _DUAL_QUATERNION_SHARE = 0.5
-_LARGEST_BULGE = 1.6  # times the displacement at 90 degrees
 
 
 @dataclass(frozen=True)
@@ -148,7 +147,8 @@ class Subject:
     def _flexed(self, local: np.ndarray) -> np.ndarray:
         """(B,V,3) rest vertices with the bulges of the bent joints."""
         trace = np.trace(local[:, _DRIVERS], axis1=-2, axis2=-1)
-        bend = np.clip(1 - (trace - 1) / 2, 0, _LARGEST_BULGE)  # 1 - cos of the joint's angle
+        # 1 - cos of the joint's angle, at most 1.6 times that of 90 degrees
+        bend = np.clip(1 - (trace - 1) / 2, 0, 1.6)
         return self.rest + np.einsum("bd,dvc->bvc", bend, self.bulges)
 
     def _blend(self, world: np.ndarray, offsets: np.ndarray, rest: np.ndarray) -> np.ndarray:
@@ -252,27 +252,10 @@ def _quaternion_product(vector: np.ndarray, quaternion: np.ndarray) -> np.ndarra
     return np.concatenate([imaginary, -(vector * v).sum(-1, keepdims=True)], -1)
 
 
-@dataclass(frozen=True)
-class HeavyShoes:
-    """Work boots, metres."""
-
-    sole: float = 0.022
-    """Thickness of the sole below the lowest skin."""
-    leather: tuple[float, float] = (0.010, 0.015)
-    """Thickness at the sides."""
-    thickest: float = 0.045
-    """Largest thickness of a sole, which fills the foot's arch."""
-    shaft: float = 0.01
-    """Height of the shoe's end above the ankles."""
-    rim: float = 0.02
-    """Height over which the leather gets thin at the end."""
-    sloping: float = 0.3
-    """Downward component of normals of skin above the sole."""
-
-
-SHOES_HEAVY = HeavyShoes()
-
-
+# Work boots
+SOLE_M = 0.022  # thickness of the sole below the lowest skin
+LEATHER_M = (0.010, 0.015)  # thickness at the sides
+SLOPING = 0.3  # downward component of the normals of skin above the sole
 FEET = ((7, 10), (8, 11))  # joints: ankle and ball of the left foot, of the right one
 
 
@@ -287,27 +270,27 @@ def in_heavy_shoes(subject: Subject, rng: np.random.Generator) -> Subject:
 
     The bare feet stay the true body; the soles stand on the floor. ``rng`` draws the leather.
     """
-    leather = rng.uniform(*SHOES_HEAVY.leather)
+    leather = rng.uniform(*LEATHER_M)
     down = -subject.normals(subject.rest[None])[0, :, 1]
     clothing, height = subject.clothing.copy(), subject.rest[:, 1]
     worn = shoe_area(subject)
     for foot in FEET:
         share = np.asarray(subject.weights[:, foot].sum(1)).ravel()
         own = np.flatnonzero(worn & (share > 0.5))
-        ground = height[own].min() - SHOES_HEAVY.sole
+        ground = height[own].min() - SOLE_M
         # along the normal down to the sole, but not farther to the side than leather may be thick
         across = np.sqrt(np.maximum(1 - down[own] ** 2, 1e-6))
-        deep = (height[own] - ground) / np.maximum(down[own], SHOES_HEAVY.sloping)
-        sole = np.minimum(deep, SHOES_HEAVY.leather[1] / across)
-        sides = leather * np.clip((_top(subject) - height[own]) / SHOES_HEAVY.rim, 0.3, 1)
-        below = np.maximum(sides, np.minimum(sole, SHOES_HEAVY.thickest))
-        clothing[own] = np.where(down[own] > SHOES_HEAVY.sloping, below, sides)
-    return replace(subject, clothing=clothing, sole_m=SHOES_HEAVY.sole)
+        deep = (height[own] - ground) / np.maximum(down[own], SLOPING)
+        sole = np.minimum(deep, LEATHER_M[1] / across)
+        sides = leather * np.clip((_top(subject) - height[own]) / 0.02, 0.3, 1)
+        below = np.maximum(sides, np.minimum(sole, 0.045))
+        clothing[own] = np.where(down[own] > SLOPING, below, sides)
+    return replace(subject, clothing=clothing, sole_m=SOLE_M)
 
 
 def _top(subject: Subject) -> float:
     """Height in the T-pose at which shoes end, metres."""
-    return float(subject.rest_joints[[7, 8], 1].mean()) + SHOES_HEAVY.shaft
+    return float(subject.rest_joints[[7, 8], 1].mean()) + 0.01
 
 
 SKIN = ((0.87, 0.68, 0.56), (0.72, 0.52, 0.40), (0.50, 0.34, 0.25), (0.93, 0.76, 0.66))

@@ -1,4 +1,4 @@
-"""A tiny capture: deterministic, readable by others, consistent with its own truth."""
+"""A tiny capture: deterministic, readable by other programs, consistent with its truth."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def test_depth_lies_on_the_true_surfaces(capture: Path) -> None:
         assert np.median(near[near < 0.03]) < 0.012
 
 
-def test_keypoints_are_near_the_truth_but_not_on_it(capture: Path) -> None:
+def test_keypoints_err_by_a_few_pixels(capture: Path) -> None:
     with artefacts.read(capture / "truth.h5", TRUTH) as truth:
         joints, poses = truth["joints"], truth["master_from_colour"]
     # OpenPose's shoulders, elbows, wrists, hips, knees, ankles among the 55 joints
@@ -200,14 +200,14 @@ def test_annotation_errs_within_its_bounds(capture: Path) -> None:
     assert np.abs(distance + offset).max() <= 0.0101
 
 
-def test_other_peoples_folders_are_left_alone(tmp_path: Path, object_entry: Entry) -> None:
+def test_foreign_folders_are_not_overwritten(tmp_path: Path, object_entry: Entry) -> None:
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(UserError, match="was not made by the studio"):
         make(tmp_path, object_entry("stool"))
     assert (tmp_path / "notes.txt").read_text() == "mine"
 
 
-def test_metrics_accept_that_a_foot_in_its_shoe_stands(capture: Path) -> None:
+def test_feet_in_heavy_shoes_count_as_supported(capture: Path) -> None:
     count = len(Subject.load("s02").fitted_face)
     truth = Truth.load(capture / "truth.h5", np.arange(FRAMES) / 15, 15, count)
     assert truth.vertices is not None

@@ -62,7 +62,7 @@ def test_some_slips_last_to_the_end_and_some_do_not() -> None:
 
 
 @pytest.mark.parametrize("fps", [15, 30, 60])
-def test_cameras_that_start_apart_are_late_by_sets_and_a_rest(fps: int) -> None:
+def test_late_starts_are_whole_sets_plus_a_fraction(fps: int) -> None:
     rig = rig_of(5)
     apart = started_apart(rig, np.random.default_rng(8), 0.5, fps)
     late = (apart.slip - rig.slip) / fps - (apart.offset_s - rig.offset_s)
@@ -75,7 +75,7 @@ def test_cameras_that_start_apart_are_late_by_sets_and_a_rest(fps: int) -> None:
 
 
 @pytest.mark.parametrize("mode", DEPTH_MODES)
-def test_a_depth_mode_reads_out_the_same_glass(mode: str) -> None:
+def test_all_depth_modes_share_one_lens(mode: str) -> None:
     """A ray falls on the same place of the sensor in every mode."""
     rays = np.array([[0.0, 0, 1], [0.2, -0.1, 1], [-0.3, 0.25, 1]])
     places = []
@@ -86,7 +86,7 @@ def test_a_depth_mode_reads_out_the_same_glass(mode: str) -> None:
     np.testing.assert_allclose(places[1], places[0], atol=1e-12)
 
 
-def test_clocks_are_unsteady_but_the_masters() -> None:
+def test_only_the_masters_clock_has_no_jitter() -> None:
     noise = NoiseSource(5, 1.0, "a", 30.0)
     failures = Failures.draw(noise, capture_of(400), 4)
     assert not failures.jitter_s[:, 0].any()
@@ -98,7 +98,7 @@ def test_clocks_are_unsteady_but_the_masters() -> None:
     assert not still.jitter_s.any() and not still.depth_away.any()
 
 
-def test_no_overlap_leaves_the_middle_to_the_master() -> None:
+def test_without_overlap_only_the_master_sees_the_middle() -> None:
     rig = rig_of(2, "no_overlap")
     middle = rig.master_from_stage[:3, 3] + rig.master_from_stage[:3, 2] * 0.85
     for index, camera in enumerate(rig.true):
@@ -181,12 +181,12 @@ def test_detectors_find_both_people(broken_capture: Path) -> None:
 def test_impossible_captures_are_refused(capture: dict[str, object], says: str) -> None:
     values = {"interaction": "stool_sit", "subject": "s02", "seed": 1} | capture
     with pytest.raises(UserError, match=says):
-        thing = "skateboard" if "shoes" in capture else "stool"
-        check_capture(StudioCapture(**values), StudioSettings(captures={}), thing)  # type: ignore[arg-type]
+        name = "skateboard" if "shoes" in capture else "stool"
+        check_capture(StudioCapture(**values), StudioSettings(captures={}), name)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("layout", ["k4a", "intercap", "behave"])
-def test_a_kinect_has_no_sixty_frames_a_second(layout: str) -> None:
+def test_kinects_refuse_sixty_frames_a_second(layout: str) -> None:
     capture = StudioCapture(interaction="stool_sit", subject="s02", seed=1, layout=layout)
     fast = StudioSettings(captures={}, fps=60)
     with pytest.raises(UserError, match=f"{layout!r} have at most 30 frames a second"):
@@ -194,7 +194,7 @@ def test_a_kinect_has_no_sixty_frames_a_second(layout: str) -> None:
     check_capture(capture.model_copy(update={"layout": "plain"}), fast, "stool")
 
 
-def test_a_detector_may_mean_other_joints() -> None:
+def test_keypoint_bias_scales_body_joints_only() -> None:
     noise = NoiseSource(3, 1.0, "a", 15.0)
     usual, other = (Detector.build(noise, 9, scale).body_bias for scale in (1.0, 1.6))
     np.testing.assert_allclose(other[:25], 1.6 * usual[:25])
@@ -209,12 +209,12 @@ def test_a_sparse_room_has_a_floor_and_two_low_pieces() -> None:
         assert room.vertices[:, 2].max() <= top
 
 
-def test_a_single_camera_has_no_faults() -> None:
+def test_faults_need_a_second_camera() -> None:
     with pytest.raises(UserError, match="need a second camera"):
         check_faults(("dead_half",), layout="k4a", cameras=1, frames=9)
 
 
-def test_detectors_may_err_anew_in_the_same_recording() -> None:
+def test_redrawn_detections_keep_the_recording() -> None:
     first, other = (NoiseSource(3, 1.0, "a", 30.0, redrawn) for redrawn in (0, 1))
     assert first.rng("depth", "k1").random() == other.rng("depth", "k1").random()
     assert first.rng("masks").random() == first.detector_rng("masks").random()
@@ -222,7 +222,7 @@ def test_detectors_may_err_anew_in_the_same_recording() -> None:
 
 
 @pytest.mark.parametrize("family", ["a", "b"])
-def test_noise_has_unit_variance_and_lasts(family: str) -> None:
+def test_noise_has_unit_variance_and_correlation(family: str) -> None:
     noise = NoiseSource(3, 1.0, family, 30.0)
     path = noise.process(np.random.default_rng(0), 6000, 8, 0.5)
     assert path.mean() == pytest.approx(0, abs=0.1)
@@ -232,7 +232,7 @@ def test_noise_has_unit_variance_and_lasts(family: str) -> None:
     assert lag > 0.6 and abs(far) < 0.2
 
 
-def test_episodes_have_their_probability_and_agree_over_views() -> None:
+def test_episodes_have_their_probability_and_are_correlated() -> None:
     noise = NoiseSource(3, 1.0, "a", 15.0)
     shared = noise.process(np.random.default_rng(1), 20000, 1, 0.5)[:, 0]
     probability = np.full((20000, 2), 0.15)

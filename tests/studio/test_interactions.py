@@ -15,9 +15,9 @@ from intercap_core.schemas import CONTACT_REGIONS
 from intercap_core.studio.capture import CONTACT_M, region_contact, support_height
 from intercap_core.studio.interactions.alone import BeamWalk
 from intercap_core.studio.interactions.slipping import (
-    BottleRegrasp,
-    RacquetGlide,
-    UmbrellaTurn,
+    GlidingSwing,
+    Regrasp,
+    TurningSwing,
     along_and_about,
 )
 from intercap_core.studio.stage import StageState, StudioStage
@@ -137,7 +137,7 @@ def test_the_object_does_not_enter_the_body(played: Played) -> None:
         assert -body.signed_distance(placed).min() < 0.015
 
 
-def test_flesh_is_pressed_in_by_no_more_than_it_gives(played: Played) -> None:
+def test_penetration_before_deformation_is_limited(played: Played) -> None:
     """Before the tissue gives way: millimetres at a hand, 15 to 20 mm on a seat."""
     stage = played.stage
     performed = stage.interaction.perform(np.arange(0.0, 3.0, 0.2))
@@ -224,7 +224,7 @@ def test_a_kicked_ball_slides_then_rolls_then_stops(make_stage: MakeStage) -> No
     np.testing.assert_allclose(spin[rolls] * 0.11, speed[rolls], rtol=0.02)
 
 
-def test_long_recordings_play_slower_and_short_ones_the_highlight(make_stage: MakeStage) -> None:
+def test_script_times_depend_on_the_recordings_length(make_stage: MakeStage) -> None:
     script = make_stage("beam_walk", "s03", 9001).interaction
     speeds = [np.diff(script.script_times(np.array([0, 0.1]), s))[0] / 0.1 for s in (3.0, 6.0)]
     assert speeds == pytest.approx([1.0, 0.5])
@@ -312,19 +312,19 @@ def held(request: pytest.FixtureRequest, make_stage: MakeStage) -> Held:
     return Held(stage, state, local, distance)
 
 
-def test_a_slide_turns_about_its_axis_and_shifts_along_it() -> None:
+def test_a_slide_rotates_about_and_moves_along_its_axis() -> None:
     moved = along_and_about(np.array([0.1]), np.array([np.pi / 2]), np.array([0.2, 0.0]))[0]
     np.testing.assert_allclose(moved @ [0.2, 0.0, 0.3, 1], [0.2, 0.0, 0.4, 1], atol=1e-12)
     np.testing.assert_allclose(moved @ [0.3, 0.0, 0.0, 1], [0.2, 0.1, 0.1, 1], atol=1e-12)
 
 
-def test_true_slip_is_as_fast_as_the_script_says(held: Held) -> None:
+def test_true_slip_has_the_scripted_speed(held: Held) -> None:
     script = held.stage.interaction
     slide = script.slide(held.stage.set_times)
-    if isinstance(script, RacquetGlide):
+    if isinstance(script, GlidingSwing):
         moved, limits, rtol, atol = slide[:, 2, 3], script.glide_s, 0.15, 0.005
         assert moved.max() == pytest.approx(script.glide_m)
-    elif isinstance(script, UmbrellaTurn):
+    elif isinstance(script, TurningSwing):
         turned = np.arccos(np.clip((np.trace(slide[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1))
         assert turned.max() == pytest.approx(np.radians(script.turn_deg))
         # the handle is a round bar of 21.5 mm
@@ -350,14 +350,14 @@ def test_skin_that_slips_stays_on_the_surface(held: Held) -> None:
     holds = np.flatnonzero(patch)
     assert held.distance[holds].min() > -0.002
     assert np.median(patch[holds]) > 30
-    if not isinstance(held.stage.interaction, BottleRegrasp):
+    if not isinstance(held.stage.interaction, Regrasp):
         hold = patch[int(np.ceil(1.0 * FPS)) : int(2.5 * FPS)]
         assert hold.min() > 0.5 * np.median(hold)
 
 
-def test_a_regrasp_lets_go_and_holds_elsewhere(held: Held) -> None:
+def test_a_regrasp_releases_and_moves_the_hand(held: Held) -> None:
     stage, script = held.stage, held.stage.interaction
-    if not isinstance(script, BottleRegrasp):
+    if not isinstance(script, Regrasp):
         pytest.skip("no regrasp")
     right = region_contact(stage, held.state).any(1)
     opens, off, back, closed = script.regrasp_s

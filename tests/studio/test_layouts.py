@@ -74,7 +74,7 @@ def images_of(folder: Path, layout: LayoutName, name: str) -> tuple[Camera, list
 @pytest.mark.parametrize(
     ("layout", "video"), [*((layout, False) for layout in LAYOUTS), ("plain", True)]
 )
-def test_what_is_written_is_read(tmp_path: Path, layout: LayoutName, video: bool) -> None:
+def test_recordings_are_read_as_written(tmp_path: Path, layout: LayoutName, video: bool) -> None:
     rig, jpeg, depth = write(tmp_path, layout, video=video)
     found = open_layout(row_of(tmp_path, layout))
     assert found.extrinsics.master == rig.claimed.names[0]
@@ -112,8 +112,8 @@ def wall_seen_in_colour(camera: Camera, distance: float) -> np.ndarray:
     return offset / (rays @ normal)
 
 
-def test_what_the_depth_camera_cannot_see_stays_empty() -> None:
-    """A card before a wall: a strip of the wall beside it has no depth, the card is whole."""
+def test_depth_unseen_by_the_depth_camera_is_empty() -> None:
+    """A card before a wall: a strip of the wall next to it has no depth, the card is whole."""
     camera = rig_of("intercap").claimed[1]
     assert camera.depth is not None and camera.colour_from_depth is not None
     depth = np.full((576, 640), 2500, np.uint16)
@@ -130,12 +130,12 @@ def test_what_the_depth_camera_cannot_see_stays_empty() -> None:
     (left, top), (right, bottom) = at.round().astype(int)
     assert on_card[top + 3 : bottom - 3, left + 3 : right - 3].all()
     middle = (top + bottom) // 2
-    beside = aligned[middle, left - 40 : right + 40]
+    strip = aligned[middle, left - 40 : right + 40]
     shift = 32.0 * (1 / 900 - 1 / 2500) * camera.colour.fx  # px, of the baseline's parallax
-    assert abs((beside == 0).sum() - shift) < 5
+    assert abs((strip == 0).sum() - shift) < 5
 
 
-def test_lenses_that_the_release_swapped(tmp_path: Path) -> None:
+def test_swapped_lenses_are_in_the_calibration(tmp_path: Path) -> None:
     rig, _, _ = write(tmp_path, "intercap", ("swapped_lenses",), cameras=5)
     for name, index in (("k4", 4), ("k5", 3), ("k3", 2)):
         camera, _ = images_of(tmp_path, "intercap", name)
@@ -150,14 +150,14 @@ def test_a_calibration_of_another_resolution_is_refused(tmp_path: Path, layout: 
         images_of(tmp_path, layout, rig.claimed.names[2])
 
 
-def test_a_plain_calibration_of_another_resolution_says_its_size(tmp_path: Path) -> None:
+def test_a_plain_calibration_of_another_size_is_accepted(tmp_path: Path) -> None:
     write(tmp_path, "plain", ("wrong_resolution",), {"wrong_resolution": 2})
     widths = [images_of(tmp_path, "plain", name)[0].colour.width for name in ("k2", "k3")]
     assert widths == [1280, 1920]
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_faults_that_a_layout_cannot_have_are_refused(layout: LayoutName) -> None:
+def test_faults_of_other_layouts_are_refused(layout: LayoutName) -> None:
     own = {"same_serial", "backwards_clock", "swapped_lenses", "wrong_resolution"}
     for fault in sorted(own):
         if fault in FOLDERS[layout].own_faults:
@@ -167,7 +167,7 @@ def test_faults_that_a_layout_cannot_have_are_refused(layout: LayoutName) -> Non
                 check_faults((fault,), layout=layout, cameras=6, frames=9)
 
 
-def test_a_capture_without_depth(tmp_path: Path) -> None:
+def test_captures_without_depth_have_no_depth_files(tmp_path: Path) -> None:
     make_capture(
         StudioCapture(interaction="walk_and_wave", subject="s03", seed=5, frames=2, layout="plain",
                       depth=False, room="bare"),
@@ -184,7 +184,7 @@ def by_the_studio(depth: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 @pytest.mark.parametrize("align", [mean_of_samples, by_the_studio])
-def test_it_is_what_the_colour_camera_would_measure(align):
+def test_aligned_depth_is_that_of_the_colour_camera(align):
     rig, zup_from_master = ring(count=2)
     for camera in rig:
         camera = replace(camera, colour=camera.colour.scaled(0.3))
@@ -201,7 +201,7 @@ def test_it_is_what_the_colour_camera_would_measure(align):
 
 
 @pytest.mark.parametrize("align", [mean_of_samples, by_the_studio])
-def test_a_surface_has_no_holes_and_a_near_one_covers_a_far_one(align):
+def test_aligned_surfaces_are_whole_and_near_ones_win(align):
     rig, _ = ring(count=1)
     camera = replace(rig[0], colour=rig[0].colour.scaled(0.5))
     far = np.full((camera.depth.height, camera.depth.width), 3000, np.uint16)

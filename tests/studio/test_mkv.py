@@ -1,4 +1,4 @@
-"""What the recording writer writes, read back by other programs."""
+"""Recordings by the studio's writer, read by other programs."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_pyav_reads_back_the_same_bytes_and_times(tmp_path):
     assert len(imu) == 4 * FRAMES and all(len(content) == 40 for _, content in imu)
 
 
-def test_ffmpegs_decoder_sees_the_depth_as_big_endian_grey(tmp_path):
+def test_ffmpeg_decodes_depth_as_big_endian_grey(tmp_path):
     _, depths = write_recording(tmp_path / "k1.mkv")
     with av.open(str(tmp_path / "k1.mkv")) as container:
         stream = next(s for s in container.streams if s.metadata.get("title") == "DEPTH")
@@ -104,7 +104,7 @@ def test_tags_attachment_and_rates(tmp_path):
         assert container.duration == last_imu_us
 
 
-def test_index_leads_to_the_frame_sought(tmp_path):
+def test_seeking_uses_the_index(tmp_path):
     write_recording(tmp_path / "k1.mkv", with_imu=False)
     with av.open(str(tmp_path / "k1.mkv")) as container:
         stream = container.streams[0]
@@ -135,7 +135,7 @@ def test_mkvtoolnix_accepts_it(tmp_path):
     assert not [line for line in info.splitlines() if "nknown element" in line]
 
 
-def test_wrong_use_is_refused(tmp_path):
+def test_invalid_calls_are_refused(tmp_path):
     jpegs, depths = make_images()
     options = dict(calibration_json=b"{}", colour_mode="720P", fps=30, serial="1")
     with MkvWriter(tmp_path / "a.mkv", depth_mode="NFOV_UNBINNED", **options) as writer:

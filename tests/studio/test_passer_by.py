@@ -1,4 +1,4 @@
-"""Another person who walks past: apart from all, seen by the cameras, no part of the truth."""
+"""A second person: clear of the subject, visible to the cameras, not in the truth."""
 
 from __future__ import annotations
 
@@ -37,16 +37,16 @@ def walker(stage: StudioStage) -> PasserBy:
     return stage.passer_by
 
 
-def test_somebody_else_walks_past_and_touches_nothing(stage: StudioStage, walker: PasserBy) -> None:
+def test_a_second_person_walks_past_without_contact(stage: StudioStage, walker: PasserBy) -> None:
     times = np.arange(0, stage.duration, 1 / 30)
     moment, passing = stage.at(times), walker.at(times)
     assert walker.subject.name != stage.subject.name and passing.present.all()
     apart = np.linalg.norm((passing.joints - moment.joints)[:, 0, :2], axis=1)
     assert PasserBy.passes_m[0] - 0.05 < apart.min() < PasserBy.passes_m[1] + 0.05
-    things = stage.prop.vertices[::50]
+    points = stage.prop.vertices[::50]
     for t in range(0, len(times), 5):
         pose = moment.stage_from_object[t]
-        at = things @ pose[:3, :3].T + pose[:3, 3]
+        at = points @ pose[:3, :3].T + pose[:3, 3]
         gap = np.linalg.norm(at[:, None] - passing.clothed[t][None, ::40], axis=2).min()
         assert gap > 0.1
     assert np.abs(passing.clothed[..., 2].min(1)).max() < 0.003
@@ -54,7 +54,7 @@ def test_somebody_else_walks_past_and_touches_nothing(stage: StudioStage, walker
     assert pace.min() > 0.8 and pace.max() < 2.2
 
 
-def test_somebody_else_stands_by_and_looks_on(object_entry: Entry) -> None:
+def test_a_second_person_stands_and_watches(object_entry: Entry) -> None:
     stage = StudioStage(
         CAPTURE.model_copy(update={"passer_by": "stands"}), SETTINGS, object_entry("stool")
     )
@@ -71,15 +71,17 @@ def test_somebody_else_stands_by_and_looks_on(object_entry: Entry) -> None:
     assert np.abs(passing.clothed[..., 2].min(1)).max() < 0.003
 
 
-def test_the_walker_comes_from_the_edge_and_leaves(walker: PasserBy) -> None:
+def test_a_walker_is_present_only_near_the_passage(walker: PasserBy) -> None:
     times = walker.way.when + np.array([-20.0, -2.0, 0.0, 2.0, 20.0])
     present = walker.at(times).present
     assert present.tolist() == [False, True, True, True, False]
 
 
-def test_nothing_else_of_the_recording_changes(stage: StudioStage, object_entry: Entry) -> None:
+def test_a_passer_by_leaves_the_recording_unchanged(
+    stage: StudioStage, object_entry: Entry
+) -> None:
     alone = StudioStage(
-        CAPTURE.model_copy(update={"passer_by": False}), SETTINGS, object_entry("stool")
+        CAPTURE.model_copy(update={"passer_by": "nobody"}), SETTINGS, object_entry("stool")
     )
     ours, theirs = (s.at(s.set_times[::4]) for s in (stage, alone))
     np.testing.assert_array_equal(ours.body, theirs.body)
@@ -88,7 +90,7 @@ def test_nothing_else_of_the_recording_changes(stage: StudioStage, object_entry:
     np.testing.assert_array_equal(stage.rig.offset_s, alone.rig.offset_s)
 
 
-def test_each_hides_what_is_behind(stage: StudioStage, walker: PasserBy) -> None:
+def test_surfaces_occlude_those_behind_them(stage: StudioStage, walker: PasserBy) -> None:
     """Against rays that are cast through all surfaces at once."""
     times = np.array([0.0, walker.way.when])
     moment, passing = stage.at(times), walker.at(times)
@@ -117,7 +119,7 @@ def test_each_hides_what_is_behind(stage: StudioStage, walker: PasserBy) -> None
     assert drawn_of_walker > 1000
 
 
-def test_a_walker_is_anywhere_in_a_file_and_only_where_seen(stage: StudioStage) -> None:
+def test_a_walker_is_detected_only_while_visible(stage: StudioStage) -> None:
     detector = Detector.build(NoiseSource(3, 1.0, "a", 5.0), 60)
     subject, walker = np.zeros((135, 3)), np.ones((60, 135, 3))
     hidden = np.zeros((60, 135), bool)

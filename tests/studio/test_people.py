@@ -13,7 +13,8 @@ from intercap_core.studio.objects import object_colours
 from intercap_core.studio.stage import StudioStage
 from intercap_core.studio.subjects import (
     FEET,
-    SHOES_HEAVY,
+    LEATHER_M,
+    SOLE_M,
     Subject,
     build_names,
     in_heavy_shoes,
@@ -76,7 +77,7 @@ def test_other_builds_stand_on_the_same_mesh(name: str) -> None:
     assert np.median(worn) > 0.003 and worn.max() < 0.021
 
 
-def test_the_rest_pose_leaves_the_body_where_it_is(person: Subject) -> None:
+def test_the_rest_pose_is_the_rest_mesh(person: Subject) -> None:
     shift = np.array([0.1, 0.2, 0.3])
     out = person.skin(np.zeros((1, 165)), shift[None])
     assert np.allclose(out.vertices[0], person.rest + shift, atol=1e-9)
@@ -94,7 +95,7 @@ def test_turning_the_whole_body_is_rigid(person: Subject) -> None:
     assert np.allclose(gaps[0], gaps[1], atol=1e-9)
 
 
-def test_a_pose_means_the_same_as_on_the_fitted_body(person: Subject, body: BodyModel) -> None:
+def test_poses_agree_with_the_fitted_body(person: Subject, body: BodyModel) -> None:
     """Limb directions of the posed skeleton agree, although the bones' lengths do not."""
     pose = np.zeros((1, 165))
     pose[0, [48, 51, 55, 12, 1]] = [0.3, -0.2, -1.2, 1.1, 0.7]
@@ -146,7 +147,7 @@ def test_mapped_points_are_on_the_surface_and_on_the_same_limb(
     assert person.fitted_bary.min() >= 0
 
 
-def test_clothes_are_where_clothes_are(person: Subject) -> None:
+def test_clothing_covers_trunk_and_legs_only(person: Subject) -> None:
     out = person.skin(_random_pose(1), np.zeros((1, 3)))
     gap = np.linalg.norm(out.clothed - out.vertices, axis=-1)[0]
     assert np.allclose(gap, person.clothing, atol=1e-9)
@@ -169,7 +170,7 @@ def test_a_bent_elbow_bulges_by_millimetres(person: Subject) -> None:
 
 
 @pytest.mark.parametrize("name", subject_names()[::3])
-def test_soles_are_flat_and_leather_is_as_thick_as_stated(name: str) -> None:
+def test_soles_are_flat_and_leather_has_its_thickness(name: str) -> None:
     bare = Subject.load(name)
     shod = in_heavy_shoes(bare, np.random.default_rng(3))
     np.testing.assert_array_equal(shod.rest, bare.rest)
@@ -178,23 +179,19 @@ def test_soles_are_flat_and_leather_is_as_thick_as_stated(name: str) -> None:
     normals = bare.normals(bare.rest[None])[0]
     for foot in FEET:
         own = shoe_area(bare) & (np.asarray(bare.weights[:, foot].sum(1)).ravel() > 0.5)
-        ground = bare.rest[own, 1].min() - SHOES_HEAVY.sole
+        ground = bare.rest[own, 1].min() - SOLE_M
         assert shod.rest_clothed[own, 1].min() == pytest.approx(ground, abs=1e-4)
         under = own & (normals[:, 1] < -0.9)
         assert np.percentile(shod.rest_clothed[under, 1] - ground, 90) < 0.001
-        level = (
-            own
-            & (np.abs(normals[:, 1]) < 0.2)
-            & (bare.rest[:, 1] < ground + SHOES_HEAVY.sole + 0.03)
-        )
+        level = own & (np.abs(normals[:, 1]) < 0.2) & (bare.rest[:, 1] < ground + SOLE_M + 0.03)
         thick = shod.clothing[level]
-        assert SHOES_HEAVY.leather[0] <= thick.min() and thick.max() <= SHOES_HEAVY.leather[1]
+        assert LEATHER_M[0] <= thick.min() and thick.max() <= LEATHER_M[1]
 
 
 def test_a_person_stands_on_the_soles() -> None:
     """Bare feet are at the height of the sole, soles on the floor."""
     settings = StudioSettings(captures={}, cameras=1)
-    for shoes, height in (("plain", 0.0), ("heavy", SHOES_HEAVY.sole)):
+    for shoes, height in (("plain", 0.0), ("heavy", SOLE_M)):
         capture = StudioCapture(
             interaction="walk_and_wave", subject="s06", seed=11, frames=20, shoes=shoes
         )
@@ -210,7 +207,7 @@ def ball() -> np.ndarray:
     return 0.1 * points / np.linalg.norm(points, axis=1, keepdims=True)
 
 
-def test_a_plain_object_has_one_colour_and_a_printed_one_sides(ball):
+def test_plain_objects_have_one_colour_printed_ones_spots(ball):
     of_mesh = np.full((len(ball), 3), 0.5)
     for seed in range(4):
         plain, printed = (

@@ -49,7 +49,7 @@ def test_turn_is_a_rotation_about_its_vector() -> None:
     np.testing.assert_allclose(turn(vector) @ vector, vector, atol=1e-12)
 
 
-def test_half_of_all_directions_meet_a_wide_wall_and_all_a_shell() -> None:
+def test_walls_block_half_of_all_directions_shells_all() -> None:
     wall = trimesh.creation.box((20.0, 20.0, 0.02))
     share = Hollow(DistanceField(wall.vertices, wall.faces)).share(np.array([[0, 0, 0.02]]))
     assert share[0] == pytest.approx(0.5, abs=2 / Hollow.directions)
@@ -59,7 +59,7 @@ def test_half_of_all_directions_meet_a_wide_wall_and_all_a_shell() -> None:
 
 
 @pytest.mark.parametrize("subject", ["s03", pytest.param("s06", marks=pytest.mark.full)])
-def test_no_finger_is_in_the_cup(subject: str, make_stage: MakeStage) -> None:
+def test_no_finger_is_inside_the_cup(subject: str, make_stage: MakeStage) -> None:
     stage = make_stage("cup_drink", subject, 911, 3)
     script = stage.interaction
     assert isinstance(script, HandlingScript)

@@ -1,4 +1,4 @@
-"""What a view draws of moving things, against rays cast by Embree."""
+"""Drawn moving surfaces, compared with rays cast by Embree."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def surfaces() -> tuple[MovingSurface, MovingSurface]:
 
 
 @pytest.mark.parametrize("index", [0, 1])
-def test_moving_things_are_drawn_where_rays_hit_them(
+def test_moving_surfaces_are_drawn_where_rays_hit(
     surfaces: tuple[MovingSurface, MovingSurface], index: int
 ) -> None:
     capture = StudioCapture(interaction="stool_sit", subject="s01", seed=1, frames=9)

@@ -1,4 +1,4 @@
-"""What the studio's microphones hear, and what its captures state of their starts."""
+"""Sound of the studio's videos, and stated start times."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from intercap_core.studio.capture import erring_starts
 from intercap_core.studio.capture_folder import SOUND_RATE as STUDIO_RATE
 from intercap_core.studio.capture_folder import Device, DeviceFrame
 from intercap_core.studio.layouts import FOLDERS
-from intercap_core.studio.sensors import ACOUSTICS, heard
+from intercap_core.studio.sensors import MAX_LATENCY_S, heard
 from intercap_core.studio.stage import StudioStage
 
 SECONDS = 3.0
@@ -40,7 +40,7 @@ def listened(samples: np.ndarray) -> Sound:
 
 
 @pytest.mark.parametrize("seed", [7911, 7912])
-def test_the_sound_tells_when_cameras_started(seed):
+def test_sound_yields_the_cameras_start_times(seed):
     """Within what devices' delays and the way of the sound explain."""
     stage = stage_of(seed)
     tracks = [heard(stage, c, -late, SECONDS) for c, late in enumerate(stage.rig.late_s)]
@@ -48,11 +48,11 @@ def test_the_sound_tells_when_cameras_started(seed):
     start, sigma = sound_starts([listened(track) for track in tracks])
     errors = (start - start[0]) + stage.rig.late_s
     assert np.isfinite(start).all() and (sigma < 0.035).all()
-    assert np.abs(errors).max() < 2 * ACOUSTICS.max_latency_s + TRAVEL_S
+    assert np.abs(errors).max() < 2 * MAX_LATENCY_S + TRAVEL_S
     assert np.abs(errors[1:]).max() > 0.001  # microphones are no clocks
 
 
-def test_sound_comes_later_to_who_is_farther():
+def test_sound_delay_is_the_travel_time():
     """Without delays of devices: by the way to the person, to half a millisecond."""
     stage = stage_of(7915, apart=0.0)
     stage.noise = type(stage.noise)(7915, 0.0, "a", 30.0)
@@ -65,7 +65,7 @@ def test_sound_comes_later_to_who_is_farther():
     assert found is not None and way.min() - 0.0015 < found.seconds < way.max() + 0.0015
 
 
-def test_a_video_carries_what_was_heard(tmp_path):
+def test_videos_contain_the_recorded_sound(tmp_path):
     stage = stage_of(7911)
     samples = heard(stage, 0, 0.0, 2.0)
     place = FOLDERS["plain"](
@@ -95,7 +95,7 @@ def test_a_video_carries_what_was_heard(tmp_path):
     assert alike > 0.9
 
 
-def test_stated_starts_err_as_they_say():
+def test_stated_starts_err_by_their_sigma():
     stage = stage_of(7911)
     exact = erring_starts(stage, 0.0)
     assert exact["starts_sigma"] == 0.001

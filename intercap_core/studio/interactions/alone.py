@@ -74,11 +74,8 @@ class BeamWalk(Interaction):
         return Trunk(pelvis, track[:, 3], bend, head)
 
     def perform(self, times: np.ndarray) -> Performance:
-        puppet, feet = self.puppet, self.footwork.feet(times)
-        balance = plateau(times, 0.2, 0.7, 1.9, 2.5)
-        trunk = puppet.settled(self._trunk(times, balance), feet[0])
-        world, pelvis = puppet.trunk(trunk), trunk.pelvis
-        puppet.legs(world, pelvis, *feet)
+        puppet, balance = self.puppet, plateau(times, 0.2, 0.7, 1.9, 2.5)
+        world, pelvis = self.on_feet(self._trunk(times, balance), times)
         swing = self.arm_swing(times)
         for side, sign in ((LEFT, 1.0), (RIGHT, -1.0)):
             outward = sign * world[:, 9, :, 0] * (1, 1, 0)
@@ -131,7 +128,7 @@ class WalkAndWave(Interaction):
         puppet, sign = self.puppet, (1.0, -1.0)[self.side]
         left, up, ahead = (world[:, 9, :, axis] for axis in range(3))
         wave = self.wave_m * np.sin(2 * np.pi * self.wave_hz * (times - self.raised_s[1]))[:, None]
-        place = puppet.arm_root(world, pelvis, self.side) + puppet.arm * (
+        place = puppet.shoulder(world, pelvis, self.side) + puppet.arm * (
             0.32 * sign * left + 0.48 * up + 0.42 * ahead
         )
         fingers = unit(up + (wave / puppet.arm) * left + 0.15 * ahead)
@@ -139,10 +136,8 @@ class WalkAndWave(Interaction):
         return WristPose(place + wave * left, rotation)
 
     def perform(self, times: np.ndarray) -> Performance:
-        puppet, feet = self.puppet, self.footwork.feet(times)
-        trunk = puppet.settled(self._trunk(times), feet[0])
-        world, pelvis = puppet.trunk(trunk), trunk.pelvis
-        puppet.legs(world, pelvis, *feet)
+        puppet = self.puppet
+        world, pelvis = self.on_feet(self._trunk(times), times)
         up = plateau(times, *self.raised_s)
         walking = plateau(times, -0.4, 0.1, 1.1, 1.5)
         stride = 0.13 * walking * np.sin(2 * np.pi * (times - 0.05) / 0.82)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from intercap_core.geometry.camera.transforms import invert
+from intercap_core.geometry.camera.transforms import invert, rigid
 from intercap_core.studio.controls import Footwork, Guide, Step, Wander
 from intercap_core.studio.motion import Puppet, Trunk
 from intercap_core.studio.objects import TrueObject
@@ -78,6 +78,14 @@ class Interaction(ABC):
         pelvis = track[:, :3] + self.weight_shift(times)
         return Trunk(pelvis, track[:, 3], bend * sway[:, :3], head * sway[:, 3:])
 
+    def on_feet(self, trunk: Trunk, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rotations (N, 55, 3, 3) and pelvis (N, 3) of a trunk on legs that follow the footwork."""
+        feet = self.footwork.feet(times)
+        trunk = self.puppet.settled(trunk, feet[0])
+        world = self.puppet.trunk(trunk)
+        self.puppet.legs(world, trunk.pelvis, *feet)
+        return world, trunk.pelvis
+
     def script_times(self, times: np.ndarray, duration: float) -> np.ndarray:
         """Script times of recording times (N,), seconds from its first set.
 
@@ -89,29 +97,19 @@ class Interaction(ABC):
         return times + np.clip(self.highlight - duration / 2, 0, SCRIPT_S - duration)
 
 
-def transform(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    """(4, 4) of a rotation (3, 3) and translation (3,)."""
-    result = np.eye(4)
-    result[:3, :3], result[:3, 3] = rotation, translation
-    return result
-
-
 def upright(x: float, y: float, z: float, heading: float) -> np.ndarray:
     """stage_from_object (4, 4) of an object that stands, turned about the vertical."""
     cos, sin = np.cos(heading), np.sin(heading)
-    return transform(np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]), np.array([x, y, z]))
+    return rigid(np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]), np.array([x, y, z]))
 
 
 def held_object(
-    puppet: Puppet,
-    world: np.ndarray,
-    pelvis: np.ndarray,
-    side: int,
-    object_from_wrist: np.ndarray,
+    puppet: Puppet, world: np.ndarray, pelvis: np.ndarray, side: int, object_from_wrist: np.ndarray
 ) -> np.ndarray:
-    """stage_from_object (N, 4, 4) of an object in the hand, from the posed wrist."""
-    wrist = np.broadcast_to(np.eye(4), (len(world), 4, 4)).copy()
+    """stage_from_object (N, 4, 4) of an object in the hand, from the posed wrist.
+
+    ``object_from_wrist``: (4, 4) or (N, 4, 4).
+    """
     index = puppet.hands[side].wrist
-    wrist[:, :3, :3] = world[:, index]
-    wrist[:, :3, 3] = puppet.skeleton.forward(world, pelvis)[:, index]
+    wrist = rigid(world[:, index], puppet.skeleton.forward(world, pelvis)[:, index])
     return wrist @ invert(object_from_wrist)

@@ -6,13 +6,13 @@ from itertools import product
 
 import numpy as np
 
+from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.studio.controls import Step, WristPose, bump, plateau, ramp
 from intercap_core.studio.hands import RELAXED, HandShape, shape
 from intercap_core.studio.interactions.base import (
     Interaction,
     Performance,
     held_object,
-    transform,
     upright,
 )
 from intercap_core.studio.motion import LEFT, RIGHT, Trunk
@@ -24,28 +24,20 @@ class HandleCarry(Interaction):
 
     highlight = 1.5
     centre = (0.22, -0.15)
-    bar_half: float
-    """Half the thickness of the handle's bar, metres."""
-    beside: float
-    """From the hip to the object's middle, metres."""
+    bar_half: float  # half the thickness of the handle's bar, metres
+    distance_m: float  # from the hip to the object's middle, metres
+    # places of the knuckles next to and below the bar that are tried, metres
     knuckles_aside: tuple[float, ...] = (0.020, 0.025, 0.030)
-    """Places of the knuckles next to the bar that are tried, metres."""
     knuckles_below: tuple[float, ...] = (0.020, 0.024, 0.028, 0.032)
-    """Places below the bar, metres."""
-    above: float
-    """Height above the grip from which the hand goes down to it, metres."""
-    lifted_s: float
-    """End of the lift, script time."""
-    lower_s: float
-    """Start of putting it down, script time."""
-    stoop_from: float
-    """Start of the stoop, script time."""
-    stoop_down: float
-    """How far the pelvis goes down, in leg lengths."""
-    stoop_back: float
-    """How far the pelvis goes back, metres."""
-    stoop_bend: float
-    """Additional bend of the trunk, rad."""
+    above: float  # height above the grip from which the hand goes down to it, metres
+    # range of the height above the floor at which it is carried, metres; None: the arm hangs
+    lift_m: tuple[float, float] | None = None
+    lifted_s: float  # end of the lift, script time
+    lower_s: float  # start of putting it down, script time
+    stoop_from: float  # start of the stoop, script time
+    stoop_down: float  # how far the pelvis goes down, in leg lengths
+    stoop_back: float  # how far the pelvis goes back, metres
+    stoop_bend: float  # additional bend of the trunk, rad
     attach_s = 1.08  # grasp, script time
     release_s = 2.46  # release, script time
     knuckles_deg = (36, 44, 52, 60)  # knuckle flexions of the hands that are tried
@@ -57,7 +49,7 @@ class HandleCarry(Interaction):
 
     def plan(self) -> None:
         rng, puppet = self.rng, self.puppet
-        side_way = -(puppet.hip_width + self.beside + rng.uniform(0, 0.02))
+        side_way = -(puppet.hip_width + self.distance_m + rng.uniform(0, 0.02))
         height = self.prop.standing_height
         ahead, turned = 0.02 + rng.normal(0, 0.01), np.pi + rng.normal(0, 0.03, 2)
         self.pick_pose = upright(ahead, side_way, height, turned[0])
@@ -78,7 +70,13 @@ class HandleCarry(Interaction):
 
     def lifted(self) -> float:
         """How high the object is carried, from the floor, metres."""
-        raise NotImplementedError
+        if self.lift_m is not None:
+            return self.rng.uniform(*self.lift_m)
+        # the arm hangs almost straight; a standing person's shoulder is at 0.81 of the height
+        puppet = self.puppet
+        shoulder = 0.81 * puppet.subject.height_m
+        wrist = shoulder - self.rng.uniform(0.83, 0.89) * puppet.arm
+        return wrist - float((self.pick_pose @ self.object_from_wrist)[2, 3])
 
     def _grasp(self) -> None:
         """Fingers level under the handle's bar where they have most room, then curled up.
@@ -105,7 +103,7 @@ class HandleCarry(Interaction):
                     room = float(surface.signed_distance(on_the_way).min())
                     room -= self.strain_m * tilt_deg / 10
                     if room > best[0]:
-                        best = (room, hook, transform(rotation, place))
+                        best = (room, hook, rigid(rotation, place))
         _, self.hook, self.object_from_wrist = best
         knuckle_limit = float(self.hook.flexion[0, 0]) + 5
         limits = {"finger": (knuckle_limit, 98.0, 62.0), "thumb": (40.0, 55.0, 60.0)}
@@ -200,36 +198,3 @@ class HandleCarry(Interaction):
         pose = np.where((times <= self.attach_s)[:, None, None], self.pick_pose, carried)
         pose = np.where((times >= self.release_s)[:, None, None], self.place_pose, pose)
         return Performance(world, pelvis, pose)
-
-
-class SuitcaseCarry(HandleCarry):
-    """The case's trolley bar is on the side away from the hand."""
-
-    object_class = "suitcase"
-    bar_half, beside, above = 0.008, 0.235, 0.14
-    lifted_s, lower_s = 1.55, 1.95
-    stoop_from, stoop_down, stoop_back, stoop_bend = 0.55, 0.24, 0.05, 0.42
-    lift_m = (0.14, 0.20)  # range of the height above the floor, metres
-
-    def lifted(self) -> float:
-        return self.rng.uniform(*self.lift_m)
-
-
-class ToolboxCarry(HandleCarry):
-    """The grip is a hand's width above the floor: knees and back bend far down."""
-
-    object_class = "toolbox"
-    bar_half, beside, above = 0.014, 0.225, 0.22
-    knuckles_aside = (0.020, 0.030, 0.040)
-    knuckles_below = (0.022, 0.028, 0.034, 0.040)
-    lifted_s, lower_s = 1.70, 1.80
-    stoop_from, stoop_down, stoop_back, stoop_bend = 0.28, 0.50, 0.08, 0.62
-    arm_share = (0.83, 0.89)  # range of the wrist below the shoulder, shares of the arm's length
-    shoulder_share = 0.81  # a standing person's shoulder, share of the height
-
-    def lifted(self) -> float:
-        """The arm hangs almost straight while it carries."""
-        puppet = self.puppet
-        shoulder = self.shoulder_share * puppet.subject.height_m
-        wrist = shoulder - self.rng.uniform(*self.arm_share) * puppet.arm
-        return wrist - float((self.pick_pose @ self.object_from_wrist)[2, 3])

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from intercap_core.body.joints import JOINT_INDEX
-from intercap_core.studio.controls import WristPose, plateau, ramp
+from intercap_core.geometry.camera.transforms import rigid
+from intercap_core.studio.controls import WristPose, bisect, plateau, ramp
 from intercap_core.studio.hands import OPEN, RELAXED, HandShape, part_of
-from intercap_core.studio.interactions.base import transform
 from intercap_core.studio.interactions.grasps import backed_off
-from intercap_core.studio.interactions.handling import HandlingScript, by_the_wall
+from intercap_core.studio.interactions.handling import HandlingScript
 from intercap_core.studio.motion import LEFT, RIGHT, Trunk
 from intercap_core.studio.skeleton import turn
 
@@ -21,7 +21,6 @@ class Drinking(HandlingScript):
     centre = (0.18, -0.05)
     tilt_deg = (42.0, 52.0)  # how far the vessel leans at the lips
     head_back = 0.22  # rad
-    grip_height_m = 0.0  # of the palm, from the vessel's origin
     lips_at_edge = True  # the lips touch the rim's near edge, else the middle of the mouth
     attach_s = 1.06  # grasp, script time
     release_s = 2.50  # release, script time
@@ -35,15 +34,12 @@ class Drinking(HandlingScript):
         self.set_out(self.plinth_share, self.aside_m)
         self.tilt = np.radians(rng.uniform(*self.tilt_deg))
         self.hover = rng.uniform(*self.hover_m)
-        self.grips[RIGHT] = by_the_wall(self, self.grip_height_m)
-        self.hold_s[RIGHT] = (self.attach_s, self.release_s)
+        self.grasp()
         self._drinking_place()
         self._hovering_place()
 
-    # --- places found on the person's own surface ------------------------------------------
-
     def _drinking_place(self) -> None:
-        """head_from_thing (4, 4): the rim against the lips, tilted; rest axes at the head joint."""
+        """Plan head_from_prop (4, 4): the tilted rim at the lips, rest axes at the head joint."""
         subject = self.puppet.subject
         head = JOINT_INDEX["head"]
         share = np.asarray(subject.weights[:, [head, JOINT_INDEX["jaw"]]].sum(1)).ravel()
@@ -65,15 +61,14 @@ class Drinking(HandlingScript):
             across *= -np.sign(across[2])
             near_rim = near_rim + np.linalg.norm(rim[:, :2], axis=1).max() * across
         mouth = np.array([0.0, corner[1] - 0.003, front])
-        low, high = -0.03, 0.05
-        for _ in range(18):
-            ahead = (low + high) / 2
+
+        def is_too_near(ahead: float) -> bool:
             centre = mouth + np.array([0, 0, ahead]) - near_rim
-            if self.prop.surface.signed_distance((face - centre) @ rotation).min() < self.lip_gap_m:
-                low = ahead
-            else:
-                high = ahead
-        self.head_from_prop = transform(rotation, mouth + np.array([0, 0, high]) - near_rim)
+            distance = self.prop.surface.signed_distance((face - centre) @ rotation).min()
+            return bool(distance < self.lip_gap_m)
+
+        _, high = bisect(-0.03, 0.05, 18, is_too_near)
+        self.head_from_prop = rigid(rotation, mouth + np.array([0, 0, high]) - near_rim)
 
     @property
     def mouth(self) -> np.ndarray:
@@ -88,7 +83,7 @@ class Drinking(HandlingScript):
         return np.array([0.0, float(np.median(heights)), float(subject.rest[pick, 2].mean())])
 
     def _hovering_place(self) -> None:
-        """The left hand flat beside the vessel, ``hover`` away, as if to steady it."""
+        """Plan the left hand: flat, ``hover`` metres from the vessel, as if to steady it."""
         hand = self.puppet.hands[LEFT]
         fingers = np.array([0.80, -0.45, -0.20])
         palm = np.array([-0.45, -0.85, 0.0])
@@ -97,9 +92,7 @@ class Drinking(HandlingScript):
         place = self.pick_pose[:3, 3] - skin[hand.palm_ids].mean(0) - 0.03 * fingers
         place[2] = self.pick_pose[2, 3] + 0.03 - skin[:, 2].mean()
         self.left_place = backed_off(hand, OPEN, self.prop.surface, self.pick_pose,
-                                     transform(rotation, place), -palm, self.hover)  # fmt: skip
-
-    # --- the script --------------------------------------------------------------------------
+                                     rigid(rotation, place), -palm, self.hover)  # fmt: skip
 
     def trunk(self, times: np.ndarray) -> Trunk:
         """Lean to the plinth, straighten up and put the head back to drink, lean again."""
@@ -114,9 +107,8 @@ class Drinking(HandlingScript):
     def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> WristPose:
         """From the plinth to the lips, tilted there, and back."""
         count = len(times)
-        head = np.broadcast_to(np.eye(4), (count, 4, 4)).copy()
-        head[:, :3, :3] = world[:, JOINT_INDEX["head"]]
-        head[:, :3, 3] = self.puppet.joint_on_trunk(world, pelvis, "head")
+        place = self.puppet.joint(world, pelvis, "head")
+        head = rigid(world[:, JOINT_INDEX["head"]], place)
         at_lips = head @ self.head_from_prop
         # before and after the drink it is upright, a little lower and ahead of the lips
         upright_share = 1 - plateau(times, 1.45, 1.80, 2.00, 2.30)
@@ -133,12 +125,7 @@ class Drinking(HandlingScript):
         )
 
     def wrist(
-        self,
-        side: int,
-        world: np.ndarray,
-        pelvis: np.ndarray,
-        times: np.ndarray,
-        prop: np.ndarray,
+        self, side: int, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray, prop: np.ndarray
     ) -> WristPose:
         """The right hand handles the vessel; the left only comes near."""
         wrist = super().wrist(side, world, pelvis, times, prop)
@@ -166,19 +153,3 @@ class Drinking(HandlingScript):
     def raised(self, times: np.ndarray, side: int) -> np.ndarray:
         """The elbow is lifted a little to drink."""
         return (0.0, 0.1)[side] * plateau(times, 1.2, 1.7, 2.0, 2.4)
-
-
-class BottleDrink(Drinking):
-    """The bottle leans over the horizontal: its bottom is higher than the lips."""
-
-    object_class = "bottle"
-    tilt_deg = (66.0, 80.0)
-    head_back = 0.42
-    grip_height_m = 0.01
-    lips_at_edge = False
-
-
-class CupDrink(Drinking):
-    """The hand around the wall, the rim's near edge at the lips."""
-
-    object_class = "cup"

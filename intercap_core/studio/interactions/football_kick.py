@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.studio.controls import Guide, Step, bump, plateau, ramp
+from intercap_core.studio.controls import Guide, Step, bisect, bump, plateau, ramp
 from intercap_core.studio.interactions.base import SCRIPT_S, Interaction, Performance
 from intercap_core.studio.motion import LEFT, RIGHT, Foot, Trunk, moved, still
 from intercap_core.studio.skeleton import turn, unit
@@ -50,8 +50,6 @@ class FootballKick(Interaction):
         self._footwork(sole_gap)
         self._roll(self.gravity * sliding, self.gravity * rolling)
 
-    # --- the foot ----------------------------------------------------------------------------
-
     def _gap(self, skin: np.ndarray, rolled: float = 0.0) -> float:
         """Least signed distance of skin (n, 3) to the ball that was moved by ``rolled`` metres."""
         local = (skin - self.spot - rolled * self.ahead) @ self.first_turn
@@ -62,14 +60,9 @@ class FootballKick(Interaction):
         """How far the ball is after the foot has pushed it away, metres."""
         if self._gap(skin, rolled) >= -self.pressed_m:
             return rolled
-        low, high = rolled, rolled + 0.02
-        for _ in range(10):
-            middle = (low + high) / 2
-            if self._gap(skin, middle) < -self.pressed_m:
-                low = middle
-            else:
-                high = middle
-        return high
+        return bisect(
+            rolled, rolled + 0.02, 10, lambda way: self._gap(skin, way) < -self.pressed_m
+        )[1]
 
     def _footwork(self, sole_gap: float) -> None:
         puppet, w, (x, y, _) = self.puppet, self.puppet.hip_width, self.spot
@@ -81,11 +74,11 @@ class FootballKick(Interaction):
         self.strike = self.foot.backed_off(strike, np.array([-0.5, 0, 0, 0, 0]), 0.0, self._gap)
         self.back = moved(self.strike, -self.backswing_m, 0, sole + 0.20 - self.strike[2], 0.12)
         self.through = moved(self.strike, self.through_m, 0.03, sole + 0.17 - self.strike[2], -0.1)
-        beside = self.strike[0] + 0.03
-        start = np.array([[beside - 0.36, w], [beside - 0.30, -w]])
+        ankle_x = self.strike[0] + 0.03
+        start = np.array([[ankle_x - 0.36, w], [ankle_x - 0.30, -w]])
         steps = [
-            Step(LEFT, 0.02, 0.38, (beside, w)),
-            Step(RIGHT, 0.28, 2.50, (beside + 0.17, -w)),
+            Step(LEFT, 0.02, 0.38, (ankle_x, w)),
+            Step(RIGHT, 0.28, 2.50, (ankle_x + 0.17, -w)),
         ]
         over = moved(on_ball, 0, 0, 0.06)
         guides = [
@@ -108,8 +101,6 @@ class FootballKick(Interaction):
         low = (1 + np.cos(np.pi * beyond)) / 2
         path[:, 1:4] += low[:, None] * (self.strike - straight)[1:4]
         return path
-
-    # --- the ball ----------------------------------------------------------------------------
 
     def _roll(self, sliding: float, rolling: float) -> None:
         """How far the ball has moved, metres, and turned, rad, by time; ``sliding`` and
@@ -147,8 +138,6 @@ class FootballKick(Interaction):
         pose[:, 2, 3] = -(pose[:, 2, :3] @ self.prop.vertices.T).min(1)
         return pose
 
-    # --- the script --------------------------------------------------------------------------
-
     def _trunk(self, times: np.ndarray) -> Trunk:
         trunk = self.standing(times)
         pelvis, bend, head = trunk.pelvis, trunk.bend, trunk.head
@@ -164,10 +153,7 @@ class FootballKick(Interaction):
         return trunk
 
     def perform(self, times: np.ndarray) -> Performance:
-        puppet, feet = self.puppet, self.footwork.feet(times)
-        trunk = puppet.settled(self._trunk(times), feet[0])
-        world = puppet.trunk(trunk)
-        puppet.legs(world, trunk.pelvis, *feet)
+        world, pelvis = self.on_feet(self._trunk(times), times)
         back = bump(times, 1.00, 1.66)
         kick = plateau(times, 1.42, 1.80, 1.85, 2.50)
         balance = plateau(times, 0.30, 0.70, 2.00, 2.60)
@@ -175,5 +161,5 @@ class FootballKick(Interaction):
             swing = sign * (0.16 * back - 0.20 * kick) + self.arm_swing(times)[:, side]
             out = (0.10 * balance)[:, None] * np.array([0, sign, 0])
             out[:, 2] += 0.05 * balance
-            puppet.swing_arm(world, trunk.pelvis, side, swing, out)
-        return Performance(world, trunk.pelvis, self._ball(times))
+            self.puppet.swing_arm(world, pelvis, side, swing, out)
+        return Performance(world, pelvis, self._ball(times))

@@ -12,20 +12,14 @@ from itertools import product
 
 import numpy as np
 
-from intercap_core.geometry.camera.transforms import invert
+from intercap_core.geometry.camera.transforms import invert, rigid
 from intercap_core.geometry.rigid.distance import DistanceField
+from intercap_core.studio.controls import bisect
 from intercap_core.studio.hands import THUMB, Hand, HandShape, shape
-from intercap_core.studio.interactions.base import transform
 from intercap_core.studio.motion import Puppet
 from intercap_core.studio.skeleton import unit
 
 PALM_PRESSED_M = 0.001  # depth to which the object presses the palm
-# A grasp with at most this gap of each finger, or this sum of gaps, is accepted at once
-FINGER_MEETS_M = 0.002
-THUMB_NEAR_M = 0.008
-FAR_M = 0.03  # larger gaps count as this gap
-# The grasped surface meets the hand this far beyond the palm's middle, towards the fingers
-ALONG_FINGERS_M = 0.030
 THUMB_BENDS = (1.0, 0.5, 0.15)  # of the thumb's largest flexion, in the order of tries
 OPPOSITIONS_DEG = (60.0, 45.0, 30.0, 75.0, 90.0, 15.0, 0.0)  # of the thumb, in the order of tries
 WRAP_OPEN = shape((10, 12, 6), (0, 4, 6), 45)
@@ -59,18 +53,15 @@ def backed_off(
 ) -> np.ndarray:
     """A wrist (4, 4) of the stage moved along ``away`` (3,), at most a quarter of a metre, until
     the hand's vertices ``ids`` are ``gap`` from the object (negative: pressed)."""
-    low, high = 0.0, 0.25
     object_from_stage = invert(stage_from_object)
-    moved = wrist.copy()
-    for _ in range(16):
-        middle = (low + high) / 2
-        moved[:3, 3] = wrist[:3, 3] + middle * away
-        if hand.gap(hand_shape, surface, object_from_stage @ moved, ids) < gap:
-            low = middle
-        else:
-            high = middle
-    moved[:3, 3] = wrist[:3, 3] + high * away
-    return moved
+
+    def moved(way: float) -> np.ndarray:
+        return rigid(wrist[:3, :3], wrist[:3, 3] + way * away)
+
+    def is_too_near(way: float) -> bool:
+        return hand.gap(hand_shape, surface, object_from_stage @ moved(way), ids) < gap
+
+    return moved(bisect(0.0, 0.25, 16, is_too_near)[1])
 
 
 class Hollow:
@@ -113,7 +104,7 @@ class Approach:
     """Direction (3,) of the fingers."""
     palm: np.ndarray
     """Direction (3,) in which the palm faces and moves."""
-    along: float = ALONG_FINGERS_M
+    along: float = 0.030
     """The goal lies this far from the palm's middle towards the fingers, metres."""
     floor: float = -np.inf
     """The hand stays above this height, metres."""
@@ -138,7 +129,7 @@ class Approach:
         place[2] = max(place[2], self.floor - skin[:, 2].min())
         ids = slice(None) if thumb else hand.but_thumb_ids
         return backed_off(hand, hand_shape, surface, stage_from_object,
-                          transform(rotation, place), -palm, -PALM_PRESSED_M, ids)  # fmt: skip
+                          rigid(rotation, place), -palm, -PALM_PRESSED_M, ids)  # fmt: skip
 
 
 def around_wall(at: np.ndarray, floor: float) -> Iterator[Approach]:
@@ -192,16 +183,16 @@ def wrapped(
             limits = {"thumb": (bend * base, bend * middle, bend * end)}
             closed, gaps = hand.close(replace(around, opposition=opposition), limits, surface,
                                       pose, fingers=(THUMB,))  # fmt: skip
-            score = -float(np.clip(gaps, 0, FAR_M).sum())
+            score = -float(np.clip(gaps, 0, 0.03).sum())
             if best is not None and score <= best[0]:
                 continue
             skin = hand.skin(np.stack([hand.local(opened), hand.local(closed)]))
             if hollow.holds(skin.reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3]):
                 continue
             best = score, Grip(opened, closed, pose, gaps)
-            if gaps.max() < FINGER_MEETS_M:
+            if gaps.max() < 0.002:  # metres: every finger meets the object
                 return best[1]
-        if best is not None and best[0] > -THUMB_NEAR_M:
+        if best is not None and best[0] > -0.008:  # metres: the thumb is near it
             break
     if best is None:
         raise ValueError("no approach leaves the thumb room outside the object")

@@ -7,10 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from intercap_core.geometry.camera.transforms import invert
 from intercap_core.studio.controls import Step, WristPose, ramp
 from intercap_core.studio.hands import RELAXED, HandShape
-from intercap_core.studio.interactions.base import Interaction, Performance, upright
+from intercap_core.studio.interactions.base import Interaction, Performance, held_object, upright
 from intercap_core.studio.interactions.grasps import (
     WRAP_OPEN,
     Approach,
@@ -35,6 +34,9 @@ class HandlingScript(Interaction):
     """
 
     lead = RIGHT
+    grip_height_m: float | None = 0.0  # of the palm above the object's origin; None: both palms
+    attach_s: float  # grasp, script time
+    release_s: float  # release, script time
     clear_m = 0.075  # an open hand leaves the object by this much, away from its palm,
     back_m = 0.03  # and towards the wrist
     rests_until_s = 0.0  # the object stays where it is until then, held or not
@@ -50,8 +52,6 @@ class HandlingScript(Interaction):
         self.hold_s: dict[int, tuple[float, float]] = {}
         self.haste: dict[int, float] = {}  # a hand takes this part of the usual time to come
         super().__post_init__()
-
-    # --- what a script decides -----------------------------------------------------------------
 
     @abstractmethod
     def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> WristPose:
@@ -86,7 +86,14 @@ class HandlingScript(Interaction):
             return self.slide(times) @ grip
         return np.broadcast_to(grip, (len(times), 4, 4))
 
-    # --- helpers of plans ------------------------------------------------------------------------
+    def grasp(self) -> None:
+        """Plan the grips: the right hand around the object's wall, or the object between palms."""
+        times = (self.attach_s, self.release_s)
+        if self.grip_height_m is None:
+            self.grips, self.hold_s = between_palms(self), dict.fromkeys(SIDES, times)
+        else:
+            self.grips = {RIGHT: by_the_wall(self, self.grip_height_m)}
+            self.hold_s = {RIGHT: times}
 
     def table(
         self,
@@ -137,11 +144,7 @@ class HandlingScript(Interaction):
         return trunk
 
     def before_chest(
-        self,
-        world: np.ndarray,
-        origin: np.ndarray,
-        offset: np.ndarray,
-        about: np.ndarray,
+        self, world: np.ndarray, origin: np.ndarray, offset: np.ndarray, about: np.ndarray
     ) -> WristPose:
         """Poses (N) of the object held in front of the person.
 
@@ -153,36 +156,29 @@ class HandlingScript(Interaction):
         heading = person @ facing(np.zeros(1))[0].T
         return WristPose(origin + person @ offset, heading @ turn(about) @ self.pick_pose[:3, :3])
 
-    # --- playing ----------------------------------------------------------------------------
-
     def wrist(
-        self,
-        side: int,
-        world: np.ndarray,
-        pelvis: np.ndarray,
-        times: np.ndarray,
-        prop: np.ndarray,
+        self, side: int, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray, prop: np.ndarray
     ) -> WristPose:
         """Wrist poses (N) of a hand: to the object ``prop`` (N, 4, 4), with it, away from it."""
         swing = self.arm_swing(times)[:, SIDES.index(side)]
         idle = self.puppet.idle_wrist(world, pelvis, side, swing)
         if side not in self.grips:
             return idle
-        (on, off), q = self.hold_s[side], self.haste.get(side, 1.0)
+        (on, end), q = self.hold_s[side], self.haste.get(side, 1.0)
         hand = self.puppet.hands[side]
         at = prop @ self.object_from_wrist(side, times)
-        beside = at.copy()
-        beside[:, :3, 3] += at[:, :3, :3] @ (-self.clear_m * hand.palm - self.back_m * hand.out)
-        over = beside.copy()
+        off = at.copy()
+        off[:, :3, 3] += at[:, :3, :3] @ (-self.clear_m * hand.palm - self.back_m * hand.out)
+        over = off.copy()
         raised = 1 - np.clip(at[:, 2:3, :3] @ hand.palm, 0, 1)  # a palm below stays below
         over[:, :3, 3] += raised * self.over_m - 0.06 * (at[:, :3, :3] @ hand.out)
-        goal, near, far = (WristPose(m[:, :3, 3], m[:, :3, :3]) for m in (at, beside, over))
+        goal, near, far = (WristPose.of(matrices) for matrices in (at, off, over))
         wrist = idle.towards(far, ramp(times, on - 0.90 * q, on - 0.38 * q))
         wrist = wrist.towards(near, ramp(times, on - 0.50 * q, on - 0.20 * q))
         wrist = wrist.towards(goal, ramp(times, on - 0.26 * q, on - 0.06 * q))
-        wrist = wrist.towards(near, ramp(times, off + 0.08 * q, off + 0.26 * q))
-        wrist = wrist.towards(far, ramp(times, off + 0.18 * q, off + 0.44 * q))
-        return wrist.towards(idle, ramp(times, off + 0.30 * q, off + 0.80 * q))
+        wrist = wrist.towards(near, ramp(times, end + 0.08 * q, end + 0.26 * q))
+        wrist = wrist.towards(far, ramp(times, end + 0.18 * q, end + 0.44 * q))
+        return wrist.towards(idle, ramp(times, end + 0.30 * q, end + 0.80 * q))
 
     def finger_keys(self, side: int, times: np.ndarray) -> list[tuple[np.ndarray, HandShape]]:
         """Hand shapes over time, as `Puppet.finger_track` takes them."""
@@ -203,7 +199,7 @@ class HandlingScript(Interaction):
         world = puppet.trunk(trunk)
         needs = self.needs(times)
         for _ in range(2):
-            prop = _matrices(self.path(world, trunk.pelvis, times))
+            prop = self.path(world, trunk.pelvis, times).matrices
             targets = {
                 side: (self.wrist(side, world, trunk.pelvis, times, prop), needs[side])
                 for side in SIDES
@@ -213,7 +209,7 @@ class HandlingScript(Interaction):
             world = puppet.trunk(trunk)
         pelvis = trunk.pelvis
         puppet.legs(world, pelvis, *feet)
-        prop = _matrices(self.path(world, pelvis, times))
+        prop = self.path(world, pelvis, times).matrices
         for side in (lead, 1 - lead):
             wrist = self.wrist(side, world, pelvis, times, prop)
             puppet.arm_to(world, pelvis, side, wrist, self.raised(times, side))
@@ -226,24 +222,12 @@ class HandlingScript(Interaction):
 
     def _held(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> np.ndarray:
         """Poses (N, 4, 4) of the object: at rest, in the leading hand, at rest."""
-        joints = self.puppet.skeleton.forward(world, pelvis)
-        index = self.puppet.hands[self.lead].wrist
-        wrist = _matrices(WristPose(joints[:, index], world[:, index]))
-        held = wrist @ invert(self.object_from_wrist(self.lead, times))
+        object_from_wrist = self.object_from_wrist(self.lead, times)
+        held = held_object(self.puppet, world, pelvis, self.lead, object_from_wrist)
         on, off = self.hold_s[self.lead]
         on = max(on, self.rests_until_s)
         pose = np.where((times <= on)[:, None, None], self.pick_pose, held)
         return np.where((times >= off)[:, None, None], self.place_pose, pose)
-
-
-def _matrices(pose: WristPose) -> np.ndarray:
-    """(N, 4, 4) of poses (N)."""
-    result = np.broadcast_to(np.eye(4), (len(pose.position), 4, 4)).copy()
-    result[:, :3, :3], result[:, :3, 3] = pose.rotation, pose.position
-    return result
-
-
-PALMS_BELOW_M = 0.01  # palms below the object's middle
 
 
 def between_palms(script: HandlingScript) -> dict[int, Grip]:
@@ -251,7 +235,7 @@ def between_palms(script: HandlingScript) -> dict[int, Grip]:
     grips = {}
     for side in SIDES:
         inward = (-1.0, 1.0)[side]
-        at = script.pick_pose[:3, 3] - (0.0, 0.0, PALMS_BELOW_M)
+        at = script.pick_pose[:3, 3] - (0.0, 0.0, 0.01)  # palms below the object's middle
         approach = Approach(at, np.array([0.9, 0.25 * inward, -0.35]),
                             np.array([0.15, inward, 0.18]),
                             floor=script.top + HandlingScript.fingers_rest_m)  # fmt: skip

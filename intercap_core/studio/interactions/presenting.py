@@ -6,13 +6,7 @@ import numpy as np
 
 from intercap_core.studio.controls import Step, WristPose, bump, plateau, ramp
 from intercap_core.studio.interactions.base import upright
-from intercap_core.studio.interactions.handling import (
-    SIDES,
-    HandlingScript,
-    between_palms,
-    by_the_wall,
-    palm_below,
-)
+from intercap_core.studio.interactions.handling import HandlingScript, palm_below
 from intercap_core.studio.motion import LEFT, RIGHT, Trunk
 
 
@@ -24,6 +18,7 @@ class Checking(HandlingScript):
     top_of_height = 0.52
     aside = 0.0
     before_eyes = (0.0, -0.35, 0.72)  # from the head's joint: left, up, ahead, arm lengths
+    second_hand = False  # the left palm comes below an object that the right hand holds
     tip_deg = 35.0  # towards the eyes, and half of it away
     spin_deg = 25.0  # about the vertical
     roll_deg = 18.0  # to the sides
@@ -38,10 +33,10 @@ class Checking(HandlingScript):
         self.size = self.rng.uniform(0.8, 1.2, 3)  # of each turn
         self.order = self.rng.choice([-1.0, 1.0], 2)  # to which side first
         self.grasp()
-
-    def grasp(self) -> None:
-        """Plan the grips."""
-        raise NotImplementedError
+        if self.second_hand:
+            self.grips[LEFT] = palm_below(self)
+            self.hold_s[LEFT] = (self.join_s, self.part_s)
+            self.haste[LEFT] = 0.6
 
     def trunk(self, times: np.ndarray) -> Trunk:
         """Lean to the plinth, straighten up, look at the object, lean again."""
@@ -58,7 +53,7 @@ class Checking(HandlingScript):
     def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> WristPose:
         """From the plinth to before the eyes, turned there about three axes, and back."""
         count = len(times)
-        head = self.puppet.joint_on_trunk(world, pelvis, "head")
+        head = self.puppet.joint(world, pelvis, "head")
         tip, spin, roll = np.radians((self.tip_deg, self.spin_deg, self.roll_deg)) * self.size
         first, second = self.order
         about = np.zeros((count, 3))
@@ -77,49 +72,7 @@ class Checking(HandlingScript):
         )
 
 
-class FootballCheck(Checking):
-    """The ball between both palms."""
-
-    object_class = "football"
-    tip_deg = 40.0
-
-    def grasp(self) -> None:
-        """Both palms from the start."""
-        self.grips = between_palms(self)
-        self.hold_s = dict.fromkeys(SIDES, (self.attach_s, self.release_s))
-
-
-class CheckingByTheWall(Checking):
-    """The right hand around its wall; the left comes under it while it is turned."""
-
-    top_of_height = 0.555
-    aside = -0.10
-    grip_height_m = 0.0
-
-    def grasp(self) -> None:
-        """Right hand around the wall, the bottom on the left palm."""
-        self.grips = {RIGHT: by_the_wall(self, self.grip_height_m), LEFT: palm_below(self)}
-        self.hold_s = {RIGHT: (self.attach_s, self.release_s), LEFT: (self.join_s, self.part_s)}
-        self.haste[LEFT] = 0.6
-
-
-class BottleCheck(CheckingByTheWall):
-    """The bottle by its body, its bottom on the other palm."""
-
-    object_class = "bottle"
-    grip_height_m = 0.01
-    before_eyes = (0.06, -0.42, 0.64)
-    tip_deg = 20.0
-
-
-class CupCheck(CheckingByTheWall):
-    """The cup by its wall, its bottom on the other palm; the person looks into it."""
-
-    object_class = "cup"
-    tip_deg = 38.0
-
-
-class Passing(HandlingScript):
+class PassingOn(HandlingScript):
     """Carry an object from one plinth to a second one on the left, and hold it out meanwhile."""
 
     highlight = 1.85
@@ -164,10 +117,6 @@ class Passing(HandlingScript):
         self.place_pose = upright(place[0], place[1], top + self.prop.standing_height, heading)
         self.grasp()
 
-    def grasp(self) -> None:
-        """Plan the grips."""
-        raise NotImplementedError
-
     def trunk(self, times: np.ndarray) -> Trunk:
         """Lean to the plinth, walk upright, offer, lean to the other plinth."""
         reach = plateau(times, 0.35, 0.9, 1.0, 1.45) + plateau(times, 2.1, 2.5, 2.6, 3.0)
@@ -191,41 +140,3 @@ class Passing(HandlingScript):
         return prop.towards(
             WristPose.still(self.place_pose, count), ramp(times, 2.12, self.release_s - 0.03), lift
         )
-
-
-class PassingByTheWall(Passing):
-    """The right hand around its wall."""
-
-    top_of_height = 0.555
-    aside = -0.10
-    carried = (-0.10, 0.20, 0.36)
-    grip_height_m = 0.0
-
-    def grasp(self) -> None:
-        """Right hand around the wall."""
-        self.grips = {RIGHT: by_the_wall(self, self.grip_height_m)}
-        self.hold_s = {RIGHT: (self.attach_s, self.release_s)}
-
-
-class CupPass(PassingByTheWall):
-    """The cup in one hand."""
-
-    object_class = "cup"
-
-
-class BottlePass(PassingByTheWall):
-    """The bottle in one hand."""
-
-    object_class = "bottle"
-    grip_height_m = 0.01
-
-
-class FootballPass(Passing):
-    """The ball, between both palms."""
-
-    object_class = "football"
-
-    def grasp(self) -> None:
-        """Both palms from the start."""
-        self.grips = between_palms(self)
-        self.hold_s = dict.fromkeys(SIDES, (self.attach_s, self.release_s))

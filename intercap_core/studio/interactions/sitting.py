@@ -8,18 +8,19 @@ from collections.abc import Sequence
 import numpy as np
 
 from intercap_core.body.joints import JOINT_INDEX
-from intercap_core.geometry.camera.transforms import invert
+from intercap_core.geometry.camera.transforms import invert, rigid
 from intercap_core.studio.controls import (
     Footwork,
     Guide,
     Step,
     WristPose,
+    bisect,
     bump,
     plateau,
     ramp,
 )
 from intercap_core.studio.hands import FLAT, RELAXED, HandShape, part_of
-from intercap_core.studio.interactions.base import Interaction, Performance, transform, upright
+from intercap_core.studio.interactions.base import Interaction, Performance, upright
 from intercap_core.studio.motion import LEFT, RIGHT, Foot, Trunk, still
 from intercap_core.studio.skeleton import local_rotations, unit
 
@@ -88,26 +89,23 @@ class Sitting(Interaction):
         """The seat's heading, rad."""
 
     def sit(self) -> None:
-        """Lower the pelvis until the flesh is pressed in by ``PRESSED_M``."""
+        """Lower the pelvis until the flesh is pressed in by ``pressed_m``."""
         puppet, subject = self.puppet, self.puppet.subject
         low_part = [JOINT_INDEX[n] for n in ("pelvis", "left_hip", "right_hip", "spine1")]
         share = np.asarray(subject.weights[:, low_part].sum(1)).ravel()
         seat = part_of(subject, np.flatnonzero(share > 0.5))
         when = np.array([(self.seated_s + self.rise_s) / 2])
-        low, high = self.seat_top + 0.02, self.seat_top + 0.22
-        for _ in range(14):
-            middle = (low + high) / 2
-            self.seated_height = middle
+
+        def is_too_low(height: float) -> bool:
+            self.seated_height = height
             trunk = self.trunk(when, still=True)
             world = puppet.trunk(trunk)
             puppet.legs(world, trunk.pelvis, *self.footwork.feet(when))
             posed = seat.skin(local_rotations(world), trunk.pelvis - subject.rest_joints[0])
             local = (posed.vertices[0] - self.seat[:3, 3]) @ self.seat[:3, :3]
-            if self.prop.surface.signed_distance(local).min() < -self.pressed_m:
-                low = middle
-            else:
-                high = middle
-        self.seated_height = high
+            return bool(self.prop.surface.signed_distance(local).min() < -self.pressed_m)
+
+        _, self.seated_height = bisect(self.seat_top + 0.02, self.seat_top + 0.22, 14, is_too_low)
 
     def _palm_on_seat(self) -> np.ndarray:
         """The right hand flat on the edge of the seat, lightly pressed."""
@@ -129,15 +127,13 @@ class Sitting(Interaction):
     ) -> np.ndarray:
         """A wrist (4, 4) moved along ``away`` from ``place`` until the hand is ``gap`` from the
         seat (negative: pressed)."""
-        low, high = -0.15, 0.12
-        for _ in range(18):
-            middle = (low + high) / 2
-            pose = invert(self.seat) @ transform(rotation, place + middle * away)
-            if self.puppet.hands[side].gap(hand_shape, self.prop.surface, pose) < gap:
-                low = middle
-            else:
-                high = middle
-        return transform(rotation, place + high * away)
+
+        def is_too_near(way: float) -> bool:
+            pose = invert(self.seat) @ rigid(rotation, place + way * away)
+            return self.puppet.hands[side].gap(hand_shape, self.prop.surface, pose) < gap
+
+        _, way = bisect(-0.15, 0.12, 18, is_too_near)
+        return rigid(rotation, place + way * away)
 
     def trunk(self, times: np.ndarray, *, still: bool = False) -> Trunk:
         track = self.pelvis_track(times)
@@ -210,11 +206,7 @@ class Sitting(Interaction):
         return WristPose(wrist.position + out[:, None] * np.array([0.0, 1.0, 0.0]), wrist.rotation)
 
     def left_wrist(
-        self,
-        idle: WristPose,
-        world: np.ndarray,
-        pelvis: np.ndarray,
-        times: np.ndarray,
+        self, idle: WristPose, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray
     ) -> WristPose:
         """The left wrist (N) until the person rises."""
         return idle.towards(self.on_thigh(world, pelvis, LEFT), ramp(times, 0.50, 1.10))
@@ -271,11 +263,7 @@ class StoolSit(Sitting):
         return self.approached(LEFT, RELAXED, rotation, place, np.array([0, 1.0, 0]), hover)
 
     def left_wrist(
-        self,
-        idle: WristPose,
-        world: np.ndarray,
-        pelvis: np.ndarray,
-        times: np.ndarray,
+        self, idle: WristPose, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray
     ) -> WristPose:
         count = len(times)
         place = self.hover_place
@@ -313,7 +301,7 @@ class ChairSit(Sitting):
         back = part_of(subject, np.flatnonzero(share > 0.5))
         when = np.array([(self.seated_s + self.rise_s) / 2])
 
-        def pressed() -> bool:
+        def is_pressed() -> bool:
             trunk = self.trunk(when, still=True)
             local = local_rotations(self.puppet.trunk(trunk))
             posed = back.skin(local, trunk.pelvis - subject.rest_joints[0]).vertices[0]
@@ -322,22 +310,17 @@ class ChairSit(Sitting):
             return float(self.prop.surface.signed_distance(at).min()) < -self.back_pressed_m
 
         self.seated_height, self.recline = self.seat_top + self.sits_above_m, self.upright_rad
-        low, high = self.sat_back, self.farthest_ahead_m
-        for _ in range(12):
-            self.sat_back = (low + high) / 2
-            if pressed():
-                low = self.sat_back
-            else:
-                high = self.sat_back
-        self.sat_back = high
+
+        def is_too_far_back(ahead: float) -> bool:
+            self.sat_back = ahead
+            return is_pressed()
+
+        def has_room(recline: float) -> bool:
+            self.recline = recline
+            return not is_pressed()
+
+        _, self.sat_back = bisect(self.sat_back, self.farthest_ahead_m, 12, is_too_far_back)
         for _ in range(2):
             super().sit()
-            low, high = 0.0, self.reclined_rad
-            for _ in range(12):
-                self.recline = (low + high) / 2
-                if pressed():
-                    high = self.recline
-                else:
-                    low = self.recline
-            self.recline = low
+            self.recline, _ = bisect(0.0, self.reclined_rad, 12, has_room)
         super().sit()

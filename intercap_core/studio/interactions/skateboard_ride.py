@@ -110,7 +110,8 @@ class SkateboardRide(Interaction):
         """A place (5,) that moves with the board."""
         return lambda times: place + (self.way * self._rolled(times))[:, None] * np.eye(5)[0]
 
-    def _trunk(self, times: np.ndarray, ankle: np.ndarray) -> Trunk:
+    def _trunk(self, times: np.ndarray) -> Trunk:
+        ankle, _, _ = self.footwork.feet(times)
         trunk = self.standing(times, bend=0.8)
         pelvis, bend, head = trunk.pelvis, trunk.bend, trunk.head
         ride = plateau(times, 0.70, 1.20, 2.00, 2.60)
@@ -127,15 +128,12 @@ class SkateboardRide(Interaction):
         return trunk
 
     def perform(self, times: np.ndarray) -> Performance:
-        puppet, feet = self.puppet, self.footwork.feet(times)
-        trunk = puppet.settled(self._trunk(times, feet[0]), feet[0])
-        world = puppet.trunk(trunk)
-        puppet.legs(world, trunk.pelvis, *feet)
+        world, pelvis = self.on_feet(self._trunk(times), times)
         balance = 0.3 * ramp(times, 0.1, 0.5) + 0.7 * plateau(times, 0.7, 1.1, 2.2, 2.9)
         for side, sign in ((LEFT, 1.0), (RIGHT, -1.0)):
             outward = sign * world[:, 9, :, 0] * (1, 1, 0)
             out = balance[:, None] * (0.20 * outward + (0, 0, 0.12))
-            puppet.swing_arm(world, trunk.pelvis, side, self.arm_swing(times)[:, side], out)
+            self.puppet.swing_arm(world, pelvis, side, self.arm_swing(times)[:, side], out)
         pose = np.broadcast_to(self.board, (len(times), 4, 4)).copy()
         pose[:, 0, 3] += self.way * self._rolled(times)
-        return Performance(world, trunk.pelvis, pose)
+        return Performance(world, pelvis, pose)

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.studio.controls import WristPose, plateau, ramp
 from intercap_core.studio.hands import HandShape
-from intercap_core.studio.interactions.handling import by_the_wall
-from intercap_core.studio.interactions.presenting import BottleCheck
-from intercap_core.studio.interactions.swinging import RacquetSwing, UmbrellaSwing
+from intercap_core.studio.interactions.presenting import Checking
+from intercap_core.studio.interactions.swinging import Swinging
 from intercap_core.studio.motion import RIGHT
 from intercap_core.studio.skeleton import turn
 
@@ -21,17 +21,15 @@ def along_and_about(along: np.ndarray, about: np.ndarray, axis: np.ndarray) -> n
 
     The rotation axis goes through ``axis`` (2,), metres.
     """
-    result = np.broadcast_to(np.eye(4), (len(along), 4, 4)).copy()
     vectors = np.zeros((len(along), 3))
     vectors[:, 2] = about
-    result[:, :3, :3] = turn(vectors)
-    place = np.array([*axis, 0.0])
-    result[:, :3, 3] = place - result[:, :3, :3] @ place
+    rotation, place = turn(vectors), np.array([*axis, 0.0])
+    result = rigid(rotation, place - rotation @ place)
     result[:, 2, 3] += along
     return result
 
 
-class RacquetGlide(RacquetSwing):
+class GlidingSwing(Swinging):
     """The hand glides along the grip towards the head as the racquet goes back, and back to the
     butt as it swings through."""
 
@@ -44,7 +42,7 @@ class RacquetGlide(RacquetSwing):
         return along_and_about(along, np.zeros(len(times)), np.zeros(2))
 
 
-class UmbrellaTurn(UmbrellaSwing):
+class TurningSwing(Swinging):
     """The straight handle turns in the fingers while it points ahead, and back."""
 
     turn_s = (1.16, 1.50, 1.62, 2.02)
@@ -53,13 +51,13 @@ class UmbrellaTurn(UmbrellaSwing):
     def slide(self, times: np.ndarray) -> np.ndarray:
         """About the middle of the handle where it is held; the object turns the other way."""
         near = np.abs(self.prop.vertices[:, 2] - self.handle_m) < 0.03
-        held = self.prop.vertices[near, :2]
-        axis = (held.min(0) + held.max(0)) / 2
+        handle = self.prop.vertices[near, :2]
+        axis = (handle.min(0) + handle.max(0)) / 2
         about = np.radians(self.turn_deg) * plateau(times, *self.turn_s)
         return along_and_about(np.zeros(len(times)), about, axis)
 
 
-class BottleRegrasp(BottleCheck):
+class Regrasp(Checking):
     """The hand lets go of the bottle and grasps it higher up and turned, then lifts it.
 
     The bottle stands on the plinth meanwhile. The right hand alone turns it before the eyes.
@@ -70,11 +68,6 @@ class BottleRegrasp(BottleCheck):
     regrasp_up_m = 0.022  # shift of the hand along the bottle, metres
     regrasp_deg = 28.0  # turn of the hand about the bottle
     regrasp_off_m = 0.012  # gap between the open hand and the bottle meanwhile, metres
-
-    def grasp(self) -> None:
-        """The wall, with the right hand alone."""
-        self.grips = {RIGHT: by_the_wall(self, self.grip_height_m)}
-        self.hold_s = {RIGHT: (self.attach_s, self.release_s)}
 
     def raised(self, times: np.ndarray, side: int) -> np.ndarray:
         """Zeros: no arm helps."""

@@ -9,9 +9,8 @@ from itertools import product
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from intercap_core.geometry.camera.transforms import invert
+from intercap_core.geometry.camera.transforms import invert, rigid
 from intercap_core.studio.controls import Step, WristPose, plateau, ramp
-from intercap_core.studio.interactions.base import transform
 from intercap_core.studio.interactions.grasps import WRAP_OPEN, Approach, wrapped
 from intercap_core.studio.interactions.handling import HandlingScript
 from intercap_core.studio.motion import RIGHT, Trunk
@@ -93,7 +92,7 @@ class Swinging(HandlingScript):
         place = np.array([ahead, -0.14, 0.0]) - rotation @ np.array([0, 0, self.handle_m])
         turned = self.prop.vertices[on_block] @ rotation.T
         place[2] = self.top - turned[:, 2].min()
-        return transform(rotation, place)
+        return rigid(rotation, place)
 
     def _approaches(self) -> Iterator[Approach]:
         """The palm from above and behind, fingers across the handle."""
@@ -130,7 +129,7 @@ class Swinging(HandlingScript):
             goal = WristPose(place, np.broadcast_to(rotation, (count, 3, 3)))
             wrist = wrist.towards(goal, ramp(times, key.start, key.end))
         at_rest = self.place_pose @ self.object_from_wrist(RIGHT, times)
-        last = WristPose(at_rest[:, :3, 3], at_rest[:, :3, :3])
+        last = WristPose.of(at_rest)
         above = WristPose(last.position + np.array([0.0, -0.02, 0.10]), last.rotation)
         wrist = wrist.towards(above, ramp(times, 2.0, 2.44))
         wrist = wrist.towards(last, ramp(times, 2.32, self.release_s - 0.03))
@@ -141,34 +140,3 @@ class Swinging(HandlingScript):
     def raised(self, times: np.ndarray, side: int) -> np.ndarray:
         """The elbow is a little away from the body in the swing."""
         return (0.0, 0.3)[side] * plateau(times, 1.0, 1.3, 1.9, 2.3)
-
-
-class RacquetSwing(Swinging):
-    """A forehand: back, through the ball's place at the right, up over the left shoulder."""
-
-    object_class = "tennis_racquet"
-    handle_m = -0.27
-    turn_back_rad, turn_through_rad = 0.45, 0.50
-    keys = (
-        Key((0.62, -0.22, -0.40), (0.80, 0.00, -0.60), (0.60, -0.05, 0.80), 0.96, 1.28),
-        Key((-0.30, -0.60, -0.55), (-0.05, -0.70, -0.70), (-0.70, -0.55, 0.45), 1.12, 1.46),
-        Key((0.60, -0.25, -0.62), (0.50, -0.15, -0.85), (0.25, -0.95, 0.05), 1.42, 1.64),
-        Key((0.62, 0.35, -0.10), (0.75, 0.60, 0.20), (0.10, -0.10, 1.00), 1.54, 1.74),
-        Key((0.45, 0.75, 0.10), (0.30, 0.90, -0.20), (-0.60, 0.30, 0.75), 1.64, 1.92),
-    )
-
-
-class UmbrellaSwing(Swinging):
-    """Like a cane: it points ahead, sweeps to the left and then low to the right."""
-
-    object_class = "umbrella"
-    handle_m = 0.305
-    far_end = -1.0
-    side_up = -1.0
-    turn_back_rad, turn_through_rad = 0.10, 0.20
-    back_s, through_s = (1.55, 1.85, 1.95, 2.25), (1.25, 1.5, 1.6, 1.9)
-    keys = (
-        Key((0.70, 0.00, -0.35), (0.60, 0.00, -0.80), (0.80, 0.05, 0.45), 0.96, 1.34),
-        Key((0.66, 0.30, -0.30), (0.50, 0.35, -0.80), (0.35, 0.90, 0.25), 1.28, 1.62),
-        Key((0.50, -0.45, -0.62), (0.30, -0.35, -0.90), (0.55, -0.75, -0.30), 1.56, 1.94),
-    )
