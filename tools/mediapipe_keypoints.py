@@ -1,14 +1,13 @@
-"""Keypoints by MediaPipe Holistic, written as COCO-WholeBody's JSON, which the pipeline reads.
+"""Detect keypoints with MediaPipe Holistic and write them as COCO-WholeBody JSON.
 
-Runs by itself in an environment of its own, since MediaPipe needs an older NumPy:
+Runs in a separate environment, because MediaPipe needs an older NumPy:
 
     python3.11 -m venv mediapipe && mediapipe/bin/pip install mediapipe==0.10.21
     mediapipe/bin/python tools/mediapipe_keypoints.py images/k1 keypoints/k1.json
 
-The images are those of one camera, a folder of them or a video, and nothing is fetched: the models
-lie in that wheel. MediaPipe finds one person an image, gives no small toes, and says for hands and
-face no confidence of their own: they have that of the wrist and of the nose. Its licence, that of
-the models too, is Apache-2.0.
+The input is a folder of images of one camera, or its video. Nothing is downloaded: the models are
+in the wheel (Apache-2.0, as MediaPipe). MediaPipe detects one person per image and no small toes.
+It has no confidence for points of hands and face: they get that of the wrist and of the nose.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ COCO_BODY = (
     "left_elbow", "right_elbow", "left_wrist", "right_wrist", "left_hip", "right_hip", "left_knee",
     "right_knee", "left_ankle", "right_ankle",
 )  # fmt: skip
-# What else MediaPipe's pose gives: the tip of the foot is the big toe.
+# Points of the feet in MediaPipe's pose: the tip of the foot is the big toe.
 FEET = {
     "left_big_toe": "left_foot_index", "left_heel": "left_heel",
     "right_big_toe": "right_foot_index", "right_heel": "right_heel",
@@ -51,8 +50,7 @@ FACE = (
     *INNER_LIPS,
 )  # fmt: skip
 IMAGES = {".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff"}
-# 0 and 2 are lighter and heavier, but not in the wheel: MediaPipe would fetch them.
-COMPLEXITY = 1
+COMPLEXITY = 1  # the models 0 (lighter) and 2 (heavier) are not in the wheel
 PER_LINE = 100  # images between two lines of progress
 
 Points = list[list[float]]  # x, y, confidence of each
@@ -67,7 +65,7 @@ def person(
     """COCO-WholeBody's lists of one person.
 
     ``body`` by MediaPipe's names in lower case: x, y as shares of the image and visibility.
-    ``hands`` left and right (21 of x, y) and ``face`` (468 or 478 of x, y), None = not found.
+    ``hands`` left and right (21 of x, y) and ``face`` (468 or 478 of x, y), None = not detected.
     ``size`` (width, height) of the image.
     """
 
@@ -101,7 +99,7 @@ def person(
 
 
 def pictures(source: Path) -> Iterator[tuple[str | None, Any]]:
-    """Images (H, W, 3) BGR of a folder, with their names, or of a video; None = is no image."""
+    """Names and images (H, W, 3) BGR of a folder or video; an unreadable image is None."""
     import cv2
 
     if source.is_dir():
@@ -111,7 +109,7 @@ def pictures(source: Path) -> Iterator[tuple[str | None, Any]]:
         return
     video = cv2.VideoCapture(str(source))
     if not video.isOpened():
-        raise SystemExit(f"{source}: is no folder of images and no video that can be read")
+        raise SystemExit(f"{source}: is neither a folder of images nor a readable video")
     while True:
         found, picture = video.read()
         if not found:
@@ -120,7 +118,7 @@ def pictures(source: Path) -> Iterator[tuple[str | None, Any]]:
 
 
 def detect(source: Path, *, min_confidence: float) -> dict[str, list[dict[str, Any]]]:
-    """The data set of one camera's images; those that cannot be read are not spoken of."""
+    """COCO data set of one camera's images, without those that cannot be read."""
     import cv2
     from mediapipe.python.solutions.holistic import Holistic, PoseLandmark
 
@@ -128,7 +126,7 @@ def detect(source: Path, *, min_confidence: float) -> dict[str, list[dict[str, A
     with Holistic(model_complexity=COMPLEXITY, min_detection_confidence=min_confidence) as model:
         for number, (name, picture) in enumerate(pictures(source)):
             if picture is None:
-                print(f"{source / (name or '')}: cannot be read, left out", file=sys.stderr)
+                print(f"{source / (name or '')}: cannot be read; it is omitted", file=sys.stderr)
                 continue
             height, width = picture.shape[:2]
             image = {"id": number, "width": width, "height": height}
@@ -168,14 +166,14 @@ def main() -> None:
     )
     options = parser.parse_args()
     if not options.images.exists():
-        raise SystemExit(f"{options.images}: there is no such folder or video")
+        raise SystemExit(f"{options.images}: does not exist")
     content = detect(options.images, min_confidence=options.min_confidence)
     if not content["images"]:
-        raise SystemExit(f"{options.images}: holds no image that can be read")
+        raise SystemExit(f"{options.images}: contains no readable image")
     options.output.parent.mkdir(parents=True, exist_ok=True)
     options.output.write_text(json.dumps(content))
     print(
-        f"{options.output}: somebody in {len(content['annotations'])} of "
+        f"{options.output}: a person in {len(content['annotations'])} of "
         f"{len(content['images'])} images",
         file=sys.stderr,
     )

@@ -59,9 +59,9 @@ def main() -> None:
         rows = [sheet_row(*what.split(":"), options.times) for what in options.what]
         save(options.output / f"studio_{options.sheet}.jpg", np.vstack(rows))
         return
-    interaction, subject, seed, thing = options.what
+    interaction, subject, seed, object_name = options.what
     capture = StudioCapture(interaction=interaction, subject=subject, seed=int(seed), frames=45)
-    stage = StudioStage(capture, StudioSettings(captures={}), object_entry(thing))
+    stage = StudioStage(capture, StudioSettings(captures={}), object_entry(object_name))
     moment = stage.at(np.array(options.times))
     rows = []
     stage_from_master = invert(stage.rig.master_from_stage)
@@ -80,8 +80,8 @@ def sheet_row(interaction: str, subject: str, seed: str, times: list[float]) -> 
     """One interaction at six moments, from ahead and the right of where the person starts."""
     capture = StudioCapture(interaction=interaction, subject=subject, seed=int(seed), frames=45,
                             room="bare")  # fmt: skip
-    thing = object_entry(interaction_named(interaction).object_class)
-    stage = StudioStage(capture, StudioSettings(captures={}, cameras=1), thing)
+    entry = object_entry(interaction_named(interaction).object_class)
+    stage = StudioStage(capture, StudioSettings(captures={}, cameras=1), entry)
     place = stage.stage_from_script
     target = np.array([*stage.interaction.centre, 0.95])
     eye = target + 2.6 * np.array([0.60, -0.72, 0.34])

@@ -18,10 +18,7 @@ def _facing_up(vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
 
 
 def _square_rod(
-    start: Sequence[float],
-    end: Sequence[float],
-    size: float,
-    end_size: float,
+    start: Sequence[float], end: Sequence[float], size: float, end_size: float
 ) -> Manifold:
     return tube([start, end], [size / np.sqrt(2), end_size / np.sqrt(2)], 4, side=(1, 0, 0))
 
@@ -67,14 +64,9 @@ def chair() -> Built:
 def stool() -> Built:
     """Round seat of 34 cm, top at 45 cm, four splayed legs and two levels of rungs."""
     rim = [
-        (0.0, 0.0),
-        (0.158, 0.0),
-        (0.168, 0.008),
-        (0.170, 0.022),
-        (0.165, 0.033),
-        (0.150, 0.038),
-        (0.0, 0.038),
-    ]
+        (0.0, 0.0), (0.158, 0.0), (0.168, 0.008), (0.170, 0.022), (0.165, 0.033),
+        (0.150, 0.038), (0.0, 0.038)
+    ]  # fmt: skip
     seat = revolve(rim, 40).translate((0, 0, 0.412)).refine_to_length(0.03)
     parts = [Part("seat", seat, TEAL, lambda v, n: (n[:, 2] > 0.3) | (v[:, 2] > 0.425))]
     corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)], float)

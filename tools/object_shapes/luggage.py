@@ -13,11 +13,7 @@ BLUE, DARK_BLUE, YELLOW = (28, 72, 152), (20, 48, 104), (226, 178, 32)
 
 
 def _handle(
-    half_span: float,
-    rise: float,
-    thickness: float,
-    flatten: float,
-    segments: int = 10,
+    half_span: float, rise: float, thickness: float, flatten: float, segments: int = 10
 ) -> Manifold:
     """A flat arch in the x-z plane from (-half_span, 0) to (half_span, 0), ``rise`` high."""
     corner = min(rise, half_span) * 0.6

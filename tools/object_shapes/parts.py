@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from manifold3d import CrossSection, JoinType, Manifold, Mesh, OpType
 
+from intercap_core.geometry.rigid.surfaces import vertex_normals
+
 Colour = tuple[int, int, int]
 Rule = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """(vertices (V, 3), normals (V, 3)) -> (V,) bool: which vertices are likely to be touched."""
@@ -39,10 +41,7 @@ def box(size: Sequence[float], centre: Sequence[float]) -> Manifold:
 
 
 def rounded_box(
-    size: Sequence[float],
-    centre: Sequence[float],
-    radius: float,
-    segments: int = 12,
+    size: Sequence[float], centre: Sequence[float], radius: float, segments: int = 12
 ) -> Manifold:
     """A box with all edges rounded by ``radius``: the hull of eight spheres."""
     half = np.asarray(size) / 2 - radius
@@ -68,11 +67,7 @@ def rod(
 
 
 def disc(
-    centre: Sequence[float],
-    axis: int,
-    radius: float,
-    width: float,
-    segments: int = 24,
+    centre: Sequence[float], axis: int, radius: float, width: float, segments: int = 24
 ) -> Manifold:
     """A cylinder of ``width`` along coordinate ``axis`` around ``centre``: a wheel, a button."""
     offset = np.zeros(3)
@@ -202,7 +197,7 @@ def union(parts: Sequence[Part], edge_length: float) -> Built:
     part_of_vertex = np.zeros(len(vertices), int)
     np.maximum.at(part_of_vertex, faces.ravel(), np.repeat(part_of_face, 3))
 
-    normals = _vertex_normals(vertices, faces)
+    normals = vertex_normals(vertices, faces)
     touched = np.zeros(len(vertices), bool)
     for number, part in enumerate(parts):
         mine = part_of_vertex == number
@@ -220,15 +215,6 @@ def _merge(vertices: np.ndarray, faces: np.ndarray, mesh: Mesh) -> tuple[np.ndar
     return vertices[used], faces.reshape(-1, 3)
 
 
-def _vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    face_normals = np.cross(b - a, c - a)
-    normals = np.zeros_like(vertices)
-    for corner in range(3):
-        np.add.at(normals, faces[:, corner], face_normals)
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-
-
 def _centroid(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Centre of mass of the solid at uniform density: tetrahedra from the origin."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
@@ -237,12 +223,7 @@ def _centroid(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def ring_stack(
-    heights: np.ndarray,
-    radii: np.ndarray,
-    *,
-    lobes: int,
-    depth: float,
-    twist_deg: float,
+    heights: np.ndarray, radii: np.ndarray, *, lobes: int, depth: float, twist_deg: float
 ) -> Manifold:
     """Star-shaped rings of ``lobes`` pleats, turned along z like a furled canopy."""
     segments = 4 * lobes

@@ -128,10 +128,7 @@ def mirrored(pose: np.ndarray) -> np.ndarray:
 
 
 def pose_space(
-    joints: np.ndarray,
-    tips: np.ndarray,
-    count: int,
-    seed: int,
+    joints: np.ndarray, tips: np.ndarray, count: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Left hand's mean (45,), components (45,45), standard deviations (45,) of `count` poses."""
     rng = np.random.default_rng(seed)

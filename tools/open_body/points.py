@@ -111,10 +111,7 @@ def markers(vertices: np.ndarray, faces: np.ndarray, joints: np.ndarray,
 
 
 def keypoint_vertices(
-    vertices: np.ndarray,
-    weights: np.ndarray,
-    joints: np.ndarray,
-    tips: np.ndarray,
+    vertices: np.ndarray, weights: np.ndarray, joints: np.ndarray, tips: np.ndarray
 ) -> dict[str, int]:
     """Vertex id of each of `POINT_NAMES`; tips (10,3) ends of the finger bones."""
 

@@ -53,10 +53,7 @@ def enlarged(template: np.ndarray, weights: np.ndarray, joints: np.ndarray) -> n
 
 
 def closest(
-    points: np.ndarray,
-    normals: np.ndarray,
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    points: np.ndarray, normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Nearest (face, barycentric) whose normal agrees; nearest of all where none nearby does."""
     import open3d as o3d

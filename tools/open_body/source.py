@@ -55,10 +55,7 @@ class Source:
     faces_uv: np.ndarray
 
     def coefficients(
-        self,
-        phenotypes: dict,
-        local: dict | None = None,
-        actions: dict | None = None,
+        self, phenotypes: dict, local: dict | None = None, actions: dict | None = None
     ) -> np.ndarray:
         """(B,K) blend-shape weights for dictionaries of (B,) values."""
         import torch
@@ -124,7 +121,7 @@ def load() -> Source:
         k = facial.bone_labels.index(bone)
         heads_t[joint] = facial.template_bone_heads.numpy()[k]
         heads_b[:, joint] = facial.bone_heads_blendshapes.numpy()[:, k]
-    # The rig's midline markers sit up to 1.6 mm beside the midline of a symmetric mesh
+    # The rig's midline markers are up to 1.6 mm off the midline of a symmetric mesh
     heads_t[[0, 3, 6, 9, 12, 15, 22], 0] = 0
     tips = [pick[i] for i in (*range(27, 40, 3), *range(42, 55, 3))]
 

@@ -110,10 +110,7 @@ def world_rotations(joints: np.ndarray, tips: np.ndarray) -> np.ndarray:
 
 
 def to_t_pose(
-    vertices: np.ndarray,
-    joints: np.ndarray,
-    tips: np.ndarray,
-    weights: np.ndarray,
+    vertices: np.ndarray, joints: np.ndarray, tips: np.ndarray, weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """One body: vertices (V,3), joints (55,3), tips (10,3), weights (V,55) -> the same, T-posed."""
     rotations = world_rotations(joints, tips)
