@@ -15,7 +15,7 @@ from intercap_core.geometry.rigid.mesh import read_mesh
 
 def write_person(frame: Path, vertices: np.ndarray, faces: np.ndarray, pose: np.ndarray) -> Path:
     """A frame's ``person_fit.ply`` and ``.pkl``, of vertices (V, 3) and a pose of 156 or 72
-    numbers; shape and translation are SMPL-H's, which nobody here can know."""
+    numbers; shape and translation of SMPL-H are placeholders."""
     path = frame / "person" / "fit02" / "person_fit.ply"
     write_mesh(path, vertices, faces)
     content = {"pose": pose, "betas": np.full(10, 99.0), "trans": np.full(3, 99.0)}
@@ -52,11 +52,7 @@ def write_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
 
 
 def write_30_fps(
-    folder: Path,
-    times: Sequence[str],
-    poses: np.ndarray,
-    angles: np.ndarray,
-    trans: np.ndarray,
+    folder: Path, times: Sequence[str], poses: np.ndarray, angles: np.ndarray, trans: np.ndarray
 ) -> None:
     """The two files of a sequence's parameters; ``times`` such as "0003.033"."""
     names = np.array([f"t{text}" for text in times])

@@ -1,7 +1,4 @@
-"""Pages from disk in a real Chromium, as somebody at a desk or with a phone meets them.
-
-Playwright drives the system's own Chromium; it downloads none.
-"""
+"""Pages in a real Chromium, on a desk or a phone; Playwright drives the installed browser."""
 
 from __future__ import annotations
 
@@ -32,37 +29,36 @@ _OPTIONS = (
     "--disable-component-update", "--disable-sync",
 )  # fmt: skip
 _READY = "document.querySelector('.viewer')?.dataset.ready === 'yes'"
-_PATIENCE_MS = 60_000  # on a machine that draws without a GPU and does other things as well
+_PATIENCE_MS = 60_000  # on a busy machine without a GPU
 
 
 @dataclass
 class Visit:
-    """An open page. ``console`` is what it printed and what went wrong in it, so far."""
+    """An open page; ``console`` lists its messages and errors so far."""
 
     page: Page
     fingers: CDPSession
     console: list[str] = field(default_factory=list)
 
     def wait(self, condition: str = _READY) -> None:
-        """Until a JavaScript expression holds; by default, that the viewer stands.
+        """Wait until a JavaScript expression is true; by default, that the viewer is ready.
 
-        Asked again and again from here: the pages' policy forbids what Playwright's own wait does.
+        It is polled here, because the pages' content policy forbids Playwright's own wait.
         """
         end = time.monotonic() + _PATIENCE_MS / 1000
         while not self.page.evaluate(condition):
             if time.monotonic() > end:
-                raise TimeoutError(f"{self.page.url}: never came to {condition}: {self.console}")
+                raise TimeoutError(f"{self.page.url}: was not reached: {condition}: {self.console}")
             self.page.wait_for_timeout(20)
 
     def picture(self) -> np.ndarray:
-        """What is in the window, (H, W, 3), blue first."""
+        """The window (H, W, 3), BGR."""
         return cv2.imdecode(np.frombuffer(self.page.screenshot(), np.uint8), cv2.IMREAD_COLOR)
 
     def touch(self, kind: str, *points: tuple[float, float]) -> None:
-        """Send ``touchStart``, ``touchMove`` or ``touchEnd`` of fingers at ``points``, as the
-        touch screen would; CSS pixels of the window."""
-        told = [{"x": x, "y": y, "id": finger} for finger, (x, y) in enumerate(points)]
-        self.fingers.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": told})
+        """Send ``touchStart``, ``touchMove`` or ``touchEnd`` of fingers at ``points``, CSS px."""
+        touches = [{"x": x, "y": y, "id": finger} for finger, (x, y) in enumerate(points)]
+        self.fingers.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": touches})
 
 
 @contextmanager
@@ -75,11 +71,12 @@ def visit(
     address: str = "",
     log: Path | None = None,
 ) -> Iterator[Visit]:
-    """The page, a file or an address, in a window of ``size`` CSS pixels; ``address`` is added to
-    its own.
+    """Open a page, a file or an address, in a window of ``size`` CSS pixels.
 
-    A ``phone`` has a touch screen, a finger in place of a pointer, and obeys the page's viewport.
-    The browser's own record of its network goes to ``log``; read it by :func:`asked`, afterwards.
+    Args:
+        phone: emulate a touch screen that obeys the page's viewport.
+        address: appended to the page's address.
+        log: file of the browser's network log, for :func:`asked`.
     """
     from playwright.sync_api import sync_playwright
 
@@ -109,18 +106,18 @@ def visit(
 
 
 def asked(log: Path) -> set[str]:
-    """The addresses that the page itself asked the network for, from the browser's record."""
+    """Addresses that the page requested, from the browser's network log."""
     found = set()
     for event in json.loads(log.read_text())["events"]:
         values: dict[str, Any] = event.get("params", {})
-        # the browser's own errands (updates, accounts) have no origin for an initiator
+        # requests of the browser itself have no origin as initiator
         if "url" in values and values.get("initiator", "not an origin") != "not an origin":
             found.add(values["url"])
     return found
 
 
 def serious_faults(visited: Visit) -> list[str]:
-    """What the accessibility checker axe calls serious or critical: rule, element, and why."""
+    """Serious and critical findings of the accessibility checker axe: rule, element, reason."""
     from axe_playwright_python.sync_playwright import Axe
 
     found = Axe().run(visited.page, options={"resultTypes": ["violations"]}).response

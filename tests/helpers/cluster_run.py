@@ -20,23 +20,23 @@ ENDS_WITHIN_S = 900.0
 
 @dataclass
 class Started:
-    """Snakemake at work, and where it writes what it says."""
+    """A running Snakemake, and the file of its output."""
 
     process: subprocess.Popen[bytes]
     transcript: Path
 
     @property
-    def said(self) -> str:
+    def output(self) -> str:
         return self.transcript.read_text(errors="replace")
 
     def ends_well(self) -> str:
-        """Wait for its end, which must be a good one; returns what it said."""
+        """Wait until it ends successfully; returns its output."""
         status = self.process.wait(ENDS_WITHIN_S)
-        assert status == 0, self.said[-6000:]
-        return self.said
+        assert status == 0, self.output[-6000:]
+        return self.output
 
     def kill(self) -> None:
-        """End Snakemake at once, as a machine does that loses its power; its jobs go on."""
+        """Kill Snakemake, as a power failure does; its jobs continue."""
         os.kill(self.process.pid, signal.SIGKILL)
         self.process.wait()
 
@@ -70,7 +70,7 @@ class ClusterRun:
                 stdin=subprocess.DEVNULL,
                 stdout=file,
                 stderr=subprocess.STDOUT,
-                # Ctrl-C is to reach it, also where the tests run in a shell's background.
+                # it must receive Ctrl-C, also if the tests run in a shell's background
                 preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
             )
         return Started(process, transcript)
@@ -83,11 +83,11 @@ class ClusterRun:
         assert done.returncode == 0, done.stderr
 
 
-DATES = (".inputs.json", ".records.json")  # to read nothing twice
+DATES = (".inputs.json", ".records.json")  # caches of file dates
 
 
 def contents(results: Path) -> dict[str, bytes]:
-    """Bytes of all files of a run's results, by place; but those that hold dates of others."""
+    """Bytes of all files of a run's results by path, without caches of file dates."""
     return {
         path.relative_to(results).as_posix(): path.read_bytes()
         for path in sorted(results.rglob("*"))
@@ -97,7 +97,7 @@ def contents(results: Path) -> dict[str, bytes]:
 
 
 def written(results: Path) -> dict[str, int]:
-    """Which file each artefact is: another one where it was computed anew."""
+    """Inode of each artefact, which changes when it is computed again."""
     return {
         path.relative_to(results).as_posix(): path.stat().st_ino for path in results.glob("*/*.h5")
     }

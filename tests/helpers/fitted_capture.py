@@ -36,21 +36,18 @@ from intercap_core.object_track.artefact import SOURCE_NONE, absent_track
 from intercap_core.schemas import (
     BODY_FIT,
     CONTACT_REGIONS,
-    DETECTIONS,
-    FRAMES,
     JOINT,
     OBJECT_TRACK,
-    PERSON,
-    SCENE,
     TRUTH,
 )
 from intercap_core.sequence_inputs import FitSettings, SequenceModels, SequencePaths
 from tests.helpers.bodies import open_body
-from tests.helpers.synthetic_capture import put_frame_sets
+from tests.helpers.synthetic_capture import fill, write_frames, write_person, write_scene
+from tests.helpers.synthetic_people import write_detections
 
 FPS = 15.0
-BODY_OFFSET_M = 0.010  # the fitted body stands this much beside the true one, down
-OBJECT_OFFSET_M = 0.004  # the tracked ball, down too; the joint result is half as far off
+BODY_OFFSET_M = 0.010  # the fitted body is this much below the true one
+OBJECT_OFFSET_M = 0.004  # the tracked ball is below the true one; half of it after joint
 SUBJECT = SubjectEntry(subject="p01", gender="neutral")
 BODY_MODELS = BodyModels()
 FIT_SETTINGS = FitSettings(JointSettings(), BodyFitSettings(), ObjectTrackSettings())
@@ -85,18 +82,6 @@ def object_entry(name: str) -> ObjectEntry:
     entry = ObjectEntry(name=name, **yaml.safe_load((folder / "objects.yaml").read_text())[name])
     paths = {"mesh": folder / entry.mesh, "contact_vertices": folder / entry.contact_vertices}
     return entry.model_copy(update=paths)
-
-
-def _fill(writer: artefacts.Writer, schema: artefacts.Schema, **dims: int) -> None:
-    """Write zeros for what the schema asks for and these tests do not look at."""
-    for key, declared in schema.fields.items():
-        if declared.optional or "{camera}" in key or key in writer._file:
-            continue
-        shape = [int(d) if d.isdigit() else dims.get(d, 1) for d in declared.dims]
-        empty = np.full(shape, "") if declared.dtype == "str" else np.zeros(shape, declared.dtype)
-        writer.put(key, empty)
-    for name in schema.attributes:
-        writer.attributes.setdefault(name, "")
 
 
 def _rig(count: int = 3) -> Rig:
@@ -240,104 +225,68 @@ def _draw(capture: Capture) -> list[list[tuple[Rendering, Rendering]]]:
 
 def _write_frames(capture: Capture, views: Any, name: str) -> None:
     rig, total = capture.rig, len(views)
-    count = len(rig)
-    with artefacts.write(
-        capture.paths["frames"], FRAMES, sequence=name, master="k1", fps=FPS
-    ) as writer:
-        index = np.repeat(np.arange(total)[:, None], count, 1)
-        put_frame_sets(
-            writer,
-            rig,
-            np.arange(total) / FPS,
-            colour_index=index,
-            depth_index=index,
-            gravity=np.tile([0.0, 1.0, 0.0], (count, 1)),
-        )
-        _fill(writer, FRAMES, T=total, C=count)
-        for c, camera in enumerate(rig):
-            packets, depths = [], []
-            for t in range(total):
-                colour, depth = views[t][c]
-                lens = camera.colour
-                shade = np.linspace(90, 160, lens.width)[None, :, None]
-                image = np.repeat(np.repeat(shade, lens.height, 0), 3, 2).astype(np.uint8)
-                image[colour.full_mask(lens, 0)] = (60, 90, 180)
-                image[colour.full_mask(lens, 1)] = (200, 200, 40)
-                packets.append(cv2.imencode(".jpg", image)[1].tobytes())
-                whole = np.full((camera.depth.height, camera.depth.width), 4000, np.uint16)
-                window = whole[depth.window]
-                window[depth.mask] = np.rint(1e3 * depth.depth[depth.mask])
-                depths.append(whole)
-            offsets, values = artefacts.pack_ragged(packets)
-            times = (np.arange(total) * 1e6 / FPS).astype(np.int64)
-            group = f"cameras/{camera.name}"
-            writer.put(f"{group}/colour", values)
-            writer.put(f"{group}/colour_offsets", offsets)
-            writer.put(f"{group}/colour_time", times)
-            writer.put(f"{group}/depth", np.stack(depths))
-            writer.put(f"{group}/depth_time", times)
+    depths = [np.full((total, *_size(camera.depth)), 4000, np.uint16) for camera in rig]
+    colours: list[list[bytes]] = [[] for _ in rig]
+    for c, camera in enumerate(rig):
+        lens = camera.colour
+        shade = np.linspace(90, 160, lens.width)[None, :, None]
+        empty = np.repeat(np.repeat(shade, lens.height, 0), 3, 2).astype(np.uint8)
+        for t in range(total):
+            colour, depth = views[t][c]
+            image = empty.copy()
+            image[colour.full_mask(lens, 0)] = (60, 90, 180)
+            image[colour.full_mask(lens, 1)] = (200, 200, 40)
+            colours[c].append(cv2.imencode(".jpg", image)[1].tobytes())
+            window = depths[c][t][depth.window]
+            window[depth.mask] = np.rint(1e3 * depth.depth[depth.mask])
+    gravity = np.tile([0.0, 1.0, 0.0], (len(rig), 1))
+    write_frames(
+        capture.paths["frames"], rig, num_sets=total, depths=depths, colours=colours,
+        gravity=gravity, sequence=name,
+    )  # fmt: skip
+
+
+def _size(lens: Intrinsics) -> tuple[int, int]:
+    return lens.height, lens.width
 
 
 def _write_scene(capture: Capture, name: str) -> None:
     rig, total = capture.rig, len(capture.vertices)
-    count = len(rig)
     floor = float(capture.vertices[..., 1].max())
     start = rig.master_from_colour.copy()
     start[1, 0, 3] += 0.012
     zup = np.eye(4)
     zup[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
     zup[2, 3] = floor
-    with artefacts.write(
-        capture.paths["scene"], SCENE, sequence=name, master="k1", fps=FPS,
-        extrinsics_refined=True, ground_found=True, ground_source="fitted", ground_rms=0.004,
-        ground_inliers=1000,
-    ) as writer:  # fmt: skip
-        for key, value in rig.datasets().items():
-            writer.put(key, value)
-        writer.put("present", np.ones(count, bool))
-        writer.put("times", np.arange(total) / FPS)
-        writer.put("master_from_colour", rig.master_from_colour)
-        writer.put("master_from_colour_start", start)
-        writer.put("depth_bias", np.zeros(count))
-        writer.put("camera_covariance", np.zeros((count, 7, count, 7)))
-        writer.put("pairs", np.array([[0, 1], [1, 2], [2, 0]]))
-        writer.put("pair_points", np.full(3, 5000))
-        writer.put("pair_residual_before", [0.012, 0.011, 0.006])
-        writer.put("pair_residual_after", [0.004, 0.004, 0.003])
-        writer.put("time_offset", np.zeros(count))
-        writer.put("time_offset_sigma", np.full(count, np.nan))
-        writer.put("slip", np.zeros((total, count), int))
-        writer.put("image_of", np.arange(total)[:, None].repeat(count, 1))
-        writer.put("ground_point", [0.0, floor, 2.4])
-        writer.put("ground_normal", [0.0, -1.0, 0.0])
-        writer.put("zup_from_master", zup)
-        _fill(writer, SCENE, T=total, C=count, P=3)
-        for camera in rig:
-            shape = (camera.depth.height, camera.depth.width)
-            writer.put(f"cameras/{camera.name}/background", np.full(shape, 4000))
+    write_scene(
+        capture.paths["scene"],
+        rig,
+        np.arange(total) / FPS,
+        [np.full(_size(camera.depth), 4000) for camera in rig],
+        zup_from_master=zup,
+        attributes={
+            "sequence": name, "extrinsics_refined": True, "ground_rms": 0.004,
+            "ground_inliers": 1000,
+        },
+        master_from_colour_start=start,
+        pairs=np.array([[0, 1], [1, 2], [2, 0]]),
+        pair_points=np.full(3, 5000),
+        pair_residual_before=np.array([0.012, 0.011, 0.006]),
+        pair_residual_after=np.array([0.004, 0.004, 0.003]),
+        ground_point=np.array([0.0, floor, 2.4]),
+    )  # fmt: skip
 
 
 def _write_detections(capture: Capture, views: Any, name: str) -> None:
     rig, total = capture.rig, len(views)
-    with artefacts.write(capture.paths["detections"], DETECTIONS, sequence=name) as writer:
-        writer.put("camera_names", rig.names)
-        writer.put("colour_size", [(c.colour.width, c.colour.height) for c in rig])
-        writer.put("note", [""] * len(rig))
-        writer.put("keypoints_found", np.ones((total, len(rig)), bool))
-        writer.put("candidates_found", np.ones((total, len(rig)), bool))
-        _fill(writer, DETECTIONS, T=total, C=len(rig))
-        for c, camera in enumerate(rig):
-            group = f"cameras/{camera.name}"
-            rles = [masks.encode(views[t][c][0].full_mask(camera.colour, 1)) for t in range(total)]
-            offsets, values = artefacts.pack_ragged(rles)
-            writer.put(f"{group}/people_offsets", np.arange(total + 1))
-            writer.put(f"{group}/people", np.zeros((total, 135, 3)))
-            writer.put(f"{group}/candidate_offsets", np.arange(total + 1))
-            writer.put(f"{group}/candidate_labels", ["sports ball"] * total)
-            writer.put(f"{group}/candidate_scores", np.full(total, 0.9))
-            writer.put(f"{group}/candidate_boxes", np.zeros((total, 4)))
-            writer.put(f"{group}/rle_offsets", offsets)
-            writer.put(f"{group}/rle", values)
+    nobody = np.zeros((135, 3))
+    balls = {
+        (t, c): [("sports ball", masks.encode(views[t][c][0].full_mask(camera.colour, 1)))]
+        for t in range(total)
+        for c, camera in enumerate(rig)
+    }
+    people = [[[nobody]] * len(rig)] * total
+    write_detections(capture.paths["detections"], rig, people, balls, sequence=name)
 
 
 def _write_person(capture: Capture, views: Any, joints: np.ndarray, name: str) -> None:
@@ -349,26 +298,14 @@ def _write_person(capture: Capture, views: Any, joints: np.ndarray, name: str) -
         for t in range(total)
         for c, camera in enumerate(rig)
     ]
-    offsets, values = artefacts.pack_ragged(rles)
-    missing = np.zeros(total, bool)
-    missing[-1] = True
     seen = np.ones((total, count, 135, 3))
     for c, camera in enumerate(rig):
         seen[:, c, :, :2] = camera.colour.project(apply(camera.colour_from_master, joints))
-    with artefacts.write(
-        capture.paths["person"], PERSON, sequence=name, images_alone=False
-    ) as writer:
-        writer.put("camera_names", rig.names)
-        writer.put("person", np.zeros((total, count), int))
-        writer.put("keypoints", seen)
-        writer.put("joints", joints)
-        writer.put("joint_views", np.full((total, 135), 3))
-        writer.put("joint_error", np.zeros((total, 135)))
-        writer.put("inlier", np.ones((total, count, 135), bool))
-        writer.put("missing", missing)
-        writer.put("mask_offsets", offsets)
-        writer.put("mask_rle", values)
-        _fill(writer, PERSON, T=total, C=count)
+    write_person(
+        capture.paths["person"], rig, rles, sequence=name, keypoints=seen, joints=joints,
+        joint_views=np.full((total, 135), 3), inlier=np.ones((total, count, 135), bool),
+        missing=np.arange(total) == total - 1,
+    )  # fmt: skip
 
 
 def _write_fits(capture: Capture, params: BodyParameters, name: str) -> None:
@@ -402,7 +339,7 @@ def _write_fits(capture: Capture, params: BodyParameters, name: str) -> None:
         writer.put("probability", np.ones(total))
         writer.put("spread", np.zeros((total, 6, 6)))
         writer.put("free_axis", np.zeros((total, 3)))
-        _fill(writer, OBJECT_TRACK, T=total, C=count)
+        fill(writer, OBJECT_TRACK, T=total, C=count)
     identity = {"sequence": name, "subject": SUBJECT.subject, "gender": "neutral"}
     with artefacts.write(
         capture.paths["body_fit"], BODY_FIT, body_model=file_digest(OPEN_BODY), **identity
@@ -415,7 +352,7 @@ def _write_fits(capture: Capture, params: BodyParameters, name: str) -> None:
         writer.put("part_names", ["left_hand", "right_hand"])
         writer.put("keypoint_sigma", np.full(135, 0.01))
         writer.put("covering_noise", np.full(len(COVERINGS), 0.01))
-        _fill(writer, BODY_FIT, T=total, C=count, P=2, G=len(COVERINGS), K=135)
+        fill(writer, BODY_FIT, T=total, C=count, P=2, G=len(COVERINGS), K=135)
     with artefacts.write(
         capture.paths["joint"], JOINT, body_model=file_digest(OPEN_BODY),
         object=capture.object_.name, iterations=3, refused=0, converged=True,
@@ -438,7 +375,7 @@ def _write_fits(capture: Capture, params: BodyParameters, name: str) -> None:
         writer.put("energy_after", [1.0, 0.5])
         writer.put("flagged", np.zeros(total, bool))
         writer.put("flag_reason", [""] * total)
-        _fill(writer, JOINT, T=total, C=count)
+        fill(writer, JOINT, T=total, C=count)
 
 
 def _write_truth(capture: Capture, tips: np.ndarray, name: str) -> None:

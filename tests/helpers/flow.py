@@ -19,7 +19,7 @@ from intercap_core.kernel_cache import use_kernel_cache
 ROOT = Path(__file__).resolve().parents[2]
 EXECUTOR = "snakemake_executor_plugin_intercap_slurm"
 COPIED = ("Snakefile", "workflow", "profiles", "envs", "config", "intercap_core", EXECUTOR)
-KERNELS = shutil.ignore_patterns("*.nbi", "*.nbc")  # of a cache beside the source
+KERNELS = shutil.ignore_patterns("*.nbi", "*.nbc")  # of a cache next to the source
 # Rewrites the manifest of every output to what the output would be made from now.
 REWRITE_MANIFESTS = """
 import sys
@@ -190,11 +190,7 @@ class Flow:
             *("--cores", "2", *arguments),
         ]
         return subprocess.run(
-            command,
-            cwd=self.folder,
-            env=self.environment,
-            capture_output=True,
-            text=True,
+            command, cwd=self.folder, env=self.environment, capture_output=True, text=True
         )
 
     @property

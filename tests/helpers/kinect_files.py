@@ -1,4 +1,4 @@
-"""Small Azure Kinect recordings of a rig whose every image tells its camera and moment."""
+"""Small Azure Kinect recordings whose images encode their camera and time."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def record(
     times_us=None,
     image_of=depth_at,
 ) -> None:
-    """Record ``ticks``; ``times_us`` maps a tick to device time where that is no whole period."""
+    """Record ``ticks``; ``times_us`` maps a tick to device time if that is not a whole period."""
     device = make_camera(camera)
     times_us = times_us or (lambda tick: clock_us + tick * PERIOD_US)
     with MkvWriter(
@@ -82,7 +82,7 @@ def record(
 
 
 def entry_of(folder: Path, cameras: int) -> SequenceEntry:
-    """Row of the sequence recorded in ``folder``, with a rig file beside it."""
+    """Row of the sequence recorded in ``folder``, with a rig file next to it."""
     rig = folder.parent / "rig.json"
     write_rig_file(rig, Extrinsics("k1", {f"k{i + 1}": pose_of(i) for i in range(cameras)}))
     return SequenceEntry(sequence="s1", subject="a", object="b", recordings=folder, calibration=rig)
@@ -96,6 +96,6 @@ def run(capture: SequenceEntry, drop=()) -> Path:
 
 
 def notes_of(path: Path) -> dict[str, str]:
-    """What the artefact says is degraded, by camera."""
+    """Notes of the artefact by camera."""
     with artefacts.read(path, FRAMES) as frames:
         return dict(zip(frames.text("camera_names"), frames.text("note"), strict=True))

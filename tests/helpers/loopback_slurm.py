@@ -1,8 +1,7 @@
-"""A real Slurm on this machine alone: munge, controller and two nodes, in a folder of their own.
+"""A real Slurm on this machine: munge, controller and two nodes, in one folder.
 
-Everything listens on the loopback address and lies in one folder; nothing of the system's own
-configuration is read or changed. Jobs that use more memory than they asked for are killed by the
-node daemon, which looks every second, so that no cgroups are needed. There is no accounting.
+All daemons listen on the loopback address; the system's configuration is neither read nor changed.
+The node daemon kills jobs that exceed their memory, once a second, without cgroups or accounting.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ SchedulerParameters=sched_min_interval=0,batch_sched_delay=0,sched_interval=2
 
 
 def missing() -> str | None:
-    """Why no Slurm can be started here; None where one can."""
+    """Reason why Slurm cannot be started here; None if it can."""
     absent = [name for name in PROGRAMS if _program(name) is None]
     if absent:
         return f"{', '.join(absent)} not installed (Debian: slurm-wlm, munge)"
@@ -93,7 +92,7 @@ class LoopbackSlurm:
 
     @property
     def environment(self) -> dict[str, str]:
-        """What makes every command of Slurm speak to this one."""
+        """Environment in which Slurm's commands use these daemons."""
         kept = {name: value for name, value in os.environ.items() if not name.startswith("SLURM_")}
         return {**kept, "SLURM_CONF": str(self.folder / "slurm.conf")}
 
@@ -120,7 +119,7 @@ class LoopbackSlurm:
             given = {"key-file": "munge.key", "socket": "munge.socket", "pid-file": "munged.pid"}
             given |= {"log-file": "munged.log", "seed-file": "munged.seed"}
             files = [f"--{option}={self.folder / file}" for option, file in given.items()]
-            # The folder is nobody else's, which munged would rather see of its parents as well.
+            # --force: munged would refuse parent folders that others may write
             return [str(_program("munged")), "--foreground", "--force", *files]
         if name == "slurmctld":
             return [str(_program("slurmctld")), "-D"]
@@ -153,7 +152,7 @@ class LoopbackSlurm:
             process.wait()
 
     def command(self, *arguments: str) -> str:
-        """What one of Slurm's commands prints."""
+        """Output of one of Slurm's commands."""
         done = subprocess.run(arguments, env=self.environment, capture_output=True, text=True)
         return done.stdout
 
@@ -185,15 +184,15 @@ class LoopbackSlurm:
         )
 
     def wait_for(self, holds: Callable[[], object], what: str, within: float = READY_WITHIN_S):
-        """Return what ``holds`` returns once it is true; fails with the daemons' last words."""
+        """Return the first true value of ``holds``; fails with the daemons' logs."""
         deadline = time.monotonic() + within
         while time.monotonic() < deadline:
             found = holds()
             if found:
                 return found
             time.sleep(0.2)
-        said = [f"{path.name}: {path.read_text()[-800:]}" for path in self.folder.glob("*.log")]
-        raise AssertionError("\n".join([f"not within {within:.0f} s: {what}", *said]))
+        logs = [f"{path.name}: {path.read_text()[-800:]}" for path in self.folder.glob("*.log")]
+        raise AssertionError("\n".join([f"not within {within:.0f} s: {what}", *logs]))
 
 
 def _program(name: str) -> str | None:

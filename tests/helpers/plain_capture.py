@@ -38,7 +38,7 @@ def plain_entry(folder: Path, **inputs: Path) -> SequenceEntry:
 
 
 def detect(capture: SequenceEntry, output: str = "detections.h5", **settings) -> Detections:
-    """What stage detections writes beside the recordings; the frames are read once."""
+    """Run stage detections next to the recordings; stage frames runs once."""
     out = capture.recordings.parent
     if not (out / "frames.h5").exists():
         frames.run(sequence=capture, output=out / "frames.h5", settings=FramesSettings())

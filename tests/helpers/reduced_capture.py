@@ -1,7 +1,6 @@
-"""A capture with fewer cameras, less depth, less colour or fewer detections than it was made with.
+"""Remove cameras, depth, colour or detections from the artefacts of a capture.
 
-Works on the artefacts of any capture, synthetic or recorded: each is copied by its schema, the T
-and C axes cut, so that the stages behind it can be run on rigs that nobody recorded.
+Each artefact is copied by its schema with shorter T and C axes.
 """
 
 from __future__ import annotations

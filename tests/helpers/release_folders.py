@@ -7,15 +7,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from intercap_core.formats.recordings.frames import Frames
-from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import invert
+from intercap_core.studio.layouts import write_behave_calibration, write_intercap_calibration
 from tests.helpers.aligned_depth import depth_on_colour
 
 Colour = Callable[[int, int], bytes | None]  # of set t and camera c
@@ -45,18 +46,7 @@ def write_intercap(
             _write(folder / "color" / f"{number:05d}.jpg", colour(number, c))
             _write(folder / "depth" / f"{number:05d}.png", _png(depth(number, c)))
     folder = root / "Data" / calibration
-    folder.mkdir(parents=True, exist_ok=True)
-    for c, camera in enumerate(rig):
-        lens, camera_from_world = camera.colour, camera.colour_from_master
-        content = {
-            "f": [lens.fx, lens.fy],
-            "c": [lens.cx, lens.cy],
-            "k": lens.distortion.tolist(),
-            "R": cv2.Rodrigues(camera_from_world[:3, :3])[0].ravel().tolist(),
-            "T": camera_from_world[:3, 3].tolist(),
-        }
-        name = f"Color_{c + 1}.json" if c else "Color.json"
-        (folder / name).write_text(json.dumps(content))
+    write_intercap_calibration(folder, rig, [camera.colour for camera in rig])
     return recordings, folder
 
 
@@ -80,18 +70,12 @@ def write_behave(
         for c in range(len(rig)):
             _write(folder / f"k{c}.color.jpg", colour(t, c))
             _write(folder / f"k{c}.depth.png", _png(depth(t, c)))
-    config = root / "calibs" / sequence.partition("_")[0] / "config"
-    for c, camera in enumerate(rig):
-        local_to_world = invert(rig[1].master_from_colour) @ camera.master_from_colour
-        (config / str(c)).mkdir(parents=True, exist_ok=True)
-        pose = {
-            "rotation": local_to_world[:3, :3].ravel().tolist(),
-            "translation": local_to_world[:3, 3].tolist(),
-        }
-        (config / str(c) / "config.json").write_text(json.dumps(pose))
-        lens = root / "calibs" / "intrinsics" / str(c) / "calibration.json"
-        lens.parent.mkdir(parents=True, exist_ok=True)
-        lens.write_text(json.dumps({"color": behave_lens(camera.colour)}))
+    date = sequence.partition("_")[0]
+    config = root / "calibs" / date / "config"
+    of_kinect_1 = rig.moved(invert(rig[1].master_from_colour) @ rig.master_from_colour)
+    kinects = Rig(tuple(replace(camera, name=f"k{c}") for c, camera in enumerate(of_kinect_1)))
+    lenses = [camera.colour for camera in kinects]
+    write_behave_calibration(root / "calibs", kinects, lenses, date)
     info = {
         "config": f"../../calibs/{config.parent.name}/config",
         "intrinsic": "../../calibs/intrinsics",
@@ -102,13 +86,6 @@ def write_behave(
     }
     (recordings / "info.json").write_text(json.dumps(info))
     return recordings, config
-
-
-def behave_lens(lens: Intrinsics) -> dict[str, object]:
-    """The colour part of ``calibration.json``."""
-    pinhole = {"fx": lens.fx, "fy": lens.fy, "cx": lens.cx, "cy": lens.cy}
-    opencv = [*pinhole.values(), *lens.distortion.tolist()]
-    return {"width": lens.width, "height": lens.height, **pinhole, "opencv": opencv}
 
 
 def convert_frames(

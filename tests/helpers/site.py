@@ -79,7 +79,7 @@ def write_site(
     failed: Mapping[str, str] | None = None,
     intents: Mapping[str, str] | None = None,
 ) -> Path:
-    """Everything that is beside the artefacts of a dataset, in the folder ``out``."""
+    """Write summaries, pages and the overview of a dataset into the folder ``out``."""
     for sequence, capture in captures.items():
         write_page(capture, out, sequence, (intents or {}).get(sequence), settings)
     merge(write_summaries(captures, out / "summaries", intents), captures, out, name, failed)
@@ -114,7 +114,7 @@ def merge(
     failed: Mapping[str, str] | None = None,
     card: CardSettings | None = None,
 ) -> Path:
-    """The overview and what lies beside it; returns the page."""
+    """Write the overview, summary and tables of a dataset; returns the page."""
     return dataset.run(
         dataset=name,
         summaries=summaries,

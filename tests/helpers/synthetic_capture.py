@@ -190,11 +190,14 @@ def write_frames(
     stated: Mapping[str, np.ndarray] | None = None,
     colour_times: bool = False,
     sound: Mapping[str, np.ndarray] | None = None,
+    colours: Sequence[Sequence[bytes]] | None = None,
+    sequence: str = "test",
 ) -> Path:
-    """Write a frames artefact without colour images.
+    """Write a frames artefact.
 
     Args:
         depths: (T, H, W) uint16 mm for each camera.
+        colours: T images for each camera; they and the depth images get device times from 0.
         stated: datasets of what the calibration states about its world.
         colour_times: also write the device times of colour images, which begin at 7 s.
         sound: datasets of the start times found in the sound.
@@ -202,7 +205,7 @@ def write_frames(
     count = len(rig)
     sets = np.repeat(np.arange(num_sets)[:, None], count, 1)
     none = np.full((num_sets, count), -1)
-    with artefacts.write(path, FRAMES, sequence="test", master="k1", fps=15.0) as writer:
+    with artefacts.write(path, FRAMES, sequence=sequence, master="k1", fps=15.0) as writer:
         put_frame_sets(
             writer,
             rig,
@@ -217,6 +220,14 @@ def write_frames(
         for index, name in enumerate(rig.names):
             if depths is not None:
                 writer.put(f"cameras/{name}/depth", depths[index])
+            if colours is not None:
+                offsets, packets = pack_ragged(colours[index])
+                times = (np.arange(num_sets) * 1e6 / 15).astype(np.int64)
+                for key, values in (
+                    ("colour", packets), ("colour_offsets", offsets), ("colour_time", times),
+                    ("depth_time", times),
+                ):  # fmt: skip
+                    writer.put(f"cameras/{name}/{key}", values)
             if colour_times:
                 times = 7_000_000 + np.rint(np.arange(num_sets) * 1e6 / 15).astype(np.int64)
                 writer.put(f"cameras/{name}/colour_time", times)
@@ -242,6 +253,7 @@ def write_scene(
     backgrounds: Sequence[np.ndarray],
     *,
     zup_from_master: np.ndarray | None = None,
+    attributes: Mapping[str, object] | None = None,
     **values: np.ndarray,
 ) -> Path:
     """Write a scene artefact whose extrinsics were not refined.
@@ -249,6 +261,7 @@ def write_scene(
     Args:
         backgrounds: depth (H, W) of the empty room for each camera.
         zup_from_master: (4, 4), None if no floor was found.
+        attributes: attributes that differ from their neutral values.
         values: datasets that differ from their neutral values.
     """
     sets, count, known = len(times), len(rig), zup_from_master is not None
@@ -266,21 +279,24 @@ def write_scene(
         "zup_from_master": zup_from_master if known else np.full((4, 4), np.nan),
         **values,
     }
-    with artefacts.write(
-        path, SCENE, sequence="test", master="k1", fps=15.0, extrinsics_refined=False,
-        extrinsics_converged=False, verdict="", ground_found=known,
-        ground_source="fitted" if known else "none", ground_rms=0.0 if known else np.nan,
-        ground_inliers=100 if known else 0,
-    ) as writer:  # fmt: skip
+    neutral = {
+        "sequence": "test", "master": "k1", "fps": 15.0, "extrinsics_refined": False,
+        "extrinsics_converged": False, "verdict": "", "ground_found": known,
+        "ground_source": "fitted" if known else "none", "ground_rms": 0.0 if known else np.nan,
+        "ground_inliers": 100 if known else 0,
+    }  # fmt: skip
+    with artefacts.write(path, SCENE, **(neutral | dict(attributes or {}))) as writer:
         for key, value in written.items():
             writer.put(key, value)
-        fill(writer, SCENE, T=sets, C=count, P=0)
+        fill(writer, SCENE, T=sets, C=count, P=len(values.get("pairs", ())))
         for name, background in zip(rig.names, backgrounds, strict=True):
             writer.put(f"cameras/{name}/background", background)
     return path
 
 
-def write_person(path: Path, rig: Rig, masks: Sequence[bytes], **values: np.ndarray) -> Path:
+def write_person(
+    path: Path, rig: Rig, masks: Sequence[bytes], sequence: str = "test", **values: np.ndarray
+) -> Path:
     """Write a person artefact.
 
     Args:
@@ -290,7 +306,7 @@ def write_person(path: Path, rig: Rig, masks: Sequence[bytes], **values: np.ndar
     sets, count = len(masks) // len(rig), len(rig)
     offsets, runs = pack_ragged(masks)
     with artefacts.write(
-        path, PERSON, sequence="test", images_alone=False, chosen_by="alone", doubts=""
+        path, PERSON, sequence=sequence, images_alone=False, chosen_by="alone", doubts=""
     ) as writer:
         known = {"camera_names": rig.names, "mask_offsets": offsets, "mask_rle": runs,
                  "mask_source": np.ones((sets, count), np.int8)}  # fmt: skip

@@ -1,4 +1,4 @@
-"""Points of moving stick people and what six cameras would see of them."""
+"""Points of moving stick people, and their projections into cameras."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class DelayedPeople:
 
     @property
     def available(self) -> np.ndarray:
-        """(T, C) bool: the image shows somebody."""
+        """(T, C) bool: the image shows a person."""
         views = range(len(self.late))
         return np.array([[len(self.people(t, c)) > 0 for c in views] for t in range(self.num_sets)])
 
@@ -107,11 +107,12 @@ def write_detections(
     people: list[list[list[np.ndarray]]],
     candidates: dict[tuple[int, int], list[tuple[str, bytes]]] | None = None,
     note: str = "",
+    sequence: str = "test",
 ) -> Path:
     """Write a detections artefact; ``people[t][c]`` lists (135, 3) arrays, ``note`` is of the
     second camera."""
     sets, views = len(people), len(rig)
-    with artefacts.write(path, DETECTIONS, sequence="test") as writer:
+    with artefacts.write(path, DETECTIONS, sequence=sequence) as writer:
         writer.put("camera_names", list(rig.names))
         writer.put("colour_size", np.array([(c.colour.width, c.colour.height) for c in rig]))
         writer.put("note", [note if c == 1 else "" for c in range(views)])

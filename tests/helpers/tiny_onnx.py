@@ -1,7 +1,7 @@
-"""Tiny ONNX models that find red and blue things, with the outputs of well-known exports.
+"""Tiny ONNX models that detect red and blue areas, with the outputs of well-known exports.
 
-Each colour's mask, box and score are computed in the graph from the image that it is given, so that
-whatever goes wrong before or after the model shows in the result.
+Each colour's mask, box and score are computed in the graph from the input image, so that errors of
+pre- and postprocessing show in the result.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
-"""Tiny ONNX models with the outputs of RTMPose or of HRNet that find coloured dots, and people made
-of them.
+"""Tiny ONNX models with the outputs of RTMPose or HRNet that detect people of coloured dots.
 
-The responses are computed in the graph from the image that it is given, so that whatever goes wrong
-before or after the model shows in the result.
+The responses are computed in the graph from the input image, so that errors of pre- and
+postprocessing show in the result.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ NAMES = tuple(PLACES)
 
 
 def person(top: tuple[float, float], height: float) -> np.ndarray:
-    """Where the dots (24, 2) of somebody are whose head's top is at ``top``."""
+    """Dots (24, 2) of a person whose head's top is at ``top``."""
     return np.array(top) + height * np.array([PLACES[name] for name in NAMES])
 
 

@@ -1,9 +1,8 @@
-"""Runs Snakemake again and again without its start: one line of arguments in, one status out.
+"""Run Snakemake repeatedly without its start-up: reads a line of arguments, prints a status.
 
-Started in a copy of the project, by its own package. Every request is answered by a fork of this
-process, which has imported Snakemake and the package's settings and read the code's syntax trees.
-What it has read is kept by each file's date, so edits of the copy are seen; where a module that is
-imported here has itself been edited, the fork starts Snakemake anew.
+It is started in a copy of the project. Each request is answered by a fork of this process, which
+has imported Snakemake and parsed the code. If a module imported here was edited since, the fork
+starts Snakemake as a new process.
 """
 
 from __future__ import annotations

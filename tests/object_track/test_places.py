@@ -29,7 +29,8 @@ from intercap_core.object_track.places import (
 from intercap_core.object_track.tracker import Tracker
 from intercap_core.object_track.view_report import ViewReport
 from tests.geometry.rigid.conftest import catalogue
-from tests.helpers.object_capture import FPS, HarshCapture
+from tests.helpers.object_capture import FPS
+from tests.object_track.harsh_capture import HarshCapture
 from tests.object_track.scenes import FIVE_DEGREES
 
 SHARE = 0.25

@@ -9,8 +9,8 @@ from intercap_core.scene.keypoint_timing import find_offsets
 from intercap_core.scene.moments import find_moments
 from intercap_core.scene.slips import find_slips
 from intercap_core.scene.start_times import find_starts
-from tests.helpers.keypoint_capture import KeypointCapture, keypoint_capture, subject_keypoints
 from tests.helpers.synthetic_people import DelayedPeople
+from tests.scene.keypoint_capture import KeypointCapture, keypoint_capture, subject_keypoints
 
 
 @pytest.fixture(scope="module")

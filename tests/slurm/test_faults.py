@@ -268,7 +268,7 @@ exit 1
         run.slurm.stop_one("slurmctld")
         started = run.start(*targets)
         run.slurm.wait_for(
-            lambda: "Slurm's controller does not answer" in started.said, "it waits", within=300
+            lambda: "Slurm's controller does not answer" in started.output, "it waits", within=300
         )
         assert not went.exists()
         run.slurm.start_one("slurmctld")
@@ -284,8 +284,8 @@ def test_interrupted(run: ClusterRun, local: dict[str, bytes], record_property: 
         number, _ = job_runs(run, "joint")
         send(signal.SIGSTOP, processes_of(run, number))  # so that it cannot end by itself
         started.process.send_signal(signal.SIGINT)
-        assert started.process.wait(120) == 1, started.said
-        assert "Traceback" not in started.said
+        assert started.process.wait(120) == 1, started.output
+        assert "Traceback" not in started.output
         run.slurm.wait_for(
             lambda: run.slurm.jobs(ended=True)[number][0] == "CANCELLED", "the job is cancelled"
         )
@@ -304,13 +304,13 @@ def test_interrupted_while_the_controller_is_down(
         send(signal.SIGSTOP, processes)
         run.slurm.stop_one("slurmctld")
         started.process.send_signal(signal.SIGINT)
-        assert started.process.wait(120) == 1, started.said
-        assert "Slurm's jobs go on, and the next run waits for them" in started.said
-        assert "Traceback" not in started.said
+        assert started.process.wait(120) == 1, started.output
+        assert "Slurm's jobs go on, and the next run waits for them" in started.output
+        assert "Traceback" not in started.output
         run.slurm.start_one("slurmctld")
         again = run.start(*targets)
         found = f"Slurm job {number} of an earlier run computes"
-        run.slurm.wait_for(lambda: found in again.said, "the job is found", within=300)
+        run.slurm.wait_for(lambda: found in again.output, "the job is found", within=300)
         send(signal.SIGCONT, processes)
         again.ends_well()
     assert len(numbers(run, ONE) - before) == 1
@@ -330,7 +330,7 @@ def test_submitter_killed(
         run.unlock()
         again = run.start(*targets)
         found = f"Slurm job {number} of an earlier run computes"
-        run.slurm.wait_for(lambda: found in again.said, "the job is found", within=300)
+        run.slurm.wait_for(lambda: found in again.output, "the job is found", within=300)
         send(signal.SIGCONT, processes)
         assert "waiting for it" in again.ends_well()
     assert len(numbers(run, ONE) - before) == 2
@@ -361,8 +361,8 @@ def test_a_stage_on_a_gpu_goes_where_one_is(run: ClusterRun, local: dict[str, by
         on_gpu = ("--config", "device=cuda", "cluster={gpu_partition: gpu}")
         started = run.start(*targets, *on_gpu)
         assert started.process.wait(300) == 1
-        assert f"{ONE}: body_fit: failed: " in started.said
-        assert "config/test/config.yaml: device is cuda, but PyTorch finds no" in started.said
+        assert f"{ONE}: body_fit: failed: " in started.output
+        assert "config/test/config.yaml: device is cuda, but PyTorch finds no" in started.output
         (number,) = numbers(run, "rule_body_fit_", ONE) - before
         assert (
             run.slurm.command("squeue", "-h", "-t", "all", "-j", number, "-o", "%P").strip()
@@ -400,7 +400,7 @@ def jobs_of_failed_run(run: ClusterRun) -> tuple[str, list[str]]:
     """What `intercap run` says, that ends in failure for the annotation, and what it submitted."""
     before = run.slurm.jobs(ended=True).keys()
     started = run.start_intercap("run", run.flow.settings, "--profile", PROFILE[1])
-    assert started.process.wait(600) == 1, started.said
-    assert "not valid YAML" in started.said
+    assert started.process.wait(600) == 1, started.output
+    assert "not valid YAML" in started.output
     jobs = run.slurm.jobs(ended=True)
-    return started.said, sorted(jobs[number][1] for number in jobs.keys() - before)
+    return started.output, sorted(jobs[number][1] for number in jobs.keys() - before)

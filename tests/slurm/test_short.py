@@ -69,9 +69,9 @@ def test_a_mistake_is_submitted_once_and_told(tiny: ClusterRun, slurm: LoopbackS
     kept = written(tiny.flow.results)
     started = tiny.start(tiny.target(NAME, "scene"))
     assert started.process.wait(300) == 1
-    assert len(slurm.submitted_for("rule_detections", NAME)) == 1, started.said
-    assert f"{NAME}: detections: failed: sequence {NAME}: no detections for any" in started.said
-    assert "It is not submitted again" in started.said
+    assert len(slurm.submitted_for("rule_detections", NAME)) == 1, started.output
+    assert f"{NAME}: detections: failed: sequence {NAME}: no detections for any" in started.output
+    assert "It is not submitted again" in started.output
     assert written(tiny.flow.results) == kept
 
 
@@ -82,5 +82,5 @@ def test_each_stage_of_a_group_is_told(tiny: ClusterRun, slurm: LoopbackSlurm) -
     started = tiny.start(tiny.target(NAME, "detections"), *grouped)
     assert started.process.wait(300) == 1
     (number,) = slurm.jobs(ended=True).keys() - before
-    assert f"Slurm job {number}, {NAME}: frames: finished" in started.said
-    assert f"Slurm job {number}, {NAME}: detections: failed: sequence {NAME}" in started.said
+    assert f"Slurm job {number}, {NAME}: frames: finished" in started.output
+    assert f"Slurm job {number}, {NAME}: detections: failed: sequence {NAME}" in started.output

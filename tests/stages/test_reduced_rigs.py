@@ -23,7 +23,7 @@ from intercap_core.entries import SubjectEntry
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.schemas import BODY_FIT, DETECTIONS, JOINT, METRICS, OBJECT_TRACK, PERSON
+from intercap_core.schemas import BODY_FIT, JOINT, METRICS, OBJECT_TRACK, PERSON
 from intercap_core.sequence_inputs import FitSettings, SequenceModels, SequencePaths
 from intercap_core.stage_list import STAGES
 from intercap_core.stages import (
@@ -42,6 +42,7 @@ from tests.helpers.body_capture import ring, write_capture
 from tests.helpers.object_capture import ObjectCapture
 from tests.helpers.reduced_capture import Reduction
 from tests.helpers.site import merge, row
+from tests.helpers.synthetic_people import write_detections
 from tests.stages.test_body_fit import motion
 
 SUBJECT = SubjectEntry(subject="s01", gender="neutral")
@@ -58,25 +59,10 @@ def detected(paths: dict[str, Path], rig: Rig, path: Path) -> Path:
     with artefacts.read(paths["person"], PERSON) as known:
         keypoints = known["keypoints"]
         masks = artefacts.unpack_ragged(known["mask_offsets"], known["mask_rle"])
-    sets, views = keypoints.shape[:2]
-    with artefacts.write(path, DETECTIONS, sequence="test") as writer:
-        writer.put("camera_names", list(rig.names))
-        writer.put("colour_size", np.array([(c.colour.width, c.colour.height) for c in rig]))
-        writer.put("note", [""] * views)
-        for key in ("keypoints_found", "candidates_found"):
-            writer.put(key, np.ones((sets, views), bool))
-        for c, name in enumerate(rig.names):
-            group = f"cameras/{name}"
-            offsets, rle = artefacts.pack_ragged(masks[c::views])
-            writer.put(f"{group}/people_offsets", np.arange(sets + 1))
-            writer.put(f"{group}/people", keypoints[:, c])
-            writer.put(f"{group}/candidate_offsets", np.arange(sets + 1))
-            writer.put(f"{group}/candidate_labels", ["person"] * sets)
-            writer.put(f"{group}/candidate_scores", np.ones(sets))
-            writer.put(f"{group}/candidate_boxes", np.zeros((sets, 4)))
-            writer.put(f"{group}/rle_offsets", offsets)
-            writer.put(f"{group}/rle", rle)
-    return path
+    images = list(np.ndindex(keypoints.shape[:2]))
+    people = [[[points] for points in views] for views in keypoints]
+    candidates = {at: [("person", mask)] for at, mask in zip(images, masks, strict=True)}
+    return write_detections(path, rig, people, candidates)
 
 
 class People:

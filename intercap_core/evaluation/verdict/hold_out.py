@@ -21,7 +21,6 @@ import numpy as np
 import torch
 
 from intercap_core.config import JointSettings
-from intercap_core.evaluation.body import BODY_JOINTS, BOTH_HANDS
 from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.fit import Assembly, assemble
 from intercap_core.joint.inputs import JointInputs
@@ -78,7 +77,7 @@ class Refits:
         return step
 
 
-JOINTS = {JudgedPart.BODY: BODY_JOINTS, JudgedPart.HANDS: BOTH_HANDS}
+JOINTS = {JudgedPart.BODY: slice(0, 22), JudgedPart.HANDS: slice(25, 55)}
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,8 +29,8 @@ from intercap_core.stages import joint, metrics
 from tests.helpers import fitted_capture as fitted
 from tests.helpers.behave_results import centred, write_30_fps, write_object, write_person
 from tests.helpers.bodies import open_body
-from tests.helpers.other_person import other_person, smplh_pose
 from tests.helpers.site import write_site
+from tests.joint.released.other_person import other_person, smplh_pose
 
 NAME = "Date03_Sub01_suitcase_lift"
 TOTAL = 3

@@ -6,14 +6,11 @@ Motion, exposure times, lenses, poses and detector errors are the studio's own.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import open3d as o3d
-import yaml
 
 from intercap_core.config import StudioCapture, StudioSettings
-from intercap_core.entries import ObjectEntry
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.person.groups import NOBODY
@@ -27,14 +24,14 @@ from intercap_core.studio.recording import COVER_M, Kinect
 from intercap_core.studio.render import scene_of
 from intercap_core.studio.skeleton import local_rotations
 from intercap_core.studio.stage import StudioStage
+from tests.helpers.fitted_capture import object_entry
 
-CONFIG = Path(__file__).resolve().parents[2] / "config"
-COVER_EVERY_S = 0.2  # what hides what is worked out this often
+COVER_EVERY_S = 0.2  # interval at which occlusion is computed
 
 
 @dataclass(frozen=True)
 class KeypointCapture:
-    """``people[t][c]`` lists the image's people (135, 3), None where the set has no image; ``rig``
+    """``people[t][c]`` lists the image's people (135, 3), None if the set has no image; ``rig``
     as claimed, ``true`` as it is; ``times`` (T,) s; true ``offset`` (C,) s and ``slip`` (T, C)."""
 
     people: list[list[list[np.ndarray] | None]]
@@ -61,17 +58,10 @@ def keypoint_capture(
     """Make one capture; the same arguments give the same numbers."""
     capture = StudioCapture(interaction=interaction, subject=subject, seed=seed, frames=frames)
     settings = StudioSettings.model_validate(
-        {
-            "captures": {},
-            "fps": fps,
-            "noise": noise,
-            "noise_family": family,
-            "cameras": cameras,
-            "slips": slips,
-        }
+        dict(captures={}, fps=fps, noise=noise, noise_family=family, cameras=cameras, slips=slips)
     )
     stage = StudioStage(
-        capture, settings, _object_entry(interaction_named(interaction).object_class)
+        capture, settings, object_entry(interaction_named(interaction).object_class)
     )
     detector = Detector.build(stage.noise, stage.frames)
     kinects = [Kinect(stage, index, settings.colour_mode) for index in range(cameras)]
@@ -90,11 +80,6 @@ def keypoint_capture(
     return KeypointCapture(
         people, rig.claimed, rig.true, stage.set_times, fps, offset - offset[0], rig.slip
     )
-
-
-def _object_entry(name: str) -> ObjectEntry:
-    found = yaml.safe_load((CONFIG / "objects.yaml").read_text())[name]
-    return ObjectEntry(name=name, mesh=CONFIG / found["mesh"], labels=found["labels"])
 
 
 def _points(stage: StudioStage, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -117,7 +102,7 @@ def _points(stage: StudioStage, times: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _hidden(stage: StudioStage, points: list[np.ndarray]) -> np.ndarray:
-    """Which keypoints (C, T, 135) something stands before, from ``points`` (T, 135, 3) a view."""
+    """Mask (C, T, 135) of occluded keypoints, from ``points`` (T, 135, 3) of each view."""
     cover = np.full(135, COVER_M["body"])
     cover[25:67], cover[67:] = COVER_M["hand"], COVER_M["face"]
     cover[[0, 15, 16, 17, 18]] = COVER_M["face"] * 2
@@ -127,10 +112,10 @@ def _hidden(stage: StudioStage, points: list[np.ndarray]) -> np.ndarray:
     eyes = apply(invert(stage.rig.master_from_stage), stage.rig.true.master_from_colour[:, :3, 3])
     hidden = np.zeros((len(points), stage.frames, 135), bool)
     for n, t in enumerate(looked):
-        pose, thing = moments.stage_from_object[n], stage.prop
+        pose, prop = moments.stage_from_object[n], stage.prop
         scene = scene_of(
             (moments.clothed[n], stage.subject.faces),
-            (apply(pose, thing.vertices), thing.faces),
+            (apply(pose, prop.vertices), prop.faces),
             (stage.room.vertices, stage.room.faces),
         )
         for c, eye in enumerate(eyes):
