@@ -15,6 +15,7 @@ from intercap_core.studio.controls import Footwork, Step, Wander
 from intercap_core.studio.motion import Puppet, Trunk
 from intercap_core.studio.noise import NoiseSource
 from intercap_core.studio.room import FLOOR_HALF_M, Room
+from intercap_core.studio.skeleton import about_z
 from intercap_core.studio.subjects import Subject, body_colours, subject_names
 
 CELL_M = 0.05  # grid of the floor plan
@@ -97,10 +98,8 @@ class PasserBy:
         self.subject = Subject.load(others[rng.integers(len(others))])
         self.puppet = Puppet(self.subject)
         self.colours = _other_colours(noise, self.subject, subject)
-        self.step_s, stride = (
-            rng.uniform(*self.step_range_s),
-            rng.uniform(*self.stride_range) * self.puppet.leg,
-        )
+        self.step_s = rng.uniform(*self.step_range_s)
+        stride = rng.uniform(*self.stride_range) * self.puppet.leg
         self.stands, self.speed = stands, 0.0 if stands else stride / self.step_s
         self.sway = Wander(6, self.sway_rad, noise.rng("passer-by sways"))
         self.way = self._way(rng, _obstacles(room), eyes, times, pelvis, prop)
@@ -175,14 +174,10 @@ class PasserBy:
         own = times - self.way.when + self.seconds / 2
         track, feet = self.track(own), self.footwork.feet(own)
         phase = np.pi * own / self.step_s  # a half turn is a step, the left foot's first
-        bend, head = np.zeros((2, len(own), 3))
-        walks = 0.0 if self.stands else 1.0
-        sway = self.sway(times)
-        bend[:, 0], bend[:, 1] = (
-            self.lean_rad * walks,
-            walks * self.counter_turn_rad * np.sin(phase - np.pi / 2),
-        )
-        bend, head = bend + sway[:, :3], head + sway[:, 3:]
+        bend, walks, sway = np.zeros((len(own), 3)), 0.0 if self.stands else 1.0, self.sway(times)
+        bend[:, 0] = self.lean_rad * walks
+        bend[:, 1] = walks * self.counter_turn_rad * np.sin(phase - np.pi / 2)
+        bend, head = bend + sway[:, :3], sway[:, 3:]
         trunk = puppet.settled(Trunk(track[:, :3], track[:, 3], bend, head), feet[0])
         world = puppet.trunk(trunk)
         puppet.legs(world, trunk.pelvis, *feet)
@@ -191,8 +186,7 @@ class PasserBy:
             swing = sign * walks * self.arm_swing_m * np.cos(phase)
             puppet.swing_arm(world, trunk.pelvis, side, swing)
         middle = self.speed * self.seconds / 2
-        cos, sin = np.cos(self.way.heading), np.sin(self.way.heading)
-        turned = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+        turned = about_z(self.way.heading)
         place = np.array([*self.way.place, 0.0])
         return turned @ world, (trunk.pelvis - [middle, 0, 0]) @ turned.T + place
 

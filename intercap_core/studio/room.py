@@ -13,6 +13,8 @@ from typing import Literal
 import cv2
 import numpy as np
 
+from intercap_core.studio.skeleton import about_z
+
 FLOOR_HALF_M = 6.0  # half the side of the floor
 
 
@@ -167,8 +169,7 @@ def _twin(
         height = rng.uniform(0.45, 0.75)
         half = 0.03 + np.abs(points[:, :2]).max()
         stand.append(Box((x - half, y - half, 0), (x + half, y + half, height), angle, "cardboard"))
-    cos, sin = np.cos(heading), np.sin(heading)
-    turned = points @ np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]).T
+    turned = points @ about_z(heading).T
     place = np.array([x, y, height - points[:, 2].min()])
     return stand, (turned + place, faces)
 

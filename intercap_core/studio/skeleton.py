@@ -33,6 +33,12 @@ def turn(rotation_vector: np.ndarray) -> np.ndarray:
     return matrices.reshape(*vector.shape[:-1], 3, 3)
 
 
+def about_z(angle: float) -> np.ndarray:
+    """Rotation (3, 3) by ``angle`` rad about the vertical."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+
+
 def blend(a: np.ndarray, b: np.ndarray, share: np.ndarray) -> np.ndarray:
     """Rotations (N, 3, 3) from ``a`` to ``b`` along the shortest way, ``share`` (N,) of it."""
     way = Rotation.from_matrix(np.swapaxes(a, -1, -2) @ b).as_rotvec()

@@ -14,7 +14,7 @@ from intercap_core.config import StudioCapture, StudioSettings
 from intercap_core.config_types import LayoutName
 from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
-from intercap_core.geometry.camera.transforms import invert
+from intercap_core.geometry.camera.transforms import invert, rigid
 from intercap_core.geometry.rigid.surfaces import vertex_normals
 from intercap_core.studio.capture_folder import SWAPPED
 from intercap_core.studio.interactions import interaction_named
@@ -26,6 +26,7 @@ from intercap_core.studio.objects import TrueObject, object_colours, press_out, 
 from intercap_core.studio.passer_by import PasserBy, Passing
 from intercap_core.studio.rig import Failures, StudioRig, build_rig, started_apart
 from intercap_core.studio.room import Furnishing, build_room
+from intercap_core.studio.skeleton import about_z
 from intercap_core.studio.subjects import Subject, build_names, in_heavy_shoes, subject_names
 
 LOOKS = ("mesh", "plain", "printed")  # equally likely
@@ -294,8 +295,6 @@ def check_faults(faults: Sequence[str], *, layout: LayoutName, cameras: int, fra
 def _placed(rng: np.random.Generator, centre: tuple[float, float]) -> np.ndarray:
     """stage_from_script (4, 4): any heading, the action's ``centre`` near the stage's middle."""
     heading = rng.uniform(0, 2 * np.pi)
-    cos, sin = np.cos(heading), np.sin(heading)
-    place = np.eye(4)
-    place[:2, :2] = [[cos, -sin], [sin, cos]]
-    place[:2, 3] = rng.normal(0, 0.12, 2) - place[:2, :2] @ centre
-    return place
+    rotation = about_z(heading)
+    shift = rng.normal(0, 0.12, 2) - rotation[:2, :2] @ centre
+    return rigid(rotation, np.array([*shift, 0.0]))

@@ -13,6 +13,7 @@ from intercap_core.studio.controls import Footwork, Guide, Step, Wander
 from intercap_core.studio.motion import Puppet, Trunk
 from intercap_core.studio.objects import TrueObject
 from intercap_core.studio.room import Box
+from intercap_core.studio.skeleton import about_z
 
 SCRIPT_S = 3.0  # length of a script; longer recordings play it slower
 
@@ -99,8 +100,7 @@ class Interaction(ABC):
 
 def upright(x: float, y: float, z: float, heading: float) -> np.ndarray:
     """stage_from_object (4, 4) of an object that stands, turned about the vertical."""
-    cos, sin = np.cos(heading), np.sin(heading)
-    return rigid(np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]), np.array([x, y, z]))
+    return rigid(about_z(heading), np.array([x, y, z]))
 
 
 def held_object(
