@@ -48,7 +48,7 @@ def write_trial(path: Path, frames: int = 4, seed: int = 0, **changes: object) -
                 writer.put(key, value)
 
 
-def test_what_is_written_comes_back(tmp_path: Path) -> None:
+def test_written_datasets_are_read_back(tmp_path: Path) -> None:
     path = tmp_path / "trial.h5"
     write_trial(path)
     with artefacts.read(path, SCHEMA) as source:
@@ -95,7 +95,7 @@ def test_every_dataset_has_checksum_and_units(tmp_path: Path) -> None:
         ({"names": None}, "missing ['names']"),
     ],
 )
-def test_what_contradicts_the_schema_is_not_written(
+def test_data_that_contradicts_the_schema_is_refused(
     tmp_path: Path, changes: dict, says: str
 ) -> None:
     with pytest.raises(ValueError, match=re.escape(says)):
@@ -181,7 +181,7 @@ def replace_by_folder(path: Path) -> None:
         (edit(lambda file: put_instead(file, "good", group=False)), "'good' holds no values"),
     ],
 )
-def test_a_broken_artefact_is_told_in_one_sentence(tmp_path: Path, damage, says: str) -> None:
+def test_broken_artefact_is_one_error_line(tmp_path: Path, damage, says: str) -> None:
     path = tmp_path / "trial.h5"
     write_trial(path)
     damage(path)
@@ -205,7 +205,7 @@ def test_a_broken_artefact_is_told_in_one_sentence(tmp_path: Path, damage, says:
         (edit(lambda file: file.attrs.__delitem__("schema")), "not an artefact"),
     ],
 )
-def test_a_file_whose_schema_cannot_be_told(tmp_path: Path, damage, says: str) -> None:
+def test_file_with_unknown_schema_is_refused(tmp_path: Path, damage, says: str) -> None:
     path = tmp_path / "trial.h5"
     write_trial(path)
     damage(path)

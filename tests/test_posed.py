@@ -27,7 +27,7 @@ def settings(capture: fitted.Capture, tmp_path_factory: pytest.TempPathFactory) 
 
 
 @pytest.mark.parametrize(("stage", "share"), [("joint", 0.5), ("body_fit", 1.0)])
-def test_points_are_where_the_artefacts_have_them(capture, settings, stage, share):
+def test_points_match_the_artefacts(capture, settings, stage, share):
     found = open_sequence(settings, "cap", stage=stage, frame="master")
     assert len(found) == 5 and len(found.times) == 5
     vertices, joints = found.bodies()
@@ -61,7 +61,7 @@ def test_shapes_of_both_stages_are_read_alike(capture):
         np.testing.assert_array_equal(read.frames(slice(0, 5)).betas.numpy(), spread)
 
 
-def test_frames_are_those_of_scene_and_cameras(capture, settings):
+def test_times_and_cameras_match_the_artefacts(capture, settings):
     seen = {
         frame: open_sequence(settings, "cap", frame=frame) for frame in ("z-up", "master", "k2")
     }
@@ -74,7 +74,7 @@ def test_frames_are_those_of_scene_and_cameras(capture, settings):
     np.testing.assert_allclose(seen["k2"].bodies()[0].reshape(-1, 3), by_camera, atol=1e-6)
 
 
-def test_what_is_not_there_is_told(settings):
+def test_missing_results_are_reported(settings):
     with pytest.raises(UserError, match="no sequence 'cup'; it has cap"):
         open_sequence(settings, "cup")
     with pytest.raises(UserError, match=r"no frame 'k7'; expected z-up, .* k1, k2"):

@@ -1,4 +1,4 @@
-"""How far a long loop is, said now and then."""
+"""Progress of long loops in the log."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from intercap_core.progress import Progress
 
 
 @pytest.mark.parametrize(
-    ("of", "steps", "told"),
+    ("of", "steps", "messages"),
     [
         (100, 100, ["tracked 38 of 100 frames, 2.5 a second, 25 s to go",
                     "tracked 76 of 100 frames, 2.5 a second, 10 s to go",
@@ -20,7 +20,7 @@ from intercap_core.progress import Progress
     ],
 )  # fmt: skip
 def test_a_long_loop_says_now_and_then_how_far_it_is(
-    caplog: pytest.LogCaptureFixture, of: int | None, steps: int, told: list[str]
+    caplog: pytest.LogCaptureFixture, of: int | None, steps: int, messages: list[str]
 ) -> None:
     now = [0.0]
     with caplog.at_level(logging.INFO, logger="intercap_core.test"):
@@ -29,4 +29,4 @@ def test_a_long_loop_says_now_and_then_how_far_it_is(
         for _ in range(steps):
             now[0] += 0.4
             progress.step()
-    assert [record.getMessage() for record in caplog.records] == told
+    assert [record.getMessage() for record in caplog.records] == messages

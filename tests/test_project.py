@@ -211,7 +211,7 @@ MISTAKES: list[tuple[Edit, list[str]]] = [
 
 
 @pytest.mark.parametrize(("edit", "says"), MISTAKES)
-def test_mistakes_stop_with_one_sentence(folder: Path, edit: Edit, says: list[str]) -> None:
+def test_mistakes_are_one_error_line(folder: Path, edit: Edit, says: list[str]) -> None:
     edit(folder)
     with pytest.raises(UserError) as raised:
         load_project(Path("config.yaml"))
@@ -290,7 +290,7 @@ def test_mistakes_stop_with_one_sentence(folder: Path, edit: Edit, says: list[st
         ("[]\n", ["expected names and values", "[]"]),
     ],
 )
-def test_a_broken_annotation_is_told_and_stops_nobody_else(
+def test_broken_annotation_fails_only_its_sequence(
     folder: Path, text: str, says: list[str]
 ) -> None:
     (folder / "annotations" / "one.yaml").write_text(text)
@@ -303,7 +303,7 @@ def test_a_broken_annotation_is_told_and_stops_nobody_else(
 
 
 @pytest.mark.parametrize("text", ["", "# nothing yet\n", "{}\n"])
-def test_an_empty_annotation_says_nothing(folder: Path, text: str) -> None:
+def test_empty_annotation_has_no_sections(folder: Path, text: str) -> None:
     (folder / "annotations" / "one.yaml").write_text(text)
     assert load_project(Path("config.yaml")).annotation("one") == Annotation()
 
@@ -329,7 +329,7 @@ def test_a_row_can_name_its_annotation(folder: Path) -> None:
     assert project.annotation("two") == Annotation()
 
 
-def test_one_pose_is_a_list_of_one() -> None:
+def test_single_pose_equals_a_list_with_one_pose() -> None:
     pose = {"frame": 3, "rotation_vector": [0, 0, 1], "translation": [0, 0, 2]}
     one = Annotation.model_validate({"object_pose": pose})
     several = Annotation.model_validate({"object_poses": [pose | {"frame": 5}, pose]})
@@ -373,8 +373,8 @@ def test_starts_of_cameras_that_are_not_there() -> None:
     stated = Annotation.model_validate({"starts": {"k1": 0, 2: {"seconds": -1.5, "sigma": 0.1}}})
     assert stated.stated_starts == {"k1": (0.0, 0.02), "2": (-1.5, 0.1)}
     assert stated.check_cameras(["k1", "2"], "k1") is None
-    said = str(stated.check_cameras(["k1", "k2", "k3"], "k1"))
-    assert said == "starts names camera '2'; the recording has k1, k2, k3"
+    fault = str(stated.check_cameras(["k1", "k2", "k3"], "k1"))
+    assert fault == "starts names camera '2'; the recording has k1, k2, k3"
     assert "lacks k3, the master" in str(stated.check_cameras(["k1", "2", "k3"], "k3"))
     assert Annotation().check_cameras(["k1"], "k1") is None and not Annotation().stated_starts
 

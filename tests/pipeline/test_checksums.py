@@ -42,12 +42,12 @@ for limit in range(0, 420_000, 7_001):  # bytes that the disk takes
             for _ in range(20):
                 rows.append(values)
         artefacts.put_made_from(path, "of this")
-        said = "whole"
+        outcome = "whole"
     except OSError as error:
-        said = "full" if fault_in(error) is not None else repr(error)
+        outcome = "full" if fault_in(error) is not None else repr(error)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    print(said, len(list(path.parent.iterdir())))
+    print(outcome, len(list(path.parent.iterdir())))
     path.unlink(missing_ok=True)
 unharmed.touch()
 """
@@ -114,7 +114,7 @@ def test_a_result_is_known_again_until_it_changes(summary: Path) -> None:
 
 
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.8])
-def test_a_flipped_bit_and_a_cut_are_found(summary: Path, share: float) -> None:
+def test_flipped_bits_and_truncation_are_detected(summary: Path, share: float) -> None:
     whole = summary.read_bytes()
     where = whole.rindex(b"\x78\x01", 0, int(share * len(whole)) + 4000)  # of compressed numbers
     flipped = bytearray(whole)
@@ -144,9 +144,9 @@ def test_a_full_disk_leaves_no_file_and_no_crash(tmp_path: Path) -> None:
         capture_output=True, text=True, cwd=Path(__file__).parents[2],
     )  # fmt: skip
     assert done.returncode == 0 and unharmed.is_file(), done.stderr[-2000:]
-    said = done.stdout.split("\n")[:-1]
-    assert set(said) == {"full 0", "whole 1"}
-    assert said == sorted(said), "more room, and yet it failed"
+    outcome = done.stdout.split("\n")[:-1]
+    assert set(outcome) == {"full 0", "whole 1"}
+    assert outcome == sorted(outcome), "more room, and yet it failed"
 
 
 def test_a_signal_during_a_write_ends_the_process_cleanly(tmp_path: Path) -> None:

@@ -121,7 +121,7 @@ def test_only_the_metrics_reach_the_truth() -> None:
     assert not [name for name in modules_reached("stages.metrics") if ".studio" in name]
 
 
-def test_the_core_knows_nothing_of_snakemake() -> None:
+def test_core_does_not_import_snakemake() -> None:
     for module in ("stages.joint", "stages.metrics"):
         for name in modules_reached(module):
             path = ROOT / Path(*name.split(".")[1:])
@@ -129,7 +129,7 @@ def test_the_core_knows_nothing_of_snakemake() -> None:
             assert "import snakemake" not in path.read_text(encoding="utf-8")
 
 
-def test_code_digest_is_about_files_not_about_where_they_are(package: Path, tmp_path: Path) -> None:
+def test_code_digest_is_independent_of_the_folder(package: Path, tmp_path: Path) -> None:
     moved = tmp_path / "elsewhere" / "intercap_core"
     shutil.copytree(package, moved)
     assert code_digest("stages.joint", root=package) == code_digest("stages.joint", root=moved)

@@ -1,4 +1,4 @@
-"""What a job of the workflow tells, beside others that write to the same stream."""
+"""Messages of a job on a stream that other processes write to."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Writes(io.StringIO):
         (ValueError("two\nlines"), "one: scene failed: unexpected ValueError: two\nlines; "),
     ],
 )
-def test_a_fault_is_told_by_one_write_that_begins_a_line(
+def test_fault_is_one_write_that_begins_a_line(
     fault: Exception, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stream = Writes()
@@ -39,10 +39,10 @@ def test_a_fault_is_told_by_one_write_that_begins_a_line(
     with pytest.raises(SystemExit) as left, job("one: scene", tmp_path / "logs" / "scene.log"):
         raise fault
     assert left.value.code == 1
-    (told,) = stream.each
+    (text,) = stream.each
     # another process may just have written a line without its end
-    assert told.startswith(f"\n{says}")
-    assert told.endswith("\n")
+    assert text.startswith(f"\n{says}")
+    assert text.endswith("\n")
     failure = last_failure(tmp_path / "logs")
     assert failure is not None
     assert says.splitlines()[0].partition("failed: ")[2] in failure

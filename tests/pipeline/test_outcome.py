@@ -70,9 +70,11 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
 
 
 def _logged(caplog: pytest.LogCaptureFixture) -> str:
-    """The last thing that was said."""
-    said = [r.getMessage() for r in caplog.records if r.name.startswith("intercap_core.pipeline")]
-    return said[-1]
+    """The last message of the pipeline."""
+    messages = [
+        r.getMessage() for r in caplog.records if r.name.startswith("intercap_core.pipeline")
+    ]
+    return messages[-1]
 
 
 def _of_folder(folder: Path) -> tuple[int, float]:
@@ -81,7 +83,7 @@ def _of_folder(folder: Path) -> tuple[int, float]:
     return len(files), sum(path.stat().st_size for path in files) / 1e6
 
 
-def test_page_export_and_dataset_say_one_line_too(
+def test_page_export_and_dataset_are_summarised_in_one_line(
     project: Project, caplog: pytest.LogCaptureFixture
 ) -> None:
     inputs = {stage: project.artefact("s01", stage) for stage in SEQUENCE_STAGES}
@@ -112,12 +114,12 @@ def test_page_export_and_dataset_say_one_line_too(
 
 
 @pytest.mark.parametrize("stage", SEQUENCE_STAGES)
-def test_a_stage_says_one_line(project: Project, stage: str) -> None:
-    said = outcome.line(stage, project.artefact("s01", stage))
-    assert said.startswith(SAYS[stage]) and "\n" not in said
+def test_each_stage_is_summarised_in_one_line(project: Project, stage: str) -> None:
+    summary = outcome.line(stage, project.artefact("s01", stage))
+    assert summary.startswith(SAYS[stage]) and "\n" not in summary
 
 
-def test_what_is_degraded_is_told_by_camera(project: Project) -> None:
+def test_degradations_are_reported_by_camera(project: Project) -> None:
     assert outcome.notes("scene", project.artefact("s01", "scene")) == [
         "camera k2: its pose is as given"
     ]
@@ -144,7 +146,7 @@ def test_a_run_ends_with_remarks_worst_first(
     assert "s01 (logs: " in printed and "k2: its pose is as given" in printed
 
 
-def test_what_was_only_logged_is_repeated_once(
+def test_logged_warnings_are_repeated_once(
     project: Project, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What the artefact says already is not. Logs are where one works."""
@@ -158,8 +160,8 @@ def test_what_was_only_logged_is_repeated_once(
         for _ in range(2):
             logger.warning("the floor is a guess")
     (found,) = remarks(project)
-    said = [text for text in found.texts if text.startswith("scene: ")]
-    assert said == ["scene: camera k2: its pose is as given", "scene: the floor is a guess"]
+    lines = [text for text in found.texts if text.startswith("scene: ")]
+    assert lines == ["scene: camera k2: its pose is as given", "scene: the floor is a guess"]
 
 
 def _warn(log: Path, *texts: str) -> None:
@@ -177,7 +179,7 @@ def _printed(project: Project) -> list[str]:
 def test_warnings_of_page_export_and_dataset_are_repeated(
     project: Project, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And what several stages warn of, each that opens a mesh, is said once."""
+    """A warning that several stages log for one mesh is repeated once."""
     monkeypatch.chdir(tmp_path)
     for stage in ("page", "export"):
         folder = project.artefact("s01", stage)

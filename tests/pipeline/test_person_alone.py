@@ -67,7 +67,7 @@ def _open(project: Project, stage: str) -> h5py.File:
     return h5py.File(project.artefact(NAME, stage))
 
 
-def test_no_stage_says_anything_of_an_object(project: Project) -> None:
+def test_no_stage_reports_an_object(project: Project) -> None:
     with _open(project, "object_track") as track, _open(project, "joint") as joint:
         assert (track.attrs["object"], track.attrs["seed_source"]) == (b"", b"none")
         assert b"names no object" in track.attrs["doubts"]
@@ -76,10 +76,10 @@ def test_no_stage_says_anything_of_an_object(project: Project) -> None:
             assert np.isnan(file["rotation"]).all() and np.isnan(file["translation"]).all()
         assert joint.attrs["object"] == b"" and np.isnan(joint["contact_probability"]).all()
     with _open(project, "metrics") as metrics:
-        told = {*metrics, *metrics["truth"], *metrics["truth/joint"]}
-        told.discard("ground_penetration")
+        content = {*metrics, *metrics["truth"], *metrics["truth/joint"]}
+        content.discard("ground_penetration")
         of_object = ("object", "contact", "penetration", "slip")
-        assert not [key for key in told if any(word in key for word in of_object)]
+        assert not [key for key in content if any(word in key for word in of_object)]
 
 
 def test_the_body_is_fitted_with_its_own_terms(project: Project) -> None:
@@ -96,10 +96,10 @@ def test_the_body_is_fitted_with_its_own_terms(project: Project) -> None:
         assert "no images" not in {reason.decode() for reason in metrics["flag_reason"]}
 
 
-def test_what_is_said_of_the_stages(project: Project) -> None:
-    said = {stage: line(stage, project.artefact(NAME, stage)) for stage in SEQUENCE_STAGES}
-    assert said["object_track"].startswith("no object: the sequence names no object")
-    assert "the body alone, without an object" in said["joint"] and "contact" not in said["joint"]
+def test_summaries_of_the_stages_omit_the_object(project: Project) -> None:
+    lines = {stage: line(stage, project.artefact(NAME, stage)) for stage in SEQUENCE_STAGES}
+    assert lines["object_track"].startswith("no object: the sequence names no object")
+    assert "the body alone, without an object" in lines["joint"] and "contact" not in lines["joint"]
     assert not notes("object_track", project.artefact(NAME, "object_track"))  # as was asked for
 
 
@@ -111,20 +111,20 @@ def test_files_for_other_tools_hold_the_body(project: Project) -> None:
     named = json.loads((folder / "coco" / "annotations.json").read_text())
     people = {kind["id"] for kind in named["categories"] if kind["name"] == "person"}
     assert named["annotations"]
-    assert {one["category_id"] for one in named["annotations"]} == people
+    assert {entry["category_id"] for entry in named["annotations"]} == people
     result = pickle.loads((folder / "intercap" / "res.pkl").read_bytes())
     assert len(result["transl"]) == 6 and not {"ob_pose", "ob_trans"} & result.keys()
     text = (folder / "README.txt").read_text()
     assert "bop is omitted" in text and "contact is omitted" in text
     assert "object pose" not in text and "Object mesh" not in text
-    told = json.loads((folder / "export.json").read_text())
-    assert (told["object"], told["formats"]) == ("", ["amass", "coco", "glb", "intercap"])
+    content = json.loads((folder / "export.json").read_text())
+    assert (content["object"], content["formats"]) == ("", ["amass", "coco", "glb", "intercap"])
     data = (folder / "glb" / f"{NAME}.glb").read_bytes()
     length = int.from_bytes(data[12:16], "little")
     assert [mesh["name"] for mesh in json.loads(data[20 : 20 + length])["meshes"]] == ["body"]
 
 
-def test_a_person_alone_counts_who_has_come_to_the_export(project: Project) -> None:
+def test_sequence_without_object_counts_as_exported(project: Project) -> None:
     def share() -> float:
         found = field.measure(project, NAME)
         return field.flat([Measured(field.ALONE, [found])])["field.people_alone_share"]
@@ -210,23 +210,23 @@ def test_a_script_and_an_object_must_fit(project: Project, tmp_path: Path) -> No
     root = project.path.parent
     text = text.replace("s04\t\t", "s04\tcup\t").replace("results/trial", f"{root}/results/trial")
     (tmp_path / "sequences.tsv").write_text(text)
-    told = [str(fault) for fault in faults_of_sequences(load_project(tmp_path / "config.yaml"))]
-    assert any("needs no object, the sequence has 'cup'" in line for line in told)
+    faults = [str(fault) for fault in faults_of_sequences(load_project(tmp_path / "config.yaml"))]
+    assert any("needs no object, the sequence has 'cup'" in line for line in faults)
 
 
-def test_what_is_given_away_is_listed_and_checked(
+def test_release_lists_and_verifies_its_files(
     project: Project, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     path = write_release(project, KINDS)
     assert path == project.results / "release.json"
     assert "no licence is stated" in caplog.text and "several" not in caplog.text
-    told = json.loads(path.read_text())
-    assert told["sequences"] == [NAME] and told["dataset"] == "trial"
-    kinds = {one["kind"] for one in told["files"]}
+    content = json.loads(path.read_text())
+    assert content["sequences"] == [NAME] and content["dataset"] == "trial"
+    kinds = {entry["kind"] for entry in content["files"]}
     assert kinds == {"card", "tables", "site", "export", "artefact"}
-    assert not any("truth" in one["path"] or "mkv" in one["path"] for one in told["files"])
+    assert not any("truth" in entry["path"] or "mkv" in entry["path"] for entry in content["files"])
     assert str(project.path.parent) not in path.read_text()  # no folder of this machine
-    assert set(told["inputs"]) >= {"sequences.tsv", "subjects.tsv", "objects.yaml"}
+    assert set(content["inputs"]) >= {"sequences.tsv", "subjects.tsv", "objects.yaml"}
     assert check_release(project.results)
     card = project.results / "card.md"
     text = card.read_text()

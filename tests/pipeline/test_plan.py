@@ -48,7 +48,7 @@ def test_of_a_sequence_without_results_no_recording_is_read(
     assert not Plan(project).all_done() and Plan(project).mark("s01", "joint") == []
 
 
-def test_a_broken_annotation_holds_all_stages_up_and_is_named(project: Project) -> None:
+def test_broken_annotation_makes_all_stages_wait(project: Project) -> None:
     path = project.annotation_path("s01")
     path.parent.mkdir()
     path.write_text("contact: [{part: seat, start: 4, end: 2}]\n")
@@ -58,7 +58,7 @@ def test_a_broken_annotation_holds_all_stages_up_and_is_named(project: Project) 
     assert Plan(project).annotation_fault("s01") == ""
 
 
-def test_what_lies_beside_a_mesh_is_part_of_what_is_recorded(project: Project) -> None:
+def test_companion_files_of_a_mesh_are_in_the_manifest(project: Project) -> None:
     def files() -> dict[str, str]:
         made_from = stage_inputs.stage_manifest(
             project, "s01", "object_track", project.annotation("s01"),

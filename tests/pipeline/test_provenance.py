@@ -1,4 +1,4 @@
-"""Records of what an output was made from: kept with it, compared in words, damage told."""
+"""Manifests: stored with the output, compared in words, damage detected."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def _artefact(path: Path) -> Path:
     return path
 
 
-def test_a_record_comes_back_and_changes_nothing_else(tmp_path: Path) -> None:
+def test_manifest_round_trip_keeps_the_artefact(tmp_path: Path) -> None:
     path = _artefact(tmp_path / "x.h5")
     assert read_manifest(path) is None
     write_manifest(path, MADE)
@@ -62,7 +62,7 @@ def test_equal_inputs_give_equal_bytes(tmp_path: Path) -> None:
     assert one.read_bytes() == two.read_bytes()
 
 
-def test_the_machine_is_told_and_decides_nothing() -> None:
+def test_machine_does_not_change_the_fingerprint() -> None:
     other = replace(MADE, machine={"cpu": "two", "device": "cuda"})
     assert other.fingerprint == MADE.fingerprint and other.to_text() != MADE.to_text()
     assert other.differences(MADE) == []
@@ -84,7 +84,7 @@ def test_the_machine_is_told_and_decides_nothing() -> None:
         ({"artefacts": {"frames": "F", "scene": "s"}}, "frames changed"),
     ],
 )  # fmt: skip
-def test_what_differs_is_named(changed: dict, words: str) -> None:
+def test_differences_are_named(changed: dict, words: str) -> None:
     now = replace(MADE, **changed)
     assert now.fingerprint != MADE.fingerprint
     assert now.differences(MADE) == [words]
@@ -130,9 +130,9 @@ def test_a_damaged_record_is_none(tmp_path: Path) -> None:
 
 def test_texts_lie_in_no_heap(tmp_path: Path) -> None:
     with h5py.File(_artefact(tmp_path / "x.h5"), "r") as file:
-        for thing in (file, file["a"]):
-            for name in thing.attrs:
-                info = h5py.check_string_dtype(thing.attrs.get_id(name).dtype)
+        for item in (file, file["a"]):
+            for name in item.attrs:
+                info = h5py.check_string_dtype(item.attrs.get_id(name).dtype)
                 assert info is None or info.length is not None, name
 
 

@@ -45,7 +45,7 @@ def project(**settings: object) -> Project:
 
 
 @pytest.mark.parametrize(("stage", "frames", "cameras", "peak"), MEASURED)
-def test_what_was_measured_fits_with_a_margin(
+def test_requests_exceed_the_measured_memory(
     stage: str, frames: int, cameras: int, peak: int
 ) -> None:
     asked = memory_mb(project(), stage, Extent(frames, cameras))
@@ -61,7 +61,7 @@ def test_requests_grow_with_length_and_attempt(stage: str) -> None:
         assert ask(tiny, stage, LONG, 3) == 3 * first
 
 
-def test_what_a_user_raises_still_grows() -> None:
+def test_scaled_memory_grows_with_attempts() -> None:
     raised = project(cluster={"memory_scale": {"joint": 2, "all": 1.5}, "time_scale": {"joint": 3}})
     for stage, times in (("joint", 2), ("metrics", 1.5)):
         for attempt in (1, 2, 3):
@@ -73,7 +73,7 @@ def test_what_a_user_raises_still_grows() -> None:
     assert minutes(raised, "metrics", LONG) == minutes(project(), "metrics", LONG)
 
 
-def test_stages_on_a_gpu_are_those_of_the_settings() -> None:
+def test_gpu_stages_follow_the_settings() -> None:
     def found(**settings: object) -> set[str]:
         return {stage for stage in JOBS if on_gpu(project(**settings), stage)}
 
@@ -99,7 +99,7 @@ def test_the_extent_of_frames_that_are_read_is_theirs(tmp_path: Path) -> None:
     assert extent_of(read, "s1") == Extent(4, 2)
 
 
-def test_megabytes_of_recordings_are_those_of_videos(tmp_path: Path) -> None:
+def test_recorded_megabytes_count_videos(tmp_path: Path) -> None:
     assert recorded_mb(tmp_path / "missing") == 0
     for name in ("k1.mkv", "k2.mkv", "notes.txt"):
         (tmp_path / name).write_bytes(b"0" * 500_000)

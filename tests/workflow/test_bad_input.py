@@ -42,7 +42,7 @@ def computed(flow: Flow, sequence: str) -> dict[str, bytes]:
     return {stage: flow.artefact(sequence, stage).read_bytes() for stage in STAGES}
 
 
-def test_an_unreadable_recording_fails_alone(recorded: Flow, flow: Flow) -> None:
+def test_unreadable_recording_fails_only_its_sequence(recorded: Flow, flow: Flow) -> None:
     printed = recorded.transcript.read_text()
     line = next(line for line in printed.splitlines() if line.startswith(f"{OTHER}: frames"))
     assert "no camera in captures/cup_drink_s04 can be used" in line
