@@ -7,7 +7,6 @@ import numpy as np
 from intercap_core.body.keypoints import CONTOUR, FACE, KeypointMap
 
 BODY_JOINTS = slice(0, 22)
-WRISTS = (20, 21)
 FOOT_JOINTS = (7, 8, 10, 11)  # ankles and balls
 FINGER_JOINTS = (slice(25, 40), slice(40, 55))  # left, right
 BOTH_HANDS = slice(25, 55)
@@ -84,7 +83,7 @@ def hand_error(
         align_wrists: first translate the fitted hand so that its wrist is at the true wrist.
     """
     errors = []
-    for side, wrist in enumerate(WRISTS):
+    for side, wrist in enumerate((20, 21)):
         at = slice(5 * side, 5 * side + 5)
         fitted = np.concatenate([joints[..., FINGER_JOINTS[side], :], tips[..., at, :]], -2)
         true = np.concatenate([true_joints[..., FINGER_JOINTS[side], :], true_tips[..., at, :]], -2)

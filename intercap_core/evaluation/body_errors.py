@@ -32,9 +32,7 @@ from intercap_core.geometry.rigid.surfaces import sample_surface
 from intercap_core.schemas import SCENE, TRUTH
 from intercap_core.sequence_inputs import SequencePaths
 
-EVERY = 5  # every fifth frame is compared with its points: neighbours are redundant
-SURFACE_SAMPLES = 4000  # area samples of the body
-CLOUD_POINTS = 3000  # at most, evenly thinned
+EVERY = 5  # every fifth frame is compared with its points: neighbouring frames are redundant
 CLOUD_KEYS = (
     "cloud_to_mesh", "mesh_to_cloud_visible", "cloud_to_mesh_floor", "mesh_to_cloud_visible_floor",
 )  # fmt: skip
@@ -59,7 +57,7 @@ class BodyClouds:
         self._faces = model.faces.numpy()
         template = model.template.numpy().astype(np.float64)
         self._tree = SurfaceTree(template, self._faces)
-        self._samples = sample_surface(template, self._faces, SURFACE_SAMPLES)
+        self._samples = sample_surface(template, self._faces, 4000)
 
     @classmethod
     @contextlib.contextmanager
@@ -91,7 +89,7 @@ class BodyClouds:
         if not len(person):
             return dict.fromkeys(CLOUD_KEYS, np.nan)
         cloud = MeasuredCloud(person)
-        chosen = person[:: -(-len(person) // CLOUD_POINTS)].astype(np.float64)
+        chosen = person[:: -(-len(person) // 3000)].astype(np.float64)
         seen = self._seen(t, true, truth)
         found = {}
         for floor, surface in (("", fitted), ("_floor", true)):

@@ -57,7 +57,8 @@ def compare(old: Path, new: Path) -> Comparison:
         except UserError as error:
             row, changed = {"state": UNLIKE, "note": str(error)}, pd.DataFrame()
         rows.append({NAME: name, **row})
-        frames.append(changed)
+        if len(changed):
+            frames.append(changed)
     columns = [
         NAME, "state", "frames", "changed_frames", "body_mm", "body_max_mm", "hands_mm",
         "object_mm", "object_max_mm", "object_deg", "contact_frames_before",
@@ -72,13 +73,13 @@ def compare(old: Path, new: Path) -> Comparison:
     table["note"] = table["note"].fillna("")
     worst = table[["body_max_mm", "object_max_mm"]].max(axis=1)
     share = table["changed_frames"] / table["frames"]
-    order = pd.DataFrame({"told": table["state"].isin([ADDED, REMOVED, UNLIKE]), "share": share,
-                          "worst": worst}).fillna(-1)  # fmt: skip
-    table = table.loc[order.sort_values(["told", "share", "worst"], ascending=False).index]
-    found = [one for one in frames if len(one)]
+    incomparable = table["state"].isin([ADDED, REMOVED, UNLIKE])
+    keys = ["incomparable", "share", "worst"]
+    order = pd.DataFrame(dict(zip(keys, (incomparable, share, worst), strict=True))).fillna(-1)
+    table = table.loc[order.sort_values(keys, ascending=False).index]
     return Comparison(
         table.reset_index(drop=True),
-        pd.concat(found, ignore_index=True) if found else pd.DataFrame(columns=[NAME, FRAME]),
+        pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=[NAME, FRAME]),
         _figures(old, new),
     )
 
@@ -88,10 +89,10 @@ def _figures(old: Path, new: Path) -> pd.DataFrame:
     both = []
     for folder in (old, new):
         try:
-            told = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+            summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return pd.DataFrame(columns=["figure", "old", "new"])
-        both.append(dict(_numbers(told)))
+        both.append(dict(_numbers(summary)))
     before, after = both
     rows = [(name, before[name], after[name]) for name in before if name in after]
     return pd.DataFrame(rows, columns=["figure", "old", "new"])
@@ -132,7 +133,7 @@ def _compare_one(name: str, old: Path, new: Path) -> tuple[dict[str, object], pd
             | (table["touches_no_more"] != "")
             | (table["flag_before"] != table["flag_after"])
         )
-        touching = [np.any(_touching(one), axis=1) for one in (before, after)]
+        touching = [np.any(_touching(joint), axis=1) for joint in (before, after)]
     contact = (table["touches"] != "") | (table["touches_no_more"] != "")
     row: dict[str, object] = {
         "state": CHANGED if changed.any() else SAME,

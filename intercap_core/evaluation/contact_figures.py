@@ -93,10 +93,6 @@ def _share(part: float, whole: float) -> float:
     return part / whole if whole else float("nan")
 
 
-# An error counts as worse if it grows by more than this share and by more than these amounts.
-WORSE_SHARE, WORSE_MM, WORSE_DEG = 0.05, 0.2, 0.1
-
-
 def hold_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figures:
     """Slip of touching skin, motion of planted feet and joint errors after ``stage``.
 
@@ -164,19 +160,22 @@ def _stated_and_true(
 
 
 def worse_objects(sequences: Sequence[SequenceMetrics]) -> list[str]:
-    """Objects whose median or 95th percentile pose error is larger after ``joint`` than tracked."""
+    """Objects whose median or 95th percentile pose error is larger after ``joint`` than tracked.
+
+    Larger by more than 5 %, and by more than 0.2 mm or 0.1 degrees.
+    """
     limits = {
-        "object_translation_mm": WORSE_MM,
-        "object_translation_p95_mm": WORSE_MM,
-        "object_rotation_deg": WORSE_DEG,
-        "object_rotation_p95_deg": WORSE_DEG,
+        "object_translation_mm": 0.2,
+        "object_translation_p95_mm": 0.2,
+        "object_rotation_deg": 0.1,
+        "object_rotation_p95_deg": 0.1,
     }
     found = []
     for name in sorted({s.object_ for s in sequences if s.has_truth}):
         some = [s for s in sequences if s.has_truth and s.object_ == name]
         before, after = (object_figures(some, stage) for stage in ("object_track", "joint"))
         if any(
-            after[key] - before[key] > max(WORSE_SHARE * before[key], limit)
+            after[key] - before[key] > max(0.05 * before[key], limit)
             for key, limit in limits.items()
             if key in before and key in after
         ):

@@ -53,16 +53,16 @@ class SequenceMetrics:
     @classmethod
     def of(cls, artefact: Artefact) -> SequenceMetrics:
         """Read from an open metrics or summary artefact."""
-        told = artefact.attributes
+        stated = artefact.attributes
         values = {
             key: artefact[key]
             for key in artefact.keys()  # noqa: SIM118 (not a dict)
             if key in METRICS.fields and key not in _PER_VERTEX
         }
         return cls(
-            str(told["sequence"]), str(told["subject"]), str(told["object"]),
-            float(told["fps"]), bool(told["has_truth"]), values,
-            str(told.get("made_by", "")),
+            str(stated["sequence"]), str(stated["subject"]), str(stated["object"]),
+            float(stated["fps"]), bool(stated["has_truth"]), values,
+            str(stated.get("made_by", "")),
         )  # fmt: skip
 
     def __len__(self) -> int:

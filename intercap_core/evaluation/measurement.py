@@ -29,12 +29,7 @@ from intercap_core.schemas import CONTACT_REGIONS
 
 log = logging.getLogger(__name__)
 
-# Area samples of the surfaces that are compared with the clouds
-BODY_SAMPLES = 4000
-VISIBILITY_SAMPLES = 2000  # of the object
 SAMPLE_SPACING_M = 0.006  # of the object's contact samples; resolves the touch of a fingertip
-MAX_OBJECT_SAMPLES = 20000
-CLOUD_POINTS = 3000  # at most, of the person, compared with the body's surface
 
 Values = dict[str, Any]
 
@@ -52,9 +47,9 @@ class HandledObject:
             ),
             axis=1,
         ).sum()
-        count = int(np.clip(area / 2 / SAMPLE_SPACING_M**2, 500, MAX_OBJECT_SAMPLES))
+        count = int(np.clip(area / 2 / SAMPLE_SPACING_M**2, 500, 20000))
         self.points = sample_surface(mesh.vertices, mesh.faces, count).of(mesh.vertices, mesh.faces)
-        self.samples = sample_surface(mesh.vertices, mesh.faces, VISIBILITY_SAMPLES)
+        self.samples = sample_surface(mesh.vertices, mesh.faces, 2000)
         self.sample_points = self.samples.of(mesh.vertices, mesh.faces)
         self.sample_normals = mesh.face_normals[self.samples.faces]
 
@@ -85,7 +80,7 @@ class Measurement:
         self.faces = body_track.model.faces.numpy()
         template = body_track.model.template.numpy().astype(np.float64)
         self.tree = SurfaceTree(template, self.faces)
-        self.body_samples = sample_surface(template, self.faces, BODY_SAMPLES)
+        self.body_samples = sample_surface(template, self.faces, 4000)
 
     def over_frames(self, floor: tuple[np.ndarray, np.ndarray], truth: Truth | None) -> Values:
         """Values by dataset of the metrics artefact.
@@ -207,7 +202,7 @@ class Measurement:
             assert sight is not None
             normals = face_normals(vertices, self.faces)[self.body_samples.faces]
             seen_body = sight.seen(body_points, normals, self.rig.cameras)
-        step = max(1, len(person.points) // CLOUD_POINTS)
+        step = max(1, len(person.points) // 3000)
         chosen = person.points[::step].astype(np.float64)
         back = surface.distance(chosen)
         row: Values = {

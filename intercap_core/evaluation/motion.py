@@ -14,11 +14,9 @@ import numpy as np
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 
 REFERENCE_FPS = 30.0
-# Speeds below which the true object rests
-REST_SPEED = 0.02  # m/s
-REST_TURN = np.radians(5.0)  # rad/s
+REST_SPEED = 0.02  # m/s, below which the true object rests
+REST_TURN = np.radians(5.0)  # rad/s, below which the true object rests
 ONSET_M = 0.010  # the object has started to move at this distance from its resting place
-MIN_REST_S = 0.2
 
 
 def second_difference(positions: np.ndarray, fps: float) -> np.ndarray:
@@ -104,7 +102,7 @@ def motion_onset_lags(
         end = start
         while end < total and is_moving[end] == is_moving[start]:
             end += 1
-        rested = not is_moving[start] and end < total and end - start >= max(2, MIN_REST_S * fps)
+        rested = not is_moving[start] and end < total and end - start >= max(2, 0.2 * fps)
         if rested:
             over = end
             while over < total and is_moving[over]:
@@ -164,11 +162,6 @@ def slip_speed(
     return found
 
 
-# A true sole vertex carries weight below this height above the floor and below this speed.
-SUPPORT_HEIGHT_M, SUPPORT_SPEED_M_S = 0.015, 0.05
-STANDING_SHARE = 0.1  # of a sole's vertices that must carry weight; toes or a heel alone suffice
-
-
 @dataclass(frozen=True)
 class Floor:
     """The plane normal . x + offset = 0."""
@@ -192,17 +185,18 @@ def support(
 ) -> np.ndarray:
     """Mask (T - 1, S) of the sole vertices that carry weight from one frame to the next.
 
-    All False for the frames in which the foot does not stand.
+    A vertex carries weight below 15 mm and 50 mm/s. A foot stands if a tenth of its vertices do:
+    toes or a heel alone suffice. All False while it does not stand.
 
     Args:
         true_sole: (T, S, 3) vertices of a true sole, metres.
         level: (T,) height above the floor of the surface under the sole, metres; None = the floor.
     """
     above = floor.height(true_sole) if level is None else floor.height(true_sole) - level[:, None]
-    low = above < SUPPORT_HEIGHT_M
+    low = above < 0.015
     speed = np.linalg.norm(np.diff(true_sole, axis=0), axis=-1) * fps
-    carrying = low[1:] & low[:-1] & (speed < SUPPORT_SPEED_M_S)
-    carrying[carrying.mean(1) < STANDING_SHARE] = False
+    carrying = low[1:] & low[:-1] & (speed < 0.05)
+    carrying[carrying.mean(1) < 0.1] = False
     return carrying
 
 

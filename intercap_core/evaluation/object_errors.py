@@ -12,15 +12,9 @@ from scipy.spatial import cKDTree
 from intercap_core import artefacts
 from intercap_core.evaluation import motion, object_pose
 from intercap_core.evaluation.tracks import read_object
-from intercap_core.evaluation.truth import match_times
+from intercap_core.evaluation.truth import match_times, object_errors
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.schemas import OBJECT_TRACK, SCENE, TRUTH
-
-SURFACE_POINTS = 500  # maximal number of vertices for ADD-S and MSSD
-ADD_S_SHARE = 0.1  # of the diameter: the usual threshold of ADD-S
-# Thresholds of MSSD over the diameter whose recalls are averaged (BOP challenge 2019)
-MSSD_SHARES = np.arange(1, 11) * 0.05
-VIEW_BINS = ((0, 1), (2, 2), (3, 3), (4, 4), (5, 5), (6, 99))
 
 Figures = dict[str, float]
 
@@ -77,53 +71,34 @@ def measure(scene: Path, object_track: Path, truth: Path, mesh: ObjectMesh) -> O
         at = match_times(truth, true["times"], found["times"], fps)
         rotation, translation = true["rotation"][at], true["translation"][at]
         views = true["object_views"][at]
-    centre, true_centre = (
-        object_pose.posed_point(r, t, mesh.centre_of_mass)
-        for r, t in ((track.rotation, track.translation), (rotation, translation))
-    )
-    moves = motion.moving(rotation, true_centre, fps)
-    if not track.known:
-        beyond, unknown = np.full(len(at), np.inf), np.full(len(at), np.nan)
-        return ObjectErrors(
-            sequence=sequence,
-            object_=mesh.name,
-            fps=fps,
-            translation=beyond,
-            rotation=beyond,
-            turn=unknown,
-            centre=centre,
-            true_centre=true_centre,
-            views=views,
-            moves=moves,
-            flagged=track.flagged,
-            add_s=beyond,
-            mssd=beyond,
-        )
-    points = mesh.vertices[:: -(-len(mesh.vertices) // SURFACE_POINTS)]
-    poses = (track.rotation, track.translation, rotation, translation)
-    normalised = normalised_turn = None
-    if track.covariance is not None:
-        normalised = object_pose.normalised_translation_error(
-            track.translation, translation, track.covariance
-        )
-        normalised_turn = object_pose.normalised_rotation_error(
-            track.rotation, rotation, track.covariance, mesh.symmetry
-        )
+    errors = object_errors(rotation, translation, track, mesh, fps)
+    true_centre = object_pose.posed_point(rotation, translation, mesh.centre_of_mass)
+    normalised_turn = None
+    add = worst = np.full(len(at), np.inf)
+    if track.known:
+        points = mesh.vertices[:: -(-len(mesh.vertices) // 500)]
+        poses = (track.rotation, track.translation, rotation, translation)
+        add = add_s(points, *poses) / mesh.diameter
+        worst = mssd(points, *poses, mesh) / mesh.diameter
+        if track.covariance is not None:
+            normalised_turn = object_pose.normalised_rotation_error(
+                track.rotation, rotation, track.covariance, mesh.symmetry
+            )
     return ObjectErrors(
         sequence=sequence,
         object_=mesh.name,
         fps=fps,
-        translation=object_pose.centre_error(centre, true_centre),
-        rotation=object_pose.rotation_error_deg(track.rotation, rotation, mesh.symmetry),
-        turn=np.append(np.nan, motion.turns(track.rotation, rotation, mesh.symmetry)),
-        centre=centre,
+        translation=errors["object_translation"],
+        rotation=errors["object_rotation"],
+        turn=errors["object_turn"],
+        centre=errors["object_centre"],
         true_centre=true_centre,
         views=views,
-        moves=moves,
+        moves=motion.moving(rotation, true_centre, fps),
         flagged=track.flagged,
-        add_s=add_s(points, *poses) / mesh.diameter,
-        mssd=mssd(points, *poses, mesh) / mesh.diameter,
-        normalised=normalised,
+        add_s=add,
+        mssd=worst,
+        normalised=errors.get("object_normalised"),
         normalised_turn=normalised_turn,
     )
 
@@ -196,8 +171,9 @@ def figures(recordings: Sequence[ObjectErrors]) -> Figures:
                 found[f"{key}_p95_{unit}"] = float(np.percentile(values, 95))
     add, worst = _pooled([r.add_s for r in recordings]), _pooled([r.mssd for r in recordings])
     if len(add):
-        found["add_s_recall"] = float((add < ADD_S_SHARE).mean())
-        found["mssd_recall"] = float((worst[:, None] < MSSD_SHARES).mean())
+        found["add_s_recall"] = float((add < 0.1).mean())  # the usual threshold
+        # recall averaged over the thresholds of the BOP challenge 2019
+        found["mssd_recall"] = float((worst[:, None] < np.arange(1, 11) * 0.05).mean())
     for name, errors_ in (
         ("normalised_median", [r.normalised for r in recordings]),
         ("normalised_turn_median", [r.normalised_turn for r in recordings]),
@@ -222,7 +198,7 @@ def by_views(recordings: Sequence[ObjectErrors]) -> dict[str, Figures]:
         np.concatenate([getattr(r, k) for r in recordings]) for k in ("translation", "rotation")
     )
     found = {}
-    for low, high in VIEW_BINS:
+    for low, high in ((0, 1), (2, 2), (3, 3), (4, 4), (5, 5), (6, 99)):
         here = (views >= low) & (views <= high)
         if here.any():
             name = str(low) if low == high else f"{low}+" if high > 90 else f"{low}-{high}"

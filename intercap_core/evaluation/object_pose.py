@@ -8,11 +8,8 @@ from intercap_core.evaluation.body import MEDIAN_CHI_3
 from intercap_core.geometry.camera.transforms import rotation_log
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 
-LOST_TRANSLATION_M = 0.050
-LOST_ROTATION_DEG = 20.0
-FOUND_TRANSLATION_M = 0.020
-FOUND_ROTATION_DEG = 10.0
-UNKNOWN_TURN_DEG = 30.0  # an axis with a larger stated deviation is not determined
+LOST_TRANSLATION_M = 0.050  # a pose with a larger error is lost
+LOST_ROTATION_DEG = 20.0  # a pose with a larger error is lost
 
 
 def posed_point(rotation: np.ndarray, translation: np.ndarray, point: np.ndarray) -> np.ndarray:
@@ -58,10 +55,7 @@ def first_seen_found(
     if len(seen) == 0:
         return None
     first = seen[0]
-    return bool(
-        translation_error_m[first] < FOUND_TRANSLATION_M
-        and rotation_error_degrees[first] < FOUND_ROTATION_DEG
-    )
+    return bool(translation_error_m[first] < 0.020 and rotation_error_degrees[first] < 10.0)
 
 
 def normalised_translation_error(
@@ -92,7 +86,7 @@ def normalised_rotation_error(
 ) -> np.ndarray:
     """Mahalanobis length (T,) of the rotation error over its median; 1 if calibrated.
 
-    Axes with a stated deviation above ``UNKNOWN_TURN_DEG`` are excluded. NaN if all are.
+    Axes with a stated deviation above 30 degrees are undetermined and excluded. NaN if all are.
     """
     from scipy.stats import chi  # takes a second to import, which most processes do not need
 
@@ -103,7 +97,7 @@ def normalised_rotation_error(
         if not np.isfinite(block).all():
             continue
         variance, axes = np.linalg.eigh(block)
-        known = (variance > 0) & (variance < np.radians(UNKNOWN_TURN_DEG) ** 2)
+        known = (variance > 0) & (variance < np.radians(30.0) ** 2)
         if known.any():
             length = np.sqrt(((error[t] @ axes[:, known]) ** 2 / variance[known]).sum())
             result[t] = length / chi(int(known.sum())).median()

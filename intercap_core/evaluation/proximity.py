@@ -41,7 +41,6 @@ def visible_to_cloud(points: np.ndarray, visible: np.ndarray, cloud: MeasuredClo
 
 REACH_M = 0.10  # distances outside are capped here: no reported figure needs larger distances
 DEEPEST_M = 0.25  # depths inside are capped here
-_LIFT_M = 0.002  # a visibility ray starts this far off the surface, clear of its own triangle
 
 
 class PosedObject:
@@ -144,7 +143,7 @@ class Sight:
             ids = ids[lens.sees(apply(camera_from_master, points[ids]))]
             if len(ids) == 0:
                 continue
-            start = points[ids] + _LIFT_M * normals[ids]
+            start = points[ids] + 0.002 * normals[ids]  # clear of its own triangle
             hidden = np.zeros(len(ids), bool)
             for surface in self._surfaces:
                 surface.blocks(start, np.broadcast_to(eye, start.shape), hidden)

@@ -50,9 +50,7 @@ def displacement(
 
 
 CAPTURE_RADIUS_M = 1.5  # of the capture area on the floor around the rig's centre
-_RINGS, _SPOKES = 40, 90  # grid of the floor points at which heights are compared
 MEDIAN_CHI_1 = 0.6745  # median of |x| for a standard normal x
-_WORSE_M = 1e-6  # changes below this are rounding
 
 
 @dataclass(frozen=True)
@@ -174,8 +172,8 @@ def ground_error(
     across /= np.linalg.norm(across)
     along = np.cross(true_normal, across)
     # Rings of equal area: all points have the same weight
-    radius = CAPTURE_RADIUS_M * np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS)
-    angle = 2 * np.pi * np.arange(_SPOKES) / _SPOKES
+    radius = CAPTURE_RADIUS_M * np.sqrt((np.arange(40) + 0.5) / 40)
+    angle = 2 * np.pi * np.arange(90) / 90
     u, v = (np.outer(radius, f(angle)).ravel()[:, None] for f in (np.cos, np.sin))
     places = foot + u * across + v * along
     height = (point - places) @ normal / (true_normal @ normal)
@@ -259,8 +257,8 @@ def figures(captures: Sequence[CaptureErrors]) -> dict[str, float]:
     several = [c for c in captures if len(c.after)]
     if several:
         change = np.array([c.after.mean() - c.before.mean() for c in several])
-        found["extrinsics_improved_share"] = float((change < -_WORSE_M).mean())
-        found["extrinsics_worse_share"] = float((change > _WORSE_M).mean())
+        found["extrinsics_improved_share"] = float((change < -1e-6).mean())
+        found["extrinsics_worse_share"] = float((change > 1e-6).mean())
     offset = _joined([c.offset for c in captures])
     if len(offset):
         found["offset_error_ms"] = 1e3 * float(np.abs(offset).mean())

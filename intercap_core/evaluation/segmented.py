@@ -5,14 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import numba
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.evaluation import segmented_kernel
 from intercap_core.formats.detections.read import Detections
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.mask_pixels import mask_pixels, mask_window
 from intercap_core.geometry.camera.masks import Runs
+from intercap_core.geometry.camera.projection import MIN_DEPTH_M
+from intercap_core.geometry.camera.projection_kernels import project_point
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.schemas import OBJECT_TRACK, PERSON
 from intercap_core.sequence_inputs import SequencePaths
@@ -81,7 +83,7 @@ class _Space:
         lens = camera.depth
         if lens is None:
             return None
-        least, most = segmented_kernel.extent(
+        least, most = _extent(
             np.asarray(near, np.float64), camera.depth_from_master, tuple(lens.parameters.tolist())
         )
         if not np.isfinite(least[2]):
@@ -103,7 +105,7 @@ class _Space:
         ``index`` (M,) are flat indices of ``depth`` (H, W), millimetres.
         """
         assert camera.depth is not None
-        return segmented_kernel.placed(
+        return _placed(
             depth,
             index,
             camera.depth.rays,
@@ -192,3 +194,67 @@ def read_clouds(
         for t in range(total)
     ]
     return SegmentedClouds(images, rig, read_person_masks(paths.person), candidates, depth_bias)
+
+
+@numba.njit(cache=True, nogil=True)
+def _extent(points, pose, lens):
+    """Minimum and maximum (2,3) of column, row and depth (metres) of the points in the image.
+
+    The minimum is infinite if no point is in the image. All arrays are float64.
+
+    Args:
+        points: (M,3).
+        pose: (4,4) camera_from_points.
+        lens: (13,) lens parameters.
+    """
+    found = np.empty((2, 3))
+    found[0], found[1] = np.inf, -np.inf
+    limit = lens[12]
+    place = np.empty(3)
+    for point in points:
+        for k in range(3):
+            place[k] = pose[k, 3]
+            for m in range(3):
+                place[k] += pose[k, m] * point[m]
+        x, y, z = place
+        if not (z > MIN_DEPTH_M and x * x + y * y <= (limit * z) ** 2):
+            continue
+        u, v = project_point(x, y, z, lens)
+        for k, value in enumerate((u, v, z)):
+            found[0, k], found[1, k] = min(found[0, k], value), max(found[1, k], value)
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def _placed(depth, index, rays, low, high, nearest, farthest, pose, bias):
+    """Points (N,3) float32 of the pixels within a window and a range of depths.
+
+    Args:
+        depth: (H,W) uint16, millimetres.
+        index: (M,) flat pixel indices.
+        rays: (H,W,2) ray directions; pixels without a finite ray are skipped.
+        low, high: first column and row, and column and row after the last.
+        nearest, farthest: range of depths, exclusive, millimetres.
+        pose: (4,4) float32, points_from_camera.
+        bias: metres, subtracted from the depth along the ray.
+    """
+    width = depth.shape[1]
+    points = np.empty((len(index), 3), np.float32)
+    count = 0
+    for flat in index:
+        row, column = flat // width, flat % width
+        if not (low[0] <= column < high[0] and low[1] <= row < high[1]):
+            continue
+        measured = depth[row, column]
+        if not nearest < measured < farthest:
+            continue
+        across, down = rays[row, column]
+        if not np.isfinite(across):
+            continue
+        z = np.float32(measured) * np.float32(1e-3)
+        z *= np.float32(1) - bias / z
+        x, y = across * z, down * z
+        for k in range(3):
+            points[count, k] = pose[k, 0] * x + pose[k, 1] * y + pose[k, 2] * z + pose[k, 3]
+        count += 1
+    return points[:count].copy()

@@ -74,7 +74,8 @@ class StageErrors:
         """Errors of the object's pose after ``stage``."""
         if self._object is None:
             return {}
-        errors = truths.object_errors(self._truth, track, self._object.mesh, self._fps)
+        true = self._truth.rotation, self._truth.translation
+        errors = truths.object_errors(*true, track, self._object.mesh, self._fps)
         return {f"truth/{stage}/{key}": value for key, value in errors.items()}
 
     def of_body(

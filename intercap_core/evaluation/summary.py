@@ -1,4 +1,4 @@
-"""What a sequence contributes to the dataset's figures, and contact heatmaps over all sequences.
+"""A sequence's contribution to the figures of the dataset, and contact heatmaps.
 
 A summary holds the metrics without distances by vertex, counts of contact, and the calibration.
 """
@@ -118,14 +118,14 @@ def write(output: Path, paths: SequencePaths, *, intent: str) -> None:
         artefacts.read(paths.metrics, METRICS) as metrics,
         artefacts.read(paths.joint, JOINT) as joint,
     ):
-        told = {
+        attributes = {
             **{name: metrics.attributes[name] for name in METRICS.attributes},
             **{k: v for k, v in metrics.attributes.items() if k in METRICS.optional_attributes},
             **{name: joint.attributes[name] for name in ("gender", "body_model")},
             "num_betas": joint["betas"].shape[-1],
             "num_expression": joint["expression"].shape[-1],
         }
-        with artefacts.write(output, SUMMARY, **told, intent=intent) as writer:
+        with artefacts.write(output, SUMMARY, **attributes, intent=intent) as writer:
             for key in metrics.keys():  # noqa: SIM118 (not a dict)
                 if key not in PER_VERTEX_METRICS:
                     is_text = METRICS.fields[key].dtype == "str"

@@ -17,7 +17,6 @@ from intercap_core.body.parameters import BodyParameters
 from intercap_core.config import BodyModels
 from intercap_core.schemas import BODY_FIT, JOINT, OBJECT_TRACK
 
-_CHUNK = 16  # frames posed at once: 16 bodies of 13 k vertices take some 20 MB
 _TIPS = [
     KEYPOINT_NAMES.index(f"{side}_{finger}_tip")
     for side in ("left", "right")
@@ -47,8 +46,8 @@ class BodyTrack:
 
     def vertices(self) -> Iterator[np.ndarray]:
         """Iterate over the frames' posed vertices (V, 3) float32."""
-        for start in range(0, len(self.joints), _CHUNK):
-            chunk = self.parameters.frames(slice(start, start + _CHUNK))
+        for start in range(0, len(self.joints), 16):  # 16 bodies take some 20 MB
+            chunk = self.parameters.frames(slice(start, start + 16))
             with torch.no_grad():
                 yield from self.model.forward(chunk).vertices.numpy()
 

@@ -105,18 +105,12 @@ class Truth:
             soles = float(file.attributes.get("sole_m", 0.0))
             offset = float(file.attributes["ground_offset"]) - soles
             columns = [names.index(name) for name in METRIC_REGIONS]
-            true_object = _TrueObject.read(file, at)
             return cls(
                 vertices=vertices,
                 visible=visible,
                 joints=file["joints"][at],
                 tips=file["fingertips"][at],
-                object_vertices=true_object.vertices,
-                object_faces=true_object.faces,
-                object_visible=true_object.visible,
-                rotation=true_object.rotation,
-                translation=true_object.translation,
-                object_views=true_object.views,
+                **_object_datasets(file, at),
                 contact_region=file["region_contact"][at][:, columns],
                 floor=Floor(file["ground_normal"], offset),
                 support_height=_support_height(file, at),
@@ -144,37 +138,26 @@ def _support_height(file: artefacts.Artefact, at: np.ndarray) -> np.ndarray:
     return file["support_height"][at] if "support_height" in file else np.zeros((len(at), 2))
 
 
-@dataclass(frozen=True, eq=False)
-class _TrueObject:
-    """The object's datasets at T frame sets; see the fields of :class:`Truth`."""
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    visible: np.ndarray
-    rotation: np.ndarray
-    translation: np.ndarray
-    views: np.ndarray
-
-    @classmethod
-    def read(cls, file: artefacts.Artefact, at: np.ndarray) -> _TrueObject:
-        if not file.attributes["object"]:
-            count = len(at)
-            return cls(
-                np.zeros((0, 3)),
-                np.zeros((0, 3), np.int32),
-                np.zeros((count, 0), bool),
-                np.full((count, 3, 3), np.nan),
-                np.full((count, 3), np.nan),
-                np.zeros(count, np.int8),
-            )
-        return cls(
-            file["object_vertices"].astype(np.float64),
-            file["object_faces"],
-            file["object_visible"][at],
-            file["rotation"][at],
-            file["translation"][at],
-            file["object_views"][at],
-        )
+def _object_datasets(file: artefacts.Artefact, at: np.ndarray) -> dict[str, np.ndarray]:
+    """Fields of :class:`Truth` about the object at the T frame sets ``at``."""
+    if not file.attributes["object"]:
+        count = len(at)
+        return {
+            "object_vertices": np.zeros((0, 3)),
+            "object_faces": np.zeros((0, 3), np.int32),
+            "object_visible": np.zeros((count, 0), bool),
+            "rotation": np.full((count, 3, 3), np.nan),
+            "translation": np.full((count, 3), np.nan),
+            "object_views": np.zeros(count, np.int8),
+        }
+    return {
+        "object_vertices": file["object_vertices"].astype(np.float64),
+        "object_faces": file["object_faces"],
+        **{
+            key: file[key][at]
+            for key in ("object_visible", "rotation", "translation", "object_views")
+        },
+    }
 
 
 def body_errors(truth: Truth, track: BodyTrack, fps: float) -> dict[str, np.ndarray]:
@@ -202,47 +185,43 @@ def body_errors(truth: Truth, track: BodyTrack, fps: float) -> dict[str, np.ndar
 
 
 def object_errors(
-    truth: Truth,
+    rotation: np.ndarray,
+    translation: np.ndarray,
     track: ObjectTrack,
     mesh: ObjectMesh,
     fps: float,
 ) -> dict[str, np.ndarray]:
-    """Errors of T object poses, by dataset of the metrics artefact."""
+    """Errors of T object poses, by dataset of the metrics artefact; infinite if none was found.
+
+    ``rotation``: (T, 3, 3) and ``translation``: (T, 3), the true poses.
+    """
     if not track.known:
-        return _errors_of_missed_object(len(truth.rotation))
+        unknown, beyond = np.full(len(rotation), np.nan), np.full(len(rotation), np.inf)
+        return {
+            "object_translation": beyond,
+            "object_rotation": beyond,
+            "object_centre": np.full((len(rotation), 3), np.nan),
+            "object_turn": unknown,
+            "object_flagged": np.ones(len(rotation), bool),
+            "acceleration_object": unknown,
+        }
     centre = mesh.centre_of_mass
     fitted = object_pose.posed_point(track.rotation, track.translation, centre)
-    true = object_pose.posed_point(truth.rotation, truth.translation, centre)
+    true = object_pose.posed_point(rotation, translation, centre)
+    turns = motion.turns(track.rotation, rotation, mesh.symmetry)
     result = {
         "object_translation": object_pose.centre_error(fitted, true),
-        "object_rotation": object_pose.rotation_error_deg(
-            track.rotation, truth.rotation, mesh.symmetry
-        ),
+        "object_rotation": object_pose.rotation_error_deg(track.rotation, rotation, mesh.symmetry),
         "object_centre": fitted,
-        "object_turn": np.append(
-            np.nan, motion.turns(track.rotation, truth.rotation, mesh.symmetry)
-        ),
+        "object_turn": np.append(np.nan, turns),
         "object_flagged": track.flagged,
         "acceleration_object": motion.acceleration_error(fitted[:, None], true[:, None], fps),
     }
     if track.covariance is not None:
         result["object_normalised"] = object_pose.normalised_translation_error(
-            track.translation, truth.translation, track.covariance
+            track.translation, translation, track.covariance
         )
     return result
-
-
-def _errors_of_missed_object(frames: int) -> dict[str, np.ndarray]:
-    """Errors of an object that the stage found in no frame: infinite."""
-    unknown = np.full(frames, np.nan)
-    return {
-        "object_translation": np.full(frames, np.inf),
-        "object_rotation": np.full(frames, np.inf),
-        "object_centre": np.full((frames, 3), np.nan),
-        "object_turn": unknown,
-        "object_flagged": np.ones(frames, bool),
-        "acceleration_object": unknown,
-    }
 
 
 def contact_counts(distance: np.ndarray, true_distance: np.ndarray) -> np.ndarray:

@@ -34,14 +34,10 @@ from intercap_core.person.sides import (
     exchange_points,
 )
 
-MOTION_MEMORY_S = 0.5  # longest gap over which motion is evaluated; tuned on the studio
-STEP_M = 0.04  # motion from set to set with a negative log likelihood of 1; tuned on the studio
-LARGEST_STEP_M = 0.3  # truncation of that motion; tuned on the studio
 # Truncation of the gap between two rays, metres, for arms, legs, head and hands. Rays of one point
 # miss each other by a few centimetres (detector bias, calibration), those of a left and a right
 # point by up to the breadth of the body, or of the face. Tuned on the studio.
 SIDE_GAPS_M = (0.12, 0.12, 0.05, 0.12)
-UNKNOWN_SIDE_COST = 0.25  # squared share of that gap, assumed without a comparison; tuned
 EXCHANGED_VIEW_COST = 0.5  # of each exchanged view, above the gain by noise; tuned on the studio
 # Negative log likelihoods of an impossible build, tuned on the studio. Knees and ankles are
 # certain, a turned head and a twisted back (each up to some 80 degrees) less so.
@@ -121,7 +117,8 @@ def _cost(
     _, gap = midpoints(first, second, from_first, from_second)
     square = np.minimum(np.nan_to_num(gap, nan=limit) / limit, 1.0) ** 2
     weight = first_weight * second_weight
-    return (weight * (square - UNKNOWN_SIDE_COST)).sum(1)
+    # relative to the cost of an unknown gap; tuned on the studio
+    return (weight * (square - 0.25)).sum(1)
 
 
 _AT = {name: index for index, name in enumerate(KEYPOINT_NAMES)}
@@ -202,7 +199,8 @@ def _steps(points: np.ndarray, times: np.ndarray) -> np.ndarray:
     steps[:] = CHANGE_COST * (_STATES[:, None] != _STATES[None]).sum(2)
     last, when = points[0].copy(), np.full(points.shape[1], times[0])
     for t, step in enumerate(steps, start=1):
-        last[times[t] - when > MOTION_MEMORY_S] = np.nan
+        # motion over more than half a second is not evaluated; tuned on the studio
+        last[times[t] - when > 0.5] = np.nan
         for number, limb in enumerate(_LIMBS):
             straight = _motion(last[limb], points[t, limb])
             crossed = _motion(last[PARTNER[limb]], points[t, limb])
@@ -217,7 +215,8 @@ def _motion(before: np.ndarray, now: np.ndarray) -> float:
     """Cost of the motion of points (n, 3); 0 if fewer than two are known."""
     step = np.linalg.norm(now - before, axis=1)
     step = step[np.isfinite(step)]
-    return float(np.minimum(step, LARGEST_STEP_M).mean() / STEP_M) if len(step) > 1 else 0.0
+    # a step of 4 cm costs 1, truncated at 30 cm; tuned on the studio
+    return float(np.minimum(step, 0.3).mean() / 0.04) if len(step) > 1 else 0.0
 
 
 def _other_hands(points: np.ndarray) -> np.ndarray:

@@ -87,11 +87,16 @@ def triangulate_people(
     min_confidence: float,
     max_error_px: float,
 ) -> tuple[np.ndarray, Triangulation]:
-    """Triangulate the subject, exchanging sides where views, build or motion say so.
+    """Triangulate the subject, with sides exchanged by views, build or motion.
 
-    ``keypoints`` (T, C, 135, 3 or more): x, y, confidence, and whatever else goes with a point;
-    ``times`` (T,) seconds, None: motion from set to set is not judged. Returns them with limbs
-    exchanged back, and the triangulation of T * 135 points, set by set.
+    Args:
+        keypoints: (T, C, 135, 3 or more) x, y, confidence, and further values of each point.
+        times: (T,) seconds; None = motion from set to set is not evaluated.
+        min_confidence: keypoints below are ignored.
+        max_error_px: largest reprojection error of an inlier, px at 1080p.
+
+    Returns:
+        The keypoints with corrected sides, and the triangulation of T * 135 points.
     """
     keypoints = keypoints.copy()
     agreed = make_views_agree(keypoints, rig, min_confidence=min_confidence)

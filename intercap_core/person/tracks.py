@@ -22,15 +22,11 @@ from intercap_core.person.groups import PersonGroup
 BUILD_SPREADS_M = (0.034, 0.027, 0.015, 0.023, 0.033, 0.025)
 BUILD_FLOOR_M = 0.012  # error of a median length with many sets: detector bias by pose; tuned
 MAX_BODY_SPEED_M_S = 4.0  # of a body's centre; people run slower indoors
-FOLLOWED_GAP_S = 0.4  # longest gap over which position alone suffices; tuned on the studio
 # Longest gap over which a single view identifies a person by position, and after which a joined
 # track is not doubted; tuned on the studio.
 MAX_LINK_GAP_S = 2.0
 WALKING_SPEED_M_S = 1.2  # usual speed during a gap
 LINK_SLACK_M = 0.25  # noise of a person's centre between sets; tuned on the studio
-# Log likelihood ratios, by build, of one person against two.
-OTHER_BUILD = -3.0  # below, tracks are not joined; tuned on the studio
-SURE_BUILD = 1.0  # below, a join after a gap is reported; tuned on the studio
 
 
 _PLACE = {name: index for index, name in enumerate(KEYPOINT_NAMES)}
@@ -89,7 +85,8 @@ def link_groups(groups: Sequence[Sequence[PersonGroup]], times: np.ndarray) -> l
     """Follow the people of each set (T lists) over short gaps, nearest first; ``times`` (T,) s."""
     tracks: list[PersonTrack] = []
     for t, in_set in enumerate(groups):
-        free = [k for k in tracks if times[t] - times[k.sets[-1]] <= FOLLOWED_GAP_S]
+        # within 0.4 s position alone identifies a person; tuned on the studio
+        free = [k for k in tracks if times[t] - times[k.sets[-1]] <= 0.4]
         pairs = sorted(
             (float(np.linalg.norm(group.centre - track.groups[-1].centre)), g, k)
             for g, group in enumerate(in_set)
@@ -204,7 +201,8 @@ def _likelihood(one: Person, other: Person, times: np.ndarray) -> float:
             return NEVER
         result -= 0.5 * (apart / (LINK_SLACK_M + WALKING_SPEED_M_S * gap)) ** 2
     alike = same_build(one.whole, other.whole)
-    return result + alike if alike > OTHER_BUILD else NEVER
+    # log likelihood ratio by build; tuned on the studio
+    return result + alike if alike > -3.0 else NEVER
 
 
 def _seams(one: Person, other: Person) -> list[tuple[PersonTrack, PersonTrack]]:
@@ -219,7 +217,7 @@ def _doubt(one: Person, other: Person, times: np.ndarray) -> tuple[str, ...]:
     gap, start = min(
         (float(times[b.sets[0]] - times[a.sets[-1]]), b.sets[0]) for a, b in _seams(one, other)
     )
-    if gap <= MAX_LINK_GAP_S or same_build(one.whole, other.whole) >= SURE_BUILD:
+    if gap <= MAX_LINK_GAP_S or same_build(one.whole, other.whole) >= 1.0:
         return ()
     return (
         f"the subject was not seen for {gap:.1f} s, and the build does not tell whether who is "

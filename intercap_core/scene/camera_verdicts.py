@@ -23,10 +23,6 @@ from intercap_core.scene.registration import (
 )
 
 MUST_IMPROVE = 0.98  # of the start's held-out cost, in one group at least; tuned on the studio
-CHANCE_SIGMA = (
-    2.0  # standard deviations by which a refined pose must be better; tuned on the studio
-)
-LEAST_UNIT_SPREAD = 0.25  # of log ratios, assumed for few units; tuned on the studio
 DOUBTFUL_RATIO = 0.5  # of refined over given errors: above it a camera gets a second look
 
 
@@ -63,7 +59,8 @@ class PoseEvidence:
     @property
     def sigma(self) -> float:
         """Standard deviation of the mean; of few units at least the usual one."""
-        spread = max(float(self.log_ratio.std()), LEAST_UNIT_SPREAD)
+        # few units may agree by chance; tuned on the studio
+        spread = max(float(self.log_ratio.std()), 0.25)
         return spread / np.sqrt(len(self.log_ratio))
 
     def __str__(self) -> str:
@@ -95,7 +92,8 @@ class PoseVerdict:
             return cls(True, ())
         mean = np.mean([e.mean for e in evidence])
         sigma = np.sqrt(sum(e.sigma**2 for e in evidence)) / len(evidence)
-        better = mean <= np.log(MUST_IMPROVE) and mean <= -CHANCE_SIGMA * sigma
+        # by two standard deviations; tuned on the studio
+        better = mean <= np.log(MUST_IMPROVE) and mean <= -2.0 * sigma
         return cls(bool(better), tuple(evidence))
 
     def __str__(self) -> str:

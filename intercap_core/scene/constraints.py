@@ -31,8 +31,6 @@ KEYPOINT_SIGMA_FLOOR_PX = 3.0  # of reprojection, including joint biases; tuned 
 ROBUST_SIGMA = 3.0  # scale of Geman and McClure's function, standard deviations; tuned
 KEYPOINT_ERROR_TIME_S = 0.5  # how long an error at one joint lasts; tuned on the studio
 MIN_BODY_POINTS = 50  # fewer do not constrain a rig; tuned on the studio
-NEAR_FLOOR_M = 0.06  # of the floor at poses that are not yet refined; tuned on the studio
-FLOOR_EFFECTIVE_POINTS = 10.0  # independent points of a camera: lens and bias errors are shared
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +208,8 @@ class FloorConstraint:
             pose = rig[c].master_from_depth
             height = (apply(pose, surface.points) - ground.point) @ ground.normal
             facing = surface.normals @ pose[:3, :3].T @ ground.normal
-            rows = np.flatnonzero((np.abs(height) < NEAR_FLOOR_M) & (facing > FLOOR_COSINE))
+            # within 6 cm, because poses are not refined yet; tuned on the studio
+            rows = np.flatnonzero((np.abs(height) < 0.06) & (facing > FLOOR_COSINE))
             if len(rows) >= 200:  # cells of 3 cm: a fifth of a square metre
                 rows = np.random.default_rng(0).permutation(rows)[:1000]
                 points[c] = surface.points[rows]
@@ -237,7 +236,8 @@ class FloorConstraint:
         for c, points in own.items():
             residual = (points - middle) @ normal
             robust = geman_mcclure_weight(residual**2, ROBUST_SIGMA * FLOOR_SIGMA_M)
-            weight = robust * min(1.0, FLOOR_EFFECTIVE_POINTS / len(points)) / FLOOR_SIGMA_M**2
+            # ten independent points per camera: errors of lens and bias are shared
+            weight = robust * min(1.0, 10.0 / len(points)) / FLOOR_SIGMA_M**2
             arm = points - poses[c, :3, 3]
             by_pose = np.column_stack(
                 [np.cross(arm, normal), np.broadcast_to(normal, points.shape)]

@@ -17,7 +17,6 @@ MIN_FOOT_SPREAD_M = 0.15  # standard deviation, of feet that show a tilt; tuned 
 FLOOR_COSINE = 0.94  # 20 degrees: of a floor point's normal with the plane's; tuned on the studio
 FLOOR_HYPOTHESIS_TOLERANCE_M = 0.03  # inliers of a hypothesis of the floor; tuned on the studio
 BELOW_FLOOR_M = 0.10  # a point this far under the plane speaks against it; tuned on the studio
-BELOW_FLOOR_COST = 3.0  # how many inliers such a point outweighs; tuned on the studio
 MIN_FLOOR_AREA_M2 = 0.5  # tuned on the studio
 MIN_FOOT_SETS = 5  # sets with feet seen, for a floor; tuned on the studio
 
@@ -81,7 +80,8 @@ def fit_ground(
     height = (sample @ normals[tried].T) - (points[tried] * normals[tried]).sum(1)
     inside = (np.abs(height) < FLOOR_HYPOTHESIS_TOLERANCE_M).sum(0)
     below = (height < -BELOW_FLOOR_M).sum(0)
-    best = tried[np.argmax(inside - BELOW_FLOOR_COST * below)]
+    # a point below the plane outweighs three inliers; tuned on the studio
+    best = tried[np.argmax(inside - 3.0 * below)]
     fitted = _refined(
         points[candidates], normals[candidates], points[best], normals[best], tolerance_m
     )

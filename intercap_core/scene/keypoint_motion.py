@@ -27,7 +27,6 @@ from intercap_core.geometry.camera.triangulation import pixel_scale, triangulate
 
 MAX_PATH_GAP_S = 0.35  # a path bridges at most this time without samples; tuned on the studio
 MIN_CONFIDENCE = 0.3  # keypoints below are ignored; tuned on the studio
-MOTION_SIGMA_FLOOR_PX = 1.0  # at 1080p, with the bias taken off; tuned on the studio
 OUTLIER_SIGMA = 4.0  # beyond, a residual is an outlier; tuned on the studio
 STIFFNESS = 10.0 ** np.arange(-3, 4)  # of third differences between sets, tried by likelihood
 # Likelihood mistakes lasting errors for motion; this factor removes the bias of the speeds. Tuned
@@ -249,7 +248,7 @@ def build_motion(
         bias = known_median(np.where(valid[..., None], raw, np.nan))
         residual = raw - bias
         size = np.linalg.norm(residual, axis=-1)
-        sigma = np.maximum(_scatter(size, known), MOTION_SIGMA_FLOOR_PX * scale)
+        sigma = np.maximum(_scatter(size, known), scale)  # a pixel at 1080p at least; tuned
         valid = known & (np.nan_to_num(size, nan=np.inf) < OUTLIER_SIGMA * sigma)
         points = _refitted(smooth, residual, by_point, valid, sigma)
     paths = smooth_paths(times, points)

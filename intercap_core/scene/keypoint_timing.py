@@ -27,10 +27,8 @@ OFFSET_SIGMA_S = 0.05  # prior of an offset; tuned on the studio
 ERROR_LENGTHS_S = {"rough": (0.2, 0.5, 1.0), "smooth": (0.15, 0.3, 0.6)}
 CONSTANT_VARIANCE = 100.0  # of a series' constant, over its other variance: nearly unconstrained
 TIMING_INFLATION = 2.0  # of sigmas: keypoints of one person err together; tuned on the studio
-SPEED_ERROR = 0.08  # relative error of an offset due to smoothing; tuned on the studio
 WINDOW_SETS = 96  # covariances over time are dense within a window, none reaches beyond it
 MIN_TIMING_SETS = 8  # fewer give no estimate
-KEYPOINT_OFFSET_KNOWN_S = 0.02  # standard deviation above which an offset is unknown; tuned
 
 
 @dataclass(frozen=True)
@@ -167,8 +165,10 @@ def estimate_offsets(motion: KeypointMotion, master: int) -> TimeOffsets:
     offset, sigma = np.zeros(views), np.zeros(views)
     offset[free[own]] = found[free[own]]
     random = inflation * np.diag(covariance)[own]
-    sigma[free[own]] = np.sqrt(random + (SPEED_ERROR * offset[free[own]]) ** 2)
-    unknown = sigma > KEYPOINT_OFFSET_KNOWN_S
+    # smoothing makes speeds, and so offsets, wrong by 8 %; tuned on the studio
+    sigma[free[own]] = np.sqrt(random + (0.08 * offset[free[own]]) ** 2)
+    # less certain offsets than to 20 ms are unknown; tuned on the studio
+    unknown = sigma > 0.02
     offset[unknown], sigma[unknown] = 0.0, np.nan
     return TimeOffsets(
         offset,

@@ -31,12 +31,10 @@ HELD_OUT_EVERY = 4  # one of so many cells of a surface is held out
 SURFACE_SEARCH_M = 0.12  # distance to the nearest cell, beyond the widest gate
 # Gates on the distance to the plane, one an iteration, annealed; tuned on the studio.
 GATES_M = (0.08, 0.05, 0.03, 0.02, 0.015, 0.015, 0.015)
-HELD_GATES_M = (0.08, 0.04, 0.04)  # the same if the poses are fixed
 MIN_NORMALS_COSINE = 0.85  # 32 degrees: one surface's normals in two views; tuned on the studio
 MAX_DIRECTION_SHARE = 0.8  # of a pair's weight, for one direction of normals; tuned on the studio
-MAX_DIRECTION_GAIN = (
-    3.0  # factor by which the weight of other directions grows; tuned on the studio
-)
+# Factor by which the weight of other directions grows; tuned on the studio
+MAX_DIRECTION_GAIN = 3.0
 MIN_PAIR_POINTS = 60  # fewer correspondences are chance; tuned on the studio
 
 
@@ -250,7 +248,7 @@ class Registration:
         current = RigEstimate(start.poses.copy(), start.bias.copy(), start.offset.copy())
         count = len(self.rig)
         rows = self._free_rows(free_poses)
-        for gate in GATES_M if np.any(free_poses) else HELD_GATES_M:
+        for gate in GATES_M if np.any(free_poses) else (0.08, 0.04, 0.04):
             matrix = np.zeros((count, FREEDOMS, count, FREEDOMS))
             gradient = np.zeros((count, FREEDOMS))
             self._add_surfaces(matrix, gradient, current, gate)

@@ -35,11 +35,7 @@ from intercap_core.scene.keypoint_timing import (
 # gain is MIN_SLIP_GAIN + MIN_SLIP_GAIN_OF_SET / (number of sets).
 MIN_SLIP_GAIN = 15.0
 MIN_SLIP_GAIN_OF_SET = 60.0
-SLIP_GAIN_PER_SET = 1.0  # least gain of a set within an interval; tuned on the studio
 CLEAR_SLIP_GAIN = 10.0  # of an interval over a delay of the whole recording; tuned on the studio
-SLIP_WORTH = (
-    0.2  # of the best gain, for an interval accepted in the same round; tuned on the studio
-)
 SLIPS_APART_S = 1.0  # closer in time, one slip may cause the evidence for another; tuned
 
 
@@ -166,7 +162,8 @@ def _apart(intervals: list[SlipInterval], times: np.ndarray) -> list[SlipInterva
     taken: list[SlipInterval] = []
     for interval in ordered:
         early, late = times[interval.first] - SLIPS_APART_S, times[interval.last] + SLIPS_APART_S
-        if interval.gain >= SLIP_WORTH * ordered[0].gain and all(
+        # a fifth of the best gain is needed in the same round; tuned on the studio
+        if interval.gain >= 0.2 * ordered[0].gain and all(
             times[other.last] < early or times[other.first] > late for other in taken
         ):
             taken.append(interval)
@@ -355,7 +352,8 @@ class _Slipped:
     def best(self, step: int) -> SlipInterval:
         """The interval of greatest gain, by place in the window, of camera 0."""
         energy = (self.precision * (self.change @ np.swapaxes(self.change, 1, 2))).sum(0)
-        gain = interval_gains(self.linear.sum(0) - SLIP_GAIN_PER_SET, energy)
+        # each set of an interval must gain 1; tuned on the studio
+        gain = interval_gains(self.linear.sum(0) - 1.0, energy)
         first, end = (int(i) for i in np.unravel_index(int(np.argmax(gain)), gain.shape))
         gains = self.gains(first, end)
         return SlipInterval(0, first, end - 1, step, float(gains.sum()), _sure(gains))

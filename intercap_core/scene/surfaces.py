@@ -22,13 +22,11 @@ from intercap_core.scene.background import Background
 # 11 mm + 0.1 % of depth (Azure Kinect DK data sheet) and its noise; margin tuned on the studio.
 BEFORE_BACKGROUND_MM = 40.0
 BEFORE_BACKGROUND_SHARE = 0.012  # of depth
-BACKGROUND_MAX_DEPTH_M = 5.0  # beyond, the error of the depth exceeds a centimetre
 MOVING_MAX_DEPTH_M = 4.0  # beyond, the error exceeds the motion of a body between sets
 # Baseline of a normal, one way: 4 px of the unbinned narrow depth camera (f = 504 px). Shorter is
 # noise, longer crosses edges; tuned on the studio.
 NORMAL_STEP_RAD = 0.008
 MAX_KINK_M_PER_M = 0.008  # deviation from the neighbours' mean, per depth; tuned on the studio
-MIN_VIEW_COSINE = 0.26  # 75 degrees: time-of-flight degrades at grazing angles; tuned on the studio
 MOVING_SEARCH_M = 0.15  # from one set to the next: 2 m/s at 15 sets a second
 BACKGROUND_CELL_M = 0.03  # of thinned surfaces
 MOVING_CELL_M = 0.02  # of thinned moving surfaces; tuned on the studio
@@ -104,7 +102,8 @@ def surface_from_depth(
     normals = np.cross(along, across).astype(np.float64)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     facing = -(normals * points).sum(1) / np.maximum(np.linalg.norm(points, axis=1), 1e-12)
-    good = np.isfinite(points).all(1) & (facing >= MIN_VIEW_COSINE)
+    # 75 degrees: time-of-flight degrades at grazing angles; tuned on the studio
+    good = np.isfinite(points).all(1) & (facing >= 0.26)
     along_z = np.column_stack([table[row, column], np.ones(len(row))])
     still = np.zeros(np.count_nonzero(good))
     return thin_surface(DepthSurface(points[good], normals[good], along_z[good], still), cell_m)
@@ -145,7 +144,8 @@ def background_surfaces(
                 lens,
                 keep=background.static,
                 cell_m=BACKGROUND_CELL_M,
-                max_depth_m=BACKGROUND_MAX_DEPTH_M,
+                # beyond, the error of the depth exceeds a centimetre
+                max_depth_m=5.0,
             )
     return surfaces
 

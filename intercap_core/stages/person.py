@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -43,6 +44,26 @@ from intercap_core.person.subject_joints import (
 from intercap_core.schemas import PERSON, SCENE
 
 
+@dataclass(frozen=True, eq=False)
+class _Result:
+    """Contents of the person artefact; T frame sets, C cameras."""
+
+    subject: SubjectDetections
+    """The subject's detections."""
+    keypoints: np.ndarray
+    """(T, C, 135, 3) x, y, confidence with corrected sides."""
+    points: Triangulation
+    """T * 135 triangulated points."""
+    missing: np.ndarray
+    """(T,) bool: the subject is not located."""
+    masks: list[bytes]
+    """T * C person masks of the detector, RLE; empty = none."""
+    beside: list[bytes]
+    """T * C unions of the other candidates, RLE; empty = none."""
+    segmented: dict[tuple[int, int], ViewSegments]
+    """Segmentation by the images alone, by moment and camera."""
+
+
 def run(
     *,
     frames: Path,
@@ -56,12 +77,16 @@ def run(
 ) -> None:
     """Find the subject by geometry and write the person artefact.
 
-    Of several people it is who is at the annotation's ``subject_points``, or who handles the object
-    (its entry tells the labels of its candidates), or who is seen most near the middle. Its left
-    and right are exchanged where ``left_right`` says that a detector exchanged them. A set in which
-    one view alone sees the subject takes its points from that view's depth; sets in which
-    neither two views nor depth place it are flagged ``missing``. Raises UserError if that is so
-    in every set, the inputs are of different captures, or a point names nobody.
+    The subject is the person named by the user, else who handles the object, else who is seen most
+    near the centre. A set with a single view of the subject takes its points from that view's
+    depth. Sets in which neither two views nor depth locate the subject are flagged ``missing``.
+    Raises UserError if all sets are missing, the inputs are of different captures, or a point
+    names nobody.
+
+    Args:
+        object_: its labels identify candidates of the object.
+        subject_points: annotated points on the subject.
+        left_right: annotated images with exchanged sides.
     """
     found = Detections.load(detections)
     with artefacts.read(scene, SCENE) as source, Frames.open(frames) as images:
@@ -92,7 +117,7 @@ def run(
         stated = images_with_stated_sides(left_right, rig.names, image_of, found.sequence)
         keypoints = given = exchange_stated(keypoints, stated)
         keypoints = steady_sides(keypoints, rig, min_confidence=confident)
-        # rays of one moment meet; what is written down is where each camera saw the points
+        # the moved points are triangulated, those as seen are written
         moved = at_set_times(keypoints, times, time_offset, rig, min_confidence=confident)
         moved, points = triangulate_people(
             np.concatenate([moved, keypoints[..., :2]], -1),
@@ -116,11 +141,12 @@ def run(
             for t, c in np.ndindex(found.num_sets, len(rig))
         ]
         segmented = _from_images(images.showing(image_of), source, found, points, rig, settings)
-    _write(output, found, subject, keypoints, points, missing, masks, beside, segmented, settings)
+    result = _Result(subject, keypoints, points, missing, masks, beside, segmented)
+    _write(output, found, result, settings)
 
 
 def _why(found: Detections) -> str:
-    """Why nobody can be placed, and what to do."""
+    """Reason why nobody can be located, and what to do."""
     seeing = [
         name
         for c, name in enumerate(found.camera_names)
@@ -129,10 +155,10 @@ def _why(found: Detections) -> str:
     if not seeing:
         noted = zip(found.camera_names, found.notes, strict=True)
         looked = f"{found.path} knows {int(found.keypoints_found.sum())} images that were looked at"
-        told = next((f"{name}: {note}" for name, note in noted if note), looked)
+        reason = next((f"{name}: {note}" for name, note in noted if note), looked)
         return (
-            f"no image has keypoints of anybody ({told}); expected people with points in the image "
-            "and confidences above 0: check the keypoint files"
+            f"no image has keypoints of anybody ({reason}); expected people with points in the "
+            "image and confidences above 0: check the keypoint files"
         )
     if len(seeing) == 1:
         return (
@@ -146,7 +172,7 @@ def _why(found: Detections) -> str:
 
 
 def subject_keypoints(detections: Detections, person: np.ndarray) -> np.ndarray:
-    """The chosen people's keypoints (T, C, 135, 3) float64, zeros where ``person`` is -1."""
+    """Keypoints (T, C, 135, 3) float64 of the chosen people; 0 where ``person`` is -1."""
     result = np.zeros((*person.shape, NUM_KEYPOINTS, 3))
     for t, c in np.argwhere(person != NOBODY):
         result[t, c] = detections.people(int(t), int(c))[person[t, c]]
@@ -160,7 +186,7 @@ def _masks(
     rig: Rig,
     min_confidence: float,
 ) -> list[bytes]:
-    """One RLE, maybe empty, for every (T, C)."""
+    """The subject's mask in each of T * C images, RLE; empty = none."""
     sets, views = keypoints.shape[:2]
     joints = points.points.reshape(sets, NUM_KEYPOINTS, 3)[:, BODY_POINTS]
     pixels = reproject(np.nan_to_num(joints.reshape(-1, 3), nan=1.0), rig)
@@ -170,7 +196,7 @@ def _masks(
     for t in range(sets):
         for c in range(views):
             body = keypoints[t, c, BODY_POINTS]
-            # What several views agree on is where the body is; one view alone may hallucinate.
+            # Triangulated points are more reliable than the detections of one view.
             at = np.where(known[t][:, None], pixels[t, :, c], body[:, :2])
             seen = known[t] | (body[:, 2] >= min_confidence)
             where = f"sequence {detections.sequence}, camera {rig.names[c]}, frame {t}"
@@ -186,7 +212,7 @@ def _from_images(
     rig: Rig,
     settings: PersonSettings,
 ) -> dict[tuple[int, int], ViewSegments]:
-    """What the images alone show, by moment and camera, where the settings ask for it."""
+    """Segment images without a detector, by moment and camera, as the settings require."""
     wanted = images.available
     if settings.segmentation == "auto":
         wanted = wanted & ~found.candidates_found
@@ -199,25 +225,16 @@ def _from_images(
     return segment_images(images, scene, joints, wanted, sigma)
 
 
-def _write(
-    output: Path,
-    detections: Detections,
-    subject: SubjectDetections,
-    keypoints: np.ndarray,
-    points: Triangulation,
-    missing: np.ndarray,
-    masks: list[bytes],
-    beside: list[bytes],
-    segmented: dict[tuple[int, int], ViewSegments],
-    settings: PersonSettings,
-) -> None:
+def _write(output: Path, detections: Detections, result: _Result, settings: PersonSettings) -> None:
+    subject, points = result.subject, result.points
+    masks, beside = list(result.masks), list(result.beside)
     sets, views = subject.people.shape
     mask_source = np.where(detections.candidates_found, FROM_DETECTOR, NOBODY_LOOKED)
     if settings.segmentation == "images":
         mask_source[:] = NOBODY_LOOKED
         masks, beside = [b""] * len(masks), [b""] * len(masks)
     candidates: list[list[ImageCandidate]] = [[] for _ in masks]
-    for (t, c), segments in segmented.items():
+    for (t, c), segments in result.segmented.items():
         image = t * views + c
         candidates[image] = segments.candidates
         if not masks[image]:
@@ -237,29 +254,29 @@ def _write(
         writer.put("camera_names", list(detections.camera_names))
         writer.put("person", subject.people)
         writer.put("others", subject.others)
-        writer.put("keypoints", keypoints)
+        writer.put("keypoints", result.keypoints)
         writer.put("joints", points.points.reshape(sets, NUM_KEYPOINTS, 3))
         writer.put("joint_views", points.views.reshape(sets, NUM_KEYPOINTS))
         writer.put("joint_error", points.error.reshape(sets, NUM_KEYPOINTS))
         writer.put("inlier", inlier)
-        writer.put("missing", missing)
+        writer.put("missing", result.missing)
         writer.put("mask_offsets", offsets)
         writer.put("mask_rle", rle)
         beside_offsets, beside_rle = artefacts.pack_ragged(beside)
         writer.put("beside_offsets", beside_offsets)
         writer.put("beside_rle", beside_rle)
         writer.put("mask_source", mask_source)
-        if segmented or settings.segmentation == "images":
+        if result.segmented or settings.segmentation == "images":
             _put_candidates(writer, candidates)
 
 
 def _put_candidates(writer: artefacts.Writer, candidates: list[list[ImageCandidate]]) -> None:
-    """Candidates of the images alone, one list an image in the order of (T, C)."""
+    """Write the candidates of the images alone, one list per image in the order of (T, C)."""
     every = [candidate for of_image in candidates for candidate in of_image]
-    offsets, rle = artefacts.pack_ragged([one.rle for one in every])
+    offsets, rle = artefacts.pack_ragged([candidate.rle for candidate in every])
     writer.put("candidate_offsets", np.cumsum([0, *map(len, candidates)]))
-    writer.put("candidate_scores", np.array([one.score for one in every], np.float32))
-    writer.put("candidate_extents", np.array([one.extent_m for one in every], np.float32))
-    writer.put("candidate_things", np.array([one.component for one in every], np.int32))
+    writer.put("candidate_scores", np.array([c.score for c in every], np.float32))
+    writer.put("candidate_extents", np.array([c.extent_m for c in every], np.float32))
+    writer.put("candidate_things", np.array([c.component for c in every], np.int32))
     writer.put("candidate_rle_offsets", offsets)
     writer.put("candidate_rle", rle)

@@ -90,7 +90,7 @@ def test_without_depth_there_are_no_points_to_compare_with(
     assert figures["pve_mm"] == pytest.approx(1e3 * OFFSET, rel=1e-4)
 
 
-def test_another_body_than_the_truth_was_matched_to_has_joints_alone(
+def test_body_of_another_topology_has_only_joint_errors(
     capture: fitted.Capture, tmp_path: Path
 ) -> None:
     path = tmp_path / "truth.h5"
@@ -108,7 +108,7 @@ def test_another_body_than_the_truth_was_matched_to_has_joints_alone(
     assert 0 <= found.worst < 5
 
 
-def test_landmarks_are_the_models_own_and_aligning_takes_out_any_rigid_motion(
+def test_landmark_alignment_removes_rigid_motion(
     capture: fitted.Capture,
 ) -> None:
     model = capture.model
@@ -124,7 +124,7 @@ def test_landmarks_are_the_models_own_and_aligning_takes_out_any_rigid_motion(
     assert body.landmark_error(mirrored, face, align=True).min() > 0.001
 
 
-def test_only_what_is_truly_seen_counts_as_visible() -> None:
+def test_visible_error_uses_truly_visible_vertices() -> None:
     true = np.zeros((2, 4, 3))
     moved = true.copy()
     moved[0, :, 0] = [0.01, 0.03, 0.5, 0.5]
@@ -145,7 +145,7 @@ def _plain(pve_mm: list[float], **changed: object) -> BodyErrors:
     return replace(errors, **changed)
 
 
-def test_flags_are_held_to_frames_off_by_more_than_40_mm() -> None:
+def test_flags_are_compared_with_errors_above_40_mm() -> None:
     flagged = np.array([False, True, True, False])
     found = body_errors.flag_figures([_plain([5, 39.9, 40.1, 90], flagged=flagged)])
     assert found == {

@@ -36,7 +36,7 @@ def versions(joint: Path, tmp_path: Path) -> tuple[Path, Path]:
     return tmp_path / "old", tmp_path / "new"
 
 
-def test_what_is_the_same_and_what_only_one_version_has(versions: tuple[Path, Path]) -> None:
+def test_unchanged_added_and_removed_sequences(versions: tuple[Path, Path]) -> None:
     found = compare(*versions)
     states = dict(zip(found.sequences["sequence"], found.sequences["state"], strict=True))
     assert states == {"a": "same", "b": "same", "came": "added", "gone": "removed"}
@@ -101,7 +101,9 @@ def test_contact_that_is_not_stated_is_no_change(versions: tuple[Path, Path]) ->
     assert found.loc["b", "contact_changed_frames"] == 0 and found.loc["b", "state"] == "same"
 
 
-def test_recordings_of_other_lengths_are_told(versions: tuple[Path, Path], tmp_path: Path) -> None:
+def test_recordings_of_different_lengths_are_reported(
+    versions: tuple[Path, Path], tmp_path: Path
+) -> None:
     longer = fitted.make_capture(tmp_path / "longer", total=5).paths["joint"]
     shutil.copyfile(longer, versions[1] / "a" / "joint.h5")
     row = compare(*versions).sequences.set_index("sequence").loc["a"]

@@ -33,7 +33,7 @@ def sliding(velocity: tuple[float, float, float], total: int = 5) -> np.ndarray:
     return start + np.arange(total)[:, None, None] / FPS * np.array(velocity)
 
 
-def test_slip_is_what_goes_along_the_surface_beyond_the_truth() -> None:
+def test_slip_is_tangential_motion_beyond_the_truth() -> None:
     touching = np.ones((5, 2), bool)
     still = sliding((0, 0, 0))
     # 3-4-5 along the surface, and any speed away from it
@@ -46,7 +46,7 @@ def test_slip_is_what_goes_along_the_surface_beyond_the_truth() -> None:
     np.testing.assert_allclose(slip_speed(still, truly, touching, up, FPS)[:3], 0.02)
 
 
-def test_slip_counts_what_touches_at_both_ends() -> None:
+def test_slip_requires_contact_at_both_ends() -> None:
     touching = np.ones((5, 2), bool)
     touching[2:, 1] = False  # the second lets go after 0.2 s
     fitted = sliding((0, 0, 0))
@@ -65,7 +65,7 @@ def sole(height: np.ndarray, forward: np.ndarray, count: int = 20) -> np.ndarray
     return points
 
 
-def test_what_carries_is_low_and_still() -> None:
+def test_support_is_low_and_still() -> None:
     height = np.array([0.0, 0.0, 0.0, 0.10, 0.10])
     forward = np.array([0.0, 0.0, 0.05, 0.05, 0.05])  # glides from 1 to 2, is high at rest after
     carrying = support(sole(height, forward), FLOOR, FPS)
@@ -77,7 +77,7 @@ def test_what_carries_is_low_and_still() -> None:
         assert support(tiptoe, FLOOR, FPS).any() == stands
 
 
-def test_what_carries_on_a_beam_is_near_its_top() -> None:
+def test_support_on_a_beam_is_near_its_top() -> None:
     standing = sole(np.full(3, 0.2), np.zeros(3))
     assert not support(standing, FLOOR, FPS).any()
     assert support(standing, FLOOR, FPS, np.full(3, 0.2)).all()
@@ -85,7 +85,7 @@ def test_what_carries_on_a_beam_is_near_its_top() -> None:
     assert support(standing, FLOOR, FPS, np.array([0.0, 0.2, 0.2])).any(1).tolist() == [False, True]
 
 
-def test_a_planted_foot_is_held_to_place_and_height() -> None:
+def test_planted_foot_has_speed_and_height_errors() -> None:
     true = sole(np.zeros(3), np.zeros(3))
     carrying = support(true, FLOOR, FPS)
     fitted = true + np.arange(3)[:, None, None] * [0.003, 0.0, 0.002]  # 30 mm/s, and rises
@@ -95,7 +95,7 @@ def test_a_planted_foot_is_held_to_place_and_height() -> None:
     assert np.isnan(found.swing).all()
 
 
-def test_a_swinging_foot_is_held_to_its_way() -> None:
+def test_swinging_foot_has_position_errors() -> None:
     true = sole(np.full(3, 0.1), np.array([0.0, 0.1, 0.2]))
     frozen = sole(np.full(3, 0.1), np.zeros(3))
     found = foot_errors(frozen, true, support(true, FLOOR, FPS), FLOOR, FPS)
@@ -201,5 +201,5 @@ def test_reliability_by_hand() -> None:
     np.testing.assert_allclose(calibration_error(probability, true), 0.4125 - 0.25)
 
 
-def test_nothing_open_has_no_calibration_error() -> None:
+def test_certain_statements_have_no_calibration_error() -> None:
     assert np.isnan(calibration_error(np.array([0.0, 1.0]), np.array([False, True])))

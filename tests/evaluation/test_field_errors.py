@@ -84,7 +84,7 @@ def test_nothing_measured_gives_no_figures() -> None:
     assert start_figures([]) == {} and floor_figures([]) == {} and beam_figures([]) == {}
 
 
-def test_stated_displacement_is_that_of_poses_drawn_from_the_covariance() -> None:
+def test_stated_displacement_matches_sampled_poses() -> None:
     rng = np.random.default_rng(2)
     poses = np.stack(
         [

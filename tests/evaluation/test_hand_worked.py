@@ -48,7 +48,7 @@ def test_vertex_and_joint_errors_are_mean_distances() -> None:
     assert body.joint_error(off, joints) == pytest.approx([0.001])
 
 
-def test_hand_errors_count_fingers_and_tips_and_can_follow_the_wrist() -> None:
+def test_hand_errors_of_fingers_and_tips_with_aligned_wrists() -> None:
     joints, tips = np.zeros((1, 55, 3)), np.zeros((1, 10, 3))
     moved, moved_tips = joints.copy(), tips.copy()
     moved[0, 20] = moved[0, 25:40] = [0.01, 0, 0]  # the whole left hand, with its wrist
@@ -86,7 +86,7 @@ def test_normalised_error_is_unknown_without_a_covariance() -> None:
     assert length[2] == pytest.approx(np.sqrt(3) / body.MEDIAN_CHI_3)
 
 
-def test_object_error_is_taken_at_the_centre_and_over_the_symmetry_group() -> None:
+def test_object_error_at_the_centre_over_the_symmetry_group() -> None:
     centre = np.array([0.1, 0, 0])
     quarter = _turn_z(90)
     at = object_pose.posed_point(quarter, np.zeros(3), centre)
@@ -199,7 +199,7 @@ def test_moving_jitter_and_onset() -> None:
     assert motion.resting_steps(moves).tolist() == [True] * 13 + [False] * 16
 
 
-def test_turns_are_beyond_the_true_ones_and_over_the_symmetry_group() -> None:
+def test_turn_errors_are_relative_and_over_the_symmetry_group() -> None:
     none = SymmetryGroup.none()
     round_ = SymmetryGroup.from_settings(
         Symmetry(continuous=(ContinuousSymmetry(axis=(0.0, 0.0, 1.0)),))
@@ -247,7 +247,7 @@ def test_distance_to_a_posed_box_both_ways() -> None:
     assert body.distance(points) == pytest.approx([0.1, 0.03, 0.05, 0.25], abs=1e-6)
 
 
-def test_depths_are_told_further_than_distances() -> None:
+def test_depths_have_a_larger_cap_than_distances() -> None:
     vertices, faces = _box(0.6)  # half a metre and more: deeper than REACH_M and DEEPEST_M
     points = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.25, 0, 0], [0.37, 0, 0], [0.45, 0, 0]])
     found = PosedObject(vertices, faces).signed_distance(points, np.eye(3), np.zeros(3))

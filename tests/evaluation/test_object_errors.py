@@ -33,7 +33,7 @@ def _errors(translation: list[float], **changed: object) -> ObjectErrors:
     return ObjectErrors("a", "cup", 15.0, np.array(translation), **(plain | changed))
 
 
-def test_add_s_forgives_what_looks_the_same_and_mssd_only_the_group() -> None:
+def test_add_s_ignores_similar_shapes_mssd_only_symmetries() -> None:
     turned = (QUARTER, NOWHERE, STILL, NOWHERE)
     assert object_errors.add_s(SQUARE, *turned) == pytest.approx([0])
     # a quarter turn moves every corner by 2, of a group with the half turn still by 2
@@ -49,7 +49,7 @@ def test_add_s_forgives_what_looks_the_same_and_mssd_only_the_group() -> None:
     assert object_errors.add_s(SQUARE, *shifted) == pytest.approx([0.3])
 
 
-def test_a_turn_about_an_axis_that_is_stated_as_unknown_is_no_error() -> None:
+def test_undetermined_axes_are_excluded_from_turn_errors() -> None:
     deviation = np.radians(2.0)
     covariance = np.eye(6)[None] * deviation**2
     turned = Rotation.from_rotvec([0, 0, 3 * deviation]).as_matrix()[None]
@@ -63,7 +63,7 @@ def test_a_turn_about_an_axis_that_is_stated_as_unknown_is_no_error() -> None:
     assert np.isnan(object_pose.normalised_rotation_error(turned, STILL, covariance, none)).all()
 
 
-def test_lost_frames_count_as_unnoticed_without_flag_and_as_recovered_when_the_track_goes_on():
+def test_lost_frames_are_unnoticed_without_a_flag_or_recovered():
     lost = [0.001, 0.2, 0.2, 0.002, 0.2]
     found = object_errors.figures(
         [_errors(lost, flagged=np.array([True, True, False, False, False]))]
@@ -77,7 +77,7 @@ def test_lost_frames_count_as_unnoticed_without_flag_and_as_recovered_when_the_t
     assert object_errors.figures([]) == {}
 
 
-def test_frames_are_grouped_by_the_views_that_truly_see_the_object() -> None:
+def test_figures_by_number_of_views() -> None:
     views = np.array([0, 1, 2, 6, 7])
     found = object_errors.by_views([_errors([0.1, 0.3, 0.02, 0.004, 0.006], views=views)])
     assert list(found) == ["0-1", "2", "6+"]

@@ -22,7 +22,7 @@ def test_offsets_are_relative_to_the_master_which_is_left_out() -> None:
     assert scene_errors.offset_errors(found, true, 1) == pytest.approx([-0.001, -0.005])
 
 
-def test_slips_are_runs_of_one_amount_over_the_images_that_there_are() -> None:
+def test_slips_are_runs_of_equal_delay() -> None:
     slip = np.array([[0, 2, 2, 0, 2, 3, 3, 1]]).T
     images = np.array([[1, 1, 1, 0, 1, 1, 1, 0]], bool).T
     assert scene_errors.slip_events(slip, images) == [Slip(0, 1, 4, 2), Slip(0, 5, 6, 3)]
@@ -62,7 +62,7 @@ def test_ground_error_of_a_raised_and_of_a_tilted_floor() -> None:
     assert np.isnan(none).all()
 
 
-def test_times_are_matched_to_the_nearest_whatever_their_number() -> None:
+def test_times_are_matched_to_the_nearest() -> None:
     path, true = Path("truth.h5"), np.arange(4) / 10
     assert match_times(path, true, np.array([0.0, 0.11, 0.29]), 10).tolist() == [0, 1, 3]
     assert match_times(path, true[:1], np.array([0.01]), 10).tolist() == [0]
@@ -115,7 +115,7 @@ def test_a_single_camera_has_no_poses_and_offsets_to_judge() -> None:
     assert found["ground_error_mm"] == pytest.approx(2)
 
 
-def test_artefacts_are_compared_camera_by_camera_and_moment_by_moment(tmp_path: Path) -> None:
+def test_artefacts_are_compared_by_camera_and_moment(tmp_path: Path) -> None:
     made = fitted.make_capture(tmp_path)
     with h5py.File(made.paths["truth"], "r+") as truth:
         truth["time_offset"][...] = [0, 0.002, -0.004]

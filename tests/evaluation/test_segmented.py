@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from intercap_core.evaluation import segmented_kernel
-from intercap_core.evaluation.segmented import MARGIN_M, ViewMasks, segmented_points
+from intercap_core.evaluation.segmented import MARGIN_M, ViewMasks, _extent, segmented_points
 from intercap_core.geometry.camera.clouds import colour_lookup, depth_points
 from intercap_core.geometry.camera.masks import Runs, encode
 from intercap_core.geometry.camera.transforms import apply, invert
@@ -65,13 +64,11 @@ def test_points_are_those_of_the_plain_lookup_around_the_meshes(bias: float):
 
 
 @pytest.mark.parametrize("number", [1, 3, 500])
-def test_the_extent_of_points_is_that_of_those_that_the_camera_covers(number: int):
+def test_extent_covers_the_points_within_the_image(number: int):
     camera = RIG[2]
     lens = camera.depth
     points = np.random.default_rng(number).uniform(-3, 3, (number, 3))
-    least, most = segmented_kernel.extent(
-        points, camera.depth_from_master, tuple(lens.parameters.tolist())
-    )
+    least, most = _extent(points, camera.depth_from_master, tuple(lens.parameters.tolist()))
     local = apply(camera.depth_from_master, points)
     local = local[lens.inside_model(local)]
     if not len(local):

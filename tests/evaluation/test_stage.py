@@ -134,7 +134,7 @@ def test_flags_carry_every_reason(measured: dict[str, np.ndarray]) -> None:
     assert measured["flagged"].tolist() == [True, False, False, False, True]
 
 
-def test_without_truth_nothing_of_it_appears_and_the_rest_is_the_same(
+def test_without_truth_all_other_values_are_the_same(
     capture: fitted.Capture, measured: dict[str, np.ndarray], tmp_path: Path
 ) -> None:
     with artefacts.read(_run(capture, tmp_path / "metrics.h5", truth=False), METRICS) as artefact:
@@ -153,9 +153,7 @@ def test_same_input_same_bytes(capture: fitted.Capture, tmp_path: Path) -> None:
     assert again.read_bytes() == capture.paths["metrics"].read_bytes()
 
 
-def test_truth_at_other_times_is_refused_whatever_its_length(
-    capture: fitted.Capture, tmp_path: Path
-) -> None:
+def test_truth_at_other_times_is_rejected(capture: fitted.Capture, tmp_path: Path) -> None:
     wrong = replace(capture, paths=capture.paths | {"truth": tmp_path / "truth.h5"})
     shutil.copy(capture.paths["truth"], wrong.paths["truth"])
     with h5py.File(wrong.paths["truth"], "r+") as file:

@@ -34,12 +34,12 @@ def test_all_else_is_one_mask() -> None:
     np.testing.assert_array_equal(masks.decode(found, HEIGHT, WIDTH), CUP | CHAIR)
 
 
-def test_the_person_again_is_not_beside() -> None:
+def test_second_mask_of_the_person_is_no_other_candidate() -> None:
     found = merge_other_candidates(_candidates(PERSON, AGAIN, CUP), masks.encode(PERSON))
     np.testing.assert_array_equal(masks.decode(found, HEIGHT, WIDTH), CUP)
 
 
-def test_nothing_is_beside_nobody_or_somebody_alone() -> None:
+def test_no_other_candidates_without_a_person_or_alone() -> None:
     assert merge_other_candidates(_candidates(CUP), b"") == b""
     assert merge_other_candidates(_candidates(PERSON, AGAIN), masks.encode(PERSON)) == b""
     assert merge_other_candidates([], masks.encode(PERSON)) == b""

@@ -55,6 +55,6 @@ def test_a_swap_and_a_miss_move_no_neighbour():
     assert np.array_equal(moved[4, 2, 4], damaged[4, 2, 4])
 
 
-def test_no_offset_changes_nothing():
+def test_zero_offsets_change_nothing():
     seen = _exposed()
     assert np.array_equal(at_set_times(seen, TIMES, np.zeros(6), RIG, min_confidence=0.3), seen)

@@ -44,7 +44,7 @@ def put_right(damaged: np.ndarray, rig=RIG) -> tuple[np.ndarray, np.ndarray]:
         (slice(0, 11), range(6)),  # most of the time
     ],
 )
-def test_people_taken_for_their_mirror_image_are_turned_back(clean, sets, views):
+def test_mirrored_people_are_corrected(clean, sets, views):
     damaged = clean.copy()
     for c in views:
         damaged[sets, c] = swap_sides(damaged[sets, c])
@@ -94,6 +94,6 @@ def test_a_kneeling_person_does_not_face_backwards():
     assert find_mirrored(turned, share, None).all()
 
 
-def test_nothing_known_is_nothing_decided():
+def test_unknown_points_decide_nothing():
     assert not find_mirrored(np.full((4, 135, 3), np.nan), np.zeros((4, 3)), TIMES[:4]).any()
     assert find_mirrored(np.zeros((0, 135, 3)), np.zeros((0, 3)), TIMES[:0]).shape == (0, 4)

@@ -41,13 +41,13 @@ def test_a_person_is_lifted_past_the_furniture_before_him():
     assert np.nanmin(naive) < 1.5, "nothing tells the table from the person"
 
 
-def test_who_stands_still_for_long_is_part_of_the_room_and_still_lifted():
+def test_person_in_the_background_is_lifted():
     still = _wall(2400)
     z = _depths(DepthRelief.of(still, CAMERA, 0.0, still))
     assert np.isfinite(z).sum() >= 8 and np.nanmax(np.abs(z - 2.4)) < 0.2
 
 
-def test_a_trunk_that_stands_still_behind_a_table_is_lifted_beside_moving_arms():
+def test_static_trunk_behind_a_table_is_lifted():
     """The upper quarter never moved and is the room's; the table is nearer by a metre."""
     seen, room = _wall(2400), _wall(4000)
     table, still = slice(room.shape[0] * 13 // 20, None), slice(0, room.shape[0] * 7 // 20)
@@ -58,7 +58,7 @@ def test_a_trunk_that_stands_still_behind_a_table_is_lifted_beside_moving_arms()
     assert np.isfinite(z[:7]).all(), "the trunk that never moved too"
 
 
-def test_keypoints_where_nothing_at_all_is_measured_are_not_lifted():
+def test_keypoints_without_depth_are_not_lifted():
     half = _wall(2400)
     half[half.shape[0] // 2 - 20 :] = 0
     z = _depths(DepthRelief.of(half, CAMERA, 0.0, None))

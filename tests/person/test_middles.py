@@ -11,7 +11,7 @@ from tests.helpers.synthetic_people import stick_person
 NECK, MID_HIP = KEYPOINT_NAMES.index("neck"), KEYPOINT_NAMES.index("mid_hip")
 
 
-def test_what_is_not_known_is_between_its_ends():
+def test_unknown_keypoints_are_interpolated():
     true = stick_person()
     points = np.stack([true, true, true])
     points[0, [NECK, MID_HIP]] = np.nan

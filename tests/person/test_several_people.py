@@ -71,7 +71,7 @@ def test_a_person_alone_is_alone(tmp_path):
     assert (found.people == 0).all() and not found.others.any()
 
 
-def test_who_touches_the_object_is_the_subject_wherever_they_stand(tmp_path):
+def test_person_who_touches_the_object_is_the_subject(tmp_path):
     """Both are seen alike, and the other one is nearer the middle."""
     sets = 8
     walks = [walking(sets, place, np.zeros(2)) for place in (MIDDLE, ASIDE)]
@@ -106,9 +106,7 @@ def with_other_in(own: list, other: list, cameras: tuple[int, ...], when: slice)
     ],
     ids=["one frame", "a while", "from the start on", "always", "two cameras"],
 )
-def test_another_person_costs_a_camera_its_frames_as_long_as_it_is_returned(
-    tmp_path, cameras, when
-):
+def test_camera_loses_only_the_frames_with_another_person(tmp_path, cameras, when):
     """A detector of one person an image, which takes somebody else nearer to the camera."""
     own, other = (people_of(walking(SETS, at, np.zeros(2))) for at in (MIDDLE, ASIDE))
     found = subject_of(detections_of(tmp_path, with_other_in(own, other, cameras, when)))
@@ -124,7 +122,7 @@ def point_on(people: list, person: int, t: int, c: int, **change) -> SubjectPoin
     return SubjectPoint.model_validate(values)
 
 
-def test_who_is_named_is_the_subject(tmp_path):
+def test_named_person_is_the_subject(tmp_path):
     people = people_of(*(walking(SETS, place, np.zeros(2)) for place in (MIDDLE, ASIDE)))
     detections = detections_of(tmp_path, people)
     image_of = np.tile(np.arange(SETS)[:, None], VIEWS)
@@ -154,7 +152,7 @@ def test_who_is_named_is_the_subject(tmp_path):
         ({"x": 3.0, "y": 3.0}, "where nobody was detected; there are people at ("),
     ],
 )
-def test_a_point_that_names_nobody_says_what_is_there(tmp_path, change, said):
+def test_point_without_a_person_reports_people_nearby(tmp_path, change, said):
     people = people_of(*(walking(SETS, place, np.zeros(2)) for place in (MIDDLE, ASIDE)))
     detections = detections_of(tmp_path, people)
     image_of = np.tile(np.arange(SETS)[:, None], VIEWS)
@@ -188,13 +186,13 @@ def leaving(size: float) -> list:
 
 
 @pytest.mark.parametrize("size", [0.93, 1.07])
-def test_who_comes_back_is_known_again_by_build(tmp_path, size):
+def test_person_who_returns_is_recognised_by_build(tmp_path, size):
     found = subject_of(detections_of(tmp_path, leaving(size)))
     assert (found.people[:30] == 0).all() and (found.people[75:] == 0).all()
     assert (found.people[SECONDS_AWAY] == -1).all()
 
 
-def test_who_leaves_is_not_another_who_stays(tmp_path):
+def test_person_who_leaves_is_not_one_who_stays(tmp_path):
     """Of another build, seen only while the subject is away."""
     own = walking(105, MIDDLE, np.zeros(2))
     other = walking(105, ASIDE, np.zeros(2), size=0.9)
@@ -203,7 +201,7 @@ def test_who_leaves_is_not_another_who_stays(tmp_path):
     assert (found.people[:60] == 0).all() and (found.people[60:] == -1).all()
 
 
-def test_a_return_that_build_does_not_tell_is_said(tmp_path):
+def test_uncertain_return_is_reported(tmp_path):
     """Seen for three sets only before and after: nothing is known of the build."""
     people = people_of(walking(60, MIDDLE, np.zeros(2)), absent=(slice(4, 56),))
     found = subject_of(detections_of(tmp_path, people))
@@ -229,7 +227,7 @@ def track_of(size: float, sets: int, noise_m: float, seed: int) -> PersonTrack:
     return PersonTrack(list(range(sets)), groups)
 
 
-def test_build_tells_people_apart_the_better_the_longer_they_are_seen():
+def test_build_is_more_certain_with_more_frames():
     own = track_of(1.0, 60, 0.02, 1)
     assert same_build(own, track_of(1.0, 60, 0.02, 2)) > 1
     other = [same_build(own, track_of(0.88, sets, 0.02, 3)) for sets in (4, 10, 60)]

@@ -70,7 +70,7 @@ def test_exchanging_back_undoes_the_exchange():
     np.testing.assert_array_equal(exchange_stated(wrong, stated), keypoints)
 
 
-def test_what_is_stated_decides_the_sides_of_its_set():
+def test_stated_sides_decide_their_set():
     """The legs of all views were exchanged in two sets, in one of which a view's are stated."""
     rng = np.random.default_rng(1)
     given, points = rng.normal(size=(2, 3, 135, 3)), rng.normal(size=(2, 135, 3))
@@ -90,7 +90,7 @@ def test_what_is_stated_decides_the_sides_of_its_set():
     assert (held.points.reshape(2, 135, 3)[0, LEGS] != points[0, LEGS]).all()
 
 
-def test_where_nothing_else_tells_the_statement_does(tmp_path):
+def test_statement_decides_without_other_evidence(tmp_path):
     """All cameras exchange the sides throughout, and nothing shows where the front is."""
     keypoints = seen_by(BODY, RIG, UP)
     shown = [_INDEX[f"{side}_{name}"] for side in ("left", "right") for name in ("shoulder", "hip")]

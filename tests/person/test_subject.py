@@ -39,7 +39,7 @@ def test_the_rings_centre_is_where_the_cameras_look():
     np.testing.assert_allclose(apply(UP, ring_centre(RIG)[None])[0], [0, 0, 0.8], atol=1e-6)
 
 
-def test_the_one_in_the_middle_is_found_whatever_the_order(tmp_path, subject, bystander):
+def test_person_at_the_centre_is_found_in_any_order(tmp_path, subject, bystander):
     first = (np.arange(T)[:, None] + np.arange(6)) % 2 == 0
     people = [
         [
@@ -61,13 +61,13 @@ def test_a_view_that_takes_back_for_front_is_still_the_subject(tmp_path, subject
     assert (subject_of(tmp_path, people) == 0).all()
 
 
-def test_a_single_view_is_bridged_by_what_was_known(tmp_path, subject, bystander):
+def test_single_view_is_bridged_by_earlier_points(tmp_path, subject, bystander):
     people = [[[bystander[t, c], subject[t, c]] for c in range(6)] for t in range(T)]
     people[5] = [[bystander[5, 0], subject[5, 0]], [], [], [], [], []]
     np.testing.assert_array_equal(subject_of(tmp_path, people)[5], [1, -1, -1, -1, -1, -1])
 
 
-def test_someone_seen_briefly_nearer_the_middle_does_not_take_over(tmp_path, subject, bystander):
+def test_brief_visitor_at_the_centre_is_not_the_subject(tmp_path, subject, bystander):
     brief = seen_by(walking(T, np.zeros(2), np.zeros(2)), RIG, UP)
     people = [[[bystander[t, c]] for c in range(6)] for t in range(T)]
     for c in range(6):
@@ -76,7 +76,7 @@ def test_someone_seen_briefly_nearer_the_middle_does_not_take_over(tmp_path, sub
     assert (found[7] == 1).all() and (np.delete(found, 7, 0) == 0).all()
 
 
-def test_ghosts_that_no_two_views_share_are_nobody(tmp_path, subject):
+def test_detections_of_single_views_are_nobody(tmp_path, subject):
     rng = np.random.default_rng(1)
     people = [
         [[np.column_stack([rng.uniform(0, 1000, (135, 2)), np.full(135, 0.9)])] for _ in range(6)]
@@ -86,7 +86,7 @@ def test_ghosts_that_no_two_views_share_are_nobody(tmp_path, subject):
     assert (subject_of(tmp_path, [[[] for _ in range(6)] for _ in range(T)]) == -1).all()
 
 
-def test_after_a_second_of_nobody_the_subject_is_still_the_same(tmp_path):
+def test_subject_is_recognised_after_a_second_without_detections(tmp_path):
     """Two people in any order, as a detector without neck and mid hip sees them; for a second the
     files say that nobody is there."""
     sets = 45
@@ -115,7 +115,7 @@ def test_after_a_second_of_nobody_the_subject_is_still_the_same(tmp_path):
 
 
 @pytest.mark.parametrize("apart_m", [0.6, 0.25])
-def test_two_who_pass_each_other_are_not_exchanged(tmp_path, apart_m):
+def test_people_who_pass_each_other_are_not_exchanged(tmp_path, apart_m):
     """Both cross the middle, in opposite directions; while they are close a view misses one of them
     three times in ten, and the order of people is by chance in every image."""
     sets = 45

@@ -7,7 +7,7 @@ import numpy as np
 from intercap_core.scene.background import sample_sets, steady_background
 
 
-def test_someone_who_stands_still_most_of_the_time_is_not_background():
+def test_person_who_mostly_stands_still_is_not_background():
     rng = np.random.default_rng(0)
     images = rng.normal(3000, 3, (20, 4, 6)).astype(np.uint16)
     images[:14, 1:3, 1:3] = rng.normal(1800, 3, (14, 2, 2))  # 70 % of the time in front
@@ -24,7 +24,7 @@ def test_single_wild_values_behind_the_wall_are_not_background():
     assert (steady_background(images).depth == 2500).all()
 
 
-def test_what_is_never_seen_or_never_steady_is_unknown():
+def test_unseen_and_unsteady_pixels_are_unknown():
     images = np.zeros((10, 1, 3), np.uint16)
     images[:, 0, 1] = np.arange(10) * 200 + 500
     images[::5, 0, 2] = 1000

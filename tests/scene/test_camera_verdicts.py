@@ -38,7 +38,7 @@ def test_evidence_pairs_units_that_both_have() -> None:
     assert str(found) == "keypoints -50 %" and found.sigma > 0
 
 
-def test_the_weakest_motion_is_that_of_poses_drawn_from_the_covariance() -> None:
+def test_weakest_motion_matches_sampled_poses() -> None:
     rng = np.random.default_rng(1)
     root = rng.normal(size=(7, 7)) * np.array([2e-3] * 3 + [4e-3] * 3 + [1e-3])
     covariance = root.T @ root

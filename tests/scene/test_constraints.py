@@ -90,7 +90,7 @@ def test_equations_are_those_of_the_distance_to_the_best_plane(patches):
     assert np.linalg.norm(floor(moved, none)[1]) < np.linalg.norm(gradient)
 
 
-def test_a_floor_that_one_camera_sees_ties_nobody(patches):
+def test_floor_seen_by_one_camera_is_no_constraint(patches):
     ground = fit_ground(
         apply(TRUTH[0].master_from_depth, patches[0].points),
         patches[0].normals @ TRUTH[0].master_from_depth[:3, :3].T,

@@ -46,7 +46,7 @@ def walk(height: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("up", [BY_CAMERAS, BY_GRAVITY], ids=["cameras", "gravity"])
 @pytest.mark.parametrize("share", [0.25, 0.5, 0.75])
 @pytest.mark.parametrize("beam_m", [0.12, 0.3])
-def test_the_floor_is_the_lowest_level_also_where_most_steps_are_on_a_beam(up, share, beam_m):
+def test_floor_is_the_lowest_level_below_a_beam(up, share, beam_m):
     height = np.where(np.arange(80) % 20 < 20 * share, beam_m, 0.0)
     ground = fit_ground_to_feet(feet_at(walk(height)), up)
     assert ground.source == "feet" and abs(ground_height(ground)) < 0.02
@@ -80,7 +80,7 @@ def test_noise_about_one_level_does_not_lower_the_floor():
     assert abs(ground_height(ground)) < 0.02
 
 
-def test_who_stands_off_a_measured_floor_is_told():
+def test_feet_off_a_measured_floor_are_reported():
     floor = stated_ground(MASTER_UP, ORIGIN)
     assert describe_raised_feet(feet_at(walk(np.zeros(60))), floor) == ""
     on_beam = np.where(np.arange(60) < 20, 0.3, 0.0)
@@ -113,7 +113,7 @@ def upright(angle_deg: float = 0.0) -> np.ndarray:
     return joints
 
 
-def test_a_wrong_axis_is_refused_where_cameras_and_person_deny_it():
+def test_wrong_axis_is_rejected_by_cameras_and_person():
     trunk = trunk_direction(upright())
     assert check_stated_up(MASTER_UP, RIG, NO_GRAVITY, trunk) == []
     assert check_stated_up(MASTER_UP, RIG, NO_GRAVITY, np.full(3, np.nan)) == []

@@ -129,7 +129,7 @@ def walking_feet(sets: int = 40) -> np.ndarray:
     return apply(invert(UP), feet.reshape(-1, 3)).reshape(feet.shape)
 
 
-def test_who_walks_along_a_line_shows_the_tilt_along_it():
+def test_walk_along_a_line_shows_the_tilt_along_it():
     """The cameras' own up is 2 degrees off along the line and 2 across it."""
     feet = apply(UP, walking_feet().reshape(-1, 3)).reshape(40, 6, 3)
     feet[..., 1] = np.repeat([0.1, -0.1], 3)  # no farther than one foot beside the other
@@ -147,7 +147,7 @@ def test_who_walks_along_a_line_shows_the_tilt_along_it():
         assert off < (2.5 if axis == 0 else 0.5)
 
 
-def test_a_floor_that_nobody_measures_is_where_the_feet_stand():
+def test_unmeasured_floor_is_under_the_feet():
     feet = walking_feet()
     for up in (BY_GRAVITY, BY_CAMERAS):
         ground = fit_ground_to_feet(feet, up)
@@ -181,7 +181,7 @@ def test_the_floor_is_below_a_platform_that_is_larger(height_m):
     assert f"{height_m:.2f} m above the floor" in ground.note
 
 
-def test_what_lies_deep_below_and_is_small_is_no_floor():
+def test_small_surface_far_below_is_no_floor():
     points, normals = platform(0.3, 1.49)  # a rim of 0.12 square metres
     ground = fit_ground(points, normals, RIG, BY_GRAVITY, tolerance_m=0.015, cell_m=CELL_M)
     assert abs(errors(ground)[1] - 0.3) < 0.002 and ground.note == ""
@@ -199,7 +199,7 @@ def test_a_beam_does_not_bend_the_floor(height_m):
     assert angle < 0.05 and offset < 0.0005
 
 
-def test_a_floor_that_a_misplaced_camera_shows_again_is_no_lower_one():
+def test_misplaced_camera_adds_no_lower_floor():
     points, normals = room(0, table=False)
     rng = np.random.default_rng(4)
     again = np.column_stack([rng.uniform(-1.2, 1.2, (1200, 2)), np.full(1200, -0.2)])

@@ -106,7 +106,7 @@ def test_depth_bias_of_one_camera_is_found():
     assert error.max() < 0.005
 
 
-def test_the_body_ties_down_what_a_bare_floor_leaves_free():
+def test_body_constrains_rigs_above_a_bare_floor():
     found, _ = surfaces(1, boxes=np.zeros((0, 2, 3)), walls=None)
     start = perturbed(TRUTH, np.random.default_rng(3), 0.01, 0.3)
     registration = registration_of(start, found)
@@ -140,7 +140,7 @@ def test_body_equations_are_the_derivatives_of_the_reprojection():
     np.testing.assert_allclose(by_point[..., 0], numeric, rtol=1e-3, atol=0.05)
 
 
-def test_moving_all_cameras_together_costs_the_body_nothing():
+def test_moving_all_cameras_together_has_no_body_cost():
     views = views_of(2, 0.0)
     matrix, gradient = BodyConstraint(views, TRUTH)(TRUTH.master_from_colour, none())
     together = np.zeros((6, 6, 3))
@@ -159,7 +159,7 @@ def test_triangulated_points_agree_with_the_constraints_own():
     np.testing.assert_allclose(body._points, found.points, atol=0.002)
 
 
-def test_cameras_that_share_nothing_stay_where_they_were():
+def test_cameras_without_overlap_keep_their_poses():
     found, _ = surfaces(0)
     start = perturbed(TRUTH, np.random.default_rng(1), 0.01, 0.3)
     only = registration_of(start, {3: found[3]})
@@ -168,7 +168,7 @@ def test_cameras_that_share_nothing_stay_where_they_were():
     assert len(only.residuals(refined, STATIC).pairs) == 0
 
 
-def test_poses_can_be_held_while_bias_is_found():
+def test_bias_is_found_with_fixed_poses():
     found, bias = surfaces(0, bias_m=0.004)
     held = registration_of(TRUTH, found).solve(RigEstimate.start(TRUTH), free_poses=False)
     np.testing.assert_array_equal(held.estimate.poses, TRUTH.master_from_colour)
@@ -223,7 +223,7 @@ def test_specks_gain_no_more_than_the_limit() -> None:
     assert found.sum() == pytest.approx(1000)
 
 
-def test_what_is_balanced_or_of_one_direction_stays_to_the_byte() -> None:
+def test_balanced_weights_are_unchanged() -> None:
     weight = np.random.default_rng(3).uniform(0, 1, 300)
     mixed = _normals({tuple(VERTICAL): 100, tuple(ACROSS): 100, tuple(AHEAD): 100})
     np.testing.assert_array_equal(balance_directions(weight, mixed), weight)

@@ -35,7 +35,7 @@ def exposures(slip: np.ndarray, offset: np.ndarray | float = 0.0, fps: float = F
     return np.arange(len(slip))[:, None] / fps - slip / fps + offset
 
 
-def test_nothing_is_found_where_nothing_slips():
+def test_no_slips_in_synchronised_images():
     for seed in range(2):
         assert not find_slips(seen(exposures(np.zeros((40, 6))), seed), RIG, TIMES, FPS).intervals
 
@@ -65,7 +65,7 @@ def test_whole_frames_of_delay_count_from_the_master():
 
 
 @pytest.mark.parametrize(("fps", "frames"), [(5, 4), (15, 4), (30, 4), (60, 8), (120, 16)])
-def test_slips_are_sought_as_long_in_time_and_in_frames_as_at_thirty_a_second(fps, frames):
+def test_longest_slip_by_frame_rate(fps, frames):
     assert longest_slip(fps) == frames
 
 
@@ -78,7 +78,7 @@ def test_at_sixty_a_second_a_slip_lasts_more_frames():
     assert np.abs(found.slip - slip).mean() < 0.1
 
 
-def test_a_slip_while_nobody_moves_is_not_reported():
+def test_slip_without_motion_is_not_reported():
     slip = np.zeros((40, 6), np.int32)
     slip[10:20, 1] = 2
     assert not find_slips(seen(exposures(slip), moving=False), RIG, TIMES, FPS).intervals

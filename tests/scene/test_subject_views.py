@@ -41,5 +41,5 @@ def test_a_late_view_is_the_subject():
     assert (found(np.zeros(2)) == 0).all()
 
 
-def test_somebody_else_is_not():
+def test_other_person_is_not_recognised():
     assert (found(np.array([0.0, 400.0]))[6:9, 2] == NOBODY).all()

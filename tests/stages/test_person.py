@@ -110,7 +110,7 @@ def test_points_views_and_flags(tmp_path, detected):
         ) == T * 6 + 1
 
 
-def test_without_neck_and_mid_hip_they_are_between_shoulders_and_hips(tmp_path, detected):
+def test_missing_neck_and_mid_hip_are_filled_in(tmp_path, detected):
     lacking = detected.copy()
     lacking[:, :, [1, 8]] = 0  # as COCO's layouts have it
     people = [[[lacking[t, c]] for c in range(6)] for t in range(T)]
@@ -145,7 +145,7 @@ def test_masks_follow_the_points_not_the_label_or_the_order(tmp_path, detected):
     assert chosen[3] == b"" and chosen[4] == b""
 
 
-def test_a_camera_that_shows_another_person_is_missed_for_as_long(tmp_path, detected):
+def test_camera_with_another_person_is_excluded_meanwhile(tmp_path, detected):
     """The detector returns one person an image; its keypoints and its mask in the third camera are
     somebody else's in three sets. They are in nothing, and the other views lose nothing."""
     other = seen_by(walking(T, np.array([0.9, 0.7]), np.zeros(2)), RIG, UP)
@@ -193,7 +193,7 @@ def test_same_input_same_bytes(tmp_path, detected):
     assert run(tmp_path, people).read_bytes() == first
 
 
-def test_nobody_and_other_captures_are_named(tmp_path, detected):
+def test_missing_people_and_foreign_captures_are_rejected(tmp_path, detected):
     with pytest.raises(UserError, match=r"sequence test: .* no image has keypoints of anybody"):
         run(tmp_path, [[[] for _ in range(6)] for _ in range(T)])
     with pytest.raises(UserError, match=r"keypoints of anybody \(k2: all points lie outside\)"):

@@ -78,9 +78,7 @@ def test_a_perfect_start_is_not_made_worse(tmp_path):
     assert extrinsics_error(Rig.from_scene(paths["output"]), TRUTH, MIDDLE).max() < 0.004
 
 
-def test_a_camera_that_was_given_right_is_kept_beside_others_that_are_refined(
-    tmp_path, monkeypatch
-):
+def test_correct_pose_is_kept_while_others_are_refined(tmp_path, monkeypatch):
     # surfaces of six sets alone: nothing moves, and there is no second half of the keypoints
     monkeypatch.setattr(camera_verdicts, "DOUBTFUL_RATIO", 0.35)
     start = perturbed(TRUTH, np.random.default_rng(0), 0.01, 0.3)
@@ -140,7 +138,7 @@ def told(paths: dict[str, Path], depths: list[np.ndarray] | None = None, **state
         return found.attributes | {"height": height, "frame": z_up_frame(found)}
 
 
-def test_a_stated_floor_serves_where_none_is_measured_and_feet_do_not_deny_it(tmp_path):
+def test_stated_floor_is_used_unless_feet_contradict_it(tmp_path):
     paths = capture(tmp_path, TRUTH)
     agrees = told(paths, **STATED)
     assert agrees["ground_source"] == "stated" and abs(agrees["height"]) < 1e-9
@@ -152,7 +150,7 @@ def test_a_stated_floor_serves_where_none_is_measured_and_feet_do_not_deny_it(tm
         told(paths, stated_up=UP[0, :3])
 
 
-def test_a_measured_floor_stays_and_is_compared_with_the_stated_one(tmp_path):
+def test_measured_floor_is_kept_and_compared_with_the_stated_one(tmp_path):
     paths = capture(tmp_path, TRUTH)
     rng = np.random.default_rng(0)
     depths = []
@@ -164,7 +162,7 @@ def test_a_measured_floor_stays_and_is_compared_with_the_stated_one(tmp_path):
     assert raised["ground_note"] == "the floor is 0.20 m below the stated one"
 
 
-def test_without_any_floor_it_is_told_what_turned_z_up(tmp_path):
+def test_source_of_up_is_stated_without_a_floor(tmp_path):
     paths = capture(tmp_path, TRUTH)
     write_detections(paths["detections"], TRUTH, [[[] for _ in TRUTH] for _ in range(T)])
     by_cameras, stated = told(paths), told(paths, stated_up=UP[2, :3])
@@ -173,7 +171,7 @@ def test_without_any_floor_it_is_told_what_turned_z_up(tmp_path):
     assert "as stated with the calibration; no floor" in stated["frame"]
 
 
-def test_a_recording_without_images_and_a_floor_on_one_line_are_named(tmp_path):
+def test_missing_images_and_collinear_floors_are_rejected(tmp_path):
     paths = capture(tmp_path, TRUTH)
     with pytest.raises(UserError, match="sequence test: annotation floor"):
         scene.run(**paths, settings=SceneSettings(), floor=[(0, 0, 1), (0, 0, 2), (0, 0, 3)])
@@ -183,7 +181,7 @@ def test_a_recording_without_images_and_a_floor_on_one_line_are_named(tmp_path):
 
 
 @pytest.mark.parametrize("with_people", [True, False])
-def test_a_rig_without_any_overlap_is_told_and_not_made_worse(tmp_path, with_people):
+def test_rig_without_overlap_is_reported_and_not_degraded(tmp_path, with_people):
     start = perturbed(TRUTH, np.random.default_rng(5), 0.01, 0.3)
     paths = capture(tmp_path, start, np.zeros((0, 2, 3)), None)
     rng, depths = np.random.default_rng(1), []
@@ -225,7 +223,7 @@ def standing(tmp_path: Path, sets: int = 30, sound: np.ndarray | None = None) ->
     }
 
 
-def test_a_stated_start_serves_where_nobody_moves(tmp_path):
+def test_stated_start_aligns_cameras_without_motion(tmp_path):
     """Cameras started by hand; only the annotation knows of it."""
     paths = standing(tmp_path)
     starts = {"k1": (3600.0, 0.02), "k2": (3600.48, 0.02), "k3": (3599.8, 0.04)}
@@ -245,14 +243,14 @@ def test_a_stated_start_serves_where_nobody_moves(tmp_path):
     assert "state when it started" in notes[3] and (image_of[:, 3] == -1).all()
 
 
-def test_starts_that_leave_nothing_in_common_are_refused(tmp_path):
+def test_starts_without_common_time_are_rejected(tmp_path):
     paths = standing(tmp_path)
     starts = {"k1": (0.0, 0.02), "k2": (480.0, 0.02)}  # milliseconds
     with pytest.raises(UserError, match=r"sequence test: .* k2 start 480\.000 s later .* 1\.9 s"):
         scene.run(**paths, settings=SceneSettings(), floor=None, starts=starts)
 
 
-def test_the_sound_serves_where_nobody_moves(tmp_path):
+def test_sound_aligns_cameras_without_motion(tmp_path):
     heard = np.array([0.0, 0.48, -0.2, 0.02, 0.3, np.nan])
     paths = standing(tmp_path, sound=heard)
     scene.run(
@@ -268,7 +266,7 @@ def test_the_sound_serves_where_nobody_moves(tmp_path):
     assert "the sound 0.480 s later than its times say: the first was taken" in notes[1]
 
 
-def test_sound_of_images_that_are_in_step_changes_nothing(tmp_path):
+def test_sound_does_not_change_synchronised_cameras(tmp_path):
     """Devices lay sound tens of milliseconds beside their images: times of one clock are better."""
     (tmp_path / "heard").mkdir()
     quiet, heard = (

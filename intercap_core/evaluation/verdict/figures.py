@@ -189,20 +189,20 @@ def verdict_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
     from scipy.stats import spearmanr  # takes a second to import, which most processes do not need
 
     found = [e for s in sequences for e in stated_errors(s) if np.isfinite(e.true)]
-    said = [e for e in found if np.isfinite(e.stated)]
-    if not said:
+    stating = [e for e in found if np.isfinite(e.stated)]
+    if not stating:
         return {}
-    result: Figures = {"silent_share": 1 - len(said) / len(found)}
+    result: Figures = {"silent_share": 1 - len(stating) / len(found)}
     ranks = []
     for part in TRUE:
-        own = [e for e in said if e.part == part]
+        own = [e for e in stating if e.part == part]
         if len(own) > 2:
             rank = float(spearmanr([e.stated for e in own], [e.true for e in own]).statistic)
             result[f"rank_correlation_{part}"] = rank
             ranks.append(rank)
     if ranks:
         result["rank_correlation"] = float(np.mean(ranks))
-    stated, true = (np.array([getattr(e, name) for e in said]) for name in ("stated", "true"))
+    stated, true = (np.array([getattr(e, name) for e in stating]) for name in ("stated", "true"))
     ratio = np.maximum(stated / true, true / stated)
     result["within_factor_share"] = float((ratio < WITHIN).mean())
     bad = true > BAD_MM

@@ -21,6 +21,7 @@ import numpy as np
 import torch
 
 from intercap_core.config import JointSettings
+from intercap_core.evaluation.body import BODY_JOINTS, BOTH_HANDS
 from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.fit import Assembly, assemble
 from intercap_core.joint.inputs import JointInputs
@@ -77,7 +78,7 @@ class Refits:
         return step
 
 
-JOINTS = {JudgedPart.BODY: slice(0, 22), JudgedPart.HANDS: slice(25, 55)}
+JOINTS = {JudgedPart.BODY: BODY_JOINTS, JudgedPart.HANDS: BOTH_HANDS}
 
 
 @dataclass(frozen=True, eq=False)

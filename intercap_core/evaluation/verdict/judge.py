@@ -64,28 +64,27 @@ class SequenceVerdict:
             )
             for part in parts
         }
-        for part, said in stated.items():
-            if said.silent:
-                log.warning("%s: no stated error: %s", part, said.silent)
-            else:
-                low, high = 1e3 * said.error / said.factor, 1e3 * said.error * said.factor
-                log.info(
-                    "%s: stated error %.1f mm (%.1f to %.1f)", part, 1e3 * said.error, low, high
-                )
+        for part, estimate in stated.items():
+            if estimate.silent:
+                log.warning("%s: no stated error: %s", part, estimate.silent)
+                continue
+            error, factor = 1e3 * estimate.error, estimate.factor
+            low, high = error / factor, error * factor
+            log.info("%s: stated error %.1f mm (%.1f to %.1f)", part, error, low, high)
         return cls(names, len(result.state), held, stated)
 
     def values(self) -> Values:
         """Datasets of the metrics artefact by name, without the prefix ``verdict/``."""
         parts = list(self.stated)
-        said = [self.stated[part] for part in parts]
+        estimates = [self.stated[part] for part in parts]
         values: Values = {
             "part_names": [str(part) for part in parts],
             "feature_names": list(FEATURES),
-            "features": np.array([[s.features[name] for name in FEATURES] for s in said]),
-            "error": np.array([s.error for s in said]),
-            "error_factor": np.array([s.factor for s in said]),
-            "error_frame": np.stack([s.by_frame for s in said]),
-            "silent": [s.silent for s in said],
+            "features": np.array([[s.features[name] for name in FEATURES] for s in estimates]),
+            "error": np.array([s.error for s in estimates]),
+            "error_factor": np.array([s.factor for s in estimates]),
+            "error_frame": np.stack([s.by_frame for s in estimates]),
+            "silent": [s.silent for s in estimates],
             "camera_names": list(self.cameras),
         }
         if self.held is None:

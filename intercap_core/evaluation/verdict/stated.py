@@ -1,4 +1,4 @@
-"""ErrorEstimate error of a part, in metres, from the held-out evaluation.
+"""Stated error of a part, in metres, from the held-out evaluation.
 
     error^2 = rest^2 + (a shift)^2 + (b keypoint)^2 + (c sigma)^2 + (d moved)^2
 
@@ -22,9 +22,6 @@ from typing import NamedTuple
 import numpy as np
 
 from intercap_core.evaluation.verdict.hold_out import HeldOut, JudgedPart
-
-# No error is stated where fewer than this share of the frames was measured.
-MIN_JUDGED_SHARE = 0.5
 
 
 class Factors(NamedTuple):
@@ -89,7 +86,7 @@ def estimate_error(
     keypoint = np.full(len(shift), _median(held.keypoint_m))
     by_frame = np.stack([shift, keypoint, sigma, moved], axis=1)
     usable = known & np.isfinite(by_frame).all(axis=1)
-    if usable.sum() < max(1, MIN_JUDGED_SHARE * len(known)):
+    if usable.sum() < max(1, 0.5 * len(known)):
         reason = f"only {int(usable.sum())} of {len(known)} frames were measured"
         return ErrorEstimate(float("nan"), factors.spread, nothing, empty, reason)
     by_frame[~usable] = np.nan

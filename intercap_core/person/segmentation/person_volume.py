@@ -46,14 +46,6 @@ SOLE_RADII_M: dict[tuple[str, str], tuple[float, float, float]] = {
 FINGER_RADII_M = (0.012, 0.010, 0.009)  # at the knuckle, middle, tip
 PALM_RADII_M = (0.024, 0.016)  # at the wrist, at the knuckles
 HAND_MARGIN_M = 0.012  # fingers are located within millimetres; tuned on the studio
-# A hand without visible fingers extends from the wrist along the forearm (anatomy).
-BLIND_HAND_LENGTH_M = 0.15
-BLIND_HAND_RADIUS_M = 0.045
-BLIND_HAND_MARGIN_M = 0.02  # tuned on the studio
-USUAL_TRUNK_M = 0.50  # neck to middle of the hips of a person with these radii (anatomy)
-MAX_HAND_SPEED_M_S = 8.0  # hands reach 5 m/s in everyday tasks
-UNKNOWN_OFFSET_S = 0.01  # standard deviation of an undetermined time offset: spread over scenes
-MAX_KEYPOINT_GAP_S = 0.5  # longest gap of a keypoint that is interpolated; tuned on the studio
 BONES_PER_GROUP = 5  # bones that are skipped together if a point is far from all of them
 FAR = 20.0  # largest distance that is computed, margins
 
@@ -74,7 +66,8 @@ def build_bones(joints: np.ndarray, sigma: np.ndarray | None = None) -> np.ndarr
     points = np.column_stack([joints, off])  # (135, 4)
     at = {name: points[i] for i, name in enumerate(KEYPOINT_NAMES[:67])}
     at["middle_ear"] = _middle(at["left_ear"], at["right_ear"])
-    size = float(np.linalg.norm((at["neck"] - at["mid_hip"])[:3])) / USUAL_TRUNK_M
+    # neck to middle of the hips of a person with these radii (anatomy)
+    size = float(np.linalg.norm((at["neck"] - at["mid_hip"])[:3])) / 0.50
     # from children to the tallest adults
     size = float(np.clip(size, 0.6, 1.25)) if np.isfinite(size) else 1.0
     radii = list(TRUNK_RADII_M.items())
@@ -112,8 +105,9 @@ def _hand(
         return rows
     along = wrist - at[f"{side}_elbow"]
     along[3] = 0.0  # as uncertain as the wrist
-    along *= BLIND_HAND_LENGTH_M / max(float(np.linalg.norm(along)), 1e-6)
-    return [(wrist, wrist + along, BLIND_HAND_RADIUS_M, BLIND_HAND_RADIUS_M, BLIND_HAND_MARGIN_M)]
+    # without visible fingers: 15 cm along the forearm, 4.5 cm thick (anatomy), margin tuned
+    along *= 0.15 / max(float(np.linalg.norm(along)), 1e-6)
+    return [(wrist, wrist + along, 0.045, 0.045, 0.02)]
 
 
 def _middle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -191,13 +185,16 @@ class MovingPerson:
         times = scene["times"]
         if frame_from_master is not None:
             joints = apply(frame_from_master, joints.reshape(-1, 3)).reshape(joints.shape)
-        self.joints = fill_short_gaps(joints, times, max_gap_s=MAX_KEYPOINT_GAP_S)
+        # longer gaps than half a second are not interpolated; tuned on the studio
+        self.joints = fill_short_gaps(joints, times, max_gap_s=0.5)
         self._sigma = np.nan_to_num(sigma)
         self._velocity = np.nan_to_num(
-            limited_velocity(self.joints, times, max_speed=MAX_HAND_SPEED_M_S)
+            # m/s; hands reach 5 m/s in everyday tasks
+            limited_velocity(self.joints, times, max_speed=8.0)
         )
         self._late = scene["time_offset"]
-        self._late_sigma = np.nan_to_num(scene["time_offset_sigma"], nan=UNKNOWN_OFFSET_S)
+        # seconds, of undetermined offsets: their spread over scenes
+        self._late_sigma = np.nan_to_num(scene["time_offset_sigma"], nan=0.01)
 
     def bones(self, t: int, c: int) -> np.ndarray:
         """Bones (B, 9) at the exposure of camera ``c`` at moment ``t``, see :func:`build_bones`."""

@@ -14,15 +14,10 @@ import numpy as np
 
 from intercap_core.person.segmentation.foreground import DepthBackground, DepthView
 
-WITHIN_REACH_M = 0.35  # distance to a keypoint of the person at any time; tuned on the studio
 STATIC_CELL_M = 0.025  # side of the cells of components; tuned on the studio
 SURFACE_CELL_M = 0.02  # side of the cells of a surface; tuned on the studio
 SURFACE_POINTS = 2  # least number of points of a surface in a cell; tuned on the studio
 MIN_STATIC_POINTS = 60  # of a static component, over all views; tuned on the studio
-LARGEST_M = 2.2  # largest object that one person handles; tuned on the studio
-LAYER_M = 0.02  # thickness of a level surface; tuned on the studio
-LEVEL_SHARE = 0.12  # of a component's points in a level surface; tuned on the studio
-ABOVE_M = 0.012  # height of an object's points above the surface under it; tuned on the studio
 _BITS = 21  # of a coordinate in the key of a cell
 
 
@@ -176,7 +171,8 @@ def find_static_objects(
     def add(members: np.ndarray, on_top: bool, carries: bool) -> None:
         own = points[members]
         size, away = box_diagonal(own), _away(own, walked)
-        if size < LARGEST_M and away < WITHIN_REACH_M:
+        # size of what one person handles, and reach, metres; tuned on the studio
+        if size < 2.2 and away < 0.35:
             pixels = [pixel[members[view_of[members] == v]] for v in range(len(views))]
             cells = OccupiedCells(own, SURFACE_CELL_M, SURFACE_POINTS)
             objects.append(StaticObject(size, away, on_top, carries, pixels, cells))
@@ -203,13 +199,14 @@ def _above_level(points: np.ndarray, members: np.ndarray) -> np.ndarray:
     """Members of a component above its highest large level surface; none without such a surface."""
     height = points[members, 2]
     bottom = float(height.min())
-    counts = np.bincount(((height - bottom) / LAYER_M).astype(int))
-    level = np.flatnonzero(counts > LEVEL_SHARE * len(members))
+    thickness = 0.02  # of a level surface, metres; tuned on the studio
+    counts = np.bincount(((height - bottom) / thickness).astype(int))
+    level = np.flatnonzero(counts > 0.12 * len(members))  # share of the points; tuned
     if not len(level):
         return members[:0]
-    low = bottom + level[-1] * LAYER_M
-    layer = height[(height >= low) & (height < low + LAYER_M)]
-    return members[height > float(np.median(layer)) + ABOVE_M]
+    low = bottom + level[-1] * thickness
+    layer = height[(height >= low) & (height < low + thickness)]
+    return members[height > float(np.median(layer)) + 0.012]  # noise of the depth; tuned
 
 
 def box_diagonal(points: np.ndarray) -> float:

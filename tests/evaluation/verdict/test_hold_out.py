@@ -71,7 +71,7 @@ def test_every_camera_is_held_out_in_turn(held: HeldOut) -> None:
         assert np.isfinite(held.repeated[part]).all()
 
 
-def test_only_the_held_camera_judges_a_frame(held: HeldOut) -> None:
+def test_only_the_held_out_camera_judges_a_frame(held: HeldOut) -> None:
     for name, without in vars(held.held_out).items():
         judged = np.isfinite(without)
         assert not judged[np.arange(3) != held.camera_index[:, None]].any(), name
@@ -97,7 +97,9 @@ def _lying(capture: fitted.Capture, folder: Path, camera: int, pixels: float) ->
     return path
 
 
-def test_a_camera_that_lies_is_told(capture: fitted.Capture, held: HeldOut, tmp_path: Path) -> None:
+def test_wrong_camera_has_a_large_held_out_error(
+    capture: fitted.Capture, held: HeldOut, tmp_path: Path
+) -> None:
     lie = _held(capture, person=_lying(capture, tmp_path, camera=1, pixels=3.0))
     before, after = (np.mean(h.shift[JudgedPart.BODY], axis=1) for h in (held, lie))
     # of what the lie is worth at the person's distance
@@ -143,7 +145,7 @@ def _joints(inputs: JointInputs, state: State) -> np.ndarray:
     return body.joints.detach().numpy()[:, JOINTS[JudgedPart.BODY]]
 
 
-def test_one_camera_alone_judges_nothing(capture: fitted.Capture, tmp_path: Path) -> None:
+def test_single_camera_has_no_verdict(capture: fitted.Capture, tmp_path: Path) -> None:
     path = tmp_path / "person.h5"
     shutil.copy(capture.paths["person"], path)
     with h5py.File(path, "r+") as file:

@@ -43,7 +43,7 @@ def test_features_add_up_as_squares() -> None:
     assert said.factor == spread and said.silent == ""
 
 
-def test_frames_that_were_filled_in_say_nothing() -> None:
+def test_filled_frames_have_no_stated_error() -> None:
     known = np.array([True, True, True, False])
     said = estimate_error(
         _held(0.003, 0.02), JudgedPart.OBJECT, np.full(T, 0.005), np.zeros(T), known
@@ -61,7 +61,7 @@ def test_frames_that_were_filled_in_say_nothing() -> None:
         (_held(0.003, np.nan), T, "only 0 of 4 frames"),
     ],
 )
-def test_nothing_is_said_without_evidence(held: HeldOut | None, known: int, reason: str) -> None:
+def test_no_stated_error_without_evidence(held: HeldOut | None, known: int, reason: str) -> None:
     said = estimate_error(
         held, JudgedPart.BODY, np.full(T, 0.005), np.zeros(T), np.arange(T) < known
     )
@@ -136,6 +136,6 @@ def test_factors_are_found_again() -> None:
     assert np.median(np.abs(np.log(bench.left_out(samples) / true))) < 0.03
 
 
-def test_a_file_without_verdict_is_told(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_file_without_verdict_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert bench.main([str(tmp_path / "absent.h5")]) == 2
     assert "absent.h5" in capsys.readouterr().err

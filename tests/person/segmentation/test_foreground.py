@@ -65,7 +65,7 @@ def test_no_points_are_no_component():
     assert not OccupiedCells(np.zeros((0, 3), np.float32), 0.1, 1).holds(np.zeros((2, 3))).any()
 
 
-def test_occupied_holds_cells_and_those_beside_them():
+def test_occupied_cells_include_face_neighbours():
     known = OccupiedCells(np.array([[0.05, 0.05, 0.05], [-0.95, 0.05, 0.05]]), 0.1, 1)
     asked = np.array([[0.05, 0.05, 0.05], [0.15, 0.05, 0.05], [0.05, -0.05, 0.05],
                       [0.15, 0.15, 0.05], [0.25, 0.05, 0.05], [-0.85, 0.05, 0.05]])  # fmt: skip
@@ -123,7 +123,7 @@ def test_points_and_reach_of_a_view():
     assert (image.ravel()[index][inside] <= reach[inside]).all()
 
 
-def test_a_thing_that_gives_way_is_no_background():
+def test_object_that_leaves_is_no_background():
     steady = np.full((40, 60), 3000, np.uint16)
     item = steady.copy()
     item[10:30, 20:40] = 2000
@@ -151,7 +151,7 @@ def test_pixels_that_float_at_an_edge_are_left_out():
     assert 5 * 20 + 9 not in found and 5 * 20 + 10 in found and len(found) == 399
 
 
-def test_what_another_camera_sees_through_is_no_background():
+def test_free_space_of_another_camera_is_no_background():
     """A box that only the first camera holds for background: the others saw the floor there."""
     rng = np.random.default_rng(2)
     box = np.array([[[-0.2, -0.2, 0.3], [0.2, 0.2, 0.8]]])
@@ -171,7 +171,7 @@ def test_what_another_camera_sees_through_is_no_background():
         assert ((old.depth > 0) & (new.depth == 0)).mean() < 0.01
 
 
-def test_static_things_near_the_person_and_on_a_table():
+def test_static_objects_near_the_person_and_on_a_table():
     """A mug on a table, a stool; furniture that nobody comes near is none."""
     rng = np.random.default_rng(2)
     table = np.array([[-0.3, -0.3, 0.0], [0.3, 0.3, 0.7]])
@@ -219,7 +219,7 @@ def test_a_window_of_cells_is_encoded_as_the_whole_image(scale):
         np.testing.assert_array_equal(masks.decode(rle, height, width), expected)
 
 
-def test_nearer_pixels_hide_farther_ones_and_holes_close_over_nobody_else():
+def test_projection_resolves_occlusion_and_closes_holes():
     camera = RIG[0]
     index = np.arange(camera.depth.height * camera.depth.width)
     near = np.zeros((camera.depth.height, camera.depth.width), np.uint16)
@@ -263,7 +263,7 @@ def test_median_without_the_person_and_with_changing_exposure():
     assert np.abs(median - 0.8 * room).max() < 12
 
 
-def test_a_shadow_or_another_exposure_is_not_before_the_scene_but_a_thing_is():
+def test_object_is_foreground_but_shadow_and_exposure_are_not():
     rng = np.random.default_rng(1)
     room = coloured_room(rng)
     known = np.ones(room.shape[:2], bool)
@@ -278,7 +278,7 @@ def test_a_shadow_or_another_exposure_is_not_before_the_scene_but_a_thing_is():
     assert found.mean() < 0.01
 
 
-def test_the_person_is_drawn_where_the_points_within_the_body_are_seen():
+def test_drawn_volume_covers_points_within_the_body():
     camera = RIG[2]
     joints = apply(invert(UP), stick_person())
     bones = build_bones(joints)

@@ -86,12 +86,12 @@ def test_the_person_is_segmented(segmented):
 
 
 @pytest.mark.parametrize("t", [1, 6, 12])
-def test_what_is_carried_is_a_candidate_at_rest_and_in_the_hand(written, segmented, t):
+def test_carried_object_is_a_candidate_at_rest_and_in_the_hand(written, segmented, t):
     found = best_overlaps(written, segmented, t, BOX)
     assert len(found) >= 2 and np.median(found) > 0.6 and min(found) > 0.35
 
 
-def test_what_never_moves_is_a_candidate_where_the_person_passes(written, segmented):
+def test_static_object_near_the_path_is_a_candidate(written, segmented):
     found = best_overlaps(written, segmented, 12, SCENERY)
     assert len(found) >= 3 and min(found) > 0.6
 
@@ -107,7 +107,7 @@ def test_candidates_tell_their_size_and_are_few(segmented):
     assert count.max() <= 8  # furniture that nobody comes near is none
 
 
-def test_without_a_floor_what_moves_is_found(written, tmp_path):
+def test_moving_objects_are_found_without_a_floor(written, tmp_path):
     frames, scene = CAPTURE.write(tmp_path, floor=False)
     wanted = np.zeros((CAPTURE.sets, CAPTURE.views), bool)
     wanted[12] = True
@@ -125,7 +125,7 @@ def test_without_a_floor_what_moves_is_found(written, tmp_path):
     assert np.median(overlaps) > 0.6
 
 
-def test_only_the_images_asked_for_are_segmented_and_lost_keypoints_are_bridged(written):
+def test_only_requested_images_are_segmented_and_gaps_are_filled(written):
     frames, scene, _ = written
     wanted = np.zeros((CAPTURE.sets, CAPTURE.views), bool)
     wanted[7, 1] = wanted[7, 3] = wanted[9, 0] = True
@@ -147,7 +147,7 @@ def test_images_that_a_detector_saw_are_left_to_it(written, tmp_path, monkeypatc
         assert "candidate_rle" not in found
 
 
-def test_what_the_images_show_follows_a_detectors_candidates(written, segmented, tmp_path):
+def test_image_candidates_follow_those_of_the_detector(written, segmented, tmp_path):
     frames, scene, _ = written
     rle = masks.encode(np.eye(1080, 1920, dtype=bool))
     named = {(7, 1): [("cup", rle)]}

@@ -49,7 +49,7 @@ def test_a_fast_hand_is_where_a_late_camera_sees_it() -> None:
     assert distance_outside(tip, moving.bones(4, 0)) > distance_outside(tip, moving.bones(4, 1)) + 1
 
 
-def test_margins_grow_by_what_keypoints_and_times_are_off_by() -> None:
+def test_margins_include_uncertainty_of_keypoints_and_times() -> None:
     joints, _ = swinging()
     usual = build_bones(joints[4])[:, 8]
     np.testing.assert_allclose(
@@ -65,7 +65,7 @@ def test_margins_grow_by_what_keypoints_and_times_are_off_by() -> None:
     np.testing.assert_allclose(untold, fast, rtol=1e-5)  # 10 ms where nothing is told
 
 
-def test_points_scatter_by_what_is_said_of_them() -> None:
+def test_points_scatter_by_their_stated_deviation() -> None:
     """Triangulated from noisy pixels of four and of two cameras."""
     rig, _ = ring()
     rng = np.random.default_rng(4)
