@@ -24,9 +24,9 @@ from intercap_core.body.parameters import NUM_POSE
 from intercap_core.body.selection import Selection
 from intercap_core.body.skeleton_kernel import _rodrigues, rest_points
 
-NUM_FEATURES = 486  # nine numbers of each rotation but the root's
-_FIRST = 3  # parameter of the first joint below the root
-_TOGETHER = 16  # points whose table stays in a core's own cache for all bodies
+NUM_FEATURES = 486  # nine numbers of each of the 54 rotations below the root (SMPL-X)
+_FIRST = 3  # parameter of the first joint below the root (SMPL-X)
+_TOGETHER = 16  # points whose tables, 6 kB each, stay in a core's cache for all bodies: speed
 
 
 class Correctives(NamedTuple):

@@ -8,10 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from intercap_core.body.joints import JOINT_INDEX
+
+if TYPE_CHECKING:
+    from intercap_core.body.loading import BodyArrays
 
 # (keypoint, joint name or "@" + name of a mesh point)
 _BODY: tuple[tuple[str, str], ...] = (
@@ -45,8 +49,8 @@ KEYPOINT_NAMES: tuple[str, ...] = (
     *(f"face_{i}" for i in range(17)),
 )
 NUM_KEYPOINTS = len(KEYPOINT_NAMES)
-BODY, LEFT_HAND, RIGHT_HAND = slice(0, 25), slice(25, 46), slice(46, 67)
-FACE, CONTOUR = slice(67, 118), slice(118, 135)
+BODY, LEFT_HAND, RIGHT_HAND = slice(0, 25), slice(25, 46), slice(46, 67)  # order of OpenPose
+FACE, CONTOUR = slice(67, 118), slice(118, 135)  # order of SMPL-X's landmarks
 
 # Bones between body keypoints by name: of an arm, leg and foot of one side; of both sides at once.
 ARM_BONES = (("shoulder", "elbow"), ("elbow", "wrist"))
@@ -73,7 +77,7 @@ FEET = (*of_side("right", FOOT_BONES), *of_side("left", FOOT_BONES))
 
 
 def keypoint_pairs(bones: Iterable[tuple[str, str]]) -> np.ndarray:
-    """Indices (B, 2) of both ends of bones among the 135 keypoints."""
+    """Return the indices (B, 2) of both ends of bones among the 135 keypoints."""
     ends = [[KEYPOINT_NAMES.index(first), KEYPOINT_NAMES.index(second)] for first, second in bones]
     return np.array(ends, int).reshape(-1, 2)
 
@@ -93,32 +97,26 @@ class KeypointMap:
     matrix: np.ndarray
     """(135, N + 55) maps these vertices followed by the 55 joints to the keypoints."""
 
-
-def keypoint_map(
-    points: dict[str, int],
-    faces: np.ndarray,
-    landmark_faces: np.ndarray,
-    landmark_barycentric: np.ndarray,
-    contour_faces: np.ndarray,
-    contour_barycentric: np.ndarray,
-) -> KeypointMap:
-    """Build the map from named vertices and the file's landmarks (51) and frontal jaw line (17)."""
-    joint = np.full(NUM_KEYPOINTS, -1)
-    ids = np.zeros((NUM_KEYPOINTS, 3), int)
-    weights = np.zeros((NUM_KEYPOINTS, 3))
-    for row, (_, source) in enumerate(_POINTS):
-        if source.startswith("@"):
-            ids[row] = points[source[1:]]
-            weights[row, 0] = 1
-        else:
-            joint[row] = JOINT_INDEX[source]
-    ids[FACE], weights[FACE] = faces[landmark_faces], landmark_barycentric
-    ids[CONTOUR], weights[CONTOUR] = faces[contour_faces], contour_barycentric
-    vertex_rows = np.flatnonzero(joint < 0)
-    vertex_ids = np.unique(ids[vertex_rows])
-    matrix = np.zeros((NUM_KEYPOINTS, len(vertex_ids) + 55))
-    place = np.searchsorted(vertex_ids, ids[vertex_rows])
-    np.add.at(matrix, (vertex_rows[:, None], place), weights[vertex_rows])
-    joint_rows = np.flatnonzero(joint >= 0)
-    matrix[joint_rows, len(vertex_ids) + joint[joint_rows]] = 1
-    return KeypointMap(joint, ids, weights, vertex_ids, matrix)
+    @classmethod
+    def of(cls, points: dict[str, int], file: BodyArrays) -> KeypointMap:
+        """Build the map from named vertices and the file's landmarks and frontal jaw line."""
+        joint = np.full(NUM_KEYPOINTS, -1)
+        ids = np.zeros((NUM_KEYPOINTS, 3), int)
+        weights = np.zeros((NUM_KEYPOINTS, 3))
+        for row, (_, source) in enumerate(_POINTS):
+            if source.startswith("@"):
+                ids[row] = points[source[1:]]
+                weights[row, 0] = 1
+            else:
+                joint[row] = JOINT_INDEX[source]
+        ids[FACE], weights[FACE] = file.faces[file.landmark_faces], file.landmark_barycentric
+        ids[CONTOUR] = file.faces[file.contour_faces[0]]
+        weights[CONTOUR] = file.contour_barycentric[0]
+        vertex_rows = np.flatnonzero(joint < 0)
+        vertex_ids = np.unique(ids[vertex_rows])
+        matrix = np.zeros((NUM_KEYPOINTS, len(vertex_ids) + 55))
+        place = np.searchsorted(vertex_ids, ids[vertex_rows])
+        np.add.at(matrix, (vertex_rows[:, None], place), weights[vertex_rows])
+        joint_rows = np.flatnonzero(joint >= 0)
+        matrix[joint_rows, len(vertex_ids) + joint[joint_rows]] = 1
+        return cls(joint, ids, weights, vertex_ids, matrix)

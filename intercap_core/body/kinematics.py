@@ -12,8 +12,8 @@ from torch.autograd.function import once_differentiable
 
 from intercap_core.body.joints import NUM_JOINTS, PARENTS
 
-SMALL_ANGLE_SQUARED = 1e-4  # below this the series' next term is under 1e-10
-_CACHE_BYTES = 2 << 20  # of blended bones in memory at once: the cache of a core
+SMALL_ANGLE_SQUARED = 1e-4  # rad^2; below it the next term of the series is under 1e-10
+_CACHE_BYTES = 2 << 20  # blended bones in memory at once, the cache of a core: speed
 
 
 def skew(v: Tensor) -> Tensor:

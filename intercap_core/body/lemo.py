@@ -29,6 +29,7 @@ from intercap_core.errors import UserError
 from intercap_core.inputs.arrays import read_arrays
 from intercap_core.inputs.files import UnreadableFile
 
+# Sizes of the released network and its input (Zhang et al. 2021)
 FRAMES_PER_SECOND = 30.0
 COORDINATES = 3 * len(MARKER_NAMES)
 _ROWS, _COLUMNS = 1, 8  # of reflection, at each side
@@ -127,20 +128,14 @@ def _read_spread(path: Path) -> np.ndarray:
             f"{_HINT}"
         )
     spread = arrays["Xstd"]
+    fault = ""
     if spread.shape != (COORDINATES,):
-        raise UserError(
-            f"LEMO's statistics {path}: Xstd has {spread.shape}, expected ({COORDINATES},) for "
-            f"{len(MARKER_NAMES)} markers; {_HINT}"
-        )
-    if spread.dtype.kind != "f":
-        raise UserError(
-            f"LEMO's statistics {path}: Xstd has {spread.dtype}, expected metres; {_HINT}"
-        )
+        fault = f"{spread.shape}, expected ({COORDINATES},) for {len(MARKER_NAMES)} markers"
+    elif spread.dtype.kind != "f":
+        fault = f"{spread.dtype}, expected metres"
     # markers of a body that walks through a room: some decimetres
-    wrong = ~((spread > 1e-4) & (spread < 100.0))
-    if wrong.any():
-        raise UserError(
-            f"LEMO's statistics {path}: Xstd has {spread[wrong][:1]}, expected metres above 0, "
-            f"0.0001 to 100; {_HINT}"
-        )
+    elif (wrong := ~((spread > 1e-4) & (spread < 100.0))).any():
+        fault = f"{spread[wrong][:1]}, expected metres above 0, 0.0001 to 100"
+    if fault:
+        raise UserError(f"LEMO's statistics {path}: Xstd has {fault}; {_HINT}")
     return spread

@@ -19,7 +19,7 @@ from intercap_core.geometry.rigid.surfaces import vertex_normals
 from intercap_core.inputs.documents import read_json
 from intercap_core.inputs.files import quoted
 
-SMPLX_VERTICES = 10_475
+SMPLX_VERTICES = 10_475  # Pavlakos et al. 2019
 
 # Vertex ids that the smplx package appends as joints 55 to 75 (its table of extra joints).
 _SMPLX_POINTS = {

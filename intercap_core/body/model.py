@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from intercap_core.body.jacobian import Linearisation, linearise, shaped_points
-from intercap_core.body.keypoints import KeypointMap, keypoint_map
+from intercap_core.body.keypoints import KeypointMap
 from intercap_core.body.kinematics import (
     PosedJoints,
     pose_joints,
@@ -24,7 +24,7 @@ from intercap_core.body.kinematics import (
 )
 from intercap_core.body.loading import BodyArrays, load_body_file
 from intercap_core.body.maps import find_regions, load_maps
-from intercap_core.body.parameters import BodyParameters
+from intercap_core.body.parameters import TRANSL, BodyParameters
 from intercap_core.body.selection import Selection, select_points
 from intercap_core.errors import UserError
 
@@ -45,7 +45,11 @@ class BodyModel:
     """A body of V vertices and 55 joints in SMPL-X's conventions (y up, facing +z, metres).
 
     Attributes:
+        template: (V, 3) mean shape in the T-pose.
+        skinning_weights: (V, 55), rows sum to one.
         faces: (F, 3) int64.
+        num_vertices: V.
+        num_parameters: length P of a parameter vector.
         hand_mean: (2, 45), left then right: axis-angle = mean + coefficients @ components.
         hand_components: (2, H, 45)
         hand_deviation: (2, H) standard deviation of each coefficient.
@@ -62,13 +66,15 @@ class BodyModel:
         self.device, self.dtype = device, dtype
         self.num_betas = file.shape_directions.shape[2]
         self.num_expression = file.expression_directions.shape[2]
+        self.num_vertices = len(file.template)
+        self.num_parameters = TRANSL.stop + self.num_betas + self.num_expression
         self.faces = torch.as_tensor(file.faces, device=device)
         directions = np.concatenate([file.shape_directions, file.expression_directions], 2)
         rest_joints = file.joint_regressor @ file.template
-        self._template = tensor(file.template)
+        self.template = tensor(file.template)
         self._directions = tensor(directions)
         self._posedirs = None if file.posedirs is None else tensor(file.posedirs)
-        self._weights = tensor(file.weights)
+        self.skinning_weights = tensor(file.weights)
         self._rest_joints = tensor(rest_joints)
         self._joint_directions = tensor(np.einsum("jv,vcs->jcs", file.joint_regressor, directions))
         self.hand_mean = tensor(file.hand_mean)
@@ -79,14 +85,7 @@ class BodyModel:
         self.hand_deviation = tensor(deviation)
 
         maps = load_maps(file.path, len(file.template))
-        self.keypoint_map: KeypointMap = keypoint_map(
-            maps.points,
-            file.faces,
-            file.landmark_faces,
-            file.landmark_barycentric,
-            file.contour_faces[0],
-            file.contour_barycentric[0],
-        )
+        self.keypoint_map = KeypointMap.of(maps.points, file)
         self._keypoint_matrix = tensor(self.keypoint_map.matrix)
         self.markers = maps.markers
         self.regions = maps.regions or _regions(file, rest_joints)
@@ -128,33 +127,10 @@ class BodyModel:
         )
         return cls(file, torch.device(device), dtype)
 
-    @property
-    def num_vertices(self) -> int:
-        return self._template.shape[0]
-
-    @property
-    def num_parameters(self) -> int:
-        return 168 + self.num_betas + self.num_expression
-
-    @property
-    def template(self) -> Tensor:
-        """(V,3) mean shape in the T-pose."""
-        return self._template
-
-    @property
-    def skinning_weights(self) -> Tensor:
-        """(V,55), rows sum to one."""
-        return self._weights
-
     def zeros(self, batch: int = 1) -> BodyParameters:
-        """Return T-posed mean bodies with flat hands."""
-        return BodyParameters.zeros(
-            batch,
-            num_betas=self.num_betas,
-            num_expression=self.num_expression,
-            device=self.device,
-            dtype=self.dtype,
-        )
+        """Return T-posed mean bodies with flat hands, at the origin."""
+        vector = torch.zeros(batch, self.num_parameters, device=self.device, dtype=self.dtype)
+        return self.parameters(vector)
 
     def parameters(self, vector: Tensor) -> BodyParameters:
         """Split parameter vectors (B,P)."""
@@ -215,10 +191,10 @@ class BodyModel:
         if key not in self._selections:
             at = slice(None) if ids is None else ids
             self._selections[key] = select_points(
-                self._template[at],
+                self.template[at],
                 self._directions[at],
                 None if self._posedirs is None else self._posedirs[at],
-                self._weights[at],
+                self.skinning_weights[at],
                 (self._rest_joints, self._joint_directions) if joints else None,
             )
             if len(self._selections) > 8:

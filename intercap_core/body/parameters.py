@@ -16,7 +16,7 @@ POSE_BLOCKS: tuple[tuple[str, int], ...] = (
     ("left_hand_pose", 45),
     ("right_hand_pose", 45),
 )
-NUM_POSE = 165
+NUM_POSE = 165  # axis-angles of the 55 joints (SMPL-X)
 TRANSL = slice(NUM_POSE, NUM_POSE + 3)
 
 
@@ -49,22 +49,6 @@ class BodyParameters:
     """(B, 3)"""
     transl: Tensor
     """(B, 3) metres."""
-
-    @classmethod
-    def zeros(
-        cls,
-        batch: int,
-        *,
-        num_betas: int = 10,
-        num_expression: int = 10,
-        device: torch.device | str = "cpu",
-        dtype: torch.dtype = torch.float32,
-    ) -> BodyParameters:
-        """The T-pose with flat hands, mean shape, at the origin."""
-        vector = torch.zeros(
-            batch, NUM_POSE + 3 + num_betas + num_expression, device=device, dtype=dtype
-        )
-        return cls.from_vector(vector, num_betas=num_betas)
 
     @classmethod
     def from_vector(cls, vector: Tensor, *, num_betas: int = 10) -> BodyParameters:

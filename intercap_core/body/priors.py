@@ -38,7 +38,7 @@ from intercap_core.body.parameters import NUM_POSE
 # Elbows and knees (Bogo et al. 2016, SMPLify, "unnatural bending"): full-pose column, sign of the
 # wrong way.
 BENDING: tuple[tuple[int, int], ...] = ((55, 1), (58, -1), (12, -1), (15, -1))
-_HAND_COLUMNS = (slice(75, 120), slice(120, 165))
+_HAND_COLUMNS = (slice(75, 120), slice(120, 165))  # left and right, of SMPL-X's pose
 
 _Range = tuple[float, float]
 _FREE: _Range = (-180.0, 180.0)
@@ -210,14 +210,13 @@ def hand_pose(
     deviation: Tensor,
     *,
     side: int,
-    count: int = 45,
 ) -> LinearRows:
     """E_theta_h: Gaussian over one hand's pose components, r = C (theta - mean) / deviation.
 
     mean (2,45), components (2,45,45) orthonormal rows, deviation (2,45) of the model; side 0 is the
-    left hand; the first `count` components are used.
+    left hand.
     """
     at = _HAND_COLUMNS[side]
-    jacobian = components[side, :count] / deviation[side, :count, None]
+    jacobian = components[side] / deviation[side, :, None]
     residuals = (vector[:, at] - mean[side]) @ jacobian.T
     return LinearRows(residuals, jacobian, torch.arange(at.start, at.stop, device=vector.device))

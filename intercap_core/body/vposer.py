@@ -25,10 +25,10 @@ from torch.nn import functional
 
 from intercap_core.body.checkpoint import read_tensors, tensor_fault
 from intercap_core.errors import UserError
-from intercap_core.inputs.files import UnreadableFile, quoted
+from intercap_core.inputs.files import UnreadableFile
 
-LATENT = 32
-_JOINTS = 21
+LATENT = 32  # numbers of a code (Pavlakos et al. 2019)
+_JOINTS = 21  # of SMPL-X's body_pose
 _VERSIONS = {
     1: (("bodyprior_dec_fc1", "bodyprior_dec_fc2", "bodyprior_dec_out"), 0.2),
     2: (("decoder_net.0", "decoder_net.3", "decoder_net.5"), 0.01),
@@ -96,7 +96,7 @@ class VPoser:
                         f"{version} is named: codes of the two mean different poses; name version "
                         f"{stored}, or take the file of version {version}."
                     )
-                _check(path, tuple((weights[w], weights[b]) for w, b in parts))
+                _check(path, weights, parts)
                 layers = tuple(
                     (weights[w].to(device, dtype), weights[b].to(device, dtype)) for w, b in parts
                 )
@@ -184,26 +184,19 @@ def _bare(name: str) -> str:
     return name
 
 
-def _check(path: Path, layers: tuple[tuple[Tensor, Tensor], ...]) -> None:
-    shapes = tuple(tuple(tuple(part.shape) for part in pair) for pair in layers)
-    hidden = len(layers[0][1]) if layers[0][1].ndim else 0
+def _check(path: Path, weights: dict[str, Tensor], layers: list[tuple[str, str]]) -> None:
+    """Raise UserError if the weights and biases cannot be those of a decoder."""
+    first = weights[layers[0][0]]
+    hidden = min(max(len(first) if first.ndim else 0, 1), 4096)  # the published files have 512
     sizes = ((hidden, LATENT), (hidden, hidden), (6 * _JOINTS, hidden))
-    expected = tuple((size, size[:1]) for size in sizes)
-    if shapes != expected or not 0 < hidden <= 4096:  # the published files have 512
-        raise UserError(
-            f"VPoser file {path} has decoder layers of shapes {quoted(shapes, 300)}; expected "
-            f"{expected}: take the published file."
-        )
     for (weight, bias), size in zip(layers, sizes, strict=True):
-        largest = 1e3  # weights of the published files are below 10
-        fault = tensor_fault(weight, size, largest) or tensor_fault(bias, size[:1], largest)
-        if fault is not None:
+        for name, shape in ((weight, size), (bias, size[:1])):
+            # weights of the published files are below 10
+            fault = tensor_fault(weights[name], shape, largest=1e3)
+            if fault is not None:
+                raise UserError(f"VPoser file {path}: {name} has {fault}: take the published file.")
+        if not bool(weights[weight].any()):
             raise UserError(
-                f"VPoser file {path} has weights that are not finite numbers of a network "
-                f"({fault}): take the published file."
-            )
-        if not bool(weight.any()):
-            raise UserError(
-                f"VPoser file {path} has a layer of zeros, so that every code decodes to one pose: "
+                f"VPoser file {path}: {weight} is zero, so that every code decodes to one pose: "
                 "take the published file."
             )

@@ -9,7 +9,8 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-# Share of their size by which triangles are enlarged, so that no ray passes between two.
+# Share of their size by which triangles are enlarged, so that no ray passes between two: some
+# thousand times the rounding of double precision (IEEE 754).
 _MARGIN = 1e-9
 
 

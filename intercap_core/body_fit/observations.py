@@ -24,7 +24,7 @@ from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.solve.thread_pool import ThreadPool
 from intercap_core.schemas import PERSON, SCENE
 
-# neck, shoulders, mid hip, hips: keypoints that place the trunk
+# neck, shoulders, mid hip and hips in OpenPose's order: keypoints that place the trunk
 TRUNK_KEYPOINTS = (1, 2, 5, 8, 9, 12)
 
 

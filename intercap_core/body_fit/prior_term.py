@@ -35,9 +35,9 @@ from intercap_core.body_fit.term_inputs import (
 )
 from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
 
-_BODY_POSE = slice(3, 66)  # columns of the 21 body joints
+_BODY_POSE = slice(3, 66)  # columns of the 21 body joints (SMPL-X)
 _BODY_START = _BODY_POSE.start
-_HANDS = (75, 120)  # first column of each hand
+_HANDS = (75, 120)  # first column of each hand (SMPL-X)
 
 Rows = priors.DiagonalRows | priors.LinearRows
 

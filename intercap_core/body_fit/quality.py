@@ -22,10 +22,9 @@ LARGEST_SIGMA_M = 0.026
 # The same for hands: fingers are 20 mm apart (anatomy), half of the joints then are on a
 # neighbouring finger.
 LARGEST_HAND_SIGMA_M = 0.013
-# A part is wrong if more than this share of its keypoints are outliers.
-_DISAGREEING_SHARE = 0.5
+_DISAGREEING_SHARE = 0.5  # a part is wrong if the majority of its keypoints are outliers
 # Share of a part's samples with points from which depth determines it: half of the third of a limb
-# that one view sees.
+# that one view sees. Tuned on the studio.
 _MEASURED_SHARE = 0.15
 # A limb seen by one view may lean towards it or away, mirrored. The ends of a forearm are then up
 # to 2 x 0.25 m apart, of a leg's segment 2 x 0.4 m, of a finger 2 x 0.08 m (anatomy). These are the

@@ -16,10 +16,11 @@ from intercap_core.body_fit.bridge import bridge
 from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.geometry.solve.levenberg_marquardt import minimise
 
-# Half of the window around a frame, seconds: six frames at 30 Hz.
+# Half of the window around a frame, seconds: six frames at 30 Hz. Tuned on the studio.
 JUMP_WINDOW_S = 0.21
 # Largest distance from the median of the window that is no jump, metres: within 0.1 s hands leave
-# the straight path by half of 30 m/s^2 times (0.1 s)^2 = 0.15 m, and fits scatter by less than 0.1.
+# the straight path by half of 30 m/s^2 times (0.1 s)^2 = 0.15 m (anatomy), and fits scatter by less
+# than 0.1 m (measured on the studio).
 JUMP_M = 0.25
 
 _BODY_JOINTS = slice(0, JOINT_INDEX["right_wrist"] + 1)

@@ -17,10 +17,9 @@ from .conftest import hand_pose, random_vector
 Rows = priors.DiagonalRows | priors.LinearRows
 
 
-def _hand(model: BodyModel, side: int, count: int) -> Callable[[Tensor], Rows]:
-    return lambda v: priors.hand_pose(
-        v, model.hand_mean, model.hand_components, model.hand_deviation, side=side, count=count
-    )
+def _hand(model: BodyModel, side: int) -> Callable[[Tensor], Rows]:
+    own = (model.hand_mean, model.hand_components, model.hand_deviation)
+    return lambda v: priors.hand_pose(v, *own, side=side)
 
 
 @pytest.mark.parametrize("name", ["limits", "bending", "rest", "left", "right"])
@@ -30,8 +29,8 @@ def test_rows_differentiate_their_energy(name: str, body64: BodyModel) -> None:
         "limits": priors.joint_limits,
         "bending": priors.bending,
         "rest": priors.rest_pose,
-        "left": _hand(body64, 0, 45),
-        "right": _hand(body64, 1, 12),
+        "left": _hand(body64, 0),
+        "right": _hand(body64, 1),
     }
     term, size = terms[name], body64.num_parameters
     vector = random_vector(2, size, 11, torch.float64) * 3
@@ -83,7 +82,7 @@ def test_likely_hands_are_within_limits(body64: BodyModel) -> None:
         code = torch.randn(200, 45, generator=generator, dtype=torch.float64)
         code = code.clamp(-1.5, 1.5) * body64.hand_deviation[side]
         vector[:, at] = hand_pose(body64, code, side)
-    rows = _hand(body64, 0, 45)(vector)
+    rows = _hand(body64, 0)(vector)
     assert rows.residuals.abs().max() < 1.5 + 1e-5
     assert priors.joint_limits(vector).residuals.abs().median() == 0
     assert torch.deg2rad(torch.tensor(12.0)) > priors.joint_limits(vector).residuals.abs().mean()

@@ -158,10 +158,10 @@ _WEIGHT, _BIAS = "bodyprior_dec_out.weight", "bodyprior_dec_fc1.bias"
 WRONG: dict[str, tuple[object, str]] = {
     "no state": ({"state_dict": None}, "no decoder"),
     "other names": ({"a.weight": torch.zeros(2)}, "no decoder"),
-    "scalars": ({name: torch.tensor(1.0) for name in _state(1)}, "shapes"),
-    "short layer": (_state(1) | {_WEIGHT: torch.zeros(10, 512)}, "shapes"),
-    "short bias": (_state(1) | {_BIAS: torch.zeros(5)}, "shapes"),
-    "sparse": (_state(1) | {_WEIGHT: _state(1)[_WEIGHT].to_sparse()}, "not finite numbers"),
+    "scalars": ({name: torch.tensor(1.0) for name in _state(1)}, r"\(\), expected \(1, 32\)"),
+    "short layer": (_state(1) | {_WEIGHT: torch.zeros(10, 512)}, r"expected \(126, 512\)"),
+    "short bias": (_state(1) | {_BIAS: torch.zeros(5)}, r"expected \(512,\)"),
+    "sparse": (_state(1) | {_WEIGHT: _state(1)[_WEIGHT].to_sparse()}, "no numbers"),
     "not finite": (_state(1) | {_BIAS: torch.full((512,), torch.nan)}, "not finite"),
 }
 
