@@ -83,7 +83,7 @@ _LEVELS, _PLACE = _levels()
 
 @dataclass(frozen=True)
 class PosedJoints:
-    """The joints of B posed bodies. A point x that follows joint k alone moves to
+    """The joints of B posed bodies. A point x that follows only joint k moves to
     rotations[k] @ x + offsets[k]."""
 
     rest: Tensor

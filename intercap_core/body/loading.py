@@ -83,8 +83,12 @@ def load_body_file(
 ) -> BodyArrays:
     """Read and check a file. Raises UserError if it is no complete SMPL-X file.
 
-    The first ``num_hand_components`` of each hand are kept. With ``flat_hand_mean`` they are
-    relative to the flat hand (mean of zero).
+    Args:
+        path: the file; None = the open body.
+        num_betas: number of shape components.
+        num_expression: number of expression components.
+        num_hand_components: number of components of each hand's pose space.
+        flat_hand_mean: the components are relative to the flat hand, with a mean of zero.
     """
     path = OPEN_BODY if path is None else Path(path)
     arrays = _read(path)

@@ -139,7 +139,7 @@ class BodyModel:
     def forward(
         self, params: BodyParameters, *, vertex_ids: Tensor | np.ndarray | None = None
     ) -> BodyOutput:
-        """Pose all vertices, or ``vertex_ids`` (N,) alone, and the joints."""
+        """Pose the joints and all vertices, or only ``vertex_ids`` (N,)."""
         selection = self.select(vertex_ids, joints=False)
         points, posed, _ = self._rest(selection, params)
         vertices = skin(points, posed.rotations, posed.offsets, selection.weights)
@@ -180,8 +180,8 @@ class BodyModel:
         return self.keypoints(self.forward(params, vertex_ids=self.keypoint_map.vertex_ids))
 
     def select(self, vertex_ids: Tensor | np.ndarray | None, *, joints: bool = False) -> Selection:
-        """Return the rest pose and the bones of these vertices (None = all), followed by the joints
-        if ``joints``. The last few selections are kept."""
+        """Return the rest pose and the bones of vertices (None = all), then of the joints if
+        ``joints``. The last eight selections are cached."""
         if vertex_ids is None:
             ids, key = None, b"all"
         else:

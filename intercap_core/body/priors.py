@@ -68,7 +68,8 @@ _TABLE: dict[str, tuple[_Range, _Range, _Range]] = {
     "thumb3": ((-50, 50), (-30, 85), (-85, 40)),
 }  # fmt: skip
 
-# Mean and standard deviation in degrees of the 25 joints that are not fingers: the arms hang
+# Mean and standard deviation in degrees of the 25 joints that are not fingers, of a standing person
+# with hanging arms: broad estimates of everyday poses
 _REST: dict[str, tuple[tuple[float, float], tuple[float, float], tuple[float, float]]] = {
     "shoulder": ((10, 40), (-20, 45), (-55, 40)),
     "elbow": ((0, 30), (-40, 45), (0, 12)),
@@ -189,11 +190,10 @@ def bending(vector: Tensor) -> DiagonalRows:
 
 
 def rest_pose(vector: Tensor, *, first: int = 1) -> DiagonalRows:
-    """E_theta_b (21 body joints) and E_theta_f (jaw, eyes), from joint ``first`` on: a weak pull to
-    standing at ease, r = (theta - mean) / sigma.
+    """E_theta_b (21 body joints) and E_theta_f (jaw, eyes) from joint ``first`` on.
 
-    Means and standard deviations (`REST_SPREAD_DEG`) are broad estimates of everyday poses: they
-    only determine parts without observations.
+    r = (theta - mean) / sigma with `REST_SPREAD_DEG`: so weak that it only determines parts without
+    observations.
     """
     columns = torch.arange(3 * first, 75, device=vector.device)
     table = torch.deg2rad(torch.tensor(REST_SPREAD_DEG, dtype=vector.dtype, device=vector.device))[

@@ -57,7 +57,7 @@ class PosedPoints(NamedTuple):
 
 
 class Skeleton(NamedTuple):
-    """B posed skeletons. A point x that follows joint k alone moves to
+    """B posed skeletons. A point x that follows only joint k moves to
     rotations[k] @ x + offsets[k]."""
 
     rotations: np.ndarray
@@ -114,6 +114,16 @@ def columns_of_limb(moved_by, place, local, to):
             local[p], to[m] = m, place[p]
             m += 1
     return m
+
+
+@numba.njit(cache=True, nogil=True)
+def add_symmetric(block, to, hessian):
+    """Add a symmetric block (m,m), given by its lower triangle, to the rows and columns ``to``."""
+    for p in range(len(block)):
+        for q in range(p):
+            hessian[to[p], to[q]] += block[p, q]
+            hessian[to[q], to[p]] += block[p, q]
+        hessian[to[p], to[p]] += block[p, p]
 
 
 @numba.njit(cache=True, nogil=True)

@@ -92,9 +92,8 @@ def _hermite(when: np.ndarray, knots: np.ndarray) -> np.ndarray:
 def unwrap_turns(rotation_vectors: np.ndarray) -> np.ndarray:
     """Return rotation vectors (T, 3) of the same turns without jumps of a full turn.
 
-    Each is v or v - 2 pi v / |v|, whichever is nearer to the previous one. A person who stands
-    upright in front of a camera whose y points down is half a turn from the rest pose, where both
-    are equally long.
+    Each is v or v - 2 pi v / |v|, whichever is nearer to that of the frame before. Both are equally
+    long at half a turn, which is the pose of an upright person if the camera's y points down.
     """
     result = rotation_vectors.copy()
     for t in range(1, len(result)):
@@ -112,9 +111,9 @@ def bridged_sigma(
 ) -> np.ndarray:
     """Return the standard deviation (T, J) of joints, metres, whose unknown frames were bridged.
 
-    The error of a bridge is measured on the known frames: bridges of the same length are built over
-    all their stretches. If there are too few, the error is the usual speed of the joint times the
-    time to the nearest known frame.
+    The error of a bridge is measured on the known frames, by all bridges of the same length between
+    them. With less than five, it is the usual speed of the joint times the time to the nearest
+    known frame.
 
     Args:
         joints: (T, J, 3) metres.

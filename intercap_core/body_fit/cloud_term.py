@@ -29,7 +29,12 @@ from intercap_core.body.correctives_kernel import PointSource, RestPoints, add_t
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
 from intercap_core.body.selection import Selection
-from intercap_core.body.skeleton_kernel import columns_of_limb, project_on_direction, turned_back
+from intercap_core.body.skeleton_kernel import (
+    add_symmetric,
+    columns_of_limb,
+    project_on_direction,
+    turned_back,
+)
 from intercap_core.body_fit.surface import Samples
 from intercap_core.body_fit.term_inputs import (
     Batch,
@@ -353,9 +358,5 @@ def add_equations(chain, limbs, given, frames, equations, rest_gradient, tables)
                 _add_squares(rows, weights, block)
             for p in range(m):
                 gradient[b, to[p]] += sample_gradient[p]
-                for q in range(p):
-                    block[q, p] = block[p, q]
-            for p in range(m):
-                for q in range(m):
-                    hessian[b, to[p], to[q]] += block[p, q]
+            add_symmetric(block, to, hessian[b])
         cost[b] += total

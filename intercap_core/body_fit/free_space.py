@@ -58,7 +58,7 @@ def find_protruding(
         normals: (N, 3) unit normals.
 
     Returns:
-        (M,) index of each point that sticks out, and that the person begins within reach of.
+        (M,) index of each point that sticks out of the person by at most 5 cm.
         (M,) distance by which it sticks out, metres, > 0.
     """
     assert camera.depth is not None
@@ -99,10 +99,10 @@ def _find_protruding(depth, top, left, lens, pose, behind, points, normals):
             inward = x - way * nx, y - way * ny, z - way * nz
             if _is_measured_behind(depth, top, left, lens, *inward, behind):
                 continue
-            # the nearest step is within the error of the image: counting only the errors outward
-            # would make every person thinner
+            # one step is within the error of the image: counting only errors outward would make
+            # every person thinner
             if s > 1:
-                # between the last step that is seen through and the first that is not
+                # the middle of the last step that is not the person's and the first that is
                 index[count], away[count] = i, way - step / 2
                 count += 1
             break

@@ -1,7 +1,7 @@
 """E_J (equation 3) of :mod:`.keypoint_term`, compiled: one pass over the keypoints of each body.
 
-A keypoint is a sum of pieces, each of which follows one bone alone. The derivatives of a piece
-touch the columns of few joints. Keypoints on the same chain of joints, a limb, share one dense
+A keypoint is a sum of pieces, each of which follows one bone. The derivatives of a piece are zero
+but for the columns of few joints. Keypoints on the same chain of joints, a limb, share one dense
 block. Equal to the torch form to rounding, pose blend shapes included
 (:mod:`intercap_core.body.correctives_kernel`).
 """
@@ -18,7 +18,7 @@ from intercap_core.body.correctives_kernel import add_to_row
 from intercap_core.body.joints import PARENTS
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
-from intercap_core.body.skeleton_kernel import columns_of_limb, rest_points
+from intercap_core.body.skeleton_kernel import add_symmetric, columns_of_limb, rest_points
 from intercap_core.body_fit.term_inputs import KeypointSet
 from intercap_core.geometry.camera.projection import MIN_DEPTH_M
 from intercap_core.geometry.camera.projection_kernels import distort_with_jacobian
@@ -362,9 +362,4 @@ def add_equations(skeleton, pieces, rest, observed, frames, equations, rest_grad
                     _add_offset(
                         turn, by_keypoint, matrix, weighted, to, first, gradient[b], hessian[b]
                     )
-            for p in range(m):
-                for q in range(p):
-                    block[q, p] = block[p, q]
-            for p in range(m):
-                for q in range(m):
-                    hessian[b, to[p], to[q]] += block[p, q]
+            add_symmetric(block, to, hessian[b])

@@ -201,7 +201,7 @@ def _fuse(
         if mask is None:
             continue
         depth = None if camera.depth is None else reader.depth(t, c)
-        # a mask without a detector counts only where there is no depth and other objects are known
+        # a mask without a detector counts only if there is no depth and other objects are known
         if observations.mask_source[t, c] == FROM_DETECTOR or (
             depth is None and observations.other_masks[at]
         ):
@@ -220,7 +220,7 @@ def _fuse(
             window,
             background=observations.background[c],
             before_m=0.04,  # of the background; tuned on the studio
-            every=2,  # neighbouring rows show the same
+            every=2,  # neighbouring rows are redundant
         )
         if len(index):
             seen_by.append((c, depth, index))
@@ -291,7 +291,7 @@ def _measure_normals(
     for dr, dc in ((0, base), (base, 0)):
         ahead, a = at(row + dr, column + dc)
         back, b = at(row - dr, column - dc)
-        # one-sided where the other side is another surface
+        # one-sided if the other side is another surface
         span = np.where(a[:, None], ahead, here) - np.where(b[:, None], back, here)
         spans.append(span)
         smooth &= a & b

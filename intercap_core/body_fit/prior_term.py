@@ -124,7 +124,7 @@ class PriorArrays(NamedTuple):
     mean: np.ndarray
     """(P,)"""
     own: np.ndarray
-    """(P,) precision of each parameter alone."""
+    """(P,) precision of each parameter without the hands."""
     hands: np.ndarray
     """(2, 45, 45) precision of the hands."""
     ranges: np.ndarray

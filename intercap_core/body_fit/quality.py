@@ -166,8 +166,10 @@ def flag_unmeasured_joints(evidence: PartEvidence) -> np.ndarray:
 
 
 def _leaning(evidence: PartEvidence) -> np.ndarray:
-    """Return the standard deviation (N, 8), metres, of parts that one view supports, whose mirrored
-    pose is as likely, or that no view supports."""
+    """Return the standard deviation (N, 8), metres, of parts that one view or no view supports.
+
+    The mirrored pose of a part in one view is as likely.
+    """
     known = np.clip(evidence.measured_share.cpu().numpy() / _MEASURED_SHARE, 0, 1)
     limbs = [part.partition("_")[2] for part in BODY_PARTS]
     mirrored = np.array([MIRRORED_SIGMA_M.get(limb, 0.0) for limb in limbs])
@@ -177,12 +179,11 @@ def _leaning(evidence: PartEvidence) -> np.ndarray:
 
 
 def widen_sigma(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
-    """Return standard deviations (N, 55), metres, widened where a fit is one of several minima.
+    """Return standard deviations (N, 55), metres, of fits that may be one of several minima.
 
-    If most observations contradict a part, the truth may be where they are: the deviation that
-    corresponds to their distance in two dimensions is added in quadrature. A limb that only one
-    view sees may lean towards it or away, the more so the fewer points it has. An error of an arm
-    is also an error of its hand.
+    Added in quadrature: if most observations contradict a part, the deviation that corresponds to
+    their distance in two dimensions; of a limb that only one view sees, its possible lean towards
+    the camera or away, which its depth points reduce. An error of an arm is also one of its hand.
     """
     # the median length of a normal error in two dimensions is 1.1774 standard deviations
     disputed = evidence.outlier_share.cpu().numpy() > _DISAGREEING_SHARE

@@ -93,8 +93,8 @@ class SelfContact(NamedTuple):
         part = _PART_OF_JOINT[model.skinning_weights.argmax(1).cpu().numpy()]
         thickness = _thickness(template, faces, samples.vertex)
         own = part[samples.vertex]
-        # samples closer along the surface than this times the mean thickness of their parts are
-        # joined; flesh meets flesh where a hinge closes; tuned on the studio
+        # samples closer along the surface than this times the mean thickness of their parts may
+        # always touch; more at a hinge, where flesh meets flesh as it closes; tuned on the studio
         factor = np.where(_hinged()[own[:, None], own], 3.2, 1.6)
         joined = factor * (thickness[:, None] + thickness) / 2
         joined[own[:, None] == own] = 0  # parts do not collide with themselves

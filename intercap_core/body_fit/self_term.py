@@ -25,7 +25,12 @@ from intercap_core.body.jacobian import Linearisation
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
 from intercap_core.body.selection import Selection
-from intercap_core.body.skeleton_kernel import add_point, project_on_direction, turned_back
+from intercap_core.body.skeleton_kernel import (
+    add_point,
+    add_symmetric,
+    project_on_direction,
+    turned_back,
+)
 from intercap_core.body_fit.surface import SAMPLE_SHARE
 from intercap_core.body_fit.term_inputs import (
     Batch,
@@ -264,14 +269,10 @@ def add_equations(chain, pairs, frames, equations, rest_gradient):
         for r in range(count):
             for q in range(m):
                 dense[r, q] = root[r] * rows[r, used[q]]
-        # written out: a BLAS product would start its threads for each frame
+        # a BLAS product would start its threads for each frame
         block = np.zeros((m, m), hessian.dtype)
         for r in range(count):
             for p in range(m):
                 for q in range(p + 1):
                     block[p, q] += dense[r, p] * dense[r, q]
-        for p in range(m):
-            for q in range(p):
-                hessian[b, used[p], used[q]] += block[p, q]
-                hessian[b, used[q], used[p]] += block[p, q]
-            hessian[b, used[p], used[p]] += block[p, p]
+        add_symmetric(block, used, hessian[b])

@@ -160,7 +160,7 @@ def keypoint_set(model: BodyModel, index: Sequence[int] | range) -> KeypointSet:
     matrix = np.concatenate([matrix[:, used], matrix[:, count:]], 1)
     device = model.device
     vertices = keypoints.vertex_ids[used]
-    # a joint follows its parent alone
+    # a joint follows only its parent
     follows = np.zeros((len(vertices) + NUM_JOINTS, NUM_JOINTS), bool)
     follows[: len(vertices)] = model.skinning_weights[torch.as_tensor(vertices)].cpu().numpy() != 0
     follows[len(vertices) + np.arange(NUM_JOINTS), [max(parent, 0) for parent in PARENTS]] = True
