@@ -25,11 +25,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from intercap_core.body.correctives_kernel import PointSource, RestPoints, add_to_row
+from intercap_core.body.correctives_kernel import PointSource, add_to_row
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
-from intercap_core.body.selection import Selection
 from intercap_core.body.skeleton_kernel import (
+    PosedPoints,
     add_symmetric,
     columns_of_limb,
     project_on_direction,
@@ -38,10 +38,10 @@ from intercap_core.body.skeleton_kernel import (
 from intercap_core.body_fit.surface import Samples
 from intercap_core.body_fit.term_inputs import (
     Batch,
-    BatchEquations,
     Bodies,
     CloudRows,
     Columns,
+    CompiledTerm,
     TermInputs,
     contiguous,
 )
@@ -118,32 +118,6 @@ class CloudTerm:
 # --- compiled --------------------------------------------------------------------------------
 
 
-class CompiledCloud:
-    """E_D by the kernels below; see :class:`.term_inputs.CompiledTerm`."""
-
-    def __init__(self, model: BodyModel, samples: Samples) -> None:
-        self._source = PointSource.of(model, samples.vertex)
-        self._group = samples.group
-
-    def prepare(
-        self, inputs: TermInputs, bodies: Bodies, *, derivatives: bool
-    ) -> PreparedCloud | None:
-        rows = inputs.rows
-        if rows is None:
-            return None
-        return PreparedCloud(
-            self._source.selection,
-            self._source.at_rest(contiguous(bodies.vectors[:, _SHAPE:]), derivatives),
-            CloudArrays(
-                contiguous(rows.normal),
-                contiguous(rows.weight),
-                contiguous(rows.target),
-                contiguous(bodies.thickness),
-                self._group,
-            ),
-        )
-
-
 class CloudArrays(NamedTuple):
     """:class:`.term_inputs.CloudRows` of T frames and N samples, and the G coverings."""
 
@@ -159,26 +133,33 @@ class CloudArrays(NamedTuple):
     """(N,) covering of each sample."""
 
 
-@dataclass(frozen=True, eq=False)
-class PreparedCloud:
-    """See :class:`.term_inputs.PreparedTerm`."""
+class CompiledCloud:
+    """E_D by the kernels below."""
 
-    selection: Selection
-    rest: RestPoints
-    rows: CloudArrays
+    def __init__(self, model: BodyModel, samples: Samples) -> None:
+        self._source = PointSource.of(model, samples.vertex)
+        self._group = samples.group
 
-    def used(self, frames: np.ndarray) -> np.ndarray:
-        return np.asarray(self.rows.weight[frames] > 0)
+    def prepare(self, inputs: TermInputs, bodies: Bodies, derivatives: bool) -> CompiledTerm | None:
+        """Return the term at these bodies, None if it is switched off."""
+        if inputs.rows is None:
+            return None
+        target, normal, weight = map(contiguous, inputs.rows)
+        rows = CloudArrays(normal, weight, target, contiguous(bodies.thickness), self._group)
+        selection = self._source.selection
+        rest = self._source.at_rest(contiguous(bodies.vectors[:, _SHAPE:]), derivatives)
 
-    def add_cost(self, batch: Batch, cost: np.ndarray) -> None:
-        chain = batch.skeleton.chain(self.selection, self.rest.points[batch.at])
-        add_cost(chain, self.rows, batch.frames, cost)
+        def posed(batch: Batch) -> PosedPoints:
+            return batch.skeleton.chain(selection, rest.points[batch.at])
 
-    def add(self, batch: Batch, equations: BatchEquations) -> None:
-        chain = batch.skeleton.chain(self.selection, self.rest.points[batch.at])
-        add_equations(
-            chain, self.selection.limbs, self.rows, batch.frames, equations,
-            self.rest.gradient[batch.at], self.rest.tables,
+        return CompiledTerm(
+            rest,
+            lambda frames: np.asarray(rows.weight[frames] > 0),
+            lambda batch, cost: add_cost(posed(batch), rows, batch.frames, cost),
+            lambda batch, equations: add_equations(
+                posed(batch), selection.limbs, rows, batch.frames, equations,
+                rest.gradient[batch.at], rest.tables,
+            ),
         )  # fmt: skip
 
 

@@ -34,6 +34,7 @@ from intercap_core.body_fit.term_inputs import (
     BatchEquations,
     Bodies,
     Columns,
+    CompiledTerm,
     KeypointSet,
     Targets,
     TermInputs,
@@ -246,52 +247,39 @@ def _add_offsets(
 
 
 class CompiledKeypoints:
-    """E_J by :mod:`.keypoint_kernel`; see :class:`.term_inputs.CompiledTerm`.
-
-    The pieces of the last set of keypoints are kept between evaluations.
-    """
+    """E_J by :mod:`.keypoint_kernel`; the pieces of the last set of keypoints are cached."""
 
     def __init__(self, model: BodyModel) -> None:
         self._model = model
-        self._kept: tuple[KeypointSet, Pieces, Correctives | None] | None = None
+        self._cached: tuple[KeypointSet, Pieces, Correctives | None] | None = None
 
-    def prepare(
-        self, inputs: TermInputs, bodies: Bodies, *, derivatives: bool
-    ) -> PreparedKeypoints:
-        if self._kept is None or self._kept[0] is not inputs.keypoints:
+    def prepare(self, inputs: TermInputs, bodies: Bodies, derivatives: bool) -> CompiledTerm:
+        """Return the term at these bodies."""
+        if self._cached is None or self._cached[0] is not inputs.keypoints:
             pieces = Pieces.of(self._model, inputs.keypoints)
             tables = pieces.posedirs
             correctives = Correctives.of(tables) if tables.shape[2] else None
-            self._kept = inputs.keypoints, pieces, correctives
-        _, pieces, correctives = self._kept
-        at_rest = pieces.at_rest(
-            contiguous(bodies.vectors[:, TRANSL.stop :]), bodies.offsets.numpy()
-        )
+            self._cached = inputs.keypoints, pieces, correctives
+        _, pieces, correctives = self._cached
+        shape = contiguous(bodies.vectors[:, TRANSL.stop :])
+        at_rest = pieces.at_rest(shape, bodies.offsets.numpy())
         rest = RestPoints.of(at_rest, correctives, derivatives)
-        return PreparedKeypoints(pieces, rest, _keypoint_data(inputs, bodies.vectors))
+        data = _keypoint_data(inputs, bodies.vectors)
 
+        def used(frames: np.ndarray) -> np.ndarray:
+            return np.ones((len(frames), rest.points.shape[1]), bool)
 
-@dataclass(frozen=True, eq=False)
-class PreparedKeypoints:
-    """See :class:`.term_inputs.PreparedTerm`."""
+        def add_cost(batch: Batch, cost: np.ndarray) -> None:
+            points = rest.points[batch.at]
+            keypoint_kernel.add_cost(batch.skeleton, pieces, points, data, batch.frames, cost)
 
-    pieces: Pieces
-    rest: RestPoints
-    data: KeypointData
+        def add(batch: Batch, equations: BatchEquations) -> None:
+            keypoint_kernel.add_equations(
+                batch.skeleton, pieces, rest.points[batch.at], data, batch.frames, equations,
+                rest.gradient[batch.at],
+            )  # fmt: skip
 
-    def used(self, frames: np.ndarray) -> np.ndarray:
-        return np.ones((len(frames), self.rest.points.shape[1]), bool)
-
-    def add_cost(self, batch: Batch, cost: np.ndarray) -> None:
-        keypoint_kernel.add_cost(
-            batch.skeleton, self.pieces, self.rest.points[batch.at], self.data, batch.frames, cost
-        )
-
-    def add(self, batch: Batch, equations: BatchEquations) -> None:
-        keypoint_kernel.add_equations(
-            batch.skeleton, self.pieces, self.rest.points[batch.at], self.data, batch.frames,
-            equations, self.rest.gradient[batch.at],
-        )  # fmt: skip
+        return CompiledTerm(rest, used, add_cost, add)
 
 
 def _keypoint_data(inputs: TermInputs, like: Tensor) -> KeypointData:

@@ -24,12 +24,12 @@ from intercap_core.body import priors
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import NUM_POSE, TRANSL
-from intercap_core.body.vposer import PoseGaussian
 from intercap_core.body_fit.term_inputs import (
     Batch,
     BatchEquations,
     Bodies,
     Columns,
+    CompiledTerm,
     TermInputs,
     contiguous,
 )
@@ -181,46 +181,37 @@ class PriorArrays(NamedTuple):
 
 
 class CompiledPriors:
-    """All priors by the kernels below; see :class:`.term_inputs.CompiledTerm`."""
+    """All priors by the kernels below."""
 
     def __init__(self, model: BodyModel) -> None:
         self._model = model
-        self._kept: dict[tuple[bool, bool], PriorArrays] = {}
+        self._cached: dict[tuple[bool, bool], PriorArrays] = {}
 
-    def prepare(self, inputs: TermInputs, bodies: Bodies, *, derivatives: bool) -> PreparedPriors:
+    def prepare(self, inputs: TermInputs, bodies: Bodies, derivatives: bool) -> CompiledTerm:
+        """Return the priors, which are the same at all bodies."""
         which = not inputs.one_shape, inputs.pose is None
-        if which not in self._kept:
-            self._kept[which] = PriorArrays.of(self._model, shape=which[0], body_pose=which[1])
-        arrays = self._kept[which]
-        arrays = arrays._replace(hands=arrays.hands * arrays.hands.dtype.type(inputs.hand_share))
-        return PreparedPriors(_with_learned(arrays, inputs.pose))
+        if which not in self._cached:
+            self._cached[which] = PriorArrays.of(self._model, shape=which[0], body_pose=which[1])
+        prior = self._cached[which]
+        prior = prior._replace(hands=prior.hands * prior.hands.dtype.type(inputs.hand_share))
+        if inputs.pose is not None:
+            mean, precision = map(contiguous, inputs.pose)
+            prior = prior._replace(pose=mean, pose_precision=precision)
 
+        def used(frames: np.ndarray) -> np.ndarray:
+            return np.zeros((len(frames), 0), bool)
 
-def _with_learned(arrays: PriorArrays, pose: PoseGaussian | None) -> PriorArrays:
-    if pose is None:
-        return arrays
-    return arrays._replace(pose=contiguous(pose.mean), pose_precision=contiguous(pose.precision))
+        def add_cost(batch: Batch, cost: np.ndarray) -> None:
+            none, fixed = np.zeros((1, 0, 0), cost.dtype), np.full(batch.vectors.shape[1], -1)
+            add_priors(prior, batch.vectors, batch.frames, fixed, False, cost, none[0], none)
 
+        def add(batch: Batch, equations: BatchEquations) -> None:
+            add_priors(
+                prior, batch.vectors, batch.frames, equations.place, True, equations.cost,
+                equations.gradient, equations.hessian,
+            )  # fmt: skip
 
-@dataclass(frozen=True, eq=False)
-class PreparedPriors:
-    """See :class:`.term_inputs.PreparedTerm`; priors have no points."""
-
-    arrays: PriorArrays
-    rest: None = None
-
-    def used(self, frames: np.ndarray) -> np.ndarray:
-        return np.zeros((len(frames), 0), bool)
-
-    def add_cost(self, batch: Batch, cost: np.ndarray) -> None:
-        none, fixed = np.zeros((1, 0, 0), cost.dtype), np.full(batch.vectors.shape[1], -1)
-        add_priors(self.arrays, batch.vectors, batch.frames, fixed, False, cost, none[0], none)
-
-    def add(self, batch: Batch, equations: BatchEquations) -> None:
-        add_priors(
-            self.arrays, batch.vectors, batch.frames, equations.place, True, equations.cost,
-            equations.gradient, equations.hessian,
-        )  # fmt: skip
+        return CompiledTerm(None, used, add_cost, add)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -20,12 +20,12 @@ import numba
 import numpy as np
 from torch import Tensor
 
-from intercap_core.body.correctives_kernel import PointSource, RestPoints
+from intercap_core.body.correctives_kernel import PointSource
 from intercap_core.body.jacobian import Linearisation
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
-from intercap_core.body.selection import Selection
 from intercap_core.body.skeleton_kernel import (
+    PosedPoints,
     add_point,
     add_symmetric,
     project_on_direction,
@@ -34,9 +34,9 @@ from intercap_core.body.skeleton_kernel import (
 from intercap_core.body_fit.surface import SAMPLE_SHARE
 from intercap_core.body_fit.term_inputs import (
     Batch,
-    BatchEquations,
     Bodies,
     Columns,
+    CompiledTerm,
     Pairs,
     TermInputs,
     contiguous,
@@ -129,70 +129,53 @@ class PairArrays(NamedTuple):
     """(M,)"""
     normal: np.ndarray
     """(M, 3)"""
-    tolerance: float
-    """metres"""
-    reach: float
-    """metres"""
     weight: float
     """1/m^2"""
 
 
 class CompiledSelfPenetration:
-    """E_P_self by the kernels below; see :class:`.term_inputs.CompiledTerm`.
-
-    The points of the last pairs are kept between evaluations.
-    """
+    """E_P_self by the kernels below; the points of the last pairs are cached."""
 
     def __init__(self, model: BodyModel) -> None:
         self._model = model
-        self._kept: tuple[Pairs, PointSource] | None = None
+        self._cached: tuple[Pairs, PointSource] | None = None
 
-    def prepare(
-        self, inputs: TermInputs, bodies: Bodies, *, derivatives: bool
-    ) -> PreparedSelfPenetration | None:
-        pairs = inputs.pairs
-        if pairs is None or not len(bodies.frames):
+    def prepare(self, inputs: TermInputs, bodies: Bodies, derivatives: bool) -> CompiledTerm | None:
+        """Return the term at these bodies, None if it is switched off."""
+        if inputs.pairs is None or not len(bodies.frames):
             return None
-        if self._kept is None or self._kept[0] is not pairs:
-            self._kept = pairs, PointSource.of(self._model, pairs.vertices.numpy())
-        source = self._kept[1]
+        if self._cached is None or self._cached[0] is not inputs.pairs:
+            vertices = inputs.pairs.vertices.numpy()
+            self._cached = inputs.pairs, PointSource.of(self._model, vertices)
+        source = self._cached[1]
         frames = np.arange(int(bodies.frames.max()) + 2)
-        arrays = PairArrays(
-            starts=np.searchsorted(pairs.frame.numpy(), frames),
-            inner=contiguous(pairs.inner),
-            outer=contiguous(pairs.outer),
-            normal=contiguous(pairs.normal),
-            tolerance=SELF_TOLERANCE_M,
-            reach=_REACH_M,
+        pairs = PairArrays(
+            starts=np.searchsorted(inputs.pairs.frame.numpy(), frames),
+            inner=contiguous(inputs.pairs.inner),
+            outer=contiguous(inputs.pairs.outer),
+            normal=contiguous(inputs.pairs.normal),
             weight=float(inputs.self_weight * _WEIGHT),
         )
         rest = source.at_rest(contiguous(bodies.vectors[:, _SHAPE:]), derivatives)
-        return PreparedSelfPenetration(arrays, source.selection, rest)
 
+        def used(frames: np.ndarray) -> np.ndarray:
+            flags = np.zeros((len(frames), rest.points.shape[1]), bool)
+            for row, t in zip(flags, frames, strict=True):
+                of_frame = slice(pairs.starts[t], pairs.starts[t + 1])
+                row[pairs.inner[of_frame]] = row[pairs.outer[of_frame]] = True
+            return flags
 
-@dataclass(frozen=True, eq=False)
-class PreparedSelfPenetration:
-    """See :class:`.term_inputs.PreparedTerm`."""
+        def posed(batch: Batch) -> PosedPoints:
+            return batch.skeleton.chain(source.selection, rest.points[batch.at])
 
-    pairs: PairArrays
-    selection: Selection
-    rest: RestPoints
-
-    def used(self, frames: np.ndarray) -> np.ndarray:
-        pairs = self.pairs
-        used = np.zeros((len(frames), self.rest.points.shape[1]), bool)
-        ends = pairs.starts[frames + 1]
-        for row, first, end in zip(used, pairs.starts[frames], ends, strict=True):
-            row[pairs.inner[first:end]] = row[pairs.outer[first:end]] = True
-        return used
-
-    def add_cost(self, batch: Batch, cost: np.ndarray) -> None:
-        chain = batch.skeleton.chain(self.selection, self.rest.points[batch.at])
-        add_cost(chain, self.pairs, batch.frames, cost)
-
-    def add(self, batch: Batch, equations: BatchEquations) -> None:
-        chain = batch.skeleton.chain(self.selection, self.rest.points[batch.at])
-        add_equations(chain, self.pairs, batch.frames, equations, self.rest.gradient[batch.at])
+        return CompiledTerm(
+            rest,
+            used,
+            lambda batch, cost: add_cost(posed(batch), pairs, batch.frames, cost),
+            lambda batch, equations: add_equations(
+                posed(batch), pairs, batch.frames, equations, rest.gradient[batch.at]
+            ),
+        )
 
 
 @numba.njit(cache=True, nogil=True)
@@ -200,13 +183,13 @@ def _depth(chain, pairs, b, at):
     """Return the depth of pair ``at`` beyond the tolerance, metres; <= 0 = no contact."""
     n = pairs.normal[at]
     outer = project_on_direction(chain, b, pairs.outer[at], n)
-    return outer - project_on_direction(chain, b, pairs.inner[at], n) - pairs.tolerance
+    return outer - project_on_direction(chain, b, pairs.inner[at], n) - SELF_TOLERANCE_M
 
 
 @numba.njit(cache=True, nogil=True)
 def add_cost(chain, pairs, frames, cost):
     """Add E_P_self to cost (B,) of the frames (B,)."""
-    square = pairs.reach * pairs.reach
+    square = _REACH_M * _REACH_M
     for b in range(len(frames)):
         total = 0.0
         for at in range(pairs.starts[frames[b]], pairs.starts[frames[b] + 1]):
@@ -230,7 +213,7 @@ def add_equations(chain, pairs, frames, equations, rest_gradient):
     columns = place[place >= 0]
     scratch = np.empty((chain.chain.shape[1], 3), hessian.dtype)
     one = np.ones(1, hessian.dtype)[0]
-    square = pairs.reach * pairs.reach
+    square = _REACH_M * _REACH_M
     for b in range(len(frames)):
         first, end = pairs.starts[frames[b]], pairs.starts[frames[b] + 1]
         rows = np.zeros((end - first, gradient.shape[1]), hessian.dtype)

@@ -6,7 +6,7 @@ compiled form is used on the CPU. Both have the same cost, gradient and Gauss-Ne
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -319,35 +319,17 @@ class BatchEquations(NamedTuple):
     :mod:`intercap_core.body.correctives_kernel`; B = 0 without pose blend shapes."""
 
 
-class PreparedTerm(Protocol):
+class CompiledTerm(NamedTuple):
     """The compiled form of a term at the b bodies of one evaluation."""
 
-    @property
-    def rest(self) -> RestPoints | None:
-        """Points of the term at rest, which pose blend shapes move; None = no points."""
-        ...
-
-    def used(self, frames: np.ndarray) -> np.ndarray:
-        """Return which of these N points the frames (B,) use, (B, N) bool."""
-        ...
-
-    def add_cost(self, batch: Batch, cost: np.ndarray) -> None:
-        """Add the cost (B,) in place."""
-        ...
-
-    def add(self, batch: Batch, equations: BatchEquations) -> None:
-        """Add the normal equations in place."""
-        ...
-
-
-class CompiledTerm(Protocol):
-    """The compiled form of a term."""
-
-    def prepare(
-        self, inputs: TermInputs, bodies: Bodies, *, derivatives: bool
-    ) -> PreparedTerm | None:
-        """Return the term at these bodies, or None if it is switched off."""
-        ...
+    rest: RestPoints | None
+    """Points of the term at rest, which pose blend shapes move; None = no points."""
+    used: Callable[[np.ndarray], np.ndarray]
+    """Returns which of these N points the frames (B,) use, (B, N) bool."""
+    add_cost: Callable[[Batch, np.ndarray], None]
+    """Adds the cost (B,) in place."""
+    add: Callable[[Batch, BatchEquations], None]
+    """Adds the normal equations in place."""
 
 
 def contiguous(values: Tensor) -> np.ndarray:

@@ -43,7 +43,6 @@ from intercap_core.body_fit.term_inputs import (
     Bodies,
     Columns,
     CompiledTerm,
-    PreparedTerm,
     TermInputs,
     TorchTerm,
 )
@@ -106,15 +105,15 @@ class CompiledTerms:
 
     def __init__(self, model: BodyModel, samples: Samples) -> None:
         self._rest_joints = RestJoints.of(model)
-        self._terms: tuple[CompiledTerm, ...] = (
-            CompiledPriors(model),
-            CompiledKeypoints(model),
-            CompiledCloud(model, samples),
-            CompiledSelfPenetration(model),
+        self._terms: tuple[Callable[[TermInputs, Bodies, bool], CompiledTerm | None], ...] = (
+            CompiledPriors(model).prepare,
+            CompiledKeypoints(model).prepare,
+            CompiledCloud(model, samples).prepare,
+            CompiledSelfPenetration(model).prepare,
         )
 
     def cost(self, inputs: TermInputs, bodies: Bodies) -> Tensor:
-        terms = self._prepare(inputs, bodies, derivatives=False)
+        terms = self._prepare(inputs, bodies, False)
         total = bodies.vectors.new_zeros(len(bodies.frames))
 
         def add_frames(at: slice) -> None:
@@ -128,7 +127,7 @@ class CompiledTerms:
     def add(
         self, inputs: TermInputs, bodies: Bodies, columns: Columns, equations: NormalEquations
     ) -> None:
-        terms = self._prepare(inputs, bodies, derivatives=True)
+        terms = self._prepare(inputs, bodies, True)
         moved = [term.rest for term in terms if term.rest and term.rest.correctives]
         place = columns.of_parameters(bodies.vectors.shape[1])
         place_u = columns.of_coverings(len(bodies.thickness))
@@ -153,14 +152,12 @@ class CompiledTerms:
 
         _divide_frames(add_frames, len(bodies.frames))
 
-    def _prepare(
-        self, inputs: TermInputs, bodies: Bodies, *, derivatives: bool
-    ) -> list[PreparedTerm]:
-        terms = [term.prepare(inputs, bodies, derivatives=derivatives) for term in self._terms]
+    def _prepare(self, inputs: TermInputs, bodies: Bodies, derivatives: bool) -> list[CompiledTerm]:
+        terms = [prepare(inputs, bodies, derivatives) for prepare in self._terms]
         return [term for term in terms if term is not None]
 
     def _batch(
-        self, terms: list[PreparedTerm], bodies: Bodies, at: slice, *, derivatives: bool
+        self, terms: list[CompiledTerm], bodies: Bodies, at: slice, *, derivatives: bool
     ) -> Batch:
         """Pose the skeletons of the bodies ``at``, and move their points by the blend shapes."""
         vectors, frames = bodies.vectors.numpy()[at], bodies.frames.numpy()[at]
