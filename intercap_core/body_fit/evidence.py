@@ -1,4 +1,4 @@
-"""Observations for bodies at their current pose: pixels of E_J, correspondences of E_D.
+"""Observations at the current bodies: pixels of E_J, correspondences of E_D, contacts of E_P_self.
 
 They are updated between rounds of the solver, together with the noise of each kind of observation.
 """
@@ -86,8 +86,8 @@ class Evidence:
 
     Attributes:
         frames: (N,) frames of the sequence.
-        keypoint_sigma: (135,) standard deviation of keypoints of usual confidence, metres.
-        keypoint_doubt: (135,) exponent by which sigma grows as confidence falls below the usual.
+        keypoint_sigma: (135,) standard deviation of a keypoint of median confidence, metres.
+        keypoint_doubt: (135,) exponent by which sigma grows as confidence falls.
         cloud_noise: (G,) noise of the samples of each covering, metres.
         cloud_residual: (N,) median distance of points at the last matching, metres, NaN = none.
         measured: (N, S) bool, samples with depth points.
@@ -127,12 +127,12 @@ class Evidence:
         self.by_view: ViewDistances | None = None
         self.keypoint_sigma = self._tensor(np.zeros(NUM_KEYPOINTS))
         self.keypoint_doubt = torch.zeros_like(self.keypoint_sigma)
-        self.usual_confidence = torch.ones_like(self.keypoint_sigma)
+        self.median_confidence = torch.ones_like(self.keypoint_sigma)
         for part, value in KEYPOINT_SIGMA_M:
             self.keypoint_sigma[part] = value
-            seen_at = observations.confidence[self.frames, :, part]
-            usual = np.median(seen_at[seen_at > 0]) if (seen_at > 0).any() else 1.0
-            self.usual_confidence[part] = float(usual)
+            confidence = observations.confidence[self.frames, :, part]
+            detected = confidence[confidence > 0]
+            self.median_confidence[part] = float(np.median(detected)) if len(detected) else 1.0
 
     def _tensor(self, values: np.ndarray) -> Tensor:
         return torch.as_tensor(values, dtype=self.model.dtype, device=self.model.device)
@@ -184,7 +184,7 @@ class Evidence:
         )
 
     def keypoints(self, *, hands: bool = False, face: bool = False) -> KeypointSet:
-        """Return the keypoints of the body, and of hands and face where requested.
+        """Return the keypoints of the body, and if requested of hands and face.
 
         The jaw line is left out: its landmarks slide over the cheek with the view.
         """
@@ -229,8 +229,8 @@ class Evidence:
         return self._tensor(velocity)
 
     def _sigma_factor(self, confidence: Tensor, index: Tensor) -> Tensor:
-        """Return the factor (N, C, K) of sigma for keypoints ``index`` (K,) of this confidence."""
-        share = confidence.clamp_min(_LEAST_CONFIDENCE) / self.usual_confidence[index]
+        """Return the factor of sigma (N, C, K) of the keypoints ``index`` (K,)."""
+        share = confidence.clamp_min(_LEAST_CONFIDENCE) / self.median_confidence[index]
         return share ** -self.keypoint_doubt[index]
 
     def refine_sigma(self, problem: BodyProblem) -> None:
@@ -246,11 +246,11 @@ class Evidence:
             here = (index >= part.start) & (index < part.stop)
             known = views.confidence[:, :, here] > 0
             if bool(known.any()):
-                sure, off = views.confidence[:, :, here][known], scaled[:, :, here][known]
-                self.keypoint_doubt[part] = fit_confidence_exponent(sure, off.mean(1))
+                confidence, errors = views.confidence[:, :, here][known], scaled[:, :, here][known]
+                self.keypoint_doubt[part] = fit_confidence_exponent(confidence, errors.mean(1))
                 factor = self._sigma_factor(views.confidence, index)[:, :, here][known]
-                usual = off / factor[:, None]
-                estimate = SIGMA_PER_MAD * PERSISTENCE * float(usual.median())
+                at_median = errors / factor[:, None]
+                estimate = SIGMA_PER_MAD * PERSISTENCE * float(at_median.median())
                 self.keypoint_sigma[part] = min(max(estimate, start * 0.1), start * 4.0)
 
     # --- cloud -------------------------------------------------------------------------------
