@@ -87,37 +87,34 @@ def test_motion_until_the_exposure_is_taken_out() -> None:
     assert distance[sideways < -0.9].mean() == pytest.approx(0.0095, abs=0.002)
 
 
+def _box(rows: slice, columns: slice) -> np.ndarray:
+    """A mask of the image with one rectangle."""
+    mask = np.zeros((LENS.height, LENS.width), bool)
+    mask[rows, columns] = True
+    return mask
+
+
 def test_image_border_is_no_rim() -> None:
-    half = np.zeros((LENS.height, LENS.width), bool)
-    half[100:, :300] = True  # leaves the image on the left and below
-    normals = _rim(_runs(half)).normals
+    normals = _rim(_runs(_box(slice(100, None), slice(300)))).normals  # leaves left and below
     assert (normals[:, 0] > 0.9).any() and (normals[:, 1] < -0.9).any()
     assert not (normals[:, 0] < -0.5).any() and not (normals[:, 1] > 0.5).any()
 
 
 def test_a_gap_between_limbs_has_a_rim_and_a_speck_has_none() -> None:
-    whole = np.zeros((LENS.height, LENS.width), bool)
-    whole[100:300, 100:300] = True
-    without = len(_rim(_runs(whole)).rays)
-    gap = whole.copy()
-    gap[150:250, 180:220] = False
-    rim = _rim(_runs(gap))
-    inner = np.abs(rim.rays[:, :2] / rim.rays[:, 2:]).max()
-    assert len(rim.rays) != without and inner < 1
-    speck = np.zeros_like(whole)
-    speck[200:204, 200:204] = True
-    assert trace_outline(_runs(speck), None, LENS, 0) is None
-    assert trace_outline(_runs(np.zeros_like(whole)), None, LENS, 0) is None
+    whole = _box(slice(100, 300), slice(100, 300))
+    rim = _rim(_runs(whole & ~_box(slice(150, 250), slice(180, 220))))
+    assert len(rim.rays) != len(_rim(_runs(whole)).rays)
+    assert np.abs(rim.rays[:, :2] / rim.rays[:, 2:]).max() < 1
+    for speck in (_box(slice(200, 204), slice(200, 204)), np.zeros_like(whole)):
+        assert trace_outline(_runs(speck), None, LENS, 0) is None
 
 
 def test_rim_next_to_another_object_is_left_out() -> None:
-    whole = np.zeros((LENS.height, LENS.width), bool)
-    whole[100:300, 100:300] = True
-    held = np.zeros_like(whole)
-    held[150:250, 302:400] = True  # two pixels beside the mask's right border
-    found = trace_outline(_runs(whole), _runs(held), LENS, 0)
-    assert found is not None
-    at = LENS.project(found.rays.astype(float))
+    whole = _box(slice(100, 300), slice(100, 300))
+    other = _box(slice(150, 250), slice(302, 400))  # two pixels from the mask's right border
+    rim = trace_outline(_runs(whole), _runs(other), LENS, 0)
+    assert rim is not None
+    at = LENS.project(rim.rays.astype(float))
     on_the_right = at[:, 0] > 298
     assert on_the_right.any()
     assert not ((at[:, 1] > 152) & (at[:, 1] < 248) & on_the_right).any()
