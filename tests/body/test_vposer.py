@@ -69,15 +69,15 @@ def test_jacobian_equals_finite_differences(tmp_path: Path) -> None:
         assert torch.allclose(jacobian[:, :, k], numeric, atol=1e-6)
 
 
-@pytest.mark.parametrize(("held", "named"), [(1, 2), (2, 1)])
-def test_weights_of_the_other_version_are_reported(held: int, named: int, tmp_path: Path) -> None:
-    path = _save(tmp_path, held)
+@pytest.mark.parametrize(("stored", "named"), [(1, 2), (2, 1)])
+def test_weights_of_the_other_version_are_reported(stored: int, named: int, tmp_path: Path) -> None:
+    path = _save(tmp_path, stored)
     with pytest.raises(
-        UserError, match=f"weights of version {held}, and version {named}"
+        UserError, match=f"weights of version {stored}, and version {named}"
     ) as caught:
         VPoser.load(path, named)
     assert str(path) in str(caught.value)
-    assert VPoser.load(path, held).version == held
+    assert VPoser.load(path, stored).version == stored
 
 
 def test_prior_around_a_pose_has_the_cost_of_the_best_code(tmp_path: Path) -> None:
@@ -137,14 +137,14 @@ class Malicious:
 @pytest.mark.parametrize("zipped", [True, False])
 def test_other_objects_of_a_checkpoint_are_not_executed(zipped: bool, tmp_path: Path) -> None:
     trace = tmp_path / "run"
-    held = {
+    content = {
         "callbacks": {Callback: {"best": Callback()}},
         "hyper_parameters": Hyperparameters(rate=1e-3),
         "other": [Malicious(trace), {1, 2}],
         "state_dict": _state(2),
     }
     path = tmp_path / "V02_05.ckpt"
-    torch.save(held, path, _use_new_zipfile_serialization=zipped)
+    torch.save(content, path, _use_new_zipfile_serialization=zipped)
     prior = VPoser.load(path)
     assert prior.version == 2 and not trace.exists()
     weight, _ = prior.layers[0]
@@ -165,9 +165,9 @@ WRONG: dict[str, tuple[object, str]] = {
 
 @pytest.mark.parametrize("name", WRONG)
 def test_checkpoints_without_a_decoder_are_reported(name: str, tmp_path: Path) -> None:
-    held, words = WRONG[name]
+    content, words = WRONG[name]
     path = tmp_path / "other.pt"
-    torch.save(held, path)
+    torch.save(content, path)
     with pytest.raises(UserError, match=words) as caught:
         VPoser.load(path)
     assert str(path) in str(caught.value)

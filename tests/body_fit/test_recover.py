@@ -56,14 +56,14 @@ def test_frames_near_placed_frames_are_usable_with_six_keypoints() -> None:
     joints[5, 5:] = np.nan  # only head and one arm
     joints[11, TRUNK_KEYPOINTS[:4]] = np.nan
     times[11] += 2.0  # no placed frame nearby
-    seen = Observations(
+    observations = Observations(
         "test", rig, np.zeros((frames, 2, 135, 2)), np.zeros((frames, 2, 135)), joints,
         np.ones((frames, 135), int), [b""] * 2 * frames, np.zeros((frames, 2)), [b""] * 2 * frames,
         [None, None], np.zeros(2), np.zeros((frames, 2), int), np.zeros(2), times,
     )  # fmt: skip
-    assert np.flatnonzero(~seen.placed).tolist() == [4, 5, 11]
-    assert np.flatnonzero(~seen.usable).tolist() == [5, 11]
-    nobody = dataclasses.replace(seen, joints=np.full_like(joints, np.nan))
+    assert np.flatnonzero(~observations.placed).tolist() == [4, 5, 11]
+    assert np.flatnonzero(~observations.usable).tolist() == [5, 11]
+    nobody = dataclasses.replace(observations, joints=np.full_like(joints, np.nan))
     assert not nobody.usable.any()
 
 

@@ -63,8 +63,8 @@ def _problem(model: BodyModel) -> BodyProblem:
     lenses[:, 12] = 0.35
     pose = torch.eye(4).repeat(CAMERAS, 1, 1)
     pose[:, 0, 3] = torch.linspace(-0.4, 0.4, CAMERAS)
-    seen = FRAMES, CAMERAS, KEYPOINTS
-    observed, confidence = 300 * _random(*seen, 2, seed=1) + 500, _random(*seen, seed=2).abs()
+    shape = FRAMES, CAMERAS, KEYPOINTS
+    observed, confidence = 300 * _random(*shape, 2, seed=1) + 500, _random(*shape, seed=2).abs()
     confidence[0, 1, 5:20], observed[0, 1, 5:20] = 0, torch.nan
     count = len(samples.vertex)
     return BodyProblem(
@@ -73,8 +73,8 @@ def _problem(model: BodyModel) -> BodyProblem:
         offsets=0.02 * _random(25, 3, seed=3),
         u=0.1 * _random(len(COVERINGS), seed=4),
         views=Views(
-            observed, confidence, torch.full(seen, 40.0), lenses, pose,
-            0.01 * _random(*seen, 3, seed=5),
+            observed, confidence, torch.full(shape, 40.0), lenses, pose,
+            0.01 * _random(*shape, 3, seed=5),
         ),
         targets=Targets(
             _random(FRAMES, KEYPOINTS, 3, seed=6), _random(FRAMES, KEYPOINTS, seed=7).relu(), 0.3
