@@ -41,9 +41,9 @@ def files_of(path: Path) -> list[Path]:
     Files in its folders of frames are not watched: there are thousands. The folder's time changes
     if a frame is added or removed.
     """
-    own = intercap_file(path)
+    main = intercap_file(path)
     inside = (path / name for name in (BEHAVE_PERSON, BEHAVE_OBJECT))
-    return [own, *(file for file in inside if own == path and file.is_file())]
+    return [main, *(file for file in inside if main == path and file.is_file())]
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,10 +158,10 @@ def read_object_pose(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Read rotation vector (3,) and translation (3,) from an ``<object>_fit.pkl``."""
     values = _named(path)
     angle, trans = (_numbers(values, name, path).ravel() for name in ("angle", "trans"))
-    for name, found in (("angle", angle), ("trans", trans)):
-        if found.shape != (3,) or not np.isfinite(found).all():
-            raise UserError(f"{path}: {name} holds {found.size} numbers, expected 3 finite ones")
-        check_range(path, name, found)
+    for name, vector in (("angle", angle), ("trans", trans)):
+        if vector.shape != (3,) or not np.isfinite(vector).all():
+            raise UserError(f"{path}: {name} holds {vector.size} numbers, expected 3 finite ones")
+        check_range(path, name, vector)
     return angle, trans
 
 
@@ -195,10 +195,10 @@ def object_poses_at_30_fps(folder: Path) -> dict[int, tuple[np.ndarray, np.ndarr
         return {}
     values = read_arrays(path, advice="get the file again")
     angles, trans = (_numbers(values, name, path) for name in ("angles", "trans"))
-    for name, found in (("angles", angles), ("trans", trans)):
-        if found.ndim != 2 or found.shape[1] != 3 or len(found) != len(angles):
-            raise UserError(f"{path}: {name} is {found.shape}, expected ({len(angles)}, 3)")
-        check_range(path, name, found)
+    for name, vectors in (("angles", angles), ("trans", trans)):
+        if vectors.ndim != 2 or vectors.shape[1] != 3 or len(vectors) != len(angles):
+            raise UserError(f"{path}: {name} is {vectors.shape}, expected ({len(angles)}, 3)")
+        check_range(path, name, vectors)
     both = zip(angles, trans, strict=True)
     return dict(zip(_times(values, path, len(angles)), both, strict=False))
 
@@ -216,12 +216,12 @@ def _as_smplx(poses: np.ndarray, path: Path) -> np.ndarray:
     if not np.isfinite(poses).all():
         raise UserError(f"{path}: a pose has values that are no numbers; get the file again")
     check_range(path, "a pose", poses)
-    theirs = poses.reshape(len(poses), _JOINTS[poses.shape[1]], 3)
-    found = np.zeros((len(poses), 55, 3))
-    found[:, :_BODY_JOINTS] = theirs[:, :_BODY_JOINTS]
-    if theirs.shape[1] == _JOINTS[156]:
-        found[:, _SMPLX_HANDS] = theirs[:, _HAND_JOINTS]
-    return found
+    rotations = poses.reshape(len(poses), _JOINTS[poses.shape[1]], 3)
+    result = np.zeros((len(poses), 55, 3))
+    result[:, :_BODY_JOINTS] = rotations[:, :_BODY_JOINTS]
+    if rotations.shape[1] == _JOINTS[156]:
+        result[:, _SMPLX_HANDS] = rotations[:, _HAND_JOINTS]
+    return result
 
 
 def _named(path: Path) -> Mapping[str, Any]:
@@ -243,10 +243,10 @@ def _numbers(values: Mapping[str, Any], name: str, path: Path) -> np.ndarray:
 def _times(values: Mapping[str, np.ndarray], path: Path, most: int) -> list[int]:
     """Times of ``frame_times``, microseconds, at most as many as there are poses."""
     texts = np.atleast_1d(values.get("frame_times", np.zeros(0)))
-    found = [FRAME_FOLDER.fullmatch(str(text)) for text in texts]
-    if not found or not all(found) or len(found) > most:
+    matches = [FRAME_FOLDER.fullmatch(str(text)) for text in texts]
+    if not matches or not all(matches) or len(matches) > most:
         raise UserError(
             f"{path}: frame_times are not times such as 't0003.033', one for each of {most} poses; "
             "get BEHAVE's file again"
         )
-    return [round(float(match.group(1)) * 1e6) for match in found if match]
+    return [round(float(match.group(1)) * 1e6) for match in matches if match]

@@ -101,9 +101,9 @@ def _array(content: bytes) -> np.ndarray:
         raise ValueError(f"it holds {dtype}, expected numbers")
     if not all(type(n) is int and n >= 0 for n in shape):
         raise ValueError(f"its shape is {shape!r:.60}")
-    size, there = math.prod(shape) * dtype.itemsize, len(content) - file.tell()
-    if size != there:
-        raise ValueError(f"its shape {shape!r:.60} needs {size} bytes, it has {there}")
+    size, available = math.prod(shape) * dtype.itemsize, len(content) - file.tell()
+    if size != available:
+        raise ValueError(f"its shape {shape!r:.60} needs {size} bytes, it has {available}")
     if not size:
         return np.zeros(shape, dtype)
     values = np.frombuffer(content, dtype, offset=file.tell())

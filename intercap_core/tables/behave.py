@@ -48,7 +48,7 @@ def draft(root: Path, *, dataset: str, results: Path | None = None) -> Draft:
         if gender is None:
             row.remarks.append(f"info.json states no gender: {subject} is {known}")
         elif gender != known:
-            row.remarks.append(f"info.json says {gender}, another sequence of {subject} {known}")
+            row.remarks.append(f"info.json states {gender}, another sequence of {subject} {known}")
         meshes[object_name] = {"mesh": mesh, "labels": [object_name]}
         if results is not None:
             _name_results(row, results)

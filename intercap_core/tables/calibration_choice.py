@@ -51,9 +51,9 @@ def choose_calibration(
     ]
     residuals = {}
     for name, rig in rigs.items():
-        found = [_residual(rig[a], rig[b], depths[a], depths[b]) for a, b in pairs]
-        if any(np.isfinite(found)):
-            residuals[name] = float(np.nanmean(found))
+        distances = [_residual(rig[a], rig[b], depths[a], depths[b]) for a, b in pairs]
+        if any(np.isfinite(distances)):
+            residuals[name] = float(np.nanmean(distances))
     order = sorted(residuals, key=lambda name: residuals[name])
     decided = len(order) > 1 and residuals[order[0]] <= 0.9 * residuals[order[1]]
     return CalibrationChoice(order[0] if decided else None, residuals)

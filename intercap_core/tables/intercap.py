@@ -99,7 +99,7 @@ def draft(root: Path, sources: Sources, *, dataset: str, objects: Path) -> Draft
 
 
 def _sequence_folders(images: Path) -> dict[Key, Path]:
-    found: dict[Key, Path] = {}
+    folders: dict[Key, Path] = {}
     for subject in _numbered_folders(images):
         for object_folder in _numbered_folders(subject):
             for path in sorted(p for p in object_folder.iterdir() if p.is_dir()):
@@ -107,8 +107,8 @@ def _sequence_folders(images: Path) -> dict[Key, Path]:
                 segment = int(match.group(1)) if match else -1
                 key = int(subject.name), int(object_folder.name), segment
                 if match and 1 <= key[1] <= len(OBJECTS):
-                    found.setdefault(key, path)
-    return dict(sorted(found.items()))
+                    folders.setdefault(key, path)
+    return dict(sorted(folders.items()))
 
 
 def _numbered_folders(folder: Path) -> list[Path]:
@@ -127,17 +127,17 @@ def _find_folder(images: Path, name: str) -> Path | None:
 def _calibrations(given: Path | None, images: Path) -> dict[str, Path]:
     names = {name: f"calibration_{name}" for name in CALIBRATIONS}
     if given is not None:
-        found = {name: given / folder for name, folder in names.items()}
+        folders = {name: given / folder for name, folder in names.items()}
     else:
         places = {name: _find_folder(images, folder) for name, folder in names.items()}
-        found = {name: place for name, place in places.items() if place is not None}
-    found = {name: folder for name, folder in found.items() if folder.is_dir()}
-    if not found:
+        folders = {name: place for name, place in places.items() if place is not None}
+    folders = {name: folder for name, folder in folders.items() if folder.is_dir()}
+    if not folders:
         raise UserError(
             f"{given or images}: holds no calibration_first, calibration_second or "
             "calibration_third; name the folder that does with --calibrations"
         )
-    return found
+    return folders
 
 
 def _row(key: Key, folder: Path, sources: Sources) -> Row:
@@ -159,9 +159,9 @@ def _row(key: Key, folder: Path, sources: Sources) -> Row:
     for column in ("keypoints", "candidates", "results"):
         parent = getattr(sources, column)
         folders = [parent / place for place in usual] if parent is not None else []
-        own = next((folder for folder in folders if folder.is_dir()), None)
-        if own is not None:
-            columns[column] = own
+        existing = next((folder for folder in folders if folder.is_dir()), None)
+        if existing is not None:
+            columns[column] = existing
     return Row(columns)
 
 

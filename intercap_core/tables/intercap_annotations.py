@@ -38,13 +38,13 @@ class Converted:
 
 def annotation_folders(root: Path) -> dict[Key, list[Path]]:
     """Folders by sequence; those whose name ends with the segment come first, then by name."""
-    found: dict[Key, list[tuple[str, Path]]] = {}
+    folders: dict[Key, list[tuple[str, Path]]] = {}
     for path in sorted(root.iterdir()):
         match = FOLDER.fullmatch(path.name)
         if match and path.is_dir():
             subject, number, segment = (int(text) for text in match.groups()[:3])
-            found.setdefault((subject, number, segment), []).append((match.group(4), path))
-    return {key: [path for _, path in sorted(paths)] for key, paths in found.items()}
+            folders.setdefault((subject, number, segment), []).append((match.group(4), path))
+    return {key: [path for _, path in sorted(paths)] for key, paths in folders.items()}
 
 
 def convert(folder: Path, numbers: np.ndarray, *, with_pose: bool) -> Converted:

@@ -119,7 +119,7 @@ def few_candidates(folder: Path) -> None:
         (without(0.8, tail=True), "", "left lasts 3.1 s (32 images), the other cameras 3.9 s"),
         (without(0.5, tail=False), "", "left has 20 images in 3.9 s, expected about 40 at 10 a"),
         (emptied, "", "left 1 of 40 colour files are empty (first: 00003.jpg)"),
-        (all_cut, "left has no image that can be read, expected 96x64", "looked at are damaged"),
+        (all_cut, "left has no image that can be read, expected 96x64", "files are damaged"),
         (few_keypoints, "", "keypoints of camera left cover 4 of its 40 images; run the"),
         (few_candidates, "", "candidates of camera left cover 2 of its 40 images; run the"),
     ],

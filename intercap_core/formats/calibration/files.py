@@ -112,7 +112,7 @@ def refuse_scale(path: Path, scale: float | None) -> None:
     """Raise UserError if a scale is stated for a file in metres."""
     if scale is not None:
         raise UserError(
-            f"{path}: is in metres, yet column calibration_scale of the table of sequences says "
+            f"{path}: is in metres, yet column calibration_scale of the table of sequences is "
             f"{scale:g}; leave it empty and write the file in metres"
         )
 
@@ -143,7 +143,7 @@ def to_calibration(
         raise UserError(f"{path}: holds no camera; calibrate again, or name another file")
     if unit is not None and scale is None:
         raise UserError(
-            f"{path}: {unit}, so nothing says how long a metre is in this file of {tool}; state "
+            f"{path}: {unit}, so the length of a metre in this file of {tool} is unknown; state "
             "metres for one of its units in column calibration_scale of the table of sequences "
             "(1 = metres, 0.001 = millimetres; else a distance that you measured between two "
             "cameras, divided by that in the file)"

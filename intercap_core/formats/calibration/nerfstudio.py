@@ -45,7 +45,7 @@ def _recognises(path: Path) -> bool:
     try:
         content = read_json(path)
     except UnreadableFile:
-        return False  # the reader of OpenCV's files says what is wrong with it
+        return False  # the reader of OpenCV's files reports the fault
     return isinstance(content, dict) and "frames" in content and "cameras" not in content
 
 

@@ -100,26 +100,26 @@ def read_camera(
         min_score: instances with a lower score are left out.
         names: classes by number, for files that do not list them.
     """
-    found = CandidatesByImage()
+    candidates = CandidatesByImage()
     if not has_candidates(folder, images.name, layout):
-        found.notes.append(f"no candidates {folder.name}/{images.name}.json")
-        return found
+        candidates.notes.append(f"no candidates {folder.name}/{images.name}.json")
+        return candidates
     form = CandidateForm(images.size, names, min_score)
     path = camera_file(folder, images.name)
     if path is not None:
         try:
             content = parse_candidates(read_json(path), form)
         except UnreadableDetections as error:
-            found.notes.append(f"{short_name(path)} {error}")
+            candidates.notes.append(f"{short_name(path)} {error}")
         else:
-            _add_file(found, content, images, path)
-    _add_image_files(found, image_files(folder, images.name), images, form)
-    _add_masks_of_camera(found, folder, images, layout)
-    return found
+            _add_file(candidates, content, images, path)
+    _add_image_files(candidates, image_files(folder, images.name), images, form)
+    _add_masks_of_camera(candidates, folder, images, layout)
+    return candidates
 
 
 def _add_file(
-    found: CandidatesByImage, content: CandidateFile, images: CameraImages, path: Path
+    candidates: CandidatesByImage, content: CandidateFile, images: CameraImages, path: Path
 ) -> None:
     """Sort one file's results by image."""
     useless = bool(content.entries) and len(content.faults) == content.entries
@@ -127,19 +127,19 @@ def _add_file(
         content.results, content.images, content.faulty, images, useless=useless
     )
     for place, instances in by_image.items():
-        found.by_image.setdefault(place, []).extend(instances)
+        candidates.by_image.setdefault(place, []).extend(instances)
     name = short_name(path)
     if content.faults:
         first = "; ".join(content.faults[:FILES_NAMED])
         count = len(content.faults)
-        found.notes.append(f"{count} of {content.entries} results in {name} left out: {first}")
+        candidates.notes.append(f"{count} of {content.entries} results in {name} left out: {first}")
     if content.scaled:
-        found.notes.append(f"{content.scaled} masks in {name} scaled to the image's size")
-    note_absent(found.notes, absent, images, name)
+        candidates.notes.append(f"{content.scaled} masks in {name} scaled to the image's size")
+    note_absent(candidates.notes, absent, images, name)
 
 
 def _add_image_files(
-    found: CandidatesByImage, paths: Iterable[Path], images: CameraImages, form: CandidateForm
+    candidates: CandidatesByImage, paths: Iterable[Path], images: CameraImages, form: CandidateForm
 ) -> None:
     """Read files that hold one image each, named after it."""
     by_name = {path.name: path for path in paths}
@@ -159,27 +159,27 @@ def _add_image_files(
             continue
         if content.results or not content.entries:
             instances = [instance for _, instance in content.results]
-            found.by_image.setdefault(place, []).extend(instances)
+            candidates.by_image.setdefault(place, []).extend(instances)
         faults += [f"{printable(name)}, {fault}" for fault in content.faults]
         entries, scaled = entries + content.entries, scaled + content.scaled
-    note_broken(found.notes, "candidates", broken)
+    note_broken(candidates.notes, "candidates", broken)
     if faults:
         first = "; ".join(faults[:FILES_NAMED])
-        found.notes.append(f"{len(faults)} of {entries} results left out: {first}")
+        candidates.notes.append(f"{len(faults)} of {entries} results left out: {first}")
     if scaled:
-        found.notes.append(f"{scaled} masks scaled to the image's size")
+        candidates.notes.append(f"{scaled} masks scaled to the image's size")
     without = len(images.recorded) - len(by_name) + len(absent)
     if by_name and without > 0:
-        found.notes.append(f"no file of candidates for {without} images")
+        candidates.notes.append(f"no file of candidates for {without} images")
     if absent:
-        found.notes.append(
+        candidates.notes.append(
             f"{len(absent)} files of candidates belong to no image (first: "
             f"{printable(absent[0][:80])})"
         )
 
 
 def _add_masks_of_camera(
-    found: CandidatesByImage, folder: Path, images: CameraImages, layout: str
+    candidates: CandidatesByImage, folder: Path, images: CameraImages, layout: str
 ) -> None:
     if layout == "intercap":
         person = release_masks(folder, images.name)
@@ -194,17 +194,17 @@ def _add_masks_of_camera(
         numbers = images.numbers_of_names(by_name)
         absent = [name for name in by_name if numbers.get(name) not in images.recorded]
         if absent:
-            found.notes.append(
+            candidates.notes.append(
                 f"masks of {len(absent)} images are named after no image (first: "
                 f"{printable(absent[0][:80])})"
             )
         files = {numbers[name]: masks for name, masks in by_name.items() if name in numbers}
     in_sets = [int(images.number[t]) for t in images.sets]
-    add_masks(found, {number: files.get(number, []) for number in in_sets}, images.size)
+    add_masks(candidates, {number: files.get(number, []) for number in in_sets}, images.size)
 
 
 def add_masks(
-    found: CandidatesByImage, files: Mapping[int, list[MaskFile]], size: tuple[int, int]
+    candidates: CandidatesByImage, files: Mapping[int, list[MaskFile]], size: tuple[int, int]
 ) -> None:
     """Read the mask files of each image number; an empty mask is no candidate."""
     missing, broken = 0, []
@@ -216,10 +216,10 @@ def add_masks(
             except DamagedImage as error:
                 broken.append(f"{short_name(file.path)} {error}")
                 continue
-            found.by_image.setdefault(number, []).extend(instances)
+            candidates.by_image.setdefault(number, []).extend(instances)
     if missing:
-        found.notes.append(f"no mask for {missing} images")
-    note_broken(found.notes, "masks", broken)
+        candidates.notes.append(f"no mask for {missing} images")
+    note_broken(candidates.notes, "masks", broken)
 
 
 def preview_candidates(
@@ -245,19 +245,19 @@ def preview_candidates(
         if content is None:
             return preview
         form = CandidateForm(size, names, min_score=0.0)
-        found = parse_candidates(content, form, one_image=whole is None)
+        parsed = parse_candidates(content, form, one_image=whole is None)
     except UnreadableDetections as error:
         preview.notes.append(f"{path} {error}; the camera will count as without candidates")
         return preview
-    if found.faults:
+    if parsed.faults:
         preview.notes.append(
-            f"{path}: {len(found.faults)} of its first {found.entries} results cannot be used "
-            f"(first: {found.faults[0]})"
+            f"{path}: {len(parsed.faults)} of its first {parsed.entries} results cannot be used "
+            f"(first: {parsed.faults[0]})"
         )
-    if found.scaled:
+    if parsed.scaled:
         preview.notes.append(
             f"{path}: masks are of another resolution than the images of {size[0]}x{size[1]} and "
             "will be scaled"
         )
-    preview.labels = {instance.label for _, instance in found.results}
+    preview.labels = {instance.label for _, instance in parsed.results}
     return preview

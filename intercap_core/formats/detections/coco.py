@@ -107,7 +107,7 @@ def parse_candidates(
         raise UnreadableDetections(
             f"holds {quoted(content)}, expected a list of results, or 'annotations' with one"
         )
-    found = CandidateFile(images=images)
+    result = CandidateFile(images=images)
     for index, entry in enumerate(entries):
         image = ImageKey(None, None)
         try:
@@ -121,13 +121,13 @@ def parse_candidates(
         except ValueError as error:
             name = image.name if image.name is not None else image.number
             where = f"entry {index}{f' (image {name})' if name is not None else ''}"
-            found.faults.append(f"{where}: {error}")
-            found.faulty.append(image)
+            result.faults.append(f"{where}: {error}")
+            result.faulty.append(image)
         else:
-            found.results.append((image, instance))
-            found.scaled += scaled
-        found.entries += 1
-    return found
+            result.results.append((image, instance))
+            result.scaled += scaled
+        result.entries += 1
+    return result
 
 
 def read_head(path: Path) -> Any:
@@ -312,5 +312,5 @@ def _label(entry: dict[str, Any], names: Mapping[int, str]) -> str:
             return names.get(entry[key], f"category {quoted(entry[key])}")
     raise ValueError(
         f"{present[0]} is {quoted(entry[present[0]])}, expected a class's number or name; "
-        "category_id or category_name says it"
+        "state category_id or category_name"
     )

@@ -78,7 +78,7 @@ def repeated_number(names: Iterable[str]) -> list[str]:
         match = _LAST_NUMBER.fullmatch(stem_of(name))
         if match:
             by_number.setdefault(int(match.group(1)), []).append(name)
-    return next((found for found in by_number.values() if len(found) > 1), [])
+    return next((group for group in by_number.values() if len(group) > 1), [])
 
 
 def camera_images(source: artefacts.Artefact, sequence: SequenceEntry) -> list[CameraImages]:
@@ -94,7 +94,8 @@ def camera_images(source: artefacts.Artefact, sequence: SequenceEntry) -> list[C
         index = number = indices[:, c]
         times = np.full(len(index), -1, np.int64)
         stems: tuple[str, ...] = ()
-        every = np.arange(_count(source, name, index))
+        key = f"cameras/{name}/colour_offsets"
+        every = np.arange(len(source[key]) - 1 if key in source else 0)
         if sequence.layout != "k4a" and (index >= 0).any():
             all_times = source[f"cameras/{name}/colour_time"]
             times = np.where(index >= 0, all_times[index], -1)
@@ -107,14 +108,6 @@ def camera_images(source: artefacts.Artefact, sequence: SequenceEntry) -> list[C
         recorded = frozenset(every.tolist())
         images.append(CameraImages(name, (width, height), number, times, recorded, stems))
     return images
-
-
-def _count(source: artefacts.Artefact, name: str, index: np.ndarray) -> int:
-    """Number of colour images of a camera in the artefact."""
-    key = f"cameras/{name}/colour_offsets"
-    if key in source:
-        return len(source[key]) - 1
-    return int(index.max(initial=-1)) + 1
 
 
 def _plain_numbers(
@@ -136,7 +129,7 @@ def _plain_numbers(
         raise UserError(
             f"sequence {layout.sequence.sequence!r}: none of the {len(files)} images of camera "
             f"{name} in {recording.source} was taken at {missing[0] / 1e6:.6f} s as the frames "
-            "artefact says; images, timestamps or calibration have changed, so run the frames "
+            "artefact states; images, timestamps or calibration have changed, so run the frames "
             "stage again"
         )
     number = np.full(len(index), -1)
@@ -161,7 +154,7 @@ def sort_by_image(
     """Sort a file's results by image number.
 
     Returns the results by number, and the names of images that were not recorded. An image that
-    the detector looked at has a list, which may be empty.
+    the detector processed has a list, which may be empty.
 
     Args:
         results: image and result of each entry.

@@ -48,18 +48,18 @@ def instance_of(label: str, score: float, mask: np.ndarray) -> Instance | None:
     return Instance(label, score, (float(x), float(y), float(width), float(height)), rle)
 
 
-def scale_to(found: tuple[int, int], size: tuple[int, int]) -> tuple[float, float]:
-    """Factors (x, y) from a mask of size ``found`` (width, height) to an image of ``size``.
+def scale_to(own: tuple[int, int], size: tuple[int, int]) -> tuple[float, float]:
+    """Factors (x, y) from a mask of size ``own`` (width, height) to an image of ``size``.
 
     Raises ValueError if the mask is no reduced copy of the image.
     """
-    if found == size:
+    if own == size:
         return 1.0, 1.0
-    x, y = size[0] / found[0], size[1] / found[1]
+    x, y = size[0] / own[0], size[1] / own[1]
     # Networks reduce by 4 to 32; a side of a reduced image is rounded to a pixel.
-    if x > 32 or abs(found[1] * x - size[1]) > max(x, 1):
+    if x > 32 or abs(own[1] * x - size[1]) > max(x, 1):
         raise ValueError(
-            f"the mask has {found[0]}x{found[1]} pixels, the image {size[0]}x{size[1]}; segment "
+            f"the mask has {own[0]}x{own[1]} pixels, the image {size[0]}x{size[1]}; segment "
             "the images as recorded"
         )
     return x, y

@@ -52,7 +52,7 @@ class KeypointCleaner:
     """Number of people with normalised coordinates."""
 
     def clean(self, people: np.ndarray) -> np.ndarray:
-        """Return the people (P, 135, 3) of whom anything is seen, as float32.
+        """Return the people (P, 135, 3) with any visible point, as float32.
 
         A point becomes zeros if it is not finite, lies outside the image or exactly at (0, 0), or
         has no confidence. Confidence beyond the full one is clipped to 1.
@@ -96,7 +96,7 @@ class KeypointCleaner:
         if self.beyond:
             notes.append(
                 f"{self.beyond} of {self.seen} confidences are beyond {self.full_confidence:g} and "
-                "count as 1; detections.keypoint_full_confidence says what is full"
+                "count as 1; detections.keypoint_full_confidence sets the full confidence"
             )
         return notes
 
@@ -106,7 +106,7 @@ class PeopleByImage:
     """People of one camera."""
 
     by_image: dict[int, np.ndarray] = field(default_factory=dict)
-    """People (P, 135, 3) by image number; P = 0 if the detector found nobody in the image."""
+    """People (P, 135, 3) by image number; P = 0 if the detector found none in the image."""
     notes: list[str] = field(default_factory=list)
     """What was left out, for the user."""
 
@@ -226,8 +226,8 @@ def _add_camera_file(
     by_image, absent = sort_by_image(
         content.results, content.images, content.faulty, images, useless=useless
     )
-    for number, found in by_image.items():
-        people = np.stack(found) if found else NOBODY
+    for number, persons in by_image.items():
+        people = np.stack(persons) if persons else NOBODY
         reading.people.by_image[number] = reading.cleaner.clean(people)
     reading.used |= not useless
     reading.faults += [f"{short_name(path)}, {fault}" for fault in content.faults]
@@ -301,20 +301,20 @@ def preview_keypoints(
         loaded = read_head(path) if reader.load is read_json else reader.load(path)
         if loaded is None:
             return []
-        found = read_people(loaded, reader.load, one_image=whole is None)
+        parsed = read_people(loaded, reader.load, one_image=whole is None)
     except UnreadableDetections as error:
         return [f"{path} {error}"]
     notes, cleaner = [], KeypointCleaner(size, full_confidence)
-    if found.faults:
+    if parsed.faults:
         notes.append(
-            f"{path}: {len(found.faults)} of its first {found.entries} people cannot be used "
-            f"(first: {found.faults[0]})"
+            f"{path}: {len(parsed.faults)} of its first {parsed.entries} people cannot be used "
+            f"(first: {parsed.faults[0]})"
         )
-    if found.results:
-        cleaner.clean(np.stack([person for _, person in found.results]))
+    if parsed.results:
+        cleaner.clean(np.stack([person for _, person in parsed.results]))
         if not cleaner.seen:
             notes.append(
-                f"{path}: none of its first {len(found.results)} people has a point with numbers "
+                f"{path}: none of its first {len(parsed.results)} people has a point with numbers "
                 "and a confidence above 0; write the keypoints again"
             )
     return notes + [f"{path}: {note}" for note in cleaner.notes()]

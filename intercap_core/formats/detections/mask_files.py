@@ -99,7 +99,7 @@ def instance_masks(folder: Path) -> dict[str, list[MaskFile]]:
     ``<image>__<label>__<n>.png``, or in a folder ``<image>/`` the label between digits:
     ``3_cup.png``.
     """
-    found: dict[str, list[MaskFile]] = {}
+    result: dict[str, list[MaskFile]] = {}
     for path in sorted(folder.iterdir()):
         if path.name.startswith("."):
             continue
@@ -107,12 +107,12 @@ def instance_masks(folder: Path) -> dict[str, list[MaskFile]]:
             for inner in sorted(path.iterdir()):
                 if _is_png(inner):
                     label = printable(inner.stem).strip("0123456789_-. ")[:MAX_LABEL]
-                    found.setdefault(path.name, []).append(MaskFile(inner, label, numbered=True))
+                    result.setdefault(path.name, []).append(MaskFile(inner, label, numbered=True))
         elif _is_png(path):
             image, _, rest = path.stem.partition("__")
             label = printable(rest.partition("__")[0])[:MAX_LABEL]
-            found.setdefault(image, []).append(MaskFile(path, label, numbered=True))
-    return found
+            result.setdefault(image, []).append(MaskFile(path, label, numbered=True))
+    return result
 
 
 def _is_png(path: Path) -> bool:
@@ -155,7 +155,7 @@ class BehaveFiles:
 
     def masks(self, time_us: int, camera: str) -> list[MaskFile]:
         """The masks of one image."""
-        found = []
+        result = []
         for kinds, label in self._labels.items():
             paths = (
                 self._existing(time_us, f"{camera}.{kind}.{suffix}")
@@ -164,8 +164,8 @@ class BehaveFiles:
             )
             path = next((path for path in paths if path is not None), None)
             if path is not None:
-                found.append(MaskFile(path, label))
-        return found
+                result.append(MaskFile(path, label))
+        return result
 
     def _existing(self, time_us: int, name: str) -> Path | None:
         folder = self._folders.get(time_us)

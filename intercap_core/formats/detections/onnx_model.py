@@ -72,10 +72,10 @@ class OnnxModel:
         self.path, self._session = path, session
         inputs = session.get_inputs()
         if len(inputs) != 1 or len(inputs[0].shape) not in (3, 4) or inputs[0].type not in _TYPES:
-            found = printable(", ".join(f"{i.name} {i.type} {i.shape}" for i in inputs)[:300])
+            inputs_text = printable(", ".join(f"{i.name} {i.type} {i.shape}" for i in inputs)[:300])
             raise UserError(
-                f"{path}: takes {found}; expected one image, (batch,) 3, height, width; export the "
-                "model for images alone"
+                f"{path}: takes {inputs_text}; expected one image, (batch,) 3, height, width; "
+                "export the model for images alone"
             )
         self._name, self._dtype = inputs[0].name, _TYPES[inputs[0].type]
         lengths = [n if isinstance(n, int) and n > 0 else None for n in inputs[0].shape]
@@ -141,7 +141,8 @@ class OnnxModel:
         values = images.transpose(0, 2, 3, 1) if self._channels_last else images
         values = values if self.batched else values[0]
         try:
-            found = self._session.run(None, {self._name: np.ascontiguousarray(values, self._dtype)})
+            feed = {self._name: np.ascontiguousarray(values, self._dtype)}
+            outputs = self._session.run(None, feed)
         except _runtime_errors() as error:
             raise UserError(
                 f"{self.path}: fails on an image of {images.shape[3]}x{images.shape[2]} pixels "
@@ -149,7 +150,7 @@ class OnnxModel:
             ) from None
         return [
             np.asarray(v, np.float32) if np.asarray(v).dtype == np.float16 else np.asarray(v)
-            for v in found
+            for v in outputs
         ]
 
     def fitted(

@@ -135,10 +135,10 @@ class PoseModel:
     def _people_in(self, picture: np.ndarray, boxes: np.ndarray, padding: float) -> np.ndarray:
         """One person (N, 135, 3) in each of the boxes (N, 4) of x, y, width, height."""
         crops = [Crop.around(box, self._size, padding) for box in boxes]
-        found = [points for batch in self._batches(picture, crops) for points in batch]
-        for crop, points in zip(crops, found, strict=True):
+        people = [points for batch in self._batches(picture, crops) for points in batch]
+        for crop, points in zip(crops, people, strict=True):
             points[:, :2] = crop.to_image(points[:, :2])
-        return to_shared(np.stack(found), _point_names(self._model, len(found[0])))
+        return to_shared(np.stack(people), _point_names(self._model, len(people[0])))
 
     def _batches(self, picture: np.ndarray, crops: list[Crop]) -> Iterator[np.ndarray]:
         """Points (B, K, 3) in the input's pixels."""
@@ -228,9 +228,9 @@ def _coarser(cells: tuple[int, ...], size: tuple[int, int]) -> bool:
     return stride > 1 and abs(size[1] / cells[0] - stride) < 1e-6
 
 
-def _unknown(model: OnnxModel, found: list[str]) -> UserError:
+def _unknown(model: OnnxModel, outputs: list[str]) -> UserError:
     return UserError(
-        f"{Path(model.path)}: its outputs ({'; '.join(found)}) are not those of a pose model; "
+        f"{Path(model.path)}: its outputs ({'; '.join(outputs)}) are not those of a pose model; "
         "expected simcc_x and simcc_y (people, points, bins) of RTMPose, RTMW or DWPose, or "
         "heatmaps (people, points, height, width) of HRNet or ViTPose; export it as "
         "docs/detectors.md shows"

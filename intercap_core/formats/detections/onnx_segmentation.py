@@ -84,14 +84,15 @@ def yolo_instances(
     boxes = fit.to_image(corners[kept])
     logits = np.tensordot(coefficients[kept], prototypes, 1)
     steps = input_size[0] / prototypes.shape[2], input_size[1] / prototypes.shape[1]
-    found = []
+    # Image to grid, in pixel edges: (image * scale + shift) / step
+    across = (fit.scale[0] / steps[0], fit.left / steps[0])
+    down = (fit.scale[1] / steps[1], fit.top / steps[1])
+    instances = []
     for k, box, logit in zip(kept.tolist(), boxes, logits, strict=True):
-        # Image to grid, in pixel edges: (image * scale + shift) / step
-        across = (fit.scale[0] / steps[0], fit.left / steps[0])
-        down = (fit.scale[1] / steps[1], fit.top / steps[1])
         label = names.get(int(classes[k]), f"category {int(classes[k])}")
-        found.append(_instance(label, float(scores[k]), box, logit, across, down, fit.size, 0.0))
-    return [instance for instance in found if instance is not None]
+        score = float(scores[k])
+        instances.append(_instance(label, score, box, logit, across, down, fit.size, 0.0))
+    return [instance for instance in instances if instance is not None]
 
 
 def rcnn_instances(
@@ -114,7 +115,7 @@ def rcnn_instances(
     kept = kept[np.argsort(-scores[kept], kind="stable")][:MAX_INSTANCES]
     whole = probabilities.shape[1:] == input_size[::-1]
     boxes = fit.to_image(corners[kept])
-    found = []
+    instances = []
     for k, box in zip(kept.tolist(), boxes, strict=True):
         mask = probabilities[k].astype(np.float32)
         if whole:
@@ -132,8 +133,8 @@ def rcnn_instances(
             across = (width / (x1 - x0), -x0 * width / (x1 - x0))
             down = (height / (y1 - y0), -y0 * height / (y1 - y0))
         label = names.get(int(classes[k]), f"category {int(classes[k])}")
-        found.append(_instance(label, float(scores[k]), box, mask, across, down, fit.size, 0.5))
-    return [instance for instance in found if instance is not None]
+        instances.append(_instance(label, float(scores[k]), box, mask, across, down, fit.size, 0.5))
+    return [instance for instance in instances if instance is not None]
 
 
 def _instance(
@@ -235,11 +236,11 @@ class Segmenter:
                 f"{model.path}: is a model for {quoted(task, 40)}, expected 'segment'; export a "
                 "segmentation model (its name ends in -seg)"
             )
-        found = _yolo_outputs(model) or _rcnn_outputs(model)
-        if found is None:
+        outputs = _yolo_outputs(model) or _rcnn_outputs(model)
+        if outputs is None:
             raise _unknown(model, [f"{n} {list(shape)}" for n, shape, _ in model.outputs])
-        yolo = "prototypes" in found
-        values = _auto_values(model, found) if not yolo else "rgb"
+        yolo = "prototypes" in outputs
+        values = _auto_values(model, outputs) if not yolo else "rgb"
         if settings.segmentation_input != "auto":
             values = settings.segmentation_input
         names: Mapping[int, str]
@@ -247,7 +248,7 @@ class Segmenter:
             names = read_label_map(settings.segmentation_labels)
         else:
             names = _own_names(model) or _coco_names(yolo, values)
-        return cls(model, _Kind(values, names, found, yolo), settings.min_score)
+        return cls(model, _Kind(values, names, outputs, yolo), settings.min_score)
 
     @property
     def classes(self) -> list[str]:
@@ -270,17 +271,19 @@ class Segmenter:
             yield from self._run(waiting)
 
     def _prepared(self, picture: np.ndarray) -> tuple[Fit, np.ndarray]:
-        own = (picture.shape[1], picture.shape[0])
+        picture_size = (picture.shape[1], picture.shape[0])
         size = self._model.size
         if size is None and self._kind.yolo:
             side = _longest_side(self._model.metadata)
-            size = _multiple_of_32(own, side / max(own))
+            size = _multiple_of_32(picture_size, side / max(picture_size))
         elif size is None and self._kind.values == "rgb":
-            size = own  # torchvision's models scale by themselves
+            size = picture_size  # torchvision's models scale by themselves
         elif size is None:
             # As the test configurations of detectron2 and maskrcnn-benchmark.
-            size = _multiple_of_32(own, min(800 / min(own), 1333 / max(own)))
-        fit = fit_within(own, size, centred=self._kind.yolo)
+            size = _multiple_of_32(
+                picture_size, min(800 / min(picture_size), 1333 / max(picture_size))
+            )
+        fit = fit_within(picture_size, size, centred=self._kind.yolo)
         grey = 114 if self._kind.yolo else 0  # as in ultralytics' training
         return fit, self._model.fitted(picture, fit, size, self._kind.values, grey)
 
@@ -303,12 +306,12 @@ class Segmenter:
         self._check_numbers(rows[index], prototypes[index])
         score, names = self._min_score, self._kind.names
         try:
-            found = yolo_instances(
+            instances = yolo_instances(
                 rows[index], prototypes[index], fit, size, min_score=score, names=names
             )
         except ValueError:
             raise _unknown(self._model, [str(list(v.shape)) for v in outputs]) from None
-        return self._plausible(found)
+        return self._plausible(instances)
 
     def _rcnn(
         self, outputs: list[np.ndarray], index: int, fit: Fit, size: tuple[int, int]
@@ -325,10 +328,10 @@ class Segmenter:
             raise _unknown(self._model, [str(list(v.shape)) for v in outputs])
         self._check_numbers(boxes, classes, scores)
         score, names = self._min_score, self._kind.names
-        found = rcnn_instances(
+        instances = rcnn_instances(
             boxes, classes, scores, soft, fit, size, min_score=score, names=names
         )
-        return self._plausible(found)
+        return self._plausible(instances)
 
     def _check_numbers(self, *outputs: np.ndarray) -> None:
         for values in outputs:
@@ -338,15 +341,15 @@ class Segmenter:
                     "again, with float32 where it was float16"
                 )
 
-    def _plausible(self, found: list[Instance]) -> list[Instance]:
+    def _plausible(self, instances: list[Instance]) -> list[Instance]:
         """Return the instances; raises UserError if their scores are no probabilities."""
-        most = max((instance.score for instance in found), default=0.0)
+        most = max((instance.score for instance in instances), default=0.0)
         if most > MAX_SCORE:
             raise UserError(
                 f"{self._model.path}: gives scores up to {most:.4g}, expected 0 to 1; export it "
                 "with its last activation"
             )
-        return found
+        return instances
 
 
 def _is_grid(shape: tuple[int, ...]) -> bool:
@@ -365,31 +368,31 @@ def _yolo_outputs(model: OnnxModel) -> dict[str, int] | None:
 
 def _rcnn_outputs(model: OnnxModel) -> dict[str, int] | None:
     """Position of each output, by the names if they name all four, else by rank and type."""
-    found: dict[str, int] = {}
+    positions: dict[str, int] = {}
     for what, words in (
         ("boxes", "box"), ("classes", "label|class"), ("scores", "score"), ("masks", "mask"),
     ):  # fmt: skip
         named = [i for i, o in enumerate(model.outputs) if re.search(words, o[0].lower())]
         if len(named) == 1:
-            found[what] = named[0]
-    if len(found) == 4 and len(set(found.values())) == 4:
-        return found
-    found = {}
+            positions[what] = named[0]
+    if len(positions) == 4 and len(set(positions.values())) == 4:
+        return positions
+    positions = {}
     for i, (_, shape, kind) in enumerate(model.outputs):
         if len(shape) == 2 and kind in FLOATS:
-            found.setdefault("boxes", i)
+            positions.setdefault("boxes", i)
         elif len(shape) == 1:  # the image's size, also of whole numbers, comes last
-            found.setdefault("scores" if kind in FLOATS else "classes", i)
+            positions.setdefault("scores" if kind in FLOATS else "classes", i)
         elif len(shape) in (3, 4):
-            found.setdefault("masks", i)
-    return found if len(found) == 4 else None
+            positions.setdefault("masks", i)
+    return positions if len(positions) == 4 else None
 
 
-def _auto_values(model: OnnxModel, found: dict[str, int]) -> PixelValues:
+def _auto_values(model: OnnxModel, outputs: dict[str, int]) -> PixelValues:
     """Pixel values by exporter: torchvision's masks cover the image, detectron2 adds its size."""
     if len(model.outputs) > 4:
         return "bgr255"
-    lengths = model.outputs[found["masks"]][1][-2:]
+    lengths = model.outputs[outputs["masks"]][1][-2:]
     fixed = all(isinstance(n, int) for n in lengths)
     over_image = not fixed or (model.size is not None and tuple(lengths) == model.size[::-1])
     return "rgb" if over_image else "bgr_mean"
@@ -419,9 +422,9 @@ def _multiple_of_32(size: tuple[int, int], ratio: float) -> tuple[int, int]:
     return width, height
 
 
-def _unknown(model: OnnxModel, found: list[str]) -> UserError:
+def _unknown(model: OnnxModel, outputs: list[str]) -> UserError:
     return UserError(
-        f"{Path(model.path)}: its outputs ({'; '.join(found)}) are of no kind that is known; "
+        f"{Path(model.path)}: its outputs ({'; '.join(outputs)}) are of no kind that is known; "
         "expected boxes, classes, scores and masks of Mask R-CNN or PointRend, or rows and "
         "prototypes of YOLO-seg; export it as docs/detectors.md shows"
     )

@@ -85,9 +85,9 @@ class Detections:
     image_sizes: np.ndarray
     """(C, 2) width and height of the colour images."""
     keypoints_found: np.ndarray
-    """(T, C) bool: a detector looked for people."""
+    """(T, C) bool: a detector of people processed the image."""
     candidates_found: np.ndarray
-    """(T, C) bool: a detector looked for instances."""
+    """(T, C) bool: a detector of instances processed the image."""
     notes: tuple[str, ...]
     """What was left out, by camera."""
 
@@ -135,8 +135,8 @@ class Detections:
     def with_candidates_of(self, person: Path) -> Detections:
         """Return the detections with the candidates that stage ``person`` found in the images.
 
-        They are appended to a detector's, or replace them if the stage was told to use the images
-        alone. Call this for detections by moment (:meth:`showing`). Raises UserError if the
+        They are appended to a detector's, or replace them if the stage used the images alone.
+        Call this for detections by moment (:meth:`showing`). Raises UserError if the
         artefact cannot be read or is of another recording.
         """
         with artefacts.read(person, PERSON) as artefact:

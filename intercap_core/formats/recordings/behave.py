@@ -83,18 +83,18 @@ def frame_folders(recordings: Path) -> dict[int, Path]:
 
     Raises UserError if two have the same time.
     """
-    found: dict[int, Path] = {}
+    folders: dict[int, Path] = {}
     for path in sorted(recordings.iterdir()):
         match = FRAME_FOLDER.fullmatch(path.name)
         if not match or not path.is_dir():
             continue
         time_us = round(float(match.group(1)) * 1e6)
-        if time_us in found:
+        if time_us in folders:
             raise UserError(
-                f"{recordings}: {found[time_us].name} and {path.name} have one time; keep one"
+                f"{recordings}: {folders[time_us].name} and {path.name} have one time; keep one"
             )
-        found[time_us] = path
-    return dict(sorted(found.items()))
+        folders[time_us] = path
+    return dict(sorted(folders.items()))
 
 
 def frame_rate(times_us: list[int]) -> float:
@@ -108,12 +108,12 @@ def frame_rate(times_us: list[int]) -> float:
 
 def _images(folder: Path) -> dict[tuple[str, str], Path]:
     """A frame's images by camera and kind, "color" or "depth"."""
-    found = {}
+    images = {}
     for path in sorted(folder.iterdir()):
         match = IMAGE_FILE.fullmatch(path.name)
         if match:
-            found[f"k{int(match.group(1))}", match.group(2).partition(".")[0].lower()] = path
-    return found
+            images[f"k{int(match.group(1))}", match.group(2).partition(".")[0].lower()] = path
+    return images
 
 
 def read_poses(folder: Path) -> Extrinsics:
@@ -176,7 +176,7 @@ def read_lens(calibration: Path, number: int) -> Intrinsics:
     if path is None or not path.is_file():
         raise UserError(
             f"no intrinsics/{number}/calibration.json above {calibration.name}; put the data set's "
-            "folder 'intrinsics' beside those of the dates"
+            "folder 'intrinsics' next to those of the dates"
         )
     where = f"intrinsics/{path.parent.name}/{path.name}"
     try:
@@ -200,9 +200,9 @@ def _kinect_folders(folder: Path) -> dict[int, Path]:
             f"{folder}: there is no such folder of camera poses; correct 'calibration' in the "
             "table of sequences"
         )
-    found = {}
+    folders = {}
     for path in sorted(folder.iterdir()):
         match = KINECT_FOLDER.fullmatch(path.name)
         if match and path.is_dir():
-            found[int(match.group(1))] = path
-    return dict(sorted(found.items()))
+            folders[int(match.group(1))] = path
+    return dict(sorted(folders.items()))

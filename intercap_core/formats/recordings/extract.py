@@ -183,12 +183,12 @@ class _Copy:
         self.depth.append(depth[None])
 
     def _refuse(
-        self, kind: str, found: tuple[int, ...], expected: tuple[int, ...], first: bool
+        self, kind: str, actual: tuple[int, ...], expected: tuple[int, ...], first: bool
     ) -> None:
         """Count an image of another size; raise UserError if it is the first of the recording."""
         if first:
             raise UserError(
-                f"{self.recording.source}: {kind} images are {found[0]}x{found[1]}, the "
+                f"{self.recording.source}: {kind} images are {actual[0]}x{actual[1]}, the "
                 f"calibration of camera {self.view.name} is for {expected[0]}x{expected[1]}; give "
                 "the calibration of this resolution"
             )

@@ -102,8 +102,8 @@ class Frames:
     def _by_moment(self, values: np.ndarray, none: float) -> np.ndarray:
         if self._image_of is None:
             return values
-        found = np.take_along_axis(values, np.maximum(self._image_of, 0), 0)
-        return np.where(self._image_of < 0, values.dtype.type(none), found)
+        shown = np.take_along_axis(values, np.maximum(self._image_of, 0), 0)
+        return np.where(self._image_of < 0, values.dtype.type(none), shown)
 
     @property
     def colour_available(self) -> np.ndarray:
@@ -133,8 +133,8 @@ class Frames:
             seen = np.flatnonzero(index[:, c] >= 0)
             if len(seen):
                 t = seen[0]
-                taken = self._artefact[f"cameras/{name}/colour_time"]
-                return float(taken[index[t, c]]) * 1e-6 - skew[t, c] - float(self.time_s[t])
+                times = self._artefact[f"cameras/{name}/colour_time"]
+                return float(times[index[t, c]]) * 1e-6 - skew[t, c] - float(self.time_s[t])
         return float("nan")
 
     @cached_property
@@ -148,9 +148,9 @@ class Frames:
         for c, name in enumerate(self.rig.names):
             seen = np.flatnonzero(index[:, c] >= 0)
             if len(seen):
-                taken = self._artefact[f"cameras/{name}/colour_time"]
+                times = self._artefact[f"cameras/{name}/colour_time"]
                 t = seen[0]
-                since = (taken[index[t, c]] - taken[0]) * 1e-6
+                since = (times[index[t, c]] - times[0]) * 1e-6
                 result[c] = self.time_s[t] + skew[t, c] - since
         return result
 

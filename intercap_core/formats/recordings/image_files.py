@@ -211,9 +211,9 @@ def faults_of_files(shots: list[ImagePair], lens: Intrinsics | None) -> list[str
                 f"{len(empty)} of {len(paths)} {kind} files are empty (first: {empty[0].name})"
             )
         bad = []
-        looked = np.unique(np.linspace(0, len(paths) - 1, 5).round().astype(int))
-        looked = looked[: len(paths)].tolist()  # evenly over the recording
-        for index in looked:
+        chosen = np.unique(np.linspace(0, len(paths) - 1, 5).round().astype(int))
+        chosen = chosen[: len(paths)].tolist()  # evenly over the recording
+        for index in chosen:
             try:
                 if kind == "colour":
                     read_colour(paths[index])
@@ -224,7 +224,7 @@ def faults_of_files(shots: list[ImagePair], lens: Intrinsics | None) -> list[str
                     bad.append(f"{paths[index].name} {error}")
         if bad:
             faults.append(
-                f"{len(bad)} of {len(looked)} {kind} files looked at are damaged (first: {bad[0]})"
+                f"{len(bad)} of {len(chosen)} inspected {kind} files are damaged (first: {bad[0]})"
             )
     return faults
 

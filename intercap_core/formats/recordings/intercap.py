@@ -86,12 +86,12 @@ def frame_rate(numbers: list[int]) -> float:
 
 def camera_folders(recordings: Path) -> dict[str, Path]:
     """The folders ``Frames_Cam<n>`` by camera name, in the cameras' order."""
-    found: dict[int, Path] = {}
+    folders: dict[int, Path] = {}
     for path in sorted(recordings.iterdir()):
         match = CAMERA_FOLDER.fullmatch(path.name)
         if match and path.is_dir():
-            found.setdefault(int(match.group(1)), path)
-    return {f"k{number}": found[number] for number in sorted(found)}
+            folders.setdefault(int(match.group(1)), path)
+    return {f"k{number}": folders[number] for number in sorted(folders)}
 
 
 def numbered_images(folder: Path) -> tuple[dict[int, Path], dict[int, Path]]:
@@ -110,19 +110,19 @@ def numbered_images(folder: Path) -> tuple[dict[int, Path], dict[int, Path]]:
 
 
 def _numbered(folder: Path | None, suffixes: tuple[str, ...]) -> dict[int, Path]:
-    found: dict[int, Path] = {}
+    images: dict[int, Path] = {}
     for path in sorted(folder.iterdir()) if folder is not None else ():
         match = NUMBERED.fullmatch(path.name)
         if not match or path.suffix.lower() not in suffixes:
             continue
         number = int(match.group(1))
-        if number in found:
+        if number in images:
             raise UserError(
-                f"{folder}: image {number} is there twice, as {found[number].name} and "
+                f"{folder}: image {number} is there twice, as {images[number].name} and "
                 f"{path.name}; keep one"
             )
-        found[number] = path
-    return found
+        images[number] = path
+    return images
 
 
 def read_lens(path: Path, size: tuple[int, int]) -> Intrinsics:

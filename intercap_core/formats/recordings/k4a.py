@@ -34,26 +34,13 @@ from intercap_core.formats.calibration.k4a import (
     read_calibration,
 )
 from intercap_core.formats.calibration.opencv import check_rate
-from intercap_core.formats.recordings.image_files import (
-    JPEG_QUALITY,
-    RAW_FORMATS,
-    decode_raw,
-    encode_jpeg,
-    encoded_size,
-)
+from intercap_core.formats.recordings import image_files, video
 from intercap_core.formats.recordings.source import (
     CameraRecording,
     ClosedOnExit,
     Image,
     RecordingLayout,
     RecordingPreview,
-)
-from intercap_core.formats.recordings.video import (
-    LATEST_US,
-    demux,
-    open_container,
-    preview_video,
-    segment_end,
 )
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.inputs.files import quoted, read_bytes
@@ -82,7 +69,7 @@ class KinectFileInfo:
     colour_mode: str
     """Key of ``COLOUR_MODES``."""
     colour_format: str
-    """MJPG or one of :data:`RAW_FORMATS`."""
+    """MJPG or one of :data:`.image_files.RAW_FORMATS`."""
     depth_mode: str | None
     """Key of ``DEPTH_MODES``; None without depth."""
     fps: float
@@ -117,7 +104,7 @@ class KinectFile(ClosedOnExit):
         truncated = _is_truncated(self.path)
         try:
             # Headers of the tracks are complete, so that probing would only buffer packets.
-            self._container = open_container(self.path, probesize="32768")
+            self._container = video.open_container(self.path, probesize="32768")
         except (av.error.FFmpegError, OSError) as error:
             raise UserError(
                 f"{self.path}: cannot be opened as a recording ({error.strerror}); record again, "
@@ -144,13 +131,13 @@ class KinectFile(ClosedOnExit):
         out and counted in ``broken_packets``. A file that was cut off ends early without an error.
         """
         streams = [self._container.streams[index] for index in self._streams]
-        for packet in demux(self._container, streams, self._count_broken):
+        for packet in video.demux(self._container, streams, self._count_broken):
             if not packet.size or packet.pts is None or packet.time_base is None:
                 continue  # the end mark of a track
             kind = self._streams[packet.stream_index]
             content = bytes(packet)
             time_us = round(packet.pts * packet.time_base * 1_000_000) + self.info.start_offset_us
-            if self._is_complete(kind, content) and abs(time_us) <= LATEST_US:
+            if self._is_complete(kind, content) and abs(time_us) <= video.LATEST_US:
                 yield Packet(kind, time_us, content)
             else:
                 self._count_broken()
@@ -160,10 +147,12 @@ class KinectFile(ClosedOnExit):
 
     def _is_complete(self, kind: Kind, content: bytes) -> bool:
         if kind == "colour" and self.info.colour_format == "MJPG":
-            return encoded_size(content) is not None
+            return image_files.encoded_size(content) is not None
         if kind == "colour":
             width, height = COLOUR_MODES[self.info.colour_mode].size
-            return len(content) == round(width * height * RAW_FORMATS[self.info.colour_format])
+            return len(content) == round(
+                width * height * image_files.RAW_FORMATS[self.info.colour_format]
+            )
         if kind == "depth" and self.info.depth_mode is not None:
             width, height = DEPTH_MODES[self.info.depth_mode].size
             return len(content) == 2 * width * height
@@ -172,7 +161,7 @@ class KinectFile(ClosedOnExit):
     def preview(self) -> RecordingPreview:
         """Inspect the colour track without reading the others."""
         index = next(index for index, kind in self._streams.items() if kind == "colour")
-        seen = preview_video(self.path, index, self.info.fps)
+        seen = video.preview_video(self.path, index, self.info.fps)
         if self.info.colour_format != "MJPG":
             return seen._replace(size=COLOUR_MODES[self.info.colour_mode].size)
         return seen
@@ -206,14 +195,14 @@ class KinectFile(ClosedOnExit):
 
     def _find_tracks(self) -> dict[int, Kind]:
         """Kind of each track by its index: by its tag, else by its name."""
-        found: dict[int, Kind] = {}
+        tracks: dict[int, Kind] = {}
         candidates = [s for s in self._container.streams if s.type != "attachment"]
         for kind, name in TRACKS.items():
             tagged = [s for s in candidates if f"K4A_{name}_TRACK" in s.metadata]
             named = [s for s in candidates if s.metadata.get("title") == name]
             for stream in (tagged or named)[:1]:
-                found[stream.index] = kind
-        return found
+                tracks[stream.index] = kind
+        return tracks
 
     def _stream(self, kind: Kind) -> Any:
         index = next((i for i, k in self._streams.items() if k == kind), None)
@@ -234,7 +223,7 @@ class KinectFile(ClosedOnExit):
             depth_mode=self._depth_mode(depth),
             fps=fps,
             serial=self._container.metadata.get("K4A_DEVICE_SERIAL_NUMBER", ""),
-            start_offset_us=self._microseconds("K4A_START_OFFSET_NS", LATEST_US),
+            start_offset_us=self._microseconds("K4A_START_OFFSET_NS", video.LATEST_US),
             depth_delay_us=self._microseconds("K4A_DEPTH_DELAY_NS", LONGEST_DELAY_US),
             subordinate_delay_us=self._microseconds("K4A_SUBORDINATE_DELAY_NS", LONGEST_DELAY_US),
             wired_sync_mode=self._container.metadata.get("K4A_WIRED_SYNC_MODE", "STANDALONE"),
@@ -246,11 +235,11 @@ class KinectFile(ClosedOnExit):
         four_cc = colour.codec_context.codec_tag.upper()
         if colour.codec_context.name == "mjpeg":
             return "MJPG"
-        if four_cc in RAW_FORMATS:
+        if four_cc in image_files.RAW_FORMATS:
             return four_cc
         raise UserError(
             f"{self.path}: colour is recorded as {four_cc or colour.codec_context.name}, expected "
-            f"MJPG, {', '.join(RAW_FORMATS)}; record in one of k4arecorder's colour modes"
+            f"MJPG, {', '.join(image_files.RAW_FORMATS)}; record in a colour mode of k4arecorder"
         )
 
     def _depth_mode(self, depth: Any) -> str | None:
@@ -275,8 +264,9 @@ class KinectFile(ClosedOnExit):
 
     def _microseconds(self, tag: str, most: int) -> int:
         value = self._container.metadata.get(tag, "0")
-        if re.fullmatch(r"-?[0-9]{1,18}", value) and abs(found := round(int(value) / 1000)) <= most:
-            return found
+        microseconds = round(int(value) / 1000) if re.fullmatch("-?[0-9]{1,18}", value) else None
+        if microseconds is not None and abs(microseconds) <= most:
+            return microseconds
         raise UserError(
             f"{self.path}: tag {tag} is {quoted(value)}, expected nanoseconds, at most "
             f"{most / 1e6:g} s; the file is damaged, copy or record it again"
@@ -318,7 +308,7 @@ def _is_truncated(path: Path) -> bool:
             f"{path}: is not a Matroska file (it starts with {head[:4]!r}); give the .mkv that "
             "k4arecorder wrote"
         )
-    end = segment_end(head)
+    end = video.segment_end(head)
     return end is None or size < end
 
 
@@ -387,12 +377,14 @@ class KinectRecording(CameraRecording):
                 content = self._recording.depth_image(packet.content)
             elif info.colour_format != "MJPG":
                 size = COLOUR_MODES[info.colour_mode].size
-                content = encode_jpeg(decode_raw(packet.content, info.colour_format, size))
+                content = image_files.encode_jpeg(
+                    image_files.decode_raw(packet.content, info.colour_format, size)
+                )
             yield Image(packet.kind, packet.device_time_us, content)
         if info.colour_format != "MJPG":
             self.notes.append(
                 f"colour was recorded as {info.colour_format} and is stored as JPEG of quality "
-                f"{JPEG_QUALITY}"
+                f"{image_files.JPEG_QUALITY}"
             )
         if self.truncated:
             self.notes.append(

@@ -38,8 +38,8 @@ class PlainLayout(RecordingLayout):
         below = sorted(sequence.recordings.iterdir())
         self._folders = {p.name: p for p in below if p.is_dir() and (_colour(p) or _depth(p))}
         self._videos = [p for p in below if p.suffix.lower() in VIDEO_SUFFIXES and p.is_file()]
-        found = sorted({*self._folders, *(path.stem for path in self._videos)})
-        self.names = [name for name in found if CAMERA_NAME.fullmatch(name)]
+        recorded = sorted({*self._folders, *(path.stem for path in self._videos)})
+        self.names = [name for name in recorded if CAMERA_NAME.fullmatch(name)]
         calibration = read_calibration(
             sequence.calibration,
             RecordedCameras(self.names, self._size_of),
@@ -67,10 +67,10 @@ class PlainLayout(RecordingLayout):
         videos = [path for path in self._videos if path.stem == name]
         recorded = [path.name for path in videos] + [f"{name}/"] * bool(colour)
         if len(recorded) != 1:
-            found = f"as {' and '.join(recorded)}" if recorded else "depth alone"
+            description = f"as {' and '.join(recorded)}" if recorded else "depth alone"
             raise UserError(
-                f"{self.sequence.recordings}: camera {name} is recorded {found}, expected one "
-                "video or one folder of .jpg or .png; keep or add one"
+                f"{self.sequence.recordings}: camera {name} is recorded {description}, expected "
+                "one video or one folder of .jpg or .png; keep or add one"
             )
         with_depth = bool(depth) and known.depth is not None
         camera = Camera(
@@ -112,7 +112,7 @@ class PlainLayout(RecordingLayout):
             )
         if depth and not with_depth:
             recording.notes.append(
-                "its depth images are not read: the calibration says nothing of depth (aligned, or "
+                "its depth images are not read: the calibration has no entry 'depth' (aligned, or "
                 "a lens)"
             )
         return recording
@@ -127,8 +127,10 @@ def _images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
 
 def _colour(folder: Path) -> list[Path]:
     """The camera's colour files, in its folder or in a folder of their own."""
-    own = [found for name in COLOUR_FOLDERS if (found := _images(folder / name, IMAGE_SUFFIXES))]
-    return own[0] if own else _images(folder, IMAGE_SUFFIXES)
+    in_folders = [
+        files for name in COLOUR_FOLDERS if (files := _images(folder / name, IMAGE_SUFFIXES))
+    ]
+    return in_folders[0] if in_folders else _images(folder, IMAGE_SUFFIXES)
 
 
 def _depth(folder: Path) -> list[Path]:

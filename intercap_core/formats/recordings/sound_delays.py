@@ -47,20 +47,20 @@ def sound_starts(sounds: Sequence[Sound | None]) -> tuple[np.ndarray, np.ndarray
     for a, b in combinations(range(views), 2):
         first, second = sounds[a], sounds[b]
         if first is not None and second is not None:
-            found = delay_between(first, second)
-            if found is not None:
-                delays[a, b] = found
+            delay = delay_between(first, second)
+            if delay is not None:
+                delays[a, b] = delay
     start, sigma = np.full(views, np.nan), np.full(views, np.nan)
     while delays:
         group = _largest_group(delays, views)
-        own = {pair: delay for pair, delay in delays.items() if pair[0] in group}
-        solved = _solved(own, group)
-        off = {(a, b): abs(solved[a] - solved[b] - d.seconds) for (a, b), d in own.items()}
+        in_group = {pair: delay for pair, delay in delays.items() if pair[0] in group}
+        solved = _solved(in_group, group)
+        off = {(a, b): abs(solved[a] - solved[b] - d.seconds) for (a, b), d in in_group.items()}
         worst = max(off, key=lambda pair: off[pair])
         if off[worst] > 0.02:  # closure of three cameras' delays, seconds; tuned on the studio
             del delays[worst]
             continue
-        spread = {c: max(d.spread for pair, d in own.items() if c in pair) for c in group}
+        spread = {c: max(d.spread for pair, d in in_group.items() if c in pair) for c in group}
         for c in group:
             start[c], sigma[c] = solved[c], np.hypot(SOUND_SIGMA_S, spread[c])
         break

@@ -36,8 +36,8 @@ def synchronise(
 ) -> SetTable:
     """Group the images of C cameras into sets.
 
-    Each image of the master makes a set. Where the next of these is more than ``NEW_SET_GAP``
-    periods away, the other cameras' images do. An image joins the nearest set if it is within
+    Each image of the master makes a set, and so do images of the other cameras that are more than
+    ``NEW_SET_GAP`` periods away from these sets. An image joins the nearest set if it is within
     ``max_skew_us`` and no other image of its camera is nearer.
 
     Args:

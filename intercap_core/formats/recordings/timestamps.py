@@ -91,17 +91,17 @@ def pair_images(
             suffix, by number, or one for each colour image in order.
         source: folder or video, for messages.
     """
-    found = _by_key(colour, depth, source)
-    keys = sorted(found)
+    pairs = _by_key(colour, depth, source)
+    keys = sorted(pairs)
     if times is None:
         if fps is None:
             raise UserError(
-                f"{source}: nothing says when the images were taken; add fps to the calibration, "
+                f"{source}: the times of the images are unknown; add fps to the calibration, "
                 "or a timestamps.csv"
             )
         seconds = {key: key / fps for key in keys}
     else:
-        seconds = _stated(found, times, source)
+        seconds = _stated(pairs, times, source)
     latest = max((abs(time + offset_s) for time in seconds.values()), default=0.0)
     if latest > LATEST_S:
         raise UserError(
@@ -109,7 +109,7 @@ def pair_images(
             "likely times, or time_offset is no seconds; write a timestamps.csv in seconds"
         )
     return [
-        ImagePair(round((seconds[key] + offset_s) * 1e6), *found[key])
+        ImagePair(round((seconds[key] + offset_s) * 1e6), *pairs[key])
         for key in keys
         if key in seconds
     ]
@@ -145,13 +145,13 @@ def _number(path: Path) -> int | None:
 
 
 def _stated(
-    found: Mapping[int, tuple[Path | None, Path | None]], times: Timestamps, source: Path
+    pairs: Mapping[int, tuple[Path | None, Path | None]], times: Timestamps, source: Path
 ) -> dict[int, float]:
     """The stated time of each key. The depth files of a video go by position in the list."""
-    coloured = [key for key in sorted(found) if found[key][0] is not None]
+    coloured = [key for key in sorted(pairs) if pairs[key][0] is not None]
     if all(isinstance(name, int) for name in times):
         if not coloured:
-            return {key: times[key] for key in found if key in times}
+            return {key: times[key] for key in pairs if key in times}
         if len(times) == len(coloured):
             return dict(zip(coloured, times.values(), strict=True))
         raise UserError(
@@ -164,12 +164,12 @@ def _stated(
         if isinstance(name, str) and re.fullmatch(r"[0-9]{1,18}", name)
     }
     seconds = {}
-    for key, files in found.items():
+    for key, files in pairs.items():
         names = [name for file in files if file is not None for name in (file.name, file.stem)]
         stated = next((times[name] for name in names if name in times), by_number.get(key))
         if stated is not None:
             seconds[key] = stated
-    missing = [path.name for key in coloured if key not in seconds and (path := found[key][0])]
+    missing = [path.name for key in coloured if key not in seconds and (path := pairs[key][0])]
     if missing:
         raise UserError(
             f"{source}: {len(missing)} images have no timestamp (first: {missing[0]}); add them, "

@@ -252,30 +252,13 @@ class VideoRecording(CameraRecording):
         """
         try:
             self._container = open_container(path)
-        except UnreadableFile as error:
-            raise UserError(f"{path}: cannot be opened as a video ({error.reason})") from error
         except (av.error.FFmpegError, OSError) as error:
             raise UserError(
                 f"{path}: cannot be opened as a video ({error.strerror}); copy the file again, or "
                 "convert it"
             ) from error
-        streams = self._container.streams.video
-        if not streams or streams[0].codec_context is None:
-            self._container.close()
-            raise UserError(
-                f"{path}: holds no video that can be decoded; convert it to a common codec"
-            )
-        self._stream: Any = streams[0]
-        self._stream.thread_type = "AUTO"
-        rate = fps or float(self._stream.average_rate or self._stream.guessed_rate or 30)
-        width, height = self._stream.codec_context.width, self._stream.codec_context.height
         try:
-            check_rate(rate, str(path))
-            if max(width, height) > MAX_SIDE:
-                raise UserError(
-                    f"{path}: states images of {width}x{height} pixels, expected at most "
-                    f"{MAX_SIDE} a side; copy or convert it again"
-                )
+            self._stream, rate = self._choose_stream(path, fps)
         except UserError:
             self._container.close()
             raise
@@ -287,6 +270,25 @@ class VideoRecording(CameraRecording):
         )
         self._damaged = 0
         self._first_s: float | None = None  # time of the first image on the file's clock
+
+    def _choose_stream(self, path: Path, fps: float | None) -> tuple[Any, float]:
+        """The video stream and its frame rate; raises UserError if it cannot be decoded."""
+        streams = self._container.streams.video
+        if not streams or streams[0].codec_context is None:
+            raise UserError(
+                f"{path}: holds no video that can be decoded; convert it to a common codec"
+            )
+        stream: Any = streams[0]
+        stream.thread_type = "AUTO"
+        rate = fps or float(stream.average_rate or stream.guessed_rate or 30)
+        check_rate(rate, str(path))
+        width, height = stream.codec_context.width, stream.codec_context.height
+        if max(width, height) > MAX_SIDE:
+            raise UserError(
+                f"{path}: states images of {width}x{height} pixels, expected at most "
+                f"{MAX_SIDE} a side; copy or convert it again"
+            )
+        return stream, rate
 
     def close(self) -> None:
         """Close the file."""

@@ -45,7 +45,7 @@ class Runs:
 
     @cached_property
     def box(self) -> tuple[int, int, int, int]:
-        """x, y, width, height of the pixels set; all 0 where there are none."""
+        """x, y, width, height of the pixels set; all 0 if none is set."""
         x, y, width, height = _box(self.ends, self.height)
         return x, y, width, height
 
@@ -177,7 +177,7 @@ def _run_ends(characters):
     if (characters[-1] - _ZERO) & 0x20:
         return first, _CUT
     count, digits, value = 0, 0, np.int64(0)
-    one, before, end = np.int64(0), np.int64(0), np.int64(0)  # the last number, the one before it
+    last, before, end = np.int64(0), np.int64(0), np.int64(0)  # the last number, the one before it
     too_long = negative = False
     for character in characters:
         bits = np.int64(character) - _ZERO
@@ -196,7 +196,7 @@ def _run_ends(characters):
             negative = True
         end += value
         ends[count] = end
-        before, one = one, value
+        before, last = last, value
         count, digits, value = count + 1, 0, np.int64(0)
     if too_long:
         return first, _LONG

@@ -94,7 +94,7 @@ def unproject(pixels, parameters, radii, distorted_radii):
     """
     fx, fy, cx, cy = parameters[0], parameters[1], parameters[2], parameters[3]
     converged = 1e-12  # normalised image plane; 1e-9 px at f = 1000
-    found = np.empty_like(pixels)
+    rays = np.empty_like(pixels)
     for n in range(len(pixels)):
         xd, yd = (pixels[n, 0] - cx) / fx, (pixels[n, 1] - cy) / fy
         distance = np.sqrt(xd * xd + yd * yd)
@@ -118,5 +118,5 @@ def unproject(pixels, parameters, radii, distorted_radii):
             at_x, at_y, xx, xy, yx, yy = distort_with_jacobian(x, y, parameters)
             off = np.sqrt((at_x - xd) ** 2 + (at_y - yd) ** 2)
         lost = not off < 1e-9
-        found[n, 0], found[n, 1] = (np.nan, np.nan) if lost else (x, y)
-    return found
+        rays[n, 0], rays[n, 1] = (np.nan, np.nan) if lost else (x, y)
+    return rays

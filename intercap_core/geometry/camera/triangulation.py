@@ -37,18 +37,18 @@ class Triangulation:
         return self.inlier.sum(1).astype(np.int8)
 
 
-def spread(found: Triangulation, rig: Rig) -> np.ndarray:
+def spread(triangulation: Triangulation, rig: Rig) -> np.ndarray:
     """Return the standard error of each point (N,), metres; 0 = no point.
 
     n views measure 3 coordinates by 2n values. With an RMS distance of e pixels the variance of a
     value is n e^2 / (2n - 3), and about 2n / 3 values determine each coordinate.
     """
     eyes = rig.master_from_colour[:, :3, 3]
-    away = np.linalg.norm(found.points[:, None] - eyes, axis=2)
+    away = np.linalg.norm(triangulation.points[:, None] - eyes, axis=2)
     metres = away / np.array([camera.colour.fx for camera in rig])
-    views = np.maximum(found.inlier.sum(1), 2)
-    pixel = np.where(found.inlier, metres, 0.0).sum(1) / views
-    return np.nan_to_num(found.error * pixel * np.sqrt(1.5 / (2 * views - 3)))
+    views = np.maximum(triangulation.inlier.sum(1), 2)
+    pixel = np.where(triangulation.inlier, metres, 0.0).sum(1) / views
+    return np.nan_to_num(triangulation.error * pixel * np.sqrt(1.5 / (2 * views - 3)))
 
 
 def pixel_scale(rig: Rig) -> np.ndarray:
@@ -170,12 +170,12 @@ def _triangulate_block(
 
 def _errors(points: np.ndarray, pixels: np.ndarray, weights: np.ndarray, rig: Rig) -> np.ndarray:
     """Reprojection errors (N, C), px; infinite where not seen, behind the camera or no point."""
-    found = np.isfinite(points).all(1)
+    finite = np.isfinite(points).all(1)
     in_camera = np.moveaxis(
-        apply(rig.colour_from_master, np.where(found[:, None], points, 0)), 0, 1
+        apply(rig.colour_from_master, np.where(finite[:, None], points, 0)), 0, 1
     )
     error = np.linalg.norm(projection.project(in_camera, rig.colour_parameters) - pixels, axis=-1)
-    return np.where((weights > 0) & (in_camera[..., 2] > 0) & found[:, None], error, np.inf)
+    return np.where((weights > 0) & (in_camera[..., 2] > 0) & finite[:, None], error, np.inf)
 
 
 def _best_proposal(
@@ -220,9 +220,9 @@ def _refined(points: np.ndarray, pixels: np.ndarray, weights: np.ndarray, rig: R
         return points
     rotation = rig.colour_from_master[:, :3, :3]
     in_camera = np.moveaxis(apply(rig.colour_from_master, points[rows]), 0, 1)
-    found, by_camera = projection.project_with_jacobian(in_camera, rig.colour_parameters)
+    projected, by_camera = projection.project_with_jacobian(in_camera, rig.colour_parameters)
     jacobian = by_camera @ rotation  # (n, C, 2, 3)
-    residual = found - pixels[rows]
+    residual = projected - pixels[rows]
     huber = 4.0 * pixel_scale(rig)  # typical standard deviation of good 2D detectors, px at 1080p
     size = np.linalg.norm(residual, axis=-1)
     weight = weights[rows] * np.minimum(1.0, huber / np.maximum(size, 1e-9)) / pixel_scale(rig) ** 2

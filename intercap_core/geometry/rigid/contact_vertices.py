@@ -72,12 +72,12 @@ def read_contact_vertices(path: Path, mesh: Path, vertices: np.ndarray) -> np.nd
 
 
 def _check_mesh(path: Path, values: Mapping[str, Any], mesh: Path, vertices: np.ndarray) -> None:
-    """Raise UserError where the list says that it belongs to other vertices."""
-    for key, found in ((_COUNT, len(vertices)), (_DIGEST, vertices_digest(vertices))):
+    """Raise UserError if the list states that it belongs to other vertices."""
+    for key, actual in ((_COUNT, len(vertices)), (_DIGEST, vertices_digest(vertices))):
         expected = values.get(key)
-        if expected is not None and str(expected) != str(found):
+        if expected is not None and str(expected) != str(actual):
             raise UserError(
-                f"{path}: was chosen on a mesh with {key} {_shown(expected)}, {mesh} has {found}; "
+                f"{path}: was chosen on a mesh with {key} {_shown(expected)}, {mesh} has {actual}; "
                 "the mesh was changed after the list was made: choose the vertices again, or leave "
                 "'contact_vertices' out of objects.yaml"
             )

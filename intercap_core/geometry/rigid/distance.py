@@ -130,10 +130,10 @@ class DistanceField:
         this is closer, so that no depth exceeds the object's thickness. Faces and barycentric
         weights always belong to the surface.
         """
-        inside, found = self.inside(points), self.closest(points)
+        inside, closest = self.inside(points), self.closest(points)
         if self._open is not None and inside.any():
-            found = self._open.nearer(np.reshape(points, (-1, 3)), inside, found)
-        return inside, found
+            closest = self._open.nearer(np.reshape(points, (-1, 3)), inside, closest)
+        return inside, closest
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Distance (N,) of points (N, 3) to the surface, metres, never negative."""
@@ -204,13 +204,13 @@ class SurfacePart:
         because the distance to this part is no depth there.
         """
         inside, nearest = self._whole.boundary(points)
-        found = _closest(self._scene, points)
+        closest = _closest(self._scene, points)
         query = np.reshape(points, (-1, 3))
-        way = np.linalg.norm(query - found.points, axis=1)
+        distance = np.linalg.norm(query - closest.points, axis=1)
         depth = np.linalg.norm(query - nearest.points, axis=1)
-        faces = self._face[found.faces]
-        below = inside & (way < depth + 1e-6)  # metres: float32 at an object's size
-        return below, Closest(found.points, faces, found.barycentric, found.normals)
+        faces = self._face[closest.faces]
+        below = inside & (distance < depth + 1e-6)  # metres: float32 at an object's size
+        return below, Closest(closest.points, faces, closest.barycentric, closest.normals)
 
 
 class _OpenSurface:
@@ -227,26 +227,26 @@ class _OpenSurface:
 
     def inside(self, query: np.ndarray) -> np.ndarray:
         """Return whether the winding number at points (N, 3) exceeds a half: (N,) bool."""
-        found = np.zeros(len(query), bool)
+        result = np.zeros(len(query), bool)
         near = np.flatnonzero(((query > self._low) & (query < self._high)).all(1))
         if len(near):
             points = query[near].astype(np.float64)
             winding = igl.fast_winding_number(self._vertices, self._faces, points)
-            found[near] = winding > 0.5
-        return found
+            result[near] = winding > 0.5
+        return result
 
-    def nearer(self, points: np.ndarray, inside: np.ndarray, found: Closest) -> Closest:
-        """Return ``found`` (N) with points and normals of the hull where points (N, 3) are
+    def nearer(self, points: np.ndarray, inside: np.ndarray, closest: Closest) -> Closest:
+        """Return ``closest`` (N) with points and normals of the hull where points (N, 3) are
         ``inside`` (N,) and the hull is closer."""
         at = np.flatnonzero(inside)
         hull = _closest(self._hull, points[at])
-        way, own = (
-            np.linalg.norm(points[at] - of, axis=1) for of in (hull.points, found.points[at])
+        to_hull, to_surface = (
+            np.linalg.norm(points[at] - of, axis=1) for of in (hull.points, closest.points[at])
         )
-        closer = way < own
-        place, normals = found.points.copy(), found.normals.copy()
+        closer = to_hull < to_surface
+        place, normals = closest.points.copy(), closest.normals.copy()
         place[at[closer]], normals[at[closer]] = hull.points[closer], hull.normals[closer]
-        return Closest(place, found.faces, found.barycentric, normals)
+        return Closest(place, closest.faces, closest.barycentric, normals)
 
 
 class OcclusionScene:

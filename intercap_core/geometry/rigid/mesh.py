@@ -1,6 +1,4 @@
-"""Rigid meshes of objects: checked, repaired where this is safe, with contact vertices, symmetry
-and colours.
-"""
+"""Rigid meshes of objects: checks, safe repairs, contact vertices, symmetry and colours."""
 
 from __future__ import annotations
 

@@ -135,8 +135,8 @@ class _FolderResolver(trimesh.resolvers.Resolver):
 
 def _stated_faces(path: Path, content: bytes) -> int:
     """Return the number of faces in a PLY's header; raises UserError if the file is too short."""
-    head, found, body = content.partition(b"end_header")
-    if not content.startswith(b"ply") or not found:
+    head, separator, body = content.partition(b"end_header")
+    if not content.startswith(b"ply") or not separator:
         raise UserError(f"{path}: not a readable mesh (it has no head of a PLY); export it again")
     counts: dict[bytes, int] = {}
     properties: dict[bytes, list[bytes]] = {}

@@ -80,7 +80,7 @@ def _nearest(queries, points, starts, low, number, size):
     """
     xs, ys, zs = points[0], points[1], points[2]
     inverse = 1 / size
-    found = np.empty(len(queries), np.float32)
+    squared = np.empty(len(queries), np.float32)
     last = 0
     for m in range(len(queries)):
         x, y, z = queries[m, 0], queries[m, 1], queries[m, 2]
@@ -131,5 +131,5 @@ def _nearest(queries, points, starts, low, number, size):
                         if dx * dx + dy * dy + dz * dz <= closest:
                             last = at
                             break
-        found[m] = best
-    return found
+        squared[m] = best
+    return squared

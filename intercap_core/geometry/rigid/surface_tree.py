@@ -51,8 +51,8 @@ class ShapedSurface:
         points are close.
         """
         queries, most = np.ascontiguousarray(points, np.float32), np.float32(reach * reach)
-        found = _nearest(queries, self._triangles, self._boxes, self._levels, most)
-        return np.where(found < most, np.sqrt(found.astype(np.float64)), reach)
+        squared = _nearest(queries, self._triangles, self._boxes, self._levels, most)
+        return np.where(squared < most, np.sqrt(squared.astype(np.float64)), reach)
 
     def signed_distance(self, points: np.ndarray, reach: float, deepest: float) -> np.ndarray:
         """Return the signed distance (N,) of points (N, 3) to a closed mesh, metres.
@@ -142,15 +142,15 @@ def _nearest(points, triangles, boxes, levels, reach_sq):
 
     Each search starts at the face found last, so consecutive points should be close.
     """
-    found = np.empty(len(points), np.float32)
+    squared = np.empty(len(points), np.float32)
     stack, reach = np.empty(levels + 2, np.int32), np.empty(levels + 2, np.float32)
     last = 0
     for m in range(len(points)):
         x, y, z = points[m, 0], points[m, 1], points[m, 2]
-        found[m], last = _search(
+        squared[m], last = _search(
             x, y, z, triangles, boxes, levels, np.float32(reach_sq), last, stack, reach
         )
-    return found
+    return squared
 
 
 @numba.njit(cache=True, nogil=True)
@@ -162,7 +162,7 @@ def _signed(points, triangles, boxes, levels, reach, deepest):
     reach the mesh lies on one side of it. A ray is cast only if neither this point's ball contains
     the last decided point, nor that point's ball contains this one.
     """
-    found = np.empty(len(points), np.float64)
+    signed = np.empty(len(points), np.float64)
     stack, ahead = np.empty(levels + 2, np.int32), np.empty(levels + 2, np.float32)
     last, within = 0, False
     # the last decided point, and the radius of its ball
@@ -171,7 +171,7 @@ def _signed(points, triangles, boxes, levels, reach, deepest):
     for m in range(len(points)):
         x, y, z = points[m, 0], points[m, 1], points[m, 2]
         if not (np.isfinite(x) and np.isfinite(y) and np.isfinite(z)):
-            found[m] = reach
+            signed[m] = reach
             continue
         square, last = _search(x, y, z, triangles, boxes, levels, reach_sq, last, stack, ahead)
         far = not square < reach_sq
@@ -187,8 +187,8 @@ def _signed(points, triangles, boxes, levels, reach, deepest):
                 x, y, z, triangles, boxes, levels, deepest_sq, last, stack, ahead
             )
             distance = np.sqrt(np.float64(square)) if square < deepest_sq else deepest
-        found[m] = -distance if within else distance
-    return found
+        signed[m] = -distance if within else distance
+    return signed
 
 
 @numba.njit(cache=True, nogil=True)
@@ -217,8 +217,8 @@ def _block(starts, ends, triangles, boxes, levels, blocked):
             near, far = 0.0, 1.0
             for k in range(3):
                 at, over = (x, a) if k == 0 else ((y, b) if k == 1 else (z, c))
-                one, other = (boxes[node, k] - at) * over, (boxes[node, 3 + k] - at) * over
-                near, far = max(near, min(one, other)), min(far, max(one, other))
+                entry, leave = (boxes[node, k] - at) * over, (boxes[node, 3 + k] - at) * over
+                near, far = max(near, min(entry, leave)), min(far, max(entry, leave))
             if near > far + _ROUNDING:
                 continue
             if node < leaves - 1:
@@ -344,10 +344,10 @@ def _crosses(x, y, z, corners):
             side = -uy if uy != 0 else ux
         if turned:
             area, side = -area, -side
-        way = 1 if side > 0 else -1
-        if side == 0 or (sign and way != sign):  # an edge of no length, or outside of this one
+        own_sign = 1 if side > 0 else -1
+        if side == 0 or (sign and own_sign != sign):  # an edge of no length, or outside of it
             return False
-        sign = way
+        sign = own_sign
         total += area
         height += area * np.float64(c[2])
     return total != 0 and height / total > z

@@ -188,11 +188,11 @@ def _damped_step(
     shared_step = right.new_zeros(num_shared)
     if num_shared:
         flat = half.flatten(0, 1)
-        taken = flat[:, 1:].T @ flat
-        schur = normal.hessian[:, n:, n:].sum(0, dtype=a.dtype) - taken[:, 1:]
+        eliminated = flat[:, 1:].T @ flat
+        schur = normal.hessian[:, n:, n:].sum(0, dtype=a.dtype) - eliminated[:, 1:]
         schur.diagonal().add_(lam.mean() * schur.diagonal().abs() + 1e-9)
         shared_step = -torch.linalg.solve(
-            schur, gradient[:, n:].sum(0, dtype=a.dtype) - taken[:, 0]
+            schur, gradient[:, n:].sum(0, dtype=a.dtype) - eliminated[:, 0]
         )
     remains = half[..., :1] + half[..., 1:] @ shared_step[:, None]
     step = -torch.linalg.solve_triangular(factor.mT, remains, upper=True)[..., 0]

@@ -365,7 +365,7 @@ def test_depth_without_a_lens_is_not_read(capture):
     del content["cameras"]["left"]["depth"]
     capture.calibration.write_text(json.dumps(content))
     output = run(capture)
-    assert "the calibration says nothing of depth" in notes_of(output)["left"]
+    assert "the calibration has no entry 'depth'" in notes_of(output)["left"]
     with Frames.open(output) as frames:
         assert frames.rig[0].depth is None
 

@@ -45,7 +45,7 @@ class PeopleFile:
     results: list[tuple[ImageKey, np.ndarray]] = field(default_factory=list)
     """Image and keypoints (135, 3) of each person: x, y (px) and confidence as written."""
     images: list[ImageKey] | None = None
-    """Images that the detector looked at; None if the file does not list them."""
+    """Images that the detector processed; None if the file does not list them."""
     faults: list[str] = field(default_factory=list)
     """Entries that are left out, with the reason."""
     faulty: list[ImageKey] = field(default_factory=list)
@@ -100,13 +100,8 @@ def layouts() -> dict[str, KeypointLayout]:
 def readers() -> tuple[KeypointReader, ...]:
     """All readers in the order in which they are asked."""
     modules = modules_of("intercap_core.formats.detections.keypoints")
-    found = [module.READER for module in modules if hasattr(module, "READER")]
-    return tuple(sorted(found, key=lambda reader: (reader.rank, reader.tool)))
-
-
-def known_counts() -> str:
-    """Numbers of points of all layouts, for messages."""
-    return ", ".join(map(str, sorted({len(layout.points) for layout in layouts().values()})))
+    unsorted = [module.READER for module in modules if hasattr(module, "READER")]
+    return tuple(sorted(unsorted, key=lambda reader: (reader.rank, reader.tool)))
 
 
 def find_layout(count: int, name: str | None = None) -> KeypointLayout:
@@ -118,28 +113,26 @@ def find_layout(count: int, name: str | None = None) -> KeypointLayout:
         count: number of points.
         name: name of the layout if the file states it.
     """
-    if name is not None and name not in layouts():
-        raise ValueError(
-            f"states {LAYOUT_KEY} {quoted(name)}, expected one of {', '.join(sorted(layouts()))}"
-        )
-    if name is not None and len(layouts()[name].points) != count:
-        expected = len(layouts()[name].points)
-        raise ValueError(f"has {count} keypoints, expected the {expected} of layout {name}")
     if name is not None:
+        if name not in layouts():
+            known = ", ".join(sorted(layouts()))
+            raise ValueError(f"states {LAYOUT_KEY} {quoted(name)}, expected one of {known}")
+        expected = len(layouts()[name].points)
+        if expected != count:
+            raise ValueError(f"has {count} keypoints, expected the {expected} of layout {name}")
         return layouts()[name]
-    found = [layout for layout in layouts().values() if len(layout.points) == count]
-    found = [layout for layout in found if layout.is_default] or found
-    if not found:
+    matching = [layout for layout in layouts().values() if len(layout.points) == count]
+    matching = [layout for layout in matching if layout.is_default] or matching
+    if not matching:
+        counts = sorted({len(layout.points) for layout in layouts().values()})
         raise ValueError(
-            f"has {count} keypoints, expected one of {known_counts()} (133 = COCO-WholeBody); "
-            "run a whole-body model"
+            f"has {count} keypoints, expected one of {', '.join(map(str, counts))} "
+            "(133 = COCO-WholeBody); run a whole-body model"
         )
-    if len(found) > 1:
-        raise ValueError(
-            f"has {count} keypoints, as have layouts {', '.join(one.name for one in found)}; state "
-            f"'{LAYOUT_KEY}'"
-        )
-    return found[0]
+    if len(matching) > 1:
+        names = ", ".join(layout.name for layout in matching)
+        raise ValueError(f"has {count} keypoints, as have layouts {names}; state '{LAYOUT_KEY}'")
+    return matching[0]
 
 
 def to_shared(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray:

@@ -3,7 +3,7 @@
 A person is an object with ``keypoints``: x, y, confidence of every point in one flat list or a list
 for each point, or x, y with separate ``keypoint_scores`` (mmpose). Feet, face and hands may be
 separate lists (``foot_kpts``, ``face_kpts``, ``lefthand_kpts``, ``righthand_kpts``:
-COCO-WholeBody's results). The number of points tells the layout, unless the person or the file
+COCO-WholeBody's results). The number of points determines the layout, unless the person or the file
 states ``keypoint_layout``, or ``meta_info.dataset_name`` as mmpose does.
 
 A file is a list of people who state their image, a data set (``images``, ``annotations``), a list

@@ -38,7 +38,7 @@ def _recognises(content: Any) -> bool:
 def _read(content: dict[str, Any], one_image: bool) -> PeopleFile:
     """Read the people of one image. A part that OpenPose did not look for has confidence 0."""
     if "people" not in content:
-        content = {"people": [{key: content.get(theirs, []) for key, theirs, _ in _LISTS}]}
+        content = {"people": [{key: content.get(behave_key, []) for key, behave_key, _ in _LISTS}]}
     people = content["people"]
     if not isinstance(people, list):
         raise UnreadableDetections("has no list 'people'; expected a file as OpenPose writes it")
@@ -72,9 +72,9 @@ READER = KeypointReader(
 def _points(values: Any, count: int, where: str) -> np.ndarray:
     """Points (count, 3) of one list."""
     if not isinstance(values, list) or len(values) not in (0, 3 * count):
-        found = len(values) if isinstance(values, list) else type(values).__name__
+        size = len(values) if isinstance(values, list) else type(values).__name__
         raise UnreadableDetections(
-            f"has {found} numbers in {where}, expected {3 * count} (x, y, confidence of {count} "
+            f"has {size} numbers in {where}, expected {3 * count} (x, y, confidence of {count} "
             "points); run OpenPose with its BODY_25 model, hands and face"
         )
     if not values:
