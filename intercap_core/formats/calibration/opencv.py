@@ -124,12 +124,7 @@ def opencv_lens(size: tuple[int, int], matrix: Any, coefficients: Any, where: st
             f"{where}: camera_matrix is no [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels; "
             "correct it"
         )
-    if (np.abs(k[:2, 2] / size - 0.5) > 0.25).any():  # shares of the image; 0.03 is usual
-        raise UserError(
-            f"{where}: the principal point {k[0, 2]:.0f}, {k[1, 2]:.0f} is that of images of about "
-            f"{2 * k[0, 2]:.0f}x{2 * k[1, 2]:.0f}, image_size is {size[0]}x{size[1]}; give the "
-            "calibration of this resolution"
-        )
+    check_resolution(k[:2, 2], size, 0.25, where)
     distortion = pad_distortion(d)
     arguments = (*size, k[0, 0], k[1, 1], k[0, 2], k[1, 2], distortion)
     turn = turning_radius(distortion)
@@ -137,6 +132,20 @@ def opencv_lens(size: tuple[int, int], matrix: Any, coefficients: Any, where: st
     widest = np.linalg.norm(Intrinsics(*arguments, turn).unproject(corners)[:, :2], axis=1).max()
     radius = min(turn, max(1.1 * float(widest), DEFAULT_METRIC_RADIUS))
     return check_lens(Intrinsics(*arguments, radius), where)
+
+
+def check_resolution(centre: np.ndarray, size: tuple[int, int], most: float, where: str) -> None:
+    """Raise UserError if a principal point (2,) is that of images of another size.
+
+    ``most`` is the largest distance from the middle, as a share of the image; 0.03 is usual.
+    """
+    if (np.abs(centre / size - 0.5) > most).any():
+        x, y = centre
+        raise UserError(
+            f"{where}: the principal point {x:.0f}, {y:.0f} is that of images of about "
+            f"{2 * x:.0f}x{2 * y:.0f}, the images have {size[0]}x{size[1]}; give the calibration "
+            "of this resolution"
+        )
 
 
 def pad_distortion(coefficients: np.ndarray) -> np.ndarray:

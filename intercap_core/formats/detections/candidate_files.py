@@ -20,11 +20,12 @@ from intercap_core.formats.detections.coco import (
     read_json,
 )
 from intercap_core.formats.detections.image_numbers import (
-    FILES_NAMED,
     CameraImages,
     json_files,
     note_absent,
     note_broken,
+    note_faults,
+    note_unmatched,
     short_name,
     sort_by_image,
 )
@@ -129,10 +130,7 @@ def _add_file(
     for place, instances in by_image.items():
         candidates.by_image.setdefault(place, []).extend(instances)
     name = short_name(path)
-    if content.faults:
-        first = "; ".join(content.faults[:FILES_NAMED])
-        count = len(content.faults)
-        candidates.notes.append(f"{count} of {content.entries} results in {name} left out: {first}")
+    note_faults(candidates.notes, f"of {content.entries} results in {name}", content.faults)
     if content.scaled:
         candidates.notes.append(f"{content.scaled} masks in {name} scaled to the image's size")
     note_absent(candidates.notes, absent, images, name)
@@ -163,19 +161,13 @@ def _add_image_files(
         faults += [f"{printable(name)}, {fault}" for fault in content.faults]
         entries, scaled = entries + content.entries, scaled + content.scaled
     note_broken(candidates.notes, "candidates", broken)
-    if faults:
-        first = "; ".join(faults[:FILES_NAMED])
-        candidates.notes.append(f"{len(faults)} of {entries} results left out: {first}")
+    note_faults(candidates.notes, f"of {entries} results", faults)
     if scaled:
         candidates.notes.append(f"{scaled} masks scaled to the image's size")
     without = len(images.recorded) - len(by_name) + len(absent)
     if by_name and without > 0:
         candidates.notes.append(f"no file of candidates for {without} images")
-    if absent:
-        candidates.notes.append(
-            f"{len(absent)} files of candidates belong to no image (first: "
-            f"{printable(absent[0][:80])})"
-        )
+    note_unmatched(candidates.notes, "files of candidates", absent)
 
 
 def _add_masks_of_camera(
@@ -193,11 +185,7 @@ def _add_masks_of_camera(
             return
         numbers = images.numbers_of_names(by_name)
         absent = [name for name in by_name if numbers.get(name) not in images.recorded]
-        if absent:
-            candidates.notes.append(
-                f"masks of {len(absent)} images are named after no image (first: "
-                f"{printable(absent[0][:80])})"
-            )
+        note_unmatched(candidates.notes, "names of masks", absent)
         files = {numbers[name]: masks for name, masks in by_name.items() if name in numbers}
     in_sets = [int(images.number[t]) for t in images.sets]
     add_masks(candidates, {number: files.get(number, []) for number in in_sets}, images.size)

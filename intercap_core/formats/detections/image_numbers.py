@@ -207,6 +207,19 @@ def note_absent(notes: list[str], names: list[str], images: CameraImages, where:
     )
 
 
+def note_faults(notes: list[str], what: str, faults: list[str]) -> None:
+    """Note entries that were left out, the first ones with their reasons."""
+    if faults:
+        notes.append(f"{len(faults)} {what} left out: {'; '.join(faults[:FILES_NAMED])}")
+
+
+def note_unmatched(notes: list[str], what: str, names: list[str]) -> None:
+    """Note files that belong to no image of the camera."""
+    if names:
+        first = printable(names[0][:80])
+        notes.append(f"{len(names)} {what} belong to no image (first: {first})")
+
+
 def short_name(path: Path) -> str:
     """The file's name with that of its folder, which is a camera or a moment."""
     return printable(f"{path.parent.name}/{path.name}")

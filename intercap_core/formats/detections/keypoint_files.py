@@ -17,16 +17,16 @@ from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.coco import UnreadableDetections, read_head, read_json
 from intercap_core.formats.detections.image_numbers import (
-    FILES_NAMED,
     CameraImages,
     note_absent,
     note_broken,
+    note_faults,
+    note_unmatched,
     repeated_number,
     short_name,
     sort_by_image,
 )
 from intercap_core.formats.detections.keypoints import KeypointReader, read_people, readers
-from intercap_core.inputs.files import printable
 
 # A person whose points all have smaller coordinates, px, has normalised ones: 0 to 1, and somewhat
 # more outside the image.
@@ -132,9 +132,7 @@ class _Reading:
             raise UserError(
                 f"{folder}: none of camera {camera}'s keypoints can be used: {self.faults[0]}"
             )
-        if self.faults:
-            first = "; ".join(self.faults[:FILES_NAMED])
-            notes.append(f"{len(self.faults)} people or files of keypoints left out: {first}")
+        note_faults(notes, "people or files of keypoints", self.faults)
         notes += self.cleaner.notes()
         return self.people
 
@@ -246,10 +244,7 @@ def _add_image_files(reading: _Reading, folder: Path, images: CameraImages) -> N
     numbers = [int(images.number[t]) for t in images.sets]
     _add_files(reading, {n: by_number.get(n) for n in numbers}, reader)
     absent = [name for name in by_name if places.get(name) not in images.recorded]
-    if absent:
-        reading.people.notes.append(
-            f"{len(absent)} keypoint files belong to no image (first: {printable(absent[0][:80])})"
-        )
+    note_unmatched(reading.people.notes, "keypoint files", absent)
 
 
 def _add_files(reading: _Reading, files: Mapping[int, Path | None], reader: KeypointReader) -> None:

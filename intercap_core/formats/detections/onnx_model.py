@@ -5,8 +5,8 @@ Nothing in a model file is run as code except its graph; custom operators are no
 
 from __future__ import annotations
 
+import ast
 import os
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from intercap_core.errors import UserError
+from intercap_core.formats.detections.class_names import names_of
 from intercap_core.inputs.files import check_file, printable
 
 FLOATS = ("tensor(float)", "tensor(float16)")  # types of outputs
@@ -27,10 +28,6 @@ PixelValues = Literal["rgb", "bgr255", "bgr_mean", "imagenet"]
 
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
 _PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
-
-_TEXT = r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*\""""
-_NAMED = re.compile(rf"""\s*["']?(\d{{1,9}})["']?\s*:\s*({_TEXT})\s*(?:,|$)""", re.DOTALL)
-_LISTED = re.compile(rf"\s*({_TEXT})\s*(?:,|$)", re.DOTALL)
 
 
 @dataclass(frozen=True)
@@ -201,24 +198,14 @@ def fit_within(picture: tuple[int, int], size: tuple[int, int], *, centred: bool
 
 
 def parse_names(text: str) -> dict[int, str]:
-    """Class names by number from a model's metadata: the text of a mapping or a list.
+    """Class names by number from a model's metadata; {} for text without names.
 
-    Exporters write the notation of Python or JSON. The text is parsed, never evaluated. Returns {}
-    for any other text.
+    The text is a mapping or a list in the notation of Python or JSON. It is parsed, not evaluated.
     """
-    text = text.strip()
-    if len(text) < 2 or text[0] + text[-1] not in ("{}", "[]"):
+    try:
+        return names_of(ast.literal_eval(text))
+    except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
         return {}
-    names: dict[int, str] = {}
-    pattern, inner, at = (_NAMED if text[0] == "{" else _LISTED), text[1:-1].rstrip(), 0
-    while at < len(inner):
-        match = pattern.match(inner, at)
-        if match is None:
-            return {}
-        *number, name = match.groups()
-        names[int(number[0]) if number else len(names)] = re.sub(r"\\(.)", r"\1", name[1:-1])
-        at = match.end()
-    return names
 
 
 def _runtime_errors() -> tuple[type[Exception], ...]:

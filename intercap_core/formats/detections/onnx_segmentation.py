@@ -26,7 +26,6 @@ from intercap_core.formats.detections.class_names import (
     COCO_NAMES,
     COCO_NAMES_FROM_0,
     COCO_NAMES_FROM_1,
-    MAX_LABEL,
     read_label_map,
 )
 from intercap_core.formats.detections.coco import MAX_SCORE
@@ -247,7 +246,7 @@ class Segmenter:
         if settings.segmentation_labels is not None:
             names = read_label_map(settings.segmentation_labels)
         else:
-            names = _own_names(model) or _coco_names(yolo, values)
+            names = parse_names(model.metadata.get("names", "")) or _coco_names(yolo, values)
         return cls(model, _Kind(values, names, outputs, yolo), settings.min_score)
 
     @property
@@ -403,11 +402,6 @@ def _coco_names(yolo: bool, values: str) -> Mapping[int, str]:
     if yolo or values == "bgr255":
         return COCO_NAMES_FROM_0
     return COCO_NAMES if values == "rgb" else COCO_NAMES_FROM_1
-
-
-def _own_names(model: OnnxModel) -> dict[int, str]:
-    names = parse_names(model.metadata.get("names", ""))
-    return {number: name[:MAX_LABEL] for number, name in names.items()}
 
 
 def _longest_side(metadata: Mapping[str, str]) -> int:

@@ -17,7 +17,7 @@ import numpy as np
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import read_extrinsics
-from intercap_core.formats.calibration.opencv import check_lens, pad_distortion
+from intercap_core.formats.calibration.opencv import check_lens, check_resolution, pad_distortion
 from intercap_core.formats.recordings.image_files import AlignedRecording, ImagePair, common_size
 from intercap_core.formats.recordings.source import RecordingLayout
 from intercap_core.geometry.camera.intrinsics import Intrinsics
@@ -145,11 +145,5 @@ def read_lens(path: Path, size: tuple[int, int]) -> Intrinsics:
             f"{where}: expected 'f' and 'c' of two numbers and 'k' of 4, 5 or 8{reason}; get the "
             "file from the release again"
         ) from None
-    # The principal points of the release lie within 3 % of the image from its middle.
-    if (np.abs(centre / size - 0.5) > 0.15).any():
-        raise UserError(
-            f"{where}: the principal point {centre[0]:.0f}, {centre[1]:.0f} is that of images of "
-            f"about {2 * centre[0]:.0f}x{2 * centre[1]:.0f}, the colour images have "
-            f"{size[0]}x{size[1]}; give the calibration of this resolution"
-        )
+    check_resolution(centre, size, 0.15, where)
     return check_lens(lens, where)

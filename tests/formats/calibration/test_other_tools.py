@@ -310,10 +310,3 @@ def test_parts_and_ambiguous_folders_are_refused(tmp_path):
     path.write_text("[project]\nframe_rate = 30\n")
     with pytest.raises(UserError, match="not their configuration"):
         read_calibration(path, RECORDED)
-
-
-def test_a_scale_for_a_file_in_metres_is_refused(tmp_path):
-    path = tmp_path / "rig.json"
-    path.write_text(json.dumps({"cameras": {}}))
-    with pytest.raises(UserError, match="is in metres, yet column calibration_scale"):
-        read_calibration(path, scale=0.001)

@@ -220,7 +220,7 @@ SURVIVED = [
     (overwrite(f"{DEPTH_2}/*.png", np.full((64, 80), 1000, np.uint16)),
      "has 80x64 pixels, the colour images 192x108", True, 5, False),
     (overwrite(f"{COLOUR_2}/*.jpg", np.zeros((72, 128, 3), np.uint8)),
-     "the colour images have 128x72", False, 0, False),
+     "the images have 128x72", False, 0, False),
     (remove(COLOUR_2), "no readable color/<number>.jpg", False, 0, False),
     (set_lens(f=None), "calibration_first/Color_2.json: expected 'f'", False, 0, False),
     (set_lens(k=[0.0] * 6), "6 coefficients", False, 0, False),

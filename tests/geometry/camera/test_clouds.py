@@ -11,16 +11,8 @@ from intercap_core.geometry.camera.clouds import colour_lookup, depth_points, ma
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import apply, invert, rigid
+from tests.geometry.camera.test_projection import COLOUR, DEPTH
 from tests.helpers.synthetic_capture import FURNITURE, ring, room_depth
-
-DEPTH = Intrinsics(
-    640, 576, 504.6, 504.7, 332.8, 348.8,
-    np.array([0.548, -0.021, 2.1e-5, -7.2e-5, -0.0027, 0.89, 0.086, -0.0139]), 1.74,
-)  # fmt: skip
-COLOUR = Intrinsics(
-    1920, 1080, 918.0, 917.0, 959.2, 549.4,
-    np.array([0.33, -2.489, -1.6e-4, -1.3e-4, 1.454, 0.209, -2.303, 1.375]),
-)  # fmt: skip
 
 
 def rotation_x(angle: float) -> np.ndarray:

@@ -40,8 +40,14 @@ def points_in_view(lens: Intrinsics, count: int = 500, seed: int = 0) -> np.ndar
 
 
 def random_points(count: int = 400, seed: int = 1) -> np.ndarray:
-    """Points all around, many beyond the metric radius and some behind the camera."""
-    return np.random.default_rng(seed).uniform([-3, -3, -0.5], [3, 3, 3.0], (count, 3))
+    """Points all around the camera; some on the axis, at the nearest depth and behind."""
+    points = np.random.default_rng(seed).uniform([-3, -3, -0.5], [3, 3, 3.0], (count, 3))
+    points[: count // 3, :2] *= 0.3  # so that many are within the radius
+    points[0] = 0, 0, 1
+    points[1] = 0.1, -0.2, -1
+    points[2] = 1e-4, 2e-4, MIN_DEPTH_M
+    points[3] = 1e-4, 2e-4, MIN_DEPTH_M / 2
+    return points
 
 
 @pytest.mark.parametrize("lens", LENSES)
@@ -179,20 +185,9 @@ def random_lens(seed: int) -> np.ndarray:
     return np.array([*focal, *centre, *distortion, rng.uniform(0.6, 0.8)])
 
 
-def scattered_points(seed: int, count: int = 300) -> np.ndarray:
-    """Points all around the camera; some on the axis, at the nearest depth and behind."""
-    points = np.random.default_rng(seed).uniform([-3, -3, -0.5], [3, 3, 3.0], (count, 3))
-    points[: count // 3, :2] *= 0.3  # so that many are within the radius
-    points[0] = 0, 0, 1
-    points[1] = 0.1, -0.2, -1
-    points[2] = 1e-4, 2e-4, MIN_DEPTH_M
-    points[3] = 1e-4, 2e-4, MIN_DEPTH_M / 2
-    return points
-
-
 @pytest.mark.parametrize("seed", range(6))
 def test_compiled_kernels_equal_numpy(seed):
-    lens, points = random_lens(seed), scattered_points(seed)
+    lens, points = random_lens(seed), random_points(300, seed)
     covered = inside_model(points, lens)
     assert 20 < covered.sum() < len(points) - 20
     pixels, jacobian = project_with_jacobian(points, lens)
@@ -205,7 +200,7 @@ def test_compiled_kernels_equal_numpy(seed):
 
 @pytest.mark.parametrize("seed", range(6))
 def test_the_compiled_jacobian_matches_finite_differences(seed):
-    lens, points = random_lens(seed), scattered_points(seed)
+    lens, points = random_lens(seed), random_points(300, seed)
     x, y, z = points.T
     radius = np.hypot(x, y) / np.maximum(z, MIN_DEPTH_M)
     # Not within a step of a kink: the metric radius, the nearest depth.
@@ -225,7 +220,7 @@ def test_the_compiled_jacobian_matches_finite_differences(seed):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_single_precision_stays_single(seed):
-    lens, points = random_lens(seed), scattered_points(seed)
+    lens, points = random_lens(seed), random_points(300, seed)
     points = points[inside_model(points, lens)].astype(np.float32)
     single = lens.astype(np.float32)
     expected = project(points, single)
