@@ -129,7 +129,7 @@ def printable(text: str) -> str:
     return text.encode("utf-8", "replace").decode("utf-8", "replace")
 
 
-def numbers_of(value: Any, where: str, field: str) -> np.ndarray:
+def parse_numbers(value: Any, where: str, field: str) -> np.ndarray:
     """Convert to an array of finite numbers; raises UserError that begins with ``where``."""
     try:
         numbers = np.array(value, np.float64)

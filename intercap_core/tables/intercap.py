@@ -12,9 +12,9 @@ import numpy as np
 
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
-from intercap_core.formats.recordings.intercap import camera_folders, numbered_images
+from intercap_core.formats.recordings.intercap import find_camera_folders, find_images
 from intercap_core.inputs.documents import read_yaml
-from intercap_core.tables.intercap_annotations import Key, annotation_folders, convert
+from intercap_core.tables.intercap_annotations import Key, convert, find_annotation_folders
 from intercap_core.tables.project_files import Draft, Row
 
 OBJECTS = (
@@ -47,7 +47,7 @@ class Sources:
     """The release's own results, a folder for each sequence."""
 
 
-def stated_calibration(subject: int, object_number: int) -> str | None:
+def find_stated_calibration(subject: int, object_number: int) -> str | None:
     """The calibration that the release states for a subject and an object; None = not stated."""
     early = object_number <= 7
     if (subject <= 3 and early) or (subject == 4 and object_number <= 4):
@@ -77,7 +77,7 @@ def draft(root: Path, sources: Sources, *, dataset: str, objects: Path) -> Draft
         )
     calibrations = _calibrations(sources.calibrations, images)
     annotations_root = sources.annotations or _find_folder(images, "configs")
-    annotated = annotation_folders(annotations_root) if annotations_root else {}
+    annotated = find_annotation_folders(annotations_root) if annotations_root else {}
     meshes = sources.meshes or _find_folder(images, "objs")
     result = Draft(dataset)
     for key, folder in folders.items():
@@ -168,16 +168,16 @@ def _row(key: Key, folder: Path, sources: Sources) -> Row:
 def _frame_numbers(folder: Path) -> np.ndarray:
     """Numbers (T,) of the frames of which any camera has a colour image, increasing."""
     numbers: set[int] = set()
-    for camera in camera_folders(folder).values():
+    for camera in find_camera_folders(folder).values():
         try:
-            numbers |= set(numbered_images(camera)[0])
+            numbers |= set(find_images(camera)[0])
         except UserError:
             continue  # the frames stage excludes this camera and notes the reason
     return np.array(sorted(numbers), np.int64)
 
 
 def _calibration(key: Key, folder: Path, known: dict[str, Path], row: Row) -> Path:
-    stated = stated_calibration(*key[:2])
+    stated = find_stated_calibration(*key[:2])
     if stated is not None:
         if stated not in known:
             raise UserError(

@@ -36,7 +36,7 @@ class Converted:
     """What was left out, and why."""
 
 
-def annotation_folders(root: Path) -> dict[Key, list[Path]]:
+def find_annotation_folders(root: Path) -> dict[Key, list[Path]]:
     """Folders by sequence; those whose name ends with the segment come first, then by name."""
     folders: dict[Key, list[tuple[str, Path]]] = {}
     for path in sorted(root.iterdir()):

@@ -19,8 +19,7 @@ from intercap_core.errors import UserError
 from intercap_core.formats.recordings.image_files import encoded_size
 from intercap_core.formats.recordings.k4a import KinectFile
 from intercap_core.geometry.camera import masks
-from intercap_core.geometry.rigid.mesh import colours_of
-from intercap_core.geometry.rigid.mesh_files import load_mesh
+from intercap_core.geometry.rigid.mesh_files import get_colours, load_mesh
 from intercap_core.studio.calibration import write_calibration
 from intercap_core.studio.mkv import MkvWriter
 from tests.fuzz.kinds import KINDS
@@ -317,7 +316,7 @@ def test_textures_outside_the_folder_of_the_mesh_are_ignored(tmp_path: Path) -> 
     cv2.imwrite(str(tmp_path / "outside.png"), np.full((4, 4, 3), (0, 0, 255), np.uint8))
     for name in ("../outside.png", str(tmp_path / "outside.png"), "/dev/zero"):
         (folder / "box.mtl").write_text(f"newmtl a\nKd 0.8 0.8 0.8\nmap_Kd {name}\n")
-        colours = colours_of(load_mesh(folder / "box.obj"))
+        colours = get_colours(load_mesh(folder / "box.obj"))
         assert not (colours[:, :3] == (255, 0, 0)).all(1).any()
 
 

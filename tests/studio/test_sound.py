@@ -10,7 +10,7 @@ from scipy import signal
 from intercap_core.config import StudioCapture, StudioSettings
 from intercap_core.entries import SequenceEntry
 from intercap_core.formats.recordings.layouts import open_layout
-from intercap_core.formats.recordings.sound_delays import delay_between, sound_starts
+from intercap_core.formats.recordings.sound_delays import estimate_delay, sound_starts
 from intercap_core.formats.recordings.source import SOUND_RATE, Sound
 from intercap_core.studio.capture import erring_starts
 from intercap_core.studio.capture_folder import SOUND_RATE as STUDIO_RATE
@@ -57,7 +57,7 @@ def test_sound_delay_is_the_travel_time():
     stage = stage_of(7915, apart=0.0)
     stage.noise = type(stage.noise)(7915, 0.0, "a", 30.0)
     tracks = [listened(heard(stage, c, 0.0, SECONDS)) for c in (0, 1)]
-    found = delay_between(*tracks)
+    found = estimate_delay(*tracks)
     moment = stage.at(stage.set_times)
     eyes = np.linalg.inv(stage.rig.master_from_stage) @ stage.rig.true.master_from_colour
     far = [np.linalg.norm(moment.joints[:, 0] - eye[:3, 3], axis=1) for eye in eyes[:2]]

@@ -20,7 +20,7 @@ from intercap_core.geometry.camera.rig import Rig
 from intercap_core.project import load_project
 from intercap_core.stages import frames as frames_stage
 from intercap_core.tables.calibration_choice import choose_calibration
-from intercap_core.tables.intercap import stated_calibration
+from intercap_core.tables.intercap import find_stated_calibration
 from tests.helpers.release_folders import write_intercap
 from tests.helpers.synthetic_capture import (
     COLOUR,
@@ -246,11 +246,13 @@ def test_odd_names_of_folders_are_ignored_or_refused(release):
 
 
 def test_calibrations_that_the_release_states():
-    unstated = {(s, o) for s in range(1, 11) for o in range(1, 11) if not stated_calibration(s, o)}
+    unstated = {
+        (s, o) for s in range(1, 11) for o in range(1, 11) if not find_stated_calibration(s, o)
+    }
     assert unstated == {(4, 5), (4, 6), (4, 7)}
-    assert stated_calibration(4, 4) == stated_calibration(3, 7) == "first"
-    assert stated_calibration(10, 1) == stated_calibration(4, 8) == "second"
-    assert stated_calibration(3, 8) == stated_calibration(7, 7) == "third"
+    assert find_stated_calibration(4, 4) == find_stated_calibration(3, 7) == "first"
+    assert find_stated_calibration(10, 1) == find_stated_calibration(4, 8) == "second"
+    assert find_stated_calibration(3, 8) == find_stated_calibration(7, 7) == "third"
 
 
 def rooms(tmp_path: Path, moved: tuple[float, float]) -> tuple[SequenceEntry, dict[str, Path]]:

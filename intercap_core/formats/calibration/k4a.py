@@ -17,7 +17,7 @@ from intercap_core.errors import UserError
 from intercap_core.formats.calibration.opencv import (
     MAX_LENSES_APART_M,
     MIN_METRIC_RADIUS,
-    lens_fault,
+    find_lens_fault,
 )
 from intercap_core.geometry.camera.intrinsics import DEFAULT_METRIC_RADIUS, Intrinsics
 from intercap_core.geometry.camera.rig import Camera
@@ -63,7 +63,7 @@ DEPTH_MODES = {
 DISTORTION_POSITIONS = (4, 5, 13, 12, 6, 7, 8, 9)
 
 
-def lens_of(entry: dict[str, Any], mode: Mode) -> Intrinsics:
+def make_lens(entry: dict[str, Any], mode: Mode) -> Intrinsics:
     """Make the lens of one camera entry of the JSON in ``mode``.
 
     Raises ValueError, KeyError or TypeError if the entry is not as the SDK writes it, and
@@ -91,7 +91,7 @@ def lens_of(entry: dict[str, Any], mode: Mode) -> Intrinsics:
         distortion=values[list(DISTORTION_POSITIONS)],
         metric_radius=radius if not radius <= MIN_METRIC_RADIUS else DEFAULT_METRIC_RADIUS,
     )
-    fault = lens_fault(lens)
+    fault = find_lens_fault(lens)
     if fault is not None:
         raise ValueError(fault)
     return lens
@@ -136,10 +136,10 @@ def read_calibration(
     pose = np.eye(4) if master_from_colour is None else master_from_colour
     try:
         cameras = _sensors(content, "Cameras", "Location")
-        colour = lens_of(cameras[COLOUR_LOCATION], COLOUR_MODES[colour_mode])
+        colour = make_lens(cameras[COLOUR_LOCATION], COLOUR_MODES[colour_mode])
         if depth_mode is None:
             return Camera(name, colour, None, None, pose)
-        depth = lens_of(cameras[DEPTH_LOCATION], DEPTH_MODES[depth_mode])
+        depth = make_lens(cameras[DEPTH_LOCATION], DEPTH_MODES[depth_mode])
         colour_from_depth = _pose_of(cameras[COLOUR_LOCATION]) @ invert(
             _pose_of(cameras[DEPTH_LOCATION])
         )

@@ -30,7 +30,7 @@ from intercap_core.formats.calibration.opencv import (
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.transforms import invert, is_rigid
 from intercap_core.inputs.documents import read_json, read_object
-from intercap_core.inputs.files import UnreadableFile, numbers_of, quoted
+from intercap_core.inputs.files import UnreadableFile, parse_numbers, quoted
 
 TRANSFORMS = "transforms.json"
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
@@ -76,7 +76,7 @@ def _images(path: Path, content: dict[str, Any]) -> Iterator[tuple[str, Intrinsi
 
 def _pose(frame: dict[str, Any], where: str) -> np.ndarray:
     """Camera from world (4, 4), OpenCV's axes."""
-    pose = numbers_of(frame.get("transform_matrix"), where, "transform_matrix")
+    pose = parse_numbers(frame.get("transform_matrix"), where, "transform_matrix")
     if not is_rigid(pose):
         raise UserError(
             f"{where}: transform_matrix is no rigid 4x4 transform of world from camera; correct it"

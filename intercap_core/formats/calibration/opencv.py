@@ -28,7 +28,7 @@ from intercap_core.geometry.camera.intrinsics import DEFAULT_METRIC_RADIUS, Intr
 from intercap_core.geometry.camera.projection import radial_fraction
 from intercap_core.geometry.camera.transforms import invert, is_rigid, rigid
 from intercap_core.inputs.documents import YamlLoader, read_json, read_yaml
-from intercap_core.inputs.files import MAX_CALIBRATION_BYTES, UnreadableFile, numbers_of, quoted
+from intercap_core.inputs.files import MAX_CALIBRATION_BYTES, UnreadableFile, parse_numbers, quoted
 
 MIN_METRIC_RADIUS = 1e-4  # the Azure Kinect Sensor SDK takes a smaller radius as "not stated"
 # Between the colour and the depth lens of a camera; beyond it, the file is in millimetres.
@@ -107,7 +107,10 @@ def opencv_lens(size: tuple[int, int], matrix: Any, coefficients: Any, where: st
     outside the view is projected into the image. Raises UserError, beginning with ``where``, for
     numbers that describe no lens.
     """
-    k, d = numbers_of(matrix, where, "camera_matrix"), numbers_of(coefficients, where, "distortion")
+    k, d = (
+        parse_numbers(matrix, where, "camera_matrix"),
+        parse_numbers(coefficients, where, "distortion"),
+    )
     d = d.ravel()
     if d.size not in (4, 5, 8):
         more = (
@@ -180,13 +183,13 @@ def _distort_radius(radius: np.ndarray, distortion: np.ndarray) -> tuple[np.ndar
 
 def check_lens(lens: Intrinsics, where: str) -> Intrinsics:
     """Return the lens; raises UserError, beginning with ``where``, if no camera has such a lens."""
-    fault = lens_fault(lens)
+    fault = find_lens_fault(lens)
     if fault is not None:
         raise UserError(f"{where}: {fault}; calibrate again, or give this camera's own calibration")
     return lens
 
 
-def lens_fault(lens: Intrinsics) -> str | None:
+def find_lens_fault(lens: Intrinsics) -> str | None:
     """Why the lens is impossible, for a message; None if it is possible."""
     if not np.isfinite(lens.parameters).all():
         return "the lens has a value that is not a finite number"
@@ -256,7 +259,7 @@ def check_rate(fps: float, where: str) -> None:
 
 def parse_number(value: Any, where: str, field: str, expected: str = "one number") -> float:
     """A single finite number; raises UserError, beginning with ``where``, for anything else."""
-    numbers = numbers_of(value, where, field)
+    numbers = parse_numbers(value, where, field)
     if numbers.size != 1:
         raise UserError(f"{where}: {field} is {quoted(value, 40)}, expected {expected}; correct it")
     return float(numbers.ravel()[0])
@@ -264,7 +267,7 @@ def parse_number(value: Any, where: str, field: str, expected: str = "one number
 
 def parse_image_size(size: Any, where: str) -> tuple[int, int]:
     """Width and height in whole pixels; raises UserError, beginning with ``where``, otherwise."""
-    numbers = numbers_of(size, where, "image_size").ravel()
+    numbers = parse_numbers(size, where, "image_size").ravel()
     whole = (numbers == numbers.round()) & (numbers >= 1) & (numbers <= MAX_SIDE)
     if numbers.size != 2 or not whole.all():
         raise UserError(
@@ -278,7 +281,7 @@ def opencv_pose(rotation: Any, translation: Any, where: str) -> np.ndarray:
 
     Raises UserError, beginning with ``where``, for numbers that are no pose.
     """
-    r, t = numbers_of(rotation, where, "R"), numbers_of(translation, where, "T").ravel()
+    r, t = parse_numbers(rotation, where, "R"), parse_numbers(translation, where, "T").ravel()
     r = Rotation.from_rotvec(r.ravel()).as_matrix() if r.size == 3 else r
     if t.size != 3 or r.shape != (3, 3) or not is_rigid(rigid(r, t)):
         raise UserError(
@@ -299,7 +302,7 @@ def _camera(entry: dict[str, Any], where: str, fps: float | None) -> CalibratedC
     elif isinstance(depth, dict):
         lens = _lens(depth, f"{where}, depth")
         field = "depth.colour_from_depth"
-        colour_from_depth = numbers_of(depth.get("colour_from_depth"), where, field)
+        colour_from_depth = parse_numbers(depth.get("colour_from_depth"), where, field)
         if not is_rigid(colour_from_depth):
             raise UserError(
                 f"{where}: {field} is no rigid 4x4 transform (x_colour = R x_depth + t, metres, "

@@ -21,7 +21,7 @@ from intercap_core.formats.detections.coco import (
 )
 from intercap_core.formats.detections.image_numbers import (
     CameraImages,
-    json_files,
+    find_json_files,
     note_absent,
     note_broken,
     note_faults,
@@ -32,9 +32,9 @@ from intercap_core.formats.detections.image_numbers import (
 from intercap_core.formats.detections.instance import Instance
 from intercap_core.formats.detections.mask_files import (
     MaskFile,
-    instance_masks,
+    find_instance_masks,
+    find_release_masks,
     read_masks,
-    release_masks,
 )
 from intercap_core.formats.recordings.image_files import DamagedImage
 from intercap_core.inputs.files import printable
@@ -72,7 +72,7 @@ def camera_file(folder: Path, camera: str) -> Path | None:
 
 def image_files(folder: Path, camera: str) -> list[Path]:
     """The files that hold one image of a camera each."""
-    return [] if camera_file(folder, camera) is not None else json_files(folder / camera)
+    return [] if camera_file(folder, camera) is not None else find_json_files(folder / camera)
 
 
 def has_candidates(folder: Path, camera: str, layout: str) -> bool:
@@ -80,8 +80,8 @@ def has_candidates(folder: Path, camera: str, layout: str) -> bool:
     if camera_file(folder, camera) is not None or image_files(folder, camera):
         return True
     if layout == "intercap":
-        return release_masks(folder, camera) is not None
-    return (folder / camera).is_dir() and bool(instance_masks(folder / camera))
+        return find_release_masks(folder, camera) is not None
+    return (folder / camera).is_dir() and bool(find_instance_masks(folder / camera))
 
 
 def read_camera(
@@ -141,7 +141,7 @@ def _add_image_files(
 ) -> None:
     """Read files that hold one image each, named after it."""
     by_name = {path.name: path for path in paths}
-    numbers = images.numbers_of_names(by_name)
+    numbers = images.match_names(by_name)
     absent, broken = [], []
     faults: list[str] = []
     scaled = entries = 0
@@ -174,16 +174,16 @@ def _add_masks_of_camera(
     candidates: CandidatesByImage, folder: Path, images: CameraImages, layout: str
 ) -> None:
     if layout == "intercap":
-        person = release_masks(folder, images.name)
+        person = find_release_masks(folder, images.name)
         if person is None:
             return
         files = {number: [file] for number, file in person.items()}
     else:
         below = folder / images.name
-        by_name = instance_masks(below) if below.is_dir() else {}
+        by_name = find_instance_masks(below) if below.is_dir() else {}
         if not by_name:
             return
-        numbers = images.numbers_of_names(by_name)
+        numbers = images.match_names(by_name)
         absent = [name for name in by_name if numbers.get(name) not in images.recorded]
         note_unmatched(candidates.notes, "names of masks", absent)
         files = {numbers[name]: masks for name, masks in by_name.items() if name in numbers}

@@ -34,12 +34,12 @@ COCO_NAMES_FROM_0: dict[int, str] = dict(enumerate(_CLASSES))
 COCO_NAMES_FROM_1: dict[int, str] = dict(enumerate(_CLASSES, start=1))
 
 
-def names_of(content: Any) -> dict[int, str]:
+def parse_class_names(content: Any) -> dict[int, str]:
     """Class names by number of parsed JSON or YAML; raises ValueError if there are none."""
     if isinstance(content, dict):
         for key in ("categories", "names"):
             if isinstance(content.get(key), list | dict):
-                return names_of(content[key])
+                return parse_class_names(content[key])
     if isinstance(content, list) and content and all(isinstance(v, dict) for v in content):
         return _unique([(v.get("id"), v.get("name")) for v in content])
     if isinstance(content, list):
@@ -58,13 +58,13 @@ def _unique(pairs: Sequence[tuple[Any, Any]]) -> dict[int, str]:
             raise ValueError(f"class {quoted(number, 40)} has the name {quoted(name, 40)}")
         if number in names:
             raise ValueError(f"two classes have the number {number}")
-        names[number] = label_text(name)
+        names[number] = check_label(name)
     if not names:
         raise ValueError("it lists none")
     return names
 
 
-def label_text(name: str) -> str:
+def check_label(name: str) -> str:
     """Return the name; raises ValueError if it is no valid text or longer than ``MAX_LABEL``."""
     try:
         name.encode("utf-8")
@@ -99,10 +99,10 @@ def read_label_map(path: Path) -> dict[int, str]:
     suffix = path.suffix.lower()
     try:
         if suffix == ".json":
-            return names_of(parse_json(text))
+            return parse_class_names(parse_json(text))
         if suffix in (".yaml", ".yml"):
-            return names_of(parse_yaml(text))
-        return names_of([line.strip() for line in text.strip().splitlines()])
+            return parse_class_names(parse_yaml(text))
+        return parse_class_names([line.strip() for line in text.strip().splitlines()])
     except (ValueError, yaml.YAMLError) as error:
         words = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
         raise UserError(

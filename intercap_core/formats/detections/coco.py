@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from intercap_core.formats.detections.class_names import label_text, names_of
+from intercap_core.formats.detections.class_names import check_label, parse_class_names
 from intercap_core.formats.detections.instance import Instance, to_rle
 from intercap_core.geometry.camera import masks
 from intercap_core.inputs.documents import json_decoder, parse_json
@@ -178,14 +178,14 @@ def _read_file_head(
     own: dict[int, str] = {}
     if content.get("categories"):
         try:
-            own = names_of(content["categories"])
+            own = parse_class_names(content["categories"])
         except ValueError as error:
             raise UnreadableDetections(
                 f"'categories' must list objects with id and name ({error})"
             ) from None
     size = _size(content.get("img_width"), content.get("img_height"))
     corners = content.get("box_format") == "xyxy"
-    listed = listed_images(content)
+    listed = read_listed_images(content)
     if listed is None:
         return _FileHead({**names, **own}, {}, {}, size, corners), None
     sizes = {
@@ -193,10 +193,10 @@ def _read_file_head(
         for value in content["images"]
         if (own_size := _size(value.get("width"), value.get("height"))) is not None
     }
-    return _FileHead({**names, **own}, files_of(listed), sizes, size, corners), listed
+    return _FileHead({**names, **own}, names_by_id(listed), sizes, size, corners), listed
 
 
-def listed_images(content: dict[str, Any]) -> list[ImageKey] | None:
+def read_listed_images(content: dict[str, Any]) -> list[ImageKey] | None:
     """The images that a data set lists; None if it lists none.
 
     Raises :class:`UnreadableDetections` if they are not objects with an id.
@@ -215,7 +215,7 @@ def listed_images(content: dict[str, Any]) -> list[ImageKey] | None:
     return images
 
 
-def files_of(images: list[ImageKey]) -> dict[int, str]:
+def names_by_id(images: list[ImageKey]) -> dict[int, str]:
     """Names of images by id, for those that have one."""
     return {i.number: i.name for i in images if i.number is not None and i.name is not None}
 
@@ -303,7 +303,7 @@ def _label(entry: dict[str, Any], names: Mapping[int, str]) -> str:
     """The class's name; "" if the detector knows no classes."""
     for key in ("category_name", "category", "class_name", "class", "label", "name"):
         if isinstance(entry.get(key), str):
-            return label_text(entry[key])
+            return check_label(entry[key])
     present = [key for key in ("category_id", "class", "class_id", "label") if key in entry]
     if not present:
         return ""

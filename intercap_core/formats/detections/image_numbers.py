@@ -15,7 +15,7 @@ from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.coco import ImageKey
 from intercap_core.formats.recordings.image_files import FilesRecording
-from intercap_core.formats.recordings.intercap import numbers_of
+from intercap_core.formats.recordings.intercap import numbers_from_times
 from intercap_core.formats.recordings.plain import PlainLayout
 from intercap_core.inputs.files import printable
 
@@ -49,14 +49,14 @@ class CameraImages:
         """Frame sets with an image."""
         return np.flatnonzero(self.number >= 0).tolist()
 
-    def numbers_of_names(self, names: Iterable[str]) -> dict[str, int]:
+    def match_names(self, names: Iterable[str]) -> dict[str, int]:
         """Numbers of the images that names of files refer to; other names are left out.
 
         If any name is that of an image file, only such names count. Otherwise the number at the
         end of a name counts (``frame_0012.jpg`` is image 12), provided that no two names end in the
         same number.
         """
-        stems = {name: stem_of(name) for name in sorted(set(names))}
+        stems = {name: strip_suffix(name) for name in sorted(set(names))}
         places = {stem: place for place, stem in enumerate(self.stems)}
         named = {name: places[stem] for name, stem in stems.items() if stem in places}
         if named:
@@ -66,16 +66,16 @@ class CameraImages:
         return numbers if len(set(numbers.values())) == len(numbers) else {}
 
 
-def stem_of(name: str) -> str:
+def strip_suffix(name: str) -> str:
     """A file's name without folders (of any system) and without the suffix of an image."""
     return _SUFFIX.sub("", PurePosixPath(name.replace("\\", "/")).name)
 
 
-def repeated_number(names: Iterable[str]) -> list[str]:
+def find_repeated_number(names: Iterable[str]) -> list[str]:
     """Names that end in the same number; [] if there are no two such names."""
     by_number: dict[int, list[str]] = {}
     for name in names:
-        match = _LAST_NUMBER.fullmatch(stem_of(name))
+        match = _LAST_NUMBER.fullmatch(strip_suffix(name))
         if match:
             by_number.setdefault(int(match.group(1)), []).append(name)
     return next((group for group in by_number.values() if len(group) > 1), [])
@@ -103,8 +103,8 @@ def camera_images(source: artefacts.Artefact, sequence: SequenceEntry) -> list[C
                 number, stems = _plain_numbers(plain, name, index, times)
                 every = np.arange(len(stems)) if stems else every
             if sequence.layout == "intercap":
-                number = np.where(index >= 0, numbers_of(times), -1)
-                every = numbers_of(all_times)
+                number = np.where(index >= 0, numbers_from_times(times), -1)
+                every = numbers_from_times(all_times)
         recorded = frozenset(every.tolist())
         images.append(CameraImages(name, (width, height), number, times, recorded, stems))
     return images
@@ -137,7 +137,7 @@ def _plain_numbers(
     return number, tuple(path.stem for _, path in files)
 
 
-def json_files(folder: Path) -> list[Path]:
+def find_json_files(folder: Path) -> list[Path]:
     """The JSON files in a folder; [] without the folder."""
     paths = folder.iterdir() if folder.is_dir() else ()
     return sorted(p for p in paths if p.suffix.lower() == ".json" and not p.name.startswith("."))
@@ -164,7 +164,7 @@ def sort_by_image(
         useless: no entry could be used. Then the file says nothing about images it does not list.
     """
     keys = [*(key for key, _ in results), *faulty, *(listed or ())]
-    by_name = images.numbers_of_names(key.name for key in keys if key.name is not None)
+    by_name = images.match_names(key.name for key in keys if key.name is not None)
     ids = {key.number for key in keys if key.number is not None}
     if len(images.recorded & ids) > len(images.recorded.intersection(by_name.values())):
         by_name = {}  # the numbers in the names are something else, such as times

@@ -39,7 +39,7 @@ def boxes_of(instances: list[Instance]) -> np.ndarray:
     return np.array([i.box for i in instances], np.float32).reshape(-1, 4)
 
 
-def instance_of(label: str, score: float, mask: np.ndarray) -> Instance | None:
+def make_instance(label: str, score: float, mask: np.ndarray) -> Instance | None:
     """The instance of a mask (H, W) of the colour image's size; None if the mask is empty."""
     rle = masks.encode(mask)
     x, y, width, height = masks.Runs(rle, *mask.shape).box
@@ -65,7 +65,7 @@ def scale_to(own: tuple[int, int], size: tuple[int, int]) -> tuple[float, float]
     return x, y
 
 
-def resized(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def resize_mask(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Resize a mask (h, w) to ``size`` (width, height): (H, W) bool."""
     grey = np.where(mask, np.uint8(255), np.uint8(0))
     return cv2.resize(grey, size, interpolation=cv2.INTER_LINEAR) >= MASK_THRESHOLD
@@ -116,7 +116,7 @@ def _from_rle(
     runs = masks.Runs(rle, height, width)
     if factors == (1.0, 1.0):
         return rle, factors
-    return masks.encode(resized(runs.decode(), size)), factors
+    return masks.encode(resize_mask(runs.decode(), size)), factors
 
 
 def _compressed(counts: Any, height: int, width: int) -> bytes:

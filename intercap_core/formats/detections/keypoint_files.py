@@ -18,11 +18,11 @@ from intercap_core.errors import UserError
 from intercap_core.formats.detections.coco import UnreadableDetections, read_head, read_json
 from intercap_core.formats.detections.image_numbers import (
     CameraImages,
+    find_repeated_number,
     note_absent,
     note_broken,
     note_faults,
     note_unmatched,
-    repeated_number,
     short_name,
     sort_by_image,
 )
@@ -235,8 +235,8 @@ def _add_camera_file(
 def _add_image_files(reading: _Reading, folder: Path, images: CameraImages) -> None:
     """Read the files of a camera's folder."""
     by_name, reader = find_image_files(folder) or ({}, readers()[0])
-    places = images.numbers_of_names(by_name)
-    repeated = [] if places else repeated_number(by_name)
+    places = images.match_names(by_name)
+    repeated = [] if places else find_repeated_number(by_name)
     if repeated:
         first, second = (by_name[name].name for name in repeated[:2])
         reading.faults.append(f"one image has two keypoint files, {first} and {second}; keep one")

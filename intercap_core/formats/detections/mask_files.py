@@ -16,8 +16,8 @@ from intercap_core.formats.detections.instance import (
     MAX_PIXELS,
     PERSON_LABEL,
     Instance,
-    instance_of,
-    resized,
+    make_instance,
+    resize_mask,
     scale_to,
 )
 from intercap_core.formats.recordings.behave import frame_folders
@@ -68,8 +68,8 @@ def read_masks(file: MaskFile, size: tuple[int, int]) -> list[Instance]:
         ) from None
     instances = []
     for mask in _split(image, file):
-        fitting = mask if mask.shape == size[::-1] else resized(mask, size)
-        instance = instance_of(file.label, 1.0, fitting)
+        fitting = mask if mask.shape == size[::-1] else resize_mask(mask, size)
+        instance = make_instance(file.label, 1.0, fitting)
         if instance is not None:
             instances.append(instance)
     return instances
@@ -92,7 +92,7 @@ def _split(image: np.ndarray, file: MaskFile) -> Iterator[np.ndarray]:
             yield image == value
 
 
-def instance_masks(folder: Path) -> dict[str, list[MaskFile]]:
+def find_instance_masks(folder: Path) -> dict[str, list[MaskFile]]:
     """Mask files of one camera by the name of their image.
 
     Names are ``<image>.png`` without a label, ``<image>__<label>.png``,
@@ -119,7 +119,7 @@ def _is_png(path: Path) -> bool:
     return path.suffix.lower() == ".png" and not path.name.startswith(".") and path.is_file()
 
 
-def release_masks(candidates: Path, camera: str) -> dict[int, MaskFile] | None:
+def find_release_masks(candidates: Path, camera: str) -> dict[int, MaskFile] | None:
     """Person masks of one camera as the InterCap release's tools store them, by image number.
 
     Names are ``<camera>/<number>.png`` or ``BodyIndexColor_<n>/<number>.png`` (for camera 1 without

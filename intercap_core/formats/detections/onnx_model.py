@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from intercap_core.errors import UserError
-from intercap_core.formats.detections.class_names import names_of
+from intercap_core.formats.detections.class_names import parse_class_names
 from intercap_core.inputs.files import check_file, printable
 
 FLOATS = ("tensor(float)", "tensor(float16)")  # types of outputs
@@ -150,7 +150,7 @@ class OnnxModel:
             for v in outputs
         ]
 
-    def fitted(
+    def fit_picture(
         self, picture: np.ndarray, fit: Fit, size: tuple[int, int], values: PixelValues, pad: int
     ) -> np.ndarray:
         """Fit a BGR picture (H, W, 3) uint8 into the input: (3, h, w) of ``size`` (width, height).
@@ -164,9 +164,9 @@ class OnnxModel:
         canvas[fit.top : fit.top + height, fit.left : fit.left + width] = cv2.resize(
             picture, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
         )
-        return self.prepared(canvas, values)
+        return self.to_input_values(canvas, values)
 
-    def prepared(self, canvas: np.ndarray, values: PixelValues) -> np.ndarray:
+    def to_input_values(self, canvas: np.ndarray, values: PixelValues) -> np.ndarray:
         """Convert a BGR picture (h, w, 3) uint8 of the input's size to its values (3, h, w).
 
         A model whose input is of bytes gets bytes.
@@ -185,7 +185,7 @@ class OnnxModel:
         return pixels.transpose(2, 0, 1)
 
 
-def fit_within(picture: tuple[int, int], size: tuple[int, int], *, centred: bool) -> Fit:
+def place_picture(picture: tuple[int, int], size: tuple[int, int], *, centred: bool) -> Fit:
     """Place a picture (width, height) in an input of ``size`` without changing its aspect ratio.
 
     The picture is in the middle if ``centred``, otherwise at the upper left.
@@ -203,7 +203,7 @@ def parse_names(text: str) -> dict[int, str]:
     The text is a mapping or a list in the notation of Python or JSON. It is parsed, not evaluated.
     """
     try:
-        return names_of(ast.literal_eval(text))
+        return parse_class_names(ast.literal_eval(text))
     except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
         return {}
 

@@ -101,7 +101,7 @@ class PoseModel:
         tiles of the whole image and then at the people found in them.
         """
         size = (picture.shape[1], picture.shape[0])
-        boxes = person_boxes(instances)
+        boxes = choose_person_boxes(instances)
         if len(boxes):
             return self._people_in(picture, boxes, BOX_PADDING)
         people, boxes = self._distinct(self._people_in(picture, tiles(size, self._size), 1.0))
@@ -146,7 +146,10 @@ class PoseModel:
         for start in range(0, len(crops), most):
             part = crops[start : start + most]
             images = np.stack(
-                [self._model.prepared(crop.cut(picture, self._size), "imagenet") for crop in part]
+                [
+                    self._model.to_input_values(crop.cut(picture, self._size), "imagenet")
+                    for crop in part
+                ]
             )
             outputs = self._model.run(images)
             yield self._points([outputs[i] for i in self._outputs], len(part))[: len(part)]
@@ -157,13 +160,13 @@ class PoseModel:
         if any(len(shape) < 3 or shape[0] < people for shape in shapes):
             raise _unknown(self._model, [str(list(shape)) for shape in shapes])
         if len(responses) == 2 and _same_bins(shapes, self._size):
-            return simcc_points(responses[0], responses[1], self._size)
+            return decode_simcc(responses[0], responses[1], self._size)
         if len(responses) == 1 and _coarser(shapes[0][2:], self._size):
-            return heatmap_points(responses[0], self._size, self._grid)
+            return decode_heatmaps(responses[0], self._size, self._grid)
         raise _unknown(self._model, [str(list(shape)) for shape in shapes])
 
 
-def person_boxes(instances: list[Instance]) -> np.ndarray:
+def choose_person_boxes(instances: list[Instance]) -> np.ndarray:
     """Boxes (N, 4) of x, y, width, height of the people among instances, best first."""
     # 0.3 is mmpose's default.
     people = [i for i in instances if i.label == PERSON_LABEL and i.score >= 0.3]
@@ -245,7 +248,7 @@ def _point_names(model: OnnxModel, count: int) -> tuple[str, ...]:
         raise UserError(f"{Path(model.path)}: {error}") from None
 
 
-def simcc_points(columns: np.ndarray, rows: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def decode_simcc(columns: np.ndarray, rows: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Decode SimCC responses: (B, K, 3) of x, y (px of the input) and confidence.
 
     Args:
@@ -259,7 +262,7 @@ def simcc_points(columns: np.ndarray, rows: np.ndarray, size: tuple[int, int]) -
     return np.stack([x, y, np.maximum(response, 0)], -1)
 
 
-def heatmap_points(maps: np.ndarray, size: tuple[int, int], grid: HeatmapGrid) -> np.ndarray:
+def decode_heatmaps(maps: np.ndarray, size: tuple[int, int], grid: HeatmapGrid) -> np.ndarray:
     """Decode heatmaps: (B, K, 3) of x, y (px of the input) and confidence.
 
     Args:
@@ -271,14 +274,14 @@ def heatmap_points(maps: np.ndarray, size: tuple[int, int], grid: HeatmapGrid) -
     """
     batch, count, height, width = maps.shape
     flat = maps.reshape(batch * count, height, width).astype(np.float64)
-    places = peaks(flat)
+    places = find_peaks(flat)
     cells, pixels = np.array([width, height]), np.array(size)
     scale = pixels / cells if grid == "msra" else (pixels - 1) / np.maximum(cells - 1, 1)
     response = np.maximum(flat.max((1, 2)), 0)
     return np.column_stack([places * scale, response]).reshape(batch, count, 3)
 
 
-def peaks(maps: np.ndarray) -> np.ndarray:
+def find_peaks(maps: np.ndarray) -> np.ndarray:
     """Peaks (N, 2) of x, y in cells of maps (N, h, w), finer than cells (DARK, Zhang et al. 2020).
 
     The result is the highest cell at the border, and if the second-order expansion of the logarithm

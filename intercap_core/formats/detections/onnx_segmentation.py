@@ -35,8 +35,8 @@ from intercap_core.formats.detections.onnx_model import (
     Fit,
     OnnxModel,
     PixelValues,
-    fit_within,
     parse_names,
+    place_picture,
 )
 from intercap_core.geometry.camera import masks
 from intercap_core.inputs.files import quoted
@@ -44,7 +44,7 @@ from intercap_core.inputs.files import quoted
 MAX_INSTANCES = 100  # of one image, as in COCO's evaluation
 
 
-def yolo_instances(
+def decode_yolo(
     rows: np.ndarray,
     prototypes: np.ndarray,
     fit: Fit,
@@ -78,7 +78,7 @@ def yolo_instances(
         half = rows[:, 2:4] / 2
         corners = np.concatenate([rows[:, :2] - half, rows[:, :2] + half], 1)
         kept = np.flatnonzero(scores >= min_score)
-        kept = kept[suppressed(corners[kept], scores[kept], classes[kept])]
+        kept = kept[suppress_overlaps(corners[kept], scores[kept], classes[kept])]
     kept = kept[:MAX_INSTANCES]
     boxes = fit.to_image(corners[kept])
     logits = np.tensordot(coefficients[kept], prototypes, 1)
@@ -94,7 +94,7 @@ def yolo_instances(
     return [instance for instance in instances if instance is not None]
 
 
-def rcnn_instances(
+def decode_rcnn(
     corners: np.ndarray,
     classes: np.ndarray,
     scores: np.ndarray,
@@ -105,7 +105,7 @@ def rcnn_instances(
     min_score: float,
     names: Mapping[int, str],
 ) -> list[Instance]:
-    """Instances of a Mask R-CNN or PointRend export; see :func:`yolo_instances`.
+    """Instances of a Mask R-CNN or PointRend export; see :func:`decode_yolo`.
 
     ``corners`` (N, 4), ``classes`` (N,) and ``scores`` (N,). The masks' ``probabilities`` (N, h, w)
     are over the whole input if they have its size, else over the box.
@@ -178,7 +178,7 @@ def _instance(
     return Instance(label, score, (float(x), float(y), float(width), float(height)), rle)
 
 
-def suppressed(corners: np.ndarray, scores: np.ndarray, classes: np.ndarray) -> np.ndarray:
+def suppress_overlaps(corners: np.ndarray, scores: np.ndarray, classes: np.ndarray) -> np.ndarray:
     """Indices (K,) of the boxes (N, 4) that greedy non-maximum suppression keeps, best first.
 
     A box is removed if a better one of its class overlaps it by more than 0.7, the default of
@@ -282,9 +282,9 @@ class Segmenter:
             size = _multiple_of_32(
                 picture_size, min(800 / min(picture_size), 1333 / max(picture_size))
             )
-        fit = fit_within(picture_size, size, centred=self._kind.yolo)
+        fit = place_picture(picture_size, size, centred=self._kind.yolo)
         grey = 114 if self._kind.yolo else 0  # as in ultralytics' training
-        return fit, self._model.fitted(picture, fit, size, self._kind.values, grey)
+        return fit, self._model.fit_picture(picture, fit, size, self._kind.values, grey)
 
     def _run(
         self, waiting: list[tuple[Key, Fit, np.ndarray]]
@@ -305,7 +305,7 @@ class Segmenter:
         self._check_numbers(rows[index], prototypes[index])
         score, names = self._min_score, self._kind.names
         try:
-            instances = yolo_instances(
+            instances = decode_yolo(
                 rows[index], prototypes[index], fit, size, min_score=score, names=names
             )
         except ValueError:
@@ -327,7 +327,7 @@ class Segmenter:
             raise _unknown(self._model, [str(list(v.shape)) for v in outputs])
         self._check_numbers(boxes, classes, scores)
         score, names = self._min_score, self._kind.names
-        instances = rcnn_instances(
+        instances = decode_rcnn(
             boxes, classes, scores, soft, fit, size, min_score=score, names=names
         )
         return self._plausible(instances)

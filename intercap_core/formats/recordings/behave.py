@@ -22,7 +22,7 @@ from intercap_core.formats.calibration.extrinsics import (
     relate_to_master,
 )
 from intercap_core.formats.calibration.opencv import check_lens, pad_distortion
-from intercap_core.formats.recordings.image_files import AlignedRecording, ImagePair, common_size
+from intercap_core.formats.recordings.image_files import AlignedRecording, ImagePair, find_size
 from intercap_core.formats.recordings.source import RecordingLayout
 from intercap_core.geometry.camera.intrinsics import DEFAULT_METRIC_RADIUS, Intrinsics
 from intercap_core.geometry.camera.transforms import is_rigid, rigid
@@ -61,7 +61,7 @@ class BehaveLayout(RecordingLayout):
             if (name, "color") in images or (name, "depth") in images
         ]
         recordings = self.sequence.recordings
-        size = common_size(shot.colour for shot in shots if shot.colour is not None)
+        size = find_size(shot.colour for shot in shots if shot.colour is not None)
         if size is None:
             raise UserError(
                 f"{recordings}: no {name}.color.jpg can be read; copy the sequence again"

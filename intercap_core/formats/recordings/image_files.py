@@ -156,7 +156,7 @@ def read_content(path: Path, length: int | None = None) -> bytes:
         raise DamagedImage(error.reason) from None
 
 
-def common_size(paths: Iterable[Path]) -> tuple[int, int] | None:
+def find_size(paths: Iterable[Path]) -> tuple[int, int] | None:
     """Width and height of the first complete image; None if there is none."""
     for path in paths:
         with contextlib.suppress(DamagedImage):
@@ -184,10 +184,10 @@ class FilesRecording(CameraRecording):
     def preview(self) -> RecordingPreview:
         """Inspect the sizes of all files, and some of the images."""
         files = self.colour_files
-        size = common_size(path for _, path in files)
+        size = find_size(path for _, path in files)
         times = [time_us for time_us, _ in files]
         seconds = (times[-1] - times[0]) * 1e-6 if times else None
-        faults = faults_of_files(self._shots, self.camera.depth)
+        faults = inspect_files(self._shots, self.camera.depth)
         return RecordingPreview(size, len(files), seconds, faults=tuple(faults))
 
     def images(self) -> Iterator[Image]:
@@ -195,7 +195,7 @@ class FilesRecording(CameraRecording):
         return read_pairs(self, self._shots)
 
 
-def faults_of_files(shots: list[ImagePair], lens: Intrinsics | None) -> list[str]:
+def inspect_files(shots: list[ImagePair], lens: Intrinsics | None) -> list[str]:
     """Faults of a camera's image files: empty files, and damaged ones among a few.
 
     ``lens`` is that of the depth camera; None = depth is not used.

@@ -18,7 +18,7 @@ from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import read_extrinsics
 from intercap_core.formats.calibration.opencv import check_lens, check_resolution, pad_distortion
-from intercap_core.formats.recordings.image_files import AlignedRecording, ImagePair, common_size
+from intercap_core.formats.recordings.image_files import AlignedRecording, ImagePair, find_size
 from intercap_core.formats.recordings.source import RecordingLayout
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.inputs.documents import read_json
@@ -31,13 +31,13 @@ DEPTH_FOLDER = re.compile(r"depth.*", re.IGNORECASE)
 NUMBERED = re.compile(r"(?!\.)\D*(\d{1,9})\.(?:jpe?g|png)", re.IGNORECASE)
 
 
-def time_of(number: int) -> int:
+def time_from_number(number: int) -> int:
     """Device time, microseconds, of the image with this number in its name."""
     return round(number * 1e6 / FPS)
 
 
-def numbers_of(times_us: np.ndarray) -> np.ndarray:
-    """Numbers in the names of the images with these device times; inverse of :func:`time_of`."""
+def numbers_from_times(times_us: np.ndarray) -> np.ndarray:
+    """Numbers in the names of the images with these device times, microseconds."""
     return np.rint(np.asarray(times_us) * (FPS / 1e6)).astype(np.int64)
 
 
@@ -53,14 +53,14 @@ class InterCapLayout(RecordingLayout):
                 "'calibration' in the table of sequences"
             )
         self.extrinsics = read_extrinsics(sequence.calibration)
-        self._folders = camera_folders(sequence.recordings)
+        self._folders = find_camera_folders(sequence.recordings)
         self.names = list(self._folders)
 
     def open(self, name: str) -> AlignedRecording:
         """Find the camera's files; raises UserError without colour images or a matching lens."""
         folder = self._folders[name]
-        colour, depth = numbered_images(folder)
-        size = common_size(colour.values())
+        colour, depth = find_images(folder)
+        size = find_size(colour.values())
         if size is None:
             raise UserError(
                 f"{folder}: holds no readable color/<number>.jpg; copy the folder from the release "
@@ -70,7 +70,7 @@ class InterCapLayout(RecordingLayout):
         lens_file = "Color.json" if number == 1 else f"Color_{number}.json"
         lens = read_lens(self.sequence.calibration / lens_file, size)
         shots = [
-            ImagePair(time_of(at), colour.get(at), depth.get(at))
+            ImagePair(time_from_number(at), colour.get(at), depth.get(at))
             for at in sorted({*colour, *depth})
         ]
         pose = self.extrinsics.master_from_colour[name]
@@ -84,7 +84,7 @@ def frame_rate(numbers: list[int]) -> float:
     return FPS / max(1.0, float(np.median(steps))) if len(steps) else FPS
 
 
-def camera_folders(recordings: Path) -> dict[str, Path]:
+def find_camera_folders(recordings: Path) -> dict[str, Path]:
     """The folders ``Frames_Cam<n>`` by camera name, in the cameras' order."""
     folders: dict[int, Path] = {}
     for path in sorted(recordings.iterdir()):
@@ -94,7 +94,7 @@ def camera_folders(recordings: Path) -> dict[str, Path]:
     return {f"k{number}": folders[number] for number in sorted(folders)}
 
 
-def numbered_images(folder: Path) -> tuple[dict[int, Path], dict[int, Path]]:
+def find_images(folder: Path) -> tuple[dict[int, Path], dict[int, Path]]:
     """Colour and depth files of a camera's folder by the number in their names.
 
     Of several folders of depth, the first whose name contains "align" is used, else the first by

@@ -284,7 +284,7 @@ class KinectFile(ClosedOnExit):
         )
 
 
-def imu_samples(content: bytes) -> np.ndarray:
+def parse_imu_samples(content: bytes) -> np.ndarray:
     """Accelerations and angular rates (n, 6) of one packet, m/s^2 and rad/s."""
     length = len(content) // IMU_SAMPLE.size * IMU_SAMPLE.size
     samples = [(*s[1:4], *s[5:8]) for s in IMU_SAMPLE.iter_unpack(content[:length])]
@@ -367,7 +367,7 @@ class KinectRecording(CameraRecording):
         acceleration, samples = np.zeros(3), 0
         for packet in self._recording.packets():
             if packet.kind == "imu":
-                values = imu_samples(packet.content)[:, :3]
+                values = parse_imu_samples(packet.content)[:, :3]
                 acceleration += values.sum(axis=0)
                 samples += len(values)
                 continue

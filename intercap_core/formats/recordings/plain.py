@@ -15,7 +15,7 @@ from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import CAMERA_NAME
 from intercap_core.formats.calibration.files import RecordedCameras, read_calibration
-from intercap_core.formats.recordings.image_files import FilesRecording, common_size
+from intercap_core.formats.recordings.image_files import FilesRecording, find_size
 from intercap_core.formats.recordings.source import CameraRecording, RecordingLayout
 from intercap_core.formats.recordings.timestamps import (
     find_timestamps,
@@ -52,10 +52,10 @@ class PlainLayout(RecordingLayout):
         folder = self._folders.get(name)
         files = _colour(folder) if folder else []
         if files:
-            return common_size(files[:1])
-        from intercap_core.formats.recordings.video import video_size
+            return find_size(files[:1])
+        from intercap_core.formats.recordings.video import read_video_size
 
-        return next((video_size(path) for path in self._videos if path.stem == name), None)
+        return next((read_video_size(path) for path in self._videos if path.stem == name), None)
 
     def open(self, name: str) -> CameraRecording:
         """Open the camera's video or folder.

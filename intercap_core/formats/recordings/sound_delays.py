@@ -47,7 +47,7 @@ def sound_starts(sounds: Sequence[Sound | None]) -> tuple[np.ndarray, np.ndarray
     for a, b in combinations(range(views), 2):
         first, second = sounds[a], sounds[b]
         if first is not None and second is not None:
-            delay = delay_between(first, second)
+            delay = estimate_delay(first, second)
             if delay is not None:
                 delays[a, b] = delay
     start, sigma = np.full(views, np.nan), np.full(views, np.nan)
@@ -67,7 +67,7 @@ def sound_starts(sounds: Sequence[Sound | None]) -> tuple[np.ndarray, np.ndarray
     return start, sigma
 
 
-def delay_between(first: Sound, second: Sound) -> Delay | None:
+def estimate_delay(first: Sound, second: Sound) -> Delay | None:
     """The delay of two tracks; None if it is not certain that they share sounds."""
     short, long = sorted((first, second), key=lambda sound: len(sound.samples))
     # A second holds several steps or words; within 10 s two clocks of 100 ppm drift by 1 ms.

@@ -21,7 +21,7 @@ from intercap_core.formats.recordings.image_files import (
     JPEG_QUALITY,
     encode_jpeg,
     encoded_size,
-    faults_of_files,
+    inspect_files,
     read_pairs,
 )
 from intercap_core.formats.recordings.source import (
@@ -213,7 +213,7 @@ def _decode_frames(container: Any, stream: Any) -> Iterator[Any]:
             yield from packet.decode()
 
 
-def video_size(path: Path) -> tuple[int, int] | None:
+def read_video_size(path: Path) -> tuple[int, int] | None:
     """Width and height of a video's images; None if it cannot be opened."""
     try:
         with open_container(path) as container:
@@ -297,7 +297,7 @@ class VideoRecording(CameraRecording):
     def preview(self) -> RecordingPreview:
         """Inspect the head, the first image, the index or the last image, and the depth files."""
         seen = preview_video(self.source, self._stream.index, self.fps)
-        faults = faults_of_files(self._shots, self.camera.depth)
+        faults = inspect_files(self._shots, self.camera.depth)
         if self._times is not None and seen.images is not None:
             stated = len(self._times)
             if abs(stated - seen.images) > max(1, 0.02 * stated):  # a number from duration and rate

@@ -16,7 +16,7 @@ import numpy as np
 import trimesh
 
 from intercap_core.errors import UserError
-from intercap_core.geometry.rigid.mesh_files import colours_of, read_mesh
+from intercap_core.geometry.rigid.mesh_files import get_colours, read_mesh
 
 OUTPUT_SUFFIXES = (".ply", ".obj")
 
@@ -89,7 +89,7 @@ def close_mesh(source: Path, output: Path, *, widest_m: float | None, share: flo
         raise UserError(_refusal(source, wide, limit, length))
     added = [_fan(hole, len(vertices) + k) for k, hole in enumerate(holes)]
     middles = np.array([hole.middle for hole in holes])
-    colours = colours_of(mesh)
+    colours = get_colours(mesh)
     around = [colours[hole.loop].mean(0).round().astype(np.uint8) for hole in holes]
     result = trimesh.Trimesh(
         np.concatenate([vertices, middles]),

@@ -26,12 +26,12 @@ def contact_list(ids: Sequence[int] | np.ndarray, vertices: np.ndarray) -> dict[
     """Return the content of a list of ``ids`` (K,) chosen on a file's ``vertices`` (V, 3)."""
     return {
         _COUNT: len(vertices),
-        _DIGEST: vertices_digest(vertices),
+        _DIGEST: digest_vertices(vertices),
         _IDS: [int(vertex) for vertex in ids],
     }
 
 
-def vertices_digest(vertices: np.ndarray) -> str:
+def digest_vertices(vertices: np.ndarray) -> str:
     """Return the SHA-256 of a mesh file's vertices (V, 3), in order, in single precision."""
     return hashlib.sha256(np.ascontiguousarray(vertices, "<f4").tobytes()).hexdigest()
 
@@ -73,7 +73,7 @@ def read_contact_vertices(path: Path, mesh: Path, vertices: np.ndarray) -> np.nd
 
 def _check_mesh(path: Path, values: Mapping[str, Any], mesh: Path, vertices: np.ndarray) -> None:
     """Raise UserError if the list states that it belongs to other vertices."""
-    for key, actual in ((_COUNT, len(vertices)), (_DIGEST, vertices_digest(vertices))):
+    for key, actual in ((_COUNT, len(vertices)), (_DIGEST, digest_vertices(vertices))):
         expected = values.get(key)
         if expected is not None and str(expected) != str(actual):
             raise UserError(

@@ -14,7 +14,12 @@ import trimesh
 from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.geometry.rigid.contact_vertices import read_contact_vertices
-from intercap_core.geometry.rigid.mesh_files import TEXTURE_ERRORS, colours_of, load_mesh, read_mesh
+from intercap_core.geometry.rigid.mesh_files import (
+    TEXTURE_ERRORS,
+    get_colours,
+    load_mesh,
+    read_mesh,
+)
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 
 log = logging.getLogger(__name__)
@@ -73,7 +78,7 @@ class ObjectMesh:
             np.asarray(mesh.faces, np.int32),
             ids.astype(np.int64),
             symmetry,
-            colours_of(mesh)[:, :3].copy(),
+            get_colours(mesh)[:, :3].copy(),
             bool(mesh.is_watertight),
         )
 
@@ -251,7 +256,7 @@ def _without_loose_vertices(
     kept = trimesh.Trimesh(
         np.asarray(mesh.vertices)[used],
         place[np.asarray(mesh.faces)],
-        vertex_colors=colours_of(mesh)[used],
+        vertex_colors=get_colours(mesh)[used],
         process=False,
         validate=False,
     )
@@ -263,7 +268,7 @@ def _repair(path: Path, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, np.ndar
     new_id = np.arange(len(mesh.vertices))
     if mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0:
         return mesh, new_id
-    colours = colours_of(mesh)
+    colours = get_colours(mesh)
     vertices, first, new_id = np.unique(
         np.asarray(mesh.vertices).round(7), axis=0, return_index=True, return_inverse=True
     )

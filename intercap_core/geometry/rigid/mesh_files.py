@@ -96,7 +96,7 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
     return mesh
 
 
-def colours_of(mesh: trimesh.Trimesh) -> np.ndarray:
+def get_colours(mesh: trimesh.Trimesh) -> np.ndarray:
     """Return vertex colours (V, 4) uint8: stored ones, sampled from a texture, or grey."""
     visual: Any = mesh.visual
     try:

@@ -17,7 +17,7 @@ class PointGrid:
     """Search structure of ``points`` (N, 3), N > 0, metres, in single precision."""
 
     def __init__(self, points: np.ndarray, cell_m: float = CELL_M) -> None:
-        self._cells = gridded(np.ascontiguousarray(points, np.float32), cell_m)
+        self._cells = sort_into_cells(np.ascontiguousarray(points, np.float32), cell_m)
 
     def distance(self, queries: np.ndarray) -> np.ndarray:
         """Return the distance (M,) float64 of finite queries (M, 3) to the nearest point, metres.
@@ -29,7 +29,7 @@ class PointGrid:
 
 
 @numba.njit(cache=True, nogil=True)
-def gridded(points, cell):
+def sort_into_cells(points, cell):
     """Sort points (N, 3) float32, N > 0, into cells of at least ``cell`` metres.
 
     Returns coordinates (3, N) in the order of cells, the start (cells + 1,) of each cell, the
@@ -76,7 +76,8 @@ def gridded(points, cell):
 def _nearest(queries, points, starts, low, number, size):
     """Return the squared distance (M,) of finite queries (M, 3) float32 to the nearest point.
 
-    The other arguments are results of :func:`gridded`. Each search starts at the point found last.
+    The other arguments are results of :func:`sort_into_cells`. Each search starts at the last
+    nearest point.
     """
     xs, ys, zs = points[0], points[1], points[2]
     inverse = 1 / size

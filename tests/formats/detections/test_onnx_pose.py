@@ -14,7 +14,7 @@ from intercap_core.errors import UserError  # noqa: E402
 from intercap_core.formats.detections.instance import Instance  # noqa: E402
 from intercap_core.formats.detections.keypoints import KeypointLayout, layouts  # noqa: E402
 from intercap_core.formats.detections.keypoints.coco import BODY  # noqa: E402
-from intercap_core.formats.detections.onnx_pose import Crop, PoseModel, person_boxes, tiles  # noqa: E402
+from intercap_core.formats.detections.onnx_pose import Crop, PoseModel, choose_person_boxes, tiles  # noqa: E402
 from tests.helpers import tiny_onnx  # noqa: E402
 
 SIZE = (640, 360)
@@ -140,9 +140,9 @@ def test_tiles_cover_the_image(size):
 
 def test_the_best_boxes_of_a_crowd_are_used():
     crowd = [around(LEFT + 5 * n, score=0.3 + n / 50) for n in range(20)]
-    boxes = person_boxes(crowd)
+    boxes = choose_person_boxes(crowd)
     assert len(boxes) == 10 and boxes[0, 0] == crowd[-1].box[0]
-    assert person_boxes([around(LEFT, score=0.29), around(LEFT, "cup")]).shape == (0, 4)
+    assert choose_person_boxes([around(LEFT, score=0.29), around(LEFT, "cup")]).shape == (0, 4)
 
 
 @pytest.mark.parametrize("kind", ["simcc", "heatmaps"])

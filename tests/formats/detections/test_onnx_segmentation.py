@@ -15,8 +15,8 @@ tiny_onnx = pytest.importorskip("tests.helpers.tiny_onnx", exc_type=ImportError)
 from intercap_core.config import DetectionsSettings  # noqa: E402
 from intercap_core.errors import UserError  # noqa: E402
 from intercap_core.formats.detections.class_names import read_label_map  # noqa: E402
-from intercap_core.formats.detections.onnx_model import OnnxModel, fit_within, parse_names  # noqa: E402
-from intercap_core.formats.detections.onnx_segmentation import Segmenter, suppressed  # noqa: E402
+from intercap_core.formats.detections.onnx_model import OnnxModel, parse_names, place_picture  # noqa: E402
+from intercap_core.formats.detections.onnx_segmentation import Segmenter, suppress_overlaps  # noqa: E402
 from intercap_core.geometry.camera import masks  # noqa: E402
 
 WIDTH, HEIGHT = 320, 180
@@ -124,7 +124,7 @@ def test_names_in_the_model_are_read_and_never_run(text, names):
 @pytest.mark.parametrize("size", [(640, 640), (320, 192), (57, 91)])
 @pytest.mark.parametrize("centred", [True, False])
 def test_pictures_keep_their_shape_and_boxes_come_back(size, centred):
-    fit = fit_within((1920, 1080), size, centred=centred)
+    fit = place_picture((1920, 1080), size, centred=centred)
     box = np.array([[100.0, 200.0, 900.0, 1000.0]], np.float32)
     inside = box * np.array(fit.scale * 2) + np.array([fit.left, fit.top] * 2)
     np.testing.assert_allclose(fit.to_image(inside), box, atol=1e-3)
@@ -134,7 +134,7 @@ def test_pictures_keep_their_shape_and_boxes_come_back(size, centred):
 
 def test_overlapping_boxes_of_one_class_leave_the_best():
     boxes = np.array([[0, 0, 10, 10], [1, 0, 11, 10], [0, 0, 10, 10], [30, 30, 40, 40]], float)
-    kept = suppressed(boxes, np.array([0.5, 0.9, 0.8, 0.7]), np.array([0, 0, 1, 0]))
+    kept = suppress_overlaps(boxes, np.array([0.5, 0.9, 0.8, 0.7]), np.array([0, 0, 1, 0]))
     assert kept.tolist() == [1, 2, 3]
 
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from intercap_core.formats.detections.onnx_pose import (
-    heatmap_points,
-    peaks,
-    simcc_points,
+    decode_heatmaps,
+    decode_simcc,
+    find_peaks,
 )
 
 
@@ -40,7 +40,7 @@ def _as_published(heatmap: np.ndarray, kernel: int) -> np.ndarray:
 def test_a_gaussians_middle_is_found_between_the_cells(size, sigma):
     rng = np.random.default_rng(0)
     places = rng.uniform((10, 10), np.array(size) - 11, (200, 2))
-    assert np.abs(peaks(_gaussians(places, size, sigma)) - places).max() < 2e-3
+    assert np.abs(find_peaks(_gaussians(places, size, sigma)) - places).max() < 2e-3
 
 
 @pytest.mark.parametrize("size, kernel", [((48, 64), 11), ((72, 96), 17)])
@@ -50,7 +50,7 @@ def test_noisy_maps_are_read_as_published(size, kernel):
     maps = np.maximum(
         _gaussians(places, size, kernel / 5) + rng.normal(0, 0.01, (100, *size[::-1])), 0
     )
-    found = peaks(maps)
+    found = find_peaks(maps)
     expected = np.array([_as_published(m, kernel) for m in maps])
     np.testing.assert_allclose(found, expected, atol=1e-9)
     finer = np.linalg.norm(found - places, axis=1).mean()
@@ -67,13 +67,13 @@ def test_borders_flats_and_nothing_are_the_highest_cell():
     maps[0, 0, 0] = maps[1, 63, 20] = maps[2, 30, 46] = 1
     maps[3] = 0.5
     maps[4, 30, 30] = -1
-    assert np.array_equal(peaks(maps), _cells(maps))
+    assert np.array_equal(find_peaks(maps), _cells(maps))
 
 
 def test_no_step_is_longer_than_a_cell():
     rng = np.random.default_rng(2)
     maps = rng.uniform(0, 1, (300, 64, 48))
-    assert np.abs(peaks(maps) - _cells(maps)).max() <= 1
+    assert np.abs(find_peaks(maps) - _cells(maps)).max() <= 1
 
 
 @pytest.mark.parametrize("grid, last", [("msra", 188.0), ("udp", 191.0)])
@@ -81,7 +81,7 @@ def test_cells_stand_for_pixels_of_the_input(grid, last):
     maps = np.zeros((1, 2, 64, 48), np.float32)
     maps[0, 0, 63, 47], maps[0, 1, 0, 0] = 0.8, -0.2
     maps[0, 1, 0, 1:] = maps[0, 1, 1:] = -0.5
-    far, near = heatmap_points(maps, (192, 256), grid)[0]
+    far, near = decode_heatmaps(maps, (192, 256), grid)[0]
     np.testing.assert_allclose(far, [last, last + 64, 0.8], rtol=1e-6)
     np.testing.assert_allclose(near, [0, 0, 0])
 
@@ -89,5 +89,5 @@ def test_cells_stand_for_pixels_of_the_input(grid, last):
 def test_bins_are_pixels_of_the_input():
     columns, rows = np.zeros((1, 2, 384)), np.full((1, 2, 512), -1.0)
     columns[0, 0, 101], rows[0, 0, 40] = 0.9, 0.7
-    points = simcc_points(columns, rows, (192, 256))
+    points = decode_simcc(columns, rows, (192, 256))
     np.testing.assert_allclose(points[0], [[50.5, 20, 0.7], [0, 0, 0]])

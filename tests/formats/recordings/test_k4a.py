@@ -13,7 +13,7 @@ import pytest
 
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.k4a import read_calibration
-from intercap_core.formats.recordings.k4a import KinectFile, imu_samples
+from intercap_core.formats.recordings.k4a import KinectFile, parse_imu_samples
 from intercap_core.studio.mkv import MkvWriter
 
 MASTERS = {0x18538067, 0x1F43B675, 0xA0, 0x1941A469, 0x61A7}  # elements that hold elements
@@ -82,7 +82,7 @@ def test_real_calibration_and_gravity(real_recording, real_calibration):
     with KinectFile(real_recording) as recording:
         assert recording.info.calibration == attached
         camera = recording.camera("k1")
-        samples = [imu_samples(p.content) for p in recording.packets() if p.kind == "imu"]
+        samples = [parse_imu_samples(p.content) for p in recording.packets() if p.kind == "imu"]
         rotation = recording.colour_from_accelerometer()
     other = read_calibration(
         real_calibration, colour_mode="720P", depth_mode="NFOV_UNBINNED", name="k1", source="json"

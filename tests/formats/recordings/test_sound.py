@@ -14,7 +14,11 @@ from scipy import signal
 from intercap_core import artefacts
 from intercap_core.config import FramesSettings
 from intercap_core.formats.recordings.frames import Frames
-from intercap_core.formats.recordings.sound_delays import SOUND_SIGMA_S, delay_between, sound_starts
+from intercap_core.formats.recordings.sound_delays import (
+    SOUND_SIGMA_S,
+    estimate_delay,
+    sound_starts,
+)
 from intercap_core.formats.recordings.source import SOUND_RATE, Sound
 from intercap_core.formats.recordings.video import read_sound
 from intercap_core.schemas import FRAMES
@@ -61,10 +65,10 @@ def test_a_track_that_is_shifted_by_whole_samples(late):
     sound = noise(1, 6.0)
     first = track(sound[10_000:40_000])
     second = track(sound[10_000 - late : 40_000 - late], 0.25)  # and began 0.25 s after its images
-    found = delay_between(first, second)
+    found = estimate_delay(first, second)
     assert found is not None and found.windows >= 3 and found.spread < 1e-4
     assert found.seconds == pytest.approx(late / SOUND_RATE + 0.25, abs=0.0003)
-    back = delay_between(second, first)
+    back = estimate_delay(second, first)
     assert back is not None and back.seconds == pytest.approx(-found.seconds, abs=0.0003)
 
 
@@ -77,7 +81,7 @@ def test_steps_in_a_room_with_noise(seed, seconds):
     count, shift = round(seconds * SOUND_RATE), round(late * SOUND_RATE)
     first = track(room(10 + seed, sound)[begin : begin + count])
     second = track(-room(20 + seed, sound)[begin - shift : begin - shift + count])  # other polarity
-    found = delay_between(first, second)
+    found = estimate_delay(first, second)
     assert found is not None
     assert found.seconds == pytest.approx(shift / SOUND_RATE, abs=0.002)
 
@@ -112,7 +116,7 @@ def beat(seconds: float) -> np.ndarray:
 )
 def test_no_delay_without_a_clear_common_sound(pair: Callable[[], tuple[np.ndarray, np.ndarray]]):
     first, second = pair()
-    assert delay_between(track(first), track(second)) is None
+    assert estimate_delay(track(first), track(second)) is None
 
 
 def test_starts_of_several_cameras():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from intercap_core.geometry.rigid.point_grid import MOST_CELLS, PointGrid, gridded
+from intercap_core.geometry.rigid.point_grid import MOST_CELLS, PointGrid, sort_into_cells
 
 RANDOM = np.random.default_rng(0)
 SHAPES = {
@@ -37,7 +37,7 @@ def test_distances_equal_a_k_d_tree(name: str, cell: float) -> None:
 @pytest.mark.parametrize("name", SHAPES)
 def test_every_point_is_in_its_cell(name: str) -> None:
     points = SHAPES[name].astype(np.float32)
-    placed, starts, low, number, size = gridded(points, 0.02)
+    placed, starts, low, number, size = sort_into_cells(points, 0.02)
     assert len(starts) - 1 == number.prod() <= MOST_CELLS
     assert starts[0] == 0 and starts[-1] == len(points) and (np.diff(starts) >= 0).all()
     order, own = np.lexsort(placed), np.lexsort(points.T)

@@ -23,9 +23,9 @@ from intercap_core.body.keypoints import KEYPOINT_NAMES, LEFT_HAND, RIGHT_HAND
 from intercap_core.formats.detections.coco import (
     ImageKey,
     UnreadableDetections,
-    files_of,
     image_of,
-    listed_images,
+    names_by_id,
+    read_listed_images,
 )
 from intercap_core.formats.detections.keypoints import (
     LAYOUT_KEY,
@@ -93,8 +93,8 @@ def _read(content: Any, one_image: bool) -> PeopleFile:
         return result
     files: dict[int, str] = {}
     if isinstance(content, dict):
-        result.images = listed_images(content)
-        files = files_of(result.images or [])
+        result.images = read_listed_images(content)
+        files = names_by_id(result.images or [])
     image = partial(image_of, files=files, one_image=one_image)
     for index, entry in enumerate(entries):
         _add(result, entry, f"entry {index}", image, layout)
