@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 
 from intercap_core import artefacts
-from intercap_core.config import FramesSettings
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.schemas import FRAMES
-from intercap_core.stages import frames as stage
+from tests.helpers.kinect_files import notes_of, run
 
 SIZE, DEPTH_SIZE = (64, 48), (32, 24)
 FPS = 25
@@ -95,17 +94,6 @@ def capture(tmp_path) -> SequenceEntry:
 def remove_images(capture: SequenceEntry, pattern: str) -> None:
     for path in capture.recordings.glob(pattern):
         path.unlink()
-
-
-def run(capture: SequenceEntry) -> Path:
-    output = capture.recordings.parent / "out" / "frames.h5"
-    stage.run(sequence=capture, output=output, settings=FramesSettings())
-    return output
-
-
-def notes_of(path: Path) -> dict[str, str]:
-    with artefacts.read(path, FRAMES) as frames:
-        return dict(zip(frames.text("camera_names"), frames.text("note"), strict=True))
 
 
 def test_images_are_copied_unchanged(capture):

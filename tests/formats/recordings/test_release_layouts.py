@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import pytest
 
-from intercap_core import artefacts
 from intercap_core.config import FramesSettings
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
@@ -19,8 +18,8 @@ from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.clouds import master_points
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply
-from intercap_core.schemas import FRAMES
 from intercap_core.stages import frames as stage
+from tests.helpers.kinect_files import notes_of, run
 from tests.helpers.release_folders import write_behave, write_intercap
 from tests.helpers.synthetic_capture import COLOUR, FURNITURE, ring, room_depth, to_millimetres
 
@@ -66,17 +65,6 @@ def behave(tmp_path) -> SequenceEntry:
     rig, _ = rig_of(4)
     folders = write_behave(tmp_path, rig, times=TIMES, colour=jpeg_at, depth=depth_at)
     return entry("behave", *folders)
-
-
-def run(sequence: SequenceEntry) -> Path:
-    output = sequence.recordings.parent / "out" / "frames.h5"
-    stage.run(sequence=sequence, output=output, settings=FramesSettings())
-    return output
-
-
-def notes_of(path: Path) -> dict[str, str]:
-    with artefacts.read(path, FRAMES) as frames:
-        return dict(zip(frames.text("camera_names"), frames.text("note"), strict=True))
 
 
 def cam(sequence: SequenceEntry, number: int) -> Path:
