@@ -13,11 +13,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import invert
 from intercap_core.studio.layouts import write_behave_calibration, write_intercap_calibration
-from tests.helpers.aligned_depth import depth_on_colour
 
 Colour = Callable[[int, int], bytes | None]  # of set t and camera c
 Depth = Callable[[int, int], np.ndarray | None]
@@ -86,33 +84,6 @@ def write_behave(
     }
     (recordings / "info.json").write_text(json.dumps(info))
     return recordings, config
-
-
-def convert_frames(
-    frames: Frames, root: Path, layout: str, sets: Iterable[int]
-) -> tuple[Path, Path]:
-    """Write frame sets of any capture as ``layout`` has them, depth on the colour grid.
-
-    Frame set t becomes InterCap's frame t, and BEHAVE's moment of t seconds; BEHAVE's Kinect 1 is
-    the second camera. Returns the folders of recordings and of calibration.
-    """
-    chosen = list(sets)
-
-    def depth(t: int, c: int) -> np.ndarray | None:
-        image = frames.depth(t, c)
-        return None if image is None else depth_on_colour(image, frames.rig[c])
-
-    if layout == "intercap":
-        return write_intercap(
-            root, frames.rig, numbers=chosen, colour=frames.colour_jpeg, depth=depth
-        )
-    return write_behave(
-        root,
-        frames.rig,
-        times=[f"{t:04d}.000" for t in chosen],
-        colour=lambda index, c: frames.colour_jpeg(chosen[index], c),
-        depth=lambda index, c: depth(chosen[index], c),
-    )
 
 
 def _png(depth: np.ndarray | None) -> bytes | None:
