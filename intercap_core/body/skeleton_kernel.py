@@ -72,7 +72,7 @@ class Skeleton(NamedTuple):
     moved: np.ndarray
     """(B, 55, 3, S) derivatives of the offsets by the shape; B = 0 without derivatives."""
 
-    def chain(self, selection: Selection, rest: np.ndarray) -> PosedPoints:
+    def with_points(self, selection: Selection, rest: np.ndarray) -> PosedPoints:
         """Return the arrays of a selection's points; rest (B,N,3)."""
         return PosedPoints(
             rest, *self, selection.directions.numpy(), selection.bones.numpy(),
@@ -127,14 +127,14 @@ def add_symmetric(block, to, hessian):
 
 
 @numba.njit(cache=True, nogil=True)
-def turned_back(chain, b, i, n):
+def turned_back(points, b, i, n):
     """Return the blended R^T n: a vector n at point i of body b, turned back to rest."""
     t0 = t1 = t2 = n[0] * np.float32(0)  # of the same type
-    for k in range(chain.bones.shape[1]):
-        w = chain.shares[i, k]
+    for k in range(points.bones.shape[1]):
+        w = points.shares[i, k]
         if w == 0:
             continue
-        r = chain.rotations[b, chain.bones[i, k]]
+        r = points.rotations[b, points.bones[i, k]]
         t0 += w * (r[0, 0] * n[0] + r[1, 0] * n[1] + r[2, 0] * n[2])
         t1 += w * (r[0, 1] * n[0] + r[1, 1] * n[1] + r[2, 1] * n[2])
         t2 += w * (r[0, 2] * n[0] + r[1, 2] * n[1] + r[2, 2] * n[2])

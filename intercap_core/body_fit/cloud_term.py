@@ -150,7 +150,7 @@ class CompiledCloud:
         rest = self._source.at_rest(contiguous(bodies.vectors[:, _SHAPE:]), derivatives)
 
         def posed(batch: Batch) -> PosedPoints:
-            return batch.skeleton.chain(selection, rest.points[batch.at])
+            return batch.skeleton.with_points(selection, rest.points[batch.at])
 
         return CompiledTerm(
             rest,
@@ -164,14 +164,14 @@ class CompiledCloud:
 
 
 @numba.njit(cache=True, nogil=True)
-def add_cost(chain, rows, frames, cost):
+def add_cost(points, rows, frames, cost):
     """Add E_D of the rows, :class:`CloudArrays`, to cost (B,) of the frames (B,)."""
     normal, weight, target, thickness, group = rows
     for b in range(len(frames)):
         t, total = frames[b], 0.0
         for i in range(len(group)):
             if weight[t, i] > 0:
-                along = project_on_direction(chain, b, i, normal[t, i])
+                along = project_on_direction(points, b, i, normal[t, i])
                 e = target[t, i] - along - thickness[group[i]]
                 total += weight[t, i] * e * e / 2
         cost[b] += total
@@ -272,22 +272,22 @@ def _add_squares(rows, weights, block):
 
 
 @numba.njit(cache=True, nogil=True)
-def add_equations(chain, limbs, given, frames, equations, rest_gradient, tables):
+def add_equations(points, limbs, arrays, frames, equations, rest_gradient, tables):
     """Add the normal equations of E_D to those of the frames (B,).
 
-    limbs: :class:`.selection.Limbs` of the samples. given: :class:`CloudArrays`.
+    limbs: :class:`.selection.Limbs` of the samples. arrays: :class:`CloudArrays`.
     equations: :class:`.term_inputs.BatchEquations`, filled in place.
     rest_gradient (B,N,3): gradient by the points at rest, filled in place; tables (N,3,486): see
     :mod:`intercap_core.body.correctives_kernel`. B and N are 0 without pose blend shapes.
     """
-    normal, weight, target, thickness, group = given
+    normal, weight, target, thickness, group = arrays
     place, place_u, cost = equations.place, equations.place_u, equations.cost
     gradient, hessian = equations.gradient, equations.hessian
     order, starts, moved_by = limbs
     dtype = hessian.dtype
     shape = np.flatnonzero(place[_SHAPE:] >= 0)
     together = 4  # rows that are added to a block at once: speed
-    arms = np.empty((chain.chain.shape[1], 3), dtype)
+    arms = np.empty((points.chain.shape[1], 3), dtype)
     by_shape = np.empty(len(place) - _SHAPE, dtype)
     weights, weighted = np.empty(together, dtype), np.empty(1, dtype)
     limbs_count, size = len(starts) - 1, len(place) + len(place_u)
@@ -314,7 +314,7 @@ def add_equations(chain, limbs, given, frames, equations, rest_gradient, tables)
                     continue
                 row = rows[filled]
                 n = normal[t, i, 0], normal[t, i, 1], normal[t, i, 2]
-                along = _fill_row(row, local, shape, chain, b, i, n, arms, by_shape)
+                along = _fill_row(row, local, shape, points, b, i, n, arms, by_shape)
                 if local_u[g] >= 0:
                     row[local_u[g]] = thickness[g]
                 e = target[t, i] - along - thickness[g]
@@ -323,7 +323,7 @@ def add_equations(chain, limbs, given, frames, equations, rest_gradient, tables)
                 for q in range(m):
                     sample_gradient[q] -= weighted[0] * row[q]
                 if len(rest_gradient):
-                    back = turned_back(chain, b, i, n)
+                    back = turned_back(points, b, i, n)
                     for d in range(3):
                         rest_gradient[b, i, d] -= weighted[0] * back[d]
                     add_to_row(row, local, of_limb, back, tables[i], equations.by_pose[b])

@@ -111,7 +111,7 @@ def _project(px, py, pz, lens):
 
 
 @numba.njit(cache=True, nogil=True)
-def evaluate_keypoint(given, t, k, p, derivatives, gradient, matrix):
+def evaluate_keypoint(data, t, k, p, derivatives, gradient, matrix):
     """Return the cost of keypoint k of frame t at point p (3,), master frame, metres.
 
     With ``derivatives``, write gradient (3,) and Gauss-Newton matrix (3,3) by the point.
@@ -119,28 +119,28 @@ def evaluate_keypoint(given, t, k, p, derivatives, gradient, matrix):
     cost = 0.0
     gradient[:] = 0
     matrix[:] = 0
-    square = given.scale * given.scale
+    square = data.scale * data.scale
     j = np.empty((2, 3))
-    views = given.confidence.shape[1] if len(given.confidence) else 0
+    views = data.confidence.shape[1] if len(data.confidence) else 0
     for c in range(views):
-        confidence = given.confidence[t, c, k]
+        confidence = data.confidence[t, c, k]
         if not confidence > 0:
             continue
         x, y, z = p
-        if len(given.shift):
-            x += given.shift[t, c, k, 0]
-            y += given.shift[t, c, k, 1]
-            z += given.shift[t, c, k, 2]
-        m = given.colour_from_master[c]
+        if len(data.shift):
+            x += data.shift[t, c, k, 0]
+            y += data.shift[t, c, k, 1]
+            z += data.shift[t, c, k, 2]
+        m = data.colour_from_master[c]
         u, v, ux, uy, uz, vx, vy, vz = _project(
             m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3],
             m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3],
             m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3],
-            given.lenses[c],
+            data.lenses[c],
         )
-        sharp = 1.0 / given.sigma[t, c, k]
-        ru = (u - given.observed[t, c, k, 0]) * sharp
-        rv = (v - given.observed[t, c, k, 1]) * sharp
+        sharp = 1.0 / data.sigma[t, c, k]
+        ru = (u - data.observed[t, c, k, 0]) * sharp
+        rv = (v - data.observed[t, c, k, 1]) * sharp
         squared = ru * ru + rv * rv
         share = square / (squared + square)
         cost += 0.5 * confidence * share * squared
@@ -154,15 +154,15 @@ def evaluate_keypoint(given, t, k, p, derivatives, gradient, matrix):
             gradient[i] += weight * (j[0, i] * ru + j[1, i] * rv)
             for o in range(3):
                 matrix[i, o] += weight * (j[0, i] * j[0, o] + j[1, i] * j[1, o])
-    if len(given.targets) and given.targets_confidence[t, k] > 0:
-        sharp = 1.0 / given.targets_sigma
-        r0 = (p[0] - given.targets[t, k, 0]) * sharp
-        r1 = (p[1] - given.targets[t, k, 1]) * sharp
-        r2 = (p[2] - given.targets[t, k, 2]) * sharp
+    if len(data.targets) and data.targets_confidence[t, k] > 0:
+        sharp = 1.0 / data.targets_sigma
+        r0 = (p[0] - data.targets[t, k, 0]) * sharp
+        r1 = (p[1] - data.targets[t, k, 1]) * sharp
+        r2 = (p[2] - data.targets[t, k, 2]) * sharp
         squared = r0 * r0 + r1 * r1 + r2 * r2
         share = square / (squared + square)
-        cost += 0.5 * given.targets_confidence[t, k] * share * squared
-        weight = given.targets_confidence[t, k] * share * share * sharp
+        cost += 0.5 * data.targets_confidence[t, k] * share * squared
+        weight = data.targets_confidence[t, k] * share * share * sharp
         gradient[0] += weight * r0
         gradient[1] += weight * r1
         gradient[2] += weight * r2
@@ -194,14 +194,14 @@ def _point(skeleton, pieces, rest, b, k):
 
 
 @numba.njit(cache=True, nogil=True)
-def add_cost(skeleton, pieces, rest, observed, frames, cost):
+def add_cost(skeleton, pieces, rest, data, frames, cost):
     """Add E_J to cost (B,) of the frames (B,); rest (B,E,3): pieces at rest."""
     gradient, matrix = np.empty(3), np.empty((3, 3))
     for b in range(len(frames)):
         total = 0.0
         for k in range(len(pieces.carrier)):
             p = _point(skeleton, pieces, rest, b, k)
-            total += evaluate_keypoint(observed, frames[b], k, p, False, gradient, matrix)
+            total += evaluate_keypoint(data, frames[b], k, p, False, gradient, matrix)
         cost[b] += total
 
 
@@ -306,7 +306,7 @@ def _add_offset(turn, by_keypoint, matrix, weighted, to, first, gradient, hessia
 
 
 @numba.njit(cache=True, nogil=True)
-def add_equations(skeleton, pieces, rest, observed, frames, equations, rest_gradient):
+def add_equations(skeleton, pieces, rest, data, frames, equations, rest_gradient):
     """Add the normal equations of E_J to those of the frames (B,).
 
     rest (B,E,3): pieces at rest.
@@ -336,7 +336,7 @@ def add_equations(skeleton, pieces, rest, observed, frames, equations, rest_grad
             for at in range(pieces.limb_starts[limb], pieces.limb_starts[limb + 1]):
                 k = pieces.order[at]
                 p = _point(skeleton, pieces, rest, b, k)
-                cost[b] += evaluate_keypoint(observed, frames[b], k, p, True, by_keypoint, matrix)
+                cost[b] += evaluate_keypoint(data, frames[b], k, p, True, by_keypoint, matrix)
                 if matrix[0, 0] + matrix[1, 1] + matrix[2, 2] == 0:
                     continue
                 _fill_rows(skeleton, pieces, rest, b, k, local, shape, rows, moved)

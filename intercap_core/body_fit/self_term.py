@@ -166,7 +166,7 @@ class CompiledSelfPenetration:
             return flags
 
         def posed(batch: Batch) -> PosedPoints:
-            return batch.skeleton.chain(source.selection, rest.points[batch.at])
+            return batch.skeleton.with_points(source.selection, rest.points[batch.at])
 
         return CompiledTerm(
             rest,
@@ -179,28 +179,28 @@ class CompiledSelfPenetration:
 
 
 @numba.njit(cache=True, nogil=True)
-def _depth(chain, pairs, b, at):
+def _depth(points, pairs, b, at):
     """Return the depth of pair ``at`` beyond the tolerance, metres; <= 0 = no contact."""
     n = pairs.normal[at]
-    outer = project_on_direction(chain, b, pairs.outer[at], n)
-    return outer - project_on_direction(chain, b, pairs.inner[at], n) - SELF_TOLERANCE_M
+    outer = project_on_direction(points, b, pairs.outer[at], n)
+    return outer - project_on_direction(points, b, pairs.inner[at], n) - SELF_TOLERANCE_M
 
 
 @numba.njit(cache=True, nogil=True)
-def add_cost(chain, pairs, frames, cost):
+def add_cost(points, pairs, frames, cost):
     """Add E_P_self to cost (B,) of the frames (B,)."""
     square = _REACH_M * _REACH_M
     for b in range(len(frames)):
         total = 0.0
         for at in range(pairs.starts[frames[b]], pairs.starts[frames[b] + 1]):
-            depth = _depth(chain, pairs, b, at)
+            depth = _depth(points, pairs, b, at)
             if depth > 0:
                 total += depth * depth * square / (depth * depth + square)
         cost[b] += 0.5 * pairs.weight * total
 
 
 @numba.njit(cache=True, nogil=True)
-def add_equations(chain, pairs, frames, equations, rest_gradient):
+def add_equations(points, pairs, frames, equations, rest_gradient):
     """Add the normal equations of E_P_self to those of the frames (B,).
 
     equations: :class:`.term_inputs.BatchEquations`, filled in place.
@@ -211,7 +211,7 @@ def add_equations(chain, pairs, frames, equations, rest_gradient):
     gradient, hessian = equations.gradient, equations.hessian
     shape = np.flatnonzero(place[_SHAPE:] >= 0)
     columns = place[place >= 0]
-    scratch = np.empty((chain.chain.shape[1], 3), hessian.dtype)
+    scratch = np.empty((points.chain.shape[1], 3), hessian.dtype)
     one = np.ones(1, hessian.dtype)[0]
     square = _REACH_M * _REACH_M
     for b in range(len(frames)):
@@ -220,13 +220,13 @@ def add_equations(chain, pairs, frames, equations, rest_gradient):
         root = np.zeros(end - first, hessian.dtype)
         count = 0
         for at in range(first, end):
-            depth = _depth(chain, pairs, b, at)
+            depth = _depth(points, pairs, b, at)
             if depth <= 0:
                 continue
             row, n = rows[count], pairs.normal[at]
             # d depth / d parameters = -n . (dp - dq)
-            add_point(row, place, shape, chain, b, pairs.outer[at], one, n, scratch)
-            add_point(row, place, shape, chain, b, pairs.inner[at], -one, n, scratch)
+            add_point(row, place, shape, points, b, pairs.outer[at], one, n, scratch)
+            add_point(row, place, shape, points, b, pairs.inner[at], -one, n, scratch)
             share = square / (depth * depth + square)
             cost[b] += 0.5 * pairs.weight * share * depth * depth
             weight = pairs.weight * share * share
@@ -234,7 +234,7 @@ def add_equations(chain, pairs, frames, equations, rest_gradient):
                 gradient[b, q] += weight * depth * row[q]
             if len(rest_gradient):
                 outer, inner = pairs.outer[at], pairs.inner[at]
-                o, p = turned_back(chain, b, outer, n), turned_back(chain, b, inner, n)
+                o, p = turned_back(points, b, outer, n), turned_back(points, b, inner, n)
                 for d in range(3):
                     rest_gradient[b, outer, d] += weight * depth * o[d]
                     rest_gradient[b, inner, d] -= weight * depth * p[d]
