@@ -67,7 +67,7 @@ class Definition:
         if wrong or len(rows) - 1 != len(POINTS):
             raise UserError(
                 f"{path}: {len(rows) - 1} points, expected each of the {len(POINTS)} of the body "
-                f"once ({quoted(wrong) if wrong else 'one is there twice'}); write it again by "
+                f"once ({quoted(wrong) if wrong else 'a point is repeated'}); write it again by "
                 "'intercap keypoint-definition'"
             )
         values = 1e-3 * np.array([by_point[name] for name in POINTS])

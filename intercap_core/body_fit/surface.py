@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from intercap_core.body.joints import JOINT_INDEX, JOINT_NAMES
+from intercap_core.body.keypoints import FACE
 from intercap_core.body.kinematics import vertex_normals
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
@@ -118,8 +119,8 @@ def _covering(joint: int, names: list[str]) -> int:
 
 
 def _flag_face(template: np.ndarray, joint: np.ndarray, model: BodyModel) -> np.ndarray:
-    """Flag the front of the head below the brows: the box of the face landmarks, seen from z."""
-    landmarks = template[model.keypoint_map.ids[67:118].reshape(-1)]
+    """Flag the front of the head in the box of the face landmarks, from the brows down."""
+    landmarks = template[model.keypoint_map.ids[FACE].reshape(-1)]
     low, high = landmarks.min(0), landmarks.max(0)
     inside = (template[:, :2] > low[:2] - 0.01) & (template[:, :2] < high[:2] + 0.01)
     on_head = np.isin(joint, [JOINT_INDEX["head"], JOINT_INDEX["jaw"]])

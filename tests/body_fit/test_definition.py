@@ -38,7 +38,7 @@ def test_without_a_table_offsets_are_zero() -> None:
     [
         (lambda text: text.replace("x_mm", "x"), "columns are"),
         (lambda text: text.replace(POINTS[3] + "\t", "shin\t"), "shin"),
-        (lambda text: text + text.splitlines()[2] + "\n", "one is there twice"),
+        (lambda text: text + text.splitlines()[2] + "\n", "a point is repeated"),
         (lambda text: text.replace(POINTS[0] + "\t", POINTS[0] + "\tfar"), "three offsets"),
         (lambda text: text.replace("\t4.0\n", "\t0.0\n"), "deviation above 0"),
         (lambda text: text.replace("\t4.0\n", "\tnan\n"), "deviation above 0"),
