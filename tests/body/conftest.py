@@ -26,13 +26,6 @@ def open_arrays() -> dict[str, np.ndarray]:
     return dict(_read_open_body())
 
 
-def save_body(path: Path, arrays: dict[str, np.ndarray]) -> Path:
-    """Write the file with the open body's maps next to it."""
-    np.savez(path, **arrays)
-    maps_path(path).write_text(maps_path(OPEN_BODY).read_text())
-    return path
-
-
 @pytest.fixture(scope="session")
 def full_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A file as the licensed ones: 300 + 100 directions, pose blend shapes, a pickled dictionary.
@@ -50,7 +43,10 @@ def full_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
         **{f"hands_mean{s}": 0.3 * rng.standard_normal(45, dtype=np.float32) for s in "lr"},
         "joint2num": np.array({name: i for i, name in enumerate(JOINT_NAMES)}),
     }
-    return save_body(tmp_path_factory.mktemp("body") / "SMPLX_NEUTRAL.npz", arrays)
+    path = tmp_path_factory.mktemp("body") / "SMPLX_NEUTRAL.npz"
+    np.savez(path, **arrays)
+    maps_path(path).write_text(maps_path(OPEN_BODY).read_text())
+    return path
 
 
 def random_vector(batch: int, size: int, seed: int, dtype: torch.dtype) -> torch.Tensor:
