@@ -18,8 +18,8 @@ from intercap_core.formats.detections.read import Detections
 from intercap_core.output.viewer.page import payload
 from intercap_core.person.left_right import excess_build_cost
 from intercap_core.person.sides import ARMS, LEGS, images_with_stated_sides, swap_sides
+from intercap_core.person.subject import subject_keypoints
 from intercap_core.schemas import BODY_FIT, JOINT, PERSON, SCENE
-from intercap_core.stages.person import subject_keypoints
 
 POINTS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle", "big_toe")  # of each side
 BONES = ((0, 1), (1, 2), (3, 4), (4, 5), (5, 6))

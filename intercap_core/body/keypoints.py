@@ -49,6 +49,7 @@ KEYPOINT_NAMES: tuple[str, ...] = (
     *(f"face_{i}" for i in range(17)),
 )
 NUM_KEYPOINTS = len(KEYPOINT_NAMES)
+KEYPOINT_INDEX = {name: index for index, name in enumerate(KEYPOINT_NAMES)}
 BODY, LEFT_HAND, RIGHT_HAND = slice(0, 25), slice(25, 46), slice(46, 67)  # order of OpenPose
 FACE, CONTOUR = slice(67, 118), slice(118, 135)  # order of SMPL-X's landmarks
 

@@ -27,7 +27,6 @@ MIN_COMMON_POINTS = 5  # body points that two detections must share; tuned on th
 SAME_PERSON_PX_AT_1080P = 60.0
 SAME_PERSON_GAP_M = 0.12  # median distance of two views' rays; tuned on the studio
 
-
 NOBODY = -1
 
 _MIRRORED = PARTNER[BODY_POINTS]  # the body's points with left and right exchanged
@@ -68,10 +67,14 @@ class PersonGroup:
 def group_set(people: list[np.ndarray], rig: Rig, min_confidence: float) -> list[PersonGroup]:
     """Group one set's people (P, 25, 3) of each view; best supported first."""
     rays, seen = [], []
-    for c, found in enumerate(people):
-        directions = rig[c].colour.unproject(found[..., :2]) if len(found) else np.zeros((0, 25, 3))
+    for c, detections in enumerate(people):
+        directions = (
+            rig[c].colour.unproject(detections[..., :2])
+            if len(detections)
+            else np.zeros((0, 25, 3))
+        )
         rays.append(directions @ rig[c].master_from_colour[:3, :3].T)
-        seen.append(found[..., 2] >= min_confidence)
+        seen.append(detections[..., 2] >= min_confidence)
     pairs, rest = view_pairs(rig)
     proposals = _pair_proposals(pairs, rays, seen, rig) or _pair_proposals(rest, rays, seen, rig)
     grown: list[PersonGroup] = []
@@ -111,8 +114,8 @@ def _with_another(groups: list[PersonGroup], group: PersonGroup) -> list[PersonG
 def lifted_groups(t: int, people: list[np.ndarray], lift: Lift) -> list[PersonGroup]:
     """Every person (P, 25, 3) of each view as a group of its own; best supported first."""
     result = []
-    for c, found in enumerate(people):
-        for i, points in enumerate(lift(t, c, found) if len(found) else ()):
+    for c, detections in enumerate(people):
+        for i, points in enumerate(lift(t, c, detections) if len(detections) else ()):
             count = int(np.isfinite(points[:, 0]).sum())
             if count >= MIN_COMMON_POINTS:
                 members = np.full(len(people), NOBODY, np.int32)
@@ -149,11 +152,6 @@ def _pair_proposals(
     return result
 
 
-def _mirror(body: np.ndarray) -> np.ndarray:
-    """Exchange left and right of body points (25, n)."""
-    return body[_MIRRORED]
-
-
 def _grow(
     points: np.ndarray,
     first: tuple[int, int],
@@ -187,10 +185,7 @@ def distance_to(
 ) -> tuple[float, int]:
     """Median distance, px, of reprojected points (25, 2) to a person, sides exchanged if better."""
     best, count = np.inf, 0
-    for candidate, visible in (
-        (person, seen),
-        (_mirror(person), _mirror(seen[:, None])[:, 0]),
-    ):
+    for candidate, visible in ((person, seen), (person[_MIRRORED], seen[_MIRRORED])):
         common = known & visible
         if common.sum() >= MIN_COMMON_POINTS:
             error = float(np.median(np.linalg.norm(pixels - candidate[:, :2], axis=-1)[common]))

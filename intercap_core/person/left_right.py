@@ -20,7 +20,7 @@ from itertools import combinations, product
 
 import numpy as np
 
-from intercap_core.body.keypoints import KEYPOINT_NAMES
+from intercap_core.body.keypoints import KEYPOINT_INDEX
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.triangulation import midpoints, rays_of
 from intercap_core.geometry.solve.time_series import cheapest_sequence
@@ -39,13 +39,6 @@ from intercap_core.person.sides import (
 # point by up to the breadth of the body, or of the face. Tuned on the studio.
 SIDE_GAPS_M = (0.12, 0.12, 0.05, 0.12)
 EXCHANGED_VIEW_COST = 0.5  # of each exchanged view, above the gain by noise; tuned on the studio
-# Negative log likelihoods of an impossible build, tuned on the studio. Knees and ankles are
-# certain, a turned head and a twisted back (each up to some 80 degrees) less so.
-HINGE_COST = 8.0
-HEAD_COST = 6.0
-TWIST_COST = 6.0
-NOSE_COST = 3.0
-DETECTED_COST = 3.0  # of contradicting the detector in all views: -log(1/20); tuned on the studio
 CHANGE_COST = 1.0  # of a limb's sides changing from set to set; tuned on the studio
 
 
@@ -74,10 +67,8 @@ def make_views_agree(keypoints: np.ndarray, rig: Rig, *, min_confidence: float) 
                 _cost(
                     rays[a][:, limb],
                     rays[b][:, side],
-                    weight[:, a, limb],
-                    weight[:, b, side],
-                    centres[a],
-                    centres[b],
+                    centres[[a, b]],
+                    weight[:, a, limb] * weight[:, b, side],
                     gap,
                 )
                 for side in (limb, PARTNER[limb])
@@ -105,23 +96,16 @@ def make_views_agree(keypoints: np.ndarray, rig: Rig, *, min_confidence: float) 
 
 
 def _cost(
-    first: np.ndarray,
-    second: np.ndarray,
-    first_weight: np.ndarray,
-    second_weight: np.ndarray,
-    from_first: np.ndarray,
-    from_second: np.ndarray,
-    limit: float,
+    first: np.ndarray, second: np.ndarray, centres: np.ndarray, weight: np.ndarray, limit: float
 ) -> np.ndarray:
-    """Truncated squared gaps (T,) of rays (T, n, 3) of two views, weighted by both (T, n)."""
-    _, gap = midpoints(first, second, from_first, from_second)
+    """Truncated squared gaps (T,) of rays (T, n, 3) from two ``centres`` (2, 3), by ``weight``
+    (T, n)."""
+    _, gap = midpoints(first, second, *centres)
     square = np.minimum(np.nan_to_num(gap, nan=limit) / limit, 1.0) ** 2
-    weight = first_weight * second_weight
     # relative to the cost of an unknown gap; tuned on the studio
     return (weight * (square - 0.25)).sum(1)
 
 
-_AT = {name: index for index, name in enumerate(KEYPOINT_NAMES)}
 _LIMBS = (ARMS, LEGS, HEAD)
 _STATES = np.array(list(product((False, True), repeat=len(_LIMBS))))
 
@@ -155,22 +139,31 @@ def excess_build_cost(points: np.ndarray) -> np.ndarray:
 
 
 def _detected(points: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Cost (T, 8) of contradicting the detector, by the share of views."""
+    """Cost (T, 8) of contradicting the detector, by the share of views.
+
+    In all views it is 3 = -log(1/20); tuned on the studio.
+    """
     known = np.stack([np.isfinite(points[:, limb, 0]).any(1) for limb in _LIMBS], 1)
     wrong = np.where(_STATES, 1 - share[:, None], share[:, None])
-    return DETECTED_COST * np.where(known[:, None], wrong, 0).sum(2)
+    return 3.0 * np.where(known[:, None], wrong, 0).sum(2)
 
 
 def _build(points: np.ndarray) -> np.ndarray:
-    """Cost (T, 8) of anatomically impossible bodies, for each way of exchanging limbs."""
+    """Cost (T, 8) of anatomically impossible bodies, for each way of exchanging limbs.
+
+    The factors are negative log likelihoods, tuned on the studio. Knees and ankles are certain, a
+    turned head and a twisted back (each up to some 80 degrees) less so.
+    """
 
     def between(start: str, end: str) -> np.ndarray:
-        return points[:, _AT[end]] - points[:, _AT[start]]
+        return points[:, KEYPOINT_INDEX[end]] - points[:, KEYPOINT_INDEX[start]]
 
     hips, shoulders = between("right_hip", "left_hip"), between("right_shoulder", "left_shoulder")
     ears = between("right_ear", "left_ear")
     up = between("mid_hip", "neck")
-    nose = points[:, _AT["nose"]] - points[:, [_AT["left_ear"], _AT["right_ear"]]].mean(1)
+    nose = points[:, KEYPOINT_INDEX["nose"]] - points[
+        :, [KEYPOINT_INDEX["left_ear"], KEYPOINT_INDEX["right_ear"]]
+    ].mean(1)
     # knee and ankle turn about the line of the hips
     hinges = np.zeros(len(points))
     for side in ("left", "right"):
@@ -186,10 +179,10 @@ def _build(points: np.ndarray) -> np.ndarray:
     head = _cosine(np.cross(_unit(up), _unit(nose)), ears)
     arms, legs, turned = np.where(_STATES, -1.0, 1.0).T
     return (
-        HINGE_COST * np.maximum(0, -legs * hinges[:, None])
-        + TWIST_COST * np.maximum(0, -arms * legs * twist[:, None])
-        + NOSE_COST * np.maximum(0, -arms * looks[:, None])
-        + HEAD_COST * np.maximum(0, -turned * head[:, None])
+        8.0 * np.maximum(0, -legs * hinges[:, None])
+        + 6.0 * np.maximum(0, -arms * legs * twist[:, None])
+        + 3.0 * np.maximum(0, -arms * looks[:, None])
+        + 6.0 * np.maximum(0, -turned * head[:, None])
     )
 
 
@@ -221,8 +214,8 @@ def _motion(before: np.ndarray, now: np.ndarray) -> float:
 
 def _other_hands(points: np.ndarray) -> np.ndarray:
     """Mask (T,) of sets whose hands are at the wrists of the other side."""
-    wrists = points[:, [_AT["left_wrist"], _AT["right_wrist"]]]
-    roots = points[:, [_AT["left_hand_wrist"], _AT["right_hand_wrist"]]]
+    wrists = points[:, [KEYPOINT_INDEX["left_wrist"], KEYPOINT_INDEX["right_wrist"]]]
+    roots = points[:, [KEYPOINT_INDEX["left_hand_wrist"], KEYPOINT_INDEX["right_hand_wrist"]]]
     own = np.linalg.norm(wrists - roots, axis=2)
     other = np.linalg.norm(wrists - roots[:, ::-1], axis=2)
     both = np.isfinite(own) & np.isfinite(other)

@@ -24,10 +24,7 @@ from intercap_core.geometry.camera.triangulation import Triangulation
 from intercap_core.person.groups import NOBODY
 from intercap_core.person.sides import ARMS, BODY_POINTS, LEGS
 
-KEYPOINT_REACH_M = 0.03  # half side of the window for depth samples, across the ray; tuned
 MIN_DEPTH_SAMPLES = 4  # depth pixels; tuned on the studio
-SURFACE_M = 0.05  # samples farther behind the nearest are another surface; tuned on the studio
-AT_BACKGROUND_MM = 40  # distance to the background within which a pixel shows it; tuned
 # Depth of a keypoint below the skin, metres: measured on the open body, standing, as the median
 # over all horizontal directions. Keypoints without an entry lie on the skin.
 INSET_M = {
@@ -40,21 +37,9 @@ INSET_M = {
     "knee": 0.059,
     "ankle": 0.040,
 }
-# Distance of shoulders, and of hips, metres, below which one occludes the other: half of an adult's
-# breadth (anatomy).
-OCCLUDED_BREADTH_M = (0.18, 0.09)
-BODY_DEPTH_M = 0.25  # largest distance of a static part from the body along the ray; tuned
-
-
-def _insets() -> np.ndarray:
-    """(135,) metres."""
-    parts = [name.removeprefix("left_").removeprefix("right_") for name in KEYPOINT_NAMES]
-    inset = np.array([INSET_M.get(part, 0.0) for part in parts])
-    inset[LEFT_HAND] = inset[RIGHT_HAND] = 0.008  # half a finger
-    return inset
-
-
-INSETS_M = _insets()
+_PARTS = [name.removeprefix("left_").removeprefix("right_") for name in KEYPOINT_NAMES]
+INSETS_M = np.array([INSET_M.get(part, 0.0) for part in _PARTS])  # (135,) metres
+INSETS_M[LEFT_HAND] = INSETS_M[RIGHT_HAND] = 0.008  # half a finger (anatomy)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +73,7 @@ class DepthRelief:
         room = np.zeros(len(index), bool)
         if background is not None:
             behind, here = background.ravel()[index].astype(int), depth.ravel()[index].astype(int)
-            room = (behind > 0) & (here > behind - AT_BACKGROUND_MM)
+            room = (behind > 0) & (here > behind - 40)  # mm; tuned on the studio
         if bias_m:
             points = points * (1 - np.float32(bias_m) / points[:, 2:])
         assert camera.colour_from_depth is not None
@@ -114,24 +99,26 @@ class DepthRelief:
         wanted = np.flatnonzero(seen & np.isfinite(rays).all(1))
         if not len(wanted) or not len(self.distance):
             return result
-        reach = self.camera.colour.fx * KEYPOINT_REACH_M / self.distance
+        reach = self.camera.colour.fx * 0.03 / self.distance  # 3 cm; tuned on the studio
         around = self._tree.query_ball_point(pixels[wanted], reach.max(), p=np.inf)
         for k, near in zip(wanted, around, strict=True):
             away = np.abs(self.pixels[near] - pixels[k]).max(1)
             around_it = np.asarray(near, int)[away < reach[near]]
             before = around_it[~self.room[around_it]]
             of_room[k] = len(before) < MIN_DEPTH_SAMPLES
-            found = self.distance[around_it if of_room[k] else before]
-            if len(found) < MIN_DEPTH_SAMPLES:
+            distances = self.distance[around_it if of_room[k] else before]
+            if len(distances) < MIN_DEPTH_SAMPLES:
                 continue
-            nearest = np.quantile(found, 0.2)  # closer samples may be flying pixels
-            surface = np.median(found[found < nearest + SURFACE_M])
+            nearest = np.quantile(distances, 0.2)  # closer samples may be flying pixels
+            surface = np.median(
+                distances[distances < nearest + 0.05]
+            )  # metres; tuned on the studio
             result[k] = rays[k] * (surface + inset_m[k])
         away = np.linalg.norm(result, axis=1)
         body = np.isfinite(away) & ~of_room
         if body.sum() >= 6:
             apart = np.abs(away - np.median(away[body]))
-            result[of_room & ~(apart < BODY_DEPTH_M)] = np.nan
+            result[of_room & ~(apart < 0.25)] = np.nan  # metres along the ray; tuned
         return apply(self.camera.master_from_colour, result)
 
     @cached_property
@@ -170,7 +157,9 @@ class Lifter:
             [relief.lift(body[:, :2], s, inset) for body, s in zip(people, seen, strict=True)]
         )
 
-    def fill(self, person: np.ndarray, keypoints: np.ndarray, found: Triangulation) -> np.ndarray:
+    def fill(
+        self, person: np.ndarray, keypoints: np.ndarray, triangulation: Triangulation
+    ) -> np.ndarray:
         """Lift missing points of sets with few triangulated ones, in place.
 
         Each set uses the view that gives most points, which becomes their only inlier.
@@ -178,14 +167,14 @@ class Lifter:
         Args:
             person: (T, C) the subject's detections.
             keypoints: (T, C, 135, 3) of the subject.
-            found: triangulation of T * 135 points.
+            triangulation: triangulation of T * 135 points.
 
         Returns:
             (T,) bool, sets with lifted points.
         """
         sets, views = person.shape
-        points = found.points.reshape(sets, -1, 3)
-        inlier = found.inlier.reshape(sets, -1, views)
+        points = triangulation.points.reshape(sets, -1, 3)
+        inlier = triangulation.inlier.reshape(sets, -1, views)
         triangulated = np.isfinite(points[:, BODY_POINTS, 0]).sum(1)
         lifted = np.zeros(sets, bool)
         for t in np.flatnonzero(triangulated < 8):
@@ -208,10 +197,11 @@ class Lifter:
 def _hidden_side(points: np.ndarray, confidence: np.ndarray) -> np.ndarray:
     """Mask (135,) of lifted ``points`` (135, 3) that the body itself must occlude.
 
-    If both shoulders or hips coincide, the limb with less confidence is occluded.
+    If the shoulders or the hips are closer than half of an adult's breadth, metres (anatomy), the
+    limb with less confidence is occluded.
     """
     hidden = np.zeros(len(points), bool)
-    for limb, breadth in zip((ARMS, LEGS), OCCLUDED_BREADTH_M, strict=True):
+    for limb, breadth in ((ARMS, 0.18), (LEGS, 0.09)):
         left, right = np.split(limb, 2)
         if np.linalg.norm(points[left[0]] - points[right[0]]) < breadth:
             sure = confidence[left] > confidence[right]

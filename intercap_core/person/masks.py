@@ -11,13 +11,6 @@ from intercap_core.formats.detections.instance import PERSON_LABEL
 from intercap_core.formats.detections.read import Candidate
 from intercap_core.geometry.camera.masks import Runs
 
-SAME_PERSON_SHARE = 0.5  # of a candidate's mask within the subject's: the same person; untuned
-MIN_INSIDE_SHARE = 0.5  # of the subject's points inside the mask; untuned
-LABEL_BONUS = 0.15  # share of points by which a mask with another label must fit better; untuned
-OUTSIDE_COST = 0.5  # share of points, for a mask entirely outside the subject's box; untuned
-BOX_MARGIN = 0.25  # share of the points' box, for hair, soles and clothes; untuned
-
-
 # Points between joints: wrists and ankles lie on a mask's rim, the middle of a limb does not.
 BONES = keypoint_pairs(SKELETON)  # (14, 2) of the 25 body points
 
@@ -27,14 +20,19 @@ def choose_mask(
 ) -> bytes:
     """RLE of the subject's candidate in one image; empty if none fits.
 
-    Raises UserError for a candidate whose RLE does not decode.
+    At least half of the subject's points must lie inside the mask. Of several such candidates, the
+    best contains most points and covers least outside the subject's box. The weights are untuned.
 
     Args:
         points: (25, 2) pixels of the body.
         seen: (25,) bool, usable points.
         where: name of the image, for messages.
+
+    Raises:
+        UserError: the RLE of a candidate does not decode.
     """
-    samples = _samples(points, seen)
+    bones = BONES[seen[BONES].all(1)]
+    samples = np.concatenate([points[seen], points[bones].mean(1)])
     if len(samples) < 4:
         return b""
     x, y = np.rint(samples).astype(np.int64).T
@@ -48,10 +46,10 @@ def choose_mask(
                 "'detections' for this sequence"
             ) from None
         share = float(runs.sample(x, y).mean())
-        if share < MIN_INSIDE_SHARE:
+        if share < 0.5:
             continue
-        score = share - OUTSIDE_COST * _share_outside(runs, samples)
-        score += LABEL_BONUS * (candidate.label == PERSON_LABEL)
+        score = share - 0.5 * _share_outside(runs, samples)
+        score += 0.15 * (candidate.label == PERSON_LABEL)
         if score > best_score:
             best, best_score = candidate.rle, score
     return best
@@ -60,8 +58,8 @@ def choose_mask(
 def merge_other_candidates(candidates: list[Candidate], person: bytes) -> bytes:
     """RLE of the union of all other candidates; empty if there are none.
 
-    Candidates mostly within the ``person``'s mask are the same person or a part, and left out.
-    Their RLEs must be valid, see :func:`choose_mask`.
+    Candidates that lie at least half within the ``person``'s mask are parts of the same person and
+    left out. The RLEs must be valid, see :func:`choose_mask`.
     """
     if not person or not candidates:
         return b""
@@ -76,21 +74,14 @@ def merge_other_candidates(candidates: list[Candidate], person: bytes) -> bytes:
         return b""
     # with iscrowd, the share of the first that lies within the second
     within = coco_mask.iou(others, [mask], [1])[:, 0]
-    apart = [
-        other for other, share in zip(others, within, strict=True) if share < SAME_PERSON_SHARE
-    ]
+    apart = [other for other, share in zip(others, within, strict=True) if share < 0.5]
     return bytes(coco_mask.merge(apart)["counts"]) if apart else b""
-
-
-def _samples(points: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    bones = BONES[seen[BONES].all(1)]
-    return np.concatenate([points[seen], points[bones].mean(1)])
 
 
 def _share_outside(runs: Runs, samples: np.ndarray) -> float:
     """Share of the mask outside the points' box with a margin, read on a coarse grid."""
     low, high = samples.min(0), samples.max(0)
-    margin = BOX_MARGIN * float((high - low).max())
+    margin = 0.25 * float((high - low).max())  # for hair, soles and clothes; untuned
     x0, y0, width, height = runs.box
     if not width or not height:
         return 1.0

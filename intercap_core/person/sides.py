@@ -11,11 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from intercap_core.annotation import ExchangedSides
-from intercap_core.body.keypoints import BODY, KEYPOINT_NAMES, LEFT_HAND, RIGHT_HAND
+from intercap_core.body.keypoints import BODY, KEYPOINT_INDEX, LEFT_HAND, RIGHT_HAND
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.triangulation import Triangulation
-
-_INDEX = {name: index for index, name in enumerate(KEYPOINT_NAMES)}
 
 
 def _partner(name: str) -> str:
@@ -27,11 +25,13 @@ def _partner(name: str) -> str:
 
 # (135,) the keypoint of the other side; itself where it has none (also all of the face, which
 # detectors find as a whole).
-PARTNER = np.array([_INDEX[_partner(name)] for name in KEYPOINT_NAMES])
+PARTNER = np.array([KEYPOINT_INDEX[_partner(name)] for name in KEYPOINT_INDEX])
 
 
 def _both_sides(*names: str) -> np.ndarray:
-    return np.array([_INDEX[f"{side}_{name}"] for side in ("left", "right") for name in names])
+    return np.array(
+        [KEYPOINT_INDEX[f"{side}_{name}"] for side in ("left", "right") for name in names]
+    )
 
 
 ARMS = _both_sides("shoulder", "elbow", "wrist")
@@ -51,12 +51,26 @@ def swap_sides(keypoints: np.ndarray, limb: np.ndarray | None = None) -> np.ndar
 
 
 def exchange_points(values: np.ndarray, which: np.ndarray) -> np.ndarray:
-    """Values (T, 135, ...) with the limbs that ``which`` (T, 4) names exchanged."""
+    """Values (T, 135, ...) with left and right exchanged for the limbs ``which`` (T, 4) bool."""
     result = values.copy()
     for limb, at in zip(LIMBS, which.T, strict=True):
         rows = np.flatnonzero(at)[:, None]
         result[rows, limb] = values[rows, PARTNER[limb]]
     return result
+
+
+def exchange_everywhere(
+    keypoints: np.ndarray, points: Triangulation, which: np.ndarray
+) -> tuple[np.ndarray, Triangulation]:
+    """Exchange left and right of the limbs ``which`` (T, 4) bool in all views and in the points.
+
+    ``keypoints``: (T, C, 135, n). ``points``: triangulation of T * 135 points.
+    """
+    keypoints = np.swapaxes(exchange_points(np.swapaxes(keypoints, 1, 2), which), 1, 2)
+    parts = (points.points, points.inlier, points.error, points.view_error)
+    by_set = (part.reshape(len(which), -1, *part.shape[1:]) for part in parts)
+    exchanged = (exchange_points(part, which) for part in by_set)
+    return keypoints, Triangulation(*(part.reshape(-1, *part.shape[2:]) for part in exchanged))
 
 
 def exchange_limb(keypoints: np.ndarray, t: np.ndarray, c: np.ndarray, limb: np.ndarray) -> None:
@@ -70,13 +84,14 @@ def images_with_stated_sides(
 ) -> np.ndarray:
     """Mask (T, C) of the images in which the user states that left and right are exchanged.
 
-    Raises UserError for an unknown camera.
-
     Args:
         names: camera names.
         image_of: (T, C) frame whose image shows each moment.
+
+    Raises:
+        UserError: the statement names an unknown camera.
     """
-    found = np.zeros(image_of.shape, bool)
+    result = np.zeros(image_of.shape, bool)
     for number, sides in enumerate(stated):
         if sides.camera is not None and sides.camera not in names:
             raise UserError(
@@ -84,8 +99,8 @@ def images_with_stated_sides(
                 f"{sides.camera!r}; the recording has {', '.join(names)}"
             )
         cameras = [sides.camera is None or name == sides.camera for name in names]
-        found |= (image_of >= sides.start) & (image_of < sides.end) & np.array(cameras)
-    return found
+        result |= (image_of >= sides.start) & (image_of < sides.end) & np.array(cameras)
+    return result
 
 
 def exchange_stated(keypoints: np.ndarray, stated: np.ndarray) -> np.ndarray:
@@ -107,20 +122,10 @@ def hold_sides(
         given: (T, C, 135, 3) keypoints with the stated sides.
         stated: (T, C) bool, images with stated sides.
     """
-    count = len(keypoints)
-    wrong = np.zeros((count, len(LIMBS)), bool)
+    wrong = np.zeros((len(keypoints), len(LIMBS)), bool)
     for number, limb in enumerate(LIMBS):
         own, other = keypoints[:, :, limb], swap_sides(given)[:, :, limb]
         same = (own == given[:, :, limb]).all((2, 3))
         exchanged = (own == other).all((2, 3))
         wrong[:, number] = (stated & exchanged & ~same).sum(1) > (stated & same & ~exchanged).sum(1)
-    if not wrong.any():
-        return keypoints, points
-    keypoints = np.swapaxes(exchange_points(np.swapaxes(keypoints, 1, 2), wrong), 1, 2)
-    parts = (points.points, points.inlier, points.error, points.view_error)
-    return keypoints, Triangulation(
-        *(
-            exchange_points(part.reshape(count, -1, *part.shape[1:]), wrong).reshape(part.shape)
-            for part in parts
-        )
-    )
+    return exchange_everywhere(keypoints, points, wrong) if wrong.any() else (keypoints, points)

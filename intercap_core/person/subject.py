@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import PeopleOfImages
 from intercap_core.geometry.camera.rig import Rig, ring_centre
@@ -34,11 +35,8 @@ from intercap_core.person.tracks import (
     link_groups,
 )
 
-CENTRE_RANGE_M = 1.5  # distance from the ring's centre at which support is halved; tuned
 HANDLING_WEIGHT = 4.0  # additional support of the person who touches the object most; untuned
-LEAST_HANDLING = 0.05  # share of the images with contact, from which it is evidence; untuned
 RIVAL_SHARE = 0.5  # of the subject's support, from which another person is reported; untuned
-
 
 Touches = Callable[[int, int, int], bool | None]
 """Whether person i of view c in set t touches the object, called with t, c and i; None = the object
@@ -85,31 +83,41 @@ def find_subject(
 ) -> SubjectDetections:
     """Find the subject in every image; nobody if nobody can be located in any set.
 
-    Raises UserError if the user names two people who are seen at the same time.
-
     Args:
         times: (T,) seconds.
         lift: locates people of single views in sets in which no two views agree on anybody.
         touches: contact with the object.
         named: detections named by the user.
+
+    Raises:
+        UserError: the user names two people who are seen at the same time.
     """
     groups = []
     for t in range(detections.num_sets):
         seen = [detections.people(t, c)[:, BODY_POINTS] for c in range(len(rig))]
-        found = group_set(seen, rig, min_confidence)
-        if not found and lift is not None:
-            found = lifted_groups(t, seen, lift)
-        groups.append(found)
+        people_here = group_set(seen, rig, min_confidence)
+        if not people_here and lift is not None:
+            people_here = lifted_groups(t, seen, lift)
+        groups.append(people_here)
     tracks = link_groups(groups, times)
     people = np.full((detections.num_sets, len(rig)), NOBODY, np.int32)
     chosen, by, doubts = _chosen(tracks, times, ring_centre(rig), touches, named)
     for t, group in zip(chosen.sets, chosen.groups, strict=True):
         people[t] = group.members
     _add_single_views(people, chosen, groups, detections, rig, times, min_confidence)
-    _add_named(people, named)
-    counts = np.array([len(found) for found in groups], np.int32)
+    for detection in named:
+        people[detection.t, detection.c] = detection.index
+    counts = np.array([len(people_here) for people_here in groups], np.int32)
     others = counts - np.isin(np.arange(len(counts)), chosen.sets)
     return SubjectDetections(people, others, by, tuple(doubts))
+
+
+def subject_keypoints(detections: PeopleOfImages, people: np.ndarray) -> np.ndarray:
+    """Keypoints (T, C, 135, 3) of the detections ``people`` (T, C); 0 for index -1."""
+    result = np.zeros((*people.shape, NUM_KEYPOINTS, 3))
+    for t, c in np.argwhere(people != NOBODY).tolist():
+        result[t, c] = detections.people(t, c)[people[t, c]]
+    return result
 
 
 def _chosen(
@@ -134,7 +142,7 @@ def _chosen(
     if len(likely) > 1:
         handling = {k: _handling(people[k].whole, touches) if touches else 0.0 for k in likely}
         most = max(handling.values())
-        by = "handling" if most >= LEAST_HANDLING else "middle"
+        by = "handling" if most >= 0.05 else "middle"  # share of the images; untuned
         if by == "handling":
             likely = {
                 k: score * (1 + HANDLING_WEIGHT * handling[k] / most) for k, score in likely.items()
@@ -149,48 +157,42 @@ def _chosen(
 def _of_named(
     tracks: list[PersonTrack], named: Sequence[NamedDetection], times: np.ndarray
 ) -> tuple[list[PersonTrack], list[str]]:
-    """Tracks of the named detections, and a message for those without a track.
-
-    Raises UserError if two of them are seen at the same time.
-    """
-    found: dict[int, tuple[PersonTrack, NamedDetection]] = {}
+    """Tracks of the named detections, and a message for those without a track."""
+    chosen: dict[int, tuple[PersonTrack, NamedDetection]] = {}
     lost = []
     for detection in named:
         track = next((k for k in tracks if _has(k, detection)), None)
         if track is None:
             lost.append(detection)
             continue
-        for other, before in found.values():
+        for other, before in chosen.values():
             if other is not track and Person((other,)).meets(Person((track,))):
                 t = max(other.sets[0], track.sets[0])
                 raise UserError(
                     f"{before.words} and {detection.words} name two people: both are seen at frame "
                     f"{t} ({times[t] - times[0]:.2f} s); keep the points that lie on one person"
                 )
-        found.setdefault(id(track), (track, detection))
-    return [track for track, _ in found.values()], [_not_followed(lost)] if lost else []
-
-
-def _not_followed(named: Sequence[NamedDetection]) -> str:
-    words = ", ".join(detection.words for detection in named)
-    return (
+        chosen.setdefault(id(track), (track, detection))
+    words = ", ".join(detection.words for detection in lost)
+    doubt = (
         f"who is named by {words} is placed by no two views there and could not be followed; name "
         "the person in a frame in which more cameras see it"
     )
+    return [track for track, _ in chosen.values()], [doubt] if lost else []
 
 
 def _has(track: PersonTrack, named: NamedDetection) -> bool:
-    place = np.searchsorted(track.sets, named.t)
-    if place == len(track.sets) or track.sets[place] != named.t:
-        return False
-    return bool(track.groups[place].members[named.c] == named.index)
+    return any(
+        t == named.t and group.members[named.c] == named.index
+        for t, group in zip(track.sets, track.groups, strict=True)
+    )
 
 
 def _score(track: PersonTrack, middle: np.ndarray) -> float:
-    away = [float(np.linalg.norm(group.centre - middle)) for group in track.groups]
+    """Support of a track, halved at 1.5 m from the ring's centre ``middle`` (3,); tuned."""
     return sum(
-        group.support / (1 + (d / CENTRE_RANGE_M) ** 2)
-        for group, d in zip(track.groups, away, strict=True)
+        group.support / (1 + (float(np.linalg.norm(group.centre - middle)) / 1.5) ** 2)
+        for group in track.groups
     )
 
 
@@ -248,9 +250,3 @@ def _add_single_views(
                 error, _ = distance_to(pixels[:, c], np.isfinite(points[:, 0]), body, seen)
                 if error < best:
                     best, people[t, c] = error, i
-
-
-def _add_named(people: np.ndarray, named: Sequence[NamedDetection]) -> None:
-    """Named detections take precedence over the views' agreement."""
-    for detection in named:
-        people[detection.t, detection.c] = detection.index

@@ -14,10 +14,6 @@ from intercap_core.formats.detections.read import Detections
 from intercap_core.person.sides import BODY_POINTS
 from intercap_core.person.subject import NamedDetection, Touches
 
-TOUCH_REACH = 0.03  # reach beyond keypoints, share of a person's height: a hand's breadth (anatomy)
-NAMED_REACH = 0.15  # from bones to a point that names the person, share of the height; untuned
-
-
 _BONES = keypoint_pairs(SKELETON)
 
 
@@ -30,12 +26,12 @@ def named_people(
 ) -> list[NamedDetection]:
     """Find the person at each point: the one with the closest bones, relative to their size.
 
-    Raises UserError for an unknown camera, a frame without an image, a point outside of it, and if
-    nobody was detected there.
-
     Args:
         detections: by moment.
         image_of: (T, C) frame whose image shows each moment.
+
+    Raises:
+        UserError: unknown camera, frame without an image, point outside the image, or nobody there.
     """
     return [
         _named(f"subject[{k}]", point, detections, image_of, min_confidence)
@@ -69,7 +65,7 @@ def _named(
     people = detections.people(t, c)[:, BODY_POINTS]
     away = [_distance(person, at, min_confidence) for person in people]
     nearest = int(np.argmin(away)) if away else -1
-    if nearest < 0 or away[nearest] > NAMED_REACH:
+    if nearest < 0 or away[nearest] > 0.15:  # of the height; untuned
         seen = [person[person[:, 2] >= min_confidence, :2] for person in people]
         places = ", ".join(
             f"({x:.0f}, {y:.0f})" for x, y in (np.median(body, 0) for body in seen if len(body))
@@ -118,7 +114,7 @@ def touch_test(
         points = points[points[:, 2] >= min_confidence, :2]
         if not objects or not len(points):
             return None
-        reach = TOUCH_REACH * float(np.ptp(points, axis=0).max())
+        reach = 0.03 * float(np.ptp(points, axis=0).max())  # a hand's breadth (anatomy)
         x, y = np.rint(points[:, None] + reach * _AROUND).astype(np.int64).reshape(-1, 2).T
         return any(bool(candidate.runs.sample(x, y).any()) for candidate in objects)
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.body.keypoints import KEYPOINT_NAMES
+from intercap_core.body.keypoints import KEYPOINT_INDEX
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.triangulation import (
     Triangulation,
@@ -23,18 +23,12 @@ from intercap_core.geometry.camera.triangulation import (
 )
 from intercap_core.geometry.solve.time_series import cheapest_sequence, limited_velocity
 from intercap_core.person.left_right import find_mirrored, make_views_agree
-from intercap_core.person.sides import LIMBS, PARTNER, exchange_limb, exchange_points
+from intercap_core.person.sides import LIMBS, PARTNER, exchange_everywhere, exchange_limb
 
 # Hands reach 5 m/s in everyday tasks, and people stand two metres from the cameras of a ring:
 # faster motion in an image is another detection. Radians per second.
 MAX_IMAGE_SPEED_RAD_S = 2.5
 MUCH_BETTER = 0.5  # cost exchanged over cost as detected, at most; tuned on the studio
-FEW_VIEWS = 4  # largest number of views for which jumps between sides are corrected; tuned
-EXCHANGED_PX_AT_1080P = 3.0  # cost of an exchanged set: detectors are mostly right; tuned
-# Cost of an exchange at the start or end of the recording: it has only one jump, as a fast turn.
-# Tuned on the studio.
-OPEN_EXCHANGE_PX_AT_1080P = 100.0
-JUMP_PX_AT_1080P = 120.0  # truncation of the motion from set to set; tuned on the studio
 
 
 def at_set_times(
@@ -60,22 +54,16 @@ def at_set_times(
     return result
 
 
-_INDEX = {name: index for index, name in enumerate(KEYPOINT_NAMES)}
-# OpenPose learnt both points as these middles of COCO's.
-_MIDDLES = tuple(
-    (_INDEX[middle], [_INDEX[f"left_{end}"], _INDEX[f"right_{end}"]])
-    for middle, end in (("neck", "shoulder"), ("mid_hip", "hip"))
-)
-
-
 def fill_middles(points: np.ndarray) -> None:
     """Fill a missing neck and mid hip of ``points`` (..., 135, 3), in place, by shoulders and hips.
 
     Only in space: the initial pose and the volume of the body use these points. The fit uses
     keypoints in images, where they would count the errors of shoulders and hips twice.
     """
-    for middle, ends in _MIDDLES:
-        at = points[..., middle, :]
+    # OpenPose learnt both points as these middles of COCO's
+    for middle, end in (("neck", "shoulder"), ("mid_hip", "hip")):
+        at = points[..., KEYPOINT_INDEX[middle], :]
+        ends = [KEYPOINT_INDEX[f"left_{end}"], KEYPOINT_INDEX[f"right_{end}"]]
         at[...] = np.where(np.isnan(at), points[..., ends, :].mean(-2), at)
 
 
@@ -100,44 +88,36 @@ def triangulate_people(
     """
     keypoints = keypoints.copy()
     agreed = make_views_agree(keypoints, rig, min_confidence=min_confidence)
-    found = _triangulate(keypoints, rig, min_confidence, max_error_px)
+    triangulation = _triangulate(keypoints, rig, min_confidence, max_error_px)
     seeing = np.stack(
         [(keypoints[:, :, limb, 2] >= min_confidence).any(2).sum(1) for limb in LIMBS], 1
     )
     share = agreed.sum(1) / np.maximum(seeing, 1)
-    turned = find_mirrored(found.points.reshape(len(keypoints), -1, 3), share[:, :3], times)
+    turned = find_mirrored(triangulation.points.reshape(len(keypoints), -1, 3), share[:, :3], times)
     if turned.any():
-        keypoints = np.swapaxes(exchange_points(np.swapaxes(keypoints, 1, 2), turned), 1, 2)
-        found = Triangulation(
-            *(
-                exchange_points(part.reshape(len(keypoints), -1, *part.shape[1:]), turned).reshape(
-                    part.shape
-                )
-                for part in (found.points, found.inlier, found.error, found.view_error)
-            )
-        )
+        keypoints, triangulation = exchange_everywhere(keypoints, triangulation, turned)
     for _ in range(2):
-        exchanged = exchange(
-            keypoints,
-            found.points.reshape(len(keypoints), -1, 3),
-            rig,
-            min_confidence=min_confidence,
-            max_error_px=max_error_px,
-        )
-        if not exchanged:
+        points = triangulation.points.reshape(len(keypoints), -1, 3)
+        if not _exchange(keypoints, points, rig, min_confidence, max_error_px):
             break
-        found = _triangulate(keypoints, rig, min_confidence, max_error_px)
-    return keypoints, found
+        triangulation = _triangulate(keypoints, rig, min_confidence, max_error_px)
+    return keypoints, triangulation
 
 
 def steady_sides(keypoints: np.ndarray, rig: Rig, *, min_confidence: float) -> np.ndarray:
-    """Exchange back limbs that jump to the other side for a while, where few views see the subject.
+    """Exchange back limbs that jump to the other side for a while, in sets with up to four views.
 
-    ``keypoints`` (T, C, 135, 3); each view and limb on its own: the sides that move least over all
-    sets, by dynamic programming. Returns them exchanged in sets that few views see.
+    Each view and limb is considered on its own: dynamic programming selects the sides that move
+    least over all sets.
+
+    Args:
+        keypoints: (T, C, 135, 3).
+
+    Returns:
+        (T, C, 135, 3) keypoints with corrected sides.
     """
     result = keypoints.copy()
-    few = (keypoints[..., 2] > 0).any(2).sum(1) <= FEW_VIEWS
+    few = (keypoints[..., 2] > 0).any(2).sum(1) <= 4  # tuned on the studio
     for c, scale in enumerate(pixel_scale(rig)):
         sets = np.flatnonzero((keypoints[:, c, :, 2] > 0).any(1))
         if len(sets) < 3 or not few[sets].any():
@@ -151,60 +131,59 @@ def steady_sides(keypoints: np.ndarray, rig: Rig, *, min_confidence: float) -> n
 
 
 def _least_motion(options: np.ndarray, scale: float, min_confidence: float) -> np.ndarray:
-    """Sets (S,) bool in which the second of the limb's ``options`` (2, S, n, 3) moves less."""
-    price = np.array([0.0, EXCHANGED_PX_AT_1080P * scale])
-    at_an_end = np.array([0.0, OPEN_EXCHANGE_PX_AT_1080P * scale])
+    """Sets (S,) bool in which the second of the limb's ``options`` (2, S, n, 3) moves less.
+
+    Costs are pixels at 1080p, tuned on the studio.
+    """
+    price = np.array([0.0, 3.0 * scale])  # of an exchanged set: detectors are mostly right
+    # at the start or end of the recording an exchange has only one jump, as a fast turn
+    at_an_end = np.array([0.0, 100.0 * scale])
     seen, pixels = options[..., 2] >= min_confidence, options[..., :2]
     # (before, now, S - 1, n)
     both = seen[:, None, :-1] & seen[None, :, 1:]
     moved = np.linalg.norm(pixels[:, None, :-1] - pixels[None, :, 1:], axis=-1)
-    moved = np.where(both, np.minimum(moved, JUMP_PX_AT_1080P * scale), 0).sum(-1)
+    moved = np.where(both, np.minimum(moved, 120.0 * scale), 0).sum(-1)
     steps = np.moveaxis(moved / np.maximum(both.sum(-1), 1), 2, 0) + price
     return cheapest_sequence(at_an_end + price, steps, at_an_end).astype(bool)
 
 
-def exchange(
-    keypoints: np.ndarray,
-    points: np.ndarray,
-    rig: Rig,
-    *,
-    min_confidence: float,
-    max_error_px: float,
-) -> int:
+def _exchange(
+    keypoints: np.ndarray, points: np.ndarray, rig: Rig, min_confidence: float, max_error_px: float
+) -> bool:
     """Exchange in place the limbs of ``keypoints`` (T, C, 135, 3 or more) that fit ``points``
-    (T, 135, 3) much better the other way; return how many."""
+    (T, 135, 3) much better the other way. Returns whether there are any."""
     sets, views = keypoints.shape[:2]
     known = np.isfinite(points[..., 0])
     pixels = reproject(np.nan_to_num(points.reshape(-1, 3), nan=1.0), rig)
     pixels = np.swapaxes(pixels.reshape(sets, -1, views, 2), 1, 2)  # (T, C, 135, 2)
     limit = max_error_px * pixel_scale(rig)[:, None]
     seen = keypoints[..., 2] >= min_confidence
-    count = 0
+    exchanged = False
     for limb in LIMBS:
-        partner = PARTNER[limb]
-        own = known[:, None, limb]
-        as_found = _cost(
-            pixels[:, :, limb], keypoints[:, :, limb, :2], own & seen[:, :, limb], limit
-        )
-        other = _cost(
-            pixels[:, :, limb], keypoints[:, :, partner, :2], own & seen[:, :, partner], limit
+        detected, other = (
+            _cost(
+                pixels[:, :, limb],
+                keypoints[:, :, side, :2],
+                known[:, None, limb] & seen[:, :, side],
+                limit,
+            )
+            for side in (limb, PARTNER[limb])
         )
         # half of the limb's points are off by the limit or more
-        wrong = (as_found > 0.25) & (other < MUCH_BETTER * as_found)
-        t, c = np.nonzero(wrong)
+        t, c = np.nonzero((detected > 0.25) & (other < MUCH_BETTER * detected))
         exchange_limb(keypoints, t, c, limb)
-        count += len(t)
-    return count
+        exchanged |= len(t) > 0
+    return exchanged
 
 
 def _cost(
-    expected: np.ndarray, found: np.ndarray, valid: np.ndarray, limit: np.ndarray
+    expected: np.ndarray, detected: np.ndarray, valid: np.ndarray, limit: np.ndarray
 ) -> np.ndarray:
     """Mean truncated squared error (T, C) in units of the limit; NaN with fewer than two points.
 
     Truncated well beyond the limit, so that exchanged sides differ from other errors.
     """
-    error = np.linalg.norm(expected - found, axis=-1) / limit
+    error = np.linalg.norm(expected - detected, axis=-1) / limit
     square = np.where(valid, np.minimum(error, 4.0) ** 2, 0).sum(-1)
     count = valid.sum(-1)
     return np.where(count >= 2, square / np.maximum(count, 1), np.nan)

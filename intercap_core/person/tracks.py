@@ -14,36 +14,27 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
-from intercap_core.body.keypoints import KEYPOINT_NAMES
+from intercap_core.body.keypoints import ARM_BONES, LEG_BONES, keypoint_pairs, of_side
 from intercap_core.person.groups import PersonGroup
 
 # Standard deviations of thigh, shank, upper arm, forearm, shoulder width and trunk among adults,
 # metres, measured over the shapes of the open body.
 BUILD_SPREADS_M = (0.034, 0.027, 0.015, 0.023, 0.033, 0.025)
-BUILD_FLOOR_M = 0.012  # error of a median length with many sets: detector bias by pose; tuned
 MAX_BODY_SPEED_M_S = 4.0  # of a body's centre; people run slower indoors
 # Longest gap over which a single view identifies a person by position, and after which a joined
 # track is not doubted; tuned on the studio.
 MAX_LINK_GAP_S = 2.0
-WALKING_SPEED_M_S = 1.2  # usual speed during a gap
 LINK_SLACK_M = 0.25  # noise of a person's centre between sets; tuned on the studio
 
-
-_PLACE = {name: index for index, name in enumerate(KEYPOINT_NAMES)}
-
-
-def _both_sides(first: str, second: str) -> tuple[tuple[int, int], ...]:
-    return tuple((_PLACE[f"{s}_{first}"], _PLACE[f"{s}_{second}"]) for s in ("left", "right"))
-
-
-# In the order of BUILD_SPREADS_M; where both sides have a bone, the mean of the two is looked at.
-_BONES: tuple[tuple[tuple[int, int], ...], ...] = (
-    _both_sides("hip", "knee"),
-    _both_sides("knee", "ankle"),
-    _both_sides("shoulder", "elbow"),
-    _both_sides("elbow", "wrist"),
-    ((_PLACE["left_shoulder"], _PLACE["right_shoulder"]),),
-    ((_PLACE["neck"], _PLACE["mid_hip"]),),
+# Pairs of keypoints (1 or 2, 2), in the order of BUILD_SPREADS_M; of bones on both sides, the mean
+# length counts.
+_BONES = (
+    *(
+        keypoint_pairs([*of_side("left", [bone]), *of_side("right", [bone])])
+        for bone in (*LEG_BONES, *ARM_BONES)
+    ),
+    keypoint_pairs([("left_shoulder", "right_shoulder")]),
+    keypoint_pairs([("neck", "mid_hip")]),
 )
 
 
@@ -69,11 +60,12 @@ class PersonTrack:
         scatter = 1.48 * np.nanmedian(np.abs(known - length[enough]), axis=0)
         # variance of a median; errors of five neighbouring sets are correlated
         independent = np.maximum(count[enough] / 5, 1)
-        variance[enough] = BUILD_FLOOR_M**2 + np.pi / 2 * scatter**2 / independent
+        # the bias of a detector by pose remains, 12 mm; tuned on the studio
+        variance[enough] = 0.012**2 + np.pi / 2 * scatter**2 / independent
         return length, variance
 
 
-def _lengths(points: np.ndarray, bone: tuple[tuple[int, int], ...]) -> np.ndarray:
+def _lengths(points: np.ndarray, bone: np.ndarray) -> np.ndarray:
     """Lengths (N,) of a bone in points (N, 25, 3), averaged over the known sides."""
     sides = np.stack([np.linalg.norm(points[:, a] - points[:, b], axis=1) for a, b in bone])
     known = np.isfinite(sides)
@@ -109,12 +101,12 @@ def link_groups(groups: Sequence[Sequence[PersonGroup]], times: np.ndarray) -> l
     return tracks
 
 
-def same_build(one: PersonTrack, other: PersonTrack) -> float:
+def same_build(first: PersonTrack, second: PersonTrack) -> float:
     """Log likelihood ratio, by the lengths of bones, of one person against two; 0 = unknown.
 
     Errors of the tracks and spreads among people are normal.
     """
-    (a, own), (b, theirs) = one.build, other.build
+    (a, own), (b, theirs) = first.build, second.build
     known = np.isfinite(own + theirs)
     apart = (a - b)[known] ** 2
     same = (own + theirs)[known]
@@ -186,38 +178,38 @@ def _ordered(parts: Sequence[PersonTrack]) -> tuple[PersonTrack, ...]:
     return tuple(sorted(parts, key=lambda track: track.sets[0]))
 
 
-def _likelihood(one: Person, other: Person, times: np.ndarray) -> float:
+def _likelihood(first: Person, second: Person, times: np.ndarray) -> float:
     """Log likelihood ratio of one person against two, by build and motion.
 
     :data:`NEVER` if they are certainly two.
     """
-    if one.meets(other):
+    if first.meets(second):
         return NEVER
     result = 0.0
-    for before, after in _seams(one, other):
+    for before, after in _seams(first, second):
         apart = float(np.linalg.norm(after.groups[0].centre - before.groups[-1].centre))
         gap = float(times[after.sets[0]] - times[before.sets[-1]])
         if apart > LINK_SLACK_M + MAX_BODY_SPEED_M_S * gap:
             return NEVER
-        result -= 0.5 * (apart / (LINK_SLACK_M + WALKING_SPEED_M_S * gap)) ** 2
-    alike = same_build(one.whole, other.whole)
+        result -= 0.5 * (apart / (LINK_SLACK_M + 1.2 * gap)) ** 2  # m/s, a usual walk
+    alike = same_build(first.whole, second.whole)
     # log likelihood ratio by build; tuned on the studio
     return result + alike if alike > -3.0 else NEVER
 
 
-def _seams(one: Person, other: Person) -> list[tuple[PersonTrack, PersonTrack]]:
+def _seams(first: Person, second: Person) -> list[tuple[PersonTrack, PersonTrack]]:
     """Pairs of successive parts, in order of time, that belong to different people."""
-    own = set(map(id, one.parts))
-    parts = _ordered((*one.parts, *other.parts))
+    own = set(map(id, first.parts))
+    parts = _ordered((*first.parts, *second.parts))
     return [(a, b) for a, b in pairwise(parts) if (id(a) in own) != (id(b) in own)]
 
 
-def _doubt(one: Person, other: Person, times: np.ndarray) -> tuple[str, ...]:
+def _doubt(first: Person, second: Person, times: np.ndarray) -> tuple[str, ...]:
     """Message on joining two people after a long gap, if their build does not decide."""
     gap, start = min(
-        (float(times[b.sets[0]] - times[a.sets[-1]]), b.sets[0]) for a, b in _seams(one, other)
+        (float(times[b.sets[0]] - times[a.sets[-1]]), b.sets[0]) for a, b in _seams(first, second)
     )
-    if gap <= MAX_LINK_GAP_S or same_build(one.whole, other.whole) >= 1.0:
+    if gap <= MAX_LINK_GAP_S or same_build(first.whole, second.whole) >= 1.0:
         return ()
     return (
         f"the subject was not seen for {gap:.1f} s, and the build does not tell whether who is "

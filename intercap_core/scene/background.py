@@ -18,16 +18,8 @@ from intercap_core.body.keypoints import LIMB_BONES, keypoint_pairs, of_side
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.transforms import apply
+from intercap_core.geometry.solve.time_series import sample_evenly
 
-# Samples of one pixel agree within this: three standard deviations of the sensor's random error,
-# about 1 mm + 0.1 % of depth, more at 4 m (Toelgyessy et al., Sensors 21(2):413, 2021, NFOV).
-BACKGROUND_AGREE_MM = 8.0
-BACKGROUND_AGREE_PER_DEPTH = 0.004  # of depth
-STEADY_SHARE = 0.2  # of a pixel's samples that must agree; tuned on the studio
-# A pixel with fewer valid samples looks past the scene, and a surface that it measures repeatedly
-# may be a passing one: VALID_AGREE of them must agree. Tuned on the studio.
-OFTEN_VALID = 0.75
-VALID_AGREE = 0.8  # of such a pixel's valid samples
 # Distance from a bone to skin, clothing and hair, metres, in the order of LIMB_BONES. Wider than
 # the radii of the segmentation: the region only has to contain the person. Tuned on the studio.
 LIMB_REACH_M = (0.16, 0.14, 0.18, 0.15, 0.14, 0.14)
@@ -41,7 +33,6 @@ TRUNK_REACH_M: dict[tuple[str, str], float] = {
     ("right_wrist", "right_wrist"): 0.24,
     ("left_wrist", "left_wrist"): 0.24,
 }
-
 
 _BONES = (*TRUNK_REACH_M, *of_side("right", LIMB_BONES), *of_side("left", LIMB_BONES))
 _FIRST, _SECOND = keypoint_pairs(_BONES).T
@@ -87,50 +78,38 @@ class Background:
     """(H, W) bool: most samples show the background."""
 
 
-def sample_sets(available: np.ndarray, most: int = 25) -> np.ndarray:
-    """Choose at most ``most`` sets, evenly among those where ``available`` (T,).
-
-    The default bounds the memory for the depth images of one camera.
-    """
-    sets = np.flatnonzero(available)
-    if len(sets) <= most:
-        return sets
-    return sets[np.linspace(0, len(sets) - 1, most).round().astype(int)]
-
-
-def camera_background(
-    frames: Frames, c: int, joints: np.ndarray | None = None
-) -> Background | None:
+def camera_background(frames: Frames, c: int, joints: np.ndarray) -> Background | None:
     """Background of camera ``c``; None if it has no depth image.
 
     ``joints``: (T, 135, 3) the subject's keypoints at the moment that the camera's image of each
     set shows, master frame, metres; NaN = unknown. Pixels near them are not background.
     """
     camera = frames.rig[c]
-    sets = sample_sets(frames.depth_available[:, c])
+    sets = sample_evenly(frames.depth_available[:, c], 25)  # bounds the memory for the images
     if not len(sets) or camera.depth is None:
         return None
     images = np.stack([image for t in sets if (image := frames.depth(int(t), c)) is not None])
-    person = np.zeros(images.shape, bool)
-    if joints is not None:
-        for image, near, t in zip(images, person, sets, strict=True):
-            near[:] = mask_person(image, camera.depth, camera.depth_from_master, joints[t])
-    return steady_background(images, person)
+    person = [
+        mask_person(image, camera.depth, camera.depth_from_master, joints[t])
+        for image, t in zip(images, sets, strict=True)
+    ]
+    return steady_background(images, np.stack(person))
 
 
-def steady_background(images: np.ndarray, person: np.ndarray | None = None) -> Background:
+def steady_background(images: np.ndarray, person: np.ndarray) -> Background:
     """Background of one camera's depth images (S, H, W), uint16 mm.
+
+    A fifth of a pixel's valid samples must agree. If less than three quarters are valid, the pixel
+    looks past the scene and a passing surface may repeat: 80 % must agree. Tuned on the studio.
 
     ``person``: (S, H, W) bool, samples that may show a person and are ignored.
     """
     samples, height, width = images.shape
-    usable = np.full(height * width, samples)
-    if person is not None:
-        usable -= person.reshape(samples, -1).sum(0)
-        images = np.where(person, 0, images)
+    usable = samples - person.reshape(samples, -1).sum(0)
+    images = np.where(person, 0, images)
     ordered = np.sort(images.reshape(samples, -1).T, axis=1)  # (pixels, S), invalid zeros first
     valid = samples - (ordered == 0).sum(1)
-    share = np.where(valid >= OFTEN_VALID * usable, STEADY_SHARE, VALID_AGREE)
+    share = np.where(valid >= 0.75 * usable, 0.2, 0.8)
     needed = np.maximum(np.ceil(share * valid), min(2, samples)).astype(int)
     depth = np.zeros(len(ordered), np.uint16)
     support = np.zeros(len(ordered))
@@ -154,7 +133,9 @@ def _farthest_cluster(ordered: np.ndarray, count: int) -> tuple[np.ndarray, np.n
     for first in range(samples - count, -1, -1):
         low, high = values[open_rows, first], values[open_rows, first + count - 1]
         middle = (low + high) / 2
-        tolerance = BACKGROUND_AGREE_MM + BACKGROUND_AGREE_PER_DEPTH * middle
+        # three standard deviations of the sensor's random error, about 1 mm + 0.1 % of depth, more
+        # at 4 m (Toelgyessy et al., Sensors 21(2):413, 2021, NFOV)
+        tolerance = 8.0 + 0.004 * middle
         agree = (low > 0) & (high - low <= tolerance)
         rows = open_rows[agree]
         if len(rows):

@@ -10,27 +10,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
 from intercap_core.scene.constraints import MIN_BODY_POINTS, BodyConstraint, BodyViews
-from intercap_core.scene.registration import (
-    MOVING,
-    STATIC,
-    PairResiduals,
-    Registration,
-    RigEstimate,
-)
+from intercap_core.scene.registration import MOVING, STATIC, Registration, RigEstimate
 
 MUST_IMPROVE = 0.98  # of the start's held-out cost, in one group at least; tuned on the studio
 DOUBTFUL_RATIO = 0.5  # of refined over given errors: above it a camera gets a second look
 
-
+Unit = TypeVar("Unit", bound=Hashable)
 _KINDS = (("background", STATIC), ("moving surfaces", MOVING))
 
 
 @dataclass(frozen=True)
-class PoseEvidence:
+class HeldOutComparison:
     """Held-out errors of one camera, refined against given pose."""
 
     kind: str
@@ -41,8 +36,8 @@ class PoseEvidence:
 
     @classmethod
     def of(
-        cls, kind: str, given: Mapping[Hashable, float], refined: Mapping[Hashable, float]
-    ) -> PoseEvidence:
+        cls, kind: str, given: Mapping[Unit, float], refined: Mapping[Unit, float]
+    ) -> HeldOutComparison:
         """Compare errors by unit, over the units that both have."""
         both = [
             np.log(max(error, 1e-6) / max(given[unit], 1e-6))
@@ -74,7 +69,7 @@ class PoseVerdict:
 
     refined: bool
     """The refined pose is kept."""
-    evidence: tuple[PoseEvidence, ...]
+    evidence: tuple[HeldOutComparison, ...]
     """Comparison by kind of data."""
 
     @property
@@ -86,7 +81,7 @@ class PoseVerdict:
         return not self.refined or bool(mean > np.log(DOUBTFUL_RATIO))
 
     @classmethod
-    def of(cls, evidence: Sequence[PoseEvidence]) -> PoseVerdict:
+    def of(cls, evidence: Sequence[HeldOutComparison]) -> PoseVerdict:
         """Decide from the evidence; every kind has the same weight."""
         if not evidence:  # the rig as a whole is better refined
             return cls(True, ())
@@ -111,24 +106,24 @@ class PoseJudge:
         registration: Registration,
         refine: Callable[[BodyViews | None, np.ndarray], RigEstimate],
         views: BodyViews | None,
-        held: RigEstimate,
+        given: RigEstimate,
         refined: RigEstimate,
     ) -> None:
         """
         Args:
             refine: estimates the rig from keypoints (None = all) and free cameras (C,).
             views: keypoints of the subject; None = too few.
-            held: given poses, with biases and offsets estimated for them.
+            given: given poses, with biases and offsets estimated for them.
             refined: all poses refined.
         """
         self._registration, self._refine = registration, refine
-        self._held, self._refined = held, refined
+        self._given, self._refined = given, refined
         self._seen = self._halved = self._held_out = None
         if views is not None:
             seen, unseen = views.halves()
             if min(len(seen.points), len(unseen.points)) >= MIN_BODY_POINTS:
                 self._seen = seen
-                self._halved = refine(seen, np.ones(len(held.poses), bool))
+                self._halved = refine(seen, np.ones(len(given.poses), bool))
                 self._held_out = BodyConstraint(unseen, registration.rig)
 
     def verdicts(self, cameras: Sequence[int]) -> dict[int, PoseVerdict]:
@@ -138,12 +133,12 @@ class PoseJudge:
         """
         verdicts = {}
         for c in cameras:
-            apart = _with_camera_of(self._refined, self._held, c)
-            halved = None if self._halved is None else _with_camera_of(self._halved, self._held, c)
+            apart = _with_camera_of(self._refined, self._given, c)
+            halved = None if self._halved is None else _with_camera_of(self._halved, self._given, c)
             verdicts[c] = self._compare(c, apart, halved)
         doubtful = [c for c, verdict in verdicts.items() if verdict.in_doubt]
         if doubtful:
-            free = np.ones(len(self._held.poses), bool)
+            free = np.ones(len(self._given.poses), bool)
             free[doubtful] = False
             apart = self._refine(None, free)
             halved = None if self._halved is None else self._refine(self._seen, free)
@@ -159,22 +154,17 @@ class PoseJudge:
         evidence = []
         for name, kind in _KINDS:
             medians = (
-                _by_pair(self._registration.residuals(at, kind, camera))
+                self._registration.median_residuals(at, kind, camera)
                 for at in (apart, self._refined)
             )
-            evidence.append(PoseEvidence.of(name, *medians))
+            evidence.append(HeldOutComparison.of(name, *medians))
         if halved is not None and self._halved is not None and self._held_out is not None:
             held_out = self._held_out
             errors = (
                 held_out.unit_errors(at.poses, at.offset, camera) for at in (halved, self._halved)
             )
-            evidence.append(PoseEvidence.of("keypoints", *errors))
+            evidence.append(HeldOutComparison.of("keypoints", *errors))
         return PoseVerdict.of([e for e in evidence if len(e.log_ratio)])
-
-
-def _by_pair(residuals: PairResiduals) -> dict[Hashable, float]:
-    pairs = map(tuple, residuals.pairs.tolist())
-    return dict(zip(pairs, residuals.median.tolist(), strict=True))
 
 
 def _with_camera_of(at: RigEstimate, other: RigEstimate, camera: int) -> RigEstimate:

@@ -27,7 +27,6 @@ from intercap_core.scene.subject_views import SubjectViews
 from intercap_core.scene.surfaces import DepthSurface
 
 FLOOR_SIGMA_M = 0.005  # floors are not flat and depth is biased; tuned on the studio
-KEYPOINT_SIGMA_FLOOR_PX = 3.0  # of reprojection, including joint biases; tuned on the studio
 ROBUST_SIGMA = 3.0  # scale of Geman and McClure's function, standard deviations; tuned
 KEYPOINT_ERROR_TIME_S = 0.5  # how long an error at one joint lasts; tuned on the studio
 MIN_BODY_POINTS = 50  # fewer do not constrain a rig; tuned on the studio
@@ -157,9 +156,8 @@ class BodyConstraint:
         residual = pixels - self._views.pixels
         size = np.linalg.norm(residual, axis=-1)
         known = self._views.weights > 0
-        sigma = max(
-            KEYPOINT_SIGMA_FLOOR_PX, float(np.median(size[known])) / 1.177
-        )  # of a Rayleigh median
+        # from a Rayleigh median; 3 px at least, for joint biases (tuned on the studio)
+        sigma = max(3.0, float(np.median(size[known])) / 1.177)
         robust = geman_mcclure_weight(size**2, ROBUST_SIGMA * sigma)
         return residual, by_point, self._views.weights * robust / sigma**2, by_pose
 
@@ -199,8 +197,8 @@ class FloorConstraint:
     def of(
         cls, rig: Rig, surfaces: dict[int, DepthSurface], ground: GroundPlane
     ) -> FloorConstraint | None:
-        """The floor points near ``ground`` at the rig's poses; None where fewer than two cameras
-        see it."""
+        """The floor points near ``ground`` at the rig's poses; None if fewer than two cameras see
+        it."""
         if not ground.found:
             return None
         points = {}
@@ -216,12 +214,7 @@ class FloorConstraint:
         return cls(rig, points, ground.normal) if len(points) >= 2 else None
 
     def __call__(self, poses: np.ndarray, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Matrix (C, 6, C, 6) and gradient (C, 6) at ``poses`` (C, 4, 4); ``offset`` is unused.
-
-        Raises ValueError for poses of another rig.
-        """
-        if len(poses) != len(self._rig):
-            raise ValueError(f"{len(poses)} poses for {len(self._rig)} cameras")
+        """Matrix (C, 6, C, 6) and gradient (C, 6) at ``poses`` (C, 4, 4); ``offset`` is unused."""
         count = len(self._rig)
         own = {c: self._in_master(c, poses[c]) for c in self._points}
         everything = np.concatenate(list(own.values()))

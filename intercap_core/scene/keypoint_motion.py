@@ -134,18 +134,10 @@ def _near_known(times: np.ndarray, known: np.ndarray) -> np.ndarray:
     return after - before <= MAX_PATH_GAP_S
 
 
-def _chosen_points() -> np.ndarray:
-    """Body; of each hand the wrist, knuckles and finger tips; corners of brows, eyes, nose, mouth.
-
-    The other keypoints move with these and would double the cost.
-    """
-    hand = np.array([0, 4, 5, 8, 9, 13, 17, 20])
-    face = FACE.start + np.array([0, 9, 10, 13, 19, 28, 31, 37])
-    body = np.arange(BODY.start, BODY.stop)
-    return np.r_[body, LEFT_HAND.start + hand, RIGHT_HAND.start + hand, face]
-
-
-POINTS = _chosen_points()
+_HAND = np.array([0, 4, 5, 8, 9, 13, 17, 20])  # wrist, knuckles and finger tips
+_FACE = np.array([0, 9, 10, 13, 19, 28, 31, 37])  # corners of brows, eyes, nose, mouth
+# The keypoints that are compared. The others move with these and would double the cost.
+POINTS = np.r_[BODY, LEFT_HAND.start + _HAND, RIGHT_HAND.start + _HAND, FACE.start + _FACE]
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,14 +277,14 @@ def _chosen(keypoints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _triangulated(pixels: np.ndarray, seen: np.ndarray, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
     """Points (T, K, 3) of each set by itself, and the views that agree with them (T, C, K)."""
     sets, views, count = seen.shape
-    found = triangulate(
+    triangulation = triangulate(
         np.swapaxes(pixels, 1, 2).reshape(-1, views, 2),
         np.swapaxes(seen, 1, 2).reshape(-1, views).astype(float),
         rig,
         max_error_px=60.0,  # at 1080p: moving limbs in views that are frames late
     )
-    inlier = np.swapaxes(found.inlier.reshape(sets, count, views), 1, 2)
-    return found.points.reshape(sets, count, 3), inlier
+    inlier = np.swapaxes(triangulation.inlier.reshape(sets, count, views), 1, 2)
+    return triangulation.points.reshape(sets, count, 3), inlier
 
 
 def _project(points: np.ndarray, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
@@ -355,7 +347,7 @@ def _scatter(size: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 def known_median(values: np.ndarray) -> np.ndarray:
-    """Median of the finite values over the first axis; 0 where there are none."""
+    """Median of the finite values over the first axis; 0 if there are none."""
     order = np.sort(values, 0)  # NaN last
     count = np.isfinite(values).sum(0)
     low = np.take_along_axis(order, np.maximum(count - 1, 0)[None] // 2, 0)[0]

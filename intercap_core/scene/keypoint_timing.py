@@ -22,9 +22,6 @@ from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.solve.time_series import filled_linearly
 from intercap_core.scene.keypoint_motion import KeypointMotion, build_motion
 
-OFFSET_SIGMA_S = 0.05  # prior of an offset; tuned on the studio
-# Correlation times, seconds, from which the likelihood chooses; tuned on the studio.
-ERROR_LENGTHS_S = {"rough": (0.2, 0.5, 1.0), "smooth": (0.15, 0.3, 0.6)}
 CONSTANT_VARIANCE = 100.0  # of a series' constant, over its other variance: nearly unconstrained
 TIMING_INFLATION = 2.0  # of sigmas: keypoints of one person err together; tuned on the studio
 WINDOW_SETS = 96  # covariances over time are dense within a window, none reaches beyond it
@@ -71,7 +68,8 @@ def fit_noise(times: np.ndarray, series: np.ndarray, valid: np.ndarray) -> TimeN
     steps = np.arange(rows.shape[1])
     rows = np.stack([filled_linearly(row[:, None], steps, np.isfinite(row))[:, 0] for row in rows])
     best, chosen = -np.inf, TimeNoise("rough", 0.5, 0.25, 1.0)
-    for kind, lengths in ERROR_LENGTHS_S.items():
+    # correlation times, seconds, tuned on the studio
+    for kind, lengths in {"rough": (0.2, 0.5, 1.0), "smooth": (0.15, 0.3, 0.6)}.items():
         for length in lengths:
             for fast in (0.03, 0.1, 0.25, 0.6):
                 covariance = _covariance(times, kind, length, fast) + CONSTANT_VARIANCE
@@ -79,9 +77,9 @@ def fit_noise(times: np.ndarray, series: np.ndarray, valid: np.ndarray) -> TimeN
                 energy = (np.linalg.solve(low, rows.T) ** 2).sum(0)
                 # Median over series: some are of occluded joints, some of an unsynchronised camera.
                 scale = max(float(np.median(energy)) / max(len(times) - 1.7, 1), 1e-6)
-                found = -np.log(np.diag(low)).sum() - len(times) / 2 * np.log(scale)
-                if found > best:
-                    best, chosen = found, TimeNoise(kind, length, fast, float(np.sqrt(scale)))
+                likelihood = -np.log(np.diag(low)).sum() - len(times) / 2 * np.log(scale)
+                if likelihood > best:
+                    best, chosen = likelihood, TimeNoise(kind, length, fast, float(np.sqrt(scale)))
     return chosen
 
 
@@ -137,33 +135,36 @@ def find_offsets(
     motion = build_motion(shown, rig, times)
     if start is None or not start.any():
         return estimate_offsets(motion, master)
-    found = estimate_offsets(motion.at_offsets(start), master)
+    offsets = estimate_offsets(motion.at_offsets(start), master)
     return replace(
-        found,
-        offset=found.offset + start,
-        vector=found.vector + found.information @ start,
+        offsets,
+        offset=offsets.offset + start,
+        vector=offsets.vector + offsets.information @ start,
     )
 
 
 def estimate_offsets(motion: KeypointMotion, master: int) -> TimeOffsets:
     """The time offsets that explain a motion's residuals."""
     views = len(motion.rig)
-    matrices, vectors = keypoint_equations(motion, motion.residual, _columns(motion))
-    # given poses are uncertain by a degree and 2 cm; tuned on the studio
+    # derivatives (7C, T, K, 2C) of the projected residuals by offsets, then by pose errors
+    by_offset = [motion.projected_of(c, motion.speed_px[:, c]) for c in range(views)]
+    columns = np.concatenate([np.stack(by_offset), pose_columns(motion)])
+    matrices, vectors = keypoint_equations(motion, motion.residual, columns)
+    # offsets are uncertain by 50 ms, given poses by a degree and 2 cm; tuned on the studio
     pose_sigma = np.repeat([np.radians(1.0), 0.02], 3)
-    prior = np.r_[np.full(views, OFFSET_SIGMA_S**-2.0), np.tile(pose_sigma**-2.0, views)]
+    prior = np.r_[np.full(views, 0.05**-2.0), np.tile(pose_sigma**-2.0, views)]
     free = np.flatnonzero(np.arange(7 * views) != master)
     matrix, vector = matrices.sum(0), vectors.sum(0)
     covariance = np.linalg.inv((matrix + np.diag(prior))[np.ix_(free, free)])
-    found = np.zeros(7 * views)
-    found[free] = covariance @ vector[free]
+    solution = np.zeros(7 * views)
+    solution[free] = covariance @ vector[free]
     own = np.searchsorted(free, np.delete(np.arange(views), master))
-    inflation = _inflation(matrices, vectors, found, covariance, free, own)
+    inflation = _inflation(matrices, vectors, solution, covariance, free, own)
     poses = (matrix + np.diag(prior))[views:, views:]
     solved = np.linalg.solve(poses, matrix[views:, :views])
     information = matrix[:views, :views] - matrix[:views, views:] @ solved
     offset, sigma = np.zeros(views), np.zeros(views)
-    offset[free[own]] = found[free[own]]
+    offset[free[own]] = solution[free[own]]
     random = inflation * np.diag(covariance)[own]
     # smoothing makes speeds, and so offsets, wrong by 8 %; tuned on the studio
     sigma[free[own]] = np.sqrt(random + (0.08 * offset[free[own]]) ** 2)
@@ -181,7 +182,7 @@ def estimate_offsets(motion: KeypointMotion, master: int) -> TimeOffsets:
 def _inflation(
     matrices: np.ndarray,
     vectors: np.ndarray,
-    found: np.ndarray,
+    solution: np.ndarray,
     covariance: np.ndarray,
     free: np.ndarray,
     own: np.ndarray,
@@ -191,7 +192,7 @@ def _inflation(
     From how the keypoints disagree at the solution (the sandwich estimator with clusters: a hand's
     or the face's points err together), as a mean over the cameras.
     """
-    scores = (vectors - matrices @ found)[:, free]
+    scores = (vectors - matrices @ solution)[:, free]
     groups = np.zeros((CLUSTER.max() + 1, len(free)))
     np.add.at(groups, CLUSTER, scores)
     taking_part = (np.abs(groups).sum(1) > 0).sum()
@@ -235,8 +236,8 @@ def precisions(motion: KeypointMotion, noise: TimeNoise, part: slice) -> np.ndar
     valid = np.moveaxis(motion.valid[part], 0, 2)  # (C, K, W)
     variance = np.where(valid, 0.0, 1e6)  # practically no weight if missing
     views, count, size = variance.shape
-    found = noise.precision(motion.times[part], variance.reshape(-1, size))
-    return np.swapaxes(found.reshape(views, count, size, size), 0, 1)
+    inverse = noise.precision(motion.times[part], variance.reshape(-1, size))
+    return np.swapaxes(inverse.reshape(views, count, size, size), 0, 1)
 
 
 def keypoint_equations(
@@ -269,12 +270,6 @@ def keypoint_equations(
                 matrices[k] += (np.swapaxes(rows, 1, 2) @ weighted).sum(0)
                 vectors[k] += np.einsum("xtn,xt->n", weighted, series[k, both, part])
     return matrices, vectors
-
-
-def _columns(motion: KeypointMotion) -> np.ndarray:
-    """Derivatives (7C, T, K, 2C) of the projected residuals by offsets, then by pose errors."""
-    offsets = [motion.projected_of(c, motion.speed_px[:, c]) for c in range(len(motion.rig))]
-    return np.concatenate([np.stack(offsets), pose_columns(motion)])
 
 
 def pose_columns(motion: KeypointMotion) -> np.ndarray:

@@ -38,67 +38,45 @@ from intercap_core.scene.keypoint_timing import (
     keypoint_equations,
     pose_columns,
 )
-from intercap_core.scene.registration import STATIC, Registration, RigEstimate, SurfaceLayer
+from intercap_core.scene.registration import STATIC, Registration, RigEstimate
 from intercap_core.scene.subject_views import SubjectViews
 from intercap_core.scene.surfaces import background_surfaces
-
-VIEW_BIAS_VARIANCE = 2.0  # of a joint's constant error in a view, over that of its noise; tuned
-MIN_LENS_GAIN = 15.0  # log likelihood; chance brings up to 9 on the studio
-SUSPICIOUS = 1.3  # residuals over usual ones from which a camera is tested; tuned on the studio
-MUCH_BETTER = 0.8  # residuals with exchanged over those with given lenses; tuned on the studio
 
 
 @dataclass(frozen=True)
 class LensPair:
     """Hypothesis that two cameras have each other's lenses."""
 
-    first: int
-    """Camera index."""
-    second: int
-    """Camera index."""
+    cameras: tuple[int, int]
+    """Camera indices."""
     gain: float
     """Log likelihood ratio, reduced if keypoints disagree by more than their noise."""
     share: float
     """Share of the expected pattern that the residuals contain; 1 = all of it."""
 
 
-def lenses_by_keypoints(
-    keypoints: np.ndarray,
-    rig: Rig,
-    times: np.ndarray,
-    *,
-    rotation_sigma: float,
-    translation_sigma: float,
-) -> list[LensPair]:
-    """Find pairs of cameras whose colour lenses are exchanged; each camera at most once.
-
-    Args:
-        keypoints: (T, C, 135, 3) x, y, confidence of the subject by moment.
-        times: (T,) seconds.
-        rotation_sigma: standard deviation of the poses about each axis, rad.
-        translation_sigma: standard deviation of the poses along each axis, metres.
-    """
-    pairs = lens_gains(
-        keypoints, rig, times, rotation_sigma=rotation_sigma, translation_sigma=translation_sigma
-    )
+def choose_pairs(pairs: Sequence[LensPair]) -> list[LensPair]:
+    """Pairs that are exchanged beyond chance; each camera at most once."""
     chosen: list[LensPair] = []
     for pair in sorted(pairs, key=lambda p: -p.gain):
-        used = {c for other in chosen for c in (other.first, other.second)}
-        good = pair.gain >= MIN_LENS_GAIN and 0.5 <= pair.share <= 1.5
-        if good and not used & {pair.first, pair.second}:
+        used = {c for other in chosen for c in other.cameras}
+        # on the studio, chance brings gains of up to 9
+        good = pair.gain >= 15.0 and 0.5 <= pair.share <= 1.5
+        if good and not used & set(pair.cameras):
             chosen.append(pair)
     return chosen
 
 
 def lens_gains(
-    keypoints: np.ndarray,
-    rig: Rig,
-    times: np.ndarray,
-    *,
-    rotation_sigma: float,
-    translation_sigma: float,
+    keypoints: np.ndarray, rig: Rig, times: np.ndarray, pose_sigma: tuple[float, float]
 ) -> list[LensPair]:
-    """Test each exchange of two different lenses for images of one size."""
+    """Test each exchange of two different lenses for images of one size.
+
+    Args:
+        keypoints: (T, C, 135, 3) x, y, confidence of the subject by moment.
+        times: (T,) seconds.
+        pose_sigma: standard deviations of the poses about each axis, rad, and along it, metres.
+    """
     size = [(camera.colour.width, camera.colour.height) for camera in rig]
     lenses = rig.colour_parameters
     orders = [
@@ -113,13 +91,14 @@ def lens_gains(
     whole = np.where(motion.seen[..., None], motion.residual + motion.bias, 0.0)
     patterns = [motion.projected_of(a, _lens_shift(motion, a, b)) for a, b in orders]
     columns = np.concatenate([np.stack(patterns), pose_columns(motion)])
-    matrices, vectors = keypoint_equations(motion, whole, columns, constant=VIEW_BIAS_VARIANCE)
+    # a joint's constant error in a view has twice the variance of its noise; tuned on the studio
+    matrices, vectors = keypoint_equations(motion, whole, columns, constant=2.0)
     number = len(orders)
-    prior = np.tile(np.repeat([rotation_sigma**-2.0, translation_sigma**-2.0], 3), len(rig))
+    prior = np.tile(np.repeat([sigma**-2.0 for sigma in pose_sigma], 3), len(rig))
     matrix, vector = matrices.sum(0), vectors.sum(0)
     poses = np.linalg.inv(matrix[number:, number:] + np.diag(prior))
     place = {order: i for i, order in enumerate(orders)}
-    found = []
+    pairs = []
     for a, b in orders:
         if a > b:
             continue
@@ -134,8 +113,8 @@ def lens_gains(
         scores = (vectors - matrices @ fitted) @ pattern
         disagreement = float((np.bincount(CLUSTER, scores) ** 2).sum()) / energy
         gain = (linear - energy / 2) / max(1.0, disagreement)
-        found.append(LensPair(a, b, gain, linear / energy))
-    return found
+        pairs.append(LensPair((a, b), gain, linear / energy))
+    return pairs
 
 
 def _lens_shift(motion: KeypointMotion, camera: int, other: int) -> np.ndarray:
@@ -152,10 +131,8 @@ def _lens_shift(motion: KeypointMotion, camera: int, other: int) -> np.ndarray:
 class LensExchange:
     """Two cameras that were given each other's intrinsics."""
 
-    first: int
-    """Camera index."""
-    second: int
-    """Camera index."""
+    cameras: tuple[int, int]
+    """Camera indices."""
     whole: bool
     """The distortion is exchanged as well."""
     before: float
@@ -184,17 +161,12 @@ def exchange_lenses(
     blind = [c for c, camera in enumerate(rig) if camera.depth is None]
     if len(blind) >= 2:
         # Poses as calibrated, before anybody touched the tripods; tuned on the studio.
-        for pair in lenses_by_keypoints(
-            subject.keypoints,
-            rig,
-            times,
-            rotation_sigma=np.radians(0.3),
-            translation_sigma=0.006,
-        ):
-            if pair.first in blind and pair.second in blind:
-                exchanges.append(LensExchange(pair.first, pair.second, True, np.nan, np.nan))
+        gains = lens_gains(subject.keypoints, rig, times, (np.radians(0.3), 0.006))
+        for pair in choose_pairs(gains):
+            if set(pair.cameras) <= set(blind):
+                exchanges.append(LensExchange(pair.cameras, True, np.nan, np.nan))
     for exchange in exchanges:
-        rig = swap_lenses(rig, exchange.first, exchange.second, whole=exchange.whole)
+        rig = swap_lenses(rig, *exchange.cameras, whole=exchange.whole)
     return rig, exchanges
 
 
@@ -230,8 +202,8 @@ class _BackgroundTest:
         exchanges: list[LensExchange] = []
         while len(free) >= 2 and (best := self._best(rig, free)) is not None:
             exchanges.append(best)
-            free = [c for c in free if c not in (best.first, best.second)]
-            rig = swap_lenses(rig, best.first, best.second, whole=best.whole)
+            free = [c for c in free if c not in best.cameras]
+            rig = swap_lenses(rig, *best.cameras, whole=best.whole)
         return exchanges
 
     def _best(self, rig: Rig, cameras: list[int]) -> LensExchange | None:
@@ -241,7 +213,7 @@ class _BackgroundTest:
             return None
         # A wrong lens also biases the poses of its neighbours: the lowest quartile is usual.
         usual = np.quantile(list(given.values()), 0.25)
-        suspects = [c for c in cameras if _mean_of(given, c) > SUSPICIOUS * usual]
+        suspects = [c for c in cameras if _mean_of(given, c) > 1.3 * usual]  # tuned on the studio
         suspects = sorted(sorted(suspects, key=lambda c: -_mean_of(given, c))[:4])
         better = []
         for (a, b), whole in product(combinations(suspects, 2), (True, False)):
@@ -251,22 +223,18 @@ class _BackgroundTest:
                 continue
             before = _mean_of(given, a, b)
             after = _mean_of(self._residuals(swap_lenses(rig, a, b, whole=whole)), a, b)
-            if after < MUCH_BETTER * before:
-                better.append(LensExchange(a, b, whole, before, after))
+            if after < 0.8 * before:  # tuned on the studio
+                better.append(LensExchange((a, b), whole, before, after))
         return min(better, key=lambda exchange: exchange.after, default=None)
 
     def _residuals(self, rig: Rig) -> dict[tuple[int, int], float]:
         """Held-out residual by pair, metres, with poses refined on the background."""
         surfaces = background_surfaces(rig, self.backgrounds)
-        registration = Registration(rig, [SurfaceLayer(surfaces, STATIC)], self.master)
+        registration = Registration(rig, {STATIC: [surfaces]}, self.master)
         enough = len(self.views.points) >= MIN_BODY_POINTS
         body = [BodyConstraint(self.views, rig)] if enough else []
         refined = registration.solve(RigEstimate.start(rig), body).estimate
-        residuals = registration.residuals(refined, STATIC)
-        return {
-            (int(a), int(b)): float(median)
-            for (a, b), median in zip(residuals.pairs, residuals.median, strict=True)
-        }
+        return registration.median_residuals(refined, STATIC)
 
 
 def _mean_of(residuals: dict[tuple[int, int], float], *cameras: int) -> float:

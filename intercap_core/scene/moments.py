@@ -18,6 +18,7 @@ from intercap_core.scene.starts import (
     StartTimes,
     StatedStarts,
     describe_start,
+    shift_images,
 )
 from intercap_core.scene.subject_views import SubjectViews, find_subject_views
 
@@ -33,14 +34,14 @@ def check_stated_starts(
     denied, step = starts.denied.copy(), starts.step_s
     constant = constant_slip(slips.slip)
     for c in np.flatnonzero(stated.known & ~denied):
-        found_sigma = TIMING_INFLATION * timing.sigma[c]
-        if not np.isfinite(found_sigma):
+        start_sigma = TIMING_INFLATION * timing.sigma[c]
+        if not np.isfinite(start_sigma):
             if constant[c] == 0:
                 continue
-            found_sigma = step / 2
-        found = (starts.sets[c] + constant[c]) * step - timing.offset[c]
-        away = np.hypot(found_sigma, stated.sigma[c])
-        if abs(found - stated.late[c]) > DENIED_SIGMAS * away:
+            start_sigma = step / 2
+        start = (starts.sets[c] + constant[c]) * step - timing.offset[c]
+        away = np.hypot(start_sigma, stated.sigma[c])
+        if abs(start - stated.late[c]) > DENIED_SIGMAS * away:
             denied[c], sigma[c] = True, np.nan
             late[c] = starts.sets[c] * step - timing.offset[c]
         elif constant[c] != 0:
@@ -67,21 +68,21 @@ def describe_stated_start(
         return ""
     source, late = stated.source[camera], float(stated.late[camera])
     whole = starts.sets[camera] + constant_slip(slips.slip)[camera]
-    found = float(whole * starts.step_s - offset)
+    start = float(whole * starts.step_s - offset)
     if starts.denied[camera]:
         return (
             f"{source} has it start {describe_start(late)}; the keypoints deny that and were "
-            f"followed: {describe_start(found)}"
+            f"followed: {describe_start(start)}"
         )
     if not offset_sigma < 0.5 * stated.sigma[camera]:  # the keypoints add little
         return (
-            f"its start rests on {source}: {describe_start(found)}, known to {offset_sigma:.3f} s; "
+            f"its start rests on {source}: {describe_start(start)}, known to {offset_sigma:.3f} s; "
             "the keypoints tell too little"
         )
     if whole == 0:
         return ""
     return (
-        f"it started {describe_start(found)}, and was brought into step: so say {source} and the "
+        f"it started {describe_start(start)}, and was brought into step: so say {source} and the "
         "keypoints"
     )
 
@@ -129,7 +130,7 @@ def find_moments(
     slips = find_slips(subject.keypoints, rig, times, fps, master=master)
     slip = starts.with_slips(slips.slip)
     image_of = images_of_moments(slip, available & ~starts.in_doubt)
-    keypoints = starts.of_images(subject.keypoints)
+    keypoints = shift_images(subject.keypoints, -starts.sets)
     timing = find_offsets(keypoints, slip, rig, times, master=master, start=starts.offset)
     starts = check_stated_starts(starts, stated, slips, timing)
     shown = replace(subject, keypoints=keypoints).showing(image_of, rig)

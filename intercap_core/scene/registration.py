@@ -9,7 +9,7 @@ degrees of freedom undetermined. Moving surfaces also observe the exposure times
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -26,12 +26,8 @@ from intercap_core.scene.surfaces import DepthSurface
 SURFACE_SIGMA_FLOOR_M = 0.003  # of point-to-plane residuals; tuned on the studio
 PRIOR_TRANSLATION_M = 0.01  # error of a careful calibration; tuned on the studio
 PRIOR_ROTATION_RAD = np.radians(0.5)  # the same
-PRIOR_BIAS_M = 0.003  # systematic depth error is at most 11 mm + 0.1 % (Azure Kinect DK data sheet)
 HELD_OUT_EVERY = 4  # one of so many cells of a surface is held out
 SURFACE_SEARCH_M = 0.12  # distance to the nearest cell, beyond the widest gate
-# Gates on the distance to the plane, one an iteration, annealed; tuned on the studio.
-GATES_M = (0.08, 0.05, 0.03, 0.02, 0.015, 0.015, 0.015)
-MIN_NORMALS_COSINE = 0.85  # 32 degrees: one surface's normals in two views; tuned on the studio
 MAX_DIRECTION_SHARE = 0.8  # of a pair's weight, for one direction of normals; tuned on the studio
 # Factor by which the weight of other directions grows; tuned on the studio
 MAX_DIRECTION_GAIN = 3.0
@@ -83,15 +79,8 @@ class SurfaceKind:
 STATIC = SurfaceKind(effective_points=10.0, rounded=False)
 MOVING = SurfaceKind(effective_points=50.0, rounded=True)
 
-
-@dataclass(frozen=True)
-class SurfaceLayer:
-    """Surfaces seen at one moment."""
-
-    surfaces: dict[int, DepthSurface]
-    """By camera index, in the depth camera's frame."""
-    kind: SurfaceKind
-    """Background or foreground."""
+Layers = Mapping[SurfaceKind, Sequence[dict[int, DepthSurface]]]
+"""By kind, the surfaces of each moment by camera index, in the depth camera's frame."""
 
 
 @dataclass
@@ -126,28 +115,6 @@ class RigSolution:
 
 
 @dataclass(frozen=True)
-class OffsetInformation:
-    """Normal equations of the time offsets: ``information`` @ offset = ``vector``."""
-
-    information: np.ndarray
-    """(C, C) 1/s^2."""
-    vector: np.ndarray
-    """(C,) 1/s."""
-
-
-@dataclass
-class PairResiduals:
-    """Held-out point-to-plane residuals by pair of cameras."""
-
-    pairs: np.ndarray
-    """(P, 2) camera indices."""
-    count: np.ndarray
-    """(P,) correspondences."""
-    median: np.ndarray
-    """(P,) median absolute residual, metres."""
-
-
-@dataclass(frozen=True)
 class _Seen:
     """Surfaces of one kind of one camera at all moments, with a search tree."""
 
@@ -163,8 +130,8 @@ class _Seen:
     """Rows that are matched for evaluation only."""
 
     @classmethod
-    def of(cls, surfaces: Sequence[tuple[int, DepthSurface]], queries: int = 2500) -> _Seen:
-        """Join ``surfaces`` by moment; at most ``queries`` points are matched."""
+    def of(cls, surfaces: Sequence[tuple[int, DepthSurface]]) -> _Seen:
+        """Join ``surfaces`` by moment; at most 2500 points are matched, and 625 held out."""
         surface = DepthSurface.joined([surface for _, surface in surfaces])
         # 10 m: beyond any search radius
         moment = np.repeat([10.0 * at for at, _ in surfaces], [len(s) for _, s in surfaces])
@@ -174,8 +141,8 @@ class _Seen:
             surface,
             moment,
             tree,
-            np.delete(order, np.s_[::HELD_OUT_EVERY])[:queries],
-            order[::HELD_OUT_EVERY][: max(1, queries // HELD_OUT_EVERY)],
+            np.delete(order, np.s_[::HELD_OUT_EVERY])[:2500],
+            order[::HELD_OUT_EVERY][: 2500 // HELD_OUT_EVERY],
         )
 
 
@@ -203,14 +170,14 @@ class Registration:
     def __init__(
         self,
         rig: Rig,
-        layers: Sequence[SurfaceLayer],
+        layers: Layers,
         master: int,
         offset_sigma: np.ndarray | None = None,
     ) -> None:
         """
         Args:
             rig: cameras as given.
-            layers: surfaces by moment and kind.
+            layers: surfaces by kind and moment.
             master: index of the master.
             offset_sigma: (C,) prior standard deviation of the given offsets, seconds; None = that
                 of synchronised devices.
@@ -221,19 +188,19 @@ class Registration:
         )
         self._master = master
         self._seen: dict[SurfaceKind, dict[int, _Seen]] = {}
-        for kind in dict.fromkeys(layer.kind for layer in layers):
+        for kind, moments in layers.items():
             by_camera: dict[int, list[tuple[int, DepthSurface]]] = {}
-            for moment, layer in enumerate(layers):
-                for camera, surface in layer.surfaces.items():
-                    if layer.kind == kind and len(surface):
+            for moment, surfaces in enumerate(moments):
+                for camera, surface in surfaces.items():
+                    if len(surface):
                         by_camera.setdefault(camera, []).append((moment, surface))
-            self._seen[kind] = {c: _Seen.of(surfaces) for c, surfaces in sorted(by_camera.items())}
+            self._seen[kind] = {c: _Seen.of(own) for c, own in sorted(by_camera.items())}
 
     def solve(
         self,
         start: RigEstimate,
         constraints: Sequence[Constraint] = (),
-        timing: OffsetInformation | None = None,
+        timing: tuple[np.ndarray, np.ndarray] | None = None,
         *,
         free_poses: bool | np.ndarray = True,
     ) -> RigSolution:
@@ -242,13 +209,20 @@ class Registration:
         Args:
             start: first estimate, and mean of the prior.
             constraints: further normal equations of the poses.
-            timing: normal equations of the offsets from the keypoints.
+            timing: normal equations of the offsets from the keypoints: matrix (C, C), 1/s^2, and
+                vector (C,), 1/s.
             free_poses: whether poses are estimated, for all cameras or by camera (C,).
         """
         current = RigEstimate(start.poses.copy(), start.bias.copy(), start.offset.copy())
         count = len(self.rig)
-        rows = self._free_rows(free_poses)
-        for gate in GATES_M if np.any(free_poses) else (0.08, 0.04, 0.04):
+        free = np.ones((count, FREEDOMS), bool)
+        free[:, :6] = np.broadcast_to(free_poses, count)[:, None]
+        free[self._master] = False
+        free[self._master, BIAS] = True
+        rows = np.flatnonzero(free.ravel())
+        # gates on the distance to the plane, metres, one an iteration; tuned on the studio
+        gates = (0.08, 0.05, 0.03, 0.02, 0.015, 0.015, 0.015)
+        for gate in gates if np.any(free_poses) else (0.08, 0.04, 0.04):
             matrix = np.zeros((count, FREEDOMS, count, FREEDOMS))
             gradient = np.zeros((count, FREEDOMS))
             self._add_surfaces(matrix, gradient, current, gate)
@@ -257,8 +231,9 @@ class Registration:
                 matrix[:, :6, :, :6] += block
                 gradient[:, :6] += slope
             if timing is not None:
-                matrix[:, OFFSET, :, OFFSET] += timing.information
-                gradient[:, OFFSET] += timing.information @ current.offset - timing.vector
+                information, vector = timing
+                matrix[:, OFFSET, :, OFFSET] += information
+                gradient[:, OFFSET] += information @ current.offset - vector
             self._add_prior(matrix, gradient, current, start)
             step = np.zeros(count * FREEDOMS)
             system = matrix.reshape(count * FREEDOMS, -1)[np.ix_(rows, rows)]
@@ -275,9 +250,12 @@ class Registration:
 
     def residuals(
         self, at: RigEstimate, kind: SurfaceKind, camera: int | None = None
-    ) -> PairResiduals:
-        """Median |point to plane| of held-out points of all pairs, or those with one ``camera``."""
-        values = {}
+    ) -> dict[tuple[int, int], np.ndarray]:
+        """Distances (n,) of held-out points to the other surface, metres, by pair of cameras.
+
+        Only the pairs with ``camera``, if given.
+        """
+        result = {}
         for a, b in combinations(self._seen.get(kind, {}), 2):
             if camera is not None and camera not in (a, b):
                 continue
@@ -287,12 +265,15 @@ class Registration:
             )
             distances = np.concatenate([np.abs(match.residual) for match in ways])
             if len(distances) >= MIN_PAIR_POINTS / HELD_OUT_EVERY:
-                values[a, b] = distances
-        return PairResiduals(
-            pairs=np.array(list(values), np.int32).reshape(-1, 2),
-            count=np.array([len(v) for v in values.values()], np.int64),
-            median=np.array([np.median(v) for v in values.values()], np.float64),
-        )
+                result[a, b] = distances
+        return result
+
+    def median_residuals(
+        self, at: RigEstimate, kind: SurfaceKind, camera: int | None = None
+    ) -> dict[tuple[int, int], float]:
+        """Medians of :meth:`residuals`."""
+        residuals = self.residuals(at, kind, camera)
+        return {pair: float(np.median(distances)) for pair, distances in residuals.items()}
 
     def _match(
         self,
@@ -321,7 +302,7 @@ class Registration:
         own_normals = queries.normals[hit] @ source[:3, :3].T
         on_target = apply(target, surface.points[nearest] - at.bias[b] * surface.rays[nearest])
         speed = (queries.speed[hit] + surface.speed[nearest]) / 2
-        good = (normals * own_normals).sum(1) >= MIN_NORMALS_COSINE
+        good = (normals * own_normals).sum(1) >= 0.85  # 32 degrees; tuned on the studio
         # The mean normal: two points of one circle are then at distance 0, however far apart
         # (Rusinkiewicz, A symmetric objective function for ICP, 2019).
         normals = normals + own_normals
@@ -350,14 +331,12 @@ class Registration:
             (kind, *pair) for kind, seen in self._seen.items() for pair in combinations(seen, 2)
         ]
         for kind, a, b in pairs:
-            found = [self._match(kind, *way, at, gate) for way in ((a, b), (b, a))]
-            residual = np.concatenate([match.residual for match in found])
+            forth, back = self._match(kind, a, b, at, gate), self._match(kind, b, a, at, gate)
+            residual = np.concatenate([forth.residual, back.residual])
             if len(residual) < 2 * MIN_PAIR_POINTS:
                 continue
-            (first_a, first_b), (second_b, second_a) = (
-                _derivatives(found[0], at, a, b),
-                _derivatives(found[1], at, b, a),
-            )
+            first_a, first_b = _derivatives(forth, at, a, b)
+            second_b, second_a = _derivatives(back, at, b, a)
             rows = np.stack([np.vstack([first_a, second_a]), np.vstack([first_b, second_b])])
             weight = (1 - np.minimum(np.abs(residual) / gate, 1) ** 2) ** 2  # Tukey's biweight
             if kind.rounded:
@@ -365,9 +344,7 @@ class Registration:
                 residual = residual - share @ residual
                 rows = rows - np.einsum("n,knf->kf", share, rows)[:, None]
             else:
-                weight = balance_directions(
-                    weight, np.concatenate([match.normals for match in found])
-                )
+                weight = balance_directions(weight, np.concatenate([forth.normals, back.normals]))
             sigma = max(SURFACE_SIGMA_FLOOR_M, SIGMA_PER_MAD * float(np.median(np.abs(residual))))
             weight /= sigma**2 * max(1.0, len(residual) / (2 * kind.effective_points))
             weighted = rows * weight[:, None]
@@ -382,7 +359,8 @@ class Registration:
         precision = np.r_[
             np.full(3, PRIOR_ROTATION_RAD**-2.0),
             np.full(3, PRIOR_TRANSLATION_M**-2.0),
-            PRIOR_BIAS_M**-2.0,
+            # the systematic depth error is at most 11 mm + 0.1 % (Azure Kinect DK data sheet)
+            0.003**-2.0,
             0.0,
         ]
         for c in range(len(self.rig)):
@@ -396,13 +374,6 @@ class Registration:
             ]
             matrix[c, :, c] += np.diag(precision)
             gradient[c] += precision * away
-
-    def _free_rows(self, free_poses: bool | np.ndarray) -> np.ndarray:
-        free = np.ones((len(self.rig), FREEDOMS), bool)
-        free[:, :6] = np.broadcast_to(free_poses, len(self.rig))[:, None]
-        free[self._master] = False
-        free[self._master, BIAS] = True
-        return np.flatnonzero(free.ravel())
 
 
 def _derivatives(m: _Match, at: RigEstimate, a: int, b: int) -> tuple[np.ndarray, np.ndarray]:

@@ -2,9 +2,9 @@
 
 While a camera's images are late, every keypoint that moves is seen where it was a while ago. For
 each camera, each number of frames and each interval of sets, the gain in log likelihood of the
-keypoints is worked out under the detector's own noise over time. The best intervals are taken,
-their images reassigned to the sets that they show, and the search is repeated until no interval is
-significant. While nobody moves a slip cannot be seen, and none is reported.
+keypoints is computed under the detector's own noise over time. The images of the best intervals are
+reassigned to the sets that they show, and the search is repeated until no interval is significant.
+While nobody moves a slip cannot be seen, and none is reported.
 """
 
 from __future__ import annotations
@@ -159,15 +159,15 @@ def _apart(intervals: list[SlipInterval], times: np.ndarray) -> list[SlipInterva
     to the next round.
     """
     ordered = sorted(intervals, key=lambda i: -i.gain)
-    taken: list[SlipInterval] = []
+    chosen: list[SlipInterval] = []
     for interval in ordered:
         early, late = times[interval.first] - SLIPS_APART_S, times[interval.last] + SLIPS_APART_S
         # a fifth of the best gain is needed in the same round; tuned on the studio
         if interval.gain >= 0.2 * ordered[0].gain and all(
-            times[other.last] < early or times[other.first] > late for other in taken
+            times[other.last] < early or times[other.first] > late for other in chosen
         ):
-            taken.append(interval)
-    return taken
+            chosen.append(interval)
+    return chosen
 
 
 def _runs(chosen: np.ndarray) -> list[np.ndarray]:
@@ -192,11 +192,11 @@ def _polished(
             before = slip.copy()
             before[run, c] = constant
             shown = with_keypoints(motion, keypoints_by_moment(keypoints, before))
-            found = _Evidence(shown.at_offsets(offset), steps, fps).best(c)
+            interval = _Evidence(shown.at_offsets(offset), steps, fps).best(c)
             result[run, c] = constant
-            if found is not None and not _whole(found, len(slip)):
-                _apply(result, found)
-                intervals.append(found)
+            if interval is not None and not _whole(interval, len(slip)):
+                _apply(result, interval)
+                intervals.append(interval)
     return result, intervals
 
 
@@ -243,23 +243,24 @@ class _Evidence:
         always = {step: np.zeros(series.shape[1]) for step in self._steps}
         top = None
         for (part, between), precision in zip(self._parts, self._precisions, strict=True):
-            window = _Window(root[part], series[part], precision[:, camera])
             cases = {
-                step: window.slipped(late[part, camera])
+                step: _Slipped.of(
+                    root[part], series[part], precision[:, camera], late[part, camera]
+                )
                 for step, late in zip(self._steps, self._late, strict=True)
             }
             if not between:
                 for step, case in cases.items():
                     always[step] += case.gains(0, part.stop - part.start)
-            found = _best_of_window(
+            interval = _best_of_window(
                 {s: case for s, case in cases.items() if s > 0 and s % own_step == 0}
             )
-            if found is not None and (top is None or found.gain > top.gain):
+            if interval is not None and (top is None or interval.gain > top.gain):
                 top = replace(
-                    found,
+                    interval,
                     camera=camera,
-                    first=part.start + found.first,
-                    last=part.start + found.last,
+                    first=part.start + interval.first,
+                    last=part.start + interval.last,
                 )
         step = max(self._steps, key=lambda s: _sure(always[s]))
         whole = SlipInterval(
@@ -272,13 +273,13 @@ class _Evidence:
 
 def _best_of_window(cases: dict[int, _Slipped]) -> SlipInterval | None:
     """The interval, by place in the window, with the greatest gain, if significant."""
-    found = [case.best(step) for step, case in cases.items()]
-    found = [interval for interval in found if interval.beyond_doubt]
-    if not found:
+    intervals = [case.best(step) for step, case in cases.items()]
+    intervals = [interval for interval in intervals if interval.beyond_doubt]
+    if not intervals:
         return None
-    most = max(found, key=lambda i: i.gain)
+    most = max(intervals, key=lambda i: i.gain)
     # the gain shows best that and when images are late, the misfit by how much
-    return min(found, key=lambda i: cases[i.slip].misfit(most.first, most.last + 1))
+    return min(intervals, key=lambda i: cases[i.slip].misfit(most.first, most.last + 1))
 
 
 def _own_series(motion: KeypointMotion, camera: int) -> tuple[np.ndarray, np.ndarray]:
@@ -303,25 +304,6 @@ def _own_series(motion: KeypointMotion, camera: int) -> tuple[np.ndarray, np.nda
 
 
 @dataclass(frozen=True, eq=False)
-class _Window:
-    """One camera's residuals in W sets."""
-
-    root: np.ndarray
-    """(W, K, 2, 2), see :func:`_own_series`."""
-    series: np.ndarray
-    """(W, K, 2), see :func:`_own_series`."""
-    precision: np.ndarray
-    """(K, W, W) inverse covariance over time."""
-
-    def slipped(self, late: np.ndarray) -> _Slipped:
-        """The hypothesis that keypoints are displaced by ``late`` (W, K, 2) px."""
-        change = np.einsum("tkij,tkj->ktj", self.root, late)
-        weighted = self.precision @ np.swapaxes(self.series, 0, 1)
-        series = np.swapaxes(self.series, 0, 1)
-        return _Slipped(series, change, (change * weighted).sum(-1), self.precision)
-
-
-@dataclass(frozen=True, eq=False)
 class _Slipped:
     """One camera's residuals under the hypothesis of a slip."""
 
@@ -333,6 +315,21 @@ class _Slipped:
     """(K, W) product of the two, whitened over time."""
     precision: np.ndarray
     """(K, W, W) inverse covariance over time."""
+
+    @classmethod
+    def of(
+        cls, root: np.ndarray, series: np.ndarray, precision: np.ndarray, late: np.ndarray
+    ) -> _Slipped:
+        """The hypothesis that keypoints are displaced by ``late`` (W, K, 2) px.
+
+        Args:
+            root: (W, K, 2, 2), see :func:`_own_series`.
+            series: (W, K, 2), see :func:`_own_series`.
+            precision: (K, W, W) inverse covariance over time.
+        """
+        change = np.einsum("tkij,tkj->ktj", root, late)
+        series = np.swapaxes(series, 0, 1)
+        return cls(series, change, (change * (precision @ series)).sum(-1), precision)
 
     def gains(self, first: int, end: int) -> np.ndarray:
         """The keypoints' gains (K,) if the sets from ``first`` to before ``end`` are late."""

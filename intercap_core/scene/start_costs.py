@@ -13,7 +13,7 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
-from intercap_core.body.keypoints import KEYPOINT_NAMES
+from intercap_core.body.keypoints import KEYPOINT_INDEX
 from intercap_core.formats.detections.read import PeopleOfImages
 from intercap_core.formats.recordings.synchronise import usual_steps
 from intercap_core.geometry.camera.rig import Rig
@@ -24,17 +24,15 @@ from intercap_core.person.tracks import MAX_LINK_GAP_S
 from intercap_core.scene.keypoint_motion import MIN_CONFIDENCE, known_median
 
 MAX_PEOPLE = 3  # of an image, the most confident
-LINK_SLACK_RAD = 0.05  # noise of a person's middles between images: a few pixels of the detector
-EPIPOLAR_PX_AT_1080P = 6.0  # scatter of epipolar distances over time at equal times; tuned
 
-
-_PLACE = {name: index for index, name in enumerate(KEYPOINT_NAMES)}
-_SIDES = [
-    (_PLACE[f"left_{name}"], _PLACE[f"right_{name}"])
-    for name in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
-]
-_ALONE = [_PLACE[name] for name in ("nose", "neck", "mid_hip")]
-MIDDLES = len(_ALONE) + len(_SIDES)
+_LEFT, _RIGHT = (
+    [
+        KEYPOINT_INDEX[f"{side}_{name}"]
+        for name in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+    ]
+    for side in ("left", "right")
+)
+_ALONE = [KEYPOINT_INDEX[name] for name in ("nose", "neck", "mid_hip")]
 
 
 def body_middles(person: np.ndarray) -> np.ndarray:
@@ -43,8 +41,7 @@ def body_middles(person: np.ndarray) -> np.ndarray:
     NaN if one of the two points of a middle is not seen.
     """
     known = np.where(person[:, 2:] >= MIN_CONFIDENCE, person[:, :2], np.nan)
-    between = [(known[left] + known[right]) / 2 for left, right in _SIDES]
-    return np.concatenate([known[_ALONE], between])
+    return np.concatenate([known[_ALONE], (known[_LEFT] + known[_RIGHT]) / 2])
 
 
 def follow_rays(
@@ -59,7 +56,7 @@ def follow_rays(
         times: (T,) seconds of the sets.
         available: (T, C) bool, the set has an image of the camera.
     """
-    rays = np.full((*available.shape, MAX_PEOPLE, MIDDLES, 2), np.nan)
+    rays = np.full((*available.shape, MAX_PEOPLE, len(_ALONE) + len(_LEFT), 2), np.nan)
     for c, usual in enumerate(usual_steps(available)):
         images = np.flatnonzero(available[:, c])
         for t in images.tolist():
@@ -90,7 +87,7 @@ def _place(rays: np.ndarray, t: int, people: np.ndarray, times: np.ndarray) -> N
     free, waiting = set(range(count)), set(range(len(people)))
     for apart, i, place in options:
         gap = float(times[t] - times[last[place]])
-        reach = LINK_SLACK_RAD + MAX_IMAGE_SPEED_RAD_S * gap
+        reach = 0.05 + MAX_IMAGE_SPEED_RAD_S * gap  # rad: a few pixels of noise
         if i in waiting and place in free and gap <= MAX_LINK_GAP_S and apart <= reach:
             rays[t, place] = people[i]
             waiting.remove(i)
@@ -141,9 +138,9 @@ class PairCosts:
         people = [rays[:, c, places] for c, places in enumerate(occupied)]
         cost = {}
         for a, b in combinations(range(len(rig)), 2):
-            epipolar = _PairEpipolar.of(rig, a, b)
+            epipolar = _epipolar_geometry(rig, a, b)
             cost[a, b] = np.stack(
-                [_cost(people[a], people[b], epipolar, lag, fewest) for lag in lags]
+                [_cost(people[a], people[b], *epipolar, lag, fewest) for lag in lags]
             )
         return cls(cost, len(rig), reach)
 
@@ -176,21 +173,28 @@ class PairCosts:
 
 
 def _cost(
-    rays_a: np.ndarray, rays_b: np.ndarray, epipolar: _PairEpipolar, lag: int, fewest: float
+    rays_a: np.ndarray,
+    rays_b: np.ndarray,
+    essential: np.ndarray,
+    focal: float,
+    lag: int,
+    fewest: float,
 ) -> np.ndarray:
     """Costs (T,) of one lag, see :class:`PairCosts`.
 
     Each person of camera a is compared with the person of camera b who agrees best over the whole
     recording. The cost is the deviation of their epipolar distances from the median over time,
-    averaged over people with their amount of motion as weight.
+    averaged over people with their amount of motion as weight: a person who stands still agrees at
+    any lag. ``essential``, ``focal``: see :func:`_epipolar_geometry`.
     """
     sets = len(rays_a)
-    found = np.full(sets, np.nan)
+    result = np.full(sets, np.nan)
     at = slice(max(0, -lag), min(sets, sets - lag))
     if at.stop - at.start < fewest:
-        return found
+        return result
     first = rays_a[at]
-    distance = epipolar.distances(first, rays_b[at.start + lag : at.stop + lag])
+    second = rays_b[at.start + lag : at.stop + lag]
+    distance = _sampson_distances(first, second, essential, focal)
     seen = np.isfinite(distance).sum(0, keepdims=True)
     distance = np.where(seen >= fewest, distance, np.nan)
     known = np.isfinite(distance).any(-1)  # (T, P, Q)
@@ -200,45 +204,33 @@ def _cost(
     for p in np.flatnonzero(np.isfinite(size).any(1)):
         own = distance[:, p, np.nanargmin(size[p])]
         own = own[:, np.isfinite(own).any(0)]
-        change = (own - known_median(own)) / EPIPOLAR_PX_AT_1080P
+        change = (own - known_median(own)) / 6.0  # px at 1080p, at the right lag; tuned
         cost[p] = known_mean((change**2 / (1 + change**2)).T)
-        weight[p] = np.where(np.isfinite(cost[p]), _moves(first[:, p]), np.nan)
-    found[at] = known_mean(weight * cost) / known_mean(weight)
-    return found
+        motion = 1e-6 + float(np.nanmean(np.sqrt(np.nanvar(first[:, p], axis=0).sum(-1))))  # rad
+        weight[p] = np.where(np.isfinite(cost[p]), motion, np.nan)
+    result[at] = known_mean(weight * cost) / known_mean(weight)
+    return result
 
 
-def _moves(rays: np.ndarray) -> float:
-    """Mean deviation, rad, of a person's rays (T, K, 2) from their mean; never 0.
+def _epipolar_geometry(rig: Rig, a: int, b: int) -> tuple[np.ndarray, float]:
+    """Essential matrix E (3, 3), with ``y' E x`` = 0 for rays x of camera a and y of camera b, and
+    the mean focal length, pixels at 1080p."""
+    b_from_a = invert(rig[b].master_from_colour) @ rig[a].master_from_colour
+    x, y, z = b_from_a[:3, 3]
+    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ b_from_a[:3, :3]
+    scale = pixel_scale(rig)
+    return essential, float(np.mean([rig[c].colour.fx / scale[c] for c in (a, b)]))
 
-    A person who stands still agrees at any lag and carries no information.
-    """
-    return 1e-6 + float(np.nanmean(np.sqrt(np.nanvar(rays, axis=0).sum(-1))))
 
-
-@dataclass(frozen=True, eq=False)
-class _PairEpipolar:
-    """Epipolar geometry of the cameras a and b."""
-
-    essential: np.ndarray
-    """(3, 3) essential matrix: ``y' essential x`` = 0 for rays x of a and y of b."""
-    focal: float
-    """Mean focal length, pixels at 1080p."""
-
-    @classmethod
-    def of(cls, rig: Rig, a: int, b: int) -> _PairEpipolar:
-        b_from_a = invert(rig[b].master_from_colour) @ rig[a].master_from_colour
-        x, y, z = b_from_a[:3, 3]
-        essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ b_from_a[:3, :3]
-        scale = pixel_scale(rig)
-        return cls(essential, np.mean([rig[c].colour.fx / scale[c] for c in (a, b)]))
-
-    def distances(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Signed distances (T, P, Q, K) of rays (T, P, K, 2) of a and (T, Q, K, 2) of b from each
-        other's epipolar lines, pixels at 1080p (Sampson)."""
-        one, two = (np.concatenate([p, np.ones_like(p[..., :1])], -1) for p in (first, second))
-        line, back = (one @ self.essential.T)[:, :, None], (two @ self.essential)[:, None]
-        size = np.sqrt((line[..., :2] ** 2).sum(-1) + (back[..., :2] ** 2).sum(-1))
-        return self.focal * (line * two[:, None]).sum(-1) / np.maximum(size, 1e-12)
+def _sampson_distances(
+    first: np.ndarray, second: np.ndarray, essential: np.ndarray, focal: float
+) -> np.ndarray:
+    """Signed distances (T, P, Q, K) of rays (T, P, K, 2) of a and (T, Q, K, 2) of b from each
+    other's epipolar lines, pixels at 1080p."""
+    one, two = (np.concatenate([p, np.ones_like(p[..., :1])], -1) for p in (first, second))
+    line, back = (one @ essential.T)[:, :, None], (two @ essential)[:, None]
+    size = np.sqrt((line[..., :2] ** 2).sum(-1) + (back[..., :2] ** 2).sum(-1))
+    return focal * (line * two[:, None]).sum(-1) / np.maximum(size, 1e-12)
 
 
 def known_mean(values: np.ndarray) -> np.ndarray:

@@ -29,15 +29,6 @@ from intercap_core.scene.starts import (
     shift_images,
 )
 
-MAX_START_S = 1.5  # cameras are started by hand or by one command that reaches them in turn
-MAX_START_SHARE = 0.4  # of the recording, for the largest delay; tuned on the studio
-# A delay is certain if the cost at the alternative is higher in most blocks of time, by a number of
-# standard errors of the mean, and by a share of the usual cost.
-START_BLOCK_S = 0.3  # length of a block, seconds; tuned on the studio
-START_BLOCKS_SHARE = 0.7  # of the blocks; tuned on the studio
-START_SIGMAS = 3.0  # standard errors; tuned on the studio
-START_WORSE = 0.2  # of the usual cost; tuned on the studio
-START_PEAK_S = 0.15  # delays closer than this belong to one minimum of the cost; tuned
 FEWEST_BLOCKS = 4  # fewer do not decide; tuned on the studio
 
 
@@ -62,7 +53,9 @@ def find_starts(
     as_stated = StartTimes.as_stated(known, step)
     if sets < 2 or views < 2:
         return as_stated
-    reach = min(round(MAX_START_S / step), int(MAX_START_SHARE * sets))
+    # cameras are started by hand, or by one command that reaches them in turn: delays of up to
+    # 1.5 s and 40 % of the recording; tuned on the studio
+    reach = min(round(1.5 / step), int(0.4 * sets))
     fewest = max(MIN_SHARED_S / step, 1)
     if reach < 1 or sets - reach < fewest:
         return as_stated
@@ -196,13 +189,17 @@ class _Search:
         return self._significant(self._worse(sets, camera, instead), sets, camera)
 
     def _significant(self, worse: np.ndarray, sets: np.ndarray, camera: int) -> bool:
-        """Whether the cost increases ``worse`` (N,), by block, are significant."""
+        """Whether the cost increases ``worse`` (N,), by block, are significant.
+
+        They must be positive in 70 % of the blocks, and their mean above three standard errors and
+        20 % of the usual cost; tuned on the studio.
+        """
         if len(worse) < FEWEST_BLOCKS:
             return False
         series = self.pairs.series(camera, int(sets[camera]), self._others(camera), sets)
         usual = np.nanmean(series)
-        least = max(START_WORSE * usual, START_SIGMAS * worse.std(ddof=1) / np.sqrt(len(worse)))
-        return bool((worse > 0).mean() >= START_BLOCKS_SHARE and worse.mean() > least)
+        least = max(0.2 * usual, 3.0 * worse.std(ddof=1) / np.sqrt(len(worse)))
+        return bool((worse > 0).mean() >= 0.7 and worse.mean() > least)
 
     def shown(self, sets: np.ndarray) -> np.ndarray:
         """Mask (C,) of the cameras whose delays the motion confirms.
@@ -229,7 +226,8 @@ class _Search:
         pairs = self.pairs
         profile = pairs.profile(camera, self._others(camera), sets)
         tried = np.arange(-pairs.reach, pairs.reach + 1)
-        far = (np.abs(tried - sets[camera]) * self.step > START_PEAK_S) & np.isfinite(profile)
+        far = np.abs(tried - sets[camera]) * self.step > 0.15  # seconds; tuned on the studio
+        far &= np.isfinite(profile)
         if not far.any() or not np.isfinite(profile[sets[camera] + pairs.reach]):
             return None
         return int(tried[far][profile[far].argmin()])
@@ -252,7 +250,7 @@ class _Search:
         others = self._others(camera)
         own = self.pairs.series(camera, int(sets[camera]), others, sets)
         change = self.pairs.series(camera, late, others, sets) - own
-        size = max(1, round(START_BLOCK_S / self.step))
+        size = max(1, round(0.3 / self.step))  # blocks of 0.3 s; tuned on the studio
         whole = change[: len(change) // size * size].reshape(-1, size)
         return known_mean(whole[np.isfinite(whole).sum(1) * 2 >= size].T)
 

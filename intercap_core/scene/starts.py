@@ -21,9 +21,6 @@ MIN_SHARED_S = 1.0  # overlap of two recordings below which a start cannot be de
 # Combined standard deviations beyond which keypoints overrule a stated start. A smaller bound would
 # overrule about one correct statement in a thousand.
 DENIED_SIGMAS = 4.0
-# Standard deviations within which starts by sound leave synchronised images alone. One of five
-# synchronised cameras exceeds it in one recording of 75.
-IN_STEP_SIGMAS = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,9 +100,10 @@ class StatedStarts:
     def unless_in_step(self) -> StatedStarts:
         """These statements, or none if they all agree with the images' own times.
 
-        The images' times are more accurate if they come from one clock.
+        The images' times are more accurate if they come from one clock. One of five synchronised
+        cameras exceeds three standard deviations in one recording of 75.
         """
-        apart = (np.abs(self.late) > IN_STEP_SIGMAS * self.sigma)[self.known].any()
+        apart = (np.abs(self.late) > 3.0 * self.sigma)[self.known].any()
         return self if apart else StatedStarts.nothing(len(self.late))
 
     def check_common(self, times: np.ndarray, names: Sequence[str]) -> None:
@@ -146,11 +144,13 @@ class StatedStarts:
         return StatedStarts(late, sigma, tuple(source)), odd
 
 
-def combine_estimates(one: tuple[float, float], other: tuple[float, float]) -> tuple[float, float]:
+def combine_estimates(
+    first: tuple[float, float], second: tuple[float, float]
+) -> tuple[float, float]:
     """Inverse-variance weighted mean of two (value, standard deviation) pairs, as such a pair."""
-    weights = one[1] ** -2.0, other[1] ** -2.0
+    weights = first[1] ** -2.0, second[1] ** -2.0
     total = sum(weights)
-    return (weights[0] * one[0] + weights[1] * other[0]) / total, total**-0.5
+    return (weights[0] * first[0] + weights[1] * second[0]) / total, total**-0.5
 
 
 def describe_start(late: float) -> str:
@@ -181,45 +181,37 @@ class StartTimes:
 
     @classmethod
     def as_stated(cls, stated: StatedStarts, step_s: float) -> StartTimes:
-        """What is stated, and of other cameras what their images' times say."""
+        """The stated starts; the times of the images for other cameras."""
         none = np.zeros(len(stated.late), bool)
         late = np.nan_to_num(stated.late)
         return cls(late, stated.sets(step_s), none, False, step_s, stated.sigma.copy(), none.copy())
 
     @property
     def offset(self) -> np.ndarray:
-        """(C,) s after which cameras expose, once images are moved by whole numbers of sets."""
+        """(C,) seconds by which cameras expose late once their images are moved by ``sets``."""
         return self.sets * self.step_s - self.late
 
     @property
     def offset_sigma(self) -> np.ndarray | None:
-        """(C,) s that these offsets are off by: what was stated, else half a set of cameras that
-        started apart; None where nothing is stated and nothing started apart."""
+        """(C,) standard deviations of ``offset``, seconds: stated, else half a set if the cameras
+        started apart. None if nothing is stated and the cameras started together."""
         stated = np.isfinite(self.sigma)
         if not self.apart and not stated.any():
             return None
         return np.where(stated, self.sigma, self.step_s / 2 if self.apart else PRIOR_OFFSET_S)
 
-    def in_step(self, values: np.ndarray) -> np.ndarray:
-        """Values (T, C, ...) of images, with each camera's moved to the sets of its moments; 0
-        where there is no image."""
-        return shift_images(values, self.sets)
-
-    def of_images(self, values: np.ndarray) -> np.ndarray:
-        """Values (T, C, ...) of moments, as :meth:`in_step` gives them, moved back."""
-        return shift_images(values, -self.sets)
-
     def with_slips(self, slip: np.ndarray) -> np.ndarray:
-        """By how many sets (T, C) images are late in all, from slips (T, C) that were found in
-        step."""
+        """Delay (T, C) of each image, in sets, by start and slip together.
+
+        ``slip``: (T, C) by moment, of images that were moved by ``sets``.
+        """
         last = len(slip) - 1
         place = np.clip(np.arange(len(slip))[:, None] - self.sets, 0, last)
         return np.take_along_axis(slip, place, 0) + self.sets.astype(slip.dtype)
 
 
 def shift_images(values: np.ndarray, by: np.ndarray, fill: float = 0) -> np.ndarray:
-    """Values (T, C, ...) of images with each camera's ``by`` (C,) sets earlier; ``fill`` where
-    there are none."""
+    """Values (T, C, ...) of images, moved ``by`` (C,) sets earlier; ``fill`` without an image."""
     sets = len(values)
     result = np.full_like(values, fill)
     for c, shift in enumerate(by.tolist()):
@@ -237,11 +229,11 @@ class AlignedPeople:
 
     @property
     def num_sets(self) -> int:
-        """How many sets there are."""
+        """Number of sets."""
         return self.detections.num_sets
 
     def people(self, t: int, c: int) -> np.ndarray:
-        """Keypoints (P, 135, 3) of the people whom camera c sees at set t's moment."""
+        """Keypoints (P, 135, 3) of the people in the image of camera c that shows set t."""
         image = t + int(self.starts.sets[c])
         if 0 <= image < self.num_sets and not self.starts.in_doubt[c]:
             return self.detections.people(image, c)

@@ -17,15 +17,10 @@ from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.triangulation import pixel_scale, reproject
 from intercap_core.person.groups import MIN_COMMON_POINTS, NOBODY
 from intercap_core.person.sides import BODY_POINTS, swap_sides
-from intercap_core.person.subject import find_subject
+from intercap_core.person.subject import find_subject, subject_keypoints
 from intercap_core.person.subject_joints import fill_middles, triangulate_people
 from intercap_core.scene.keypoint_motion import MIN_CONFIDENCE
 from intercap_core.scene.slips import longest_slip
-
-LOOSE_PX_AT_1080P = 40.0  # reprojection error at poses that are a centimetre off; tuned
-# Median distance to a body seen shortly before: joint biases, unrefined poses, half a frame of
-# motion; tuned on the studio.
-SAME_PERSON_PX_AT_1080P = 45.0
 
 
 def add_late_views(
@@ -34,9 +29,6 @@ def add_late_views(
     joints: np.ndarray,
     rig: Rig,
     times: np.ndarray,
-    *,
-    fps: float,
-    min_confidence: float,
 ) -> np.ndarray:
     """Add detections that are where the subject was shortly before, as far back as slips reach.
 
@@ -45,38 +37,34 @@ def add_late_views(
         joints: (T, 135, 3) triangulated from the views with a detection, metres; NaN = unknown.
         times: (T,) seconds.
     """
+    fps = 1 / float(np.median(np.diff(times)))
     reach_s = longest_slip(fps) / fps
     result = index.copy()
     body = joints[:, BODY_POINTS]
-    limit = SAME_PERSON_PX_AT_1080P * pixel_scale(rig)
-    for t, c in np.argwhere(index == NOBODY):
-        found = detections.people(int(t), int(c))
-        if not len(found):
+    # joint biases, unrefined poses and half a frame of motion; tuned on the studio
+    limit = 45.0 * pixel_scale(rig)
+    for t, c in np.argwhere(index == NOBODY).tolist():
+        people = detections.people(t, c)
+        if not len(people):
             continue
-        before = _sets_before(times, int(t), reach_s)
+        before = np.arange(np.searchsorted(times, times[t] - reach_s - 1e-3), t + 1)
         expected = reproject(np.nan_to_num(body[before].reshape(-1, 3), nan=1.0), rig)[:, c]
         expected = expected.reshape(len(before), -1, 2)
         known = np.isfinite(body[before, :, 0])
-        errors = [_distance(person, expected, known, min_confidence) for person in found]
+        errors = [_distance(person, expected, known) for person in people]
         if min(errors, default=np.inf) < limit[c]:
             result[t, c] = int(np.argmin(errors))
     return result
 
 
-def _sets_before(times: np.ndarray, t: int, reach_s: float) -> np.ndarray:
-    """Sets from ``reach_s`` before set ``t`` to ``t``."""
-    first = np.searchsorted(times, times[t] - reach_s - 1e-3)
-    return np.arange(first, t + 1)
+def _distance(person: np.ndarray, expected: np.ndarray, known: np.ndarray) -> float:
+    """Least median distance, px, of a person (135, 3) from N bodies (N, 25, 2).
 
-
-def _distance(
-    person: np.ndarray, expected: np.ndarray, known: np.ndarray, min_confidence: float
-) -> float:
-    """Least median distance, px, of a person (135, 3) to N bodies (N, 25, 2), with either order of
-    sides."""
+    Left and right of the person are also exchanged. ``known``: (N, 25) bool.
+    """
     best = np.inf
     for body in (person[BODY_POINTS], swap_sides(person)[BODY_POINTS]):
-        common = known & (body[:, 2] >= min_confidence)
+        common = known & (body[:, 2] >= MIN_CONFIDENCE)
         away = np.linalg.norm(expected - body[:, :2], axis=-1)
         for row, both in zip(away, common, strict=True):
             if both.sum() >= MIN_COMMON_POINTS:
@@ -107,28 +95,13 @@ class SubjectViews:
 def find_subject_views(detections: PeopleOfImages, rig: Rig, times: np.ndarray) -> SubjectViews:
     """Find the subject at the given poses; all 0 and NaN if no two views agree on anybody."""
     index = find_subject(detections, rig, times, min_confidence=MIN_CONFIDENCE).people
-    found = triangulate_views(_keypoints_of(detections, index), rig)
+    views = triangulate_views(subject_keypoints(detections, index), rig)
     if len(times) < 2:
-        return found
-    late = add_late_views(
-        index,
-        detections,
-        found.joints,
-        rig,
-        times,
-        fps=1 / float(np.median(np.diff(times))),
-        min_confidence=MIN_CONFIDENCE,
-    )
+        return views
+    late = add_late_views(index, detections, views.joints, rig, times)
     if np.array_equal(late, index):
-        return found
-    return triangulate_views(_keypoints_of(detections, late), rig)
-
-
-def _keypoints_of(detections: PeopleOfImages, index: np.ndarray) -> np.ndarray:
-    keypoints = np.zeros((*index.shape, NUM_KEYPOINTS, 3))
-    for t, c in np.argwhere(index != NOBODY):
-        keypoints[t, c] = detections.people(t, c)[index[t, c]]
-    return keypoints
+        return views
+    return triangulate_views(subject_keypoints(detections, late), rig)
 
 
 def triangulate_views(keypoints: np.ndarray, rig: Rig) -> SubjectViews:
@@ -136,17 +109,11 @@ def triangulate_views(keypoints: np.ndarray, rig: Rig) -> SubjectViews:
     sets, views = keypoints.shape[:2]
     body = np.zeros_like(keypoints)
     body[:, :, BODY_POINTS] = keypoints[:, :, BODY_POINTS]
-    body, found = triangulate_people(
-        body, rig, min_confidence=MIN_CONFIDENCE, max_error_px=LOOSE_PX_AT_1080P
-    )
+    # the poses as given are a centimetre off; tuned on the studio
+    body, points = triangulate_people(body, rig, min_confidence=MIN_CONFIDENCE, max_error_px=40.0)
     keypoints = keypoints.copy()
     keypoints[:, :, BODY_POINTS] = body[:, :, BODY_POINTS]
-    inlier = np.swapaxes(found.inlier.reshape(sets, NUM_KEYPOINTS, views), 1, 2)
-    joints = found.points.reshape(sets, NUM_KEYPOINTS, 3)
+    inlier = np.swapaxes(points.inlier.reshape(sets, NUM_KEYPOINTS, views), 1, 2)
+    joints = points.points.reshape(sets, NUM_KEYPOINTS, 3)
     fill_middles(joints)
-    return SubjectViews(
-        keypoints,
-        inlier,
-        joints,
-        found.views.reshape(sets, NUM_KEYPOINTS),
-    )
+    return SubjectViews(keypoints, inlier, joints, points.views.reshape(sets, NUM_KEYPOINTS))

@@ -16,20 +16,12 @@ from scipy.spatial import cKDTree
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Rig
+from intercap_core.geometry.solve.time_series import sample_evenly
 from intercap_core.scene.background import Background
 
-# A pixel nearer than the background by this much is foreground: above the systematic error of
-# 11 mm + 0.1 % of depth (Azure Kinect DK data sheet) and its noise; margin tuned on the studio.
-BEFORE_BACKGROUND_MM = 40.0
-BEFORE_BACKGROUND_SHARE = 0.012  # of depth
 MOVING_MAX_DEPTH_M = 4.0  # beyond, the error exceeds the motion of a body between sets
-# Baseline of a normal, one way: 4 px of the unbinned narrow depth camera (f = 504 px). Shorter is
-# noise, longer crosses edges; tuned on the studio.
-NORMAL_STEP_RAD = 0.008
-MAX_KINK_M_PER_M = 0.008  # deviation from the neighbours' mean, per depth; tuned on the studio
 MOVING_SEARCH_M = 0.15  # from one set to the next: 2 m/s at 15 sets a second
 BACKGROUND_CELL_M = 0.03  # of thinned surfaces
-MOVING_CELL_M = 0.02  # of thinned moving surfaces; tuned on the studio
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +77,9 @@ def surface_from_depth(
         usable &= keep[window]
     z = depth.astype(np.float32) * np.float32(1e-3)
     grid = np.dstack([table * z[..., None], z])
-    step = max(1, round(NORMAL_STEP_RAD * lens.fx))
+    # Baseline of a normal, one way: 4 px of the unbinned narrow depth camera (f = 504 px). Shorter
+    # is noise, longer crosses edges; tuned on the studio.
+    step = max(1, round(0.008 * lens.fx))
     middle = np.s_[step:-step, step:-step]
     left, right = np.s_[step:-step, : -2 * step], np.s_[step:-step, 2 * step :]
     up, down = np.s_[: -2 * step, step:-step], np.s_[2 * step :, step:-step]
@@ -93,7 +87,7 @@ def surface_from_depth(
     for one, other in ((left, right), (up, down)):
         flat &= usable[one] & usable[other]
         kink = np.abs((z[one] + z[other]) / 2 - z[middle])
-        flat &= kink <= MAX_KINK_M_PER_M * z[middle]
+        flat &= kink <= 0.008 * z[middle]  # tuned on the studio
     row, column = np.nonzero(flat)
     row, column = row + step, column + step
     points = grid[row, column].astype(np.float64)
@@ -155,9 +149,8 @@ def moving_surfaces(
     rig: Rig,
     image_of: np.ndarray,
     backgrounds: list[Background | None],
-    most: int = 16,
 ) -> list[dict[int, DepthSurface]]:
-    """Return the moving surfaces of up to ``most`` frame sets, by camera index.
+    """Return the moving surfaces of up to 16 frame sets, by camera index.
 
     Points are in the depth camera's frame. Surfaces without a neighbouring set on both sides are
     omitted, because their speed is unknown.
@@ -166,14 +159,12 @@ def moving_surfaces(
         rig: lenses of the cameras.
         image_of: (T, C) set whose image of camera c shows moment t; -1 = none.
     """
-    depth_image = _with_depth(frames, image_of)
+    has_depth = frames.depth_available[np.maximum(image_of, 0), np.arange(image_of.shape[1])]
+    depth_image = np.where((image_of >= 0) & has_depth, image_of, -1)
     whole = np.zeros(depth_image.shape, bool)  # (T, C) with the sets before and after
     whole[1:-1] = (depth_image[:-2] >= 0) & (depth_image[1:-1] >= 0) & (depth_image[2:] >= 0)
-    usable = np.flatnonzero(whole.sum(1) >= 2)
-    if len(usable) > most:
-        usable = usable[np.linspace(0, len(usable) - 1, most).round().astype(int)]
     result = []
-    for t in usable:
+    for t in sample_evenly(whole.sum(1) >= 2, 16):
         at_once = {}
         for c in np.flatnonzero(whole[t]):
             background, lens = backgrounds[c], rig[int(c)].depth
@@ -189,20 +180,13 @@ def moving_surfaces(
     return result
 
 
-def _with_depth(frames: Frames, image_of: np.ndarray) -> np.ndarray:
-    """``image_of`` (T, C), -1 where that image has no depth."""
-    available = frames.depth_available
-    has = available[np.maximum(image_of, 0), np.arange(image_of.shape[1])]
-    return np.where((image_of >= 0) & has, image_of, -1)
-
-
 def _moving(
     images: list[np.ndarray | None], background: Background, lens: Intrinsics, gaps: np.ndarray
 ) -> DepthSurface:
     """The surface of the middle one of three depth images, ``gaps`` (2,) seconds apart."""
     before, now, after = (_foreground(image, background) for image in images)
     surface = surface_from_depth(
-        now, lens, window=_box(now), cell_m=MOVING_CELL_M, max_depth_m=MOVING_MAX_DEPTH_M
+        now, lens, window=_box(now), cell_m=0.02, max_depth_m=MOVING_MAX_DEPTH_M
     )
     if not len(surface):
         return surface
@@ -216,7 +200,9 @@ def _foreground(image: np.ndarray | None, background: Background) -> np.ndarray:
     """The depth image (H, W) uint16 mm where it is in front of the background, 0 elsewhere."""
     assert image is not None
     behind = background.depth
-    limit = behind * (1 - BEFORE_BACKGROUND_SHARE) - BEFORE_BACKGROUND_MM
+    # above the systematic error of 11 mm + 0.1 % of depth (Azure Kinect DK data sheet) and noise;
+    # margins tuned on the studio
+    limit = behind * (1 - 0.012) - 40.0
     return np.where((behind == 0) | (image < limit), image, 0).astype(np.uint16)
 
 

@@ -7,20 +7,13 @@ from typing import Literal
 
 import numpy as np
 
-from intercap_core.body.keypoints import KEYPOINT_NAMES
+from intercap_core.body.keypoints import KEYPOINT_INDEX
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.rig import Rig
 
 GRAVITY_CONE_DEG = 10.0  # error of an accelerometer on a tripod, or of a board laid on the floor
 CAMERA_UP_CONE_DEG = 40.0  # error of the cameras' mean up direction; tuned on the studio
-# Deviations of the floor from the stated one that are reported: a board is laid by hand and is a
-# few centimetres thick, and feet show a tilt to about 3 degrees.
-STATED_UP_DEG = 4.0
-STATED_FLOOR_M = 0.06
 WRONG_UP_DEG = 60.0  # another axis is 90 degrees away; a person who bends leans by less
-
-
-_NECK, _MID_HIP = (KEYPOINT_NAMES.index(name) for name in ("neck", "mid_hip"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +54,7 @@ def trunk_direction(joints: np.ndarray) -> np.ndarray:
 
     NaN if fewer than five sets show both.
     """
-    trunk = joints[:, _NECK] - joints[:, _MID_HIP]
+    trunk = joints[:, KEYPOINT_INDEX["neck"]] - joints[:, KEYPOINT_INDEX["mid_hip"]]
     trunk = trunk[np.isfinite(trunk).all(1)]
     if len(trunk) < 5:
         return np.full(3, np.nan)
@@ -74,9 +67,12 @@ def check_stated_up(
 ) -> list[str]:
     """Report where the ``stated`` up (3,) contradicts the sensors, or the cameras and a person.
 
-    ``trunk``: see :func:`trunk_direction`. Raises UserError, to be prefixed with the sequence, if
-    gravity was not measured and both the cameras and the person contradict the statement: any
-    surface perpendicular to it could be mistaken for the floor.
+    ``trunk``: see :func:`trunk_direction`.
+
+    Raises:
+        UserError: gravity was not measured, and both the cameras and the person contradict the
+            statement: any surface perpendicular to it could be mistaken for the floor. The message
+            lacks the sequence.
     """
     if not np.isfinite(stated).all():
         return []
@@ -106,6 +102,9 @@ def compare_with_stated(
 ) -> list[str]:
     """Report where a floor deviates from the stated one; all in the master's frame.
 
+    The stated floor is a board, laid by hand and a few centimetres thick; feet show a tilt to about
+    3 degrees.
+
     Args:
         point: (3,) of the floor.
         normal: (3,) of the floor.
@@ -115,10 +114,10 @@ def compare_with_stated(
     """
     notes = []
     off = degrees_between(up, normal)
-    if off > STATED_UP_DEG:
+    if off > 4.0:
         notes.append(f"the floor is tilted by {off:.1f} degrees from the stated up")
     higher = (point - middle) @ normal - (floor - middle) @ up
-    if abs(higher) > STATED_FLOOR_M:
+    if abs(higher) > 0.06:
         side = "above" if higher > 0 else "below"
         notes.append(f"the floor is {abs(higher):.2f} m {side} the stated one")
     return notes

@@ -33,7 +33,7 @@ from intercap_core.person.sides import (
     hold_sides,
     images_with_stated_sides,
 )
-from intercap_core.person.subject import SubjectDetections, find_subject
+from intercap_core.person.subject import SubjectDetections, find_subject, subject_keypoints
 from intercap_core.person.subject_hints import named_people, touch_test
 from intercap_core.person.subject_joints import (
     at_set_times,
@@ -169,14 +169,6 @@ def _why(found: Detections) -> str:
         f"no two views agree on one person ({found.path}); check the keypoint files and the "
         "calibration"
     )
-
-
-def subject_keypoints(detections: Detections, person: np.ndarray) -> np.ndarray:
-    """Keypoints (T, C, 135, 3) float64 of the chosen people; 0 where ``person`` is -1."""
-    result = np.zeros((*person.shape, NUM_KEYPOINTS, 3))
-    for t, c in np.argwhere(person != NOBODY):
-        result[t, c] = detections.people(int(t), int(c))[person[t, c]]
-    return result
 
 
 def _masks(

@@ -315,7 +315,7 @@ def _notes(
         evidence = "by the keypoints"
         if np.isfinite(swap.before):
             evidence = f"background {1e3 * swap.before:.1f} to {1e3 * swap.after:.1f} mm"
-        for own, other in ((swap.first, swap.second), (swap.second, swap.first)):
+        for own, other in (swap.cameras, swap.cameras[::-1]):
             notes[own].append(
                 f"{part} and those of {source.rig.names[other]} are exchanged in the calibration "
                 f"and were put right ({evidence})"

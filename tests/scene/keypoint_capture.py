@@ -13,10 +13,7 @@ import open3d as o3d
 from intercap_core.config import StudioCapture, StudioSettings
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply, invert
-from intercap_core.person.groups import NOBODY
-from intercap_core.person.subject import find_subject
-from intercap_core.scene.keypoint_motion import MIN_CONFIDENCE
-from intercap_core.scene.subject_views import add_late_views, triangulate_views
+from intercap_core.scene.subject_views import find_subject_views
 from intercap_core.studio.hands import part_of
 from intercap_core.studio.interactions import interaction_named
 from intercap_core.studio.keypoints import Detector
@@ -140,30 +137,6 @@ class _People:
 
 
 def subject_keypoints(capture: KeypointCapture) -> np.ndarray:
-    """The subject's keypoints (T, C, 135, 3), sides put right, as the scene stage finds them;
-    zeros where not seen."""
+    """The subject's keypoints (T, C, 135, 3) as the scene stage finds them; 0 = not seen."""
     people = _People(capture)
-    index = find_subject(
-        people,  # type: ignore[arg-type]
-        capture.rig,
-        capture.times,
-        min_confidence=MIN_CONFIDENCE,
-    ).people
-    first = triangulate_views(_keypoints(people, index), capture.rig)
-    index = add_late_views(
-        index,
-        people,
-        first.joints,
-        capture.rig,
-        capture.times,
-        fps=capture.fps,
-        min_confidence=MIN_CONFIDENCE,
-    )
-    return triangulate_views(_keypoints(people, index), capture.rig).keypoints
-
-
-def _keypoints(people: _People, index: np.ndarray) -> np.ndarray:
-    result = np.zeros((*index.shape, 135, 3))
-    for t, c in np.argwhere(index != NOBODY):
-        result[t, c] = people.people(t, c)[index[t, c]]
-    return result
+    return find_subject_views(people, capture.rig, capture.times).keypoints

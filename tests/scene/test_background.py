@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from intercap_core.scene.background import sample_sets, steady_background
+from intercap_core.geometry.solve.time_series import sample_evenly
+from intercap_core.scene.background import Background, steady_background
+
+
+def background_of(images: np.ndarray) -> Background:
+    return steady_background(images, np.zeros(images.shape, bool))
 
 
 def test_person_who_mostly_stands_still_is_not_background():
@@ -12,7 +17,7 @@ def test_person_who_mostly_stands_still_is_not_background():
     images = rng.normal(3000, 3, (20, 4, 6)).astype(np.uint16)
     images[:14, 1:3, 1:3] = rng.normal(1800, 3, (14, 2, 2))  # 70 % of the time in front
     images[rng.random(images.shape) < 0.1] = 0
-    background = steady_background(images)
+    background = background_of(images)
     assert np.abs(background.depth.astype(int) - 3000).max() <= 8
     assert not background.static[1:3, 1:3].any() and background.static[3].all()
 
@@ -21,26 +26,26 @@ def test_single_wild_values_behind_the_wall_are_not_background():
     images = np.full((20, 3, 3), 2500, np.uint16)
     images[4] = 3900
     images[9] = 3300
-    assert (steady_background(images).depth == 2500).all()
+    assert (background_of(images).depth == 2500).all()
 
 
 def test_unseen_and_unsteady_pixels_are_unknown():
     images = np.zeros((10, 1, 3), np.uint16)
     images[:, 0, 1] = np.arange(10) * 200 + 500
     images[::5, 0, 2] = 1000
-    background = steady_background(images)
+    background = background_of(images)
     np.testing.assert_array_equal(background.depth, [[0, 0, 1000]])
     np.testing.assert_array_equal(background.static, [[False, False, False]])
 
 
 def test_one_image_is_its_own_background():
     image = np.array([[0, 700, 4000]], np.uint16)
-    np.testing.assert_array_equal(steady_background(image[None]).depth, image)
+    np.testing.assert_array_equal(background_of(image[None]).depth, image)
 
 
 def test_memory_is_bounded_by_the_sets_looked_at():
     available = np.ones(3000, bool)
     available[::2] = False
-    sets = sample_sets(available)
+    sets = sample_evenly(available, 25)
     assert len(sets) == 25 and (sets % 2 == 1).all() and sets[-1] > 2900
-    np.testing.assert_array_equal(sample_sets(np.array([True, False, True])), [0, 2])
+    np.testing.assert_array_equal(sample_evenly(np.array([True, False, True]), 25), [0, 2])

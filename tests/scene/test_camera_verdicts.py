@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.scene.camera_verdicts import (
-    PoseEvidence,
+    HeldOutComparison,
     PoseVerdict,
     describe_direction,
     weakest_motion,
@@ -18,8 +18,8 @@ UP = np.array([0.0, 0.0, 1.0])
 LEVEL = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # looks along +x, its image is upright
 
 
-def _evidence(*ratios: float) -> PoseEvidence:
-    return PoseEvidence("background", np.log(ratios))
+def _evidence(*ratios: float) -> HeldOutComparison:
+    return HeldOutComparison("background", np.log(ratios))
 
 
 def test_a_camera_is_refined_only_beyond_chance() -> None:
@@ -33,7 +33,7 @@ def test_a_camera_is_refined_only_beyond_chance() -> None:
 
 
 def test_evidence_pairs_units_that_both_have() -> None:
-    found = PoseEvidence.of("keypoints", {1: 2.0, 2: 4.0, 3: 1.0}, {1: 1.0, 2: 2.0, 4: 9.0})
+    found = HeldOutComparison.of("keypoints", {1: 2.0, 2: 4.0, 3: 1.0}, {1: 1.0, 2: 2.0, 4: 9.0})
     np.testing.assert_allclose(found.log_ratio, np.log([0.5, 0.5]))
     assert str(found) == "keypoints -50 %" and found.sigma > 0
 

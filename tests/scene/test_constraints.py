@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.scene.constraints import FloorConstraint
 from intercap_core.scene.ground import fit_ground
-from intercap_core.scene.registration import STATIC, Registration, RigEstimate, SurfaceLayer
+from intercap_core.scene.registration import STATIC, Registration, RigEstimate
 from intercap_core.scene.surfaces import DepthSurface, surface_from_depth
 from intercap_core.scene.up import rough_up
 from tests.helpers.synthetic_capture import perturbed, ring, room_depth, to_millimetres
@@ -48,8 +48,8 @@ def floor_of(rig, patches) -> FloorConstraint:
 
 def test_height_and_tilt_come_back_without_overlap(patches):
     start = perturbed(TRUTH, np.random.default_rng(2), 0.01, 0.3)
-    registration = Registration(start, [SurfaceLayer(patches, STATIC)], 0)
-    assert len(registration.residuals(RigEstimate.start(start), STATIC).pairs) == 0
+    registration = Registration(start, {STATIC: [patches]}, 0)
+    assert not registration.residuals(RigEstimate.start(start), STATIC)
     refined = registration.solve(RigEstimate.start(start), [floor_of(start, patches)]).estimate
 
     def errors(poses: np.ndarray) -> tuple[float, float]:

@@ -40,10 +40,8 @@ def aligned_rig() -> Rig:
 @pytest.fixture(scope="module")
 def seen():
     rig, rng = aligned_rig(), np.random.default_rng(0)
-    backgrounds = [
-        steady_background(to_millimetres(room_depth(c, UP, FURNITURE), rng, noise=0.3)[None])
-        for c in rig
-    ]
+    images = [to_millimetres(room_depth(c, UP, FURNITURE), rng, noise=0.3)[None] for c in rig]
+    backgrounds = [steady_background(image, np.zeros(image.shape, bool)) for image in images]
     nobody = triangulate_views(np.zeros((1, 5, 135, 3)), rig)
     return perturbed(rig, rng, 0.005, 0.2), backgrounds, nobody
 
@@ -59,7 +57,7 @@ def test_exchanged_lenses_are_put_right(seen, whole):
     rig, backgrounds, nobody = seen
     given = swap_lenses(rig, 2, 3, whole=whole)
     result, found = exchange_lenses(given, backgrounds, nobody, TIMES, 0)
-    assert [(one.first, one.second) for one in found] == [(2, 3)]
+    assert [exchange.cameras for exchange in found] == [(2, 3)]
     assert found[0].after < 0.5 * found[0].before
     for c in (2, 3):
         np.testing.assert_array_equal(result[c].depth.parameters, rig[c].colour.parameters)

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 
 from intercap_core.geometry.camera.rig import Rig
-from intercap_core.scene.lens_exchange import lens_gains, lenses_by_keypoints
+from intercap_core.scene.lens_exchange import choose_pairs, lens_gains
 from tests.helpers.synthetic_capture import perturbed, ring
 from tests.helpers.synthetic_people import seen_by, walking
 
 RIG, UP = ring()
 TIMES = np.arange(40) / 15
-SIGMA = {"rotation_sigma": np.radians(0.1), "translation_sigma": 0.003}
+SIGMA = (np.radians(0.1), 0.003)
 
 
 def unlike(rng: np.random.Generator) -> Rig:
@@ -53,9 +53,9 @@ def test_exchanged_lenses_are_found_and_only_they():
         rig = unlike(rng)
         keypoints = observed(rig, rng)
         claimed = perturbed(rig, rng, 0.003, 0.1)
-        assert lenses_by_keypoints(keypoints, claimed, TIMES, **SIGMA) == []
-        found = lenses_by_keypoints(keypoints, exchanged(claimed, 3, 4), TIMES, **SIGMA)
-        assert [(pair.first, pair.second) for pair in found] == [(3, 4)]
+        assert choose_pairs(lens_gains(keypoints, claimed, TIMES, SIGMA)) == []
+        found = choose_pairs(lens_gains(keypoints, exchanged(claimed, 3, 4), TIMES, SIGMA))
+        assert [pair.cameras for pair in found] == [(3, 4)]
 
 
 def test_poses_that_are_uncertain_hide_the_exchange():
@@ -63,13 +63,13 @@ def test_poses_that_are_uncertain_hide_the_exchange():
     rig = unlike(rng)
     keypoints = observed(rig, rng)
     wrong = exchanged(rig, 3, 4)
-    sure = {(p.first, p.second): p.gain for p in lens_gains(keypoints, wrong, TIMES, **SIGMA)}
-    loose = lens_gains(keypoints, wrong, TIMES, rotation_sigma=0.02, translation_sigma=0.03)
-    unsure = {(p.first, p.second): p.gain for p in loose}
+    sure = {p.cameras: p.gain for p in lens_gains(keypoints, wrong, TIMES, SIGMA)}
+    loose = lens_gains(keypoints, wrong, TIMES, (0.02, 0.03))
+    unsure = {p.cameras: p.gain for p in loose}
     assert max(sure, key=lambda pair: sure[pair]) == (3, 4)
     assert unsure[3, 4] < sure[3, 4] / 2
 
 
 def test_like_lenses_cannot_be_exchanged():
     keypoints = observed(RIG, np.random.default_rng(0))
-    assert lens_gains(keypoints, RIG, TIMES, **SIGMA) == []
+    assert lens_gains(keypoints, RIG, TIMES, SIGMA) == []

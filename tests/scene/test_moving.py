@@ -8,7 +8,7 @@ import pytest
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.scene.background import camera_background
-from intercap_core.scene.registration import MOVING, Registration, RigEstimate, SurfaceLayer
+from intercap_core.scene.registration import MOVING, Registration, RigEstimate
 from intercap_core.scene.surfaces import moving_surfaces
 from tests.helpers.synthetic_capture import (
     FURNITURE,
@@ -44,8 +44,9 @@ def layers(tmp_path_factory):
     path = tmp_path_factory.mktemp("moving") / "frames.h5"
     write_frames(path, TRUTH, num_sets=T, depths=depths)
     image_of = np.tile(np.arange(T)[:, None], len(TRUTH))
+    nobody = np.full((T, 135, 3), np.nan)
     with Frames.open(path) as frames:
-        backgrounds = [camera_background(frames, c) for c in range(len(TRUTH))]
+        backgrounds = [camera_background(frames, c, nobody) for c in range(len(TRUTH))]
         return moving_surfaces(frames, TRUTH, image_of, backgrounds)
 
 
@@ -62,7 +63,7 @@ def test_speed_is_that_of_the_crate_along_its_faces(layers):
 
 
 def test_offsets_come_out_of_the_motion(layers):
-    registration = Registration(TRUTH, [SurfaceLayer(at_once, MOVING) for at_once in layers], 0)
+    registration = Registration(TRUTH, {MOVING: layers}, 0)
     solved = registration.solve(RigEstimate.start(TRUTH), free_poses=False)
     error = np.abs(solved.estimate.offset - OFFSET)
     assert error.max() < 0.002 and error.mean() < 0.001

@@ -34,7 +34,7 @@ def found(offset: np.ndarray) -> np.ndarray:
     someone = OnePerson(offset)
     index = np.zeros((T, len(RIG)), np.int32)
     index[6:9, 2] = NOBODY
-    return add_late_views(index, someone, someone.joints, RIG, TIMES, fps=FPS, min_confidence=0.3)
+    return add_late_views(index, someone, someone.joints, RIG, TIMES)
 
 
 def test_a_late_view_is_the_subject():

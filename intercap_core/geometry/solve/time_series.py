@@ -7,6 +7,14 @@ import numpy as np
 from intercap_core.geometry.camera.transforms import rotation_log
 
 
+def sample_evenly(available: np.ndarray, most: int) -> np.ndarray:
+    """Indices of at most ``most`` frames, evenly spaced among those that are ``available`` (T,)."""
+    frames = np.flatnonzero(available)
+    if len(frames) <= most:
+        return frames
+    return frames[np.linspace(0, len(frames) - 1, most).round().astype(int)]
+
+
 def filled_linearly(values: np.ndarray, at: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Return values (T, D) with rows that are not ``known`` (T,) interpolated linearly.
 

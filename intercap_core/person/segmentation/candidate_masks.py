@@ -11,10 +11,6 @@ import numpy as np
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import apply
 
-# Distance behind the nearest point of its cell from which a point is occluded, metres: above the
-# slope of a surface within a cell. Tuned on the studio.
-OCCLUDED_BEHIND_M = 0.03
-
 
 @dataclass(frozen=True)
 class ImageCandidate:
@@ -47,7 +43,7 @@ class ColourCells:
     """Cells of the colour image in which points lie."""
 
     cell: np.ndarray
-    """(N,) flat index; -1 = outside the image."""
+    """(N,) flat index; -1 = outside the image, or occluded."""
     z: np.ndarray
     """(N,) depth in the colour camera, metres."""
     height: int
@@ -84,28 +80,13 @@ class ColourCells:
         cell, z = (np.concatenate([getattr(part, key) for part in parts]) for key in ("cell", "z"))
         return replace(parts[0], cell=cell, z=z)
 
-
-@dataclass(frozen=True, eq=False)
-class ProjectedCells:
-    """Cells of the colour image in which depth pixels are visible."""
-
-    cell: np.ndarray
-    """(N,) flat index; -1 = occluded by a nearer pixel, or outside the image."""
-    width: int
-    """Columns of cells."""
-    scale: int
-    """Side of a cell, pixels."""
-    colour_size: tuple[int, int]
-    """Width and height of the image, pixels."""
-
-    @classmethod
-    def of(cls, cells: ColourCells) -> ProjectedCells:
-        """Remove the pixels of ``cells`` that are clearly behind others."""
-        hidden = _hidden(cells.cell, cells.z, cells.height * cells.width)
-        return cls(np.where(hidden, -1, cells.cell), cells.width, cells.scale, cells.colour_size)
+    def visible(self) -> ColourCells:
+        """The same, without the points that are clearly behind others of their cell."""
+        hidden = _hidden(self.cell, self.z, self.height * self.width)
+        return replace(self, cell=np.where(hidden, -1, self.cell))
 
     def rle(self, chosen: np.ndarray, others: np.ndarray) -> bytes:
-        """Mask of the pixels ``chosen`` (N,) bool as COCO RLE; empty bytes if none is visible.
+        """Mask of the points ``chosen`` (N,) bool as COCO RLE; empty bytes if none is visible.
 
         Holes of the projection are closed, but not over cells of ``others`` (N,) bool.
         """
@@ -145,14 +126,17 @@ def encode_window(
 
 @numba.njit(cache=True)
 def _hidden(cell: np.ndarray, z: np.ndarray, cells: int) -> np.ndarray:
-    """Pixels (N,) bool behind a nearer one of their cell by more than a surface's slope there."""
+    """Mask (N,) of points behind the nearest one of their cell.
+
+    They are farther by more than the slope of a surface within a cell, 3 cm; tuned on the studio.
+    """
     nearest = np.full(cells, np.float32(1e9))
     for i in range(len(cell)):
         if cell[i] >= 0 and z[i] < nearest[cell[i]]:
             nearest[cell[i]] = z[i]
     hidden = np.zeros(len(cell), np.bool_)
     for i in range(len(cell)):
-        hidden[i] = cell[i] >= 0 and z[i] > nearest[cell[i]] + np.float32(OCCLUDED_BEHIND_M)
+        hidden[i] = cell[i] >= 0 and z[i] > nearest[cell[i]] + np.float32(0.03)
     return hidden
 
 

@@ -16,6 +16,7 @@ from intercap_core.artefacts import Artefact
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import apply
+from intercap_core.geometry.solve.time_series import sample_evenly
 from intercap_core.person.segmentation.candidate_masks import (
     ImageCandidate,
     ViewSegments,
@@ -23,21 +24,9 @@ from intercap_core.person.segmentation.candidate_masks import (
 )
 from intercap_core.person.segmentation.person_volume import MovingPerson
 
-# Horprasert, Harwood and Davis (1999): a pixel is split into brightness along the background's
-# colour and a deviation from it. A shadow is darker and of the same colour.
-OFF_COLOUR = 14.0  # deviation, grey levels; tuned on the studio
-SHADOW = 0.5  # least brightness, share; tuned on the studio
-HIGHLIGHT = 1.4  # largest brightness, share; tuned on the studio
 DARK = 40.0  # grey levels below which a background has no colour direction; tuned on the studio
-DARK_CHANGE = 30.0  # change of such a background, grey levels; tuned on the studio
-# Margins by which the person's volume is enlarged in the colour image, tuned on the studio:
-SAMPLE_MARGINS = 5.0  # excluded from the background
-MASK_MARGINS = 2.0  # contains the person's mask
-THING_MARGINS = 1.0  # contains no object
 COLOUR_SCALE = 2  # images are decoded at half size, which takes a quarter of the time for JPEG
-UNSURE_CELLS = 4  # around a volume without motion, whose border is no outline; untuned
 MIN_COLOUR_SAMPLES = 3  # least number of samples of a pixel without the person
-MIN_COLOUR_CELLS = 60  # of a candidate, at the reduced size; tuned on the studio
 
 
 class ColourSegmenter:
@@ -71,17 +60,18 @@ class ColourSegmenter:
         moved = find_foreground(image, *background)
         # the volume fills in clothes of the wall's colour, and places that the person never left
         body = draw_volume(bones, camera, moved.shape, 0)
-        person = body | (moved & draw_volume(bones, camera, moved.shape, MASK_MARGINS))
+        # the numbers of margins are tuned on the studio
+        person = body | (moved & draw_volume(bones, camera, moved.shape, 2.0))
         # borders of the volume, of the cut, and of unknown background are no outline
-        block = np.ones((2 * UNSURE_CELLS + 1,) * 2, np.uint8)
-        assumed = cv2.dilate((body & ~moved).view(np.uint8), block) > 0
+        assumed = cv2.dilate((body & ~moved).view(np.uint8), np.ones((9, 9), np.uint8)) > 0
         unsure = assumed | (moved & ~person) | ~background[1]
-        objects = moved & ~draw_volume(bones, camera, moved.shape, THING_MARGINS)
+        objects = moved & ~draw_volume(bones, camera, moved.shape, 1.0)
         block = np.ones((3, 3), np.uint8)
         rest = cv2.morphologyEx(objects.view(np.uint8), cv2.MORPH_OPEN, block)
         _, label, stats, _ = cv2.connectedComponentsWithStats(rest, connectivity=8)
         areas = stats[:, cv2.CC_STAT_AREA]
-        large = [k for k in np.argsort(-areas, kind="stable") if k and areas[k] >= MIN_COLOUR_CELLS]
+        # at least 60 pixels of the reduced image; tuned on the studio
+        large = [k for k in np.argsort(-areas, kind="stable") if k and areas[k] >= 60]
         candidates = [
             ImageCandidate(self._rle(label == k, camera), 0.5, float("nan"), -1) for k in large[:5]
         ]
@@ -100,15 +90,12 @@ class ColourSegmenter:
         return image if image is not None and image.shape == size else None
 
     def _background(self, c: int) -> tuple[np.ndarray, np.ndarray] | None:
-        sets = np.flatnonzero(self._frames.colour_available[:, c])
-        if len(sets) > 15:
-            sets = sets[np.linspace(0, len(sets) - 1, 15).round().astype(int)]
         images, people = [], []
-        for t in sets:
+        for t in sample_evenly(self._frames.colour_available[:, c], 15):
             image, bones = self._image(int(t), c), self._person.bones(int(t), c)
             if image is not None:
                 images.append(image)
-                people.append(draw_volume(bones, self._rig[c], image.shape[:2], SAMPLE_MARGINS))
+                people.append(draw_volume(bones, self._rig[c], image.shape[:2], 5.0))
         if len(images) < MIN_COLOUR_SAMPLES:
             return None
         return median_background(np.stack(images), np.stack(people))
@@ -175,8 +162,13 @@ def find_foreground(image: np.ndarray, background: np.ndarray, known: np.ndarray
 
 @numba.njit(cache=True)
 def _changed(image: np.ndarray, background: np.ndarray, gain: np.ndarray) -> np.ndarray:
+    """Mask (H, W) of changed pixels, by Horprasert, Harwood and Davis (1999).
+
+    A pixel is split into brightness along the background's colour and a deviation from it. A shadow
+    is darker and of the same colour. Thresholds are tuned on the studio.
+    """
     height, width, channels = image.shape
-    found = np.zeros((height, width), np.bool_)
+    changed = np.zeros((height, width), np.bool_)
     for y in range(height):
         for x in range(width):
             power = along = length = largest = np.float32(0)
@@ -188,14 +180,12 @@ def _changed(image: np.ndarray, background: np.ndarray, gain: np.ndarray) -> np.
                 length += seen * seen
                 largest = max(largest, abs(seen - known))
             if power < DARK * DARK:
-                found[y, x] = largest > DARK_CHANGE
+                changed[y, x] = largest > 30.0
                 continue
             brightness = along / power
             off = length - brightness * along  # squared distance from the background's colour
-            found[y, x] = (
-                off > OFF_COLOUR * OFF_COLOUR or brightness < SHADOW or brightness > HIGHLIGHT
-            )
-    return found
+            changed[y, x] = off > 14.0 * 14.0 or brightness < 0.5 or brightness > 1.4
+    return changed
 
 
 def _gain(image: np.ndarray, reference: np.ndarray) -> np.ndarray:

@@ -27,7 +27,6 @@ from intercap_core.geometry.camera.rig import Rig
 from intercap_core.person.segmentation.candidate_masks import (
     ColourCells,
     ImageCandidate,
-    ProjectedCells,
     ViewSegments,
 )
 from intercap_core.person.segmentation.foreground import (
@@ -50,10 +49,8 @@ NEAR_CUT = 1.0  # first distance from which an object may begin; tuned on the st
 FAR_CUT = 2.5  # second distance, tried as well; tuned on the studio
 CLOTHING_MARGINS = 2.2  # a component within is clothing; tuned on the studio
 AROUND_PATH_M = 1.5  # searched distance from the person's path; tuned on the studio
-ABOVE_HEAD_M = 0.7  # searched height above the highest keypoint; tuned on the studio
 MAX_COMPONENTS = 6  # of one kind, in one frame set
 CELL_M = 0.02  # points of one surface 4 m away are 8 mm apart
-NEARBY_CELL_M = 0.07  # gap of components that may be one held object: a hand's breadth (anatomy)
 FLOOR_M = 0.025  # lower points may be the floor; tuned on the studio
 MIN_POINTS = 40  # of a component, over all views; tuned on the studio
 
@@ -125,7 +122,7 @@ class DepthSegmenter:
         joints = self._person.joints
         everywhere = joints[np.isfinite(joints).all(-1)]
         self._low = everywhere.min(0) - AROUND_PATH_M
-        above = ABOVE_HEAD_M if upright else AROUND_PATH_M
+        above = 0.7 if upright else AROUND_PATH_M  # metres above the highest keypoint; tuned
         self._high = everywhere.max(0) + np.array([AROUND_PATH_M, AROUND_PATH_M, above])
         if grounded:
             self._low[2] = FLOOR_M
@@ -148,19 +145,21 @@ class DepthSegmenter:
         self._background = dict(zip(self.cameras, backgrounds, strict=True))
         # with the floor, the whole scene would be one component
         bottom = self._low if grounded else self._high
-        self._static = find_static_objects(views, backgrounds, bottom, self._high, everywhere)
+        self._static, self._surface = find_static_objects(
+            views, backgrounds, bottom, self._high, everywhere
+        )
         self._fixed = {c: self._static_points(number, c) for number, c in enumerate(self.cameras)}
 
     def _static_points(
         self, number: int, c: int
     ) -> list[tuple[np.ndarray, np.ndarray, ColourCells]]:
         """Flat pixels, points and cells of each static object in one camera."""
-        view, found = self._views[c], []
-        for item in self._static.objects:
+        view, parts = self._views[c], []
+        for item in self._static:
             pixels = item.pixels[number]
             points, local = view.points(self._background[c].depth, pixels)
-            found.append((pixels, points, ColourCells.of(local, view.camera)))
-        return found
+            parts.append((pixels, points, ColourCells.of(local, view.camera)))
+        return parts
 
     def segment(self, t: int, wanted: list[int]) -> dict[int, ViewSegments]:
         """Segment the views ``wanted`` of moment ``t``, except those without a depth image."""
@@ -194,15 +193,13 @@ class DepthSegmenter:
         away = distance_outside(points, bones)
         # background that is unknown in this view may be known in another one
         rest = np.flatnonzero((away > NEAR_CUT) & (background.depth.ravel()[index] == 0))
-        scene = rest[self._static.surface.holds(points[rest])]
+        scene = rest[self._surface.holds(points[rest])]
         moving = np.ones(len(points), bool)
         moving[scene] = False
         shown = background.shows(image).ravel()
         parts, cells, of_static = [points], [ColourCells.of(local, view.camera)], []
         count = len(points)
-        for item, (pixels, fixed, fixed_cells) in zip(
-            self._static.objects, self._fixed[c], strict=True
-        ):
+        for item, (pixels, fixed, fixed_cells) in zip(self._static, self._fixed[c], strict=True):
             here = shown[pixels]
             parts.append(fixed[here])
             cells.append(fixed_cells[here])
@@ -223,7 +220,7 @@ class DepthSegmenter:
             _Component(
                 [view.of_static[k] for view in seen], 0.3 if item.on_top else 0.2, item.extent_m
             )
-            for k, item in enumerate(self._static.objects)
+            for k, item in enumerate(self._static)
         ]
 
     def _partly_moved(self, seen: list[_ViewPoints]) -> list[_Component]:
@@ -237,19 +234,19 @@ class DepthSegmenter:
         for view in seen:
             moving = np.flatnonzero(view.moving & (view.outside > NEAR_CUT))
             parts = [moving]
-            for k, item in enumerate(self._static.objects):
+            for k, item in enumerate(self._static):
                 if not item.carries:
                     parts.append(view.of_static[k])
                     touched |= bool(item.cells.holds(view.points[moving]).any())
             chosen.append(np.unique(np.concatenate(parts)))
         if not touched:
             return []
-        found = []
+        result = []
         for members, points in _connected(seen, chosen):
             moves = [v.moving[m].sum() for v, m in zip(seen, members, strict=True)]
             if MIN_POINTS < sum(moves) < len(points) - MIN_POINTS:
-                found.append(_Component(members, 0.4, box_diagonal(points)))
-        return found[:MAX_COMPONENTS]
+                result.append(_Component(members, 0.4, box_diagonal(points)))
+        return result[:MAX_COMPONENTS]
 
 
 def _connected(
@@ -294,12 +291,12 @@ def _merged_neighbours(seen: list[_ViewPoints], proposed: list[_Component]) -> l
     if len(proposed) < 2:
         return []
     chosen = [np.unique(np.concatenate([c.members[v] for c in proposed])) for v in range(len(seen))]
-    found: list[_Component] = []
-    for members, points in _connected(seen, chosen, NEARBY_CELL_M):
+    result: list[_Component] = []
+    for members, points in _connected(seen, chosen, 0.07):  # metres: a hand (anatomy)
         parts = components(points, CELL_M, MIN_POINTS)
-        if len(parts) > 1 and len(found) < MAX_COMPONENTS:
-            found.append(_Component(members, 0.5, box_diagonal(points)))
-    return found
+        if len(parts) > 1 and len(result) < MAX_COMPONENTS:
+            result.append(_Component(members, 0.5, box_diagonal(points)))
+    return result
 
 
 def _is_same(own: list[np.ndarray], other: list[np.ndarray]) -> bool:
@@ -312,7 +309,7 @@ def _is_same(own: list[np.ndarray], other: list[np.ndarray]) -> bool:
 
 def _masks(seen: _ViewPoints, number: int, proposed: list[_Component]) -> ViewSegments:
     """Masks of the person and of the components in one view, the ``number``-th of those seen."""
-    projected = ProjectedCells.of(seen.cells)
+    visible = seen.cells.visible()
     person = seen.moving & (seen.outside < PERSON_MARGINS)
     candidates = []
     for index, component in enumerate(proposed):
@@ -321,7 +318,7 @@ def _masks(seen: _ViewPoints, number: int, proposed: list[_Component]) -> ViewSe
             continue
         chosen = np.zeros(len(person), bool)
         chosen[members] = True
-        rle = projected.rle(chosen, person & ~chosen)
+        rle = visible.rle(chosen, person & ~chosen)
         if rle:
             candidates.append(ImageCandidate(rle, component.score, component.extent_m, index))
-    return ViewSegments(projected.rle(person, ~person), candidates)
+    return ViewSegments(visible.rle(person, ~person), candidates)

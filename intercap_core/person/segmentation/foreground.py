@@ -21,21 +21,14 @@ import numpy as np
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import apply, invert
+from intercap_core.geometry.solve.time_series import sample_evenly
 from intercap_core.person.segmentation.person_volume import distance_outside
 
 # Distance from the background to the foreground: five standard deviations of the sensor's random
 # error and its bias between images (Toelgyessy et al., Sensors 21(2):413, 2021).
 BEFORE_MM = 15.0
 BEFORE_PER_DEPTH = 0.005  # of depth, added to BEFORE_MM; same source
-FLOATING_MM = 30.0  # distance of a flying pixel from nearer and farther neighbours; tuned
 GONE_SHARE = 0.08  # of images without the background, from which a pixel is no background; tuned
-# Distance to the other camera's background, for calibration errors and grazing surfaces.
-BEHIND_M = 0.05  # tuned on the studio
-BEHIND_PER_DEPTH = 0.01  # of depth, added to BEHIND_M; tuned on the studio
-MIN_SURFACE_PX = 400  # size of a smooth surface that is no trace of a person; tuned on the studio
-SMOOTH_MM = 100.0  # range of depth in 3 x 3 pixels of a smooth surface; tuned on the studio
-TRACE_MARGINS = 1.0  # distance outside the person within which a patch may be a trace; tuned
-TRACE_SHARE = 0.4  # of moments at which a trace is within the person; tuned on the studio
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,12 +72,12 @@ class DepthBackground:
 
         Includes pixels with an unknown background. Flying pixels at edges are left out.
         """
-        found = (image > 0) & (image < self.limit)
-        index = np.flatnonzero(found)
+        foreground = (image > 0) & (image < self.limit)
+        index = np.flatnonzero(foreground)
         if not len(index):
             return index
-        rows = np.flatnonzero(found.any(1))
-        columns = np.flatnonzero(found.any(0))
+        rows = np.flatnonzero(foreground.any(1))
+        columns = np.flatnonzero(foreground.any(0))
         window = np.s_[max(rows[0] - 1, 0) : rows[-1] + 2, max(columns[0] - 1, 0) : columns[-1] + 2]
         floats = np.zeros(image.shape, bool)
         floats[window] = _floating(image[window])
@@ -97,19 +90,17 @@ class DepthBackground:
 
 
 def _floating(image: np.ndarray) -> np.ndarray:
+    """Pixels (H, W) farther than a neighbour and nearer than another, each by more than 3 cm."""
     block = np.ones((3, 3), np.uint8)
     values = image.astype(np.float32)
     farthest = cv2.dilate(values, block)
     nearest = cv2.erode(np.where(image == 0, np.float32(65535), values), block)
-    return (values - nearest > FLOATING_MM) & (farthest - values > FLOATING_MM)
+    return (values - nearest > 30.0) & (farthest - values > 30.0)  # tuned on the studio
 
 
-def sampled_images(frames: Frames, c: int, most: int = 25) -> list[np.ndarray]:
-    """Evenly spread depth images (H, W) uint16 mm of camera ``c``, at most ``most``."""
-    sets = np.flatnonzero(frames.depth_available[:, c])
-    if len(sets) > most:
-        sets = sets[np.linspace(0, len(sets) - 1, most).round().astype(int)]
-    images = (frames.depth(int(t), c) for t in sets)
+def sampled_images(frames: Frames, c: int) -> list[np.ndarray]:
+    """At most 25 depth images (H, W), uint16 mm, of camera ``c``, evenly spaced in time."""
+    images = (frames.depth(int(t), c) for t in sample_evenly(frames.depth_available[:, c], 25))
     return [image for image in images if image is not None]
 
 
@@ -197,7 +188,10 @@ def without_free_space(
 def without_person_traces(
     view: DepthView, background: DepthBackground, bodies: list[np.ndarray]
 ) -> DepthBackground:
-    """Remove small patches that are inside the person for much of the recording.
+    """Remove small patches that are inside the person at more than 40 % of the moments.
+
+    Smooth surfaces of 400 pixels and more, with less than 10 cm of depth in 3 x 3 pixels, remain.
+    All thresholds are tuned on the studio.
 
     ``bodies``: bones (B, 9) of :func:`.person_volume.build_bones` at some moments, in the view's
     frame.
@@ -206,25 +200,25 @@ def without_person_traces(
     block = np.ones((3, 3), np.uint8)
     nearest = cv2.erode(depth.astype(np.float32), block)
     farthest = cv2.dilate(depth.astype(np.float32), block)
-    smooth = ((nearest > 0) & (farthest - nearest < SMOOTH_MM)).view(np.uint8)
+    smooth = ((nearest > 0) & (farthest - nearest < 100.0)).view(np.uint8)
     _, label, stats, _ = cv2.connectedComponentsWithStats(smooth, connectivity=4)
-    large = stats[:, cv2.CC_STAT_AREA] >= MIN_SURFACE_PX
+    large = stats[:, cv2.CC_STAT_AREA] >= 400
     large[0] = False
     surface = cv2.dilate(large[label].view(np.uint8), block) > 0
     index = np.flatnonzero((depth > 0) & ~surface & (depth <= background.reach))
     points, _ = view.points(depth, index)
     inside = np.zeros(len(index))
     for bones in bodies:
-        inside += distance_outside(points, bones) < TRACE_MARGINS
+        inside += distance_outside(points, bones) < 1.0
     trace = np.zeros(depth.shape, bool)
-    trace.ravel()[index[inside > TRACE_SHARE * len(bodies)]] = True
+    trace.ravel()[index[inside > 0.4 * len(bodies)]] = True
     return _with_unknown(background, trace)
 
 
 def _with_unknown(background: DepthBackground, gone: np.ndarray) -> DepthBackground:
-    taken = gone & (background.depth > 0)
-    depth = np.where(taken, np.uint16(0), background.depth)
-    limit = np.where(taken, background.reach, background.limit)
+    removed = gone & (background.depth > 0)
+    depth = np.where(removed, np.uint16(0), background.depth)
+    limit = np.where(removed, background.reach, background.limit)
     return replace(background, depth=depth, limit=limit)
 
 
@@ -238,4 +232,5 @@ def _occludes_background(view: DepthView, nearest: np.ndarray, points: np.ndarra
     column, row = np.clip(column, 0, lens.width - 1), np.clip(row, 0, lens.height - 1)
     behind = nearest[row, column] * np.float32(1e-3) - view.bias_m
     z = local[:, 2]
-    return seen & (nearest[row, column] > 0) & (behind > z + BEHIND_M + BEHIND_PER_DEPTH * z)
+    # 5 cm and 1 % of depth, for calibration errors and grazing surfaces; tuned on the studio
+    return seen & (nearest[row, column] > 0) & (behind > z + 0.05 + 0.01 * z)

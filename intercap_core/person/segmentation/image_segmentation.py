@@ -35,7 +35,7 @@ def segment_images(
     sigma = np.zeros(joints.shape[:2]) if sigma is None else sigma
     posed = np.isfinite(scene["master_from_colour"]).all((1, 2)) & scene["present"]
     wanted = wanted & posed
-    found: dict[tuple[int, int], ViewSegments] = {}
+    result: dict[tuple[int, int], ViewSegments] = {}
     depth = wanted & frames.depth_available
     if depth.any() and np.isfinite(joints).any():
         segmenter = DepthSegmenter(
@@ -45,7 +45,7 @@ def segment_images(
         progress = Progress(log, "segmented", len(moments), "frames by depth")
         for t in moments:
             segments = segmenter.segment(t, np.flatnonzero(depth[t]).tolist())
-            found.update({(t, c): view for c, view in segments.items()})
+            result.update({(t, c): view for c, view in segments.items()})
             progress.step()
     colour = wanted & ~depth & frames.colour_available
     if colour.any() and np.isfinite(joints).any():
@@ -54,6 +54,6 @@ def segment_images(
         for t, c in np.argwhere(colour).tolist():
             view = by_colour.segment(t, c)
             if view is not None:
-                found[t, c] = view
+                result[t, c] = view
             progress.step()
-    return found
+    return result

@@ -13,7 +13,7 @@ import numba
 import numpy as np
 
 from intercap_core.artefacts import Artefact
-from intercap_core.body.keypoints import KEYPOINT_NAMES, LIMB_BONES, of_side
+from intercap_core.body.keypoints import KEYPOINT_NAMES, of_side
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.solve.time_series import limited_velocity
 
@@ -30,16 +30,14 @@ TRUNK_RADII_M: dict[tuple[str, str], tuple[float, float, float]] = {
     ("middle_ear", "middle_ear"): (0.125, 0.125, 0.025),
     ("nose", "middle_ear"): (0.045, 0.105, 0.025),
 }
-# The same for the bones of `body.keypoints.LIMB_BONES`, and for the soles.
+# The same for the bones of each side.
 LIMB_RADII_M: dict[tuple[str, str], tuple[float, float, float]] = {
     ("shoulder", "elbow"): (0.065, 0.048, 0.025),
     ("elbow", "wrist"): (0.048, 0.034, 0.018),
     ("hip", "knee"): (0.105, 0.070, 0.030),
     ("knee", "ankle"): (0.068, 0.045, 0.022),
-    ("ankle", "heel"): (0.050, 0.045, 0.022),
     ("ankle", "big_toe"): (0.048, 0.035, 0.022),
-}
-SOLE_RADII_M: dict[tuple[str, str], tuple[float, float, float]] = {
+    ("ankle", "heel"): (0.050, 0.045, 0.022),
     ("heel", "small_toe"): (0.040, 0.035, 0.022),
     ("heel", "big_toe"): (0.040, 0.035, 0.022),
 }
@@ -48,9 +46,6 @@ PALM_RADII_M = (0.024, 0.016)  # at the wrist, at the knuckles
 HAND_MARGIN_M = 0.012  # fingers are located within millimetres; tuned on the studio
 BONES_PER_GROUP = 5  # bones that are skipped together if a point is far from all of them
 FAR = 20.0  # largest distance that is computed, margins
-
-# By name, for each side.
-_SIDE_RADII_M = {bone: LIMB_RADII_M[bone] for bone in LIMB_BONES} | SOLE_RADII_M
 
 
 def build_bones(joints: np.ndarray, sigma: np.ndarray | None = None) -> np.ndarray:
@@ -72,19 +67,18 @@ def build_bones(joints: np.ndarray, sigma: np.ndarray | None = None) -> np.ndarr
     size = float(np.clip(size, 0.6, 1.25)) if np.isfinite(size) else 1.0
     radii = list(TRUNK_RADII_M.items())
     for side in ("left", "right"):
-        bones = of_side(side, _SIDE_RADII_M)
-        radii += zip(bones, _SIDE_RADII_M.values(), strict=True)
+        radii += zip(of_side(side, LIMB_RADII_M), LIMB_RADII_M.values(), strict=True)
     rows = [(at[a], at[b], size * ra, size * rb, margin) for (a, b), (ra, rb, margin) in radii]
     for side in ("left", "right"):
         rows += _hand(at, side)
-    found = np.array(
+    bones = np.array(
         [
             [*a[:3], *b[:3], ra, rb, np.hypot(margin, (a[3] + b[3]) / 2)]
             for a, b, ra, rb, margin in rows
         ],
         np.float32,
     )
-    return found[np.isfinite(found).all(1)].reshape(-1, 9)
+    return bones[np.isfinite(bones).all(1)].reshape(-1, 9)
 
 
 def _hand(
@@ -134,7 +128,7 @@ def distance_outside(points: np.ndarray, bones: np.ndarray) -> np.ndarray:
 
 @numba.njit(cache=True, fastmath=True)
 def _outside(points: np.ndarray, bones: np.ndarray, balls: np.ndarray) -> np.ndarray:
-    found = np.empty(len(points), np.float32)
+    result = np.empty(len(points), np.float32)
     for i in range(len(points)):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         nearest = np.float32(FAR)
@@ -161,8 +155,8 @@ def _outside(points: np.ndarray, bones: np.ndarray, balls: np.ndarray) -> np.nda
             away = ux * ux + uy * uy + uz * uz
             if reach > 0 and away < reach * reach:
                 nearest = (np.sqrt(away) - radius) / bones[b, 8]
-        found[i] = nearest
-    return found
+        result[i] = nearest
+    return result
 
 
 class MovingPerson:

@@ -8,9 +8,12 @@ are segmented from it by height. Components are computed on a voxel grid.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
-import numba
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from intercap_core.person.segmentation.foreground import DepthBackground, DepthView
 
@@ -30,9 +33,8 @@ def label_components(points: np.ndarray, cell_m: float) -> tuple[np.ndarray, int
     if not len(points):
         return np.zeros(0, np.int32), 0
     occupied, inverse = np.unique(_keys(points, cell_m), return_inverse=True)
-    root = _roots(occupied)
-    _, label, size = np.unique(root, return_inverse=True, return_counts=True)
-    order = np.argsort(-size, kind="stable")
+    label = _label_cells(occupied)
+    order = np.argsort(-np.bincount(label), kind="stable")
     rank = np.empty(len(order), np.int32)
     rank[order] = np.arange(len(order), dtype=np.int32)
     return rank[label][inverse], len(order)
@@ -78,40 +80,18 @@ def _keys(points: np.ndarray, cell_m: float) -> np.ndarray:
     return (cells[:, 0] << (2 * _BITS)) | (cells[:, 1] << _BITS) | cells[:, 2]
 
 
-@numba.njit(cache=True)
-def _roots(keys: np.ndarray) -> np.ndarray:
-    """Index (M,) of the first cell of each cell's component; ``keys`` (M,) ascending."""
-    parent = np.arange(len(keys))
-    # only the neighbours with a smaller key: adjacency is symmetric
-    for dx in range(-1, 1):
-        for dy in range(-1, 2):
-            for dz in range(-1, 2):
-                step = dx * (1 << 2 * _BITS) + dy * (1 << _BITS) + dz
-                if step >= 0:
-                    continue
-                j = 0
-                for i in range(len(keys)):
-                    wanted = keys[i] + step
-                    while j < len(keys) and keys[j] < wanted:
-                        j += 1
-                    if j < len(keys) and keys[j] == wanted:
-                        a, b = i, j
-                        while parent[a] != a:
-                            parent[a] = parent[parent[a]]
-                            a = parent[a]
-                        while parent[b] != b:
-                            parent[b] = parent[parent[b]]
-                            b = parent[b]
-                        if a < b:
-                            parent[b] = a
-                        elif b < a:
-                            parent[a] = b
-    for i in range(len(keys)):
-        a = i
-        while parent[a] != a:
-            a = parent[a]
-        parent[i] = a
-    return parent
+def _label_cells(keys: np.ndarray) -> np.ndarray:
+    """Component (M,) of each cell, numbered by its first cell; ``keys`` (M,) ascending."""
+    around = [(x << 2 * _BITS) + (y << _BITS) + z for x, y, z in product((-1, 0, 1), repeat=3)]
+    cells, neighbours = [], []
+    for step in around[:13]:  # those with smaller keys: adjacency is symmetric
+        place = np.searchsorted(keys, keys + step)
+        hit = np.flatnonzero(keys[place] == keys + step)
+        cells.append(hit)
+        neighbours.append(place[hit])
+    edges = (np.concatenate(cells), np.concatenate(neighbours))
+    graph = coo_array((np.ones(len(edges[0]), bool), edges), shape=(len(keys), len(keys)))
+    return np.asarray(connected_components(graph, directed=False)[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,26 +112,20 @@ class StaticObject:
     """Cells with its points."""
 
 
-@dataclass(frozen=True, eq=False)
-class StaticScene:
-    """Components of the static scene."""
-
-    objects: list[StaticObject]
-    """Possible objects, the closest to the person first."""
-    surface: OccupiedCells
-    """Cells in which any view measures the scene."""
-
-
 def find_static_objects(
     views: list[DepthView],
     backgrounds: list[DepthBackground],
     low: np.ndarray,
     high: np.ndarray,
     joints: np.ndarray,
-) -> StaticScene:
+) -> tuple[list[StaticObject], OccupiedCells]:
     """Find components of the background in the box ``low`` to ``high`` (3,), z up, metres.
 
     ``joints``: (N, 3) keypoints of the person at all times, same frame.
+
+    Returns:
+        Possible objects, the closest to the person first, and the cells in which any view measures
+        the scene.
     """
     parts, owner, index = [], [], []
     for number, (view, background) in enumerate(zip(views, backgrounds, strict=True)):
@@ -184,13 +158,11 @@ def find_static_objects(
         for standing in above:
             add(standing, True, False)
     objects.sort(key=lambda item: item.away_m)
-    return StaticScene(objects[:8], surface)
+    return objects[:8], surface
 
 
 def _away(points: np.ndarray, places: np.ndarray) -> float:
     """Smallest distance, metres, of points (N, 3) from places (M, 3)."""
-    from scipy.spatial import cKDTree
-
     sample = points[:: max(1, len(points) // 2000)]
     return float(cKDTree(places).query(sample)[0].min()) if len(places) else np.inf
 

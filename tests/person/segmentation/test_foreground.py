@@ -8,11 +8,7 @@ from scipy import ndimage
 
 from intercap_core.geometry.camera import masks
 from intercap_core.geometry.camera.transforms import apply, invert
-from intercap_core.person.segmentation.candidate_masks import (
-    ColourCells,
-    ProjectedCells,
-    encode_window,
-)
+from intercap_core.person.segmentation.candidate_masks import ColourCells, encode_window
 from intercap_core.person.segmentation.colour_candidates import (
     draw_volume,
     find_foreground,
@@ -35,7 +31,6 @@ from tests.helpers.synthetic_people import stick_person
 
 RIG, UP = ring()
 LOW, HIGH = np.array([-2.0, -2.0, 0.025]), np.array([2.0, 2.0, 2.3])
-
 
 # --- cells ---------------------------------------------------------------------------------------
 
@@ -185,17 +180,16 @@ def test_static_objects_near_the_person_and_on_a_table():
         image = to_millimetres(room, rng)
         backgrounds.append(DepthBackground.of(image, [image], view.reach_mm(LOW, HIGH)))
     person = stick_person() + np.array([0.0, 0.55, 0.0])
-    scene = find_static_objects(views, backgrounds, LOW, HIGH, person)
-    sizes = [item.extent_m for item in scene.objects]
-    assert len(scene.objects) == 3
+    objects, surface = find_static_objects(views, backgrounds, LOW, HIGH, person)
+    sizes = [item.extent_m for item in objects]
+    assert len(objects) == 3
     for box, on_top, carries in ((table, False, True), (mug, True, False), (stool, False, False)):
         size = np.linalg.norm(box[1] - box[0])
-        item = scene.objects[int(np.argmin(np.abs(np.array(sizes) - size)))]
+        item = objects[int(np.argmin(np.abs(np.array(sizes) - size)))]
         assert abs(item.extent_m - size) < 0.12 * size + 0.05
         assert (item.on_top, item.carries) == (on_top, carries)
         assert sum(len(pixels) > 0 for pixels in item.pixels) >= 4
-    assert scene.surface.holds(np.array([[0.0, 0.3, 0.35]]))[0]
-    assert not scene.surface.holds(np.array([[0.0, 0.0, 1.5]]))[0]
+    assert surface.holds(np.array([[0.0, 0.3, 0.35], [0.0, 0.0, 1.5]])).tolist() == [True, False]
 
 
 # --- masks ---------------------------------------------------------------------------------------
@@ -231,7 +225,7 @@ def test_projection_resolves_occlusion_and_closes_holes():
         [view.points(image, index[image.ravel() > 0])[1] for image in (near, far)]
     )
     first = np.arange(len(local)) < (near > 0).sum()
-    projected = ProjectedCells.of(ColourCells.of(local, camera))
+    projected = ColourCells.of(local, camera).visible()
     front = masks.decode(projected.rle(first, ~first), 1080, 1920)
     back = masks.decode(projected.rle(~first, first), 1080, 1920)
     assert front.any() and back.sum() > front.sum() and not (front & back).any()
