@@ -43,7 +43,7 @@ class BodyViews:
     points: np.ndarray
     """(N, 3) points triangulated at the given poses, metres."""
     velocity: np.ndarray
-    """(N, 3) m/s; 0 = unknown."""
+    """(N, 3) m/s, by central differences; 0 = unknown."""
     unit: np.ndarray
     """(N,) number shared by the points of one joint for as long as a detector's error lasts."""
 
@@ -66,22 +66,15 @@ def body_views(subject: SubjectViews, times: np.ndarray) -> BodyViews:
     good = (subject.views[:, BODY_POINTS].ravel() >= enough) & np.isfinite(points[:, 0])
     gap = float(np.median(np.diff(times))) if len(times) > 1 else KEYPOINT_ERROR_TIME_S
     weights = by_point[..., 2] * inlier * min(1.0, gap / KEYPOINT_ERROR_TIME_S)
-    velocity = np.nan_to_num(velocities(subject.joints[:, BODY_POINTS], times)).reshape(-1, 3)
+    velocity = np.zeros((len(times), len(BODY_POINTS), 3))
+    if len(times) > 2:
+        change = subject.joints[2:, BODY_POINTS] - subject.joints[:-2, BODY_POINTS]
+        velocity[1:-1] = np.nan_to_num(change / (times[2:] - times[:-2])[:, None, None])
+    velocity = velocity.reshape(-1, 3)
     joint = np.arange(NUM_KEYPOINTS)[BODY_POINTS]
     span = np.floor(times / KEYPOINT_ERROR_TIME_S).astype(np.int64)
     unit = (NUM_KEYPOINTS * span[:, None] + joint).ravel()
     return BodyViews(by_point[good, :, :2], weights[good], points[good], velocity[good], unit[good])
-
-
-def velocities(points: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Central differences (T, K, 3), m/s, of points (T, K, 3) at ``times`` (T,) seconds.
-
-    NaN at both ends and next to unknown points.
-    """
-    result = np.full(points.shape, np.nan)
-    if len(times) > 2:
-        result[1:-1] = (points[2:] - points[:-2]) / (times[2:] - times[:-2])[:, None, None]
-    return result
 
 
 class BodyConstraint:

@@ -1,4 +1,4 @@
-"""Refined camera poses of one recording, or the given ones where no improvement can be shown."""
+"""Refined camera poses of one recording, or the given poses if no improvement can be shown."""
 
 from __future__ import annotations
 
@@ -62,8 +62,6 @@ class Refinement:
     """(C,) seconds by which each camera exposes after the set's time."""
     offset_sigma: np.ndarray
     """(C,) standard deviation of ``offset``, seconds; NaN = unknown."""
-    improved: bool
-    """At least one pose is refined."""
     converged: bool
     """The last step moved no viewed point by more than a millimetre."""
     pairs: PairTable
@@ -75,7 +73,7 @@ class Refinement:
     verdicts: tuple[str, ...]
     """Reason for each camera's pose."""
     notes: tuple[str, ...]
-    """What weakly connected cameras rest on; "" = nothing to report."""
+    """What determines the pose of each weakly connected camera; "" = nothing to report."""
 
 
 def refine(
@@ -142,7 +140,6 @@ def refine(
             if kept.any():
                 result = freed if kept.sum() == len(verdicts) else solve(None, kept)
                 covariance = freed.covariance  # given poses are as certain as they would be refined
-    improved = bool(kept.any())
     pairs = _pair_table(registration, unmoved.estimate, result.estimate)
     sigma = np.sqrt(np.diagonal(result.covariance[:, OFFSET, :, OFFSET]))
     # above 8 ms the offset of a synchronised device is unknown (tuned), stated times are known
@@ -150,7 +147,7 @@ def refine(
     sigma = np.where(unknown, np.nan, sigma)
     sigma[master] = 0.0
     converged = result.last_step_m < 0.001
-    verdict = _verdict(rig, pairs, ratios, improved=improved, converged=converged, free=free_poses)
+    verdict = _verdict(rig, pairs, ratios, kept, converged=converged, free=free_poses)
     on_floor = floor.cameras if floor is not None and floor in constraints else ()
     return Refinement(
         poses=result.estimate.poses,
@@ -158,7 +155,6 @@ def refine(
         covariance=_stated_covariance(covariance, master),
         offset=np.where(unknown, given.offset, result.estimate.offset),
         offset_sigma=sigma,
-        improved=improved,
         converged=converged,
         pairs=pairs,
         verdict=verdict,
@@ -238,8 +234,8 @@ def _verdict(
     rig: Rig,
     pairs: PairTable,
     ratios: list[float],
+    refined: np.ndarray,
     *,
-    improved: bool,
     converged: bool,
     free: bool,
 ) -> str:
@@ -250,7 +246,7 @@ def _verdict(
         return "refinement is switched off: poses as given"
     if not ratios:
         return "too little is seen by several cameras at once: poses as given"
-    if not improved:
+    if not refined.any():
         return "held-out points do not get better: poses as given"
     words = "refined" if converged else "refined, not fully converged"
     for k, kind in enumerate(("background", "moving surfaces")):
@@ -266,12 +262,12 @@ def _notes(
     master: int,
     pairs: PairTable,
     body_weights: np.ndarray,
-    improved: np.ndarray,
+    refined: np.ndarray,
     on_floor: Collection[int],
 ) -> tuple[str, ...]:
     """Describe what the pose of each weakly connected camera rests on; "" = connected.
 
-    ``improved``: (C,) refined cameras. ``on_floor``: cameras with the common floor's constraint.
+    ``refined``: (C,) refined cameras. ``on_floor``: cameras with the common floor's constraint.
     """
     linked = _linked(pairs.pairs.tolist(), master)
     notes = []
@@ -281,7 +277,7 @@ def _notes(
         else:
             why = "shares no surface with the others" if rig[c].depth else "has no depth"
             seen = len(body_weights) and (body_weights[:, c] > 0).sum() >= MIN_BODY_POINTS
-            if improved[c] and seen:
+            if refined[c] and seen:
                 rests = "the keypoints and the floor" if c in on_floor else "the keypoints"
                 notes.append(f"{why}: its pose rests on {rests}")
             elif seen:

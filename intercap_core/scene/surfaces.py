@@ -57,24 +57,20 @@ def surface_from_depth(
     depth: np.ndarray,
     lens: Intrinsics,
     *,
-    keep: np.ndarray | None = None,
-    window: tuple[slice, slice] = (slice(None), slice(None)),
     cell_m: float,
     max_depth_m: float,
 ) -> DepthSurface:
     """Thin a depth image (H, W), uint16 mm, to one mean point and normal per cell.
 
-    Edges, grazing views and points beyond ``max_depth_m`` are left out.
-
-    Args:
-        keep: (H, W) bool, pixels that take part; None = all.
-        window: rows and columns that are processed.
-        cell_m: side of a cell, metres.
+    Edges, grazing views and points beyond ``max_depth_m`` are left out. ``cell_m``: side of a cell,
+    metres.
     """
+    rows, columns = np.flatnonzero(depth.any(1)), np.flatnonzero(depth.any(0))
+    if not len(rows):
+        rows = columns = np.zeros(1, int)
+    window = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     depth, table = depth[window], lens.rays[window]
     usable = (depth > 0) & (depth <= max_depth_m * 1000)
-    if keep is not None:
-        usable &= keep[window]
     z = depth.astype(np.float32) * np.float32(1e-3)
     grid = np.dstack([table * z[..., None], z])
     # Baseline of a normal, one way: 4 px of the unbinned narrow depth camera (f = 504 px). Shorter
@@ -134,9 +130,8 @@ def background_surfaces(
         lens = rig[c].depth
         if background is not None and lens is not None:
             surfaces[c] = surface_from_depth(
-                background.depth,
+                np.where(background.static, background.depth, 0),
                 lens,
-                keep=background.static,
                 cell_m=BACKGROUND_CELL_M,
                 # beyond, the error of the depth exceeds a centimetre
                 max_depth_m=5.0,
@@ -185,9 +180,7 @@ def _moving(
 ) -> DepthSurface:
     """The surface of the middle one of three depth images, ``gaps`` (2,) seconds apart."""
     before, now, after = (_foreground(image, background) for image in images)
-    surface = surface_from_depth(
-        now, lens, window=_box(now), cell_m=0.02, max_depth_m=MOVING_MAX_DEPTH_M
-    )
+    surface = surface_from_depth(now, lens, cell_m=0.02, max_depth_m=MOVING_MAX_DEPTH_M)
     if not len(surface):
         return surface
     earlier = _along_normals(surface, _points(before, lens))
@@ -204,13 +197,6 @@ def _foreground(image: np.ndarray | None, background: Background) -> np.ndarray:
     # margins tuned on the studio
     limit = behind * (1 - 0.012) - 40.0
     return np.where((behind == 0) | (image < limit), image, 0).astype(np.uint16)
-
-
-def _box(image: np.ndarray) -> tuple[slice, slice]:
-    rows, columns = np.flatnonzero(image.any(1)), np.flatnonzero(image.any(0))
-    if not len(rows):
-        return slice(0, 1), slice(0, 1)
-    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
 
 
 def _points(image: np.ndarray, lens: Intrinsics) -> np.ndarray:

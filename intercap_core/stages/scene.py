@@ -258,7 +258,7 @@ def _write(output: Path, source: Frames, scene: _Scene, settings: SceneSettings)
         sequence=source.sequence,
         master=source.master,
         fps=source.fps,
-        extrinsics_refined=refined.improved,
+        extrinsics_refined=bool(refined.refined.any()),
         extrinsics_converged=refined.converged,
         verdict=refined.verdict,
         ground_found=ground.found,

@@ -22,7 +22,7 @@ def _evidence(*ratios: float) -> HeldOutComparison:
     return HeldOutComparison("background", np.log(ratios))
 
 
-def test_a_camera_is_refined_only_beyond_chance() -> None:
+def test_camera_is_refined_only_if_significantly_better() -> None:
     assert PoseVerdict.of([_evidence(0.1, 0.2, 0.15)]).refined
     assert not PoseVerdict.of([_evidence(0.9, 1.1, 0.95, 1.0)]).refined
     # better on one kind, undecided on the other: both count the same, however many units one has
@@ -33,9 +33,10 @@ def test_a_camera_is_refined_only_beyond_chance() -> None:
 
 
 def test_evidence_pairs_units_that_both_have() -> None:
-    found = HeldOutComparison.of("keypoints", {1: 2.0, 2: 4.0, 3: 1.0}, {1: 1.0, 2: 2.0, 4: 9.0})
-    np.testing.assert_allclose(found.log_ratio, np.log([0.5, 0.5]))
-    assert str(found) == "keypoints -50 %" and found.sigma > 0
+    errors = {1: 2.0, 2: 4.0, 3: 1.0}, {1: 1.0, 2: 2.0, 4: 9.0}
+    comparison = HeldOutComparison.of("keypoints", *errors)
+    np.testing.assert_allclose(comparison.log_ratio, np.log([0.5, 0.5]))
+    assert str(comparison) == "keypoints -50 %" and comparison.sigma > 0
 
 
 def test_weakest_motion_matches_sampled_poses() -> None:

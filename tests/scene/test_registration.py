@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -35,23 +36,29 @@ TRUTH, UP = ring()
 MIDDLE = apply(invert(UP), np.array([[0, 0, 0.8]]))[0]
 
 
-def surfaces(seed: int, bias_m: float = 0.0, boxes=FURNITURE, walls=3.6):
+NONE = np.zeros(len(TRUTH))
+
+
+@cache
+def room(furnished: bool) -> list[np.ndarray]:
+    boxes, walls = (FURNITURE, 3.6) if furnished else (np.zeros((0, 2, 3)), None)
+    return [room_depth(camera, UP, boxes, walls) for camera in TRUTH]
+
+
+@cache
+def surfaces(seed: int, bias_m: float = 0.0, furnished: bool = True):
+    """Surfaces by camera, and the biases (C,) of their depth."""
     rng = np.random.default_rng(seed)
-    bias = rng.normal(0, bias_m, len(TRUTH)) if bias_m else np.zeros(len(TRUTH))
-    found = {}
-    for c, camera in enumerate(TRUTH):
-        depth = room_depth(camera, UP, boxes, walls)
+    bias = rng.normal(0, bias_m, len(TRUTH)) if bias_m else NONE
+    result = {}
+    for c, depth in enumerate(room(furnished)):
         image = to_millimetres(np.where(depth > 0, depth + bias[c], 0), rng, noise=0.3)
-        found[c] = surface_from_depth(image, camera.depth, cell_m=0.03, max_depth_m=5.0)
-    return found, bias
+        result[c] = surface_from_depth(image, TRUTH[c].depth, cell_m=0.03, max_depth_m=5.0)
+    return result, bias
 
 
-def registration_of(rig, found) -> Registration:
-    return Registration(rig, {STATIC: [found]}, 0)
-
-
-def none() -> np.ndarray:
-    return np.zeros(len(TRUTH))
+def registration_of(rig, seen) -> Registration:
+    return Registration(rig, {STATIC: [seen]}, 0)
 
 
 def views_of(seed: int, noise_px: float) -> BodyViews:
@@ -68,8 +75,7 @@ def views_of(seed: int, noise_px: float) -> BodyViews:
 
 
 def test_surfaces_lie_on_the_room_and_face_the_camera():
-    found, _ = surfaces(0)
-    for c, surface in found.items():
+    for c, surface in surfaces(0)[0].items():
         world = apply(UP @ TRUTH[c].master_from_depth, surface.points)
         on_floor = np.abs(world[:, 2]) < 0.015
         assert on_floor.mean() > 0.3
@@ -79,10 +85,10 @@ def test_surfaces_lie_on_the_room_and_face_the_camera():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_furnished_room_brings_perturbed_cameras_back(seed):
-    found, _ = surfaces(seed, bias_m=0.002)
+def test_furnished_room_corrects_perturbed_cameras(seed):
+    seen, _ = surfaces(seed, bias_m=0.002)
     start = perturbed(TRUTH, np.random.default_rng(seed), 0.01, 0.3)
-    registration = registration_of(start, found)
+    registration = registration_of(start, seen)
     refined = registration.solve(RigEstimate.start(start)).estimate
     before = extrinsics_error(start, TRUTH, MIDDLE)
     after = extrinsics_error(start.moved(refined.poses), TRUTH, MIDDLE)
@@ -96,11 +102,10 @@ def test_a_furnished_room_brings_perturbed_cameras_back(seed):
     assert medians[1] < 0.5 * medians[0]
 
 
-def test_depth_bias_of_one_camera_is_found():
-    found, _ = surfaces(0)
-    biased = found[2]
-    shifted = replace(biased, points=biased.points + 0.006 * biased.rays)
-    registration = registration_of(TRUTH, {**found, 2: shifted})
+def test_depth_bias_of_one_camera_is_estimated():
+    seen, _ = surfaces(0)
+    shifted = replace(seen[2], points=seen[2].points + 0.006 * seen[2].rays)
+    registration = registration_of(TRUTH, {**seen, 2: shifted})
     refined = registration.solve(RigEstimate.start(TRUTH)).estimate
     others = np.delete(refined.bias, 2)
     assert refined.bias[2] - others.mean() > 0.003
@@ -109,9 +114,8 @@ def test_depth_bias_of_one_camera_is_found():
 
 
 def test_body_constrains_rigs_above_a_bare_floor():
-    found, _ = surfaces(1, boxes=np.zeros((0, 2, 3)), walls=None)
     start = perturbed(TRUTH, np.random.default_rng(3), 0.01, 0.3)
-    registration = registration_of(start, found)
+    registration = registration_of(start, surfaces(1, furnished=False)[0])
     alone = registration.solve(RigEstimate.start(start)).estimate
     body = BodyConstraint(views_of(0, 3.0), TRUTH)
     together = registration.solve(RigEstimate.start(start), [body]).estimate
@@ -125,8 +129,8 @@ def test_body_equations_are_the_derivatives_of_the_reprojection():
     views = views_of(1, 2.0)
     poses = perturbed(TRUTH, np.random.default_rng(0), 0.005, 0.2).master_from_colour
     body = BodyConstraint(views, TRUTH)
-    body(poses, none())
-    residual, by_point, _, by_pose = body._linearised(poses, none())
+    body(poses, NONE)
+    residual, by_point, _, by_pose = body._linearised(poses, NONE)
     step = 1e-6
     for axis in range(6):
         moved = poses.copy()
@@ -135,16 +139,16 @@ def test_body_equations_are_the_derivatives_of_the_reprojection():
             moved[:, :3, :3] = turn @ moved[:, :3, :3]
         else:
             moved[:, axis - 3, 3] += step
-        numeric = (body._linearised(moved, none())[0] - residual) / step
+        numeric = (body._linearised(moved, NONE)[0] - residual) / step
         np.testing.assert_allclose(by_pose[..., axis], numeric, rtol=1e-3, atol=0.05)
     body._points = body._points + np.array([step, 0, 0])
-    numeric = (body._linearised(poses, none())[0] - residual) / step
+    numeric = (body._linearised(poses, NONE)[0] - residual) / step
     np.testing.assert_allclose(by_point[..., 0], numeric, rtol=1e-3, atol=0.05)
 
 
 def test_moving_all_cameras_together_has_no_body_cost():
     views = views_of(2, 0.0)
-    matrix, gradient = BodyConstraint(views, TRUTH)(TRUTH.master_from_colour, none())
+    matrix, gradient = BodyConstraint(views, TRUTH)(TRUTH.master_from_colour, NONE)
     together = np.zeros((6, 6, 3))
     together[:, 3:] = np.eye(3)  # every camera translated alike
     motion = together.reshape(36, 3)
@@ -153,33 +157,31 @@ def test_moving_all_cameras_together_has_no_body_cost():
     assert np.abs(gradient).max() < 1e-3 * np.abs(matrix).max() * 1e-3
 
 
-def test_triangulated_points_agree_with_the_constraints_own():
+def test_points_of_the_body_term_are_triangulated():
     views = views_of(3, 1.0)
     body = BodyConstraint(views, TRUTH)
-    body(TRUTH.master_from_colour, none())
-    found = triangulate(views.pixels, views.weights, TRUTH, max_error_px=20)
-    np.testing.assert_allclose(body._points, found.points, atol=0.002)
+    body(TRUTH.master_from_colour, NONE)
+    points = triangulate(views.pixels, views.weights, TRUTH, max_error_px=20).points
+    np.testing.assert_allclose(body._points, points, atol=0.002)
 
 
 def test_cameras_without_overlap_keep_their_poses():
-    found, _ = surfaces(0)
     start = perturbed(TRUTH, np.random.default_rng(1), 0.01, 0.3)
-    only = registration_of(start, {3: found[3]})
+    only = registration_of(start, {3: surfaces(0)[0][3]})
     refined = only.solve(RigEstimate.start(start)).estimate
     np.testing.assert_array_equal(refined.poses, start.master_from_colour)
     assert not only.residuals(refined, STATIC)
 
 
-def test_bias_is_found_with_fixed_poses():
-    found, bias = surfaces(0, bias_m=0.004)
-    held = registration_of(TRUTH, found).solve(RigEstimate.start(TRUTH), free_poses=False)
-    np.testing.assert_array_equal(held.estimate.poses, TRUTH.master_from_colour)
-    assert held.last_step_m == 0
-    left = held.estimate.bias - bias
-    assert np.std(left) < 0.5 * np.std(bias)
+def test_bias_is_estimated_with_fixed_poses():
+    seen, bias = surfaces(0, bias_m=0.004)
+    solved = registration_of(TRUTH, seen).solve(RigEstimate.start(TRUTH), free_poses=False)
+    np.testing.assert_array_equal(solved.estimate.poses, TRUTH.master_from_colour)
+    assert solved.last_step_m == 0
+    assert np.std(solved.estimate.bias - bias) < 0.5 * np.std(bias)
 
 
-def test_two_views_count_only_where_the_rig_has_no_more():
+def test_two_views_count_only_in_rigs_of_two():
     def points(cameras: int) -> BodyViews:
         shape = (20, cameras, 135)
         seen_by_two = np.where(np.arange(cameras)[:, None] < 2, 1.0, 0.0) * np.ones(shape)
@@ -199,37 +201,26 @@ def test_two_views_count_only_where_the_rig_has_no_more():
     assert not set(seen.unit) & set(unseen.unit)
 
 
-VERTICAL, ACROSS, AHEAD = np.eye(3)[[2, 0, 1]]
+def normals(*counts: int) -> np.ndarray:
+    """Noisy unit normals: ``counts`` along z, x and y."""
+    directions = np.repeat(np.eye(3)[[2, 0, 1]][: len(counts)], counts, axis=0)
+    directions = directions + np.random.default_rng(1).normal(0, 0.03, directions.shape)
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-def _normals(counts: dict[tuple[float, ...], int]) -> np.ndarray:
-    normals = np.repeat([np.array(n) for n in counts], list(counts.values()), axis=0)
-    normals = normals + np.random.default_rng(1).normal(0, 0.03, normals.shape)
-    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
-
-
-def test_a_floor_has_at_most_its_share_and_the_sum_stays() -> None:
-    normals = _normals({tuple(VERTICAL): 900, tuple(ACROSS): 60, tuple(AHEAD): 40})
+def test_floor_keeps_at_most_its_share_of_the_weight() -> None:
     weight = np.random.default_rng(2).uniform(0.5, 1, 1000)
-    found = balance_directions(weight, normals)
-    assert found.sum() == pytest.approx(weight.sum())
-    assert found[:900].sum() / found.sum() == pytest.approx(MAX_DIRECTION_SHARE)
-    # what lies one way keeps its own proportions
-    assert np.ptp(found[:900] / weight[:900]) < 1e-12 and np.ptp(found[900:] / weight[900:]) < 1e-12
+    balanced = balance_directions(weight, normals(900, 60, 40))
+    assert balanced.sum() == pytest.approx(weight.sum())
+    assert balanced[:900].sum() / balanced.sum() == pytest.approx(MAX_DIRECTION_SHARE)
+    gain = balanced / weight  # the same for all points of a direction
+    assert np.ptp(gain[:900]) < 1e-12 and np.ptp(gain[900:]) < 1e-12
+    few = balance_directions(np.ones(1000), normals(995, 5))
+    np.testing.assert_allclose(few[995:], MAX_DIRECTION_GAIN)
+    assert few.sum() == pytest.approx(1000)
 
 
-def test_specks_gain_no_more_than_the_limit() -> None:
-    normals = _normals({tuple(VERTICAL): 995, tuple(ACROSS): 5})
-    found = balance_directions(np.ones(1000), normals)
-    np.testing.assert_allclose(found[995:], MAX_DIRECTION_GAIN)
-    assert found.sum() == pytest.approx(1000)
-
-
-def test_balanced_weights_are_unchanged() -> None:
-    weight = np.random.default_rng(3).uniform(0, 1, 300)
-    mixed = _normals({tuple(VERTICAL): 100, tuple(ACROSS): 100, tuple(AHEAD): 100})
-    np.testing.assert_array_equal(balance_directions(weight, mixed), weight)
-    np.testing.assert_array_equal(
-        balance_directions(weight, _normals({tuple(VERTICAL): 300})), weight
-    )
-    np.testing.assert_array_equal(balance_directions(np.zeros(300), mixed), np.zeros(300))
+@pytest.mark.parametrize(("counts", "scale"), [((100, 100, 100), 1), ((300,), 1), ((300,), 0)])
+def test_balanced_weights_are_unchanged(counts, scale) -> None:
+    weight = scale * np.random.default_rng(3).uniform(0, 1, 300)
+    np.testing.assert_array_equal(balance_directions(weight, normals(*counts)), weight)

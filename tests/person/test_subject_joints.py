@@ -1,11 +1,12 @@
-"""Keypoints of cameras that expose late or early, brought to one moment."""
+"""The subject's joints: keypoints moved to one moment, and middles of shoulders and hips."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from intercap_core.body.keypoints import KEYPOINT_INDEX
 from intercap_core.geometry.camera.transforms import apply, invert
-from intercap_core.person.subject_joints import at_set_times, triangulate_people
+from intercap_core.person.subject_joints import at_set_times, fill_middles, triangulate_people
 from tests.helpers.synthetic_capture import ring
 from tests.helpers.synthetic_people import seen_by, stick_person
 
@@ -58,3 +59,17 @@ def test_a_swap_and_a_miss_move_no_neighbour():
 def test_zero_offsets_change_nothing():
     seen = _exposed()
     assert np.array_equal(at_set_times(seen, TIMES, np.zeros(6), RIG, min_confidence=0.3), seen)
+
+
+def test_neck_and_mid_hip_are_filled_by_middles():
+    neck, mid_hip, shoulder = (KEYPOINT_INDEX[n] for n in ("neck", "mid_hip", "left_shoulder"))
+    true = stick_person()
+    points = np.stack([true, true, true])
+    points[0, [neck, mid_hip]] = np.nan
+    points[1, [neck, shoulder]] = np.nan
+    fill_middles(points)
+    both = [shoulder, KEYPOINT_INDEX["right_shoulder"]]
+    np.testing.assert_allclose(points[0, neck], true[both].mean(0))
+    np.testing.assert_allclose(points[0, mid_hip], [0, 0, 0.93])
+    assert np.isnan(points[1, neck]).all(), "one shoulder is unknown"
+    np.testing.assert_array_equal(points[2], true)
