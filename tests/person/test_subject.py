@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from intercap_core.config import SubjectPoint
+from intercap_core.annotation import SubjectPoint
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import Detections
 from intercap_core.geometry.camera.masks import encode
