@@ -1,9 +1,9 @@
-"""Keypoints of one view lifted to 3D by the depth beside them, where no second view sees them.
+"""Keypoints seen by a single view, lifted to 3D by the depth around their pixels.
 
 Depth measures the skin, a keypoint is a joint inside the body: the point lies deeper on the pixel's
 ray by an inset that depends on the joint. The depth at an occluded joint is of another surface:
 pixels of the scene's background are skipped, and if a side view shows both shoulders or hips in one
-place, the one with less confidence is occluded and left out with its limb.
+place, the limb with less confidence is left out as occluded.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class DepthRelief:
     """Depth pixels projected into the colour image."""
 
     camera: Camera
-    """The camera."""
+    """Has depth and colour."""
     pixels: np.ndarray
     """(N, 2) in the colour image."""
     distance: np.ndarray
@@ -59,7 +59,7 @@ class DepthRelief:
     def of(
         cls, depth: np.ndarray, camera: Camera, bias_m: float, background: np.ndarray | None
     ) -> DepthRelief:
-        """Project every second pixel of every second row of a depth image.
+        """Project every second pixel of every second row of a depth image into the colour image.
 
         Args:
             depth: (H, W) uint16 mm.

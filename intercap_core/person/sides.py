@@ -23,8 +23,8 @@ def _partner(name: str) -> str:
     return name
 
 
-# (135,) the keypoint of the other side; itself where it has none (also all of the face, which
-# detectors find as a whole).
+# (135,) the keypoint of the other side; itself if there is none, and for the face, which detectors
+# recognise as a whole.
 PARTNER = np.array([KEYPOINT_INDEX[_partner(name)] for name in KEYPOINT_INDEX])
 
 

@@ -54,7 +54,7 @@ class NamedDetection:
     index: int
     """Person in the image."""
     words: str
-    """Name of the entry, for messages."""
+    """Entry of the annotation, for messages."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ class SubjectDetections:
     chosen_by: str
     """"alone", "named", "handling" or "middle"."""
     doubts: tuple[str, ...]
-    """Evidence against the choice."""
+    """Evidence against the choice, for messages."""
 
 
 def find_subject(
@@ -225,7 +225,7 @@ def _add_single_views(
     times: np.ndarray,
     min_confidence: float,
 ) -> None:
-    """Add the detection closest to the last known points where a single view sees the subject.
+    """Add the detection closest to the last known points in sets without agreeing views.
 
     People whom agreeing views locate elsewhere are excluded.
     """

@@ -123,7 +123,7 @@ def steady_background(images: np.ndarray, person: np.ndarray) -> Background:
 def _farthest_cluster(ordered: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Median (N,) and size (N,) of the farthest ``count`` or more samples that agree.
 
-    ``ordered`` (N, S) ascending mm, 0 = invalid. 0 and 0 where no such samples agree.
+    ``ordered`` (N, S) ascending mm, 0 = invalid. Both are 0 if no such samples agree.
     """
     values = ordered.astype(np.float32)
     samples = values.shape[1]

@@ -1,4 +1,4 @@
-"""Decides for each camera whether its refined pose explains held-out data better than the given.
+"""Compares the refined pose of each camera with its given pose on held-out data.
 
 Each camera in turn gets its given pose back while the others stay refined. If that is not far
 worse, the others are also refined with this camera fixed. The two are compared on the held-out

@@ -168,8 +168,10 @@ def annotated_ground(
 ) -> GroundPlane:
     """Plane through annotated floor points (M, 3), M >= 3, master frame.
 
-    Background ``points`` (N, 3) are only counted. Raises UserError, to be prefixed with the
-    sequence, if the annotated points lie on one line.
+    Background ``points`` (N, 3) are only counted.
+
+    Raises:
+        UserError: the annotated points lie on one line. The message lacks the sequence.
     """
     point = floor.mean(0)
     axes = np.linalg.svd(floor - point, full_matrices=False)[2]

@@ -151,7 +151,7 @@ class KeypointMotion:
     paths: SmoothPaths
     """In the master's frame."""
     residual: np.ndarray
-    """(T, C, K, 2) detected less expected pixels, without bias; 0 where not ``seen``."""
+    """(T, C, K, 2) detected less expected pixels, without bias; 0 = not ``seen``."""
     seen: np.ndarray
     """(T, C, K) bool: has a residual."""
     valid: np.ndarray
@@ -184,7 +184,7 @@ class KeypointMotion:
     def shifted(self, seconds: float) -> np.ndarray:
         """Displacement (T, C, K, 2), px, of the points in images that are ``seconds`` older.
 
-        NaN where the path is unknown.
+        NaN = the path is unknown.
         """
         points = self.paths.at(self.times - seconds)
         return _pixels_of(points, self.rig) - self.expected
@@ -308,7 +308,7 @@ def _in_cameras(points: np.ndarray, rig: Rig) -> np.ndarray:
 
 
 def _where_known(points: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """``pixels``, NaN where the point is: projection would place it at the smallest depth."""
+    """``pixels`` with NaN for unknown points, which projection places at the smallest depth."""
     return np.where(~np.isfinite(points[..., 0])[:, None, :, None], np.nan, pixels)
 
 

@@ -1,7 +1,7 @@
 """Detects images that are whole frames older than their device times, from the body's motion.
 
-While a camera's images are late, every keypoint that moves is seen where it was a while ago. For
-each camera, each number of frames and each interval of sets, the gain in log likelihood of the
+While a camera's images are late, moving keypoints are seen at their earlier positions. For each
+camera, each number of frames and each interval of sets, the gain in log likelihood of the
 keypoints is computed under the detector's own noise over time. The images of the best intervals are
 reassigned to the sets that they show, and the search is repeated until no interval is significant.
 While nobody moves a slip cannot be seen, and none is reported.

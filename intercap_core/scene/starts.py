@@ -1,7 +1,7 @@
-"""Start times of cameras: stated by the user or by sound, and as found from the keypoints.
+"""Start times of cameras: stated by the user or by sound, and estimated from the keypoints.
 
-A stated start is where the search of :mod:`.start_times` begins, and a prior of the time offset. It
-is rejected if the keypoints clearly contradict it.
+The search of :mod:`.start_times` begins at a stated start, which is also the prior of the time
+offset. A statement is rejected if the keypoints clearly contradict it.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ class StatedStarts:
                 )
 
     def combine(self, other: StatedStarts) -> tuple[StatedStarts, list[str]]:
-        """Combine two sources of starts; where they disagree, this one takes precedence.
+        """Combine two sources of starts; if they disagree about a camera, this one has precedence.
 
         Returns the combined starts, and a message (C,) for each disagreement, "" = none.
         """

@@ -30,7 +30,7 @@ def add_late_views(
     rig: Rig,
     times: np.ndarray,
 ) -> np.ndarray:
-    """Add detections that are where the subject was shortly before, as far back as slips reach.
+    """Add detections at earlier positions of the subject, as far back as slips reach.
 
     Args:
         index: (T, C) the subject's detection in each image; -1 = not seen.

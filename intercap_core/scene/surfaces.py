@@ -178,7 +178,7 @@ def moving_surfaces(
 def _moving(
     images: list[np.ndarray | None], background: Background, lens: Intrinsics, gaps: np.ndarray
 ) -> DepthSurface:
-    """The surface of the middle one of three depth images, ``gaps`` (2,) seconds apart."""
+    """Surface with speeds in the second of three depth images, ``gaps`` (2,) seconds apart."""
     before, now, after = (_foreground(image, background) for image in images)
     surface = surface_from_depth(now, lens, cell_m=0.02, max_depth_m=MOVING_MAX_DEPTH_M)
     if not len(surface):
@@ -190,7 +190,7 @@ def _moving(
 
 
 def _foreground(image: np.ndarray | None, background: Background) -> np.ndarray:
-    """The depth image (H, W) uint16 mm where it is in front of the background, 0 elsewhere."""
+    """Depth (H, W), uint16 mm, of the pixels in front of the background; 0 for others."""
     assert image is not None
     behind = background.depth
     # above the systematic error of 11 mm + 0.1 % of depth (Azure Kinect DK data sheet) and noise;

@@ -80,13 +80,15 @@ def run(
     The subject is the person named by the user, else who handles the object, else who is seen most
     near the centre. A set with a single view of the subject takes its points from that view's
     depth. Sets in which neither two views nor depth locate the subject are flagged ``missing``.
-    Raises UserError if all sets are missing, the inputs are of different captures, or a point
-    names nobody.
 
     Args:
         object_: its labels identify candidates of the object.
         subject_points: annotated points on the subject.
         left_right: annotated images with exchanged sides.
+
+    Raises:
+        UserError: all sets are missing, the inputs are of different captures, or a point names
+            nobody.
     """
     found = Detections.load(detections)
     with artefacts.read(scene, SCENE) as source, Frames.open(frames) as images:

@@ -87,12 +87,13 @@ def run(
 ) -> None:
     """Write the scene artefact of one sequence.
 
-    Raises UserError if the recording has no image, the two artefacts are of different recordings,
-    the annotated floor points span no plane, or the annotated starts leave no common time.
-
     Args:
         floor: annotated floor points, master frame, metres; they replace the fit.
         starts: annotated time of the first image and its standard deviation, seconds, by camera.
+
+    Raises:
+        UserError: the recording has no image, the two artefacts are of different recordings, the
+            annotated floor points span no plane, or the annotated starts leave no common time.
     """
     with Frames.open(frames) as source:
         if not source.available.any():
@@ -163,7 +164,7 @@ def _stated_starts(
 def _backgrounds(
     source: Frames, subject: SubjectViews, slip: np.ndarray
 ) -> list[Background | None]:
-    """Background of each camera; the person is masked where they were at the exposure."""
+    """Background of each camera, without the person at the exposure of each image."""
     last = source.num_sets - 1
     moment = np.clip(np.arange(source.num_sets)[:, None] - slip, 0, last)
     return [

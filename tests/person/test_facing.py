@@ -1,4 +1,4 @@
-"""Whole bodies and limbs with left taken for right, in some or in all views."""
+"""Whole bodies and limbs with left and right exchanged, in some or in all views."""
 
 from __future__ import annotations
 
@@ -26,12 +26,11 @@ def clean() -> np.ndarray:
     return keypoints
 
 
-def put_right(damaged: np.ndarray, rig=RIG) -> tuple[np.ndarray, np.ndarray]:
-    fixed, found = triangulate_people(damaged, rig, TIMES, min_confidence=0.3, max_error_px=20)
-    error = found.points.reshape(SETS, 135, 3) - apply(invert(UP), TRUTH.reshape(-1, 3)).reshape(
-        SETS, 135, 3
-    )
-    return fixed, np.linalg.norm(error, axis=2)
+def corrected(damaged: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Keypoints with corrected sides, and errors (T * 135,) of the points, metres."""
+    fixed, points = triangulate_people(damaged, RIG, TIMES, min_confidence=0.3, max_error_px=20)
+    true = apply(invert(UP), TRUTH.reshape(-1, 3))
+    return fixed, np.linalg.norm(points.points - true, axis=1)
 
 
 @pytest.mark.parametrize(
@@ -48,29 +47,29 @@ def test_mirrored_people_are_corrected(clean, sets, views):
     damaged = clean.copy()
     for c in views:
         damaged[sets, c] = swap_sides(damaged[sets, c])
-    fixed, error = put_right(damaged)
+    fixed, error = corrected(damaged)
     np.testing.assert_array_equal(fixed[:, :, ALL], clean[:, :, ALL])
     assert error.max() < 0.03
 
 
 @pytest.mark.parametrize("limb", [LEGS, HANDS], ids=["legs", "hands"])
-def test_a_limb_that_all_views_exchange_is_put_back(clean, limb):
+def test_limb_exchanged_in_all_views_is_corrected(clean, limb):
     damaged = clean.copy()
     damaged[4:10] = swap_sides(damaged[4:10], limb)
-    fixed, _ = put_right(damaged)
+    fixed, _ = corrected(damaged)
     np.testing.assert_array_equal(fixed[:, :, ALL], clean[:, :, ALL])
 
 
-def test_two_views_that_contradict_each_other(clean):
+def test_two_contradicting_views_are_corrected(clean):
     damaged = np.zeros_like(clean)
     damaged[:, :2] = clean[:, :2]
     damaged[4:10, 1] = swap_sides(damaged[4:10, 1])
-    fixed, _ = put_right(damaged)
+    fixed, _ = corrected(damaged)
     limbs = np.r_[ARMS, LEGS, HANDS]  # two views cannot tell four points of a head apart
     np.testing.assert_array_equal(fixed[:, :2][:, :, limbs], clean[:, :2][:, :, limbs])
 
 
-def test_views_that_agree_stay(clean):
+def test_consistent_views_are_unchanged(clean):
     keypoints = clean.copy()
     assert not make_views_agree(keypoints, RIG, min_confidence=0.3).any()
     np.testing.assert_array_equal(keypoints, clean)
@@ -78,7 +77,7 @@ def test_views_that_agree_stay(clean):
     assert not make_views_agree(unseen, RIG, min_confidence=0.3).any()
 
 
-def test_a_kneeling_person_does_not_face_backwards():
+def test_kneeling_person_does_not_face_backwards():
     """Feet that point backwards are no contradiction: the shin does too."""
     body = stick_person()
     knee = body[[10, 13]].copy()
@@ -94,6 +93,6 @@ def test_a_kneeling_person_does_not_face_backwards():
     assert find_mirrored(turned, share, None).all()
 
 
-def test_unknown_points_decide_nothing():
+def test_unknown_points_exchange_nothing():
     assert not find_mirrored(np.full((4, 135, 3), np.nan), np.zeros((4, 3)), TIMES[:4]).any()
     assert find_mirrored(np.zeros((0, 135, 3)), np.zeros((0, 3)), TIMES[:0]).shape == (0, 4)

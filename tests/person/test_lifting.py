@@ -1,4 +1,4 @@
-"""Keypoints that one view and its depth place."""
+"""Keypoints of one view located by its depth."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def _depths(relief: DepthRelief) -> np.ndarray:
     return apply(CAMERA.colour_from_master, points)[:, 2]
 
 
-def test_a_person_is_lifted_past_the_furniture_before_him():
+def test_person_is_lifted_behind_a_table():
     """A table hides the lower quarter of the image; the person stands at 2.4 m."""
     room, seen = _wall(4000), _wall(2400)
     table = slice(room.shape[0] * 11 // 20, None)
@@ -38,7 +38,7 @@ def test_a_person_is_lifted_past_the_furniture_before_him():
     known = np.isfinite(z)
     assert 6 <= known.sum() < 10 and z[known].min() > 2.2
     naive = _depths(DepthRelief.of(seen, CAMERA, 0.0, None))
-    assert np.nanmin(naive) < 1.5, "nothing tells the table from the person"
+    assert np.nanmin(naive) < 1.5  # without a background the table is the person
 
 
 def test_person_in_the_background_is_lifted():

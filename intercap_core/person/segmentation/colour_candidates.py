@@ -1,4 +1,4 @@
-"""The person's mask and candidates of the object from colour images, where a camera has no depth.
+"""The person's mask and candidates of the object from images of a camera without depth.
 
 Background subtraction: a pixel that differs in colour from the recording's median is foreground.
 Foreground around the projected keypoints is the person. Without depth, an object that occludes the
@@ -109,7 +109,7 @@ class ColourSegmenter:
 
 
 def median_background(images: np.ndarray, people: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Median colour (H, W, 3) float32 without the person, and where it is known, (H, W) bool.
+    """Median colour (H, W, 3) float32 without the person, and mask (H, W) of known pixels.
 
     Exposures are first matched to that of the first image.
 

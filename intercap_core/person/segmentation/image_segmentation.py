@@ -1,4 +1,4 @@
-"""Masks and candidates from the images alone, by depth where a camera measures it, else colour."""
+"""Masks and candidates from images alone: by depth if the camera measures it, else by colour."""
 
 from __future__ import annotations
 

@@ -59,17 +59,17 @@ def overlap(a: np.ndarray, b: np.ndarray) -> float:
     return float((a & b).sum() / max(1, (a | b).sum()))
 
 
-def best_overlaps(written, segmented, t: int, what: int) -> list[float]:
-    """IoU of each view's best candidate with what is truly there, views that show it well."""
+def best_overlaps(written, segmented, t: int, part: int) -> list[float]:
+    """IoU of each view's best candidate with the true mask, in views with more than 300 pixels."""
     frames, _, detections = written
     with Frames.open(frames) as images:
         moments = np.tile(np.arange(images.num_sets)[:, None], (1, CAPTURE.views))
-    found = Detections.load(detections).showing(moments).with_candidates_of(segmented)
+    detected = Detections.load(detections).showing(moments).with_candidates_of(segmented)
     result = []
     for c, camera in enumerate(CAPTURE.rig):
-        truth = CAPTURE.true_masks(t, camera, STEP) == what
+        truth = CAPTURE.true_masks(t, camera, STEP) == part
         if truth.sum() > 300:
-            drawn = [one.mask()[::STEP, ::STEP] for one in found.candidates(t, c)]
+            drawn = [candidate.mask()[::STEP, ::STEP] for candidate in detected.candidates(t, c)]
             result.append(max([overlap(mask, truth) for mask in drawn], default=0.0))
     return result
 
@@ -96,7 +96,7 @@ def test_static_object_near_the_path_is_a_candidate(written, segmented):
     assert len(found) >= 3 and min(found) > 0.6
 
 
-def test_candidates_tell_their_size_and_are_few(segmented):
+def test_candidates_have_their_size_and_are_few(segmented):
     with artefacts.read(segmented, PERSON_SCHEMA) as found:
         extents, scores = found["candidate_extents"], found["candidate_scores"]
         count = np.diff(found["candidate_offsets"])
@@ -104,7 +104,7 @@ def test_candidates_tell_their_size_and_are_few(segmented):
     for size in (np.linalg.norm(BOX_M), np.linalg.norm(STOOL[1] - STOOL[0])):
         assert (np.abs(extents - size) < 0.12).sum() >= CAPTURE.sets
     assert ((scores > 0) & (scores <= 1)).all() and (things >= 0).all()
-    assert count.max() <= 8  # furniture that nobody comes near is none
+    assert count.max() <= 8  # no furniture that nobody comes near
 
 
 def test_moving_objects_are_found_without_a_floor(written, tmp_path):

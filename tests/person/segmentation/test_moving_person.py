@@ -1,11 +1,11 @@
-"""The person as a camera shows it: where it is at the exposure, as uncertain as it is."""
+"""The person's volume at a camera's exposure, with the uncertainty of keypoints and times."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from intercap_core.body.keypoints import KEYPOINT_NAMES
+from intercap_core.body.keypoints import KEYPOINT_INDEX
 from intercap_core.geometry.camera.triangulation import reproject, spread, triangulate
 from intercap_core.person.segmentation.person_volume import (
     MovingPerson,
@@ -16,7 +16,7 @@ from tests.helpers.synthetic_capture import ring
 from tests.helpers.synthetic_people import stick_person
 
 FPS, SPEED = 30.0, 4.0  # of a wrist, m/s
-WRIST, ELBOW = (KEYPOINT_NAMES.index(f"left_{name}") for name in ("wrist", "elbow"))
+WRIST = KEYPOINT_INDEX["left_wrist"]
 HAND = np.array([WRIST, *range(25, 46)])
 
 
@@ -61,8 +61,8 @@ def test_margins_include_uncertainty_of_keypoints_and_times() -> None:
     assert still.sum() > 10 and (fast[~still] > 0.026).sum() >= 20
     forearm = fast[~still].min()
     assert forearm == pytest.approx(np.hypot(0.018, 0.5 * 0.01 * SPEED), rel=0.01)
-    untold = person(0.0, np.nan).bones(4, 1)[:, 8]
-    np.testing.assert_allclose(untold, fast, rtol=1e-5)  # 10 ms where nothing is told
+    unknown = person(0.0, np.nan).bones(4, 1)[:, 8]
+    np.testing.assert_allclose(unknown, fast, rtol=1e-5)  # 10 ms
 
 
 def test_points_scatter_by_their_stated_deviation() -> None:
