@@ -216,7 +216,7 @@ def _from_images(
 
     joints = points.points.reshape(*wanted.shape[:1], NUM_KEYPOINTS, 3)
     sigma = spread(points, rig).reshape(joints.shape[:2])
-    return segment_images(images, scene, joints, wanted, sigma)
+    return segment_images(images, scene, joints, sigma, wanted)
 
 
 def _write(output: Path, detections: Detections, result: _Result, settings: PersonSettings) -> None:

@@ -270,11 +270,10 @@ def test_unmeasured_floor_is_under_the_feet(up):
     assert not fit_ground_to_feet(np.full_like(feet, np.nan), up).found
 
 
-def test_tilt_of_the_hint_is_corrected_by_spread_feet():
-    turn = tilted(EAST, 6)
-    ground = fit_ground_to_feet(turn.apply(walk(80).reshape(-1, 3)).reshape(80, 6, 3), BY_CAMERAS)
+def test_tilted_hint_is_no_staircase():
+    feet = tilted(EAST, 6).apply(walk(80).reshape(-1, 3)).reshape(80, 6, 3)
+    ground = fit_ground_to_feet(feet, BY_CAMERAS)
     assert ground.found and ground.note == ""
-    assert degrees_between(ground.normal, turn.apply(MASTER_UP)) < 1
 
 
 @pytest.mark.parametrize(

@@ -35,13 +35,7 @@ class ColourSegmenter:
     def __init__(
         self, frames: Frames, scene: Artefact, joints: np.ndarray, sigma: np.ndarray
     ) -> None:
-        """
-        Args:
-            frames: read by the moment that their images show.
-            scene: the scene artefact.
-            joints: (T, 135, 3) the subject's keypoints, master frame, metres; NaN = unknown.
-            sigma: (T, 135) their standard deviations, metres.
-        """
+        """The arguments are those of :func:`.image_segmentation.segment_images`."""
         self._frames = frames
         self._rig = Rig.from_artefact(scene)
         self._person = MovingPerson(joints, sigma, scene)
@@ -119,31 +113,12 @@ def median_background(images: np.ndarray, people: np.ndarray) -> tuple[np.ndarra
     """
     gains = np.stack([_gain(image, images[0]) for image in images])
     seen = len(images) - people.sum(0)
-    return _median(images, people, gains), seen >= MIN_COLOUR_SAMPLES
-
-
-@numba.njit(cache=True)
-def _median(images: np.ndarray, people: np.ndarray, gains: np.ndarray) -> np.ndarray:
-    samples, height, width, channels = images.shape
-    median = np.zeros((height, width, channels), np.float32)
-    values = np.empty(samples, np.float32)
-    for y in range(height):
-        for x in range(width):
-            for channel in range(channels):
-                count = 0
-                for s in range(samples):
-                    if people[s, y, x]:
-                        continue
-                    value = min(images[s, y, x, channel] * gains[s, channel], np.float32(255))
-                    at = count  # sorted as they come: there are few
-                    while at > 0 and values[at - 1] > value:
-                        values[at] = values[at - 1]
-                        at -= 1
-                    values[at] = value
-                    count += 1
-                if count:
-                    median[y, x, channel] = values[(count - 1) // 2]
-    return median
+    values = np.minimum(images * gains[:, None, None], np.float32(255))
+    values[people] = np.inf
+    middle = np.maximum(seen - 1, 0) // 2
+    median = np.take_along_axis(np.sort(values, 0), middle[None, ..., None], 0)[0]
+    median[seen == 0] = 0
+    return median, seen >= MIN_COLOUR_SAMPLES
 
 
 def find_foreground(image: np.ndarray, background: np.ndarray, known: np.ndarray) -> np.ndarray:

@@ -96,10 +96,7 @@ class DepthSegmenter:
     ) -> None:
         """
         Args:
-            frames: read by the moment that their images show.
-            scene: the scene artefact.
-            joints: (T, 135, 3) the subject's keypoints, master frame, metres; NaN = unknown.
-            sigma: (T, 135) their standard deviations, metres.
+            frames, scene, joints, sigma: see :func:`.image_segmentation.segment_images`.
             cameras: indices of the cameras to segment.
         """
         self._frames = frames

@@ -20,8 +20,8 @@ def segment_images(
     frames: Frames,
     scene: Artefact,
     joints: np.ndarray,
+    sigma: np.ndarray,
     wanted: np.ndarray,
-    sigma: np.ndarray | None = None,
 ) -> dict[tuple[int, int], ViewSegments]:
     """Segment images; returns the result by moment and camera, for those that can be segmented.
 
@@ -29,10 +29,9 @@ def segment_images(
         frames: read by the moment that their images show.
         scene: the scene artefact.
         joints: (T, 135, 3) the subject's keypoints, master frame, metres; NaN = unknown.
+        sigma: (T, 135) standard deviations of the keypoints, metres.
         wanted: (T, C) bool, images to segment.
-        sigma: (T, 135) standard deviations of the keypoints, metres; None = 0.
     """
-    sigma = np.zeros(joints.shape[:2]) if sigma is None else sigma
     posed = np.isfinite(scene["master_from_colour"]).all((1, 2)) & scene["present"]
     wanted = wanted & posed
     result: dict[tuple[int, int], ViewSegments] = {}

@@ -15,7 +15,7 @@ import numpy as np
 from intercap_core.artefacts import Artefact
 from intercap_core.body.keypoints import KEYPOINT_NAMES, of_side
 from intercap_core.geometry.camera.transforms import apply
-from intercap_core.geometry.solve.time_series import limited_velocity
+from intercap_core.geometry.solve.time_series import filled_linearly, limited_velocity
 
 # Radii at the first and at the second keypoint, and the uncertainty of the surface (one margin:
 # clothing and build), metres. Radii are half breadths, and girths over 2 pi, of NASA-STD-3000,
@@ -209,15 +209,8 @@ def fill_short_gaps(joints: np.ndarray, times: np.ndarray, *, max_gap_s: float) 
     """
     result = joints.copy()
     for k in range(joints.shape[1]):
-        known = np.flatnonzero(np.isfinite(joints[:, k]).all(1))
-        if not len(known):
-            continue
-        for t in np.flatnonzero(~np.isfinite(joints[:, k]).all(1)):
-            after = int(np.searchsorted(known, t))
-            around = known[max(after - 1, 0) : after + 1]
-            if np.abs(times[around] - times[t]).min() > max_gap_s:
-                continue
-            result[t, k] = [
-                np.interp(times[t], times[around], joints[around, k, i]) for i in range(3)
-            ]
+        known = np.isfinite(joints[:, k]).all(1)
+        if known.any():
+            near = np.abs(times[:, None] - times[known]).min(1) <= max_gap_s
+            result[near, k] = filled_linearly(joints[:, k], times, known)[near]
     return result

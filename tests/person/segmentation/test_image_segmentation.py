@@ -21,6 +21,7 @@ from tests.person.segmentation.carrying import BOX, BOX_M, PERSON, SCENERY, STOO
 
 STEP = 4
 CAPTURE = Carrying()
+CERTAIN = np.zeros(CAPTURE.joints.shape[:2])
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +113,7 @@ def test_moving_objects_are_found_without_a_floor(written, tmp_path):
     wanted = np.zeros((CAPTURE.sets, CAPTURE.views), bool)
     wanted[12] = True
     with Frames.open(frames) as images, artefacts.read(scene, SCENE) as artefact:
-        found = segment_images(images, artefact, CAPTURE.joints, wanted)
+        found = segment_images(images, artefact, CAPTURE.joints, CERTAIN, wanted)
     overlaps = []
     for c, camera in enumerate(CAPTURE.rig):
         truth = CAPTURE.true_masks(12, camera, STEP)
@@ -132,8 +133,8 @@ def test_only_requested_images_are_segmented_and_gaps_are_filled(written):
     joints = CAPTURE.joints.copy()
     joints[6:8] = np.nan
     with Frames.open(frames) as images, artefacts.read(scene, SCENE) as artefact:
-        found = segment_images(images, artefact, joints, wanted)
-        nobody = segment_images(images, artefact, np.full_like(joints, np.nan), wanted)
+        found = segment_images(images, artefact, joints, CERTAIN, wanted)
+        nobody = segment_images(images, artefact, np.full_like(joints, np.nan), CERTAIN, wanted)
     assert sorted(found) == [(7, 1), (7, 3), (9, 0)] and not nobody
     truth = CAPTURE.true_masks(7, CAPTURE.rig[1], STEP) == PERSON
     assert overlap(masks.decode(found[7, 1].person, 1080, 1920)[::STEP, ::STEP], truth) > 0.7
