@@ -20,7 +20,7 @@ from intercap_core.person.groups import PersonGroup
 # Standard deviations of thigh, shank, upper arm, forearm, shoulder width and trunk among adults,
 # metres, measured over the shapes of the open body.
 BUILD_SPREADS_M = (0.034, 0.027, 0.015, 0.023, 0.033, 0.025)
-MAX_BODY_SPEED_M_S = 4.0  # of a body's centre; people run slower indoors
+MAX_BODY_SPEED_M_S = 4.0  # of a body's centre; people run slower indoors; untuned
 # Longest gap over which a single view identifies a person by position, and after which a joined
 # track is not doubted; tuned on the studio.
 MAX_LINK_GAP_S = 2.0

@@ -18,7 +18,7 @@ from intercap_core.scene.constraints import MIN_BODY_POINTS, BodyConstraint, Bod
 from intercap_core.scene.registration import MOVING, STATIC, Registration, RigEstimate
 
 MUST_IMPROVE = 0.98  # of the start's held-out cost, in one group at least; tuned on the studio
-DOUBTFUL_RATIO = 0.5  # of refined over given errors: above it a camera gets a second look
+DOUBTFUL_RATIO = 0.5  # refined over given error from which a camera is judged again; tuned
 
 Unit = TypeVar("Unit", bound=Hashable)
 _KINDS = (("background", STATIC), ("moving surfaces", MOVING))

@@ -11,13 +11,13 @@ from intercap_core.errors import UserError
 from intercap_core.geometry.camera.rig import Rig, ring_centre
 from intercap_core.scene.up import UpDirection, degrees_between
 
-FOOT_HEIGHT_M = 0.014  # of the lowest of heel and toe keypoints: the open body's, standing
+FOOT_HEIGHT_M = 0.014  # of the lowest keypoint of a foot, measured on the open body, standing
 FOOT_TOLERANCE_M = 0.05  # feet that differ by more do not stand on one floor; tuned on the studio
 MIN_FOOT_SPREAD_M = 0.15  # standard deviation, of feet that show a tilt; tuned on the studio
 FLOOR_COSINE = 0.94  # 20 degrees: of a floor point's normal with the plane's; tuned on the studio
 FLOOR_HYPOTHESIS_TOLERANCE_M = 0.03  # inliers of a hypothesis of the floor; tuned on the studio
 BELOW_FLOOR_M = 0.10  # a point this far under the plane speaks against it; tuned on the studio
-MIN_FLOOR_AREA_M2 = 0.5  # tuned on the studio
+MIN_FLOOR_AREA_M2 = 0.5  # of visible floor; tuned on the studio
 MIN_FOOT_SETS = 5  # sets with feet seen, for a floor; tuned on the studio
 
 

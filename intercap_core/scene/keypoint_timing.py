@@ -24,8 +24,8 @@ from intercap_core.scene.keypoint_motion import KeypointMotion, build_motion
 
 CONSTANT_VARIANCE = 100.0  # of a series' constant, over its other variance: nearly unconstrained
 TIMING_INFLATION = 2.0  # of sigmas: keypoints of one person err together; tuned on the studio
-WINDOW_SETS = 96  # covariances over time are dense within a window, none reaches beyond it
-MIN_TIMING_SETS = 8  # fewer give no estimate
+WINDOW_SETS = 96  # covariances over time are dense within a window; bounds memory and time
+MIN_TIMING_SETS = 8  # sets; fewer give no estimate; tuned on the studio
 
 
 @dataclass(frozen=True)

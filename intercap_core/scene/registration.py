@@ -25,12 +25,11 @@ from intercap_core.scene.surfaces import DepthSurface
 
 SURFACE_SIGMA_FLOOR_M = 0.003  # of point-to-plane residuals; tuned on the studio
 PRIOR_TRANSLATION_M = 0.01  # error of a careful calibration; tuned on the studio
-PRIOR_ROTATION_RAD = np.radians(0.5)  # the same
-HELD_OUT_EVERY = 4  # one of so many cells of a surface is held out
-SURFACE_SEARCH_M = 0.12  # distance to the nearest cell, beyond the widest gate
+PRIOR_ROTATION_RAD = np.radians(0.5)  # error of a careful calibration; tuned on the studio
+HELD_OUT_EVERY = 4  # cells of a surface for each that is held out; untuned
+SURFACE_SEARCH_M = 0.12  # to the nearest cell, beyond the widest gate; tuned on the studio
 MAX_DIRECTION_SHARE = 0.8  # of a pair's weight, for one direction of normals; tuned on the studio
-# Factor by which the weight of other directions grows; tuned on the studio
-MAX_DIRECTION_GAIN = 3.0
+MAX_DIRECTION_GAIN = 3.0  # factor of the weight of other directions; tuned on the studio
 MIN_PAIR_POINTS = 60  # fewer correspondences are chance; tuned on the studio
 
 

@@ -23,7 +23,7 @@ from intercap_core.person.subject_joints import MAX_IMAGE_SPEED_RAD_S
 from intercap_core.person.tracks import MAX_LINK_GAP_S
 from intercap_core.scene.keypoint_motion import MIN_CONFIDENCE, known_median
 
-MAX_PEOPLE = 3  # of an image, the most confident
+MAX_PEOPLE = 3  # of an image, the most confident; untuned
 
 _LEFT, _RIGHT = (
     [

@@ -15,9 +15,9 @@ from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import PeopleOfImages
 
-PRIOR_OFFSET_S = 0.01  # synchronised devices expose within a third of a period of 1/30 s
-FEWEST_SETS_APART = 2  # a smaller shift is a slip or an offset, not a late start; tuned
-MIN_SHARED_S = 1.0  # overlap of two recordings below which a start cannot be determined
+PRIOR_OFFSET_S = 0.01  # synchronised devices expose within a third of 1/30 s; tuned on the studio
+FEWEST_SETS_APART = 2  # sets; a smaller shift is a slip or an offset, not a late start; tuned
+MIN_SHARED_S = 1.0  # least overlap of two recordings to determine a start; tuned on the studio
 # Combined standard deviations beyond which keypoints overrule a stated start. A smaller bound would
 # overrule about one correct statement in a thousand.
 DENIED_SIGMAS = 4.0

@@ -21,7 +21,7 @@ from intercap_core.scene.background import Background
 
 MOVING_MAX_DEPTH_M = 4.0  # beyond, the error exceeds the motion of a body between sets
 MOVING_SEARCH_M = 0.15  # from one set to the next: 2 m/s at 15 sets a second
-BACKGROUND_CELL_M = 0.03  # of thinned surfaces
+BACKGROUND_CELL_M = 0.03  # side of the cells of thinned backgrounds; tuned on the studio
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Refinement of poses: derivatives, recovery, and what it must not break."""
+"""Registration of a rig: on surfaces, a body, a common floor, and moving surfaces."""
 
 from __future__ import annotations
 
@@ -9,19 +9,29 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.geometry.camera.triangulation import triangulate
-from intercap_core.scene.constraints import BodyConstraint, BodyViews, body_views
+from intercap_core.scene.background import camera_background
+from intercap_core.scene.constraints import (
+    BodyConstraint,
+    BodyViews,
+    FloorConstraint,
+    body_views,
+)
+from intercap_core.scene.ground import fit_ground
 from intercap_core.scene.registration import (
     MAX_DIRECTION_GAIN,
     MAX_DIRECTION_SHARE,
+    MOVING,
     STATIC,
     Registration,
     RigEstimate,
     balance_directions,
 )
 from intercap_core.scene.subject_views import SubjectViews
-from intercap_core.scene.surfaces import surface_from_depth
+from intercap_core.scene.surfaces import DepthSurface, moving_surfaces, surface_from_depth
+from intercap_core.scene.up import rough_up
 from tests.helpers.synthetic_capture import (
     FURNITURE,
     extrinsics_error,
@@ -29,6 +39,7 @@ from tests.helpers.synthetic_capture import (
     ring,
     room_depth,
     to_millimetres,
+    write_frames,
 )
 from tests.helpers.synthetic_people import seen_by, walking
 
@@ -224,3 +235,122 @@ def test_floor_keeps_at_most_its_share_of_the_weight() -> None:
 def test_balanced_weights_are_unchanged(counts, scale) -> None:
     weight = scale * np.random.default_rng(3).uniform(0, 1, 300)
     np.testing.assert_array_equal(balance_directions(weight, normals(*counts)), weight)
+
+
+# --- a common floor ------------------------------------------------------------------------------
+
+BY_CAMERAS = rough_up(TRUTH, np.full((6, 3), np.nan))
+
+
+@pytest.fixture(scope="module")
+def patches() -> dict[int, DepthSurface]:
+    """Each camera's own sixth of a bare floor: no two cameras share any of it."""
+    result = {}
+    for c, surface in surfaces(0, furnished=False)[0].items():
+        world = apply(UP @ TRUTH[c].master_from_depth, surface.points)
+        sector = np.arctan2(world[:, 1], world[:, 0]) - 2 * np.pi * c / 6
+        off = np.abs((sector + np.pi) % (2 * np.pi) - np.pi)
+        own = (off < np.radians(22)) & (np.hypot(*world.T[:2]) > 0.4)
+        result[c] = surface.subset(np.flatnonzero(own))
+    return result
+
+
+def floor_of(rig, patches) -> FloorConstraint | None:
+    points = [apply(rig[c].master_from_depth, s.points) for c, s in patches.items()]
+    normals = [s.normals @ rig[c].master_from_depth[:3, :3].T for c, s in patches.items()]
+    cloud = np.concatenate(points), np.concatenate(normals)
+    ground = fit_ground(*cloud, rig, BY_CAMERAS, tolerance_m=0.03, cell_m=0.03)
+    return FloorConstraint.of(rig, patches, ground)
+
+
+def test_common_floor_corrects_height_and_tilt_without_overlap(patches):
+    start = perturbed(TRUTH, np.random.default_rng(2), 0.01, 0.3)
+    registration = registration_of(start, patches)
+    assert not registration.residuals(RigEstimate.start(start), STATIC)
+    refined = registration.solve(RigEstimate.start(start), [floor_of(start, patches)]).estimate
+
+    def errors(poses: np.ndarray) -> tuple[float, float]:
+        heights, tilts = [], []
+        for pose, true in zip(poses[1:], TRUTH.master_from_colour[1:], strict=True):
+            moved = UP @ pose @ np.linalg.inv(true) @ np.linalg.inv(UP)
+            middle = apply(UP @ true, np.array([[0.0, 0, 2.5]]))
+            heights.append(abs((apply(moved, middle) - middle)[0, 2]))
+            tilts.append(np.degrees(np.arccos(min(1.0, moved[2, 2]))))
+        return float(np.mean(heights)), float(np.mean(tilts))
+
+    before, after = errors(start.master_from_colour), errors(refined.poses)
+    assert after[0] < 0.5 * before[0] and after[1] < 0.6 * before[1]
+
+
+def test_floor_equations_are_those_of_the_best_plane(patches):
+    start = perturbed(TRUTH, np.random.default_rng(3), 0.003, 0.05)
+    floor, poses = floor_of(start, patches), start.master_from_colour
+    matrix, gradient = floor(poses, NONE)
+    flat = matrix.reshape(36, 36)
+    np.testing.assert_allclose(flat, flat.T, atol=1e-6 * np.abs(flat).max())
+    assert np.linalg.eigvalsh(flat).min() > -1e-6 * np.abs(flat).max()
+    # turning or moving all cameras together has no cost
+    together = np.zeros((6, 6, 6))
+    for axis in range(3):
+        together[:, axis, axis] = together[:, 3 + axis, 3 + axis] = 1
+        together[:, 3:, axis] = np.cross(np.eye(3)[axis], poses[:, :3, 3])
+    assert np.abs(flat @ together.reshape(36, 6)).max() < 2e-2 * np.abs(flat).max()
+    # a step against the gradient brings the floors together
+    step = -1e-3 * gradient / np.abs(gradient).max()
+    moved = poses.copy()
+    moved[:, :3, :3] = Rotation.from_rotvec(step[:, :3]).as_matrix() @ moved[:, :3, :3]
+    moved[:, :3, 3] += step[:, 3:]
+    assert np.linalg.norm(floor(moved, NONE)[1]) < np.linalg.norm(gradient)
+
+
+def test_floor_seen_by_one_camera_is_no_constraint(patches):
+    assert floor_of(TRUTH, {0: patches[0]}) is None
+
+
+# --- moving surfaces -----------------------------------------------------------------------------
+
+FPS, T = 15.0, 10
+VELOCITY = np.array([0.7, -0.5, 0.2])
+OFFSET = np.array([0.0, 0.006, -0.007, 0.004, 0.008, -0.003])
+
+
+def box_at(seconds: float) -> np.ndarray:
+    """A crate (1, 2, 3) on its way through the room; it turns back after a third of a second."""
+    way = seconds if seconds < 1 / 3 else 2 / 3 - seconds
+    middle, half = np.array([-0.1, 0.1, 0.9]) + VELOCITY * way, np.array([0.25, 0.3, 0.35])
+    return np.stack([middle - half, middle + half])[None]
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory):
+    rng = np.random.default_rng(0)
+    depths = []
+    for c, camera in enumerate(TRUTH):
+        boxes = [np.concatenate([FURNITURE, box_at(t / FPS + OFFSET[c])]) for t in range(T)]
+        clean = [room_depth(camera, UP, own) for own in boxes]
+        depths.append(np.stack([to_millimetres(depth, rng, noise=0.5) for depth in clean]))
+    path = tmp_path_factory.mktemp("moving") / "frames.h5"
+    write_frames(path, TRUTH, num_sets=T, depths=depths)
+    image_of, nobody = np.tile(np.arange(T)[:, None], 6), np.full((T, 135, 3), np.nan)
+    with Frames.open(path) as frames:
+        backgrounds = [camera_background(frames, c, nobody) for c in range(6)]
+        return moving_surfaces(frames, TRUTH, image_of, backgrounds)
+
+
+def test_speed_is_that_of_the_crate_along_its_faces(moving):
+    for c, surface in moving[1].items():  # before it turns back
+        pose = UP @ TRUTH[c].master_from_depth
+        expected = (surface.normals @ pose[:3, :3].T) @ VELOCITY
+        assert np.median(np.abs(surface.speed - expected)) < 0.05
+        world = apply(pose, surface.points)
+        low, high = box_at(2 / FPS)[0]
+        assert ((world > low - 0.05) & (world < high + 0.05)).all(1).mean() > 0.9
+
+
+def test_moving_surfaces_determine_time_offsets(moving):
+    registration = Registration(TRUTH, {MOVING: moving}, 0)
+    solved = registration.solve(RigEstimate.start(TRUTH), free_poses=False)
+    error = np.abs(solved.estimate.offset - OFFSET)
+    assert error.max() < 0.002 and error.mean() < 0.001
+    sigma = np.sqrt(np.diagonal(solved.covariance[:, 7, :, 7]))
+    assert (error[1:] < 4 * sigma[1:]).all()

@@ -1,4 +1,4 @@
-"""Silent slips and time offsets from the keypoints of a walking stick person."""
+"""Late images and time offsets from the keypoints of a walking stick person."""
 
 from __future__ import annotations
 
@@ -10,58 +10,61 @@ import pytest
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.geometry.camera.triangulation import reproject
 from intercap_core.scene.keypoint_timing import WINDOW_SETS, find_offsets
-from intercap_core.scene.slips import find_slips, interval_gains, longest_slip
+from intercap_core.scene.slips import Slips, find_slips, interval_gains, longest_slip
 from tests.helpers.synthetic_capture import ring
 from tests.helpers.synthetic_people import walker
 
-FPS = 15.0
+FPS, SETS = 15.0, 40
 RIG, UP = ring()
-TIMES = np.arange(40) / FPS
+TIMES = np.arange(SETS) / FPS
 
 
-def seen(exposures: np.ndarray, seed: int = 0, moving: bool = True) -> np.ndarray:
-    """Keypoints (T, C, 135, 3) at ``exposures`` (T, C) s, scattered by 2 px."""
+def slip_of(intervals: dict[int, tuple[slice, int]], sets: int = SETS, views: int = 6):
+    """(T, C) frames by which images are late, from (sets, frames) by camera."""
+    slip = np.zeros((sets, views), np.int32)
+    for camera, (when, frames) in intervals.items():
+        slip[when, camera] = frames
+    return slip
+
+
+def seen(slip: np.ndarray, offset=0.0, fps: float = FPS, seed: int = 0, moving: bool = True):
+    """Keypoints (T, C, 135, 3), scattered by 2 px, of images that are late by ``slip`` (T, C)
+    frames and exposed ``offset`` seconds after their sets."""
     rng = np.random.default_rng(seed)
+    exposures = (np.arange(len(slip))[:, None] / fps - slip / fps + offset) * moving
     keypoints = np.full((*exposures.shape, 135, 3), 0.9)
-    for c in range(exposures.shape[1]):
-        points = walker(exposures[:, c] if moving else 0 * exposures[:, c])
-        in_master = apply(invert(UP), points.reshape(-1, 3))
-        pixels = reproject(in_master, RIG)[:, c].reshape(len(points), 135, 2)
+    for c, times in enumerate(exposures.T):
+        points = apply(invert(UP), walker(times).reshape(-1, 3))
+        pixels = reproject(points, RIG)[:, c].reshape(len(times), 135, 2)
         keypoints[:, c, :, :2] = pixels + rng.normal(0, 2, pixels.shape)
     return keypoints
 
 
-def exposures(slip: np.ndarray, offset: np.ndarray | float = 0.0, fps: float = FPS) -> np.ndarray:
-    return np.arange(len(slip))[:, None] / fps - slip / fps + offset
+def slips_of(keypoints: np.ndarray, fps: float = FPS) -> Slips:
+    return find_slips(keypoints, RIG, np.arange(len(keypoints)) / fps, fps)
 
 
-def test_no_slips_in_synchronised_images():
-    for seed in range(2):
-        assert not find_slips(seen(exposures(np.zeros((40, 6))), seed), RIG, TIMES, FPS).intervals
+@pytest.mark.parametrize("seed", range(2))
+def test_synchronised_images_have_no_slips(seed):
+    assert not slips_of(seen(slip_of({}), seed=seed)).intervals
 
 
-def test_two_cameras_may_slip_at_once():
-    slip = np.zeros((40, 6), np.int32)
-    slip[12:24, 2], slip[18:30, 4] = 3, 1
-    found = find_slips(seen(exposures(slip)), RIG, TIMES, FPS)
-    np.testing.assert_array_equal(found.slip, slip)
+@pytest.mark.parametrize(
+    "slip",
+    [
+        slip_of({2: (slice(12, 24), 3), 4: (slice(18, 30), 1)}),
+        slip_of({2: (slice(45, 70), 2), 5: (slice(80, None), 1)}, sets=WINDOW_SETS + 14),
+        slip_of({3: (slice(None), 2)}),
+    ],
+    ids=["two cameras at once", "over the edge of a window", "a constant delay"],
+)
+def test_slips_are_found_exactly(slip):
+    np.testing.assert_array_equal(slips_of(seen(slip)).slip, slip)
 
 
-def test_a_slip_may_lie_over_the_edge_of_a_window():
-    slip = np.zeros((WINDOW_SETS + 14, 6), np.int32)
-    slip[45:70, 2], slip[80:, 5] = 2, 1
-    times = np.arange(len(slip)) / FPS
-    np.testing.assert_array_equal(find_slips(seen(exposures(slip)), RIG, times, FPS).slip, slip)
-
-
-def test_whole_frames_of_delay_count_from_the_master():
-    slip = np.zeros((40, 6), np.int32)
-    slip[:, 3] = 2
-    found = find_slips(seen(exposures(slip)), RIG, TIMES, FPS)
-    np.testing.assert_array_equal(found.slip, slip)
-    slip[:, 3], slip[:, 0] = 0, 2
-    found = find_slips(seen(exposures(slip)), RIG, TIMES, FPS)
-    np.testing.assert_array_equal(found.slip, slip - slip[:, :1])
+def test_constant_delays_are_relative_to_the_master():
+    slip = slip_of({0: (slice(None), 2)})
+    np.testing.assert_array_equal(slips_of(seen(slip)).slip, slip - slip[:, :1])
 
 
 @pytest.mark.parametrize(("fps", "frames"), [(5, 4), (15, 4), (30, 4), (60, 8), (120, 16)])
@@ -69,43 +72,38 @@ def test_longest_slip_by_frame_rate(fps, frames):
     assert longest_slip(fps) == frames
 
 
-def test_at_sixty_a_second_a_slip_lasts_more_frames():
-    slip = np.zeros((90, 6), np.int32)
-    slip[20:60, 2], slip[50:, 5] = 7, 5
-    times = np.arange(len(slip)) / 60
-    found = find_slips(seen(exposures(slip, fps=60.0)), RIG, times, 60.0)
-    assert sorted((i.camera, i.slip) for i in found.intervals) == [(2, 7), (5, 5)]
-    assert np.abs(found.slip - slip).mean() < 0.1
+def test_slip_lasts_more_frames_at_sixty_per_second():
+    slip = slip_of({2: (slice(20, 60), 7), 5: (slice(50, None), 5)}, sets=90)
+    slips = slips_of(seen(slip, fps=60.0), 60.0)
+    assert sorted((i.camera, i.slip) for i in slips.intervals) == [(2, 7), (5, 5)]
+    assert np.abs(slips.slip - slip).mean() < 0.1
 
 
-def test_slip_without_motion_is_not_reported():
-    slip = np.zeros((40, 6), np.int32)
-    slip[10:20, 1] = 2
-    assert not find_slips(seen(exposures(slip), moving=False), RIG, TIMES, FPS).intervals
-    found = find_offsets(seen(exposures(slip), moving=False), slip, RIG, TIMES)
-    assert np.isnan(found.sigma[1:]).all() and not found.offset.any()
+def test_neither_slip_nor_offset_is_reported_without_motion():
+    slip = slip_of({1: (slice(10, 20), 2)})
+    keypoints = seen(slip, moving=False)
+    assert not slips_of(keypoints).intervals
+    offsets = find_offsets(keypoints, slip, RIG, TIMES)
+    assert np.isnan(offsets.sigma[1:]).all() and not offsets.offset.any()
 
 
 def test_offsets_are_seconds_after_the_master():
     true = np.array([0.003, -0.004, 0.008, 0.0, -0.002, 0.006])
-    found = find_offsets(seen(exposures(np.zeros((40, 6)), true)), np.zeros((40, 6), int),
-                             RIG, TIMES, master=1)  # fmt: skip
-    np.testing.assert_allclose(found.offset, true - true[1], atol=0.0015)
+    slip = slip_of({})
+    offsets = find_offsets(seen(slip, true), slip, RIG, TIMES, master=1)
+    np.testing.assert_allclose(offsets.offset, true - true[1], atol=0.0015)
     free = np.delete(np.arange(6), 1)
-    alone = np.linalg.solve(found.information[np.ix_(free, free)], found.vector[free])
-    np.testing.assert_allclose(alone, found.offset[free], atol=2e-4)
+    alone = np.linalg.solve(offsets.information[np.ix_(free, free)], offsets.vector[free])
+    np.testing.assert_allclose(alone, offsets.offset[free], atol=2e-4)
 
 
 def test_three_cameras_with_unequal_frame_counts_suffice():
     rig = replace(RIG, cameras=RIG.cameras[:3])
-    slip = np.zeros((40, 3), np.int32)
-    slip[15:28, 1] = 3
-    keypoints = seen(exposures(slip))
-    keypoints[36:, 1] = 0
-    keypoints[:3, 0] = 0
+    slip = slip_of({1: (slice(15, 28), 3)}, views=3)
+    keypoints = seen(slip)
+    keypoints[36:, 1] = keypoints[:3, 0] = 0
     np.testing.assert_array_equal(find_slips(keypoints, rig, TIMES, FPS).slip, slip)
-    offsets = find_offsets(keypoints, slip, rig, TIMES)
-    assert np.abs(offsets.offset).max() < 0.004
+    assert np.abs(find_offsets(keypoints, slip, rig, TIMES).offset).max() < 0.004
 
 
 def test_interval_gains_are_sums_over_intervals():

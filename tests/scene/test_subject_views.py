@@ -3,43 +3,27 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.person.groups import NOBODY
 from intercap_core.scene.subject_views import add_late_views
 from tests.helpers.synthetic_capture import ring
-from tests.helpers.synthetic_people import seen_by, walking
+from tests.helpers.synthetic_people import DelayedPeople, seen_by, walking
 
 RIG, UP = ring()
-T, FPS, LATE = 12, 15.0, 4
-TIMES = np.arange(T) / FPS
 
 
-class OnePerson:
-    """The walker in every image; camera 2's images of sets 6 to 8 are ``LATE`` frames old."""
-
-    def __init__(self, offset: np.ndarray) -> None:
-        path = walking(T, np.array([-0.4, -0.2]), np.array([0.09, 0.05]))
-        self.joints = apply(invert(UP), path.reshape(-1, 3)).reshape(path.shape)
-        self._keypoints = seen_by(path, RIG, UP)
-        for t in (8, 7, 6):
-            self._keypoints[t, 2] = self._keypoints[t - LATE, 2]
-        self._keypoints[6:9, 2, :, :2] += offset
-
-    def people(self, t: int, c: int) -> np.ndarray:
-        return self._keypoints[t, c][None]
-
-
-def found(offset: np.ndarray) -> np.ndarray:
-    someone = OnePerson(offset)
-    index = np.zeros((T, len(RIG)), np.int32)
-    index[6:9, 2] = NOBODY
-    return add_late_views(index, someone, someone.joints, RIG, TIMES)
-
-
-def test_a_late_view_is_the_subject():
-    assert (found(np.zeros(2)) == 0).all()
-
-
-def test_other_person_is_not_recognised():
-    assert (found(np.array([0.0, 400.0]))[6:9, 2] == NOBODY).all()
+@pytest.mark.parametrize(("offset_px", "index"), [(0, 0), (400, NOBODY)], ids=["subject", "other"])
+def test_late_view_is_the_subject_but_no_other_person(offset_px, index):
+    """The images of camera 2 in sets 6 to 8 are four frames old."""
+    path = walking(12, np.array([-0.4, -0.2]), np.array([0.09, 0.05]))
+    keypoints = seen_by(path, RIG, UP)
+    keypoints[6:9, 2] = keypoints[2:5, 2]
+    keypoints[6:9, 2, :, 1] += offset_px
+    people = DelayedPeople([[[own] for own in row] for row in keypoints], np.zeros(6, int))
+    known = np.zeros((12, 6), np.int32)
+    known[6:9, 2] = NOBODY
+    joints = apply(invert(UP), path.reshape(-1, 3)).reshape(path.shape)
+    result = add_late_views(known, people, joints, RIG, np.arange(12) / 15)
+    assert (result[6:9, 2] == index).all() and (np.delete(result, 2, 1) == 0).all()

@@ -26,7 +26,7 @@ from intercap_core.person.segmentation.person_volume import MovingPerson
 
 DARK = 40.0  # grey levels below which a background has no colour direction; tuned on the studio
 COLOUR_SCALE = 2  # images are decoded at half size, which takes a quarter of the time for JPEG
-MIN_COLOUR_SAMPLES = 3  # least number of samples of a pixel without the person
+MIN_COLOUR_SAMPLES = 3  # images that show a pixel without the person; untuned
 
 
 class ColourSegmenter:

@@ -41,8 +41,8 @@ LIMB_RADII_M: dict[tuple[str, str], tuple[float, float, float]] = {
     ("heel", "small_toe"): (0.040, 0.035, 0.022),
     ("heel", "big_toe"): (0.040, 0.035, 0.022),
 }
-FINGER_RADII_M = (0.012, 0.010, 0.009)  # at the knuckle, middle, tip
-PALM_RADII_M = (0.024, 0.016)  # at the wrist, at the knuckles
+FINGER_RADII_M = (0.012, 0.010, 0.009)  # at the knuckle, middle, tip (anatomy)
+PALM_RADII_M = (0.024, 0.016)  # at the wrist, at the knuckles (anatomy)
 HAND_MARGIN_M = 0.012  # fingers are located within millimetres; tuned on the studio
 BONES_PER_GROUP = 5  # bones that are skipped together if a point is far from all of them
 FAR = 20.0  # largest distance that is computed, margins
