@@ -137,9 +137,7 @@ def find_offsets(
         return estimate_offsets(motion, master)
     offsets = estimate_offsets(motion.at_offsets(start), master)
     return replace(
-        offsets,
-        offset=offsets.offset + start,
-        vector=offsets.vector + offsets.information @ start,
+        offsets, offset=offsets.offset + start, vector=offsets.vector + offsets.information @ start
     )
 
 

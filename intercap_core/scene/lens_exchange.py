@@ -25,12 +25,7 @@ from intercap_core.geometry.camera import projection
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.scene.background import Background
-from intercap_core.scene.constraints import (
-    MIN_BODY_POINTS,
-    BodyConstraint,
-    BodyViews,
-    body_views,
-)
+from intercap_core.scene.constraints import MIN_BODY_POINTS, BodyConstraint, BodyViews, body_views
 from intercap_core.scene.keypoint_motion import KeypointMotion, build_motion
 from intercap_core.scene.keypoint_timing import (
     CLUSTER,

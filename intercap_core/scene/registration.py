@@ -167,11 +167,7 @@ class Registration:
     """Estimates a rig from surfaces; the pose and time of the master are fixed."""
 
     def __init__(
-        self,
-        rig: Rig,
-        layers: Layers,
-        master: int,
-        offset_sigma: np.ndarray | None = None,
+        self, rig: Rig, layers: Layers, master: int, offset_sigma: np.ndarray | None = None
     ) -> None:
         """
         Args:

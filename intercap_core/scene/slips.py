@@ -82,12 +82,7 @@ def longest_slip(fps: float) -> int:
 
 
 def find_slips(
-    keypoints: np.ndarray,
-    rig: Rig,
-    times: np.ndarray,
-    fps: float,
-    *,
-    master: int = 0,
+    keypoints: np.ndarray, rig: Rig, times: np.ndarray, fps: float, *, master: int = 0
 ) -> Slips:
     """Find slips of up to :func:`longest_slip` frames, temporary or constant.
 

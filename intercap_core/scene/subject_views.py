@@ -24,11 +24,7 @@ from intercap_core.scene.slips import longest_slip
 
 
 def add_late_views(
-    index: np.ndarray,
-    detections: PeopleOfImages,
-    joints: np.ndarray,
-    rig: Rig,
-    times: np.ndarray,
+    index: np.ndarray, detections: PeopleOfImages, joints: np.ndarray, rig: Rig, times: np.ndarray
 ) -> np.ndarray:
     """Add detections at earlier positions of the subject, as far back as slips reach.
 

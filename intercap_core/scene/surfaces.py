@@ -54,11 +54,7 @@ class DepthSurface:
 
 
 def surface_from_depth(
-    depth: np.ndarray,
-    lens: Intrinsics,
-    *,
-    cell_m: float,
-    max_depth_m: float,
+    depth: np.ndarray, lens: Intrinsics, *, cell_m: float, max_depth_m: float
 ) -> DepthSurface:
     """Thin a depth image (H, W), uint16 mm, to one mean point and normal per cell.
 
@@ -140,10 +136,7 @@ def background_surfaces(
 
 
 def moving_surfaces(
-    frames: Frames,
-    rig: Rig,
-    image_of: np.ndarray,
-    backgrounds: list[Background | None],
+    frames: Frames, rig: Rig, image_of: np.ndarray, backgrounds: list[Background | None]
 ) -> list[dict[int, DepthSurface]]:
     """Return the moving surfaces of up to 16 frame sets, by camera index.
 

@@ -9,12 +9,7 @@ import pytest
 
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.scene.background import steady_background
-from intercap_core.scene.lens_exchange import (
-    choose_pairs,
-    exchange_lenses,
-    lens_gains,
-    swap_lenses,
-)
+from intercap_core.scene.lens_exchange import choose_pairs, exchange_lenses, lens_gains, swap_lenses
 from intercap_core.scene.subject_views import triangulate_views
 from tests.helpers.synthetic_capture import (
     DEPTH,

@@ -13,12 +13,7 @@ from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.geometry.camera.triangulation import triangulate
 from intercap_core.scene.background import camera_background
-from intercap_core.scene.constraints import (
-    BodyConstraint,
-    BodyViews,
-    FloorConstraint,
-    body_views,
-)
+from intercap_core.scene.constraints import BodyConstraint, BodyViews, FloorConstraint, body_views
 from intercap_core.scene.ground import fit_ground
 from intercap_core.scene.registration import (
     MAX_DIRECTION_GAIN,

@@ -230,11 +230,7 @@ def test_stated_start_may_lie_beyond_the_search_range():
 
 @pytest.mark.parametrize(
     ("fps", "wrong"),
-    [
-        (15.0, 0.4),
-        pytest.param(30.0, -0.4, marks=FULL),
-        pytest.param(60.0, 0.4, marks=FULL),
-    ],
+    [(15.0, 0.4), pytest.param(30.0, -0.4, marks=FULL), pytest.param(60.0, 0.4, marks=FULL)],
 )
 def test_keypoints_of_a_walker_reject_a_wrong_statement(fps, wrong):
     late = delays(6, 0.8)

@@ -157,10 +157,7 @@ class DepthView:
 
 
 def without_free_space(
-    views: list[DepthView],
-    backgrounds: list[DepthBackground],
-    low: np.ndarray,
-    high: np.ndarray,
+    views: list[DepthView], backgrounds: list[DepthBackground], low: np.ndarray, high: np.ndarray
 ) -> list[DepthBackground]:
     """Remove pixels from the backgrounds whose points lie in free space of another camera.
 

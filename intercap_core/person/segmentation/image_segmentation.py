@@ -17,11 +17,7 @@ log = logging.getLogger(__name__)
 
 
 def segment_images(
-    frames: Frames,
-    scene: Artefact,
-    joints: np.ndarray,
-    sigma: np.ndarray,
-    wanted: np.ndarray,
+    frames: Frames, scene: Artefact, joints: np.ndarray, sigma: np.ndarray, wanted: np.ndarray
 ) -> dict[tuple[int, int], ViewSegments]:
     """Segment images; returns the result by moment and camera, for those that can be segmented.
 

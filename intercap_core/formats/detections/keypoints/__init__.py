@@ -140,7 +140,7 @@ def to_shared(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
 
     Returns (..., 135, 3). Points that the detector does not give have confidence 0. Those include
     COCO's neck and middle of the hips, which are estimated in space later
-    (:func:`intercap_core.person.middles.fill_middles`).
+    (:func:`intercap_core.person.subject_joints.fill_middles`).
 
     Args:
         points: (..., K, 3) of x, y, confidence.
