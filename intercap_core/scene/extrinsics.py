@@ -114,7 +114,7 @@ def refine(
     unmoved = registration.solve(given, (), known, free_poses=False)
     result, ratios, covariance = unmoved, [], unmoved.covariance
     verdicts: dict[int, PoseVerdict] = {}
-    kept = np.zeros(len(rig), bool)
+    refined = np.zeros(len(rig), bool)
     if free_poses and len(rig) > 1:
 
         def solve(some: BodyViews | None, free: np.ndarray) -> RigSolution:
@@ -136,9 +136,9 @@ def refine(
                 freed.estimate,
             )
             verdicts = judge.verdicts([c for c in range(len(rig)) if c != master])
-            kept = np.array([c in verdicts and verdicts[c].refined for c in range(len(rig))])
-            if kept.any():
-                result = freed if kept.sum() == len(verdicts) else solve(None, kept)
+            refined = np.array([c in verdicts and verdicts[c].refined for c in range(len(rig))])
+            if refined.any():
+                result = freed if refined.sum() == len(verdicts) else solve(None, refined)
                 covariance = freed.covariance  # given poses are as certain as they would be refined
     pairs = _pair_table(registration, unmoved.estimate, result.estimate)
     sigma = np.sqrt(np.diagonal(result.covariance[:, OFFSET, :, OFFSET]))
@@ -147,7 +147,7 @@ def refine(
     sigma = np.where(unknown, np.nan, sigma)
     sigma[master] = 0.0
     converged = result.last_step_m < 0.001
-    verdict = _verdict(rig, pairs, ratios, kept, converged=converged, free=free_poses)
+    verdict = _verdict(rig, pairs, ratios, refined, converged=converged, free=free_poses)
     on_floor = floor.cameras if floor is not None and floor in constraints else ()
     return Refinement(
         poses=result.estimate.poses,
@@ -158,9 +158,9 @@ def refine(
         converged=converged,
         pairs=pairs,
         verdict=verdict,
-        refined=kept,
+        refined=refined,
         verdicts=_verdicts(rig, master, verdicts, verdict),
-        notes=_notes(rig, master, pairs, views.weights, kept, on_floor),
+        notes=_notes(rig, master, pairs, views.weights, refined, on_floor),
     )
 
 
