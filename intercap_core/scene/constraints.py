@@ -209,7 +209,8 @@ class FloorConstraint:
     def __call__(self, poses: np.ndarray, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Matrix (C, 6, C, 6) and gradient (C, 6) at ``poses`` (C, 4, 4); ``offset`` is unused."""
         count = len(self._rig)
-        own = {c: self._in_master(c, poses[c]) for c in self._points}
+        moved = self._rig.moved(poses)
+        own = {c: apply(moved[c].master_from_depth, points) for c, points in self._points.items()}
         everything = np.concatenate(list(own.values()))
         middle = everything.mean(0)
         axes = np.linalg.svd(everything - middle, full_matrices=False)[2]
@@ -242,8 +243,3 @@ class FloorConstraint:
         matrix -= cross.T @ solved[:, :-1]
         gradient -= cross.T @ solved[:, -1]
         return matrix.reshape(count, 6, count, 6), gradient.reshape(count, 6)
-
-    def _in_master(self, camera: int, pose: np.ndarray) -> np.ndarray:
-        between = self._rig[camera].colour_from_depth
-        assert between is not None
-        return apply(pose @ between, self._points[camera])

@@ -281,7 +281,7 @@ class Registration:
         held_out: bool = False,
     ) -> _Match:
         """Correspondences within reach of camera a's points on camera b's surface."""
-        source, target = (at.poses[c] @ self._colour_from_depth(c) for c in (a, b))
+        source, target = (self.rig[c].moved(at.poses[c]).master_from_depth for c in (a, b))
         own, other = self._seen[kind][a], self._seen[kind][b]
         rows = own.held_out if held_out else own.queries
         queries, surface = own.surface.subset(rows), other.surface
@@ -313,11 +313,6 @@ class Registration:
             surface.rays[nearest[good]] @ target[:3, :3].T,
             speed[good],
         )
-
-    def _colour_from_depth(self, camera: int) -> np.ndarray:
-        between = self.rig[camera].colour_from_depth
-        assert between is not None
-        return between
 
     def _add_surfaces(
         self, matrix: np.ndarray, gradient: np.ndarray, at: RigEstimate, gate: float

@@ -238,10 +238,9 @@ class _Evidence:
         always = {step: np.zeros(series.shape[1]) for step in self._steps}
         top = None
         for (part, between), precision in zip(self._parts, self._precisions, strict=True):
+            own = root[part], series[part], precision[:, camera]
             cases = {
-                step: _Slipped.of(
-                    root[part], series[part], precision[:, camera], late[part, camera]
-                )
+                step: _Slipped.of(*own, late[part, camera])
                 for step, late in zip(self._steps, self._late, strict=True)
             }
             if not between:
@@ -251,12 +250,8 @@ class _Evidence:
                 {s: case for s, case in cases.items() if s > 0 and s % own_step == 0}
             )
             if interval is not None and (top is None or interval.gain > top.gain):
-                top = replace(
-                    interval,
-                    camera=camera,
-                    first=part.start + interval.first,
-                    last=part.start + interval.last,
-                )
+                first, last = part.start + interval.first, part.start + interval.last
+                top = replace(interval, camera=camera, first=first, last=last)
         step = max(self._steps, key=lambda s: _sure(always[s]))
         whole = SlipInterval(
             camera, 0, sets - 1, step, float(always[step].sum()), _sure(always[step])

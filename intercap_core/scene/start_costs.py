@@ -140,7 +140,7 @@ class PairCosts:
         for a, b in combinations(range(len(rig)), 2):
             epipolar = _epipolar_geometry(rig, a, b)
             cost[a, b] = np.stack(
-                [_cost(people[a], people[b], *epipolar, lag, fewest) for lag in lags]
+                [_cost(people[a], people[b], epipolar, lag, fewest) for lag in lags]
             )
         return cls(cost, len(rig), reach)
 
@@ -175,8 +175,7 @@ class PairCosts:
 def _cost(
     rays_a: np.ndarray,
     rays_b: np.ndarray,
-    essential: np.ndarray,
-    focal: float,
+    epipolar: tuple[np.ndarray, float],
     lag: int,
     fewest: float,
 ) -> np.ndarray:
@@ -185,16 +184,15 @@ def _cost(
     Each person of camera a is compared with the person of camera b who agrees best over the whole
     recording. The cost is the deviation of their epipolar distances from the median over time,
     averaged over people with their amount of motion as weight: a person who stands still agrees at
-    any lag. ``essential``, ``focal``: see :func:`_epipolar_geometry`.
+    any lag. ``epipolar``: see :func:`_epipolar_geometry`.
     """
     sets = len(rays_a)
     result = np.full(sets, np.nan)
     at = slice(max(0, -lag), min(sets, sets - lag))
     if at.stop - at.start < fewest:
         return result
-    first = rays_a[at]
-    second = rays_b[at.start + lag : at.stop + lag]
-    distance = _sampson_distances(first, second, essential, focal)
+    first, second = rays_a[at], rays_b[at.start + lag : at.stop + lag]
+    distance = _sampson_distances(first, second, *epipolar)
     seen = np.isfinite(distance).sum(0, keepdims=True)
     distance = np.where(seen >= fewest, distance, np.nan)
     known = np.isfinite(distance).any(-1)  # (T, P, Q)
@@ -227,10 +225,10 @@ def _sampson_distances(
 ) -> np.ndarray:
     """Signed distances (T, P, Q, K) of rays (T, P, K, 2) of a and (T, Q, K, 2) of b from each
     other's epipolar lines, pixels at 1080p."""
-    one, two = (np.concatenate([p, np.ones_like(p[..., :1])], -1) for p in (first, second))
-    line, back = (one @ essential.T)[:, :, None], (two @ essential)[:, None]
+    x, y = (np.concatenate([rays, np.ones_like(rays[..., :1])], -1) for rays in (first, second))
+    line, back = (x @ essential.T)[:, :, None], (y @ essential)[:, None]
     size = np.sqrt((line[..., :2] ** 2).sum(-1) + (back[..., :2] ** 2).sum(-1))
-    return focal * (line * two[:, None]).sum(-1) / np.maximum(size, 1e-12)
+    return focal * (line * y[:, None]).sum(-1) / np.maximum(size, 1e-12)
 
 
 def known_mean(values: np.ndarray) -> np.ndarray:
