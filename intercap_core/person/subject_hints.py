@@ -33,48 +33,38 @@ def named_people(
     Raises:
         UserError: unknown camera, frame without an image, point outside the image, or nobody there.
     """
-    return [
-        _named(f"subject[{k}]", point, detections, image_of, min_confidence)
-        for k, point in enumerate(points)
-    ]
-
-
-def _named(
-    entry: str,
-    point: SubjectPoint,
-    detections: Detections,
-    image_of: np.ndarray,
-    min_confidence: float,
-) -> NamedDetection:
     names = detections.camera_names
     sizes = {
         name: (int(w), int(h)) for name, (w, h) in zip(names, detections.image_sizes, strict=True)
     }
-    words = f"sequence {detections.sequence}: the annotation's {entry}"
-    if fault := point.fault(sizes):
-        raise UserError(f"{words} {fault}")
-    c = names.index(point.camera)
-    where = f"camera {point.camera}, frame {point.frame}"
-    shows = np.flatnonzero(image_of[:, c] == point.frame)
-    if not len(shows):
-        raise UserError(
-            f"{words} names {where}, which has no image, or one that is not in step; name the "
-            "person in another frame or camera"
-        )
-    t, at = int(shows[0]), np.array([point.x, point.y])
-    people = detections.people(t, c)[:, BODY_POINTS]
-    away = [_distance(person, at, min_confidence) for person in people]
-    nearest = int(np.argmin(away)) if away else -1
-    if nearest < 0 or away[nearest] > 0.15:  # of the height; untuned
-        seen = [person[person[:, 2] >= min_confidence, :2] for person in people]
-        places = ", ".join(
-            f"({x:.0f}, {y:.0f})" for x, y in (np.median(body, 0) for body in seen if len(body))
-        )
-        raise UserError(
-            f"{words} is at x {point.x:g}, y {point.y:g} of {where}, where nobody was detected; "
-            f"there are people at {places or 'no place of it'}"
-        )
-    return NamedDetection(t, c, nearest, entry)
+    named = []
+    for k, point in enumerate(points):
+        words = f"sequence {detections.sequence}: the annotation's subject[{k}]"
+        if fault := point.fault(sizes):
+            raise UserError(f"{words} {fault}")
+        c = names.index(point.camera)
+        where = f"camera {point.camera}, frame {point.frame}"
+        shows = np.flatnonzero(image_of[:, c] == point.frame)
+        if not len(shows):
+            raise UserError(
+                f"{words} names {where}, which has no image, or one that is not in step; name the "
+                "person in another frame or camera"
+            )
+        t, at = int(shows[0]), np.array([point.x, point.y])
+        people = detections.people(t, c)[:, BODY_POINTS]
+        away = [_distance(person, at, min_confidence) for person in people]
+        nearest = int(np.argmin(away)) if away else -1
+        if nearest < 0 or away[nearest] > 0.15:  # of the height; untuned
+            seen = [person[person[:, 2] >= min_confidence, :2] for person in people]
+            places = ", ".join(
+                f"({x:.0f}, {y:.0f})" for x, y in (np.median(body, 0) for body in seen if len(body))
+            )
+            raise UserError(
+                f"{words} is at x {point.x:g}, y {point.y:g} of {where}, where nobody was "
+                f"detected; there are people at {places or 'no place of it'}"
+            )
+        named.append(NamedDetection(t, c, nearest, f"subject[{k}]"))
+    return named
 
 
 def _distance(person: np.ndarray, point: np.ndarray, min_confidence: float) -> float:
