@@ -67,21 +67,16 @@ class PersonGroup:
 def group_set(people: list[np.ndarray], rig: Rig, min_confidence: float) -> list[PersonGroup]:
     """Group one set's people (P, 25, 3) of each view; best supported first."""
     rays, seen = [], []
-    for c, detections in enumerate(people):
-        directions = (
-            rig[c].colour.unproject(detections[..., :2])
-            if len(detections)
-            else np.zeros((0, 25, 3))
-        )
+    for c, own in enumerate(people):
+        directions = rig[c].colour.unproject(own[..., :2]) if len(own) else np.zeros((0, 25, 3))
         rays.append(directions @ rig[c].master_from_colour[:3, :3].T)
-        seen.append(detections[..., 2] >= min_confidence)
+        seen.append(own[..., 2] >= min_confidence)
     pairs, rest = view_pairs(rig)
     proposals = _pair_proposals(pairs, rays, seen, rig) or _pair_proposals(rest, rays, seen, rig)
     grown: list[PersonGroup] = []
     for _, points, first, second in sorted(proposals, key=lambda p: p[0]):
-        if any(
-            g.members[first[0]] == first[1] and g.members[second[0]] == second[1] for g in grown
-        ):
+        (a, i), (b, j) = first, second
+        if any(group.members[a] == i and group.members[b] == j for group in grown):
             continue  # a better pair of views has led to these two already
         group = _grow(points, first, second, people, seen, rig)
         if group is not None:
