@@ -22,8 +22,8 @@ from intercap_core.scene.starts import (
 from tests.helpers.synthetic_capture import ring
 from tests.helpers.synthetic_people import DelayedPeople, seen_by, walker, walking
 
-VIEWS = 5
-RIG, UP = ring(VIEWS)
+RIG, UP = ring()
+VIEWS = len(RIG)
 FULL = pytest.mark.full
 
 
@@ -75,7 +75,7 @@ def test_bystander_who_stands_still_does_not_shift_cameras(apart):
     """Two people in any order; the detector's bias differs by person and view. A person who stands
     still agrees at any lag."""
     fps, rng = 15.0, np.random.default_rng(11)
-    late = delays(11) * apart
+    late = np.r_[0.0, rng.uniform(-1, 1, VIEWS - 1)] * apart
     people = walk(late, fps, 5.0)
     standing = seen_by(walking(1, np.array([0.9, -0.7]), np.zeros(2)), RIG, UP)[0]
     for c in range(VIEWS):
@@ -96,7 +96,7 @@ def test_bystander_who_stands_still_does_not_shift_cameras(apart):
 def test_another_person_in_one_view_affects_only_those_images(apart):
     """The third camera shows a passer-by instead of the subject for two of five seconds."""
     fps, rng = 15.0, np.random.default_rng(12)
-    late = delays(12) * apart
+    late = np.r_[0.0, rng.uniform(-1, 1, VIEWS - 1)] * apart
     people = walk(late, fps, 5.0)
     usual = moments_of(people, fps)
     passing = walking(people.num_sets, np.array([0.9, -0.7]), np.array([-0.01, 0]))
@@ -116,9 +116,9 @@ def test_another_person_in_one_view_affects_only_those_images(apart):
 @pytest.mark.parametrize(
     ("fps", "every"),
     [
-        (30.0, [1, 1, 2, 1, 2]),
-        pytest.param(60.0, [1, 2, 2, 2, 2], marks=FULL),
-        pytest.param(60.0, [1, 4, 1, 2, 3], marks=FULL),
+        (30.0, [1, 1, 2, 1, 1, 2]),
+        pytest.param(60.0, [1, 2, 2, 2, 2, 2], marks=FULL),
+        pytest.param(60.0, [1, 4, 1, 2, 3, 1], marks=FULL),
     ],
 )
 def test_cameras_of_different_rates_are_aligned(fps, every):
@@ -229,14 +229,14 @@ def test_keypoints_of_a_walker_reject_a_wrong_statement(fps, wrong):
 
     assert note(2).startswith("the annotation has it start") and "deny" in note(2)
     assert f"{abs(late[2] + wrong):.3f} s" in note(2)
-    for c in (1, 3, 4):
+    for c in (1, 3, 4, 5):
         assert "and was brought into step: so say the annotation and the keypoints" in note(c)
 
 
 def test_offsets_reject_a_precise_but_wrong_statement():
     """Stated to a millisecond and wrong by 20 ms: less than a set, so only offsets reveal it."""
     people = walk(np.zeros(VIEWS), 15.0, 4.0)
-    result = moments_of(people, 15.0, stated_by_annotation(np.array([0, 0.02, 0, 0, 0]), 0.001))
+    result = moments_of(people, 15.0, stated_by_annotation(np.array([0, 0.02, 0, 0, 0, 0]), 0.001))
     assert np.flatnonzero(result.starts.denied).tolist() == [1]
     late = result.slip.mean(0) / 15 - result.timing.offset
     assert np.abs(late).max() < 0.004
@@ -244,12 +244,12 @@ def test_offsets_reject_a_precise_but_wrong_statement():
 
 
 def test_keypoints_align_cameras_without_a_statement():
-    late = np.r_[0.0, 0.7, -0.6, 0.5, -0.4]
+    late = np.r_[0.0, 0.7, -0.6, 0.5, -0.4, 0.3]
     stated = stated_by_annotation(np.where(np.arange(VIEWS) < 3, late, np.nan))
     starts = starts_of(walk(late, 15.0, 4.0), 15.0, stated)
     assert not starts.in_doubt.any() and np.abs(starts.late - late).max() < 0.5 / 15
     starts = starts_of(walk(late, 15.0, 4.0, moving=False), 15.0, stated)
-    assert starts.apart and starts.in_doubt.tolist() == [False] * 3 + [True] * 2
+    assert starts.apart and starts.in_doubt.tolist() == [False] * 3 + [True] * 3
 
 
 def test_stated_starts_are_relative_to_the_times_of_the_files():
