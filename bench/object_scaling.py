@@ -144,7 +144,7 @@ def _view(mesh: ObjectMesh, geometry: ViewGeometry, pose: np.ndarray) -> View:
     depth = np.zeros((lens.height, lens.width), np.float32)
     depth[drawn.window] = drawn.depth
     mask = ReducedMask(silhouette.x0, silhouette.y0, silhouette.mask)
-    return View(geometry, depth, EMPTY, (MaskCandidate(0, mesh.name, 1.0, mask),))
+    return View(geometry, depth, EMPTY, (MaskCandidate(0, mesh.name, mask),))
 
 
 def _shots(scene: Scene, count: int) -> list[Shot]:

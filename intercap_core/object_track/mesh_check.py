@@ -15,6 +15,7 @@ import numpy as np
 
 from intercap_core.formats.detections.read import Detections
 from intercap_core.formats.recordings.frames import Frames
+from intercap_core.geometry.camera.clouds import depth_points
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.observer import Observer
@@ -96,11 +97,8 @@ def _extents(
     depth = frames.depth(t, c)
     if depth is None:
         return []
-    z = depth[::3, ::3] * np.float32(1e-3)
-    rays = camera.depth.rays[::3, ::3]
-    valid = (z > 0) & np.isfinite(rays[..., 0])
-    local = np.column_stack([rays[valid] * z[valid][:, None], z[valid]])
-    points = apply(camera.colour_from_depth, local)
+    every_third = np.arange(depth.size).reshape(depth.shape)[::3, ::3].ravel()
+    points = apply(camera.colour_from_depth, depth_points(depth, camera, every_third).points)
     pixels = np.rint(camera.colour.project(points)).astype(np.int64)
     extents = []
     for candidate in candidates:

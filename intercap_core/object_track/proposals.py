@@ -82,7 +82,7 @@ class Proposals:
             pose in a neighbouring frame that shows it; None if no frame does.
         """
         t, pose = given.frame, given.pose
-        wide = self._observer.fit(t, pose, MotionPrior(pose), FIT_ROUNDS, 1.0)
+        wide = self._fit(t, pose)
         fits = [wide] if wide.log_ratio > SEEN_LOG_RATIO else []
         if not fits or not given.holds(self._observer.mesh, wide.pose):
             prior = MotionPrior(pose, given.sigma_m, given.sigma_rad)
@@ -101,7 +101,7 @@ class Proposals:
         near = range(max(t - 5, 0), min(t + 6, self._observer.count))
         best: tuple[int, FittedPose] | None = None
         for u in sorted(near, key=lambda u: abs(u - t)):
-            fit = self._observer.fit(u, pose, MotionPrior(pose), FIT_ROUNDS, 1.0)
+            fit = self._fit(u, pose)
             if best is None or fit.log_ratio > best[1].log_ratio + RIVAL_LOG_RATIO:
                 best = u, fit
             if best[1].log_ratio > SEED_SURE_LOG_RATIO:
@@ -133,48 +133,56 @@ class Proposals:
         A frame is uncertain if its hypothesis is improbable or has less than half of the weight
         that is usual in this recording.
         """
-        fits = self._hypotheses.fits
-        ratio, sure = np.zeros(len(fits)), np.zeros(len(fits))
+        fits, hidden = self._hypotheses.fits, decoded.path == HIDDEN
+        weight, probability = np.zeros(len(fits)), np.zeros(len(fits))
         for t, k in enumerate(decoded.path):
-            ratio[t] = 0.0 if k == HIDDEN else self._prior.weigh(t, fits[t])[k]
-            sure[t] = decoded.probability[t][k]
-        usual = float(np.median(ratio[ratio > 0])) if (ratio > 0).any() else 0.0
+            weight[t] = 0.0 if k == HIDDEN else self._prior.weigh(t, fits[t])[k]
+            probability[t] = decoded.probability[t][k]
+        usual = float(np.median(weight[weight > 0])) if (weight > 0).any() else 0.0
         poor = 0.5 * usual
-        doubt = (ratio < poor) | (sure < DOUBTFUL_PROBABILITY) | (decoded.path == HIDDEN)
-        known = {int(t): fits[t][decoded.path[t]].pose for t in np.flatnonzero(~doubt)}
+        doubtful = (weight < poor) | (probability < DOUBTFUL_PROBABILITY) | hidden
+        sure = {int(t): fits[t][decoded.path[t]].pose for t in np.flatnonzero(~doubtful)}
+        uncertain = np.flatnonzero(doubtful).tolist()
         new = False
-        waiting = [int(t) for t in np.flatnonzero(doubt)]
-        for t in sorted(waiting, key=lambda t: min((abs(t - u) for u in known), default=0)):
+        for t in sorted(uncertain, key=lambda t: min((abs(t - u) for u in sure), default=0)):
             if self._hypotheses.best(t) < poor and t not in self._searched_nearby:
-                new |= self._search_nearby(t, known)
-        near = self._prior.near_annotated(decoded.path == HIDDEN)
-        new |= self._search_near_annotated([t for t in waiting if near[t]], known)
+                new |= self._search_nearby(t, sure)
+        near = self._prior.near_annotated(hidden)
+        new |= self._search_near_annotated([t for t in uncertain if near[t]], sure)
         every_s = 0.5
-        most = 6 + int((self._times[-1] - self._times[0]) / every_s)
-        for t in self._unsearched_runs(decoded.path, ratio)[: max(most - len(self._searched), 0)]:
-            self._searched.add(t)
-            new |= self._follow(t, self._observer.search(t))
+        budget = 6 + int((self._times[-1] - self._times[0]) / every_s)
+        runs = self._unsearched_runs(decoded.path, weight)
+        for t in runs[: max(budget - len(self._searched), 0)]:
+            new |= self._search(t)
         if new:
             return True
         apart = self._observer.frames_in(every_s) // 2
         # a hidden pose that motion makes sure is not elsewhere
-        waiting = [t for t in waiting if sure[t] < DOUBTFUL_PROBABILITY or ratio[t] < 0.25 * usual]
-        while len(self._searched) < most and not new:
-            waiting = [
+        is_open = (probability < DOUBTFUL_PROBABILITY) | (weight < 0.25 * usual)
+        uncertain = [t for t in uncertain if is_open[t]]
+        while len(self._searched) < budget and not new:
+            uncertain = [
                 t
-                for t in waiting
+                for t in uncertain
                 if self._hypotheses.best(t) < poor
                 and min((abs(t - u) for u in self._searched), default=apart) >= apart
             ]
-            if not waiting:
+            if not uncertain:
                 break
-            t = max(waiting, key=self._observer.count_promising_views)
-            self._searched.add(t)
-            new = self._follow(t, self._observer.search(t))
+            new = self._search(max(uncertain, key=self._observer.count_promising_views))
         return new
 
-    def _search_near_annotated(self, frames: list[int], known: dict[int, np.ndarray]) -> bool:
-        """Search ``frames`` near annotated poses once, around the nearest ``known`` poses.
+    def _search(self, t: int) -> bool:
+        """Search frame t with all rotations; returns whether a hypothesis is new."""
+        self._searched.add(t)
+        return self._follow(t, self._observer.search(t))
+
+    def _fit(self, t: int, pose: np.ndarray, twist: np.ndarray | None = None) -> FittedPose:
+        """Fit frame t from a pose (4, 4) that is as far off as the result of a search."""
+        return self._observer.fit(t, pose, MotionPrior(pose), FIT_ROUNDS, 1.0, twist=twist)
+
+    def _search_near_annotated(self, frames: list[int], sure: dict[int, np.ndarray]) -> bool:
+        """Search ``frames`` near annotated poses once, around the nearest ``sure`` poses (4, 4).
 
         All rotations are tried. Returns whether a hypothesis is new.
         """
@@ -182,8 +190,8 @@ class Proposals:
         for t in frames:
             if t not in self._searched | self._searched_near_annotated:
                 self._searched_near_annotated.add(t)
-                before, after = [u for u in known if u < t], [u for u in known if u > t]
-                poses = [known[u] for u in (*before[-1:], *after[:1])]
+                before, after = [u for u in sure if u < t], [u for u in sure if u > t]
+                poses = [sure[u] for u in (*before[-1:], *after[:1])]
                 places = np.array([self._observer.mesh.centre_at(pose) for pose in poses])
                 new |= self._follow(t, self._observer.search(t, places=places if poses else None))
         return new
@@ -193,7 +201,7 @@ class Proposals:
         near = range(-self._reach, self._reach + 1)
         self._searched_nearby -= {t + step for t in changed for step in near}
 
-    def _unsearched_runs(self, path: np.ndarray, ratio: np.ndarray) -> list[int]:
+    def _unsearched_runs(self, path: np.ndarray, weight: np.ndarray) -> list[int]:
         """Return the likeliest frame of every visible run of 0.2 s without a searched frame.
 
         An object that reappears may have turned out of sight.
@@ -201,17 +209,14 @@ class Proposals:
         seen = np.flatnonzero(path != HIDDEN)
         runs = np.split(seen, np.flatnonzero(np.diff(seen) > 1) + 1)
         return [
-            int(run[ratio[run].argmax()])
+            int(run[weight[run].argmax()])
             for run in runs
             if len(run) * self._observer.step_s >= 0.2 and not self._searched & set(run.tolist())
         ]
 
-    def _search_nearby(self, t: int, known: dict[int, np.ndarray]) -> bool:
-        """Search frame t from the ``known`` poses (4, 4) of neighbouring frames.
-
-        Returns whether a hypothesis is new.
-        """
-        starts, rates = self._starts(t, known)
+    def _search_nearby(self, t: int, sure: dict[int, np.ndarray]) -> bool:
+        """Search frame t from poses of neighbouring frames; returns whether a hypothesis is new."""
+        starts, rates = self._starts(t, sure)
         if not len(starts):
             return False
         self._searched_nearby.add(t)
@@ -219,9 +224,7 @@ class Proposals:
         assessed.sort(key=lambda fit: -fit.log_ratio)
         mesh, fits = self._observer.mesh, []
         for k in distinct_poses(mesh, [fit.pose for fit in assessed], BASIN, count=3):
-            pose, twist = assessed[k].pose, assessed[k].twist
-            prior = MotionPrior(pose)
-            fits.append(self._observer.fit(t, pose, prior, FIT_ROUNDS, 1.0, twist=twist))
+            fits.append(self._fit(t, assessed[k].pose, assessed[k].twist))
             if fits[-1].log_ratio > SEARCH_GOOD_LOG_RATIO:
                 break
         best = max(fits, key=lambda fit: fit.log_ratio)
@@ -233,17 +236,17 @@ class Proposals:
             fits += self._observer.search(t, around.reshape(-1, 3, 3), np.array(places), motion)
         return self._follow(t, fits)
 
-    def _starts(self, t: int, known: dict[int, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    def _starts(self, t: int, sure: dict[int, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Predict poses (N, 4, 4) of frame t and their twists (N, 6) from neighbouring frames.
 
         From either side: at rest, at constant velocity, in a hand; and between both sides.
         """
-        fits, reach = self._hypotheses.fits, self._reach
+        fits, times = self._hypotheses.fits, self._times
         same = self._observer.mesh.symmetry.nearest_equivalent_pose
         poses = {}
-        for u in range(max(t - reach, 0), min(t + reach + 1, len(fits))):
-            if u in known:
-                poses[u] = known[u]
+        for u in range(max(t - self._reach, 0), min(t + self._reach + 1, len(fits))):
+            if u in sure:
+                poses[u] = sure[u]
             elif u != t and self._hypotheses.best(u) > SEARCH_GOOD_LOG_RATIO:
                 poses[u] = fits[u][int(self._prior.weigh(u, fits[u]).argmax())].pose
         before = [u for u in poses if u < t][:-3:-1]
@@ -252,25 +255,21 @@ class Proposals:
         for near in (before, after):
             if not near:
                 continue
-            here = poses[near[0]]
-            ahead = self._times[t] - self._times[near[0]]
+            here, ahead = poses[near[0]], times[t] - times[near[0]]
             starts.append(here)
             rates.append(np.zeros(6))
             if len(near) > 1:
-                rate = step_between(same(poses[near[1]], here), here) / (
-                    self._times[near[0]] - self._times[near[1]]
-                )
-                starts.append(apply_step(here, rate * ahead))
-                rates.append(rate)
+                step = step_between(same(poses[near[1]], here), here)
+                rates.append(step / (times[near[0]] - times[near[1]]))
+                starts.append(apply_step(here, rates[-1] * ahead))
             for pose in self._observer.carried(near[0], t, here):
                 starts.append(pose)
                 rates.append(step_between(here, pose) / ahead)
         if before and after:
             a, b = before[0], after[0]
-            gap = self._times[b] - self._times[a]
-            rate = step_between(poses[a], same(poses[b], poses[a])) / gap
-            starts.append(apply_step(poses[a], rate * (self._times[t] - self._times[a])))
-            rates.append(rate)
+            step = step_between(poses[a], same(poses[b], poses[a]))
+            rates.append(step / (times[b] - times[a]))
+            starts.append(apply_step(poses[a], rates[-1] * (times[t] - times[a])))
         return np.array(starts).reshape(-1, 4, 4), np.array(rates).reshape(-1, 6)
 
     def add_near_symmetries(self, decoded: Decoded) -> bool:
@@ -289,10 +288,8 @@ class Proposals:
         new = False
         for t, own in keys.items():
             poses = own.pose @ turns[1:]
-            rates = np.array(
-                [shift_twist(own.twist, own.pose[:3, 3], pose[:3, 3]) for pose in poses]
-            )
-            fits = self._observer.assess_all(t, poses, twists=rates)
+            rates = [shift_twist(own.twist, own.pose[:3, 3], pose[:3, 3]) for pose in poses]
+            fits = self._observer.assess_all(t, poses, np.array(rates))
             fits = [fit for fit in fits if fit.log_ratio > own.log_ratio - RIVAL_LOG_RATIO]
             fits.sort(key=lambda fit: -fit.log_ratio)
             for other in fits[:2]:
@@ -303,7 +300,7 @@ class Proposals:
         return new
 
     def _follow(self, t: int, fits: list[FittedPose]) -> bool:
-        """Follow those of the fits of frame t that may be true; returns whether one is new."""
+        """Follow the fits of frame t that may be true; returns whether a hypothesis is new."""
         own = self._hypotheses.fits[t]
         weights = self._prior.weigh(t, [*fits, *own])
         least = max(float(weights.max(initial=0.0)) - RIVAL_LOG_RATIO, SEEN_LOG_RATIO)

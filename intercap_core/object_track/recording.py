@@ -81,7 +81,7 @@ class ObjectRecording:
         """Return the view of camera number ``place`` among :attr:`cameras` at moment t."""
         c = self.cameras[place]
         candidates = [
-            (candidate.index, candidate.label, candidate.score, candidate.rle)
+            (candidate.index, candidate.label, candidate.rle)
             for candidate in self._candidates(t, c)
         ]
         depth = self._frames.depth(t, c)

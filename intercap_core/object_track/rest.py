@@ -46,14 +46,14 @@ def find_rests(evidence: FrameEvidence, times: np.ndarray, centre: np.ndarray) -
     step = float(np.median(np.diff(times))) if count > 1 else ERROR_LASTING_S
     share = min(1.0, step / ERROR_LASTING_S)
     shortest = max(3, round(MIN_REST_S / step))
-    wander = 1.0
+    variance = 1.0
     segments = np.full(count, -1)
     for _ in range(2):
-        segments, spread = _partition(poses, information, seen, share / wander, share, shortest)
+        segments, spread = _partition(poses, information, seen, share / variance, share, shortest)
         if spread is None:
             break
-        wander = float(np.clip(wander * spread, 0.5, 2.0))
-    information = information / wander
+        variance = float(np.clip(variance * spread, 0.5, 2.0))
+    information = information / variance
     return _merge(_trim(segments, poses, information), poses, information * share, seen)
 
 

@@ -140,8 +140,6 @@ class MaskCandidate:
     """Index in the detections of the image."""
     label: str
     """Class name, empty if the detector names none."""
-    score: float
-    """The detector's score."""
     mask: ReducedMask
     """Reduced mask."""
 
@@ -191,7 +189,7 @@ class View:
         geometry: ViewGeometry,
         depth_mm: np.ndarray | None,
         person_rle: bytes,
-        candidates: list[tuple[int, str, float, bytes]],
+        candidates: list[tuple[int, str, bytes]],
         detected: bool = True,
         background: np.ndarray | None = None,
     ) -> View:
@@ -204,15 +202,15 @@ class View:
             geometry: camera and reduced lenses.
             depth_mm: (H, W) uint16 mm; None without a depth image.
             person_rle: mask of the person, COCO compressed RLE.
-            candidates: (index, label, score, RLE) of each candidate.
+            candidates: (index, label, RLE) of each candidate.
             detected: as the field.
             background: as the field; None if unknown.
         """
         depth = None if depth_mm is None else geometry.reduced_depth(depth_mm)
         colour, step = geometry.camera.colour, geometry.step
         whole = tuple(
-            MaskCandidate(index, label, score, decode(rle, colour, step))
-            for index, label, score, rle in candidates
+            MaskCandidate(index, label, decode(rle, colour, step))
+            for index, label, rle in candidates
         )
         person = decode(person_rle, colour, step) if person_rle else EMPTY
         parts = tuple(

@@ -35,7 +35,8 @@ def views_of(
         geometry = ViewGeometry.for_object(camera, capture.mesh.diameter, time_offset_s=late)
         if t in blank:
             depth, candidates = np.zeros_like(depth), []
-        views.append(View.build(geometry, depth, person, candidates, t not in blank))
+        masks = [(index, label, rle) for index, label, _, rle in candidates]
+        views.append(View.build(geometry, depth, person, masks, t not in blank))
     return views
 
 

@@ -1,4 +1,4 @@
-"""Lost frames: in the hand that held the object, or on the straight path, as the images show."""
+"""Lost frames: carried in a hand, or on the straight path, as the images show."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ def bridges_of(mesh: ObjectMesh, poses: np.ndarray, joints: np.ndarray) -> list[
 
 
 def test_a_held_object_moves_with_the_hand(suitcase, arc):
-    direct, held = bridges_of(suitcase, arc, hand_of(arc, np.array([0.05, 0, 0])))
-    assert held.log_ratio == pytest.approx(0) and direct.log_ratio < -3
-    np.testing.assert_allclose(held.poses, arc[2:-2], atol=1e-9)
+    direct, in_hand = bridges_of(suitcase, arc, hand_of(arc, np.array([0.05, 0, 0])))
+    assert in_hand.log_ratio == pytest.approx(0) and direct.log_ratio < -3
+    np.testing.assert_allclose(in_hand.poses, arc[2:-2], atol=1e-9)
     assert np.linalg.norm((direct.poses - arc[2:-2])[:, :3, 3], axis=1).max() > 0.1
     # information falls with the time before and after; the straight path gives none
-    information = held.information[:, 0, 0]
+    information = in_hand.information[:, 0, 0]
     assert (np.diff(information)[:2] < 0).all() and (np.diff(information)[2:] > 0).all()
     assert not direct.information.any()
 
@@ -64,9 +64,9 @@ def test_a_slip_in_the_hand_is_spread_over_the_gap(suitcase, arc):
 def test_frames_without_the_hand_are_on_the_straight_path(suitcase, arc):
     joints = hand_of(arc, np.array([0.05, 0, 0]))
     joints[4] = np.nan
-    direct, held = bridges_of(suitcase, arc, joints)
-    assert not held.information[2].any() and held.information[[0, 1, 3, 4], 0, 0].all()
-    np.testing.assert_array_equal(held.poses[2], direct.poses[2])
+    direct, in_hand = bridges_of(suitcase, arc, joints)
+    assert not in_hand.information[2].any() and in_hand.information[[0, 1, 3, 4], 0, 0].all()
+    np.testing.assert_array_equal(in_hand.poses[2], direct.poses[2])
     joints[2:-2] = np.nan  # unknown in all lost frames
     assert len(bridges_of(suitcase, arc, joints)) == 1
     joints[-2] = np.nan  # unknown after the gap

@@ -138,7 +138,7 @@ def test_each_mode_of_motion_has_its_cost(cup: ObjectMesh) -> None:
 
 @pytest.mark.parametrize("fps", [5, 30])
 def test_more_modes_do_not_raise_the_evidence(cup: ObjectMesh, fps: int) -> None:
-    """An object at rest near hands that do not move may be held as well."""
+    """An object at rest near hands that do not move may be in a hand as well."""
     still = HandMotion(np.eye(3), np.array([0.1, 0, 0]), np.array([0.1, 0, 0]))
     here, count = poses_of([0.0]), 3 * fps
     steps = [step_log_ratios(cup, here, here, 1 / fps, [still] * hands) for hands in range(3)]
@@ -168,17 +168,17 @@ def test_a_turning_hand_carries_it_through_hidden_frames(cup: ObjectMesh) -> Non
     with the palm and the old pose look alike."""
     turns = [*[0.0] * 3, *np.linspace(0, 70, 10)[1:], *[70.0] * 3]
     wrist = np.array([0.06, 0.0, 0.0])
-    held, steps = [], []
+    hypotheses, steps = [], []
     for angle in turns:
         pose = poses_of([0.0], float(angle))
         pose[0, :3, 3] = wrist - pose[0, :3, :3] @ wrist
-        held.append(np.concatenate([pose, poses_of([0.0])]))
-    held = [both[:1] if t < 3 else both for t, both in enumerate(held)]
-    for t, (a, b) in enumerate(pairwise(held)):
+        hypotheses.append(np.concatenate([pose, poses_of([0.0])]))
+    hypotheses = [both[:1] if t < 3 else both for t, both in enumerate(hypotheses)]
+    for t, (a, b) in enumerate(pairwise(hypotheses)):
         turn = Rotation.from_euler("z", turns[t + 1] - turns[t], degrees=True).as_matrix()
         steps.append(step_log_ratios(cup, a, b, 1 / 15, [HandMotion(turn, wrist, wrist), None]))
     seen = [4.0 if t < 3 or t > 11 else 0.0 for t in range(len(turns))]
-    emissions = [np.full(len(own), nats) for own, nats in zip(held, seen, strict=True)]
+    emissions = [np.full(len(own), nats) for own, nats in zip(hypotheses, seen, strict=True)]
     emissions[12][1] += 1.0  # a little for the wrong one
     resting = decode(emissions, steps).probability[-1]
     for step in steps[2:12]:  # and it is lifted: it does not stand
@@ -197,14 +197,14 @@ def test_a_held_object_turns_about_the_wrist(cup: ObjectMesh) -> None:
     with_it[0, :3, :3], with_it[0, :3, 3] = turn, turn @ (-wrist) + end
     after = np.concatenate([with_it, before])
     every = step_log_ratios(cup, before, after, 1 / 15, [HandMotion(turn, wrist, end), None])
-    held = every[2, 2, 0, :-1] + np.log(1 + 2 * (1 - np.exp(-MODE_CHANGES_S / 15)))
-    assert held[0] == pytest.approx(0, abs=1e-9)
+    in_hand = every[2, 2, 0, :-1] + np.log(1 + 2 * (1 - np.exp(-MODE_CHANGES_S / 15)))
+    assert in_hand[0] == pytest.approx(0, abs=1e-9)
     # what stays behind is off by the turn, and by the shift as far as the turn is known
     sigma = np.hypot(HELD_RAD, HELD_RAD_S / 15)
     arm = np.linalg.norm(cup.centre_at(before[0]) - wrist)
     moved = np.linalg.norm(cup.centre_at(after[0]) - cup.centre_at(before[0]))
     shift = moved / np.sqrt(HELD_M**2 + (HELD_M_S / 15) ** 2 + (arm * sigma) ** 2)
-    assert held[1] == pytest.approx(-0.5 * ((np.radians(40) / sigma) ** 2 + shift**2))
+    assert in_hand[1] == pytest.approx(-0.5 * ((np.radians(40) / sigma) ** 2 + shift**2))
 
 
 def test_it_is_hidden_for_a_second_and_gone_after_five(cup: ObjectMesh) -> None:

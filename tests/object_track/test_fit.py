@@ -193,7 +193,7 @@ def test_outline_costs_by_hand():
     shifted, count = cost(square, (52, 50))
     assert count == 152 and 0.4 < shifted < 1.3
     assert cost(square[:2, :2], (90, 90))[0] == 4.5  # nowhere near
-    # a person beside the mask ends its outline there
+    # a person next to the mask ends its outline there
     half, covered = square.copy(), np.zeros((20, 20), bool)
     half[:, 10:], covered[:, 10:] = False, True
     agreed, fewer = cost(half, (50, 50), covered)

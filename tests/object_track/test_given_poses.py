@@ -115,7 +115,7 @@ def test_uncertain_carried_frames_are_ambiguous_first(
     assert (found.status, found.ambiguous) == (expected, ambiguous)
 
 
-def test_single_views_beside_unseen_frames_are_flagged():
+def test_single_views_next_to_unseen_frames_are_flagged():
     report = ViewReport(0, 0.9, 0.002, 1.0, 500, 0.95)
     ratios = [(9, 9), (9, 0), (0, 0), (9, 9), (0, 9), (9, 0), (9, -2), (0, 0), (5, -1)]
     fits = [

@@ -1,4 +1,4 @@
-"""Prior of places and hypotheses, and a start beside a twin of the object."""
+"""Prior of places and hypotheses, and a start next to a twin of the object."""
 
 from __future__ import annotations
 
@@ -127,15 +127,18 @@ def prior_of(mesh: ObjectMesh, up: np.ndarray | None = None) -> Prior:
 
 
 def test_a_twin_weighs_no_more_than_its_place(cup):
-    held, twin = fit_of(cup, HANDLED, 12.0, 0), fit_of(cup, APART, 60.0, 1)
-    found = prior_of(cup).weigh(3, [held, twin])
+    handled, twin = fit_of(cup, HANDLED, 12.0, 0), fit_of(cup, APART, 60.0, 1)
+    found = prior_of(cup).weigh(3, [handled, twin])
     assert found[0] == pytest.approx(12.0)  # the person is at it
     assert found[1] == pytest.approx(np.log(0.1 / 0.9) / SHARE)
 
 
 def test_poses_of_one_candidate_differ_by_their_evidence(cup):
-    twin, beside = fit_of(cup, APART, 60.0, 1), fit_of(cup, APART + np.array([0.4, 0, 0]), 20.0, 1)
-    found = prior_of(cup).weigh(3, [twin, beside])
+    twin, neighbour = (
+        fit_of(cup, APART, 60.0, 1),
+        fit_of(cup, APART + np.array([0.4, 0, 0]), 20.0, 1),
+    )
+    found = prior_of(cup).weigh(3, [twin, neighbour])
     assert found[1] == pytest.approx(found[0] - 40.0)
 
 
@@ -184,7 +187,7 @@ def harsh_observer(capture: HarshCapture, mesh: ObjectMesh) -> Observer:
     )  # fmt: skip
 
 
-def test_the_tracker_starts_beside_a_twin_with_bad_detections():
+def test_a_track_starts_next_to_a_twin_with_bad_detections():
     entry = catalogue()["tennis_racquet"]
     mesh = ObjectMesh.load(entry)
     capture = HarshCapture(mesh, 3, label=entry.labels[0], still=0.2)

@@ -20,11 +20,11 @@ def evidence_at(poses: np.ndarray, sigma: np.ndarray = SIGMA, seed: int = 0) -> 
     """Independent evidence on poses (T, 4, 4), evaluated near the truth."""
     rng = np.random.default_rng(seed)
     information = np.tile(np.diag(sigma**-2.0), (len(poses), 1, 1))
-    beside = rng.normal(size=(len(poses), 6)) * SIGMA
+    offset = rng.normal(size=(len(poses), 6)) * SIGMA
     noise = rng.normal(size=(len(poses), 6)) * sigma
-    # the minimum lies at the truth + noise, seen from beside the truth
-    gradient = np.einsum("tij,tj->ti", information, beside - noise)
-    return FrameEvidence(apply_step(poses, beside), information, gradient)
+    # the minimum lies at the truth + noise, seen from a pose nearby
+    gradient = np.einsum("tij,tj->ti", information, offset - noise)
+    return FrameEvidence(apply_step(poses, offset), information, gradient)
 
 
 def lifted(count: int, starts: int, stops: int) -> np.ndarray:
