@@ -188,32 +188,39 @@ class WholeTrack:
         fits = [frame.fit for frame in frames]
         lost = np.array([frame.lost for frame in frames])
         decided = np.array([fit.log_ratio for fit in fits])
-        at = [pose.frame for pose in given]
-        # poses that were followed unseen are left to the annotated ones
-        lost |= np.isfinite(seconds_since(at, decided < SEEN_LOG_RATIO, self._times))
-        lost[at] = False
+        annotated = [pose.frame for pose in given]
+        # Poses of unseen frames that were followed from annotated ones are not known: they are
+        # filled in again, with the annotated poses as evidence.
+        lost |= np.isfinite(seconds_since(annotated, decided < SEEN_LOG_RATIO, self._times))
+        lost[annotated] = False
         smoothed = self._smooth(fits, lost, given)
-        status = self._decide_status(smoothed, decided)
+        gone = np.array([frame.gone for frame in frames])
+        status = self._decide_status(smoothed, decided, gone)
         ambiguous = status == FrameStatus.CARRIED
-        ambiguous[at] = False
-        ambiguous |= flag_edges(smoothed.fits, status >= FrameStatus.CARRIED, at, self._times)
+        ambiguous[annotated] = False
+        unseen = status >= FrameStatus.CARRIED
+        ambiguous |= flag_edges(smoothed.fits, unseen, annotated, self._times)
         return [
             replace(
                 frame,
                 fit=smoothed.fits[t],
-                status=frame.status if frame.gone and status[t] == FrameStatus.LOST
-                else FrameStatus(status[t]),
+                status=FrameStatus(status[t]),
                 resting=bool(smoothed.segment[t] >= 0),
                 free_axis=smoothed.free_axis[t],
                 ambiguous=frame.ambiguous or bool(ambiguous[t]),
             )
             for t, frame in enumerate(frames)
-        ]  # fmt: skip
+        ]
 
-    def _decide_status(self, smoothed: _SmoothedTrack, decided: np.ndarray) -> np.ndarray:
+    def _decide_status(
+        self, smoothed: _SmoothedTrack, decided: np.ndarray, gone: np.ndarray
+    ) -> np.ndarray:
         """Decide the status (T,) of each frame.
 
-        ``decided`` (T,) are the log-likelihood ratios of the decided poses before smoothing.
+        Args:
+            smoothed: the solution over all frames.
+            decided: (T,) log-likelihood ratios of the poses before smoothing, nats.
+            gone: (T,) frames in which the object has left, unless its pose is known nevertheless.
         """
         ratio = np.array([fit.log_ratio for fit in smoothed.fits])
         poses = np.array([fit.pose for fit in smoothed.fits])
@@ -224,13 +231,12 @@ class WholeTrack:
         contradicted &= ~carried | (ratio < DENIED_LOG_RATIO)
         seen = ~contradicted & (~unseen | ~smoothed.lost)
         bridged = smoothed.in_hand | self._between_equal_poses(poses, ~seen)
-        rules = {
-            FrameStatus.LOST: contradicted,
-            FrameStatus.CARRIED: carried,
-            FrameStatus.SEEN: seen,
-            FrameStatus.BRIDGED: bridged,
-        }
-        return np.select([*rules.values()], [*rules], FrameStatus.LOST)
+        nothing = np.where(gone, FrameStatus.GONE, FrameStatus.LOST)
+        return np.select(  # the first condition that holds
+            [contradicted, carried, seen, bridged],
+            [nothing, FrameStatus.CARRIED, FrameStatus.SEEN, FrameStatus.BRIDGED],
+            nothing,
+        )
 
     def _between_equal_poses(self, poses: np.ndarray, lost: np.ndarray) -> np.ndarray:
         """Find frames (T,) in gaps of 0.3 s between equal poses: the object stayed in place."""
@@ -249,11 +255,11 @@ class WholeTrack:
         filled = fill_lost(self._observer, np.array([fit.pose for fit in fits]), lost)
         poses = filled.poses
         motion = rigid_velocity(poses, ~lost, self._times)
-        blind = lost.copy()
+        hidden = lost.copy()  # frames whose images are no evidence
         for pose in given:
-            blind[pose.frame] |= fits[pose.frame].log_ratio < SEEN_LOG_RATIO
+            hidden[pose.frame] |= fits[pose.frame].log_ratio < SEEN_LOG_RATIO
         evidence = [
-            None if blind[t] else self._observer.evidence(t, poses[t], motion[t])
+            None if hidden[t] else self._observer.evidence(t, poses[t], motion[t])
             for t in range(count)
         ]
         unseen = np.array([own is None or own.log_ratio < SEEN_LOG_RATIO for own in evidence])
@@ -275,7 +281,7 @@ class WholeTrack:
         pairs = [pose_distances(self._mesh, evaluated[[t]], track[[t]]) for t in range(count)]
         turn, shift = np.array(pairs).reshape(-1, 2).T
         known = np.array([own is not None for own in evidence])
-        moved_off = known & ((shift > BASIN[0]) | (turn > np.radians(BASIN[1]))) | blind
+        moved_off = known & ((shift > BASIN[0]) | (turn > np.radians(BASIN[1]))) | hidden
         result = []
         for t, (fit, own) in enumerate(zip(fits, evidence, strict=True)):
             views = own.reports if own else fit.views
