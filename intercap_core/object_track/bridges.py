@@ -162,9 +162,7 @@ class FilledTrack:
 def fill_lost(observer: Observer, poses: np.ndarray, lost: np.ndarray) -> FilledTrack:
     """Fill in the lost frames of a track by the likeliest path between known frames.
 
-    A hand surely carried the object if the odds against any different path are above seven to one
-    (2 nats), the images do not contradict it, and the gap is short. Known poses are replaced by
-    equivalent ones that follow each other.
+    Known poses are replaced by equivalent ones that follow each other.
 
     Args:
         observer: the recording.
@@ -178,39 +176,45 @@ def fill_lost(observer: Observer, poses: np.ndarray, lost: np.ndarray) -> Filled
     for a, b in pairwise(np.flatnonzero(known).tolist()):
         if b == a + 1:
             continue
-        paths = Gap(observer.mesh, track, times, observer.joints, a, b).bridges()
-        fits = [_fit_path(observer, path) for path in paths] if len(paths) > 1 else []
-        by_images = np.array(
-            [
-                observer.share * sum(map(_path_log_ratio, path.poses, path.information, own))
-                for path, own in zip(paths, fits, strict=False)
-            ]
-        )
-        total = by_images + [path.log_ratio for path in paths] if len(paths) > 1 else np.zeros(1)
-        best = int(total.argmax())
-        path = paths[best]
-        track[a + 1 : b] = [fit.pose for fit in fits[best]] if fits else path.poses
+        gap = Gap(observer.mesh, track, times, observer.joints, a, b)
+        path, fits, is_sure = _choose_path(observer, gap.bridges())
+        track[a + 1 : b] = [fit.pose for fit in fits] if fits else path.poses
         track[b] = path.end
         track[b:] = unwrap_symmetry(symmetry, track[b:], known[b:])
         in_hand = np.any(path.information, axis=(1, 2))
         for i, t in enumerate(path.frames):
             if in_hand[i]:
                 hand[t] = path.information[i]
-                images[t] = np.linalg.inv(fits[best][i].covariance) - path.information[i]
+                images[t] = np.linalg.inv(fits[i].covariance) - path.information[i]
                 pull[t] = path.information[i] @ step_between(path.poses[i], track[t])
-        rivals = [
-            total[i] for i, other in enumerate(paths) if _is_different(observer.mesh, path, other)
-        ]
-        if (
-            in_hand.any()
-            and total[best] - max(rivals, default=-np.inf) > 2.0
-            and by_images[best] > CONTRADICTED_LOG_RATIO
-            and times[b] - times[a] < UNSEEN_S
-        ):
-            sure[path.frames] = in_hand
+        sure[path.frames] = in_hand & (is_sure and gap.seconds < UNSEEN_S)
     first, last = np.flatnonzero(known)[[0, -1]] if known.any() else (0, count - 1)
     track[:first], track[last + 1 :] = track[first], track[last]
     return FilledTrack(track, hand, images, pull, sure)
+
+
+def _choose_path(observer: Observer, paths: list[Bridge]) -> tuple[Bridge, list[FittedPose], bool]:
+    """Choose the path with the highest likelihood of motion and images.
+
+    Returns:
+        The path; the fits of its frames, none if there is no other path; and whether it is sure:
+            the odds against any different path are above seven to one (2 nats), and the images do
+            not contradict it.
+    """
+    if len(paths) == 1:
+        return paths[0], [], False
+    fits = [_fit_path(observer, path) for path in paths]
+    by_images = np.array(
+        [
+            observer.share * sum(map(_path_log_ratio, path.poses, path.information, own))
+            for path, own in zip(paths, fits, strict=True)
+        ]
+    )
+    total = by_images + [path.log_ratio for path in paths]
+    best = int(total.argmax())
+    different = [_is_different(observer.mesh, paths[best], path) for path in paths]
+    lead = total[best] - max(total[different], default=-np.inf)
+    return paths[best], fits[best], bool(lead > 2.0 and by_images[best] > CONTRADICTED_LOG_RATIO)
 
 
 def _path_log_ratio(pose: np.ndarray, information: np.ndarray, fit: FittedPose) -> float:
