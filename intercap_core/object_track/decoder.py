@@ -21,27 +21,27 @@ from scipy.special import logsumexp
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.motion import HandMotion
 
-# Standard deviations of the motion between frames; tuned on the studio, as all values below.
-STANDING_M = 0.015  # fits of an object at rest
-STANDING_RAD = np.radians(8)
-HELD_M = 0.02  # in a hand: fits and joints ...
-HELD_RAD = np.radians(10)
-HELD_M_S = 0.3  # ... and slipping
-HELD_RAD_S = 1.0
+# "Tuned" is on the studio. Standard deviations of the motion between frames:
+STANDING_M = 0.015  # of fits of an object at rest, metres; tuned
+STANDING_RAD = np.radians(8)  # radians; tuned
+HELD_M = 0.02  # of fits and joints in a hand, metres; tuned
+HELD_RAD = np.radians(10)  # radians; tuned
+HELD_M_S = 0.3  # of slipping in a hand, m/s; tuned
+HELD_RAD_S = 1.0  # rad/s; tuned
 # Costs are minus log-likelihoods, nats.
-FREE_COST_S = 30.0  # of free motion per second: rest and hands explain most recordings
-MODE_CHANGES_S = 1.0  # changes from one mode of motion to another per second
-JUMP_COST = 10.0  # of a step that no motion explains
-VANISH_COST = 7.0  # of going out of sight, and of coming into sight
-LEAVE_COST = 4.0  # of leaving the room or coming back, in addition
+FREE_COST_S = 30.0  # of free motion, nats/s: rest and hands explain most recordings; tuned
+MODE_CHANGES_S = 1.0  # changes from one mode of motion to another per second; tuned
+JUMP_COST = 10.0  # of a step that no motion explains, nats; tuned
+VANISH_COST = 7.0  # of going out of sight, and of coming into sight, nats; tuned
+LEAVE_COST = 4.0  # of leaving the room or coming back, in addition, nats; tuned
 # Cost of going out of reach between two sure frames, and of coming back: clutter is anywhere in a
 # room, of which the reachable part is a hundredth.
-EXCURSION_COST = 5.0
-REACH_M = 0.2  # error of either pose of two that can be reached from each other
+EXCURSION_COST = 5.0  # nats; tuned
+REACH_M = 0.2  # error of either pose of two that can be reached from each other, metres; tuned
 
-FIRST_HAND = 2  # modes of motion: rest, free, then each hand
-HIDDEN = -1  # in paths: no hypothesis is true
-_CERTAIN = 1e4  # nats, far more than the evidence of all frames
+FIRST_HAND = 2  # first mode that is a hand, after rest and free motion
+HIDDEN = -1  # index in paths: no hypothesis is true
+_CERTAIN = 1e4  # nats: far more than the evidence of all frames
 
 
 def step_log_ratios(

@@ -21,8 +21,8 @@ from intercap_core.object_track.view_report import ViewReport
 # Total variance of the views' errors (common and independent) over the independent part, of shifts
 # and of turns: errors common to all views (calibration, masks that are too large) shift the object
 # rather than rotate it. Tuned on the studio.
-COMMON_ERROR_VARIANCE = 4.0
-COMMON_TURN_VARIANCE = 1.5
+COMMON_ERROR_VARIANCE = 4.0  # of shifts; tuned
+COMMON_TURN_VARIANCE = 1.5  # of turns; tuned
 TURN_SCALE = np.repeat([np.sqrt(COMMON_TURN_VARIANCE / COMMON_ERROR_VARIANCE), 1.0], 3)
 """(6,) factor of the standard deviations that were computed with ``COMMON_ERROR_VARIANCE``."""
 # Duration of errors of masks: frames within it are one independent observation. Tuned on the

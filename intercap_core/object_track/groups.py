@@ -25,7 +25,7 @@ from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.object_silhouette import rim_mask
 from intercap_core.object_track.view import MaskCandidate, View
 
-OUTLINE_DIRECTIONS = 16  # image directions in which the support function is sampled
+OUTLINE_DIRECTIONS = 16  # image directions in which the support function is sampled; tuned
 LOCATED_MIN_POINTS = 15  # of a candidate's point cloud, or pixels of its mask; tuned on the studio
 
 

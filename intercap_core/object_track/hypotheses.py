@@ -32,14 +32,14 @@ from intercap_core.object_track.motion import (
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.turns import distinct_poses, same_pose
 
-BASIN = (0.04, 15.0)  # metres and degrees within which all fits lead to one pose
-MAX_HYPOTHESES = 12  # of a frame: turns of a mug with a hidden handle, 30 degrees apart
-RIVAL_PROBABILITY = 0.01  # of a hypothesis, below which it is not considered further
-RIVAL_LOG_RATIO = 5.0  # nats of independent evidence below the best, up to which to follow
+BASIN = (0.04, 15.0)  # metres and degrees within which all fits lead to one pose; tuned
+MAX_HYPOTHESES = 12  # of a frame: turns of a mug with a hidden handle, 30 degrees apart (tuned)
+RIVAL_PROBABILITY = 0.01  # of a hypothesis, below which it is not considered further; tuned
+RIVAL_LOG_RATIO = 5.0  # nats of independent evidence below the best, up to which to follow; tuned
 UPRIGHT_LOG_RATIO = 2.0  # nats times the cosine of the angle to the standing pose; tuned on studio
 # Nats of one frame for its annotated pose, and for all poses within reach of it. The latter is the
 # cost of a jump there and back for that frame alone.
-ANNOTATION_LOG_RATIO = 10.0
+ANNOTATION_LOG_RATIO = 10.0  # nats; tuned
 ANNOTATED_LOG_RATIO = 2 * (JUMP_COST + EXCURSION_COST)
 
 

@@ -27,16 +27,16 @@ from intercap_core.object_track.reduced_mask import EMPTY, covers
 from intercap_core.object_track.view import FitContext, MaskCandidate, View
 
 # Thresholds of log-likelihood ratios of all views of a frame, nats.
-SEEN_LOG_RATIO = 3.0  # the images show the object
+SEEN_LOG_RATIO = 3.0  # the images show the object; tuned
 SEARCH_GOOD_LOG_RATIO = 25.0  # good enough to stop searching the frame; tuned on the studio
-CONTRADICTED_LOG_RATIO = -6.0  # the images contradict the pose
+CONTRADICTED_LOG_RATIO = -6.0  # the images contradict the pose; tuned
 
 # All values below are tuned on the studio.
 CONTOUR_SIGMA_PX = 2.0  # of a detector's contour, pixels at full resolution
-DEPTH_HALF_SAMPLES_PX = 120  # pixels at which depth counts half of its samples
-VIEW_SAMPLES = 4.0  # independent samples of a view's depth, or outline, at most
-LOG_MISSED = float(np.log(0.1))  # how often a detector misses an object that is fully visible
-LABEL_LOG_RATIO = 1.0  # of a candidate with the object's label, nats; minus this with another label
+DEPTH_HALF_SAMPLES_PX = 120  # pixels at which depth counts half of its samples; tuned
+VIEW_SAMPLES = 4.0  # independent samples of a view's depth, or outline, at most; tuned
+LOG_MISSED = float(np.log(0.1))  # how often detectors miss an object that is fully visible; tuned
+LABEL_LOG_RATIO = 1.0  # nats of a candidate with the object's label; minus this with another; tuned
 
 
 def log_ratio(

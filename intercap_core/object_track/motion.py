@@ -14,11 +14,11 @@ from intercap_core.object_track.fit import MotionPrior
 
 # Standard deviation of the change of the velocity from one frame to the next; tuned on the studio,
 # as the next ones.
-ONSET_M_S = 0.6
-ONSET_RAD_S = np.radians(60)
+ONSET_M_S = 0.6  # m/s; tuned
+ONSET_RAD_S = np.radians(60)  # rad/s; tuned
 # Standard deviation added per second without observation.
-GROWTH_LOST_M_S = 1.2
-GROWTH_LOST_RAD_S = np.radians(240)
+GROWTH_LOST_M_S = 1.2  # m/s; tuned
+GROWTH_LOST_RAD_S = np.radians(240)  # rad/s; tuned
 HOLDING_REACH_M = 0.20  # from a wrist to the surface of a held object: a hand's length (anatomy)
 
 _HANDS = [

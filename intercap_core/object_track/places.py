@@ -20,15 +20,15 @@ from intercap_core.object_track.view import View
 
 # All values are tuned on the studio.
 # Shares of the surveyed frames in which a place is occupied.
-ALWAYS_PRESENT = 0.85
-SOMETIMES_PRESENT = 0.5
-MOVED_PRIOR = 0.8  # prior of an object that was not in its place all the time
-MIN_PLACE_PRIOR = 0.1  # prior of an object that stands far from the person all the time
-UNHANDLED_LOG_RATIO = 10.0  # nats of a frame against an object that moves with nobody near
-RIVAL_FRAMES = 2  # frames with the place occupied while the object is elsewhere: another object
+ALWAYS_PRESENT = 0.85  # tuned
+SOMETIMES_PRESENT = 0.5  # tuned
+MOVED_PRIOR = 0.8  # prior of an object that was not in its place all the time; tuned
+MIN_PLACE_PRIOR = 0.1  # prior of an object that stands far from the person all the time; tuned
+UNHANDLED_LOG_RATIO = 10.0  # nats of a frame against an object that moves with nobody near; tuned
+RIVAL_FRAMES = 2  # frames with the place occupied while the object is elsewhere; tuned
 # Largest evidence, nats, that a similar object takes off the evidence for the object in its place:
 # a part of furniture, not a twin that the track may have mistaken.
-CLUTTER_LOG_RATIO = 10.0
+CLUTTER_LOG_RATIO = 10.0  # nats; tuned
 
 
 @dataclass(eq=False)

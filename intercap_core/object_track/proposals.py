@@ -17,9 +17,9 @@ from intercap_core.object_track.motion import shift_twist
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.turns import distinct_poses, find_near_symmetries
 
-SEED_SURE_LOG_RATIO = 40.0  # nats at which the search for a frame to start from ends
-KEY_FRAME_S = 0.2  # time between the frames in which near symmetries and colours are compared
-DOUBTFUL_PROBABILITY = 0.9  # of the chosen hypothesis, below which a frame is uncertain
+SEED_SURE_LOG_RATIO = 40.0  # nats at which the search for a frame to start from ends; tuned
+KEY_FRAME_S = 0.2  # time between frames in which near symmetries and colours are compared; tuned
+DOUBTFUL_PROBABILITY = 0.9  # of the chosen hypothesis, below which a frame is uncertain; tuned
 # Log-likelihood ratio at which the images of a frame clearly contradict an annotated pose: two or
 # three views see past the object. An occluded frame reaches -6, and so does chance. Tuned on five
 # objects of the studio at noise 2 with two cameras.

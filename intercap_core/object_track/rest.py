@@ -15,11 +15,11 @@ from intercap_core.geometry.camera.transforms import rotation_exp, step_between
 from intercap_core.object_track.evidence import ERROR_LASTING_S, FrameEvidence
 
 MIN_REST_S = 0.25  # shortest rest; tuned on the studio, as all values below
-BLIP_FRAMES = 2  # within these an object cannot move away and back: a tenth of a second at 30 Hz
-MAX_REST_FRAMES = 900  # tested against one pose
+BLIP_FRAMES = 2  # within these nothing moves away and back: 0.1 s at 30 Hz; tuned
+MAX_REST_FRAMES = 900  # tested against one pose: half a minute at 30 Hz; bounds the time
 # Costs are minus log-likelihoods of one independent observation.
-MOVING_COST = 9.0  # of a pose of its own: six numbers, each of which must differ from noise
-REST_COST = 8.0  # of one more rest: its pose, its begin and its end
+MOVING_COST = 9.0  # of a pose of its own: six numbers that must differ from noise; tuned
+REST_COST = 8.0  # of one more rest: its pose, its begin and its end; tuned
 
 
 def find_rests(evidence: FrameEvidence, times: np.ndarray, centre: np.ndarray) -> np.ndarray:

@@ -18,8 +18,8 @@ from intercap_core.object_track.evidence import UNKNOWN_SIGMA, FrameEvidence, st
 
 # Standard deviation of accelerations of a carried object; a kick is an outlier. Tuned on the
 # studio.
-ACCELERATION_M_S2 = 6.0
-ACCELERATION_RAD_S2 = 20.0
+ACCELERATION_M_S2 = 6.0  # m/s^2; tuned
+ACCELERATION_RAD_S2 = 20.0  # rad/s^2; tuned
 IMPACT_SIGMAS = 3.0  # standard deviations of an acceleration beyond which it is an impact
 OUTLIER_SIGMAS = 5.0  # evidence this many standard deviations away counts a quarter
 BAND = 2  # nodes before to which an acceleration couples a node

@@ -39,10 +39,10 @@ from intercap_core.object_track.whole import FrameResult, FrameStatus, WholeTrac
 # Having left is likelier than being hidden from all cameras by this, nats of an independent
 # observation: after about two seconds. Tuned on the studio, as all values below.
 ABSENT_LOG_RATIO = 1.0
-AMBIGUOUS_PROBABILITY = 0.2  # of different poses, above which a frame is ambiguous
+AMBIGUOUS_PROBABILITY = 0.2  # of different poses, above which a frame is ambiguous; tuned
 # Nats of all believed frames, as independent observations, below which there is no object. False
 # detections reach 8; the least of real objects (a cup behind a hand without depth) is about 25.
-NOTHING_LOG_RATIO = 12.0
+NOTHING_LOG_RATIO = 12.0  # nats; tuned
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 from intercap_core.geometry.solve.robust import geman_mcclure_weight
 
-SAME_POSE_M = 0.02  # poses within this distance ...
-SAME_POSE_DEG = 12.0  # ... and angle are one hypothesis; tuned on the studio
+SAME_POSE_M = 0.02  # metres ...; tuned on the studio
+SAME_POSE_DEG = 12.0  # ... and degrees within which poses are one hypothesis; tuned on the studio
 # Share of the surface that a turn may clearly displace to be a near symmetry; tuned on the studio.
 NEAR_TURN_CHANGED_SHARE = 0.3
 

@@ -20,9 +20,9 @@ from intercap_core.object_track.view import FitContext, MaskCandidate, View
 MIN_RENDERED_PX = 12  # renderings with fewer pixels are not compared
 # Depth this much behind (nearer than) the render is background (an occluder): above the sensor's
 # systematic error and that of the pose.
-FREE_SPACE_M = 0.03
+FREE_SPACE_M = 0.03  # metres; tuned
 AGREEMENT_SCALE_M = 0.010  # a pixel this far off agrees by half: Azure Kinect's systematic error
-ASSESS_MIN_OVERLAP = 0.1  # smallest IoU of a candidate that an unfitted pose is compared with
+ASSESS_MIN_OVERLAP = 0.1  # smallest IoU of a candidate to compare an unfitted pose with; tuned
 
 
 def choose_candidate(
