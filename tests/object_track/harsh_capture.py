@@ -170,8 +170,7 @@ class HarshCapture:
             found.append((self._label(rng), self._border(drawn.body == TWIN, t, c, 3)))
         rng.shuffle(found)
         candidates = [
-            (i, label, encode(self._full(drawn, mask)))
-            for i, (label, mask) in enumerate(found)
+            (i, label, encode(self._full(drawn, mask))) for i, (label, mask) in enumerate(found)
         ]
         person = encode(self._full(drawn, self._border(figure, t, c, 4)))
         return View.build(geometry, self._depth(t, c, rng, blocked), person, candidates)
