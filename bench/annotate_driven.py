@@ -102,7 +102,7 @@ class Placing:
 
     def __init__(self, hand: Hand, eye: Eye) -> None:
         self.hand, self.eye = hand, eye
-        cameras = hand.see("window.annotate.told.cameras")
+        cameras = hand.see("window.annotate.info.cameras")
         self.cameras = {one["name"]: one for one in cameras if one["pose"] is not None}
         self.poses = {name: np.array(one["pose"]) for name, one in self.cameras.items()}
 
@@ -116,7 +116,7 @@ class Placing:
         if hand.see("document.body.dataset.mode"):
             hand.key("Escape")
         self._enlarge(frame)
-        if hand.see("window.annotate.near"):
+        if hand.see("window.annotate.following"):
             hand.key("f")
         hand.key("o")
         self._move(frame)
@@ -390,7 +390,7 @@ def _drag_end(hand: Hand, part: str, one: Interval, end: str, frames: int) -> No
     lane = page.locator(f'[data-part="{part}"] .lane').bounding_box()
     if box is None or lane is None:
         raise UserError(f"the timeline shows no interval of {part}")
-    by = frames * lane["width"] / int(hand.see("window.annotate.told.frames"))
+    by = frames * lane["width"] / int(hand.see("window.annotate.info.frames"))
     hand.drag((box["x"] + box["width"] / 2, box["y"] + box["height"] / 2), (by, 0.0))
 
 

@@ -137,13 +137,13 @@ class Hand:
         self.click('#dialog [data-answer="run"]')
         with self._waiting():
             begin = time.monotonic()
-            self.visit.wait("window.annotate.keep.run.state === 'running'")
-            while self.see("window.annotate.keep.run.state") == "running":
+            self.visit.wait("window.annotate.saving.run.state === 'running'")
+            while self.see("window.annotate.saving.run.state") == "running":
                 if time.monotonic() - begin > RUN_S:
                     raise UserError(f"the run did not end within {RUN_S:.0f} s")
                 self.visit.page.wait_for_timeout(500)
-            if self.see("window.annotate.keep.run.state") != "done":
-                raise UserError(f"the run failed: {self.see('window.annotate.keep.run.words')}")
+            if self.see("window.annotate.saving.run.state") != "done":
+                raise UserError(f"the run failed: {self.see('window.annotate.saving.run.message')}")
             self.visit.wait(
                 "document.getElementById('hint').textContent.startsWith('the new result')"
             )
@@ -173,7 +173,7 @@ WATCH = """
   let pressed = null;
   window.addEventListener("keydown", (event) => { pressed = event.timeStamp; }, { capture: true });
   app.drawn = () => {
-    const stepped = app.asked !== null && app.asked !== undefined;
+    const stepped = app.requestedAt !== null && app.requestedAt !== undefined;
     drawn();
     if (!stepped || pressed === null) return;
     const key = pressed, solid = document.querySelector(".viewer canvas")?.getContext("webgl2");
@@ -246,7 +246,7 @@ def measure(settings: Path, sequence: str, steps: int) -> dict[str, float]:
     with served_page(settings, sequence) as page:
         page.page.wait_for_timeout(1500)
         page.page.evaluate(WATCH)
-        steps = min(steps, page.page.evaluate("window.annotate.told.frames") - 1)
+        steps = min(steps, page.page.evaluate("window.annotate.info.frames") - 1)
         on = steps_ms(page.page, steps)
         page.page.reload()
         page.wait(READY)

@@ -55,7 +55,7 @@ def _contact(page: Visit) -> None:
     _take(page, "annotate_contact")
     page.page.keyboard.press("Control+s")
     page.wait("document.getElementById('dialog').open")
-    page.wait("!document.getElementById('dialog').textContent.includes('looked up')")
+    page.wait("!document.getElementById('dialog').textContent.includes('Determining')")
     _take(page, "annotate_save")
     page.page.locator("#dialog-buttons").get_by_text("Cancel").click()
 

@@ -1,5 +1,1 @@
-"""Mend a sequence's annotation in the browser: see the result over the images, fix it, run again.
-
-``server`` gives the page in ``page/`` what ``sequence``, ``images``, ``result`` and ``snap`` read
-of the results, and keeps what is answered by ``document``, ``questions`` and ``rerun``.
-"""
+"""Correction of a sequence's annotation in the browser, and runs with the corrected annotation."""

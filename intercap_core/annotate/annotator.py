@@ -13,17 +13,9 @@ from typing import Any
 from starlette.exceptions import HTTPException
 
 from intercap_core import artefacts
-from intercap_core.annotate import (
-    before,
-    document,
-    objects,
-    questions,
-    rerun,
-    result,
-    snap,
-)
-from intercap_core.annotate.opened import Opened, Pictures
-from intercap_core.annotate.questions import answers_path
+from intercap_core.annotate import document, objects, questions, rerun, result, snap
+from intercap_core.annotate.before import Backup
+from intercap_core.annotate.opened import Opened
 from intercap_core.annotation import Annotation, ObjectPose
 from intercap_core.commands.check import fault_of_cameras
 from intercap_core.entries import ObjectEntry
@@ -34,8 +26,8 @@ from intercap_core.output.site.tables import sequence_table
 from intercap_core.project import Project, load_project
 from intercap_core.schemas import CONTACT_REGIONS, SUMMARY
 
-_MOST = 1e9  # largest number that a page may send
-OPEN_SEQUENCES = 3  # whose images and meshes stay in memory
+_LARGEST = 1e9  # largest number that the page may send
+_OPEN_SEQUENCES = 6  # sequences, current or before the last run, that stay open
 
 
 class Annotator:
@@ -53,8 +45,7 @@ class Annotator:
     ) -> None:
         self.settings, self.by = settings, by
         self.project = load_project(settings)
-        self.runs = rerun.Runs(cores=cores, profile=profile)
-        self.pictures = Pictures()
+        self.runs = rerun.RunManager(cores=cores, profile=profile)
         self._list = SequenceList()
         self._opened: OrderedDict[str, Opened] = OrderedDict()
         self._lock = threading.Lock()
@@ -62,7 +53,7 @@ class Annotator:
     # --- reading -------------------------------------------------------------------------------
 
     def sequences(self) -> dict[str, Any]:
-        """Return the table of sequences, which is read again."""
+        """Read the project again and return the table of sequences."""
         self.project = load_project(self.settings)
         rows = self._list.rows(self.project)
         return {"dataset": self.project.config.dataset, "by": self.by, "sequences": rows}
@@ -77,55 +68,50 @@ class Annotator:
         key = f"{version}/{name}"
         with self._lock:
             if key not in self._opened:
-                paths = before.before_paths(self.project, name) if version == "before" else None
+                paths = Backup(self.project, name).paths if version == "before" else None
                 self._opened[key] = Opened(self.project, name, paths)
             self._opened.move_to_end(key)
-            while len(self._opened) > 2 * OPEN_SEQUENCES:
+            while len(self._opened) > _OPEN_SEQUENCES:
                 self._opened.popitem(last=False)[1].close()
             return self._opened[key]
 
     def sequence(self, name: str) -> dict[str, Any]:
-        """Return everything but images and meshes."""
+        """Return everything about a sequence but images and meshes."""
         opened = self.opened(name)
-        if not opened.has("frames"):
-            by_hand = shlex.join(["intercap", "run", str(self.settings), "--", "--until", "frames"])
-            note = f"no images have been read of this recording yet: run it, or `{by_hand}`"
-            found: dict[str, Any] = {
-                "sequence": name, "frames": 0, "notes": [note], "result": opened.stamp(),
+        try:
+            if not opened.has("frames"):
+                run = shlex.join(["intercap", "run", str(self.settings), "--", "--until", "frames"])
+                raise UserError(f"no images of this recording have been read: run it, or `{run}`")
+            description = result.describe(opened)
+        except UserError as error:  # a run may read the images again
+            description = {
+                "sequence": name, "frames": 0, "notes": [str(error)], "result": opened.stamp(),
             }  # fmt: skip
-        else:
-            try:
-                found = result.describe(opened)
-            except UserError as error:  # a run can read the images again
-                found = {
-                    "sequence": name, "frames": 0, "notes": [str(error)], "result": opened.stamp(),
-                }  # fmt: skip
         row = self.project.sequences[name]
-        made = self.project.annotation_made(name)
-        found |= {
+        return description | {
             "object": row.object or "",
             "person": row.subject,
             "annotation": self.annotation(name),
             "regions": list(CONTACT_REGIONS),
             "read_only": "the studio writes this annotation together with the recording"
-            if made
+            if self.project.annotation_made(name)
             else document.locked(self.project.annotation_path(name)),
             "profile": str(self.runs.profile or ""),
             "project": hashlib.sha256(str(self.settings.resolve()).encode()).hexdigest()[:16],
         }
-        return found
 
     def annotation(self, name: str) -> dict[str, Any]:
         """Return the annotation file."""
-        return document_to_json(document.read(self.project.annotation_path(name)))
+        return document.read(self.project.annotation_path(name)).to_json()
 
     def state(self, name: str) -> dict[str, Any]:
         """Return stamps by which an open page notices changed annotations or results."""
-        opened = self.opened(name)
-        return {
-            "annotation": document.read(self.project.annotation_path(name)).digest,
-            "result": opened.stamp(),
-        }
+        annotation = document.read(self.project.annotation_path(name))
+        return {"annotation": annotation.digest, "result": self.opened(name).stamp()}
+
+    def compare(self, name: str) -> dict[str, Any]:
+        """Compare the result with the one before the last run."""
+        return Backup(self.project, name).compare()
 
     def questions(self, name: str) -> list[dict[str, Any]]:
         """Return open questions, those with the largest effect first."""
@@ -135,65 +121,64 @@ class Annotator:
     # --- changing ------------------------------------------------------------------------------
 
     def check(self, name: str, request: dict[str, Any]) -> dict[str, Any]:
-        """Return faults of changed sections, the difference in the file, and stages to re-run."""
+        """Return faults of changed sections, the difference in the file, and stale stages."""
         now = document.read(self.project.annotation_path(name))
         changes = _changes(request)
         faults, text = self._edited(name, now, changes)
-        found: dict[str, Any] = {"faults": faults, "digest": now.digest, "difference": ""}
+        answer: dict[str, Any] = {"faults": faults, "digest": now.digest, "difference": ""}
         if faults:
-            return found
-        found["difference"] = document.difference(now.text, text, now.path.name)
+            return answer
+        answer["difference"] = document.difference(now.text, text, now.path.name)
         if request.get("plan"):
             annotation = Annotation.model_validate(document.sections_with(now, changes))
             edited = rerun.EditedProject.of(self.project, name, annotation)
-            found["touched"] = rerun.touched(edited, name)
-        return found
+            answer["stale"] = rerun.stale_stages(edited, name)
+        return answer
 
     def save(self, name: str, request: dict[str, Any]) -> dict[str, Any]:
         """Save changed sections if the file is still the one that the page has read."""
         if self.project.annotation_made(name):
             raise UserError("the studio writes this annotation; it cannot be changed here")
-        path = self.project.annotation_path(name)
-        now = document.read(path)
+        now = document.read(self.project.annotation_path(name))
         changes = _changes(request)
         if now.digest != request.get("digest"):
             base = str(request.get("text", ""))
-            raise document.Changed(now, document.difference(base, now.text, path.name))
+            raise document.Changed(now, document.difference(base, now.text, now.path.name))
         faults, text = self._edited(name, now, changes)
         if faults:
-            raise UserError("; ".join(f"{fault['where']}: {fault['words']}" for fault in faults))
+            raise UserError("; ".join(f"{fault['where']}: {fault['message']}" for fault in faults))
         saved = document.save(now, text)
         if self.by:
             record = {"kind": "saved", "sections": sorted(changes)}
             with contextlib.suppress(OSError):  # the annotation itself is saved
                 questions.keep_answer(self._answers(name), record, self.by)
-        return document_to_json(saved)
+        return saved.to_json()
 
     def answer(self, name: str, request: dict[str, Any]) -> dict[str, Any]:
         """Save an answer, so that its question is not asked again."""
-        self.opened(name)
-        kept = {
-            key: request.get(key) for key in ("kind", "part", "answer", "first", "last", "frame")
-        }
-        if any(v is not None and not isinstance(v, str | int) for v in kept.values()):
+        keys = ("kind", "part", "answer", "first", "last", "frame")
+        record = {key: request.get(key) for key in keys}
+        if any(v is not None and not isinstance(v, str | int) for v in record.values()):
             raise UserError("an answer may have texts and frame numbers only")
-        if any(len(str(v)) > 80 for v in kept.values()):
+        if any(len(str(v)) > 80 for v in record.values()):
             raise UserError("a text of the answer is longer than 80 characters")
-        kept |= {key: _number(request, key) for key in ("from_s", "to_s")}
-        questions.keep_answer(self._answers(name), kept, self.by or None)
+        record |= {key: _number(request, key) for key in ("from_s", "to_s")}
+        questions.keep_answer(self._answers(name), record, self.by or None)
         return {"questions": self.questions(name)}
 
     def snap(self, name: str, request: dict[str, Any]) -> dict[str, Any]:
         """Fit the object's pose to the images of a frame."""
-        entry, pose = self._object(name), _pose(request)
+        entry, opened, pose = self._object(name), self.opened(name), _pose(request)
+        _check_frame(opened, pose.frame)
+        start = list(pose.rotation_vector), list(pose.translation)
+        return snap.snap(opened, entry, pose.frame, *start)
+
+    def point(self, name: str, request: dict[str, Any]) -> dict[str, Any]:
+        """Return the 3D point at a pixel."""
         opened = self.opened(name)
-        with opened.images() as images:
-            if not 0 <= pose.frame < images.num_sets:
-                raise UserError(f"there is no frame {pose.frame}")
-        found = snap.snap(
-            opened, entry, pose.frame, list(pose.rotation_vector), list(pose.translation)
-        )
-        return found.__dict__
+        frame, x, y = int(_number(request, "frame")), _number(request, "x"), _number(request, "y")
+        _check_frame(opened, frame)
+        return {"point": snap.point_under(opened, str(request["camera"]), frame, x, y)}
 
     def read_surface(self, name: str) -> dict[str, Any]:
         """Return where people are likely to touch the sequence's object."""
@@ -204,7 +189,7 @@ class Annotator:
         vertices = request["vertices"]
         if not isinstance(vertices, list) or not all(type(v) is int for v in vertices):
             raise UserError("vertices must be a list of vertex numbers")
-        if any(not 0 <= v < _MOST for v in vertices):
+        if any(not 0 <= v < _LARGEST for v in vertices):
             raise UserError("a vertex number is outside of the mesh")
         digest = str(request["digest"])
         saved = objects.save_surface(self.project, self._object(name), vertices, digest)
@@ -217,50 +202,36 @@ class Annotator:
 
     def symmetry(self, name: str, request: dict[str, Any]) -> dict[str, Any]:
         """Save the object's symmetry, for all of its sequences."""
-        wanted = request["symmetry"]
-        if not isinstance(wanted, dict):
+        symmetry, digest = request["symmetry"], str(request["digest"])
+        if not isinstance(symmetry, dict):
             raise UserError("symmetry must be discrete, continuous or sphere")
-        entry = self._object(name)
-        saved = objects.save_symmetry(self.project, entry, wanted, str(request["digest"]))
+        saved = objects.save_symmetry(self.project, self._object(name), symmetry, digest)
         self.project = load_project(self.settings)
         return saved
 
-    def _object(self, name: str) -> ObjectEntry:
-        entry = self.project.object_of(self.opened(name).name)
-        if entry is None:
-            raise UserError(f"sequence {name!r} names no object")
-        return entry
-
-    def point(self, name: str, request: dict[str, Any]) -> dict[str, Any]:
-        """Return the 3D point at a pixel."""
-        opened = self.opened(name)
-        frame, x, y = int(_number(request, "frame")), _number(request, "x"), _number(request, "y")
-        with opened.images() as images:
-            if not 0 <= frame < images.num_sets:
-                raise UserError(f"there is no frame {frame}")
-        return {"point": snap.point_under(opened, str(request["camera"]), frame, x, y)}
-
     def run(self, name: str, request: dict[str, Any]) -> dict[str, Any]:
         """Start or stop a run; return its state."""
-        wanted = request.get("do")
-        project = self.project
-        if wanted == "start":
-            self.opened(name)
+        if request.get("do") == "start":
             self.project.annotation(name)
-            self.runs.start(project, name)
-        elif wanted == "stop":
+            self.runs.start(self.project, name)
+        elif request.get("do") == "stop":
             self.runs.stop()
         return self.run_state(name)
 
     def run_state(self, name: str) -> dict[str, Any]:
         """Return the run's progress, and the equivalent command."""
-        self.opened(name)
         command = rerun.command(
             self.project, name, cores=self.runs.cores, profile=self.runs.profile
         )
         cluster = self.runs.profile is not None
         progress = self.runs.progress(self.project)
         return progress | {"command": shlex.join(command), "cluster": cluster}
+
+    def _object(self, name: str) -> ObjectEntry:
+        entry = self.project.object_of(name)
+        if entry is None:
+            raise UserError(f"sequence {name!r} names no object")
+        return entry
 
     def _answers(self, name: str) -> Path:
         return questions.answers_path(self.project.annotation_path(name))
@@ -270,42 +241,37 @@ class Annotator:
     ) -> tuple[list[dict[str, str]], str]:
         """Return faults of the changed annotation, and the file's changed text."""
         if now.problem:
-            return [{"where": "file", "words": now.problem}], now.text
+            return [{"where": "file", "message": now.problem}], now.text
         sections = document.sections_with(now, changes)
         faults = document.faults(sections)
-        faults = faults or self._faults(name, Annotation.model_validate(sections))
+        faults = faults or self._contradictions(name, Annotation.model_validate(sections))
         if faults:
             return faults, now.text
         text = document.patched(now, changes)
         # an unchanged entry may have an invalid form, such as frame 12.0
         return document.faults(document.parsed(text)), text
 
-    def _faults(self, name: str, annotation: Annotation) -> list[dict[str, str]]:
+    def _contradictions(self, name: str, annotation: Annotation) -> list[dict[str, str]]:
         """Return contradictions between an annotation and the recording."""
-        faults = [annotation.check_object(self.project.sequences[name].object)]
         recorded = self.project.recording_extent(name)
-        faults.append(
+        messages = [
+            annotation.check_object(self.project.sequences[name].object),
             annotation.check_recording(recorded)
             if recorded
-            else fault_of_cameras(self.project, name, annotation)
-        )
-        return [{"where": words.partition(".")[0].partition("[")[0].split(" ")[0], "words": words}
-                for words in faults if words]  # fmt: skip
+            else fault_of_cameras(self.project, name, annotation),
+        ]
+        return [
+            {"where": message.partition(".")[0].partition("[")[0].split(" ")[0], "message": message}
+            for message in messages
+            if message
+        ]
 
 
 def _number(request: dict[str, Any], key: str) -> float:
     value = request.get(key)
-    if not isinstance(value, int | float) or not -_MOST < value < _MOST:
+    if not isinstance(value, int | float) or not -_LARGEST < value < _LARGEST:
         raise UserError(f"{key} must be a number")
     return float(value)
-
-
-def document_to_json(found: document.Document) -> dict[str, Any]:
-    """Serialize an annotation file for the page."""
-    return {
-        "path": str(found.path), "text": found.text, "digest": found.digest,
-        "sections": found.sections, "problem": found.problem, "note": found.note,
-    }  # fmt: skip
 
 
 def _changes(request: dict[str, Any]) -> dict[str, Any]:
@@ -318,37 +284,40 @@ def _changes(request: dict[str, Any]) -> dict[str, Any]:
 def _pose(request: dict[str, Any]) -> ObjectPose:
     faults = document.faults({"object_poses": [request]})
     if faults:
-        raise UserError(f"{faults[0]['where']}: {faults[0]['words']}")
+        raise UserError(f"{faults[0]['where']}: {faults[0]['message']}")
     return ObjectPose.model_validate(request)
+
+
+def _check_frame(opened: Opened, frame: int) -> None:
+    with opened.images() as images:
+        if not 0 <= frame < images.num_sets:
+            raise UserError(f"there is no frame {frame}")
 
 
 class SequenceList:
     """Rows of all sequences; a summary is read again only if its file changed."""
 
     def __init__(self) -> None:
-        self._known: dict[Path, tuple[tuple[int, int], SequenceMetrics | str]] = {}
+        self._summaries: dict[Path, tuple[tuple[int, int], SequenceMetrics | str]] = {}
 
     def rows(self, project: Project) -> list[dict[str, Any]]:
         """Return a row per sequence, worst first by the site's rank, without a result last."""
         rows, measured = [], []
         for name, row in project.sequences.items():
-            found = self._summary(project.artefact(name, "summary"))
-            annotation = project.annotation_path(name)
+            summary = self._summary(project.artefact(name, "summary"))
             entry: dict[str, Any] = {
                 "name": name, "subject": row.subject, "object": row.object or "", "rank": None,
-                "annotated": annotation.is_file(),
-                "answered": answers_path(annotation).is_file(),
-                "frames_there": project.artefact(name, "frames").is_file(),
-                "note": found if isinstance(found, str) else "",
+                "annotated": project.annotation_path(name).is_file(),
+                "note": summary if isinstance(summary, str) else "",
             }  # fmt: skip
-            if isinstance(found, SequenceMetrics):
-                measured.append(found)
+            if isinstance(summary, SequenceMetrics):
+                measured.append(summary)
                 entry |= {
-                    "frames": len(found),
-                    "flagged": int(found.values["flagged"].sum()),
+                    "frames": len(summary),
+                    "flagged": int(summary.values["flagged"].sum()),
                     "errors": {
                         e.part: round(e.stated, 1) if e.stated == e.stated else None
-                        for e in stated_errors(found)
+                        for e in stated_errors(summary)
                     },
                 }
             rows.append(entry)
@@ -362,16 +331,16 @@ class SequenceList:
     def _summary(self, path: Path) -> SequenceMetrics | str:
         """Return a sequence's figures, or why there are none."""
         try:
-            stat = path.stat()
+            status = path.stat()
         except OSError:
             return "no result yet"
-        stamp = stat.st_mtime_ns, stat.st_size
-        known = self._known.get(path)
+        stamp = status.st_mtime_ns, status.st_size
+        known = self._summaries.get(path)
         if known is None or known[0] != stamp:
             try:
                 with artefacts.read(path, SUMMARY) as artefact:
                     known = stamp, SequenceMetrics.of(artefact)
             except UserError as error:
                 known = stamp, str(error)
-            self._known[path] = known
+            self._summaries[path] = known
         return known[1]

@@ -1,7 +1,7 @@
 """The previous result of a sequence: backup before a run from the page, and comparison.
 
-A run that failed or was stopped leaves results of two annotations. The backup is therefore kept
-until a run has succeeded and the next run starts.
+A run that failed or was stopped leaves a mixture of old and new results. The backup is therefore
+replaced only by the first run after a successful one.
 """
 
 from __future__ import annotations
@@ -25,126 +25,101 @@ from intercap_core.project import Project
 from intercap_core.schemas import JOINT, OBJECT_TRACK
 from intercap_core.stage_list import SEQUENCE_STAGES
 
-_MARK = "kept.json"  # time of the backup, stages of the run, and whether the run succeeded
 
+class Backup:
+    """The backup of a sequence's artefacts before the last run."""
 
-def before_folder(project: Project, sequence: str) -> Path:
-    """Return the folder of the backup."""
-    return project.results / ".annotate" / sequence / "before"
+    def __init__(self, project: Project, sequence: str) -> None:
+        self.folder = project.results / ".annotate" / sequence / "before"
+        self.artefacts = {stage: project.artefact(sequence, stage) for stage in SEQUENCE_STAGES}
+        self.paths = {stage: self.folder / f"{stage}.h5" for stage in SEQUENCE_STAGES}
 
+    def make(self, stages: Sequence[str]) -> None:
+        """Back up the artefacts before a run of ``stages``, by hard links if possible.
 
-def before_paths(project: Project, sequence: str) -> dict[str, Path]:
-    """Return the artefacts of the backup by stage."""
-    folder = before_folder(project, sequence)
-    return {stage: folder / f"{stage}.h5" for stage in SEQUENCE_STAGES}
+        The backup is not replaced if the previous run did not succeed.
+        """
+        state = self._state()
+        if state is not None and not self._succeeded(state):
+            return
+        part = self.folder.with_name("before.part")
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir(parents=True)
+        for path in self.artefacts.values():
+            if path.is_file():
+                try:
+                    os.link(path, part / path.name)
+                except OSError:
+                    shutil.copy2(path, part / path.name)
+        self._write({"at": time.time(), "stages": list(stages), "ended": False}, part)
+        shutil.rmtree(self.folder, ignore_errors=True)
+        part.rename(self.folder)
 
+    def mark_success(self) -> None:
+        """Record that the run succeeded, so that the next run replaces the backup."""
+        state = self._state()
+        if state is not None:
+            self._write(state | {"ended": True}, self.folder)
 
-def keep(project: Project, sequence: str, stages: Sequence[str]) -> None:
-    """Back up the artefacts before a run of ``stages``, by hard links if possible.
-
-    The backup is not replaced if the previous run did not succeed.
-    """
-    folder = before_folder(project, sequence)
-    kept = _mark(folder)
-    if kept is not None and not _ended_well(project, sequence, kept):
-        return
-    part = folder.with_name("before.part")
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir(parents=True)
-    for stage in SEQUENCE_STAGES:
-        path = project.artefact(sequence, stage)
-        if path.is_file():
-            try:
-                os.link(path, part / path.name)
-            except OSError:
-                shutil.copy2(path, part / path.name)
-    _write(part, {"at": time.time(), "stages": list(stages), "ended": False})
-    shutil.rmtree(folder, ignore_errors=True)
-    part.rename(folder)
-
-
-def ended_well(project: Project, sequence: str) -> None:
-    """Record that the run succeeded, so that the next run replaces the backup."""
-    folder = before_folder(project, sequence)
-    kept = _mark(folder)
-    if kept is not None:
-        _write(folder, kept | {"ended": True})
-
-
-def _ended_well(project: Project, sequence: str, kept: Mapping[str, Any]) -> bool:
-    """Return whether the run succeeded, or all its artefacts were written since.
-
-    The latter happens if the server was killed, or by a run in a terminal.
-    """
-    outputs = [project.artefact(sequence, s) for s in SEQUENCE_STAGES if s in kept["stages"]]
-    return bool(kept["ended"]) or (
-        bool(outputs) and all(p.is_file() and p.stat().st_mtime > kept["at"] for p in outputs)
-    )
-
-
-def _mark(folder: Path) -> dict[str, Any] | None:
-    try:
-        mark = json.loads((folder / _MARK).read_text(encoding="utf-8"))
-        return {"at": float(mark["at"]), "stages": list(mark["stages"]), "ended": mark["ended"]}
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-
-
-def _write(folder: Path, kept: Mapping[str, Any]) -> None:
-    part = folder / f"{_MARK}.part"
-    part.write_text(json.dumps(kept), encoding="utf-8")
-    part.replace(folder / _MARK)
-
-
-def compare(project: Project, sequence: str) -> dict[str, Any]:
-    """Compare the result with the backup: figures, and motion of body and object, millimetres.
-
-    Without a backup, there are no rows of old figures.
-    """
-    old = before_paths(project, sequence)
-    new = {stage: project.artefact(sequence, stage) for stage in SEQUENCE_STAGES}
-    rows: list[dict[str, Any]] = []
-    comparison: dict[str, Any] = {
-        "rows": rows,
-        "there": old["joint"].is_file(),
-        **_when(project, sequence),
-    }
-    figures = [_figures(old), _figures(new)]
-    for name in dict.fromkeys([*figures[0], *figures[1]]):
-        rows.append({"name": name, "old": figures[0].get(name), "new": figures[1].get(name)})
-    try:
-        with artefacts.read(old["joint"], JOINT) as a, artefacts.read(new["joint"], JOINT) as b:
+    def compare(self) -> dict[str, Any]:
+        """Compare the result with the backup: figures, and motion of body and object, mm."""
+        comparison: dict[str, Any] = {"rows": [], "exists": self.paths["joint"].is_file()}
+        state = self._state()
+        if state is not None and comparison["exists"]:
+            comparison |= {
+                "made_at": _isoformat(self.paths["joint"].stat().st_mtime),
+                "kept_at": _isoformat(state["at"]),
+                "unfinished": not self._succeeded(state),
+            }
+        old, new = _figures(self.paths), _figures(self.artefacts)
+        for name in old | new:
+            row = {"name": name, "old": old.get(name), "new": new.get(name)}
+            comparison["rows"].append(row)
+        with (
+            contextlib.suppress(artefacts.Unreadable),
+            artefacts.read(self.paths["joint"], JOINT) as a,
+            artefacts.read(self.artefacts["joint"], JOINT) as b,
+        ):
             if a["joints"].shape == b["joints"].shape:
                 moved = np.linalg.norm(a["joints"] - b["joints"], axis=2).mean(1)
                 comparison["body_moved_mm"] = (1e3 * moved).round(1).tolist()
                 shift = np.linalg.norm(a["translation"] - b["translation"], axis=1)
                 if np.isfinite(shift).all():
                     comparison["object_moved_mm"] = (1e3 * shift).round(1).tolist()
-    except artefacts.Unreadable:
-        pass
-    return comparison
+        return comparison
+
+    def _succeeded(self, state: Mapping[str, Any]) -> bool:
+        """Return whether the run succeeded, or all its artefacts were written since.
+
+        The latter happens if the server was killed, or by a run in a terminal.
+        """
+        outputs = [path for stage, path in self.artefacts.items() if stage in state["stages"]]
+        return bool(state["ended"]) or (
+            bool(outputs) and all(p.is_file() and p.stat().st_mtime > state["at"] for p in outputs)
+        )
+
+    def _state(self) -> dict[str, Any] | None:
+        """Return time of the backup, stages of the run, and whether it succeeded."""
+        try:
+            state = json.loads((self.folder / "kept.json").read_text(encoding="utf-8"))
+            return {"at": float(state["at"]), "stages": list(state["stages"]),
+                    "ended": state["ended"]}  # fmt: skip
+        except (OSError, ValueError, KeyError, TypeError):
+            return None
+
+    def _write(self, state: Mapping[str, Any], folder: Path) -> None:
+        part = folder / "kept.json.part"
+        part.write_text(json.dumps(state), encoding="utf-8")
+        part.replace(folder / "kept.json")
 
 
-def _when(project: Project, sequence: str) -> dict[str, Any]:
-    """Return times of the old result and its backup, and whether a run since did not succeed."""
-    folder = before_folder(project, sequence)
-    kept, joint = _mark(folder), before_paths(project, sequence)["joint"]
-    if kept is None or not joint.is_file():
-        return {}
-    return {
-        "made_at": _moment(joint.stat().st_mtime),
-        "kept_at": _moment(kept["at"]),
-        "unfinished": not _ended_well(project, sequence, kept),
-    }
-
-
-def _moment(seconds: float) -> str:
+def _isoformat(seconds: float) -> str:
     return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="seconds")
 
 
 def _figures(paths: Mapping[str, Path]) -> dict[str, float | None]:
     rows: dict[str, float | None] = {}
-    try:
+    with contextlib.suppress(artefacts.Unreadable):
         metrics = SequenceMetrics.read(paths["metrics"])
         for error in stated_errors(metrics):
             stated = error.stated if np.isfinite(error.stated) else None
@@ -154,12 +129,10 @@ def _figures(paths: Mapping[str, Path]) -> dict[str, float | None]:
             rows["frames in contact"] = int(metrics.values["contact_frame"].sum())
             depth = metrics.values["penetration_mean"]
             rows["penetration, mm"] = round(1e3 * float(np.nanmean(depth)), 2)
-    except artefacts.Unreadable:
-        pass
     with (
         contextlib.suppress(artefacts.Unreadable),
         artefacts.read(paths["object_track"], OBJECT_TRACK) as track,
     ):
         rows["frames with the object lost"] = int(track["lost"].sum())
-        rows["frames with an ambiguous turn"] = int(track["ambiguous"].sum())
+        rows["frames with an ambiguous rotation"] = int(track["ambiguous"].sum())
     return rows

@@ -23,7 +23,7 @@ import yaml
 from pydantic import ValidationError
 
 from intercap_core.annotate.yaml_edit import replace_section
-from intercap_core.annotate.yaml_entries import UnsupportedLayout, equal_values
+from intercap_core.annotate.yaml_entries import UnsupportedLayout
 from intercap_core.annotation import STATED_EMPTY, Annotation
 from intercap_core.errors import UserError
 from intercap_core.inputs.documents import parse_yaml, yaml_fault
@@ -43,9 +43,7 @@ class Changed(UserError):
     """
 
     def __init__(self, now: Document, difference: str) -> None:
-        super().__init__(
-            f"{now.path}: was changed by somebody else in the meantime; nothing was saved"
-        )
+        super().__init__(f"{now.path}: was changed by another annotator; nothing was saved")
         self.now, self.difference = now, difference
 
 
@@ -66,6 +64,13 @@ class Document:
     marked: bool = False
     """The file begins with a byte order mark, which is not part of ``text``."""
 
+    def to_json(self) -> dict[str, Any]:
+        """Serialize for the page."""
+        return {
+            "path": str(self.path), "text": self.text, "digest": self.digest,
+            "sections": self.sections, "problem": self.problem, "note": self.note,
+        }  # fmt: skip
+
 
 def read(path: Path) -> Document:
     """Read a file; ``problem`` describes invalid YAML.
@@ -82,24 +87,21 @@ def read(path: Path) -> Document:
     try:
         text = data.decode("utf-8-sig")
         sections = parsed(text)
-        json.dumps(sections, allow_nan=False, ensure_ascii=False).encode()  # as the page reads it
-    except TypeError:
-        words = (
-            f"{path}: has a value that no annotation has, such as a date; correct it in an editor"
-        )
-        return Document(path, text, digest, {}, words, note)
-    except (UnicodeError, yaml.YAMLError, ValueError) as error:
-        shown = data.decode("utf-8", "replace")
-        words = f"{path}: not valid YAML{yaml_fault(error)}; correct it in an editor"
-        return Document(path, shown, digest, {}, words, note)
+        json.dumps(sections, allow_nan=False, ensure_ascii=False).encode()  # as sent to the page
+    except (TypeError, UnicodeError, yaml.YAMLError, ValueError) as error:
+        fault = f"not valid YAML{yaml_fault(error)}"
+        if isinstance(error, TypeError):
+            fault = "has a value that no annotation has, such as a date"
+        text = data.decode("utf-8", "replace")
+        return Document(path, text, digest, {}, f"{path}: {fault}; correct it in an editor", note)
     return Document(path, text, digest, sections, note=note, marked=data.startswith(_BOM))
 
 
 def patched(document: Document, changes: Mapping[str, Any]) -> str:
     """Return the annotation's text with changed sections.
 
-    None removes a section, as does an empty list unless it is a statement (``STATED_EMPTY``).
-    Raises UserError if the file cannot be changed without loss.
+    None removes a section, as does an empty list, except in sections of ``STATED_EMPTY``, where it
+    is a statement. Raises UserError if the file cannot be changed without loss.
     """
     unknown = sorted(set(changes) - set(Annotation.model_fields))
     if unknown:
@@ -135,7 +137,7 @@ def with_changes(document: Document, changes: Mapping[str, Any]) -> str:
     try:
         for section, value in changes.items():
             text = replace_section(text, section, value)
-        done = equal_values(parsed(text), wanted)
+        done = parsed(text) == wanted
     except (UnsupportedLayout, yaml.YAMLError):  # such as an alias of a removed value
         done = False
     if not done:
@@ -147,14 +149,14 @@ def with_changes(document: Document, changes: Mapping[str, Any]) -> str:
 
 
 def faults(sections: Mapping[str, Any]) -> list[dict[str, str]]:
-    """Return the faults of an annotation's sections, each with ``where`` and ``words``."""
+    """Return the faults of an annotation's sections, each with ``where`` and ``message``."""
     try:
         Annotation.model_validate(dict(sections))
     except ValidationError as error:
         return [
             {
                 "where": ".".join(map(str, fault["loc"])) or "annotation",
-                "words": fault["msg"].removeprefix("Value error, "),
+                "message": fault["msg"].removeprefix("Value error, "),
             }
             for fault in error.errors(include_url=False)
         ]
@@ -183,9 +185,8 @@ def save(document: Document, text: str) -> Document:
                 raise Changed(now, difference(document.text, now.text, path.name))
             replace(path, "\ufeff" + text if document.marked else text)
     except OSError as error:
-        raise UserError(
-            f"{path}: cannot be saved ({error.strerror}); nothing was changed"
-        ) from None
+        message = f"{path}: cannot be saved ({error.strerror}); nothing was changed"
+        raise UserError(message) from None
     return read(path)
 
 
@@ -225,7 +226,7 @@ def replace(path: Path, text: str) -> None:
 def locked(path: Path) -> str:
     """Return why the file may not be written, "" if it may or does not exist.
 
-    The mode is checked as well, because the system refuses nothing to root.
+    The mode is checked as well, because root may write every file.
     """
     real = Path(os.path.realpath(path))
     if not real.exists():

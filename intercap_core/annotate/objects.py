@@ -1,4 +1,4 @@
-"""Contact surface and symmetry of an object, in the files that its entry in objects.yaml names.
+"""Contact surface and symmetry of an object, in objects.yaml and the files that it names.
 
 Both belong to the object and therefore to all of its sequences.
 """
@@ -24,17 +24,17 @@ from intercap_core.geometry.rigid.mesh_files import load_mesh
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 from intercap_core.project import Project, tidy
 
-_SAME = 1e-6  # vertices closer than this share of the object's diameter are equal
+_CHANGED = "{}: was changed by another annotator; reload the page"
 
 
 def read_surface(project: Project, entry: ObjectEntry) -> dict[str, Any]:
     """Return the painted vertices, the path of their list, and its digest."""
     mesh = ObjectMesh.load(entry)
     ids = mesh.contact_vertices if entry.contact_vertices is not None else np.zeros(0, int)
-    users = [n for n, row in project.sequences.items() if row.object == entry.name]
+    path = _vertex_list(entry)
     return {
-        "vertices": ids.tolist(), "path": str(_list_of(entry)), "digest": _digest(_list_of(entry)),
-        "sequences": len(users),
+        "vertices": ids.tolist(), "path": str(path), "digest": _digest(path),
+        "sequences": _count_sequences(project, entry),
     }  # fmt: skip
 
 
@@ -45,38 +45,32 @@ def save_surface(
 
     Raises UserError if the list changed since it was read, or no vertex is painted.
     """
-    mesh, path = ObjectMesh.load(entry), _list_of(entry)
+    mesh, path = ObjectMesh.load(entry), _vertex_list(entry)
     painted = np.zeros(len(mesh.vertices), bool)
     ids = np.array(vertices, int) if vertices else np.zeros(0, int)
     if not len(ids) or ids.min() < 0 or ids.max() >= len(painted):
         raise UserError(f"object {entry.name!r}: paint at least one of its {len(painted)} vertices")
     painted[ids] = True
     if _digest(path) != digest:
-        raise UserError(f"{path}: was changed by somebody else in the meantime; reload the page")
+        raise UserError(_CHANGED.format(path))
     in_file = np.asarray(load_mesh(Path(entry.mesh)).vertices, np.float64)
     away, nearest = cKDTree(mesh.vertices).query(np.nan_to_num(in_file, nan=1e9))
-    chosen = np.flatnonzero(painted[nearest] & (away <= _SAME * mesh.diameter))
-    text = json.dumps(contact_list(chosen, in_file)) + "\n"
-    document.replace(path, text)
+    same = away <= 1e-6 * mesh.diameter  # loading merges equal vertices
+    chosen = np.flatnonzero(painted[nearest] & same)
+    document.replace(path, json.dumps(contact_list(chosen, in_file)) + "\n")
     if entry.contact_vertices != path:
-        _name_list(project, entry, path)
+        objects = document.read(_file(project))
+        relative = os.path.relpath(path, objects.path.parent)
+        _save_entry(objects, entry, {"contact_vertices": relative})
     return read_surface(project, entry.model_copy(update={"contact_vertices": path}))
 
 
-def _list_of(entry: ObjectEntry) -> Path:
+def _vertex_list(entry: ObjectEntry) -> Path:
     """Return the list that the entry names if it is JSON, else a file next to the mesh."""
     named = entry.contact_vertices
     if named is not None and named.suffix == ".json":
         return named
     return Path(entry.mesh).with_suffix(".contact.json")
-
-
-def _name_list(project: Project, entry: ObjectEntry, path: Path) -> None:
-    objects = tidy(project.path.parent / project.config.objects)
-    found = document.read(objects)
-    changed = dict(found.sections[entry.name])
-    changed["contact_vertices"] = os.path.relpath(path, objects.parent)
-    document.save(found, document.with_changes(found, {entry.name: changed}))
 
 
 def _digest(path: Path) -> str:
@@ -85,12 +79,11 @@ def _digest(path: Path) -> str:
 
 def read_symmetry(project: Project, entry: ObjectEntry) -> dict[str, Any]:
     """Return the object's symmetry and the digest of objects.yaml."""
-    found = document.read(_file(project))
-    settings = found.sections.get(entry.name) or {}
-    users = [n for n, row in project.sequences.items() if row.object == entry.name]
+    objects = document.read(_file(project))
+    settings = objects.sections.get(entry.name) or {}
     return {
-        "symmetry": settings.get("symmetry") or {}, "path": str(found.path), "digest": found.digest,
-        "sequences": len(users),
+        "symmetry": settings.get("symmetry") or {}, "path": str(objects.path),
+        "digest": objects.digest, "sequences": _count_sequences(project, entry),
     }  # fmt: skip
 
 
@@ -106,17 +99,24 @@ def save_symmetry(
     except (ValidationError, ValueError) as error:
         fault = str(error).splitlines()[0][:200]
         raise UserError(f"object {entry.name!r}: symmetry is invalid ({fault})") from None
-    found = document.read(_file(project))
-    if found.problem:
-        raise UserError(found.problem)
-    if found.digest != digest:
-        raise UserError(
-            f"{found.path}: was changed by somebody else in the meantime; reload the page"
-        )
-    own = {k: v for k, v in dict(found.sections[entry.name]).items() if k != "symmetry"}
-    own |= {"symmetry": symmetry} if symmetry else {}
-    document.save(found, document.with_changes(found, {entry.name: own}))
+    objects = document.read(_file(project))
+    if objects.problem:
+        raise UserError(objects.problem)
+    if objects.digest != digest:
+        raise UserError(_CHANGED.format(objects.path))
+    _save_entry(objects, entry, {"symmetry": symmetry or None})
     return read_symmetry(project, entry)
+
+
+def _save_entry(objects: document.Document, entry: ObjectEntry, changes: dict[str, Any]) -> None:
+    """Change settings of an object in objects.yaml; None removes a setting."""
+    settings = {**objects.sections[entry.name], **changes}
+    settings = {key: value for key, value in settings.items() if value is not None}
+    document.save(objects, document.with_changes(objects, {entry.name: settings}))
+
+
+def _count_sequences(project: Project, entry: ObjectEntry) -> int:
+    return sum(row.object == entry.name for row in project.sequences.values())
 
 
 def _file(project: Project) -> Path:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections import OrderedDict, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -23,9 +23,9 @@ T = TypeVar("T")
 
 
 class Opened:
-    """Artefacts of one sequence, with a cache of results that is valid until the files change.
+    """Open artefacts of one sequence, with a cache of results that are valid until a file changes.
 
-    It is thread-safe; ``lock`` keeps the images open while they are read.
+    Thread-safe. Hold ``lock`` to keep the images open.
 
     Args:
         paths: artefacts by stage, by default those of the project.
@@ -41,7 +41,7 @@ class Opened:
         self._images: tuple[str, Frames, Frames, np.ndarray] | None = None
 
     def stamp(self, *stages: str) -> str:
-        """Return a stamp that changes with these artefacts, by default with any."""
+        """Return a text that changes if one of these artefacts, by default any, is replaced."""
         return "-".join(_stamp(self.paths[stage]) for stage in stages or self.paths)
 
     def has(self, stage: str) -> bool:
@@ -49,9 +49,9 @@ class Opened:
         return self.paths[stage].is_file()
 
     def cached(self, key: str, stages: tuple[str, ...], make: Callable[[], T]) -> T:
-        """Return the result of ``make``, called again if an artefact of ``stages`` changed.
+        """Return the result of ``make``; call it again if an artefact of ``stages`` changed.
 
-        Concurrent callers wait for one call.
+        Concurrent callers share one call.
         """
         with self.lock:
             making = self._making[key]
@@ -67,7 +67,7 @@ class Opened:
     def images(self) -> Iterator[Frames]:
         """Open the images by the frame that they show; by set if there is no scene artefact.
 
-        Raises UserError if the frames cannot be read.
+        Raises UserError if the artefact of frames cannot be read.
         """
         with self.lock:
             yield self._opened()[1]
@@ -106,69 +106,38 @@ class Opened:
 
 def _stamp(path: Path) -> str:
     try:
-        found = path.stat()
+        status = path.stat()
     except OSError:
         return "0"
-    return f"{found.st_size:x}.{found.st_mtime_ns:x}.{found.st_ino:x}"
+    return f"{status.st_size:x}.{status.st_mtime_ns:x}.{status.st_ino:x}"
 
 
 WIDTHS = (240, 320, 480, 640, 960, 1280)  # pixels; requests are rounded up to one of these
-KEPT_BYTES = 192 << 20
-_QUALITY = 78  # of JPEG: 20 kB for an image 480 pixels wide
 
 
-class Pictures:
-    """Reduced images with a cache of the last used."""
+def read_jpeg(opened: Opened, camera: str, frame: int, width: int) -> bytes | None:
+    """Return the image of a camera in a frame as JPEG, None if there is none.
 
-    def __init__(self, kept_bytes: int = KEPT_BYTES) -> None:
-        self._kept: OrderedDict[tuple[str, str, int, int, int], bytes] = OrderedDict()
-        self._bytes, self._most = 0, kept_bytes
-        self._lock = threading.Lock()
-
-    def jpeg(self, opened: Opened, camera: str, moment: int, width: int) -> bytes | None:
-        """Return the image of a camera at a frame, at least ``width`` pixels wide if recorded so.
-
-        None if there is no image. Raises UserError if it cannot be read.
-        """
-        wide = next((size for size in WIDTHS if size >= width), 0)
-        with opened.images() as frames:
-            names = frames.rig.names
-            if camera not in names or not 0 <= moment < frames.num_sets:
-                raise UserError(
-                    f"sequence {opened.name!r} has no image of camera {camera!r}, frame {moment}"
-                )
-            c = names.index(camera)
-            key = (opened.name, opened.stamp("frames", "scene"), moment, c, wide)
-            with self._lock:
-                if key in self._kept:
-                    self._kept.move_to_end(key)
-                    return self._kept[key]
-            lens = frames.rig[c].colour
-            if wide == 0 or wide >= lens.width:
-                data = frames.colour_jpeg(moment, c)
-            else:
-                data = None
-                image = frames.colour(moment, c, _reduction(lens.width, wide))
-                if image is not None:
-                    size = (wide, round(lens.height * wide / lens.width))
-                    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-                    options = [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
-                    data = cv2.imencode(".jpg", small, options)[1].tobytes()
-        if data is not None:
-            self._keep(key, data)
-        return data
-
-    def _keep(self, key: tuple[str, str, int, int, int], data: bytes) -> None:
-        with self._lock:
-            if key not in self._kept:
-                self._kept[key] = data
-                self._bytes += len(data)
-            while self._bytes > self._most and len(self._kept) > 1:
-                self._bytes -= len(self._kept.popitem(last=False)[1])
-
-
-def _reduction(recorded: int, wide: int) -> Literal[1, 2, 4]:
-    """Return by which factor the decoder may reduce an image."""
-    if recorded >= 4 * wide:
-        return 4
-    return 2 if recorded >= 2 * wide else 1
+    It is reduced to the next of ``WIDTHS`` if the recorded image is wider. Raises UserError if the
+    image cannot be read. Browsers cache the images.
+    """
+    reduced = next((size for size in WIDTHS if size >= width), 0)
+    with opened.images() as frames:
+        names = frames.rig.names
+        if camera not in names or not 0 <= frame < frames.num_sets:
+            raise UserError(
+                f"sequence {opened.name!r} has no image of camera {camera!r}, frame {frame}"
+            )
+        c = names.index(camera)
+        lens = frames.rig[c].colour
+        if reduced == 0 or reduced >= lens.width:
+            return frames.colour_jpeg(frame, c)
+        factors: tuple[Literal[1, 2, 4], ...] = (4, 2, 1)  # by which the decoder can reduce
+        factor = next(f for f in factors if lens.width >= f * reduced)
+        image = frames.colour(frame, c, factor)
+    if image is None:
+        return None
+    size = (reduced, round(lens.height * reduced / lens.width))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    quality = 78  # 20 kB for an image 480 pixels wide
+    return cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()

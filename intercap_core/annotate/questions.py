@@ -18,14 +18,11 @@ import numpy as np
 from intercap_core import artefacts
 from intercap_core.annotate.opened import Opened
 from intercap_core.annotate.sides import doubts
+from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.errors import UserError
 from intercap_core.evaluation.flags import ranges
 from intercap_core.schemas import JOINT, OBJECT_TRACK, PERSON
 
-EVEN = (0.25, 0.75)  # range of uncertain probabilities of contact
-SHORTEST_S = 0.1  # shorter uncertain contact is ignored
-MOST = 40  # questions of a sequence at a time
-_MID_HIP = 8  # of the 135 keypoints
 _MAX_BYTES = 1 << 22
 
 
@@ -38,40 +35,40 @@ def propose(opened: Opened, answered: Sequence[Mapping[str, Any]]) -> list[dict[
     """Return open questions, those that change most frames first.
 
     Each has ``kind``, ``part``, frames ``first`` to ``last`` (``from_s`` to ``to_s`` in seconds),
-    the ``frame`` to look at, ``words``, ``weight`` (expected number of changed frames) and
+    the ``frame`` to look at, ``message``, ``weight`` (expected number of changed frames) and
     ``choices``.
     """
-    found: list[dict[str, Any]] = []
+    questions: list[dict[str, Any]] = []
     with opened.lock:
         with opened.images() as images:
             times = images.time_s
         object_ = opened.project.sequences[opened.name].object or ""
-        for look in (_of_subject, _of_sides, _of_object, _of_contact):
+        for ask in (_ask_subject, _ask_sides, _ask_object, _ask_contact):
             try:
-                found += look(opened, object_.replace("_", " "), times)
+                questions += ask(opened, object_.replace("_", " "), times)
             except UserError:  # missing or of another version, which result.py reports
                 continue
-    for question in found:
+    for question in questions:
         question["from_s"] = round(float(times[question["first"]]), 3)
         question["to_s"] = round(float(times[question["last"]]), 3)
-    unanswered = [q for q in found if not any(_answers(q, answer) for answer in answered)]
+    unanswered = [q for q in questions if not any(_answers(q, answer) for answer in answered)]
     unanswered.sort(key=lambda question: -question["weight"])
-    return unanswered[:MOST]
+    return unanswered[:40]
 
 
 def read_answers(path: Path) -> list[dict[str, Any]]:
     """Read the answers; incomplete lines of interrupted writes are skipped."""
     if not path.is_file() or path.stat().st_size > _MAX_BYTES:
         return []
-    found = []
+    answers = []
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         try:
             answer = json.loads(line)
         except ValueError:
             continue
         if isinstance(answer, dict):
-            found.append(answer)
-    return found
+            answers.append(answer)
+    return answers
 
 
 def keep_answer(path: Path, answer: Mapping[str, Any], by: str | None) -> None:
@@ -109,24 +106,24 @@ def _answers(question: Mapping[str, Any], answer: Mapping[str, Any]) -> bool:
 
 
 def _question(
-    kind: str, part: str, first: int, last: int, frame: int, words: str, weight: float,
+    kind: str, part: str, first: int, last: int, frame: int, message: str, weight: float,
     choices: Sequence[tuple[str, str]], **more: Any,
 ) -> dict[str, Any]:  # fmt: skip
     return {
         "id": f"{kind}.{part}.{first}.{last}", "kind": kind, "part": part, "first": int(first),
-        "last": int(last), "frame": int(frame), "words": words, "weight": round(weight, 2),
+        "last": int(last), "frame": int(frame), "message": message, "weight": round(weight, 2),
         "choices": [{"answer": answer, "label": label} for answer, label in choices], **more,
     }  # fmt: skip
 
 
-def _of_subject(opened: Opened, object_: str, times: np.ndarray) -> list[dict[str, Any]]:
+def _ask_subject(opened: Opened, object_: str, times: np.ndarray) -> list[dict[str, Any]]:
     with artefacts.read(opened.paths["person"], PERSON) as person:
         doubts, by = str(person.attributes["doubts"]), str(person.attributes["chosen_by"])
         if by in ("alone", "named") and not doubts:
             return []
-        shown = person["keypoints"][:, :, _MID_HIP, 2]  # (T, C)
-        t, c = np.unravel_index(int(shown.argmax()), shown.shape)
-        x, y, confidence = person["keypoints"][t, c, _MID_HIP]
+        hips = person["keypoints"][:, :, KEYPOINT_NAMES.index("mid_hip")]  # (T, C, 3)
+        t, c = np.unravel_index(int(hips[..., 2].argmax()), hips.shape[:2])
+        x, y, confidence = hips[t, c]
         camera = person.text("camera_names")[c]
     if not confidence > 0:
         return []
@@ -141,56 +138,64 @@ def _of_subject(opened: Opened, object_: str, times: np.ndarray) -> list[dict[st
     ]  # fmt: skip
 
 
-def _of_sides(opened: Opened, object_: str, times: np.ndarray) -> list[dict[str, Any]]:
+def _ask_sides(opened: Opened, object_: str, times: np.ndarray) -> list[dict[str, Any]]:
     return [
         _question(
-            "sides", "", one.first, one.last, one.frame,
+            "sides", "", doubt.first, doubt.last, doubt.frame,
             "Are L and R in the views the subject's own left and right?",
-            2.0 * (one.last - one.first + 1),
-            (("yes", "Yes, in every view"), ("view", f"Exchanged in {one.camera}"),
+            2.0 * (doubt.last - doubt.first + 1),
+            (("yes", "Yes, in every view"), ("view", f"Exchanged in {doubt.camera}"),
              ("all", "Exchanged in every view"), ("mark", "I mark where"),
              ("unsure", "I cannot tell")),
-            camera=one.camera, why=one.words,
+            camera=doubt.camera, why=doubt.message,
         )
-        for one in doubts(opened)
+        for doubt in doubts(opened)
     ]  # fmt: skip
 
 
-def _of_object(opened: Opened, object_: str, times: np.ndarray) -> list[dict[str, Any]]:
+def _ask_object(opened: Opened, object_: str, times: np.ndarray) -> list[dict[str, Any]]:
     if not object_:
         return []
     with artefacts.read(opened.paths["object_track"], OBJECT_TRACK) as track:
         lost, ambiguous = track["lost"], track["ambiguous"] & ~track["lost"]
-    found = []
-    for first, last, _ in ranges(["x" if one else "" for one in lost]):
-        choices = (("place", "I place it"), ("hidden", "It is not visible"))
-        words = f"The {object_} is lost here. Where is it?"
-        found.append(_question("lost", "", first, last, (first + last) // 2, words,
-                               2.0 * (last - first + 1), choices))  # fmt: skip
-    for first, last, _ in ranges(["x" if one else "" for one in ambiguous]):
-        turns = (("yes", "Yes, as drawn"), ("no", "No: I rotate it"), ("unsure", "I cannot tell"))
-        words = f"Is the rotation of the {object_} as drawn?"
-        found.append(_question("turn", "", first, last, (first + last) // 2, words,
-                               3.0 + 1.5 * (last - first), turns))  # fmt: skip
-    return found
+    questions = []
+    choices: tuple[tuple[str, str], ...] = (
+        ("place", "I place it"),
+        ("hidden", "It is not visible"),
+    )
+    for first, last in _runs(lost):
+        message = f"The {object_} is lost here. Where is it?"
+        questions.append(_question("lost", "", first, last, (first + last) // 2, message,
+                                   2.0 * (last - first + 1), choices))  # fmt: skip
+    choices = (("yes", "Yes, as drawn"), ("no", "No: I rotate it"), ("unsure", "I cannot tell"))
+    for first, last in _runs(ambiguous):
+        message = f"Is the rotation of the {object_} as drawn?"
+        questions.append(_question("turn", "", first, last, (first + last) // 2, message,
+                                   3.0 + 1.5 * (last - first), choices))  # fmt: skip
+    return questions
 
 
-def _of_contact(opened: Opened, object_: str, times: np.ndarray) -> list[dict[str, Any]]:
+def _ask_contact(opened: Opened, object_: str, times: np.ndarray) -> list[dict[str, Any]]:
     with artefacts.read(opened.paths["joint"], JOINT) as joint:
         probability, labels = joint["contact_probability"], joint["contact_annotated"]
         regions = joint.text("region_names")
     step = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
-    found = []
+    questions = []
     for r, region in enumerate(regions):
         p = probability[:, r]
-        even = (p > EVEN[0]) & (p < EVEN[1]) & (labels[:, r] < 0)
-        for first, last, _ in ranges(["x" if one else "" for one in even]):
-            if (last - first + 1) * step < SHORTEST_S:
+        uncertain = (p > 0.25) & (p < 0.75) & (labels[:, r] < 0)
+        for first, last in _runs(uncertain):
+            if (last - first + 1) * step < 0.1:  # too short to matter
                 continue
             run = p[first : last + 1]
             frame = first + int(np.abs(run - 0.5).argmin())
-            words = f"Does the {region.replace('_', ' ')} touch the {object_} here?"
+            message = f"Does the {region.replace('_', ' ')} touch the {object_} here?"
             choices = (("yes", "It touches"), ("no", "It does not"), ("unsure", "I cannot tell"))
-            found.append(_question("contact", region, first, last, frame, words,
-                                   float((4 * run * (1 - run)).sum()), choices))  # fmt: skip
-    return found
+            questions.append(_question("contact", region, first, last, frame, message,
+                                       float((4 * run * (1 - run)).sum()), choices))  # fmt: skip
+    return questions
+
+
+def _runs(mask: np.ndarray) -> list[tuple[int, int]]:
+    """Return first and last frame of each run of set frames (T,)."""
+    return [(first, last) for first, last, _ in ranges(["x" if on else "" for on in mask])]

@@ -1,4 +1,4 @@
-"""Re-running the stages that an edit makes stale, by `intercap run`."""
+"""Runs of the stages that an edit makes stale, by `intercap run`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from intercap_core.annotate import before
+from intercap_core.annotate.before import Backup
 from intercap_core.annotation import Annotation
 from intercap_core.commands.run import ENDS_WITHIN_S
 from intercap_core.errors import UserError
@@ -23,7 +23,6 @@ from intercap_core.pipeline.plan import OutputStatus, Plan
 from intercap_core.project import Project
 from intercap_core.stage_list import LEAVES
 
-_LAST_LINES = 12
 _PLANNING = threading.Lock()  # Python 3.11 fails if two threads parse source at a time
 _PATIENCE_S = 10.0  # added to the time in which `intercap run` ends in order
 
@@ -47,18 +46,18 @@ class EditedProject(Project):
         return super().annotation(sequence, look_at_frames=look_at_frames)
 
 
-def touched(project: Project, sequence: str) -> list[dict[str, Any]]:
+def stale_stages(project: Project, sequence: str) -> list[dict[str, Any]]:
     """Return the stages that a run would compute, in order, with the reasons."""
     with _PLANNING:
         plan = Plan(project)
-        found = [
-            {"stage": stage, "state": str(state.status), "reasons": list(state.reasons)}
-            for stage, state in plan.states(sequence).items()
-            if state.status is not OutputStatus.done
-        ]
+        states = plan.states(sequence).items()
         if not isinstance(project, EditedProject):
             plan.save()
-        return found
+    return [
+        {"stage": stage, "reasons": list(state.reasons)}
+        for stage, state in states
+        if state.status is not OutputStatus.done
+    ]
 
 
 def targets(project: Project, sequence: str) -> list[str]:
@@ -78,7 +77,7 @@ def command(
     ]  # fmt: skip
 
 
-class Runs:
+class RunManager:
     """Runs that the page starts, one at a time."""
 
     def __init__(self, *, cores: int = 0, profile: Path | None = None) -> None:
@@ -87,13 +86,12 @@ class Runs:
         self._process: subprocess.Popen[bytes] | None = None
         self._sequence = ""
         self._stages: list[str] = []
-        self._start = 0.0
-        self._ended = 0.0
+        self._start = self._ended = 0.0
         self._stop_time = 0.0  # time.monotonic() of the request to stop, 0 = none
         self._output: Path | None = None
 
     @property
-    def going_on(self) -> bool:
+    def in_progress(self) -> bool:
         """True while a run that was started here has not ended."""
         return self._process is not None and self._process.poll() is None
 
@@ -111,15 +109,15 @@ class Runs:
         if self.profile is not None:
             raise UserError(f"jobs go to a cluster: run {shlex.join(arguments)}")
         with self._lock:
-            if self.going_on:
+            if self.in_progress:
                 raise UserError(
                     f"a run of {self._sequence} is in progress; wait for its end, or stop it"
                 )
-            self._stages = [one["stage"] for one in touched(project, sequence)]
+            self._stages = [stale["stage"] for stale in stale_stages(project, sequence)]
             if not self._stages:
                 raise UserError(f"nothing to run: all results of {sequence} are up to date")
             self._note_end(project)
-            before.keep(project, sequence, self._stages)
+            Backup(project, sequence).make(self._stages)
             self._output = project.logs / "annotate.txt"  # not .log, which jobs use
             self._output.parent.mkdir(parents=True, exist_ok=True)
             self._sequence, self._start, self._ended = sequence, time.time(), 0.0
@@ -137,7 +135,7 @@ class Runs:
         A second request has no effect while the run may end in order. After that, it kills the run.
         """
         with self._lock:
-            if self._process is None or not self.going_on:
+            if self._process is None or not self.in_progress:
                 return
             if not self._stop_time:
                 self._stop_time = time.monotonic()
@@ -163,33 +161,33 @@ class Runs:
             state = "ending" if stopping else "running"
         else:
             state = "done" if status == 0 else ("stopped" if stopping else "failed")
-        words = ""
+        message = ""
         if state == "failed" and self._output is not None and self._output.is_file():
             lines = self._output.read_text(encoding="utf-8", errors="replace").splitlines()
-            words = "\n".join(lines[-_LAST_LINES:])
+            message = "\n".join(lines[-12:])
         return {
-            "state": state, "sequence": self._sequence, "stages": stages, "words": words,
+            "state": state, "sequence": self._sequence, "stages": stages, "message": message,
             "seconds": round((self._ended or time.time()) - self._start, 1),
             "ending_s": round(time.monotonic() - self._stop_time, 1) if stopping else 0.0,
             "ends_within_s": ENDS_WITHIN_S + _PATIENCE_S,
         }  # fmt: skip
 
     def _note_end(self, project: Project) -> None:
-        if self._process is None or self.going_on or self._ended:
+        if self._process is None or self.in_progress or self._ended:
             return
         self._ended = time.time()
         if self._process.returncode == 0:
-            before.ended_well(project, self._sequence)
+            Backup(project, self._sequence).mark_success()
 
     def _stage(self, project: Project, stage: str) -> dict[str, str]:
         log = project.logs / self._sequence / f"{stage}.log"
         try:
-            if log.stat().st_mtime < self._start - 1.0:
-                return {"state": "waits", "words": ""}
-            state, words = read_state(log)
-            return {"state": state, "words": words or last_words(log)}
+            if log.stat().st_mtime >= self._start - 1.0:
+                state, message = read_state(log)
+                return {"state": state, "message": message or last_words(log)}
         except FileNotFoundError:
-            return {"state": "waits", "words": ""}
+            pass
+        return {"state": "waits", "message": ""}
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:
@@ -197,9 +195,7 @@ def _kill(process: subprocess.Popen[bytes]) -> None:
     import psutil
 
     with contextlib.suppress(psutil.NoSuchProcess):
-        for one in (
-            *psutil.Process(process.pid).children(recursive=True),
-            psutil.Process(process.pid),
-        ):
+        parent = psutil.Process(process.pid)
+        for descendant in (*parent.children(recursive=True), parent):
             with contextlib.suppress(psutil.NoSuchProcess):
-                one.kill()
+                descendant.kill()

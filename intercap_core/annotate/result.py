@@ -6,7 +6,7 @@ Artefacts that cannot be read are reported in ``notes``; everything else is show
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -26,26 +26,19 @@ from intercap_core.pipeline.provenance import read_manifest
 from intercap_core.schemas import BODY_FIT, JOINT, METRICS, OBJECT_TRACK, PERSON, SCENE
 from intercap_core.sequence_inputs import SequencePaths
 
-DOUBTED = 1.5  # frames with a larger multiple of the part's stated error are doubtful
-_DRAWN = {"scene", "body_fit", "joint", "metrics", "object_track"}  # drawn by the viewer
-_LENGTHS = {  # a dataset of each stage with a row per frame
-    "scene": (SCENE, "times"),
-    "person": (PERSON, "missing"),
-    "object_track": (OBJECT_TRACK, "lost"),
-    "body_fit": (BODY_FIT, "failed"),
-    "joint": (JOINT, "flagged"),
-    "metrics": (METRICS, "flagged"),
-}
+DOUBTFUL = 1.5  # frames with a larger multiple of the part's stated error are doubtful
 _CALL = 'showInterCap("'  # call in the page's script, before the data
 _VIEWER = ("frames", "scene", "body_fit")  # stages that the viewer needs
+_DRAWN = {"scene", "body_fit", "joint", "metrics", "object_track"}  # stages that the viewer draws
 
 
 def describe(opened: Opened) -> dict[str, Any]:
     """Return everything but images and meshes for JSON; raises UserError without frames."""
     with opened.lock:
-        found: dict[str, Any] = {"notes": [], "places": []}
         with opened.images() as images:
-            found |= {
+            info: dict[str, Any] = {
+                "notes": [],
+                "places": [],
                 "sequence": opened.name,
                 "frames": images.num_sets,
                 "fps": images.fps,
@@ -54,38 +47,34 @@ def describe(opened: Opened) -> dict[str, Any]:
                 "stamp": opened.stamp("frames", "scene"),
                 "result": opened.stamp(),
                 "images": ["".join(map(str, c)) for c in images.colour_available.T.astype(int)],
+                "image_of": None,
+                "zup_from_master": np.eye(4)[:3].tolist(),
             }
             rig = images.rig
-            found["image_of"] = None
-        found["dropped"] = np.flatnonzero(opened.dropped()).tolist()
-        found["zup_from_master"] = np.eye(4)[:3].tolist()
+        info["dropped"] = np.flatnonzero(opened.dropped()).tolist()
         broken: set[str] = set()
-        for look in (_scene, _person, _track, _body, _joint, _metrics):
-            stage = look.__name__[1:]
-            stage = {"track": "object_track", "body": "body_fit"}.get(stage, stage)
+        for stage, (read, schema, key) in _READERS.items():
             if not opened.has(stage):
                 continue
             try:
-                _same_recording(opened, stage, found["frames"])
-                rig = look(opened, found) or rig
+                _check_frames(opened, stage, schema, key, info["frames"])
+                rig = read(opened, info) or rig
             except UserError as error:  # another version, damaged, or of another recording
-                found["notes"].append(str(error))
+                info["notes"].append(str(error))
                 broken.add(stage)
-        found["cameras"] = _cameras(rig)
-        found["viewer"] = all(opened.has(stage) for stage in _VIEWER) and not broken & _DRAWN
+        info["cameras"] = _cameras(rig)
+        info["viewer"] = all(opened.has(stage) for stage in _VIEWER) and not broken & _DRAWN
         if not opened.has("joint"):
-            found["notes"].append(
-                "there is no joint result yet: "
-                + ("the sequential fits are shown" if found["viewer"] else "only images are shown")
-            )
+            shown = "the sequential fits" if info["viewer"] else "only images"
+            info["notes"].append(f"there is no joint result yet: {shown} are shown")
         recordings = opened.project.sequences[opened.name].recordings
         if not recordings.exists():
-            found["notes"].append(
+            info["notes"].append(
                 f"{recordings}: the recordings are missing; computed results can be viewed and "
                 "annotated, but a run that reads recordings fails until the table has their path"
             )
-        found["places"].sort(key=lambda place: -place["weight"])
-    return found
+        info["places"].sort(key=lambda place: -place["weight"])
+    return info
 
 
 def viewer_payload(opened: Opened) -> str:
@@ -125,7 +114,7 @@ def _final_result(
 def _data_of_page(opened: Opened) -> str:
     """Return the viewer's data of the site's page if it was made from these artefacts, else "".
 
-    This saves a minute for a long sequence.
+    Computing the data takes a minute for a long sequence.
     """
     page = opened.project.artefact(opened.name, "page")
     script, record = page / page_of.SCRIPT, read_manifest(page)
@@ -168,12 +157,14 @@ def object_payload(opened: Opened) -> str:
     return opened.cached("object", ("joint", "object_track"), make)
 
 
-def _same_recording(opened: Opened, stage: str, frames: int) -> None:
+def _check_frames(
+    opened: Opened, stage: str, schema: artefacts.Schema, key: str, frames: int
+) -> None:
     """Raise UserError if an artefact has another number of frames than the images.
 
-    This happens if the images were read again and the stage was not.
+    This happens if the images were read again and the stage was not run. ``key`` is a dataset of
+    the stage with a row per frame.
     """
-    schema, key = _LENGTHS[stage]
     with artefacts.read(opened.paths[stage], schema) as source:
         count = source.describe(key)[0][0]
     if count != frames:
@@ -183,33 +174,34 @@ def _same_recording(opened: Opened, stage: str, frames: int) -> None:
         )
 
 
-def _scene(opened: Opened, found: dict[str, Any]) -> Rig:
+def _scene(opened: Opened, info: dict[str, Any]) -> Rig:
     with artefacts.read(opened.paths["scene"], SCENE) as scene:
-        found["zup_from_master"] = scene["zup_from_master"][:3].tolist()
-        found["image_of"] = scene["image_of"].T.tolist()
+        info["zup_from_master"] = scene["zup_from_master"][:3].tolist()
+        info["image_of"] = scene["image_of"].T.tolist()
         point, normal = scene["ground_point"], scene["ground_normal"]
         if np.isfinite(point).all():
-            found["ground"] = {"point": point.tolist(), "normal": normal.tolist()}
+            info["ground"] = {"point": point.tolist(), "normal": normal.tolist()}
         return Rig.from_artefact(scene)
 
 
-def _person(opened: Opened, found: dict[str, Any]) -> None:
+def _person(opened: Opened, info: dict[str, Any]) -> None:
     with artefacts.read(opened.paths["person"], PERSON) as person:
-        found["subject"] = {
+        info["subject"] = {
             "chosen_by": str(person.attributes["chosen_by"]),
             "doubts": str(person.attributes["doubts"]),
             "others": int(person["others"].max(initial=0)),
         }
         missing = person["missing"]
-    found["places"] += _runs(missing, "subject", "fewer than two views see the subject", 1.0)
-    found["places"] += [
-        _place(one.first, one.last, "sides", one.words, 2.0, one.frame) for one in doubts(opened)
+    info["places"] += _runs(missing, "subject", "fewer than two views see the subject", 1.0)
+    info["places"] += [
+        _place(doubt.first, doubt.last, "sides", doubt.message, 2.0, doubt.frame)
+        for doubt in doubts(opened)
     ]
 
 
-def _track(opened: Opened, found: dict[str, Any]) -> None:
+def _track(opened: Opened, info: dict[str, Any]) -> None:
     with artefacts.read(opened.paths["object_track"], OBJECT_TRACK) as track:
-        found["track"] = {
+        info["track"] = {
             "object": str(track.attributes["object"]),
             "source": str(track.attributes["seed_source"]),
             "seed": int(track.attributes["seed_frame"]),
@@ -218,43 +210,43 @@ def _track(opened: Opened, found: dict[str, Any]) -> None:
             "ambiguous": np.flatnonzero(track["ambiguous"]).tolist(),
             "probability": _bytes(track["probability"]),
         }
-        if not found["track"]["object"]:
+        if not info["track"]["object"]:
             return
-        found["places"] += _runs(track["lost"], "object", "the object is lost", 3.0)
-        words = "the rotation of the object is ambiguous"
-        found["places"] += _runs(track["ambiguous"], "object", words, 2.0)
+        info["places"] += _runs(track["lost"], "object", "the object is lost", 3.0)
+        message = "the rotation of the object is ambiguous"
+        info["places"] += _runs(track["ambiguous"], "object", message, 2.0)
 
 
-def _body(opened: Opened, found: dict[str, Any]) -> None:
+def _body(opened: Opened, info: dict[str, Any]) -> None:
     with artefacts.read(opened.paths["body_fit"], BODY_FIT) as fit:
         failed = fit["failed"]
-    found["places"] += _runs(failed, "body", "the body fit failed", 2.5)
+    info["places"] += _runs(failed, "body", "the body fit failed", 2.5)
 
 
-def _joint(opened: Opened, found: dict[str, Any]) -> Rig | None:
+def _joint(opened: Opened, info: dict[str, Any]) -> Rig | None:
     with artefacts.read(opened.paths["joint"], JOINT) as joint:
         probability = joint["contact_probability"]
         if np.isfinite(probability).any():
-            found["contact"] = {
+            info["contact"] = {
                 "regions": joint.text("region_names"),
                 "probability": _bytes(probability),
                 "annotated": bool((joint["contact_annotated"] >= 0).any()),
             }
-        found["flags"] = ranges(joint.text("flag_reason"))
+        info["flags"] = ranges(joint.text("flag_reason"))
         moved = joint["master_from_colour"]
     if opened.has("scene"):
         return Rig.from_scene(opened.paths["scene"]).moved(moved)
     return None
 
 
-def _metrics(opened: Opened, found: dict[str, Any]) -> None:
+def _metrics(opened: Opened, info: dict[str, Any]) -> None:
     with artefacts.read(opened.paths["metrics"], METRICS) as metrics:
-        found["flags"] = ranges(metrics.text("flag_reason"))
+        info["flags"] = ranges(metrics.text("flag_reason"))
         if "verdict/error" in metrics:
             parts = metrics.text("verdict/part_names")
             error, by_frame = metrics["verdict/error"], metrics["verdict/error_frame"]
             silent = metrics.text("verdict/silent")
-            found["verdict"] = [
+            info["verdict"] = [
                 {
                     "part": part,
                     "mm": None if not np.isfinite(error[p]) else round(1e3 * float(error[p]), 1),
@@ -265,36 +257,48 @@ def _metrics(opened: Opened, found: dict[str, Any]) -> None:
                 for p, part in enumerate(parts)
             ]  # fmt: skip
             for p, part in enumerate(parts):
-                found["places"] += _doubted(part, float(error[p]), by_frame[p])
-    for first, last, reason in found["flags"]:
-        found["places"].append(_place(first, last, "flag", f"flagged: {reason}", 1.5))
+                info["places"] += _doubtful(part, float(error[p]), by_frame[p])
+    for first, last, reason in info["flags"]:
+        info["places"].append(_place(first, last, "flag", f"flagged: {reason}", 1.5))
 
 
-def _doubted(part: str, error: float, by_frame: np.ndarray) -> Iterator[dict[str, Any]]:
+_Reader = Callable[[Opened, dict[str, Any]], Rig | None]
+# Reader of each stage, schema, and a dataset with a row per frame
+_READERS: dict[str, tuple[_Reader, artefacts.Schema, str]] = {
+    "scene": (_scene, SCENE, "times"),
+    "person": (_person, PERSON, "missing"),
+    "object_track": (_track, OBJECT_TRACK, "lost"),
+    "body_fit": (_body, BODY_FIT, "failed"),
+    "joint": (_joint, JOINT, "flagged"),
+    "metrics": (_metrics, METRICS, "flagged"),
+}
+
+
+def _doubtful(part: str, error: float, by_frame: np.ndarray) -> Iterator[dict[str, Any]]:
     """Return runs of frames with a stated error well above the sequence's, at their worst frame."""
     if not np.isfinite(error):
         return
-    high = np.nan_to_num(by_frame) > DOUBTED * error
-    for first, last, _ in ranges(["x" if one else "" for one in high]):
+    high = np.nan_to_num(by_frame) > DOUBTFUL * error
+    for first, last, _ in ranges(["x" if value else "" for value in high]):
         worst = first + int(np.nanargmax(by_frame[first : last + 1]))
         ratio = float(by_frame[worst] / error)
-        words = f"the verdict states {1e3 * by_frame[worst]:.0f} mm for the {part} here"
-        yield _place(first, last, "verdict", words, min(ratio, 3.0), worst)
+        message = f"the verdict states {1e3 * by_frame[worst]:.0f} mm for the {part} here"
+        yield _place(first, last, "verdict", message, min(ratio, 3.0), worst)
 
 
-def _runs(mask: np.ndarray, kind: str, words: str, weight: float) -> list[dict[str, Any]]:
-    runs = ranges([words if one else "" for one in mask])
-    return [_place(first, last, kind, words, weight) for first, last, _ in runs]
+def _runs(mask: np.ndarray, kind: str, message: str, weight: float) -> list[dict[str, Any]]:
+    runs = ranges([message if value else "" for value in mask])
+    return [_place(first, last, kind, message, weight) for first, last, _ in runs]
 
 
 def _place(
-    first: int, last: int, kind: str, words: str, weight: float, frame: int | None = None
+    first: int, last: int, kind: str, message: str, weight: float, frame: int | None = None
 ) -> dict[str, Any]:
     """Return a run of frames to check, and the frame to show."""
     middle = (first + last) // 2 if frame is None else frame
     return {
         "first": int(first), "last": int(last), "frame": int(middle), "kind": kind,
-        "words": words, "weight": round(weight * float(np.log2(2 + last - first)), 3),
+        "message": message, "weight": round(weight * float(np.log2(2 + last - first)), 3),
     }  # fmt: skip
 
 

@@ -82,7 +82,7 @@ def serve(
             uvicorn.Server(options).run(sockets=[listening])
         finally:
             annotator.runs.stop()
-            if annotator.runs.going_on:
+            if annotator.runs.in_progress:
                 say(f"the run of {annotator.runs.sequence} is ending; finished results are kept")
                 annotator.runs.wait()
 

@@ -1,6 +1,6 @@
 """HTTP server of the annotation page, and its protection.
 
-Login nodes are shared: other users can reach ports of the loopback address, and web pages can send
+On shared login nodes, other users can reach ports of the loopback address, and web pages can send
 requests to them from the annotator's browser. Each request therefore carries a token in a header,
 which other pages cannot set. Requests to another host or from another origin are refused.
 """
@@ -24,14 +24,16 @@ from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from intercap_core.annotate import before, document, result, sides
-from intercap_core.annotate.annotator import Annotator, document_to_json
-from intercap_core.annotate.opened import Opened
+from intercap_core.annotate import document, result, sides
+from intercap_core.annotate.annotator import Annotator
+from intercap_core.annotate.opened import Opened, read_jpeg
 from intercap_core.errors import UserError
 from intercap_core.output.viewer.page import DATA as VIEWER
 
 PAGE = Path(__file__).parent / "page"
-_KEEP = {"cache-control": "private, max-age=86400, immutable"}  # for addresses that contain a stamp
+_CACHED = {
+    "cache-control": "private, max-age=86400, immutable"
+}  # for addresses that contain a stamp
 
 
 def application(annotator: Annotator, token: str) -> App:
@@ -44,21 +46,21 @@ def application(annotator: Annotator, token: str) -> App:
         at = request.path_params
         width = int(request.query_params.get("width", "0") or 0)
         opened = annotator.opened(at["name"])
-        data = annotator.pictures.jpeg(opened, at["camera"], at["frame"], width or 1 << 20)
+        data = read_jpeg(opened, at["camera"], at["frame"], width or 1 << 20)
         if data is None:
             raise HTTPException(404, "there is no image")
         kind = "image/png" if data[:4] == b"\x89PNG" else "image/jpeg"
-        return Response(data, media_type=kind, headers=_KEEP)
+        return Response(data, media_type=kind, headers=_CACHED)
 
-    def arrays(made: Callable[[Opened], str]) -> Callable[[Request], Response]:
+    def arrays(make: Callable[[Opened], str]) -> Callable[[Request], Response]:
         def endpoint(request: Request) -> Response:
             version = request.query_params.get("version", "now")
-            data = base64.b64decode(made(annotator.opened(request.path_params["name"], version)))
-            return Response(data, media_type="application/octet-stream", headers=_KEEP)
+            data = base64.b64decode(make(annotator.opened(request.path_params["name"], version)))
+            return Response(data, media_type="application/octet-stream", headers=_CACHED)
 
         return endpoint
 
-    def look(function: Callable[[str], Any]) -> Callable[[Request], Response]:
+    def read(function: Callable[[str], Any]) -> Callable[[Request], Response]:
         def endpoint(request: Request) -> Response:
             name = request.path_params["name"]
             annotator.opened(name)
@@ -82,25 +84,22 @@ def application(annotator: Annotator, token: str) -> App:
 
         return endpoint
 
-    def compare(name: str) -> dict[str, Any]:
-        return before.compare(annotator.project, name)
-
     of = "/api/sequences/{name}"
-    squeezed = [Middleware(GZipMiddleware, compresslevel=6)]
+    compressed = [Middleware(GZipMiddleware, compresslevel=6)]
     routes = [
         Route("/", page),
         Route("/sequence/{name}", page),
         Mount("/page", GZipMiddleware(StaticFiles(directory=PAGE), compresslevel=6)),
         Mount("/viewer", GZipMiddleware(StaticFiles(directory=VIEWER), compresslevel=6)),
-        Route("/api/sequences", lambda _: _json(annotator.sequences()), middleware=squeezed),
-        Route(of, look(annotator.sequence), middleware=squeezed),
-        Route(f"{of}/annotation", look(annotator.annotation)),
-        Route(f"{of}/state", look(annotator.state)),
-        Route(f"{of}/questions", look(annotator.questions)),
-        Route(f"{of}/run", look(annotator.run_state), methods=["GET"]),
-        Route(f"{of}/beside", look(compare)),
-        Route(f"{of}/surface", look(annotator.read_surface), methods=["GET"]),
-        Route(f"{of}/symmetry", look(annotator.read_symmetry), methods=["GET"]),
+        Route("/api/sequences", lambda _: _json(annotator.sequences()), middleware=compressed),
+        Route(of, read(annotator.sequence), middleware=compressed),
+        Route(f"{of}/annotation", read(annotator.annotation)),
+        Route(f"{of}/state", read(annotator.state)),
+        Route(f"{of}/questions", read(annotator.questions)),
+        Route(f"{of}/run", read(annotator.run_state), methods=["GET"]),
+        Route(f"{of}/comparison", read(annotator.compare)),
+        Route(f"{of}/surface", read(annotator.read_surface), methods=["GET"]),
+        Route(f"{of}/symmetry", read(annotator.read_symmetry), methods=["GET"]),
         Route(f"{of}/image/{{camera}}/{{frame:int}}", image),
         Route(f"{of}/viewer", arrays(result.viewer_payload)),
         Route(f"{of}/object", arrays(result.object_payload)),
@@ -123,7 +122,7 @@ def application(annotator: Annotator, token: str) -> App:
 
 
 def _changed(_: Request, error: Any) -> Response:
-    content = {"error": str(error), "now": document_to_json(error.now)}
+    content = {"error": str(error), "now": error.now.to_json()}
     return _json(content | {"difference": error.difference}, 409)
 
 

@@ -25,13 +25,9 @@ POINTS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle", "big_toe")  # of
 BONES = ((0, 1), (1, 2), (3, 4), (4, 5), (5, 6))
 # Difference of negative log likelihoods of the build, tuned on the studio: correct bodies stay
 # below 2, mirrored bodies exceed 2.5 in two of three frames.
-AGAINST_BUILD = 2.5
-MOST_VIEWS = 0.5  # share of the views of a limb from which an exchange contradicts the detector
-WEIGHT = 3.0  # of an exchange in all views, relative to AGAINST_BUILD's scale
-JOINED = 3  # doubtful frames with at most this many frames between are one run
+MIRRORED_BUILD = 2.5
 _KEYPOINTS = [KEYPOINT_NAMES.index(f"{s}_{p}") for s in ("left", "right") for p in POINTS]
 _JOINTS = [JOINT_INDEX[f"{s}_{p}"] for s in ("left", "right") for p in (*POINTS[:-1], "foot")]
-_NOWHERE = -1
 _STAGES = ("detections", "scene", "person", "joint", "body_fit")
 
 
@@ -66,7 +62,7 @@ class Doubt:
     """Frame to look at."""
     camera: str
     """Camera with most exchanged sides."""
-    words: str
+    message: str
 
 
 def sides_of(opened: Opened) -> Sides:
@@ -128,10 +124,10 @@ def _sides(opened: Opened) -> Sides:
     confident = opened.project.config.person.min_confidence
     limbs = np.stack([_exchanged(given, used, limb, confident) for limb in (ARMS, LEGS)], 2)
     points = given[:, :, _KEYPOINTS]
-    pixels = np.where(points[..., 2:] >= confident, np.rint(points[..., :2]), _NOWHERE)
+    pixels = np.where(points[..., 2:] >= confident, np.rint(points[..., :2]), -1)
     source, result, jumped = _result(opened, joints)
     return Sides(
-        cameras, np.clip(pixels, _NOWHERE, 32767).astype(np.int16), limbs, result, source,
+        cameras, np.clip(pixels, -1, 32767).astype(np.int16), limbs, result, source,
         excess_build_cost(joints.astype(np.float64)), jumped, image_of,
     )  # fmt: skip
 
@@ -140,10 +136,10 @@ def _exchanged(
     given: np.ndarray, used: np.ndarray, limb: np.ndarray, confident: float
 ) -> np.ndarray:
     """Return whether a limb (T, C) was exchanged: 1 yes, 0 no, -1 not visible."""
-    own, as_found, other = used[:, :, limb], given[:, :, limb], swap_sides(given)[:, :, limb]
-    seen = (as_found[..., 2] >= confident).any(2)
-    exchanged = (own == other).all((2, 3)) & (own != as_found).any((2, 3))
-    return np.where(seen, exchanged.astype(int), -1)
+    result, detected, swapped = used[:, :, limb], given[:, :, limb], swap_sides(given)[:, :, limb]
+    visible = (detected[..., 2] >= confident).any(2)
+    exchanged = (result == swapped).all((2, 3)) & (result != detected).any((2, 3))
+    return np.where(visible, exchanged.astype(int), -1)
 
 
 def _result(opened: Opened, joints: np.ndarray) -> tuple[str, np.ndarray, np.ndarray]:
@@ -151,35 +147,36 @@ def _result(opened: Opened, joints: np.ndarray) -> tuple[str, np.ndarray, np.nda
     for stage, schema in (("joint", JOINT), ("body_fit", BODY_FIT)):
         try:
             with artefacts.read(opened.paths[stage], schema) as body:
-                found = body["joints"]
+                refined = body["joints"]
         except artefacts.Unreadable:
             continue
-        if len(found) == len(joints):
-            return stage, found[:, _JOINTS], np.any(list(exchanged(found).values()), 0)
+        if len(refined) == len(joints):
+            return stage, refined[:, _JOINTS], np.any(list(exchanged(refined).values()), 0)
     return "person", joints[:, _KEYPOINTS], np.zeros(len(joints), bool)
 
 
 def _runs(limbs: np.ndarray, sides: Sides) -> list[Doubt]:
+    """Return runs of doubtful frames; ``limbs`` (T, C, 2) as :attr:`Sides.exchanged`."""
     against, jumped = sides.against, sides.jumped
-    seen = (limbs >= 0).sum(1)
-    share = (limbs > 0).sum(1) / np.maximum(seen, 1)  # (T, 2)
-    contradicted = ((seen > 1) & (share >= MOST_VIEWS)).any(1)
-    doubted = contradicted | (against >= AGAINST_BUILD) | jumped
-    for before, after in pairwise(np.flatnonzero(doubted).tolist()):
-        if after - before <= JOINED + 1:
-            doubted[before:after] = True
-    found = []
-    for first, last, _ in ranges(["x" if one else "" for one in doubted]):
+    visible = (limbs >= 0).sum(1)
+    share = (limbs > 0).sum(1) / np.maximum(visible, 1)  # (T, 2)
+    contradicted = ((visible > 1) & (share >= 0.5)).any(1)
+    doubtful = contradicted | (against >= MIRRORED_BUILD) | jumped
+    for before, after in pairwise(np.flatnonzero(doubtful).tolist()):
+        if after - before <= 4:  # at most three frames between are part of the run
+            doubtful[before:after] = True
+    runs = []
+    for first, last, _ in ranges(["x" if value else "" for value in doubtful]):
         run = slice(first, last + 1)
         why = []
         if contradicted[run].any():
             why.append("the detector is contradicted in half of the views or more")
-        if (against[run] >= AGAINST_BUILD).any():
+        if (against[run] >= MIRRORED_BUILD).any():
             why.append("knees, feet or head suit exchanged sides better")
         if jumped[run].any():
             why.append("the body's limbs jump to the other side and back")
-        worst = first + int((against[run] + WEIGHT * share[run].max(1)).argmax())
+        worst = first + int((against[run] + 3.0 * share[run].max(1)).argmax())
         most = int((limbs[run] > 0).sum((0, 2)).argmax())
-        words = f"left and right: {'; '.join(why)}"
-        found.append(Doubt(first, last, worst, sides.cameras[most], words))
-    return found
+        message = f"left and right: {'; '.join(why)}"
+        runs.append(Doubt(first, last, worst, sides.cameras[most], message))
+    return runs

@@ -1,9 +1,9 @@
-"""Fit of the object's pose in one frame, started by the annotator; and 3D points at pixels."""
+"""Fit of the object's pose in one frame, started by the annotator, and 3D points at pixels."""
 
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -26,28 +26,6 @@ from intercap_core.object_track.view import FitContext, View
 from intercap_core.schemas import SCENE
 
 NEEDED = ("frames", "detections", "scene", "person")
-REACH_DIAMETERS = (0.35, 0.7, 1.2)  # distances of other starts, in diameters of the object
-FITTED_AROUND = 4  # number of other starts that are fitted
-NEAR_PX = 5.0  # largest distance of a depth point from a click, in the colour image
-SAME_SURFACE_M = 0.03  # depth range of points that count as the clicked surface
-
-
-@dataclass(frozen=True)
-class Snapped:
-    """A fitted pose master_from_object, as the annotation stores it."""
-
-    rotation_vector: list[float]
-    """Radians."""
-    translation: list[float]
-    """Metres."""
-    overlap: float
-    """Mean IoU over ``views``."""
-    views: int
-    """Number of views that show the object."""
-    seen: bool
-    """The images support the pose."""
-    moved_m: float
-    turned_rad: float
 
 
 def snap(
@@ -56,8 +34,14 @@ def snap(
     frame: int,
     rotation_vector: list[float],
     translation: list[float],
-) -> Snapped:
+) -> dict[str, Any]:
     """Fit the pose of a frame to depth and masks of all views, from this start.
+
+    Returns, for JSON:
+        ``rotation_vector``, ``translation``: master_from_object, radians and metres.
+        ``overlap``: mean IoU over the ``views`` (number) that show the object.
+        ``seen``: the images support the pose.
+        ``moved_m``, ``turned_rad``: difference to the start.
 
     Raises UserError if a result of an earlier stage is missing.
     """
@@ -82,15 +66,15 @@ def snap(
     fit = _fitted(mesh, views, start, settings, entry.labels)
     turned = Rotation.from_matrix(fit.pose[:3, :3] @ start[:3, :3].T).magnitude()
     middle = mesh.centre_at(fit.pose) - mesh.centre_at(start)
-    return Snapped(
-        Rotation.from_matrix(fit.pose[:3, :3]).as_rotvec().round(6).tolist(),
-        fit.pose[:3, 3].round(5).tolist(),
-        round(fit.mean_overlap, 3),
-        fit.support,
-        bool(fit.log_ratio > SEEN_LOG_RATIO),
-        round(float(np.linalg.norm(middle)), 5),
-        round(float(turned), 5),
-    )
+    return {
+        "rotation_vector": Rotation.from_matrix(fit.pose[:3, :3]).as_rotvec().round(6).tolist(),
+        "translation": fit.pose[:3, 3].round(5).tolist(),
+        "overlap": round(fit.mean_overlap, 3),
+        "views": fit.support,
+        "seen": bool(fit.log_ratio > SEEN_LOG_RATIO),
+        "moved_m": round(float(np.linalg.norm(middle)), 5),
+        "turned_rad": round(float(turned), 5),
+    }
 
 
 def _fitted(
@@ -117,12 +101,13 @@ def _fitted(
     steps = np.array(list(itertools.product((-1, 0, 1), repeat=3)), float)
     steps = steps[np.abs(steps).sum(1) > 0]
     steps /= np.linalg.norm(steps, axis=1, keepdims=True)
-    around = np.repeat(start[None], len(steps) * len(REACH_DIAMETERS), 0)
-    shifts = [mesh.diameter * far * steps for far in REACH_DIAMETERS]
-    around[:, :3, 3] += np.concatenate(shifts)
-    seen = assess_all(context, views, around)
-    order = np.argsort([-one.log_ratio for one in seen], kind="stable")[:FITTED_AROUND]
-    return max([best, *(fitted(around[k]) for k in order)], key=lambda one: one.log_ratio)
+    shifts = np.concatenate([mesh.diameter * distance * steps for distance in (0.35, 0.7, 1.2)])
+    around = np.repeat(start[None], len(shifts), 0)
+    around[:, :3, 3] += shifts
+    assessed = assess_all(context, views, around)
+    most_likely = np.argsort([-fit.log_ratio for fit in assessed], kind="stable")[:4]
+    fits = [best, *(fitted(around[k]) for k in most_likely)]
+    return max(fits, key=lambda fit: fit.log_ratio)
 
 
 def point_under(opened: Opened, camera: str, frame: int, x: float, y: float) -> list[float]:
@@ -152,10 +137,10 @@ def point_under(opened: Opened, camera: str, frame: int, x: float, y: float) -> 
         points = master_points(depth, rig[c]).points.astype(np.float64)
         seen = apply(rig[c].colour_from_master, points)
         away = np.linalg.norm(lens.project(seen) - pixel, axis=1)
-        near = np.flatnonzero((away < NEAR_PX) & lens.inside_model(seen))
+        near = np.flatnonzero((away < 5.0) & lens.inside_model(seen))
         if len(near):
             ahead = seen[near, 2]
-            kept = near[ahead < ahead.min() + SAME_SURFACE_M]
+            kept = near[ahead < ahead.min() + 0.03]  # points within 30 mm are one surface
             middle = np.median(seen[kept], axis=0)
             middle *= 1 - float(np.nan_to_num(bias[c])) / middle[2]
             return apply(rig[c].master_from_colour, middle[None])[0].round(4).tolist()

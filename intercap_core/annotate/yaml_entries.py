@@ -2,13 +2,11 @@
 
 Each entry keeps its comments: those on its lines, indented below it, or directly above it. A
 comment that a blank line separates from the entry below stands alone, as do comments above the
-whole list.
+whole list. Lines have no line ends.
 """
 
 from __future__ import annotations
 
-import difflib
-import json
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,14 +14,13 @@ from typing import Any
 
 import yaml
 
-# Keys that identify an entry of a list, and numbers in it that may change
-_IDENTITY: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "contact": (("part",), ("start", "end")),
-    "left_right": (("camera",), ("start", "end")),
-    "object_poses": (("frame",), ()),
-    "subject": (("camera", "frame"), ()),
+# Keys that identify an entry of a list; a missing frame is frame 0
+_IDENTITY = {
+    "contact": ("part",),
+    "left_right": ("camera",),
+    "object_poses": ("frame",),
+    "subject": ("camera", "frame"),
 }
-_DEFAULT = {"frame": 0}
 
 
 class UnsupportedLayout(ValueError):
@@ -31,7 +28,7 @@ class UnsupportedLayout(ValueError):
 
 
 @dataclass(frozen=True)
-class Entry:
+class EntryLines:
     """Lines of an entry of a list or mapping."""
 
     standalone: list[str]
@@ -42,30 +39,13 @@ class Entry:
 
 
 @dataclass(frozen=True)
-class Entries:
+class SectionLines:
     """Lines of a section."""
 
     header: list[str]
     """Down to the first entry."""
-    entries: list[Entry]
+    entries: list[EntryLines]
     tail: list[str]
-
-
-def equal_values(a: Any, b: Any) -> bool:
-    """Compare two values of YAML or JSON; 1.0 equals 1, because JavaScript has one number type."""
-    return _canonical(a) == _canonical(b)
-
-
-def _canonical(value: Any) -> str:
-    return json.dumps(_integral(value), sort_keys=True, default=str)
-
-
-def _integral(value: Any) -> Any:
-    if isinstance(value, float) and value.is_integer():
-        return int(value)
-    if isinstance(value, Mapping):
-        return {str(k): _integral(v) for k, v in value.items()}
-    return [_integral(v) for v in value] if isinstance(value, list | tuple) else value
 
 
 def comment_columns(text: str) -> dict[int, int]:
@@ -91,16 +71,15 @@ def comments(text: str) -> list[str]:
     return sorted(lines[n][column:].rstrip() for n, column in comment_columns(text).items())
 
 
-def split_entries(lines: Sequence[str], node: yaml.CollectionNode) -> Entries:
+def split_entries(lines: Sequence[str], node: yaml.CollectionNode) -> SectionLines:
     """Split a section whose value is the block list or mapping ``node``."""
-    text = "".join(lines)
+    text = "\n".join(lines)
     if isinstance(node, yaml.MappingNode):
         marks = [key.start_mark for key, _ in node.value]
     else:
         marks = [t.start_mark for t in yaml.scan(text) if isinstance(t, yaml.BlockEntryToken)]
     column = marks[0].column
-    marks = [mark for mark in marks if mark.column == column]
-    starts = [mark.line for mark in marks]
+    starts = [mark.line for mark in marks if mark.column == column]
     own_line = all(not lines[k][:column].strip() for k in starts)
     if not own_line or len(starts) != len(node.value) or len(set(starts)) < len(starts):
         raise UnsupportedLayout
@@ -124,12 +103,12 @@ def split_entries(lines: Sequence[str], node: yaml.CollectionNode) -> Entries:
             end -= 1
         while end < last and end in comment_lines and columns[end] > column:  # indented below
             end += 1
-        entries.append(Entry(standalone, lead, list(lines[first:end])))
+        entries.append(EntryLines(standalone, lead, list(lines[first:end])))
         standalone, lead = gap(end, last)
-    return Entries(header, entries, standalone + lead)
+    return SectionLines(header, entries, standalone + lead)
 
 
-def join_entries(old: Entries, new: Sequence[tuple[int | None, list[str]]], end: str) -> list[str]:
+def join_entries(old: SectionLines, new: Sequence[tuple[int | None, list[str]]]) -> list[str]:
     """Join the lines of a section with other entries.
 
     A removed entry takes its comments along. A comment above it stays if it may be a heading, of
@@ -140,21 +119,18 @@ def join_entries(old: Entries, new: Sequence[tuple[int | None, list[str]]], end:
     """
     place = {k: j for j, (k, _) in enumerate(new) if k is not None}
     header = list(old.header)
-    kept: defaultdict[int, list[str]] = defaultdict(list)  # by the new entry below
+    kept: defaultdict[int, list[str]] = defaultdict(list)  # by the new entry below, -1 = the end
     for k, entry in enumerate(old.entries):
         if k in place:
             continue
         remaining = list(entry.standalone)
         if entry.lead and (k == 0 or any(i in place for i in _directly_below(old.entries, k))):
-            remaining += [*entry.lead, end]
-        if k == 0:
-            header += remaining
-        else:
-            below = next((place[i] for i in range(k, len(old.entries)) if i in place), -1)
-            kept[below] += remaining
+            remaining += [*entry.lead, ""]
+        below = next((place[i] for i in range(k, len(old.entries)) if i in place), -1)
+        (header if k == 0 else kept[below]).extend(remaining)
     lines = header
     for j, (known, own) in enumerate(new):
-        entry = Entry([], [], own) if known is None else old.entries[known]
+        entry = EntryLines([], [], own) if known is None else old.entries[known]
         lines = _append(_append(lines, kept[j]), entry.standalone) + entry.lead + own
     lines = _append(_append(lines, kept[-1]), old.tail)
     while not old.tail and not lines[-1].strip():
@@ -162,7 +138,7 @@ def join_entries(old: Entries, new: Sequence[tuple[int | None, list[str]]], end:
     return lines
 
 
-def _directly_below(entries: Sequence[Entry], k: int) -> list[int]:
+def _directly_below(entries: Sequence[EntryLines], k: int) -> list[int]:
     """Return the entries that follow entry ``k`` without lines between them."""
     below = []
     for i in range(k + 1, len(entries)):
@@ -182,45 +158,37 @@ def _append(lines: list[str], more: list[str]) -> list[str]:
 def match_entries(section: str, old: Sequence[Any], new: Sequence[Any]) -> list[int | None]:
     """Return for each new entry of a list the index of its old entry, None if it is new.
 
-    Equal entries match first, in order and then moved; then the nearest of the same identity.
+    Equal entries match first, then the nearest intervals of the same identity.
     """
-    a, b = [_canonical(entry) for entry in old], [_canonical(entry) for entry in new]
-    match: dict[int, int] = {}
-    for block in difflib.SequenceMatcher(None, a, b, autojunk=False).get_matching_blocks():
-        match |= {block.b + i: block.a + i for i in range(block.size)}
-    moved: defaultdict[str, list[int]] = defaultdict(list)
-    for k in sorted(set(range(len(old))) - set(match.values()), reverse=True):
-        moved[a[k]].append(k)
-    for j, text in enumerate(b):
-        if j not in match and moved[text]:
-            match[j] = moved[text].pop()
-    keys, numbers = _IDENTITY.get(section, ((), ()))
-    left = set(range(len(old))) - set(match.values())
+    left = list(range(len(old)))
+    matches: list[int | None] = []
+    for entry in new:
+        match = next((k for k in left if old[k] == entry), None)
+        matches.append(match)
+        if match is not None:
+            left.remove(match)
+    keys = _IDENTITY.get(section, ())
     pairs = sorted(
-        (_distance(old[k], new[j], numbers), j, k)
-        for j in sorted(set(range(len(new))) - set(match))
-        for k in sorted(left)
-        if keys and _same_identity(old[k], new[j], keys)
+        (_distance(old[k], new[j]), j, k)
+        for j, match in enumerate(matches)
+        for k in left
+        if match is None and keys and _same_identity(old[k], new[j], keys)
     )
     for _, j, k in pairs:
-        if j not in match and k in left:
-            match[j] = k
+        if matches[j] is None and k in left:
+            matches[j] = k
             left.remove(k)
-    return [match.get(j) for j in range(len(new))]
+    return matches
 
 
 def _same_identity(a: Any, b: Any, keys: Sequence[str]) -> bool:
     if not isinstance(a, Mapping) or not isinstance(b, Mapping):
         return False
-    return all(
-        equal_values(a.get(key, _DEFAULT.get(key)), b.get(key, _DEFAULT.get(key))) for key in keys
+    return all(a.get(key, 0) == b.get(key, 0) for key in keys)
+
+
+def _distance(a: Mapping[str, Any], b: Mapping[str, Any]) -> float:
+    pairs = [(a.get(key), b.get(key)) for key in ("start", "end")]
+    return sum(
+        abs(x - y) for x, y in pairs if isinstance(x, int | float) and isinstance(y, int | float)
     )
-
-
-def _distance(a: Mapping[str, Any], b: Mapping[str, Any], numbers: Sequence[str]) -> float:
-    distance = 0.0
-    for key in numbers:
-        x, y = a.get(key), b.get(key)
-        numeric = isinstance(x, int | float) and isinstance(y, int | float)
-        distance += abs(x - y) if numeric else 1e9  # type: ignore[operator]
-    return distance

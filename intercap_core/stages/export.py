@@ -20,7 +20,7 @@ from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.output.export import body_files, bop, coco, contact, glb, meshes, parameters
-from intercap_core.output.export.about import About, BodyFile, Deviations, Verdict
+from intercap_core.output.export.about import About, Deviations, ExportBody, Verdict
 from intercap_core.output.export.body_files import WrittenBody
 from intercap_core.output.export.contact import ContactVertices, StatedContact
 from intercap_core.output.export.motion import Coordinates, Motion, read_motion, z_up_frame
@@ -134,7 +134,7 @@ def _about(paths: SequencePaths, motion: Motion, mesh: ObjectMesh | None) -> Abo
         )
     return About(
         motion.sequence,
-        BodyFile.of(motion.model, motion.gender),
+        ExportBody.of(motion.model, motion.gender),
         [str(reason) for reason in measured.values["flag_reason"]],
         None if mesh is None else StatedContact.read(paths.joint),
         Verdict.of(measured),

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -34,7 +35,7 @@ from intercap_core.output.site.overlays import (
     overlays,
 )
 from intercap_core.output.site.sequence_page import SequenceContent, ViewerParts, page
-from intercap_core.output.site.track_section import TrackFacts, read_track
+from intercap_core.output.site.track_section import read_track
 from intercap_core.output.viewer import page as viewer
 from intercap_core.schemas import JOINT, OBJECT_TRACK, SCENE
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
@@ -176,7 +177,7 @@ def _closeups(
     return [closeup(handling, hold) for hold in holds(handling.probability)[:_MAX_CLOSEUPS]]
 
 
-def _track(paths: SequencePaths, entry: ObjectEntry) -> TrackFacts:
+def _track(paths: SequencePaths, entry: ObjectEntry) -> dict[str, Any]:
     with artefacts.read(paths.scene, SCENE) as scene:
         detections = Detections.load(paths.detections).showing(scene["image_of"])
     detections = detections.with_candidates_of(paths.person)

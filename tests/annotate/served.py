@@ -88,8 +88,8 @@ class Served:
         assert status == 200, body
         return json.loads(body)
 
-    def post(self, path: str, told: Any) -> tuple[int, Any]:
-        status, body = self._ask(f"/api/{path}", json.dumps(told).encode(), {})
+    def post(self, path: str, content: Any) -> tuple[int, Any]:
+        status, body = self._ask(f"/api/{path}", json.dumps(content).encode(), {})
         return status, json.loads(body)
 
     def _ask(self, path: str, data: bytes | None, headers: dict[str, str]) -> tuple[int, bytes]:

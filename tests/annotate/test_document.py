@@ -103,23 +103,23 @@ def test_other_layouts_are_understood_or_left_alone(path: Path, text: str) -> No
     assert ("\r\n" in new) == ("\r\n" in text)
 
 
-def test_a_broken_file_is_named_and_never_written(path: Path) -> None:
+def test_an_invalid_file_is_reported_and_not_written(path: Path) -> None:
     path.write_text("contact: [\n")
-    found = document.read(path)
-    assert str(path) in found.problem and "line" in found.problem
+    file = document.read(path)
+    assert str(path) in file.problem and "line" in file.problem
     with pytest.raises(UserError, match="not valid YAML"):
-        document.patched(found, {"drop_frames": [1]})
+        document.patched(file, {"drop_frames": [1]})
 
 
 def test_faults_are_those_of_the_settings_model() -> None:
     faults = document.faults(
         {"contact": [{"part": "tail", "start": 5, "end": 2}], "floor": [[0, 0, 1]]}
     )
-    assert {one["where"] for one in faults} >= {"contact.0.part"}
+    assert {fault["where"] for fault in faults} >= {"contact.0.part"}
     assert not document.faults({"contact": [{"part": "any", "start": 1, "end": 2}]})
 
 
-def test_a_second_annotators_change_is_shown_and_kept(path: Path) -> None:
+def test_a_change_of_another_annotator_is_kept(path: Path) -> None:
     path.write_text(WRITTEN)
     mine = document.read(path)
     theirs = WRITTEN.replace("[3, 4]", "[3, 4, 5]")
@@ -131,7 +131,7 @@ def test_a_second_annotators_change_is_shown_and_kept(path: Path) -> None:
     assert refused.value.now.sections["drop_frames"] == [3, 4, 5]
 
 
-def test_a_file_that_came_meanwhile_is_not_overwritten(path: Path) -> None:
+def test_a_new_file_of_another_annotator_is_kept(path: Path) -> None:
     nothing = document.read(path)
     path.write_text("drop_frames: [1]\n")
     with pytest.raises(document.Changed):
@@ -140,11 +140,11 @@ def test_a_file_that_came_meanwhile_is_not_overwritten(path: Path) -> None:
 
 
 @pytest.mark.parametrize("cut_off_in", ["fsync", "replace"])
-def test_a_save_that_is_cut_off_leaves_the_file_as_it_was(
+def test_an_interrupted_save_leaves_the_file_unchanged(
     path: Path, monkeypatch: pytest.MonkeyPatch, cut_off_in: str
 ) -> None:
     path.write_text(WRITTEN)
-    found = document.read(path)
+    file = document.read(path)
 
     def cut_off(*_: object) -> None:
         raise KeyboardInterrupt
@@ -153,13 +153,13 @@ def test_a_save_that_is_cut_off_leaves_the_file_as_it_was(
         patch.setattr(os, cut_off_in, cut_off)
         patch.setattr(Path, "unlink", lambda *_, **__: None)  # a killed process clears nothing
         with pytest.raises(KeyboardInterrupt):
-            document.save(found, "drop_frames: [2]\n")
+            document.save(file, "drop_frames: [2]\n")
     assert path.read_text() == WRITTEN
     again = document.read(path)
-    assert "interrupted" in again.note and again.digest == found.digest
+    assert "interrupted" in again.note and again.digest == file.digest
     saved = document.save(again, "drop_frames: [2]\n")
     assert path.read_text() == "drop_frames: [2]\n" and not saved.note
-    assert [one.name for one in path.parent.iterdir()] == [path.name]
+    assert [fault.name for fault in path.parent.iterdir()] == [path.name]
 
 
 def test_a_link_and_its_permissions_stay(tmp_path: Path) -> None:
@@ -173,7 +173,7 @@ def test_a_link_and_its_permissions_stay(tmp_path: Path) -> None:
     assert real.stat().st_mode & 0o777 == 0o640
 
 
-def test_dropping_frames_leaves_intervals_where_they_are_in_time(path: Path) -> None:
+def test_dropping_frames_does_not_move_intervals(path: Path) -> None:
     """A dropped frame keeps its number, so that nothing else of the annotation moves."""
     new = _patched(path, WRITTEN, drop_frames=[0, 1, 2, 3, 4])
     assert yaml.safe_load(new)["contact"] == yaml.safe_load(WRITTEN)["contact"]
@@ -186,15 +186,15 @@ def test_dropping_frames_leaves_intervals_where_they_are_in_time(path: Path) -> 
         "subject: [{camera: \"\\ud800\", x: 1, y: 2}]\n", "starts: {k1: .inf, k2: 0}\n",
     ],
 )  # fmt: skip
-def test_values_that_no_page_can_be_told_are_said_and_never_written(path: Path, text: str) -> None:
+def test_values_without_json_form_are_reported_not_written(path: Path, text: str) -> None:
     path.write_text(text)
-    found = document.read(path)
-    assert str(path) in found.problem and "correct it in an editor" in found.problem
+    file = document.read(path)
+    assert str(path) in file.problem and "correct it in an editor" in file.problem
     with pytest.raises(UserError, match="correct it in an editor"):
-        document.patched(found, {"drop_frames": [1]})
+        document.patched(file, {"drop_frames": [1]})
 
 
-def test_an_alias_of_what_is_taken_away_is_left_to_an_editor(path: Path) -> None:
+def test_removing_an_aliased_value_is_refused(path: Path) -> None:
     text = (
         "floor:\n  - &p [0, 0, 1]\n  - [1, 0, 1]\n  - [0, 1, 1]\n"
         "object_pose: {frame: 0, rotation_vector: [0, 0, 0], translation: *p}\n"
@@ -204,7 +204,7 @@ def test_an_alias_of_what_is_taken_away_is_left_to_an_editor(path: Path) -> None
     assert path.read_text() == text
 
 
-def test_nothing_touches_is_another_statement_than_none(path: Path) -> None:
+def test_empty_contact_differs_from_missing_contact(path: Path) -> None:
     new = _patched(path, WRITTEN, contact=[])
     assert Annotation.model_validate(yaml.safe_load(new)).contact == ()
     assert "# looked at twice" in new and "# the end" in new
@@ -215,7 +215,7 @@ def test_nothing_touches_is_another_statement_than_none(path: Path) -> None:
     assert _patched(path, "# mine\n", contact=[]) == "# mine\n\ncontact: []\n"
 
 
-def test_of_all_sections_contact_alone_says_something_when_it_is_empty(path: Path) -> None:
+def test_only_an_empty_contact_section_is_a_statement(path: Path) -> None:
     """Of the others an empty list is what the section is without, or no value at all."""
     without = Annotation()
     for name in Annotation.model_fields:
@@ -223,25 +223,25 @@ def test_of_all_sections_contact_alone_says_something_when_it_is_empty(path: Pat
             assert getattr(Annotation.model_validate({name: []}), name) is not None
             continue
         try:
-            told = Annotation.model_validate({name: []})
+            value = Annotation.model_validate({name: []})
         except ValidationError:
             continue
-        assert told == without, name
+        assert value == without, name
     assert STATED_EMPTY == ("contact",)
     assert _patched(path, "drop_frames: [1]\nfloor: []\n", drop_frames=[]) == "floor: []\n"
     assert document.faults(document.read(path).sections)  # as a run has it
 
 
-def test_lines_that_stay_keep_their_bytes_and_new_ones_end_as_most(path: Path) -> None:
+def test_unchanged_lines_keep_their_bytes_and_line_ends(path: Path) -> None:
     mixed = (
         "\ufeff# café\r\n\r\ncontact:\n- part: seat\r\n  start: 1\n  end: 4\r\n\r\n"
         "drop_frames: [3]\r\nfloor: # of the hall\n- [0, 0, 1]\n- [1, 0, 1]\n- [0, 1, 1]"
     ).encode()
     path.write_bytes(mixed)
-    found = document.read(path)
+    file = document.read(path)
     contact = [{"part": "seat", "start": 1, "end": 5}, {"part": "any", "start": 7, "end": 8}]
-    floor = [*found.sections["floor"], [1, 1, 1]]
-    document.save(found, document.patched(found, {"contact": contact, "floor": floor}))
+    floor = [*file.sections["floor"], [1, 1, 1]]
+    document.save(file, document.patched(file, {"contact": contact, "floor": floor}))
     assert path.read_bytes() == mixed.replace(
         b"  end: 4\r\n", b"  end: 5\r\n- {part: any, start: 7, end: 8}\r\n"
     ).replace(b"- [0, 1, 1]", b"- [0, 1, 1]\r\n- [1, 1, 1]\r\n")
@@ -250,10 +250,10 @@ def test_lines_that_stay_keep_their_bytes_and_new_ones_end_as_most(path: Path) -
 def test_a_read_only_file_is_not_overwritten(path: Path) -> None:
     path.write_text(WRITTEN)
     path.chmod(0o444)
-    found = document.read(path)
+    file = document.read(path)
     with pytest.raises(UserError, match="read-only"):
-        document.save(found, "drop_frames: [2]\n")
+        document.save(file, "drop_frames: [2]\n")
     assert path.read_text() == WRITTEN and document.locked(path)
     path.chmod(0o644)
     assert not document.locked(path) and not document.locked(path.with_name("none.yaml"))
-    document.save(found, "drop_frames: [2]\n")
+    document.save(file, "drop_frames: [2]\n")

@@ -34,9 +34,13 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Project:
 
 def test_a_first_list_is_written_and_named(project: Project) -> None:
     entry = project.objects["cup"]
-    told = objects.read_surface(project, entry)
-    assert told["vertices"] == [] and told["digest"] == document.NO_FILE and told["sequences"] == 1
-    saved = objects.save_surface(project, entry, [3, 4, 50], told["digest"])
+    current = objects.read_surface(project, entry)
+    assert (
+        current["vertices"] == []
+        and current["digest"] == document.NO_FILE
+        and current["sequences"] == 1
+    )
+    saved = objects.save_surface(project, entry, [3, 4, 50], current["digest"])
     assert saved["vertices"] == [3, 4, 50]
     assert Path("objects.yaml").read_text() == (
         "# ours\ncup:\n  mesh: cup.ply # scanned\n  contact_vertices: cup.contact.json\n"
@@ -45,28 +49,28 @@ def test_a_first_list_is_written_and_named(project: Project) -> None:
     assert np.array_equal(ObjectMesh.load(again).contact_vertices, [3, 4, 50])
 
 
-def test_a_list_that_changed_meanwhile_stays(project: Project) -> None:
+def test_a_changed_vertex_list_is_not_overwritten(project: Project) -> None:
     entry = project.objects["cup"]
     first = objects.read_surface(project, entry)
     objects.save_surface(project, entry, [3], first["digest"])
     entry = load_project(Path("config.yaml")).objects["cup"]
-    with pytest.raises(UserError, match="in the meantime"):
+    with pytest.raises(UserError, match="another annotator"):
         objects.save_surface(project, entry, [4], first["digest"])
     assert objects.read_surface(project, entry)["vertices"] == [3]
 
 
 @pytest.mark.parametrize("vertices", [[], [-1], [10**9]])
-def test_what_is_no_vertex_is_refused(project: Project, vertices: list[int]) -> None:
+def test_invalid_vertices_are_refused(project: Project, vertices: list[int]) -> None:
     with pytest.raises(UserError, match="vertices"):
         objects.save_surface(project, project.objects["cup"], vertices, document.NO_FILE)
 
 
-def test_a_symmetry_is_written_and_taken_away(project: Project) -> None:
+def test_a_symmetry_is_written_and_removed(project: Project) -> None:
     entry = project.objects["cup"]
     before = Path("objects.yaml").read_text()
-    told = objects.read_symmetry(project, entry)
+    current = objects.read_symmetry(project, entry)
     about_z = {"continuous": [{"axis": [0, 0, 1]}]}
-    saved = objects.save_symmetry(project, entry, about_z, told["digest"])
+    saved = objects.save_symmetry(project, entry, about_z, current["digest"])
     assert saved["symmetry"] == about_z
     assert "# scanned" in Path("objects.yaml").read_text()
     again = load_project(Path("config.yaml")).objects["cup"]
@@ -75,11 +79,11 @@ def test_a_symmetry_is_written_and_taken_away(project: Project) -> None:
     assert Path("objects.yaml").read_text() == before
 
 
-def test_an_impossible_symmetry_and_another_file_are_refused(project: Project) -> None:
+def test_invalid_symmetries_and_changed_files_are_refused(project: Project) -> None:
     entry = project.objects["cup"]
-    told = objects.read_symmetry(project, entry)
+    current = objects.read_symmetry(project, entry)
     with pytest.raises(UserError, match="invalid"):
-        objects.save_symmetry(project, entry, {"discrete": [[1, 2]]}, told["digest"])
+        objects.save_symmetry(project, entry, {"discrete": [[1, 2]]}, current["digest"])
     Path("objects.yaml").write_text("cup: {mesh: cup.ply}\n")
-    with pytest.raises(UserError, match="in the meantime"):
-        objects.save_symmetry(project, entry, {"sphere": True}, told["digest"])
+    with pytest.raises(UserError, match="another annotator"):
+        objects.save_symmetry(project, entry, {"sphere": True}, current["digest"])

@@ -25,29 +25,19 @@ from tests.annotate.served import NAME, Served, annotation, artefact, copied, se
 OF = f"sequences/{NAME}"
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small_project(tmp_path_factory.mktemp("annotated"))
-
-
-@pytest.fixture
-def settings(made: Path, tmp_path: Path) -> Path:
-    return copied(made, tmp_path / "project")
-
-
 @pytest.fixture
 def page(settings: Path) -> Iterator[Served]:
-    with served(settings) as found:
-        yield found
+    with served(settings) as server:
+        yield server
 
 
-def test_the_list_and_a_sequence_are_told(page: Served) -> None:
+def test_the_list_and_a_sequence_are_served(page: Served) -> None:
     rows = page.json("sequences")["sequences"]
     assert [row["name"] for row in rows] == [NAME] and not rows[0]["annotated"]
-    told = page.json(OF)
-    assert told["frames"] == 6 and told["object"] == "football" and told["viewer"]
-    assert [one["name"] for one in told["cameras"]] == ["k1", "k2", "k3"]
-    assert told["annotation"]["digest"] == "none"
+    answer = page.json(OF)
+    assert answer["frames"] == 6 and answer["object"] == "football" and answer["viewer"]
+    assert [entry["name"] for entry in answer["cameras"]] == ["k1", "k2", "k3"]
+    assert answer["annotation"]["digest"] == "none"
 
 
 def test_images_come_as_large_as_they_are_shown(page: Served) -> None:
@@ -72,7 +62,7 @@ def test_only_sequences_of_the_table_are_known(page: Served, name: str) -> None:
     assert page.get(f"/page/{name}/config.yaml")[0] == 404
 
 
-def test_without_the_token_or_from_elsewhere_nothing_is_told(page: Served) -> None:
+def test_the_server_refuses_requests_without_token(page: Served) -> None:
     assert page.get("/api/sequences", **{"x-intercap-token": ""})[0] == 401
     assert page.get("/", host="evil.example")[0] == 400
     assert page.get("/")[0] == 200
@@ -80,22 +70,24 @@ def test_without_the_token_or_from_elsewhere_nothing_is_told(page: Served) -> No
 
 def test_an_edit_is_checked_as_it_is_typed(page: Served) -> None:
     contact = [{"part": "right_hand", "start": 1, "end": 9}]
-    _, told = page.post(f"{OF}/check", {"changes": {"contact": contact}})
-    assert told["faults"] == [
-        {"where": "contact", "words": "contact[0].end is 9, the recording has 6 frames"}
+    _, answer = page.post(f"{OF}/check", {"changes": {"contact": contact}})
+    assert answer["faults"] == [
+        {"where": "contact", "message": "contact[0].end is 9, the recording has 6 frames"}
     ]
     contact[0]["end"] = 4
-    _, told = page.post(f"{OF}/check", {"changes": {"contact": contact}})
-    assert not told["faults"] and "+  - {part: right_hand, start: 1, end: 4}" in told["difference"]
-    _, told = page.post(f"{OF}/check", {"changes": {"contact": [{"part": "tail"}]}})
-    assert told["faults"][0]["where"].startswith("contact.0")
+    _, answer = page.post(f"{OF}/check", {"changes": {"contact": contact}})
+    assert (
+        not answer["faults"] and "+  - {part: right_hand, start: 1, end: 4}" in answer["difference"]
+    )
+    _, answer = page.post(f"{OF}/check", {"changes": {"contact": [{"part": "tail"}]}})
+    assert answer["faults"][0]["where"].startswith("contact.0")
 
 
 _PLACE = {"rotation_vector": [0, 0, 0], "translation": [0, 0, 2]}
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"contact": [{"part": "seat", "start": 1, "end": 9}]}, "contact[0].end is 9"),
         ({"object_poses": [{"frame": 6, **_PLACE}]}, "object_poses[0].frame is 6"),
@@ -111,90 +103,86 @@ _PLACE = {"rotation_vector": [0, 0, 0], "translation": [0, 0, 2]}
         ({"floor": [[0, 0, 1], [1, 0, 1], [0.5, 0.02, 1]]}, "on one line within 20 mm"),
     ],
 )
-def test_what_is_not_of_the_recording_is_said_as_a_run_says_it(
-    page: Served, settings: Path, changes: dict, said: str
+def test_the_page_reports_the_same_faults_as_a_run(
+    page: Served, settings: Path, changes: dict, message: str
 ) -> None:
-    _, told = page.post(f"{OF}/check", {"changes": changes})
-    [fault] = told["faults"]
-    assert said in fault["words"]
+    _, answer = page.post(f"{OF}/check", {"changes": changes})
+    [fault] = answer["faults"]
+    assert message in fault["message"]
     path = annotation(settings)
     path.write_text(yaml.safe_dump(changes))
     with pytest.raises(UserError) as refused:
         page.annotator.project.annotation(NAME)
-    assert fault["words"] in str(refused.value)
-    _, told = page.post(f"{OF}/check", {"changes": {}})  # of the file as it is, too
-    assert told["faults"] == [fault]
+    assert fault["message"] in str(refused.value)
+    _, answer = page.post(f"{OF}/check", {"changes": {}})  # of the file as it is, too
+    assert answer["faults"] == [fault]
 
 
-def test_a_click_beside_the_image_places_no_point(page: Served) -> None:
+def test_a_click_outside_the_image_is_refused(page: Served) -> None:
     for x, y in ((-1, 5), (5, 270.5), (1e8, 5)):
-        status, told = page.post(f"{OF}/point", {"camera": "k1", "frame": 0, "x": x, "y": y})
-        assert status == 422 and "outside of the image" in told["error"]
+        status, answer = page.post(f"{OF}/point", {"camera": "k1", "frame": 0, "x": x, "y": y})
+        assert status == 422 and "outside of the image" in answer["error"]
 
 
-def test_a_read_only_annotation_is_said_and_stays(page: Served, settings: Path) -> None:
+def test_a_read_only_annotation_is_reported(page: Served, settings: Path) -> None:
     path = annotation(settings)
     path.write_text("drop_frames: [1]\n")
     path.chmod(0o444)
-    told = page.json(OF)
-    assert "read-only" in told["read_only"]
-    digest = told["annotation"]["digest"]
-    status, told = page.post(f"{OF}/save", {"digest": digest, "changes": {"drop_frames": [2]}})
-    assert status == 422 and "read-only" in told["error"]
+    answer = page.json(OF)
+    assert "read-only" in answer["read_only"]
+    digest = answer["annotation"]["digest"]
+    status, answer = page.post(f"{OF}/save", {"digest": digest, "changes": {"drop_frames": [2]}})
+    assert status == 422 and "read-only" in answer["error"]
     assert path.read_text() == "drop_frames: [1]\n"
 
 
-def test_a_number_of_another_form_is_said_before_it_fails_in_a_run(
-    page: Served, settings: Path
-) -> None:
+def test_a_float_frame_number_is_a_fault(page: Served, settings: Path) -> None:
     """A page knows no 2.0 beside 2, a frame's number is a whole one."""
     annotation(settings).write_text("contact:\n- {part: seat, start: 2.0, end: 4}\n")
     contact = [{"part": "seat", "start": 2, "end": 4}, {"part": "any", "start": 0, "end": 1}]
-    _, told = page.post(f"{OF}/check", {"changes": {"contact": contact}})
-    assert told["faults"][0]["where"] == "contact.0.start"
+    _, answer = page.post(f"{OF}/check", {"changes": {"contact": contact}})
+    assert answer["faults"][0]["where"] == "contact.0.start"
 
 
-def test_a_save_writes_what_was_shown_and_refuses_what_it_did_not_see(
-    page: Served, settings: Path
-) -> None:
+def test_a_save_from_an_outdated_page_is_refused(page: Served, settings: Path) -> None:
     path = annotation(settings)
     path.write_text("# mine\ndrop_frames: [1] # dark\n")
     digest = page.json(f"{OF}/annotation")["digest"]
     pose = {"frame": 2, "rotation_vector": [0, 0.1, 0], "translation": [0, 0.2, 2.4]}
-    told = {"digest": digest, "changes": {"object_pose": pose}}
-    status, saved = page.post(f"{OF}/save", told)
+    content = {"digest": digest, "changes": {"object_pose": pose}}
+    status, saved = page.post(f"{OF}/save", content)
     assert status == 200 and path.read_text().startswith("# mine\ndrop_frames: [1] # dark\n")
     assert Annotation.model_validate(yaml.safe_load(path.read_text())).object_pose is not None
-    status, refused = page.post(f"{OF}/save", told)  # a second tab, with the older file
+    status, refused = page.post(f"{OF}/save", content)  # a second tab, with the older file
     assert status == 409 and refused["now"]["digest"] == saved["digest"]
-    told = {"digest": saved["digest"], "changes": {"drop_frames": [77]}}
-    status, refused = page.post(f"{OF}/save", told)
+    content = {"digest": saved["digest"], "changes": {"drop_frames": [77]}}
+    status, refused = page.post(f"{OF}/save", content)
     assert status == 422 and "77" in refused["error"]
 
 
-def test_who_and_when_are_kept_by_choice_alone(settings: Path) -> None:
+def test_name_and_time_are_saved_only_with_by(settings: Path) -> None:
     answers = annotation(settings).with_name(f"{NAME}.answers.jsonl")
-    told = {"kind": "turn", "part": "", "answer": "yes", "from_s": 0.0, "to_s": 0.1}
+    content = {"kind": "turn", "part": "", "answer": "yes", "from_s": 0.0, "to_s": 0.1}
     with served(settings) as page:
-        assert page.post(f"{OF}/answer", told)[0] == 200
+        assert page.post(f"{OF}/answer", content)[0] == 200
     with served(settings, by="ann") as page:
-        assert page.post(f"{OF}/answer", told)[0] == 200
+        assert page.post(f"{OF}/answer", content)[0] == 200
     without, named = map(json.loads, answers.read_text().splitlines())
     assert "by" not in without and "at" not in without
     assert named["by"] == "ann" and named["at"]
 
 
-def test_a_save_stands_where_who_did_it_cannot_be_kept(settings: Path) -> None:
+def test_a_save_succeeds_if_the_answer_log_fails(settings: Path) -> None:
     path = annotation(settings)
     path.with_name(f"{NAME}.answers.jsonl").mkdir(parents=True)
     with served(settings, by="ann") as page:
-        told = {"digest": "none", "text": "", "changes": {"drop_frames": [1]}}
-        assert page.post(f"{OF}/save", told)[0] == 200
+        content = {"digest": "none", "text": "", "changes": {"drop_frames": [1]}}
+        assert page.post(f"{OF}/save", content)[0] == 200
     assert "drop_frames: [1]" in path.read_text()
 
 
 @pytest.mark.parametrize(
-    ("verb", "told"),
+    ("verb", "content"),
     [
         ("point", {"camera": "k1", "frame": None, "x": 1, "y": 2}),
         ("point", {"camera": "k1", "frame": 0, "x": [1], "y": 2}),
@@ -204,60 +192,56 @@ def test_a_save_stands_where_who_did_it_cannot_be_kept(settings: Path) -> None:
         ("answer", {"kind": "turn", "part": "", "answer": "yes", "from_s": 0, "to_s": 1e300}),
     ],
 )
-def test_what_is_no_number_or_word_is_refused(page: Served, verb: str, told: dict) -> None:
-    status, words = page.post(f"{OF}/{verb}", told)
-    assert status == 422 and "unexpected" not in str(words)
+def test_values_of_other_types_are_refused(page: Served, verb: str, content: dict) -> None:
+    status, answer = page.post(f"{OF}/{verb}", content)
+    assert status == 422 and "unexpected" not in str(answer)
 
 
-def test_images_alone_are_shown_where_nothing_else_is_there(page: Served, settings: Path) -> None:
+def test_images_are_served_without_other_results(page: Served, settings: Path) -> None:
     for path in artefact(settings, "joint").parent.glob("*.h5"):
         if path.stem != "frames":
             path.unlink()
-    told = page.json(OF)
-    assert told["frames"] == 6 and not told["viewer"]
-    assert any("only images" in note for note in told["notes"])
+    answer = page.json(OF)
+    assert answer["frames"] == 6 and not answer["viewer"]
+    assert any("only images" in note for note in answer["notes"])
     assert page.get(f"/api/{OF}/image/k2/0?width=240")[0] == 200
     assert page.get(f"/api/{OF}/viewer")[0] == 422
     assert page.json(f"{OF}/questions") == []
-    status, told = page.post(
+    status, answer = page.post(
         f"{OF}/snap", {"frame": 0, "rotation_vector": [0, 0, 0], "translation": [0, 0, 2]}
     )
-    assert status == 422 and "run it first" in told["error"]
+    assert status == 422 and "run it first" in answer["error"]
 
 
-def test_before_the_first_run_it_says_what_to_do(page: Served, settings: Path) -> None:
+def test_before_the_first_run_the_page_names_the_command(page: Served, settings: Path) -> None:
     artefact(settings, "frames").unlink()
-    told = page.json(OF)
-    assert told["frames"] == 0 and "intercap run" in told["notes"][0]
+    answer = page.json(OF)
+    assert answer["frames"] == 0 and "intercap run" in answer["notes"][0]
 
 
-def test_a_result_of_an_older_version_is_named_and_the_rest_is_shown(
-    page: Served, settings: Path
-) -> None:
+def test_a_result_of_another_version_is_reported(page: Served, settings: Path) -> None:
     with h5py.File(artefact(settings, "joint"), "r+") as file:
         file.attrs["schema_version"] = 1
-    told = page.json(OF)
-    assert told["frames"] == 6
-    assert any("joint" in note and "re-run" in note for note in told["notes"])
+    answer = page.json(OF)
+    assert answer["frames"] == 6
+    assert any("joint" in note and "re-run" in note for note in answer["notes"])
     status, answer = page.get(f"/api/{OF}/viewer")
     assert status == 422 and b"joint" in answer
 
 
-def test_a_result_of_other_frames_is_named_and_not_drawn(page: Served, settings: Path) -> None:
+def test_a_result_with_other_frames_is_not_drawn(page: Served, settings: Path) -> None:
     other = small_project(settings.parent / "shorter", total=4)
     shutil.copy(artefact(other, "joint"), artefact(settings, "joint"))
-    told = page.json(OF)
-    assert any("has 4 frames, but 6 were read" in note for note in told["notes"])
-    assert "contact" not in told and not told["viewer"]
+    answer = page.json(OF)
+    assert any("has 4 frames, but 6 were read" in note for note in answer["notes"])
+    assert "contact" not in answer and not answer["viewer"]
 
 
-def test_recordings_that_were_moved_are_named(page: Served) -> None:
+def test_missing_recordings_are_reported(page: Served) -> None:
     assert any("the recordings are missing" in note for note in page.json(OF)["notes"])
 
 
-def test_results_that_change_while_the_page_is_open_are_noticed(
-    page: Served, settings: Path
-) -> None:
+def test_changed_results_change_the_state(page: Served, settings: Path) -> None:
     before = page.json(f"{OF}/state")
     path = artefact(settings, "joint")
     shutil.copy(path, path.with_suffix(".new"))
@@ -268,47 +252,45 @@ def test_results_that_change_while_the_page_is_open_are_noticed(
     assert page.get(f"/api/{OF}/object")[0] == 200
 
 
-def test_what_an_edit_touches_is_what_a_run_would_make(page: Served, settings: Path) -> None:
+def test_an_edited_project_has_the_unsaved_annotation(page: Served, settings: Path) -> None:
     project = page.annotator.project
     edited = rerun.EditedProject.of(project, NAME, Annotation.model_validate({"drop_frames": [1]}))
     assert edited.annotation(NAME).drop_frames == (1,)
     assert project.annotation(NAME).drop_frames == ()
-    told = rerun.command(project, NAME, profile=Path("profiles/slurm"))
-    assert told[:2] == ["intercap", "run"] and "profiles/slurm" in told
-    assert [Path(one).name for one in told[-3:]] == ["summary.h5", NAME, "export"]
+    command = rerun.command(project, NAME, profile=Path("profiles/slurm"))
+    assert command[:2] == ["intercap", "run"] and "profiles/slurm" in command
+    assert [Path(target).name for target in command[-3:]] == ["summary.h5", NAME, "export"]
 
 
-def test_on_a_cluster_the_command_is_told_instead(settings: Path) -> None:
+def test_on_a_cluster_the_page_shows_the_command(settings: Path) -> None:
     with served(settings, profile=Path("profiles/slurm")) as page:
-        status, told = page.post(f"{OF}/run", {"do": "start"})
-        assert status == 422 and "intercap run" in told["error"]
+        status, answer = page.post(f"{OF}/run", {"do": "start"})
+        assert status == 422 and "intercap run" in answer["error"]
         assert page.json(f"{OF}/run")["cluster"]
 
 
-def test_the_command_is_as_a_shell_takes_it(made: Path, tmp_path: Path) -> None:
+def test_commands_are_quoted_for_the_shell(made: Path, tmp_path: Path) -> None:
     settings = copied(made, tmp_path / "two words; $(x)")
     with served(settings) as page:
-        told = page.json(f"{OF}/run")["command"]
-        assert shlex.split(told)[:3] == ["intercap", "run", str(settings)]
+        answer = page.json(f"{OF}/run")["command"]
+        assert shlex.split(answer)[:3] == ["intercap", "run", str(settings)]
         artefact(settings, "frames").unlink()
         assert shlex.quote(str(settings)) in page.json(OF)["notes"][0]
 
 
-def test_images_that_cannot_be_read_are_named_and_a_run_is_offered(
-    page: Served, settings: Path
-) -> None:
+def test_unreadable_images_are_reported(page: Served, settings: Path) -> None:
     path = artefact(settings, "frames")
     path.write_bytes(path.read_bytes()[:3000])
-    told = page.json(OF)
-    assert told["frames"] == 0 and "frames.h5" in told["notes"][0]
+    answer = page.json(OF)
+    assert answer["frames"] == 0 and "frames.h5" in answer["notes"][0]
     assert page.json(f"{OF}/run")["command"]
 
 
-def test_what_goes_through_a_tunnel_is_the_result_alone_and_packed(page: Served) -> None:
+def test_the_viewer_receives_only_the_result_compressed(page: Served) -> None:
     status, data = page.get(f"/api/{OF}/viewer")
     header, arrays = unpacked(base64.b64encode(data).decode())
     assert status == 200 and list(header["versions"]) == ["joint"]
     assert "joint/transforms" in arrays
     assert not [name for name in arrays if name.startswith(("sequential/", "truth/"))]
-    _, told = page.get(f"/api/{OF}", **{"accept-encoding": "gzip"})
-    assert json.loads(gzip.decompress(told))["frames"] == 6
+    _, answer = page.get(f"/api/{OF}", **{"accept-encoding": "gzip"})
+    assert json.loads(gzip.decompress(answer))["frames"] == 6

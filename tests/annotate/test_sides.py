@@ -14,26 +14,21 @@ from intercap_core.annotate.opened import Opened
 from intercap_core.errors import UserError
 from intercap_core.output.viewer.page import unpacked
 from intercap_core.project import load_project
-from tests.annotate.served import NAME, annotation, artefact, copied, detect, small_project
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small_project(tmp_path_factory.mktemp("sides"))
+from tests.annotate.served import NAME, annotation, artefact, detect
 
 
 @pytest.fixture
-def opened(made: Path, tmp_path: Path) -> Iterator[Opened]:
-    found = Opened(load_project(copied(made, tmp_path / "project")), NAME)
-    yield found
-    found.close()
+def opened(settings: Path) -> Iterator[Opened]:
+    opened = Opened(load_project(settings), NAME)
+    yield opened
+    opened.close()
 
 
-def _doubted(opened: Opened) -> list[tuple[int, int, str]]:
-    return [(one.first, one.last, one.camera) for one in sides.doubts(opened)]
+def _doubtful(opened: Opened) -> list[tuple[int, int, str]]:
+    return [(doubt.first, doubt.last, doubt.camera) for doubt in sides.doubts(opened)]
 
 
-def test_points_are_as_detected_and_the_result_beside_them(opened: Opened) -> None:
+def test_payload_has_detected_and_fitted_limbs(opened: Opened) -> None:
     detect(opened.project.path, {"k2": [1, 2]})
     header, arrays = unpacked(sides.sides_payload(opened))
     assert header["cameras"] == ["k1", "k2", "k3"] and header["source"] == "joint"
@@ -48,30 +43,30 @@ def test_points_are_as_detected_and_the_result_beside_them(opened: Opened) -> No
     np.testing.assert_array_equal(arrays["result"][:, 0], left_shoulder)
 
 
-def test_one_view_of_three_is_no_doubt_but_two_are_until_it_is_stated(opened: Opened) -> None:
+def test_exchanges_in_most_views_are_doubtful_until_stated(opened: Opened) -> None:
     detect(opened.project.path, {"k2": [1, 2]})
-    assert _doubted(opened) == []
+    assert _doubtful(opened) == []
     detect(opened.project.path, {"k2": [1, 2, 5], "k3": [2, 5]})
-    assert _doubted(opened) == [(2, 5, "k2")]  # a gap of two frames is one place
+    assert _doubtful(opened) == [(2, 5, "k2")]  # a gap of two frames is one place
     assert [p["kind"] for p in result.describe(opened)["places"]].count("sides") == 1
-    asked = [q for q in questions.propose(opened, []) if q["kind"] == "sides"]
-    assert [(q["first"], q["last"], q["camera"]) for q in asked] == [(2, 5, "k2")]
+    proposed = [q for q in questions.propose(opened, []) if q["kind"] == "sides"]
+    assert [(q["first"], q["last"], q["camera"]) for q in proposed] == [(2, 5, "k2")]
     annotation(opened.project.path).write_text("left_right: [{start: 2, end: 6, camera: k3}]\n")
-    assert _doubted(opened) == []
+    assert _doubtful(opened) == []
 
 
 def test_a_result_that_jumps_to_the_other_side_is_doubted(opened: Opened) -> None:
     detect(opened.project.path, {})
-    assert _doubted(opened) == []
+    assert _doubtful(opened) == []
     with h5py.File(artefact(opened.project.path, "joint"), "r+") as joint:
         moved = joint["joints"][...]
         arms = np.array([16, 17, 18, 19, 20, 21])
         moved[3:5, arms] = moved[3:5, arms[[1, 0, 3, 2, 5, 4]]]
         joint["joints"][...] = moved
-    assert [(first, last) for first, last, _ in _doubted(opened)] == [(3, 4)]
+    assert [(first, last) for first, last, _ in _doubtful(opened)] == [(3, 4)]
 
 
-def test_a_person_of_other_detections_is_named(opened: Opened) -> None:
+def test_a_person_of_other_detections_is_reported(opened: Opened) -> None:
     with h5py.File(artefact(opened.project.path, "person"), "r+") as person:
         person["person"][2, 1] = 4
     with pytest.raises(UserError, match="re-run stage 'person'"):

@@ -18,9 +18,9 @@ Interval = dict[str, Any]
 
 @st.composite
 def _entries(draw: st.DrawFn) -> list[Interval]:
-    told = draw(st.lists(st.tuples(st.sampled_from(PARTS), st.integers(0, 9)), unique=True,
+    pairs = draw(st.lists(st.tuples(st.sampled_from(PARTS), st.integers(0, 9)), unique=True,
                          max_size=6))  # fmt: skip
-    return [{"part": part, "start": 10 * at, "end": 10 * at + 5} for part, at in told]
+    return [{"part": part, "start": 10 * at, "end": 10 * at + 5} for part, at in pairs]
 
 
 @st.composite
@@ -30,18 +30,18 @@ def _written(draw: st.DrawFn) -> tuple[str, list[Interval]]:
     dash = draw(st.sampled_from(["", "  ", "    "]))
     lines = [*draw(st.sampled_from([[], ["# head", ""], ["# head"]])), "contact:"]
     lines[-1] += draw(st.sampled_from(["", " # key"]))
-    for k, one in enumerate(entries):
+    for k, entry in enumerate(entries):
         if draw(st.booleans()):
             lines += draw(st.sampled_from([[""], ["", f"{dash}# loose{k}", ""]]))
         if draw(st.booleans()):
             lines += [f"{dash}# lead{k}"] * draw(st.integers(1, 2))
-        told = f" # own{k}" if draw(st.booleans()) else ""
+        comment = f" # own{k}" if draw(st.booleans()) else ""
         if draw(st.booleans()):
-            inner = ", ".join(f"{key}: {value}" for key, value in one.items())
-            lines.append(f"{dash}- {{{inner}}}{told}")
+            inner = ", ".join(f"{key}: {value}" for key, value in entry.items())
+            lines.append(f"{dash}- {{{inner}}}{comment}")
         else:
-            (first, part), *rest = one.items()
-            lines.append(f"{dash}- {first}: {part}{told}")
+            (first, part), *rest = entry.items()
+            lines.append(f"{dash}- {first}: {part}{comment}")
             lines += [f"{dash}  {key}:  {value}" for key, value in rest]
             if draw(st.booleans()):
                 lines.insert(-1, f"{dash}  # own{k}")
@@ -58,25 +58,25 @@ def _written(draw: st.DrawFn) -> tuple[str, list[Interval]]:
 @st.composite
 def _edited(draw: st.DrawFn, entries: list[Interval]) -> list[Interval]:
     """Entries deleted, moved in time, split, added, and put into another order."""
-    found = []
-    for one in entries:
-        what = draw(st.sampled_from(["stays", "stays", "goes", "moves", "splits"]))
-        if what == "moves":
-            found.append({**one, "end": one["end"] + 1})
-        elif what == "splits":
-            middle = one["start"] + 2
-            found += [{**one, "end": middle}, {**one, "start": middle}]
-        elif what == "stays":
-            found.append(one)
-    found += [one for one in draw(_entries()) if one not in entries and one not in found]
-    return draw(st.permutations(found)) if draw(st.booleans()) else found
+    result = []
+    for entry in entries:
+        action = draw(st.sampled_from(["stays", "stays", "goes", "moves", "splits"]))
+        if action == "moves":
+            result.append({**entry, "end": entry["end"] + 1})
+        elif action == "splits":
+            middle = entry["start"] + 2
+            result += [{**entry, "end": middle}, {**entry, "start": middle}]
+        elif action == "stays":
+            result.append(entry)
+    result += [entry for entry in draw(_entries()) if entry not in entries and entry not in result]
+    return draw(st.permutations(result)) if draw(st.booleans()) else result
 
 
-def _said(text: str) -> dict[str, list[str]]:
+def _comments_by_entry(text: str) -> dict[str, list[str]]:
     """The comments on, in and directly above each entry, by the entry's values."""
     lines = text.splitlines()
     starts = [k for k, line in enumerate(lines) if line.lstrip().startswith("- ")]
-    found: dict[str, list[str]] = {}
+    result: dict[str, list[str]] = {}
     for number, k in enumerate(starts):
         dash = len(lines[k]) - len(lines[k].lstrip())
         first = k
@@ -91,22 +91,22 @@ def _said(text: str) -> dict[str, list[str]]:
             last += 1
         value = yaml.safe_load("\n".join(lines[k:last]))[0]
         words = [line.partition("#")[2] for line in lines[first:last] if "#" in line]
-        assert str(value) not in found, number
-        found[str(value)] = words
-    return found
+        assert str(value) not in result, number
+        result[str(value)] = words
+    return result
 
 
 @settings(max_examples=80, deadline=None)
 @given(st.data())
-def test_each_entry_keeps_its_own_comments_whatever_happens_to_others(data: st.DataObject) -> None:
+def test_each_entry_keeps_its_own_comments(data: st.DataObject) -> None:
     text, old = data.draw(_written())
     new = data.draw(_edited(old))
     changed = replace_section(text, "contact", new)
     assert yaml.safe_load(changed) == {"contact": new, "drop_frames": [1]}
-    before, after = _said(text), _said(changed)
-    for one in new:
-        if one in old:
-            assert after[str(one)] == before[str(one)], changed
+    before, after = _comments_by_entry(text), _comments_by_entry(changed)
+    for entry in new:
+        if entry in old:
+            assert after[str(entry)] == before[str(entry)], changed
     for k in range(len(old)):
         for word in (f"# own{k}", f"# lead{k}"):
             assert changed.count(word) <= text.count(word), changed
@@ -120,15 +120,15 @@ def test_each_entry_keeps_its_own_comments_whatever_happens_to_others(data: st.D
         *(f"loose{k}" for k in range(9)),
     ):
         assert text.count(f"# {word}") == changed.count(f"# {word}"), (word, changed)
-    for k, one in enumerate(old):
-        if one in new:
-            others = [w for other, words in after.items() if other != str(one) for w in words]
+    for k, entry in enumerate(old):
+        if entry in new:
+            others = [w for other, words in after.items() if other != str(entry) for w in words]
             assert not {f" lead{k}", f" own{k}"} & set(others), changed
     assert ("\r\n" in text) == ("\r\n" in changed) and "\r\r" not in changed
     assert "\r\n" not in text or "\n" not in changed.replace("\r\n", "")
 
 
-def test_an_entry_that_changes_keeps_its_comments_and_the_form_of_the_rest() -> None:
+def test_a_changed_entry_keeps_comments_and_number_formats() -> None:
     text = (
         "object_poses:  # by Ann\n  # the first\n  - frame: 0\n"
         "    rotation_vector: [0.10, -1.2, 0.30] # by eye\n"
@@ -157,7 +157,7 @@ def test_an_entry_that_changes_keeps_its_comments_and_the_form_of_the_rest() -> 
         ("drop_frames:\n- 3 # dark\n- 4 # blurred\n- 5\n", [4, 5, 6],
          "drop_frames:\n- 4 # blurred\n- 5\n- 6\n"),
         ("floor: [\n  [0.0, 0, 1.50],\n  [1, 0, 1]\n]\n", [[0, 0, 1.5], [2, 0, 1], [1, 0, 1]],
-         "floor: [\n  [0.0, 0, 1.50],\n  [2, 0, 1],\n  [1, 0, 1]\n]\n"),
+         "floor: [[0.0, 0, 1.50], [2, 0, 1], [1, 0, 1]]\n"),
         ("football:\n  mesh: a.ply\n  symmetry: {sphere: true}\n  # maybe\n  labels: [x]\n",
          {"mesh": "a.ply", "labels": ["x"]},
          "football:\n  mesh: a.ply\n  # maybe\n  labels: [x]\n"),
@@ -175,6 +175,6 @@ def test_sections_of_other_forms(text: str, value: Any, expected: str) -> None:
         "contact: [ # x\n  {part: any}, # y\n]\n",
     ],
 )
-def test_comments_that_could_be_lost_are_left_to_an_editor(text: str) -> None:
+def test_layouts_that_would_lose_comments_are_refused(text: str) -> None:
     with pytest.raises(UnsupportedLayout):
         replace_section(text, "contact", [{"part": "seat"}, {"part": "back"}])

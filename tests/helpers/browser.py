@@ -1,7 +1,13 @@
-"""Pages in a real Chromium, on a desk or a phone; Playwright drives the installed browser."""
+"""Pages in Chromium, in the window of a desktop or a phone.
+
+Playwright drives the system's own Chromium. All visits of a process share one browser, each in its
+own context.
+"""
 
 from __future__ import annotations
 
+import atexit
+import functools
 import json
 import shutil
 import time
@@ -16,7 +22,7 @@ import numpy as np
 import pytest
 
 if TYPE_CHECKING:
-    from playwright.sync_api import CDPSession, Page
+    from playwright.sync_api import Browser, CDPSession, Page, Playwright
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("chrome")
 needs_chromium = pytest.mark.skipif(
@@ -34,11 +40,12 @@ _PATIENCE_MS = 60_000  # on a busy machine without a GPU
 
 @dataclass
 class Visit:
-    """An open page; ``console`` lists its messages and errors so far."""
+    """An open page."""
 
     page: Page
     fingers: CDPSession
     console: list[str] = field(default_factory=list)
+    """Messages of the console and errors so far."""
 
     def wait(self, condition: str = _READY) -> None:
         """Wait until a JavaScript expression is true; by default, that the viewer is ready.
@@ -71,38 +78,55 @@ def visit(
     address: str = "",
     log: Path | None = None,
 ) -> Iterator[Visit]:
-    """Open a page, a file or an address, in a window of ``size`` CSS pixels.
+    """Open a page.
 
     Args:
-        phone: emulate a touch screen that obeys the page's viewport.
-        address: appended to the page's address.
-        log: file of the browser's network log, for :func:`asked`.
+        shown: file or address of the page.
+        size: window, CSS pixels.
+        phone: emulate a phone with a touch screen.
+        address: suffix of the address.
+        log: file for the browser's network log, which :func:`asked` reads after the visit.
     """
+    browser = _shared_browser() if log is None else _launch(f"--log-net-log={log}")
+    context = browser.new_context(
+        viewport={"width": size[0], "height": size[1]},
+        is_mobile=phone,
+        has_touch=phone,
+        color_scheme="dark" if dark else "light",
+        reduced_motion="reduce",
+    )
+    try:
+        page = context.new_page()
+        visited = Visit(page, context.new_cdp_session(page))
+        page.set_default_timeout(_PATIENCE_MS)
+        page.on("console", lambda message: visited.console.append(message.text))
+        page.on("pageerror", lambda error: visited.console.append(str(error)))
+        page.goto((shown if isinstance(shown, str) else shown.resolve().as_uri()) + address)
+        yield visited
+    finally:
+        context.close()
+        if log is not None:
+            browser.close()
+
+
+@functools.cache
+def _playwright() -> Playwright:
     from playwright.sync_api import sync_playwright
 
-    options = [*_OPTIONS, *([] if log is None else [f"--log-net-log={log}"])]
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(
-            executable_path=CHROMIUM, args=options, chromium_sandbox=False
-        )
-        context = browser.new_context(
-            viewport={"width": size[0], "height": size[1]},
-            is_mobile=phone,
-            has_touch=phone,
-            color_scheme="dark" if dark else "light",
-            reduced_motion="reduce",
-        )
-        page = context.new_page()
-        found = Visit(page, context.new_cdp_session(page))
-        found.page.set_default_timeout(_PATIENCE_MS)
-        found.page.on("console", lambda message: found.console.append(message.text))
-        found.page.on("pageerror", lambda error: found.console.append(str(error)))
-        own = shown if isinstance(shown, str) else shown.resolve().as_uri()
-        found.page.goto(own + address)
-        try:
-            yield found
-        finally:
-            browser.close()
+    playwright = sync_playwright().start()
+    atexit.register(playwright.stop)
+    return playwright
+
+
+def _launch(*options: str) -> Browser:
+    return _playwright().chromium.launch(
+        executable_path=CHROMIUM, args=[*_OPTIONS, *options], chromium_sandbox=False
+    )
+
+
+@functools.cache
+def _shared_browser() -> Browser:
+    return _launch()
 
 
 def asked(log: Path) -> set[str]:

@@ -16,6 +16,8 @@ from intercap_core import artefacts
 from intercap_core.body.artefact import read_parameters
 from intercap_core.body.model import BodyModel
 from intercap_core.config import ExportSettings, MetricsSettings
+from intercap_core.output.export.about import About, ExportBody, Verdict
+from intercap_core.output.export.motion import Motion
 from intercap_core.schemas import JOINT
 from intercap_core.stage_list import STAGES
 from intercap_core.stages import export, metrics
@@ -46,6 +48,13 @@ def run(capture: fitted.Capture, output: Path, **settings: Any) -> Path:
         output=output,
     )
     return output
+
+
+def plain_about(motion: Motion) -> About:
+    """Return facts without flags, contact and verdict."""
+    total = len(motion)
+    verdict = Verdict((), np.zeros((0, total)), ())
+    return About("cap", ExportBody.of(motion.model, "neutral"), [""] * total, None, verdict)
 
 
 def changed(capture: fitted.Capture, stage: str, folder: Path) -> tuple[fitted.Capture, Path]:

@@ -1,37 +1,38 @@
-/* Contact by body part: what was found, as a draft, and what the annotation states. Once a section
- * states contact, nothing touches outside of its intervals; so the first edit takes all that was
- * found into the draft. */
-import { bytes } from "./api.js";
-import { UNSEEN } from "./draft.js";
+/* Contact by body part: the intervals that the program estimated, and those of the annotation.
+ * If an annotation states contact, nothing touches outside of its intervals. The first edit therefore
+ * copies all estimated intervals into the draft. */
+import { fromBase64 } from "./api.js";
+import { UNCONFIRMED } from "./draft.js";
 
-const TOUCHING = 0.5;
+const TOUCHING = 0.5; // least probability of estimated contact
 
 export class Contact {
   constructor(app) {
     this.app = app;
-    const told = app.told.contact;
-    this.regions = told?.regions ?? app.told.regions;
-    this.probability = told ? bytes(told.probability) : null;
+    const { contact, regions } = app.info;
+    this.regions = contact?.regions ?? regions;
+    this.probability = contact ? fromBase64(contact.probability) : null;
     this.selected = null; // { part, start, end }
   }
 
-  p(part, frame) {
+  /* Probability of contact of a part in a frame; null if unknown. */
+  probabilityAt(part, frame) {
     const r = this.regions.indexOf(part);
     return this.probability && r >= 0 ? this.probability[frame * this.regions.length + r] / 255 : null;
   }
 
   mean(interval) {
     let sum = 0;
-    for (let t = interval.start; t < interval.end; t += 1) sum += this.p(interval.part, t) ?? 0;
+    for (let t = interval.start; t < interval.end; t += 1) sum += this.probabilityAt(interval.part, t) ?? 0;
     return sum / Math.max(1, interval.end - interval.start);
   }
 
-  found() {
+  estimated() {
     const intervals = [];
     for (const part of this.regions) {
       let start = -1;
-      for (let t = 0; t <= this.app.told.frames; t += 1) {
-        const on = t < this.app.told.frames && (this.p(part, t) ?? 0) >= TOUCHING;
+      for (let t = 0; t <= this.app.info.frames; t += 1) {
+        const on = t < this.app.info.frames && (this.probabilityAt(part, t) ?? 0) >= TOUCHING;
         if (on && start < 0) start = t;
         if (!on && start >= 0) { intervals.push({ part, start, end: t }); start = -1; }
       }
@@ -39,105 +40,109 @@ export class Contact {
     return intervals;
   }
 
+  /* Intervals of the draft; null if it states nothing about contact. */
   get stated() { return this.app.draft.get("contact"); }
 
-  intervals() { return this.stated ?? this.found(); }
+  intervals() { return this.stated ?? this.estimated(); }
 
-  /* The intervals to change: the draft's, or what was found, which becomes the draft; and those of them
-   * that nobody has looked at. */
-  #taken() {
-    if (this.stated) return { all: structuredClone(this.stated), unseen: new Set(this.app.draft.get(UNSEEN) ?? []) };
-    const all = this.found();
-    return { all, unseen: new Set(all.map(id)) };
+  /* A copy of the intervals to edit, and the ids of those that nobody has confirmed. */
+  #editable() {
+    if (this.stated) return { all: structuredClone(this.stated), unconfirmed: new Set(this.app.draft.get(UNCONFIRMED) ?? []) };
+    const all = this.estimated();
+    return { all, unconfirmed: new Set(all.map(id)) };
   }
 
-  looked(interval) { return this.stated !== null && !this.app.draft.get(UNSEEN)?.includes(id(interval)); }
+  isConfirmed(interval) { return this.stated !== null && !this.app.draft.get(UNCONFIRMED)?.includes(id(interval)); }
 
-  #put(intervals, unseen, says) {
+  #store(intervals, unconfirmed, label) {
     intervals.sort((a, b) => order(this.regions, a) - order(this.regions, b) || a.start - b.start);
-    this.app.draft.put({ contact: intervals, [UNSEEN]: intervals.map(id).filter((one) => unseen.has(one)) }, says);
+    this.app.draft.put({ contact: intervals, [UNCONFIRMED]: intervals.map(id).filter((key) => unconfirmed.has(key)) }, label);
   }
 
   change(interval, start, end) {
-    const { all, unseen } = this.#taken(), k = all.findIndex((one) => id(one) === id(interval));
+    const { all, unconfirmed } = this.#editable(), k = all.findIndex((other) => id(other) === id(interval));
     if (k < 0) return;
-    const bound = (v) => Math.max(0, Math.min(this.app.told.frames, Math.round(v)));
-    const next = { ...all[k], start: bound(start), end: bound(end) };
-    if (next.end <= next.start) { this.app.say("contact would end before it starts"); return; }
-    all[k] = next;
-    unseen.delete(id(interval));
-    this.selected = next;
-    this.#put(all, unseen, "contact moved");
+    const clamp = (v) => Math.max(0, Math.min(this.app.info.frames, Math.round(v)));
+    const changed = { ...all[k], start: clamp(start), end: clamp(end) };
+    if (changed.end <= changed.start) { this.app.say("contact would end before it starts"); return; }
+    all[k] = changed;
+    unconfirmed.delete(id(interval));
+    this.selected = changed;
+    this.#store(all, unconfirmed, "contact moved");
   }
 
   confirm(interval) {
-    const { all, unseen } = this.#taken();
-    unseen.delete(id(interval));
+    const { all, unconfirmed } = this.#editable();
+    unconfirmed.delete(id(interval));
     this.selected = interval;
-    this.#put(all, unseen, "contact confirmed");
+    this.#store(all, unconfirmed, "contact confirmed");
   }
 
   remove(interval) {
     this.selected = null;
-    const { all, unseen } = this.#taken(), left = all.filter((one) => id(one) !== id(interval));
-    this.#put(left, unseen, "contact deleted");
-    if (!left.length) this.app.say("nothing touches any more, and that is annotated; \"As found again\" takes the statement away");
+    const { all, unconfirmed } = this.#editable(), kept = all.filter((other) => id(other) !== id(interval));
+    this.#store(kept, unconfirmed, "contact deleted");
+    if (!kept.length) this.app.say("The annotation now states that nothing touches. \"Use the estimate\" removes this statement.");
   }
 
   split(interval, frame) {
-    if (frame <= interval.start || frame >= interval.end) { this.app.say("go to a frame within the interval to split it there"); return; }
-    const { all, unseen } = this.#taken(), rest = all.filter((one) => id(one) !== id(interval));
+    if (frame <= interval.start || frame >= interval.end) { this.app.say("go to a frame inside the interval to split it there"); return; }
+    const { all, unconfirmed } = this.#editable(), others = all.filter((other) => id(other) !== id(interval));
     const parts = [{ ...interval, end: frame }, { ...interval, start: frame }];
-    if (unseen.has(id(interval))) parts.forEach((one) => unseen.add(id(one)));
+    if (unconfirmed.has(id(interval))) parts.forEach((part) => unconfirmed.add(id(part)));
     this.selected = parts[1];
-    this.#put([...rest, ...parts], unseen, "contact split");
+    this.#store([...others, ...parts], unconfirmed, "contact split");
   }
 
+  /* Add contact; overlapping intervals of the part are merged. */
   add(part, start, end) {
-    const { all, unseen } = this.#taken(), meets = all.filter((one) => one.part === part && one.start < end && one.end > start);
-    const next = {
-      part, start: Math.min(start, ...meets.map((one) => one.start)),
-      end: Math.max(end, ...meets.map((one) => one.end)),
+    const { all, unconfirmed } = this.#editable();
+    const overlapping = all.filter((other) => other.part === part && other.start < end && other.end > start);
+    const added = {
+      part, start: Math.min(start, ...overlapping.map((other) => other.start)),
+      end: Math.max(end, ...overlapping.map((other) => other.end)),
     };
-    this.selected = next;
-    unseen.delete(id(next));
-    this.#put([...all.filter((one) => !meets.includes(one)), next], unseen, "contact added");
+    this.selected = added;
+    unconfirmed.delete(id(added));
+    this.#store([...all.filter((other) => !overlapping.includes(other)), added], unconfirmed, "contact added");
   }
 
-  /* No contact of a part in these frames. */
+  /* State that a part does not touch in frames `start` to `end` - 1. */
   clear(part, start, end) {
-    const { all, unseen } = this.#taken(), left = [];
-    for (const one of all) {
-      if (one.part !== part || one.end <= start || one.start >= end) { left.push(one); continue; }
-      if (one.start < start) left.push({ ...one, end: start });
-      if (one.end > end) left.push({ ...one, start: end });
+    const { all, unconfirmed } = this.#editable(), kept = [];
+    for (const interval of all) {
+      if (interval.part !== part || interval.end <= start || interval.start >= end) { kept.push(interval); continue; }
+      if (interval.start < start) kept.push({ ...interval, end: start });
+      if (interval.end > end) kept.push({ ...interval, start: end });
     }
-    this.#put(left, unseen, "contact denied");
+    this.#store(kept, unconfirmed, "contact denied");
   }
 
-  /* No part touches in the whole sequence; an empty list says so. */
-  nothing() {
+  /* State that no part touches in the whole sequence, by an empty list. */
+  stateNone() {
     this.selected = null;
-    this.#put([], new Set(), "nothing touches");
+    this.#store([], new Set(), "nothing touches");
   }
 
-  /* The annotation says nothing of contact: it is found again. */
-  asFound() {
+  /* Remove contact from the annotation, so that the program estimates it. */
+  unstate() {
     this.selected = null;
-    this.app.draft.put({ contact: null, [UNSEEN]: null }, "contact as found again");
+    this.app.draft.put({ contact: null, [UNCONFIRMED]: null }, "contact estimated");
   }
 
-  takeAll() {
-    const { all, unseen } = this.#taken();
-    this.#put(all, unseen, "found contact taken");
+  /* Copy all estimated intervals into the draft. */
+  copyEstimate() {
+    const { all, unconfirmed } = this.#editable();
+    this.#store(all, unconfirmed, "estimated contact copied");
   }
 
-  /* The chosen interval; where a step back has changed it, that of the same part at the frame. */
-  chosen(frame) {
-    const of = this.selected && this.intervals().filter((one) => one.part === this.selected.part);
-    return of?.find((one) => id(one) === id(this.selected)) ?? of?.find((one) => one.start <= frame && frame < one.end) ?? null;
+  /* The selected interval; if undo has changed it, the interval of the same part at the frame. */
+  selectedAt(frame) {
+    const same = this.selected && this.intervals().filter((interval) => interval.part === this.selected.part);
+    return same?.find((interval) => id(interval) === id(this.selected))
+      ?? same?.find((interval) => interval.start <= frame && frame < interval.end) ?? null;
   }
 }
 
-export const id = (one) => `${one.part}:${one.start}:${one.end}`;
-const order = (regions, one) => (one.part === "any" ? 99 : regions.indexOf(one.part));
+export const id = (interval) => `${interval.part}:${interval.start}:${interval.end}`;
+const order = (regions, interval) => (interval.part === "any" ? 99 : regions.indexOf(interval.part));

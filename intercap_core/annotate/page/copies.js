@@ -1,64 +1,61 @@
-/* Copies of what was edited and not saved, in this browser, so that a tab that closes or a tunnel that
- * breaks loses nothing: one for each project, sequence and tab. What a tab left that is gone is
- * offered to the next. */
+/* Copies of unsaved edits in this browser's storage, one for each project, sequence and tab, so that a
+ * closed tab or a broken tunnel loses nothing. Copies of closed tabs are offered to the next tab. */
 const PREFIX = "intercap-draft:";
-const TAB = "intercap-tab"; // in the tab's own storage: this tab's name
-const LOCK = "intercap-tab:"; // held as long as the tab lives
-const KEPT_MS = 30 * 24 * 3600 * 1000;
+const TAB = "intercap-tab"; // key in the tab's own storage: name of this tab
+const LOCK = "intercap-tab:"; // prefix of a lock that is held while the tab is open
+const MAX_AGE_MS = 30 * 24 * 3600 * 1000;
 
 export class Copies {
   static async open(project, sequence) {
     const copies = new Copies();
-    copies.of = `${PREFIX}${project}:${sequence}:`;
-    copies.tab = await ownTab();
-    copies.found = await copies.#left();
+    copies.prefix = `${PREFIX}${project}:${sequence}:`;
+    copies.tab = await nameTab();
+    copies.orphans = await copies.#readOrphans();
     return copies;
   }
 
-  keep(what) { stored((all) => all.setItem(this.of + this.tab, JSON.stringify({ ...what, at: Date.now() }))); }
+  keep(content) { access((storage) => storage.setItem(this.prefix + this.tab, JSON.stringify({ ...content, at: Date.now() }))); }
 
-  drop(key = this.of + this.tab) { stored((all) => all.removeItem(key)); }
+  drop(key = this.prefix + this.tab) { access((storage) => storage.removeItem(key)); }
 
-  /* Copies of tabs that are gone, the latest first. This tab's own, from before it was loaded again,
-   * gets another name, so that new edits do not take its place. */
-  async #left() {
-    const living = await livingTabs(), found = [];
-    for (const key of stored((all) => Object.keys(all)) ?? []) {
+  /* Copies of closed tabs, latest first. This tab's own copy, from before a reload, gets another name,
+   * so that new edits do not overwrite it. */
+  async #readOrphans() {
+    const open = await openTabs(), orphans = [];
+    for (const key of access((storage) => Object.keys(storage)) ?? []) {
       if (!key.startsWith(PREFIX)) continue;
-      const kept = read(key), tab = key.slice(this.of.length);
-      if (!(Date.now() - kept?.at < KEPT_MS)) { this.drop(key); continue; }
-      if (!key.startsWith(this.of) || (tab !== this.tab && living.has(tab)) || !kept.sections) continue;
-      const own = tab === this.tab ? this.of + crypto.randomUUID() : key;
-      if (own !== key) stored((all) => { all.setItem(own, JSON.stringify(kept)); all.removeItem(key); });
-      found.push({ ...kept, key: own });
+      const copy = access((storage) => JSON.parse(storage.getItem(key))), tab = key.slice(this.prefix.length);
+      if (!(Date.now() - copy?.at < MAX_AGE_MS)) { this.drop(key); continue; }
+      if (!key.startsWith(this.prefix) || (tab !== this.tab && open.has(tab)) || !copy.sections) continue;
+      const name = tab === this.tab ? this.prefix + crypto.randomUUID() : key;
+      if (name !== key) access((storage) => { storage.setItem(name, JSON.stringify(copy)); storage.removeItem(key); });
+      orphans.push({ ...copy, key: name });
     }
-    return found.sort((a, b) => b.at - a.at);
+    return orphans.sort((a, b) => b.at - a.at);
   }
 }
 
-const read = (key) => stored((all) => JSON.parse(all.getItem(key)));
-
-/* null in a browser that keeps nothing, or no more. */
-function stored(act) {
+/* Use the browser's storage; null if it is disabled or full. */
+function access(act) {
   try { return act(localStorage); } catch { return null; }
 }
 
-/* A tab that was duplicated has its storage twice, and gets a name of its own. */
-async function ownTab() {
+/* A duplicated tab has a copy of the storage, and therefore gets a new name. */
+async function nameTab() {
   let name = sessionStorage.getItem(TAB) ?? crypto.randomUUID();
-  if (!(await hold(name))) await hold(name = crypto.randomUUID());
+  if (!(await lock(name))) await lock(name = crypto.randomUUID());
   sessionStorage.setItem(TAB, name);
   return name;
 }
 
-const hold = (name) => new Promise((resolve) => {
-  navigator.locks.request(LOCK + name, { ifAvailable: true }, (lock) => {
-    resolve(lock !== null);
-    return lock && new Promise(() => {});
+const lock = (name) => new Promise((resolve) => {
+  navigator.locks.request(LOCK + name, { ifAvailable: true }, (granted) => {
+    resolve(granted !== null);
+    return granted && new Promise(() => {});
   });
 });
 
-async function livingTabs() {
+async function openTabs() {
   const { held } = await navigator.locks.query();
-  return new Set(held.filter((one) => one.name.startsWith(LOCK)).map((one) => one.name.slice(LOCK.length)));
+  return new Set(held.filter(({ name }) => name.startsWith(LOCK)).map(({ name }) => name.slice(LOCK.length)));
 }

@@ -1,4 +1,4 @@
-/* Elements, always by text and never by HTML: what files and users say is shown as it is. */
+/* Creation of page elements. Text from files and users is inserted as text, never as HTML. */
 export const find = (id) => document.getElementById(id);
 
 export function make(tag, properties = {}, ...children) {
@@ -17,27 +17,27 @@ export function make(tag, properties = {}, ...children) {
 export const button = (text, click, properties = {}) =>
   make("button", { type: "button", onclick: click, ...properties }, text);
 
-export const words = (name) => name.replaceAll("_", " ");
+export const readable = (name) => name.replaceAll("_", " ");
 
-/* New children of a box. What was in focus by the keyboard stays so: the nearest that is called the same,
- * else the box's first. */
+/* Replace the children of a box. A control that had the keyboard focus passes it to the nearest new control
+ * with the same label, or else to the first one. */
 export function refill(box, ...children) {
   const all = () => [...box.querySelectorAll("button, input, select, summary")];
-  const called = (one) => `${one.tagName} ${one.title || one.textContent}`;
+  const label = (control) => `${control.tagName} ${control.title || control.textContent}`;
   const old = document.activeElement, at = old?.matches(":focus-visible") ? all().indexOf(old) : -1;
   box.replaceChildren(...children);
   if (at < 0) return;
-  const now = all(), alike = now.filter((one) => called(one) === called(old));
-  const [next] = alike.sort((a, b) => Math.abs(now.indexOf(a) - at) - Math.abs(now.indexOf(b) - at));
+  const now = all(), same = now.filter((control) => label(control) === label(old));
+  const [next] = same.sort((a, b) => Math.abs(now.indexOf(a) - at) - Math.abs(now.indexOf(b) - at));
   (next ?? now[0])?.focus({ preventScroll: true });
 }
 
-/* A dialog with buttons; resolves to the value of the one that was pressed, "" = it was closed. */
+/* Show a dialog; resolves to the value of the pressed button, "" if the dialog was closed. */
 export function ask(title, body, choices) {
   const dialog = find("dialog");
   find("dialog-title").textContent = title;
   find("dialog-body").replaceChildren(...[body].flat());
-  dialog.onclose?.(); // another dialog was open: it is not answered
+  dialog.onclose?.(); // an open dialog is closed without an answer
   return new Promise((resolve) => {
     let answer = "";
     const close = (value) => { answer = value; dialog.close(); };
@@ -49,7 +49,7 @@ export function ask(title, body, choices) {
   });
 }
 
-/* A sentence above the views, with what can be done about it. */
+/* Show a message above the views with buttons for actions; "" removes it. */
 export function banner(id, text, actions = []) {
   find("banners").querySelector(`[data-banner="${id}"]`)?.remove();
   if (!text) return;

@@ -1,115 +1,115 @@
-/* The annotation as it is edited: its sections, undo and redo; a copy of it is kept in this browser. */
+/* The edited annotation: its sections, and undo and redo. A copy is stored in this browser. */
 export const SECTIONS = ["contact", "object_poses", "object_pose", "floor", "subject", "drop_frames", "left_right"];
-/* Not of the file: intervals of contact, as they were found, that nobody has looked at. */
-export const UNSEEN = "unseen";
-const plain = (value) => JSON.stringify(value ?? null, (_, one) => // whatever the order of its keys
-  (one && typeof one === "object" && !Array.isArray(one) ? Object.fromEntries(Object.entries(one).sort()) : one));
-export const same = (a, b) => plain(a) === plain(b);
-/* An empty list says as much as no section, but of contact: there it says that nothing touches. */
-export const stated = (name, value) => (Array.isArray(value) && !value.length && name !== "contact" ? null : value ?? null);
+/* Not a section of the file: ids of estimated contact intervals that nobody has confirmed. */
+export const UNCONFIRMED = "unconfirmed";
+const canonical = (value) => JSON.stringify(value ?? null, (_, item) => // independent of the order of keys
+  (item && typeof item === "object" && !Array.isArray(item) ? Object.fromEntries(Object.entries(item).sort()) : item));
+export const same = (a, b) => canonical(a) === canonical(b);
+/* An empty list equals a missing section, except for contact: there it states that nothing touches. */
+export const normalize = (name, value) => (Array.isArray(value) && !value.length && name !== "contact" ? null : value ?? null);
 
 export class Draft extends EventTarget {
   constructor(annotation, copies) {
     super();
     this.copies = copies;
-    this.undone = [];
-    this.done = [];
-    this.base(annotation);
+    this.redoSteps = [];
+    this.undoSteps = [];
+    this.rebase(annotation);
     this.sections = structuredClone(this.saved);
   }
 
-  /* What the file holds by now; the edits stay. Of theirs no step back leads out: an earlier step
-   * would take away what they saved. */
-  base(annotation, theirs = false) {
-    if (theirs) { this.done = []; this.undone = []; }
+  /* Replace the saved sections by those of the file; edits stay. After a save by another annotator
+   * (`theirs`), undo is cleared: an earlier step would remove their changes. */
+  rebase(annotation, theirs = false) {
+    if (theirs) { this.undoSteps = []; this.redoSteps = []; }
     this.file = annotation;
     this.saved = {};
-    for (const name of SECTIONS) this.saved[name] = stated(name, annotation.sections[name]);
+    for (const name of SECTIONS) this.saved[name] = normalize(name, annotation.sections[name]);
   }
 
   get(section) { return this.sections[section] ?? null; }
 
-  /* One step that can be undone; what is said of it is shown. */
-  set(section, value, says = "") { this.put({ [section]: value }, says); }
+  set(section, value, label = "") { this.put({ [section]: value }, label); }
 
-  /* The same of several sections at once. */
-  put(values, says = "") {
+  /* Set several sections as one undo step with a label. */
+  put(values, label = "") {
     const next = {};
-    for (const [name, value] of Object.entries(values)) next[name] = structuredClone(stated(name, value));
+    for (const [name, value] of Object.entries(values)) next[name] = structuredClone(normalize(name, value));
     if (Object.keys(next).every((name) => same(next[name], this.sections[name]))) return;
-    this.done.push({ sections: this.sections, says });
-    this.undone = [];
+    this.undoSteps.push({ sections: this.sections, label });
+    this.redoSteps = [];
     this.sections = { ...this.sections, ...next };
-    this.told();
+    this.notify();
   }
 
-  undo() { this.#swap(this.done, this.undone); }
+  undo() { this.#step(this.undoSteps, this.redoSteps); }
 
-  redo() { this.#swap(this.undone, this.done); }
+  redo() { this.#step(this.redoSteps, this.undoSteps); }
 
-  #swap(from, to) {
+  #step(from, to) {
     const step = from.pop();
     if (!step) return;
-    to.push({ sections: this.sections, says: step.says });
+    to.push({ sections: this.sections, label: step.label });
     this.sections = step.sections;
-    this.told();
+    this.notify();
   }
 
-  /* The sections that differ from the file's; null takes one away. */
+  /* Sections that differ from the file; null removes a section. */
   changes() {
-    const found = {};
+    const changes = {};
     for (const name of SECTIONS) {
-      if (!same(this.sections[name], this.saved[name])) found[name] = this.sections[name] ?? null;
+      if (!same(this.sections[name], this.saved[name])) changes[name] = this.sections[name] ?? null;
     }
-    return found;
+    return changes;
   }
 
   get dirty() { return Object.keys(this.changes()).length > 0; }
 
-  /* Edits upon what the file has by now. */
-  over(edits) {
-    this.sections = { ...structuredClone(this.saved), ...structuredClone(edits), [UNSEEN]: this.get(UNSEEN) };
-    this.told();
+  /* Apply edits to the saved sections. */
+  reapply(edits) {
+    this.sections = { ...structuredClone(this.saved), ...structuredClone(edits), [UNCONFIRMED]: this.get(UNCONFIRMED) };
+    this.notify();
   }
 
-  /* The file's sections in place of the edits, as a step that can be undone. */
-  takeFile(says) {
-    this.done.push({ sections: this.sections, says });
+  /* Replace the edits by the file's sections, as one undo step. */
+  revert(label) {
+    this.undoSteps.push({ sections: this.sections, label });
     this.sections = structuredClone(this.saved);
-    this.told();
+    this.notify();
   }
 
-  told() {
+  /* Update the copy in the browser, and notify listeners. */
+  notify() {
     if (this.dirty) {
       const { digest, text } = this.file;
-      this.copies.keep({ digest, text, sections: this.saved, changes: this.changes(), [UNSEEN]: this.get(UNSEEN) });
+      this.copies.keep({ digest, text, sections: this.saved, changes: this.changes(), [UNCONFIRMED]: this.get(UNCONFIRMED) });
     } else this.copies.drop();
     this.dispatchEvent(new Event("change"));
   }
 
-  /* Edits that tabs which are gone did not save, the latest first. */
-  left() {
-    return this.copies.found.filter((kept) => {
-      const open = SECTIONS.some((name) => name in kept.changes && !same(kept.changes[name], this.saved[name]));
-      if (!open) this.copies.drop(kept.key);
-      return open;
+  /* Unsaved edits of closed tabs, latest first; copies without a difference to the file are dropped. */
+  orphans() {
+    return this.copies.orphans.filter((copy) => {
+      const differs = SECTIONS.some((name) => name in copy.changes && !same(copy.changes[name], this.saved[name]));
+      if (!differs) this.copies.drop(copy.key);
+      return differs;
     });
   }
 
-  /* Go on with such edits, upon the file that they were made on. */
-  takeLeft(kept) {
-    if (kept.digest === this.file.digest) this.done.push({ sections: this.sections, says: "taken up again" });
+  /* Continue the edits of a closed tab on the file that they were made on. */
+  restore(copy) {
+    if (copy.digest === this.file.digest) this.undoSteps.push({ sections: this.sections, label: "edits restored" });
     else {
-      this.base({ ...this.file, digest: kept.digest, text: kept.text, sections: kept.sections }, true);
+      this.rebase({ ...this.file, digest: copy.digest, text: copy.text, sections: copy.sections }, true);
       this.sections = structuredClone(this.saved);
     }
-    this.sections = { ...this.sections, ...structuredClone({ ...kept.changes, [UNSEEN]: kept[UNSEEN] ?? null }) };
-    this.told();
-    this.dropLeft(kept);
+    this.sections = { ...this.sections, ...structuredClone({ ...copy.changes, [UNCONFIRMED]: copy[UNCONFIRMED] ?? null }) };
+    this.notify();
+    this.discard(copy);
   }
 
-  dropLeft(kept) {
-    this.copies.found = this.copies.found.filter((one) => one !== kept);
-    this.copies.drop(kept.key);
+  discard(copy) {
+    this.copies.orphans = this.copies.orphans.filter((other) => other !== copy);
+    this.copies.drop(copy.key);
   }
 }

@@ -1,4 +1,5 @@
-/* Rigid motions as 3x4 rows, rotation vectors, and the lens of intercap_core/geometry/camera/projection.py. */
+/* Rigid transforms as rows of a 3x4 matrix, rotation vectors, and the lens model of
+ * intercap_core/geometry/camera/projection.py. */
 export const IDENTITY = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]];
 
 export const compose = (a, b) => a.map((row) => [0, 1, 2, 3].map((k) =>
@@ -9,7 +10,7 @@ export const invert = (a) => [0, 1, 2].map((k) => [
 
 export const apply = (a, [x, y, z]) => a.map((row) => row[0] * x + row[1] * y + row[2] * z + row[3]);
 
-export const turnOnly = (a, [x, y, z]) => a.map((row) => row[0] * x + row[1] * y + row[2] * z);
+export const rotate = (a, [x, y, z]) => a.map((row) => row[0] * x + row[1] * y + row[2] * z);
 
 export const norm = (v) => Math.hypot(...v);
 
@@ -18,7 +19,7 @@ export const columnMajor = (a) => new Float32Array([
 
 export const rows = (flat) => [flat.slice(0, 4), flat.slice(4, 8), flat.slice(8, 12)].map((row) => [...row]);
 
-/* Rotation vector (axis times angle) to 3x4 rows with a translation. */
+/* Transform of a rotation vector (axis times angle) and a translation. */
 export function rigid(vector, translation) {
   const angle = norm(vector);
   const [x, y, z] = angle > 1e-12 ? vector.map((v) => v / angle) : [0, 0, 0];
@@ -37,7 +38,7 @@ export function rotationVector(a) {
   const off = [a[2][1] - a[1][2], a[0][2] - a[2][0], a[1][0] - a[0][1]];
   if (angle < 1e-7) return off.map((v) => v / 2);
   if (Math.PI - angle > 1e-4) return off.map((v) => (v * angle) / (2 * Math.sin(angle)));
-  // near half a turn the axis is in the symmetric part
+  // near half a turn, the axis is in the symmetric part of the matrix
   const k = [0, 1, 2].reduce((best, i) => (a[i][i] > a[best][best] ? i : best), 0);
   const axis = [0, 1, 2].map((i) => (a[i][k] + a[k][i]) / 2 + (i === k ? 1 : 0));
   const length = norm(axis);
@@ -45,14 +46,14 @@ export function rotationVector(a) {
   return axis.map((v) => (sign * v * angle) / length);
 }
 
-/* The pose turned by a rotation vector about a point, all in the pose's outer frame. */
-export function turnedAbout(pose, vector, point) {
+/* Rotate a pose by a rotation vector about a point; both are in the pose's outer frame. */
+export function rotateAbout(pose, vector, point) {
   const turn = rigid(vector, [0, 0, 0]);
-  const shift = turnOnly(turn, point).map((v, i) => point[i] - v);
+  const shift = rotate(turn, point).map((v, i) => point[i] - v);
   return compose(turn.map((row, i) => [row[0], row[1], row[2], shift[i]]), pose);
 }
 
-/* Pixel of a point in the camera's frame, and its depth. */
+/* Project a point of the camera's frame: [x, y] in pixels and depth. */
 export function project(lens, [px, py, pz]) {
   const [fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, limit] = lens;
   const depth = Math.max(pz, 1e-3);

@@ -1,30 +1,30 @@
-/* What is clicked in the images: the subject, points of the floor; and frames to drop. */
+/* Marks in the images: the subject, points of the floor, and frames to drop. */
 import { post } from "./api.js";
 import { button, make } from "./dom.js";
 import { runs } from "./timeline.js";
 
-/* Who of several people is the subject: a click on the person. */
+/* Clicks on the subject among several people. */
 export class SubjectMarks {
   constructor(app) { this.app = app; }
 
-  get hint() { return "Click the subject in any view, once; again where the person left and came back. Esc ends."; }
+  get hint() { return "Click the subject once, in any view; click again in a frame after the person was out of view. Esc ends."; }
 
   press(view, event) {
     if (event.button !== 0) return null;
     const { app } = this, [x, y] = view.pixel(event), [w, h] = view.camera.size;
     const set = app.setOf(view.index, app.frame);
-    if (set < 0 || x < 0 || y < 0 || x >= w || y >= h) { app.say("this view has no image here"); return {}; }
+    if (set < 0 || x < 0 || y < 0 || x >= w || y >= h) { app.say("there is no image at this position"); return {}; }
     const point = { camera: view.camera.name, frame: set, x: Number(x.toFixed(1)), y: Number(y.toFixed(1)) };
-    const others = (app.draft.get("subject") ?? []).filter((one) => one.camera !== point.camera || one.frame !== set);
-    app.draft.set("subject", [...others, point], "subject named");
+    const others = (app.draft.get("subject") ?? []).filter((mark) => mark.camera !== point.camera || mark.frame !== set);
+    app.draft.set("subject", [...others, point], "subject marked");
     return {};
   }
 
   mark(view, brush) {
     const { app } = this;
-    for (const one of app.draft.get("subject") ?? []) {
-      if (one.camera !== view.camera.name || (one.frame ?? 0) !== app.setOf(view.index, app.frame)) continue;
-      const [x, y] = app.views.spot(view, one.x, one.y);
+    for (const mark of app.draft.get("subject") ?? []) {
+      if (mark.camera !== view.camera.name || (mark.frame ?? 0) !== app.setOf(view.index, app.frame)) continue;
+      const [x, y] = app.views.spot(view, mark.x, mark.y);
       ring(brush, x, y, "#ffd60a", 9);
       brush.font = "bold 13px system-ui";
       brush.fillStyle = "#ffd60a";
@@ -33,19 +33,19 @@ export class SubjectMarks {
   }
 
   panel() {
-    const { app } = this, points = app.draft.get("subject") ?? [], told = app.told.subject;
-    const by = { alone: "nobody else was seen", named: "named in the annotation", handling: "who handles the object", middle: "who is seen most" };
+    const { app } = this, points = app.draft.get("subject") ?? [], { subject } = app.info;
+    const reasons = { alone: "the only person", named: "marked in the annotation", handling: "the person who handles the object", middle: "the person who is visible most" };
     return make("div", {},
-      make("p", {}, told ? `Chosen as: ${by[told.chosen_by] ?? told.chosen_by}.${told.doubts ? ` Doubt: ${told.doubts}.` : ""}` : "The subject is not chosen yet."),
-      make("ul", {}, points.map((one, k) => make("li", {}, `${one.camera}, frame ${one.frame ?? 0} `,
-        button("Go", () => app.show(one.frame ?? 0)),
+      make("p", {}, subject ? `The subject is ${reasons[subject.chosen_by] ?? subject.chosen_by}.${subject.doubts ? ` Doubt: ${subject.doubts}.` : ""}` : "The subject has not been determined yet."),
+      make("ul", {}, points.map((point, k) => make("li", {}, `${point.camera}, frame ${point.frame ?? 0} `,
+        button("Go", () => app.show(point.frame ?? 0)),
         button("Remove", () => app.draft.set("subject", points.filter((_, i) => i !== k), "subject point removed"))))),
       app.mode === this ? button("Done", () => app.setMode(null), { title: "Esc" })
         : button("Click the subject", () => app.setMode(this), { class: "main", title: "U" }));
   }
 }
 
-/* Three points of the floor or more; where they lie, a camera's depth says. */
+/* Three or more points of the floor; the server measures their position by depth. */
 export class FloorMarks {
   constructor(app) { this.app = app; }
 
@@ -60,8 +60,8 @@ export class FloorMarks {
   async #add(view, event) {
     const { app } = this, [x, y] = view.pixel(event);
     try {
-      const found = await post(`sequences/${app.told.sequence}/point`, { camera: view.camera.name, frame: app.frame, x, y });
-      app.draft.set("floor", [...(app.draft.get("floor") ?? []), found.point], "floor point");
+      const { point } = await post(`sequences/${app.info.sequence}/point`, { camera: view.camera.name, frame: app.frame, x, y });
+      app.draft.set("floor", [...(app.draft.get("floor") ?? []), point], "floor point");
     } catch (error) { app.say(error.message); }
   }
 
@@ -87,10 +87,10 @@ export class FloorMarks {
     }
   }
 
-  /* Lines of the plane through the points, as a grid about their middle; without, of the known floor. */
+  /* Grid lines of the plane through the points, or of the known floor. */
   grid() {
     const points = this.app.draft.get("floor") ?? [];
-    const known = this.app.told.ground;
+    const known = this.app.info.ground;
     const normal = points.length >= 3 ? planeNormal(points) : known?.normal;
     if (!normal) return [];
     const middle = points.length >= 3 ? [0, 1, 2].map((i) => points.reduce((s, p) => s + p[i], 0) / points.length) : this.#below(known);
@@ -105,7 +105,7 @@ export class FloorMarks {
     return lines;
   }
 
-  #below(ground) { // of the scene's floor, the point under the middle of the room
+  #below(ground) { // point of the floor below the middle of the room
     const middle = this.app.middle(), { point, normal } = ground;
     const above = normal.reduce((s, n, i) => s + n * (middle[i] - point[i]), 0);
     return middle.map((v, i) => v - above * normal[i]);
@@ -113,9 +113,9 @@ export class FloorMarks {
 
   panel() {
     const { app } = this, points = app.draft.get("floor") ?? [];
-    const says = points.length ? `${points.length} points${points.length < 3 ? ": a plane needs 3 or more" : ""}.`
-      : app.told.ground ? "The floor is known; the grid shows it. Points replace it." : "No floor is known.";
-    return make("div", {}, make("p", {}, says),
+    const status = points.length ? `${points.length} points${points.length < 3 ? ": a plane needs 3 or more" : ""}.`
+      : app.info.ground ? "The grid shows the known floor. Points replace it." : "No floor is known.";
+    return make("div", {}, make("p", {}, status),
       make("ol", {}, points.map((point, k) => make("li", {}, `${point.map((v) => v.toFixed(3)).join(", ")} m `,
         button("Remove", () => app.draft.set("floor", points.filter((_, i) => i !== k), "floor point removed"))))),
       app.mode === this ? button("Done", () => app.setMode(null), { title: "Esc" })
@@ -123,8 +123,7 @@ export class FloorMarks {
   }
 }
 
-/* Frame sets that count as not recorded; all frames keep their numbers, so intervals stay where they
- * are in time. */
+/* Frame sets that count as not recorded. Other frames keep their numbers. */
 export class DroppedFrames {
   constructor(app) { this.app = app; this.from = null; this.on = true; }
 
@@ -133,16 +132,16 @@ export class DroppedFrames {
   toggle(frame) { this.put(frame, frame, !this.has(frame)); }
 
   put(first, last, on) {
-    const { app } = this, now = new Set(app.draft.get("drop_frames") ?? []);
-    for (let t = first; t <= last; t += 1) { if (on) now.add(t); else now.delete(t); }
-    app.draft.set("drop_frames", [...now].sort((a, b) => a - b), on ? "frames dropped" : "frames kept");
+    const { app } = this, frames = new Set(app.draft.get("drop_frames") ?? []);
+    for (let t = first; t <= last; t += 1) { if (on) frames.add(t); else frames.delete(t); }
+    app.draft.set("drop_frames", [...frames].sort((a, b) => a - b), on ? "frames dropped" : "frames kept");
   }
 
   panel() {
     const { app } = this, dropped = app.draft.get("drop_frames") ?? [];
     return make("div", {},
       make("p", {}, dropped.length ? `Dropped: ${runs(dropped).map(([a, b]) => (a === b ? a : `${a}–${b}`)).join(", ")}.` : "No frames are dropped."),
-      make("p", { class: "dim" }, "A dropped frame keeps its number and counts as not recorded: contact and poses stay where they are in time."),
+      make("p", { class: "dim" }, "A dropped frame counts as not recorded. All frames keep their numbers, so contact and poses do not move in time."),
       button(this.has(app.frame) ? `Keep frame ${app.frame}` : `Drop frame ${app.frame}`, () => this.toggle(app.frame), { class: "main", title: "X" }),
       this.from === null
         ? button(`${this.has(app.frame) ? "Keep" : "Drop"} from this frame…`, () => { this.from = app.frame; this.on = !this.has(app.frame); app.panels(); })
@@ -167,7 +166,7 @@ function ring(brush, x, y, colour, radius) {
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const unit = (v) => { const n = Math.hypot(...v) || 1; return v.map((x) => x / n); };
 
-/* Of three points their plane's; of more, the mean of the triangles' about the middle. */
+/* Normal of a plane: the mean normal of the triangles that pairs of points form with their centroid. */
 function planeNormal(points) {
   const middle = [0, 1, 2].map((i) => points.reduce((s, p) => s + p[i], 0) / points.length);
   let sum = [0, 0, 0];

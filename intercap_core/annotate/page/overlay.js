@@ -1,9 +1,9 @@
-/* Body and object drawn as the cameras saw them, lens included, all views on one WebGL canvas: one
- * picture a step, from which each view takes its part. */
+/* Body and object rendered through each camera's lens. All views share one WebGL canvas, from which
+ * each view copies its part. */
 import { columnMajor } from "./geometry.js";
 
-const CELLS_M = [0.01, 0.02, 0.04]; // of the coarser meshes
-const COARSE_PX = 4; // a cell may be seen this large
+const CELLS_M = [0.01, 0.02, 0.04]; // cell sizes of the simplified meshes
+const COARSE_PX = 4; // largest size of a cell in a view
 
 const VERTEX = `#version 300 es
 in vec3 place; in vec3 colour;
@@ -41,7 +41,7 @@ export class Overlay {
   constructor() {
     this.canvas = document.createElement("canvas");
     const gl = this.canvas.getContext("webgl2", { antialias: false, alpha: true, premultipliedAlpha: true, powerPreference: "high-performance" });
-    if (!gl) throw new Error("this browser draws no 3D (WebGL is switched off or missing)");
+    if (!gl) throw new Error("this browser cannot draw in 3D (WebGL is disabled or missing)");
     this.gl = gl;
     this.program = link(gl);
     this.at = {};
@@ -53,59 +53,59 @@ export class Overlay {
     gl.enable(gl.SCISSOR_TEST);
   }
 
-  /* A mesh by name: faces and one colour (3,), or colours by vertex with `move`. With its `rest`
-   * places (metres) it is also drawn coarser where a view shows it small. */
+  /* Add a mesh: faces, and one colour (3,) or, by `move`, a colour per vertex. With vertices of a rest
+   * pose (metres), simplified meshes are made for views that show it small. */
   mesh(name, faces, colour, rest = null) {
     const gl = this.gl;
-    const own = { colour, vao: gl.createVertexArray(), place: gl.createBuffer(), paint: null, levels: [] };
-    gl.bindVertexArray(own.vao);
-    gl.bindBuffer(gl.ARRAY_BUFFER, own.place);
+    const mesh = { colour, vao: gl.createVertexArray(), place: gl.createBuffer(), paint: null, levels: [] };
+    gl.bindVertexArray(mesh.vao);
+    gl.bindBuffer(gl.ARRAY_BUFFER, mesh.place);
     gl.enableVertexAttribArray(0);
     gl.vertexAttribPointer(0, 3, gl.FLOAT, false, 0, 0);
     gl.bindVertexArray(null);
     for (const cell of rest ? [0, ...CELLS_M] : [0]) {
-      const kept = cell ? coarser(faces, rest, cell) : faces;
+      const kept = cell ? simplify(faces, rest, cell) : faces;
       const buffer = gl.createBuffer();
       gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, buffer);
       gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, kept, gl.STATIC_DRAW);
-      own.levels.push({ cell, buffer, count: kept.length });
+      mesh.levels.push({ cell, buffer, count: kept.length });
     }
-    this.meshes.set(name, own);
+    this.meshes.set(name, mesh);
   }
 
   move(name, places, colours = null) {
-    const gl = this.gl, own = this.meshes.get(name);
-    gl.bindBuffer(gl.ARRAY_BUFFER, own.place);
+    const gl = this.gl, mesh = this.meshes.get(name);
+    gl.bindBuffer(gl.ARRAY_BUFFER, mesh.place);
     gl.bufferData(gl.ARRAY_BUFFER, places, gl.DYNAMIC_DRAW);
     if (!colours) return;
-    gl.bindVertexArray(own.vao);
-    own.paint ??= gl.createBuffer();
-    gl.bindBuffer(gl.ARRAY_BUFFER, own.paint);
+    gl.bindVertexArray(mesh.vao);
+    mesh.paint ??= gl.createBuffer();
+    gl.bindBuffer(gl.ARRAY_BUFFER, mesh.paint);
     gl.bufferData(gl.ARRAY_BUFFER, colours, gl.DYNAMIC_DRAW);
     gl.enableVertexAttribArray(1);
     gl.vertexAttribPointer(1, 3, gl.FLOAT, false, 0, 0);
     gl.bindVertexArray(null);
   }
 
-  /* Draw `things` ({ name, pose: master_from_mesh }) for each of `views` ({ camera, crop, width,
-   * height }); afterwards view.part is where its picture lies on this.canvas. */
-  draw(views, things) {
+  /* Draw `drawables` ({ name, pose: master_from_mesh }) for `views` ({ camera, crop, width, height }).
+   * Sets view.part, the rectangle of each view on this.canvas. */
+  draw(views, drawables) {
     const gl = this.gl;
-    let top = 0, wide = 1;
+    let top = 0, width = 1;
     for (const view of views) {
       view.part = [0, top, view.width, view.height];
       top += view.height;
-      wide = Math.max(wide, view.width);
+      width = Math.max(width, view.width);
     }
-    if (this.canvas.width < wide || this.canvas.height < top || this.canvas.width > 2 * wide) {
-      this.canvas.width = wide;
+    if (this.canvas.width < width || this.canvas.height < top || this.canvas.width > 2 * width) {
+      this.canvas.width = width;
       this.canvas.height = Math.max(1, top);
     }
     gl.useProgram(this.program);
     gl.scissor(0, 0, this.canvas.width, this.canvas.height);
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    for (const thing of things) thing.matrix = columnMajor(thing.pose);
+    for (const drawable of drawables) drawable.matrix = columnMajor(drawable.pose);
     for (const view of views) {
       if (!view.camera.pose) continue;
       const [x, y, w, h] = view.part;
@@ -115,11 +115,11 @@ export class Overlay {
       gl.uniformMatrix4fv(this.at.camera_from_master, false, columnMajor(view.camera.pose));
       gl.uniform1fv(this.at.lens, view.camera.lens);
       gl.uniform4fv(this.at.crop, view.crop);
-      for (const { name, matrix, colour } of things) {
-        const own = this.meshes.get(name), level = levelFor(own, view, matrix);
-        gl.bindVertexArray(own.vao);
+      for (const { name, matrix, colour } of drawables) {
+        const mesh = this.meshes.get(name), level = levelFor(mesh, view, matrix);
+        gl.bindVertexArray(mesh.vao);
         gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, level.buffer);
-        if (!own.paint) gl.vertexAttrib3f(1, ...(colour ?? own.colour));
+        if (!mesh.paint) gl.vertexAttrib3f(1, ...(colour ?? mesh.colour));
         gl.uniformMatrix4fv(this.at.master_from_mesh, false, matrix);
         gl.drawElements(gl.TRIANGLES, level.count, gl.UNSIGNED_INT, 0);
       }
@@ -128,25 +128,25 @@ export class Overlay {
   }
 }
 
-/* The coarsest level whose cells a view shows no larger than a few pixels. */
-function levelFor(own, view, matrix) {
+/* The coarsest level whose cells are at most COARSE_PX large in a view. */
+function levelFor(mesh, view, matrix) {
   const [, , ahead] = view.camera.pose;
   const depth = Math.max(0.5, ahead[0] * matrix[12] + ahead[1] * matrix[13] + ahead[2] * matrix[14] + ahead[3]);
-  const pixels = (view.camera.lens[0] / depth) * (view.width / view.crop[2]); // of a metre
-  return own.levels.findLast((level) => level.cell * pixels <= COARSE_PX) ?? own.levels[0];
+  const pixels = (view.camera.lens[0] / depth) * (view.width / view.crop[2]); // pixels per metre
+  return mesh.levels.findLast((level) => level.cell * pixels <= COARSE_PX) ?? mesh.levels[0];
 }
 
-/* Faces with all vertices of a cell drawn as one: those that are left. */
-function coarser(faces, rest, cell) {
-  const first = new Map(), stands = new Uint32Array(rest.length / 3);
-  for (let v = 0; v < stands.length; v += 1) {
+/* Simplify a mesh by vertex clustering: merge the vertices of each grid cell, drop collapsed faces. */
+function simplify(faces, rest, cell) {
+  const first = new Map(), merged = new Uint32Array(rest.length / 3);
+  for (let v = 0; v < merged.length; v += 1) {
     const key = [0, 1, 2].map((k) => Math.floor(rest[3 * v + k] / cell)).join();
     if (!first.has(key)) first.set(key, v);
-    stands[v] = first.get(key);
+    merged[v] = first.get(key);
   }
   const kept = [];
   for (let f = 0; f < faces.length; f += 3) {
-    const [a, b, c] = [stands[faces[f]], stands[faces[f + 1]], stands[faces[f + 2]]];
+    const [a, b, c] = [merged[faces[f]], merged[faces[f + 1]], merged[faces[f + 2]]];
     if (a !== b && b !== c && c !== a) kept.push(a, b, c);
   }
   return new Uint32Array(kept);

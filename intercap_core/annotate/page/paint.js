@@ -1,92 +1,92 @@
-/* Where people are likely to touch the object, painted on its mesh in any view. The list is of the
- * object: all sequences that have it share it, so it is saved by a button of its own. */
+/* Painting of the surface that people are likely to touch, in any view. The list belongs to the object
+ * and all its sequences, and therefore has its own save button. */
 import { get, post } from "./api.js";
 import { ask, button, make } from "./dom.js";
-import { apply, turnOnly } from "./geometry.js";
+import { apply, rotate } from "./geometry.js";
 
-const BRUSH_PX = 14; // of the screen
-const BEHIND = 0.04; // of the object's size: what lies this much behind the nearest is not painted
+const BRUSH_PX = 14; // radius on the screen
+const DEPTH_RANGE = 0.04; // share of the object's diameter; vertices farther behind the nearest are not painted
 
 export class Paint {
-  /* `before`: the one until now, whose strokes go on where the mesh is the same. */
+  /* `before`: the earlier instance, whose unsaved strokes are kept if the mesh is the same. */
   constructor(app, object, before = null) {
     this.app = app;
     const { vertices, faces } = object.arrays;
     this.vertices = vertices;
     this.normals = normalsOf(vertices, faces);
     this.size = object.header.diameter;
-    this.told = null;
+    this.surface = null;
     this.painted = new Set();
     this.strokes = [];
-    this.undone = [];
+    this.redoStrokes = [];
     if (before?.changed) {
-      const { vertices: own } = before;
-      if (own.length === vertices.length && own.every((v, k) => v === vertices[k])) {
-        const { told, saved, painted, strokes, undone } = before;
-        Object.assign(this, { told, saved, painted, strokes, undone });
-      } else app.say("the object has another mesh by now: what was painted and not saved was of the old one, and is gone");
+      const { vertices: old } = before;
+      if (old.length === vertices.length && old.every((v, k) => v === vertices[k])) {
+        const { surface, saved, painted, strokes, redoStrokes } = before;
+        Object.assign(this, { surface, saved, painted, strokes, redoStrokes });
+      } else app.say("the object's mesh has changed: unsaved paint on the old mesh was discarded");
     }
   }
 
   get hint() { return "Paint where people touch the object; Shift erases, the wheel zooms, Ctrl+Z undoes a stroke. Esc ends."; }
 
-  get path() { return `sequences/${this.app.told.sequence}/surface`; }
+  get path() { return `sequences/${this.app.info.sequence}/surface`; }
 
   async start() {
     const { app } = this;
-    if (!app.pose.at(app.frame)) { app.say("the object is not in this frame; place it first"); return; }
+    if (!app.pose.at(app.frame)) { app.say("the object has no pose in this frame; place it first"); return; }
     try {
-      if (!this.told) this.#take(await get(this.path));
+      if (!this.surface) this.#load(await get(this.path));
     } catch (error) { app.say(error.message); return; }
     app.setMode(this);
-    app.near = false;
-    app.views.near(app.middle(), 0.9 * this.size);
+    app.following = false;
+    app.views.zoomTo(app.middle(), 0.9 * this.size);
   }
 
-  #take(told) {
-    this.told = told;
-    this.saved = new Set(told.vertices);
-    this.painted = new Set(told.vertices);
+  #load(surface) {
+    this.surface = surface;
+    this.saved = new Set(surface.vertices);
+    this.painted = new Set(surface.vertices);
     this.strokes = [];
-    this.undone = [];
+    this.redoStrokes = [];
   }
 
-  /* Vertices that a view sees from ahead: { id, at: on its canvas, depth }. */
-  #seen(view) {
-    const { app } = this, pose = app.pose.at(app.frame), found = [];
-    if (!pose || !view.camera.pose) return found;
+  /* Vertices that face a view: { id, at: position on its canvas, depth }. */
+  #visible(view) {
+    const { app } = this, pose = app.pose.at(app.frame), visible = [];
+    if (!pose || !view.camera.pose) return visible;
     for (let v = 0; v < this.vertices.length / 3; v += 1) {
-      const own = [this.vertices[3 * v], this.vertices[3 * v + 1], this.vertices[3 * v + 2]];
-      const point = apply(pose, own), ahead = apply(view.camera.pose, point);
-      const normal = turnOnly(view.camera.pose, turnOnly(pose, [this.normals[3 * v], this.normals[3 * v + 1], this.normals[3 * v + 2]]));
-      if (normal[0] * ahead[0] + normal[1] * ahead[1] + normal[2] * ahead[2] >= 0) continue;
+      const vertex = [this.vertices[3 * v], this.vertices[3 * v + 1], this.vertices[3 * v + 2]];
+      const point = apply(pose, vertex), inCamera = apply(view.camera.pose, point);
+      const normal = rotate(view.camera.pose, rotate(pose, [this.normals[3 * v], this.normals[3 * v + 1], this.normals[3 * v + 2]]));
+      if (normal[0] * inCamera[0] + normal[1] * inCamera[1] + normal[2] * inCamera[2] >= 0) continue;
       const at = app.views.place(view, point);
-      if (at) found.push({ id: v, at, depth: ahead[2] });
+      if (at) visible.push({ id: v, at, depth: inCamera[2] });
     }
-    return found;
+    return visible;
   }
 
   press(view, event) {
     if (event.button !== 0) return null;
-    const seen = this.#seen(view), before = new Set(this.painted), scale = view.width / view.canvas.clientWidth;
+    const visible = this.#visible(view), before = new Set(this.painted), scale = view.width / view.canvas.clientWidth;
     const dab = (next) => {
       const box = view.canvas.getBoundingClientRect();
       const [x, y] = [(next.clientX - box.left) * scale, (next.clientY - box.top) * scale];
-      const under = seen.filter(({ at }) => Math.hypot(at[0] - x, at[1] - y) < BRUSH_PX * scale);
-      const nearest = Math.min(...under.map((one) => one.depth));
+      const under = visible.filter(({ at }) => Math.hypot(at[0] - x, at[1] - y) < BRUSH_PX * scale);
+      const nearest = Math.min(...under.map(({ depth }) => depth));
       for (const { id, depth } of under) {
-        if (depth > nearest + BEHIND * this.size) continue;
+        if (depth > nearest + DEPTH_RANGE * this.size) continue;
         if (next.shiftKey) this.painted.delete(id); else this.painted.add(id);
       }
       this.app.redraw();
     };
     dab(event);
-    return { move: dab, end: () => { this.strokes.push(before); this.undone = []; this.app.panels(); } };
+    return { move: dab, end: () => { this.strokes.push(before); this.redoStrokes = []; this.app.panels(); } };
   }
 
-  undo() { this.#swap(this.strokes, this.undone); }
+  undo() { this.#swap(this.strokes, this.redoStrokes); }
 
-  redo() { this.#swap(this.undone, this.strokes); }
+  redo() { this.#swap(this.redoStrokes, this.strokes); }
 
   #swap(from, to) {
     const next = from.pop();
@@ -100,21 +100,21 @@ export class Paint {
 
   mark(view, brush) {
     brush.fillStyle = "#ff3df2";
-    for (const { id, at } of this.#seen(view)) {
+    for (const { id, at } of this.#visible(view)) {
       if (this.painted.has(id)) brush.fillRect(at[0] - 1.5, at[1] - 1.5, 3, 3);
     }
   }
 
-  get changed() { return this.told && (this.painted.size !== this.saved.size || [...this.painted].some((id) => !this.saved.has(id))); }
+  get changed() { return this.surface && (this.painted.size !== this.saved.size || [...this.painted].some((id) => !this.saved.has(id))); }
 
   async save() {
     const added = [...this.painted].filter((id) => !this.saved.has(id)).length;
-    const gone = [...this.saved].filter((id) => !this.painted.has(id)).length;
-    const answer = await ask(`Save ${this.told.path}`, make("p", {}, `${added} vertices come, ${gone} go, ${this.painted.size} are painted. ${this.told.sequences} sequences have this object: a run makes what uses the list anew in all of them.`),
+    const removed = [...this.saved].filter((id) => !this.painted.has(id)).length;
+    const answer = await ask(`Save ${this.surface.path}`, make("p", {}, `${added} vertices are added and ${removed} removed; ${this.painted.size} are painted. The stages that use this list become stale in all ${this.surface.sequences} sequences of this object.`),
       [["save", "Save", true], ["", "Cancel"]]);
     if (!answer) return;
     try {
-      this.#take(await post(this.path, { vertices: [...this.painted], digest: this.told.digest }));
+      this.#load(await post(this.path, { vertices: [...this.painted], digest: this.surface.digest }));
       this.app.say("saved");
     } catch (error) { this.app.say(error.message); }
     this.app.panels();
@@ -122,9 +122,9 @@ export class Paint {
 
   panel() {
     const { app } = this, on = app.mode === this;
-    return make("div", {}, make("h2", {}, "Where people touch it"),
-      this.told ? make("p", {}, `${this.painted.size} of ${this.vertices.length / 3} vertices are painted; the list is of the object, for all its sequences.`) : null,
-      on ? button("Done", () => app.setMode(null), { title: "Esc" }) : button("Paint its contact surface", () => this.start()),
+    return make("div", {}, make("h2", {}, "Contact surface"),
+      this.surface ? make("p", {}, `${this.painted.size} of ${this.vertices.length / 3} vertices are painted. The list belongs to the object and all its sequences.`) : null,
+      on ? button("Done", () => app.setMode(null), { title: "Esc" }) : button("Paint the contact surface", () => this.start()),
       this.changed ? button("Save the surface…", () => this.save(), { class: "main" }) : null);
   }
 }

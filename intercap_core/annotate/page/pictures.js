@@ -1,53 +1,54 @@
-/* Images by camera, frame and width: fetched once, decoded, the next ones ahead of time. */
-import { Refused, blob } from "./api.js";
+/* Cache of decoded images by camera, frame and width, with prefetching. */
+import { RequestError, blob } from "./api.js";
 
-const KEPT_BYTES = 300e6;
-const AT_ONCE = 6; // requests: what a browser sends to one server
-const WIDTHS = [240, 320, 480, 640, 960, 1280];
+const MAX_BYTES = 300e6; // of decoded images
+const MAX_REQUESTS = 6; // browsers open at most six connections to a server
+const WIDTHS = [240, 320, 480, 640, 960, 1280]; // pixels, as in opened.py
 
 export class Pictures {
   constructor(sequence, stamp) {
     this.path = `sequences/${sequence}/image`;
     this.stamp = stamp;
-    this.kept = new Map();
+    this.cache = new Map();
     this.bytes = 0;
-    this.waiting = new Map(); // by key: { promise, urgent }
+    this.waiting = new Map(); // jobs by key
     this.queue = [];
     this.running = 0;
   }
 
-  width(pixels) { return WIDTHS.find((one) => one >= 0.9 * pixels) ?? 0; }
+  /* Width to fetch for an image that is shown `pixels` wide; 0 = full size. */
+  width(pixels) { return WIDTHS.find((width) => width >= 0.9 * pixels) ?? 0; }
 
   #key(camera, frame, width) { return `${camera}/${frame}/${width}`; }
 
-  /* The decoded image where it is there, else undefined; null = there is none. */
-  now(camera, frame, width) {
-    const key = this.#key(camera, frame, width), found = this.kept.get(key);
-    if (found !== undefined) { this.kept.delete(key); this.kept.set(key, found); }
-    return found?.bitmap;
+  /* The decoded image: undefined if it is not cached, null if it does not exist. */
+  cached(camera, frame, width) {
+    const key = this.#key(camera, frame, width), entry = this.cache.get(key);
+    if (entry !== undefined) { this.cache.delete(key); this.cache.set(key, entry); }
+    return entry?.bitmap;
   }
 
-  /* Any image of this camera and frame, to stand in for the right one. */
-  any(camera, frame) {
+  /* A cached image of any width, shown until the requested width arrives. */
+  cachedAny(camera, frame) {
     for (const width of [...WIDTHS, 0]) {
-      const found = this.now(camera, frame, width);
-      if (found) return found;
+      const image = this.cached(camera, frame, width);
+      if (image) return image;
     }
     return undefined;
   }
 
-  /* Fetch an image; those that are `urgent` first. Resolves to undefined where nothing is known of it. */
-  want(camera, frame, width, urgent = true) {
+  /* Fetch an image, `urgent` ones first. Resolves to undefined if the request was cancelled or failed. */
+  fetch(camera, frame, width, urgent = true) {
     const key = this.#key(camera, frame, width);
-    if (this.kept.has(key)) return Promise.resolve(this.kept.get(key).bitmap);
-    const known = this.waiting.get(key);
-    if (known) {
-      if (urgent && !known.urgent) {
-        known.urgent = true;
-        const place = this.queue.indexOf(known);
-        if (place >= 0) { this.queue.splice(place, 1); this.queue.unshift(known); }
+    if (this.cache.has(key)) return Promise.resolve(this.cache.get(key).bitmap);
+    const waiting = this.waiting.get(key);
+    if (waiting) {
+      if (urgent && !waiting.urgent) {
+        waiting.urgent = true;
+        const position = this.queue.indexOf(waiting);
+        if (position >= 0) { this.queue.splice(position, 1); this.queue.unshift(waiting); }
       }
-      return known.promise;
+      return waiting.promise;
     }
     const job = { key, camera, frame, width, urgent };
     job.promise = new Promise((resolve) => (job.resolve = resolve));
@@ -58,8 +59,8 @@ export class Pictures {
     return job.promise;
   }
 
-  /* Forget what was asked for and has not begun: another frame is wanted by now. */
-  calm() {
+  /* Cancel requests that have not started, because another frame is shown. */
+  cancel() {
     for (const job of this.queue) {
       this.waiting.delete(job.key);
       job.resolve(undefined);
@@ -68,7 +69,7 @@ export class Pictures {
   }
 
   async #next() {
-    if (this.running >= AT_ONCE || !this.queue.length) return;
+    if (this.running >= MAX_REQUESTS || !this.queue.length) return;
     const job = this.queue.shift();
     this.running += 1;
     let bitmap = null;
@@ -76,17 +77,17 @@ export class Pictures {
       bitmap = await createImageBitmap(
         await blob(`${this.path}/${encodeURIComponent(job.camera)}/${job.frame}?width=${job.width}&v=${this.stamp}`));
     } catch (error) {
-      if (error instanceof Refused && error.status === 0) bitmap = undefined; // the server is away: it is asked again
-    } // else a gap in the recording, or an image that does not decode: none is shown
+      if (error instanceof RequestError && error.status === 0) bitmap = undefined; // connection lost: requested again later
+    } // otherwise the image is missing or does not decode
     this.running -= 1;
     this.waiting.delete(job.key);
     if (bitmap === undefined) { job.resolve(bitmap); this.#next(); return; }
     const size = bitmap ? 4 * bitmap.width * bitmap.height : 0;
-    this.kept.set(job.key, { bitmap, size });
+    this.cache.set(job.key, { bitmap, size });
     this.bytes += size;
-    for (const [key, old] of this.kept) {
-      if (this.bytes <= KEPT_BYTES || key === job.key) break;
-      this.kept.delete(key);
+    for (const [key, old] of this.cache) {
+      if (this.bytes <= MAX_BYTES || key === job.key) break;
+      this.cache.delete(key);
       this.bytes -= old.size;
       old.bitmap?.close();
     }

@@ -1,11 +1,11 @@
-/* The 4D viewer beside the views, and what the overlay takes from it: the body's places and colours at
- * a frame, where parts touch; and the result before the last run. */
-import { base64, packed } from "./api.js";
+/* The 4D viewer, and what the overlay uses of it: vertices and colours of the body in a frame, and the
+ * parts in contact; also the result before the last run. */
+import { toBase64, fetchArrays } from "./api.js";
 import { find, make } from "./dom.js";
 import { apply, compose, invert } from "./geometry.js";
 import { posedFrames } from "./pose.js";
 
-export const GREY = [0.62, 0.62, 0.64]; // beside colours that tell left from right
+export const GREY = [0.62, 0.62, 0.64]; // of the body while left and right are coloured
 const BODY = [0.42, 0.66, 0.92], TOUCHING = [0.86, 0.2, 0.26], STATED = [0.95, 0.62, 0.25];
 export const BEFORE = [0.72, 0.5, 0.95];
 
@@ -18,26 +18,26 @@ export class Space {
 
   async load() {
     const { app } = this;
-    find("space").replaceChildren(make("p", { class: "dim" }, "Loading the body and the 4D viewer, some MB… Images and marks are there meanwhile."));
+    find("space").replaceChildren(make("p", { class: "dim" }, "Loading the body and the 4D viewer (some MB)… Images and marks can already be used."));
     try {
-      const { header, arrays, data } = await packed(`sequences/${app.told.sequence}/viewer?v=${app.told.result}`);
+      const { header, arrays, data } = await fetchArrays(`sequences/${app.info.sequence}/viewer?v=${app.info.result}`);
       find("space").replaceChildren(viewerElement());
-      await window.showInterCap(await base64(data));
+      await window.showInterCap(await toBase64(data));
       this.viewer = window.intercapViewer;
-      if (!this.viewer) throw new Error("this browser shows no 3D");
+      if (!this.viewer) throw new Error("this browser cannot draw in 3D");
       this.main = Object.keys(header.versions)[0];
       app.overlay?.mesh("body", arrays.faces, BODY, arrays[`${this.main}/rest`]);
       this.skin = skinPaint(header, arrays);
       this.regionOf = arrays["contact/region"];
-      this.middlesOf = -1;
-      this.master_from_zup = invert(app.told.zup_from_master);
+      this.centresFrame = -1;
+      this.master_from_zup = invert(app.info.zup_from_master);
     } catch (error) {
       this.viewer = null;
       find("space").replaceChildren(make("p", { class: "fault" }, error.message));
       return;
     }
     const root = document.querySelector(".viewer");
-    new MutationObserver(() => { // the viewer's own keys and fingers move time as well
+    new MutationObserver(() => { // the viewer's own controls change the frame as well
       const frame = Number(root.dataset.frame);
       if (frame !== app.frame && !this.follows) app.show(frame);
     }).observe(root, { attributes: true, attributeFilter: ["data-frame"] });
@@ -45,97 +45,97 @@ export class Space {
     app.redraw();
   }
 
-  /* Nothing to show, for a reason. */
-  none(words) {
+  /* Show why there is no viewer. */
+  showReason(reason) {
     this.viewer = null;
-    find("space").replaceChildren(make("p", { class: "dim" }, words));
+    find("space").replaceChildren(make("p", { class: "dim" }, reason));
   }
 
-  /* The result before the last run, to be drawn beside the new one. */
+  /* Load the result before the last run. */
   async loadBefore() {
-    const { app } = this, found = {};
-    for (const what of ["object", "viewer"]) {
-      try { found[what] = await packed(`sequences/${app.told.sequence}/${what}?version=before&v=${app.told.result}`); } catch { /* it was not there */ }
+    const { app } = this, before = {};
+    for (const name of ["object", "viewer"]) {
+      try { before[name] = await fetchArrays(`sequences/${app.info.sequence}/${name}?version=before&v=${app.info.result}`); } catch { /* the old result did not have it */ }
     }
-    const { viewer } = found;
+    const { viewer } = before;
     if (viewer && app.overlay) {
       const name = Object.keys(viewer.header.versions)[0];
-      found.body = window.skinnedBody(name, viewer.header, viewer.arrays);
-      // its own upright frame, which the master camera's pose in it tells
-      found.master_from_zup = invert(viewer.header.cameras.find((one) => one.name === app.told.master).pose);
+      before.body = window.skinnedBody(name, viewer.header, viewer.arrays);
+      // the old result has its own z-up frame, given by the pose of the master camera
+      before.master_from_zup = invert(viewer.header.cameras.find(({ name: camera }) => camera === app.info.master).pose);
       app.overlay.mesh("before", viewer.arrays.faces, BEFORE, viewer.arrays[`${name}/rest`]);
     }
-    this.before = found;
+    this.before = before;
   }
 
-  /* Bodies to draw over the images at a frame. */
+  /* Bodies to draw over the images in a frame. */
   bodies(frame, layers) {
-    const { overlay } = this.app, found = [];
-    if (!layers.body) return found;
+    const { overlay } = this.app, bodies = [];
+    if (!layers.body) return bodies;
     if (layers.before && this.before?.body) {
       this.before.body.pose(frame);
       overlay.move("before", this.before.body.mesh.geometry.attributes.position.array);
-      found.push({ name: "before", pose: this.before.master_from_zup });
+      bodies.push({ name: "before", pose: this.before.master_from_zup });
     }
     if (this.viewer) {
       const body = this.viewer.versions[this.main];
       body.pose(frame);
       overlay.move("body", body.mesh.geometry.attributes.position.array, this.skin(frame, layers.contact && !layers.sides, layers.sides ? GREY : BODY));
-      found.push({ name: "body", pose: this.master_from_zup });
+      bodies.push({ name: "body", pose: this.master_from_zup });
     }
-    return found;
+    return bodies;
   }
 
-  layers({ contact, body, object }) {
+  setLayers({ contact, body, object }) {
     if (!this.viewer) return;
     this.viewer.state.contact = contact;
     const version = this.viewer.versions[this.main];
     version.group.children[0].visible = body;
-    if (version.object) version.object.wanted = object;
+    if (version.object) version.object.shown = object;
   }
 
-  /* The 3D viewer follows in the next frame: the images come first. */
+  /* Update the 3D viewer in the next animation frame, after the images. */
   follow() {
     if (!this.viewer || this.follows) return;
     this.follows = true;
     requestAnimationFrame(() => {
       this.follows = false;
       this.viewer?.show(this.app.frame);
-      this.#edited();
+      this.#showEdited();
     });
   }
 
-  /* The pose that is edited, in 3D as well. */
-  #edited() {
+  /* Show the edited pose in 3D. */
+  #showEdited() {
     const { app } = this, object = this.viewer?.versions[this.main]?.object, pose = app.pose?.at(app.frame);
     if (!object || !pose || !(app.pose.editing || posedFrames(app.draft).length)) return;
-    const [a, b, c] = compose(app.told.zup_from_master, pose);
+    const [a, b, c] = compose(app.info.zup_from_master, pose);
     object.mesh.visible = app.layers.object;
     object.mesh.matrix.set(...a, ...b, ...c, 0, 0, 0, 1);
     object.mesh.matrixWorldNeedsUpdate = true;
     this.viewer.draw();
   }
 
-  /* The viewer's eye as a camera of the master's frame, and metres of the room for a pixel. */
+  /* The viewer's virtual camera: camera_from_master, and the size of a pixel in metres at a depth. */
   eye() {
     const { eye } = this.viewer, canvas = document.querySelector(".viewer canvas");
     eye.updateMatrixWorld();
     const m = eye.matrixWorld.elements; // column-major, looks along -z with y up
     const zup_from_eye = [0, 1, 2].map((k) => [m[k], -m[4 + k], -m[8 + k], m[12 + k]]);
-    const camera_from_master = compose(invert(zup_from_eye), this.app.told.zup_from_master);
+    const camera_from_master = compose(invert(zup_from_eye), this.app.info.zup_from_master);
     const tall = 2 * Math.tan((eye.fov * Math.PI) / 360);
     return { camera_from_master, metres: (depth) => (depth * tall) / canvas.clientHeight };
   }
 
-  /* Which parts touch, whatever hides them from the camera: a dot in the middle of each. */
+  /* Mark parts in contact by a dot at their centre, even if they are occluded. */
   markContact(view, brush) {
     const { app } = this;
-    if (!this.viewer || !app.told.object) return;
-    if (this.middlesOf !== app.frame) {
-      this.middlesOf = app.frame;
-      this.middles = this.#middles();
+    if (!this.viewer || !app.info.object) return;
+    if (this.centresFrame !== app.frame) {
+      this.centresFrame = app.frame;
+      this.centres = this.#centres();
     }
-    for (const [k, { part, share, point }] of this.middles.entries()) {
+    for (const [k, { part, share, point }] of this.centres.entries()) {
       const at = app.views.place(view, point);
       if (!at) continue;
       brush.globalAlpha = Math.max(0.35, share);
@@ -151,7 +151,7 @@ export class Space {
         brush.lineWidth = 3;
         brush.strokeStyle = "rgba(0, 0, 0, 0.7)";
         const text = `${part.replaceAll("_", " ")} ${Math.round(100 * share)} %`;
-        const below = at[1] - 3 + 15 * k; // so that no two lie on each other
+        const below = at[1] - 3 + 15 * k; // avoids overlapping labels
         brush.strokeText(text, at[0] + 9, below);
         brush.fillStyle = "#ffffff";
         brush.fillText(text, at[0] + 9, below);
@@ -160,29 +160,29 @@ export class Space {
     }
   }
 
-  #middles() {
-    const { app } = this, { regions } = app.contact, region = this.regionOf, places = this.viewer.versions[this.main].mesh.geometry.attributes.position.array;
+  #centres() {
+    const { app } = this, { regions } = app.contact, region = this.regionOf, vertices = this.viewer.versions[this.main].mesh.geometry.attributes.position.array;
     if (!region) return [];
-    const sums = regions.map((part) => ({ part, share: app.contact.p(part, app.frame) ?? 0, count: 0, sum: [0, 0, 0] }));
+    const sums = regions.map((part) => ({ part, share: app.contact.probabilityAt(part, app.frame) ?? 0, count: 0, sum: [0, 0, 0] }));
     for (let v = 0; v < region.length; v += 1) {
-      const own = sums[region[v]];
-      if (!own || own.share < 0.25) continue;
-      own.count += 1;
-      for (let k = 0; k < 3; k += 1) own.sum[k] += places[3 * v + k];
+      const total = sums[region[v]];
+      if (!total || total.share < 0.25) continue;
+      total.count += 1;
+      for (let k = 0; k < 3; k += 1) total.sum[k] += vertices[3 * v + k];
     }
-    return sums.filter((one) => one.count).map(({ part, share, count, sum }) =>
+    return sums.filter(({ count }) => count).map(({ part, share, count, sum }) =>
       ({ part, share, point: apply(this.master_from_zup, sum.map((v) => v / count)) }));
   }
 }
 
-/* Colours by vertex (V, 3): red where the meshes touch, orange where contact is stated. */
+/* Colours of vertices (V, 3): red where the meshes touch, orange where the result states contact. */
 function skinPaint(header, arrays) {
   const region = arrays["contact/region"], probability = arrays["contact/probability"], touching = arrays["contact/touching"];
   const count = header.regions?.length ?? 0, total = arrays.faces.reduce((most, v) => Math.max(most, v), 0) + 1;
   const colours = new Float32Array(3 * total), width = touching ? touching.length / header.frames : 0;
-  return (frame, shown, plain) => {
+  return (frame, shown, base) => {
     for (let v = 0; v < total; v += 1) {
-      let colour = plain;
+      let colour = base;
       if (shown && touching && (touching[frame * width + (v >> 3)] >> (v & 7)) & 1) colour = TOUCHING;
       else if (shown && region && region[v] < 255 && probability[frame * count + region[v]] >= 128) colour = STATED;
       colours[3 * v] = colour[0];

@@ -1,21 +1,20 @@
-/* The synchronised views: some large, the others as a strip; image, overlay and marks of each. */
+/* Camera views of the same frame, some large and the others in a strip: image, overlay and marks. */
 import { find, make } from "./dom.js";
 import { apply, project } from "./geometry.js";
 
-const AHEAD = 4; // frames fetched before they are asked for
-const NEAREST = 16; // times the whole image: the largest zoom
-
-const QUALITY = "intercap-images"; // as chosen, kept by the browser
+const PREFETCHED = 4; // frames that are fetched ahead
+const MAX_ZOOM = 16;
+const QUALITY = "intercap-images"; // storage key of the chosen image size
 
 export class Views {
   constructor(app) {
     this.app = app;
-    this.views = app.told.cameras.map((camera, index) => this.#view(camera, index));
+    this.views = app.info.cameras.map((camera, index) => this.#view(camera, index));
     this.order = this.views.map((view) => view.index);
     this.large = Number(find("large").value);
     find("large").onchange = () => { this.large = Number(find("large").value); this.arrange(); };
-    find("quality").value = remembered() ?? "1";
-    find("quality").onchange = () => { remember(find("quality").value); app.show(app.frame); };
+    find("quality").value = storedQuality() ?? "1";
+    find("quality").onchange = () => { storeQuality(find("quality").value); app.show(app.frame); };
     new ResizeObserver(() => app.redraw()).observe(find("views"));
     this.arrange();
   }
@@ -27,7 +26,7 @@ export class Views {
       make("figcaption", {}, camera.name));
     const [w, h] = camera.size;
     const view = { camera, index, figure, canvas, brush: canvas.getContext("2d"), crop: [0, 0, w, h], last: null };
-    view.pixel = (event) => { // of the image as recorded
+    view.pixel = (event) => { // pixel of the recorded image under the pointer
       const box = canvas.getBoundingClientRect();
       const [x, y, wide, high] = view.crop;
       return [
@@ -71,7 +70,7 @@ export class Views {
     const from = [event.clientX, event.clientY], [x, y] = view.crop;
     return {
       move: (next) => {
-        this.app.near = false;
+        this.app.following = false;
         const scale = view.crop[2] / view.canvas.clientWidth;
         view.crop[0] = x - (next.clientX - from[0]) * scale;
         view.crop[1] = y - (next.clientY - from[1]) * scale;
@@ -82,9 +81,9 @@ export class Views {
   }
 
   zoom(view, [px, py], factor) {
-    this.app.near = false;
+    this.app.following = false;
     const [w, h] = view.camera.size;
-    const wide = Math.min(w, Math.max(w / NEAREST, view.crop[2] * factor));
+    const wide = Math.min(w, Math.max(w / MAX_ZOOM, view.crop[2] * factor));
     const high = (wide * h) / w, by = wide / view.crop[2];
     view.crop = [px - (px - view.crop[0]) * by, py - (py - view.crop[1]) * by, wide, high];
     this.#bound(view);
@@ -97,8 +96,8 @@ export class Views {
     view.crop[1] = Math.min(Math.max(0, view.crop[1]), h - view.crop[3]);
   }
 
-  /* All views near to a point of the room, or to all again. */
-  near(point, radius) {
+  /* Zoom all views to a point of the room; null shows whole images. */
+  zoomTo(point, radius) {
     for (const view of this.views) {
       const [w, h] = view.camera.size;
       view.crop = [0, 0, w, h];
@@ -107,7 +106,7 @@ export class Views {
       if (at[2] < 0.2) continue;
       const [x, y] = project(view.camera.lens, at);
       if (x < 0 || y < 0 || x > w || y > h) continue;
-      const high = Math.min(h, Math.max(h / NEAREST, (2 * radius * view.camera.lens[1]) / at[2]));
+      const high = Math.min(h, Math.max(h / MAX_ZOOM, (2 * radius * view.camera.lens[1]) / at[2]));
       view.crop = [x - (high * w) / h / 2, y - high / 2, (high * w) / h, high];
       this.#bound(view);
     }
@@ -119,10 +118,10 @@ export class Views {
     this.arrange();
   }
 
-  /* The view that a key is of: under the pointer or in focus, else the first large one. */
-  get chosen() { return this.active ?? this.views[this.order[0]]; }
+  /* The view that a key acts on: under the pointer or in focus, or else the first large one. */
+  get selected() { return this.active ?? this.views[this.order[0]]; }
 
-  /* Those cameras first. */
+  /* Show these cameras first. */
   prefer(names) {
     const first = this.views.filter((view) => names.includes(view.camera.name)).map((view) => view.index);
     this.order = [...first, ...this.order.filter((index) => !first.includes(index))];
@@ -137,7 +136,7 @@ export class Views {
     this.app.redraw();
   }
 
-  /* Draw all views at the app's frame; what is not there yet is fetched and drawn when it comes. */
+  /* Draw all views; missing images are fetched and drawn when they arrive. */
   draw() {
     const { app } = this, { pictures, frame } = app;
     for (const view of this.views) {
@@ -148,36 +147,36 @@ export class Views {
         view.canvas.width = view.width;
         view.canvas.height = view.height;
       }
-      const near = view.camera.size[0] / view.crop[2];
-      const wanted = view.width * near * Number(find("quality").value);
+      const zoom = view.camera.size[0] / view.crop[2];
+      const wanted = view.width * zoom * Number(find("quality").value);
       view.fetched = pictures.width(Math.min(wanted, view.camera.size[0]));
     }
-    const things = app.things();
-    if (app.overlay && things.length) app.overlay.draw(this.views, things);
+    const drawables = app.drawables();
+    if (app.overlay && drawables.length) app.overlay.draw(this.views, drawables);
     let missing = 0;
-    for (const view of this.views) missing += this.#paint(view, things.length > 0) ? 0 : 1;
+    for (const view of this.views) missing += this.#paint(view, drawables.length > 0) ? 0 : 1;
     if (missing === 0) app.drawn();
-    for (let k = 1; k <= AHEAD; k += 1) {
+    for (let k = 1; k <= PREFETCHED; k += 1) {
       const next = frame + k * app.direction;
-      if (next < 0 || next >= app.told.frames) break;
+      if (next < 0 || next >= app.info.frames) break;
       for (const view of this.views) {
-        if (app.has(view.index, next)) pictures.want(view.camera.name, next, view.fetched, false);
+        if (app.has(view.index, next)) pictures.fetch(view.camera.name, next, view.fetched, false);
       }
     }
   }
 
-  /* Whether the right image was there. */
+  /* Draw one view; returns whether its image was cached. */
   #paint(view, overlaid) {
     const { app } = this, { pictures, frame } = app, brush = view.brush;
     const { name } = view.camera;
-    let right = true;
+    let complete = true;
     let image = null;
     if (app.has(view.index, frame)) {
-      image = pictures.now(name, frame, view.fetched);
+      image = pictures.cached(name, frame, view.fetched);
       if (image === undefined) {
-        right = false;
-        pictures.want(name, frame, view.fetched).then((bitmap) => { if (bitmap !== undefined && app.frame === frame) app.redraw(); });
-        image = pictures.any(name, frame);
+        complete = false;
+        pictures.fetch(name, frame, view.fetched).then((bitmap) => { if (bitmap !== undefined && app.frame === frame) app.redraw(); });
+        image = pictures.cachedAny(name, frame);
       }
     }
     const [w, h] = [view.width, view.height];
@@ -188,14 +187,14 @@ export class Views {
     } else {
       brush.fillStyle = "#30343b";
       brush.fillRect(0, 0, w, h);
-      if (!right && view.last?.width) { // of another frame, and not to be taken for this one
+      if (!complete && view.last?.width) { // an earlier frame, dimmed
         brush.globalAlpha = 0.3;
         brush.drawImage(view.last, ...view.crop.map((v) => (v * view.last.width) / view.camera.size[0]), 0, 0, w, h);
         brush.globalAlpha = 1;
       }
       brush.fillStyle = "#e7eaef";
       brush.font = "13px system-ui";
-      brush.fillText(right ? "no image" : `image of frame ${frame}…`, 10, h - 12);
+      brush.fillText(complete ? "no image" : `loading frame ${frame}…`, 10, h - 12);
     }
     if (overlaid && app.overlay && view.camera.pose) {
       brush.globalAlpha = app.opacity;
@@ -207,10 +206,10 @@ export class Views {
       brush.fillRect(0, 0, w, h);
     }
     app.mark(view, brush);
-    return right;
+    return complete;
   }
 
-  /* A point of the master's frame on a view's canvas; null = not before the camera. */
+  /* Project a point of the master frame onto a view's canvas; null if it is behind the camera. */
   place(view, point) {
     if (!view.camera.pose) return null;
     const at = apply(view.camera.pose, point);
@@ -219,7 +218,7 @@ export class Views {
     return this.spot(view, x, y);
   }
 
-  /* A pixel of the image as recorded on a view's canvas. */
+  /* Convert a pixel of the recorded image to a position on a view's canvas. */
   spot(view, x, y) {
     return [
       ((x + 0.5 - view.crop[0]) / view.crop[2]) * view.width,
@@ -227,10 +226,10 @@ export class Views {
   }
 }
 
-function remembered() {
-  try { return localStorage.getItem(QUALITY); } catch { return null; } // a browser that keeps nothing
+function storedQuality() {
+  try { return localStorage.getItem(QUALITY); } catch { return null; } // storage is disabled
 }
 
-function remember(value) {
+function storeQuality(value) {
   try { localStorage.setItem(QUALITY, value); } catch { /* as above */ }
 }

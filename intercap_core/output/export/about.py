@@ -39,7 +39,7 @@ _VERDICT_MEANING = (
 
 
 @dataclass(frozen=True)
-class BodyFile:
+class ExportBody:
     """The body file whose mesh the parameters move. They give another person with another mesh."""
 
     path: Path
@@ -49,7 +49,7 @@ class BodyFile:
     num_expression: int
 
     @classmethod
-    def of(cls, model: BodyModel, gender: str) -> BodyFile:
+    def of(cls, model: BodyModel, gender: str) -> ExportBody:
         return cls(model.path, gender, model.num_vertices, model.num_betas, model.num_expression)
 
     @property
@@ -252,7 +252,7 @@ class About:
     """Everything that an export states about its numbers."""
 
     sequence: str
-    body: BodyFile
+    body: ExportBody
     flags: Sequence[str]
     """(T,) reason why each frame is flagged, "" if it is trusted."""
     contact: StatedContact | None

@@ -17,7 +17,7 @@ import numpy as np
 from intercap_core.body.artefact import file_digest
 from intercap_core.body.joints import JOINT_NAMES
 from intercap_core.body.maps import maps_path
-from intercap_core.output.export.about import BodyFile
+from intercap_core.output.export.about import ExportBody
 
 _POSE_DIRECTIONS = 9 * (len(JOINT_NAMES) - 1)  # a rotation matrix for each joint but the pelvis
 _FRAME = "rest pose of the body: y up, facing z, x to its left; origin near the chest"
@@ -50,7 +50,7 @@ class WrittenBody:
     """Columns of the expression, as start:stop."""
 
 
-def layouts(body: BodyFile) -> Sequence[Layout]:
+def layouts(body: ExportBody) -> Sequence[Layout]:
     """Return the layouts with enough columns for the parameters."""
     return [
         layout
@@ -59,7 +59,7 @@ def layouts(body: BodyFile) -> Sequence[Layout]:
     ]
 
 
-def write(folder: Path, body: BodyFile) -> Sequence[WrittenBody]:
+def write(folder: Path, body: ExportBody) -> Sequence[WrittenBody]:
     """Write the body file, its maps of points and regions, and a file per layout into ``folder``.
 
     Columns beyond those of the parameters are zero, as are the pose blend shapes, which the open
@@ -75,7 +75,7 @@ def write(folder: Path, body: BodyFile) -> Sequence[WrittenBody]:
         arrays = {name: file[name] for name in file.files}
     half = arrays["shapedirs"].shape[2] // 2
     written = [
-        WrittenBody(body.path.name, file_digest(body.path), f"0:{half}", f"{half}:{2 * half}"),
+        WrittenBody(body.path.name, file_digest(body.path), f"0:{half}", f"{half}:{2 * half}")
     ]
     for layout in layouts(body):
         path = folder / f"{body.path.stem}_{layout.name}.npz"
@@ -93,7 +93,7 @@ def write(folder: Path, body: BodyFile) -> Sequence[WrittenBody]:
 
 
 def _laid_out(
-    arrays: dict[str, np.ndarray], body: BodyFile, layout: Layout
+    arrays: dict[str, np.ndarray], body: ExportBody, layout: Layout
 ) -> dict[str, np.ndarray]:
     table = arrays["shapedirs"]
     vertices, half = len(table), table.shape[2] // 2

@@ -20,7 +20,6 @@ from intercap_core.output.export.motion import Coordinates
 from intercap_core.output.export.silhouettes import Scenes, Silhouettes
 
 UNITS = "millimetres, radians, pixels; rotations are matrices row by row"
-LEAST_VISIBLE = 0.1  # visible share of a target object (BOP Challenge 2019)
 
 
 def object_id(mesh_path: Path) -> int:
@@ -71,7 +70,7 @@ def write(folder: Path, scenes: Scenes, obj_id: int, about: About, *, masks: boo
         targets += [
             {"scene_id": number, "im_id": image, "obj_id": obj_id, "inst_count": 1}
             for image in poses
-            if not info or info[str(image)][0]["visib_fract"] >= LEAST_VISIBLE
+            if not info or info[str(image)][0]["visib_fract"] >= 0.1  # BOP Challenge 2019
         ]
     _dump(folder / "test_targets_bop19.json", targets)
     _dump(folder / "lenses.json", lenses)

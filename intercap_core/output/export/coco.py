@@ -29,8 +29,6 @@ _SKELETON = [
     [8, 10], [9, 11], [2, 3], [1, 2], [1, 3], [2, 4], [3, 5], [4, 6], [5, 7],
 ]  # fmt: skip
 UNITS = "pixels of the images as recorded, x right and y down, seconds"
-_INSIDE_M = 0.15  # largest depth of a keypoint below the skin (half a trunk's depth)
-_HIDDEN, _VISIBLE = 1, 2  # COCO's visibility; 0 = not in the image
 
 
 def write(path: Path, scenes: Scenes, about: About) -> None:
@@ -122,11 +120,11 @@ def _with_visibility(drawn: Silhouettes, camera: Camera, points: np.ndarray) -> 
         if not (-0.5 <= x < lens.width - 0.5 and -0.5 <= y < lens.height - 0.5):
             continue
         row, column = round(y) - drawn.body.y0, round(x) - drawn.body.x0
-        visibility = _HIDDEN
+        visibility = 1
         height, width = drawn.depth.shape
         if 0 <= row < height and 0 <= column < width:
             depth = float(drawn.depth[row, column])
-            if depth == 0 or depth > local[k, 2] - _INSIDE_M:
-                visibility = _VISIBLE
+            if depth == 0 or depth > local[k, 2] - 0.15:  # half the depth of a trunk
+                visibility = 2
         keypoints[k] = x, y, visibility
     return keypoints

@@ -15,8 +15,6 @@ from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.output.export.motion import Motion
 from intercap_core.schemas import JOINT, METRICS
 
-TOUCHING = 0.5  # a region counts as touching from this probability
-
 _DRAFT_HEADER = """\
 # Draft of the contact of {sequence}, as the joint stage states it: correct it, and copy it to
 # annotations/{sequence}.yaml. Frames are numbered from 0; an interval's end is the first frame
@@ -50,7 +48,7 @@ class StatedContact:
         """Return region, first frame and first frame after it of each contact, by region."""
         intervals = []
         for r, region in enumerate(self.regions):
-            on = np.concatenate([[False], self.probability[:, r] >= TOUCHING, [False]])
+            on = np.concatenate([[False], self.probability[:, r] >= 0.5, [False]])
             changes = np.flatnonzero(np.diff(on.astype(np.int8)))
             intervals += [(region, int(a), int(b)) for a, b in changes.reshape(-1, 2)]
         return intervals

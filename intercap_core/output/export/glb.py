@@ -9,12 +9,10 @@ from __future__ import annotations
 
 import json
 import struct
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
 
 from intercap_core.body.joints import JOINT_NAMES, PARENTS
@@ -22,14 +20,11 @@ from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.surfaces import vertex_normals
 from intercap_core.object_track.appearance import linear
 from intercap_core.output.export.about import About
-from intercap_core.output.export.motion import Coordinates, Motion
+from intercap_core.output.export.motion import Coordinates, Motion, rest_pose
 
-_FLOAT, _USHORT, _UINT, _UBYTE = 5126, 5123, 5125, 5121
-_ARRAY, _ELEMENTS = 34962, 34963  # buffer targets
+_ARRAY, _ELEMENTS = 34962, 34963  # buffer targets, glTF 2.0 specification
 _SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
-_COMPONENTS = {"<f4": _FLOAT, "<u2": _USHORT, "<u4": _UINT, "|u1": _UBYTE}
-_BODY_COLOUR = (0.72, 0.60, 0.52, 1.0)
-_ROUGHNESS = 0.8
+_COMPONENTS = {"<f4": 5126, "<u2": 5123, "<u4": 5125, "|u1": 5121}
 # glTF's frame (x right, y up, z towards the viewer) from the motion's frame
 _YUP_FROM_ZUP = Rotation.from_euler("x", -90, degrees=True)
 _YUP_FROM_CAMERA = Rotation.from_euler("x", 180, degrees=True)
@@ -53,11 +48,7 @@ class _Document:
         self._length = 0
 
     def accessor(
-        self,
-        values: np.ndarray,
-        *,
-        target: int | None = None,
-        bounds: bool = False,
+        self, values: np.ndarray, *, target: int | None = None, bounds: bool = False
     ) -> int:
         """Append an array (N,) or (N, k); return its accessor. ``bounds`` adds min and max."""
         values = np.ascontiguousarray(values)
@@ -137,27 +128,11 @@ def coordinates(motion: Motion, *, z_up: bool) -> Coordinates:
     return Coordinates(frame, _YUP_FROM_CAMERA.apply(motion.up))
 
 
-def rest_pose(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices (V, 3) and joints (55, 3) of the shaped body in the T-pose, metres."""
-    params = motion.parameters
-    rest = replace(
-        motion.model.zeros(1),
-        betas=params.betas[:1].to(motion.model.dtype),
-        expression=params.expression[:1].to(motion.model.dtype),
-    )
-    with torch.no_grad():
-        posed = motion.model.forward(rest)
-    return posed.vertices[0].numpy().astype(np.float64), posed.joints[0].numpy().astype(np.float64)
-
-
 def _body(
-    document: _Document,
-    motion: Motion,
-    animation: dict[str, Any],
-    times: int,
+    document: _Document, motion: Motion, animation: dict[str, Any], times: int
 ) -> tuple[int, int]:
     """Add the skinned mesh and its skeleton; return the nodes of pelvis and mesh."""
-    vertices, joints = rest_pose(motion)
+    vertices, joints = rest_pose(motion.model, motion.parameters)
     faces = motion.model.faces.numpy()
     weights = motion.model.skinning_weights.numpy()
     strongest = np.argsort(-weights, axis=1, kind="stable")[:, :4]
@@ -167,7 +142,7 @@ def _body(
     geometry = _geometry(document, vertices, faces)
     geometry["attributes"]["JOINTS_0"] = document.accessor(strongest.astype("|u1"), target=_ARRAY)
     geometry["attributes"]["WEIGHTS_0"] = document.accessor(kept.astype("<f4"), target=_ARRAY)
-    geometry["material"] = _material(document, "skin", _BODY_COLOUR)
+    geometry["material"] = _material(document, "skin", (0.72, 0.60, 0.52, 1.0))
     shape = document.add("meshes", {"name": "body", "primitives": [geometry]})
 
     first = len(document.json["nodes"])
@@ -201,11 +176,7 @@ def _body(
 
 
 def _object(
-    document: _Document,
-    motion: Motion,
-    mesh: ObjectMesh,
-    animation: dict[str, Any],
-    times: int,
+    document: _Document, motion: Motion, mesh: ObjectMesh, animation: dict[str, Any], times: int
 ) -> int:
     geometry = _geometry(document, mesh.vertices, mesh.faces)
     colours = np.column_stack([mesh.colours, np.full(len(mesh.colours), 255, np.uint8)])
@@ -233,7 +204,7 @@ def _geometry(document: _Document, vertices: np.ndarray, faces: np.ndarray) -> d
 
 
 def _material(document: _Document, name: str, colour: tuple[float, ...]) -> int:
-    surface = {"baseColorFactor": colour, "metallicFactor": 0.0, "roughnessFactor": _ROUGHNESS}
+    surface = {"baseColorFactor": colour, "metallicFactor": 0.0, "roughnessFactor": 0.8}
     return document.add("materials", {"name": name, "pbrMetallicRoughness": surface})
 
 

@@ -14,7 +14,6 @@ from intercap_core.output.export.about import About
 from intercap_core.output.export.motion import Coordinates, Motion
 
 Kind = Literal["ply", "obj"]
-_DIGITS = 6  # decimals of coordinates in obj files: micrometres
 
 
 def write(
@@ -57,11 +56,7 @@ def write(
 
 
 def _save(
-    path: Path,
-    mesh: trimesh.Trimesh,
-    touching: np.ndarray | None,
-    lines: Sequence[str],
-    kind: Kind,
+    path: Path, mesh: trimesh.Trimesh, touching: np.ndarray | None, lines: Sequence[str], kind: Kind
 ) -> None:
     if kind == "ply":
         if touching is not None:
@@ -71,7 +66,7 @@ def _save(
         path.write_bytes(ply(mesh, lines))
     else:
         text = trimesh.exchange.obj.export_obj(
-            mesh, include_normals=False, include_texture=False, digits=_DIGITS,
+            mesh, include_normals=False, include_texture=False, digits=6,
             header="\n".join(lines).replace("\n", "\n# "),
         )  # fmt: skip
         path.write_text(text if text.endswith("\n") else text + "\n", encoding="utf-8")

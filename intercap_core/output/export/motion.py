@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,13 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core import artefacts
 from intercap_core.body.artefact import load_model, read_parameters
-from intercap_core.body.model import BodyModel
+from intercap_core.body.model import BodyModel, BodyOutput
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.config import BodyModels
 from intercap_core.schemas import JOINT
 
 METRES = "metres, radians, seconds"
-_AXIS_TOLERANCE = 1e-4  # rad between a vector and the axis by which it is named
 _FLOOR = "z-up: gravity-aligned, ground at z = 0, metres"
 _STATED_FLOOR = "z-up: up and ground at z = 0 as stated with the calibration, metres"
 _UP_SOURCE = {
@@ -130,6 +130,27 @@ def read_motion(
     )
 
 
+def rest_pose(model: BodyModel, parameters: BodyParameters) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices (V, 3) and joints (55, 3) of the first frame's shape in the T-pose."""
+    rest = replace(
+        model.zeros(1),
+        betas=parameters.betas[:1].to(model.dtype),
+        expression=parameters.expression[:1].to(model.dtype),
+    )
+    with torch.no_grad():
+        posed = model.forward(rest)
+    return posed.vertices[0].double().numpy(), posed.joints[0].double().numpy()
+
+
+def posed_batches(model: BodyModel, parameters: BodyParameters) -> Iterator[BodyOutput]:
+    """Pose the bodies of all frames, 32 frames at a time."""
+    cast = BodyParameters(**{k: v.to(model.dtype) for k, v in vars(parameters).items()})
+    for first in range(0, cast.batch, 32):
+        with torch.no_grad():
+            posed = model.forward(cast.frames(slice(first, first + 32)))
+        yield posed
+
+
 @dataclass(frozen=True, eq=False)
 class Coordinates:
     """Coordinate frame and units of the numbers in a file."""
@@ -149,7 +170,7 @@ class Coordinates:
     def up_axis(self) -> str:
         """The axis that points up, such as ``z`` or ``-y``, or why no axis does."""
         for axis, value in zip("xyz", self.up, strict=True):
-            if abs(abs(value) - 1) < _AXIS_TOLERANCE**2:
+            if abs(abs(value) - 1) < 1e-8:  # within 1e-4 rad
                 return axis if value > 0 else f"-{axis}"
         return "none: see the vector up" if np.isfinite(self.up).all() else "unknown"
 

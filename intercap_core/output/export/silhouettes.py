@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
-import torch
 
 from intercap_core.geometry.camera.masks import encode_window
 from intercap_core.geometry.camera.rig import Camera, Rig
@@ -18,9 +17,7 @@ from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.render import render, render_scene
 from intercap_core.geometry.rigid.shots import Drawable, Rendering
 from intercap_core.geometry.solve.time_series import rigid_velocity
-from intercap_core.output.export.motion import Motion
-
-_BATCH = 32  # frames posed at a time
+from intercap_core.output.export.motion import Motion, posed_batches
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,15 +139,8 @@ class Scenes:
 
 def body_vertices(motion: Motion) -> np.ndarray:
     """Compute the body's vertices (T, V, 3) float32 in the motion's frame."""
-    parameters = motion.parameters.__class__(
-        **{k: v.to(motion.model.dtype) for k, v in vars(motion.parameters).items()}
-    )
-    vertices = []
-    with torch.no_grad():
-        for first in range(0, len(motion), _BATCH):
-            posed = motion.model.forward(parameters.frames(slice(first, first + _BATCH)))
-            vertices.append(posed.vertices.numpy())
-    return np.concatenate(vertices)
+    batches = posed_batches(motion.model, motion.parameters)
+    return np.concatenate([posed.vertices.numpy() for posed in batches])
 
 
 def _visible_part(rendering: Rendering, number: int) -> Mask:

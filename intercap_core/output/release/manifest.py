@@ -24,7 +24,7 @@ _BLOCK = 1 << 22  # bytes read at a time
 
 
 @dataclass(frozen=True)
-class Entry:
+class ReleasedFile:
     """One released file."""
 
     path: str
@@ -66,7 +66,7 @@ def write(
     kinds: Sequence[str] = KINDS,
     sequences: Sequence[str] | None = None,
     threads: int = 1,
-) -> list[Entry]:
+) -> list[ReleasedFile]:
     """Write ``release.json`` and ``release.sha256`` (for sha256sum -c) into ``folder``.
 
     Args:
@@ -87,11 +87,11 @@ def write(
         )
     progress = Progress(log, "read", len(paths), "files")
 
-    def read_entry(item: tuple[PurePosixPath, str]) -> Entry:
+    def read_entry(item: tuple[PurePosixPath, str]) -> ReleasedFile:
         path, kind = item
         digest, size = _digest(folder / path)
         progress.step()
-        return Entry(path.as_posix(), kind, size, digest)
+        return ReleasedFile(path.as_posix(), kind, size, digest)
 
     entries = ThreadPool(threads).map(read_entry, paths)
     content = {"format": FORMAT, **made_with, "files": [vars(entry) for entry in entries]}
@@ -109,7 +109,7 @@ def check(folder: Path, *, threads: int = 1) -> tuple[int, Differences]:
     """
     listed = _read(folder / MANIFEST)
 
-    def compare(entry: Entry) -> str:
+    def compare(entry: ReleasedFile) -> str:
         path = folder / entry.path
         exists = path.is_file()
         same = exists and path.stat().st_size == entry.bytes and _digest(path)[0] == entry.sha256
@@ -161,7 +161,7 @@ def _digest(path: Path) -> tuple[str, int]:
     return digest.hexdigest(), size
 
 
-def _read(path: Path) -> list[Entry]:
+def _read(path: Path) -> list[ReleasedFile]:
     """Read a manifest; paths that lead out of its folder are refused."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
@@ -171,7 +171,9 @@ def _read(path: Path) -> list[Entry]:
                 "version of this program that wrote it"
             )
         entries = [
-            Entry(str(file["path"]), str(file["kind"]), int(file["bytes"]), str(file["sha256"]))
+            ReleasedFile(
+                str(file["path"]), str(file["kind"]), int(file["bytes"]), str(file["sha256"])
+            )
             for file in content["files"]
         ]
     except FileNotFoundError:

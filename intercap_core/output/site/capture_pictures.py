@@ -25,35 +25,13 @@ CAMERA_COLOURS = (
     "#4e9bde", "#f28e2b", "#59a14f", "#e15759", "#b07aa1", "#d4b13a", "#3fa7a3", "#ff7fa5",
     "#9c755f", "#8c8c8c", "#7570b3", "#a0c15a", "#c0448f", "#5b7fd1", "#c97b3d", "#4f8f74",
 )  # fmt: skip
-_GROUND = np.array((0.075, 0.086, 0.105), np.float32)
-_SIZE = (840, 560)
-_FOCAL = 900.0
-_SIDES = (("front", 22.0, 20.0), ("other side, from above", 200.0, 48.0))  # from the master, deg
-_MARGIN_M = 0.35  # shown around the ring of cameras
-_LARGEST_M, _SMALLEST_M = 4.0, 1.0  # limits of the shown radius
-_FLOOR_M, _TOP_M = -0.25, 2.6  # limits of the shown heights
-_AIM_M = 0.65  # height at the centre of the pictures
-_CELL_M = 0.5  # spacing of the floor's grid
-_DISTANCES = np.arange(2.2, 4.0, 0.1)  # viewing distances in radii, the nearest that fits is used
-_BORDER_PX = 24
-_FRUSTUM_M = 0.28
-_NEAR_M = 0.1
-_LONGEST_NAME = 12
-_MOST_GAIN = 1.5
-_SLICE_HALF_M, _SLICE_LEAST_M, _SLICE_MARGIN = 0.9, 0.5, 1.15
-_SLICE_THICK_M = 0.05
-_SLICE_SIZE = (840, 520)
-_SLICE_HEIGHTS_M = tuple(0.1 * n for n in range(3, 18))
-_FEW_IN_SLICE = 40
-_SCALE_BAR_M = 0.1
-_DOT_PX = 2
-_STRIP_M, _STRIP_BIN_M, _STRIP_HEIGHT_M = 0.3, 0.08, 0.08
-_STRIPS_M = (0.0, 0.3, -0.3, 0.6, -0.6)  # y of candidate strips from the centre
-_STANDING_M = 0.4  # points up to this height are objects on the strip
-_FEW_IN_BIN = 5
-_INK, _SHADOW = (235, 235, 235), (10, 12, 16)
+_GROUND = np.array((0.075, 0.086, 0.105), np.float32)  # RGB
+_INK, _SHADOW = (235, 235, 235), (10, 12, 16)  # RGB
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _SHIFT = 4  # fractional bits of the coordinates that OpenCV draws
+_SIDES = (("front", 22.0, 20.0), ("other side, from above", 200.0, 48.0))  # from the master, deg
+_SLICE_SIZE = (840, 520)  # px
+_SLICE_THICK_M = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,21 +115,23 @@ def floor_profiles(cloud: FusedCloud, centre: np.ndarray) -> list[FloorProfile]:
 
     The strip is near ``centre`` (2,), where the fewest points are above the floor.
     """
+    half_width, bin_m, highest = 0.15, 0.08, 0.08  # metres; points above are not floor
     height, offset = cloud.points[:, 2], cloud.points[:, 1] - centre[1]
-    standing = offset[(height > _STRIP_HEIGHT_M) & (height < _STANDING_M)]
-    least = min(_STRIPS_M, key=lambda at: int((np.abs(standing - at) < _STRIP_M / 2).sum()))
-    low = (np.abs(height) < _STRIP_HEIGHT_M) & (cloud.normals[:, 2] > 0.9)
-    low &= np.abs(offset - least) < _STRIP_M / 2
+    standing = offset[(height > highest) & (height < 0.4)]
+    strips = (0.0, 0.3, -0.3, 0.6, -0.6)
+    least = min(strips, key=lambda at: int((np.abs(standing - at) < half_width).sum()))
+    low = (np.abs(height) < highest) & (cloud.normals[:, 2] > 0.9)
+    low &= np.abs(offset - least) < half_width
     profiles = []
     for c in np.unique(cloud.camera[low]):
         points = cloud.points[low & (cloud.camera == c)]
-        bins = np.floor((points[:, 0] - centre[0]) / _STRIP_BIN_M).astype(int)
+        bins = np.floor((points[:, 0] - centre[0]) / bin_m).astype(int)
         order = np.lexsort((points[:, 2], bins))
         places, first, count = np.unique(bins[order], return_index=True, return_counts=True)
-        kept = count >= _FEW_IN_BIN
+        kept = count >= 5
         middle = (first + count // 2)[kept]
         if kept.sum() >= 2:
-            along = (places[kept] + 0.5) * _STRIP_BIN_M
+            along = (places[kept] + 0.5) * bin_m
             profiles.append(FloorProfile(int(c), along, points[order][middle, 2].astype(float)))
     return profiles
 
@@ -173,18 +153,18 @@ class _ShownRoom:
     def around(cls, cloud: FusedCloud, rig: Rig, world_from_master: np.ndarray) -> _ShownRoom:
         eyes = apply(world_from_master, rig.master_from_colour[:, :3, 3])
         centre = np.median(cloud.points[:, :2], 0) if len(cloud.points) else eyes[:, :2].mean(0)
-        reach = np.linalg.norm(eyes[:, :2] - centre, axis=1).max() + _MARGIN_M
-        radius = float(np.clip(reach, _SMALLEST_M, _LARGEST_M))
+        reach = np.linalg.norm(eyes[:, :2] - centre, axis=1).max() + 0.35
+        radius = float(np.clip(reach, 1.0, 4.0))
         first = eyes[0, :2] - centre
         bright = float(np.percentile(cloud.colours, 98)) if len(cloud.colours) else 1.0
-        gain = float(np.clip(0.95 / max(bright, 1e-3), 1, _MOST_GAIN))
+        gain = float(np.clip(0.95 / max(bright, 1e-3), 1, 1.5))
         azimuth = float(np.arctan2(first[1], first[0]))
         return cls(centre.astype(np.float64), radius, azimuth, gain)
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Return which points (N, 3) are shown."""
         near = np.linalg.norm(points[:, :2] - self.centre.astype(points.dtype), axis=1)
-        return (near < self.radius) & (points[:, 2] > _FLOOR_M) & (points[:, 2] < _TOP_M)
+        return (near < self.radius) & (points[:, 2] > -0.25) & (points[:, 2] < 2.6)
 
     def picture(
         self,
@@ -196,14 +176,14 @@ class _ShownRoom:
     ) -> EncodedImage:
         """Draw the coloured cloud with the floor's grid and the cameras."""
         name, azimuth, elevation = side
-        target = np.append(self.centre, _AIM_M)
+        target = np.append(self.centre, 0.65)
         places = [_frustum(camera, world @ camera.master_from_colour) for camera in rig]
-        for distance in _DISTANCES * self.radius:
+        for distance in np.arange(2.2, 4.0, 0.1) * self.radius:  # the nearest that shows all
             view = Viewpoint.towards(
                 target, self.azimuth + np.radians(azimuth), np.radians(elevation), distance,
-                _FOCAL, _SIZE,
+                900.0, (840, 560),
             )  # fmt: skip
-            if view.contains(np.concatenate(places), _BORDER_PX):
+            if view.contains(np.concatenate(places), 24):
                 break
         colours, depth = splat(cloud, view)
         colours *= self.gain
@@ -216,7 +196,8 @@ class _ShownRoom:
 
     def _draw_floor(self, picture: np.ndarray, depth: np.ndarray, view: Viewpoint) -> None:
         """Blend the grid over the floor where it is visible."""
-        lines = np.arange(-np.floor(self.radius / _CELL_M), self.radius / _CELL_M) * _CELL_M
+        cell_m = 0.5
+        lines = np.arange(-np.floor(self.radius / cell_m), self.radius / cell_m) * cell_m
         layer = np.zeros(depth.shape, np.uint8)
         for offset in lines:
             half = np.sqrt(max(self.radius**2 - offset**2, 0))
@@ -244,7 +225,7 @@ def _frustum(camera: Camera, pose: np.ndarray) -> np.ndarray:
     lens = camera.colour
     half = 0.5 * np.array([lens.width / lens.fx, lens.height / lens.fy])
     corners = [[x * half[0], y * half[1], 1] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-    return apply(pose, _FRUSTUM_M * np.array([[0, 0, 0], *corners]))
+    return apply(pose, 0.28 * np.array([[0, 0, 0], *corners]))
 
 
 def _draw_frustum(
@@ -255,9 +236,9 @@ def _draw_frustum(
     at, z = view.project(corners)
     for shade, thick in ((_SHADOW, 3), (_rgb(c), 1)):
         _draw_lines(picture, view, corners[np.array(pairs)], shade, thick)
-    if not (z > _NEAR_M).all():
+    if not (z > 0.1).all():
         return
-    text = name[:_LONGEST_NAME].encode("ascii", "replace").decode()
+    text = name[:12].encode("ascii", "replace").decode()
     (width, height), _ = cv2.getTextSize(text, _FONT, 0.5, 1)
     x, y = int(at[:, 0].mean()) - width // 2, int(at[:, 1].min()) - 8
     cv2.rectangle(picture, (x - 4, y - height - 4), (x + width + 4, y + 4), _SHADOW, -1)
@@ -273,7 +254,7 @@ def _draw_lines(
 ) -> None:
     """Draw anti-aliased lines (N, 2, 3); lines that reach behind the viewer are skipped."""
     at, z = view.project(ends.reshape(-1, 3))
-    kept = (z > _NEAR_M).reshape(-1, 2).all(1) & (np.abs(at.reshape(-1, 4)).max(1) < 1e4)
+    kept = (z > 0.1).reshape(-1, 2).all(1) & (np.abs(at.reshape(-1, 4)).max(1) < 1e4)
     for a, b in np.rint(at.reshape(-1, 2, 2)[kept] * 2**_SHIFT).astype(int).tolist():
         cv2.line(picture, a, b, colour, thick, cv2.LINE_AA, _SHIFT)
 
@@ -295,19 +276,19 @@ class Slice:
 
         None if no two cameras have points at the same height.
         """
-        near = np.abs(cloud.points[:, :2] - centre).max(1) < _SLICE_HALF_M
-        best, found = (1, 0), None
-        for height in _SLICE_HEIGHTS_M:
+        near = np.abs(cloud.points[:, :2] - centre).max(1) < 0.9
+        best, chosen = (1, 0), None
+        for height in (0.1 * n for n in range(3, 18)):
             inside = near & (np.abs(cloud.points[:, 2] - height) < _SLICE_THICK_M / 2)
             counts = np.bincount(cloud.camera[inside])
-            score = (int((counts >= _FEW_IN_SLICE).sum()), int(inside.sum()))
+            score = (int((counts >= 40).sum()), int(inside.sum()))
             if score[0] >= 2 and score > best:
-                best, found = score, (height, cloud.points[inside, :2])
-        if found is None:
+                best, chosen = score, (height, cloud.points[inside, :2])
+        if chosen is None:
             return None
-        low, high = np.percentile(found[1], (1, 99), axis=0)
-        extent = np.maximum(_SLICE_MARGIN * (high - low), _SLICE_LEAST_M)
-        return cls(found[0], (low + high) / 2, float((np.array(_SLICE_SIZE) / extent).min()))
+        low, high = np.percentile(chosen[1], (1, 99), axis=0)
+        extent = np.maximum(1.15 * (high - low), 0.5)
+        return cls(chosen[0], (low + high) / 2, float((np.array(_SLICE_SIZE) / extent).min()))
 
     def picture(self, cloud: FusedCloud, when: str) -> EncodedImage:
         """Draw the points at this height from above in their cameras' colours, with a scale."""
@@ -320,11 +301,10 @@ class Slice:
         # Cameras take turns, so that none covers all others
         order = np.argsort(np.arange(len(at)) * 2654435761 % 2**32, kind="stable")
         for place, c in zip(at[order].tolist(), cameras[order].tolist(), strict=True):
-            cv2.circle(picture, place, _DOT_PX << _SHIFT, _rgb(c), -1, cv2.LINE_AA, _SHIFT)
-        x, y, bar = 18, height - 20, round(_SCALE_BAR_M * self.scale)
+            cv2.circle(picture, place, 2 << _SHIFT, _rgb(c), -1, cv2.LINE_AA, _SHIFT)
+        x, y, bar = 18, height - 20, round(0.1 * self.scale)
         cv2.line(picture, (x, y), (x + bar, y), _INK, 2)
-        label = f"{100 * _SCALE_BAR_M:.0f} cm"
-        cv2.putText(picture, label, (x, y - 8), _FONT, 0.5, _INK, 1, cv2.LINE_AA)
+        cv2.putText(picture, "10 cm", (x, y - 8), _FONT, 0.5, _INK, 1, cv2.LINE_AA)
         name = _captioned(f"slice at {self.height:.1f} m", when)
         return _encode_png(picture, name)
 

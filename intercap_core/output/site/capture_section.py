@@ -22,10 +22,7 @@ from intercap_core.output.site.capture_pictures import (
 )
 from intercap_core.schemas import FRAMES, SCENE
 
-_MAX_PAIRS = 45
-_LEAST_PROFILE_MM = 10.0  # least height of the floor's charts
-_BIAS = 6  # row of the depth bias in a camera's block of camera_covariance
-_GAP = 1.5  # frame periods between neighbouring sets that count as a gap
+_MAX_PAIRS = 45  # drawn pairs of cameras
 STATES = ("recorded", "part", "slipped", "missing", "dropped")
 _WORDS = {
     "recorded": "recorded",
@@ -127,10 +124,7 @@ def read_capture(frames: Path, scene: Path) -> CaptureFacts:
 
 
 def camera_states(
-    colour: np.ndarray,
-    depth: np.ndarray,
-    slip: np.ndarray,
-    dropped: np.ndarray,
+    colour: np.ndarray, depth: np.ndarray, slip: np.ndarray, dropped: np.ndarray
 ) -> list[str]:
     """Return the state of one camera in each set, a key of STATES; arguments are (T,)."""
     state = np.full(len(colour), "missing", object)
@@ -144,7 +138,7 @@ def camera_states(
 def gaps(times: np.ndarray, fps: float) -> list[tuple[int, int]]:
     """Return gaps without any image: (set before the gap, number of missing sets)."""
     steps = np.diff(times) * fps
-    return [(int(t), round(float(steps[t])) - 1) for t in np.flatnonzero(steps > _GAP)]
+    return [(int(t), round(float(steps[t])) - 1) for t in np.flatnonzero(steps > 1.5)]
 
 
 def context(facts: CaptureFacts) -> dict[str, Any]:
@@ -180,7 +174,7 @@ def _cameras(recorded: artefacts.Artefact, refined: artefacts.Artefact) -> list[
         refined[key] for key in ("time_offset", "time_offset_sigma", "depth_bias")
     )
     has_depth = refined["depth_size"][:, 0] > 0
-    variance = np.einsum("cici->ci", refined["camera_covariance"])[:, _BIAS]
+    variance = np.einsum("cici->ci", refined["camera_covariance"])[:, 6]
     bias_sigma = np.sqrt(np.maximum(variance, 0))  # 0 = not stated
     notes = zip(recorded.text("note"), refined.text("note"), strict=True)
     judged = "camera_verdict" in refined  # absent in artefacts of earlier versions
@@ -251,7 +245,7 @@ def _pair_charts(pairs: Sequence[Pair]) -> list[tuple[str, str]]:
             what,
             charts.bar_pairs(
                 [
-                    charts.BarPair(
+                    charts.BarPair.change(
                         pair.name, 1e3 * before, 1e3 * after, f"{points:,} points", pair.weak
                     )
                     for pair, before, after, points in rows
@@ -272,14 +266,14 @@ def _timeline(facts: CaptureFacts) -> str:
             for state, slip in zip(camera.state, camera.slip, strict=True)
         ]
         runs = []
-        for first, last, words in flags.ranges(states):
-            state, _, frames = words.partition(" by ")
+        for first, last, text in flags.ranges(states):
+            state, _, frames = text.partition(" by ")
             at = f"{first}" if first == last else f"{first}–{last}"
             late = f", {frames} {_frames(int(frames))} before" if frames else ""
-            runs.append((first, last, state, f"{at}: {_WORDS[state]}{late}"))
-        rows.append(charts.StateRow(camera.name, runs, _row_label(camera)))
+            runs.append((first, last, f"state {state}", f"{at}: {_WORDS[state]}{late}"))
+        rows.append(charts.Row(camera.name, runs, _row_label(camera)))
     marks = [(t, f"{count} {_sets(count)} without any image") for t, count in facts.gaps]
-    return charts.state_timeline(rows, len(facts.times), marks)
+    return charts.timeline(rows, len(facts.times), marks)
 
 
 def _row_label(camera: CameraFacts) -> str:
@@ -342,7 +336,7 @@ def _profile_charts(drawn: CapturePictures) -> list[tuple[str, str]]:
     every = [profile for profiles in drawn.profiles for profile in profiles]
     if not every:
         return []
-    top = max(_LEAST_PROFILE_MM, *(1e3 * float(np.abs(p.height).max()) for p in every))
+    top = max(10.0, *(1e3 * float(np.abs(p.height).max()) for p in every))
     top = 10 * float(np.ceil(top / 10))
     low = min(float(p.along.min()) for p in every)
     high = max(float(p.along.max()) for p in every)
@@ -357,9 +351,7 @@ def _profile_charts(drawn: CapturePictures) -> list[tuple[str, str]]:
 
 
 def _profile_chart(
-    profiles: Sequence[FloorProfile],
-    x_range: tuple[float, float],
-    top: float,
+    profiles: Sequence[FloorProfile], x_range: tuple[float, float], top: float
 ) -> str:
     series = [charts.Series("", _colour(p.c), p.along, 1e3 * p.height) for p in profiles]
     return charts.line_chart(

@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from intercap_core import artefacts
@@ -26,25 +25,21 @@ from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.render import render_scene
 from intercap_core.geometry.rigid.shots import Drawable
-from intercap_core.output.site.drawing import ColouredMesh, EncodedImage, draw, encode_jpeg
+from intercap_core.output.site.drawing import (
+    ColouredMesh,
+    EncodedImage,
+    draw,
+    encode_jpeg,
+    put_text,
+)
 from intercap_core.output.site.overlays import BODY_COLOUR, OBJECT_COLOUR
 from intercap_core.schemas import JOINT, SCENE
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 
 SIDES = ("left", "right")
 TOUCHING_COLOUR = (0.86, 0.20, 0.26)
-HOLDING = 0.5  # least probability of contact, as in all output
-VIEWS = 2
-_CELL_PX, _GAP_PX, _HEAD_PX = 200, 4, 18
-_FIELD_M = 0.25  # width and height of a cell at the hand
+_CELL_PX = 200
 _DISTANCE_M = 0.8  # of the viewer from the hand
-_SURVEY_PX = 48  # side of pictures for choosing viewpoints
-_APART_DEG = 60.0  # least angle between both viewpoints
-_STEEPEST = 0.8  # largest vertical component of a viewing direction from above
-_NEAR_M = 0.03  # a viewpoint should show skin within this distance of the object
-_GROUND, _INK = 225, (40, 44, 52)
-_CELL = np.ones((_CELL_PX, _CELL_PX, 3), np.float32)
-_FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,11 +179,11 @@ def read_handling(
 
 
 def holds(probability: np.ndarray) -> list[Hold]:
-    """Return runs of frames with a probability (T, 2) above HOLDING, longest first."""
+    """Return runs of frames with a probability (T, 2) above 0.5, longest first."""
     runs = [
         Hold(side, first, last)
         for side, values in zip(SIDES, probability.T, strict=True)
-        for first, last, _ in flags.ranges(["x" if p > HOLDING else "" for p in values])
+        for first, last, _ in flags.ranges(["x" if p > 0.5 else "" for p in values])
     ]
     return sorted(runs, key=lambda hold: (hold.first - hold.last, hold.first, hold.side))
 
@@ -201,25 +196,26 @@ def closeup(handling: Handling, hold: Hold) -> EncodedImage:
     pairs = [column.at(t) for column in handling.columns]
     fitted = pairs[-2] if handling.has_truth else pairs[-1]
     views = _viewpoints(fitted, hand, arms, handling.up)
-    step = _CELL_PX + _GAP_PX
-    shape = (_HEAD_PX + len(views) * step - _GAP_PX, len(pairs) * step - _GAP_PX, 3)
-    sheet = np.full(shape, _GROUND, np.uint8)
+    gap, head = 4, 18  # px
+    step = _CELL_PX + gap
+    sheet = np.full((head + len(views) * step - gap, len(pairs) * step - gap, 3), 225, np.uint8)
+    white = np.ones((_CELL_PX, _CELL_PX, 3), np.float32)
     for c, (column, pair) in enumerate(zip(handling.columns, pairs, strict=True)):
         colours = _skin_colours(pair, arms)
         for row, view in enumerate(views):
             picture = draw(_coloured(pair, arms, colours, view), _lens(_CELL_PX))
-            y, x = _HEAD_PX + row * step, c * step
-            sheet[y : y + _CELL_PX, x : x + _CELL_PX] = np.rint(255 * picture.over(_CELL))
+            y, x = head + row * step, c * step
+            sheet[y : y + _CELL_PX, x : x + _CELL_PX] = np.rint(255 * picture.over(white))
         label = column.name
         if handling.has_truth and c < len(pairs) - 1:
             off = np.linalg.norm((pair.body - pairs[-1].body)[hand], axis=1).mean()
             label += f", hand {1e3 * off:.1f} mm off"
-        cv2.putText(sheet, label, (c * step + 3, 13), _FONT, 0.4, _INK, 1, cv2.LINE_AA)
+        put_text(sheet, label, (c * step + 3, 13), 0.4, (40, 44, 52))
     return encode_jpeg(sheet / np.float32(255), hold.caption)
 
 
 def _lens(pixels: int) -> Intrinsics:
-    focal, middle = pixels * _DISTANCE_M / _FIELD_M, (pixels - 1) / 2
+    focal, middle = pixels * _DISTANCE_M / 0.25, (pixels - 1) / 2  # shows 0.25 m at the hand
     return Intrinsics(pixels, pixels, focal, focal, middle, middle)
 
 
@@ -241,9 +237,9 @@ def _viewpoints(
     """Choose camera_from_master (4, 4) of two viewpoints that show most skin and object."""
     target = fitted.body[hand].mean(0)
     near = np.zeros(len(fitted.body), bool)
-    near[hand[fitted.distance(hand) < _NEAR_M]] = True
+    near[hand[fitted.distance(hand) < 0.03]] = True
     showing = near[arms].any(1)
-    lens, candidates = _lens(_SURVEY_PX), []
+    lens, candidates = _lens(48), []
     for direction in _directions(up):
         pose = _look_at(target, direction, up)
         drawn = render_scene(
@@ -255,10 +251,10 @@ def _viewpoints(
         candidates.append((score, direction, pose))
     order = sorted(range(len(candidates)), key=lambda i: (-candidates[i][0], i))
     chosen = order[:1]
-    limit = np.cos(np.radians(_APART_DEG))
+    limit = np.cos(np.radians(60.0))  # least angle between both viewpoints
     for i in order:
         apart = all(candidates[i][1] @ candidates[j][1] < limit for j in chosen)
-        if len(chosen) < VIEWS and apart:
+        if len(chosen) < 2 and apart:
             chosen.append(i)
     return [candidates[i][2] for i in chosen]
 
@@ -270,7 +266,7 @@ def _directions(up: np.ndarray) -> list[np.ndarray]:
     front = np.cross(side, up)
     return [
         -np.sqrt(1 - rise**2) * (np.cos(turn) * side + np.sin(turn) * front) - rise * up
-        for rise in (-0.3, 0.1, 0.45, _STEEPEST)
+        for rise in (-0.3, 0.1, 0.45, 0.8)
         for turn in np.arange(12) * np.pi / 6
     ]
 

@@ -16,16 +16,6 @@ from intercap_core.geometry.rigid.render import render_scene
 from intercap_core.geometry.rigid.shots import Drawable, Rendering
 from intercap_core.geometry.rigid.surfaces import vertex_normals
 
-_JPEG_QUALITY = 82
-_AMBIENT = 0.38  # share of light that does not depend on the direction of the surface
-_LIGHT = np.array([-0.35, -0.55, -0.76])  # towards the light, camera frame: above, left, in front
-_SMOOTHING = 2  # supersampling factor
-# of sheets
-_GAP_PX, _HEAD_PX = 4, 18
-_GROUND = (19, 22, 27)  # RGB
-_INK, _DIM = (235, 235, 235), (120, 128, 138)  # RGB
-_FONT = cv2.FONT_HERSHEY_SIMPLEX
-
 
 @dataclass(frozen=True, eq=False)
 class EncodedImage:
@@ -68,7 +58,7 @@ class RenderedImage:
 
 def draw(meshes: Sequence[ColouredMesh], lens: Intrinsics) -> RenderedImage:
     """Render meshes with mutual occlusion into the whole image of ``lens``."""
-    fine = lens.scaled(_SMOOTHING)
+    fine = lens.scaled(2)  # supersampling
     rendering = render_scene(
         [Drawable(m.vertices, m.faces, m.camera_from_mesh) for m in meshes], fine
     )
@@ -86,7 +76,9 @@ def _shade(meshes: Sequence[ColouredMesh], rendering: Rendering, lens: Intrinsic
     """
     result = np.zeros((*rendering.depth.shape, 4), np.float32)
     rays = lens.rays[rendering.window]
-    light = _LIGHT / np.linalg.norm(_LIGHT)
+    light = np.array([-0.35, -0.55, -0.76])  # towards the light, camera frame: left, above, front
+    light /= np.linalg.norm(light)
+    ambient = 0.38
     for number, mesh in enumerate(meshes):
         rows, columns = np.nonzero(rendering.body == number)
         if len(rows) == 0:
@@ -99,7 +91,7 @@ def _shade(meshes: Sequence[ColouredMesh], rendering: Rendering, lens: Intrinsic
         weights = _barycentric(points, *(vertices[corners[:, k]] for k in range(3)))
         normals = _mix(vertex_normals(vertices, mesh.faces), corners, weights)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-        lit = _AMBIENT + (1 - _AMBIENT) * np.clip(normals @ light, 0, 1)
+        lit = ambient + (1 - ambient) * np.clip(normals @ light, 0, 1)
         colours = _mix(mesh.colours, corners, weights) * lit[:, None]
         result[rows, columns, :3] = colours
         result[rows, columns, 3] = 1
@@ -123,7 +115,7 @@ def _mix(values: np.ndarray, corners: np.ndarray, weights: np.ndarray) -> np.nda
 def encode_jpeg(rgb: np.ndarray, caption: str = "") -> EncodedImage:
     """Encode an image (H, W, 3) in 0..1 as JPEG."""
     bgr = np.rint(np.clip(rgb[..., ::-1], 0, 1) * 255).astype(np.uint8)
-    options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
+    options = [cv2.IMWRITE_JPEG_QUALITY, 82, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
     data = cv2.imencode(".jpg", bgr, options)[1].tobytes()
     return EncodedImage(data, "jpeg", bgr.shape[1], bgr.shape[0], caption)
 
@@ -138,16 +130,8 @@ def encode_png(picture: RenderedImage, caption: str = "") -> EncodedImage:
     return EncodedImage(data, "png", pixels.shape[1], pixels.shape[0], caption)
 
 
-@dataclass(frozen=True, eq=False)
-class Sheet:
-    """A table of small pictures: a row per frame, a column per camera."""
-
-    image: EncodedImage
-    frames: Sequence[int]
-
-
 @dataclass(frozen=True)
-class Crop:
+class SquareCrop:
     """A square part of an image, shown at another size."""
 
     x0: int
@@ -164,12 +148,7 @@ class Crop:
         return cv2.resize(window, (self.cell, self.cell), interpolation=cv2.INTER_AREA)
 
     def outline(
-        self,
-        cell: np.ndarray,
-        mask: np.ndarray,
-        x: int,
-        y: int,
-        colour: tuple[int, int, int],
+        self, cell: np.ndarray, mask: np.ndarray, x: int, y: int, colour: tuple[int, int, int]
     ) -> None:
         """Draw the contour of a mask (h, w) whose corner is at image pixel (x, y)."""
         square = np.zeros((self.size, self.size), np.uint8)
@@ -193,29 +172,46 @@ CellDrawer = Callable[[Camera, int, int, np.ndarray], np.ndarray | None]
 
 
 def make_sheet(
-    images: Frames, rig: Rig, frames: Sequence[int], cell_px: int, draw_cell: CellDrawer
-) -> Sheet:
-    """Draw a sheet of cells of ``cell_px`` pixels.
+    name: str, images: Frames, rig: Rig, frames: Sequence[int], cell_px: int, draw_cell: CellDrawer
+) -> EncodedImage:
+    """Draw a table of small pictures: a row per frame, a column per camera.
 
     Args:
+        name: name of the sequence.
         images: images by the frame that they show (:meth:`Frames.showing`).
+        cell_px: side of a cell.
         draw_cell: called with camera, frame, index of the camera and RGB image; returns the cell,
             or None if nothing is in view.
     """
-    step = cell_px + _GAP_PX
-    sheet = np.empty((len(frames) * step + _HEAD_PX, len(rig) * step, 3), np.uint8)
-    sheet[:] = _GROUND
+    step, head = cell_px + 4, 18
+    bright, dim = (235, 235, 235), (120, 128, 138)  # RGB
+    sheet = np.empty((len(frames) * step + head, len(rig) * step, 3), np.uint8)
+    sheet[:] = (19, 22, 27)
     for c, camera in enumerate(rig):
-        cv2.putText(sheet, camera.name[:16], (c * step + 4, 13), _FONT, 0.42, _INK, 1, cv2.LINE_AA)
+        put_text(sheet, camera.name[:16], (c * step + 4, 13), 0.42, bright)
         for row, t in enumerate(frames):
             image = images.colour(t, c)
             cell = None if image is None else draw_cell(camera, t, c, image[..., ::-1])
-            y, x = _HEAD_PX + row * step, c * step
+            y, x = head + row * step, c * step
             if cell is not None:
                 sheet[y : y + cell_px, x : x + cell_px] = cell
             if c == 0 or cell is None:
                 label = f"frame {t}" if c == 0 else "no image" if image is None else "not in view"
-                ink = _INK if cell is not None else _DIM
-                cv2.putText(sheet, label, (x + 4, y + 13), _FONT, 0.4, (0, 0, 0), 3, cv2.LINE_AA)
-                cv2.putText(sheet, label, (x + 4, y + 13), _FONT, 0.4, ink, 1, cv2.LINE_AA)
-    return Sheet(encode_jpeg(sheet / np.float32(255)), list(frames))
+                ink = bright if cell is not None else dim
+                put_text(sheet, label, (x + 4, y + 13), 0.4, (0, 0, 0), 3)
+                put_text(sheet, label, (x + 4, y + 13), 0.4, ink)
+    caption = f"{name}, frames {', '.join(map(str, frames))} in every camera"
+    return encode_jpeg(sheet / np.float32(255), caption)
+
+
+def put_text(
+    picture: np.ndarray,
+    text: str,
+    corner: tuple[int, int],
+    size: float,
+    colour: tuple[int, int, int],
+    thickness: int = 1,
+) -> None:
+    """Draw a line of text with its lower left corner at a pixel; ``size`` in OpenCV's units."""
+    font = cv2.FONT_HERSHEY_SIMPLEX
+    cv2.putText(picture, text, corner, font, size, colour, thickness, cv2.LINE_AA)

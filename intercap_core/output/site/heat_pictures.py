@@ -16,19 +16,14 @@ from intercap_core.output.site.drawing import ColouredMesh, EncodedImage, draw, 
 
 # sRGB, from no contact to the map's maximum: grey skin, yellow, red, dark red
 COLOUR_STOPS = ((0.80, 0.81, 0.83), (0.99, 0.80, 0.25), (0.91, 0.26, 0.15), (0.40, 0.02, 0.12))
-_STOP_AT = (0.0, 0.25, 0.6, 1.0)
-_FAR = 40.0  # viewing distance in sizes of the surface: nearly parallel rays
-_MAX_EDGE_M = 0.012  # an object's mesh is subdivided to edges of at most this length
-_KERNEL_M = 0.006  # standard deviation of the kernel that interpolates surface points
-_WRIST_M = 0.03  # length of the forearm shown with a hand
-_ARMS_DOWN = 1.0  # rad, rotation of each shoulder from the T-pose
+STOP_AT = (0.0, 0.25, 0.6, 1.0)  # likelihoods of COLOUR_STOPS, shares of the maximum
 
 
 def colours(values: np.ndarray, top: float) -> np.ndarray:
     """Return colours (V, 3) of values (V,); ``top`` has the last colour."""
     share = np.clip(values / max(top, 1e-12), 0, 1)
     stops = np.array(COLOUR_STOPS)
-    return np.column_stack([np.interp(share, _STOP_AT, stops[:, k]) for k in range(3)])
+    return np.column_stack([np.interp(share, STOP_AT, stops[:, k]) for k in range(3)])
 
 
 def body_surfaces(
@@ -41,7 +36,7 @@ def body_surfaces(
     """
     params = model.zeros(1)
     for index, turn in ((JOINT_INDEX["left_shoulder"], -1), (JOINT_INDEX["right_shoulder"], 1)):
-        params.body_pose[:, 3 * (index - 1) + 2] = turn * _ARMS_DOWN
+        params.body_pose[:, 3 * (index - 1) + 2] = turn
     with torch.no_grad():
         standing = model.forward(params).vertices[0].numpy().astype(np.float64)
     faces, top = model.faces.numpy(), highest(likelihood)
@@ -56,7 +51,7 @@ def body_surfaces(
         joints = model.forward(model.zeros(1)).joints[0].numpy()
     for side, outwards in (("left", 1.0), ("right", -1.0)):
         wrist = joints[JOINT_INDEX[f"{side}_wrist"], 0]
-        shown = outwards * (template[:, 0] - wrist) > -_WRIST_M
+        shown = outwards * (template[:, 0] - wrist) > -0.03  # with 3 cm of the forearm
         kept = faces[shown[faces].all(1)]
         fingers = np.array([outwards, 0, 0])  # in the T-pose, fingers point away from the body
         top = highest(likelihood[shown])
@@ -75,13 +70,10 @@ def highest(likelihood: np.ndarray) -> float:
 
 
 def object_pictures(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    heat: SurfaceHeat,
-    top: float,
+    vertices: np.ndarray, faces: np.ndarray, heat: SurfaceHeat, top: float
 ) -> list[EncodedImage]:
     """Draw two opposite views of an object (V, 3), (F, 3) from above; its frame is z up."""
-    fine, triangles = trimesh.remesh.subdivide_to_size(vertices, faces, _MAX_EDGE_M, max_iter=12)
+    fine, triangles = trimesh.remesh.subdivide_to_size(vertices, faces, 0.012, max_iter=12)
     paint = colours(_interpolate(heat, fine), top)
     up = np.array([0, 0, 1.0])
     return [
@@ -93,7 +85,7 @@ def object_pictures(
 def _interpolate(heat: SurfaceHeat, points: np.ndarray) -> np.ndarray:
     """Interpolate the likelihood at points (N, 3) of the surface by a Gaussian kernel."""
     distance, near = cKDTree(heat.points).query(points, k=min(12, len(heat.points)))
-    weight = np.exp(-0.5 * (distance / _KERNEL_M) ** 2) + 1e-12
+    weight = np.exp(-0.5 * (distance / 0.006) ** 2) + 1e-12
     return (weight * heat.likelihood[near]).sum(1) / weight.sum(1)
 
 
@@ -115,7 +107,7 @@ def _draw_from(
     used = vertices[np.unique(faces)] @ turn.T
     low, high = used.min(0), used.max(0)
     middle, extent = (low + high) / 2, (high - low)[:2]
-    distance = _FAR * float(extent.max())
+    distance = 40.0 * float(extent.max())  # nearly parallel rays
     focal = 0.92 * distance * min(size[0] / extent[0], size[1] / extent[1])
     lens = Intrinsics(*size, focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2)
     pose = rigid(turn, np.array([0, 0, distance]) - middle)

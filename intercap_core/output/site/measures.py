@@ -9,15 +9,17 @@ import numpy as np
 
 from intercap_core.evaluation import contact_figures, figures
 from intercap_core.evaluation.figures import SequenceMetrics
-from intercap_core.evaluation.verdict.figures import StatedError, stated_errors, verdict_figures
+from intercap_core.evaluation.verdict.figures import (
+    StatedError,
+    held_out_cameras,
+    stated_errors,
+    verdict_figures,
+)
 from intercap_core.output.site import charts
 from intercap_core.stage_list import ESTIMATES
 
 _MAX_CAMERA_ROWS = 40
-_HISTOGRAM_MM = 30.0
-_BIN_MM = 1.0
-_LEAST_ACCELERATION_MM = 5.0  # least height of the chart
-_PUBLISHED_CLOUD_MM = (20.29, 18.50)  # body and object, the paper's Experiments
+_PUBLISHED_CLOUD_MM = (20.29, 18.50)  # body and object, InterCap paper, Experiments
 _NAMES = {"object_track": "object track", "body_fit": "body fit", "joint": "joint"}
 # key, label, digits, True if larger is better (None: neither)
 _TRUTH_ROWS: tuple[tuple[str, str, int, bool | None], ...] = (
@@ -132,25 +134,26 @@ def penetration(sequences: Sequence[SequenceMetrics]) -> dict[str, Any] | None:
     touching = figures.pooled(sequences, "contact_frame")
     if touching is None:
         return None
-    edges = np.arange(0, _HISTOGRAM_MM + _BIN_MM / 2, _BIN_MM)
+    deepest, bin_mm = 30.0, 1.0
+    edges = np.arange(0, deepest + bin_mm / 2, bin_mm)
     lines, shares, tallest = [], [], 1.0
     for name, colour in (("max", "c2"), ("mean", "c1"), ("median", "c3")):
         values = figures.pooled(sequences, f"penetration_{name}")
         assert values is not None
         depth = 1e3 * values[touching].astype(np.float64)
-        counts = np.histogram(np.clip(depth, 0, _HISTOGRAM_MM), edges)[0].astype(float)
+        counts = np.histogram(np.clip(depth, 0, deepest), edges)[0].astype(float)
         tallest = max(tallest, float(counts.max()))
         outline = np.repeat(counts, 2)
         lines.append(charts.Series(name, colour, np.repeat(edges, 2)[1:-1], outline))
-        grid = np.linspace(0, _HISTOGRAM_MM, 121)
+        grid = np.linspace(0, deepest, 121)
         share = np.array([(depth <= g).mean() if len(depth) else 0.0 for g in grid])
         shares.append(charts.Series(name, colour, grid, 100 * share))
-    x_range = (0.0, _HISTOGRAM_MM)
+    x_range = (0.0, deepest)
     summary = figures.penetration_figures(sequences)
     return {
         **summary,
         "frames": int(touching.sum()),
-        "bin": f"{_BIN_MM:g}",
+        "bin": f"{bin_mm:g}",
         "histogram": charts.line_chart(
             lines,
             x_label="penetration depth, mm (last bin: all larger)",
@@ -182,7 +185,7 @@ def accelerations(sequences: Sequence[SequenceMetrics]) -> str:
             lines.append((name, colour, np.sort(known.astype(np.float64))))
     if not lines:
         return ""
-    top = max(_LEAST_ACCELERATION_MM, max(float(np.quantile(v, 0.99)) for _, _, v in lines))
+    top = max(5.0, max(float(np.quantile(v, 0.99)) for _, _, v in lines))
     grid = np.linspace(0, top, 121)
     return charts.line_chart(
         [
@@ -216,7 +219,7 @@ def cameras(
     sequences: Sequence[SequenceMetrics],
     residuals: Mapping[str, Sequence[tuple[str, float, float]]],
 ) -> dict[str, Any]:
-    """Return residuals before and after refinement, by pair or, for several sequences, by those."""
+    """Return residuals before and after refinement, by pair of cameras or by sequence."""
     if len(residuals) == 1:
         rows = [(n, 1e3 * a, 1e3 * b) for n, a, b in next(iter(residuals.values()))]
     else:
@@ -231,19 +234,25 @@ def cameras(
     if len(rows) > _MAX_CAMERA_ROWS:
         note = f"The {_MAX_CAMERA_ROWS} worst of {len(rows)}; all are in tables/sequences.csv."
     return {
-        "chart": charts.dumbbells(rows[:_MAX_CAMERA_ROWS], "residual, mm") if rows else "",
+        "chart": _residual_chart(rows[:_MAX_CAMERA_ROWS]),
         "note": note,
         "truth": figures.extrinsics_figures(sequences) or None,
     }
 
 
-# dataset, label, unit, scale to that unit, digits
-_VIEWS: tuple[tuple[str, str, str, float, int], ...] = (
-    ("keypoint_px", "keypoints", "px", 1.0, 1),
-    ("person_m", "person's points", "mm", 1e3, 1),
-    ("overlap", "object's mask", "IoU", 1.0, 2),
-    ("object_depth_m", "object's depth", "mm", 1e3, 1),
-)
+def _residual_chart(rows: Sequence[tuple[str, float, float]]) -> str:
+    if not rows:
+        return ""
+    return charts.bar_pairs(
+        [charts.BarPair.change(*row, "", False) for row in rows], "residual, mm"
+    )
+
+
+# label, unit and digits of IMAGE_MEASURES
+_VIEWS = (
+    ("keypoints", "px", 1), ("person's points", "mm", 1), ("object's mask", "IoU", 2),
+    ("object's depth", "mm", 1),
+)  # fmt: skip
 
 
 def verdict(sequences: Sequence[SequenceMetrics], shown: set[str]) -> dict[str, Any] | None:
@@ -261,12 +270,21 @@ def verdict(sequences: Sequence[SequenceMetrics], shown: set[str]) -> dict[str, 
         "parts": parts,
         "truth": any(s.has_truth for s in judged),
         "rows": [_row(s.name, parts, errors) for s, errors in by_sequence],
-        "views": [{"name": name, "unit": unit} for _, name, unit, _, _ in _VIEWS],
+        "views": [{"name": name, "unit": unit} for name, unit, _ in _VIEWS],
         "cameras": [
-            camera
+            {
+                "camera": held.camera,
+                "views": [
+                    {"pair": pair, "digits": digits}
+                    for *pair, (_, _, digits) in zip(
+                        held.held_in, held.held_out, _VIEWS, strict=True
+                    )
+                ],
+                "shift": list(held.shift_mm.values()),
+            }
             for s in judged
-            if s.name in shown and "verdict/held_camera" in s.values
-            for camera in _cameras(s)
+            if s.name in shown
+            for held in held_out_cameras(s)
         ],
         "figures": verdict_figures(judged) or None,
     }
@@ -290,41 +308,3 @@ def _cell(error: StatedError | None) -> dict[str, Any]:
         return {"stated": None, "range": "", **known}
     low, high = error.stated / error.factor, error.stated * error.factor
     return {"stated": error.stated, "range": f"{low:.1f}–{high:.1f}", **known}
-
-
-def _cameras(s: SequenceMetrics) -> list[dict[str, Any]]:
-    """Return a row for each camera that was held out."""
-    values = s.values
-    moved = np.sqrt(_mean(values["verdict/shift"] ** 2, axis=2))  # (P, C)
-    rows = []
-    for c, name in enumerate(values["verdict/camera_names"]):
-        if not np.isfinite(moved[:, c]).any():
-            continue
-        held = values["verdict/held_camera"] == c
-        cells = []
-        for key, _, _, scale, digits in _VIEWS:
-            pair = [
-                scale * _median(values[f"verdict/{key}{end}"][held, c]) for end in ("", "_held_out")
-            ]
-            cells.append({"pair": pair, "digits": digits})
-        rows.append(
-            {
-                "sequence": s.name,
-                "camera": str(name),
-                "views": cells,
-                "shift": (1e3 * moved[:, c]).tolist(),
-            }
-        )
-    return rows
-
-
-def _median(values: np.ndarray) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if len(known) else float("nan")
-
-
-def _mean(values: np.ndarray, axis: int) -> np.ndarray:
-    """Average finite values; NaN where none is finite."""
-    known = np.isfinite(values)
-    total = np.where(known, values, 0).sum(axis=axis)
-    return total / np.where(known.any(axis=axis), known.sum(axis=axis), np.nan)

@@ -16,7 +16,7 @@ from intercap_core.evaluation.verdict.figures import mean_stated
 from intercap_core.output.site import measures
 from intercap_core.output.site.drawing import EncodedImage
 from intercap_core.output.site.embed import css, embedded, render, span, tile
-from intercap_core.output.site.heat_pictures import COLOUR_STOPS
+from intercap_core.output.site.heat_pictures import COLOUR_STOPS, STOP_AT
 from intercap_core.versions import versions
 
 _MAX_RUNS = 400  # rows of the list of flagged frames
@@ -257,8 +257,7 @@ def _text(value: object) -> str:
 
 def _heat(content: DatasetContent) -> dict[str, Any]:
     stops = ", ".join(
-        f"{css(colour)} {100 * at:g}%"
-        for colour, at in zip(COLOUR_STOPS, (0, 0.25, 0.6, 1), strict=True)
+        f"{css(colour)} {100 * at:g}%" for colour, at in zip(COLOUR_STOPS, STOP_AT, strict=True)
     )
     return {
         "gradient": f"linear-gradient(90deg, {stops})",

@@ -13,13 +13,7 @@ from intercap_core.geometry.camera.clouds import colour_lookup
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import apply
 
-_MAX_POINTS = 600_000  # of all cameras together, more than the pictures have pixels
-_EDGE = 0.06  # a larger relative change of depth over two grid steps is an edge
-_GRAZING = 0.12  # cosine between ray and normal below which depth is noise
-_UNCOLOURED = (0.55, 0.55, 0.58)  # colour of points without a colour image
-_SAME_SURFACE_M = 0.015  # points this close behind the nearest of a pixel are averaged with it
 _BEHIND_M = 0.03  # a point hides those of neighbouring pixels this much farther away
-_CLOSED = 5  # an empty pixel with this many drawn neighbours is a hole in a surface
 _NEIGHBOURS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
 
 
@@ -118,20 +112,17 @@ def measured_points(images: Frames, rig: Rig, t: int) -> list[CameraPoints]:
     Raises UserError if a recorded image does not decode.
     """
     seen = [c for c, camera in enumerate(rig) if camera.depth and images.depth_available[t, c]]
-    found = []
+    most = 600_000 // max(1, len(seen))  # in all more points than the pictures have pixels
+    measured = []
     for c in seen:
         depth = images.depth(t, c)
         assert depth is not None
-        points = _camera_points(c, rig[c], depth, images.colour(t, c), _MAX_POINTS // len(seen))
-        found.append(points)
-    return found
+        measured.append(_camera_points(c, rig[c], depth, images.colour(t, c), most))
+    return measured
 
 
 def fuse(
-    measured: Sequence[CameraPoints],
-    rig: Rig,
-    world_from_master: np.ndarray,
-    bias: np.ndarray,
+    measured: Sequence[CameraPoints], rig: Rig, world_from_master: np.ndarray, bias: np.ndarray
 ) -> FusedCloud:
     """Transform all cameras' points into one frame by the poses of ``rig``.
 
@@ -164,7 +155,7 @@ def splat(cloud: FusedCloud, view: Viewpoint) -> tuple[np.ndarray, np.ndarray]:
     count = view.width * view.height
     nearest = np.full(count, np.inf, np.float32)
     np.minimum.at(nearest, pixel, z)
-    front = z < nearest[pixel] + _SAME_SURFACE_M
+    front = z < nearest[pixel] + 0.015
     pixel, colours = pixel[front], cloud.colours[facing[inside][front]]
     weight = np.maximum(np.bincount(pixel, minlength=count), 1)
     picture = np.empty((count, 3), np.float32)
@@ -182,14 +173,12 @@ def _spread(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     source, near = _cover(np.arange(depth.size).reshape(depth.shape), depth, depth)
     drawn = np.isfinite(near).astype(np.uint8)
     around = cv2.boxFilter(drawn, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
-    hole = (drawn == 0) & (around >= _CLOSED)
+    hole = (drawn == 0) & (around >= 5)  # most neighbours are drawn
     return _cover(source, near, np.where(hole, np.inf, -np.inf))
 
 
 def _cover(
-    source: np.ndarray,
-    depth: np.ndarray,
-    coverable: np.ndarray,
+    source: np.ndarray, depth: np.ndarray, coverable: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Replace a pixel by its nearest neighbour if that is in front of ``coverable`` (H, W)."""
     height, width = depth.shape
@@ -205,11 +194,7 @@ def _cover(
 
 
 def _camera_points(
-    c: int,
-    camera: Camera,
-    depth: np.ndarray,
-    image: np.ndarray | None,
-    most: int,
+    c: int, camera: Camera, depth: np.ndarray, image: np.ndarray | None, most: int
 ) -> CameraPoints:
     step = max(1, int(np.ceil(np.sqrt(depth.size / most))))
     thin = _thinned(camera, depth[::step, ::step].shape, step)
@@ -219,10 +204,11 @@ def _camera_points(
     z = depth.astype(np.float32) * np.float32(1e-3)
     rays = np.dstack([rays, np.ones_like(z)])
     normals, kept = _normals(rays * z[..., None])
-    kept &= -np.einsum("ijk,ijk->ij", normals, rays) > _GRAZING * np.linalg.norm(rays, axis=2)
+    # depth of surfaces at a grazing angle is noise
+    kept &= -np.einsum("ijk,ijk->ij", normals, rays) > 0.12 * np.linalg.norm(rays, axis=2)
     if image is None:
         index = np.flatnonzero(kept)
-        colours = np.tile(np.array(_UNCOLOURED, np.float32), (len(index), 1))
+        colours = np.tile(np.array([0.55, 0.55, 0.58], np.float32), (len(index), 1))
     else:
         lookup = colour_lookup(depth, thin, np.flatnonzero(kept))
         shown = (lookup.colour_index >= 0) & ~lookup.hidden
@@ -253,7 +239,8 @@ def _normals(grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     length = np.linalg.norm(normals, axis=2)
     z = grid[..., 2]
     smooth = (z > 0) & np.isfinite(length) & (length > 0)
-    smooth &= (np.abs(across[..., 2]) < _EDGE * z) & (np.abs(down[..., 2]) < _EDGE * z)
+    edge = 0.06 * z  # a larger change of depth over two grid steps is an edge
+    smooth &= (np.abs(across[..., 2]) < edge) & (np.abs(down[..., 2]) < edge)
     for axis in (0, 1):
         smooth &= (np.roll(z, 1, axis) > 0) & (np.roll(z, -1, axis) > 0)
     smooth[[0, -1]] = smooth[:, [0, -1]] = False

@@ -13,17 +13,13 @@ from intercap_core.annotation import ContactInterval
 from intercap_core.evaluation import figures, flags
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.verdict.figures import stated_errors
-from intercap_core.output.site import body_section, capture_section, charts, measures, track_section
-from intercap_core.output.site.body_section import BodyFacts
+from intercap_core.output.site import capture_section, charts, measures
 from intercap_core.output.site.capture_section import CaptureFacts
 from intercap_core.output.site.drawing import EncodedImage
 from intercap_core.output.site.embed import css, embedded, render, span, tile
 from intercap_core.output.site.overlays import BODY_COLOUR, OBJECT_COLOUR, Overlay
-from intercap_core.output.site.track_section import TrackFacts
 from intercap_core.schemas import METRIC_REGIONS
 from intercap_core.versions import versions
-
-_LEAST_MM = 10.0  # least height of charts of distances
 
 
 @dataclass(frozen=True)
@@ -56,9 +52,10 @@ class SequenceContent:
     """Name of each energy term with its values before and after the joint fit."""
     closeups: Sequence[EncodedImage]
     capture: CaptureFacts
-    track: TrackFacts | None
-    """None without an object."""
-    body: BodyFacts
+    track: dict[str, Any] | None
+    """Variables of the section on the track, None without an object."""
+    body: dict[str, Any]
+    """Variables of the section on the body."""
     annotated: Sequence[ContactInterval] | None
     """Annotated contact."""
     made_by: Mapping[str, str]
@@ -84,7 +81,7 @@ def page(content: SequenceContent) -> str:
         "frames": len(s),
         "fps": s.fps,
         "tiles": _tiles(s),
-        "timeline": charts.timeline(_bands(s, content.annotated), len(s)),
+        "timeline": charts.timeline(_rows(s, content.annotated), len(s)),
         "annotated": content.annotated is not None,
         "residuals": _residuals(s),
         "verdict": measures.verdict([s], {s.name}),
@@ -100,10 +97,8 @@ def page(content: SequenceContent) -> str:
         "note": content.note,
         "closeups": [embedded(picture) for picture in content.closeups],
         "capture": _capture(content.capture),
-        "track": None
-        if content.track is None
-        else _with_sheet(track_section.context(content.track)),
-        "body": _with_sheet(body_section.context(content.body)),
+        "track": None if content.track is None else _with_sheet(content.track),
+        "body": _with_sheet(content.body),
         "colours": {"body": css(BODY_COLOUR), "object": css(OBJECT_COLOUR)},
         "made_by": list(content.made_by.items()),
         "versions": [*versions(), ("body file", content.body_file)],
@@ -128,11 +123,11 @@ def _tiles(s: SequenceMetrics) -> list[dict[str, str]]:
         for error in stated_errors(s)
     ]
     if s.has_truth:
-        found = figures.truth_figures([s], "joint")
-        tiles.append(tile("body", found.get("body_pve_mm"), "mm", "per vertex, against truth"))
+        errors = figures.truth_figures([s], "joint")
+        tiles.append(tile("body", errors.get("body_pve_mm"), "mm", "per vertex, against truth"))
         if s.has_object:
-            error = found.get("object_translation_mm")
-            tiles.append(tile("object", error, "mm", "centre, median, against truth"))
+            centre = errors.get("object_translation_mm")
+            tiles.append(tile("object", centre, "mm", "centre, median, against truth"))
     cloud = figures.cloud_figures([s])
     tiles.append(tile("body to cloud", cloud["body_visible_mm"], "mm", "visible surface"))
     if s.has_object:
@@ -146,36 +141,42 @@ def _tiles(s: SequenceMetrics) -> list[dict[str, str]]:
     return [*tiles, tile("flagged", share, "%", f"{int(flagged.sum())} frames not trusted")]
 
 
-def _bands(s: SequenceMetrics, annotated: Sequence[ContactInterval] | None) -> list[charts.Band]:
+def _rows(s: SequenceMetrics, annotated: Sequence[ContactInterval] | None) -> list[charts.Row]:
     """Return rows for flags, frames in contact, and contact of each region by source."""
     reasons = flags.ranges(list(s.values["flag_reason"]))
-    bands = [
-        charts.Band("flagged", "flag", [(a, b, f"{span(a, b)}: {why}") for a, b, why in reasons])
+    rows = [
+        charts.Row(
+            "flagged", [(a, b, "fill flag", f"{span(a, b)}: {why}") for a, b, why in reasons]
+        )
     ]
-    annotated_runs: dict[str, list[tuple[int, int, str]]] = {}
+    annotated_runs: dict[str, list[tuple[int, int, str, str]]] = {}
     for interval in annotated or ():
         last = min(interval.end, len(s)) - 1
         if last >= interval.start:
             title = f"{span(interval.start, last)}: annotated"
-            annotated_runs.setdefault(interval.part, []).append((interval.start, last, title))
+            run = (interval.start, last, "fill annotated", title)
+            annotated_runs.setdefault(interval.part, []).append(run)
     if not s.has_object:
-        return bands
-    bands.append(charts.Band("in contact", "any", _runs(s.values["contact_frame"])))
+        return rows
+    rows.append(charts.Row("in contact", _runs(s.values["contact_frame"])))
     names = list(s.values["region_names"])
     if "any" in annotated_runs:
-        bands.append(charts.Band("any, annotated", "said", annotated_runs["any"]))
+        rows.append(charts.Row("any, annotated", annotated_runs["any"]))
     for region in METRIC_REGIONS:
         label = region.replace("_", " ")
         if region in annotated_runs:
-            bands.append(charts.Band(f"{label}, annotated", "said", annotated_runs[region]))
+            rows.append(charts.Row(f"{label}, annotated", annotated_runs[region]))
         stated = s.values["contact_probability"][:, names.index(region)]
         touching = s.values["region_contact"][:, names.index(region)]
         if (stated >= 0.5).any() or touching.any() or region in annotated_runs:
-            runs = _stated_runs(stated)
-            bands.append(charts.Band(f"{label}, stated", "touch", runs, levels=stated))
+            runs = [
+                (a, b, "hover", f"{span(a, b)}: {100 * stated[a : b + 1].mean():.0f} %")
+                for a, b, _, _ in _runs(stated >= 0.5)
+            ]
+            rows.append(charts.Row(f"{label}, stated", runs, levels=stated))
         if touching.any():
-            bands.append(charts.Band(f"{label}, meshes", "any", _runs(touching)))
-    return bands
+            rows.append(charts.Row(f"{label}, meshes", _runs(touching)))
+    return rows
 
 
 def _residuals(s: SequenceMetrics) -> list[tuple[str, str]]:
@@ -193,10 +194,7 @@ def _residuals(s: SequenceMetrics) -> list[tuple[str, str]]:
         ),
         _over_frames(
             s,
-            (
-                ("body", "c1", "acceleration_body"),
-                ("object", "c2", "acceleration_object"),
-            ),
+            (("body", "c1", "acceleration_body"), ("object", "c2", "acceleration_object")),
             "acceleration, mm/frame²",
             "Second differences at 30 frames per second, which show jitter.",
         ),
@@ -236,7 +234,7 @@ def _chart(
                 series.append(charts.Series(name if first else "", colour, run, values[run]))
     if not series:
         return None
-    top = max(_LEAST_MM, 1.1 * max(float(line.y.max()) for line in series))
+    top = max(10.0, 1.1 * max(float(line.y.max()) for line in series))
     total = len(lines[0][2])
     drawn = charts.line_chart(
         series,
@@ -255,7 +253,7 @@ def _energies(terms: Sequence[tuple[str, float, float]]) -> str:
     total = max(sum(before for _, before, _ in terms), 1e-12)
     return charts.bar_pairs(
         [
-            charts.BarPair(
+            charts.BarPair.change(
                 name.replace("_", " "), 100 * before / total, 100 * after / total, "", False
             )
             for name, before, after in terms
@@ -274,21 +272,10 @@ def _capture(facts: CaptureFacts) -> dict[str, Any]:
 def _with_sheet(variables: dict[str, Any]) -> dict[str, Any]:
     """Embed the sheet of a section, if it has one."""
     sheet = variables["sheet"]
-    if sheet is not None:
-        rows = ", ".join(map(str, sheet.frames))
-        caption = f"{variables['name']}, frames {rows} in every camera"
-        variables["sheet"] = embedded(sheet.image, caption)
-    return variables
+    return variables | {"sheet": None if sheet is None else embedded(sheet)}
 
 
-def _runs(mask: np.ndarray) -> list[tuple[int, int, str]]:
+def _runs(mask: np.ndarray) -> list[tuple[int, int, str, str]]:
+    """Return the runs of set frames (T,) for a row of the timeline."""
     runs = flags.ranges(["x" if value else "" for value in mask])
-    return [(first, last, span(first, last)) for first, last, _ in runs]
-
-
-def _stated_runs(probability: np.ndarray) -> list[tuple[int, int, str]]:
-    """Return runs with a probability (T,) of at least a half, and its mean in the title."""
-    return [
-        (first, last, f"{frames}: {100 * probability[first : last + 1].mean():.0f} %")
-        for first, last, frames in _runs(probability >= 0.5)
-    ]
+    return [(first, last, "fill any", span(first, last)) for first, last, _ in runs]

@@ -13,7 +13,12 @@ from pyarrow import csv
 from intercap_core.evaluation import figures
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.summary import SequenceSummary
-from intercap_core.evaluation.verdict.figures import TRUE, mean_stated, stated_errors
+from intercap_core.evaluation.verdict.figures import (
+    IMAGE_MEASURES,
+    TRUE,
+    mean_stated,
+    stated_errors,
+)
 from intercap_core.stage_list import ESTIMATES
 
 _MILLIMETRES = {
@@ -27,10 +32,6 @@ _RANKED = {  # columns of the table of sequences, and the measures that they ran
     "penetration.p98_mm": "penetration",
 }
 _ACCELERATIONS = {"acceleration_body", "acceleration_object"}
-_JUDGED_VIEWS = (  # the verdict's measures of a camera, scale and unit of their columns
-    ("keypoint_px", 1.0, ""), ("person_m", 1e3, "_mm"), ("overlap", 1.0, ""),
-    ("object_depth_m", 1e3, "_mm"),
-)  # fmt: skip
 
 
 def sequence_table(
@@ -154,10 +155,11 @@ def camera_table(summaries: Sequence[SequenceSummary]) -> pd.DataFrame:
             if "verdict/held_camera" in values and name in judged:
                 place = judged.index(name)
                 held = values["verdict/held_camera"] == place
-                for key, scale, unit in _JUDGED_VIEWS:
+                for view in IMAGE_MEASURES:
+                    name, unit = view.key.removesuffix("_m"), "_mm" if view.unit == "mm" else ""
                     for end, frames in (("", slice(None)), ("_held_out", held)):
-                        value = scale * _median(values[f"verdict/{key}{end}"][frames, place])
-                        row[f"verdict.{key.removesuffix('_m')}{end}{unit}"] = value
+                        errors = values[f"verdict/{view.key}{end}"][frames, place]
+                        row[f"verdict.{name}{end}{unit}"] = view.scale * _median(errors)
             rows.append(row)
     return pd.DataFrame(rows)
 
@@ -263,11 +265,11 @@ def write(folder: Path, tables: Mapping[str, pd.DataFrame]) -> None:
 
 def _significant(values: pd.Series) -> np.ndarray:
     """Round finite values to six significant digits."""
-    found = values.to_numpy(np.float64, copy=True)
-    known = np.isfinite(found) & (found != 0)
-    scale = 10.0 ** (5 - np.floor(np.log10(np.abs(found[known]))))
-    found[known] = np.round(found[known] * scale) / scale
-    return found
+    rounded = values.to_numpy(np.float64, copy=True)
+    known = np.isfinite(rounded) & (rounded != 0)
+    scale = 10.0 ** (5 - np.floor(np.log10(np.abs(rounded[known]))))
+    rounded[known] = np.round(rounded[known] * scale) / scale
+    return rounded
 
 
 def _mean(values: np.ndarray) -> float:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,15 +17,12 @@ from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.render import render
 from intercap_core.object_track.artefact import SOURCE_NONE as NO_TRACK
 from intercap_core.output.site import charts
-from intercap_core.output.site.drawing import Crop, Sheet, make_sheet
+from intercap_core.output.site.drawing import EncodedImage, SquareCrop, make_sheet
 from intercap_core.output.site.overlays import choose_frames
 from intercap_core.schemas import OBJECT_TRACK, SCENE
 from intercap_core.sequence_inputs import SequencePaths
 
 GOOD_OVERLAP = 0.7  # a view agrees from this IoU
-_ROWS = 5  # frames of the sheet
-_LEAST_MM, _LEAST_DEG = 5.0, 2.0  # least heights of the charts
-_MOST_DEG = 90.0  # largest deviation that the chart shows
 VIEW_STATES = {
     "agrees": f"candidate used, IoU {GOOD_OVERLAP:g} or more",
     "partly": "candidate used, smaller IoU",
@@ -43,160 +38,113 @@ TRACK_STATES = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class TrackFacts:
-    """The track of one object over T frames and C cameras; unknown values are NaN."""
-
-    name: str
-    object_: str
-    seed: str
-    """Frame of the first pose and its source."""
-    cameras: list[str]
-    overlap: np.ndarray
-    """(T, C) IoU with the candidate."""
-    depth: np.ndarray
-    """(T, C) residual of the depth, metres."""
-    contour: np.ndarray
-    """(T, C) residual of the silhouette, pixels."""
-    state: list[str]
-    """(T,) keys of TRACK_STATES."""
-    sigma_mm: np.ndarray
-    """(T,) largest stated deviation of the position."""
-    sigma_deg: np.ndarray
-    """(T,) largest stated deviation of the rotation."""
-    recovered: list[int]
-    """Frames in which a lost object was found again."""
-    sheet: Sheet | None
-    note: str = ""
-    """Why there is no sheet, and doubts of the track."""
-
-
 def read_track(
-    paths: SequencePaths,
-    mesh: ObjectMesh,
-    kept: Callable[[int, int], bytes],
-) -> TrackFacts:
-    """Read and draw one track.
+    paths: SequencePaths, mesh: ObjectMesh, kept: Callable[[int, int], bytes]
+) -> dict[str, Any]:
+    """Read and draw one track; return the variables of the template track.html.j2.
 
     Args:
         kept: returns the RLE of the candidate that the track uses in frame t and camera c, b"" if
             it uses none.
 
-    Raises UserError as :func:`artefacts.read` does.
+    If an image is unreadable, ``sheet`` is None and ``note`` has the reason. Raises UserError as
+    :func:`artefacts.read` does.
     """
     with artefacts.read(paths.object_track, OBJECT_TRACK) as track:
         poses = np.array(
             [rigid(r, t) for r, t in zip(track["rotation"], track["translation"], strict=True)]
         )
-        source = track.attributes["seed_source"]
+        name, source = str(track.attributes["sequence"]), track.attributes["seed_source"]
         sheet, note = None, str(track.attributes["doubts"])
         seed = "none: the object was found in no frame"
         if source != NO_TRACK:
-            sheet, note = _sheet(paths.frames, paths.scene, mesh, poses, kept, track["overlap"])
-            found = "annotated" if source == "annotated" else "found by search"
-            seed = f"frame {track.attributes['seed_frame']}, {found}"
+            sheet, note = _sheet(name, paths, mesh, poses, kept, track["overlap"])
+            origin = "annotated" if source == "annotated" else "found by search"
+            seed = f"frame {track.attributes['seed_frame']}, {origin}"
         covariance = track["covariance"]
-        return TrackFacts(
-            name=str(track.attributes["sequence"]),
-            object_=str(track.attributes["object"]),
-            seed=seed,
-            cameras=track.text("camera_names"),
-            overlap=track["overlap"],
-            depth=track["depth_residual"],
-            contour=track["silhouette_residual"],
-            state=_states(
-                gone=track["gone"],
-                lost=track["lost"],
-                carried=track["carried"] if "carried" in track else np.zeros_like(track["lost"]),
-                doubtful=track["ambiguous"],
-                resting=track["resting"],
-            ),
-            sigma_mm=1e3 * _largest(covariance[:, 3:, 3:]),
-            sigma_deg=np.degrees(_largest(covariance[:, :3, :3])),
-            recovered=np.flatnonzero(track["recovered"]).tolist(),
-            sheet=sheet,
-            note=note,
-        )
+        sigma_mm = 1e3 * _largest(covariance[:, 3:, 3:])
+        sigma_deg = np.degrees(_largest(covariance[:, :3, :3]))
+        return {
+            "name": name,
+            "object": str(track.attributes["object"]),
+            "seed": seed,
+            "sheet": sheet,
+            "note": note,
+            "timeline": _timeline(track),
+            "charts": [
+                _chart(values, label, least, most)
+                for values, label, least, most in (
+                    (sigma_mm, "deviation of the position, mm", 5.0, np.inf),
+                    (sigma_deg, "deviation of the rotation, degrees", 2.0, 90.0),
+                )
+                if np.isfinite(values).any()
+            ],
+            "track_states": list(TRACK_STATES.items()),
+            "view_states": list(VIEW_STATES.items()),
+            "colours": {
+                "track": "#{:02x}{:02x}{:02x}".format(*TRACK_COLOUR),
+                "candidate": "#{:02x}{:02x}{:02x}".format(*CANDIDATE_COLOUR),
+            },
+        }
 
 
 def _sheet(
-    frames: Path,
-    scene: Path,
+    name: str,
+    paths: SequencePaths,
     mesh: ObjectMesh,
     poses: np.ndarray,
     kept: Callable[[int, int], bytes],
     overlap: np.ndarray,
-) -> tuple[Sheet | None, str]:
+) -> tuple[EncodedImage | None, str]:
     """Draw the sheet; if an image is unreadable, return None and the reason."""
     try:
-        with artefacts.read(scene, SCENE) as refined, Frames.open(frames) as images:
-            moments = images.showing(refined["image_of"])
-            rig = Rig.from_artefact(refined)
-            shown = choose_frames(1 - _mean(overlap, 1), _ROWS)
-            return track_sheet(moments, rig, mesh, poses, kept, shown), ""
+        with artefacts.read(paths.scene, SCENE) as scene, Frames.open(paths.frames) as images:
+            shown_images = images.showing(scene["image_of"])
+            rig = Rig.from_artefact(scene)
+            shown = choose_frames(1 - _mean(overlap, 1), 5)
+            return track_sheet(name, shown_images, rig, mesh, poses, kept, shown), ""
     except (UserError, ValueError) as error:  # ValueError: a candidate that does not decode
         return None, str(error)
 
 
-def context(facts: TrackFacts) -> dict[str, Any]:
-    """Return the variables of the template track.html.j2."""
-    total = len(facts.state)
-    states = charts.state_runs(facts.state, TRACK_STATES)
-    rows = [charts.StateRow("track", states, _state_counts(facts))]
-    for c, name in enumerate(facts.cameras):
-        overlap = facts.overlap[:, c]
-        kept = np.isfinite(overlap)
-        seen = ["nothing" if not k else _grade(v) for k, v in zip(kept, overlap, strict=True)]
-        label = f"{100 * kept.mean():.0f} % used"
-        if kept.any():
-            label += f" · IoU {_median(overlap):.2f}"
-            label += _median_text(1e3 * facts.depth[:, c], "mm")
-            label += _median_text(facts.contour[:, c], "px")
-        rows.append(charts.StateRow(name, charts.state_runs(seen, VIEW_STATES), label))
-    marks = [(t - 1, f"{t}: found again") for t in facts.recovered]
-    return {
-        "name": facts.name,
-        "object": facts.object_,
-        "seed": facts.seed,
-        "sheet": facts.sheet,
-        "note": facts.note,
-        "timeline": charts.state_timeline(rows, total, marks),
-        "charts": [
-            _chart(values, label, least, most)
-            for values, label, least, most in (
-                (facts.sigma_mm, "deviation of the position, mm", _LEAST_MM, np.inf),
-                (facts.sigma_deg, "deviation of the rotation, degrees", _LEAST_DEG, _MOST_DEG),
-            )
-            if np.isfinite(values).any()
-        ],
-        "track_states": list(TRACK_STATES.items()),
-        "view_states": list(VIEW_STATES.items()),
-        "colours": {
-            "track": "#{:02x}{:02x}{:02x}".format(*TRACK_COLOUR),
-            "candidate": "#{:02x}{:02x}{:02x}".format(*CANDIDATE_COLOUR),
-        },
-    }
+def _timeline(track: artefacts.Artefact) -> str:
+    """Draw the states of the track and of every view."""
+    states = _states(
+        gone=track["gone"],
+        lost=track["lost"],
+        carried=track["carried"] if "carried" in track else np.zeros_like(track["lost"]),
+        doubtful=track["ambiguous"],
+        resting=track["resting"],
+    )
+    counts = [
+        f"{n} {state}"
+        for state in ("gone", "lost", "carried", "doubtful", "resting")
+        if (n := states.count(state))
+    ]
+    label = " · ".join(counts) or "no doubtful frame"
+    rows = [charts.Row("track", charts.state_runs(states, TRACK_STATES), label)]
+    overlaps, depths, contours = (
+        track[key].T for key in ("overlap", "depth_residual", "silhouette_residual")
+    )
+    for c, name in enumerate(track.text("camera_names")):
+        used = np.isfinite(overlaps[c])
+        good = overlaps[c] >= GOOD_OVERLAP
+        views = np.where(used, np.where(good, "agrees", "partly"), "nothing").tolist()
+        label = f"{100 * used.mean():.0f} % used"
+        if used.any():
+            label += f" · IoU {_median(overlaps[c]):.2f}"
+            label += _median_text(1e3 * depths[c], "mm") + _median_text(contours[c], "px")
+        rows.append(charts.Row(name, charts.state_runs(views, VIEW_STATES), label))
+    marks = [(t - 1, f"{t}: found again") for t in np.flatnonzero(track["recovered"]).tolist()]
+    return charts.timeline(rows, len(states), marks)
 
 
 def _states(**flags: np.ndarray) -> list[str]:
     """Return for each frame the name of its first set flag (T,), "moving" if none is set."""
     return [
-        next((name for name, own in zip(flags, of_frame, strict=True) if own), "moving")
-        for of_frame in zip(*flags.values(), strict=True)
+        next((name for name, value in zip(flags, frame, strict=True) if value), "moving")
+        for frame in zip(*flags.values(), strict=True)
     ]
-
-
-def _grade(overlap: float) -> str:
-    return "agrees" if overlap >= GOOD_OVERLAP else "partly"
-
-
-def _state_counts(facts: TrackFacts) -> str:
-    parts = [
-        f"{n} {word}"
-        for word in ("gone", "lost", "carried", "doubtful", "resting")
-        if (n := facts.state.count(word))
-    ]
-    return " · ".join(parts) or "no doubtful frame"
 
 
 def _chart(values: np.ndarray, label: str, least: float, most: float) -> str:
@@ -237,17 +185,17 @@ def _largest(covariance: np.ndarray) -> np.ndarray:
 
 TRACK_COLOUR, CANDIDATE_COLOUR = (255, 158, 46), (64, 224, 255)  # RGB
 _CELL_PX = 148
-_REACH = 1.35  # side of a cell in diameters of the object
 
 
 def track_sheet(
+    name: str,
     images: Frames,
     rig: Rig,
     mesh: ObjectMesh,
     poses: np.ndarray,
     kept: Callable[[int, int], bytes],
     frames: Sequence[int],
-) -> Sheet:
+) -> EncodedImage:
     """Draw the outlines of track and candidate over crops of the images.
 
     Args:
@@ -259,15 +207,11 @@ def track_sheet(
     def draw(camera: Camera, t: int, c: int, rgb: np.ndarray) -> np.ndarray | None:
         return _cell(camera, rgb, mesh, poses[t], kept(t, c))
 
-    return make_sheet(images, rig, frames, _CELL_PX, draw)
+    return make_sheet(name, images, rig, frames, _CELL_PX, draw)
 
 
 def _cell(
-    camera: Camera,
-    rgb: np.ndarray,
-    mesh: ObjectMesh,
-    pose: np.ndarray,
-    rle: bytes,
+    camera: Camera, rgb: np.ndarray, mesh: ObjectMesh, pose: np.ndarray, rle: bytes
 ) -> np.ndarray | None:
     """Draw the image around the object with both outlines; None if it is not in view."""
     lens = camera.colour
@@ -276,8 +220,8 @@ def _cell(
     if centre[2] < 0.1 or not lens.sees(centre[None])[0]:
         return None
     x, y = lens.project(centre[None])[0]
-    size = max(int(_REACH * mesh.diameter * lens.fx / centre[2]), 16)
-    crop = Crop(int(x) - size // 2, int(y) - size // 2, size, _CELL_PX)
+    size = max(int(1.35 * mesh.diameter * lens.fx / centre[2]), 16)
+    crop = SquareCrop(int(x) - size // 2, int(y) - size // 2, size, _CELL_PX)
     cell = crop.extract(rgb)
     drawn = render(mesh.vertices, mesh.faces, lens, in_camera, cull_back=mesh.watertight)
     crop.outline(cell, drawn.mask, drawn.x0, drawn.y0, TRACK_COLOUR)

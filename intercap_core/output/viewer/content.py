@@ -30,15 +30,7 @@ from intercap_core.output.viewer.skinning import skinned
 from intercap_core.schemas import BODY_FIT, JOINT, METRICS, OBJECT_TRACK, SCENE
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 
-MOMENTS = 40  # at most this many evenly spread frames have clouds and images
-TRUE_MOMENTS = 60  # at most this many frames have the true body, which has no skeleton
-CLOUD_POINTS = (2500, 800)  # at most this many points of person and object per frame
-IMAGE_WIDTH_PX = 256
 MESH_FACES = 20000  # an object with more faces is simplified
-_JPEG_QUALITY = 70
-_SURVEY_STEP = 7  # every n-th body vertex finds the points near the meshes
-
-IMPORTED = "another program's"  # label of imported results
 VERSIONS = {"joint": "joint fit", "sequential": "sequential fits", "truth": "truth"}
 
 
@@ -87,7 +79,7 @@ def gather(paths: SequencePaths, models: SequenceModels, *, truth: Path | None =
             imported = "made_by" in joint.attributes
             _add_stated_contact(content, joint, model)
     bodies["sequential"] = _sequential(paths.body_fit, existing, body_models, gender)
-    names = {**VERSIONS, "joint": IMPORTED} if imported else VERSIONS
+    names = {**VERSIONS, "joint": "another program's"} if imported else VERSIONS
     shown = next(iter(bodies.values()))
     total = shown.parameters.batch
     if "metrics" in existing:
@@ -107,7 +99,7 @@ def gather(paths: SequencePaths, models: SequenceModels, *, truth: Path | None =
             _add_poses(content, name, body.rotation, body.translation, zup)
     with Frames.open(paths.frames) as recorded:
         images = recorded.showing(image_of)
-        moments = np.unique(np.linspace(0, total - 1, min(total, MOMENTS)).round().astype(int))
+        moments = _spread(total, 40)  # frames with clouds and images
         content.header |= {
             "name": images.sequence,
             "fps": images.fps,
@@ -245,10 +237,10 @@ def _add_images(content: Content, images: Frames, rig: Rig, moments: np.ndarray)
             except UserError:  # the stages report images that do not decode
                 image = None
             if image is not None:
-                lens = camera.colour.scaled(IMAGE_WIDTH_PX / camera.colour.width)
+                lens = camera.colour.scaled(256 / camera.colour.width)
                 small = cv2.resize(image, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
                 small = cv2.undistort(small, lens.matrix, lens.distortion)
-                options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+                options = [cv2.IMWRITE_JPEG_QUALITY, 70]
                 packet = cv2.imencode(".jpg", small, options)[1].tobytes()
             data.append(packet)
             starts.append(starts[-1] + len(packet))
@@ -270,11 +262,11 @@ def _add_clouds(
     for t in moments:
         with torch.no_grad():
             body = shown.model.forward(shown.parameters.frames(slice(int(t), int(t) + 1)))
-        near = body.vertices[0, ::_SURVEY_STEP].double().numpy()
+        near = body.vertices[0, ::7].double().numpy()
         if mesh is not None and np.isfinite(shown.translation[t]).all():
             at = mesh.vertices @ shown.rotation[t].T + shown.translation[t]
             near = np.concatenate([near, at])
-        for part, points, most in zip(parts, clouds.at(int(t), near), CLOUD_POINTS, strict=True):
+        for part, points, most in zip(parts, clouds.at(int(t), near), (2500, 800), strict=True):
             kept = points
             if len(points) > most:
                 kept = points[np.sort(random.choice(len(points), most, replace=False))]
@@ -290,8 +282,7 @@ def _add_clouds(
 def _add_truth(content: Content, true: Truth, zup: np.ndarray) -> None:
     """Add the true body in every n-th frame and the true object."""
     if true.vertices is not None:
-        total = len(true.vertices)
-        chosen = np.unique(np.linspace(0, total - 1, min(total, TRUE_MOMENTS)).round().astype(int))
+        chosen = _spread(len(true.vertices), 60)
         vertices = apply(zup, true.vertices[chosen].reshape(-1, 3).astype(np.float64))
         steps, low, step = quantised(vertices.reshape(len(chosen), -1, 3))
         # differences between frames compress to half the size of positions; they may wrap around
@@ -303,6 +294,11 @@ def _add_truth(content: Content, true: Truth, zup: np.ndarray) -> None:
         content.arrays["truth/object_vertices"] = true.object_vertices.astype(np.float32)
         content.arrays["truth/object_faces"] = true.object_faces.astype(np.uint32)
         _add_poses(content, "truth", true.rotation, true.translation, zup)
+
+
+def _spread(total: int, most: int) -> np.ndarray:
+    """Choose at most ``most`` evenly spread frames of ``total``."""
+    return np.unique(np.linspace(0, total - 1, min(total, most)).round().astype(int))
 
 
 def quantised(points: np.ndarray) -> tuple[np.ndarray, list[float], float]:

@@ -43,11 +43,7 @@ def load() -> str:
 
 
 def write_script(
-    output: Path,
-    paths: SequencePaths,
-    models: SequenceModels,
-    *,
-    truth: Path | None = None,
+    output: Path, paths: SequencePaths, models: SequenceModels, *, truth: Path | None = None
 ) -> None:
     """Write the viewer with a sequence's data; see :func:`.content.gather` for the arguments."""
     content = gather(paths, models, truth=truth)

@@ -8,21 +8,18 @@ is the smallest that brings every vertex within tolerance.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
 
 from intercap_core.body.joints import PARENTS
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
+from intercap_core.output.export.motion import posed_batches, rest_pose
 
-WEIGHTS = 4
 CLOSE_M = 0.001  # largest distance of a vertex from the model's
 _MOST_MODES = 64
-_BATCH = 32  # frames posed at a time
-_STEPS = 32767  # int16 value of a mode's largest coordinate
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,12 +49,14 @@ class SkinnedBody:
 
 def skinned(model: BodyModel, parameters: BodyParameters) -> SkinnedBody:
     """Compress T posed bodies in the frame of the parameters."""
-    rest, rest_joints = _rest(model, parameters)
+    rest, rest_joints = rest_pose(model, parameters)
     all_weights = model.skinning_weights.cpu().numpy().astype(np.float64)
-    strongest = np.argsort(-all_weights, axis=1, kind="stable")[:, :WEIGHTS]
+    strongest = np.argsort(-all_weights, axis=1, kind="stable")[:, :4]
     weights = np.take_along_axis(all_weights, strongest, 1)
     weights /= weights.sum(1, keepdims=True)
-    vertices, joints = _posed(model, parameters)
+    batches = list(posed_batches(model, parameters))
+    vertices = np.concatenate([posed.vertices.double().numpy() for posed in batches])
+    joints = np.concatenate([posed.joints.double().numpy() for posed in batches])
     turns = _global_rotations(parameters.full_pose().cpu().numpy())
     shifts = joints - np.einsum("tjab,jb->tja", turns, rest_joints)
     transforms = np.concatenate([turns, shifts[..., None]], 3)
@@ -72,26 +71,6 @@ def skinned(model: BodyModel, parameters: BodyParameters) -> SkinnedBody:
     residual -= residual.mean(0)
     modes, amounts, error = _modes(residual)
     return SkinnedBody(rest, strongest, weights, transforms, modes, amounts, error)
-
-
-def _rest(model: BodyModel, parameters: BodyParameters) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices (V, 3) and joints (55, 3) of the first frame's shape in the T-pose."""
-    params = replace(
-        model.zeros(1), betas=parameters.betas[:1], expression=parameters.expression[:1]
-    )
-    with torch.no_grad():
-        posed = model.forward(params)
-    return posed.vertices[0].double().numpy(), posed.joints[0].double().numpy()
-
-
-def _posed(model: BodyModel, parameters: BodyParameters) -> tuple[np.ndarray, np.ndarray]:
-    vertices, joints = [], []
-    with torch.no_grad():
-        for first in range(0, parameters.batch, _BATCH):
-            posed = model.forward(parameters.frames(slice(first, first + _BATCH)))
-            vertices.append(posed.vertices.double().numpy())
-            joints.append(posed.joints.double().numpy())
-    return np.concatenate(vertices), np.concatenate(joints)
 
 
 def _global_rotations(pose: np.ndarray) -> np.ndarray:
@@ -144,7 +123,7 @@ def _modes(residual: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         largest = np.abs(mode).max()
         if largest < 1e-9:
             break
-        mode = np.rint(mode / largest * _STEPS) / _STEPS  # as stored
+        mode = np.rint(mode / largest * 32767) / 32767  # as stored in int16
         modes.append(mode)
         amounts.append(amount * largest)
         remaining -= np.outer(amounts[-1], mode)

@@ -1,4 +1,4 @@
-"""A project that the tests of the page share, and a copy for each."""
+"""A project with ten frames and uncertain contact, which the tests of the page share."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import h5py
 import pytest
 
-from tests.annotate.served import artefact, copied, small_project
+from tests.annotate.served import artefact, small_project
 
 
 @pytest.fixture(scope="session")
@@ -20,8 +20,3 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         file["contact_probability"][4:8, names.index("seat")] = 0.45
         file["contact_annotated"][...] = -1
     return settings
-
-
-@pytest.fixture
-def settings(made: Path, tmp_path: Path) -> Path:
-    return copied(made, tmp_path / "project")

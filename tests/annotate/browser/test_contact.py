@@ -4,99 +4,83 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tests.annotate.browser.hand import HAND, READY, SAVED, draft_of, drag, open_page, save
+from tests.annotate.browser.hand import HAND, SAVED, open_page
 from tests.annotate.served import annotation, served
 from tests.helpers.browser import needs_chromium
 
 pytestmark = needs_chromium
+NONE = "the annotation states that nothing touches"
 
 
-def test_contact_is_dragged_split_denied_and_saved_with_its_difference(settings: Path) -> None:
+def test_contact_is_dragged_split_deleted_and_saved(settings: Path) -> None:
     annotation(settings).write_text("# kept\ndrop_frames: [9]\n")
-    with served(settings) as server, open_page(server) as page:
-        keys = page.page.keyboard
-        box = page.page.locator(HAND).bounding_box()
-        assert box is not None
-        frame = box["width"] / 6
-        drag(page, (box["x"] + box["width"] - 4, box["y"] + 10), (-2 * frame, 3))
-        assert draft_of(page, "contact") == [{"part": "right_hand", "start": 2, "end": 6}]
-        keys.press("Control+z")
-        assert draft_of(page, "contact") is None
-        keys.press("Control+Shift+z")
-        page.page.locator(HAND).focus()
-        page.page.evaluate("window.annotate.show(4)")
-        keys.press("k")
-        assert [one["start"] for one in draft_of(page, "contact")] == [2, 4]
-        keys.press("Delete")
-        assert draft_of(page, "contact") == [{"part": "right_hand", "start": 2, "end": 4}]
-        keys.press("Control+s")
-        page.wait("document.getElementById('dialog').open")
-        shown = page.page.locator("#dialog").inner_text()
-        assert "+  - {part: right_hand, start: 2, end: 4}" in shown
-        page.page.locator('[data-answer="save"]').click()
-        page.wait(SAVED)
-        text = annotation(settings).read_text()
-        assert text.startswith("# kept\ndrop_frames: [9]\n") and "start: 2, end: 4" in text
+    with served(settings) as server, open_page(server) as hand:
+        x, y, width, _ = hand.box(HAND)
+        hand.drag((x + width - 4, y + 10), (-2 * width / 6, 3))
+        assert hand.draft("contact") == [{"part": "right_hand", "start": 2, "end": 6}]
+        hand.press("Control+z")
+        assert hand.draft("contact") is None
+        hand.press("Control+Shift+z")
+        hand.page.locator(HAND).focus()
+        hand.show(4)
+        hand.press("k")
+        assert [interval["start"] for interval in hand.draft("contact")] == [2, 4]
+        hand.press("Delete")
+        assert hand.draft("contact") == [{"part": "right_hand", "start": 2, "end": 4}]
+        assert "+  - {part: right_hand, start: 2, end: 4}" in hand.open_save()
+        hand.answer("save")
+        hand.wait(SAVED)
+    text = annotation(settings).read_text()
+    assert text.startswith("# kept\ndrop_frames: [9]\n") and "start: 2, end: 4" in text
 
 
-def test_that_nothing_touches_is_stated_and_taken_back(settings: Path) -> None:
+def test_nothing_touches_is_stated_and_removed(settings: Path) -> None:
     path = annotation(settings)
-    with served(settings) as server, open_page(server) as page:
-        bar, keys = page.page.locator("#contact-bar"), page.page.keyboard
-        page.page.locator(HAND).focus()
-        keys.press("Delete")  # the last interval: nothing touches any more
-        assert (
-            draft_of(page, "contact") == [] and "nothing touches, as annotated" in bar.inner_text()
-        )
-        page.page.get_by_role("button", name="As found again").click()
-        assert draft_of(page, "contact") is None and page.page.locator(HAND).count() == 1
-        keys.press("Control+z")
-        assert draft_of(page, "contact") == []
-        keys.press("Control+s")
-        page.wait("document.getElementById('dialog').open")
-        page.wait("document.querySelector('[data-part=touches]').textContent.includes('joint')")
-        assert "+contact: []" in page.page.locator("#dialog").inner_text()
-        page.page.locator('[data-answer="save"]').click()
-        page.wait(SAVED)
+    with served(settings) as server, open_page(server) as hand:
+        hand.page.locator(HAND).focus()
+        hand.press("Delete")  # the last interval
+        assert hand.draft("contact") == [] and NONE in hand.text("#contact-bar")
+        hand.click("Use the estimate")
+        assert hand.draft("contact") is None and hand.page.locator(HAND).count() == 1
+        hand.press("Control+z")
+        assert hand.draft("contact") == []
+        assert "+contact: []" in hand.open_save()
+        hand.wait("document.querySelector('[data-part=stale]').textContent.includes('joint')")
+        hand.answer("save")
+        hand.wait(SAVED)
         assert path.read_text() == "contact: []\n"
-        page.page.reload()
-        page.wait(READY)
-        assert (
-            draft_of(page, "contact") == [] and "nothing touches, as annotated" in bar.inner_text()
-        )
-        page.page.get_by_role("button", name="As found again").click()
-        save(page)
-        page.wait("document.getElementById('status').textContent === 'no annotation yet'")
-        page.page.get_by_role("button", name="Nothing touches").click()
-        assert draft_of(page, "contact") == [] and path.read_text().strip() == ""
+        hand.reload()
+        assert hand.draft("contact") == [] and NONE in hand.text("#contact-bar")
+        hand.click("Use the estimate")
+        hand.open_save()
+        hand.answer("save")
+        hand.wait("document.getElementById('status').textContent === 'no annotation yet'")
+        hand.click("Nothing touches")
+        assert hand.draft("contact") == [] and path.read_text().strip() == ""
 
 
-def test_a_step_back_leads_to_what_was_and_delete_takes_the_chosen_part(settings: Path) -> None:
-    looked = "window.annotate.contact.intervals().map((one) => window.annotate.contact.looked(one))"
+def test_undo_restores_contact_and_delete_removes_the_selected(settings: Path) -> None:
+    confirmed = "contact.intervals().map((i) => window.annotate.contact.isConfirmed(i))"
     back = {"part": "back", "start": 3, "end": 10}
-    with served(settings) as server, open_page(server) as page:
-        keys, hint = page.page.keyboard, page.page.locator("#hint")
+    with served(settings) as server, open_page(server) as hand:
         for key in ("k", "Delete"):
-            keys.press(key)
-            assert "choose a bar" in hint.inner_text()
-        page.page.evaluate("window.annotate.show(3)")
-        page.page.locator("#part").select_option("back")
-        assert page.page.evaluate(looked) == [False, True]  # the hand's is taken as it was found
-        page.page.locator(HAND).focus()
-        keys.press("c")
-        assert page.page.evaluate(looked) == [True, True]
-        keys.press("Control+z")  # of confirming alone
-        assert page.page.evaluate(looked) == [False, True] and back in draft_of(page, "contact")
-        page.page.locator(HAND).focus()
-        page.page.evaluate("window.annotate.show(9)")
-        keys.press("[")
-        assert "would end before" in hint.inner_text()
-        page.page.evaluate("window.annotate.show(5)")
-        keys.press("]")
-        keys.press("Control+z")
-        keys.press("Delete")
-        assert draft_of(page, "contact") == [back]
-        box = page.page.locator('[data-part="back"] .bar').bounding_box()
-        assert box is not None  # a bar that is dragged past the first frame keeps its length
-        drag(page, (box["x"] + box["width"] / 2, box["y"] + 8), (-box["width"], 2))
-        assert draft_of(page, "contact") == [back | {"start": 0, "end": 7}]
+            hand.press(key)
+            assert "select a bar" in hand.text("#hint")
+        hand.show(3)
+        hand.page.locator("#part").select_option("back")
+        assert hand.app(confirmed) == [False, True]  # the hand's estimate was copied
+        hand.page.locator(HAND).focus()
+        hand.press("c")
+        assert hand.app(confirmed) == [True, True]
+        hand.press("Control+z")
+        assert hand.app(confirmed) == [False, True] and back in hand.draft("contact")
+        hand.page.locator(HAND).focus()
+        hand.show(9)
+        hand.press("[")
+        assert "would end before" in hand.text("#hint")
+        hand.show(5)
+        hand.press("]", "Control+z", "Delete")
+        assert hand.draft("contact") == [back]
+        x, y, width, _ = hand.box('[data-part="back"] .bar')
+        hand.drag((x + width / 2, y + 8), (-width, 2))  # past the first frame: the length stays
+        assert hand.draft("contact") == [back | {"start": 0, "end": 7}]

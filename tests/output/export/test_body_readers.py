@@ -1,4 +1,4 @@
-"""Bodies of an export, posed by a library of others: body-models on the file that goes along."""
+"""Bodies of an export, posed by the library body-models from the exported body file."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from intercap_core.body.model import BodyModel
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.inputs.arrays import read_pickle
 from intercap_core.output.export import body_files
-from intercap_core.output.export.about import BodyFile
+from intercap_core.output.export.about import ExportBody
 from intercap_core.schemas import JOINT
 from tests.helpers import exported
 from tests.helpers import fitted_capture as fitted
@@ -58,59 +58,61 @@ def _posed(peer: Any, **values: np.ndarray) -> np.ndarray:
         return peer.forward_vertices(**tensors).numpy()
 
 
-def test_amass_parameters_move_the_exported_body_as_the_joint_result_does(
+def test_amass_parameters_reproduce_the_joint_result(
     folder: Path, expected: np.ndarray, zup_from_master: np.ndarray
 ) -> None:
-    with np.load(folder / "amass" / "body.npz") as told:
-        total = len(told["trans"])
-        head = [told["pose_jaw"], *np.split(told["pose_eye"], 2, axis=1)]
-        found = _posed(
+    with np.load(folder / "amass" / "body.npz") as content:
+        total = len(content["trans"])
+        assert content["poses"].shape == (total, 165) and str(content["gender"]) == "neutral"
+        assert float(content["mocap_frame_rate"]) == fitted.FPS
+        head = [content["pose_jaw"], *np.split(content["pose_eye"], 2, axis=1)]
+        vertices = _posed(
             _peer(folder / "body" / FULL, flat_hand_mean=True),
-            body_pose=told["pose_body"].reshape(total, 21, 3),
+            body_pose=content["pose_body"].reshape(total, 21, 3),
             head_pose=np.stack(head, 1),
-            hand_pose=told["pose_hand"].reshape(total, 30, 3),
-            pelvis_rotation=told["root_orient"],
-            shape=np.tile(told["betas"], (total, 1)),
-            expression=told["expression"],
-            global_translation=told["trans"],
+            hand_pose=content["pose_hand"].reshape(total, 30, 3),
+            pelvis_rotation=content["root_orient"],
+            shape=np.tile(content["betas"], (total, 1)),
+            expression=content["expression"],
+            global_translation=content["trans"],
         )
-    assert np.abs(found - apply(zup_from_master, expected.astype(float))).max() < 1e-5
+    assert np.abs(vertices - apply(zup_from_master, expected.astype(float))).max() < 1e-5
 
 
 @pytest.mark.parametrize("hands", ["components over the mean hand", "full poses"])
-def test_intercap_parameters_move_the_exported_body_as_the_joint_result_does(
+def test_intercap_parameters_reproduce_the_joint_result(
     hands: str, folder: Path, expected: np.ndarray
 ) -> None:
-    told = read_pickle(folder / "intercap" / "res.pkl")
-    total = len(told["transl"])
+    content = read_pickle(folder / "intercap" / "res.pkl")
+    total = len(content["transl"])
     by_components = hands.startswith("components")
     if by_components:
         with np.load(folder / "body" / FULL) as file:
             sides = [
-                told[f"{side}_hand_pose"] @ file[f"hands_components{side[0]}"][:12]
+                content[f"{side}_hand_pose"] @ file[f"hands_components{side[0]}"][:12]
                 for side in ("left", "right")
             ]
     else:
-        sides = [told[f"{side}_hand_pose_axis_angle"] for side in ("left", "right")]
-    found = _posed(
+        sides = [content[f"{side}_hand_pose_axis_angle"] for side in ("left", "right")]
+    vertices = _posed(
         _peer(folder / "body" / FULL, flat_hand_mean=not by_components),
-        body_pose=told["body_pose"].reshape(total, 21, 3),
-        head_pose=np.stack([told[f"{name}_pose"] for name in ("jaw", "leye", "reye")], 1),
+        body_pose=content["body_pose"].reshape(total, 21, 3),
+        head_pose=np.stack([content[f"{name}_pose"] for name in ("jaw", "leye", "reye")], 1),
         hand_pose=np.concatenate(sides, 1).reshape(total, 30, 3),
-        pelvis_rotation=told["global_orient"],
-        shape=told["betas"],
-        expression=told["expression"],
-        global_translation=told["transl"],
+        pelvis_rotation=content["global_orient"],
+        shape=content["betas"],
+        expression=content["expression"],
+        global_translation=content["transl"],
     )
-    assert np.abs(found - expected).max() < 1e-5
+    assert np.abs(vertices - expected).max() < 1e-5
 
 
 def test_object_poses_of_both_formats_are_the_same_object(
     lively: fitted.Capture, folder: Path, zup_from_master: np.ndarray
 ) -> None:
-    told = read_pickle(folder / "intercap" / "res.pkl")
+    content = read_pickle(folder / "intercap" / "res.pkl")
     with np.load(folder / "amass" / "object.npz") as amass:
-        for t, (turn, at) in enumerate(zip(told["ob_pose"], told["ob_trans"], strict=True)):
+        for t, (turn, at) in enumerate(zip(content["ob_pose"], content["ob_trans"], strict=True)):
             placed = lively.mesh.vertices @ Rotation.from_rotvec(turn).as_matrix().T + at
             upright = lively.mesh.vertices @ amass["rotation"][t].T + amass["translation"][t]
             assert np.abs(upright - apply(zup_from_master, placed)).max() < 1e-6
@@ -144,7 +146,7 @@ def test_expression_is_where_readers_look_for_it(folder: Path, capture: fitted.C
 
 
 @pytest.mark.parametrize("name", [SMALL, FULL, "open_body.npz"])
-def test_each_body_file_serves_as_this_projects_body_model(
+def test_each_body_file_loads_as_a_body_model(
     name: str, folder: Path, lively: fitted.Capture, expected: np.ndarray, tmp_path: Path
 ) -> None:
     path = Path(shutil.copy(folder / "body" / name, tmp_path / name))
@@ -154,19 +156,19 @@ def test_each_body_file_serves_as_this_projects_body_model(
     assert np.abs(vertices - expected).max() < 1e-7
 
 
-def test_each_body_file_is_named_with_its_digest_and_columns(folder: Path) -> None:
-    told = json.loads((folder / "export.json").read_text())
+def test_body_files_are_listed_with_digest_and_columns(folder: Path) -> None:
+    content = json.loads((folder / "export.json").read_text())
     files = {path.name: path for path in (folder / "body").glob("*.npz")}
-    assert set(told["body_files"]) == set(files) == {SMALL, FULL, "open_body.npz"}
+    assert set(content["body_files"]) == set(files) == {SMALL, FULL, "open_body.npz"}
     text = (folder / "README.txt").read_text()
     for name, path in files.items():
-        said = told["body_files"][name]
-        assert said["digest"] == hashlib.sha256(path.read_bytes()).hexdigest()[:16]
-        assert f"{name}, digest {said['digest']}: betas {said['betas']}" in text
-        assert f"expression {said['expression']}" in text
-    assert told["body"]["body_file_digest"] == file_digest(OPEN_BODY)
-    assert told["body_files"][SMALL]["expression"] == "10:20"
-    assert told["body_files"][FULL]["expression"] == "300:310"
+        entry = content["body_files"][name]
+        assert entry["digest"] == hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+        assert f"{name}, digest {entry['digest']}: betas {entry['betas']}" in text
+        assert f"expression {entry['expression']}" in text
+    assert content["body"]["body_file_digest"] == file_digest(OPEN_BODY)
+    assert content["body_files"][SMALL]["expression"] == "10:20"
+    assert content["body_files"][FULL]["expression"] == "300:310"
     for name in (SMALL, FULL):
         with np.load(files[name]) as file:
             assert file["surface_model_type"] == "intercap-open-body"
@@ -174,24 +176,14 @@ def test_each_body_file_is_named_with_its_digest_and_columns(folder: Path) -> No
             assert (str(file["up_axis"]), str(file["units"])) == ("y", "metres")
 
 
-def test_same_files_of_the_same_body(folder: Path, tmp_path: Path) -> None:
-    body = BodyFile(OPEN_BODY, "neutral", 13492, 10, 10)
-    body_files.write(tmp_path / "body", body)
-    names = sorted(path.name for path in (folder / "body").iterdir())
-    assert names == sorted(path.name for path in (tmp_path / "body").iterdir())
-    for name in names:
-        same = (tmp_path / "body" / name).read_bytes() == (folder / "body" / name).read_bytes()
-        assert same, name
-
-
 @pytest.mark.parametrize(
     ("betas", "expression", "names"),
     [(10, 10, ["10_10", "300_100"]), (4, 10, ["10_10", "300_100"]), (16, 10, ["300_100"])],
 )
-def test_more_numbers_of_shape_than_the_small_layout_has(
+def test_layouts_need_enough_shape_columns(
     betas: int, expression: int, names: list[str], tmp_path: Path
 ) -> None:
-    body = BodyFile(OPEN_BODY, "neutral", 13492, betas, expression)
+    body = ExportBody(OPEN_BODY, "neutral", 13492, betas, expression)
     assert [layout.name for layout in body_files.layouts(body)] == names
     written = {file.name: file for file in body_files.write(tmp_path / "body", body)}
     with np.load(OPEN_BODY) as file:
@@ -203,7 +195,7 @@ def test_more_numbers_of_shape_than_the_small_layout_has(
     assert written[FULL].betas == f"0:{betas}"
 
 
-def test_a_licensed_file_is_named_and_not_given_away(tmp_path: Path) -> None:
-    licensed = BodyFile(tmp_path / "SMPLX_MALE.npz", "male", 10475, 10, 10)
+def test_a_licensed_body_file_is_not_exported(tmp_path: Path) -> None:
+    licensed = ExportBody(tmp_path / "SMPLX_MALE.npz", "male", 10475, 10, 10)
     assert not body_files.write(tmp_path / "body", licensed)
     assert not (tmp_path / "body").exists()

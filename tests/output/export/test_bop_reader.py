@@ -80,7 +80,7 @@ def images(turning: Path) -> list[Image]:
 
 
 @pytest.fixture(scope="module")
-def held(everything: Path) -> list[Image]:
+def occluded(everything: Path) -> list[Image]:
     """With a hand before the object, in some views."""
     return list(_images(everything / "bop"))
 
@@ -103,10 +103,10 @@ def test_the_projected_object_is_its_mask(images: list[Image]) -> None:
         assert _grown(drawn)[image.mask].all(), "part of the mask where nothing of the object is"
 
 
-def test_what_is_seen_is_where_the_object_faces_the_camera(held: list[Image]) -> None:
+def test_visible_masks_agree_with_facing_points(occluded: list[Image]) -> None:
     """Of the points that face it, as many fall into mask_visib as the visible share says."""
     shares = []
-    for image in held:
+    for image in occluded:
         column, row = np.rint(image.pixels[image.facing]).astype(int).T
         near = np.zeros_like(image.visible)
         near[row, column] = True
@@ -136,7 +136,7 @@ def test_targets_are_images_in_which_it_is_seen(turning: Path, images: list[Imag
         assert len(ours) == target["inst_count"]
 
 
-def test_the_world_of_all_scenes_is_one(turning: Path) -> None:
+def test_all_scenes_share_the_world_frame(turning: Path) -> None:
     """The object's pose in the world, by the cameras of any scene, is the same in one frame."""
     places: dict[str, list[np.ndarray]] = {}
     for scene in sorted((turning / "scenes").iterdir()):
@@ -147,5 +147,5 @@ def test_the_world_of_all_scenes_is_one(turning: Path) -> None:
             at = np.array(entry["cam_t_m2c"]) - camera["cam_t_w2c"]
             places.setdefault(image, []).append(turn.T @ at)
     assert len(places) == 5
-    for found in places.values():
-        assert len(found) == 3 and np.ptp(found, axis=0).max() < 1e-2  # mm
+    for positions in places.values():
+        assert len(positions) == 3 and np.ptp(positions, axis=0).max() < 1e-2  # mm

@@ -42,7 +42,7 @@ def test_the_draft_says_how_sure_each_interval_is():
     assert "{part: mouth, start: 20, end: 24}  # 0.80, least 0.50" in draft(stated)
 
 
-def test_the_table_has_every_frame_and_region_and_leaves_unknown_labels_empty():
+def test_the_contact_table_has_a_row_per_frame_and_region():
     stated = _stated(("mouth", 20, 24))
     stated.annotated[0, 0] = 1
     rows = [row.split("\t") for row in table(stated).splitlines()]

@@ -22,7 +22,7 @@ def _npz(path: Path) -> dict[str, Any]:
         return {key: file[key].tolist() for key in ("frame", "up_axis", "up", "units")}
 
 
-def _said(folder: Path) -> dict[str, dict[str, Any]]:
+def _coordinates(folder: Path) -> dict[str, dict[str, Any]]:
     """What the files of each format say, by format."""
     glb = pygltflib.GLTF2().load(str(folder / "glb" / "cap.glb"))
     coco = json.loads((folder / "coco" / "annotations.json").read_text())
@@ -46,42 +46,42 @@ def in_camera(capture: fitted.Capture, tmp_path_factory: pytest.TempPathFactory)
     return exported.run(capture, out, formats=formats, frame="camera")
 
 
-def test_z_up_is_said_where_it_is(everything: Path, zup_from_master: np.ndarray) -> None:
+def test_exports_state_their_frame(everything: Path, zup_from_master: np.ndarray) -> None:
     up_in_master = np.linalg.inv(zup_from_master)[:3, 2]
     manifest = json.loads((everything / "export.json").read_text())
-    for name, said in _said(everything).items():
+    for name, stated in _coordinates(everything).items():
         fixed = name.split("/")[0] in ("intercap", "bop", "coco")
         up = up_in_master if fixed else [0, 1, 0] if name == "glb" else [0, 0, 1]
-        assert said["up"] == pytest.approx(up, abs=1e-6), name
-        assert said["up_axis"] == ("-y" if fixed else "y" if name == "glb" else "z"), name
-        assert ("x right, y down" in said["frame"]) == fixed and said["units"], name
+        assert stated["up"] == pytest.approx(up, abs=1e-6), name
+        assert stated["up_axis"] == ("-y" if fixed else "y" if name == "glb" else "z"), name
+        assert ("x right, y down" in stated["frame"]) == fixed and stated["units"], name
         for what in ("frame", "up", "up_axis", "units"):
-            there = manifest[what][name.split("/")[0]]
-            same = pytest.approx(there) if what == "up" else there
-            assert said[what] == same, (name, what)
-    assert _said(everything)["bop"]["units"].startswith("millimetres")
-    assert _said(everything)["coco"]["units"].startswith("pixels")
+            expected = manifest[what][name.split("/")[0]]
+            same = pytest.approx(expected) if what == "up" else expected
+            assert stated[what] == same, (name, what)
+    assert _coordinates(everything)["bop"]["units"].startswith("millimetres")
+    assert _coordinates(everything)["coco"]["units"].startswith("pixels")
 
 
-def test_a_cameras_frame_is_said_where_it_is(in_camera: Path) -> None:
-    for name, said in _said(in_camera).items():
-        assert "x right, y down" in said["frame"], name
-        assert said["up_axis"] == ("y" if name == "glb" else "-y")
+def test_exports_in_a_camera_frame_say_so(in_camera: Path) -> None:
+    for name, stated in _coordinates(in_camera).items():
+        assert "x right, y down" in stated["frame"], name
+        assert stated["up_axis"] == ("y" if name == "glb" else "-y")
     text = (in_camera / "README.txt").read_text()
     assert "z-up" not in text and "up: -y (" in text
 
 
-def test_bodies_stand_along_the_vector_that_is_called_up(
+def test_heads_are_above_feet_along_up(
     everything: Path, in_camera: Path, capture: fitted.Capture
 ) -> None:
     """Heads are above feet along it, in files of parameters and of vertices."""
     head = capture.model.skinning_weights[:, 15].numpy() > 0.9
     for folder in (everything, in_camera):
-        said = _said(folder)["meshes"]
+        stated = _coordinates(folder)["meshes"]
         for path in sorted((folder / "meshes" / "Mesh").glob("*_second.ply")):
             import trimesh
 
-            height = trimesh.load(path, process=False).vertices @ np.array(said["up"])
+            height = trimesh.load(path, process=False).vertices @ np.array(stated["up"])
             assert height[head].min() > height.max() - 0.45
             assert height.max() - height.min() > 1.4
 
@@ -92,7 +92,7 @@ def test_a_ply_of_bop_says_that_it_is_in_millimetres(everything: Path) -> None:
     assert b"comment units: millimetres" in head and b"comment frame: the object's own" in head
 
 
-def test_the_readme_says_it_of_every_format(everything: Path) -> None:
+def test_the_readme_states_the_frame_of_every_format(everything: Path) -> None:
     text = (everything / "README.txt").read_text()
     for name in ("intercap/res", "amass/body", "bop/", "coco/", "glb/", "contact/", "meshes/"):
         assert f"\n{name}" in text
@@ -111,7 +111,7 @@ def test_the_readme_says_it_of_every_format(everything: Path) -> None:
         ([np.nan] * 3, "unknown"),
     ],
 )
-def test_an_axis_is_named_where_one_is_up(up: Any, axis: str) -> None:
+def test_the_axis_that_points_up_is_named(up: Any, axis: str) -> None:
     place = Coordinates("somewhere", np.array(up, float))
     assert place.up_axis == axis and place.to_json()["up_axis"] == axis
     json.dumps(place.to_json(), allow_nan=False)

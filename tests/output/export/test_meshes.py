@@ -12,8 +12,8 @@ import trimesh
 
 from intercap_core import artefacts
 from intercap_core.geometry.camera.transforms import apply
+from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.output.export import meshes
-from intercap_core.output.export.about import About, BodyFile, Verdict
 from intercap_core.output.export.motion import read_motion
 from intercap_core.schemas import JOINT
 from tests.helpers import exported
@@ -65,52 +65,50 @@ def test_meshes_are_those_of_the_joint_result(
                 assert np.abs(vertices - placed).max() < 2e-6
                 np.testing.assert_array_equal(triangles, faces)
     head = (out / "meshes" / "Mesh" / names[0]).read_bytes()[:600].decode("ascii", "replace")
-    said = "up: z (" if frame == "z-up" else "frame: master colour camera: x right, y down"
-    assert said in head and "units: metres" in head and "sequence cap, frame 0" in head
+    header = "up: z (" if frame == "z-up" else "frame: master colour camera: x right, y down"
+    assert header in head and "units: metres" in head and "sequence cap, frame 0" in head
 
 
-def test_a_ply_says_which_vertices_touch(everything: Path) -> None:
-    with np.load(everything / "contact" / "contact_vertices.npz") as told:
+def test_ply_files_mark_touching_vertices(everything: Path) -> None:
+    with np.load(everything / "contact" / "contact_vertices.npz") as content:
         for name, end in (("body", "second"), ("object", "second_obj")):
-            offsets, vertices = (told[f"{name}_contact_{k}"] for k in ("offsets", "vertices"))
+            offsets, vertices = (content[f"{name}_contact_{k}"] for k in ("offsets", "vertices"))
             for t in range(len(offsets) - 1):
                 path = everything / "meshes" / "Mesh" / f"{t:05d}_{end}.ply"
                 mesh = trimesh.load(path, process=False)
                 touching = mesh.metadata["_ply_raw"]["vertex"]["data"]["contact"].ravel()
                 assert set(np.unique(touching)) == {0, 1}
-                found = np.flatnonzero(touching)
-                np.testing.assert_array_equal(found, vertices[offsets[t] : offsets[t + 1]])
+                marked = np.flatnonzero(touching)
+                np.testing.assert_array_equal(marked, vertices[offsets[t] : offsets[t + 1]])
 
 
-def test_they_are_made_on_request_alone(capture: fitted.Capture, tmp_path: Path) -> None:
+def test_meshes_are_written_only_on_request(capture: fitted.Capture, tmp_path: Path) -> None:
     out = exported.run(capture, tmp_path / "out")
     assert not (out / "meshes").exists()
     assert "meshes" not in json.loads((out / "export.json").read_text())["formats"]
 
 
-def test_without_an_object_there_is_the_body_alone(
+def _write(capture: fitted.Capture, bodies: np.ndarray, mesh: ObjectMesh | None, out: Path) -> list:
+    """Write meshes of a motion whose object has no pose in frame 1; return the sorted files."""
+    motion = read_motion(capture.paths["joint"], 15.0, fitted.BODY_MODELS, "neutral")
+    motion.translation[1] = np.nan
+    about = exported.plain_about(motion)
+    meshes.write(out, motion, bodies, mesh, about, kind="ply", every=1)
+    return sorted((out / "Mesh").iterdir())
+
+
+def test_without_an_object_only_bodies_are_written(
     capture: fitted.Capture, expected, tmp_path: Path
 ) -> None:
-    motion = read_motion(capture.paths["joint"], 15.0, fitted.BODY_MODELS, "neutral")
-    motion.rotation[:], motion.translation[:] = np.nan, np.nan
-    total = len(motion)
-    nothing = Verdict((), np.zeros((0, total)), ())
-    about = About("cap", BodyFile.of(motion.model, "neutral"), [""] * total, None, nothing)
-    meshes.write(tmp_path / "out", motion, expected[0], None, about, kind="ply", every=1)
-    names = sorted(path.name for path in (tmp_path / "out" / "Mesh").iterdir())
-    assert names == [f"{t:05d}_second.ply" for t in range(total)]
-    mesh = trimesh.load(tmp_path / "out" / "Mesh" / names[0], process=False)
+    files = _write(capture, expected[0], None, tmp_path / "out")
+    assert [path.name for path in files] == [f"{t:05d}_second.ply" for t in range(5)]
+    mesh = trimesh.load(files[0], process=False)
     assert "contact" not in mesh.metadata["_ply_raw"]["vertex"]["data"].dtype.names
 
 
-def test_a_frame_without_an_object_has_no_mesh_of_it(
+def test_frames_without_an_object_pose_have_no_object_mesh(
     capture: fitted.Capture, expected, tmp_path: Path
 ) -> None:
-    motion = read_motion(capture.paths["joint"], 15.0, fitted.BODY_MODELS, "neutral")
-    motion.translation[1] = np.nan
-    total = len(motion)
-    nothing = Verdict((), np.zeros((0, total)), ())
-    about = About("cap", BodyFile.of(motion.model, "neutral"), [""] * total, None, nothing)
-    meshes.write(tmp_path / "out", motion, expected[0], capture.mesh, about, kind="ply", every=1)
-    names = {path.name for path in (tmp_path / "out" / "Mesh").glob("*_obj.ply")}
-    assert names == {f"{t:05d}_second_obj.ply" for t in (0, 2, 3, 4)}
+    files = _write(capture, expected[0], capture.mesh, tmp_path / "out")
+    objects = {path.name for path in files if path.stem.endswith("_obj")}
+    assert objects == {f"{t:05d}_second_obj.ply" for t in (0, 2, 3, 4)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -30,23 +31,23 @@ def _by_frame(offsets: np.ndarray, vertices: np.ndarray) -> list[set[int]]:
 
 @pytest.fixture(scope="module")
 def touching(everything: Path) -> dict[str, list[set[int]]]:
-    with np.load(everything / "contact" / "contact_vertices.npz") as told:
+    with np.load(everything / "contact" / "contact_vertices.npz") as content:
         return {
-            name: _by_frame(told[f"{name}_contact_offsets"], told[f"{name}_contact_vertices"])
+            name: _by_frame(content[f"{name}_contact_offsets"], content[f"{name}_contact_vertices"])
             for name in ("body", "object")
         }
 
 
-def test_the_vertices_are_those_that_another_library_finds_in_contact(
+def test_contact_vertices_agree_with_trimesh(
     capture: fitted.Capture, touching: dict[str, list[set[int]]], everything: Path
 ) -> None:
     with artefacts.read(capture.paths["joint"], JOINT) as joint:
         bodies, _ = exported.posed(capture.model, joint)
         rotation, translation = joint["rotation"], joint["translation"]
-    with np.load(everything / "contact" / "contact_vertices.npz") as told:
-        assert float(told["contact_threshold_m"]) == LIMIT_M
-        distance = told["body_contact_distance"]
-    assert min(len(found) for found in touching["body"]) > 5
+    with np.load(everything / "contact" / "contact_vertices.npz") as content:
+        assert float(content["contact_threshold_m"]) == LIMIT_M
+        distance = content["body_contact_distance"]
+    assert min(len(entries) for entries in touching["body"]) > 5
     for t, body in enumerate(bodies):
         cup = trimesh.Trimesh(
             capture.mesh.vertices @ rotation[t].T + translation[t], capture.mesh.faces
@@ -56,30 +57,30 @@ def test_the_vertices_are_those_that_another_library_finds_in_contact(
         sure = set(near[signed < LIMIT_M - WITHIN_M].tolist())
         maybe = set(near[signed < LIMIT_M + WITHIN_M].tolist())
         assert sure <= touching["body"][t] <= maybe
-        start = sum(len(found) for found in touching["body"][:t])
+        start = sum(len(entries) for entries in touching["body"][:t])
         own = dict(zip(near.tolist(), signed.tolist(), strict=True))
         for place, vertex in enumerate(sorted(touching["body"][t])):
             assert distance[start + place] == pytest.approx(own[vertex], abs=WITHIN_M)
 
 
-def _told(folder: Path) -> dict[str, Any]:
+def _per_frame(folder: Path) -> dict[str, Any]:
     """What each format says of every frame, by the name of its file."""
-    found: dict[str, Any] = {}
+    entries: dict[str, Any] = {}
     for name in ("amass/body.npz", "amass/object.npz", "intercap/res.npz"):
         with np.load(folder / name) as file:
-            found[name] = {key: file[key] for key in file.files}
-    found["res.pkl"] = read_pickle(folder / "intercap" / "res.pkl")["about"]["by_frame"]
+            entries[name] = {key: file[key] for key in file.files}
+    entries["res.pkl"] = read_pickle(folder / "intercap" / "res.pkl")["about"]["by_frame"]
     for name in ("bop/about.json", "meshes/about.json"):
-        found[name] = json.loads((folder / name).read_text())["by_frame"]
+        entries[name] = json.loads((folder / name).read_text())["by_frame"]
     coco = json.loads((folder / "coco" / "annotations.json").read_text())
-    found["coco"] = coco["info"]["by_frame"]
+    entries["coco"] = coco["info"]["by_frame"]
     glb = pygltflib.GLTF2().load(str(folder / "glb" / "cap.glb"))
-    found["glb"] = glb.asset.extras["by_frame"]
-    return found
+    entries["glb"] = glb.asset.extras["by_frame"]
+    return entries
 
 
-def _is_json(told: Any) -> bool:
-    return isinstance(told["contact_probability"], list)
+def _is_json(content: Any) -> bool:
+    return isinstance(content["contact_probability"], list)
 
 
 def test_contact_is_in_every_format(
@@ -89,21 +90,21 @@ def test_contact_is_in_every_format(
         regions, probability = joint.text("region_names"), joint["contact_probability"]
     with artefacts.read(capture.paths["metrics"], METRICS) as measured:
         reasons = measured.text("flag_reason")
-    told = _told(everything)
-    assert len(told) == 8
-    for name, found in told.items():
+    content = _per_frame(everything)
+    assert len(content) == 8
+    for name, entries in content.items():
         for surface in ("body", "object"):
             vertices = _by_frame(
-                np.array(found[f"{surface}_contact_offsets"]),
-                np.array(found[f"{surface}_contact_vertices"]),
+                np.array(entries[f"{surface}_contact_offsets"]),
+                np.array(entries[f"{surface}_contact_vertices"]),
             )
             assert vertices == touching[surface], (name, surface)
-        assert list(found["contact_region"]) == regions, name
-        said = np.array(found["contact_probability"])
-        assert said == pytest.approx(probability, abs=1e-4), name
-        assert np.shape(found["contact_annotated"]) == probability.shape
-        if not _is_json(found):
-            assert list(found["flag_reason"]) == reasons, name
+        assert list(entries["contact_region"]) == regions, name
+        exported_values = np.array(entries["contact_probability"])
+        assert exported_values == pytest.approx(probability, abs=1e-4), name
+        assert np.shape(entries["contact_annotated"]) == probability.shape
+        if not _is_json(entries):
+            assert list(entries["flag_reason"]) == reasons, name
 
 
 def test_deviations_and_stated_errors_are_in_every_format(
@@ -118,23 +119,25 @@ def test_deviations_and_stated_errors_are_in_every_format(
         errors = dict(zip(parts, 1e3 * measured["verdict/error_frame"], strict=True))
         silent = dict(zip(parts, measured.text("verdict/silent"), strict=True))
     assert lost.tolist() == [True, False, False, False, False]
-    for name, found in _told(everything).items():
-        if _is_json(found):
-            sigma = np.array(found["joint_sigma_mm"]) / 1e3
-            at = [None if v is None else v / 1e3 for v in found["object_position_sigma_mm"]]
-            turn = found["object_rotation_sigma_deg"]
-            stated = found["stated_error_mm"]
+    for name, entries in _per_frame(everything).items():
+        if _is_json(entries):
+            sigma = np.array(entries["joint_sigma_mm"]) / 1e3
+            at = [None if v is None else v / 1e3 for v in entries["object_position_sigma_mm"]]
+            turn = entries["object_rotation_sigma_deg"]
+            stated = entries["stated_error_mm"]
             assert at[0] is turn[0] is None
             turn = np.radians(turn[1:])
         else:
-            sigma, at = found["joint_sigma"], found["object_position_sigma"]
-            turn = found["object_rotation_sigma"]
-            rows = zip(found["stated_error_part"], found["stated_error_by_frame_mm"], strict=True)
+            sigma, at = entries["joint_sigma"], entries["object_position_sigma"]
+            turn = entries["object_rotation_sigma"]
+            rows = zip(
+                entries["stated_error_part"], entries["stated_error_by_frame_mm"], strict=True
+            )
             stated = {str(part): row for part, row in rows}
             assert np.isnan(at[0]) and np.isnan(turn[0])
             turn = turn[1:]
         assert sigma == pytest.approx(joint, abs=1e-4), name
-        assert len(found["joint_name"]) == 55
+        assert len(entries["joint_name"]) == 55
         # the fixture's covariance is that of 4 mm and 4 mrad along each axis
         assert np.array(at[1:], float) == pytest.approx(0.004, abs=1e-5)
         assert turn == pytest.approx(0.004, abs=1e-5)
@@ -143,19 +146,19 @@ def test_deviations_and_stated_errors_are_in_every_format(
             expected = errors[part]
             known = np.isfinite(expected)
             assert known.any()
-            said = np.array(row, dtype=float)
-            assert said[known] == pytest.approx(expected[known], abs=0.006), (name, part)
-            assert np.isnan(said[~known]).all()
+            exported_values = np.array(row, dtype=float)
+            assert exported_values[known] == pytest.approx(expected[known], abs=0.006), (name, part)
+            assert np.isnan(exported_values[~known]).all()
 
 
-def test_the_verdict_of_each_camera_is_said(capture: fitted.Capture, everything: Path) -> None:
-    told = json.loads((everything / "verdict.json").read_text())
+def test_the_verdict_of_each_camera_is_exported(capture: fitted.Capture, everything: Path) -> None:
+    content = json.loads((everything / "verdict.json").read_text())
     manifest = json.loads((everything / "export.json").read_text())
-    assert manifest["verdict_by_camera"] == told["verdict_by_camera"]
-    cameras = {one["camera"]: one for one in told["verdict_by_camera"]}
-    assert set(cameras) == {"k1", "k2", "k3"} and "held_out" in told["meaning"]
+    assert manifest["verdict_by_camera"] == content["verdict_by_camera"]
+    cameras = {one["camera"]: one for one in content["verdict_by_camera"]}
+    assert set(cameras) == {"k1", "k2", "k3"} and "held_out" in content["meaning"]
     with artefacts.read(capture.paths["metrics"], METRICS) as measured:
-        held = measured["verdict/held_camera"]
+        held_camera = measured["verdict/held_camera"]
         for c, name in enumerate(measured.text("verdict/camera_names")):
             for key, dataset, scale in (
                 ("keypoint", "keypoint_px", 1.0),
@@ -163,101 +166,84 @@ def test_the_verdict_of_each_camera_is_said(capture: fitted.Capture, everything:
                 ("overlap", "overlap", 1.0),
                 ("object_depth", "object_depth_m", 1e3),
             ):
-                for said, end in (("held_in", ""), ("held_out", "_held_out")):
-                    found = cameras[name][key][said]
-                    values = measured[f"verdict/{dataset}{end}"][held == c, c]
+                for exported_values, end in (("held_in", ""), ("held_out", "_held_out")):
+                    entries = cameras[name][key][exported_values]
+                    values = measured[f"verdict/{dataset}{end}"][held_camera == c, c]
                     values = values[np.isfinite(values)]
                     if not len(values):
-                        assert found is None
+                        assert entries is None
                         continue
-                    assert found == pytest.approx(scale * np.median(values), abs=1e-3)
+                    assert entries == pytest.approx(scale * np.median(values), abs=1e-3)
             for p, part in enumerate(measured.text("verdict/part_names")):
                 shift = measured["verdict/shift"][p, c]
                 expected = 1e3 * np.sqrt(np.nanmean(shift**2))
                 assert cameras[name]["shift_mm"][part] == pytest.approx(expected, abs=0.01)
     with np.load(everything / "amass" / "body.npz") as file:
         assert file["verdict_camera"].tolist() == ["k1", "k2", "k3"]
-        said = [cameras[name]["keypoint"]["held_out"] for name in file["verdict_camera"]]
-        known = [value is not None for value in said]
+        exported_values = [cameras[name]["keypoint"]["held_out"] for name in file["verdict_camera"]]
+        known = [value is not None for value in exported_values]
         assert any(known)
         assert file["verdict_held_out"][known, 0] == pytest.approx(
-            [value for value in said if value is not None], abs=1e-3
+            [value for value in exported_values if value is not None], abs=1e-3
         )
     for where in ("bop/about.json", "meshes/about.json"):
         there = json.loads((everything / where).read_text())
-        assert there["verdict_by_camera"] == told["verdict_by_camera"]
+        assert there["verdict_by_camera"] == content["verdict_by_camera"]
 
 
-def test_an_image_of_bop_says_which_frame_it_shows(
-    capture: fitted.Capture, everything: Path
-) -> None:
+def test_bop_images_name_their_frame(capture: fitted.Capture, everything: Path) -> None:
     with artefacts.read(capture.paths["metrics"], METRICS) as measured:
         reasons = measured.text("flag_reason")
     for number, camera in enumerate(capture.rig):
         scene = everything / "bop" / "scenes" / f"{number:06d}"
-        told = json.loads((scene / "scene_about.json").read_text())
-        assert told["camera"] == camera.name
-        assert told["images"].keys() == json.loads((scene / "scene_gt.json").read_text()).keys()
-        for image, said in told["images"].items():
-            assert said == {"frame": int(image), "flagged": reasons[int(image)]}
+        content = json.loads((scene / "scene_about.json").read_text())
+        assert content["camera"] == camera.name
+        assert content["images"].keys() == json.loads((scene / "scene_gt.json").read_text()).keys()
+        for image, exported_values in content["images"].items():
+            assert exported_values == {"frame": int(image), "flagged": reasons[int(image)]}
 
 
-def test_of_another_programs_result_no_deviation_is_stated(
-    capture: fitted.Capture, tmp_path: Path
-) -> None:
+def test_imported_results_have_no_deviations(capture: fitted.Capture, tmp_path: Path) -> None:
     made, path = exported.changed(capture, "joint", tmp_path)
     with h5py.File(path, "r+") as file:
         file.attrs["made_by"] = "another program: res.pkl"
     out = exported.run(made, tmp_path / "out", formats=("amass", "intercap"))
-    with np.load(out / "amass" / "body.npz") as told:
-        assert str(told["made_by"]) == "another program: res.pkl"
-        assert "joint_sigma" not in told and "object_position_sigma" not in told
-        assert "body_contact_vertices" in told
+    with np.load(out / "amass" / "body.npz") as content:
+        assert str(content["made_by"]) == "another program: res.pkl"
+        assert "joint_sigma" not in content and "object_position_sigma" not in content
+        assert "body_contact_vertices" in content
     assert "joint_sigma" not in (out / "README.txt").read_text()
 
 
-def _replace(path: Path, key: str, values: np.ndarray) -> None:
-    """Put other values in the place of an artefact's dataset, its attributes kept."""
-    with h5py.File(path, "r+") as file:
-        kept = dict(file[key].attrs)
-        del file[key]
-        file.create_dataset(key, data=values, fletcher32=True, chunks=True).attrs.update(kept)
-
-
 @pytest.mark.parametrize(
-    ("key", "shape", "words"),
+    ("key", "shape", "parts"),
     [
         ("body_to_object", (5, 10475), ["5 frames of 10475", "open_body.npz", "13492 vertices"]),
         ("object_to_body", (5, 12), ["5 frames of 12", "mesh of object 'cup'"]),
+        ("body_to_object", None, ["has no body_to_object, although sequence 'cap' has an object"]),
     ],
 )
-def test_metrics_of_another_body_or_object_are_named(
-    key: str, shape: tuple[int, int], words: list[str], capture: fitted.Capture, tmp_path: Path
+def test_metrics_of_another_body_or_object_are_refused(
+    key: str, shape: tuple | None, parts: list[str], capture: fitted.Capture, tmp_path: Path
 ) -> None:
     made, path = exported.changed(capture, "metrics", tmp_path)
-    _replace(path, key, np.zeros(shape, np.float32))
+    with h5py.File(path, "r+") as file:
+        attributes = dict(file[key].attrs)
+        del file[key]
+        if shape is not None:
+            values = np.zeros(shape, np.float32)
+            data = file.create_dataset(key, data=values, fletcher32=True, chunks=True)
+            data.attrs.update(attributes)
     with pytest.raises(UserError) as caught:
         exported.run(made, tmp_path / "out")
-    for word in [str(path), key, "sequence 'cap'", "re-run stage 'metrics'", *words]:
-        assert word in str(caught.value)
+    for part in [str(path), "sequence 'cap'", "re-run stage 'metrics'", *parts]:
+        assert part in str(caught.value)
     assert not (tmp_path / "out").exists()
 
 
-def test_metrics_without_the_object_are_named(capture: fitted.Capture, tmp_path: Path) -> None:
-    made, path = exported.changed(capture, "metrics", tmp_path)
-    with h5py.File(path, "r+") as file:
-        del file["body_to_object"]
-    with pytest.raises(UserError, match="has no body_to_object, although sequence 'cap' has"):
-        exported.run(made, tmp_path / "out")
-
-
-def test_fits_of_another_number_of_frames_are_named(
-    capture: fitted.Capture, tmp_path: Path
-) -> None:
+def test_fits_with_other_frames_are_refused(capture: fitted.Capture, tmp_path: Path) -> None:
     longer = fitted.make_capture(tmp_path, object_name="cup", total=6)
     for stage in ("body_fit", "object_track"):
-        made = fitted.Capture(
-            **{**vars(capture), "paths": capture.paths | {stage: longer.paths[stage]}}
-        )
+        made = replace(capture, paths=capture.paths | {stage: longer.paths[stage]})
         with pytest.raises(UserError, match=f"6 frames.*'cap' has 5; re-run stage '{stage}'"):
             exported.run(made, tmp_path / "out")

@@ -66,7 +66,7 @@ def test_json_says_what_the_tables_say(folder: Path) -> None:
     assert card["counts"]["objects"] == 2 and card["counts"]["subjects"] == 1
     assert card["flagged"]["frames"] == sum(int(row["flagged_frames"]) for row in rows) >= 6
     # numbers within a reason make no new one
-    reasons = {one["reason"]: one["frames"] for one in card["flagged"]["reasons"]}
+    reasons = {entry["reason"]: entry["frames"] for entry in card["flagged"]["reasons"]}
     assert reasons["lost … frames | ago"] == 6 and reasons["unsure"] == 3
     assert [row["object"] for row in card["by_object"]] == ["cup", "football"]
     assert card["failed"] == [{"sequence": "s02_o01", "reason": "k2.mkv: cut\nmore"}]
@@ -90,10 +90,10 @@ def test_splits_are_in_a_table(folder: Path) -> None:
 def test_markdown_has_a_head_that_hubs_read(folder: Path) -> None:
     text = (folder / "card.md").read_text()
     _, head, body = text.split("---\n", 2)
-    told = yaml.safe_load(head)
-    assert told["pretty_name"] == CARD.title and told["license"] == "cc-by-4.0"
-    assert told["size_categories"] == ["n<1K"]
-    for config in told["configs"]:
+    header = yaml.safe_load(head)
+    assert header["pretty_name"] == CARD.title and header["license"] == "cc-by-4.0"
+    assert header["size_categories"] == ["n<1K"]
+    for config in header["configs"]:
         assert (folder / config["data_files"]).is_file()
     assert CARD.description in body and "2026-03-01" in body and "A. Body, B. Object" in body
     assert "lost … frames / ago" in body  # a bar would end the cell

@@ -33,9 +33,9 @@ def folder(tmp_path: Path) -> Path:
 
 def test_every_file_of_the_dataset_is_listed_and_no_other(folder: Path) -> None:
     entries = manifest.write(folder, {"dataset": "demo"}, threads=2)
-    assert {one.path: one.kind for one in entries} == FILES
-    told = json.loads((folder / "release.json").read_text())
-    assert told["dataset"] == "demo" and len(told["files"]) == len(FILES)
+    assert {entry.path: entry.kind for entry in entries} == FILES
+    content = json.loads((folder / "release.json").read_text())
+    assert content["dataset"] == "demo" and len(content["files"]) == len(FILES)
     assert manifest.check(folder) == (len(FILES), manifest.Differences())
     first = (folder / "release.json").read_bytes()
     manifest.write(folder, {"dataset": "demo"})  # the lists do not list themselves
@@ -53,27 +53,27 @@ def test_sha256sum_reads_the_list(folder: Path) -> None:
     assert done.returncode == 1 and "s01/joint.h5: FAILED" in done.stdout
 
 
-def test_differences_are_told_apart(folder: Path) -> None:
+def test_differences_are_classified(folder: Path) -> None:
     manifest.write(folder, {}, kinds=("card", "tables", "artefact"))
     (folder / "card.md").unlink()
     changed = folder / "s02" / "joint.h5"
     changed.write_bytes(changed.read_bytes()[:-1] + b"x")  # of the same size
     (folder / "tables" / "new.csv").write_text("")
     (folder / "site" / "new.html").write_text("")  # of a kind that was not released
-    _, found = manifest.check(folder)
-    assert found == manifest.Differences(["card.md"], ["s02/joint.h5"], ["tables/new.csv"])
-    assert found
+    _, differences = manifest.check(folder)
+    assert differences == manifest.Differences(["card.md"], ["s02/joint.h5"], ["tables/new.csv"])
+    assert differences
 
 
 def test_kinds_and_sequences_choose(folder: Path) -> None:
     entries = manifest.write(folder, {}, kinds=("site", "export"), sequences=["s02"])
-    assert [one.path for one in entries] == ["site/index.html", "site/sequences/s02/index.html"]
+    assert [entry.path for entry in entries] == ["site/index.html", "site/sequences/s02/index.html"]
     with pytest.raises(UserError, match="no files to release"):
         manifest.write(folder, {}, kinds=("export",), sequences=["s02"])
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         (None, "no such file"),
         ("{", "is not a manifest"),
@@ -88,13 +88,13 @@ def test_kinds_and_sequences_choose(folder: Path) -> None:
          '"sha256": ""}]}', "is not a file of this dataset"),
     ],
 )  # fmt: skip
-def test_broken_lists(tmp_path: Path, text: str | None, said: str) -> None:
+def test_broken_manifests_are_refused(tmp_path: Path, text: str | None, message: str) -> None:
     if text is not None:
         (tmp_path / "release.json").write_text(text)
-    with pytest.raises(UserError, match=said):
+    with pytest.raises(UserError, match=message):
         manifest.check(tmp_path)
 
 
-def test_a_folder_that_is_not_there(tmp_path: Path) -> None:
+def test_a_missing_folder_is_reported(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no such folder"):
         manifest.write(tmp_path / "none", {})

@@ -12,23 +12,21 @@ NAMES = st.text("abcdefghij0123456789_", min_size=1, max_size=6)
 
 
 @given(st.dictionaries(NAMES, st.integers(1, 500), min_size=2, max_size=30), st.floats(0.05, 0.6))
-def test_every_group_is_in_one_part_and_no_group_would_come_nearer(
-    frames: dict[str, int], share: float
-) -> None:
-    found = split(frames, share=share)
-    assert not found.why and found.train and found.test
-    assert sorted([*found.train, *found.test]) == sorted(frames)
-    held, total = sum(frames[name] for name in found.test), sum(frames.values())
-    if len(found.test) > 1:  # the last one that was taken brought it nearer
-        assert abs(held - share * total) <= share * total
-    assert split(dict(reversed(frames.items())), share=share) == found
-    assert all(found.of(name) == (TEST if name in found.test else TRAIN) for name in frames)
-    assert found.of("") == ""
+def test_every_group_is_in_one_part_near_the_share(frames: dict[str, int], share: float) -> None:
+    parts = split(frames, share=share)
+    assert not parts.why and parts.train and parts.test
+    assert sorted([*parts.train, *parts.test]) == sorted(frames)
+    test_frames, total = sum(frames[name] for name in parts.test), sum(frames.values())
+    if len(parts.test) > 1:  # the last one that was taken brought it nearer
+        assert abs(test_frames - share * total) <= share * total
+    assert split(dict(reversed(frames.items())), share=share) == parts
+    assert all(parts.of(name) == (TEST if name in parts.test else TRAIN) for name in frames)
+    assert parts.of("") == ""
 
 
 def test_ten_equal_subjects_give_two() -> None:
-    found = split({f"s{i:02d}": 100 for i in range(10)}, share=0.2)
-    assert len(found.test) == 2 and len(found.train) == 8
+    parts = split({f"s{i:02d}": 100 for i in range(10)}, share=0.2)
+    assert len(parts.test) == 2 and len(parts.train) == 8
 
 
 @pytest.mark.parametrize(
@@ -44,9 +42,9 @@ def test_ten_equal_subjects_give_two() -> None:
         ({"a": 5, "b": 5}, 0.2, ("x",), (), "none of x"),
     ],
 )
-def test_few_and_named(
+def test_splits_of_few_or_named_groups(
     frames: dict[str, int], share: float, named: tuple[str, ...], test: tuple[str, ...], why: str
 ) -> None:
-    found = split(frames, share=share, named=named)
-    assert found.test == test
-    assert why in found.why if why else not found.why
+    parts = split(frames, share=share, named=named)
+    assert parts.test == test
+    assert why in parts.why if why else not parts.why

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import h5py
@@ -13,7 +14,7 @@ import pytest
 from intercap_core.errors import UserError
 from intercap_core.output.site import body_section, charts
 from intercap_core.output.site.body_section import FIT_COLOUR, KEYPOINT_COLOUR
-from intercap_core.output.site.drawing import Crop
+from intercap_core.output.site.drawing import SquareCrop
 from tests.helpers import fitted_capture as fitted
 
 SETS = 6
@@ -33,43 +34,41 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
     return found
 
 
-def _facts(made: fitted.Capture, **instead: Path) -> body_section.BodyFacts:
+def _section(made: fitted.Capture, **instead: Path) -> dict[str, Any]:
     paths = replace(made.inputs("frames", "scene", "person", "body_fit"), **instead)
     return body_section.read_fit(paths, made.models)
 
 
 def test_states_of_fit_and_views_and_deviations_by_joint(made: fitted.Capture) -> None:
-    facts = _facts(made)
-    assert facts.state == ["moving", "lost", *["moving"] * (SETS - 2)]
-    assert facts.sigma_mm[0, 20] == pytest.approx(20)
-    found = body_section.context(facts)
-    timeline = found["timeline"]
+    section = _section(made)
+    timeline = section["timeline"]
+    assert timeline.count('class="state moving"') == 2
     assert "1 interpolated" in timeline and timeline.count('class="state lost"') == 1
     # 8 px of 1080 rows are 2 px of 270
     assert timeline.count('class="state agrees"') == 1
     assert timeline.count('class="state partly"') == 1
     assert timeline.count('class="state nothing"') == 1
     assert "100 % visible · 1.9 px" in timeline and "0 % visible" in timeline
-    over_time, by_joint = found["charts"]
+    over_time, by_joint = section["charts"]
     assert "largest deviation of a joint" in over_time
     assert "left wrist" in by_joint and "20.0, up to 20.0" in by_joint
     assert "10.0, up to 40.0" in by_joint and "right fingers" in by_joint
 
 
-def test_another_body_file_than_was_fitted_is_named(made: fitted.Capture, tmp_path: Path) -> None:
+def test_another_body_file_is_refused(made: fitted.Capture, tmp_path: Path) -> None:
     other = tmp_path / "fitted.h5"
     other.write_bytes(made.paths["body_fit"].read_bytes())
     with h5py.File(other, "r+") as fit:
         fit.attrs["body_model"] = "0123456789abcdef"
     with pytest.raises(UserError, match=r"fitted\.h5: the bodies of .* with another body file"):
-        _facts(made, body_fit=other)
+        _section(made, body_fit=other)
 
 
 def test_the_sheet_shows_fit_and_keypoints(made: fitted.Capture) -> None:
-    sheet = _facts(made).sheet
-    assert sheet is not None and len(sheet.frames) == 4 and 1 in sheet.frames  # the worst one
-    bgr = cv2.imdecode(np.frombuffer(sheet.image.data, np.uint8), cv2.IMREAD_COLOR)
-    assert bgr.shape == (sheet.image.height, sheet.image.width, 3)
+    sheet = _section(made)["sheet"]
+    assert sheet is not None and ", 1, " in sheet.caption  # the frame with the largest deviation
+    bgr = cv2.imdecode(np.frombuffer(sheet.data, np.uint8), cv2.IMREAD_COLOR)
+    assert bgr.shape == (sheet.height, sheet.width, 3)
     first, *others = np.array_split(bgr[..., ::-1].astype(int), 3, axis=1)
     assert all((np.abs(c - FIT_COLOUR).max(-1) < 70).sum() > 100 for c in (first, *others))
 
@@ -79,14 +78,11 @@ def test_the_sheet_shows_fit_and_keypoints(made: fitted.Capture) -> None:
     assert dots(first) > 5 * 4 and all(dots(c) < 5 for c in others)
 
 
-def test_images_that_cannot_be_read_cost_the_sheet_alone(
-    made: fitted.Capture, tmp_path: Path
-) -> None:
+def test_unreadable_images_only_omit_the_sheet(made: fitted.Capture, tmp_path: Path) -> None:
     broken = tmp_path / "frames.h5"
     broken.write_bytes(b"no frames")
-    facts = _facts(made, frames=broken)
-    assert facts.sheet is None and "frames.h5" in facts.note
-    assert len(facts.state) == SETS
+    section = _section(made, frames=broken)
+    assert section["sheet"] is None and "frames.h5" in section["note"] and section["timeline"]
 
 
 def test_a_body_that_no_camera_sees_is_not_drawn(made: fitted.Capture, tmp_path: Path) -> None:
@@ -94,14 +90,14 @@ def test_a_body_that_no_camera_sees_is_not_drawn(made: fitted.Capture, tmp_path:
     path.write_bytes(made.paths["body_fit"].read_bytes())
     with h5py.File(path, "r+") as fit:
         fit["transl"][:, 1] += 50.0  # far under the floor
-    sheet = _facts(made, body_fit=path).sheet
+    sheet = _section(made, body_fit=path)["sheet"]
     assert sheet is not None
-    bgr = cv2.imdecode(np.frombuffer(sheet.image.data, np.uint8), cv2.IMREAD_COLOR)
+    bgr = cv2.imdecode(np.frombuffer(sheet.data, np.uint8), cv2.IMREAD_COLOR)
     assert (np.abs(bgr[..., ::-1].astype(int) - FIT_COLOUR).max(-1) < 70).sum() < 50
 
 
 def test_a_crop_places_pixels_and_outlines_alike() -> None:
-    crop = Crop(10, 20, 40, 80)
+    crop = SquareCrop(10, 20, 40, 80)
     assert crop.to_cell(np.array([[10.0, 20.0], [49.0, 59.0]])).tolist() == [[0, 0], [78, 78]]
     cell = np.zeros((80, 80, 3), np.uint8)
     crop.outline(cell, np.ones((10, 10), bool), 20, 30, (255, 255, 255))
@@ -114,6 +110,6 @@ def test_a_crop_places_pixels_and_outlines_alike() -> None:
 
 
 def test_bars_have_their_value_and_most() -> None:
-    drawn = charts.bars([charts.Bar("a & b", 1.0, 2.0, "up to 2")], "mm")
+    drawn = charts.bar_pairs([charts.BarPair("a & b", 2.0, 1.0, "1.0, up to 2")], "mm")
     assert "a &amp; b" in drawn and "1.0, up to 2" in drawn
-    assert 'width="300.0"' in drawn and 'width="150.0"' in drawn
+    assert 'width="360.0"' in drawn and 'width="180.0"' in drawn

@@ -38,7 +38,7 @@ def _decoded(picture: EncodedImage) -> np.ndarray:
     return image
 
 
-def test_pictures_are_drawn_before_and_after_where_poses_changed(made: fitted.Capture) -> None:
+def test_pictures_are_drawn_before_and_after_refinement(made: fitted.Capture) -> None:
     facts = capture_section.read_capture(made.paths["frames"], made.paths["scene"])
     assert facts.pictures is not None and facts.pictures.when == ("before", "after")
     before, after = (_decoded(picture).astype(int) for picture in facts.pictures.views[0])
@@ -62,7 +62,7 @@ def test_facts_of_cameras_and_pairs(made: fitted.Capture) -> None:
     assert "1,000 supporting points" in facts.ground and "4.0 mm" in facts.ground
 
 
-def test_a_depth_bias_is_told_with_its_deviation(made: fitted.Capture, tmp_path: Path) -> None:
+def test_a_depth_bias_has_its_deviation(made: fitted.Capture, tmp_path: Path) -> None:
     scene = Path(shutil.copy(made.paths["scene"], tmp_path / "scene.h5"))
     with h5py.File(scene, "r+") as file:
         file["depth_bias"][...] = [0.0021, -0.004, 0.001]
@@ -121,7 +121,7 @@ def test_states_of_a_cameras_frames() -> None:
     assert without == ["recorded", "recorded", "missing", "missing", "recorded", "dropped"]
 
 
-def test_the_timeline_tells_how_late_slipped_images_are(made: fitted.Capture) -> None:
+def test_the_timeline_states_how_late_slipped_images_are(made: fitted.Capture) -> None:
     facts = capture_section.read_capture(made.paths["frames"], made.paths["scene"])
     late = replace(
         facts.cameras[1],
@@ -134,15 +134,16 @@ def test_the_timeline_tells_how_late_slipped_images_are(made: fitted.Capture) ->
     assert "3 slipped by 1 or 2" in drawn and "1 missing" in drawn
 
 
-def test_gaps_are_where_time_runs_on() -> None:
+def test_gaps_between_sets() -> None:
     assert capture_section.gaps(np.array([0, 1, 2, 5, 6]) / 15, 15) == [(2, 2)]
     assert capture_section.gaps(np.zeros(1), 15) == []
 
 
-def test_names_and_notes_are_no_markup(made: fitted.Capture, tmp_path: Path) -> None:
-    row = charts.StateRow("<b>k1</b>", [(0, 1, "recorded", "<i>")], "<u>")
-    drawn = charts.state_timeline([row], 2, [(0, "<s>")])
-    pair = charts.bar_pairs([charts.BarPair("<b>", 1.0, float("nan"), "<i>", True)], "<u>")
+def test_names_and_notes_are_escaped(made: fitted.Capture, tmp_path: Path) -> None:
+    row = charts.Row("<b>k1</b>", [(0, 1, "state recorded", "<i>")], "<u>")
+    drawn = charts.timeline([row], 2, [(0, "<s>")])
+    change = charts.BarPair.change("<b>", 1.0, float("nan"), "<i>", True)
+    pair = charts.bar_pairs([change], "<u>")
     for text in (drawn, pair):
         assert not re.search(r"<[bius]>", text)
         assert "nan" not in text
@@ -169,7 +170,7 @@ def _both(first: FusedCloud, second: FusedCloud) -> FusedCloud:
     return FusedCloud(*(np.concatenate(pair) for pair in parts))
 
 
-def test_near_points_hide_far_ones_and_backs_are_not_drawn() -> None:
+def test_near_points_occlude_far_points() -> None:
     view = Viewpoint.towards(np.zeros(3), 0.0, 0.0, 4.0, 100.0, (60, 60))
     cloud = _both(_wall(0.0), _wall(1.0, camera=1))
     picture, depth = splat(cloud, view)
@@ -188,7 +189,7 @@ def test_a_point_is_drawn_where_the_view_projects_it() -> None:
     assert view.eye == pytest.approx([0, 5, 1])
 
 
-def test_fusing_moves_points_by_poses_and_takes_the_bias_off() -> None:
+def test_fusing_applies_poses_and_depth_bias() -> None:
     from intercap_core.output.site.point_cloud import CameraPoints
 
     lens = Intrinsics(10, 10, 10.0, 10.0, 4.5, 4.5)
@@ -211,7 +212,7 @@ def test_floor_profiles_are_median_heights_by_camera() -> None:
     assert not floor_profiles(FusedCloud(points, -up, up, camera), np.zeros(2))
 
 
-def test_floor_profiles_keep_clear_of_what_stands_there() -> None:
+def test_floor_profiles_avoid_objects() -> None:
     x, y = np.meshgrid(np.linspace(-1, 1, 200), np.linspace(-0.8, 0.8, 65))
     box = (np.abs(x) < 0.2) & (np.abs(y) < 0.1)
     z = np.where(box, 0.07, 0)

@@ -35,9 +35,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
 
 def read(capture: fitted.Capture, truth: Path | None) -> Handling:
     return closeups.read_handling(
-        capture.inputs("scene", "body_fit", "object_track", "joint"),
-        capture.models,
-        truth=truth,
+        capture.inputs("scene", "body_fit", "object_track", "joint"), capture.models, truth=truth
     )
 
 
@@ -71,7 +69,7 @@ def test_holds_are_runs_over_a_half_longest_first() -> None:
     assert found[0].frame == 1 and found[0].caption == "right hand, frames 0–2, drawn at 1"
 
 
-def test_columns_are_sequential_joint_and_what_is_known(
+def test_columns_are_sequential_joint_and_truth(
     capture: fitted.Capture, handling: Handling
 ) -> None:
     assert [column.name for column in handling.columns] == ["sequential", "joint", "truth"]
@@ -84,7 +82,7 @@ def test_columns_are_sequential_joint_and_what_is_known(
     np.testing.assert_allclose(joint.body - truth.body, [body] * len(truth.body), atol=1e-5)
 
 
-def test_every_cell_shows_skin_and_object_and_truth_touches(handling: Handling) -> None:
+def test_every_cell_shows_skin_and_object(handling: Handling) -> None:
     (hold,) = closeups.holds(handling.probability)
     assert hold == Hold("right", 1, 3)
     picture = closeups.closeup(handling, hold)
@@ -151,7 +149,7 @@ def test_the_command_writes_a_picture_for_each_hold(project: Path, tmp_path: Pat
     assert not (tmp_path / "none").exists()
 
 
-def test_what_is_not_there_is_named(project: Path, tmp_path: Path) -> None:
+def test_missing_inputs_are_reported(project: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"no sequence 'nobody'.*lists s01_o03"):
         draw_closeups(project, ["nobody"])
     with pytest.raises(UserError, match=r"config.yaml: is a file, expected a folder"):

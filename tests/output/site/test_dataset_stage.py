@@ -162,14 +162,14 @@ def test_pages_show_overlays_flags_and_failures(
         text = " ".join(" ".join(shown.text).split())
         for part in ("Over time", "Verdict", "Joint fit", "before (grey) and after (blue)"):
             assert part in text
-    held = [str(image["alt"]) for image in pages["s01_o03"].images]
-    assert [c for c in held if " hand, frames " in c] == [
+    ball_captions = [str(image["alt"]) for image in pages["s01_o03"].images]
+    assert [c for c in ball_captions if " hand, frames " in c] == [
         "left hand, frames 0–1, drawn at 0",
         "right hand, frames 0–1, drawn at 0",
     ]  # of four holds the longest
 
 
-def test_what_is_annotated_is_beside_what_is_stated(
+def test_annotated_contact_is_shown_with_stated_contact(
     captures: dict[str, fitted.Capture], tmp_path: Path
 ) -> None:
     capture = captures["s01_o03"]
@@ -200,9 +200,7 @@ def test_a_page_replaces_a_page_and_nothing_else(
     assert (tmp_path / "notes.txt").read_text() == "mine"
 
 
-def test_markup_in_words_is_shown_as_words(
-    captures: dict[str, fitted.Capture], tmp_path: Path
-) -> None:
+def test_markup_in_texts_is_escaped(captures: dict[str, fitted.Capture], tmp_path: Path) -> None:
     paths = write_summaries(captures, tmp_path)
     with h5py.File(paths["s01_o03"], "r+") as file:
         file["rig/note"][0] = "<script>alert(1)</script>"
@@ -226,7 +224,7 @@ def test_a_summary_that_cannot_be_read_is_listed(
     assert summary["sequences"] == 1
 
 
-def test_what_heatmaps_cannot_take_is_told_and_the_rest_counts(
+def test_sequences_that_do_not_fit_the_heatmaps_are_reported(
     captures: dict[str, fitted.Capture], tmp_path: Path
 ) -> None:
     """Another object's mesh, another body's vertices, another body file: none ends the merge."""
@@ -254,7 +252,7 @@ def test_what_heatmaps_cannot_take_is_told_and_the_rest_counts(
     assert "right hand, back" in text
 
 
-def test_an_object_that_is_not_listed_any_more_ends_no_merge(
+def test_an_unlisted_object_does_not_stop_the_merge(
     captures: dict[str, fitted.Capture], tmp_path: Path
 ) -> None:
     paths = write_summaries(captures, tmp_path)
@@ -264,9 +262,7 @@ def test_an_object_that_is_not_listed_any_more_ends_no_merge(
     assert "its object football has no entry in the list of objects" in text
 
 
-def test_overlay_covers_the_person_in_the_image(
-    pages: dict[str, _Reader],
-) -> None:
+def test_overlay_covers_the_person_in_the_image(pages: dict[str, _Reader]) -> None:
     """The recorded person is red; the overlay turns it blue where the fit is right."""
     image = next(i for i in pages["s01_o03"].images if str(i["alt"]).startswith("camera "))
     data = base64.b64decode(str(image["src"]).split(",")[1])

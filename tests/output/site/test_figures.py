@@ -49,7 +49,7 @@ def test_penetration_is_over_the_contact_frames_of_all_sequences() -> None:
     assert found["share_le_20mm"] == pytest.approx(2 / 3)
 
 
-def test_cloud_figures_leave_frames_without_a_cloud_out() -> None:
+def test_cloud_figures_omit_frames_without_a_cloud() -> None:
     found = figures.cloud_figures([sequence(body_to_cloud=[0.01, 0.02, np.nan, 0.03])])
     assert found["body_mm"] == pytest.approx(20)
     assert found["object_visible_mm"] == pytest.approx(10)
@@ -175,7 +175,7 @@ def test_late_and_early_starts_of_motion_do_not_cancel() -> None:
     assert found["motion_onset_late_frames"] == pytest.approx(1)
 
 
-def test_extrinsics_leave_the_master_and_absent_cameras_out() -> None:
+def test_extrinsics_omit_the_master_and_absent_cameras() -> None:
     none = np.nan
     moved = {"before": [0.01, none, none, 0.03], "after": [0, none, none, 0.002]}
     s = sequence(**{f"truth/extrinsics_{when}": values for when, values in moved.items()})

@@ -64,11 +64,7 @@ DAMAGES: dict[str, tuple[Damage, list[str]]] = {
     "no_metrics": (lambda folder: (folder / "metrics.h5").unlink(), ["no_metrics/summary.h5"]),
     "other_version": (
         lambda folder: _set(folder / "metrics.h5", schema_version=METRICS.version + 1),
-        [
-            "other_version/metrics.h5",
-            f"version {METRICS.version + 1}",
-            "re-run stage 'metrics'",
-        ],
+        ["other_version/metrics.h5", f"version {METRICS.version + 1}", "re-run stage 'metrics'"],
     ),
     "other_vertices": (_of_another_body, ["a body of 1000 vertices", "not in the body's heatmap"]),
     "other_body": (
@@ -78,7 +74,7 @@ DAMAGES: dict[str, tuple[Damage, list[str]]] = {
 }
 
 
-def test_a_damaged_sequence_is_named_and_the_others_are_shown(
+def test_a_damaged_sequence_is_reported_and_others_are_shown(
     capture: fitted.Capture, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     project = _project(tmp_path, capture, DAMAGES)

@@ -71,15 +71,15 @@ def out(captures: dict[str, fitted.Capture], tmp_path_factory: pytest.TempPathFa
     return write_site(captures, folder, name="mixed", settings=PageSettings(cameras=1, frames=1))
 
 
-def test_the_body_is_measured_alike(measured: dict[str, SequenceMetrics]) -> None:
+def test_the_body_is_measured_as_with_an_object(measured: dict[str, SequenceMetrics]) -> None:
     held, alone, missed = (measured[name] for name in (HELD, ALONE, MISSED))
     assert (held.object_, alone.object_, missed.object_) == ("football", "", "football")
     assert [s.has_object for s in (held, alone, missed)] == [True, False, False]
     for key in ("body_to_cloud", "truth/joint/body_pve", "truth/joint/planted_speed"):
         np.testing.assert_allclose(alone.values[key], held.values[key], rtol=1e-4)
     assert list(held.values["verdict/part_names"]) == ["body", "hands", "object"]
-    for nothing in (alone, missed):
-        assert list(nothing.values["verdict/part_names"]) == ["body", "hands"]
+    for without in (alone, missed):
+        assert list(without.values["verdict/part_names"]) == ["body", "hands"]
     judged = {key for key in alone.values if key.startswith("verdict/")}
     about = {key.rpartition("/")[2].partition("_")[0] for key in alone.values.keys() - judged}
     assert not about & {"object", "contact", "region", "penetration", "vertex"}
@@ -89,9 +89,9 @@ def test_an_object_that_was_missed_is_lost(measured: dict[str, SequenceMetrics])
     missed = measured[MISSED]
     assert np.isposinf(missed.values["truth/joint/object_translation"]).all()
     for stage in ("object_track", "joint"):
-        found = truth_figures([missed], stage)
-        assert found["lost_share"] == 1 and found["lost_unnoticed_share"] == 0
-        assert "object_translation_mm" not in found
+        heat = truth_figures([missed], stage)
+        assert heat["lost_share"] == 1 and heat["lost_unnoticed_share"] == 0
+        assert "object_translation_mm" not in heat
     assert truth_figures([missed], "joint")["contact_recall"] == 0
     assert missed.values["flagged"].all()
     assert flag_figures([missed, measured[ALONE]])["bad_frames"] == 0.5
@@ -101,21 +101,21 @@ def test_figures_of_a_mixed_dataset_are_those_of_its_parts(
     measured: dict[str, SequenceMetrics],
 ) -> None:
     held, alone = measured[HELD], measured[ALONE]
-    both, one = areas([held, alone]), areas([held])
+    both, single = areas([held, alone]), areas([held])
     for area in ("joint", "body_fit", "penetration", "vertex_to_cloud"):
-        for key, value in one[area].items():
+        for key, value in single[area].items():
             assert both[area][key] == pytest.approx(value, rel=1e-4), key
     assert not [key for key in areas([alone])["joint"] if "object" in key or "contact" in key]
 
 
-def test_heatmaps_count_those_who_could_touch(out: Path) -> None:
+def test_heatmaps_count_only_sequences_with_an_object(out: Path) -> None:
     summaries = [
         SequenceSummary.read(out / "summaries" / f"{name}.h5") for name in (ALONE, HELD, MISSED)
     ]
-    found, held = collect_heatmaps(summaries), collect_heatmaps(summaries[1:2])
-    assert found.body_frames == TOTAL and list(found.objects) == ["football"]
-    np.testing.assert_array_equal(found.body, held.body)
-    assert found.objects["football"].frames == TOTAL
+    heat, held = collect_heatmaps(summaries), collect_heatmaps(summaries[1:2])
+    assert heat.body_frames == TOTAL and list(heat.objects) == ["football"]
+    np.testing.assert_array_equal(heat.body, held.body)
+    assert heat.objects["football"].frames == TOTAL
 
 
 def test_tables_have_gaps_and_no_zeros(out: Path) -> None:
@@ -138,7 +138,7 @@ def test_tables_have_gaps_and_no_zeros(out: Path) -> None:
     assert json.loads((out / "summary.json").read_text())["sequences"] == 3
 
 
-def test_the_pages_show_each_sequence_what_it_has(out: Path) -> None:
+def test_pages_omit_missing_parts(out: Path) -> None:
     overview = (out / "site" / "index.html").read_text()
     assert "3 sequences, 12 frames" in overview and "1 object<" in overview.replace(
         "1 object\n", "1 object<"

@@ -222,7 +222,7 @@ def test_fingers_turn_come_nearer_play_seek_and_switch(shown: Path) -> None:
 
 
 @needs_chromium
-def test_words_from_files_are_words(capture: fitted.Capture, tmp_path: Path) -> None:
+def test_text_from_files_is_escaped(capture: fitted.Capture, tmp_path: Path) -> None:
     shutil.copy(capture.paths["joint"], tmp_path / "joint.h5")
     with h5py.File(tmp_path / "joint.h5", "r+") as file:
         reasons = file["flag_reason"][()].astype("S60")
@@ -234,10 +234,7 @@ def test_words_from_files_are_words(capture: fitted.Capture, tmp_path: Path) -> 
         "joint": tmp_path / "joint.h5",
     }})  # fmt: skip
     shown = _write(changed, tmp_path / "page", name='<b onclick="x">"name"</b>')
-    found = _browse(
-        shown,
-        "result.flag = root.querySelector('[data-part=flag]').innerHTML;",
-    )
+    found = _browse(shown, "result.flag = root.querySelector('[data-part=flag]').innerHTML;")
     assert found["console"] == [] and "<b onclick" not in found["dom"]
     assert found["result"]["flag"].startswith("flagged: &lt;img src=x")
 
@@ -254,9 +251,7 @@ def test_a_page_without_its_file_says_so(shown: Path, tmp_path: Path) -> None:
         assert visited.page.evaluate("window.intercapViewer") is None
 
 
-def test_any_artefact_from_the_body_fit_on_is_enough(
-    capture: fitted.Capture, tmp_path: Path
-) -> None:
+def test_the_viewer_needs_only_the_body_fit(capture: fitted.Capture, tmp_path: Path) -> None:
     found = gather(capture.inputs("frames", "scene", "body_fit"), capture.models)
     assert list(found.header["versions"]) == ["sequential"] and found.header["object"] == ""
     assert "clouds/person" not in found.arrays and found.header["frames"] == FRAMES

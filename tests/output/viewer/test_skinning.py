@@ -42,7 +42,7 @@ def _moving(model: BodyModel):
     )
 
 
-def test_every_vertex_is_where_the_model_has_it(model: BodyModel) -> None:
+def test_skinned_vertices_agree_with_the_model(model: BodyModel) -> None:
     params = _moving(model)
     found = skinning.skinned(model, params)
     with torch.no_grad():
@@ -53,7 +53,9 @@ def test_every_vertex_is_where_the_model_has_it(model: BodyModel) -> None:
     assert len(found.modes) < FRAMES
 
 
-def test_without_modes_it_would_not_be(model: BodyModel, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_modes_the_error_is_larger(
+    model: BodyModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(skinning, "_MOST_MODES", 0)
     found = skinning.skinned(model, _moving(model))
     assert found.error_m > 2 * skinning.CLOSE_M and found.modes.shape == (0, model.num_vertices, 3)
@@ -70,7 +72,7 @@ def test_a_body_that_stands_still_needs_no_modes(model: BodyModel) -> None:
     assert len(skinning.skinned(model, still).modes) == 0
 
 
-def test_what_is_packed_is_read_back() -> None:
+def test_payloads_are_read_back() -> None:
     random = np.random.default_rng(0)
     arrays = {
         "a": random.standard_normal((3, 2)).astype(np.float32),
@@ -86,7 +88,7 @@ def test_what_is_packed_is_read_back() -> None:
         np.testing.assert_array_equal(found[name], values)
 
 
-def test_steps_are_finer_than_the_clouds() -> None:
+def test_quantised_points_are_within_half_a_step() -> None:
     points = np.random.default_rng(1).uniform(-2, 2, (500, 3))
     steps, low, step = quantised(points)
     assert np.abs(np.array(low) + step * steps - points).max() <= step / 2 + 1e-9

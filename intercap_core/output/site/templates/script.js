@@ -1,15 +1,16 @@
 "use strict";
+/* Sorting of tables by a click on a column's head. */
 for (const table of document.querySelectorAll("table.sortable")) {
   const heads = [...table.tHead.rows[0].cells];
   heads.forEach((head, column) => {
-    const words = column === 0 || head.classList.contains("left");
+    const isText = column === 0 || head.classList.contains("left");
     const button = document.createElement("button");
     button.type = "button";
     button.append(...head.childNodes);
     head.append(button);
     button.addEventListener("click", () => {
       const now = head.getAttribute("aria-sort");
-      const up = now ? now === "descending" : words; // numbers begin with the largest
+      const up = now ? now === "descending" : isText; // numbers are first sorted in descending order
       heads.forEach((other) => other.removeAttribute("aria-sort"));
       head.setAttribute("aria-sort", up ? "ascending" : "descending");
       const body = table.tBodies[0];
@@ -17,15 +18,16 @@ for (const table of document.querySelectorAll("table.sortable")) {
       const rows = [...body.rows];
       rows.sort((a, b) => {
         const [x, y] = [key(a), key(b)];
-        if (words) return (up ? 1 : -1) * x.localeCompare(y, "en", { numeric: true });
+        if (isText) return (up ? 1 : -1) * x.localeCompare(y, "en", { numeric: true });
         const [p, q] = [parseFloat(x), parseFloat(y)];
-        if (Number.isNaN(p) || Number.isNaN(q)) return Number.isNaN(p) - Number.isNaN(q); // last
+        if (Number.isNaN(p) || Number.isNaN(q)) return Number.isNaN(p) - Number.isNaN(q); // missing values last
         return up ? p - q : q - p;
       });
       body.append(...rows);
     });
   });
 }
+/* Filters of the table of sequences. */
 for (const form of document.querySelectorAll("form.filters")) {
   const rows = [...document.getElementById(form.dataset.filters).tBodies[0].rows];
   const fields = [...form.querySelectorAll("[data-column]")];
@@ -34,9 +36,9 @@ for (const form of document.querySelectorAll("form.filters")) {
     let shown = 0;
     for (const row of rows) {
       const kept = fields.every((field) => {
-        const has = row.dataset[field.dataset.column].toLowerCase();
-        const wanted = field.value.trim().toLowerCase();
-        return !wanted || (field.type === "search" ? has.includes(wanted) : has === wanted);
+        const value = row.dataset[field.dataset.column].toLowerCase();
+        const pattern = field.value.trim().toLowerCase();
+        return !pattern || (field.type === "search" ? value.includes(pattern) : value === pattern);
       });
       row.hidden = !kept || (flagged.checked && !(parseFloat(row.dataset.flagged) > 0));
       shown += row.hidden ? 0 : 1;
@@ -48,8 +50,8 @@ for (const form of document.querySelectorAll("form.filters")) {
   update();
 }
 
-/* What scrolls can be reached by the keyboard; what does not is no stop on its way. */
-const watched = new ResizeObserver((entries) => {
+/* Only areas that scroll can be reached by the keyboard. */
+const observer = new ResizeObserver((entries) => {
   for (const { target } of entries) {
     const area = target.closest(".scroll");
     const more = area.scrollWidth > area.clientWidth || area.scrollHeight > area.clientHeight;
@@ -58,10 +60,11 @@ const watched = new ResizeObserver((entries) => {
   }
 });
 for (const area of document.querySelectorAll(".scroll")) {
-  watched.observe(area);
-  watched.observe(area.firstElementChild);
+  observer.observe(area);
+  observer.observe(area.firstElementChild);
 }
 
+/* Enlargement of pictures. */
 const dialog = document.querySelector("dialog");
 const large = dialog.querySelector("img");
 const enlarge = (image) => {
@@ -69,7 +72,7 @@ const enlarge = (image) => {
   large.alt = image.alt;
   dialog.querySelector("p").textContent = image.alt;
   dialog.showModal();
-  // as large as the window, and no smaller than the picture; wider pictures are scrolled
+  // fit the window, but do not shrink the picture; larger pictures are scrolled
   const room = [dialog.clientWidth - 8, dialog.clientHeight - 48];
   const [wide, tall] = [Number(image.getAttribute("width")), Number(image.getAttribute("height"))];
   const scale = Math.max(1, Math.min(room[0] / wide, room[1] / tall));

@@ -1,6 +1,6 @@
 "use strict";
-/* A sequence in 4D: body, object, clouds, cameras and contact over time, in the element with class
- * "viewer". Called with the payload that intercap_core/output/viewer/package.py writes. */
+/* Show a sequence in 4D (body, object, point clouds, cameras, contact) in the element with class "viewer".
+ * `payload` is the result of `payload` in intercap_core/output/viewer/page.py. */
 async function showInterCap(payload) {
   const root = document.querySelector(".viewer");
   const find = (name) => root.querySelector(`[data-part="${name}"]`);
@@ -13,7 +13,7 @@ async function showInterCap(payload) {
   try {
     data = await unpack(payload);
   } catch (error) {
-    say(`The sequence's data cannot be read by this browser: ${error.message}`);
+    say(`This browser cannot read the data of the sequence: ${error.message}`);
     return;
   }
   const { header, arrays } = data;
@@ -22,7 +22,7 @@ async function showInterCap(payload) {
   try {
     renderer = new THREE.WebGLRenderer({ canvas: find("canvas"), antialias: true });
   } catch {
-    say("This browser shows no 3D (WebGL is switched off or missing).");
+    say("This browser cannot draw in 3D (WebGL is disabled or missing).");
     return;
   }
   renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
@@ -35,7 +35,7 @@ async function showInterCap(payload) {
   const sun = new THREE.DirectionalLight(0xffffff, 1.6);
   scene.add(sun);
   const floor = new THREE.GridHelper(6, 12, 0x8a919c, 0xb9bec6);
-  floor.rotation.x = Math.PI / 2; // three's grid lies across y, the floor across z
+  floor.rotation.x = Math.PI / 2; // the grid of three.js is normal to y, the floor to z
   scene.add(floor);
   const eye = new THREE.PerspectiveCamera(40, 1, 0.05, 60);
   eye.up.set(0, 0, 1);
@@ -45,7 +45,7 @@ async function showInterCap(payload) {
   // ------------------------------------------------------------------ bodies and objects
   const COLOURS = { joint: [0.42, 0.66, 0.92], sequential: [0.66, 0.6, 0.78], truth: [0.45, 0.74, 0.5] };
   const TOUCHING = [0.86, 0.2, 0.26];
-  const STATED = [[0.97, 0.84, 0.62], [0.93, 0.5, 0.06]]; // likelier than not, and certain
+  const STATED = [[0.97, 0.84, 0.62], [0.93, 0.5, 0.06]]; // colours of probabilities 0.5 and 1
   const names = Object.keys(header.versions);
   const versions = {};
   for (const name of names) {
@@ -124,7 +124,7 @@ async function showInterCap(payload) {
     return { ...camera, pose, plane, place, index: c };
   });
   scene.add(frusta, planes);
-  let through = -1; // the camera that is looked through
+  let through = -1; // camera whose view is shown, -1 = free view
   const showImage = (camera, moment) => {
     const starts = arrays["images/starts"];
     const place = moment * cameras.length + camera.index;
@@ -136,10 +136,10 @@ async function showInterCap(payload) {
     const url = URL.createObjectURL(
       new Blob([arrays["images/data"].subarray(first, last)], { type: "image/jpeg" }));
     const image = new Image();
-    const wanted = (camera.wanted = Symbol("image"));
+    const request = (camera.request = Symbol("image"));
     image.onload = () => {
       URL.revokeObjectURL(url);
-      if (camera.wanted !== wanted) return; // a later moment was asked for meanwhile
+      if (camera.request !== request) return; // a later request replaced this one
       const texture = new THREE.Texture(image);
       texture.colorSpace = THREE.SRGBColorSpace;
       texture.needsUpdate = true;
@@ -177,7 +177,7 @@ async function showInterCap(payload) {
   }
   if (header.object) {
     addLayer("object", header.object, true, (on) => {
-      for (const version of Object.values(versions)) if (version.object) version.object.wanted = on;
+      for (const version of Object.values(versions)) if (version.object) version.object.shown = on;
     });
   }
   if (arrays["contact/touching"] || arrays["contact/probability"]) {
@@ -209,7 +209,7 @@ async function showInterCap(payload) {
     if (!state.playing) return;
     state.playing = false;
     find("play").textContent = "Play";
-    tellMoment();
+    updateAddress();
   };
   const tick = (now) => {
     if (!state.playing) return;
@@ -241,14 +241,14 @@ async function showInterCap(payload) {
     event.preventDefault();
   });
 
-  // ------------------------------------------------------------------ what is shown
+  // ------------------------------------------------------------------ drawing
   const moments = header.moments;
   const momentOf = (frame) => moments.reduce(
     (best, at, i) => (Math.abs(at - frame) < Math.abs(moments[best] - frame) ? i : best), 0);
   const reasons = new Map(header.flags);
   let moment = -1;
-  const show = (wanted, again = false) => {
-    const frame = Math.max(0, Math.min(header.frames - 1, Math.round(wanted)));
+  const show = (number, redraw = false) => {
+    const frame = Math.max(0, Math.min(header.frames - 1, Math.round(number)));
     state.frame = frame;
     for (const [name, version] of Object.entries(versions)) {
       if (!version.group.visible) continue;
@@ -257,7 +257,7 @@ async function showInterCap(payload) {
       version.object?.pose(frame);
     }
     const now = momentOf(frame);
-    if (again || now !== moment) {
+    if (redraw || now !== moment) {
       moment = now;
       if (clouds.visible) for (const part of cloudParts) part(now);
       for (const camera of cameras) {
@@ -270,7 +270,7 @@ async function showInterCap(payload) {
     find("time").textContent = `${(frame / header.fps).toFixed(2)} s, frame ${frame}`;
     find("flag").textContent = why ? `flagged: ${why}` : "";
     root.dataset.frame = frame;
-    if (!state.playing) tellMoment();
+    if (!state.playing) updateAddress();
     draw();
   };
   const paintContact = (version, frame) => {
@@ -301,7 +301,7 @@ async function showInterCap(payload) {
       const camera = cameras[through];
       const tall = (2 * Math.atan(camera.size[1] / 2 / camera.focal[1]) * 180) / Math.PI;
       const wide = camera.size[0] / camera.size[1];
-      // the whole image fits, whatever the canvas' shape
+      // the whole image fits into the canvas
       eye.fov = eye.aspect >= wide ? tall
         : (2 * Math.atan((Math.tan((tall * Math.PI) / 360) * wide) / eye.aspect) * 180) / Math.PI;
     }
@@ -325,18 +325,18 @@ async function showInterCap(payload) {
       eye.position.setFromMatrixPosition(pose);
       eye.up.copy(y.negate());
       eye.lookAt(eye.position.clone().add(z));
-      place(12); // behind the scene
+      place(12); // the image is behind the scene
     }
     show(state.frame, true);
   };
   const overview = () => {
     const version = versions[names[0]];
     const middle = version.centre(state.frame);
-    const ahead = version.facing(state.frame); // from the front, a little from the side and above
+    const ahead = version.facing(state.frame); // the viewer is in front of the body, slightly to the side and above
     const aside = new THREE.Vector3(-ahead.y, ahead.x, 0);
     controls.target.copy(middle);
     const { clientWidth: width, clientHeight: height } = renderer.domElement;
-    const far = Math.max(1, (1.1 * height) / Math.max(width, 1)); // a narrow canvas shows all too
+    const far = Math.max(1, (1.1 * height) / Math.max(width, 1)); // a narrow canvas needs a larger distance
     eye.position.copy(middle).addScaledVector(ahead, 2.6 * far).addScaledVector(aside, 1.3 * far);
     eye.position.z += 0.7 * far;
     controls.update();
@@ -358,22 +358,22 @@ async function showInterCap(payload) {
   new ResizeObserver(draw).observe(renderer.domElement);
 
   // ------------------------------------------------------------------ #t=3.2
-  const asked = () => /(?:^#|&)t=([0-9.]+)/.exec(location.hash)?.[1];
-  const tellMoment = () => {
+  const timeInAddress = () => /(?:^#|&)t=([0-9.]+)/.exec(location.hash)?.[1];
+  const updateAddress = () => {
     const hash = `#t=${(state.frame / header.fps).toFixed(2)}`;
-    if (asked() !== undefined || state.touched) history.replaceState(null, "", hash);
+    if (timeInAddress() !== undefined || state.touched) history.replaceState(null, "", hash);
     state.touched = true;
   };
-  const obey = () => {
-    const seconds = Number(asked());
-    if (asked() !== undefined && Number.isFinite(seconds)) {
+  const followAddress = () => {
+    const seconds = Number(timeInAddress());
+    if (timeInAddress() !== undefined && Number.isFinite(seconds)) {
       pause();
       show(seconds * header.fps);
     }
   };
-  window.addEventListener("hashchange", obey);
+  window.addEventListener("hashchange", followAddress);
 
-  const first = Number(asked() ?? 0) * header.fps;
+  const first = Number(timeInAddress() ?? 0) * header.fps;
   show(Number.isFinite(first) ? first : 0);
   overview();
   draw();
@@ -381,7 +381,7 @@ async function showInterCap(payload) {
   root.dataset.loadedMs = Math.round(performance.now());
   root.dataset.ready = "yes";
 
-  // What a test, or a curious user at the console, may ask and do.
+  // Interface for tests and the browser's console
   window.intercapViewer = { header, show, look, play, pause, state, versions, cameras, eye, draw };
 }
 
@@ -422,7 +422,7 @@ function centreOf(mesh) {
   };
 }
 
-/* Linear blend skinning with corrective modes, as intercap_core/output/viewer/skinning.py writes them. */
+/* Linear blend skinning with modes of the residual, see intercap_core/output/viewer/skinning.py. */
 function skinnedBody(name, header, arrays) {
   const COLOUR = { joint: [0.42, 0.66, 0.92], sequential: [0.66, 0.6, 0.78] }[name];
   const [rest, joints, weights, transforms, modes, amounts] = [
@@ -465,7 +465,7 @@ function skinnedBody(name, header, arrays) {
     mesh.geometry.computeVertexNormals();
   };
   pose(0);
-  const facing = (frame) => { // the pelvis looks along its z axis
+  const facing = (frame) => { // the z axis of the pelvis points forward
     const m = frame * skeleton;
     const ahead = new THREE.Vector3(transforms[m + 2], transforms[m + 6], 0);
     return ahead.length() > 0.1 ? ahead.normalize() : new THREE.Vector3(0, -1, 0);
@@ -473,13 +473,13 @@ function skinnedBody(name, header, arrays) {
   return { mesh, pose, facing, centre: centreOf(mesh) };
 }
 
-/* The true body has no skeleton: its places at some moments, each as steps beyond the one before. */
+/* The true body has no skeleton: vertices in some frames, stored as differences to the previous frame. */
 function trueBody(header, arrays) {
   const { moments, low, step } = header.truth;
   const moved = arrays["truth/vertices"];
   const size = moved.length / moments.length;
   const steps = new Uint16Array(moved);
-  for (let i = size; i < steps.length; i += 1) steps[i] += steps[i - size]; // wraps around, as it was written
+  for (let i = size; i < steps.length; i += 1) steps[i] += steps[i - size]; // uint16 arithmetic wraps around
   const mesh = meshOf(size / 3, arrays.faces, [0.45, 0.74, 0.5]);
   const place = mesh.geometry.attributes.position;
   const pose = (frame) => {
@@ -494,10 +494,10 @@ function trueBody(header, arrays) {
 
 function objectOf(name, header, arrays) {
   const poses = arrays[`${name}/object`];
-  const own = name === "truth" ? "truth/object_" : "object/";
-  const vertices = arrays[`${own}vertices`];
+  const prefix = name === "truth" ? "truth/object_" : "object/";
+  const vertices = arrays[`${prefix}vertices`];
   if (!poses || !vertices) return null;
-  const mesh = meshOf(vertices.length / 3, arrays[`${own}faces`], [0.45, 0.74, 0.5]);
+  const mesh = meshOf(vertices.length / 3, arrays[`${prefix}faces`], [0.45, 0.74, 0.5]);
   mesh.geometry.attributes.position.array.set(vertices);
   const painted = name === "truth" ? null : arrays["object/colours"];
   if (painted && name === "joint") {
@@ -509,17 +509,17 @@ function objectOf(name, header, arrays) {
   }
   mesh.geometry.computeVertexNormals();
   mesh.matrixAutoUpdate = false;
-  const object = { mesh, wanted: true };
+  const object = { mesh, shown: true };
   object.pose = (frame) => {
     const m = poses.subarray(12 * frame, 12 * frame + 12);
-    mesh.visible = object.wanted && Number.isFinite(m[0]);
+    mesh.visible = object.shown && Number.isFinite(m[0]);
     if (mesh.visible) mesh.matrix.set(...m, 0, 0, 0, 1);
     mesh.matrixWorldNeedsUpdate = true;
   };
   return object;
 }
 
-/* Under the slider: red where a frame is flagged, blue where the body touches the object. */
+/* Marks under the slider: flagged frames are red, contact is blue. */
 function paintMarks(canvas, header, arrays) {
   canvas.width = header.frames;
   canvas.height = 2;
