@@ -179,7 +179,9 @@ def readme(
         "meshes": _MESHES,
     }
     if mesh is None:
-        parts |= {n: _OMITTED.format(name=n, content=held) for n, held in _NEED_OBJECT.items()}
+        parts |= {
+            n: _OMITTED.format(name=n, content=content) for n, content in _NEED_OBJECT.items()
+        }
     text = _HEAD + _stated_errors(about.verdict.stated) + "".join(parts[name] for name in formats)
     for old, new in _WITHOUT_OBJECT.items() if mesh is None else ():
         text = text.replace(old, new)

@@ -100,14 +100,14 @@ def _timeline(states: list[str], cloud_mm: np.ndarray, keypoint_px: np.ndarray, 
     label = ", ".join(counts) or "no doubtful frame"
     if np.isfinite(cloud_mm).any():
         label += f" · points {np.nanmedian(cloud_mm):.1f} mm off"
-    rows = [charts.Row("fit", charts.state_runs(states, FIT_STATES), label)]
+    rows = [charts.TimelineRow("fit", charts.state_runs(states, FIT_STATES), label)]
     for camera, pixels in zip(rig, keypoint_px.T, strict=True):
         visible = np.isfinite(pixels)
         good = pixels <= GOOD_PX * camera.colour.height / 1080
         views = np.where(visible, np.where(good, "agrees", "partly"), "nothing").tolist()
         label = f"{100 * visible.mean():.0f} % visible"
         label += f" · {np.median(pixels[visible]):.1f} px" if visible.any() else ""
-        rows.append(charts.Row(camera.name, charts.state_runs(views, VIEW_STATES), label))
+        rows.append(charts.TimelineRow(camera.name, charts.state_runs(views, VIEW_STATES), label))
     return charts.timeline(rows, len(states))
 
 

@@ -271,7 +271,7 @@ def _timeline(facts: CaptureFacts) -> str:
             at = f"{first}" if first == last else f"{first}–{last}"
             late = f", {frames} {_frames(int(frames))} before" if frames else ""
             runs.append((first, last, f"state {state}", f"{at}: {_WORDS[state]}{late}"))
-        rows.append(charts.Row(camera.name, runs, _row_label(camera)))
+        rows.append(charts.TimelineRow(camera.name, runs, _row_label(camera)))
     marks = [(t, f"{count} {_sets(count)} without any image") for t, count in facts.gaps]
     return charts.timeline(rows, len(facts.times), marks)
 

@@ -98,7 +98,7 @@ def _legend(names: Sequence[str]) -> list[tuple[float, int]]:
 
 
 @dataclass(frozen=True, eq=False)
-class Row:
+class TimelineRow:
     """A row of a timeline."""
 
     name: str
@@ -110,7 +110,7 @@ class Row:
     """(T,) in 0..1: the row is filled to these levels, and the runs are invisible."""
 
 
-def timeline(rows: Sequence[Row], total: int, marks: Sequence[tuple[int, str]] = ()) -> str:
+def timeline(rows: Sequence[TimelineRow], total: int, marks: Sequence[tuple[int, str]] = ()) -> str:
     """Draw rows of runs over ``total`` frames.
 
     Args:
@@ -163,7 +163,7 @@ def _steps(levels: np.ndarray) -> list[tuple[int, float]]:
 
 
 def state_runs(states: Sequence[str], words: Mapping[str, str]) -> list[tuple[int, int, str, str]]:
-    """Return runs of equal states for a :class:`Row`; ``words`` has the tooltip of each state."""
+    """Return the runs of a :class:`TimelineRow`; ``words`` has the tooltip of each state."""
     return [
         (a, b, f"state {state}", f"{a}–{b}: {words[state]}" if b > a else f"{a}: {words[state]}")
         for a, b, state in flags.ranges(states)

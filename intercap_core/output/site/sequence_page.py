@@ -141,11 +141,13 @@ def _tiles(s: SequenceMetrics) -> list[dict[str, str]]:
     return [*tiles, tile("flagged", share, "%", f"{int(flagged.sum())} frames not trusted")]
 
 
-def _rows(s: SequenceMetrics, annotated: Sequence[ContactInterval] | None) -> list[charts.Row]:
+def _rows(
+    s: SequenceMetrics, annotated: Sequence[ContactInterval] | None
+) -> list[charts.TimelineRow]:
     """Return rows for flags, frames in contact, and contact of each region by source."""
     reasons = flags.ranges(list(s.values["flag_reason"]))
     rows = [
-        charts.Row(
+        charts.TimelineRow(
             "flagged", [(a, b, "fill flag", f"{span(a, b)}: {why}") for a, b, why in reasons]
         )
     ]
@@ -158,14 +160,14 @@ def _rows(s: SequenceMetrics, annotated: Sequence[ContactInterval] | None) -> li
             annotated_runs.setdefault(interval.part, []).append(run)
     if not s.has_object:
         return rows
-    rows.append(charts.Row("in contact", _runs(s.values["contact_frame"])))
+    rows.append(charts.TimelineRow("in contact", _runs(s.values["contact_frame"])))
     names = list(s.values["region_names"])
     if "any" in annotated_runs:
-        rows.append(charts.Row("any, annotated", annotated_runs["any"]))
+        rows.append(charts.TimelineRow("any, annotated", annotated_runs["any"]))
     for region in METRIC_REGIONS:
         label = region.replace("_", " ")
         if region in annotated_runs:
-            rows.append(charts.Row(f"{label}, annotated", annotated_runs[region]))
+            rows.append(charts.TimelineRow(f"{label}, annotated", annotated_runs[region]))
         stated = s.values["contact_probability"][:, names.index(region)]
         touching = s.values["region_contact"][:, names.index(region)]
         if (stated >= 0.5).any() or touching.any() or region in annotated_runs:
@@ -173,9 +175,9 @@ def _rows(s: SequenceMetrics, annotated: Sequence[ContactInterval] | None) -> li
                 (a, b, "hover", f"{span(a, b)}: {100 * stated[a : b + 1].mean():.0f} %")
                 for a, b, _, _ in _runs(stated >= 0.5)
             ]
-            rows.append(charts.Row(f"{label}, stated", runs, levels=stated))
+            rows.append(charts.TimelineRow(f"{label}, stated", runs, levels=stated))
         if touching.any():
-            rows.append(charts.Row(f"{label}, meshes", _runs(touching)))
+            rows.append(charts.TimelineRow(f"{label}, meshes", _runs(touching)))
     return rows
 
 

@@ -113,22 +113,25 @@ def group_table(
     """
     rows = []
     for group in sorted({group_of[s.name] for s in sequences} - {""}):
-        own = [s for s in sequences if group_of[s.name] == group]
-        flagged, touching = figures.pooled(own, "flagged"), figures.pooled(own, "contact_frame")
+        members = [s for s in sequences if group_of[s.name] == group]
+        flagged, touching = (
+            figures.pooled(members, "flagged"),
+            figures.pooled(members, "contact_frame"),
+        )
         assert flagged is not None
         row: dict[str, object] = {
             by: group,
-            "sequences": len(own),
+            "sequences": len(members),
             "frames": len(flagged),
-            "minutes": sum(len(s) / s.fps for s in own) / 60,
+            "minutes": sum(len(s) / s.fps for s in members) / 60,
             "flagged_percent": 100 * float(flagged.mean()),
             "contact_percent": np.nan if touching is None else 100 * float(touching.mean()),
-            **_figures(own),
+            **_figures(members),
         }
-        for part, value in mean_stated(own).items():
+        for part, value in mean_stated(members).items():
             row[f"verdict.{part}_mm"] = value
-        if any(s.has_truth for s in own):
-            for name, value in figures.truth_figures(own, "joint").items():
+        if any(s.has_truth for s in members):
+            for name, value in figures.truth_figures(members, "joint").items():
                 row[f"joint.{name}"] = value
         rows.append(row)
     return pd.DataFrame(rows, columns=None if rows else [by, "sequences", "frames"])
@@ -173,16 +176,16 @@ def camera_groups(cameras: pd.DataFrame) -> pd.DataFrame:
         return pd.DataFrame(columns=["camera", "sequences", "frames", "images"])
     rows = []
     means = cameras.select_dtypes("float").columns
-    for name, own in cameras.groupby("camera", sort=True):
+    for name, entries in cameras.groupby("camera", sort=True):
         row: dict[str, object] = {
             "camera": name,
-            "sequences": len(own),
-            "frames": int(own["frames"].sum()),
-            "images": int(own["images"].sum()),
-            "with_note": int((own["note"] != "").sum()),
+            "sequences": len(entries),
+            "frames": int(entries["frames"].sum()),
+            "images": int(entries["images"].sum()),
+            "with_note": int((entries["note"] != "").sum()),
         }
         for column in means:
-            known = own[np.isfinite(own[column])]
+            known = entries[np.isfinite(entries[column])]
             weights = known["frames"]
             row[column] = np.average(known[column], weights=weights) if len(known) else np.nan
         rows.append(row)

@@ -122,7 +122,7 @@ def _timeline(track: artefacts.Artefact) -> str:
         if (n := states.count(state))
     ]
     label = " · ".join(counts) or "no doubtful frame"
-    rows = [charts.Row("track", charts.state_runs(states, TRACK_STATES), label)]
+    rows = [charts.TimelineRow("track", charts.state_runs(states, TRACK_STATES), label)]
     overlaps, depths, contours = (
         track[key].T for key in ("overlap", "depth_residual", "silhouette_residual")
     )
@@ -134,7 +134,7 @@ def _timeline(track: artefacts.Artefact) -> str:
         if used.any():
             label += f" · IoU {_median(overlaps[c]):.2f}"
             label += _median_text(1e3 * depths[c], "mm") + _median_text(contours[c], "px")
-        rows.append(charts.Row(name, charts.state_runs(views, VIEW_STATES), label))
+        rows.append(charts.TimelineRow(name, charts.state_runs(views, VIEW_STATES), label))
     marks = [(t - 1, f"{t}: found again") for t in np.flatnonzero(track["recovered"]).tolist()]
     return charts.timeline(rows, len(states), marks)
 

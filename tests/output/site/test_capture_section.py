@@ -140,7 +140,7 @@ def test_gaps_between_sets() -> None:
 
 
 def test_names_and_notes_are_escaped(made: fitted.Capture, tmp_path: Path) -> None:
-    row = charts.Row("<b>k1</b>", [(0, 1, "state recorded", "<i>")], "<u>")
+    row = charts.TimelineRow("<b>k1</b>", [(0, 1, "state recorded", "<i>")], "<u>")
     drawn = charts.timeline([row], 2, [(0, "<s>")])
     change = charts.BarPair.change("<b>", 1.0, float("nan"), "<i>", True)
     pair = charts.bar_pairs([change], "<u>")

@@ -26,7 +26,7 @@ def test_charts_are_well_formed_xml() -> None:
         [charts.Series("a < b", "c1", x, x)],
         x_label="x & y", y_label="y", x_range=(0, 2), y_range=(0, 2), marks=((1, "1"),),
     )  # fmt: skip
-    line = charts.timeline([charts.Row("flag", [(0, 3, "fill flag", 'a "b" <c>')])], 10)
+    line = charts.timeline([charts.TimelineRow("flag", [(0, 3, "fill flag", 'a "b" <c>')])], 10)
     for text in (chart, line):
         ElementTree.fromstring(text)
     points = ElementTree.fromstring(chart).find(".//polyline").get("points").split()
@@ -40,7 +40,7 @@ def test_charts_are_well_formed_xml() -> None:
 
 def test_a_band_is_filled_to_its_level_in_every_frame() -> None:
     levels = np.array([0.0, 0.9, 0.9, 0.2, np.nan])
-    row = charts.Row("hand", [(1, 2, "hover", "1–2: 90 %")], levels=levels)
+    row = charts.TimelineRow("hand", [(1, 2, "hover", "1–2: 90 %")], levels=levels)
     found = ElementTree.fromstring(charts.timeline([row], 5))
     path = found.find(".//path").get("d")
     track = found.find(".//rect[@class='track']")
