@@ -235,8 +235,8 @@ def mend_object(project: Project, name: str, hand: Hand) -> dict[str, float]:
     posed: set[int] = set()
     after = before
     for apart in APART:
-        placed = _answered(placing, errors)
-        for frame in _to_place(errors.lost & (eye.views > 0), posed | placed, apart):
+        placed = _answer_questions(placing, errors)
+        for frame in _frames_to_place(errors.lost & (eye.views > 0), posed | placed, apart):
             placing.place(frame)
             placed.add(frame)
         if not placed:
@@ -258,7 +258,7 @@ def mend_object(project: Project, name: str, hand: Hand) -> dict[str, float]:
     }
 
 
-def _answered(placing: Placing, errors: ObjectErrors) -> set[int]:
+def _answer_questions(placing: Placing, errors: ObjectErrors) -> set[int]:
     """Answer the questions about the object; returns the frames in which it was placed."""
     hand, found = placing.hand, set()
     for _ in range(12):
@@ -283,7 +283,7 @@ def _answered(placing: Placing, errors: ObjectErrors) -> set[int]:
     return found
 
 
-def _to_place(lost: np.ndarray, posed: set[int], apart: int) -> list[int]:
+def _frames_to_place(lost: np.ndarray, posed: set[int], apart: int) -> list[int]:
     """The ``lost`` frames (T,) without a pose within ``apart`` frames."""
     found: list[int] = []
     for frame in np.flatnonzero(lost).tolist():
@@ -301,7 +301,7 @@ def mend_contact(project: Project, name: str, hand: Hand) -> dict[str, float]:
     print(f"{name}: contact F1 {before:.3f}, of the fitted meshes {meshes_before:.3f}")
     edits = 0
     for part, wanted in true.items():
-        while edits <= _MAX_EDITS and not _edited(hand, part, wanted):
+        while edits <= _MAX_EDITS and not _apply_edit(hand, part, wanted):
             edits += 1
     if edits > _MAX_EDITS:
         raise UserError(f"{name}: after {edits} edits contact is still not as it is seen")
@@ -332,7 +332,7 @@ def contact_figures(project: Project, name: str) -> tuple[float, float, dict[str
     return float(stated), float(meshes), intervals
 
 
-def _edited(hand: Hand, part: str, wanted: list[Interval]) -> bool:
+def _apply_edit(hand: Hand, part: str, wanted: list[Interval]) -> bool:
     """Apply one edit to a part's intervals; True where they all match."""
     shown = _bars(hand, part)
     for one in shown:
@@ -398,14 +398,14 @@ def _drag_end(hand: Hand, part: str, one: Interval, end: str, frames: int) -> No
 
 
 @contextmanager
-def opened(settings: Path, sequence: str, cores: int) -> Iterator[Hand]:
+def open_page(settings: Path, sequence: str, cores: int) -> Iterator[Hand]:
     """The sequence's page in a browser, with a server process of its own."""
     with annotate_page.served_page(settings, sequence, cores) as found:
         found.page.wait_for_timeout(1000)
         yield Hand(found)
 
 
-def made_plain(project: Project, cores: int) -> None:
+def compute_without_annotations(project: Project, cores: int) -> None:
     """Compute the results of both recordings without annotations.
 
     Raises UserError if annotations are outside the results folder, as a user's would be.
@@ -427,17 +427,17 @@ def made_plain(project: Project, cores: int) -> None:
         raise UserError(f"{project.path}: the run without annotations failed")
 
 
-def driven(settings: Path, cores: int) -> dict[str, float]:
+def measure_sessions(settings: Path, cores: int) -> dict[str, float]:
     """Figures of both sessions and of the page; figures of a failed session are omitted."""
     from playwright.sync_api import Error
 
     project = load_project(settings)
-    made_plain(project, cores)
+    compute_without_annotations(project, cores)
     found: dict[str, float] = {}
     actions, seconds, whole = 0, 0.0, True
     for name, mend in ((OBJECT, mend_object), (CONTACT, mend_contact)):
         try:
-            with opened(settings, name, cores) as hand:
+            with open_page(settings, name, cores) as hand:
                 found |= mend(project, name, hand)
                 actions, seconds = actions + hand.actions, seconds + hand.seconds
         except (UserError, TimeoutError, Error) as error:
@@ -461,7 +461,7 @@ def main() -> None:
     parser.add_argument("--cores", type=int, default=0, help="of runs; 0 = all")
     options = parser.parse_args()
     with exit_on_user_error():
-        found = driven(options.settings, options.cores)
+        found = measure_sessions(options.settings, options.cores)
         replace_figures(options.output, found, ("annotate.",))
     for name, value in found.items():
         print(f"{name}: {value:.4g}")

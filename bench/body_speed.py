@@ -64,7 +64,7 @@ class Run:
         return float(self.pve.mean())
 
 
-def ours(clip: BodyClip) -> Run:
+def fit_clip(clip: BodyClip) -> Run:
     """Fit all frames of the clip as the stage does."""
     begin = time.perf_counter()
     fit = Fitter(clip.model, clip.seen, clip.clouds, clip.settings).run()
@@ -75,13 +75,13 @@ def ours(clip: BodyClip) -> Run:
     return Run(seconds / len(clip), clip.errors(vectors.to(clip.model.device), fit.frames))
 
 
-def one_by_one(clip: BodyClip) -> Run:
+def fit_frames_separately(clip: BodyClip) -> Run:
     """Fit every frame separately."""
-    runs = [ours(clip.part(slice(t, t + 1))) for t in range(len(clip))]
+    runs = [fit_clip(clip.part(slice(t, t + 1))) for t in range(len(clip))]
     return Run(float(np.mean([r.seconds for r in runs])), np.concatenate([r.pve for r in runs]))
 
 
-def placed(clip: BodyClip) -> Tensor:
+def initial_bodies(clip: BodyClip) -> Tensor:
     """Initial bodies (T, P) of both methods: the rest pose aligned to the triangulated trunk."""
     model, rest = clip.model, clip.model.zeros()
     keypoints = model.keypoints_of(rest)[0].double().cpu().numpy()
@@ -93,12 +93,12 @@ def placed(clip: BodyClip) -> Tensor:
     return vectors
 
 
-def paper(clip: BodyClip) -> tuple[list[FrameFit], list[FrameFit]]:
+def run_recipe(clip: BodyClip) -> tuple[list[FrameFit], list[FrameFit]]:
     """Fits of the first frames by all stages, and of all frames but the first by the last stage.
 
     Every frame but the first starts from the frame before it.
     """
-    start = placed(clip)[0]
+    start = initial_bodies(clip)[0]
     whole: list[FrameFit] = []
     short: list[FrameFit] = []
     for t in track(range(len(clip)), "the paper's recipe"):
@@ -112,14 +112,16 @@ def paper(clip: BodyClip) -> tuple[list[FrameFit], list[FrameFit]]:
     return whole, short
 
 
-def finished(clip: BodyClip, fits: list[FrameFit], first: int) -> Run:
+def end_of_fits(clip: BodyClip, fits: list[FrameFit], first: int) -> Run:
     """Errors and times at the end of the fits of frames ``first``, ``first + 1``, ..."""
     frames = np.arange(first, first + len(fits))
     seconds = float(np.mean([fit.seconds[-1] for fit in fits]))
     return Run(seconds, clip.errors(torch.stack([fit.end for fit in fits]), frames))
 
 
-def until(clip: BodyClip, fits: list[FrameFit], first: int, wanted: np.ndarray) -> tuple[Run, bool]:
+def first_reaching(
+    clip: BodyClip, fits: list[FrameFit], first: int, wanted: np.ndarray
+) -> tuple[Run, bool]:
     """Errors and times where the fits first reach ``wanted`` (N,), else near their smallest.
 
     The second value tells whether every frame reached its wanted error.
@@ -145,15 +147,15 @@ def measure(settings: Path, output: Path, frames: int) -> None:
     first = max((len(recording) - frames) // 2, 0)
     at = slice(first, first + frames)
     clip = recording.part(at)
-    ours(clip.part(slice(0, 2)))  # imports and warms up
+    fit_clip(clip.part(slice(0, 2)))  # imports and warms up
 
-    all_at_once = ours(recording)
-    together, alone = ours(clip), one_by_one(clip)
-    whole, short = paper(clip)
-    again = ours(recording)  # before and after, to average out other load
+    all_at_once = fit_clip(recording)
+    together, alone = fit_clip(clip), fit_frames_separately(clip)
+    whole, short = run_recipe(clip)
+    again = fit_clip(recording)  # before and after, to average out other load
     fit = Run((all_at_once.seconds + again.seconds) / 2, all_at_once.pve[at])
-    recipe, quick = finished(clip, whole, 0), finished(clip, short, 1)
-    reached, is_as_good = until(clip, short, 1, fit.pve)
+    recipe, quick = end_of_fits(clip, whole, 0), end_of_fits(clip, short, 1)
+    reached, is_as_good = first_reaching(clip, short, 1, fit.pve)
     figures = {
         "fps": 1 / fit.seconds,
         "fps_frames_together": 1 / together.seconds,
@@ -178,8 +180,8 @@ def measure(settings: Path, output: Path, frames: int) -> None:
     }
     if torch.cuda.is_available():
         on_gpu = recording.on(torch.device("cuda"))
-        ours(on_gpu)
-        figures["gpu_fps"] = 1 / ours(on_gpu).seconds
+        fit_clip(on_gpu)
+        figures["gpu_fps"] = 1 / fit_clip(on_gpu).seconds
     add_figures(output, "body", figures)
     rows = {
         f"ours, {len(recording)} frames at once": fit,

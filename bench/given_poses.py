@@ -67,7 +67,7 @@ def compare(
         for count in (0, *counts):
             frames = spread_over(before.lost, count)
             poses = poses_from_truth(project, name, frames, seed)
-            errors, carried, lost = tracked(project, name, poses)
+            errors, carried, lost = track(project, name, poses)
             own = figures(errors, before.lost) | {
                 "carried_share": float(carried.mean()),
                 "said_lost_share": float(lost.mean()),
@@ -124,7 +124,7 @@ def poses_from_truth(
     return found
 
 
-def tracked(
+def track(
     project: Project, name: str, poses: Sequence[ObjectPose]
 ) -> tuple[ObjectErrors, np.ndarray, np.ndarray]:
     """Errors of the track with these poses, and its masks (T,) of bridged and lost frames."""

@@ -37,7 +37,7 @@ from intercap_core.stage_list import STAGES
 LONG = (300, 1000)  # frames
 
 
-def ours(project: Project, sequence: str) -> tuple[float, State]:
+def run_stage(project: Project, sequence: str) -> tuple[float, State]:
     """Run the whole stage; returns its seconds and its result."""
     inputs = {name: project.artefact(sequence, name) for name in STAGES["joint"].reads}
     with tempfile.TemporaryDirectory(dir=project.results) as folder:
@@ -53,13 +53,13 @@ def measure(settings: Path, output: Path, steps: int) -> None:
     project = load_project(settings)
     sequence = next(iter(project.sequences))
     clip = JointClip.load(project, sequence)
-    ours(project, sequence)  # imports and warms up
+    run_stage(project, sequence)  # imports and warms up
     energy = Energy(clip)
     refine(energy, len(clip), 1)
 
-    first, state = ours(project, sequence)
+    first, state = run_stage(project, sequence)
     recipe = refine(energy, len(clip), steps)
-    again, _ = ours(project, sequence)  # before and after, to average out other load
+    again, _ = run_stage(project, sequence)  # before and after, to average out other load
     seconds = (first + again) / 2
     found = [clip.errors(one) for one in recipe.states]
     start, end, reached = clip.errors(clip.start), found[-1], clip.errors(state)

@@ -113,7 +113,7 @@ def _given(start: np.ndarray) -> GivenPose:
     return GivenPose(0, start, 0.01, np.radians(5.0))
 
 
-def whole_track(clip: ObjectClip, start: np.ndarray | None, repeats: int = REPEATS) -> Run:
+def run_tracker(clip: ObjectClip, start: np.ndarray | None, repeats: int = REPEATS) -> Run:
     """Run the whole stage; without ``start`` it searches the first pose."""
     seconds, poses = [], np.zeros(0)
     for _ in range(repeats if start is not None else 1):
@@ -125,7 +125,7 @@ def whole_track(clip: ObjectClip, start: np.ndarray | None, repeats: int = REPEA
     return Run.of(clip, poses, statistics.median(seconds))
 
 
-def one_pass(clip: ObjectClip, start: np.ndarray) -> Run:
+def run_single_pass(clip: ObjectClip, start: np.ndarray) -> Run:
     """Fit each frame once in order, as the paper does, without the stage's other steps."""
     seconds, poses = [], np.zeros(0)
     for _ in range(REPEATS):
@@ -143,19 +143,19 @@ def one_pass(clip: ObjectClip, start: np.ndarray) -> Run:
     return Run.of(clip, poses, statistics.median(seconds))
 
 
-def paper(clip: ObjectClip, start: np.ndarray, recipe: Recipe) -> Run:
+def run_recipe(clip: ObjectClip, start: np.ndarray, recipe: Recipe) -> Run:
     """Run the baseline; each frame starts at the pose that the tracker would extrapolate."""
     begin, before, now = time.perf_counter(), start, start
     poses: list[np.ndarray] = []
     for views in clip.views:
         guess = extrapolate(before, now)
-        fit = adam(clip, views, guess, recipe, recipe.steps if poses else recipe.first_steps)
+        fit = fit_frame(clip, views, guess, recipe, recipe.steps if poses else recipe.first_steps)
         before, now = (now if poses else fit.poses[-1]), fit.poses[-1]
         poses.append(now)
     return Run.of(clip, np.array(poses), time.perf_counter() - begin)
 
 
-def adam(
+def fit_frame(
     clip: ObjectClip, views: list[View], pose: np.ndarray, recipe: Recipe, steps: int
 ) -> FrameFit:
     """The baseline's fit of one frame with the clip's mesh and settings."""
@@ -170,18 +170,18 @@ def adam(
     )
 
 
-def schedules(clip: ObjectClip, start: np.ndarray) -> list[tuple[int, Run]]:
+def run_schedules(clip: ObjectClip, start: np.ndarray) -> list[tuple[int, Run]]:
     """Run the baseline with each schedule; returns (steps per frame, result), fewest first."""
     found = []
     for steps, rates in SCHEDULES.items():
         first = steps * Recipe.first_steps // Recipe.steps
         for rate in rates:
             recipe = Recipe(first, steps, learning_rate_m=rate, learning_rate_rad=2 * rate)
-            found.append((steps, paper(clip, start, recipe)))
+            found.append((steps, run_recipe(clip, start, recipe)))
     return found
 
 
-def until(ours: Run, found: list[tuple[int, Run]]) -> tuple[int, Run, bool]:
+def shortest_as_good(ours: Run, found: list[tuple[int, Run]]) -> tuple[int, Run, bool]:
     """The shortest schedule as accurate as ours, else the shortest near the baseline's best.
 
     The last value tells whether it is as accurate as ours.
@@ -197,7 +197,7 @@ def until(ours: Run, found: list[tuple[int, Run]]) -> tuple[int, Run, bool]:
 
 def milliseconds_a_step(clip: ObjectClip, start: np.ndarray, steps: int) -> float:
     """Median duration of an Adam step in one frame."""
-    fit = adam(clip, clip.views[0], start, Recipe(), steps)
+    fit = fit_frame(clip, clip.views[0], start, Recipe(), steps)
     return 1e3 * float(np.median(np.diff(fit.seconds)[1:]))
 
 
@@ -212,14 +212,14 @@ def measure(settings: Path, output: Path, frames: int) -> None:
     warm.tracker().run([_given(start)])
     milliseconds_a_step(warm, start, 3)
 
-    ours, single = whole_track(clip, start), one_pass(clip, start)
-    found = schedules(clip, start)
-    recipe = paper(clip, start, Recipe())
+    ours, single = run_tracker(clip, start), run_single_pass(clip, start)
+    found = run_schedules(clip, start)
+    recipe = run_recipe(clip, start, Recipe())
     found.append((Recipe.steps, recipe))
-    again = whole_track(clip, start)  # before and after, to average out other load
+    again = run_tracker(clip, start)  # before and after, to average out other load
     ours = replace(ours, ms=(ours.ms + again.ms) / 2)
-    search = len(clip) * (whole_track(clip, None).ms - ours.ms)
-    steps, reached, is_as_good = until(ours, found)
+    search = len(clip) * (run_tracker(clip, None).ms - ours.ms)
+    steps, reached, is_as_good = shortest_as_good(ours, found)
     fast = milliseconds_a_step(clip, start, 50)
     figures = {
         "ms_per_frame": ours.ms,
@@ -270,7 +270,7 @@ def compare_recordings(settings: Path, frames: int) -> dict[str, tuple[Run, Run]
         clip = ObjectClip.load(project, sequence, frames)
         if clip.seen.any():
             start = clip.annotated
-            found[row.object] = (whole_track(clip, start, 1), paper(clip, start, Recipe()))
+            found[row.object] = (run_tracker(clip, start, 1), run_recipe(clip, start, Recipe()))
     return found
 
 
@@ -421,7 +421,7 @@ def _convergence_of_recipe(
     """Rows (steps, 3) as of :func:`_convergence_of_ours`."""
     found = []
     for t, start in zip(frames, starts, strict=True):
-        fit = adam(clip, clip.views[t], start, recipe, CONVERGENCE_STEPS)
+        fit = fit_frame(clip, clip.views[t], start, recipe, CONVERGENCE_STEPS)
         if len(fit.poses) == CONVERGENCE_STEPS + 1:  # something was seen
             found.append(np.stack([fit.seconds, *clip.errors(fit.poses, int(t))], 1)[1:])
     return np.median(found, axis=0)

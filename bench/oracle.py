@@ -235,7 +235,7 @@ Figures = dict[str, float]
 Found = dict[str, dict[str, SequenceMetrics]]  # by variant and sequence
 
 
-def consult(
+def compute_variants(
     settings: Path,
     sequences: Sequence[str],
     folder: Path,
@@ -255,11 +255,11 @@ def consult(
         raise UserError(f"there is no variant {strange[0]!r}; known are {', '.join(VARIANTS)}")
     given = (repeat(settings), names, repeat(folder), repeat(tuple(variants)))
     if cores == 1 or len(names) == 1:
-        every = list(map(_consult_one, *given))
+        every = list(map(_compute_sequence, *given))
     else:
         context = get_context("spawn")  # numerical libraries keep threads that a fork would lose
         with ProcessPoolExecutor(min(cores, len(names)), mp_context=context) as pool:
-            every = list(pool.map(_consult_one, *given))
+            every = list(pool.map(_compute_sequence, *given))
     return {
         variant: {
             name: SequenceMetrics.read(paths[variant])
@@ -269,7 +269,7 @@ def consult(
     }
 
 
-def _consult_one(
+def _compute_sequence(
     settings: Path, sequence: str, folder: Path, variants: Sequence[str]
 ) -> dict[str, Path]:
     """Metrics of one sequence by variant."""
@@ -281,7 +281,7 @@ def _consult_one(
         begin = time.perf_counter()
         place = folder / sequence / slug(name)
         plain = artefacts_of(project, sequence)
-        given, scene = _put_in(project, sequence, variant, place)
+        given, scene = _replace_inputs(project, sequence, variant, place)
         paths = plain | {"scene": scene}
         # Whether cameras are held is nothing to the tracker.
         key = variant.cameras, variant.biases, variant.mesh
@@ -297,7 +297,9 @@ def _consult_one(
     return found
 
 
-def _put_in(project: Project, sequence: str, variant: Variant, place: Path) -> tuple[Project, Path]:
+def _replace_inputs(
+    project: Project, sequence: str, variant: Variant, place: Path
+) -> tuple[Project, Path]:
     """The project with the variant's mesh, and the scene with its cameras."""
     row = project.sequences[sequence]
     assert row.truth is not None
@@ -430,7 +432,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     with exit_on_user_error():
         cores = options.cores or len(os.sched_getaffinity(0))
-        found = consult(
+        found = compute_variants(
             options.settings,
             options.sequences or (),
             options.folder,

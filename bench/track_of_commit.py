@@ -50,7 +50,7 @@ def errors_of(settings: Path, sequence: str, folder: Path) -> Any:
     )
 
 
-def measured(settings: list[Path], folder: Path, workers: int) -> dict[str, Any]:
+def measure_settings(settings: list[Path], folder: Path, workers: int) -> dict[str, Any]:
     """Figures by dataset, as in ``intercap evaluate``; see :func:`errors_of`."""
     from intercap_core.evaluation.object_errors import figures
     from intercap_core.project import load_project
@@ -64,8 +64,8 @@ def measured(settings: list[Path], folder: Path, workers: int) -> dict[str, Any]
     return found
 
 
-def before(commit: str, settings: list[Path], workers: int) -> dict[str, Any]:
-    """:func:`measured` with the code of ``commit``."""
+def measure_commit(commit: str, settings: list[Path], workers: int) -> dict[str, Any]:
+    """:func:`measure_settings` with the code of ``commit``."""
     with tempfile.TemporaryDirectory() as folder:
         tree = Path(folder) / "tree"
         subprocess.run(["git", "worktree", "add", "--detach", str(tree), commit], check=True)
@@ -92,12 +92,12 @@ def main() -> None:
     arguments = parser.parse_args()
     settings = [path.resolve() for path in arguments.settings]
     if arguments.made_in is not None:  # within the other commit's code
-        found = measured(settings, arguments.made_in, arguments.workers)
+        found = measure_settings(settings, arguments.made_in, arguments.workers)
         arguments.output.write_text(json.dumps(found), encoding="utf-8")
         return
-    both = {"before": before(arguments.commit, settings, arguments.workers)}
+    both = {"before": measure_commit(arguments.commit, settings, arguments.workers)}
     with tempfile.TemporaryDirectory() as folder:
-        both["now"] = measured(settings, Path(folder), arguments.workers)
+        both["now"] = measure_settings(settings, Path(folder), arguments.workers)
     _print(arguments.commit, both)
     from bench.command import add_figures
 

@@ -88,7 +88,7 @@ def fit(samples: Samples) -> Factors:
     return Factors(float(found[0]), tuple(found[1:].tolist()), spread)
 
 
-def left_out(samples: Samples) -> np.ndarray:
+def cross_validated(samples: Samples) -> np.ndarray:
     """Stated errors (N,) by factors that were fitted to recordings of other kinds."""
     stated = np.empty(len(samples.true))
     for kind in np.unique(samples.kind):
@@ -118,7 +118,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for part, samples in parts.items():
         factors, kinds = fit(samples), len(np.unique(samples.kind))
         if kinds > 1:
-            stated = left_out(samples)
+            stated = cross_validated(samples)
             off = np.exp(np.abs(np.log(stated / samples.true)))
             factors = factors._replace(spread=float(np.quantile(off, SPREAD_SHARE)))
             rank = spearmanr(stated, samples.true).statistic

@@ -133,7 +133,7 @@ def test_factors_are_found_again() -> None:
     assert factors.of == pytest.approx((2.0, 0.6, 0.0), abs=0.15)
     # four of five of a normal deviate are within 1.28 deviations
     assert factors.spread == pytest.approx(np.exp(1.28 * 0.1), rel=0.03)
-    assert np.median(np.abs(np.log(bench.left_out(samples) / true))) < 0.03
+    assert np.median(np.abs(np.log(bench.cross_validated(samples) / true))) < 0.03
 
 
 def test_file_without_verdict_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
