@@ -26,11 +26,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Column, Table
 
-from bench.again import artefacts_of, check_run, compute_once
+from bench.again import artefacts_of, check_run, compute_once, slug
 from bench.command import exit_on_user_error, figure_class
 from intercap_core import artefacts
 from intercap_core.config import JointSettings
-from intercap_core.errors import UserError
 from intercap_core.evaluation.contact import CONTACT_M
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.proximity import PosedObject
@@ -315,10 +314,7 @@ def ablate(
     """
     plain = load_project(settings)
     names = list(sequences or plain.sequences)
-    check_run(plain, names, STAGES)
-    strange = [name for name in variants if name not in VARIANTS]
-    if strange:
-        raise UserError(f"there is no variant {strange[0]!r}; known are {', '.join(VARIANTS)}")
+    check_run(plain, names, STAGES, variants, VARIANTS)
     projects = {  # all before the first is computed, so that invalid settings fail at once
         variant: load_project(settings, {"joint": VARIANTS[variant]}) for variant in variants
     }
@@ -342,11 +338,6 @@ def ablate(
         **{variant: _figures(found, sequential=False) for variant, found in paths.items()},
         SEQUENTIAL: _figures(next(iter(paths.values())), sequential=True),
     }
-
-
-def slug(variant: str) -> str:
-    """A variant's name in keys and folders."""
-    return variant.replace(" ", "_")
 
 
 def _fit(project: Project, sequence: str, folder: Path) -> dict[str, Path]:

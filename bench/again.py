@@ -14,11 +14,26 @@ from intercap_core.project import Project
 from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
 
 
-def check_run(project: Project, sequences: Sequence[str], stages: Collection[str]) -> None:
-    """Raise UserError where a sequence is unknown, has no truth, or lacks a required artefact.
+def slug(variant: str) -> str:
+    """A variant's name in keys and folders."""
+    return variant.replace(" ", "_")
 
-    Required are the artefacts that ``stages`` read and that none of them writes.
+
+def check_run(
+    project: Project,
+    sequences: Sequence[str],
+    stages: Collection[str],
+    variants: Sequence[str] = (),
+    known: Collection[str] = (),
+) -> None:
+    """Raise UserError if a sequence is unknown, has no truth, or lacks a required artefact.
+
+    Required are the artefacts that ``stages`` read and that none of them writes. Each of
+    ``variants`` must be ``known``.
     """
+    strange = [name for name in variants if name not in known]
+    if strange:
+        raise UserError(f"there is no variant {strange[0]!r}; known are {', '.join(known)}")
     settings = project.path
     unknown = [name for name in sequences if name not in project.sequences]
     if unknown:

@@ -45,7 +45,7 @@ import trimesh
 from rich.table import Column, Table
 from scipy.spatial import cKDTree
 
-from bench.again import artefacts_of, check_run, compute_once
+from bench.again import artefacts_of, check_run, compute_once, slug
 from bench.command import exit_on_user_error
 from intercap_core import artefacts
 from intercap_core.artefacts import Artefact
@@ -249,10 +249,7 @@ def compute_variants(
     """
     project = load_project(settings)
     names = list(sequences or project.sequences)
-    check_run(project, names, STAGES)
-    strange = [name for name in variants if name not in VARIANTS]
-    if strange:
-        raise UserError(f"there is no variant {strange[0]!r}; known are {', '.join(VARIANTS)}")
+    check_run(project, names, STAGES, variants, VARIANTS)
     given = (repeat(settings), names, repeat(folder), repeat(tuple(variants)))
     if cores == 1 or len(names) == 1:
         every = list(map(_compute_sequence, *given))
@@ -313,11 +310,6 @@ def _replace_inputs(
     elif variant.mesh == "open":
         entry = write_open_mesh(place / "mesh.ply", entry)
     return replace(project, objects={**project.objects, row.object: entry}), scene
-
-
-def slug(variant: str) -> str:
-    """A variant's name in keys and folders."""
-    return variant.replace(" ", "_")
 
 
 def by_variant(found: Found) -> dict[str, Figures]:
