@@ -173,12 +173,6 @@ def test_a_link_and_its_permissions_stay(tmp_path: Path) -> None:
     assert real.stat().st_mode & 0o777 == 0o640
 
 
-def test_dropping_frames_does_not_move_intervals(path: Path) -> None:
-    """A dropped frame keeps its number, so that nothing else of the annotation moves."""
-    new = _patched(path, WRITTEN, drop_frames=[0, 1, 2, 3, 4])
-    assert yaml.safe_load(new)["contact"] == yaml.safe_load(WRITTEN)["contact"]
-
-
 @pytest.mark.parametrize(
     "text",
     [

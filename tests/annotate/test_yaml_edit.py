@@ -110,15 +110,8 @@ def test_each_entry_keeps_its_own_comments(data: st.DataObject) -> None:
     for k in range(len(old)):
         for word in (f"# own{k}", f"# lead{k}"):
             assert changed.count(word) <= text.count(word), changed
-    for word in (
-        "head",
-        "key",
-        "tail",
-        "between",
-        "dark",
-        "foot",
-        *(f"loose{k}" for k in range(9)),
-    ):
+    words = ["head", "key", "tail", "between", "dark", "foot", *(f"loose{k}" for k in range(9))]
+    for word in words:
         assert text.count(f"# {word}") == changed.count(f"# {word}"), (word, changed)
     for k, entry in enumerate(old):
         if entry in new:

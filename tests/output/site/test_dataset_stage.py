@@ -97,16 +97,8 @@ def test_tables_by_object_subject_intent_and_camera(
     site: Path, captures: dict[str, fitted.Capture]
 ) -> None:
     tables = {path.stem: pd.read_csv(path) for path in (site / "tables").glob("*.csv")}
-    assert set(tables) == {
-        "sequences",
-        "frames",
-        "cameras",
-        "objects",
-        "rig",
-        "splits",
-        "subjects",
-        "intents",
-    }
+    names = "sequences frames cameras objects rig splits subjects intents"
+    assert set(tables) == set(names.split())
     assert tables["objects"]["object"].tolist() == ["cup", "football"]
     subject = tables["subjects"].iloc[0]
     assert (subject["sequences"], subject["frames"]) == (2, 8)
@@ -276,13 +268,8 @@ def test_same_input_same_bytes(
     captures: dict[str, fitted.Capture], site: Path, tmp_path: Path
 ) -> None:
     write_page(captures["s01_o03"], tmp_path, "s01_o03", "use")
-    merge(
-        write_summaries(captures, tmp_path / "summaries", INTENTS),
-        captures,
-        tmp_path,
-        "demo",
-        FAILED,
-    )
+    paths = write_summaries(captures, tmp_path / "summaries", INTENTS)
+    merge(paths, captures, tmp_path, "demo", FAILED)
     for path in sorted(p for p in tmp_path.rglob("*") if p.is_file()):
         assert (site / path.relative_to(tmp_path)).read_bytes() == path.read_bytes(), path.name
 
