@@ -22,4 +22,5 @@ Files in the order of a run:
    frames), ``given_poses`` (annotated poses) and ``smooth`` (most probable track, covariance).
 
 Poses are master_from_object, in metres. The quality of a pose is a log-likelihood ratio in nats.
+Constants that are marked as tuned were tuned on the studio's recordings.
 """

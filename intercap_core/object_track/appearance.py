@@ -22,11 +22,9 @@ from intercap_core.object_track.reduced_mask import covers
 
 COLOUR_SAMPLES = 2.0  # independent samples of a view's colours at most; tuned on the studio
 # Standard deviations of measured colours at least, in logarithms of light: shadows and lamps change
-# the brightness more than the two ratios. Tuned on the studio.
-COLOUR_MIN_SIGMA = np.array([0.25, 0.08, 0.08])
-
-# Grey levels; darker ones are noise, brighter ones are saturated. Tuned on the studio.
-LEVELS_USED = slice(10, 251)
+# the brightness more than the two ratios.
+COLOUR_MIN_SIGMA = np.array([0.25, 0.08, 0.08])  # tuned
+LEVELS_USED = slice(10, 251)  # grey levels; darker ones are noise, brighter ones saturated; tuned
 
 
 def linear(levels: np.ndarray) -> np.ndarray:

@@ -32,7 +32,7 @@ from intercap_core.object_track.motion import estimate_hand_motions, unwrap_symm
 from intercap_core.object_track.observer import Observer
 
 # Standard deviations, or distances, at which a pose is as good as lost: one frame in six would be
-# off by more. Tuned on the studio.
+# off by more.
 UNSURE_M = 0.035  # metres; tuned on the studio
 UNSURE_RAD = np.radians(15)  # radians; tuned on the studio
 

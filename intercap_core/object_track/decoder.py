@@ -21,7 +21,7 @@ from scipy.special import logsumexp
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.motion import HandMotion
 
-# "Tuned" is on the studio. Standard deviations of the motion between frames:
+# Standard deviations of the motion between frames.
 STANDING_M = 0.015  # of fits of an object at rest, metres; tuned
 STANDING_RAD = np.radians(8)  # radians; tuned
 HELD_M = 0.02  # of fits and joints in a hand, metres; tuned

@@ -20,16 +20,15 @@ from intercap_core.object_track.view_report import ViewReport
 
 # Total variance of the views' errors (common and independent) over the independent part, of shifts
 # and of turns: errors common to all views (calibration, masks that are too large) shift the object
-# rather than rotate it. Tuned on the studio.
+# rather than rotate it.
 COMMON_ERROR_VARIANCE = 4.0  # of shifts; tuned
 COMMON_TURN_VARIANCE = 1.5  # of turns; tuned
 TURN_SCALE = np.repeat([np.sqrt(COMMON_TURN_VARIANCE / COMMON_ERROR_VARIANCE), 1.0], 3)
 """(6,) factor of the standard deviations that were computed with ``COMMON_ERROR_VARIANCE``."""
-# Duration of errors of masks: frames within it are one independent observation. Tuned on the
-# studio.
-ERROR_LASTING_S = 0.3
+# Duration of errors of masks, seconds: frames within it are one independent observation.
+ERROR_LASTING_S = 0.3  # tuned
 # Standard deviations (rad, metres) of an unobserved pose: a uniform angle; a room.
-UNKNOWN_SIGMA = np.repeat([np.pi / np.sqrt(3), 1.0], 3)
+UNKNOWN_SIGMA = np.repeat([np.pi / np.sqrt(3), 1.0], 3)  # standard deviation of a uniform angle
 
 
 @dataclass(frozen=True)

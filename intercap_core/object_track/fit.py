@@ -18,9 +18,9 @@ from intercap_core.object_track.view_fit import NormalEquations, ViewFit, shots_
 from intercap_core.object_track.view_report import ViewReport, quick_report
 
 # Geman-McClure scales, first and last: from the error of a start to a few standard deviations of
-# the noise. Metres; pixels at full resolution. Tuned on the studio.
-DEPTH_SCALES_M = (0.050, 0.012)  # tuned
-CONTOUR_SCALES_PX = (30.0, 6.0)  # tuned
+# the noise.
+DEPTH_SCALES_M = (0.050, 0.012)  # metres; tuned
+CONTOUR_SCALES_PX = (30.0, 6.0)  # pixels at full resolution; tuned
 REPORT_CONTOUR_PX = 4.0 * CONTOUR_SCALES_PX[1]  # scale of the residuals in a report, pixels
 FIT_ROUNDS = (4, 5)  # Gauss-Newton steps at most after each choice of candidates; tuned
 

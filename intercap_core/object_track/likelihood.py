@@ -28,11 +28,9 @@ from intercap_core.object_track.view import FitContext, MaskCandidate, View
 
 # Thresholds of log-likelihood ratios of all views of a frame, nats.
 SEEN_LOG_RATIO = 3.0  # the images show the object; tuned
-SEARCH_GOOD_LOG_RATIO = 25.0  # good enough to stop searching the frame; tuned on the studio
+SEARCH_GOOD_LOG_RATIO = 25.0  # good enough to stop searching the frame; tuned
 CONTRADICTED_LOG_RATIO = -6.0  # the images contradict the pose; tuned
-
-# All values below are tuned on the studio.
-CONTOUR_SIGMA_PX = 2.0  # of a detector's contour, pixels at full resolution
+CONTOUR_SIGMA_PX = 2.0  # of a detector's contour, pixels at full resolution; tuned
 DEPTH_HALF_SAMPLES_PX = 120  # pixels at which depth counts half of its samples; tuned
 VIEW_SAMPLES = 4.0  # independent samples of a view's depth, or outline, at most; tuned
 LOG_MISSED = float(np.log(0.1))  # how often detectors miss an object that is fully visible; tuned

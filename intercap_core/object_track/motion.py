@@ -12,8 +12,7 @@ from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 from intercap_core.object_track.fit import MotionPrior
 
-# Standard deviation of the change of the velocity from one frame to the next; tuned on the studio,
-# as the next ones.
+# Standard deviation of the change of the velocity from one frame to the next.
 ONSET_M_S = 0.6  # m/s; tuned
 ONSET_RAD_S = np.radians(60)  # rad/s; tuned
 # Standard deviation added per second without observation.

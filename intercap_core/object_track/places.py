@@ -18,7 +18,6 @@ from intercap_core.object_track.groups import find_groups, locate_group
 from intercap_core.object_track.likelihood import SEARCH_GOOD_LOG_RATIO
 from intercap_core.object_track.view import View
 
-# All values are tuned on the studio.
 # Shares of the surveyed frames in which a place is occupied.
 ALWAYS_PRESENT = 0.85  # tuned
 SOMETIMES_PRESENT = 0.5  # tuned

@@ -21,9 +21,8 @@ SEED_SURE_LOG_RATIO = 40.0  # nats at which the search for a frame to start from
 KEY_FRAME_S = 0.2  # time between frames in which near symmetries and colours are compared; tuned
 DOUBTFUL_PROBABILITY = 0.9  # of the chosen hypothesis, below which a frame is uncertain; tuned
 # Log-likelihood ratio at which the images of a frame clearly contradict an annotated pose: two or
-# three views see past the object. An occluded frame reaches -6, and so does chance. Tuned on five
-# objects of the studio at noise 2 with two cameras.
-DENIED_LOG_RATIO = -25.0
+# three views see past the object. An occluded frame reaches -6, and so does chance.
+DENIED_LOG_RATIO = -25.0  # nats; tuned on five objects at noise 2 with two cameras of the studio
 
 log = logging.getLogger(__name__)
 

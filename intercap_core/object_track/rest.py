@@ -79,7 +79,7 @@ def _partition(
             rest.
     """
     count = len(poses)
-    moving = np.where(seen, MOVING_COST, 1.0) * share
+    moving = np.where(seen, MOVING_COST, 1.0) * share  # a frame without evidence costs 1
     best_rest, best_move = np.full(count + 1, np.inf), np.full(count + 1, np.inf)
     best_rest[0] = best_move[0] = 0.0
     began = np.zeros(count + 1, int)
@@ -94,11 +94,10 @@ def _partition(
         until = min(a + MAX_REST_FRAMES, count)
         spread = _spread(poses[a:until], information[a:until], seen[a:until])
         ends = a + 1 + np.arange(len(spread))
-        # the recording may show a part of its first and its last rest; a longer one costs no more
-        # than to move in its last frames
+        # The recording may show only a part of its first and its last rest. Such a rest costs less
+        # than a whole one; how much more a longer one costs is less than motion in these frames.
         length = ends - a
         cut = (a == 0) | (ends == count)
-        # a rest that the recording's begin or end cuts costs less, the less the shorter it is
         longer = np.maximum(length - shortest + 1, 0) * MOVING_COST * share * 0.9
         own = np.where(cut, np.minimum(5.0 + longer, REST_COST), REST_COST)
         cost = best_move[a] + own + 0.5 * weight * spread

@@ -16,12 +16,11 @@ from intercap_core.geometry.camera.transforms import apply_step, rotation_log, s
 from intercap_core.geometry.solve.robust import geman_mcclure_weight
 from intercap_core.object_track.evidence import UNKNOWN_SIGMA, FrameEvidence, steps_about_point
 
-# Standard deviation of accelerations of a carried object; a kick is an outlier. Tuned on the
-# studio.
-ACCELERATION_M_S2 = 6.0  # m/s^2; tuned
-ACCELERATION_RAD_S2 = 20.0  # rad/s^2; tuned
-IMPACT_SIGMAS = 3.0  # standard deviations of an acceleration beyond which it is an impact
-OUTLIER_SIGMAS = 5.0  # evidence this many standard deviations away counts a quarter
+# Standard deviations of accelerations of a carried object; a kick is an outlier.
+ACCELERATION_M_S2 = 6.0  # m/s^2; tuned on the studio
+ACCELERATION_RAD_S2 = 20.0  # rad/s^2; tuned on the studio
+IMPACT_SIGMAS = 3.0  # standard deviations beyond which an acceleration is an impact; tuned
+OUTLIER_SIGMAS = 5.0  # evidence this many standard deviations away counts a quarter; tuned
 BAND = 2  # nodes before to which an acceleration couples a node
 
 

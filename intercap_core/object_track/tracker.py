@@ -37,8 +37,8 @@ from intercap_core.object_track.proposals import DOUBTFUL_PROBABILITY, NotFound,
 from intercap_core.object_track.whole import FrameResult, FrameStatus, WholeTrack, flag_frames
 
 # Having left is likelier than being hidden from all cameras by this, nats of an independent
-# observation: after about two seconds. Tuned on the studio, as all values below.
-ABSENT_LOG_RATIO = 1.0
+# observation: after about two seconds.
+ABSENT_LOG_RATIO = 1.0  # nats; tuned
 AMBIGUOUS_PROBABILITY = 0.2  # of different poses, above which a frame is ambiguous; tuned
 # Nats of all believed frames, as independent observations, below which there is no object. False
 # detections reach 8; the least of real objects (a cup behind a hand without depth) is about 25.

@@ -17,10 +17,10 @@ from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 from intercap_core.geometry.solve.robust import geman_mcclure_weight
 
-SAME_POSE_M = 0.02  # metres ...; tuned on the studio
-SAME_POSE_DEG = 12.0  # ... and degrees within which poses are one hypothesis; tuned on the studio
-# Share of the surface that a turn may clearly displace to be a near symmetry; tuned on the studio.
-NEAR_TURN_CHANGED_SHARE = 0.3
+# Poses within both distances are one hypothesis.
+SAME_POSE_M = 0.02  # metres; tuned
+SAME_POSE_DEG = 12.0  # degrees; tuned
+NEAR_TURN_CHANGED_SHARE = 0.3  # of the surface that near symmetries clearly displace; tuned
 
 
 def find_near_symmetries(mesh: ObjectMesh, field: DistanceField) -> np.ndarray:

@@ -34,13 +34,13 @@ from intercap_core.object_track.view_report import (
 )
 
 # The lambdas of equation 1. Pixels of a view err together, so each term of a view counts as this
-# many independent samples; tuned on the studio.
+# many independent samples.
 DEPTH_SAMPLES = 4.0  # tuned
 CONTOUR_SAMPLES = 3.0  # tuned
 # Standard deviation of one view's depth: systematic error and calibration, not pixel noise. Azure
 # Kinect's data sheet states a systematic error below 11 mm + 0.1 % of the distance; half of that
 # bound is a guess of its standard deviation.
-DEPTH_SIGMA_M = 0.005
+DEPTH_SIGMA_M = 0.005  # metres; data sheet
 GATE_SCALES = 2.5  # robust scales; matches beyond weigh below 2 % and are left out (tuned)
 
 NormalEquations = tuple[np.ndarray, np.ndarray]

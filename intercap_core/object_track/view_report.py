@@ -16,12 +16,11 @@ from intercap_core.object_track.likelihood import log_ratio
 from intercap_core.object_track.reduced_mask import EMPTY, ReducedMask, covers
 from intercap_core.object_track.view import FitContext, MaskCandidate, View
 
-# Tuned on the studio.
-MIN_RENDERED_PX = 12  # renderings with fewer pixels are not compared
+MIN_RENDERED_PX = 12  # renderings with fewer pixels are not compared; tuned
 # Depth this much behind (nearer than) the render is background (an occluder): above the sensor's
 # systematic error and that of the pose.
 FREE_SPACE_M = 0.03  # metres; tuned
-AGREEMENT_SCALE_M = 0.010  # a pixel this far off agrees by half: Azure Kinect's systematic error
+AGREEMENT_SCALE_M = 0.010  # a pixel this far off agrees by half (Azure Kinect's data sheet)
 ASSESS_MIN_OVERLAP = 0.1  # smallest IoU of a candidate to compare an unfitted pose with; tuned
 
 
