@@ -30,7 +30,7 @@ from snakemake_interface_executor_plugins.executors.base import SubmittedJobInfo
 from snakemake_interface_executor_plugins.jobs import JobExecutorInterface
 
 from .endings import Ending, endings
-from .ledger import Entry, Ledger, by_outputs, run_name
+from .ledger import JobEntry, Ledger, by_outputs, run_name
 from .slurm import HELD, LIVE, cancel, states, wait_for_controller
 
 MAX_POLL_INTERVAL_S = 20.0
@@ -51,10 +51,10 @@ class Executor(SlurmExecutor):
     def __init__(self, workflow: Any, logger: Any) -> None:
         # Set before the base class starts to poll jobs.
         self._ledger = Ledger(Path(".snakemake") / "slurm_jobs")
-        self._left: dict[tuple[str, ...], Entry] | None = None
+        self._left: dict[tuple[str, ...], JobEntry] | None = None
         self._adoption_lock = threading.Lock()
         self._ending = threading.Event()
-        self._entries: dict[JobExecutorInterface, Entry] = {}
+        self._entries: dict[JobExecutorInterface, JobEntry] = {}
         self._not_reached: set[JobExecutorInterface] = set()
         self._polled: list[SubmittedJobInfo] = []
         self._over: set[int] = set()
@@ -89,7 +89,7 @@ class Executor(SlurmExecutor):
         wait_for_controller(self.logger, self._ending)
         if self._ending.is_set():
             return
-        entry = Entry.of(job)
+        entry = JobEntry.of(job)
         left = self._jobs_of_earlier_runs().pop(entry.outputs, None)
         if left is not None and left.digest == entry.digest:
             self.logger.info(f"{_computes(left)}; waiting for it.")
@@ -114,7 +114,7 @@ class Executor(SlurmExecutor):
         else:
             super()._report_job_error_threadsafe(job_info, msg)
 
-    def _jobs_of_earlier_runs(self) -> dict[tuple[str, ...], Entry]:
+    def _jobs_of_earlier_runs(self) -> dict[tuple[str, ...], JobEntry]:
         """Jobs of the ledger that Slurm still has, by their outputs; queried once."""
         with self._adoption_lock:
             if self._left is None:
@@ -132,7 +132,7 @@ class Executor(SlurmExecutor):
         aux = job_info.aux or {}
         if ENTRY not in aux:
             log = Path(aux["slurm_logfile"]).relative_to(self.slurm_logdir)
-            entry = self._entries.pop(job_info.job, None) or Entry.of(job_info.job)
+            entry = self._entries.pop(job_info.job, None) or JobEntry.of(job_info.job)
             aux[ENTRY] = entry.submitted(str(job_info.external_jobid), str(log))
             self._ledger.write(aux[ENTRY])
         super().report_job_submission(job_info, register_job)
@@ -234,5 +234,5 @@ def _endings(info: SubmittedJobInfo) -> list[Ending]:
     return endings(info.job, info.aux[ENTRY], Path(info.aux["slurm_logfile"]))
 
 
-def _computes(left: Entry) -> str:
+def _computes(left: JobEntry) -> str:
     return f"Slurm job {left.slurm_id} of an earlier run computes {', '.join(left.outputs)}"

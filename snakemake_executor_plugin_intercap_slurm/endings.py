@@ -10,7 +10,7 @@ from typing import Any
 
 from intercap_core.pipeline.job import ENDED, UNEXPECTED, read_state
 
-from .ledger import Entry, members, stamp
+from .ledger import JobEntry, members, stamp
 
 # Reasons in Slurm's log of a job that Slurm itself ended.
 REASONS = re.compile(
@@ -45,7 +45,7 @@ class Ending:
         return f"Slurm job {slurm_id}, {self.name}: {lines[self.state]}"
 
 
-def endings(job: Any, entry: Entry, slurm_log: Path) -> list[Ending]:
+def endings(job: Any, entry: JobEntry, slurm_log: Path) -> list[Ending]:
     """End of each stage of a failed job, in their order."""
     found = []
     for part in members(job):

@@ -38,7 +38,7 @@ def members(job: Any) -> list[Any]:
 
 
 @dataclass(frozen=True)
-class Entry:
+class JobEntry:
     """A submitted job."""
 
     outputs: tuple[str, ...]
@@ -53,8 +53,8 @@ class Entry:
     """Path of Slurm's log."""
 
     @classmethod
-    def of(cls, job: Any) -> Entry:
-        """Entry of a job before its submission."""
+    def of(cls, job: Any) -> JobEntry:
+        """JobEntry of a job before its submission."""
         parts = members(job)
         outputs = sorted({str(path) for part in parts for path in part.output})
         content = [
@@ -69,7 +69,7 @@ class Entry:
         logs = {str(path): stamp(path) for part in parts for path in part.log}
         return cls(tuple(outputs), hashlib.sha256(repr(content).encode()).hexdigest(), logs)
 
-    def submitted(self, slurm_id: str, slurm_log: str) -> Entry:
+    def submitted(self, slurm_id: str, slurm_log: str) -> JobEntry:
         """The entry after the submission."""
         return replace(self, slurm_id=slurm_id, slurm_log=slurm_log)
 
@@ -80,7 +80,7 @@ class Ledger:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
-    def write(self, entry: Entry) -> None:
+    def write(self, entry: JobEntry) -> None:
         self._folder.mkdir(parents=True, exist_ok=True)
         part = self._folder / f".{entry.slurm_id}.part"
         part.write_text(json.dumps(asdict(entry)), encoding="utf-8")
@@ -89,7 +89,7 @@ class Ledger:
     def remove(self, slurm_id: str) -> None:
         self._file(slurm_id).unlink(missing_ok=True)
 
-    def keep(self, live: Collection[str]) -> list[Entry]:
+    def keep(self, live: Collection[str]) -> list[JobEntry]:
         """Remove the entries of jobs that are not in ``live``; returns the others."""
         kept = []
         for path in sorted(self._folder.glob("*.json")):
@@ -103,15 +103,15 @@ class Ledger:
         return self._folder / f"{slurm_id}.json"
 
 
-def by_outputs(entries: Iterable[Entry]) -> dict[tuple[str, ...], Entry]:
+def by_outputs(entries: Iterable[JobEntry]) -> dict[tuple[str, ...], JobEntry]:
     return {entry.outputs: entry for entry in entries}
 
 
-def _read(path: Path) -> Entry | None:
+def _read(path: Path) -> JobEntry | None:
     """The entry in a file; None if the file is damaged."""
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
         logs = {name: tuple(value) if value else None for name, value in values["logs"].items()}
-        return Entry(**{**values, "outputs": tuple(values["outputs"]), "logs": logs})
+        return JobEntry(**{**values, "outputs": tuple(values["outputs"]), "logs": logs})
     except (ValueError, TypeError, KeyError, AttributeError):
         return None

@@ -62,7 +62,7 @@ SMOKE = frozenset(
         "test_a_step_is_drawn_in_all_views_in_time",
         "test_pages_print_no_errors_and_ask_for_nothing",
         "test_loads_plays_and_seeks_without_an_error",
-        "test_a_mistake_is_submitted_once_and_told",
+        "test_a_user_error_is_submitted_once",
     }
 )
 

@@ -20,10 +20,6 @@ from intercap_core.evaluation.summary import SequenceSummary
 from intercap_core.evaluation.verdict.figures import stated_errors
 from intercap_core.schemas import JOINT
 
-TOUCHING = 0.5  # probability of contact from which a region counts as touching
-# A frame counts as changed if body or object moved, or the object turned, by more than this.
-MOVED_MM = 1.0
-TURNED_DEG = 0.5
 NAME, FRAME = "sequence", "frame"
 SAME, CHANGED, ADDED, REMOVED, UNLIKE = "same", "changed", "added", "removed", "not comparable"
 
@@ -125,10 +121,8 @@ def _compare_one(name: str, old: Path, new: Path) -> tuple[dict[str, object], pd
     ):
         table = _frames(name, before, after)
         changed = (
-            (table["body_mm"] > MOVED_MM)
-            | (table["hands_mm"] > MOVED_MM)
-            | (table["object_mm"] > MOVED_MM)
-            | (table["object_deg"] > TURNED_DEG)
+            (table[["body_mm", "hands_mm", "object_mm"]] > 1.0).any(axis=1)
+            | (table["object_deg"] > 0.5)
             | (table["touches"] != "")
             | (table["touches_no_more"] != "")
             | (table["flag_before"] != table["flag_after"])
@@ -190,7 +184,7 @@ def _frames(name: str, before: Artefact, after: Artefact) -> pd.DataFrame:
 
 
 def _touching(joint: Artefact) -> np.ndarray:
-    return np.nan_to_num(joint["contact_probability"]) >= TOUCHING
+    return np.nan_to_num(joint["contact_probability"]) >= 0.5
 
 
 def _named(regions: np.ndarray, which: np.ndarray) -> Sequence[str]:

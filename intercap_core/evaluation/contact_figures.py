@@ -15,7 +15,6 @@ from intercap_core.evaluation import contact, motion
 from intercap_core.evaluation.figures import Figures, SequenceMetrics, object_figures, pooled
 from intercap_core.schemas import METRIC_REGIONS
 
-NEAR_MISS_M = 0.03  # a region closer than this without contact is a near miss
 # Bin edges of the reliability table; the first and the last bin hold the certain statements.
 RELIABILITY_BINS = (0.0, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 1.0)
 
@@ -26,7 +25,7 @@ def detected_figures(
     """Agreement of stated contact (probability above 0.5) with true contact.
 
     Returns precision, recall and F1 over all frames and regions; precision among regions nearer
-    than :data:`NEAR_MISS_M`; F1 of each region with true contact and their minimum; the Brier score
+    than 30 mm; F1 of each region with true contact and their minimum; the Brier score
     (mean squared error of the probability); the calibration error.
 
     Args:
@@ -38,7 +37,7 @@ def detected_figures(
     found = probability > 0.5
     counts = contact.confusion(found.T, true.T)
     hits, false_alarms, misses = (float(n) for n in counts[:, :3].sum(0))
-    near = distance < NEAR_MISS_M
+    near = distance < 0.03
     figures = {
         "contact_detected_precision": _share(hits, hits + false_alarms),
         "contact_detected_recall": _share(hits, hits + misses),
@@ -170,7 +169,7 @@ def worse_objects(sequences: Sequence[SequenceMetrics]) -> list[str]:
         "object_rotation_deg": 0.1,
         "object_rotation_p95_deg": 0.1,
     }
-    found = []
+    worse = []
     for name in sorted({s.object_ for s in sequences if s.has_truth}):
         some = [s for s in sequences if s.has_truth and s.object_ == name]
         before, after = (object_figures(some, stage) for stage in ("object_track", "joint"))
@@ -179,8 +178,8 @@ def worse_objects(sequences: Sequence[SequenceMetrics]) -> list[str]:
             for key, limit in limits.items()
             if key in before and key in after
         ):
-            found.append(name)
-    return found
+            worse.append(name)
+    return worse
 
 
 def _joint_figures(sequences: Sequence[SequenceMetrics], key: str) -> Figures:

@@ -80,6 +80,12 @@ def pooled(sequences: Sequence[SequenceMetrics], key: str) -> np.ndarray | None:
     return np.concatenate(found) if found else None
 
 
+def finite_median(values: np.ndarray) -> float:
+    """Median of the finite values; NaN if there is none."""
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else float("nan")
+
+
 def penetration_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
     """The paper's penetration figures, from each contact frame's mean depth."""
     depth, touching = pooled(sequences, "penetration_mean"), pooled(sequences, "contact_frame")
@@ -88,27 +94,20 @@ def penetration_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
     return contact.penetration_summary(depth, touching)
 
 
+def _cloud_distances(sequences: Sequence[SequenceMetrics], dataset: str) -> Figures:
+    names = ("body", "object", "body_visible", "object_visible")
+    return {f"{n}_mm": 1e3 * _over(sequences, dataset.format(n), np.nanmean) for n in names}
+
+
 def cloud_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
     """Mean distances between meshes and measured points over all frames with a cloud."""
-    keys = {
-        "body_mm": "body_to_cloud",
-        "object_mm": "object_to_cloud",
-        "body_visible_mm": "body_visible_to_cloud",
-        "object_visible_mm": "object_visible_to_cloud",
-    }
-    return {name: 1e3 * _over(sequences, key, np.nanmean) for name, key in keys.items()}
+    return _cloud_distances(sequences, "{}_to_cloud")
 
 
 def floor_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
     """The figures of :func:`cloud_figures` for the true poses; empty without truth."""
-    keys = {
-        "body_mm": "truth/body_floor",
-        "object_mm": "truth/object_floor",
-        "body_visible_mm": "truth/body_visible_floor",
-        "object_visible_mm": "truth/object_visible_floor",
-    }
-    found = {name: 1e3 * _over(sequences, key, np.nanmean) for name, key in keys.items()}
-    return {name: value for name, value in found.items() if np.isfinite(value)}
+    figures = _cloud_distances(sequences, "truth/{}_floor")
+    return {name: value for name, value in figures.items() if np.isfinite(value)}
 
 
 def truth_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figures:
@@ -116,8 +115,8 @@ def truth_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figures:
 
     Quantities that the stage does not estimate are omitted. Object errors are medians and 95th
     percentiles over the frames in which two or more cameras truly see the object. Accelerations are
-    in millimetres per frame^2 at 30 fps. ``acceleration_error`` is the body's, or the object's
-    where the stage has no body.
+    in millimetres per frame^2 at 30 fps. ``acceleration_error`` is the body's, or the object's if
+    the stage has no body.
     """
     known = [s for s in sequences if s.has_truth]
 
@@ -217,8 +216,8 @@ def _hand_in_grasp(sequences: Sequence[SequenceMetrics], stage: str) -> float:
     touching = pooled(handling, "truth/contact_region")
     if errors is None or touching is None:
         return float("nan")
-    held = errors[touching[:, :2]]  # METRIC_REGIONS starts with the left and the right hand
-    return 1e3 * float(held.mean()) if len(held) else float("nan")
+    chosen = errors[touching[:, :2]]  # METRIC_REGIONS starts with the left and the right hand
+    return 1e3 * float(chosen.mean()) if len(chosen) else float("nan")
 
 
 def _object_errors(s: SequenceMetrics, stage: str) -> ObjectErrors:
@@ -259,11 +258,13 @@ def _contact_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figure
     have = [s for s in sequences if f"{key}region_contact" in s.values]
     if not have:
         return {}
-    found, true = pooled(have, f"{key}region_contact"), pooled(have, "truth/contact_region")
-    counts = pooled(have, f"{key}vertex_contact_counts")
-    touching, truly = pooled(have, f"{key}contact_frame"), pooled(have, "truth/contact_frame")
-    assert found is not None and true is not None and counts is not None
-    assert touching is not None and truly is not None
+    names = (
+        f"{key}region_contact", "truth/contact_region", f"{key}vertex_contact_counts",
+        f"{key}contact_frame", "truth/contact_frame",
+    )  # fmt: skip
+    found, true, counts, touching, truly = (
+        np.concatenate([s.values[name] for s in have if name in s.values]) for name in names
+    )
     at = list(contact.SWEEP_M).index(contact.CONTACT_M)
     return {
         "contact_region_f1": contact.f1(contact.confusion(found.ravel(), true.ravel())),

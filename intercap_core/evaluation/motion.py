@@ -1,7 +1,7 @@
 """Motion of a track against the true motion: jitter, acceleration, lag, slip and planted feet.
 
-A foot stands where enough of its true sole rests near the floor, or near the furniture under it. A
-fit that froze all feet would have no error there, so swinging feet are measured too.
+A foot carries weight if enough of its true sole is near the floor, or near the furniture under it.
+The position of swinging feet is measured too, because a fit with frozen feet has no other error.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def second_difference(positions: np.ndarray, fps: float) -> np.ndarray:
     result = np.full(positions.shape, np.nan)
     if len(positions) > 2:
         middle = positions[2:] - 2 * positions[1:-1] + positions[:-2]
-        result[1:-1] = middle * (fps / REFERENCE_FPS) ** 2
+        result[1:-1] = middle * (fps / 30.0) ** 2
     return result
 
 
@@ -55,7 +55,7 @@ def moving(rotation: np.ndarray, centre: np.ndarray, fps: float) -> np.ndarray:
     speed = np.linalg.norm(np.diff(centre, axis=0), axis=-1) * fps
     chord = np.linalg.norm(np.diff(rotation, axis=0), axis=(-1, -2)) / (2 * np.sqrt(2))
     turn = 2 * np.arcsin(np.clip(chord, 0, 1)) * fps
-    step = (speed > REST_SPEED) | (turn > REST_TURN)
+    step = (speed > 0.02) | (turn > np.radians(5.0))
     result[:-1] |= step
     result[1:] |= step
     return result
@@ -107,16 +107,16 @@ def motion_onset_lags(
             over = end
             while over < total and is_moving[over]:
                 over += 1
-            found, true = (_onset(path[start:over], end - start) for path in (centre, true_centre))
+            fitted, true = (_onset(path[start:over], end - start) for path in (centre, true_centre))
             if true is not None:
-                lags.append(float((over - start if found is None else found) - true))
+                lags.append(float((over - start if fitted is None else fitted) - true))
         start = end
     return lags
 
 
 def _onset(path: np.ndarray, rest: int) -> int | None:
-    """First frame at which a path (N, 3) is ``ONSET_M`` from the mean of its first ``rest``."""
-    away = np.linalg.norm(path - path[:rest].mean(0), axis=-1) > ONSET_M
+    """First frame at which a path (N, 3) is 10 mm from the mean of its first ``rest`` frames."""
+    away = np.linalg.norm(path - path[:rest].mean(0), axis=-1) > 0.010
     away[: max(1, rest // 2)] = False  # jitter at the start of the rest is not motion
     return int(np.argmax(away)) if away.any() else None
 
@@ -148,15 +148,15 @@ def slip_speed(
     found = np.full(total, np.nan)
     window = max(1, round(SLIP_S * fps))
     for t in range(total - window):
-        held = np.flatnonzero(touching[t] & touching[t + window])
-        if not len(held):
+        both = np.flatnonzero(touching[t] & touching[t + window])
+        if not len(both):
             continue
         moved, truly = (
-            points[t + window, held].astype(np.float64) - points[t, held]
+            points[t + window, both].astype(np.float64) - points[t, both]
             for points in (local, true_local)
         )
         excess = (moved - truly) * (fps / window)
-        normal = normals_at(true_local[t, held].astype(np.float64))
+        normal = normals_at(true_local[t, both].astype(np.float64))
         along = excess - (excess * normal).sum(1, keepdims=True) * normal
         found[t] = np.linalg.norm(along, axis=1).mean()
     return found

@@ -139,11 +139,11 @@ def compare_slips(slip: np.ndarray, true_slip: np.ndarray, available: np.ndarray
     event without a match is missed, a detected event without a match is false.
     """
     true, found = slip_events(true_slip, available), slip_events(slip, available)
-    answered = sum(any(_meet(t, f) for f in found) for t in true)
+    detected = sum(any(_match(t, f) for f in found) for t in true)
     return SlipCounts(
-        found=answered,
-        missed=len(true) - answered,
-        false=sum(not any(_meet(t, f) for t in true) for f in found),
+        found=detected,
+        missed=len(true) - detected,
+        false=sum(not any(_match(t, f) for t in true) for f in found),
         images_wrong=int((slip != true_slip)[available].sum()),
         images=int(available.sum()),
     )
@@ -193,10 +193,10 @@ def measure(frames: Path, scene: Path, truth: Path) -> CaptureErrors:
     ):
         names, true_names = found.text("camera_names"), true.text("camera_names")
         at = match_times(truth, true["times"], found["times"], float(found.attributes["fps"]))
-        strangers = sorted(set(names) - set(true_names))
-        if strangers:
+        unknown = sorted(set(names) - set(true_names))
+        if unknown:
             raise UserError(
-                f"{truth}: has no camera {strangers[0]!r}, which {scene} has; expected "
+                f"{truth}: has no camera {unknown[0]!r}, which {scene} has; expected "
                 "the truth of the same recording"
             )
         order = [true_names.index(name) for name in names]
@@ -294,7 +294,7 @@ def _true_bias(truth: artefacts.Artefact) -> np.ndarray:
     return np.full(len(truth["time_offset"]), np.nan)
 
 
-def _meet(a: Slip, b: Slip) -> bool:
+def _match(a: Slip, b: Slip) -> bool:
     return a.camera == b.camera and a.frames == b.frames and a.first <= b.last and b.first <= a.last
 
 

@@ -100,11 +100,11 @@ class StageErrors:
         self, body_track: BodyTrack, track: ObjectTrack, known: np.ndarray | None
     ) -> Values:
         """Errors of skin, contact, slip and planted feet."""
-        pve, counts, touching, held, soles = [], [], [], [], []
+        pve, counts, touching, skin, soles = [], [], [], [], []
         assert self._truth.vertices is not None
         regions = body_track.model.regions
         for t, vertices in enumerate(body_track.vertices()):
-            held.append(vertices[self._touched])
+            skin.append(vertices[self._touched])
             soles.append([vertices[regions[foot]] for foot in _FEET])
             pve.append(body.vertex_error(vertices, self._truth.vertices[t]))
             if self._object is None or self._true_distance is None:
@@ -129,17 +129,17 @@ class StageErrors:
             return of_body
         touched = np.stack(touching)
         return of_body | {
-            **self._slip(np.stack(held), track),
+            **self._slip(np.stack(skin), track),
             "vertex_contact_counts": np.stack(counts),
             "contact_frame": touched.any(1),
             "region_contact": contact.region_contact(touched, regions, METRIC_REGIONS),
         }
 
-    def _slip(self, held: np.ndarray, track: ObjectTrack) -> Values:
+    def _slip(self, skin: np.ndarray, track: ObjectTrack) -> Values:
         """Slip of the skin vertices (T, N, 3) that are ever in true contact."""
         assert self._true_distance is not None and self._object is not None
         if not track.known:
-            return {"slip": np.full(len(held), np.nan)}
+            return {"slip": np.full(len(skin), np.nan)}
         pose, true = (rigid(of.rotation, of.translation) for of in (track, self._truth))
         symmetry = self._object.mesh.symmetry  # a rotation about a symmetry axis is no slip
         pose = np.array(
@@ -147,7 +147,7 @@ class StageErrors:
         )
         touching = contact.vertex_contact(self._true_distance[:, self._touched])
         speed = slip_speed(
-            _local(held, pose[:, :3, :3], pose[:, :3, 3]),
+            _local(skin, pose[:, :3, :3], pose[:, :3, 3]),
             self._true_local,
             touching,
             self._object.true_normals,

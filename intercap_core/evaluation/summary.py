@@ -19,8 +19,6 @@ from intercap_core.evaluation.scene_errors import displacement
 from intercap_core.schemas import JOINT, METRICS, PER_VERTEX_METRICS, SCENE, SUMMARY
 from intercap_core.sequence_inputs import SequencePaths
 
-_RIG = "rig/"
-
 
 @dataclass(frozen=True)
 class FittedBody:
@@ -77,38 +75,35 @@ class SequenceSummary:
     def read(cls, path: Path) -> SequenceSummary:
         """Read a summary artefact; raises UserError if it cannot be read."""
         with artefacts.read(path, SUMMARY) as artefact:
-
-            def optional(key: str) -> np.ndarray | None:
-                if key not in artefact:
-                    return None
-                return artefact[key]
-
+            attributes = artefact.attributes
+            body_contact, surface, surface_contact = (
+                artefact[key] if key in artefact else None  # noqa: SIM401 (not a dict)
+                for key in ("body_contact_frames", "object_sample_points", "object_sample_contact")
+            )
+            made_by = zip(
+                artefact.text("made_by/stages"),
+                artefact["made_by/versions"],
+                artefact.text("made_by/settings"),
+                strict=True,
+            )
             return cls(
                 SequenceMetrics.of(artefact),
-                str(artefact.attributes["intent"]),
+                str(attributes["intent"]),
                 FittedBody(
-                    str(artefact.attributes["gender"]),
-                    str(artefact.attributes["body_model"]),
-                    int(artefact.attributes["num_betas"]),
-                    int(artefact.attributes["num_expression"]),
+                    str(attributes["gender"]),
+                    str(attributes["body_model"]),
+                    int(attributes["num_betas"]),
+                    int(attributes["num_expression"]),
                 ),
                 {
-                    key.removeprefix(_RIG): artefact[key]
+                    key.removeprefix("rig/"): artefact[key]
                     for key in SUMMARY.fields
-                    if key.startswith(_RIG)
+                    if key.startswith("rig/")
                 },
-                optional("body_contact_frames"),
-                optional("object_sample_points"),
-                optional("object_sample_contact"),
-                {
-                    stage: (int(version), settings)
-                    for stage, version, settings in zip(
-                        artefact.text("made_by/stages"),
-                        artefact["made_by/versions"],
-                        artefact.text("made_by/settings"),
-                        strict=True,
-                    )
-                },
+                body_contact,
+                surface,
+                surface_contact,
+                {stage: (int(version), settings) for stage, version, settings in made_by},
             )
 
 
@@ -135,7 +130,7 @@ def write(output: Path, paths: SequencePaths, *, intent: str) -> None:
                 writer.put("body_contact_frames", touching.sum(0).astype(np.int32))
             with artefacts.read(paths.scene, SCENE) as scene:
                 for key, values in _rig(scene).items():
-                    writer.put(f"{_RIG}{key}", values)
+                    writer.put(f"rig/{key}", values)
             stages, versions, settings = [], [], []
             for stage, path in paths.by_stage().items():
                 schema = getattr(schemas, stage.upper())
@@ -204,15 +199,15 @@ def collect_heatmaps(summaries: Sequence[SequenceSummary]) -> Heatmaps:
     first sequence defines it. Bodies with another number of vertices and objects measured with
     another mesh are excluded and listed in ``left_out``.
     """
-    body = np.zeros(0)
-    body_frames = 0
+    body, body_frames = np.zeros(0), 0
     left_out: dict[str, list[str]] = {}
     counts: dict[str, np.ndarray] = {}
     points: dict[str, np.ndarray] = {}
     frames: dict[str, int] = {}
     for summary in summaries:
-        contact, here, found = summary.body_contact, summary.surface, summary.surface_contact
-        if contact is None or here is None or found is None:
+        contact, surface = summary.body_contact, summary.surface
+        surface_contact = summary.surface_contact
+        if contact is None or surface is None or surface_contact is None:
             continue
         name, count = summary.metrics.object_, len(summary.metrics)
         if body_frames == 0:
@@ -222,19 +217,20 @@ def collect_heatmaps(summaries: Sequence[SequenceSummary]) -> Heatmaps:
             body_frames += count
         else:
             left_out.setdefault(summary.name, []).append(
-                f"its body has {len(contact)} vertices, those of the sequences before {len(body)}: "
-                "not in the body's heatmap"
+                f"its body has {len(contact)} vertices, that of the first sequence {len(body)}: "
+                "excluded from the body's heatmap"
             )
         if name not in counts:
-            counts[name], points[name], frames[name] = np.zeros(len(found)), here, 0
-        if not np.array_equal(points[name], here):
+            counts[name], points[name] = np.zeros(len(surface_contact)), surface
+            frames[name] = 0
+        if not np.array_equal(points[name], surface):
             left_out.setdefault(summary.name, []).append(
-                f"object {name!r} was measured with another mesh than in the sequences before: "
+                f"object {name!r} was measured with another mesh than in the first sequence: "
                 "excluded from its heatmap; re-run stage 'metrics' of the sequences with the older "
                 "mesh"
             )
             continue
-        counts[name] += found
+        counts[name] += surface_contact
         frames[name] += count
     return Heatmaps(
         body / max(1, body_frames),

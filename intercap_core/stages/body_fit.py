@@ -30,9 +30,7 @@ from intercap_core.entries import SubjectEntry
 from intercap_core.errors import UserError
 from intercap_core.schemas import BODY_FIT, BODY_PARTS
 
-# Median error of the trunk's keypoints from which the fit is not this person's body, metres. Tuned
-# on the studio.
-WRONG_TRUNK_M = 0.06
+WRONG_TRUNK_M = 0.06  # median trunk keypoint error of a fit to something else; tuned on the studio
 BAD_BODY_M = 0.040  # mean error of the surface that the metrics call a bad body, metres
 
 

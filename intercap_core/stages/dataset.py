@@ -1,4 +1,4 @@
-"""All sequences together: tables, heatmaps, the summary and the site's first page."""
+"""Stage dataset: tables, heatmaps, summary, dataset card and first page of the site."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.evaluation import figures
 from intercap_core.evaluation.contact import CONTACT_M
-from intercap_core.evaluation.summary import FittedBody, Heatmaps, SequenceSummary, collect_heatmaps
+from intercap_core.evaluation.summary import Heatmaps, SequenceSummary, collect_heatmaps
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.output.release.card import facts, markdown, split_table
 from intercap_core.output.release.croissant import croissant
@@ -50,12 +50,20 @@ def run(
 ) -> Path:
     """Merge the sequences' summaries; returns the site's first page.
 
-    ``summaries`` by name, in the order of the table; ``card`` and ``formats`` of the exports are
-    what the dataset's card says, which is written beside ``summary``; ``virtual``: the studio made
-    all recordings; ``failed`` are sequences without a result, with the reason; ``changed``: name,
-    value and default of the settings that are not the program's own. A summary that is missing or
-    broken is told, left out and listed, as is what a heatmap cannot take. Raises UserError if no
-    sequence is left.
+    Summaries that are missing or broken are logged, left out and listed on the page. Raises
+    UserError if no sequence is left.
+
+    Args:
+        summaries: paths by sequence, in the order of the table.
+        site: folder of the site.
+        summary: path of summary.json; the dataset card is written into the same folder.
+        heatmaps: path of the heatmaps artefact.
+        tables_folder: folder of the tables.
+        card: statements of the dataset card.
+        formats: formats of the exports, for the card.
+        virtual: the studio rendered all recordings.
+        failed: reason by sequence without a result.
+        changed: name, value and default of each setting that differs from its default.
     """
     found, broken = _read(summaries)
     unreported = {**(failed or {}), **broken}
@@ -94,11 +102,13 @@ def run(
         log.warning("sequence %s: %s", name, why)
     _write_heatmaps(heatmaps, dataset, heat)
     _replace(summary, _json(figures.summary(dataset, measured)))
-    told = facts(dataset, card, found, groups, formats=formats, failed=unreported, virtual=virtual)
+    stated = facts(
+        dataset, card, found, groups, formats=formats, failed=unreported, virtual=virtual
+    )
     folder = summary.parent
-    _replace(folder / "card.md", markdown(told))
-    _replace(folder / "card.json", _json(told))
-    _replace(folder / "croissant.json", _json(croissant(told, tables_folder.parent, written)))
+    _replace(folder / "card.md", markdown(stated))
+    _replace(folder / "card.json", _json(stated))
+    _replace(folder / "croissant.json", _json(croissant(stated, tables_folder.parent, written)))
     content = DatasetContent(
         dataset=dataset,
         sequences=found,
@@ -118,7 +128,7 @@ def run(
 
 
 def _read(summaries: Mapping[str, Path]) -> tuple[list[SequenceSummary], dict[str, str]]:
-    """Those that can be read, and why others cannot."""
+    """Readable summaries, and the reason by sequence for the others."""
     found, broken = [], {}
     for name, path in summaries.items():
         try:
@@ -132,8 +142,10 @@ def _read(summaries: Mapping[str, Path]) -> tuple[list[SequenceSummary], dict[st
 def _body_heat(
     summaries: Sequence[SequenceSummary], heat: Heatmaps, body_models: BodyModels
 ) -> tuple[list[Heat], dict[str, str]]:
-    """The body and both hands, on the body of the first sequence that counts in the map and whose
-    body file is there; and those whose file is another one than they were fitted with, and why."""
+    """Heatmaps of the body and both hands, and remarks by sequence.
+
+    They are drawn on the body of the first sequence in the map whose body file is unchanged.
+    """
     doubts: dict[str, str] = {}
     if not heat.body_frames:
         return [], doubts
@@ -142,25 +154,23 @@ def _body_heat(
             continue
         path = body_models.of(summary.body.gender) or OPEN_BODY
         if file_digest(path) == summary.body.digest:
-            model = _model(path, summary.body)
+            body = summary.body
+            model = BodyModel.load(
+                path, num_betas=body.num_betas, num_expression=body.num_expression
+            )
             surfaces = body_surfaces(model, heat.body)
             return [Heat(*surface, heat.body_frames) for surface in surfaces], doubts
         doubts[summary.name] = (
-            f"{path} is another body file than it was fitted with (digest {summary.body.digest}): "
-            "the body's heatmap has no picture of it; name that file again in body_models, or run "
-            "the sequence anew"
+            f"{path} is not the body file of the fit (digest {summary.body.digest}): the body's "
+            "heatmap has no picture of it; set body_models to that file, or run the sequence again"
         )
     return [], doubts
-
-
-def _model(path: Path, told: FittedBody) -> BodyModel:
-    return BodyModel.load(path, num_betas=told.num_betas, num_expression=told.num_expression)
 
 
 def _unlisted(
     summaries: Sequence[SequenceSummary], objects: Mapping[str, ObjectEntry]
 ) -> dict[str, str]:
-    """Sequences whose object has no entry any more, and what that means."""
+    """Remark by sequence whose object is no longer in the list of objects."""
     return {
         summary.name: f"its object {summary.metrics.object_} has no entry in the list of objects: "
         "the object's heatmap has no picture; put the entry back, or correct the sequence's row"
@@ -185,17 +195,19 @@ def _medians(pairs: Sequence[tuple[str, float, float]]) -> tuple[float, float]:
 
 
 def _write_heatmaps(path: Path, dataset: str, heat: Heatmaps) -> None:
-    found = list(heat.objects.values())
-    ends = np.cumsum([len(one.likelihood) for one in found], dtype=np.int64)
+    objects = list(heat.objects.values())
+    ends = np.cumsum([len(o.likelihood) for o in objects], dtype=np.int64)
     with artefacts.write(
         path, HEATMAPS, dataset=dataset, contact_m=CONTACT_M, body_frames=heat.body_frames
     ) as writer:
         writer.put("body_likelihood", heat.body)
         writer.put("object_names", list(heat.objects))
-        writer.put("object_frames", np.array([one.frames for one in found], np.int64))
+        writer.put("object_frames", np.array([o.frames for o in objects], np.int64))
         writer.put("object_offsets", np.concatenate([np.zeros(1, np.int64), ends]))
-        writer.put("object_points", np.concatenate([np.zeros((0, 3)), *(f.points for f in found)]))
-        writer.put("object_likelihood", np.concatenate([[], *(f.likelihood for f in found)]))
+        writer.put(
+            "object_points", np.concatenate([np.zeros((0, 3)), *(o.points for o in objects)])
+        )
+        writer.put("object_likelihood", np.concatenate([[], *(o.likelihood for o in objects)]))
 
 
 def _json(values: Any) -> str:
@@ -203,7 +215,7 @@ def _json(values: Any) -> str:
 
 
 def _replace(path: Path, text: str) -> None:
-    """Write a whole text file or none."""
+    """Write a text file atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = artefacts.part_of(path)
     part.write_text(text, encoding="utf-8")

@@ -42,28 +42,23 @@ class CameraDetections:
     instances: list[list[Instance]]
     """Candidates."""
     keypoints_found: np.ndarray
-    """(T,) bool: a detector looked for people."""
+    """(T,) bool: a detector searched for people."""
     candidates_found: np.ndarray
-    """(T,) bool: a detector looked for instances."""
+    """(T,) bool: a detector searched for instances."""
     notes: list[str] = field(default_factory=list)
-    """What was left out, for the user."""
+    """Remarks for the user on what was left out."""
 
 
 def run(
-    *,
-    frames: Path,
-    output: Path,
-    sequence: SequenceEntry,
-    settings: DetectionsSettings,
+    *, frames: Path, output: Path, sequence: SequenceEntry, settings: DetectionsSettings
 ) -> None:
     """Read the sequence's files of keypoints and candidates and write the detections artefact.
 
-    Files are matched to colour images by number or name (:mod:`.image_numbers`). BEHAVE's keypoints
-    and masks lie in the folders of its images and are read from there unless the row names others.
-    Models look at the images for which there is no file: first the segmentation model, then the
-    keypoint model. Missing or broken files, unusable entries and missing cameras are noted. Raises
-    UserError if there are neither keypoints nor candidates for any image, or if none of a camera's
-    keypoints can be used.
+    Files are matched to colour images by number or name (:mod:`.image_numbers`). BEHAVE's files are
+    read from the folders of its images unless the row names others. Images without a file are
+    processed by the models of the settings: first segmentation, then keypoints. Missing or broken
+    files, unusable entries and missing cameras are noted. Raises UserError if no image has
+    keypoints or candidates, or if none of a camera's keypoints can be used.
     """
     with artefacts.read(frames, FRAMES) as source:
         images = camera_images(source, sequence)
@@ -205,7 +200,7 @@ def _segment(
     found: list[CameraDetections],
     settings: DetectionsSettings,
 ) -> None:
-    """Let the model find instances in the images without candidates from files."""
+    """Run the segmentation model on the images without candidates from files."""
     from intercap_core.formats.detections.onnx_segmentation import Segmenter
 
     wanted = _unknown(images, [d.candidates_found for d in found])
@@ -230,7 +225,7 @@ def _find_people(
     found: list[CameraDetections],
     settings: DetectionsSettings,
 ) -> None:
-    """Let the model find people in the images without keypoints from files."""
+    """Run the keypoint model on the images without keypoints from files."""
     from intercap_core.formats.detections.onnx_pose import PoseModel
 
     wanted = _unknown(images, [d.keypoints_found for d in found])
@@ -253,7 +248,7 @@ def _find_people(
 
 
 def _unknown(images: list[CameraImages], known: list[np.ndarray]) -> list[Image]:
-    """The images that no detector looked at; ``known`` (T,) of each camera."""
+    """Images that no detector has processed; ``known`` (T,) of each camera."""
     return [
         (t, c)
         for c, (camera, found) in enumerate(zip(images, known, strict=True))

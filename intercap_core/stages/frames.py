@@ -35,12 +35,6 @@ from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.schemas import FRAMES
 
-MIN_DRIFT_US = 1000.0  # less than the exposure time of an image
-# Median deviation of a camera's skews from their median, beyond which it is noted. Smaller ones are
-# jitter of the clock; in 2 ms a walking person moves by some millimetres.
-MIN_UNEVEN_US = 2000.0
-OTHER_RATE = 1.5  # ratio of frame rates: half way between equal and double
-
 
 def run(
     *,
@@ -279,9 +273,10 @@ def _note_defects(views: list[ExtractedCamera], table: SetTable, clock: int) -> 
         seen = np.flatnonzero(table.index[:, camera] >= 0)
         own = frame_rate(view.usable_times) or sets_per_s
         ratio = own / sets_per_s
-        if not 1 / OTHER_RATE < ratio < OTHER_RATE:
+        half_way = 1.5  # between an equal and a double frame rate
+        if not 1 / half_way < ratio < half_way:
             view.notes.append(_other_rate(own, sets_per_s, int(table.unmatched[camera])))
-        if table.unmatched[camera] and ratio < OTHER_RATE:
+        if table.unmatched[camera] and ratio < half_way:
             used = np.zeros(len(view.colour_times), bool)
             used[table.index[seen, camera]] = True
             left_out = view.colour_times[view.colour_usable & ~used]
@@ -293,14 +288,14 @@ def _note_defects(views: list[ExtractedCamera], table: SetTable, clock: int) -> 
         if not len(seen):
             continue
         drift = clock_drift_us(table.times_us, table.skew_us[:, camera])
-        if abs(drift) > MIN_DRIFT_US:
+        if abs(drift) > 1000.0:  # less than the exposure time of an image
             view.notes.append(
                 f"its clock runs away from {views[clock].name}'s by {drift / 1e3:.1f} "
                 "ms over the recording"
             )
         off = table.skew_us[seen, camera]
         uneven = float(np.median(np.abs(off - np.median(off))))
-        if uneven > MIN_UNEVEN_US:
+        if uneven > 2000.0:  # a walking person moves by some millimetres; less is clock jitter
             view.notes.append(
                 f"the skew of its images varies by {uneven / 1e3:.1f} ms (median): fits use one "
                 "time offset for all of them"
@@ -318,7 +313,7 @@ def _note_defects(views: list[ExtractedCamera], table: SetTable, clock: int) -> 
 
 
 def _other_rate(own: float, sets: float, unmatched: int) -> str:
-    """Note for a camera with ``own`` images a second, if that is not the rate of the sets."""
+    """Note for a camera with ``own`` images a second, if the frame sets have another rate."""
     text = f"it has {own:.3g} images a second beside {sets:.3g} frame sets"
     if own > sets:
         return (

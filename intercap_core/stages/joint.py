@@ -28,21 +28,10 @@ from intercap_core.sequence_inputs import FitSettings, SequenceModels, SequenceP
 
 log = logging.getLogger(__name__)
 
-# Number of views of a hand's median keypoint up to which the hand is undetermined: what occludes it
-# in the other views occludes fingers in these.
-FEW_HAND_VIEWS = 2
-
 _BODY_PARAMETERS = (
-    "expression",
-    "global_orient",
-    "transl",
-    "body_pose",
-    "jaw_pose",
-    "leye_pose",
-    "reye_pose",
-    "left_hand_pose",
-    "right_hand_pose",
-)
+    "expression", "global_orient", "transl", "body_pose", "jaw_pose", "leye_pose", "reye_pose",
+    "left_hand_pose", "right_hand_pose",
+)  # fmt: skip
 
 
 def run(
@@ -66,26 +55,15 @@ def run(
     """
     settings = fit_settings.joint
     if results is not None:
-        import_joint(
-            results,
-            paths,
-            models,
-            output,
-            betas=fit_settings.body_fit.betas,
-            settings_digest=digest(settings),
-        )
+        betas, settings_digest = fit_settings.body_fit.betas, digest(settings)
+        import_joint(results, paths, models, output, betas=betas, settings_digest=settings_digest)
         return
     with open_inputs(paths, models, fit_settings, device) as inputs:
         fitted = fit(inputs, settings, contact)
     for issue in fitted.contact.issues:
         first, last = issue.frames.start, max(issue.frames.start, issue.frames.stop - 1)
-        log.warning(
-            "sequence %s, frames %d to %d: %s",
-            inputs.attributes["sequence"],
-            first,
-            last,
-            issue.text,
-        )
+        sequence = inputs.attributes["sequence"]
+        log.warning("sequence %s, frames %d to %d: %s", sequence, first, last, issue.text)
     with artefacts.write(
         output,
         JOINT,
@@ -106,10 +84,13 @@ def run(
 
 
 def _hands_of_few_views(person: Path) -> np.ndarray:
-    """Mask (T, 2) of left and right hands of which few views see the median keypoint."""
+    """Mask (T, 2) of left and right hands whose median keypoint at most two views see.
+
+    The object that occludes the hand in the other views occludes fingers in these.
+    """
     with artefacts.read(person, PERSON) as artefact:
         views = artefact["joint_views"]
-    few = [np.median(views[:, hand], axis=1) <= FEW_HAND_VIEWS for hand in (LEFT_HAND, RIGHT_HAND)]
+    few = [np.median(views[:, hand], axis=1) <= 2 for hand in (LEFT_HAND, RIGHT_HAND)]
     return np.stack(few, axis=1)
 
 

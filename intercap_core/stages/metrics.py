@@ -35,8 +35,6 @@ from intercap_core.sequence_inputs import FitSettings, SequenceModels, SequenceP
 
 log = logging.getLogger(__name__)
 
-_FOREIGN_TRUTH_M = 0.06  # clothing, noise and occlusion leave some 10 mm
-
 
 def run(
     *,
@@ -47,15 +45,14 @@ def run(
     output: Path,
     truth: Path | None = None,
 ) -> None:
-    """Measure the joint result of one sequence, state its error from held-out cameras, and compare
-    every stage with the truth if it is known.
+    """Measure the joint result of one sequence, state its error and compare all stages with truth.
 
     Object and contact metrics are omitted if the sequence has no object or the object was found in
-    no frame. The errors of an object that is present but was not found are infinite. Raises
-    UserError if an input artefact is missing, broken or does not fit the others.
+    no frame; then the errors of an object that is in the recording are infinite. Raises UserError
+    if an input artefact is missing, broken or does not match the others.
 
     Args:
-        fit_settings: settings of the fits, which the held-out comparison repeats in part.
+        fit_settings: settings of the fits, for the refits of the held-out evaluation.
         truth: truth file of a virtual recording.
     """
     object_, body_models, gender = models.object_, models.body_models, models.gender
@@ -78,13 +75,7 @@ def run(
         handled = None
         if mesh is not None and fitted_object.known:
             handled = HandledObject(mesh, fitted_object)
-        measured = Measurement(
-            handled,
-            fitted_body,
-            clouds,
-            rig,
-            settings.contact_mm * 1e-3,
-        )
+        measured = Measurement(handled, fitted_body, clouds, rig, settings.contact_mm * 1e-3)
         values = measured.over_frames((setting["ground_point"], setting["ground_normal"]), known)
         true_distance = values.pop("true_distance", None)
         _warn_of_foreign_truth(truth, values)
@@ -170,10 +161,7 @@ def _flags(images: Frames, paths: SequencePaths) -> Values:
     for t in np.flatnonzero(joint_flags):
         reason = joint_reasons[t] or "joint fit not trusted"
         reasons[t] = f"{reasons[t]}; {reason}" if reasons[t] else reason
-    return {
-        "flagged": np.array([bool(r) for r in reasons]),
-        "flag_reason": reasons,
-    }
+    return {"flagged": np.array([bool(r) for r in reasons]), "flag_reason": reasons}
 
 
 def _extrinsics_errors(
@@ -210,10 +198,10 @@ def _warn_of_foreign_truth(path: Path | None, values: Values) -> None:
     keys = [f"truth/{name}_floor" for name in ("body", "object")]
     floor = [values[key] for key in keys if key in values]
     apart = [float(np.nanmedian(v)) for v in floor if np.isfinite(v).any()]
-    if apart and min(apart) > _FOREIGN_TRUTH_M:
+    if apart and min(apart) > 0.06:  # clothing, noise and occlusion leave some 10 mm
         log.warning(
-            "%s: its body and object are %.0f mm and more from the segmented points; unless the "
-            "detections are all wrong, it is the truth of another recording",
+            "%s: its body and object are at least %.0f mm from the segmented points; unless all "
+            "detections are wrong, it is the truth of another recording",
             path,
             1e3 * min(apart),
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -34,8 +34,6 @@ from intercap_core.object_track.tracker import NOTHING_LOG_RATIO, Track, Tracker
 from intercap_core.schemas import OBJECT_TRACK
 
 log = logging.getLogger(__name__)
-
-UNSOUND_SHARE = 0.5  # of lost, or lost and ambiguous frames, above which a warning is logged
 
 
 def run(
@@ -83,14 +81,11 @@ def run(
             paint=Paint.load(Path(object_.mesh), mesh),
         )
         warn = partial(log.warning, "sequence %s: object %r: %s", sequence, object_.name)
-        doubts = [
-            doubt
-            for doubt in (
-                label_doubt(detected, object_.labels),
-                size_doubt(recording, detected, mesh.diameter, object_.labels),
-            )
-            if doubt
-        ]
+        known = (
+            label_doubt(detected, object_.labels),
+            size_doubt(recording, detected, mesh.diameter, object_.labels),
+        )
+        doubts = [doubt for doubt in known if doubt]
         for doubt in doubts:
             warn(doubt)
         track: Track | None = None
@@ -105,28 +100,28 @@ def run(
         if track is None or reason:
             reason += (
                 ": no frame has a pose of it; check the candidates, annotate 'object_poses', or "
-                "clear the column 'object' where there is none"
+                "clear the column 'object' if there is none"
             )
             warn(reason)
             _write(output, recording, object_.name, [reason, *doubts], settings, None, [])
             return
         for doubt in track.doubts:
             warn(doubt)
-        _warn_if_unsound(track, sequence)
+        _warn_if_unsound(track, warn)
         doubts += track.doubts
         _write(output, recording, object_.name, doubts, settings, track, source.cameras)
 
 
 def _absence(track: Track) -> str:
-    """Return why the track is not believed in any frame; empty if it is in some."""
-    believed = sum(not frame.lost for frame in track.frames)
-    if believed == 0:
+    """Reason to reject the track in all frames; "" if it is accepted in some."""
+    accepted = sum(not frame.lost for frame in track.frames)
+    if accepted == 0:
         return "its track is lost in every frame"
     if track.shows_nothing:
         return (
-            f"the track in {believed} of {len(track.frames)} frames is not believed, as all images "
-            f"together hardly show it ({track.evidence:.0f} nats, expected "
-            f"{NOTHING_LOG_RATIO:.0f} and more)"
+            f"the track in {accepted} of {len(track.frames)} frames is rejected, as the images do "
+            f"not support it ({track.evidence:.0f} nats, expected at least "
+            f"{NOTHING_LOG_RATIO:.0f})"
         )
     return ""
 
@@ -190,34 +185,25 @@ def _seed_source(track: Track | None) -> str:
     return "annotated" if track.agrees else "annotated against the images"
 
 
-def _warn_if_unsound(track: Track, sequence: str) -> None:
+def _warn_if_unsound(track: Track, warn: Callable[[str], None]) -> None:
     """Log warnings about lost, gone and ambiguous frames."""
     count = len(track.frames)
-    lost = sum(frame.lost for frame in track.frames)
-    gone = sum(frame.gone for frame in track.frames)
-    ambiguous = sum(frame.ambiguous for frame in track.frames)
+    lost, gone, ambiguous = (
+        sum(getattr(frame, state) for frame in track.frames)
+        for state in ("lost", "gone", "ambiguous")
+    )
     if gone:
-        log.warning(
-            "sequence %s: in %d of %d frames no camera shows the object for so long that it seems "
-            "to have left; if it was there, check the candidates, or annotate 'object_poses'",
-            sequence,
-            gone,
-            count,
+        warn(
+            f"in {gone} of {count} frames no camera shows it for so long that it seems to have "
+            "left; if it was there, check the candidates, or annotate 'object_poses'"
         )
-    if lost > UNSOUND_SHARE * count:
-        log.warning(
-            "sequence %s: the object is lost in %d of %d frames; check the candidates, or "
-            "annotate 'object_poses'",
-            sequence,
-            lost,
-            count,
+    if lost > 0.5 * count:
+        warn(
+            f"it is lost in {lost} of {count} frames; check the candidates, or annotate "
+            "'object_poses'"
         )
-    elif lost + ambiguous > UNSOUND_SHARE * count:
-        log.warning(
-            "sequence %s: of %d frames the object is lost in %d, and different poses explain %d "
-            "equally well; annotate 'object_poses' to decide",
-            sequence,
-            count,
-            lost,
-            ambiguous,
+    elif lost + ambiguous > 0.5 * count:
+        warn(
+            f"of {count} frames it is lost in {lost}, and different poses explain {ambiguous} "
+            "equally well; annotate 'object_poses' to decide"
         )

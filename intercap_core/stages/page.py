@@ -121,8 +121,7 @@ def _overlays(
 
 
 def _describe_joint(joint: Artefact, rig: Rig, master: int) -> str:
-    """Iterations of the joint fit, and by how much it has moved the cameras of ``rig``, in
-    words."""
+    """Iterations of the joint fit, and the displacement of the cameras of ``rig``, in words."""
     if "made_by" in joint.attributes:
         return (
             f"Not fitted here: made by {joint.attributes['made_by']}, with the cameras as they "

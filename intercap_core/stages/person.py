@@ -164,8 +164,8 @@ def _why(found: Detections) -> str:
         )
     if len(seeing) == 1:
         return (
-            f"camera {seeing[0]} alone sees anybody, without depth beside its keypoints, so that "
-            "the distance is not known; add a second camera or depth"
+            f"camera {seeing[0]} alone sees anybody, without depth at its keypoints, so that the "
+            "distance is unknown; add a second camera or depth"
         )
     return (
         f"no two views agree on one person ({found.path}); check the keypoint files and the "

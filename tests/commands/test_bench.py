@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from intercap_core.commands import bench
 from intercap_core.commands.bench import add_figures, time_extraction
 from intercap_core.config import Config
 from intercap_core.entries import ObjectEntry, SubjectEntry
@@ -15,7 +16,10 @@ from intercap_core.project import Project
 from tests.helpers.kinect_files import entry_of, record
 
 
-def test_extraction_counts_sets_and_whole_files(tmp_path: Path) -> None:
+def test_extraction_counts_sets_and_whole_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bench, "REPEATS", 1)
     folder = tmp_path / "recordings"
     folder.mkdir()
     for camera in range(2):

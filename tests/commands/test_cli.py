@@ -62,20 +62,15 @@ def intercap(*arguments: str, folder: Path = ROOT) -> subprocess.CompletedProces
     return subprocess.CompletedProcess(arguments, status, output.getvalue(), errors.getvalue())
 
 
-def start_intercap(*arguments: str, folder: Path = ROOT) -> subprocess.CompletedProcess[str]:
-    """Run the command line in a process of its own."""
-    return subprocess.run(
-        [sys.executable, "-m", "intercap_core.cli", *arguments],
-        cwd=folder,
+def test_help_is_quick_and_has_examples() -> None:
+    start = resource.getrusage(resource.RUSAGE_CHILDREN)
+    done = subprocess.run(
+        [sys.executable, "-m", "intercap_core.cli", "--help"],
+        cwd=ROOT,
         env={"PATH": "/usr/bin:/bin", "COLUMNS": "200", "PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
     )
-
-
-def test_help_is_quick_and_has_examples() -> None:
-    start = resource.getrusage(resource.RUSAGE_CHILDREN)
-    done = start_intercap("--help")
     end = resource.getrusage(resource.RUSAGE_CHILDREN)
     # Processor time, not wall time: whatever else the machine does
     assert end.ru_utime + end.ru_stime - start.ru_utime - start.ru_stime < 1.0
@@ -174,6 +169,13 @@ def small_project(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.fixture
+def inside(small_project: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The same as the working directory."""
+    monkeypatch.chdir(small_project)
+    return small_project
+
+
 def test_check_lists_all_faults_of_all_sequences(small_project: Path) -> None:
     done = intercap("check", "config.yaml", folder=small_project)
     assert done.returncode == 1
@@ -205,14 +207,7 @@ def test_check_lists_all_faults_of_all_sequences(small_project: Path) -> None:
         ("annotations/good.yml", "", "problem: annotations/good.yml: no sequence has this"),
     ],
 )
-def test_check_opens_the_files(
-    small_project: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    file: str,
-    content: str | None,
-    says: str,
-) -> None:
-    monkeypatch.chdir(small_project)
+def test_check_opens_the_files(inside: Path, file: str, content: str | None, says: str) -> None:
     project = load_project(Path("config.yaml"), {"exclude": ["bad", "empty"]})
     assert faults_of_sequences(project) == []
     if content is None:
@@ -223,8 +218,7 @@ def test_check_opens_the_files(
     assert says in f"problem: {fault}"
 
 
-def test_check_names_unknown_cameras(small_project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(small_project)
+def test_check_names_unknown_cameras(inside: Path) -> None:
     settings = {"exclude": ["bad", "empty"], "frames": {"cameras": ["k9"]}}
     (fault,) = faults_of_sequences(load_project(Path("config.yaml"), settings))
     assert "the setting frames.cameras names 'k9', rec has k1" in str(fault)
@@ -233,10 +227,7 @@ def test_check_names_unknown_cameras(small_project: Path, monkeypatch: pytest.Mo
     assert "\n" not in str(fault)
 
 
-def test_check_notes_cameras_without_recording_or_detections(
-    small_project: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(small_project)
+def test_check_notes_cameras_without_recording_or_detections(inside: Path) -> None:
     exclude = {"exclude": ["bad", "empty"]}
     (note,) = notes_of_sequences(load_project(Path("config.yaml"), exclude))
     assert str(note).startswith("sequence 'good': its row names neither keypoints nor candidates")
@@ -248,18 +239,26 @@ def test_check_notes_cameras_without_recording_or_detections(
     head, good, *others = table.read_text().splitlines()
     lines = [f"{head}\tkeypoints\tcandidates", f"{good}\tpoints\tmasks"]
     table.write_text("\n".join([*lines, *(f"{line}\t\t" for line in others)]) + "\n")
-    (small_project / "points" / "camera1").mkdir(parents=True)
-    (small_project / "masks").mkdir()
+    (inside / "points" / "camera1").mkdir(parents=True)
+    (inside / "masks").mkdir()
     missing = [str(note) for note in notes_of_sequences(load_project(Path("config.yaml"), exclude))]
     assert [text.partition(": ")[2].partition(";")[0] for text in missing] == [
         "rec records k1", "points has no folder k1 and no k1.json", "masks has no k1.json",
     ]  # fmt: skip
     assert "rig.json also has k2" in missing[0]
-    (small_project / "points" / "k1").mkdir()
-    (small_project / "masks" / "k1.json").write_text("[]")
+    (inside / "points" / "k1").mkdir()
+    (inside / "masks" / "k1.json").write_text("[]")
     assert len(notes_of_sequences(load_project(Path("config.yaml"), exclude))) == 1
-    done = intercap("check", "config.yaml", folder=small_project)
+    done = intercap("check", "config.yaml", folder=inside)
     assert "note: sequence 'good': rec records k1" in done.stdout
+
+
+def notes_with(column: str, folder: str) -> list[str]:
+    """Notes of the good sequence with one more column in its row."""
+    table = Path("sequences.tsv")
+    head, good, *_ = table.read_text().splitlines()
+    table.write_text(f"{head}\t{column}\n{good}\t{folder}\n")
+    return [str(note) for note in notes_of_sequences(load_project(Path("config.yaml")))]
 
 
 LARGE = [
@@ -282,18 +281,12 @@ LARGE = [
         ([], ""),
     ],
 )  # fmt: skip
-def test_check_reads_the_first_candidates(
-    small_project: Path, monkeypatch: pytest.MonkeyPatch, content: str | list, says: str
-) -> None:
-    monkeypatch.chdir(small_project)
-    table, objects = Path("sequences.tsv"), Path("objects.yaml")
-    head, good, *_ = table.read_text().splitlines()
-    table.write_text(f"{head}\tcandidates\n{good}\tmasks\n")
-    objects.write_text(yaml.safe_dump({"cup": {"mesh": "cup.ply", "labels": ["mug"]}}))
-    Path("config.yaml").write_text("dataset: small\n")
+def test_check_reads_the_first_candidates(inside: Path, content: str | list, says: str) -> None:
+    objects = {"cup": {"mesh": "cup.ply", "labels": ["mug"]}}
+    Path("objects.yaml").write_text(yaml.safe_dump(objects))
     Path("masks").mkdir()
     Path("masks/k1.json").write_text(content if isinstance(content, str) else json.dumps(content))
-    notes = [str(note) for note in notes_of_sequences(load_project(Path("config.yaml")))]
+    notes = notes_with("candidates", "masks")
     assert len(notes) == bool(says)
     assert not says or says in notes[0]
 
@@ -317,29 +310,24 @@ FAR_OUT = [v for i in range(133) for v in (1300.0 + i, 20.0, 0.5)]
     ],
 )  # fmt: skip
 def test_check_reads_the_first_keypoints(
-    small_project: Path, monkeypatch: pytest.MonkeyPatch, name: str, content: object, says: str
+    inside: Path, name: str, content: object, says: str
 ) -> None:
-    monkeypatch.chdir(small_project)
-    table = Path("sequences.tsv")
-    head, good, *_ = table.read_text().splitlines()
-    table.write_text(f"{head}\tkeypoints\n{good}\tpoints\n")
     Path("points/k1").mkdir(parents=True)
     text = content if isinstance(content, str) else json.dumps(content)
     Path("points", name).write_text(text)
-    notes = [str(note) for note in notes_of_sequences(load_project(Path("config.yaml")))]
-    notes = [note for note in notes if "candidates" not in note]
+    notes = [note for note in notes_with("keypoints", "points") if "candidates" not in note]
     assert len(notes) == bool(says), notes
     assert not says or says in notes[0]
 
 
 def test_check_notes_objects_unknown_to_the_model(
-    small_project: Path, monkeypatch: pytest.MonkeyPatch
+    inside: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("onnxruntime")
     tiny_onnx = pytest.importorskip("tests.helpers.tiny_onnx", exc_type=ImportError)
-    monkeypatch.chdir(small_project)
+    monkeypatch.chdir(inside)
     names = {"names": "{0: 'suitcase', 1: 'cup'}"}
-    path = tiny_onnx.yolo(small_project / "model.onnx", (64, 64), names)
+    path = tiny_onnx.yolo(inside / "model.onnx", (64, 64), names)
     settings = {"detections": {"segmentation_model": path.name}}
     for labels, count in ((["mug"], 1), (["mug", "cup"], 0), ([], 0)):
         Path("objects.yaml").write_text(
@@ -377,8 +365,7 @@ def test_an_invalid_body_file_stops_before_any_job(
     assert " file body.npz " in done.stderr
 
 
-def test_a_missing_device_is_an_error(small_project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(small_project)
+def test_a_missing_device_is_an_error(inside: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     check_device(load_project(Path("config.yaml")))
     with pytest.raises(UserError, match=r"config\.yaml: device is cuda, .* set device: cpu"):
@@ -404,8 +391,7 @@ def test_inspect_prints_attributes_and_datasets(detections: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "sequence  one" in done.stdout
     row = next(line for line in done.stdout.splitlines() if "keypoints_found" in line)
-    assert "2 x 1" in row
-    assert "bool" in row
+    assert "2 x 1" in row and "bool" in row
     assert "checksum is right" in done.stdout
 
 
@@ -445,10 +431,7 @@ def test_a_stage_rejects_inputs_of_another_sequence(small_project: Path) -> None
     )
 
 
-def test_reasons_with_markup_are_printed_literally(
-    small_project: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(small_project)
+def test_reasons_with_markup_are_printed_literally(inside: Path) -> None:
     words = io.StringIO()
     watcher = Watcher(load_project(Path("config.yaml")), Console(file=words, width=200))
     log = Path("logs/trial/good/scene.log")
@@ -458,10 +441,7 @@ def test_reasons_with_markup_are_printed_literally(
     assert words.getvalue() == "good: scene: failed a[/b] has [3] points\n"
 
 
-def test_a_log_removed_while_it_is_read_is_ignored(
-    small_project: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(small_project)
+def test_a_log_removed_while_it_is_read_is_ignored(inside: Path) -> None:
     watcher = Watcher(load_project(Path("config.yaml")), Console(file=io.StringIO()))
     gone = Path("logs/trial/good/scene.log")
     gone.parent.mkdir(parents=True)
@@ -479,16 +459,12 @@ def test_the_studio_never_replaces_real_recordings(small_project: Path) -> None:
         "good\ts01\tcup\tresults/trial/recordings/good"
         "\tresults/trial/recordings/good/calibration.json\n"
     )
-    done = start_intercap("run", "config.yaml", "--", "--dry-run", folder=small_project)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "good: reading and synchronising" in done.stdout
-    assert "virtual recording" not in done.stdout
+    assert load_project(small_project / "config.yaml").recordings_made("good") is None
+    done = intercap("studio", "config.yaml", "good", folder=small_project)
+    assert done.returncode == 1 and "its recordings are real" in done.stderr
 
 
-def test_a_run_without_a_terminal_prints_progress(
-    small_project: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(small_project)
+def test_a_run_without_a_terminal_prints_progress(inside: Path) -> None:
     project = load_project(Path("config.yaml"))
     watcher = Watcher(project, Console(file=io.StringIO()))
     watcher.transcript.parent.mkdir(parents=True)

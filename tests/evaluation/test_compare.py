@@ -1,4 +1,4 @@
-"""Two versions of a dataset set against each other."""
+"""Comparison of two versions of a dataset."""
 
 from __future__ import annotations
 
@@ -21,18 +21,13 @@ from tests.helpers import fitted_capture as fitted
 HAND = CONTACT_REGIONS.index("right_hand")
 
 
-@pytest.fixture(scope="module")
-def joint(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return fitted.make_capture(tmp_path_factory.mktemp("capture"), total=4).paths["joint"]
-
-
 @pytest.fixture
-def versions(joint: Path, tmp_path: Path) -> tuple[Path, Path]:
+def versions(capture: fitted.Capture, tmp_path: Path) -> tuple[Path, Path]:
     """Three sequences before, three after, one of which is new; all of the same content."""
     for version, names in (("old", ("a", "b", "gone")), ("new", ("a", "b", "came"))):
         for name in names:
             (tmp_path / version / name).mkdir(parents=True)
-            shutil.copyfile(joint, tmp_path / version / name / "joint.h5")
+            shutil.copyfile(capture.paths["joint"], tmp_path / version / name / "joint.h5")
     return tmp_path / "old", tmp_path / "new"
 
 
@@ -55,10 +50,8 @@ def test_a_change_is_measured_in_its_frames(versions: tuple[Path, Path]) -> None
         file["contact_probability"][3, HAND] = 0.9
     found = compare(*versions)
     row = found.sequences.set_index("sequence").loc["b"]
-    assert (row["state"], row["changed_frames"], row["frames"]) == ("changed", 3, 4)
-    assert row["body_mm"] == pytest.approx(5 / 4, rel=1e-4) and row["body_max_mm"] == pytest.approx(
-        5, rel=1e-4
-    )
+    assert (row["state"], row["changed_frames"], row["frames"]) == ("changed", 3, 5)
+    assert (row["body_mm"], row["body_max_mm"]) == pytest.approx((5 / 5, 5), rel=1e-4)
     assert row["object_max_mm"] == pytest.approx(10) and row["contact_changed_frames"] == 1
     frames = found.frames.set_index("frame")
     assert frames.index.tolist() == [1, 2, 3] and set(frames["sequence"]) == {"b"}
@@ -70,13 +63,17 @@ def test_a_change_is_measured_in_its_frames(versions: tuple[Path, Path]) -> None
     assert back.loc[3, "touches"] == "right_hand"
 
 
-def test_figures_of_both_stand_side_by_side(
+def test_figures_of_both_versions_are_listed(
     versions: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert compare(*versions).figures.empty
     for folder, value in zip(versions, (1.5, 20.29), strict=True):
-        told = {"dataset": "x", "frames": 4, "vertex_to_cloud": {"body_mm": value, "other": None}}
-        (folder / "summary.json").write_text(json.dumps(told))
+        summary = {
+            "dataset": "x",
+            "frames": 4,
+            "vertex_to_cloud": {"body_mm": value, "other": None},
+        }
+        (folder / "summary.json").write_text(json.dumps(summary))
     figures = compare(*versions).figures.set_index("figure")
     assert figures.loc["vertex_to_cloud.body_mm"].tolist() == [1.5, 20.29]
     assert set(figures.index) == {"frames", "vertex_to_cloud.body_mm"}
@@ -88,13 +85,13 @@ def test_figures_of_both_stand_side_by_side(
     assert compare(*versions).figures.empty
 
 
-def test_contact_that_is_not_stated_is_no_change(versions: tuple[Path, Path]) -> None:
+def test_unstated_contact_is_no_change(versions: tuple[Path, Path]) -> None:
     with h5py.File(versions[0] / "b" / "joint.h5", "r+") as file:
         file["contact_probability"][:, HAND] = 0.9
     with h5py.File(versions[1] / "b" / "joint.h5", "r+") as file:
         file["contact_probability"][:] = np.nan
     found = compare(*versions).sequences.set_index("sequence")
-    assert found.loc["b", "contact_changed_frames"] == 4
+    assert found.loc["b", "contact_changed_frames"] == 5
     with h5py.File(versions[1] / "b" / "joint.h5", "r+") as file:
         file.attrs["made_by"] = "another program"
     found = compare(*versions).sequences.set_index("sequence")
@@ -107,7 +104,7 @@ def test_recordings_of_different_lengths_are_reported(
     longer = fitted.make_capture(tmp_path / "longer", total=5).paths["joint"]
     shutil.copyfile(longer, versions[1] / "a" / "joint.h5")
     row = compare(*versions).sequences.set_index("sequence").loc["a"]
-    assert row["state"] == "not comparable" and "4 frames before and 5 after" in row["note"]
+    assert row["state"] == "not comparable" and "5 frames before and 4 after" in row["note"]
 
 
 def test_a_broken_artefact_costs_its_own_sequence(versions: tuple[Path, Path]) -> None:
@@ -117,14 +114,14 @@ def test_a_broken_artefact_costs_its_own_sequence(versions: tuple[Path, Path]) -
     assert states.loc["b", "state"] == "same"
 
 
-def test_tables_and_words(
+def test_tables_are_written_and_printed(
     versions: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with h5py.File(versions[1] / "b" / "joint.h5", "r+") as file:
         file["joints"][1] += 0.1
     written = print_comparison(*versions, tmp_path / "changes")
-    told = capsys.readouterr().out
-    assert "3 of 4 sequences differ, 1 frames; 1 are the same" in " ".join(told.split())
+    printed = capsys.readouterr().out
+    assert "3 of 4 sequences differ, 1 frames; 1 are the same" in " ".join(printed.split())
     assert [path.name for path in written] == [
         "compare_sequences.csv", "compare_frames.csv", "compare_figures.csv"
     ]  # fmt: skip

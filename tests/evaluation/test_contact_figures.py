@@ -148,7 +148,7 @@ def held(name: str, object_: str, slip: list[float]) -> SequenceMetrics:
     )
 
 
-def test_objects_count_alike_in_slip_and_joints_err_in_two_ways() -> None:
+def test_slip_is_averaged_over_objects() -> None:
     some = [held("a", "cup", [0.1, np.nan]), held("b", "cup", [0.2, 0.3]), held("c", "bat", [0, 0])]
     assert slip_by_object(some, "joint") == pytest.approx({"bat": 0.0, "cup": 200.0})
     found = hold_figures(some, "joint")

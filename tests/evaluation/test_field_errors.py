@@ -50,7 +50,7 @@ def test_cameras_are_solved_within_half_a_set_or_named() -> None:
     assert found["offset_normalised"] == pytest.approx(1.5 / 0.6745)
 
 
-def test_cameras_that_end_worse_than_given_are_counted() -> None:
+def test_cameras_made_worse_are_counted() -> None:
     scene = _scene(15, [0, 0], before=[0.004, 0.008], after=[0.0052, 0.0085], stated=[0.0052, 0])
     found = floor_figures([scene])
     assert found["extrinsics_worse_cameras"] == 1
@@ -73,7 +73,7 @@ def test_a_floor_is_measured_under_the_feet() -> None:
     assert np.isnan(floor_error(unknown, unknown, true, feet)).all()
 
 
-def test_a_floor_that_is_missing_is_counted_and_no_error() -> None:
+def test_a_missing_floor_is_counted_but_no_error() -> None:
     without = replace(_scene(15, [0]), floor_m=float("nan"), tilt_deg=float("nan"))
     found = beam_figures([_scene(15, [0]), without])
     assert found["beam_floor_missing"] == 1 and found["beam_floor_mm"] == pytest.approx(4.0)

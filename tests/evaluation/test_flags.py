@@ -1,4 +1,4 @@
-"""Limbs whose sides are exchanged for a while are told; limbs that cross are not."""
+"""Limbs whose left and right are exchanged for some frames."""
 
 from __future__ import annotations
 

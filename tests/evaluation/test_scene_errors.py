@@ -30,7 +30,7 @@ def test_slips_are_runs_of_equal_delay() -> None:
     assert scene_errors.slip_events(np.full((3, 1), 4), np.ones((3, 1), bool)) == [Slip(0, 0, 2, 4)]
 
 
-def test_a_slip_is_found_where_camera_and_amount_are_right() -> None:
+def test_slips_match_by_camera_and_lag() -> None:
     true = np.zeros((10, 3), int)
     true[2:6, 1] = 2
     true[3:5, 2] = 4

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -20,26 +19,28 @@ from tests.helpers import fitted_capture as fitted
 STAGES = ("frames", "scene", "detections", "person", "object_track", "body_fit", "joint")
 
 
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
-    return fitted.make_capture(tmp_path_factory.mktemp("capture"))
-
-
-def _run(capture: fitted.Capture, output: Path, truth: bool) -> Path:
+def _run(capture: fitted.Capture, output: Path, truth: Path | None, **settings: bool) -> Path:
     metrics.run(
-        paths=capture.inputs(*STAGES),
-        output=output,
-        models=capture.models,
-        settings=MetricsSettings(),
-        fit_settings=fitted.FIT_SETTINGS,
-        truth=capture.paths["truth"] if truth else None,
-    )
+        paths=capture.inputs(*STAGES), output=output, models=capture.models, truth=truth,
+        settings=MetricsSettings(**settings), fit_settings=fitted.FIT_SETTINGS,
+    )  # fmt: skip
     return output
+
+
+def _changed_truth(capture: fitted.Capture, folder: Path, **offsets: float) -> Path:
+    """A copy of the truth with constants added to some datasets."""
+    path = folder / "truth.h5"
+    shutil.copy(capture.paths["truth"], path)
+    with h5py.File(path, "r+") as file:
+        for key, offset in offsets.items():
+            file[key][...] += offset
+    return path
 
 
 @pytest.fixture(scope="module")
 def measured(capture: fitted.Capture) -> dict[str, np.ndarray]:
-    with artefacts.read(_run(capture, capture.paths["metrics"], truth=True), METRICS) as artefact:
+    output = _run(capture, capture.paths["metrics"], capture.paths["truth"])
+    with artefacts.read(output, METRICS) as artefact:
         assert artefact.attributes["has_truth"]
         return {key: artefact[key] for key in artefact.keys()}  # noqa: SIM118
 
@@ -137,7 +138,8 @@ def test_flags_carry_every_reason(measured: dict[str, np.ndarray]) -> None:
 def test_without_truth_all_other_values_are_the_same(
     capture: fitted.Capture, measured: dict[str, np.ndarray], tmp_path: Path
 ) -> None:
-    with artefacts.read(_run(capture, tmp_path / "metrics.h5", truth=False), METRICS) as artefact:
+    output = _run(capture, tmp_path / "metrics.h5", None)  # the verdict reads no truth either
+    with artefacts.read(output, METRICS) as artefact:
         assert not artefact.keys("truth/")
         for key in artefact.keys():  # noqa: SIM118
             if key.endswith("visible_to_cloud"):  # seen by the fit instead of by the truth
@@ -149,26 +151,19 @@ def test_without_truth_all_other_values_are_the_same(
 
 
 def test_same_input_same_bytes(capture: fitted.Capture, tmp_path: Path) -> None:
-    again = _run(capture, tmp_path / "metrics.h5", truth=True)
+    again = _run(capture, tmp_path / "metrics.h5", capture.paths["truth"])
     assert again.read_bytes() == capture.paths["metrics"].read_bytes()
 
 
 def test_truth_at_other_times_is_rejected(capture: fitted.Capture, tmp_path: Path) -> None:
-    wrong = replace(capture, paths=capture.paths | {"truth": tmp_path / "truth.h5"})
-    shutil.copy(capture.paths["truth"], wrong.paths["truth"])
-    with h5py.File(wrong.paths["truth"], "r+") as file:
-        file["times"][...] *= 1.5
+    truth = _changed_truth(capture, tmp_path, times=0.05)
     with pytest.raises(UserError, match=r"truth\.h5: holds 5 frames, the recording 5"):
-        _run(wrong, tmp_path / "metrics.h5", truth=True)
+        _run(capture, tmp_path / "metrics.h5", truth)
 
 
 def test_truth_of_another_recording_is_noticed(
     capture: fitted.Capture, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    wrong = replace(capture, paths=capture.paths | {"truth": tmp_path / "truth.h5"})
-    shutil.copy(capture.paths["truth"], wrong.paths["truth"])
-    with h5py.File(wrong.paths["truth"], "r+") as file:
-        file["body_vertices"][...] += 0.5
-        file["translation"][...] += 0.5
-    _run(wrong, tmp_path / "metrics.h5", truth=True)
+    truth = _changed_truth(capture, tmp_path, body_vertices=0.5, translation=0.5)
+    _run(capture, tmp_path / "metrics.h5", truth, hold_out=False)
     assert "truth of another recording" in caplog.text

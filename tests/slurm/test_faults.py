@@ -1,7 +1,7 @@
-"""The small dataset as Slurm jobs, and what goes wrong on clusters: one command goes on, the bytes
-are those of a local run, and nothing that was complete is computed again.
+"""The small dataset as Slurm jobs while parts of the cluster fail.
 
-`make test-slurm` runs these; `fault` names what was tried in its figures.
+Each run continues after one command, writes the bytes of a local run, and recomputes nothing that
+was complete. `make test-slurm` runs these; the property `fault` names the fault in its figures.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from tests.helpers.loopback_slurm import NODES, LoopbackSlurm
 
 pytestmark = pytest.mark.usefixtures("everything")
 
-# Of two sequences on two nodes these never wait for a node; then two jobs of each go side by side.
+# With two sequences on two nodes these stages never wait for a node.
 CHAIN = ("frames", "detections", "scene", "person")
 Record = Callable[[str, object], None]
 
@@ -42,7 +42,7 @@ def local(everything: None, tmp_path_factory: pytest.TempPathFactory) -> dict[st
 
 @pytest.fixture(scope="module")
 def run(everything: None, slurm: LoopbackSlurm, tmp_path_factory: pytest.TempPathFactory):
-    """A finished run of the same as Slurm jobs. Tests leave it as they found it."""
+    """A finished run as Slurm jobs, which the tests restore."""
     run = ClusterRun(Flow.copy(tmp_path_factory.mktemp("cluster")), slurm)
     with overheads(run) as seconds:
         run.start().ends_well()
@@ -52,8 +52,10 @@ def run(everything: None, slurm: LoopbackSlurm, tmp_path_factory: pytest.TempPat
 
 @contextlib.contextmanager
 def overheads(run: ClusterRun) -> Iterator[list[float]]:
-    """Seconds of each job of the chain beside its stage's own: from its entry in the ledger to the
-    moment when Snakemake knows that it has ended."""
+    """Seconds of each job of the chain without those of its stage.
+
+    Measured from the job's entry in the ledger to the moment when Snakemake knows of its end.
+    """
     entries = run.flow.folder / ".snakemake" / "slurm_jobs"
     appeared: dict[str, tuple[float, str]] = {}
     seconds: list[float] = []
@@ -83,9 +85,11 @@ def overheads(run: ClusterRun) -> Iterator[list[float]]:
 
 
 @contextlib.contextmanager
-def computed_anew(run: ClusterRun, local: dict[str, bytes], *stages: str) -> Iterator[list[str]]:
-    """Within the block these artefacts of one sequence are missing; after it they are there again,
-    with the bytes of a local run, and no other was touched. Gives the targets of a run."""
+def recomputed(run: ClusterRun, local: dict[str, bytes], *stages: str) -> Iterator[list[str]]:
+    """Targets of a run; within the block these artefacts of one sequence are missing.
+
+    After the block they have the bytes of a local run, and no other artefact was written.
+    """
     paths = [run.flow.artefact(ONE, stage) for stage in stages]
     names = {path.relative_to(run.flow.results).as_posix() for path in paths}
     for path in paths:
@@ -104,7 +108,7 @@ def numbers(run: ClusterRun, *words: str) -> set[str]:
 
 
 def job_runs(run: ClusterRun, stage: str) -> tuple[str, str]:
-    """Number and node of this stage's job, as soon as its stage computes."""
+    """Number and node of the stage's job as soon as the stage has started."""
     log = run.flow.folder / "logs" / "test" / ONE / f"{stage}.log"
     start = time.time()
     found = run.slurm.wait_for(
@@ -138,26 +142,18 @@ def test_nothing_is_left_to_do(run: ClusterRun) -> None:
     assert run.slurm.jobs(ended=True).keys() == before
 
 
-def test_memory(run: ClusterRun, local: dict[str, bytes], record_property: Record) -> None:
-    record_property("fault", "a job killed for its memory")
-    before = numbers(run, "rule_joint_", ONE)
-    with computed_anew(run, local, "joint") as targets:
-        scale = "cluster={memory_scale: {joint: 0.4}}"
-        said = run.start(*targets, "--config", scale).ends_well()
-    assert "exceeded memory limit" in said
-    assert len(numbers(run, "rule_joint_", ONE) - before) in (2, 3)
-
-
 def test_cancelled(run: ClusterRun, local: dict[str, bytes], record_property: Record) -> None:
     record_property("fault", "a job cancelled")
     before = numbers(run, "rule_joint_", ONE)
-    with computed_anew(run, local, "joint") as targets:
+    with recomputed(run, local, "joint") as targets:
         started = run.start(*targets)
         number, _ = job_runs(run, "joint")
         run.slurm.command("scancel", number)
         said = started.ends_well()
-    (told,) = [line for line in said.splitlines() if f"Slurm job {number}, {ONE}: joint: " in line]
-    assert told.endswith("CANCELLED")
+    (reason,) = [
+        line for line in said.splitlines() if f"Slurm job {number}, {ONE}: joint: " in line
+    ]
+    assert reason.endswith("CANCELLED")
     assert len(numbers(run, "rule_joint_", ONE) - before) == 2
 
 
@@ -165,7 +161,7 @@ def test_node_down_and_back(
     run: ClusterRun, local: dict[str, bytes], record_property: Record
 ) -> None:
     record_property("fault", "a node down and back")
-    with computed_anew(run, local, "joint") as targets:
+    with recomputed(run, local, "joint") as targets:
         started = run.start(*targets)
         number, node = job_runs(run, "joint")
         run.slurm.kill(node)
@@ -178,7 +174,7 @@ def test_node_down_and_back(
 
 
 def processes_of(run: ClusterRun, number: str, *, keepers: bool = False) -> list[int]:
-    """The processes that compute a job; or Slurm's own that look after it."""
+    """Processes that compute a job, or with ``keepers`` Slurm's own processes of the job."""
     own = f"slurmstepd: [{number}.".encode()
     here = f"SLURM_CONF={run.environment['SLURM_CONF']}".encode()
     found = []
@@ -204,7 +200,7 @@ def test_controller_restarted(
 ) -> None:
     record_property("fault", "the controller down for half a minute while a job ends")
     before = numbers(run, ONE)
-    with computed_anew(run, local, "joint", "metrics") as targets:
+    with recomputed(run, local, "joint", "metrics") as targets:
         started = run.start(*targets)
         number, _ = job_runs(run, "joint")
         run.slurm.stop_one("slurmctld")
@@ -218,12 +214,12 @@ def test_controller_restarted(
 def test_controller_killed(
     run: ClusterRun, local: dict[str, bytes], record_property: Record
 ) -> None:
-    """What it has not saved is that the job runs: it starts it again, which its node refuses, and
-    then holds it and drains the node."""
+    """The restarted controller starts the job again, which its node refuses; it then holds the job
+    and drains the node."""
     record_property("fault", "the controller killed before it notes that a job runs, which ends")
     before = numbers(run, ONE)
     saved = run.slurm.folder / "state" / "job_state"
-    with computed_anew(run, local, "joint", "metrics") as targets:
+    with recomputed(run, local, "joint", "metrics") as targets:
         # It saves a change at once where it has saved none for five seconds; else later.
         run.slurm.wait_for(lambda: time.time() - saved.stat().st_mtime > 10.0, "it has saved all")
         started = run.start(*targets)
@@ -248,7 +244,7 @@ def test_controller_down_when_jobs_are_submitted(
     record_property: Record,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Before a submission, and so late that it was seen to answer: as if it went down just then."""
+    """Before a submission, and between the check that it answers and the submission."""
     record_property("fault", "the controller down when a job is submitted")
     before = numbers(run, ONE)
     sbatch, went = run.flow.folder / "bin" / "sbatch", run.flow.folder / "bin" / "went"
@@ -264,7 +260,7 @@ exit 1
     )
     sbatch.chmod(0o755)
     monkeypatch.setenv("PATH", f"{sbatch.parent}:{os.environ['PATH']}")
-    with computed_anew(run, local, "joint") as targets:
+    with recomputed(run, local, "joint") as targets:
         run.slurm.stop_one("slurmctld")
         started = run.start(*targets)
         run.slurm.wait_for(
@@ -279,7 +275,7 @@ exit 1
 
 def test_interrupted(run: ClusterRun, local: dict[str, bytes], record_property: Record) -> None:
     record_property("fault", "Ctrl-C while a job runs")
-    with computed_anew(run, local, "joint") as targets:
+    with recomputed(run, local, "joint") as targets:
         started = run.start(*targets)
         number, _ = job_runs(run, "joint")
         send(signal.SIGSTOP, processes_of(run, number))  # so that it cannot end by itself
@@ -297,7 +293,7 @@ def test_interrupted_while_the_controller_is_down(
 ) -> None:
     record_property("fault", "Ctrl-C while the controller is down")
     before = numbers(run, ONE)
-    with computed_anew(run, local, "joint") as targets:
+    with recomputed(run, local, "joint") as targets:
         started = run.start(*targets)
         number, _ = job_runs(run, "joint")
         processes = processes_of(run, number)
@@ -321,7 +317,7 @@ def test_submitter_killed(
 ) -> None:
     record_property("fault", "Snakemake killed and started again while its job runs on")
     before = numbers(run, ONE)
-    with computed_anew(run, local, "joint", "metrics") as targets:
+    with recomputed(run, local, "joint", "metrics") as targets:
         started = run.start(*targets)
         number, _ = job_runs(run, "joint")
         processes = processes_of(run, number)
@@ -341,7 +337,7 @@ def test_submitter_killed_and_the_input_edited(
 ) -> None:
     record_property("fault", "Snakemake killed, its job's settings edited before it ended")
     other = ("--config", "joint={contact_weight: 2}")
-    with computed_anew(run, local, "joint") as targets:
+    with recomputed(run, local, "joint") as targets:
         started = run.start(*targets, *other)
         number, _ = job_runs(run, "joint")
         send(signal.SIGSTOP, processes_of(run, number))
@@ -354,10 +350,10 @@ def test_submitter_killed_and_the_input_edited(
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="here the stage would find a GPU")
-def test_a_stage_on_a_gpu_goes_where_one_is(run: ClusterRun, local: dict[str, bytes]) -> None:
-    """Slurm believes that a node has one; that PyTorch finds none there is told once."""
+def test_a_gpu_stage_uses_the_gpu_partition(run: ClusterRun, local: dict[str, bytes]) -> None:
+    """Slurm's node claims a GPU; the error that PyTorch finds none is reported once."""
     before = numbers(run, "rule_body_fit_", ONE)
-    with computed_anew(run, local, "body_fit") as targets:
+    with recomputed(run, local, "body_fit") as targets:
         on_gpu = ("--config", "device=cuda", "cluster={gpu_partition: gpu}")
         started = run.start(*targets, *on_gpu)
         assert started.process.wait(300) == 1
@@ -375,19 +371,19 @@ def test_a_stage_on_a_gpu_goes_where_one_is(run: ClusterRun, local: dict[str, by
 def test_a_broken_annotation_fails_once_and_alone(
     run: ClusterRun, local: dict[str, bytes], record_property: Record
 ) -> None:
-    """What was computed stays, in the report too; a sequence that is not complete is left out."""
+    """Results stay, in the report too; an incomplete sequence is left out."""
     record_property("fault", "one sequence's annotation broken")
     annotation, summary = run.flow.annotation(OTHER), run.flow.artefact(OTHER, "summary")
     annotation.parent.mkdir(exist_ok=True)
     annotation.write_text("floor: [[\n")
-    told, new = jobs_of_failed_run(run)
-    assert "the report leaves out" not in told
+    output, new = jobs_of_failed_run(run)
+    assert "the report leaves out" not in output
     assert new == [f"rule_broken_annotation_wildcards_{OTHER}"]
     assert contents(run.flow.results) == local
     summary.unlink()
     kept = written(run.flow.results)
-    told, new = jobs_of_failed_run(run)
-    assert f"the report leaves out {OTHER}" in told
+    output, new = jobs_of_failed_run(run)
+    assert f"the report leaves out {OTHER}" in output
     assert new == [f"rule_broken_annotation_wildcards_{OTHER}", "rule_dataset"]
     assert "not valid YAML" in (run.flow.results / "site" / "index.html").read_text()
     assert written(run.flow.results) == kept
@@ -397,7 +393,7 @@ def test_a_broken_annotation_fails_once_and_alone(
 
 
 def jobs_of_failed_run(run: ClusterRun) -> tuple[str, list[str]]:
-    """What `intercap run` says, that ends in failure for the annotation, and what it submitted."""
+    """Output of an `intercap run` that fails because of the annotation, and its submitted jobs."""
     before = run.slurm.jobs(ended=True).keys()
     started = run.start_intercap("run", run.flow.settings, "--profile", PROFILE[1])
     assert started.process.wait(600) == 1, started.output

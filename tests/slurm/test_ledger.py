@@ -1,4 +1,4 @@
-"""What a run leaves for the next one, and how the end of a job is read; without a Slurm."""
+"""The ledger of submitted jobs, and the end of a job according to its logs; without Slurm."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from snakemake_executor_plugin_intercap_slurm.endings import endings
-from snakemake_executor_plugin_intercap_slurm.ledger import Entry, Ledger
+from snakemake_executor_plugin_intercap_slurm.ledger import JobEntry, Ledger
 
 
 @dataclass
@@ -54,7 +54,7 @@ def folder(tmp_path: Path) -> Path:
 def test_an_entry_is_read_back_as_it_was(folder: Path) -> None:
     (folder / "joint.log").write_text("old")
     ledger = Ledger(folder / "ledger")
-    entry = Entry.of(Job(folder)).submitted("17", "rule_joint/walk/17.log")
+    entry = JobEntry.of(Job(folder)).submitted("17", "rule_joint/walk/17.log")
     ledger.write(entry)
     assert ledger.keep({"17"}) == [entry]
     assert ledger.keep({"18"}) == []
@@ -69,23 +69,23 @@ def test_a_damaged_entry_counts_as_none(folder: Path) -> None:
     assert ledger.keep({"0", "1", "2", "3"}) == []
 
 
-def test_what_is_asked_for_decides(folder: Path) -> None:
-    entry = Entry.of(Job(folder))
-    assert Entry.of(Job(folder)) == entry
-    assert Entry.of(Job(folder, settings="b")).digest != entry.digest
+def test_the_digest_depends_on_settings_and_inputs(folder: Path) -> None:
+    entry = JobEntry.of(Job(folder))
+    assert JobEntry.of(Job(folder)) == entry
+    assert JobEntry.of(Job(folder, settings="b")).digest != entry.digest
     (folder / "frames.h5").write_bytes(b"other frames")
-    assert Entry.of(Job(folder)).digest != entry.digest
+    assert JobEntry.of(Job(folder)).digest != entry.digest
 
 
 def log(folder: Path, stage: str, *lines: str) -> None:
     (folder / f"{stage}.log").write_text("".join(f"12:00:00 {line}\n" for line in lines))
 
 
-def test_each_stage_of_a_group_is_told(folder: Path) -> None:
+def test_each_stage_of_a_group_is_reported(folder: Path) -> None:
     stages = ("page", "export", "joint", "metrics")
     group = Group(Job(folder, stage=stage) for stage in stages)
     log(folder, "metrics", "failed: of an earlier run")
-    entry = Entry.of(group)
+    entry = JobEntry.of(group)
     log(folder, "page", "page finished", "finished in 3.0 s")
     log(folder, "export", "failed: no such mesh")
     log(folder, "joint", "joint started with 1 thread(s)")
@@ -100,16 +100,16 @@ def test_each_stage_of_a_group_is_told(folder: Path) -> None:
     assert "CANCELLED" in found["walk: joint"].line("5")
 
 
-def test_what_the_program_did_not_expect_is_no_mistake(folder: Path) -> None:
-    entry = Entry.of(Job(folder))
+def test_an_unexpected_error_is_no_user_error(folder: Path) -> None:
+    entry = JobEntry.of(Job(folder))
     log(folder, "joint", "failed: unexpected OSError: stale file handle")
     (ending,) = endings(Job(folder), entry, folder / "missing.log")
     assert ending.state == "failed"
     assert not ending.is_mistake
 
 
-def test_a_job_that_is_killed_after_its_stage_is_told(folder: Path) -> None:
-    entry = Entry.of(Job(folder))
+def test_a_job_killed_after_its_stage_is_reported(folder: Path) -> None:
+    entry = JobEntry.of(Job(folder))
     log(folder, "joint", "finished in 3.0 s")
     slurm = folder / "slurm.log"
     slurm.write_text("slurmstepd: error: StepId=5.batch exceeded memory limit (2 > 1)\n")
@@ -119,9 +119,9 @@ def test_a_job_that_is_killed_after_its_stage_is_told(folder: Path) -> None:
     assert ending.line("5") == said
 
 
-def test_a_log_that_was_there_before_says_nothing(folder: Path) -> None:
+def test_a_log_of_an_earlier_run_is_ignored(folder: Path) -> None:
     log(folder, "joint", "failed: no such mesh")
-    entry = Entry.of(Job(folder))
+    entry = JobEntry.of(Job(folder))
     (ending,) = endings(Job(folder), entry, folder / "missing.log")
     assert ending.state == "waiting"
     os.utime(folder / "joint.log", (1, 1))

@@ -65,7 +65,7 @@ def test_a_job_killed_for_its_memory_comes_back_with_more(
     assert frames.read_bytes() == local
 
 
-def test_a_mistake_is_submitted_once_and_told(tiny: ClusterRun, slurm: LoopbackSlurm) -> None:
+def test_a_user_error_is_submitted_once(tiny: ClusterRun, slurm: LoopbackSlurm) -> None:
     kept = written(tiny.flow.results)
     started = tiny.start(tiny.target(NAME, "scene"))
     assert started.process.wait(300) == 1
@@ -75,7 +75,7 @@ def test_a_mistake_is_submitted_once_and_told(tiny: ClusterRun, slurm: LoopbackS
     assert written(tiny.flow.results) == kept
 
 
-def test_each_stage_of_a_group_is_told(tiny: ClusterRun, slurm: LoopbackSlurm) -> None:
+def test_each_stage_of_a_group_is_reported(tiny: ClusterRun, slurm: LoopbackSlurm) -> None:
     tiny.flow.artefact(NAME, "frames").unlink()
     before = slurm.jobs(ended=True).keys()
     grouped = ("--groups", "frames=reading", "detections=reading")

@@ -1,4 +1,4 @@
-"""What Slurm's commands say, and what is made of it; without a Slurm."""
+"""Answers of Slurm's commands and the executor's reactions; without Slurm."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from snakemake_interface_executor_plugins.executors.base import SubmittedJobInfo
 
 import snakemake_executor_plugin_intercap_slurm as plugin
 from snakemake_executor_plugin_intercap_slurm import slurm
-from snakemake_executor_plugin_intercap_slurm.ledger import Entry
+from snakemake_executor_plugin_intercap_slurm.ledger import JobEntry
 from tests.slurm.test_ledger import Job, log
 
 
@@ -24,7 +24,7 @@ def answer(monkeypatch: pytest.MonkeyPatch, text: str, status: int = 0) -> None:
     monkeypatch.setattr(slurm, "_run", lambda command: done)
 
 
-def test_a_job_is_held_by_slurm_or_by_somebody(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_jobs_held_by_slurm_differ_from_user_holds(monkeypatch: pytest.MonkeyPatch) -> None:
     answer(
         monkeypatch,
         "1|RUNNING|None\n2|PENDING|launch failed requeued held\n3|PENDING|JobHeldUser\n\n"
@@ -74,7 +74,7 @@ class Executor(plugin.Executor):
 
 def submitted(folder: Path, number: str) -> SubmittedJobInfo:
     job = Job(folder)
-    aux = {plugin.ENTRY: Entry.of(job), "slurm_logfile": folder / f"{number}.log"}
+    aux = {plugin.ENTRY: JobEntry.of(job), "slurm_logfile": folder / f"{number}.log"}
     return SubmittedJobInfo(job, number, aux)
 
 
@@ -111,7 +111,7 @@ def test_a_held_job_is_cancelled_and_judged_by_its_log(
     assert ("success" if finished else "Slurm could not launch job '7'") in said
 
 
-def test_ctrl_c_reaches_jobs_that_are_looked_at(
+def test_ctrl_c_cancels_jobs_that_are_being_polled(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     cancelled: list[str | None] = []

@@ -72,8 +72,19 @@ def motion(model: BodyModel, frames: int, seed: int = 0) -> torch.Tensor:
     return torch.as_tensor(x, dtype=torch.float32)
 
 
+def fit(inputs: Inputs, output: Path, person: Path | None = None, **options) -> dict:
+    """Attributes and datasets of the fit to a capture, with another person artefact if given."""
+    given = {"subject": SUBJECT, "body_models": BodyModels(), "settings": SETTINGS} | options
+    body_fit.run(
+        frames=inputs.frames, scene=inputs.scene, person=person or inputs.person, output=output,
+        **given,
+    )  # fmt: skip
+    with artefacts.read(output, BODY_FIT) as read:
+        return dict(read.attributes) | {key: read[key] for key in read.keys("")}
+
+
 class Capture:
-    """True vectors, vertices and joints, and the artefacts of what the cameras saw."""
+    """True vectors, vertices and joints, and the artefacts of a virtual recording."""
 
     def __init__(self, model: BodyModel, folder: Path, frames: int, **options) -> None:
         cameras = options.pop("cameras", 5)
@@ -93,16 +104,8 @@ class Capture:
             folder, ring(cameras), surface, model.faces.numpy(), keypoints, **options
         )
 
-    def fit(self, output: Path, **options):
-        given = {
-            "subject": SUBJECT, "body_models": BodyModels(), "settings": SETTINGS, **options
-        }  # fmt: skip
-        body_fit.run(
-            frames=self.inputs.frames, scene=self.inputs.scene, person=self.inputs.person,
-            output=output, **given,
-        )  # fmt: skip
-        with artefacts.read(output, BODY_FIT) as read:
-            return dict(read.attributes) | {key: read[key] for key in read.keys("")}
+    def fit(self, output: Path, **options) -> dict:
+        return fit(self.inputs, output, **options)
 
     def errors_mm(self, model: BodyModel, found) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Per frame: vertices, 22 joints, finger joints."""
@@ -137,20 +140,11 @@ def test_known_time_offsets_improve_a_moving_body(model, tmp_path):
             tmp_path / name, ring(5), np.stack([o.vertices.double().numpy() for o in exposed], 1),
             model.faces.numpy(),
             np.stack([model.keypoints(o).double().numpy() for o in exposed], 1),
-            time_offset=offset,
+            time_offset=offset, depth=False,
         )  # fmt: skip
-        body_fit.run(
-            frames=inputs.frames, scene=inputs.scene, person=inputs.person,
-            output=tmp_path / f"{name}.h5", subject=SUBJECT, body_models=BodyModels(),
-            settings=BODY_ALONE,
-        )  # fmt: skip
-        with artefacts.read(tmp_path / f"{name}.h5", BODY_FIT) as read:
-            joints = read["joints"]
-            errors.append(
-                1000 * np.linalg.norm(joints - truth.joints.numpy(), axis=2)[:, :22].mean()
-            )
-            pixels = np.nanmedian(read["keypoint_residual"])
-        errors.append(pixels)
+        found = fit(inputs, tmp_path / f"{name}.h5", settings=BODY_ALONE)
+        apart = np.linalg.norm(found["joints"] - truth.joints.numpy(), axis=2)
+        errors += [1000 * apart[:, :22].mean(), np.nanmedian(found["keypoint_residual"])]
     with_offsets, px, without, px_without = errors
     assert with_offsets < 0.7 * without and px < 0.3 * px_without
 
@@ -158,7 +152,7 @@ def test_known_time_offsets_improve_a_moving_body(model, tmp_path):
 def test_exact_keypoints_alone_give_the_parameters_back() -> None:
     """With next to no noise assumed, E_J alone returns body, hands and face to under 1 mm."""
     model = open_body(torch.float64)
-    truth = motion(open_body(), 2).double()
+    truth = motion(open_body(), 1).double()
     points = model.keypoints_of(model.parameters(truth))
     start = truth + 0.03 * torch.randn(
         truth.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
@@ -247,13 +241,8 @@ def test_unseen_and_contradicted_parts_are_undetermined(model, clothed, tmp_path
         keypoints[4][:, leg, :2] += shift[:, None]
 
     changed = with_keypoints(capture.inputs.person, tmp_path / "person.h5", guess)
-    body_fit.run(
-        frames=capture.inputs.frames, scene=capture.inputs.scene, person=changed,
-        output=tmp_path / "body_fit.h5", subject=SUBJECT, body_models=BodyModels(),
-        settings=SETTINGS,
-    )  # fmt: skip
-    with artefacts.read(tmp_path / "body_fit.h5", BODY_FIT) as read:
-        open_parts, failed = read["undetermined"], read["failed"]
+    found = capture.fit(tmp_path / "body_fit.h5", person=changed)
+    open_parts, failed = found["undetermined"], found["failed"]
     expected = np.zeros_like(open_parts)
     expected[3] = True
     expected[1, names.index("left_hand")] = expected[4, names.index("right_leg")] = True
@@ -299,7 +288,7 @@ def test_a_named_vposer_draws_the_fit_to_its_pose(model, tmp_path: Path) -> None
     state[f"{names[2]}.bias"] = rotation_from_axis_angle(pose)[..., :2].reshape(126)
     weights = tmp_path / "weights.pt"
     torch.save({"state_dict": state}, weights)
-    capture = Capture(model, tmp_path, 2, cameras=3, depth=False)
+    capture = Capture(model, tmp_path, 1, cameras=3, depth=False)
     found = {}
     for name, models in (("open", BodyModels()), ("learned", BodyModels(vposer=weights))):
         read = capture.fit(tmp_path / f"{name}.h5", settings=BODY_ALONE, body_models=models)
@@ -335,11 +324,7 @@ def test_artefacts_of_another_recording_are_refused(model, clothed, tmp_path: Pa
     capture, _, _ = clothed
     other = Capture(model, tmp_path, 2, cameras=2, depth=False)
     with pytest.raises(UserError, match="re-run stage"):
-        body_fit.run(
-            frames=other.inputs.frames, scene=other.inputs.scene, person=capture.inputs.person,
-            output=tmp_path / "out.h5", subject=SUBJECT, body_models=BodyModels(),
-            settings=SETTINGS,
-        )  # fmt: skip
+        other.fit(tmp_path / "out.h5", person=capture.inputs.person)
 
 
 def test_compiled_and_torch_fits_agree_with_blend_shapes(tmp_path):

@@ -1,4 +1,4 @@
-"""Files of candidates that are broken or of other images: told, left out, and the rest counts."""
+"""Faulty files of candidates are noted and left out; the others are used."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ NONE, ALL = [0, 0, 0, 0], [1, 1, 1, 1]
         ([], "", ALL, NONE),
     ],
 )  # fmt: skip
-def test_one_cameras_file_never_fails_the_sequence(candidates, content, words, found, count):
+def test_a_faulty_file_costs_only_its_own_entries(candidates, content, words, found, count):
     text = content if isinstance(content, str) else json.dumps(content)
     (candidates / "k1.json").write_text(text)
     read = run(candidates)
@@ -109,14 +109,14 @@ def test_one_cameras_file_never_fails_the_sequence(candidates, content, words, f
     assert read.notes[1] == "" and read.candidates_found[:, 1].all()
 
 
-def test_a_huge_file_is_told(candidates, monkeypatch):
+def test_a_huge_file_is_not_read(candidates, monkeypatch):
     (candidates / "k1.json").write_text(json.dumps(GOOD * 3))
     monkeypatch.setattr(coco, "MAX_JSON_BYTES", (candidates / "k2.json").stat().st_size)
     read = run(candidates)
     assert "one file an image" in read.notes[0] and not read.candidates_found[:, 0].any()
 
 
-def test_reasons_are_told_where_nothing_is_left(candidates):
+def test_reasons_are_listed_if_no_candidate_is_left(candidates):
     for name in ("k1", "k2"):
         (candidates / f"{name}.json").write_text("{")
     with pytest.raises(UserError, match=r"k2: candidates/k2\.json is not valid JSON"):
@@ -139,7 +139,7 @@ def test_numbers_of_classes(candidates, setting, number, label):
     assert read.candidates(0, 0)[0].label == label
 
 
-def test_a_data_set_whose_ids_are_not_its_images_numbers(candidates):
+def test_ids_are_resolved_by_the_list_of_images(candidates):
     images = [{"id": 50 + n, "file_name": f"k1/frame_{n:05d}.jpg"} for n in range(3)]
     annotations = [result(50 + n, x=300 + 10 * n) for n in range(2)]
     content = {"images": images, "annotations": annotations}
@@ -149,7 +149,7 @@ def test_a_data_set_whose_ids_are_not_its_images_numbers(candidates):
     assert [c.box[0] for t in range(SETS) for c in read.candidates(t, 0)] == [300, 310]
 
 
-def test_names_that_number_something_else_leave_the_ids(candidates):
+def test_unrelated_numbers_in_names_are_ignored(candidates):
     images = [{"id": n, "file_name": f"img_{n + 160530:06d}.jpg"} for n in range(SETS)]
     content = {"images": images, "annotations": GOOD}
     (candidates / "k1.json").write_text(json.dumps(content))
@@ -158,13 +158,13 @@ def test_names_that_number_something_else_leave_the_ids(candidates):
 
 
 @pytest.mark.parametrize("name", ["coco_instances_results.json", "predictions.json"])
-def test_what_detectors_call_their_file(candidates, name):
+def test_default_file_names_of_detectors(candidates, name):
     (candidates / "k1").mkdir()
     (candidates / "k1" / name).write_text(json.dumps(GOOD))
     assert run(candidates).candidates_found[:, 0].all()
 
 
-def test_one_file_an_image(candidates):
+def test_one_file_per_image(candidates):
     folder = candidates / "k1"
     folder.mkdir()
     sam = {k: v for k, v in GOOD[0].items() if k == "segmentation"} | {"predicted_iou": 0.75}
@@ -208,7 +208,7 @@ def test_masks_as_images(candidates):
         (None, "is no image"),
     ],
 )
-def test_images_that_are_no_masks(candidates, image, words):
+def test_invalid_mask_images_are_noted(candidates, image, words):
     folder = candidates / "k1"
     folder.mkdir()
     if image is None:

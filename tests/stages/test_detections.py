@@ -1,4 +1,4 @@
-"""From files to the detections artefact and back through its reader."""
+"""Stage ``detections`` from files to the artefact and its reader."""
 
 from __future__ import annotations
 
@@ -20,15 +20,16 @@ RIG, _ = ring(2)
 WIDTH, HEIGHT = 1920, 1080
 
 
-def entry(tmp_path: Path, **paths) -> SequenceEntry:
-    return SequenceEntry(
-        sequence="test",
-        subject="s",
-        object="o",
-        recordings=tmp_path,
-        calibration=tmp_path / "rig.json",
-        **paths,
-    )
+def run(folder: Path, output: str = "detections.h5", **paths: Path) -> Path:
+    row = SequenceEntry(
+        sequence="test", subject="s", object="o", recordings=folder,
+        calibration=folder / "rig.json", **paths,
+    )  # fmt: skip
+    detections.run(
+        frames=folder / "frames.h5", output=folder / output, sequence=row,
+        settings=DetectionsSettings(),
+    )  # fmt: skip
+    return folder / output
 
 
 def people_file(path: Path, x: list[float]) -> None:
@@ -40,21 +41,16 @@ def people_file(path: Path, x: list[float]) -> None:
 def result(image: int, width: int, label: str) -> dict:
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[100:200, 300 : 300 + width] = 1
-    rle = masks.encode(mask).decode()
+    segmentation = {"size": [HEIGHT, WIDTH], "counts": masks.encode(mask).decode()}
     return {
-        "image_id": image,
-        "category_name": label,
-        "score": 0.5,
-        "segmentation": {"size": [HEIGHT, WIDTH], "counts": rle},
-    }
+        "image_id": image, "category_name": label, "score": 0.5, "segmentation": segmentation
+    }  # fmt: skip
 
 
 def test_files_reach_the_sets_that_hold_their_image(tmp_path):
     index = np.array([[0, 0], [1, 2], [2, -1], [3, 3]])
     dropped = np.array([False, False, False, True])
-    frames = write_frames(
-        tmp_path / "frames.h5", RIG, num_sets=4, colour_index=index, dropped=dropped
-    )
+    write_frames(tmp_path / "frames.h5", RIG, num_sets=4, colour_index=index, dropped=dropped)
     keypoints, candidates = tmp_path / "keypoints", tmp_path / "candidates"
     people_file(keypoints / "k1" / "000000000000_keypoints.json", [10])
     people_file(keypoints / "k1" / "000000000001_keypoints.json", [11, 12])
@@ -62,13 +58,7 @@ def test_files_reach_the_sets_that_hold_their_image(tmp_path):
     people_file(keypoints / "k1" / "000000000003_keypoints.json", [99])
     candidates.mkdir()
     (candidates / "k2.json").write_text(json.dumps([result(2, 7, "person"), result(2, 9, "cup")]))
-    output = tmp_path / "detections.h5"
-    detections.run(
-        frames=frames,
-        output=output,
-        sequence=entry(tmp_path, keypoints=keypoints, candidates=candidates),
-        settings=DetectionsSettings(),
-    )
+    output = run(tmp_path, keypoints=keypoints, candidates=candidates)
     read = Detections.load(output)
     assert read.camera_names == ("k1", "k2") and read.num_sets == 4
     np.testing.assert_array_equal(read.keypoints_found[:, 0], [True, True, False, False])
@@ -84,24 +74,13 @@ def test_files_reach_the_sets_that_hold_their_image(tmp_path):
     assert "000000000002_keypoints.json" in read.notes[0]
     assert "no candidates candidates/k1.json" in read.notes[0]
     assert "keypoints/k2" in read.notes[1]
-    again = tmp_path / "again.h5"
-    detections.run(
-        frames=frames,
-        output=again,
-        sequence=entry(tmp_path, keypoints=keypoints, candidates=candidates),
-        settings=DetectionsSettings(),
-    )
+    again = run(tmp_path, "again.h5", keypoints=keypoints, candidates=candidates)
     assert again.read_bytes() == output.read_bytes()
 
 
 def test_no_detections_at_all_is_an_error(tmp_path):
-    frames = write_frames(tmp_path / "frames.h5", RIG, num_sets=2)
+    write_frames(tmp_path / "frames.h5", RIG, num_sets=2)
     for paths in ({}, {"keypoints": tmp_path / "none", "candidates": tmp_path / "none"}):
         with pytest.raises(UserError, match="sequence test: no detections"):
-            detections.run(
-                frames=frames,
-                output=tmp_path / "detections.h5",
-                sequence=entry(tmp_path, **paths),
-                settings=DetectionsSettings(),
-            )
+            run(tmp_path, **paths)
     assert not (tmp_path / "detections.h5").exists()

@@ -77,7 +77,7 @@ def test_cameras_poses_and_gravity(capture):
         assert np.allclose(frames.gravity, down[None], atol=1e-6)
 
 
-def test_what_is_degraded_is_noted(capture):
+def test_degraded_cameras_are_noted(capture):
     notes = notes_of(run(capture))
     assert notes["k1"] == ""
     assert "no image in 1 frame sets" in notes["k2"]
@@ -95,7 +95,7 @@ def test_same_recordings_same_bytes(capture):
     assert run(capture).read_bytes() == first
 
 
-def test_a_camera_without_file_pose_or_readable_head_is_kept_and_flagged(capture):
+def test_an_unusable_camera_is_kept_and_flagged(capture):
     (capture.recordings / "k2.mkv").unlink()
     (capture.recordings / "k3.mkv").write_text("not a recording")
     record(capture.recordings, 3, range(6))
@@ -120,7 +120,7 @@ def test_without_the_masters_recording_its_frame_stays(capture):
         assert not frames.available[:, 0].any()
 
 
-def test_a_cut_recording_gives_what_it_holds(capture):
+def test_a_cut_recording_is_read_as_far_as_possible(capture):
     path = capture.recordings / "k2.mkv"
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
@@ -151,9 +151,7 @@ def test_a_rig_without_depth_gives_colour(capture):
 
 
 def test_cameras_and_depth_can_be_left_out(capture):
-    output = capture.calibration.parent / "frames.h5"
-    chosen = FramesSettings(cameras=("k1", "k3"), depth=False)
-    stage.run(sequence=capture, output=output, settings=chosen)
+    output = frames_of(capture, cameras=("k1", "k3"), depth=False)
     with Frames.open(output) as frames:
         assert frames.rig.names == ("k1", "k2", "k3")
         assert frames.present.tolist() == [True, False, True]
@@ -172,61 +170,50 @@ def test_a_device_with_a_clock_of_its_own_is_set_aside(capture):
         assert frames.num_sets == 6 and not frames.present[2]
 
 
-def drop_too_far(capture):
-    return run(capture, drop=(6,))
+def frames_of(capture, **settings):
+    output = capture.calibration.parent / "frames.h5"
+    stage.run(sequence=capture, output=output, settings=FramesSettings(**settings))
+    return output
 
 
 def nothing_readable(capture):
     for path in capture.recordings.glob("*.mkv"):
         path.write_bytes(b"")
-    return run(capture)
-
-
-def no_folder(capture):
-    return run(capture.model_copy(update={"recordings": capture.recordings / "none"}))
-
-
-def master_unknown(capture):
-    capture.calibration.write_text(json.dumps({"master": "k9", "cameras": {"k1": {}}}))
-    return run(capture)
+    run(capture)
 
 
 def pose_not_rigid(capture):
     content = json.loads(capture.calibration.read_text())
     content["cameras"]["k2"]["master_from_camera"][0][0] = 3
     capture.calibration.write_text(json.dumps(content))
-    return run(capture)
+    run(capture)
 
 
-def not_json(capture):
-    capture.calibration.write_text("{")
-    return run(capture)
+def with_calibration(text):
+    def fault(capture):
+        capture.calibration.write_text(text)
+        run(capture)
 
-
-def too_wide_a_window(capture):
-    output = capture.calibration.parent / "frames.h5"
-    stage.run(sequence=capture, output=output, settings=FramesSettings(max_skew_ms=40))
-
-
-def unknown_camera(capture):
-    output = capture.calibration.parent / "frames.h5"
-    stage.run(sequence=capture, output=output, settings=FramesSettings(cameras=("k1", "K2")))
+    return fault
 
 
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
-        (unknown_camera, "frames.cameras names 'K2', the cameras of sequence 's1' are k1, k2, k3"),
-        (drop_too_far, "drop_frames holds 6, the recording has frame sets 0 to 5"),
+        (lambda c: frames_of(c, cameras=("k1", "K2")),
+         "frames.cameras names 'K2', the cameras of sequence 's1' are k1, k2, k3"),
+        (lambda c: run(c, drop=(6,)), "drop_frames holds 6, the recording has frame sets 0 to 5"),
         (nothing_readable, "'s1': no camera in .* can be used .*k2: k2.mkv: is empty"),
-        (no_folder, "no such folder"),
-        (master_unknown, "master 'k9' is none of the cameras"),
+        (lambda c: run(c.model_copy(update={"recordings": c.recordings / "none"})),
+         "no such folder"),
+        (with_calibration('{"master": "k9", "cameras": {"k1": {}}}'),
+         "master 'k9' is none of the cameras"),
         (pose_not_rigid, "camera 'k2' has no rigid 4x4"),
-        (not_json, "not valid JSON"),
-        (too_wide_a_window, "max_skew_ms is 40"),
+        (with_calibration("{"), "not valid JSON"),
+        (lambda c: frames_of(c, max_skew_ms=40), "max_skew_ms is 40"),
     ],
-)
-def test_faults_of_the_user_are_told_and_leave_no_file(capture, fault, words):
+)  # fmt: skip
+def test_user_errors_leave_no_file(capture, fault, words):
     with pytest.raises(UserError, match=words):
         fault(capture)
     assert not list(capture.calibration.parent.rglob("*frames.h5*"))

@@ -1,4 +1,4 @@
-"""A detector's definition, learnt from people with depth, and told to a recording without."""
+"""The definition of a detector's keypoints, learned from people with depth."""
 
 from __future__ import annotations
 
@@ -9,31 +9,23 @@ import pytest
 
 from intercap_core import artefacts
 from intercap_core.body_fit.definition import FITTED_SIGMA_M, average_offsets
-from intercap_core.config import BodyFitSettings, BodyModels
 from intercap_core.entries import SubjectEntry
 from intercap_core.errors import UserError
 from intercap_core.schemas import BODY_FIT
-from intercap_core.stages import body_fit
 from tests.helpers.bodies import open_body
-from tests.stages.test_body_fit import Capture
-
-PLAIN = BodyFitSettings(hands=False, face=False)
+from tests.stages.test_body_fit import BODY_ALONE, Capture
 
 
 @pytest.fixture(scope="module")
 def people(tmp_path_factory) -> list[Path]:
-    """Fits of three people with depth, then of one without,."""
+    """Fits of three people with depth, then of one without."""
     model, found = open_body(), []
     for number in range(4):
         folder = tmp_path_factory.mktemp("person")
         capture = Capture(model, folder, 3, cameras=4, pixel_noise=0.5, depth=number < 3)
         found.append(folder / "body_fit.h5")
-        body_fit.run(
-            frames=capture.inputs.frames, scene=capture.inputs.scene,
-            person=capture.inputs.person, output=found[-1],
-            subject=SubjectEntry(subject=f"p{number}", gender="neutral"),
-            body_models=BodyModels(), settings=PLAIN,
-        )  # fmt: skip
+        subject = SubjectEntry(subject=f"p{number}", gender="neutral")
+        capture.fit(found[-1], subject=subject, settings=BODY_ALONE)
     return found
 
 

@@ -1,4 +1,4 @@
-"""Stage ``person``: the subject, its points, its masks."""
+"""Stage ``person``: the subject, its keypoints and its masks."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def write_scene(path: Path, rig: Rig, sets: int, slip: np.ndarray | None = None)
 
 
 def silhouette(keypoints: np.ndarray, grow: int = 25) -> np.ndarray:
-    """A filled box around the body's points: all that matters here is what is inside."""
+    """A filled box around the body's points."""
     mask = np.zeros((1080, 1920), np.uint8)
     low = np.clip(keypoints[:25, :2].min(0) - grow, 0, None).astype(int)
     high = (keypoints[:25, :2].max(0) + grow).astype(int)
@@ -72,6 +72,11 @@ def detected() -> np.ndarray:
     keypoints = seen_by(BODY, RIG, UP)
     keypoints[..., :2] += np.random.default_rng(0).normal(0, 3, keypoints[..., :2].shape)
     return keypoints
+
+
+def alone(keypoints: np.ndarray) -> list:
+    """One person per image with keypoints (T, C, 135, 3)."""
+    return [[[of_view] for of_view in of_set] for of_set in keypoints]
 
 
 def run(tmp_path, people, candidates=None, slip=None, note="") -> Path:
@@ -89,7 +94,7 @@ def test_points_views_and_flags(tmp_path, detected):
     damaged = detected.copy()
     damaged[3, 1, 4, :2] += 150  # one wrist, in one view
     damaged[4, 2, 10, 2] = 0.1  # one knee that the detector does not believe
-    people = [[[damaged[t, c]] for c in range(6)] for t in range(T)]
+    people = alone(damaged)
     people[6] = [[] for _ in range(6)]
     people[7] = [[damaged[7, 0]], *[[] for _ in range(5)]]
     with artefacts.read(run(tmp_path, people), PERSON) as found:
@@ -113,8 +118,7 @@ def test_points_views_and_flags(tmp_path, detected):
 def test_missing_neck_and_mid_hip_are_filled_in(tmp_path, detected):
     lacking = detected.copy()
     lacking[:, :, [1, 8]] = 0  # as COCO's layouts have it
-    people = [[[lacking[t, c]] for c in range(6)] for t in range(T)]
-    with artefacts.read(run(tmp_path, people), PERSON) as found:
+    with artefacts.read(run(tmp_path, alone(lacking)), PERSON) as found:
         joints = found["joints"]
         assert not found["missing"].any() and (found["person"] == 0).all()
         assert (found["joint_views"][:, [1, 8]] == 0).all()
@@ -124,7 +128,7 @@ def test_missing_neck_and_mid_hip_are_filled_in(tmp_path, detected):
 
 
 def test_masks_follow_the_points_not_the_label_or_the_order(tmp_path, detected):
-    people = [[[detected[t, c]] for c in range(6)] for t in range(T)]
+    people = alone(detected)
     own = silhouette(detected[0, 0])
     beside = np.roll(own, 600, axis=1)
     everything = np.ones_like(own)
@@ -152,7 +156,7 @@ def test_camera_with_another_person_is_excluded_meanwhile(tmp_path, detected):
     wrong = np.zeros((T, 6), bool)
     wrong[2:5, 2] = True
     seen = np.where(wrong[..., None, None], other, detected)
-    people = [[[seen[t, c]] for c in range(6)] for t in range(T)]
+    people = alone(seen)
     candidates = {
         (t, c): [("person", masks.encode(silhouette(seen[t, c])))]
         for t, c in np.argwhere(wrong | np.roll(wrong, 3, axis=0)).tolist()
@@ -171,8 +175,8 @@ def test_camera_with_another_person_is_excluded_meanwhile(tmp_path, detected):
         assert chosen[t * 6 + c] == (b"" if wrong[t, c] else candidates[t, c][0][1])
 
 
-def test_slipped_images_count_where_their_moment_is(tmp_path, detected):
-    """From set 3 on the fourth camera's images are two sets old: only moments 6 and 7 lack them."""
+def test_slipped_images_are_used_at_their_moment(tmp_path, detected):
+    """From set 3 on the fourth camera's images are two sets old; moments 6 and 7 lack them."""
     slip = np.zeros((T, 6), np.int32)
     slip[3:, 3] = 2
     late = [[[detected[t - slip[t, c], c]] for c in range(6)] for t in range(T)]
@@ -188,9 +192,8 @@ def test_slipped_images_count_where_their_moment_is(tmp_path, detected):
 
 
 def test_same_input_same_bytes(tmp_path, detected):
-    people = [[[detected[t, c]] for c in range(6)] for t in range(T)]
-    first = run(tmp_path, people).read_bytes()
-    assert run(tmp_path, people).read_bytes() == first
+    first = run(tmp_path, alone(detected)).read_bytes()
+    assert run(tmp_path, alone(detected)).read_bytes() == first
 
 
 def test_missing_people_and_foreign_captures_are_rejected(tmp_path, detected):
@@ -200,12 +203,12 @@ def test_missing_people_and_foreign_captures_are_rejected(tmp_path, detected):
         run(tmp_path, [[[] for _ in range(6)] for _ in range(T)], note="all points lie outside")
     with pytest.raises(UserError, match="frame sets differ"):
         run(tmp_path, [[[detected[0, c]] for c in range(6)] for _ in range(T - 1)])
-    people = [[[detected[t, c]] for c in range(6)] for t in range(T)]
+    people = alone(detected)
     with pytest.raises(UserError, match=r"camera k1, frame 0, candidate 0 \(cup\).*re-run"):
         run(tmp_path, people, {(0, 0): [("cup", b"11")]})
 
 
-def test_two_views_do_not_take_a_passing_exchange_of_sides(detected):
+def test_two_views_undo_a_temporary_side_exchange(detected):
     views = Rig(RIG.cameras[:2])
     exchanged = detected[:, :2].copy()
     exchanged[3:6, 0] = swap_sides(exchanged[3:6, 0], LEGS)

@@ -1,4 +1,4 @@
-"""Which image a keypoint file of a plain recording belongs to."""
+"""Matching of keypoints and candidates to the images of a plain recording."""
 
 from __future__ import annotations
 
@@ -9,11 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from intercap_core.config import DetectionsSettings, FramesSettings
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
-from intercap_core.formats.detections.read import Detections
-from intercap_core.stages import detections, frames
 from tests.helpers.plain_capture import detect, plain_entry, write_rig
 
 SIZE = (64, 48)
@@ -42,12 +39,10 @@ def capture(tmp_path) -> SequenceEntry:
 
 
 def found(capture: SequenceEntry) -> dict[str, list[float]]:
-    """By camera the first x of each frame set's person; 0 = nobody."""
+    """First x of each frame set's person by camera; 0 = nobody."""
     read = detect(capture)
-    people = {
-        name: [read.people(t, c) for t in range(read.num_sets)]
-        for c, name in enumerate(("left", "right"))
-    }
+    sets = range(read.num_sets)
+    people = {name: [read.people(t, c) for t in sets] for c, name in enumerate(("left", "right"))}
     return {
         name: [float(persons[0, 0, 0]) if len(persons) else 0.0 for persons in in_sets]
         for name, in_sets in people.items()
@@ -67,17 +62,10 @@ def test_files_named_after_the_images_follow_them(capture):
 
 def candidates(capture: SequenceEntry, content: list) -> tuple[list[list[float]], str]:
     """The right camera's boxes by frame set where it has candidates, and its note."""
-    (capture.recordings.parent / "candidates").mkdir()
-    path = capture.recordings.parent / "candidates" / "right.json"
-    path.write_text(json.dumps(content))
-    capture = capture.model_copy(update={"keypoints": None, "candidates": path.parent})
-    out = path.parent.parent
-    frames.run(sequence=capture, output=out / "frames.h5", settings=FramesSettings())
-    detections.run(
-        frames=out / "frames.h5", output=out / "detections.h5", sequence=capture,
-        settings=DetectionsSettings(),
-    )  # fmt: skip
-    read = Detections.load(out / "detections.h5")
+    folder = capture.recordings.parent / "candidates"
+    folder.mkdir()
+    (folder / "right.json").write_text(json.dumps(content))
+    read = detect(capture.model_copy(update={"keypoints": None, "candidates": folder}))
     assert not read.candidates_found[:, 0].any()
     boxes = [[float(c.box[0]) for c in read.candidates(t, 1)] for t in range(read.num_sets)]
     return boxes, read.notes[1]
@@ -96,7 +84,7 @@ def test_candidates_named_after_the_images_follow_them(capture, key):
     assert "2 results" in note and "(first: right/shot_0004.jpg;" in note
 
 
-def test_a_data_sets_images_are_known_by_their_names(capture):
+def test_images_of_a_dataset_are_matched_by_name(capture):
     content = {
         "images": [{"id": 7 * n, "file_name": f"shot_{n:04d}.jpg"} for n in (5, 3)],
         "annotations": [corners(n) | {"image_id": 7 * n} for n in (5, 3)],
@@ -123,14 +111,10 @@ def test_files_numbered_by_place_count_damaged_images(capture):
     assert people["right"] == [1, 0, 3, 0, 5, 6]
 
 
-def test_times_that_changed_since_the_frames_are_told(capture):
+def test_changed_times_require_new_frames(capture):
     keypoints(capture.keypoints / "left" / "shot_0001_keypoints.json", 1)
     found(capture)
     content = json.loads(capture.calibration.read_text()) | {"fps": 7}
     capture.calibration.write_text(json.dumps(content))
-    out = capture.recordings.parent
     with pytest.raises(UserError, match=r"images of camera left in .*run the frames stage again"):
-        detections.run(
-            frames=out / "frames.h5", output=out / "again.h5", sequence=capture,
-            settings=DetectionsSettings(),
-        )  # fmt: skip
+        detect(capture, "again.h5")

@@ -1,8 +1,9 @@
-"""Stages on rigs of 1 to 16 cameras, with depth, with little of it and with none."""
+"""Stages on rigs of 1 to 16 cameras, with, with little and without depth."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -19,15 +20,13 @@ from intercap_core.config import (
     PageSettings,
     PersonSettings,
 )
-from intercap_core.entries import SubjectEntry
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.schemas import BODY_FIT, JOINT, METRICS, OBJECT_TRACK, PERSON
+from intercap_core.schemas import JOINT, METRICS, OBJECT_TRACK, PERSON
 from intercap_core.sequence_inputs import FitSettings, SequenceModels, SequencePaths
 from intercap_core.stage_list import STAGES
 from intercap_core.stages import (
-    body_fit,
     export,
     joint,
     metrics,
@@ -38,14 +37,13 @@ from intercap_core.stages import (
 )
 from tests.geometry.rigid.conftest import catalogue
 from tests.helpers import fitted_capture as fitted
-from tests.helpers.body_capture import ring, write_capture
+from tests.helpers.body_capture import Inputs, ring, write_capture
 from tests.helpers.object_capture import ObjectCapture
 from tests.helpers.reduced_capture import Reduction
 from tests.helpers.site import merge, row
 from tests.helpers.synthetic_people import write_detections
-from tests.stages.test_body_fit import motion
+from tests.stages.test_body_fit import SUBJECT, fit, motion
 
-SUBJECT = SubjectEntry(subject="s01", gender="neutral")
 FAST = BodyFitSettings(points_per_frame=600, hands=False, face=False)
 SETS = 2
 FULL = pytest.mark.full
@@ -88,14 +86,10 @@ class People:
 
     def fitted_mm(self, paths: dict[str, Path], folder: Path) -> tuple[np.ndarray, np.ndarray]:
         """Mean error of 22 joints (T,) of the body's fit, mm, and which frames failed."""
-        body_fit.run(
-            frames=paths["frames"], scene=paths["scene"], person=paths["person"],
-            output=folder / "body_fit.h5", subject=SUBJECT, body_models=BodyModels(),
-            settings=FAST,
-        )  # fmt: skip
-        with artefacts.read(folder / "body_fit.h5", BODY_FIT) as found:
-            error = np.linalg.norm(found["joints"] - self.joints[: len(found["joints"])], axis=2)
-            return 1000 * error[:, :22].mean(1), found["failed"]
+        inputs = Inputs(paths["frames"], paths["scene"], paths["person"])
+        found = fit(inputs, folder / "body_fit.h5", settings=FAST)
+        error = np.linalg.norm(found["joints"] - self.joints[: len(found["joints"])], axis=2)
+        return 1000 * error[:, :22].mean(1), found["failed"]
 
 
 @pytest.fixture(scope="module")
@@ -161,17 +155,23 @@ def gliding(name: str, frames: int = 2, cameras: int = 6) -> ObjectCapture:
     return ObjectCapture.make(mesh, frames, cameras=cameras, label=entry.labels[0])
 
 
-class Gliding:
+class Gliding(NamedTuple):
     """One object's capture and its artefacts."""
 
-    def __init__(self, name: str, folder: Path) -> None:
-        self.name, self.made = name, gliding(name)
-        self.paths = self.made.write(folder)
+    made: ObjectCapture
+    paths: dict[str, Path]
+
+    @classmethod
+    def make(cls, name: str, folder: Path) -> Gliding:
+        made = gliding(name)
+        return cls(made, made.write(folder))
 
 
 @pytest.fixture(scope="module")
 def objects(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Gliding]:
-    return {name: Gliding(name, tmp_path_factory.mktemp(name)) for name in ("suitcase", "football")}
+    return {
+        name: Gliding.make(name, tmp_path_factory.mktemp(name)) for name in ("suitcase", "football")
+    }
 
 
 def tracked(paths: dict[str, Path], output: Path, name: str = "suitcase") -> Path:
@@ -207,7 +207,7 @@ def test_object_on_reduced_rigs(objects, tmp_path, name, reduction, limit_mm):
         assert np.max(angle) < 10
 
 
-def test_object_that_nothing_locates_is_lost_with_a_reason(objects, tmp_path):
+def test_an_object_that_cannot_be_located_is_lost(objects, tmp_path):
     for name, reduction in (
         ("alone", Reduction(cameras=["k1"], depth=[])),
         ("none", Reduction(candidates=[])),

@@ -1,4 +1,4 @@
-"""Detections of released folders: BEHAVE's beside its images, InterCap's by number."""
+"""Detections in the folders of the releases BEHAVE and InterCap."""
 
 from __future__ import annotations
 
@@ -70,16 +70,12 @@ def behave(tmp_path) -> SequenceEntry:
             }
             (folder / f"k{c}.color.json").write_text(json.dumps(joints))
     return SequenceEntry(
-        sequence="s",
-        subject="a",
-        object="chairwood",
-        layout="behave",
-        recordings=recordings,
+        sequence="s", subject="a", object="chairwood", layout="behave", recordings=recordings,
         calibration=calibration,
-    )
+    )  # fmt: skip
 
 
-def test_keypoints_and_masks_beside_the_images_are_read(behave, tmp_path):
+def test_behave_keypoints_and_masks_are_read(behave, tmp_path):
     read = run(behave, tmp_path)
     assert read.keypoints_found.all() and read.candidates_found.all()
     assert read.notes == ("", "")
@@ -136,7 +132,7 @@ def empty_mask_file(folder: Path) -> None:
         (empty_mask_file, "t0004.000/k0.person_mask.jpg is no image", 1, ["chairwood"]),
     ],
 )
-def test_faulty_files_beside_the_images(behave, tmp_path, fault, words, people, labels):
+def test_faulty_behave_files_are_noted(behave, tmp_path, fault, words, people, labels):
     fault(behave.recordings / "t0004.000")
     read = run(behave, tmp_path)
     assert words in read.notes[0] and bool(words) == bool(read.notes[0])
@@ -146,7 +142,7 @@ def test_faulty_files_beside_the_images(behave, tmp_path, fault, words, people, 
     assert read.notes[1] == ""
 
 
-def test_the_rows_own_detections_go_before_behaves(behave, tmp_path):
+def test_detections_of_the_row_have_priority(behave, tmp_path):
     candidates = tmp_path / "candidates"
     candidates.mkdir()
     for c in range(2):
@@ -173,15 +169,9 @@ def test_release_files_belong_to_the_number_in_the_images_name(tmp_path, first_f
             mask = square(10 * number, 30, inside=0, outside=255)
             cv2.imwrite(str(candidates / folder / f"{number:05d}.png"), mask)
     sequence = SequenceEntry(
-        sequence="s",
-        subject="a",
-        object="cup",
-        layout="intercap",
-        recordings=recordings,
-        calibration=calibration,
-        keypoints=keypoints,
-        candidates=candidates,
-    )
+        sequence="s", subject="a", object="cup", layout="intercap", recordings=recordings,
+        calibration=calibration, keypoints=keypoints, candidates=candidates,
+    )  # fmt: skip
     read = run(sequence, tmp_path)
     assert read.num_sets == 3
     assert read.keypoints_found[:, 0].tolist() == [True, True, False]
@@ -195,7 +185,7 @@ def test_release_files_belong_to_the_number_in_the_images_name(tmp_path, first_f
         assert "no mask for 1 images" in read.notes[c]
 
 
-def test_no_detections_beside_the_images_is_an_error(behave, tmp_path):
+def test_missing_behave_detections_are_an_error(behave, tmp_path):
     for pattern in ("*mask*", "*.color.json"):
         for path in behave.recordings.glob(f"t*/{pattern}"):
             path.unlink()

@@ -32,14 +32,19 @@ MIDDLE = apply(invert(UP), np.array([[0, 0, 0.8]]))[0]
 T = 6
 
 
-def capture(
-    tmp_path: Path, rig: Rig, boxes=FURNITURE, walls: float | None = 3.6
-) -> dict[str, Path]:
+def run(paths: dict[str, Path], **changes) -> None:
+    scene.run(**paths, **({"settings": SceneSettings(), "floor": None} | changes))
+
+
+def depths_of(rng: np.random.Generator, boxes=FURNITURE, walls: float | None = 3.6) -> list:
+    """Noisy depth images (T, H, W) of each camera."""
+    clean = [room_depth(camera, UP, boxes, walls) for camera in TRUTH]
+    return [np.stack([to_millimetres(depth, rng) for _ in range(T)]) for depth in clean]
+
+
+def capture(tmp_path: Path, rig: Rig, *room) -> dict[str, Path]:
     rng = np.random.default_rng(0)
-    depths = []
-    for camera in TRUTH:
-        clean = room_depth(camera, UP, boxes, walls)
-        depths.append(np.stack([to_millimetres(clean, rng) for _ in range(T)]))
+    depths = depths_of(rng, *room)
     body = seen_by(walking(T, np.array([-0.3, -0.2]), np.array([0.1, 0.08]), 0.1), TRUTH, UP)
     body[..., :2] += rng.normal(0, 3, body[..., :2].shape)
     people = [[[body[t, c]] for c in range(len(TRUTH))] for t in range(T)]
@@ -53,13 +58,13 @@ def capture(
 def test_cameras_floor_and_background_of_a_furnished_room(tmp_path):
     start = perturbed(TRUTH, np.random.default_rng(0), 0.01, 0.3)
     paths = capture(tmp_path, start)
-    scene.run(**paths, settings=SceneSettings(), floor=None)
+    run(paths)
     rig = Rig.from_scene(paths["output"])
     assert extrinsics_error(rig, TRUTH, MIDDLE)[1:].mean() < 0.006
     with artefacts.read(paths["output"], SCENE) as found:
-        said = found.attributes
-        assert said["extrinsics_refined"] and said["ground_found"]
-        assert said["ground_source"] == "fitted" and said["ground_rms"] < 0.005
+        attributes = found.attributes
+        assert attributes["extrinsics_refined"] and attributes["ground_found"]
+        assert attributes["ground_source"] == "fitted" and attributes["ground_rms"] < 0.005
         assert (found["pair_residual_after"] < found["pair_residual_before"]).all()
         height = apply(UP, found["ground_point"][None])[0, 2]
         assert abs(height) < 0.003 and found["ground_normal"] @ UP[2, :3] > np.cos(np.radians(0.2))
@@ -68,13 +73,13 @@ def test_cameras_floor_and_background_of_a_furnished_room(tmp_path):
         truth = room_depth(TRUTH[1], UP, FURNITURE)
         assert np.median(np.abs(background - truth)[truth > 0]) < 0.005
     first = paths["output"].read_bytes()
-    scene.run(**paths, settings=SceneSettings(), floor=None)
+    run(paths)
     assert paths["output"].read_bytes() == first
 
 
 def test_a_perfect_start_is_not_made_worse(tmp_path):
     paths = capture(tmp_path, TRUTH)
-    scene.run(**paths, settings=SceneSettings(), floor=None)
+    run(paths)
     assert extrinsics_error(Rig.from_scene(paths["output"]), TRUTH, MIDDLE).max() < 0.004
 
 
@@ -85,7 +90,7 @@ def test_correct_pose_is_kept_while_others_are_refined(tmp_path, monkeypatch):
     poses = start.master_from_colour.copy()
     poses[3] = TRUTH.master_from_colour[3]
     start = start.moved(poses)
-    scene.run(**capture(tmp_path, start), settings=SceneSettings(), floor=None)
+    run(capture(tmp_path, start))
     with artefacts.read(tmp_path / "scene.h5", SCENE) as found:
         assert found["camera_refined"].tolist() == [False, True, True, False, True, True]
         np.testing.assert_array_equal(found["master_from_colour"][3], poses[3])
@@ -102,12 +107,12 @@ def test_refinement_can_be_turned_off_and_the_floor_annotated(tmp_path):
     paths = capture(tmp_path, start)
     floor = apply(invert(UP), np.array([[0, 0, 0.005], [1, 0, 0.005], [0, 1, 0.005]]))
     settings = SceneSettings(refine_extrinsics=False)
-    scene.run(**paths, settings=settings, floor=[tuple(p) for p in floor])
+    run(paths, settings=settings, floor=[tuple(p) for p in floor])
     with artefacts.read(paths["output"], SCENE) as found:
         assert not found.attributes["extrinsics_refined"]
         assert "switched off" in found.attributes["verdict"]
         assert not found["camera_refined"].any()
-        assert all("switched off" in said for said in found.text("camera_verdict")[1:])
+        assert all("switched off" in verdict for verdict in found.text("camera_verdict")[1:])
         np.testing.assert_array_equal(found["pair_residual_before"], found["pair_residual_after"])
         assert found.attributes["ground_source"] == "annotated"
         np.testing.assert_array_equal(found["master_from_colour"], start.master_from_colour)
@@ -117,7 +122,7 @@ def test_refinement_can_be_turned_off_and_the_floor_annotated(tmp_path):
 def test_without_depth_the_start_stays_and_feet_show_the_floor(tmp_path):
     paths = capture(tmp_path, TRUTH)
     write_frames(paths["frames"], TRUTH, num_sets=T)
-    scene.run(**paths, settings=SceneSettings(), floor=None)
+    run(paths)
     with artefacts.read(paths["output"], SCENE) as found:
         assert found.attributes["ground_source"] == "feet" and found.keys("cameras/") == []
         assert np.degrees(np.arccos(min(1, found["ground_normal"] @ UP[2, :3]))) < 3
@@ -129,10 +134,10 @@ ORIGIN = apply(invert(UP), np.zeros((1, 3)))[0]
 STATED = {"stated_up": UP[2, :3], "stated_floor": ORIGIN}
 
 
-def told(paths: dict[str, Path], depths: list[np.ndarray] | None = None, **stated) -> dict:
-    """The scene's attributes, and its z_up_frame, where a row states these."""
+def ground_of(paths: dict[str, Path], depths: list[np.ndarray] | None = None, **stated) -> dict:
+    """Attributes, floor height and z_up_frame of the scene for a row with stated up and floor."""
     write_frames(paths["frames"], TRUTH, num_sets=T, stated=stated, depths=depths)
-    scene.run(**paths, settings=SceneSettings(), floor=None)
+    run(paths)
     with artefacts.read(paths["output"], SCENE) as found:
         height = apply(UP, found["ground_point"][None])[0, 2]
         return found.attributes | {"height": height, "frame": z_up_frame(found)}
@@ -140,24 +145,20 @@ def told(paths: dict[str, Path], depths: list[np.ndarray] | None = None, **state
 
 def test_stated_floor_is_used_unless_feet_contradict_it(tmp_path):
     paths = capture(tmp_path, TRUTH)
-    agrees = told(paths, **STATED)
+    agrees = ground_of(paths, **STATED)
     assert agrees["ground_source"] == "stated" and abs(agrees["height"]) < 1e-9
     assert "ground_note" not in agrees and "as stated with the calibration" in agrees["frame"]
-    denied = told(paths, **STATED | {"stated_floor": ORIGIN + 0.4 * UP[2, :3]})
+    denied = ground_of(paths, **STATED | {"stated_floor": ORIGIN + 0.4 * UP[2, :3]})
     assert denied["ground_source"] == "feet" and abs(denied["height"]) < 0.02
     assert "0.4" in denied["ground_note"] and "below the stated one" in denied["ground_note"]
     with pytest.raises(UserError, match="sequence test: calibration_up is 90 degrees"):
-        told(paths, stated_up=UP[0, :3])
+        ground_of(paths, stated_up=UP[0, :3])
 
 
 def test_measured_floor_is_kept_and_compared_with_the_stated_one(tmp_path):
     paths = capture(tmp_path, TRUTH)
-    rng = np.random.default_rng(0)
-    depths = []
-    for camera in TRUTH:
-        clean = room_depth(camera, UP, FURNITURE)
-        depths.append(np.stack([to_millimetres(clean, rng) for _ in range(T)]))
-    raised = told(paths, depths, **STATED | {"stated_floor": ORIGIN + 0.2 * UP[2, :3]})
+    depths = depths_of(np.random.default_rng(0))
+    raised = ground_of(paths, depths, **STATED | {"stated_floor": ORIGIN + 0.2 * UP[2, :3]})
     assert raised["ground_source"] == "fitted" and abs(raised["height"]) < 0.005
     assert raised["ground_note"] == "the floor is 0.20 m below the stated one"
 
@@ -165,7 +166,7 @@ def test_measured_floor_is_kept_and_compared_with_the_stated_one(tmp_path):
 def test_source_of_up_is_stated_without_a_floor(tmp_path):
     paths = capture(tmp_path, TRUTH)
     write_detections(paths["detections"], TRUTH, [[[] for _ in TRUTH] for _ in range(T)])
-    by_cameras, stated = told(paths), told(paths, stated_up=UP[2, :3])
+    by_cameras, stated = ground_of(paths), ground_of(paths, stated_up=UP[2, :3])
     assert by_cameras["up_source"] == "cameras" and stated["up_source"] == "stated"
     assert "mean of the cameras" in by_cameras["frame"] and "no floor" in by_cameras["frame"]
     assert "as stated with the calibration; no floor" in stated["frame"]
@@ -174,10 +175,10 @@ def test_source_of_up_is_stated_without_a_floor(tmp_path):
 def test_missing_images_and_collinear_floors_are_rejected(tmp_path):
     paths = capture(tmp_path, TRUTH)
     with pytest.raises(UserError, match="sequence test: annotation floor"):
-        scene.run(**paths, settings=SceneSettings(), floor=[(0, 0, 1), (0, 0, 2), (0, 0, 3)])
+        run(paths, floor=[(0, 0, 1), (0, 0, 2), (0, 0, 3)])
     write_frames(paths["frames"], TRUTH, num_sets=T, colour_index=np.full((T, 6), -1))
     with pytest.raises(UserError, match="no image of any camera"):
-        scene.run(**paths, settings=SceneSettings(), floor=None)
+        run(paths)
 
 
 @pytest.mark.parametrize("with_people", [True, False])
@@ -196,7 +197,7 @@ def test_rig_without_overlap_is_reported_and_not_degraded(tmp_path, with_people)
     if not with_people:
         nobody = [[[] for _ in TRUTH] for _ in range(T)]
         write_detections(paths["detections"], TRUTH, nobody)
-    scene.run(**paths, settings=SceneSettings(), floor=None)
+    run(paths)
     with artefacts.read(paths["output"], SCENE) as found:
         notes, refined = found.text("note"), found.attributes["extrinsics_refined"]
         assert len(found["pairs"]) == 0 and refined == with_people
@@ -207,16 +208,15 @@ def test_rig_without_overlap_is_reported_and_not_degraded(tmp_path, with_people)
 
 
 def standing(tmp_path: Path, sets: int = 30, sound: np.ndarray | None = None) -> dict[str, Path]:
-    """Somebody who stands still before cameras without depth; ``sound`` (C,) s says when they
-    started."""
-    told = {} if sound is None else {"sound_start": sound, "sound_start_sigma": 0 * sound + 0.03}
+    """A motionless person in cameras without depth; ``sound`` (C,): their starts, seconds."""
+    heard = {} if sound is None else {"sound_start": sound, "sound_start_sigma": 0 * sound + 0.03}
     rng = np.random.default_rng(1)
     still = seen_by(walking(sets, np.array([-0.3, -0.2]), np.zeros(2), 0.0), TRUTH, UP)
     still[..., :2] += rng.normal(0, 2, still[..., :2].shape)
     people = [[[still[t, c]] for c in range(len(TRUTH))] for t in range(sets)]
     return {
         "frames": write_frames(
-            tmp_path / "frames.h5", TRUTH, num_sets=sets, colour_times=True, sound=told
+            tmp_path / "frames.h5", TRUTH, num_sets=sets, colour_times=True, sound=heard
         ),
         "detections": write_detections(tmp_path / "detections.h5", TRUTH, people),
         "output": tmp_path / "scene.h5",
@@ -227,7 +227,7 @@ def test_stated_start_aligns_cameras_without_motion(tmp_path):
     """Cameras started by hand; only the annotation knows of it."""
     paths = standing(tmp_path)
     starts = {"k1": (3600.0, 0.02), "k2": (3600.48, 0.02), "k3": (3599.8, 0.04)}
-    scene.run(**paths, settings=SceneSettings(), floor=None, starts=starts)
+    run(paths, starts=starts)
     with artefacts.read(paths["output"], SCENE) as found:
         notes, slip = found.text("note"), found["slip"]
         offset, sigma = found["time_offset"], found["time_offset_sigma"]
@@ -247,15 +247,13 @@ def test_starts_without_common_time_are_rejected(tmp_path):
     paths = standing(tmp_path)
     starts = {"k1": (0.0, 0.02), "k2": (480.0, 0.02)}  # milliseconds
     with pytest.raises(UserError, match=r"sequence test: .* k2 start 480\.000 s later .* 1\.9 s"):
-        scene.run(**paths, settings=SceneSettings(), floor=None, starts=starts)
+        run(paths, starts=starts)
 
 
 def test_sound_aligns_cameras_without_motion(tmp_path):
     heard = np.array([0.0, 0.48, -0.2, 0.02, 0.3, np.nan])
     paths = standing(tmp_path, sound=heard)
-    scene.run(
-        **paths, settings=SceneSettings(), floor=None, starts={"k1": (0, 0.02), "k2": (0.9, 0.02)}
-    )
+    run(paths, starts={"k1": (0, 0.02), "k2": (0.9, 0.02)})
     with artefacts.read(paths["output"], SCENE) as found:
         notes, late = found.text("note"), found["slip"].mean(0) / 15 - found["time_offset"]
         seen = (found["image_of"] >= 0).any(0)
@@ -274,5 +272,5 @@ def test_sound_does_not_change_synchronised_cameras(tmp_path):
         standing(tmp_path / "heard", sound=np.array([0.0, 0.05, -0.06, 0.02, 0.08, np.nan])),
     )
     for paths in (quiet, heard):
-        scene.run(**paths, settings=SceneSettings(), floor=None)
+        run(paths)
     assert quiet["output"].read_bytes() == heard["output"].read_bytes()

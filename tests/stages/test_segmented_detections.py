@@ -1,4 +1,4 @@
-"""A segmentation model in the stage: which images it sees, and what becomes of its instances."""
+"""Candidates from a segmentation model for the images without a file."""
 
 from __future__ import annotations
 
@@ -74,17 +74,3 @@ def test_images_without_candidates_are_segmented(capture, tmp_path, caplog, make
     detect(capture, "again.h5", segmentation_model=moved)
     first, second = (tmp_path / name for name in ("detections.h5", "again.h5"))
     assert first.read_bytes() == second.read_bytes()
-
-
-def test_without_a_model_nothing_is_loaded(capture):
-    import subprocess
-    import sys
-
-    detect(capture, "detections.h5")
-    words = (
-        "import sys, intercap_core.stages.detections; "
-        "sys.exit('onnxruntime' in sys.modules or "
-        "'intercap_core.formats.detections.onnx_model' "
-        "in sys.modules)"
-    )
-    assert subprocess.run([sys.executable, "-c", words]).returncode == 0

@@ -64,7 +64,7 @@ def _seen(model: BodyModel, truth: torch.Tensor) -> Observations:
     )  # fmt: skip
 
 
-def test_hands_tell_the_detector_s_wrist_from_a_longer_forearm():
+def test_hands_separate_wrist_offset_from_forearm_length():
     """Held at what the body's keypoints alone say, the forearm is taken to be longer."""
     model = open_body()
     truth = _person(model)

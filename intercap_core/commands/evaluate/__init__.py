@@ -4,7 +4,7 @@
 - ``part``: the type of a part of the evaluation, and caching of measured errors.
 - ``sequences``, ``captures``, ``objects``, ``bodies``, ``field_scenes``, ``field``: the six parts.
 - ``workflows``: brings the artefacts of all projects up to date.
-- ``budget``: expected and measured minutes of each part.
+- ``budget``: budgeted and measured minutes of each part.
 - ``seeds``: the same recordings with new random seeds.
 - ``reference``: the regression gate of the quick evaluation.
 """

@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from typing import NamedTuple
 
 from rich.console import Console
 from rich.table import Table
 
 from intercap_core.commands.evaluate.part import (
     EvaluationPart,
+    Figures,
     Measured,
     add_rows,
     console_of,
     keyed,
     number,
-    spread,
     truth_of,
     variant,
+    with_spread,
 )
 from intercap_core.config import Config
 from intercap_core.evaluation import body_errors
 from intercap_core.evaluation.body_errors import BodyErrors
-from intercap_core.evaluation.figures import Figures
 from intercap_core.project import Project
 
 Bodies = Measured[BodyErrors]
@@ -49,11 +50,6 @@ def measure(project: Project, sequence: str) -> BodyErrors:
     )
 
 
-def _start(evaluation: Bodies) -> str:
-    """Prefix of the keys of a project's figures."""
-    return variant(evaluation.dataset, AREA, *OTHER_AREAS)
-
-
 def rig_of(config: Config) -> str:
     """Description of the cameras and depth that the settings select, and of the shape's fit."""
     cameras = config.frames.cameras
@@ -65,73 +61,75 @@ def rig_of(config: Config) -> str:
     return ", ".join(words)
 
 
-def flat(evaluations: Sequence[Bodies]) -> dict[str, float]:
+class _Projects(NamedTuple):
+    """The evaluated projects, by their recordings."""
+
+    reference: Bodies | None
+    """The project that is not a variant."""
+    separate: list[Bodies]
+    """The reference and the variants with recordings of their own."""
+    reduced: list[Bodies]
+    """Variants that use recordings of the reference with fewer views or less data."""
+    compared: list[BodyErrors]
+    """Errors of the reference in the recordings of ``reduced``."""
+
+
+def _sort(evaluations: Sequence[Bodies]) -> _Projects:
+    reference = next((e for e in evaluations if not _variant(e)), None)
+    known = {e.truth for e in reference.errors} if reference else set()
+    separate: list[Bodies] = []
+    reduced: list[Bodies] = []
+    for project in evaluations:
+        own = project is reference or not {e.truth for e in project.errors} <= known
+        (separate if own else reduced).append(project)
+    shared = {e.truth for project in reduced for e in project.errors}
+    compared = [e for e in reference.errors if e.truth in shared] if reference else []
+    return _Projects(reference, separate, reduced, compared)
+
+
+def _variant(evaluation: Bodies) -> str:
+    return variant(evaluation.dataset, AREA, *OTHER_AREAS)
+
+
+def flat(evaluations: Sequence[Bodies]) -> Figures:
     """Keys ``body.pve_mm``, ``body.cup_drink.pve_mm``, ``body.noise2_pve_mm``.
 
     Recall and precision of the flags without a variant's prefix are over all projects, because a
     single project may have no bad frames. ``body.compared_...`` are figures of the project without
     a variant, over the recordings that variants also evaluate.
     """
-    found: dict[str, float] = {}
+    found: Figures = {}
+    projects = _sort(evaluations)
     for evaluation in evaluations:
-        start = _start(evaluation)
+        start = _variant(evaluation)
         found[f"{AREA}.{start}recordings"] = float(len(evaluation.errors))
-        found |= _keys("", start, _with_spread(evaluation.errors))
-        if evaluation is _reference(evaluations):
+        found |= keyed(f"{AREA}.{start}", with_spread(body_errors.figures, evaluation.errors))
+        if evaluation is projects.reference:
             for name, (mean, _, _) in body_errors.by_joint(evaluation.errors).items():
                 found[f"{AREA}.joint_{name}_mm"] = mean
-        if evaluation in _apart(evaluations):
+        if evaluation in projects.separate:
             for name, recordings in body_errors.by_interaction(evaluation.errors).items():
-                found |= _keys(f"{name}.", start, body_errors.figures(recordings))
-    compared = _compared(evaluations)
-    if compared:
-        found |= _keys("", "compared_", _with_spread(compared))
-    if _reference(evaluations) is not None:
-        every = body_errors.flag_figures([e for found_ in evaluations for e in found_.errors])
+                found |= keyed(f"{AREA}.{name}.{start}", body_errors.figures(recordings))
+    if projects.compared:
+        compared = with_spread(body_errors.figures, projects.compared)
+        found |= keyed(f"{AREA}.compared_", compared)
+    if projects.reference is not None:
+        every = body_errors.flag_figures([e for some in evaluations for e in some.errors])
         for key in _FLAGS:
             found.pop(f"{AREA}.{key}", None)
-        found |= _keys("", "", {key: every[key] for key in _FLAGS if key in every})
+        found |= keyed(f"{AREA}.", {key: every[key] for key in _FLAGS if key in every})
     return found
-
-
-def _with_spread(errors: Sequence[BodyErrors]) -> Figures:
-    return body_errors.figures(errors) | spread(body_errors.figures, errors)
-
-
-def _keys(group: str, start: str, figures: Mapping[str, float]) -> dict[str, float]:
-    return keyed(f"{AREA}.{group}{start}", figures)
-
-
-def _reference(evaluations: Sequence[Bodies]) -> Bodies | None:
-    """The project that is not a variant; None if there is none."""
-    return next((e for e in evaluations if not _start(e)), None)
-
-
-def _apart(evaluations: Sequence[Bodies]) -> list[Bodies]:
-    """Projects with their own recordings, that is not the reference's with fewer views or data."""
-    reference = _reference(evaluations)
-    known = {e.truth for e in reference.errors} if reference else set()
-    return [e for e in evaluations if e is reference or not {x.truth for x in e.errors} <= known]
-
-
-def _compared(evaluations: Sequence[Bodies]) -> list[BodyErrors]:
-    """The reference's errors in the recordings that variants evaluate with less data."""
-    reference = _reference(evaluations)
-    others = [e for e in evaluations if e not in _apart(evaluations)]
-    if reference is None or not others:
-        return []
-    shared = {x.truth for e in others for x in e.errors}
-    return [x for x in reference.errors if x.truth in shared]
 
 
 def print_bodies(evaluations: Sequence[Bodies]) -> None:
     """Print tables by interaction, by rig, by joint, and of each recording's worst frame."""
     console = console_of(190)
-    apart = _apart(evaluations)
-    for found in apart:
+    projects = _sort(evaluations)
+    for found in projects.separate:
         _print_interactions(console, found)
-    _print_rigs(console, evaluations)
-    _print_joints(console, apart)
+    if projects.compared:
+        _print_rigs(console, projects)
+    _print_joints(console, projects.separate)
     _print_worst(console, evaluations)
     every = [e for found in evaluations for e in found.errors]
     flags = body_errors.flag_figures(every)
@@ -147,38 +145,30 @@ def print_bodies(evaluations: Sequence[Bodies]) -> None:
 def _print_interactions(console: Console, found: Bodies) -> None:
     table = Table("interaction", "frames", *_COLUMNS, box=None)
     table.title = f"{found.dataset}: bodies against truth, mm, after body_fit"
-    groups = body_errors.by_interaction(found.errors)
-    for name, errors in {**groups, "all": list(found.errors)}.items():
-        _add_row(table, name, errors, with_spread=name == "all")
+    for name, errors in body_errors.by_interaction(found.errors).items():
+        figures = body_errors.figures(errors)
+        add_rows(table, name, figures, _COLUMNS, [number(figures["frames"], 0)])
+    _add_row(table, "all", found.errors)
     for name in found.missing:
         table.add_row(f"{name}: no fit")
     console.print(table)
 
 
-def _print_rigs(console: Console, evaluations: Sequence[Bodies]) -> None:
-    compared = _compared(evaluations)
-    if not compared:
-        return
+def _print_rigs(console: Console, projects: _Projects) -> None:
+    assert projects.reference is not None
     table = Table("rig", "frames", *_COLUMNS, box=None)
-    table.title = f"the same {len(compared)} recordings with less"
-    reference, apart = _reference(evaluations), _apart(evaluations)
-    assert reference is not None
-    _add_row(table, reference.rig, compared)
-    for found in evaluations:
-        if found in apart:
-            continue
+    table.title = f"the same {len(projects.compared)} recordings with less"
+    _add_row(table, projects.reference.rig, projects.compared)
+    for found in projects.reduced:
         _add_row(table, found.rig, found.errors)
         for name in found.missing:
             table.add_row(f"{found.rig}: {name}: no fit")
     console.print(table)
 
 
-def _add_row(
-    table: Table, name: str, errors: Sequence[BodyErrors], *, with_spread: bool = True
-) -> None:
-    figures = body_errors.figures(errors)
-    spreads = spread(body_errors.figures, errors) if with_spread else None
-    add_rows(table, name, figures, _COLUMNS, spreads, [number(figures.get("frames"), 0)])
+def _add_row(table: Table, name: str, errors: Sequence[BodyErrors]) -> None:
+    figures = with_spread(body_errors.figures, errors)
+    add_rows(table, name, figures, _COLUMNS, [number(figures.get("frames"), 0)])
 
 
 def _print_joints(console: Console, evaluations: Sequence[Bodies]) -> None:

@@ -16,8 +16,8 @@ from intercap_core.commands.evaluate.part import (
     console_of,
     keyed,
     number,
-    spread,
     truth_of,
+    with_spread,
 )
 from intercap_core.evaluation import scene_errors
 from intercap_core.evaluation.scene_errors import CaptureErrors
@@ -36,9 +36,7 @@ def flat(evaluations: Sequence[Captures]) -> Figures:
     """Keys ``<dataset>.<measure>``."""
     found: Figures = {}
     for captured in evaluations:
-        figures = scene_errors.figures(captured.errors) | spread(
-            scene_errors.figures, captured.errors
-        )
+        figures = with_spread(scene_errors.figures, captured.errors)
         found |= keyed(f"{captured.dataset}.", figures)
     return found
 
@@ -66,19 +64,16 @@ def print_captures(evaluations: Sequence[Captures]) -> None:
         for name in found.missing:
             table.add_row(name, "no scene")
     console.print(table)
-    columns = [
-        scene_errors.figures(found.errors) | spread(scene_errors.figures, found.errors)
-        for found in evaluations
-    ]
+    columns = [with_spread(scene_errors.figures, found.errors) for found in evaluations]
     names = [name for column in columns for name in column if not name.endswith(SPREAD)]
     table = Table("measure", *(found.dataset for found in evaluations), box=None)
     table.title = "all captures, after scene (+- standard error over captures)"
     for name in dict.fromkeys(names):
-        table.add_row(name, *(_with_spread(column, name) for column in columns))
+        table.add_row(name, *(_cell(column, name) for column in columns))
     console.print(table)
 
 
-def _with_spread(figures: Figures, name: str) -> str:
+def _cell(figures: Figures, name: str) -> str:
     value, error = (figures.get(key, math.nan) for key in (name, f"{name}{SPREAD}"))
     return number(value, 3) + (f" +- {error:.3f}" if math.isfinite(error) else "")
 

@@ -16,9 +16,9 @@ from intercap_core.commands.evaluate.part import (
     console_of,
     keyed,
     number,
-    spread,
     truth_of,
     variant,
+    with_spread,
 )
 from intercap_core.evaluation import object_errors
 from intercap_core.evaluation.object_errors import ObjectErrors
@@ -65,13 +65,13 @@ def flat(evaluations: Sequence[Objects]) -> Figures:
         start = variant(tracked.dataset, AREA)
         found[f"{AREA}.{start}recordings"] = float(len(tracked.errors))
         for group, errors in {"": tracked.errors, **by_object(tracked.errors)}.items():
-            figures = object_errors.figures(errors) | spread(object_errors.figures, errors)
+            figures = with_spread(object_errors.figures, errors)
             found |= keyed(f"{AREA}.{group}{'.' if group else ''}{start}", figures)
         for views, figures in object_errors.by_views(tracked.errors).items():
             found |= keyed(f"{AREA}.{start}views_{views.replace('-', '_to_')}.", figures)
     drawn = lost_by_draw(evaluations)
     spreads = {name: max(shares) - min(shares) for name, shares in drawn.items()}
-    found |= {f"{AREA}.{name}.lost_spread": spread for name, spread in spreads.items()}
+    found |= {f"{AREA}.{name}.lost_spread": value for name, value in spreads.items()}
     if spreads:
         found[f"{AREA}.lost_spread"] = float(np.mean(list(spreads.values())))
     return found
@@ -82,7 +82,7 @@ def lost_by_draw(evaluations: Sequence[Objects]) -> dict[str, list[float]]:
 
     Only objects that all draws have; empty if there is only one draw.
     """
-    draws = [by_object(one.errors) for one in evaluations if REDRAWN.fullmatch(one.dataset)]
+    draws = [by_object(e.errors) for e in evaluations if REDRAWN.fullmatch(e.dataset)]
     if len(draws) < 2:
         return {}
     return {
@@ -99,8 +99,7 @@ def print_objects(evaluations: Sequence[Objects]) -> None:
         table.title = f"{found.dataset}: objects against truth, after object_track"
         for name, errors in by_object(found.errors).items():
             add_rows(table, name, object_errors.figures(errors), _COLUMNS)
-        spreads = spread(object_errors.figures, found.errors)
-        add_rows(table, "all", object_errors.figures(found.errors), _COLUMNS, spreads)
+        add_rows(table, "all", with_spread(object_errors.figures, found.errors), _COLUMNS)
         for name in found.missing:
             table.add_row(f"{name}: no track")
         console.print(table)

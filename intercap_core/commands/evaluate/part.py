@@ -217,20 +217,21 @@ def keyed(prefix: str, figures: Mapping[str, float]) -> Figures:
     return {f"{prefix}{key}": value for key, value in figures.items()}
 
 
-def spread(
+def with_spread(
     figures: Callable[[Sequence[Errors]], Mapping[str, float]], recordings: Sequence[Errors]
 ) -> Figures:
-    """Standard error of each figure over the recordings, keys ``<figure>_spread``.
+    """Figures over the recordings and their standard errors, keys ``<figure>_spread``.
 
-    The sample standard deviation of the recordings' own figures over the square root of their
-    number. Counts, extremes and figures of fewer than two recordings have none.
+    The standard error is the sample standard deviation of the recordings' own figures over the
+    square root of their number. Counts, extremes and figures of one recording have none.
     """
     samples: dict[str, list[float]] = {}
     for recording in recordings:
         for key, value in figures([recording]).items():
-            if math.isfinite(value) and key not in COUNTS and "worst" not in key:
+            name = key.rpartition(".")[2]
+            if math.isfinite(value) and name not in COUNTS and "worst" not in name:
                 samples.setdefault(key, []).append(value)
-    return {
+    return dict(figures(recordings)) | {
         f"{key}{SPREAD}": float(np.array(values).std(ddof=1) / np.sqrt(len(values)))
         for key, values in samples.items()
         if len(values) > 1
@@ -242,14 +243,13 @@ def add_rows(
     name: str,
     figures: Mapping[str, float],
     columns: Columns,
-    spreads: Mapping[str, float] | None = None,
     cells: Sequence[str] = (),
 ) -> None:
-    """Add a row of ``cells`` and ``figures``, and a second row of ``spreads`` if given."""
+    """Add a row of ``cells`` and ``figures``, and one of their standard errors if there are any."""
     row = (number(figures.get(key), digits) for key, digits in columns.values())
     table.add_row(name, *cells, *row)
-    if spreads:
-        row = (number(spreads.get(key + SPREAD), digits) for key, digits in columns.values())
+    if any(key + SPREAD in figures for key, _ in columns.values()):
+        row = (number(figures.get(key + SPREAD), digits) for key, digits in columns.values())
         table.add_row("  +-", *("" for _ in cells), *row)
 
 

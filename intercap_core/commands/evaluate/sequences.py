@@ -14,9 +14,8 @@ from intercap_core.commands.evaluate.part import (
     EvaluationPart,
     Figures,
     Measured,
-    keyed,
     number,
-    spread,
+    with_spread,
 )
 from intercap_core.evaluation import contact_figures, figures
 from intercap_core.evaluation.figures import SequenceMetrics
@@ -145,11 +144,12 @@ def _by_object(sequences: Sequence[SequenceMetrics]) -> dict[str, list[SequenceM
     return {name: [s for s in sequences if s.object_ == name] for name in names}
 
 
-def with_spread(sequences: Sequence[SequenceMetrics]) -> Areas:
-    """The figures of :func:`areas` and their standard errors over the sequences."""
+def flat_areas(sequences: Sequence[SequenceMetrics]) -> Figures:
+    """The figures of :func:`areas` with keys ``area.figure``."""
     return {
-        area: found | spread(lambda some, area=area: areas(some)[area], sequences)  # type: ignore[misc]
+        f"{area}.{name}": value
         for area, found in areas(sequences).items()
+        for name, value in found.items()
     }
 
 
@@ -157,8 +157,10 @@ def flat(evaluations: Sequence[Sequences]) -> Figures:
     """Keys ``joint.body_pve_mm``; areas of annotated sequences end in ``_annotated``."""
     found: Figures = {}
     for group, sequences in groups(evaluations).items():
-        for area, measures in with_spread(sequences).items():
-            found |= keyed(f"{area}{'' if group == PLAIN else '_annotated'}.", measures)
+        suffix = "" if group == PLAIN else "_annotated"
+        for key, value in with_spread(flat_areas, sequences).items():
+            area, _, name = key.partition(".")
+            found[f"{area}{suffix}.{name}"] = value
     if "joint_annotated.contact_detected_f1" in found:
         found["joint.contact_detected_annotated_f1"] = found["joint_annotated.contact_detected_f1"]
     return found
@@ -167,21 +169,20 @@ def flat(evaluations: Sequence[Sequences]) -> Figures:
 def print_sequences(evaluations: Sequence[Sequences]) -> None:
     """Print a table of the three stages, one of the other areas, and one by object."""
     console = Console()
-    found = {name: with_spread(some) for name, some in groups(evaluations).items()}
-    counts = {name: len(some) for name, some in groups(evaluations).items()}
-    for group, tables in found.items():
+    found = {name: with_spread(flat_areas, some) for name, some in groups(evaluations).items()}
+    keys = dict.fromkeys(key for figures in found.values() for key in figures)
+    keys = dict.fromkeys(key for key in keys if not key.endswith(SPREAD))
+    measures = [key.partition(".")[2] for key in keys if key.partition(".")[0] in ESTIMATES]
+    for group, some in groups(evaluations).items():
         table = Table("measure", *ESTIMATES, box=None)
-        table.title = f"against truth, {group} ({counts[group]} sequences, +- standard error)"
-        for measure in _names([tables[stage] for stage in ESTIMATES]):
-            table.add_row(measure, *(_cell(tables[stage], measure) for stage in ESTIMATES))
+        table.title = f"against truth, {group} ({len(some)} sequences, +- standard error)"
+        for measure in dict.fromkeys(measures):
+            table.add_row(measure, *(_cell(found[group], f"{s}.{measure}") for s in ESTIMATES))
         console.print(table)
     table = Table("after joint", *found, box=None, title="all frames (+- standard error)")
-    for area in next(iter(found.values()), {}):
-        if area in ESTIMATES:
-            continue
-        columns = [tables[area] for tables in found.values()]
-        for name in _names(columns):
-            table.add_row(f"{area}.{name}", *(_cell(column, name) for column in columns))
+    for key in keys:
+        if key.partition(".")[0] not in ESTIMATES:
+            table.add_row(key, *(_cell(figures, key) for figures in found.values()))
     console.print(table)
     for group, some in groups(evaluations).items():
         table = Table("object", *BY_OBJECT, "stated F1", "penetration mm", box=None)
@@ -201,11 +202,6 @@ def _row(found: Areas) -> list[str]:
     ]
     stated = number(joint.get("contact_detected_f1"), 2)
     return [*cells, stated, number(joint.get("penetration_mean_mm"), 1)]
-
-
-def _names(columns: Sequence[Figures]) -> list[str]:
-    names = dict.fromkeys(name for column in columns for name in column)
-    return [name for name in names if not name.endswith(SPREAD)]
 
 
 def _cell(column: Figures, name: str) -> str:

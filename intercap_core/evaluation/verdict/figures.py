@@ -9,7 +9,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from intercap_core.evaluation import figures
-from intercap_core.evaluation.figures import Figures, SequenceMetrics
+from intercap_core.evaluation.figures import Figures, SequenceMetrics, finite_median
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def held_out_cameras(sequence: SequenceMetrics) -> Sequence[HeldOutCamera]:
         judged = values["verdict/held_camera"] == c
         held_in, held_out = (
             tuple(
-                view.scale * _median(values[f"verdict/{view.key}{end}"][judged, c])
+                view.scale * finite_median(values[f"verdict/{view.key}{end}"][judged, c])
                 for view in IMAGE_MEASURES
             )
             for end in ("", "_held_out")
@@ -71,17 +71,11 @@ def held_out_cameras(sequence: SequenceMetrics) -> Sequence[HeldOutCamera]:
     return tuple(found)
 
 
-def _median(values: np.ndarray) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if len(known) else float("nan")
-
-
 def _rms(values: np.ndarray) -> float:
     known = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")
 
 
-BAD_MM = 20.0  # a part with a larger mean error over a sequence should have a large stated error
 WITHIN = 1.5  # factor within which a stated error counts as correct
 # the figure against truth of each part
 TRUE = {
@@ -184,7 +178,7 @@ def verdict_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
     - ``silent_share``: share of parts without a stated error; these count in no other figure.
     - ``rank_correlation``: Spearman's, over sequences, of each part and their mean.
     - ``within_factor_share``: share of parts whose stated error is within WITHIN of the true error.
-    - ``bad_sequence_recall``: share of the parts above BAD_MM whose stated error is above it too.
+    - ``bad_sequence_recall``: share of the parts above 20 mm whose stated error is above it too.
     """
     from scipy.stats import spearmanr  # takes a second to import, which most processes do not need
 
@@ -205,8 +199,9 @@ def verdict_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
     stated, true = (np.array([getattr(e, name) for e in stating]) for name in ("stated", "true"))
     ratio = np.maximum(stated / true, true / stated)
     result["within_factor_share"] = float((ratio < WITHIN).mean())
-    bad = true > BAD_MM
+    bad_mm = 20.0
+    bad = true > bad_mm
     if bad.any():
-        result["bad_sequence_recall"] = float((stated[bad] > BAD_MM).mean())
+        result["bad_sequence_recall"] = float((stated[bad] > bad_mm).mean())
         result["bad_sequences"] = float(bad.sum())
     return result

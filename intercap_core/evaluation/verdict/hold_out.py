@@ -33,10 +33,6 @@ from intercap_core.joint.terms.object_data import NoObject, ObjectData
 from intercap_core.joint.terms.object_images import ObjectImagesData
 from intercap_core.object_track.view_report import ViewReport
 
-# A camera judges the frames of this many seconds, then the next camera does. Longer than the window
-# of velocities, short enough that every camera judges a recording of two seconds.
-HELD_S = 0.2
-
 
 class JudgedPart(StrEnum):
     """A part of a result whose error is stated."""
@@ -141,17 +137,19 @@ def hold_out(inputs: JointInputs, settings: JointSettings, result: JointResult) 
         used = everything.copy()
         used[first::2] = False
         half.append(refits.with_views(used))
-    block = np.arange(len(state)) // max(1, round(inputs.fps * HELD_S))
+    # each camera judges the frames of 0.2 s in turn: longer than the window of velocities, short
+    # enough that every camera judges a recording of two seconds
+    block = np.arange(len(state)) // max(1, round(inputs.fps * 0.2))
     turn = block % len(cameras)
     mixed = _select_states(without, turn)
-    held = cameras[turn]
-    judged = _errors_in_held_out(assembly, mixed, held)
+    camera_index = cameras[turn]
+    judged = _errors_in_held_out(assembly, mixed, camera_index)
     points = _points(inputs, state)
     moved = [_points(inputs, other) for other in without]
     halves = _points(inputs, _select_states(half, np.arange(len(state)) % 2))
     return HeldOut(
         cameras,
-        held,
+        camera_index,
         within,
         judged,
         _pixels_to_metres(judged.keypoint_px, result, points[JudgedPart.BODY]),
@@ -181,14 +179,14 @@ def _errors_within(assembly: Assembly) -> ViewErrors:
     )
 
 
-def _errors_in_held_out(assembly: Assembly, state: State, held: np.ndarray) -> ViewErrors:
-    """Errors of ``state`` in the camera ``held`` (T,) of each frame; NaN in the other cameras."""
+def _errors_in_held_out(assembly: Assembly, state: State, camera: np.ndarray) -> ViewErrors:
+    """Errors of ``state`` in the ``camera`` (T,) of each frame; NaN in the other cameras."""
     images = assembly.object_
-    assembly.body.compare(state, held)
+    assembly.body.compare(state, camera)
     found = _view_errors(
-        assembly.body, images.compare(state, held) if isinstance(images, ObjectImagesData) else ()
+        assembly.body, images.compare(state, camera) if isinstance(images, ObjectImagesData) else ()
     )
-    mine = np.arange(found.keypoint_px.shape[1]) == held[:, None]
+    mine = np.arange(found.keypoint_px.shape[1]) == camera[:, None]
     return ViewErrors(*(np.where(mine, values, np.nan) for values in vars(found).values()))
 
 

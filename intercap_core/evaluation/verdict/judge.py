@@ -33,7 +33,7 @@ class SequenceVerdict:
     held: HeldOut | None
     """None if fewer than two cameras show the person."""
     stated: dict[JudgedPart, ErrorEstimate]
-    """Without the object where the recording has none."""
+    """Error of each part; without the object if the recording has none."""
 
     @classmethod
     def reach(

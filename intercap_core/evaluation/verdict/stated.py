@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from intercap_core.evaluation.figures import finite_median
 from intercap_core.evaluation.verdict.hold_out import HeldOut, JudgedPart
 
 
@@ -65,12 +66,16 @@ class ErrorEstimate:
 
 
 def estimate_error(
-    held: HeldOut | None, part: JudgedPart, sigma: np.ndarray, moved: np.ndarray, known: np.ndarray
+    held_out: HeldOut | None,
+    part: JudgedPart,
+    sigma: np.ndarray,
+    moved: np.ndarray,
+    known: np.ndarray,
 ) -> ErrorEstimate:
     """Estimate the error of ``part``.
 
     Args:
-        held: the held-out evaluation; None if there is none.
+        held_out: held-out evaluation; None if there is none.
         sigma: (T,) standard deviation that the sequential fits state, metres.
         moved: (T,) displacement from the sequential fits to the joint fit, metres.
         known: (T,) mask of the frames in which the part was measured, not filled in.
@@ -78,12 +83,12 @@ def estimate_error(
     nothing = np.full(len(known), np.nan)
     empty = dict.fromkeys(FEATURES, float("nan"))
     factors = FACTORS[part]
-    if held is None:
+    if held_out is None:
         reason = "fewer than two cameras show the person, so none can be held out"
         return ErrorEstimate(float("nan"), factors.spread, nothing, empty, reason)
-    count = len(held.cameras)
-    shift = np.sqrt((count - 1) / count * (held.shift[part] ** 2).sum(axis=0))
-    keypoint = np.full(len(shift), _median(held.keypoint_m))
+    count = len(held_out.cameras)
+    shift = np.sqrt((count - 1) / count * (held_out.shift[part] ** 2).sum(axis=0))
+    keypoint = np.full(len(shift), finite_median(held_out.keypoint_m))
     by_frame = np.stack([shift, keypoint, sigma, moved], axis=1)
     usable = known & np.isfinite(by_frame).all(axis=1)
     if usable.sum() < max(1, 0.5 * len(known)):
@@ -102,8 +107,3 @@ def estimate_error(
 def _error(features: np.ndarray, rest: float, factors: tuple[float, ...]) -> np.ndarray:
     """Errors (...,) of features (..., F)."""
     return np.sqrt(rest**2 + ((features * np.array(factors)) ** 2).sum(axis=-1))
-
-
-def _median(values: np.ndarray) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if len(known) else float("nan")

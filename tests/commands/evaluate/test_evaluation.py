@@ -1,4 +1,4 @@
-"""What `intercap evaluate` refuses and prints; the workflow itself is tested elsewhere."""
+"""Settings, figures and tables of `intercap evaluate`."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from intercap_core.project import load_project
 CONFIGS = sorted(Path("config/capture").glob("*.yaml"))
 
 
-def test_captures_of_the_evaluation_are_apart_from_all_others() -> None:
+def test_no_two_recordings_share_a_seed() -> None:
     seeds: list[int] = []
     for path in CONFIGS:
         studio = load_project(path).config.studio
@@ -61,7 +61,7 @@ def test_all_objects_are_evaluated_with_and_without_a_detector() -> None:
     ]
 
 
-def test_detections_are_drawn_anew_of_the_same_recordings() -> None:
+def test_redrawn_detections_are_of_the_same_recordings() -> None:
     one, *others = (
         load_project(Path(f"config/object/{name}.yaml"))
         for name in ("config", "redrawn_1", "redrawn_2")
@@ -73,7 +73,7 @@ def test_detections_are_drawn_anew_of_the_same_recordings() -> None:
         assert list(other.sequences) == list(one.sequences)
 
 
-def test_the_spread_of_what_is_lost_is_by_object() -> None:
+def test_lost_shares_are_by_object_and_draw() -> None:
     def measured(dataset: str, shares: dict[str, float]) -> Any:
         errors = [
             SimpleNamespace(object_=name, lost=np.arange(100) < 100 * share)
@@ -91,7 +91,7 @@ def test_the_spread_of_what_is_lost_is_by_object() -> None:
     assert lost_by_draw(draws[:2]) == {}
 
 
-def test_captures_without_truth_cannot_be_evaluated() -> None:
+def test_captures_without_truth_are_rejected() -> None:
     with pytest.raises(UserError, match="has no truth to be evaluated against"):
         require_truth(load_project(Path("config/config.yaml")))
 
@@ -114,13 +114,17 @@ def test_every_capture_and_figure_is_printed(capsys: pytest.CaptureFixture[str])
     assert "nan" not in printed
 
 
-def test_keys_of_a_variant_come_after_the_area_and_the_object() -> None:
-    count = 3
-    cup = ObjectErrors(
-        "a", "cup", 15.0, np.array([0.002, 0.003, 0.1]), np.zeros(count), np.full(count, np.nan),
-        np.zeros((count, 3)), np.zeros((count, 3)), np.array([6, 2, 1]), np.ones(count, bool),
-        np.zeros(count, bool),
+def _cup(translation: list[float], views: list[int]) -> ObjectErrors:
+    count = len(translation)
+    none = np.zeros(count, bool)
+    return ObjectErrors(
+        "a", "cup", 15.0, np.array(translation), np.full(count, 0.5), np.full(count, np.nan),
+        np.zeros((count, 3)), np.zeros((count, 3)), np.array(views), ~none, none,
     )  # fmt: skip
+
+
+def test_keys_name_area_object_and_variant() -> None:
+    cup = _cup([0.002, 0.003, 0.1], [6, 2, 1])
     flat = object_evaluation.flat([Measured("object", [cup])])
     assert flat["object.translation_median_mm"] == pytest.approx(2.5)
     assert flat["object.cup.lost_share"] == flat["object.views_0_to_1.lost_share"] / 3
@@ -131,11 +135,7 @@ def test_keys_of_a_variant_come_after_the_area_and_the_object() -> None:
 
 
 def test_every_object_and_number_of_views_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    cup = ObjectErrors(
-        "a", "cup", 15.0, np.array([0.0021]), np.array([0.5]), np.full(1, np.nan),
-        np.zeros((1, 3)), np.zeros((1, 3)), np.array([4]), np.zeros(1, bool), np.zeros(1, bool),
-    )  # fmt: skip
-    print_objects([Measured("object", [cup], ["kick_s09"])])
+    print_objects([Measured("object", [_cup([0.0021], [4])], ["kick_s09"])])
     printed = capsys.readouterr().out
     for words in ("cup", "all", "kick_s09: no track", "2.1", "0.50"):
         assert words in printed
@@ -182,7 +182,7 @@ def _bodies() -> list[Measured[BodyErrors]]:
     ]
 
 
-def test_figures_that_versions_are_compared_by_keep_their_names() -> None:
+def test_keys_of_compared_figures_are_stable() -> None:
     clouds = {key: np.ones(1) for key in CLOUD_KEYS}
     error = replace(_body("a", 50, flagged=True), clouds=clouds)
     kinds = ("object", "object_noise2", "body_per_frame_shape", "body_rgb_only", "body_two_view")

@@ -1,4 +1,4 @@
-"""Errors of a recording are measured again only where what they come from has changed."""
+"""Cache of measured errors, and standard errors of figures."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from intercap_core.commands.evaluate.captures import PART
-from intercap_core.commands.evaluate.part import measure_cached, spread
+from intercap_core.commands.evaluate.part import measure_cached, with_spread
 from intercap_core.config import Config
 from intercap_core.entries import ObjectEntry, SubjectEntry
 from intercap_core.errors import UserError
@@ -58,5 +58,6 @@ def test_the_spread_is_the_standard_error_over_recordings() -> None:
     def figures(values: list[float]) -> dict[str, float]:
         return {"mm": sum(values) / len(values), "worst_mm": max(values)}
 
-    assert spread(figures, [1.0, 3.0]) == {"mm_spread": pytest.approx(1.0)}
-    assert spread(figures, [1.0]) == {}
+    found = with_spread(figures, [1.0, 3.0])
+    assert found == {"mm": 2.0, "worst_mm": 3.0, "mm_spread": pytest.approx(1.0)}
+    assert with_spread(figures, [1.0]) == {"mm": 1.0, "worst_mm": 1.0}

@@ -1,4 +1,4 @@
-"""Recordings drawn anew: everything random is other, everything else the same."""
+"""New random seeds change recordings and people, and nothing else."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def drawn(here: Path, name: str, seed: int) -> Project:
     return load_project(redraw_settings({"objects": [path]}, seed)["objects"][0])
 
 
-def test_seeds_and_people_are_others_and_the_scripts_the_same(here: Path) -> None:
+def test_only_seeds_and_people_change(here: Path) -> None:
     old = load_project(Path("config/object/config.yaml"))
     new, other = (drawn(here, "config.yaml", seed) for seed in (5, 6))
     assert old.config.studio and new.config.studio and other.config.studio
@@ -42,13 +42,13 @@ def test_seeds_and_people_are_others_and_the_scripts_the_same(here: Path) -> Non
     assert new.config.object_track == old.config.object_track and new.config.dataset == "object"
 
 
-def test_it_is_repeatable(here: Path) -> None:
+def test_the_same_seed_gives_the_same_settings(here: Path) -> None:
     first = drawn(here, "noise_2.yaml", 5)
     text = first.path.read_bytes()
     assert drawn(here, "noise_2.yaml", 5).path.read_bytes() == text
 
 
-def test_recordings_of_another_dataset_are_its_new_ones(here: Path) -> None:
+def test_shared_recordings_stay_shared(here: Path) -> None:
     """Those without a detector are those of config.yaml."""
     shared, own = drawn(here, "no_detector.yaml", 5), drawn(here, "config.yaml", 5)
     assert shared.results == Path("results/seed_5/object_no_detector")

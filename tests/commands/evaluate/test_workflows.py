@@ -58,7 +58,7 @@ def test_projects_wait_for_those_that_make_their_recordings(
     assert by_name["object_noise2"].after == []
 
 
-def test_people_alone_are_taken_to_the_export_and_nobody_else(wanted: dict[str, Targets]) -> None:
+def test_only_people_without_object_are_exported(wanted: dict[str, Targets]) -> None:
     to_export = [run for run in plan_runs(wanted) if "export" in run.stages]
     assert [run.project.config.dataset for run in to_export] == ["field_alone"]
     assert to_export[0].stages == ["export"]
@@ -98,7 +98,7 @@ def test_each_part_is_expected_to_keep_to_its_budget(wanted: dict[str, Targets])
     assert sum(BUDGET_MINUTES[part] for part in PARTS) <= 60
 
 
-def test_what_is_left_shrinks_as_jobs_are_done(tmp_path: Path) -> None:
+def test_remaining_work_shrinks_as_jobs_end(tmp_path: Path) -> None:
     project = load_project(Path("config/test/config.yaml"))
     run = ProjectRun(project, ["scene"], {"frames": [10.0, 30.0], "scene": [60.0, 60.0]})
     assert run.left() == (160.0, 0.0)

@@ -1,4 +1,4 @@
-"""What holding a camera out says of a small capture whose joint result is 10 mm too low."""
+"""Held-out evaluation of a small capture whose joint result is 10 mm too low."""
 
 from __future__ import annotations
 
@@ -62,9 +62,8 @@ def held(capture: fitted.Capture) -> HeldOut:
 
 def test_every_camera_is_held_out_in_turn(held: HeldOut) -> None:
     np.testing.assert_array_equal(held.cameras, [0, 1, 2])
-    np.testing.assert_array_equal(
-        held.camera_index, [0, 0, 0, 1, 1, 1]
-    )  # 0.2 s at 15 frames a second
+    # 0.2 s at 15 frames a second
+    np.testing.assert_array_equal(held.camera_index, [0, 0, 0, 1, 1, 1])
     for part in JudgedPart:
         assert held.shift[part].shape == (3, 6)
         assert np.isfinite(held.shift[part]).all()
@@ -78,7 +77,7 @@ def test_only_the_held_out_camera_judges_a_frame(held: HeldOut) -> None:
     assert np.isfinite(held.held_out.keypoint_px).sum() == 6
 
 
-def test_the_result_is_compared_as_it_stands(held: HeldOut) -> None:
+def test_errors_of_the_result_in_all_cameras(held: HeldOut) -> None:
     # the result stands 10 mm below the true keypoints, 2.4 m from cameras of 230 px
     expected = fitted.BODY_OFFSET_M * 230 / 2.4
     assert np.median(held.all_cameras.keypoint_px) == pytest.approx(expected, rel=0.1)
@@ -109,7 +108,7 @@ def test_wrong_camera_has_a_large_held_out_error(
     assert np.median(seen[0]) > np.median(seen[1])  # a fit without it does not follow the lie
 
 
-def test_one_step_goes_where_many_do(capture: fitted.Capture, held: HeldOut) -> None:
+def test_one_step_agrees_with_an_iterated_refit(capture: fitted.Capture, held: HeldOut) -> None:
     """Against Gauss-Newton steps with correspondences taken anew, until they end."""
     with _opened(capture) as (inputs, settings, result):
         assembly = assemble(inputs, settings)

@@ -1,4 +1,4 @@
-"""ErrorEstimate errors: worked out by hand, and where nothing is said."""
+"""Stated errors worked out by hand, and cases without a stated error."""
 
 from __future__ import annotations
 
