@@ -13,11 +13,6 @@ import numpy as np
 
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 
-REFERENCE_FPS = 30.0
-REST_SPEED = 0.02  # m/s, below which the true object rests
-REST_TURN = np.radians(5.0)  # rad/s, below which the true object rests
-ONSET_M = 0.010  # the object has started to move at this distance from its resting place
-
 
 def second_difference(positions: np.ndarray, fps: float) -> np.ndarray:
     """x[t+1] - 2 x[t] + x[t-1] of (T, ..., 3), scaled to 30 fps; NaN at both ends, metres.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
 import numba
@@ -24,98 +24,46 @@ from intercap_core.sequence_inputs import SequencePaths
 MARGIN_M = 0.25
 
 
-@dataclass(frozen=True, eq=False)
-class ViewMasks:
-    """Masks of one colour image; None if it has none."""
-
-    person: Runs | None
-    object_: Runs | None
-    """The candidate that the object's track kept."""
-
-
 def segmented_points(
-    depth: np.ndarray,
-    camera: Camera,
-    masks: ViewMasks,
-    near: np.ndarray,
-    bias_m: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Points of the person and of the object, each (N, 3) float32, master frame, metres.
+    depth: np.ndarray, camera: Camera, masks: Sequence[Runs | None], near: np.ndarray, bias_m: float
+) -> list[np.ndarray]:
+    """Points (N, 3) float32 of each mask, master frame, metres.
 
     A point belongs to the mask that covers its pixel in the colour image.
 
     Args:
         depth: (H, W) uint16 depth image, millimetres.
+        masks: masks of the colour image; None = no points.
         near: (M, 3) mesh points, master frame; only depth pixels around them are used.
         bias_m: subtracted from the depth along the ray.
     """
-    found = [np.empty((0, 3), np.float32), np.empty((0, 3), np.float32)]
-    space = _Space.around(camera, near)
-    for place, runs in enumerate((masks.person, masks.object_)):
-        window = None if runs is None or space is None else mask_window(depth, camera, runs)
-        if window is not None:
-            assert runs is not None and space is not None
-            found[place] = space.points(
-                depth, camera, mask_pixels(depth, camera, runs, window), bias_m
-            )
-    return found[0], found[1]
-
-
-@dataclass(frozen=True)
-class _Space:
-    """A window of a depth image and a range of depths."""
-
-    low: tuple[int, int]
-    """First column and row."""
-    high: tuple[int, int]
-    """Column and row after the last."""
-    nearest: float
-    """Millimetres."""
-    farthest: float
-    """Millimetres."""
-
-    @classmethod
-    def around(cls, camera: Camera, near: np.ndarray) -> _Space | None:
-        """Space around points (M, 3), master frame, with ``MARGIN_M``.
-
-        None if the camera sees none of the points.
-        """
-        lens = camera.depth
-        if lens is None:
-            return None
-        least, most = _extent(
-            np.asarray(near, np.float64), camera.depth_from_master, tuple(lens.parameters.tolist())
-        )
-        if not np.isfinite(least[2]):
-            return None
-        margin = lens.fx * MARGIN_M / max(float(least[2]), MARGIN_M)
-        low, high = np.floor(least[:2] - margin), np.ceil(most[:2] + margin) + 1
-        return cls(
+    points = [np.empty((0, 3), np.float32) for _ in masks]
+    lens = camera.depth
+    if lens is None:
+        return points
+    least, most = _extent(
+        np.asarray(near, np.float64), camera.depth_from_master, tuple(lens.parameters.tolist())
+    )
+    if not np.isfinite(least[2]):  # the camera sees none of the points
+        return points
+    margin = lens.fx * MARGIN_M / max(float(least[2]), MARGIN_M)
+    low, high = np.floor(least[:2] - margin), np.ceil(most[:2] + margin) + 1
+    for place, runs in enumerate(masks):
+        window = None if runs is None else mask_window(depth, camera, runs)
+        if runs is None or window is None:
+            continue
+        points[place] = _placed(
+            depth,
+            mask_pixels(depth, camera, runs, window),
+            lens.rays,
             (int(low[0]), int(low[1])),
             (int(high[0]), int(high[1])),
             1e3 * max(float(least[2]) - MARGIN_M, 0.0),
             1e3 * (float(most[2]) + MARGIN_M),
-        )
-
-    def points(
-        self, depth: np.ndarray, camera: Camera, index: np.ndarray, bias_m: float
-    ) -> np.ndarray:
-        """Points (N, 3) float32, master frame, of the pixels within the space.
-
-        ``index`` (M,) are flat indices of ``depth`` (H, W), millimetres.
-        """
-        assert camera.depth is not None
-        return _placed(
-            depth,
-            index,
-            camera.depth.rays,
-            self.low,
-            self.high,
-            self.nearest,
-            self.farthest,
             camera.master_from_depth.astype(np.float32),
             np.float32(bias_m),
         )
+    return points
 
 
 def read_person_masks(person: Path) -> list[list[bytes]]:
@@ -162,8 +110,7 @@ class SegmentedClouds:
                 Runs(masks[t][c], colour.height, colour.width) if masks and masks[t][c] else None
                 for masks in self._masks
             ]
-            bias = float(self._bias[c])
-            found = segmented_points(depth, camera, ViewMasks(*runs), near, bias)
+            found = segmented_points(depth, camera, runs, near, float(self._bias[c]))
             person.append(found[0])
             object_.append(found[1])
         if not person:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from intercap_core.evaluation.segmented import MARGIN_M, ViewMasks, _extent, segmented_points
+from intercap_core.evaluation.segmented import MARGIN_M, _extent, segmented_points
 from intercap_core.geometry.camera.clouds import colour_lookup, depth_points
 from intercap_core.geometry.camera.masks import Runs, encode
 from intercap_core.geometry.camera.transforms import apply, invert
@@ -15,10 +15,10 @@ RIG, UP = ring()
 NEAR = apply(invert(UP), np.array([[1.2, 1.35, 0.5], [0.9, 1.1, 1.1]]))
 
 
-def everything() -> ViewMasks:
+def everything() -> tuple[Runs, None]:
     lens = RIG[4].colour
     runs = Runs(encode(np.ones((lens.height, lens.width), bool)), lens.height, lens.width)
-    return ViewMasks(runs, None)
+    return runs, None
 
 
 def test_points_lie_on_the_surface_that_the_camera_sees():
