@@ -101,8 +101,8 @@ def test_unstated_contact_is_no_change(versions: tuple[Path, Path]) -> None:
 def test_recordings_of_different_lengths_are_reported(
     versions: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    longer = fitted.make_capture(tmp_path / "longer", total=5).paths["joint"]
-    shutil.copyfile(longer, versions[1] / "a" / "joint.h5")
+    shorter = fitted.make_capture(tmp_path / "shorter", total=4).paths["joint"]
+    shutil.copyfile(shorter, versions[1] / "a" / "joint.h5")
     row = compare(*versions).sequences.set_index("sequence").loc["a"]
     assert row["state"] == "not comparable" and "5 frames before and 4 after" in row["note"]
 
