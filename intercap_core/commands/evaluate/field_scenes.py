@@ -70,7 +70,7 @@ def print_scenes(evaluations: Sequence[FieldScenes]) -> None:
                 number(1e3 * float(e.before.mean()), 1),
                 number(1e3 * float(e.after.mean()), 1),
                 number(1e3 * float(np.median(e.stated)), 1),
-                str(int((e.after > e.before + field_errors.WORSE_M).sum())),
+                str(int(e.worse.sum())),
                 number(1e3 * e.floor_m, 1) or "-",
                 number(e.tilt_deg, 2) or "-",
             )

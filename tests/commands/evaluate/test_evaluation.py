@@ -15,11 +15,13 @@ from intercap_core.commands.evaluate import bodies as body_evaluation
 from intercap_core.commands.evaluate import objects as object_evaluation
 from intercap_core.commands.evaluate.captures import flat as capture_figures
 from intercap_core.commands.evaluate.captures import print_captures
+from intercap_core.commands.evaluate.field_scenes import print_scenes
 from intercap_core.commands.evaluate.objects import lost_by_draw, print_objects
 from intercap_core.commands.evaluate.part import Measured, require_truth
 from intercap_core.commands.evaluate.run import QUICK_SETTINGS
 from intercap_core.errors import UserError
 from intercap_core.evaluation.body_errors import CLOUD_KEYS, BodyErrors
+from intercap_core.evaluation.field_errors import FieldScene
 from intercap_core.evaluation.object_errors import ObjectErrors
 from intercap_core.evaluation.scene_errors import CaptureErrors, SlipCounts
 from intercap_core.project import load_project
@@ -221,3 +223,14 @@ def test_bodies_are_printed_by_interaction_and_rig(
         assert words in printed
     assert "bad frames in all: 4 of 8; flags' recall 0.50, precision 1.00" in printed
     assert "nan" not in printed
+
+
+def test_every_field_scene_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    one = np.array([0.004])
+    scene = FieldScene(
+        "walk", 15.0, one, one, one, np.array([False]), one, one + 0.002, one, 0.003, np.nan
+    )
+    print_scenes([Measured("field_floor", [scene], ["broken"])])
+    printed = capsys.readouterr().out
+    for words in ("field_floor: walk", "broken", "field.extrinsics_worse_cameras: 1"):
+        assert words in printed
