@@ -1,17 +1,14 @@
 """Small corrections of the cameras from the evidence of body and object (beyond the paper).
 
-The scene's cameras are the best that the room shows. Body and object move through all views: errors
-that their evidence has in common over all frames are the cameras'. Between the rounds each camera's
-turn about its centre, shift and depth bias d go to the minimum of the images' evidence over all
-poses, with the prior that the scene's covariance P^-1 gives:
+Image residuals that body and object have in common over all frames are errors of the cameras. Each
+camera's turn about its centre, shift and depth bias d minimise the images' evidence over all poses
+x (Schur complement), with the scene's covariance P^-1 as prior:
 
     S = P + sum a (H_dd - H_dx H_xx^-1 H_xd)
     step = -S^-1 (P d + sum a (g_d - H_dx H_xx^-1 g_x))
 
-summed over frames, body (E_B) and object (E_O). x is the pose, which follows by -H_xx^-1 H_xd step.
-a is the share of an independent observation that a frame is, as errors last. S^-1 is the covariance
-of the corrections. Contact relates body and object to each other and says nothing of the cameras.
-The keypoints of the scene's registration count a second time here, with the body's small share.
+summed over frames, body (E_B) and object (E_O). The poses follow by -H_xx^-1 H_xd step, S^-1 is the
+covariance of the corrections, and a the weight of a frame, as errors last over frames.
 """
 
 from __future__ import annotations
@@ -25,15 +22,8 @@ from scipy.spatial.transform import Rotation
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.joint.state import ALL
 
-# Correction, in standard deviations of the scene, from which on body or object are wrong: twice the
-# largest on the studio.
-MAX_CAMERA_SIGMAS = 5.0
-# Largest correction of a point at ``CAMERA_REACH_M``, metres: beyond it the calibration is wrong.
-# Three times the largest correction on the studio.
-MAX_CAMERA_SHIFT_M = 0.03
-CAMERA_REACH_M = 2.5
-
-FREEDOMS = 7  # of a camera: turn about its centre, shift, depth bias
+# Unknowns of a camera: turn about its centre, shift, depth bias.
+FREEDOMS = 7
 TURN, SHIFT, BIAS = slice(0, 3), slice(3, 6), 6
 
 
@@ -41,10 +31,8 @@ TURN, SHIFT, BIAS = slice(0, 3), slice(3, 6), 6
 class Cameras:
     """Poses, lenses and depth biases of C cameras."""
 
-    rig: Rig
-    """Lenses and poses."""
-    depth_bias: np.ndarray
-    """(C,) metres to subtract from depth."""
+    rig: Rig  # Lenses and poses
+    depth_bias: np.ndarray  # (C,) metres to subtract from depth
 
     def moved(self, step: np.ndarray) -> Cameras:
         """The cameras after ``step`` (C, 7): turns about their centres, shifts, depth biases."""
@@ -56,37 +44,24 @@ class Cameras:
 
 @dataclass(frozen=True, eq=False)
 class CameraEvidence:
-    """Quadratic form of the images' evidence, by some unknowns of T frames and by the cameras.
+    """Quadratic form of the images' evidence: n unknowns of each frame, D = 7 C of the cameras."""
 
-    n is the number of these unknowns, D = 7 C that of the cameras' corrections.
-    """
-
-    columns: slice
-    """The n unknowns of a frame."""
-    matrix: np.ndarray
-    """(T, n, n) second derivative by the frames' unknowns, H_xx."""
-    gradient: np.ndarray
-    """(T, n) g_x."""
-    cross: np.ndarray
-    """(T, n, D) H_xd."""
-    hessian: np.ndarray
-    """(D, D) H_dd, summed over frames."""
-    pull: np.ndarray
-    """(D,) g_d, summed over frames."""
-    share: float
-    """Share of an independent observation that a frame is."""
+    columns: slice  # The n unknowns of a frame
+    matrix: np.ndarray  # (T, n, n) H_xx
+    gradient: np.ndarray  # (T, n) g_x
+    cross: np.ndarray  # (T, n, D) H_xd
+    hessian: np.ndarray  # (D, D) H_dd, summed over frames
+    pull: np.ndarray  # (D,) g_d, summed over frames
+    share: float  # Weight of a frame: 1 / number of frames that err together
 
 
 @dataclass(frozen=True, eq=False)
 class CameraStep:
     """A correction of the cameras."""
 
-    step: np.ndarray
-    """(C, 7)."""
-    along: np.ndarray
-    """(T, N) step of the frames' unknowns that follows from it."""
-    covariance: np.ndarray
-    """(C, 7, C, 7) of the cameras' corrections after the step."""
+    step: np.ndarray  # (C, 7)
+    along: np.ndarray  # (T, N) step of the frames' unknowns that follows
+    covariance: np.ndarray  # (C, 7, C, 7) of the cameras' corrections after the step
 
     @property
     def shift(self) -> float:
@@ -101,11 +76,14 @@ class CameraFit:
     Attributes:
         now: the cameras after all accepted steps.
         covariance: (C, 7, C, 7) of the corrections; 0 for what is fixed.
-        refused: a step was implausible, and the cameras are those of the scene again.
+        refused: a step was implausible, and the cameras were reset to the scene's.
     """
 
     def __init__(self, start: Cameras, covariance: np.ndarray) -> None:
-        """Raises LinAlgError if the covariance is not positive definite."""
+        """``covariance`` (C, 7, C, 7) is 0 for fixed unknowns.
+
+        Raises LinAlgError if it is not positive definite.
+        """
         self._given = start, covariance
         self.now, self.covariance, self.refused = start, covariance, False
         self._away = np.zeros((len(start.rig), FREEDOMS))
@@ -117,10 +95,7 @@ class CameraFit:
         self._information = np.linalg.inv(own)
 
     def take(self, correction: CameraStep) -> bool:
-        """Move the cameras; if that is implausible, put all of them back instead.
-
-        Returns whether they were moved.
-        """
+        """Apply a plausible correction and return True; otherwise reset all cameras."""
         away = self._away + correction.step
         if not self._is_plausible(away):
             (self.now, self.covariance), self._away = self._given, np.zeros_like(away)
@@ -131,35 +106,34 @@ class CameraFit:
         return True
 
     def _is_plausible(self, away: np.ndarray) -> bool:
-        """Whether corrections (C, 7) are within the scene's standard deviations and small.
+        """Whether corrections (C, 7) are below 5 of the scene's standard deviations and 30 mm.
 
-        The standard deviations bound each correction and all of them together.
+        The standard deviations bound each correction and all together; the 30 mm are those of a
+        point at 2.5 m. Both are two to three times the largest correction on the studio.
         """
         free = away.ravel()[self._free]
         together = np.sqrt(free @ self._information @ free / max(len(free), 1))
-        size = np.linalg.norm(away[:, TURN], axis=1) * CAMERA_REACH_M
+        size = np.linalg.norm(away[:, TURN], axis=1) * 2.5
         size += np.linalg.norm(away[:, SHIFT], axis=1) + np.abs(away[:, BIAS])
         return bool(
-            (np.abs(free) < MAX_CAMERA_SIGMAS * self._sigma).all()
-            and together < MAX_CAMERA_SIGMAS
-            and (size < MAX_CAMERA_SHIFT_M).all()
+            (np.abs(free) < 5.0 * self._sigma).all() and together < 5.0 and (size < 0.03).all()
         )
 
     def solve(self, evidence: Sequence[CameraEvidence]) -> CameraStep:
-        """The best step from the present cameras, of what is not fixed."""
+        """Find the minimum of ``evidence`` and prior over the unknowns that are not fixed."""
         free = self._free
         total, pull = self._information, self._information @ self._away.ravel()[free]
         follows = []
-        for seen in evidence:
-            cross = seen.cross[..., free]
-            right = np.concatenate([cross, seen.gradient[..., None]], axis=2)
-            solved = np.linalg.solve(seen.matrix, right)
-            inside = seen.hessian[np.ix_(free, free)] - np.einsum(
+        for form in evidence:
+            cross = form.cross[..., free]
+            right = np.concatenate([cross, form.gradient[..., None]], axis=2)
+            solved = np.linalg.solve(form.matrix, right)
+            inside = form.hessian[np.ix_(free, free)] - np.einsum(
                 "tid,tie->de", cross, solved[..., :-1], optimize=True
             )
-            total = total + seen.share * inside
-            own = seen.pull[free] - np.einsum("tid,ti->d", cross, solved[..., -1])
-            pull = pull + seen.share * own
+            total = total + form.share * inside
+            own = form.pull[free] - np.einsum("tid,ti->d", cross, solved[..., -1])
+            pull = pull + form.share * own
             follows.append(solved[..., :-1])
         covariance = np.linalg.inv(total)
         step = np.zeros(self._away.size)
@@ -167,8 +141,8 @@ class CameraFit:
         stated = np.zeros((step.size, step.size))
         stated[np.ix_(free, free)] = covariance
         along = np.zeros((len(evidence[0].matrix), ALL.stop))
-        for seen, follow in zip(evidence, follows, strict=True):
-            along[:, seen.columns] -= follow @ step[free]
+        for form, follow in zip(evidence, follows, strict=True):
+            along[:, form.columns] -= follow @ step[free]
         return CameraStep(
             step.reshape(self._away.shape), along, stated.reshape(self.covariance.shape)
         )

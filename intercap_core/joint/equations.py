@@ -17,10 +17,6 @@ RATE = (-1.0, 1.0)  # stencil over frames t, t+1
 Rows = Callable[[slice, np.ndarray], np.ndarray]
 """Derivatives (F, K, R, m) of K of a term's N values, R numbers each, in F frames (a slice)."""
 
-# Values whose weight is a smaller share of their term's largest change nothing: the tail of a
-# Gaussian over a contact patch would have a row of each of its vertices.
-NEGLIGIBLE_WEIGHT = 1e-7
-
 _CHUNK = 8  # frames whose rows are computed at a time: few enough to stay in the cache
 
 
@@ -45,10 +41,7 @@ class BandedEquations:
         self.energies: dict[str, np.ndarray] = {}
 
     def copy(self, bands: np.ndarray | None = None) -> BandedEquations:
-        """A copy, to which more can be added.
-
-        ``bands`` is memory of the same shape to use again: allocation takes half of the time.
-        """
+        """A copy, in the memory ``bands`` if given: allocation takes half of the time."""
         made = BandedEquations(0, self._threads)
         made.bands = np.empty_like(self.bands) if bands is None else bands
         made.bands[...], made.damped = self.bands, self.damped.copy()
@@ -58,8 +51,8 @@ class BandedEquations:
     def step(self, damping: np.ndarray) -> np.ndarray | None:
         """The Gauss-Newton step (T, n), or None if the matrix is not positive definite.
 
-        ``damping`` (T,) is a share of the diagonal. The step consumes ``bands``, most of the memory
-        of a long recording: another step needs new equations.
+        ``damping`` (T,) is a share of the diagonal. The step consumes ``bands`` to save memory:
+        another step needs new equations.
         """
         matrix, self.bands = torch.from_numpy(self.bands), np.zeros((0, 0, 0, 0))
         damped = torch.from_numpy(damping[:, None] * self.damped)
@@ -142,7 +135,8 @@ class BandedEquations:
             _over_stencil([f * g for f, g in zip(stencil, stencil[d:], strict=False)], weights)
             for d in range(ahead + 1)
         ]
-        counts = couplings[0] > NEGLIGIBLE_WEIGHT * couplings[0].max(initial=0.0)
+        # the tail of a Gaussian over a contact patch would have a row of each of its vertices
+        counts = couplings[0] > 1e-7 * couplings[0].max(initial=0.0)
 
         def add_chunk(start: int) -> None:
             stop = min(start + _CHUNK, frames)

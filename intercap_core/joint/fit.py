@@ -1,18 +1,19 @@
-"""The joint fit: alternates between estimating contact and minimising the energy of equation 6."""
+"""The joint fit: rounds of minimising equation 6, each with new contact, time offsets, cameras."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from intercap_core.annotation import ContactInterval
 from intercap_core.config import JointSettings
 from intercap_core.joint.cameras import CameraFit
-from intercap_core.joint.contact.estimate import ContactEstimate, ContactEstimator
-from intercap_core.joint.floor import FloorPlane, contradiction
+from intercap_core.joint.contact_estimate import ContactEstimate, estimate_contact
+from intercap_core.joint.floor import contradiction
 from intercap_core.joint.inputs import JointInputs
 from intercap_core.joint.minimise import limited, minimise
 from intercap_core.joint.problem import JointProblem, build_terms
@@ -24,23 +25,7 @@ from intercap_core.joint.terms.object_data import NoObject, ObjectData
 from intercap_core.joint.terms.object_images import ObjectImagesData
 from intercap_core.joint.terms.term import TermContext
 
-# Largest number of accepted steps of each round: the first round moves most. Contact is estimated
-# between rounds. Tuned on the studio.
-ROUND_STEPS = (6, 4, 3)
-# Duration of errors of masks and keypoints, seconds: the frames of that time are one observation of
-# the cameras. Tuned on the studio.
-ERROR_LASTING_S = 0.3
-# Weight of the body's evidence of the cameras: a detector's errors follow view and pose, and
-# clothing has an unknown thickness. Tuned on the studio.
-BODY_SHARE = 0.05
-# Changes after which another round has nothing to improve: of a contact probability (tuned on the
-# studio), of time offsets, seconds (3 mm of a hand at 3 m/s), and of cameras, metres.
-CONTACT_CONVERGED = 0.1
-OFFSET_CHANGED_S = 0.001
-CAMERAS_CHANGED_M = 0.0005
-# Depth of skin in the object, or of the object in the body, that flags a frame, metres: far beyond
-# what skin yields, so one of the two poses is wrong. Tuned on the studio.
-FLAGGED_DEPTH = 0.03
+ROUND_STEPS = (6, 4, 3)  # accepted steps of each round at most; tuned on the studio
 
 log = logging.getLogger(__name__)
 
@@ -52,27 +37,19 @@ ObjectTerm = ObjectData | ObjectImagesData | NoObject
 class Assembly:
     """The energy of a recording, and those of its terms that the fit updates between rounds."""
 
-    problem: JointProblem
-    """All terms."""
-    body: BodyData
-    """E_B."""
-    object_: ObjectTerm
-    """E_O."""
-    contact: Contact | None
-    """E_C; None without an object."""
-    floor: FloorPlane | None
-    """The floor that the terms use."""
-    against_floor: str
-    """Why the scene's floor is not used; "" if it is, or if there is none."""
-    share: float
-    """Share of an independent observation of the cameras that a frame is."""
+    problem: JointProblem  # All terms
+    body: BodyData  # E_B
+    object_: ObjectTerm  # E_O
+    contact: Contact | None  # E_C; None without an object
+    against_floor: str  # Why the scene's floor is not used; "" if it is, or if there is none
+    share: float  # Weight of a frame as evidence of the cameras
 
 
 def assemble(inputs: JointInputs, settings: JointSettings) -> Assembly:
-    """Build all terms.
+    """Build all terms. A floor that the sequential fits contradict is left out.
 
-    Without images the object's track stands for E_O; without an object the body's terms remain. A
-    floor that the sequential fits contradict is left out.
+    E_O compares images, or uses the object track if there are no images. Without an object only
+    the body's terms remain.
     """
     sequential, floor = inputs.sequential, inputs.floor
     against_floor = contradiction(inputs.geometry, sequential, floor) if floor else ""
@@ -86,7 +63,7 @@ def assemble(inputs: JointInputs, settings: JointSettings) -> Assembly:
         encoder=inputs.encoder,
         up=floor.normal if floor else None,
     )
-    share = min(1.0, 1 / (inputs.fps * ERROR_LASTING_S))
+    share = min(1.0, 1 / (inputs.fps * 0.3))  # masks and keypoints err alike for 0.3 s; tuned
     object_data: ObjectTerm = NoObject()
     if sequential.tracked is not None:
         object_data = (
@@ -100,7 +77,6 @@ def assemble(inputs: JointInputs, settings: JointSettings) -> Assembly:
         body=inputs.body_data,
         object_=object_data,
         contact=context.find(Contact) if inputs.geometry.has_object else None,
-        floor=context.floor,
         against_floor=against_floor,
         share=share,
     )
@@ -111,22 +87,17 @@ def fit(
 ) -> JointFit:
     """Minimise equation 6 from the sequential fits.
 
-    ``intervals`` are the annotated contacts; None to detect contact. A floor that the sequential
-    fits contradict flags every frame.
+    ``intervals`` are the annotated contacts; None to detect contact. If the sequential fits
+    contradict the floor, every frame is flagged.
     """
     alone = not inputs.geometry.has_object
     if settings.refine_cameras and not (settings.look_again or alone):
-        log.warning("refine_cameras needs look_again: the cameras stay as the scene has them")
+        log.warning("refine_cameras needs look_again: the cameras stay as in scene.h5")
     assembly = assemble(inputs, settings)
     if assembly.against_floor:
-        log.warning(
-            "%s: every frame is flagged; look at the scene's ground", assembly.against_floor
-        )
+        log.warning("%s: every frame is flagged; check the scene's ground", assembly.against_floor)
     cameras = inputs.cameras if (inputs.images or alone) and settings.refine_cameras else None
-    estimator = ContactEstimator(
-        inputs.geometry, inputs.sequential, assembly.floor, inputs.fps, settings, intervals
-    )
-    rounds = _Rounds(inputs, assembly, estimator)
+    rounds = _Rounds(inputs, assembly, partial(estimate_contact, inputs, settings, intervals))
     for number, max_steps in enumerate(ROUND_STEPS, 1):
         rounds.minimise(max_steps)
         if number == len(ROUND_STEPS):
@@ -168,24 +139,20 @@ def fit(
 
 
 class _Rounds:
-    """The alternation between minimisation and estimates of contact, time offsets and cameras.
+    """State, contact and statistics of the rounds so far; see :class:`JointFit` for the fields.
 
-    Attributes:
-        state: present state.
-        estimate: contact at this state.
-        steps: number of accepted steps of all rounds.
-        refused: number of refused steps of all rounds.
-        stalled: (T,) frames that no round moved, since each step raised the energy there.
-        energy_before: energy by term at the start.
-        energy_after: energy by term at the end of the last round.
+    ``stalled`` (T,) are frames that no round moved, since each step raised the energy there.
     """
 
     def __init__(
-        self, inputs: JointInputs, assembly: Assembly, estimator: ContactEstimator
+        self,
+        inputs: JointInputs,
+        assembly: Assembly,
+        contact_at: Callable[[State], ContactEstimate],
     ) -> None:
-        self._assembly, self._estimator, self._prior = assembly, estimator, inputs.prior
+        self._assembly, self._contact_at, self._prior = assembly, contact_at, inputs.prior
         self.state = inputs.sequential.state
-        self.estimate = estimator.at(self.state)
+        self.estimate = contact_at(self.state)
         self.steps = self.refused = 0
         self.stalled = np.ones(len(self.state), bool)
         self.energy_before: dict[str, float] = {}
@@ -196,18 +163,14 @@ class _Rounds:
     @property
     def convergence(self) -> Convergence:
         """Outcome so far."""
-        if self._unchanged and self._camera_shift < CAMERAS_CHANGED_M:
+        if self._unchanged and self._camera_shift < 0.0005:  # metres
             return Convergence.CONVERGED
         if self.steps == 0 and self.refused > 0:
             return Convergence.STALLED
         return Convergence.ITERATION_LIMIT
 
     def minimise(self, max_steps: int) -> None:
-        """Do one round.
-
-        Update time offsets and correspondences at the state, take at most ``max_steps`` steps, and
-        estimate contact again.
-        """
+        """Update time offsets and correspondences, minimise, and estimate contact again."""
         assembly, body = self._assembly, self._assembly.body
         if assembly.contact is not None:
             assembly.contact.take_contact(self.estimate.probability, self.estimate.labels)
@@ -224,17 +187,16 @@ class _Rounds:
         log.info("%d steps, energy %.4g", self.steps, minimum.equations.total)
         converged = minimum.converged
         del minimum  # its equations are most of the memory
-        previous, self.estimate = self.estimate, self._estimator.at(self.state)
+        previous, self.estimate = self.estimate, self._contact_at(self.state)
         contact_change = self.estimate.change(previous)
-        self._unchanged = bool(
-            converged and contact_change < CONTACT_CONVERGED and offset_change < OFFSET_CHANGED_S
-        )
+        # 1 ms is 3 mm of a hand at 3 m/s; the change of a probability is tuned on the studio
+        self._unchanged = bool(converged and contact_change < 0.1 and offset_change < 0.001)
 
     def correct_cameras(self, cameras: CameraFit) -> None:
-        """Correct ``cameras`` by the evidence of the body and, if there are images of it, the
-        object."""
+        """Correct ``cameras`` by the evidence of the body and of images of the object."""
         body, images = self._assembly.body, self._assembly.object_
-        evidence = [body.camera_evidence(self.state, BODY_SHARE * self._assembly.share)]
+        # a twentieth (tuned): detectors' errors follow view and pose, clothing hides the skin
+        evidence = [body.camera_evidence(self.state, 0.05 * self._assembly.share)]
         if isinstance(images, ObjectImagesData):
             evidence.append(images.camera_evidence(self.state))
         correction = cameras.solve(evidence)
@@ -246,11 +208,11 @@ class _Rounds:
         if isinstance(images, ObjectImagesData):
             images.take_cameras(cameras.now)
         if cameras.refused:
-            # the state was fitted to the cameras before: at least one more round
+            # the state was fitted to the corrected cameras: at least one more round
             self._camera_shift, self._unchanged = 0.0, False
             log.warning(
-                "body and object would move a camera by %.0f mm, far beyond what the scene "
-                "leaves open: all cameras stay as the scene has them; look at their poses, the "
+                "body and object would move a camera by %.0f mm, far more than the scene's "
+                "standard deviations: all cameras stay as in scene.h5; check their poses, the "
                 "body and the object",
                 1e3 * correction.shift,
             )
@@ -276,8 +238,9 @@ def _flag_reasons(
     lost = "object found in no frame"
     if inputs.geometry.has_object:
         posed = inputs.geometry.at(state)
-        deep = posed.proximity.distance.min(axis=1) < -FLAGGED_DEPTH
-        sunk = posed.object_depth(inputs.threads) > FLAGGED_DEPTH
+        limit = 0.03  # metres, far more than skin yields: one pose is wrong; tuned on the studio
+        deep = posed.proximity.distance.min(axis=1) < -limit
+        sunk = posed.object_depth(inputs.threads) > limit
         lost = "object lost, filled in"
     causes = (
         (flags.filled, "body not seen well enough, filled in"),
@@ -287,7 +250,7 @@ def _flag_reasons(
         (flags.ambiguous & ~flags.carried, "object pose ambiguous"),
         (deep, "body deep inside the object"),
         (sunk, "object deep inside the body"),
-        *estimate.distrust(),
+        *estimate.doubtful_frames(),
         (stalled, "no step of the joint fit lowered its energy"),
         (against_images, CONTRADICTED),
         (np.full(len(state), bool(against_floor)), against_floor),

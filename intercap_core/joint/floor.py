@@ -1,8 +1,7 @@
 """The floor plane, and a test whether the sequential fits contradict it.
 
-Several terms at once push body and object onto the floor, so that a floor that is wrong by
-decimetres would displace the whole body. The sequential fits do not use the floor: they can
-contradict it.
+Several terms push body and object onto the floor: a floor that is wrong by decimetres would
+displace the whole body. The sequential fits do not use the floor, so they can contradict it.
 """
 
 from __future__ import annotations
@@ -15,13 +14,7 @@ from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.sequential import SequentialFits
 from intercap_core.schemas import CONTACT_REGIONS
 
-# Distance between feet and floor that contradicts the floor, metres: three times the largest error
-# of the sequential fits on the studio.
-CONTRADICTION_M = 0.10
-# Quantile over the frames of the height of the lowest of feet and object: a jump ends, and so does
-# a walk with the object in the air. Tuned on the studio.
-REACHED_QUANTILE = 0.1
-
+CONTRADICTION_M = 0.10  # three times the largest error of sequential fits on the studio
 _FEET = tuple(CONTACT_REGIONS.index(f"{side}_foot") for side in ("left", "right"))
 
 
@@ -29,22 +22,27 @@ _FEET = tuple(CONTACT_REGIONS.index(f"{side}_foot") for side in ("left", "right"
 class FloorPlane:
     """The floor, in the master frame."""
 
-    point: np.ndarray
-    """(3,) any point of the plane, metres."""
-    normal: np.ndarray
-    """(3,) upward unit vector."""
+    point: np.ndarray  # (3,) any point of the plane, metres
+    normal: np.ndarray  # (3,) upward unit vector
 
     def heights(self, points: np.ndarray) -> np.ndarray:
         """Heights (..., N) of points (..., N, 3) above the floor, metres; negative below it."""
         return (points - self.point) @ self.normal
 
+    def depths(self, points: np.ndarray) -> np.ndarray:
+        """Heights (..., N) of points below the floor, 0 for those above it; metres.
+
+        The derivative by a point is the normal where the height is negative, 0 elsewhere.
+        """
+        return np.minimum(self.heights(points), 0.0)
+
 
 def contradiction(geometry: Geometry, sequential: SequentialFits, floor: FloorPlane) -> str:
     """Describe how the sequential fits contradict ``floor``; "" if they do not.
 
-    A floor is contradicted if the lower foot is below it in most frames, or if neither feet nor
-    object come near it in any part of the recording. Frames with an interpolated body do not
-    count, and neither does the object in frames in which it is lost.
+    They do if the lower foot is below the floor in most frames, or if feet and object are far above
+    it in 90 % of the frames (jumps end). Frames with an interpolated body do not count, nor does
+    the object while it is lost.
     """
     posed = geometry.at(sequential.state)
     feet = geometry.skin.patch[np.isin(geometry.patches.region, _FEET)]
@@ -59,7 +57,7 @@ def contradiction(geometry: Geometry, sequential: SequentialFits, floor: FloorPl
     if geometry.has_object:
         objects = floor.heights(posed.object_vertices).min(axis=1)
         reach = np.where(sequential.flags.lost, lowest, np.minimum(lowest, objects))
-    nearest = float(np.quantile(reach[known], REACHED_QUANTILE))
+    nearest = float(np.quantile(reach[known], 0.1))
     if nearest > CONTRADICTION_M:
         return f"floor {nearest:.2f} m below feet and object, not used"
     return ""

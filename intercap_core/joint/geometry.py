@@ -18,14 +18,7 @@ from intercap_core.joint.proximity import Proximity, SearchableSurface, proximit
 from intercap_core.joint.skin import Patches, SkinSamples
 from intercap_core.joint.state import BODY, State
 
-# Least distance of the six points to the object's centre, metres: hands turn an object with
-# 20 rad/s^2 if they move it with 6 m/s^2, and a thin object's own points would leave its spin free.
-# Tuned on the studio.
-OBJECT_ARM = 0.3
-# Points of the object's surface that are searched inside the body.
-DEPTH_POINTS = 400
-
-_CHUNK = 32  # frames whose derivatives are computed at a time, to bound the memory
+_CHUNK = 32  # frames that are computed at a time, to bound the memory
 
 
 class Geometry:
@@ -53,7 +46,7 @@ class Geometry:
 
     @property
     def has_object(self) -> bool:
-        """Whether there is an object; the properties below that concern it need one."""
+        """Whether there is an object. The object's properties need one."""
         return self._mesh is not None
 
     @property
@@ -70,24 +63,22 @@ class Geometry:
 
     @cached_property
     def moments(self) -> np.ndarray:
-        """Points (6, 3) with the object's moments, object frame."""
-        return moment_points(self.mesh.vertices, OBJECT_ARM)
+        """Points (6, 3) with the object's moments, object frame.
+
+        They are at least 0.3 m from its centre (tuned on the studio): hands turn an object with
+        20 rad/s^2 if they move it with 6 m/s^2. Points of a thin object would not bound its spin.
+        """
+        return moment_points(self.mesh.vertices, 0.3)
 
     def at(self, state: State) -> PosedGeometry:
-        """The geometry at ``state``. The result for the last state is kept: all terms ask for it.
-
-        A state is never changed in place, so its identity is the key.
-        """
+        """Geometry at ``state``; the last one is cached by the identity of its state."""
         if self._last is None or self._last.state is not state:
             self._last = PosedGeometry(self, state)
         return self._last
 
 
 class PosedGeometry:
-    """Points, distances and derivatives at one state, each computed on first use.
-
-    Master frame, metres.
-    """
+    """Points, distances and derivatives at a state, computed on first use; master frame, metres."""
 
     def __init__(self, geometry: Geometry, state: State) -> None:
         self._geometry, self.state = geometry, state
@@ -110,13 +101,11 @@ class PosedGeometry:
     def object_depth(self, threads: ThreadPool) -> np.ndarray:
         """Largest depth (T,) of the object's surface inside the body, metres; 0 without overlap.
 
-        Points spread over the object are compared with the whole posed body.
+        400 points of the object are compared with the whole posed body.
         """
         g, state = self._geometry, self.state
         mesh, faces = g.mesh, g.model.faces.cpu().numpy()
-        points = sample_surface(mesh.vertices, mesh.faces, DEPTH_POINTS).of(
-            mesh.vertices, mesh.faces
-        )
+        points = sample_surface(mesh.vertices, mesh.faces, 400).of(mesh.vertices, mesh.faces)
         vector, depth = self._parameters.vector(), np.zeros(len(state))
         for start in range(0, len(state), _CHUNK):
             with torch.no_grad():
@@ -151,17 +140,11 @@ class PosedGeometry:
         return proximity(touched, self.skin, state.rotation, state.translation)
 
     def skin_by_body(self, frames: slice, index: np.ndarray, axes: np.ndarray) -> np.ndarray:
-        """Derivative (F, K, R, 168) of skin samples by the body, along axes.
-
-        Args:
-            frames: F of the frames.
-            index: (K,) of the samples.
-            axes: (F, K, R, 3) directions along which the points are measured.
-        """
+        """Derivative (F, K, R, 168) of the skin samples ``index`` (K,); see the next method."""
         return self.vertices_by_body(frames, self._geometry.skin.vertices[index], axes)
 
     def vertices_by_body(self, frames: slice, ids: np.ndarray, axes: np.ndarray) -> np.ndarray:
-        """Derivative (F, K, R, 168) of the body's vertices ``ids`` (K,) by the body, along axes.
+        """Derivative (F, K, R, 168) of vertices ``ids`` (K,) by the body in F ``frames``.
 
         ``axes`` (F, K, R, 3) are the directions along which the points are measured.
         """
@@ -217,9 +200,7 @@ def moment_points(vertices: np.ndarray, least: float = 0.0) -> np.ndarray:
 
 
 def points_by_object(
-    points: np.ndarray,
-    rotation: np.ndarray,
-    translation: np.ndarray,
+    points: np.ndarray, rotation: np.ndarray, translation: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Object points (N, 3) in all frames (T, N, 3), and their derivative (T, N, 3, 6).
 

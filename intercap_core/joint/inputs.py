@@ -16,7 +16,6 @@ from intercap_core.body.artefact import load_model, load_pose_prior
 from intercap_core.body.lemo import FEWEST_FRAMES, FRAMES_PER_SECOND, MotionEncoder
 from intercap_core.body.model import BodyModel
 from intercap_core.config import JointSettings
-from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import Detections
 from intercap_core.formats.recordings.frames import Frames
@@ -36,37 +35,22 @@ from intercap_core.object_track.recording import ObjectRecording
 from intercap_core.schemas import BODY_FIT, OBJECT_TRACK, SCENE
 from intercap_core.sequence_inputs import FitSettings, SequenceModels, SequencePaths
 
-# Relative difference between the frame rate of a recording and that of LEMO's encoder beyond which
-# its steps are other motion: walks in AMASS, its training data, differ by more among themselves.
-MAX_RATE_ERROR = 0.1
-
 
 @dataclass(frozen=True, eq=False)
 class JointInputs:
     """The sequential fits of a recording, and the data that they were fitted to."""
 
-    geometry: Geometry
-    """Meshes of body and object."""
-    sequential: SequentialFits
-    """Body fit and object track."""
-    body_data: BodyData
-    """E_B over keypoints and clouds."""
-    images: ObjectImages | None
-    """Images of the object; None without an object, or if ``look_again`` is off."""
-    floor: FloorPlane | None
-    """The scene's floor, if it has one."""
-    prior: OffsetPrior
-    """The scene's time offsets."""
-    cameras: CameraFit
-    """The scene's cameras and their covariance."""
-    encoder: MotionEncoder | None
-    """LEMO's motion encoder, if the settings name its weights."""
-    fps: float
-    """Frames per second."""
-    threads: ThreadPool
-    """Threads that compute rows and compare images."""
-    attributes: dict[str, object]
-    """Sequence, gender and body model of the body fit."""
+    geometry: Geometry  # Meshes of body and object
+    sequential: SequentialFits  # Body fit and object track
+    body_data: BodyData  # E_B over keypoints and clouds
+    images: ObjectImages | None  # None without an object or without ``look_again``
+    floor: FloorPlane | None  # The scene's floor, if it has one
+    prior: OffsetPrior  # The scene's time offsets
+    cameras: CameraFit  # The scene's cameras and their covariance
+    encoder: MotionEncoder | None  # LEMO's motion encoder, if the settings name its weights
+    fps: float  # Frames per second
+    threads: ThreadPool  # Threads that compute rows and compare images
+    attributes: dict[str, object]  # Sequence, gender and body model of the body fit
 
     @property
     def model(self) -> BodyModel:
@@ -76,18 +60,20 @@ class JointInputs:
 
 @contextmanager
 def open_inputs(
-    paths: SequencePaths,
-    models: SequenceModels,
-    fit_settings: FitSettings,
-    device: str = "cpu",
+    paths: SequencePaths, models: SequenceModels, fit_settings: FitSettings, device: str = "cpu"
 ) -> Iterator[JointInputs]:
     """Open the inputs of the joint fit for a ``with`` block, in which images are read.
 
-    An object whose track is lost in all frames is treated as absent. Raises UserError if an
-    artefact or the mesh cannot be used.
+    An object whose track is lost in all frames counts as absent. Raises UserError if an artefact or
+    the mesh cannot be used.
     """
     settings, object_, body_models = fit_settings.joint, models.object_, models.body_models
-    mesh = _mesh(object_, settings)
+    mesh: ObjectMesh | None = None
+    if object_ is not None:
+        problem = settings.check_object(object_)
+        if problem:
+            raise UserError(problem)
+        mesh = ObjectMesh.load(object_)
     with (
         artefacts.read(paths.body_fit, BODY_FIT) as body,
         artefacts.read(paths.object_track, OBJECT_TRACK) as track,
@@ -107,13 +93,17 @@ def open_inputs(
             fps=fps,
             pose_prior=load_pose_prior(body_models, model),
         )
-        floor, prior, cameras = _floor(scene), _offset_prior(scene), read_cameras(scene)
+        floor = None
+        if scene.attributes["ground_found"]:
+            floor = FloorPlane(scene["ground_point"], scene["ground_normal"])
+        master = scene.text("camera_names").index(str(scene.attributes["master"]))
+        prior = OffsetPrior(scene["time_offset"], scene["time_offset_sigma"], master)
+        cameras = read_cameras(scene)
     if sequential.tracked is None:
         mesh = None
     geometry = _geometry(model, mesh, settings)
     threads = ThreadPool(torch.get_num_threads() if model.device.type == "cpu" else 1)
-    # numpy would divide its products among threads too: small ones gain nothing, and products of
-    # two of our threads would wait for each other
+    # numpy would use threads too: small products gain nothing, and threads would block each other
     with Frames.open(paths.frames) as recording, threadpool_limits(1, user_api="blas"):
         images = None
         if settings.look_again and object_ is not None and mesh is not None:
@@ -140,22 +130,15 @@ def open_inputs(
         )
 
 
-def _mesh(entry: ObjectEntry | None, settings: JointSettings) -> ObjectMesh | None:
-    """The object's mesh; None for a person alone. Raises UserError if it cannot be used."""
-    if entry is None:
-        return None
-    problem = settings.check_object(entry)
-    if problem:
-        raise UserError(problem)
-    return ObjectMesh.load(entry)
-
-
 def _geometry(model: BodyModel, mesh: ObjectMesh | None, settings: JointSettings) -> Geometry:
     patches = contact_patches(model)
     if mesh is None:
         return Geometry(model, None, None, patches)
     field = DistanceField(mesh.vertices, mesh.faces, watertight=mesh.watertight)
-    return Geometry(model, mesh, field, patches, _touched(mesh, field, settings))
+    touched = None
+    if settings.contact_to == "annotated":
+        touched = SurfacePart(field, mesh.vertices, mesh.faces, mesh.contact_vertices)
+    return Geometry(model, mesh, field, patches, touched)
 
 
 def _motion_encoder(
@@ -171,7 +154,7 @@ def _motion_encoder(
     problem = ""
     if frames < FEWEST_FRAMES:
         problem = f"has {frames} frames, and LEMO's encoder needs {FEWEST_FRAMES} or more"
-    elif abs(fps / FRAMES_PER_SECOND - 1) > MAX_RATE_ERROR:
+    elif abs(fps / FRAMES_PER_SECOND - 1) > 0.1:  # walks in AMASS, its data, differ by more
         problem = (
             f"has {fps:g} frames a second, and LEMO's encoder knows steps of motion at "
             f"{FRAMES_PER_SECOND:g}"
@@ -184,27 +167,8 @@ def _motion_encoder(
             "joint.lemo out for small accelerations of the joints"
         )
     weights, statistics = settings.lemo_files
-    # Double precision: E_S is a small difference of large latents, and convolutions on a GPU may
-    # round to ten bits.
+    # E_S is a small difference of large latents, and GPU convolutions may round to ten bits
     return MotionEncoder.load(weights, statistics, device=model.device, dtype=torch.float64)
-
-
-def _touched(mesh: ObjectMesh, field: DistanceField, settings: JointSettings) -> SurfacePart | None:
-    """The part of the object that contact draws skin to; None for all of it."""
-    if settings.contact_to == "any":
-        return None
-    return SurfacePart(field, mesh.vertices, mesh.faces, mesh.contact_vertices)
-
-
-def _floor(scene: Artefact) -> FloorPlane | None:
-    if not scene.attributes["ground_found"]:
-        return None
-    return FloorPlane(scene["ground_point"], scene["ground_normal"])
-
-
-def _offset_prior(scene: Artefact) -> OffsetPrior:
-    master = scene.text("camera_names").index(str(scene.attributes["master"]))
-    return OffsetPrior(scene["time_offset"], scene["time_offset_sigma"], master)
 
 
 def read_cameras(scene: Artefact) -> CameraFit:

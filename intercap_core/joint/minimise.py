@@ -9,32 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.joint.equations import BandedEquations
-from intercap_core.joint.state import (
-    BODY_SHIFT,
-    BODY_TURNS,
-    OBJECT_SHIFT,
-    OBJECT_TURN,
-    State,
-)
+from intercap_core.joint.state import BODY_SHIFT, BODY_TURNS, OBJECT_SHIFT, OBJECT_TURN, State
 
-# Damping as a share of the diagonal. Tuned on the studio.
-INITIAL_DAMPING = 1e-3
-MIN_DAMPING = 1e-6
-# Damping from which on a frame hardly moves. Tuned on the studio.
-STALLED_DAMPING = 0.5
-# Factors after a refused and after an accepted step. Tuned on the studio.
-DAMPING_UP = 10.0
-DAMPING_DOWN = 5.0
-# Largest change in one step, rad and metres: beyond it a linearisation of skinning is poor. Tuned
-# on the studio.
-MAX_STEP_TURN = 0.5
-MAX_STEP_SHIFT = 0.1
-# A step that gains less than this share of the round's total gain ends the round. Tuned on the
-# studio.
-MIN_GAIN_SHARE = 0.03
-# A refused step whose slope promised less than this share of the energy ends the round: the fit is
-# at a minimum. Tuned on the studio.
-NEGLIGIBLE_SHARE = 1e-3
+MIN_DAMPING = 1e-6  # share of the diagonal; tuned on the studio
+STALLED_DAMPING = 0.5  # share of the diagonal with which a frame hardly moves; tuned on the studio
 
 log = logging.getLogger(__name__)
 
@@ -43,60 +21,44 @@ log = logging.getLogger(__name__)
 class Minimum:
     """Result of one round of minimisation."""
 
-    state: State
-    """Final state."""
-    equations: BandedEquations
-    """Equations at the final state."""
-    energy_before: dict[str, float]
-    """Energy of each term at the start."""
-    steps: int
-    """Number of accepted steps."""
-    refused: int
-    """Number of refused steps."""
-    converged: bool
-    """Whether the last step gained little, or would have."""
-    stalled: np.ndarray
-    """(T,) frames that no step moved, since each raised the energy there."""
+    state: State  # Final state
+    equations: BandedEquations  # Equations at the final state
+    energy_before: dict[str, float]  # Energy of each term at the start
+    steps: int  # Number of accepted steps
+    refused: int  # Number of refused steps
+    converged: bool  # Whether the last step gained little, or would have
+    stalled: np.ndarray  # (T,) frames that no step moved, since each raised the energy there
 
 
 def minimise(
-    linearise: Callable[[State], BandedEquations],
-    state: State,
-    *,
-    max_steps: int,
+    linearise: Callable[[State], BandedEquations], state: State, *, max_steps: int
 ) -> Minimum:
     """Try at most ``max_steps`` steps from ``state``; a step is accepted if it lowers the energy.
 
-    Each frame has its own damping, which grows if the energy of a refused step rose there: a badly
+    Each frame has its own damping, which grows if the energy rose there in a refused step: a badly
     linearised frame slows down its neighbourhood alone. Convergence is relative to the gain of this
-    round, since most of the energy is noise that no state explains. Refused steps are rare:
-    equations are computed again after one rather than kept for it.
+    round, since most of the energy is noise. Factors and tolerances are tuned on the studio.
     """
     accepted, refused, gained, converged = 0, 0, 0.0, False
-    damping, moved = np.full(len(state), INITIAL_DAMPING), np.zeros(len(state), bool)
+    damping, moved = np.full(len(state), 1e-3), np.zeros(len(state), bool)
     here = linearise(state)
     before = here.energy
     for _ in range(max_steps):
         step = here.step(damping)
         if step is None:
-            damping, refused = damping * DAMPING_UP, refused + 1
+            damping, refused = damping * 10.0, refused + 1
             here = linearise(state)
             continue
         trial = state.moved(limited(step))
         there = linearise(trial)
-        log.info(
-            "energy %.4g -> %.4g (damping %.0e to %.0e)",
-            here.total,
-            there.total,
-            damping.min(),
-            damping.max(),
-        )
+        bounds = damping.min(), damping.max()
+        log.info("energy %.4g -> %.4g (damping %.0e to %.0e)", here.total, there.total, *bounds)
         if not there.total < here.total:
             rose, tried = _risen(there.by_frame - here.by_frame), damping
-            damping, refused = np.where(rose, damping * DAMPING_UP**2, damping), refused + 1
+            damping, refused = np.where(rose, damping * 100.0, damping), refused + 1
             # a quadratic energy falls by half of what its slope promises, by less if damped
             promised = -0.5 * float((here.gradient * step).sum())
-            if promised < NEGLIGIBLE_SHARE * here.total and tried.max() < STALLED_DAMPING:
+            if promised < 1e-3 * here.total and tried.max() < STALLED_DAMPING:
                 converged = True
                 break
             del there  # the equations of two states are never kept at once
@@ -106,8 +68,8 @@ def minimise(
         gained += gain
         state, here, accepted = trial, there, accepted + 1
         moved |= damping < STALLED_DAMPING
-        damping = np.maximum(damping / DAMPING_DOWN, MIN_DAMPING)
-        if gain < MIN_GAIN_SHARE * gained:
+        damping = np.maximum(damping / 5.0, MIN_DAMPING)
+        if gain < 0.03 * gained:
             converged = True
             break
     stalled = (damping >= STALLED_DAMPING) & ~moved
@@ -125,11 +87,14 @@ def _risen(change: np.ndarray) -> np.ndarray:
 
 
 def limited(step: np.ndarray) -> np.ndarray:
-    """Scale each frame's step (T, 174) down to the range in which the linearisation holds."""
+    """Scale each frame's step (T, 174) down to at most 0.5 rad and 0.1 m (tuned on the studio).
+
+    Beyond that the linearisation of skinning is poor.
+    """
 
     def largest(*columns: slice) -> np.ndarray:
         return np.maximum.reduce([np.abs(step[:, part]).max(axis=1) for part in columns])
 
     turns, shifts = largest(BODY_TURNS, OBJECT_TURN), largest(BODY_SHIFT, OBJECT_SHIFT)
-    excess = np.maximum(turns / MAX_STEP_TURN, shifts / MAX_STEP_SHIFT)
+    excess = np.maximum(turns / 0.5, shifts / 0.1)
     return step / np.maximum(1.0, excess)[:, None]

@@ -1,40 +1,27 @@
 """Signed distances of body points to the moving object, with derivatives.
 
-Both E_C of equation 6 (A.4) and the term body in object are functions of this distance. E_C may
-measure it to the annotated part of the surface.
-
 d = n . (x - q), with q the point of the object's surface closest to x and n the outward direction
-from q to x. Far from the object, where no term asks for d, q is the nearest point of the object's
-box: searches of the surface are the most expensive there.
+from q to x. E_C of equation 6 (A.4) and the term body in object are functions of d. Far from the
+object, where no term needs d, q is the nearest point of the object's box, which is cheap.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
-from intercap_core.geometry.rigid.distance import Closest
+from intercap_core.geometry.rigid.distance import DistanceField, SurfacePart
 
-# Distance to the object's box beyond which the box replaces the surface, metres: many times the
-# range of any term.
-FAR_FROM_BOX = 0.25
-# Distance below which the direction to the closest point is noise and the face's normal replaces
-# it, metres. Tuned on the studio.
-ON_SURFACE = 1e-4
+ON_SURFACE = (
+    1e-4  # metres; below it the face's normal replaces the direction, which is noise; tuned
+)
 
 _CHUNK = 32  # frames that are computed at a time, to bound the memory
 
 
-class SearchableSurface(Protocol):
-    """An object's surface, or a part of it."""
-
-    box: np.ndarray
-    """(2, 3) corners of a box that holds the surface."""
-
-    def boundary(self, points: np.ndarray) -> tuple[np.ndarray, Closest]:
-        """Mask of the points (N, 3) that are inside, and their closest points; object frame."""
+SearchableSurface = DistanceField | SurfacePart
+"""An object's surface, or a part of it."""
 
 
 @dataclass(frozen=True)
@@ -46,10 +33,8 @@ class Proximity:
     order.
     """
 
-    distance: np.ndarray
-    """(T, N), negative inside."""
-    normals: np.ndarray
-    """(T, N, 3) derivative of the distance by the point."""
+    distance: np.ndarray  # (T, N), negative inside
+    normals: np.ndarray  # (T, N, 3) derivative of the distance by the point
 
     def at(self, index: np.ndarray) -> Proximity:
         """The distances of the points ``index`` (M,)."""
@@ -68,45 +53,28 @@ def along_by_object(points: np.ndarray, along: np.ndarray, translation: np.ndarr
 
 
 def proximity(
-    surface: SearchableSurface,
-    points: np.ndarray,
-    rotation: np.ndarray,
-    translation: np.ndarray,
+    surface: SearchableSurface, points: np.ndarray, rotation: np.ndarray, translation: np.ndarray
 ) -> Proximity:
     """Measure distances of ``points`` (T, N, 3) to the object.
 
     ``rotation`` (T, 3, 3) and ``translation`` (T, 3) are master_from_object.
     """
-    shape = points.shape[:2]
-    near = Proximity(np.empty(shape), np.empty((*shape, 3)))
+    result = Proximity(np.empty(points.shape[:2]), np.empty(points.shape))
     for start in range(0, len(points), _CHUNK):
         at = slice(start, start + _CHUNK)
-        near.distance[at], near.normals[at] = _measure(
-            surface, points[at], rotation[at], translation[at]
-        )
-    return near
-
-
-def _measure(
-    surface: SearchableSurface,
-    points: np.ndarray,
-    rotation: np.ndarray,
-    translation: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Distances (T, N) and normals (T, N, 3)."""
-    frames, count = points.shape[:2]
-    local = (points - translation[:, None]) @ rotation
-    flat = local.reshape(-1, 3)
-    offset = flat - np.clip(flat, *surface.box)
-    length = np.linalg.norm(offset, axis=1)
-    near = np.flatnonzero(length < FAR_FROM_BOX)
-    inside, closest = surface.boundary(flat[near])
-    offset[near] = flat[near] - closest.points
-    length[near] = np.linalg.norm(offset[near], axis=1)
-    sign = np.ones(len(flat))
-    sign[near[inside]] = -1.0
-    direction = sign[:, None] * offset / np.maximum(length, ON_SURFACE)[:, None]
-    touching = length[near] < ON_SURFACE
-    direction[near[touching]] = closest.normals[touching]
-    normals = direction.reshape(frames, count, 3) @ rotation.transpose(0, 2, 1)
-    return (sign * length).reshape(frames, count), normals
+        local = (points[at] - translation[at, None]) @ rotation[at]
+        flat = local.reshape(-1, 3)
+        offset = flat - np.clip(flat, *surface.box)
+        length = np.linalg.norm(offset, axis=1)
+        near = np.flatnonzero(length < 0.25)  # metres: many times the range of any term
+        inside, closest = surface.boundary(flat[near])
+        offset[near] = flat[near] - closest.points
+        length[near] = np.linalg.norm(offset[near], axis=1)
+        sign = np.ones(len(flat))
+        sign[near[inside]] = -1.0
+        direction = sign[:, None] * offset / np.maximum(length, ON_SURFACE)[:, None]
+        touching = length[near] < ON_SURFACE
+        direction[near[touching]] = closest.normals[touching]
+        result.normals[at] = direction.reshape(local.shape) @ rotation[at].transpose(0, 2, 1)
+        result.distance[at] = (sign * length).reshape(local.shape[:2])
+    return result

@@ -12,7 +12,7 @@ from intercap_core import artefacts
 from intercap_core.artefacts import Artefact
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.joint.cameras import Cameras
-from intercap_core.joint.contact.estimate import ContactEstimate
+from intercap_core.joint.contact_estimate import ContactEstimate
 from intercap_core.joint.sequential import pose_vector
 from intercap_core.joint.state import State
 from intercap_core.joint.terms.body_data import BodyResiduals
@@ -39,48 +39,30 @@ class Convergence(Enum):
 class JointFit:
     """Result of the joint fit of T frames."""
 
-    state: State
-    """Refined body and object."""
-    contact: ContactEstimate
-    """Contact at this state."""
-    time_offsets: OffsetEstimate
-    """Time offsets of the cameras."""
-    residuals: BodyResiduals
-    """Distances of the body to the images."""
-    energy_before: dict[str, float]
-    """Energy by term at the start."""
-    energy_after: dict[str, float]
-    """Energy by term at this state."""
-    steps: int
-    """Number of accepted steps."""
-    refused: int
-    """Number of refused steps."""
-    convergence: Convergence
-    """Outcome of the rounds."""
-    flag_reasons: list[str]
-    """(T,) reasons not to trust a frame; "" if there is none."""
-    cameras_corrected: bool
-    """Whether the cameras were corrected."""
+    state: State  # Refined body and object
+    contact: ContactEstimate  # Contact at this state
+    time_offsets: OffsetEstimate  # Time offsets of the cameras
+    residuals: BodyResiduals  # Distances of the body to the images
+    energy_before: dict[str, float]  # Energy by term at the start
+    energy_after: dict[str, float]  # Energy by term at this state
+    steps: int  # Number of accepted steps
+    refused: int  # Number of refused steps
+    convergence: Convergence  # Outcome of the rounds
+    flag_reasons: list[str]  # (T,) reasons not to trust a frame; "" if there is none
+    cameras_corrected: bool  # Whether the cameras were corrected
 
 
 @dataclass(frozen=True, eq=False)
 class JointResult:
     """The joint artefact of T frames, R contact regions and C cameras."""
 
-    state: State
-    """Body and object."""
-    probability: np.ndarray
-    """(T, R) probability of contact."""
-    annotated: np.ndarray
-    """(T, R) annotation: 1 touching, 0 free, -1 no label."""
-    cameras: Cameras
-    """Corrected cameras."""
-    time_offset: np.ndarray
-    """(C,) time offsets of the cameras, seconds."""
-    flagged: np.ndarray
-    """(T,) frames not to be trusted."""
-    contradicted: np.ndarray
-    """(T,) frames whose images contradict the object's pose."""
+    state: State  # Body and object
+    probability: np.ndarray  # (T, R) probability of contact
+    annotated: np.ndarray  # (T, R) annotation: 1 touching, 0 free, -1 no label
+    cameras: Cameras  # Corrected cameras
+    time_offset: np.ndarray  # (C,) time offsets of the cameras, seconds
+    flagged: np.ndarray  # (T,) frames not to be trusted
+    contradicted: np.ndarray  # (T,) frames whose images contradict the object's pose
 
     @classmethod
     def read(cls, path: Path, scene: Artefact) -> JointResult:

@@ -8,75 +8,41 @@ from math import radians
 import numpy as np
 
 from intercap_core.artefacts import Artefact
-from intercap_core.body.parameters import TRANSL
+from intercap_core.body.parameters import POSE_BLOCKS, TRANSL
 from intercap_core.geometry.camera.transforms import apply_step, rigid
 from intercap_core.geometry.solve.time_series import rigid_velocity
 from intercap_core.joint.state import State
 
-# Standard deviations of the object's pose, six numbers each: rad for turns, metres for shifts. All
-# are tuned on the studio.
-# Smallest one of a tracked pose: the mesh differs from the object.
-_FLOOR = np.repeat([radians(0.05), 0.0005], 3)
-# In a frame without a measurement, about the interpolated pose.
-_INTERPOLATED = np.repeat([0.5, 0.15], 3)
-# Added if different poses explain a frame equally well. Nearly always the rotation is ambiguous: on
-# which side the handle is.
-_AMBIGUOUS = np.repeat([radians(10.0), 0.002], 3)
-# Standard deviation of the object's position if the track is lost, metres: contact detection then
-# learns nothing from the distance. Tuned on the studio.
-UNTRACKED_SIGMA = 0.5
+UNTRACKED_SIGMA = 0.5  # of a lost object's position, metres: wide open; tuned on the studio
 
-# In the order of `BodyParameters`.
-_POSE = (
-    "global_orient",
-    "body_pose",
-    "jaw_pose",
-    "leye_pose",
-    "reye_pose",
-    "left_hand_pose",
-    "right_hand_pose",
-    "transl",
-)
+POSE_NAMES = (*(name for name, _ in POSE_BLOCKS), "transl")
+"""Arrays of an artefact that are an unknown of a frame, in the order of the parameter vector."""
 
 
 @dataclass(frozen=True)
 class TrackMarks:
     """Masks (T,) of frames of the object track."""
 
-    lost: np.ndarray
-    """The object is lost; its pose is interpolated."""
-    ambiguous: np.ndarray
-    """Different poses explain the frame equally well."""
-    carried: np.ndarray
-    """The images show nothing: the pose follows from annotated poses alone."""
-    resting: np.ndarray
-    """The object rests."""
+    lost: np.ndarray  # The object is lost; its pose is interpolated
+    ambiguous: np.ndarray  # Different poses explain the frame equally well
+    carried: np.ndarray  # The images show nothing: the pose follows from annotated poses alone
+    resting: np.ndarray  # The object rests
 
 
 @dataclass(frozen=True)
 class TrackedPoses:
     """The object track as Gaussians, one per frame."""
 
-    rotation: np.ndarray
-    """(T, 3, 3) of master_from_object."""
-    translation: np.ndarray
-    """(T, 3) of master_from_object, metres."""
-    information: np.ndarray
-    """(T, 6, 6) inverse covariance of turn (left) and shift."""
-    twist: np.ndarray
-    """(T, 6) motion per second; 0 at rest."""
-    share: np.ndarray
-    """(T, C) share of each camera in the evidence for a pose."""
-    time_offset: np.ndarray
-    """(C,) time offsets of the cameras that the tracker assumed, seconds."""
-    seen: np.ndarray
-    """(T,) frames whose images determine the pose."""
-    resting: np.ndarray
-    """(T,) frames in which the object rests."""
-    times: np.ndarray
-    """(T,) seconds."""
-    spread: np.ndarray
-    """(T, 6) variance of the pose beyond what the images of its frame leave open."""
+    rotation: np.ndarray  # (T, 3, 3) of master_from_object
+    translation: np.ndarray  # (T, 3) of master_from_object, metres
+    information: np.ndarray  # (T, 6, 6) inverse covariance of turn (left) and shift
+    twist: np.ndarray  # (T, 6) motion per second; 0 at rest
+    share: np.ndarray  # (T, C) share of each camera in the evidence for a pose
+    time_offset: np.ndarray  # (C,) time offsets of the cameras that the tracker assumed, seconds
+    seen: np.ndarray  # (T,) frames whose images determine the pose
+    resting: np.ndarray  # (T,) frames in which the object rests
+    times: np.ndarray  # (T,) seconds
+    spread: np.ndarray  # (T, 6) variance of the pose beyond what the images of its frame leave open
 
     @classmethod
     def from_track(
@@ -99,12 +65,17 @@ class TrackedPoses:
             times: (T,) seconds.
             time_offset: (C,) seconds.
         """
+        # standard deviations of turn (rad) and shift (m), tuned on the studio: at least, as the
+        # mesh differs from the object; ambiguous, mostly in rotation; interpolated
+        smallest = np.repeat([radians(0.05), 0.0005], 3)
+        ambiguous = np.hypot(smallest, np.repeat([radians(10.0), 0.002], 3))
+        interpolated = np.repeat([0.5, 0.15], 3)
         tracked = ~marks.lost & np.isfinite(covariance).all(axis=(1, 2))
         total = np.where(tracked[:, None, None], covariance, 0.0)
         # the covariance of a carried pose contains its ambiguity
-        ambiguous = (marks.ambiguous & ~marks.carried)[:, None]
-        smallest = np.where(ambiguous, np.hypot(_FLOOR, _AMBIGUOUS), _FLOOR)
-        spread = np.where(tracked[:, None], smallest, _INTERPOLATED) ** 2
+        several = (marks.ambiguous & ~marks.carried)[:, None]
+        added = np.where(several, ambiguous, smallest)
+        spread = np.where(tracked[:, None], added, interpolated) ** 2
         total += np.eye(6) * spread[:, None, :]
         twist = rigid_velocity(poses, ~marks.lost, times)
         twist[marks.resting] = 0
@@ -138,46 +109,33 @@ class TrackedPoses:
 class Trust:
     """Frames and steps in which the sequential fits are trusted."""
 
-    body: np.ndarray
-    """(T,) frames with a fit of the body."""
-    object_: np.ndarray
-    """(T,) frames in which the object is tracked."""
-    still: np.ndarray
-    """(T - 1,) steps over which the object rests."""
+    body: np.ndarray  # (T,) frames with a fit of the body
+    object_: np.ndarray  # (T,) frames in which the object is tracked
+    still: np.ndarray  # (T - 1,) steps over which the object rests
 
 
 @dataclass(frozen=True)
 class SequentialFlags:
     """Frames that a sequential fit has flagged."""
 
-    filled: np.ndarray
-    """(T,) the body was not seen well enough and is interpolated."""
-    uncertain: np.ndarray
-    """(T,) the body is not determined by the images."""
-    lost: np.ndarray
-    """(T,) the sequence has an object and its track is lost."""
-    ambiguous: np.ndarray
-    """(T,) different poses of the object explain the frame."""
-    carried: np.ndarray
-    """(T,) the object's pose follows from annotated poses alone."""
-    hands: np.ndarray
-    """(T, 2) left or right hand is not determined by the images; does not flag the frame."""
+    filled: np.ndarray  # (T,) the body was not seen well enough and is interpolated
+    uncertain: np.ndarray  # (T,) the body is not determined by the images
+    lost: np.ndarray  # (T,) the sequence has an object and its track is lost
+    ambiguous: np.ndarray  # (T,) different poses of the object explain the frame
+    carried: np.ndarray  # (T,) the object's pose follows from annotated poses alone
+    hands: np.ndarray  # (T, 2) left, right hand is undetermined; flags no frame
 
 
 @dataclass(frozen=True)
 class SequentialFits:
     """Body fit and object track as one state, and how far they are trusted."""
 
-    state: State
-    """Both fits with the mean shape. Without an object its poses are NaN."""
-    tracked: TrackedPoses | None
-    """The object track; None if it is lost in all frames."""
+    state: State  # Both fits with the mean shape. Without an object its poses are NaN.
+    tracked: TrackedPoses | None  # The object track; None if it is lost in all frames
     trust: Trust
     flags: SequentialFlags
-    joint_sigma: np.ndarray
-    """(T, 55) stated standard deviations of the joints' positions, metres."""
-    object_sigma: np.ndarray
-    """(T,) stated standard deviation of the object's position, metres."""
+    joint_sigma: np.ndarray  # (T, 55) stated standard deviations of the joints' positions, metres
+    object_sigma: np.ndarray  # (T,) stated standard deviation of the object's position, metres
 
     @classmethod
     def read(cls, body: Artefact, track: Artefact, scene: Artefact) -> SequentialFits:
@@ -186,6 +144,8 @@ class SequentialFits:
         failed, lost = body["failed"], track["lost"]
         named = bool(track.attributes["object"])
         filled = failed | body["bridged"]
+        parts = body.text("part_names")
+        hands = body["undetermined"][:, [parts.index(f"{s}_hand") for s in ("left", "right")]]
         carried = np.asarray(track["carried"] if "carried" in track else np.zeros_like(lost))
         marks = TrackMarks(lost, track["ambiguous"], carried, track["resting"])
         flags = SequentialFlags(
@@ -194,7 +154,7 @@ class SequentialFits:
             lost=lost & named,
             ambiguous=marks.ambiguous,
             carried=carried,
-            hands=_undetermined_hands(body) | filled[:, None],
+            hands=hands | filled[:, None],
         )
         tracked = None
         if lost.all():
@@ -219,16 +179,9 @@ class SequentialFits:
         )
 
 
-def _undetermined_hands(body: Artefact) -> np.ndarray:
-    """Mask (T, 2) of left and right hands that the body fit marks as undetermined."""
-    parts = body.text("part_names")
-    hands = [parts.index(f"{side}_hand") for side in ("left", "right")]
-    return np.asarray(body["undetermined"][:, hands])
-
-
 def pose_vector(body: Artefact) -> np.ndarray:
     """Pose and translation (T, 168) of a body_fit or joint artefact."""
-    vector = np.concatenate([body[name] for name in _POSE], axis=1).astype(float)
+    vector = np.concatenate([body[name] for name in POSE_NAMES], axis=1).astype(float)
     assert vector.shape[1] == TRANSL.stop
     return vector
 

@@ -1,7 +1,4 @@
-"""Vertices of the body that are compared with object and floor: dense contact patches, and samples.
-
-The contact patches are H of E_C (A.4): the body's likely-contact vertices.
-"""
+"""Vertices compared with object and floor: samples, and contact patches, H of E_C (A.4)."""
 
 from __future__ import annotations
 
@@ -15,46 +12,37 @@ from intercap_core.body.model import BodyModel
 from intercap_core.body_fit.surface import choose_samples
 from intercap_core.schemas import CONTACT_REGIONS
 
-# Vertices kept of each region: fingers are thin and wrap around objects, and a large region that
-# sits on an edge touches it with few vertices. Tuned on the studio.
-REGION_VERTICES = 240
-# Vertices of the body's mesh, inside the object or below the floor, that are one measurement:
-# neighbours err together. Tuned on the studio.
-VERTICES_PER_MEASUREMENT = 10.0
+VERTICES_PER_MEASUREMENT = 10.0  # neighbouring vertices err together; tuned on the studio
 
-# Joints from here on are the fingers', three per finger, first of the left hand.
-_FIRST_FINGER_JOINT = JOINT_INDEX["left_index1"]
-_PALM = -1
+_FIRST_FINGER_JOINT = JOINT_INDEX["left_index1"]  # three joints per finger from here on
 
 
 @dataclass(frozen=True)
 class Patches:
     """Vertices of the contact regions, cut into patches."""
 
-    vertices: np.ndarray
-    """(M,) ids on the body."""
-    region: np.ndarray
-    """(M,) index into ``CONTACT_REGIONS``."""
-    patch: np.ndarray
-    """(M,) patch of each vertex."""
-    region_of_patch: np.ndarray
-    """(P,) region of each patch."""
-    joint: np.ndarray
-    """(M,) joint with the largest skinning weight."""
-    share: np.ndarray
-    """(M,) number of vertices of the region that each stands for."""
+    vertices: np.ndarray  # (M,) ids on the body
+    region: np.ndarray  # (M,) index into ``CONTACT_REGIONS``
+    patch: np.ndarray  # (M,) patch of each vertex
+    region_of_patch: np.ndarray  # (P,) region of each patch
+    joint: np.ndarray  # (M,) joint with the largest skinning weight
+    share: np.ndarray  # (M,) number of vertices of the region that each stands for
 
 
 def contact_patches(model: BodyModel) -> Patches:
-    """Cut hands into palm and fingers; each of the other regions is one patch."""
+    """Cut hands into palm and fingers; each of the other regions is one patch.
+
+    A region keeps at most 240 vertices (tuned on the studio): fingers are thin and wrap around
+    objects, and a large region that sits on an edge touches it with few vertices.
+    """
     template = model.template.cpu().numpy()
     joint_of = model.skinning_weights.cpu().numpy().argmax(axis=1)
     region_of_patch: list[int] = []
     vertices, region, patch, share = [], [], [], []
     for r, name in enumerate(CONTACT_REGIONS):
         ids = np.asarray(model.regions[name])
-        kept = ids[farthest_points(template[ids], REGION_VERTICES)]
-        part = np.full(len(kept), _PALM)
+        kept = ids[farthest_points(template[ids], 240)]
+        part = np.full(len(kept), -1)  # the palm, or the only patch
         if name.endswith("_hand"):
             finger = joint_of[kept] >= _FIRST_FINGER_JOINT
             part[finger] = (joint_of[kept][finger] - _FIRST_FINGER_JOINT) // 3
@@ -92,12 +80,9 @@ def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
 class SkinSamples:
     """All contact patches and an even sample of the outer skin."""
 
-    vertices: np.ndarray
-    """(N,) ids on the body, ascending."""
-    share: np.ndarray
-    """(N,) number of vertices of the mesh that each stands for."""
-    patch: np.ndarray
-    """(M,) indices of the contact patches' vertices among the samples."""
+    vertices: np.ndarray  # (N,) ids on the body, ascending
+    share: np.ndarray  # (N,) number of vertices of the mesh that each stands for
+    patch: np.ndarray  # (M,) indices of the contact patches' vertices among the samples
 
     @classmethod
     def select(cls, model: BodyModel, patches: Patches) -> SkinSamples:

@@ -24,16 +24,11 @@ ALL = slice(0, OBJECT.stop)
 class State:
     """Body and object in T frames. A state is never changed in place."""
 
-    body: np.ndarray
-    """(T, 168) pose and translation in the order of ``BodyParameters``."""
-    betas: np.ndarray
-    """(S,) shape, not an unknown."""
-    expression: np.ndarray
-    """(T, X) expression, not an unknown."""
-    rotation: np.ndarray
-    """(T, 3, 3) of master_from_object; NaN without an object."""
-    translation: np.ndarray
-    """(T, 3) of master_from_object, metres; NaN without an object."""
+    body: np.ndarray  # (T, 168) pose and translation in the order of ``BodyParameters``
+    betas: np.ndarray  # (S,) shape, not an unknown
+    expression: np.ndarray  # (T, X) expression, not an unknown
+    rotation: np.ndarray  # (T, 3, 3) of master_from_object; NaN without an object
+    translation: np.ndarray  # (T, 3) of master_from_object, metres; NaN without an object
 
     def __len__(self) -> int:
         return len(self.body)

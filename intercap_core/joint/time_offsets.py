@@ -4,15 +4,12 @@ A camera c that exposes tau_c later than the fit assumes sees every point farthe
 With r the prediction minus the observation of a point in a view, u the prediction's velocity in
 that view and J its derivative by the point's position,
 
-    r_c = - u_c tau_c + J_c e + b_c + noise,
+    r_c = - u_c tau_c + J_c e + b_c + noise
 
-e is the fit's error of that point in that frame, which all views share, and b_c a camera's constant
-bias at the point (the detector's definition of a joint, calibration, clothing). e is eliminated for
-each point and frame, b by subtracting the mean over time. Errors and noise last over many frames: r
-and u are replaced by the innovations of a first-order autoregression with the correlation of the
-residuals. The innovations are weighted by their scale and robustly (Geman-McClure), and solved for
-all cameras at once with a prior of their offsets. The master's offset is zero, since the times of
-the frame sets are the master's.
+The fit's error e of a point in a frame, which all views share, is eliminated; a camera's constant
+bias b_c is removed with the mean over time. Errors last over many frames: r and u are replaced by
+the innovations of a first-order autoregression, weighted robustly (Geman-McClure). The master's
+offset is zero. Thresholds and weights are tuned on the studio.
 """
 
 from __future__ import annotations
@@ -30,69 +27,37 @@ from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.geometry.camera import projection
 from intercap_core.geometry.solve.robust import SIGMA_PER_MAD, geman_mcclure_weight
 
-# Standard deviation of an offset without a prior, seconds: a third of the time between frames at
-# 30 fps. Beyond it frame sets would have been matched differently.
-LOOSE_OFFSET_SIGMA_S = 0.010
-# Smallest standard deviation of the prior, seconds: it comes from the same keypoints. Tuned on the
-# studio.
-MIN_PRIOR_SIGMA_S = 0.0005
-# Standard deviation of the fit's error of a point, metres; large, so that only disagreement between
-# views counts. Tuned on the studio.
-POINT_SIGMA_M = 0.03
-# Largest correlation of successive residuals. Tuned on the studio.
-MAX_CORRELATION = 0.98
-# Standard deviations at which an innovation counts a quarter. Tuned on the studio.
-INNOVATION_OUTLIER = 3.0
-# Largest total weight of the points of one part of the body: their errors are correlated. Tuned on
-# the studio.
-POINTS_PER_PART = 4.0
-# Number of a camera's depth points at a sample of the skin that gives half its full weight. Tuned
-# on the studio.
-HALF_WEIGHT_POINTS = 2.0
-# Largest time step between successive frames, relative to the median: a missing frame doubles it.
-MAX_STEP_RATIO = 1.5
-# Number of points in successive frames below which there is no estimate. Tuned on the studio.
-MIN_INNOVATIONS = 50
-# Iterations of the robust weights. Tuned on the studio.
-OFFSET_ITERATIONS = 4
+LOOSE_OFFSET_SIGMA_S = 0.010  # without a prior: a third of the time between frames; tuned
+POINT_SIGMA_M = 0.03  # error of the fit, large: only disagreement of views counts; tuned
+INNOVATION_OUTLIER = 3.0  # standard deviations at which an innovation counts a quarter; tuned
 
 
 @dataclass(frozen=True, eq=False)
 class PointObservations:
     """Observations by C cameras of K points in T frames, D numbers each (pixels, or a distance)."""
 
-    residual: np.ndarray
-    """(T, C, K, D) prediction minus observation."""
-    velocity: np.ndarray
-    """(T, C, K, D) change of the prediction per second."""
-    by_point: np.ndarray
-    """(T, C, K, D, P) derivative of the prediction by P coordinates of the point, per metre."""
-    weight: np.ndarray
-    """(T, C, K) relative confidence; 0 if not seen."""
-    part: np.ndarray
-    """(K,) part of the body; errors within a part are correlated."""
+    residual: np.ndarray  # (T, C, K, D) prediction minus observation
+    velocity: np.ndarray  # (T, C, K, D) change of the prediction per second
+    by_point: np.ndarray  # (T, C, K, D, P) derivative by P coordinates of the point
+    weight: np.ndarray  # (T, C, K) relative confidence; 0 if not seen
+    part: np.ndarray  # (K,) part of the body; errors within a part are correlated
 
 
 @dataclass(frozen=True)
 class OffsetPrior:
     """Prior of the time offsets of C cameras."""
 
-    offset: np.ndarray
-    """(C,) seconds."""
-    sigma: np.ndarray
-    """(C,) standard deviations, seconds; NaN for a broad prior about zero."""
-    master: int
-    """Index of the camera whose offset is zero."""
+    offset: np.ndarray  # (C,) seconds
+    sigma: np.ndarray  # (C,) standard deviations, seconds; NaN for a broad prior about zero
+    master: int  # Index of the camera whose offset is zero
 
 
 @dataclass(frozen=True)
 class OffsetEstimate:
     """Time offsets of C cameras; zero for the master."""
 
-    offset: np.ndarray
-    """(C,) exposure after the times of the frame sets, seconds."""
-    sigma: np.ndarray
-    """(C,) standard deviations, seconds."""
+    offset: np.ndarray  # (C,) exposure after the times of the frame sets, seconds
+    sigma: np.ndarray  # (C,) standard deviations, seconds
 
 
 def estimate_offsets(
@@ -110,7 +75,8 @@ def estimate_offsets(
     count = len(current)
     has_prior = np.isfinite(prior.sigma)
     expected = np.where(has_prior, prior.offset, 0.0) - current
-    sigma = np.maximum(np.where(has_prior, prior.sigma, LOOSE_OFFSET_SIGMA_S), MIN_PRIOR_SIGMA_S)
+    # at least 0.5 ms: the prior comes from the same keypoints
+    sigma = np.maximum(np.where(has_prior, prior.sigma, LOOSE_OFFSET_SIGMA_S), 0.0005)
     precision = np.diag(sigma**-2.0)
     free = np.arange(count) != prior.master
     all_innovations = [
@@ -119,7 +85,7 @@ def estimate_offsets(
         if (innovations := _Innovations.of(points, times)) is not None
     ]
     change = np.zeros(count)
-    for _ in range(OFFSET_ITERATIONS):
+    for _ in range(4):
         hessian, gradient = precision.copy(), precision @ (expected - change)
         for innovations in all_innovations:
             h, g = innovations.normal_equations(change)
@@ -136,18 +102,12 @@ def estimate_offsets(
 class _Innovations:
     """Innovations over time of the N points that any view saw, in units of their deviation."""
 
-    residual: np.ndarray
-    """(N, C, D) less its mean over time."""
-    velocity: np.ndarray
-    """(N, C, D) less its mean over time."""
-    by_point: np.ndarray
-    """(N, C, D, P)."""
-    weight: np.ndarray
-    """(N, C)."""
-    part: np.ndarray
-    """(N,) part of the body."""
-    frame: np.ndarray
-    """(N,) frame."""
+    residual: np.ndarray  # (N, C, D) less its mean over time
+    velocity: np.ndarray  # (N, C, D) less its mean over time
+    by_point: np.ndarray  # (N, C, D, P)
+    weight: np.ndarray  # (N, C)
+    part: np.ndarray  # (N,) part of the body
+    frame: np.ndarray  # (N,) frame
 
     @classmethod
     def of(cls, seen: PointObservations, times: np.ndarray) -> _Innovations | None:
@@ -155,9 +115,9 @@ class _Innovations:
         step = np.diff(times)
         if not len(step):
             return None
-        following = (step < MAX_STEP_RATIO * np.median(step))[:, None, None]
+        following = (step < 1.5 * np.median(step))[:, None, None]  # a missing frame doubles a step
         weight = np.minimum(seen.weight[1:], seen.weight[:-1]) * following
-        if np.count_nonzero(weight) < MIN_INNOVATIONS:
+        if np.count_nonzero(weight) < 50:
             return None
         correlation = _correlation(_centred(seen.residual, seen.weight), weight > 0)
         residual, velocity = (
@@ -166,7 +126,8 @@ class _Innovations:
         scale = np.ones(residual.shape[2])
         for part in np.unique(seen.part):
             here = seen.part == part
-            weight[:, :, here] *= min(1.0, POINTS_PER_PART / np.count_nonzero(here))
+            # errors within a part are correlated: it counts at most as four points
+            weight[:, :, here] *= min(1.0, 4.0 / np.count_nonzero(here))
             size = np.abs(residual[:, :, here][weight[:, :, here] > 0])
             scale[here] = SIGMA_PER_MAD * np.median(size) if len(size) else 1.0
         scale = np.maximum(scale, 1e-9)[:, None]
@@ -199,9 +160,7 @@ class _Innovations:
         return self.weight * geman_mcclure_weight(square, INNOVATION_OUTLIER)
 
     def _without_point_errors(
-        self,
-        residual: np.ndarray,
-        weight: np.ndarray,
+        self, residual: np.ndarray, weight: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         count, size = len(residual), self.by_point.shape[-1]
         by_point = self.by_point.reshape(count, -1, size)
@@ -247,7 +206,7 @@ def _correlation(residual: np.ndarray, both: np.ndarray) -> float:
     limit = INNOVATION_OUTLIER * SIGMA_PER_MAD * np.median(np.abs(now))
     now, before = (np.clip(x, -limit, limit) for x in (now, before))
     power = np.sqrt((now**2).sum() * (before**2).sum())
-    return float(np.clip((now * before).sum() / max(power, 1e-30), 0.0, MAX_CORRELATION))
+    return float(np.clip((now * before).sum() / max(power, 1e-30), 0.0, 0.98))
 
 
 def observe_keypoints(evidence: Evidence, problem: BodyProblem) -> PointObservations:
@@ -272,26 +231,29 @@ def observe_keypoints(evidence: Evidence, problem: BodyProblem) -> PointObservat
 
 
 def observe_clouds(evidence: Evidence, problem: BodyProblem) -> PointObservations | None:
-    """Depth points at the samples of the skin, along its normal; None without depth."""
-    found = evidence.by_view
-    if found is None:
+    """Depth points at the samples of the skin, along its normal; None without depth.
+
+    A sample at which a camera has two points has half its full weight.
+    """
+    clouds = evidence.by_view
+    if clouds is None:
         return None
     params = evidence.model.parameters(problem.base)
-    where = evidence.model.forward(params, vertex_ids=evidence.sample_ids).vertices
-    along = (evidence.velocity(where) * found.normal).sum(-1)
+    samples = evidence.model.forward(params, vertex_ids=evidence.sample_ids).vertices
+    along = (evidence.velocity(samples) * clouds.normal).sum(-1)
     joint = evidence.model.skinning_weights.argmax(1)[evidence.sample_ids]
-    shape = (*found.distance.shape, 1)
+    shape = (*clouds.distance.shape, 1)
     return PointObservations(
-        -_array(found.distance)[..., None],
+        -_array(clouds.distance)[..., None],
         np.broadcast_to(_array(along)[:, None, :, None], shape),
         np.ones((*shape, 1)),
-        _array(found.points / (found.points + HALF_WEIGHT_POINTS)),
+        _array(clouds.points / (clouds.points + 2.0)),
         joint.cpu().numpy(),
     )
 
 
 def _part_of_keypoint(index: np.ndarray) -> np.ndarray:
-    """Part (K,) of keypoints: each body keypoint, each hand and the face are one part."""
+    """Part (K,) of keypoints: each body keypoint, each hand and the face is a part."""
     starts = (LEFT_HAND.start, RIGHT_HAND.start, FACE.start)
     hand_or_face = BODY.stop - 1 + np.searchsorted(starts, index, side="right")
     return np.where(index < BODY.stop, index, hand_or_face)

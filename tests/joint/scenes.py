@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -59,7 +59,7 @@ def bodies(model: BodyModel, gap: float, frames: int = FRAMES) -> State:
 
 def with_object_at(state: State, translation: np.ndarray) -> State:
     """The state with the object at ``translation`` (T, 3)."""
-    return State(state.body, state.betas, state.expression, state.rotation, translation)
+    return replace(state, translation=translation)
 
 
 def floor_under_soles(model: BodyModel, state: State) -> FloorPlane:

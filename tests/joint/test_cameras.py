@@ -1,14 +1,18 @@
-"""Corrections of cameras: what body and object say of them, and what they settle on."""
+"""Corrections of cameras and time offsets from rendered captures, at the true bodies."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.body.model import BodyModel
 from intercap_core.body_fit.observations import person_clouds, read_observations
+from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.body_fit.schedule import Fitter, Settled
 from intercap_core.body_fit.surface import COVERINGS
 from intercap_core.config import BodyFitSettings
@@ -24,40 +28,55 @@ from intercap_core.joint.cameras import (
 )
 from intercap_core.joint.state import BODY, OBJECT
 from intercap_core.joint.terms.body_data import add_by_cameras
+from intercap_core.joint.time_offsets import (
+    OffsetPrior,
+    estimate_offsets,
+    observe_clouds,
+    observe_keypoints,
+)
 from tests.helpers.bodies import open_body
-from tests.helpers.body_capture import ring, write_capture
-from tests.joint.test_sightings import moving_vectors
+from tests.helpers.body_capture import master_from_room, ring, write_capture
 
-FRAMES, CAMERAS, WRONG = 8, 4, 2
+FPS, CAMERAS, WRONG = 15.0, 4, 2
 # Turn, rad, shift and depth bias, metres, that the wrong camera needs.
 NEEDED = np.array([0.002, -0.003, 0.002, 0.004, 0.003, -0.005, 0.0])
 LOOSE = np.repeat([0.02, 0.02, 0.02], (3, 3, 1)) ** 2
+LATE = np.array([0.0, 0.007, -0.006, 0.004])  # exposures after the times of the frames, seconds
 
 
-@pytest.fixture(scope="module")
-def fitter(tmp_path_factory) -> Fitter:
-    """At the true bodies; one camera's pose is given wrongly."""
+def moving_vectors(model: BodyModel, times: np.ndarray) -> torch.Tensor:
+    """Parameter vectors (T, P) of a person who sways through the ring and swings both arms."""
+    x = model.zeros(len(times)).vector().double().numpy()
+    x[:, 75:120], x[:, 120:165] = model.hand_mean.numpy()
+    x[:, 0] = np.pi  # y down, facing the master
+    room = master_from_room()
+    x[:, 165:168] = room[:3, :3] @ [0, 0, 0.95] + room[:3, 3]
+    x[:, 165] += 0.4 * np.sin(4 * times)
+    x[:, 167] += 0.2 * np.sin(5 * times + 1)
+    for side, joint in ((-1, "left_shoulder"), (1, "right_shoulder")):
+        x[:, 3 * JOINT_INDEX[joint] + 2] += side * (0.9 + 0.3 * np.sin(6 * times + side))
+    return torch.as_tensor(x, dtype=torch.float32)
+
+
+def _make_fitter(folder: Path, frames: int, late: np.ndarray) -> Fitter:
+    """Render a capture whose cameras expose ``late`` (C,), seconds."""
     model = open_body()
-    times = np.arange(FRAMES) / 15
-    body = model.forward(model.parameters(moving_vectors(model, times)))
+    times = np.arange(frames) / FPS
+    bodies = [model.forward(model.parameters(moving_vectors(model, times + at))) for at in late]
     inputs = write_capture(
-        tmp_path_factory.mktemp("cameras"),
+        folder,
         ring(CAMERAS),
-        np.repeat(body.vertices.double().numpy()[:, None], CAMERAS, 1),
+        np.stack([body.vertices.double().numpy() for body in bodies], 1),
         model.faces.numpy(),
-        np.repeat(model.keypoints(body).double().numpy()[:, None], CAMERAS, 1),
+        np.stack([model.keypoints(body).double().numpy() for body in bodies], 1),
     )
     observed = read_observations(inputs.scene, inputs.person)
-    step = np.zeros((CAMERAS, FREEDOMS))
-    step[WRONG] = -NEEDED
-    wrong = Cameras(observed.rig, observed.depth_bias).moved(step)
     clouds = person_clouds(inputs.frames, observed, 3000, model.device)
-    fitter = Fitter(model, observed, clouds, BodyFitSettings(points_per_frame=3000))
-    fitter.evidence.take_cameras(wrong.rig, wrong.depth_bias)
-    return fitter
+    return Fitter(model, observed, clouds, BodyFitSettings(points_per_frame=3000))
 
 
-def _problem(fitter: Fitter):
+def _problem(fitter: Fitter) -> BodyProblem:
+    """Problem at the true bodies, with correspondences."""
     settled = Settled(
         torch.zeros(25, 3),
         torch.full((len(COVERINGS),), -3.0),
@@ -65,29 +84,80 @@ def _problem(fitter: Fitter):
         torch.tensor([covering.noise for covering in COVERINGS]),
         fitter.evidence.keypoint_doubt,
     )
-    vectors = moving_vectors(fitter.model, np.arange(FRAMES) / 15)
-    problem = fitter.resume(vectors, settled)
+    times = np.arange(len(fitter.evidence.observations.times)) / FPS
+    problem = fitter.resume(moving_vectors(fitter.model, times), settled)
     fitter.observe(problem)
     return problem
 
 
-def _seen_from(fitter: Fitter, problem, held: float) -> CameraEvidence:
-    size = FREEDOMS * CAMERAS
-    seen = CameraEvidence(
+@pytest.fixture(scope="module")
+def late_fitter(tmp_path_factory) -> Fitter:
+    """The cameras expose ``LATE``, which the fitter does not know."""
+    return _make_fitter(tmp_path_factory.mktemp("late"), 12, LATE)
+
+
+@pytest.fixture(scope="module")
+def fitter(tmp_path_factory) -> Fitter:
+    """One camera's pose is wrong."""
+    fitter = _make_fitter(tmp_path_factory.mktemp("cameras"), 8, np.zeros(CAMERAS))
+    step = np.zeros((CAMERAS, FREEDOMS))
+    step[WRONG] = -NEEDED
+    seen = fitter.evidence.observations
+    wrong = Cameras(seen.rig, seen.depth_bias).moved(step)
+    fitter.evidence.take_cameras(wrong.rig, wrong.depth_bias)
+    return fitter
+
+
+# --- time offsets
+
+
+def test_velocities_are_the_change_with_exposure_time(late_fitter):
+    evidence, step = late_fitter.evidence, 0.002
+    given, problem = evidence.observations, _problem(late_fitter)
+    before = observe_keypoints(evidence, problem), observe_clouds(evidence, problem)
+    evidence.observations = replace(given, time_offset=np.full(CAMERAS, step))
+    late_fitter.observe(problem)
+    after = observe_keypoints(evidence, problem), observe_clouds(evidence, problem)
+    evidence.observations = given
+    for a, b, tolerance in zip(before, after, (0.02, 0.05), strict=True):
+        same = (a.weight > 0) & (b.weight == a.weight)
+        change, expected = (b.residual - a.residual)[same], step * a.velocity[same]
+        assert np.median(np.abs(expected)) > 0
+        assert np.abs(change - expected).mean() < tolerance * np.abs(expected).mean()
+
+
+@pytest.mark.parametrize("observe", [observe_keypoints, observe_clouds])
+def test_offsets_are_estimated_at_the_true_bodies(late_fitter, observe):
+    seen = late_fitter.evidence.observations
+    observations = observe(late_fitter.evidence, _problem(late_fitter))
+    prior = OffsetPrior(np.zeros(CAMERAS), np.full(CAMERAS, np.nan), 0)
+    estimate = estimate_offsets([observations], seen.times, seen.time_offset, prior)
+    error = np.abs(estimate.offset - LATE)
+    assert error.max() < 1e-3
+    assert (error[1:] < 4 * estimate.sigma[1:] + 1e-4).all()
+
+
+# --- poses of cameras
+
+
+def _camera_evidence(fitter: Fitter, problem: BodyProblem, stiffness: float) -> CameraEvidence:
+    """Evidence of the body, whose parameters are held with ``stiffness``."""
+    frames, size = len(fitter.evidence.observations.times), FREEDOMS * CAMERAS
+    evidence = CameraEvidence(
         BODY,
-        np.tile(held * np.eye(BODY.stop), (FRAMES, 1, 1)),
-        np.zeros((FRAMES, BODY.stop)),
-        np.zeros((FRAMES, BODY.stop, size)),
+        np.tile(stiffness * np.eye(BODY.stop), (frames, 1, 1)),
+        np.zeros((frames, BODY.stop)),
+        np.zeros((frames, BODY.stop, size)),
         np.zeros((size, size)),
         np.zeros(size),
         1.0,
     )
-    add_by_cameras(fitter.evidence, problem, np.ones(FRAMES, bool), seen)
-    return seen
+    add_by_cameras(fitter.evidence, problem, np.ones(frames, bool), evidence)
+    return evidence
 
 
-@pytest.mark.parametrize("only", ["keypoints", "clouds"])
-def test_beside_known_bodies_a_wrong_camera_is_put_right(fitter: Fitter, only: str) -> None:
+@pytest.mark.parametrize("source", ["keypoints", "clouds"])
+def test_wrong_camera_is_corrected_at_known_bodies(fitter, source: str):
     evidence = fitter.evidence
     start = Cameras(evidence.observations.rig, evidence.observations.depth_bias)
     covariance = np.zeros((CAMERAS, FREEDOMS, CAMERAS, FREEDOMS))
@@ -95,30 +165,29 @@ def test_beside_known_bodies_a_wrong_camera_is_put_right(fitter: Fitter, only: s
     cameras = CameraFit(start, covariance)
     for _ in range(4):
         problem = _problem(fitter)
-        if only == "keypoints":
+        if source == "keypoints":
             problem.rows = None
         else:
             problem.views = None
-        cameras.take(cameras.solve([_seen_from(fitter, problem, held=1e9)]))
+        cameras.take(cameras.solve([_camera_evidence(fitter, problem, stiffness=1e9)]))
         evidence.take_cameras(cameras.now.rig, cameras.now.depth_bias)
-    found, true = cameras.now.rig[WRONG], ring(CAMERAS)[WRONG]
-    apart = found.master_from_colour @ np.linalg.inv(true.master_from_colour)
     at_body = evidence.observations.joints[0, 0]
-    before = start.rig[WRONG].master_from_colour @ np.linalg.inv(true.master_from_colour)
-    off, was = (np.linalg.norm(m[:3, :3] @ at_body + m[:3, 3] - at_body) for m in (apart, before))
-    assert off < 0.5 * was
-    others = [c for c in range(CAMERAS) if c != WRONG]
-    for c in others:  # held ones stay to the last digit
-        assert np.array_equal(
-            cameras.now.rig[c].master_from_colour, start.rig[c].master_from_colour
-        )
+    true = np.linalg.inv(ring(CAMERAS)[WRONG].master_from_colour)
+    after, before = (
+        np.linalg.norm(step[:3, :3] @ at_body + step[:3, 3] - at_body)
+        for step in (rig[WRONG].master_from_colour @ true for rig in (cameras.now.rig, start.rig))
+    )
+    assert after < 0.5 * before
+    fixed = [c for c in range(CAMERAS) if c != WRONG]
+    poses, given = cameras.now.rig.master_from_colour, start.rig.master_from_colour
+    assert np.array_equal(poses[fixed], given[fixed])
     sigma = np.sqrt(np.diagonal(cameras.covariance[WRONG, :, WRONG]))
     assert (sigma[:6] < np.sqrt(LOOSE[:6])).all()
     evidence.take_cameras(start.rig, start.depth_bias)
 
 
-def test_what_a_view_saw_moves_with_its_camera(fitter: Fitter) -> None:
-    """Points of a cloud follow their camera's motion; a bias moves them along their rays."""
+def test_cloud_moves_with_its_camera(fitter):
+    """A bias moves the points along their rays."""
     evidence = fitter.evidence
     cloud, seen = evidence.clouds[0], evidence.observations
     step = np.zeros((CAMERAS, FREEDOMS))
@@ -136,92 +205,15 @@ def test_what_a_view_saw_moves_with_its_camera(fitter: Fitter) -> None:
     nearer = Cameras(seen.rig, seen.depth_bias).moved(step)
     other = cloud.through(nearer.rig, nearer.depth_bias, seen.rig, seen.depth_bias)
     eye = seen.rig[1].master_from_depth[:3, 3]
-    away = np.linalg.norm(cloud.points[of_view].double().numpy() - eye, axis=1)
-    now = np.linalg.norm(other.points[of_view].double().numpy() - eye, axis=1)
-    assert (now < away).all() and np.median(away - now) == pytest.approx(0.0105, abs=0.001)
+    before, after = (
+        np.linalg.norm(points[of_view].double().numpy() - eye, axis=1)
+        for points in (cloud.points, other.points)
+    )
+    assert (after < before).all()
+    assert np.median(before - after) == pytest.approx(0.0105, abs=0.001)
 
 
-def test_poses_go_along_and_the_prior_holds() -> None:
-    """One camera sees an object's place: what it says is shared by prior and evidence, and the pose
-    that no one else sees follows the camera."""
-    rig = ring(1)
-    prior, precision, frames, off = 0.004, 250.0, 5, 0.01
-    covariance = np.zeros((1, FREEDOMS, 1, FREEDOMS))
-    covariance[0, SHIFT, 0, SHIFT] = np.eye(3) * prior**2
-    cameras = CameraFit(Cameras(rig, np.zeros(1)), covariance)
-    jacobian = np.zeros((6, FREEDOMS))
-    jacobian[3:, SHIFT] = -np.eye(3)  # the residual is x - d
-    weight = precision**2
-
-    def sights(known: float) -> CameraEvidence:
-        """The pose is also known from elsewhere to be ``off`` from what the camera says."""
-        own = np.concatenate([np.zeros(3), np.full(3, off)])
-        return CameraEvidence(
-            OBJECT,
-            np.tile((weight + known) * np.eye(6), (frames, 1, 1)),
-            np.tile(weight * own, (frames, 1)),
-            np.tile(weight * jacobian, (frames, 1, 1)),
-            frames * weight * jacobian.T @ jacobian,
-            frames * weight * jacobian.T @ own,
-            1.0,
-        )
-
-    nothing = cameras.solve([sights(known=0.0)])  # any camera explains a pose that is free
-    np.testing.assert_allclose(nothing.step, 0, atol=1e-9)
-    found = cameras.solve([sights(known=1e6 * weight)])
-    expected = off * frames * weight / (frames * weight + prior**-2)
-    np.testing.assert_allclose(found.step[0, SHIFT], expected, rtol=1e-3)
-    np.testing.assert_allclose(found.step[0, TURN], 0)
-    free = cameras.solve([replace(sights(known=0.0), pull=frames * np.ones(FREEDOMS))])
-    np.testing.assert_allclose(free.along[:, OBJECT][:, 3:], np.tile(free.step[0, SHIFT], (5, 1)))
-
-
-def _free(part: slice, sigma: float) -> np.ndarray:
-    covariance = np.zeros((1, FREEDOMS, 1, FREEDOMS))
-    covariance[0, part, 0, part] = np.eye(3) * sigma**2
-    return covariance
-
-
-def _step(covariance: np.ndarray, **parts: float) -> CameraStep:
-    step = np.zeros((1, FREEDOMS))
-    for name, value in parts.items():
-        step[0, {"turn": TURN, "shift": SHIFT}[name]] = value
-    return CameraStep(step, np.zeros((1, 1)), covariance)
-
-
-def test_what_goes_far_beyond_the_scene_s_covariance_is_not_taken() -> None:
-    covariance = _free(SHIFT, 0.003)
-    cameras = CameraFit(Cameras(ring(1), np.zeros(1)), covariance)
-    before = cameras.now.rig.master_from_colour.copy()
-    assert not cameras.take(_step(covariance, shift=0.1))
-    assert cameras.take(_step(covariance / 4, shift=0.005))
-    moved = cameras.now.rig.master_from_colour[:, :3, 3] - before[:, :3, 3]
-    np.testing.assert_allclose(moved, 0.005)
-    np.testing.assert_array_equal(cameras.covariance, covariance / 4)
-    # with what was taken before it is too far: all go back
-    assert not cameras.take(_step(covariance / 9, shift=0.011))
-    np.testing.assert_array_equal(cameras.now.rig.master_from_colour, before)
-    np.testing.assert_array_equal(cameras.covariance, covariance)
-    assert cameras.refused
-
-
-def test_small_parts_may_be_too_much_together_or_far_away() -> None:
-    tied = _free(TURN, 0.01) + _free(SHIFT, 0.01)
-    for axis in range(3):  # a turn and a shift that hide each other
-        tied[0, axis, 0, 3 + axis] = tied[0, 3 + axis, 0, axis] = -0.9999 * 0.01**2
-    cameras = CameraFit(Cameras(ring(1), np.zeros(1)), tied)
-    assert not cameras.take(_step(tied, turn=0.004, shift=0.004))
-    loose = _free(TURN, 0.02)
-    cameras = CameraFit(Cameras(ring(1), np.zeros(1)), loose)
-    assert not cameras.take(_step(loose, turn=0.03))
-    indefinite = np.zeros_like(loose)
-    indefinite[0, :, 0] = np.eye(FREEDOMS)
-    indefinite[0, 0, 0, 1] = indefinite[0, 1, 0, 0] = 2.0
-    with pytest.raises(np.linalg.LinAlgError):
-        CameraFit(Cameras(ring(1), np.zeros(1)), indefinite)
-
-
-def test_a_camera_without_a_pose_says_nothing(fitter: Fitter) -> None:
+def test_camera_without_a_pose_has_no_evidence(fitter):
     evidence = fitter.evidence
     given = evidence.observations
     poses = given.rig.master_from_colour.copy()
@@ -236,8 +228,83 @@ def test_a_camera_without_a_pose_says_nothing(fitter: Fitter) -> None:
     )
     evidence.by_view.points[:, 3] = 0
     evidence.observations = replace(given, rig=given.rig.moved(poses), confidence=confidence)
-    seen = _seen_from(fitter, problem, held=1.0)
+    form = _camera_evidence(fitter, problem, stiffness=1.0)
     evidence.observations = given
     mine = slice(3 * FREEDOMS, 4 * FREEDOMS)
-    assert np.isfinite(seen.hessian).all() and np.isfinite(seen.cross).all()
-    assert not seen.hessian[mine].any() and not seen.pull[mine].any()
+    assert np.isfinite(form.hessian).all() and np.isfinite(form.cross).all()
+    assert not form.hessian[mine].any() and not form.pull[mine].any()
+
+
+def test_prior_and_evidence_share_a_correction():
+    """A camera sees an object's place; a pose that no other camera sees follows this camera."""
+    prior, precision, frames, off = 0.004, 250.0, 5, 0.01
+    cameras = CameraFit(Cameras(ring(1), np.zeros(1)), _covariance(SHIFT, prior))
+    jacobian = np.zeros((6, FREEDOMS))
+    jacobian[3:, SHIFT] = -np.eye(3)  # the residual is x - d
+    weight = precision**2
+
+    def evidence(known: float) -> CameraEvidence:
+        """Other evidence, of precision ``known``, is ``off`` from that of the camera."""
+        own = np.concatenate([np.zeros(3), np.full(3, off)])
+        return CameraEvidence(
+            OBJECT,
+            np.tile((weight + known) * np.eye(6), (frames, 1, 1)),
+            np.tile(weight * own, (frames, 1)),
+            np.tile(weight * jacobian, (frames, 1, 1)),
+            frames * weight * jacobian.T @ jacobian,
+            frames * weight * jacobian.T @ own,
+            1.0,
+        )
+
+    free = cameras.solve([evidence(known=0.0)])  # any camera explains a pose that is free
+    np.testing.assert_allclose(free.step, 0, atol=1e-9)
+    shared = cameras.solve([evidence(known=1e6 * weight)])
+    expected = off * frames * weight / (frames * weight + prior**-2)
+    np.testing.assert_allclose(shared.step[0, SHIFT], expected, rtol=1e-3)
+    np.testing.assert_allclose(shared.step[0, TURN], 0)
+    pulled = cameras.solve([replace(evidence(known=0.0), pull=frames * np.ones(FREEDOMS))])
+    along = np.tile(pulled.step[0, SHIFT], (5, 1))
+    np.testing.assert_allclose(pulled.along[:, OBJECT][:, 3:], along)
+
+
+def _covariance(part: slice, sigma: float) -> np.ndarray:
+    covariance = np.zeros((1, FREEDOMS, 1, FREEDOMS))
+    covariance[0, part, 0, part] = np.eye(3) * sigma**2
+    return covariance
+
+
+def _step(covariance: np.ndarray, turn: float = 0.0, shift: float = 0.0) -> CameraStep:
+    step = np.zeros((1, FREEDOMS))
+    step[0, TURN], step[0, SHIFT] = turn, shift
+    return CameraStep(step, np.zeros((1, 1)), covariance)
+
+
+def test_implausible_correction_resets_all_cameras():
+    covariance = _covariance(SHIFT, 0.003)
+    cameras = CameraFit(Cameras(ring(1), np.zeros(1)), covariance)
+    before = cameras.now.rig.master_from_colour.copy()
+    assert not cameras.take(_step(covariance, shift=0.1))
+    assert cameras.take(_step(covariance / 4, shift=0.005))
+    moved = cameras.now.rig.master_from_colour[:, :3, 3] - before[:, :3, 3]
+    np.testing.assert_allclose(moved, 0.005)
+    np.testing.assert_array_equal(cameras.covariance, covariance / 4)
+    # too far together with the accepted one
+    assert not cameras.take(_step(covariance / 9, shift=0.011))
+    np.testing.assert_array_equal(cameras.now.rig.master_from_colour, before)
+    np.testing.assert_array_equal(cameras.covariance, covariance)
+    assert cameras.refused
+
+
+def test_corrections_are_bounded_together_and_in_size():
+    tied = _covariance(TURN, 0.01) + _covariance(SHIFT, 0.01)
+    for axis in range(3):  # a turn and a shift that cancel each other
+        tied[0, axis, 0, 3 + axis] = tied[0, 3 + axis, 0, axis] = -0.9999 * 0.01**2
+    for covariance, step in (
+        (tied, {"turn": 0.004, "shift": 0.004}), (_covariance(TURN, 0.02), {"turn": 0.03}),
+    ):  # fmt: skip
+        cameras = CameraFit(Cameras(ring(1), np.zeros(1)), covariance)
+        assert not cameras.take(_step(covariance, **step))
+    indefinite = _covariance(TURN, 1.0)
+    indefinite[0, 0, 0, 1] = indefinite[0, 1, 0, 0] = 2.0
+    with pytest.raises(np.linalg.LinAlgError):
+        CameraFit(Cameras(ring(1), np.zeros(1)), indefinite)

@@ -36,7 +36,7 @@ ROWS = _rows(PAGE[PAGE.index("## Table") :])
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.term} {row.file}")
-def test_row_names_code_and_setting_that_exist(row: Row) -> None:
+def test_row_names_code_and_setting_that_exist(row: Row):
     defined = [
         node.name
         for node in ast.parse((PACKAGE / row.file).read_text()).body
@@ -49,13 +49,13 @@ def test_row_names_code_and_setting_that_exist(row: Row) -> None:
         assert field in getattr(annotation, "model_fields", {})
 
 
-def test_every_equation_of_the_paper_has_a_row() -> None:
+def test_every_equation_of_the_paper_has_a_row():
     sources = [row.paper for row in ROWS] + [term.equation.source for term in JOINT_TERMS]
     numbers = {number.strip() for source in sources for number in source.split(",")}
     assert numbers - {"beyond"} == {*"123456", "A.1", "A.2", "A.3", "A.4", "A.5", "A.6"}
 
 
-def test_every_term_is_listed_and_every_setting_has_a_row() -> None:
+def test_every_term_is_listed_and_every_setting_has_a_row():
     files = {path.stem for path in (PACKAGE / "joint" / "terms").glob("[a-z]*.py")} - {"term"}
     assert files == {term.__module__.rpartition(".")[2] for term in JOINT_TERMS}
     kinds, waiting = set(), [JointTerm]
@@ -71,7 +71,7 @@ def test_every_term_is_listed_and_every_setting_has_a_row() -> None:
     }
 
 
-def test_terms_of_equation_6_are_named_in_their_file() -> None:
+def test_terms_of_equation_6_are_named_in_their_file():
     for term in JOINT_TERMS:
         if term.equation.source.startswith("6"):
             described = ast.get_docstring(

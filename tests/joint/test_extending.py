@@ -55,7 +55,7 @@ with h5py.File(copy / "fit.h5") as fit:
 """
 
 
-def test_a_new_joint_term_takes_three_files_and_a_test(tmp_path: Path) -> None:
+def test_a_new_joint_term_takes_three_files_and_a_test(tmp_path):
     for name in CHANGED:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, tmp_path / name)

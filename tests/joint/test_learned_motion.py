@@ -9,7 +9,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from intercap_core.body import lemo
-from intercap_core.body.model import BodyModel
 from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.minimise import minimise
 from intercap_core.joint.problem import JointProblem
@@ -30,24 +29,20 @@ UP = np.array([0.0, 1.0, 0.0])
 
 
 @pytest.fixture(scope="module")
-def context(body64: BodyModel) -> TermContext:
+def context(body64) -> TermContext:
     context = Scene(body64, bodies(body64, 1.0)).context
     return replace(context, encoder=random_encoder(), up=UP, fps=lemo.FRAMES_PER_SECOND)
 
 
 @pytest.fixture(scope="module")
-def term(context: TermContext) -> LearnedMotion:
+def term(context) -> LearnedMotion:
     return LearnedMotion(context)
 
 
 @pytest.fixture(scope="module")
-def unbiased(context: TermContext) -> LearnedMotion:
+def unbiased(context) -> LearnedMotion:
     """The term of an encoder without biases, which show at the image's ends."""
     return LearnedMotion(replace(context, encoder=random_encoder(bias=0.0)))
-
-
-def _with_body(state: State, body: np.ndarray) -> State:
-    return State(body, state.betas, state.expression, state.rotation, state.translation)
 
 
 def _moving(frames: int = FRAMES) -> State:
@@ -65,13 +60,13 @@ def _equations(term: JointTerm, state: State) -> BandedEquations:
     return sums
 
 
-def test_gradient_is_the_derivative_of_the_energy(term: LearnedMotion) -> None:
+def test_gradient_is_the_derivative_of_the_energy(term):
     state = _moving()
     term.refresh(state)
     check_gradient(term, state, step=1e-5, rel=1e-3)
 
 
-def test_curvature_bounds_the_energy_and_steps_lower_it(term: LearnedMotion) -> None:
+def test_curvature_bounds_the_energy_and_steps_lower_it(term):
     state = _moving()
     term.refresh(state)
     here = _equations(term, state)
@@ -91,9 +86,9 @@ def test_curvature_bounds_the_energy_and_steps_lower_it(term: LearnedMotion) -> 
     assert actual <= promised + 0.5 * curvature
 
 
-def test_no_energy_and_no_gradient_at_rest(unbiased: LearnedMotion) -> None:
+def test_no_energy_and_no_gradient_at_rest(unbiased):
     state = _moving()
-    still = _with_body(state, np.tile(state.body[:1], (FRAMES, 1)))
+    still = replace(state, body=np.tile(state.body[:1], (FRAMES, 1)))
     unbiased.refresh(still)
     here = _equations(unbiased, still)
     assert here.total == 0 and not here.gradient.any()
@@ -101,9 +96,7 @@ def test_no_energy_and_no_gradient_at_rest(unbiased: LearnedMotion) -> None:
     assert _equations(unbiased, state).total > 1
 
 
-def test_energy_does_not_depend_on_place_and_heading(
-    context: TermContext, term: LearnedMotion
-) -> None:
+def test_energy_does_not_depend_on_place_and_heading(context, term):
     state = _moving()
     term.refresh(state)
     energy = _equations(term, state).total
@@ -112,29 +105,27 @@ def test_energy_does_not_depend_on_place_and_heading(
     body[:, :3] = (turn * Rotation.from_rotvec(state.body[:, :3])).as_rotvec()
     fixed = pelvis - state.body[:, BODY_SHIFT]  # turns about the pelvis leave it where it is
     body[:, BODY_SHIFT] = turn.apply(pelvis) - fixed + [3.0, 0.0, -2.0]
-    turned = _with_body(state, body)
+    turned = replace(state, body=body)
     term.refresh(turned)
     assert _equations(term, turned).total == pytest.approx(energy, rel=1e-6)
 
 
-def test_everyday_motion_costs_as_much_as_in_the_joints_term(
-    context: TermContext, unbiased: LearnedMotion
-) -> None:
+def test_everyday_motion_costs_as_much_as_in_the_joints_term(context, unbiased):
     """A translating body with small accelerations, for which the joints' term is quadratic."""
     rng, frames = np.random.default_rng(2), PROBE_STEPS + 1
     shift = np.cumsum(np.cumsum(rng.normal(size=(frames, 3)), 0), 0) / lemo.FRAMES_PER_SECOND**2
     state = _moving(frames=frames)
     body = np.tile(state.body[:1], (frames, 1))
     body[:, BODY_SHIFT] = 0.1 * BODY_ACCELERATION * shift
-    moved = _with_body(state, body)
+    moved = replace(state, body=body)
     unbiased.refresh(moved)
     joints = BodyMotion(context)
     ratio = _equations(unbiased, moved).total / _equations(joints, moved).total
     assert 0.5 < ratio < 2
 
 
-def test_a_fit_lowers_the_energy(context: TermContext) -> None:
-    """With all channels of the release, whose curvature is closer to its bound."""
+def test_a_fit_lowers_the_energy(context):
+    """With all channels of the release the curvature is closer to its bound."""
     term = LearnedMotion(replace(context, encoder=random_encoder(channels=CHANNELS)))
     seen = _moving()
     problem = JointProblem((Hold(seen, 0.01), NoObject(), term))

@@ -67,7 +67,7 @@ class Refits:
     def _step(self, used: np.ndarray) -> np.ndarray:
         equations = self._rest.copy(self._bands)
         for columns, term in self._seen:
-            equations.add_blocks(term.name, columns, *term.of_views(used, self.state))
+            equations.add_blocks(term.name, columns, *term.linearise_views(used, self.state))
         step = equations.step(np.full(len(self.state), MIN_DAMPING))
         if step is None:  # some parameter is not determined
             return np.full(self._rest.gradient.shape, np.nan)

@@ -10,30 +10,21 @@ import numpy as np
 
 from intercap_core.annotation import ANY_REGION, ContactInterval
 
-# Log odds of an annotation away from its ends: above all that distance and slip can say against it.
-ANNOTATED_LOGIT = 12.0
-# An annotated contact this far from the object is a mistake of one or the other, metres: beyond
-# what the fits err by where they are not flagged. Tuned on the studio.
-FAR_CONTACT = 0.15
+ANNOTATED_LOGIT = 12.0  # log odds above those that distance and slip can reach; tuned
+FAR_CONTACT = 0.15  # metres, above the errors of frames that are not flagged; tuned on the studio
 
 
 @dataclass(frozen=True)
 class AnnotationIssue:
     """An implausible annotated interval."""
 
-    frames: range
-    """Frames concerned."""
-    text: str
-    """Description."""
-    distrusted: bool = False
-    """Whether the frames are flagged."""
+    frames: range  # Frames concerned
+    text: str  # Description
+    distrusted: bool = False  # Whether the frames are flagged
 
 
 def annotation_evidence(
-    intervals: Sequence[ContactInterval],
-    regions: Sequence[str],
-    frames: int,
-    uncertainty: int,
+    intervals: Sequence[ContactInterval], regions: Sequence[str], frames: int, uncertainty: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Log odds (T, R) of contact from annotated intervals, and their labels (T, R) int8.
 
@@ -76,22 +67,28 @@ def find_issues(
         distance: (T, R) of each region to the object in the fit, metres.
         unseen: (T,) frames in which body or object was not seen.
     """
-    issues = [
-        AnnotationIssue(
-            range(i.start, i.end), f"contact of {i.part} annotated for no frame at {i.start}"
-        )
-        for i in intervals
-        if i.end <= i.start
-    ]
     filled = [interval for interval in intervals if interval.end > interval.start]
-    issues += _overlaps(filled)
-    for interval in filled:
-        issues += _unseen_ends(interval, unseen)
-        issues += _far_away(interval, regions, distance, unseen)
-    return issues
+    return [
+        *(
+            AnnotationIssue(
+                range(i.start, i.end), f"contact of {i.part} annotated for no frame at {i.start}"
+            )
+            for i in intervals
+            if i.end <= i.start
+        ),
+        *_find_overlaps(filled),
+        *(
+            issue
+            for interval in filled
+            for issue in (
+                *_find_unseen_ends(interval, unseen),
+                *_find_far(interval, regions, distance, unseen),
+            )
+        ),
+    ]
 
 
-def _overlaps(intervals: Sequence[ContactInterval]) -> list[AnnotationIssue]:
+def _find_overlaps(intervals: Sequence[ContactInterval]) -> list[AnnotationIssue]:
     """Overlapping intervals of one part, which count once."""
     by_part = sorted(intervals, key=lambda i: (i.part, i.start, i.end))
     issues = []
@@ -105,7 +102,7 @@ def _overlaps(intervals: Sequence[ContactInterval]) -> list[AnnotationIssue]:
     return issues
 
 
-def _unseen_ends(interval: ContactInterval, unseen: np.ndarray) -> list[AnnotationIssue]:
+def _find_unseen_ends(interval: ContactInterval, unseen: np.ndarray) -> list[AnnotationIssue]:
     """Ends in unseen frames: the annotation alone determines when the contact changes."""
     ends = {"begins": interval.start, "ends": interval.end}
     return [
@@ -117,11 +114,8 @@ def _unseen_ends(interval: ContactInterval, unseen: np.ndarray) -> list[Annotati
     ]
 
 
-def _far_away(
-    interval: ContactInterval,
-    regions: Sequence[str],
-    distance: np.ndarray,
-    unseen: np.ndarray,
+def _find_far(
+    interval: ContactInterval, regions: Sequence[str], distance: np.ndarray, unseen: np.ndarray
 ) -> list[AnnotationIssue]:
     """Frames in which the annotated part is far from the object."""
     of_part = (

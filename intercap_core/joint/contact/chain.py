@@ -1,4 +1,8 @@
-"""An on/off process over time: a semi-Markov chain whose dwell times are a mixture."""
+"""An on/off process over time: a hidden Markov chain whose dwell times are a mixture.
+
+With several kinds of dwell, short ones are not suppressed and long ones last through frames without
+evidence (hyperexponential dwell times; forward-backward algorithm, Rabiner 1989).
+"""
 
 from __future__ import annotations
 
@@ -9,18 +13,11 @@ import numpy as np
 
 @dataclass(frozen=True)
 class DwellChain:
-    """A hidden chain with one state "off" and one state "on" for each of K kinds of dwell.
+    """A hidden chain with one state "off" and one state "on" for each of K kinds of dwell."""
 
-    With several kinds, short dwells are not suppressed and long ones last through frames without
-    evidence.
-    """
-
-    begins: float
-    """Rate at which "off" turns to "on", 1/s."""
-    durations: tuple[float, ...]
-    """(K,) mean dwell time of each kind, seconds."""
-    shares: tuple[float, ...]
-    """(K,) share of each kind among the dwells."""
+    begins: float  # Rate at which "off" turns to "on", 1/s
+    durations: tuple[float, ...]  # (K,) mean dwell time of each kind, seconds
+    shares: tuple[float, ...]  # (K,) share of each kind among the dwells
 
     def start(self) -> np.ndarray:
         """Stationary probability (1 + K,) of "off" and of each kind."""
@@ -39,10 +36,7 @@ class DwellChain:
         return matrix
 
     def posterior(self, evidence: np.ndarray, fps: float) -> np.ndarray:
-        """Probability (T, R) of "on" for R independent chains (forward-backward algorithm).
-
-        ``evidence`` (T, R) are log-likelihood ratios of on against off.
-        """
+        """Probability (T, R) of "on" from log-likelihood ratios ``evidence`` (T, R); R chains."""
         with np.errstate(divide="ignore"):  # kinds of dwell never turn into each other
             transition, start = np.log(self.transition(fps)), np.log(self.start())
         on = np.arange(len(start)) > 0

@@ -1,7 +1,4 @@
-"""Whose release results are of.
-
-Another program's results as the joint artefact, which metrics and all that follows read.
-"""
+"""Write another program's results as joint.h5, in place of a joint fit."""
 
 from __future__ import annotations
 
@@ -28,32 +25,27 @@ from intercap_core.formats.released import (
 )
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply, invert
-from intercap_core.joint.released import behave as release_behave
-from intercap_core.joint.released import intercap as release_intercap
+from intercap_core.joint.released import behave, intercap
+from intercap_core.joint.sequential import POSE_NAMES
 from intercap_core.schemas import CONTACT_REGIONS, JOINT, PERSON, SCENE
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 
 log = logging.getLogger(__name__)
-_FULL_HAND = 45
-_SHAPE_VARIES_M = 0.001  # of the skin, from which on one shape for all frames is told
-_LEAST_CONFIDENCE = 0.3  # of keypoints whose residuals are reported
-_POSE = ("global_orient", "transl", "body_pose", "jaw_pose", "leye_pose", "reye_pose",
-         "left_hand_pose", "right_hand_pose")  # fmt: skip
 
 
 def read_results(path: Path, recording: Recording) -> Results:
-    """Results of a sequence, whoever's they are.
+    """Read a sequence's results, in InterCap's or BEHAVE's format.
 
-    A file, and a folder that holds one of InterCap's names, is InterCap's; a folder of frame
-    folders ``t<seconds>``, or with BEHAVE's parameters at 30 fps, is BEHAVE's. Raises UserError
-    where it is neither, and as the readers do.
+    InterCap: a file, or a folder that holds one of its names. BEHAVE: a folder with frame folders
+    ``t<seconds>`` or with parameters at 30 fps. Raises UserError if ``path`` is neither, or if the
+    files cannot be used.
     """
     file = intercap_file(Path(path))
     if not file.is_dir():
-        return release_intercap.read_results(file)
+        return intercap.read_results(file)
     at_30_fps = (BEHAVE_PERSON, BEHAVE_OBJECT)
     if any((file / name).is_file() for name in at_30_fps) or any(file.glob("t[0-9]*/")):
-        return release_behave.read_results(file, recording)
+        return behave.read_results(file, recording)
     raise UserError(
         f"{file}: holds none of {', '.join(INTERCAP)} (InterCap's), no frame's folder t<seconds> "
         f"and none of {' and '.join(at_30_fps)} (BEHAVE's); name the file or folder of results"
@@ -69,58 +61,59 @@ def import_joint(
     betas: int,
     settings_digest: str,
 ) -> None:
-    """Write joint.h5 of what another program found, in place of a fit.
+    """Write joint.h5 from another program's results.
 
-    Cameras are those that were given, which the results belong to, with depth as measured; contact
-    is what the meshes say, so that no probability is stated, nor is any energy. Frames without a
-    result are filled from the nearest one and flagged. ``betas``: numbers of the shape, where
-    results are of another body and ours is fitted to it. Raises UserError where the results are of
-    another number of frames, or of more numbers than the body file has.
+    Cameras are the given ones, to which the results belong. The artefact has no contact
+    probabilities and no energies. Frames without a result get the nearest result and are flagged.
+    Raises UserError if the results have another number of frames, or more shape parameters than
+    the body file.
+
+    Args:
+        betas: number of shape parameters of our body if it is fitted to another body's surface.
     """
     object_, subject = models.object_, models.subject
-    path = models.body_models.of(subject.gender) or OPEN_BODY
-    with artefacts.read(paths.scene, SCENE) as setting:
-        total, sequence = len(setting["times"]), str(setting.attributes["sequence"])
-        rig = Rig.from_artefact(setting).moved(setting["master_from_colour_start"])
-        offsets, offset_sigma = setting["time_offset"], setting["time_offset_sigma"]
-    with Frames.open(paths.frames) as recorded:
-        times = recorded.first_set_s + recorded.time_s
-    found = read_results(results, Recording(sequence, times, object_, path, betas))
-    if len(found) != total:
+    body_file = models.body_models.of(subject.gender) or OPEN_BODY
+    with artefacts.read(paths.scene, SCENE) as scene:
+        total, sequence = len(scene["times"]), str(scene.attributes["sequence"])
+        rig = Rig.from_artefact(scene).moved(scene["master_from_colour_start"])
+        offsets, offset_sigma = scene["time_offset"], scene["time_offset_sigma"]
+    with Frames.open(paths.frames) as frames:
+        times = frames.first_set_s + frames.time_s
+    released = read_results(results, Recording(sequence, times, object_, body_file, betas))
+    if len(released) != total:
         raise UserError(
-            f"{found.path}: holds {len(found)} frames, sequence {sequence!r} has {total}; name the "
-            "results of this recording, or drop the same frames of both (drop_frames)"
+            f"{released.path}: holds {len(released)} frames, sequence {sequence!r} has {total}; "
+            "name the results of this recording, or drop the same frames of both (drop_frames)"
         )
-    known = found.known
+    known = released.known
     if not known.any():
-        raise UserError(f"{found.path}: has no frame whose every number is finite")
+        raise UserError(f"{released.path}: has no frame in which all numbers are finite")
     model = BodyModel.load(
-        path, num_betas=found.betas.shape[1], num_expression=found.expression.shape[1]
+        body_file, num_betas=released.betas.shape[1], num_expression=released.expression.shape[1]
     )
-    fill = np.arange(total)
     places = np.flatnonzero(known)
-    fill[~known] = places[np.abs(places[None] - fill[~known, None]).argmin(axis=1)]
-    shape = np.median(found.betas[known], axis=0)
-    params = _parameters(found, model, fill, shape)
+    nearest = np.arange(total)
+    nearest[~known] = places[np.abs(places[None] - nearest[~known, None]).argmin(axis=1)]
+    shape = np.median(released.betas[known], axis=0)
+    params = _body_parameters(released, model, nearest, shape)
     with torch.no_grad():
         posed = model.forward(params, vertex_ids=model.keypoint_map.vertex_ids)
         keypoints = model.keypoints(posed).double().numpy()
-    nothing_told = np.where(known, "", "no result in the imported file")
-    reasons = list(found.reasons) or list(nothing_told)
-    varies = _shape_varies(model, found.betas[known], shape)
-    if varies > _SHAPE_VARIES_M:
+    reasons = list(released.reasons) or [
+        "" if k else "no result in the imported file" for k in known
+    ]
+    variation = _shape_variation(model, released.betas[known], shape)
+    if variation > 0.001:
         log.warning(
-            "sequence %s: the shape in %s varies by frame; its median was taken, up to %.0f mm "
-            "from it",
-            sequence, found.path, 1e3 * varies,
+            "sequence %s: the shape in %s varies by frame; its median is used, which displaces the "
+            "skin by up to %.0f mm",
+            sequence, released.path, 1e3 * variation,
         )  # fmt: skip
-    has_object = object_ is not None and np.isfinite(found.translation).any()
-    if object_ is not None and not has_object:
-        log.warning("sequence %s: %s has no poses of an object", sequence, found.path)
-    nothing = np.full(found.rotation.shape, np.nan), np.full(found.translation.shape, np.nan)
-    rotation, translation = (
-        (found.rotation[fill], found.translation[fill]) if has_object else nothing
-    )
+    rotation, translation = released.rotation[nearest], released.translation[nearest]
+    if object_ is None or not np.isfinite(released.translation).any():
+        rotation, translation = np.full_like(rotation, np.nan), np.full_like(translation, np.nan)
+        if object_ is not None:
+            log.warning("sequence %s: %s has no poses of an object", sequence, released.path)
     count, regions = len(rig), len(CONTACT_REGIONS)
     with artefacts.write(
         output,
@@ -130,19 +123,18 @@ def import_joint(
         subject=subject.subject,
         object=object_.name if object_ else "",
         gender=subject.gender,
-        body_model=file_digest(path),
+        body_model=file_digest(body_file),
         iterations=0,
         refused=0,
         converged=True,
         cameras_corrected=False,
-        made_by=f"another program: {found.source}",
+        made_by=f"another program: {released.source}",
     ) as writer:
         writer.put("betas", shape.astype(np.float32))
-        writer.put("expression", params.expression.numpy())
-        for name in _POSE:
+        for name in ("expression", *POSE_NAMES):
             writer.put(name, getattr(params, name).numpy())
         writer.put("joints", posed.joints.numpy())
-        writer.put("keypoint_residual", _residuals(paths.person, rig, keypoints))
+        writer.put("keypoint_residual", _keypoint_errors(paths.person, rig, keypoints))
         writer.put("cloud_residual", np.full(total, np.nan, np.float32))
         writer.put("rotation", rotation)
         writer.put("translation", translation)
@@ -161,41 +153,44 @@ def import_joint(
         writer.put("hand_undetermined", np.zeros((total, 2), bool))
         writer.put("flagged", np.array([bool(reason) for reason in reasons]))
         writer.put("flag_reason", reasons)
-        if found.surface_distance is not None:
-            writer.put("surface_distance", found.surface_distance)
+        if released.surface_distance is not None:
+            writer.put("surface_distance", released.surface_distance)
 
 
-def _parameters(
-    found: Results, model: BodyModel, fill: np.ndarray, betas: np.ndarray
+def _body_parameters(
+    released: Results, model: BodyModel, frames: np.ndarray, betas: np.ndarray
 ) -> BodyParameters:
-    """Those of all frames, one shape; hands as full poses, mean included."""
+    """Parameters of ``frames`` (T,) with one shape ``betas`` (S,) and full hand poses."""
     hands = []
-    for side, hand in enumerate(found.hands):
-        if hand.shape[1] < _FULL_HAND:
+    for side, hand in enumerate(released.hands):
+        if hand.shape[1] < intercap.FULL_HAND:
             basis = model.hand_components[side, : hand.shape[1]].numpy().astype(np.float64)
             hand = model.hand_mean[side].numpy().astype(np.float64) + hand @ basis
         hands.append(hand)
     values = {
-        **found.turns,
-        "transl": found.transl,
-        "expression": found.expression,
+        **released.turns,
+        "transl": released.transl,
+        "expression": released.expression,
         "left_hand_pose": hands[0],
         "right_hand_pose": hands[1],
     }
     tensors = {
-        name: torch.as_tensor(value[fill], dtype=torch.float32) for name, value in values.items()
+        name: torch.as_tensor(value[frames], dtype=torch.float32) for name, value in values.items()
     }
     shape = torch.as_tensor(betas, dtype=torch.float32)[None]
     return BodyParameters(betas=shape, **tensors)
 
 
-def _shape_varies(model: BodyModel, betas: np.ndarray, median: np.ndarray) -> float:
-    """How far the skin of the T-pose is from that of the median shape, at most, metres."""
-    far = betas[np.abs(betas - median).max(axis=1).argmax()]
-    if np.allclose(far, median, atol=1e-6):
+def _shape_variation(model: BodyModel, betas: np.ndarray, median: np.ndarray) -> float:
+    """Largest distance between the T-poses of the ``median`` and the most different shape, metres.
+
+    ``betas`` (T, S) are the shapes.
+    """
+    farthest = betas[np.abs(betas - median).max(axis=1).argmax()]
+    if np.allclose(farthest, median, atol=1e-6):
         return 0.0
     skins = []
-    for shape in (far, median):
+    for shape in (farthest, median):
         rest = model.zeros(1)
         rest.betas = torch.as_tensor(shape, dtype=model.dtype)[None]
         with torch.no_grad():
@@ -203,15 +198,18 @@ def _shape_varies(model: BodyModel, betas: np.ndarray, median: np.ndarray) -> fl
     return float(np.linalg.norm(skins[0] - skins[1], axis=1).max())
 
 
-def _residuals(person: Path, rig: Rig, keypoints: np.ndarray) -> np.ndarray:
-    """Median reprojection error (T, C) px of keypoints (T, 135, 3); NaN = not seen."""
+def _keypoint_errors(person: Path, rig: Rig, keypoints: np.ndarray) -> np.ndarray:
+    """Median reprojection error (T, C) of keypoints (T, 135, 3), pixels; NaN if none is detected.
+
+    Keypoints with a confidence below 0.3 do not count.
+    """
     with artefacts.read(person, PERSON) as artefact:
-        seen = artefact["keypoints"]
-    found = np.full(seen.shape[:2], np.nan, np.float32)
+        detected = artefact["keypoints"]
+    median = np.full(detected.shape[:2], np.nan, np.float32)
     for c, camera in enumerate(rig):
         pixels = camera.colour.project(apply(invert(camera.master_from_colour), keypoints))
-        away = np.linalg.norm(pixels - seen[:, c, :, :2], axis=-1)
-        away[seen[:, c, :, 2] < _LEAST_CONFIDENCE] = np.nan
-        some = np.isfinite(away).any(axis=1)
-        found[some, c] = np.nanmedian(away[some], axis=1)
-    return found
+        error = np.linalg.norm(pixels - detected[:, c, :, :2], axis=-1)
+        error[detected[:, c, :, 2] < 0.3] = np.nan
+        frames = np.isfinite(error).any(axis=1)
+        median[frames, c] = np.nanmedian(error[frames], axis=1)
+    return median

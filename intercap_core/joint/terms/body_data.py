@@ -1,16 +1,13 @@
 """Body data: E_B of equation 6, which is equation 2 with the constants of the body fit.
 
 Shape, thickness of clothing and keypoint offsets are those of the body fit. The terms of E_B and
-their weights are those of :mod:`intercap_core.body_fit.problem`; no setting of the joint fit weighs
-them. E_theta_h alone has less weight: a hand's pose lasts, so that its prior in successive frames
-is one observation, whereas keypoints of each frame are new. With full weight in every frame fingers
-stay tens of millimetres short of the pose on which several views agree. A frame without a fit stays
-near its interpolated pose.
+their weights are those of :mod:`intercap_core.body_fit.problem`, except for E_theta_h: a hand's
+pose lasts, so that its prior in successive frames is one observation. With full weight in every
+frame, fingers stay tens of millimetres short of the pose on which several views agree.
 
 E_J and E_D (equations 3 and 4) also depend on the cameras. A camera that is turned by w about its
-centre s, shifted by v and whose depth bias grows by b displaces a point measured at p by
-w x (p - s) + v - b r, with r the ray to p for a metre of depth. For keypoints it is as if the body
-had moved the other way. The weights are those of the last comparison with the images.
+centre s, shifted by v and whose depth bias grows by b displaces a point p by w x (p - s) + v - b r,
+with r the ray to p per metre of depth. For keypoints it is as if the body had moved the other way.
 """
 
 from __future__ import annotations
@@ -46,29 +43,16 @@ from intercap_core.joint.time_offsets import (
 )
 from intercap_core.sequence_inputs import SequencePaths
 
-# Duration of a hand's pose, seconds: its prior in the frames of that time is one observation. Tuned
-# on the studio: 0.3 to 1 are alike.
-HAND_LASTING_S = 0.5
-# Standard deviations about an interpolated pose: of each joint, rad, and of the translation,
-# metres. Tuned on the studio.
-INTERPOLATED_TURN = 0.3
-INTERPOLATED_SHIFT = 0.1
-# Change of time offsets that is ignored, seconds: a hand at 3 m/s moves a millimetre.
-OFFSET_UNCHANGED_S = 0.0003
-
 log = logging.getLogger(__name__)
 _CHUNK = 64  # frames whose equations are computed at a time, to bound the memory
-_CAMERA_CHUNK = 32  # frames whose derivatives by the cameras are computed at a time
 
 
 @dataclass(frozen=True)
 class BodyResiduals:
     """Distances of the body to the images; NaN without an observation."""
 
-    keypoint_px: np.ndarray
-    """(T, C) median reprojection error, pixels."""
-    cloud_m: np.ndarray
-    """(T,) median distance of the clouds beyond the clothing, metres."""
+    keypoint_px: np.ndarray  # (T, C) median reprojection error, pixels
+    cloud_m: np.ndarray  # (T,) median distance of the clouds beyond the clothing, metres
 
 
 class BodyData(JointTerm):
@@ -104,21 +88,18 @@ class BodyData(JointTerm):
         observations = read_observations(paths.scene, paths.person)
         clouds = person_clouds(paths.frames, observations, settings.points_per_frame, model.device)
         fitter = Fitter(model, observations, clouds, settings, pose_prior)
-        settled = Settled(
-            *(
-                torch.from_numpy(body_fit[name])
-                for name in (
-                    "keypoint_offsets",
-                    "covering",
-                    "keypoint_sigma",
-                    "covering_noise",
-                    "keypoint_doubt",
-                )
-            )
-        )
+        names = [
+            "keypoint_offsets",
+            "covering",
+            "keypoint_sigma",
+            "covering_noise",
+            "keypoint_doubt",
+        ]
+        settled = Settled(*(torch.from_numpy(body_fit[name]) for name in names))
         problem = fitter.resume(state.parameters(model).vector()[fitter.frames], settled)
         problem.columns = torch.arange(BODY.stop, device=model.device)
-        lasting = min(fps * HAND_LASTING_S, len(fitter.frames))
+        # a hand's pose lasts 0.5 s (tuned on the studio: 0.3 to 1 are alike)
+        lasting = min(fps * 0.5, len(fitter.frames))
         problem.hand_share = 1 / max(lasting, 1.0)
         return cls(fitter, problem, ~body_fit["failed"])
 
@@ -132,8 +113,8 @@ class BodyData(JointTerm):
     def compare(self, state: State, camera: np.ndarray) -> None:
         """Compare ``state`` with one view per frame, for the errors in views that were held out.
 
-        Afterwards :meth:`residuals` and :meth:`person_by_view` refer to ``state`` and to the camera
-        ``camera`` (T,) of each frame. :meth:`refresh` comes before further equations.
+        Afterwards :meth:`residuals` and :meth:`person_by_view` refer to ``state`` and to ``camera``
+        (T,), the index of each frame's view. Call :meth:`refresh` before further equations.
         """
         self._place(state)
         self._fitter.observe_only(self._problem, camera[self._fitter.frames])
@@ -142,7 +123,9 @@ class BodyData(JointTerm):
         """Add E_B at ``state`` with the correspondences of the last :meth:`refresh`."""
         equations.add_blocks(self.name, BODY, *self._equations(state))
 
-    def of_views(self, used: np.ndarray, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def linearise_views(
+        self, used: np.ndarray, state: State
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """E_B's matrix (T, 168, 168), gradient (T, 168) and energy (T,) at ``state`` of some views.
 
         ``used`` (T, C) masks the views; correspondences are those of the last :meth:`refresh`.
@@ -167,18 +150,19 @@ class BodyData(JointTerm):
         hessian = np.zeros((len(state), BODY.stop, BODY.stop))
         gradient = np.zeros((len(state), BODY.stop))
         energy = np.zeros(len(state))
-        for some in self._index.split(_CHUNK):
-            normal = self._problem.linearise(pose[some], shared, some)
-            places = some.cpu().numpy()  # a tensor with one element would index like a scalar
+        for chunk in self._index.split(_CHUNK):
+            normal = self._problem.linearise(pose[chunk], shared, chunk)
+            places = chunk.cpu().numpy()  # a tensor with one element would index like a scalar
             trusted = self._trusted[places]
             at = self._fitter.frames[places][trusted]
             hessian[at] = normal.hessian.cpu().numpy()[trusted]
             gradient[at] = normal.gradient.cpu().numpy()[trusted]
             energy[at] = normal.cost.double().cpu().numpy()[trusted]
         frames = self._fitter.frames[self._trusted]
+        # a frame without a fit stays near its interpolated pose: 0.3 rad, 0.1 m (tuned)
         filled = np.setdiff1d(np.arange(len(state)), frames)
-        precision = np.full(BODY.stop, INTERPOLATED_TURN**-2)
-        precision[BODY_SHIFT] = INTERPOLATED_SHIFT**-2
+        precision = np.full(BODY.stop, 0.3**-2)
+        precision[BODY_SHIFT] = 0.1**-2
         offset = state.body[filled] - self._interpolated[filled]
         hessian[filled] = np.diag(precision)
         gradient[filled] = precision * offset
@@ -196,10 +180,7 @@ class BodyData(JointTerm):
             evidence.observations = replace(evidence.observations, time_offset=time_offset)
 
     def camera_evidence(self, state: State, share: float) -> CameraEvidence:
-        """Evidence of keypoints and clouds about the cameras at ``state``.
-
-        ``share`` is the share of an independent observation that a frame is.
-        """
+        """Evidence of keypoints and clouds about the cameras; ``share`` is a frame's weight."""
         self._place(state)
         count = FREEDOMS * len(self._fitter.evidence.observations.rig)
         hessian, gradient, _ = self._equations(state)
@@ -221,17 +202,14 @@ class BodyData(JointTerm):
         return BodyResiduals(keypoint, cloud)
 
     def person_by_view(self) -> np.ndarray:
-        """Median distance (T, C) of the person's points beyond the clothing, metres, in each view.
-
-        At the last :meth:`refresh`; NaN without points.
-        """
+        """Median distance (T, C) of the person's points beyond the clothing, metres, or NaN."""
         seen = self._fitter.evidence.observations
         person = np.full((len(seen.times), len(seen.rig)), np.nan)
-        found = self._fitter.evidence.by_view
-        if found is not None:
-            apart = (found.distance - self._problem.thickness()).abs()
-            apart = torch.where(found.points > 0, apart, torch.nan)
-            person[self._fitter.frames] = apart.nanmedian(2).values.cpu().numpy()
+        clouds = self._fitter.evidence.by_view
+        if clouds is not None:
+            distance = (clouds.distance - self._problem.thickness()).abs()
+            distance = torch.where(clouds.points > 0, distance, torch.nan)
+            person[self._fitter.frames] = distance.nanmedian(2).values.cpu().numpy()
         return person
 
     @property
@@ -256,7 +234,7 @@ class BodyData(JointTerm):
         """Use these time offsets (C,), seconds; returns the largest change."""
         evidence = self._fitter.evidence
         change = float(np.abs(offset - self.time_offset).max())
-        if change > OFFSET_UNCHANGED_S:
+        if change > 0.0003:  # seconds: a hand at 3 m/s moves a millimetre
             evidence.observations = replace(evidence.observations, time_offset=offset)
             self._fitter.observe(self._problem)
         return change
@@ -271,7 +249,7 @@ def add_by_cameras(
 ) -> None:
     """Add the evidence of the ``trusted`` (N,) frames at the problem's bodies to ``seen``."""
     frames = np.flatnonzero(trusted)
-    for part in np.array_split(frames, max(1, -(-len(frames) // _CAMERA_CHUNK))):
+    for part in np.array_split(frames, max(1, -(-len(frames) // 32))):
         if len(part):
             _add_keypoints(evidence, problem, part, seen)
             _add_clouds(evidence, problem, part, seen)
@@ -283,7 +261,7 @@ def _add_keypoints(
     views = problem.views
     if views is None:
         return
-    found = keypoint_term.evaluate(
+    model_points = keypoint_term.evaluate(
         problem.model,
         problem.model.parameters(problem.base[part]),
         problem.keypoints,
@@ -291,8 +269,8 @@ def _add_keypoints(
         derivatives=True,
         columns=torch.arange(BODY.stop, device=problem.base.device),
     )
-    assert found.derivatives is not None
-    points = found.points[:, None]
+    assert model_points.derivatives is not None
+    points = model_points.points[:, None]
     if views.shift is not None:
         points = points + views.shift[part]
     rotation = views.colour_from_master[:, :3, :3]
@@ -312,7 +290,7 @@ def _add_keypoints(
     hessian = torch.einsum("bckaf,bckag->cfg", weighted, rows)
     gradient = torch.einsum("bckaf,bcka->cf", weighted, residual)
     by_keypoint = torch.einsum("bckaf,bckax->bkxcf", weighted, by_point)
-    cross = torch.einsum("bkxn,bkxcf->bncf", found.derivatives, by_keypoint)
+    cross = torch.einsum("bkxn,bkxcf->bncf", model_points.derivatives, by_keypoint)
     for camera, block in enumerate(_array(hessian)):
         own = slice(FREEDOMS * camera, FREEDOMS * (camera + 1))
         seen.hessian[own, own] += block

@@ -3,17 +3,13 @@
     E_C = CD( H(W(body)), H'(W'(object)) )
 
 CD is the Chamfer distance between H, the body's likely-contact vertices, and H', their closest
-points on the object: the signed distances of :mod:`intercap_core.joint.proximity`. In the paper's
-appendix H' is the whole object, in its text the vertices labelled as likely touched; the setting
-``contact_to`` selects either. Labelled vertices stand for the faces between them, as vertices of a
-mesh may be centimetres apart.
+points on the object (:mod:`intercap_core.joint.proximity`). H' is the whole object (the paper's
+appendix) or the faces between labelled vertices (its text); see the setting ``contact_to``.
 
-Equation 6 weighs E_C by the binary Q_t times lambda_Q (setting ``contact_weight``); here Q_t is the
-probability that a region touches. Equation 6 also has an E_C without Q_t, which is left out: a body
-that does not touch is not drawn to the object.
-
-Beyond the paper each region is cut into patches (a palm, each finger, a sole). The nearest patches
-carry the weight, within a patch the nearest vertices, and a patch that is far is an outlier
+Q_t, binary in the paper, is the probability that a region touches; lambda_Q is the setting
+``contact_weight``. Equation 6 also has an E_C without Q_t, which is left out: a body that does not
+touch is not drawn to the object. Beyond the paper each region is cut into patches (a palm, each
+finger, a sole). The nearest patches and vertices carry the weight, and far patches are outliers
 (Geman-McClure): a hand that holds a handle with three fingers does not pull the other two along.
 """
 
@@ -28,34 +24,20 @@ from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.state import State
 from intercap_core.joint.terms.term import Data, Equation, JointTerm, TermContext
 
-# Distance of a patch that touches, after errors of skin, mesh and calibration, metres. Tuned on the
-# studio.
-CONTACT_SIGMA = 0.004
-# Weight of an annotated contact relative to a detected one: half the deviation. It applies only
-# while the region stands apart; with it, an annotated mouth reaches the bottle in spite of lasting
-# errors of head and object. Tuned on the studio: with 1 the mouth stays 10 mm off, with 16 the hand
-# is displaced.
+CONTACT_SIGMA = 0.004  # of a touching patch's distance, metres: skin, mesh, calibration; tuned
+# Weight of an annotated contact relative to a detected one while the region stands apart. Tuned on
+# the studio: with 1 the mouth stays 10 mm off the bottle, with 16 the hand is displaced.
 ANNOTATED_CONTACT_WEIGHT = 4.0
-# Excess distance, metres, at which a vertex counts exp(-1/2) in its patch, and a patch in its
-# region: skin yields and meshes err by millimetres, so contact is an area of this depth. Tuned on
-# the studio.
-CONTACT_SOFTNESS = 0.006
-# Distance at which a patch counts a quarter, metres: the accuracy that keypoints and depth leave to
-# a hand. Tuned on the studio.
-CONTACT_OUTLIER = 0.02
-# Distance that costs nothing, metres: half the default of the setting ``metrics.contact_mm``,
-# rounded down. Tuned on the studio.
-CONTACT_TOLERANCE = 0.002
+CONTACT_OUTLIER = 0.02  # distance at which a patch counts a quarter, metres; tuned on the studio
+CONTACT_TOLERANCE = 0.002  # m, costs nothing: half of ``metrics.contact_mm``; tuned on the studio
 
 
 @dataclass(frozen=True)
 class ContactShares:
     """How contact is spread over the body."""
 
-    area: np.ndarray
-    """(T, M) weights of the patches' vertices; they sum to one in each patch."""
-    gate: np.ndarray
-    """(T, P) participation of each patch in its region's contact, 0 to 1."""
+    area: np.ndarray  # (T, M) weights of the patches' vertices; they sum to one in each patch
+    gate: np.ndarray  # (T, P) participation of each patch in its region's contact, 0 to 1
 
 
 def spread_contact(
@@ -86,10 +68,7 @@ def spread_contact(
 
 
 def evaluate_contact(
-    distance: np.ndarray,
-    patch_of: np.ndarray,
-    shares: ContactShares,
-    probability: np.ndarray,
+    distance: np.ndarray, patch_of: np.ndarray, shares: ContactShares, probability: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Residuals (T, M) in metres, weights (T, M) and energies (T,) in m^2.
 
@@ -115,8 +94,11 @@ def evaluate_contact(
 
 
 def _closeness(excess: np.ndarray) -> np.ndarray:
-    """Weight of points by their ``excess`` distance over the nearest one, metres."""
-    return np.exp(-np.square(excess / CONTACT_SOFTNESS) / 2)
+    """Weight of points by their ``excess`` distance over the nearest one, metres.
+
+    Skin yields and meshes err by millimetres: contact is an area of 6 mm depth (tuned).
+    """
+    return np.exp(-np.square(excess / 0.006) / 2)
 
 
 class Contact(JointTerm):
@@ -147,7 +129,7 @@ class Contact(JointTerm):
         """
         self._probability, self._annotated = probability, labels == 1
 
-    def holding(self) -> np.ndarray:
+    def holding_probability(self) -> np.ndarray:
         """Probability (T, M) that each patch vertex holds the object, times its share of the patch.
 
         As of the last :meth:`refresh`.
@@ -160,8 +142,7 @@ class Contact(JointTerm):
 
     def refresh(self, state: State) -> None:
         """Choose the vertices that carry the contact, and the weight of each region."""
-        assert self._probability is not None, "take_contact comes first"
-        assert self._annotated is not None, "take_contact comes first"
+        assert self._probability is not None and self._annotated is not None, "take_contact first"
         patches = self.geometry.patches
         distance = self.geometry.at(state).touching.distance[:, self.geometry.skin.patch]
         self._shares = spread_contact(distance, patches.patch, patches.region_of_patch)

@@ -19,16 +19,9 @@ from intercap_core.joint.equations import RATE, BandedEquations
 from intercap_core.joint.state import BODY, OBJECT, State
 from intercap_core.joint.terms.term import Data, Equation, JointTerm, TermContext
 
-# Change of a sequential fit's lasting errors: a random walk, metres in one second. Tuned on the
-# studio.
-BODY_DRIFT = 0.010
-OBJECT_DRIFT = 0.004
-# Points of body or object whose corrections are one measurement: neighbouring points move as one.
-# Tuned on the studio.
-POINTS_PER_MEASUREMENT = 2.0
-# Distance that an object at rest moves between frames, metres: practically none. Tuned on the
-# studio.
-RESTING_SIGMA = 2e-5
+# Change of a sequential fit's lasting errors: a random walk.
+BODY_DRIFT = 0.010  # m in one second; tuned on the studio
+OBJECT_DRIFT = 0.004  # m in one second; tuned on the studio
 
 
 def jitter(points: np.ndarray, valid: np.ndarray) -> float:
@@ -81,7 +74,7 @@ class _Drift(JointTerm):
             self.name,
             columns,
             lambda at, some: jacobian[at, some],
-            weight / POINTS_PER_MEASUREMENT,
+            weight / 2.0,  # neighbouring points move as one: two are one measurement (tuned)
             change,
             stencil=RATE,
             stiff=stiff,
@@ -110,7 +103,6 @@ class BodyDrift(_Drift):
         self._weights = context.settings.drift_weight * (trusted[1:] & trusted[:-1]) / sigma**2
 
     def add(self, state: State, equations: BandedEquations) -> None:
-        """Add the drift at ``state``."""
         if len(state) < 3:
             return
         joints, jacobian = self.geometry.at(state).joints
@@ -139,10 +131,10 @@ class ObjectDrift(_Drift):
         sigma = self._sigma(self._sequential, trusted, OBJECT_DRIFT, context.fps)
         moving = trusted[1:] & trusted[:-1] & ~resting
         self._weights = context.settings.drift_weight * moving / sigma**2
-        self._resting = resting.astype(float) / RESTING_SIGMA**2
+        # an object at rest moves 0.02 mm between frames: practically not (tuned on the studio)
+        self._resting = resting.astype(float) / 2e-5**2
 
     def add(self, state: State, equations: BandedEquations) -> None:
-        """Add the drift at ``state``."""
         if len(state) < 3:
             return
         points, jacobian = self.geometry.at(state).moments

@@ -12,25 +12,15 @@ from __future__ import annotations
 import numpy as np
 
 from intercap_core.joint.equations import BandedEquations
-from intercap_core.joint.floor import FloorPlane
 from intercap_core.joint.proximity import along_by_object
 from intercap_core.joint.skin import VERTICES_PER_MEASUREMENT
 from intercap_core.joint.state import BODY, OBJECT, State
 from intercap_core.joint.terms.term import Data, Equation, JointTerm, TermContext
 
-# Standard deviation of the floor's height, metres. Tuned on the studio.
-GROUND_SIGMA = 0.005
-# The object's vertices below the floor count as one measurement, and as less if they are fewer than
-# this: an edge that just touches the floor. Tuned on the studio.
+GROUND_SIGMA = 0.005  # of the floor's height, metres; tuned on the studio
+# An object's vertices below the floor are one measurement; fewer than this, an edge that just
+# touches the floor, are less. Tuned on the studio.
 MIN_STANDING_VERTICES = 4
-
-
-def depth_below(points: np.ndarray, floor: FloorPlane) -> np.ndarray:
-    """Height (..., N) of points (..., N, 3) over the floor if negative, else 0; metres.
-
-    Its derivative by a point is the floor's normal where it is negative, and 0 elsewhere.
-    """
-    return np.minimum(floor.heights(points), 0.0)
 
 
 class _Ground(JointTerm):
@@ -56,9 +46,8 @@ class BodyGround(_Ground):
     needs = frozenset({Data.FLOOR})
 
     def add(self, state: State, equations: BandedEquations) -> None:
-        """Add E_G at ``state``."""
         posed = self.geometry.at(state)
-        height = depth_below(posed.skin, self._floor)
+        height = self._floor.depths(posed.skin)
         scale = self._weight / GROUND_SIGMA**2 / VERTICES_PER_MEASUREMENT
         weight = np.where(height < 0, self.geometry.skin.share, 0.0) * scale
 
@@ -108,4 +97,4 @@ class ObjectGround(_Ground):
         equations.add_rows(self.name, OBJECT, rows, weight, height[..., None])
 
     def _height(self, state: State) -> np.ndarray:
-        return depth_below(self.geometry.at(state).object_vertices, self._floor)
+        return self._floor.depths(self.geometry.at(state).object_vertices)

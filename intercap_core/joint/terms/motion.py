@@ -26,18 +26,12 @@ from intercap_core.joint.equations import ACCELERATION, BandedEquations
 from intercap_core.joint.state import BODY, OBJECT, State
 from intercap_core.joint.terms.term import Data, Equation, JointTerm, TermContext
 
-# Standard deviations of accelerations in everyday motion, m/s^2: trunk and limbs, fingers, carried
-# objects. Tuned on the studio.
-BODY_ACCELERATION = 6.0
-FINGER_ACCELERATION = 10.0
-OBJECT_ACCELERATION = 6.0
-# Standard deviations beyond which an acceleration counts as a start, a stop or an impact. Tuned on
-# the studio.
-ACCELERATION_OUTLIER = 2.0
-# Steps of the motion that calibrates weight and curvature of the learned E_S, and power iterations
-# for the curvature.
-PROBE_STEPS = 16
-SPECTRAL_ITERATIONS = 5
+# Standard deviations of accelerations in everyday motion.
+BODY_ACCELERATION = 6.0  # m/s^2, of trunk and limbs; tuned on the studio
+FINGER_ACCELERATION = 10.0  # m/s^2; tuned on the studio
+OBJECT_ACCELERATION = 6.0  # m/s^2, of carried objects; tuned on the studio
+ACCELERATION_OUTLIER = 2.0  # standard deviations: a start, a stop, an impact; tuned on the studio
+PROBE_STEPS = 16  # of the motion that calibrates the learned E_S; tuned
 
 _FIRST_FINGER = JOINT_INDEX["left_index1"]  # joints from here on are the fingers'
 _HIPS = [JOINT_INDEX["left_hip"], JOINT_INDEX["right_hip"]]
@@ -57,7 +51,46 @@ def pseudo_huber(acceleration: np.ndarray, scale: float) -> tuple[np.ndarray, np
     return 1.0 / root, scale**2 * (root - 1.0).sum(axis=1)
 
 
-class BodyMotion(JointTerm):
+class _Smoothness(JointTerm):
+    """Robust squared accelerations of points."""
+
+    def __init__(self, context: TermContext) -> None:
+        super().__init__(context)
+        self._fps, self._settings = context.fps, context.settings
+
+    def _add_accelerations(
+        self,
+        columns: slice,
+        points: np.ndarray,
+        jacobian: np.ndarray,
+        sigma: np.ndarray,
+        factor: float,
+        equations: BandedEquations,
+    ) -> None:
+        """Add the accelerations of points (T, N, 3), if there are three frames or more.
+
+        Args:
+            jacobian: (T, N, 3, m) derivative of the points by the unknowns ``columns``.
+            sigma: (N,) standard deviations, m/s^2.
+            factor: weight of the term.
+        """
+        if len(points) < 3:
+            return
+        acceleration = accelerations(points, self._fps) / sigma[:, None]
+        weight, energy = pseudo_huber(acceleration, ACCELERATION_OUTLIER)
+        unit = self._fps**2 / sigma
+        equations.add_rows(
+            self.name,
+            columns,
+            lambda at, some: jacobian[at, some] * unit[some, None, None],
+            weight * factor,
+            acceleration,
+            energy * factor,
+            stencil=ACCELERATION,
+        )
+
+
+class BodyMotion(_Smoothness):
     """E_S without LEMO: small accelerations of the 55 joints."""
 
     name = "body_motion"
@@ -68,37 +101,19 @@ class BodyMotion(JointTerm):
         settings=("body_smoothness",),
     )
 
-    def __init__(self, context: TermContext) -> None:
-        super().__init__(context)
-        self._fps, self._weight = context.fps, context.settings.body_smoothness
-        fingers = np.arange(NUM_JOINTS) >= _FIRST_FINGER
-        self._sigma = np.where(fingers, FINGER_ACCELERATION, BODY_ACCELERATION)
-
     @classmethod
     def applies(cls, context: TermContext) -> bool:
         """Whether the settings name no learned E_S."""
         return context.encoder is None
 
     def add(self, state: State, equations: BandedEquations) -> None:
-        """Add E_S at ``state``."""
-        if len(state) < 3:
-            return
-        joints, jacobian = self.geometry.at(state).joints
-        acceleration = accelerations(joints, self._fps) / self._sigma[:, None]
-        weight, energy = pseudo_huber(acceleration, ACCELERATION_OUTLIER)
-        unit = self._fps**2 / self._sigma
-        equations.add_rows(
-            self.name,
-            BODY,
-            lambda at, some: jacobian[at, some] * unit[some, None, None],
-            weight * self._weight,
-            acceleration,
-            energy * self._weight,
-            stencil=ACCELERATION,
-        )
+        fingers = np.arange(NUM_JOINTS) >= _FIRST_FINGER
+        sigma = np.where(fingers, FINGER_ACCELERATION, BODY_ACCELERATION)
+        factor = self._settings.body_smoothness
+        self._add_accelerations(BODY, *self.geometry.at(state).joints, sigma, factor, equations)
 
 
-class ObjectMotion(JointTerm):
+class ObjectMotion(_Smoothness):
     """E_A: small accelerations of the object's points."""
 
     name = "object_motion"
@@ -110,27 +125,11 @@ class ObjectMotion(JointTerm):
     )
     needs = frozenset({Data.OBJECT})
 
-    def __init__(self, context: TermContext) -> None:
-        super().__init__(context)
-        self._fps, self._weight = context.fps, context.settings.object_smoothness
-
     def add(self, state: State, equations: BandedEquations) -> None:
-        """Add E_A at ``state``."""
-        if len(state) < 3:
-            return
         points, jacobian = self.geometry.at(state).moments
-        acceleration = accelerations(points, self._fps) / OBJECT_ACCELERATION
-        weight, energy = pseudo_huber(acceleration, ACCELERATION_OUTLIER)
-        unit = self._fps**2 / OBJECT_ACCELERATION
-        equations.add_rows(
-            self.name,
-            OBJECT,
-            lambda at, some: jacobian[at, some] * unit,
-            weight * self._weight,
-            acceleration,
-            energy * self._weight,
-            stencil=ACCELERATION,
-        )
+        sigma = np.full(points.shape[1], OBJECT_ACCELERATION)
+        factor = self._settings.object_smoothness
+        self._add_accelerations(OBJECT, points, jacobian, sigma, factor, equations)
 
 
 class LearnedMotion(JointTerm):
@@ -138,19 +137,17 @@ class LearnedMotion(JointTerm):
 
         E_S = k / 2 sum over t of || z(t+1) - z(t) ||^2,  Z = F_S(steps of the markers)
 
-    F_S is :class:`intercap_core.body.lemo.MotionEncoder`. k, which stands for 1 / Q(T - 2), makes
-    the term as strong as :class:`BodyMotion` before that is robust: a body that translates with
-    random everyday accelerations costs as much in both. k follows from the user's weights and
-    ``BODY_ACCELERATION``.
+    F_S is :class:`intercap_core.body.lemo.MotionEncoder`. k stands for 1 / Q(T - 2): a body that
+    translates with random everyday accelerations costs as much as in :class:`BodyMotion` if that
+    were not robust.
 
     Energy and gradient are exact: automatic differentiation up to the markers, then the body's
     Jacobian. The exact curvature couples 22 frames, of which three fit into the bands of the
-    equations. Except for the signs at its leaky ReLUs the encoder commutes with a shift in time:
-    with K its derivative, z(t+1) - z(t) changes by K times the change of the markers' acceleration
-    a. So k |K|^2 |da|^2 / 2, with the spectral norm, bounds the curvature and couples three frames.
-    K is taken at the everyday motion above. Where the ReLUs differ from it, the bound does not
-    hold; a step that raises the energy is then refused and damped. The bound is steeper than the
-    energy in most directions, so that steps are shorter than those of the other terms.
+    equations; an upper bound replaces it. Except for the signs at its leaky ReLUs the encoder
+    commutes with a shift in time: with K its derivative, z(t+1) - z(t) changes by K times the
+    change da of the markers' acceleration, so that k |K|^2 |da|^2 / 2 (spectral norm) bounds the
+    curvature. K is taken at the everyday motion above. If ReLUs differ, the bound does not hold; a
+    step that raises the energy is then refused and damped.
     """
 
     name = "body_motion"
@@ -245,7 +242,7 @@ def _squared_norm(encoder: MotionEncoder, steps: Tensor) -> float:
     """
     along = torch.ones_like(steps) / steps.numel() ** 0.5
     largest = 0.0
-    for _ in range(SPECTRAL_ITERATIONS):
+    for _ in range(5):
         turned = torch.func.jvp(encoder.latents, (steps,), (along * encoder.spread,))[1]
         at = steps.clone().requires_grad_()
         (back,) = torch.autograd.grad(encoder.latents(at), at, turned)

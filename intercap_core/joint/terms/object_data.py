@@ -41,10 +41,11 @@ class ObjectData(JointTerm):
         self._poses = self._tracked.at(time_offset)
 
     def add(self, state: State, equations: BandedEquations) -> None:
-        """Add E_O at ``state``."""
         equations.add_blocks(self.name, OBJECT, *self._equations(self._poses.information, state))
 
-    def of_views(self, used: np.ndarray, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def linearise_views(
+        self, used: np.ndarray, state: State
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """E_O's matrix (T, 6, 6), gradient (T, 6) and energy (T,) at ``state`` of some views.
 
         The track states no information of single views: the views in the mask ``used`` (T, C) have

@@ -5,19 +5,16 @@ small step x of the object's pose and of corrections d_v of the cameras,
 
     E(x, d, e) = sum_v |x + e - A_v d_v|^2 by I_v / 2 + g_v (x + e - A_v d_v),    e ~ N(0, F)
 
-A_v is the apparent step of the object under a correction of camera v. e is the difference between
-mesh and object: at the best e the matrix of x is I - I K I with K = (I + F^-1)^-1 and I = sum I_v.
-The scale of I_v follows from the disagreement of the views of a frame. Errors that all views share,
-which the tracker adds to its covariance, are here explained by the cameras and by e.
-
-Frames in which the object is lost, or whose images contradict the pose, stay near the tracked pose,
-as in :mod:`.object_data`. Evidence that is far from its own pose has little weight (Geman-McClure).
-No setting weighs E_O: its strength is that of the images.
+A_v is the apparent step of the object under a correction of camera v, and e the difference between
+mesh and object. At the best e the matrix of x is I - I K I with K = (I + F^-1)^-1, I = sum I_v. The
+scale of I_v follows from the disagreement of the views. Evidence far from its own pose has little
+weight (Geman-McClure). Frames in which the object is lost, or whose images contradict the pose,
+stay near the tracked pose, as in :mod:`.object_data`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,21 +45,20 @@ from intercap_core.object_track.recording import TRACKING_FACES, ObjectRecording
 from intercap_core.object_track.view import FitContext
 from intercap_core.object_track.view_report import ViewReport
 
-# Standard deviations from its own pose at which evidence counts a quarter. Tuned on the studio.
-IMAGES_OUTLIER = 5.0
-# Memory for images that are kept between rounds, bytes: some hundred frames of six cameras.
-VIEWS_KEPT_BYTES = 200_000_000
+IMAGES_OUTLIER = 5.0  # standard deviations at which evidence counts a quarter; tuned on the studio
 
 
 class ObjectImages:
-    """The object's images, compared as in the tracker (equation 1).
+    """The object's images, with which poses are compared as in the tracker (equation 1).
 
     Silhouettes and depth are those of the best candidate of each view, occluded by the person.
 
     Attributes:
-        cameras: (V,) indices of the cameras that have images and a pose.
-        count: number of cameras of the rig.
+        recording: images and candidates of the V cameras that have images and a pose.
+        views: cache of the frames' views.
         mesh: simplified mesh of the object.
+        context: renderer and settings of the comparison.
+        threads: compare a frame each.
     """
 
     def __init__(
@@ -71,135 +67,35 @@ class ObjectImages:
         mesh: ObjectMesh,
         settings: ObjectTrackSettings,
         labels: tuple[str, ...],
-        threads: ThreadPool | None = None,
+        threads: ThreadPool,
     ) -> None:
-        """``threads`` compare a frame each; None for one thread."""
-        self._recording = recording
-        self._views = ViewCache(recording.views, VIEWS_KEPT_BYTES)
-        self._geometry = list(recording.geometry)
-        self._threads = ThreadPool()
-        if threads is not None:
-            self._threads = threads
-        self.mesh, self.cameras = mesh.simplified(TRACKING_FACES), recording.cameras
+        self.recording, self.threads = recording, threads
+        self.views = ViewCache(recording.views, 200_000_000)  # bytes: 100s of frames of 6 cameras
+        self.mesh = mesh.simplified(TRACKING_FACES)
         renderer = open_renderer(settings.render_on, threads=1)
-        self._context = FitContext(
+        self.context = FitContext(
             self.mesh, labels, settings.min_overlap, settings.background_term, renderer
         )
-        self.count = recording.count
-
-    def take_cameras(self, cameras: Cameras) -> None:
-        """Use these poses and depth biases."""
-        self._geometry = [
-            given.corrected(
-                cameras.rig[c],
-                float(np.nan_to_num(cameras.depth_bias[c])),
-                given.time_offset_s,
-            )
-            for c, given in zip(self.cameras, self._geometry, strict=True)
-        ]
-
-    def take_offsets(self, time_offset: np.ndarray) -> None:
-        """Use these time offsets (C,), seconds."""
-        self._geometry = [
-            given.corrected(given.camera, given.depth_bias_m, float(time_offset[c]))
-            for c, given in zip(self.cameras, self._geometry, strict=True)
-        ]
-
-    def look(
-        self, frames: Sequence[int], poses: np.ndarray, twists: np.ndarray
-    ) -> dict[int, ImageEvidence]:
-        """Evidence of each of ``frames`` about its pose.
-
-        Turns about the axes of a round object have no evidence, although its facets show some.
-
-        Args:
-            poses: (T, 4, 4) master_from_object.
-            twists: (T, 6) motion per second.
-        """
-        evidence = self._threads.map(lambda t: self._look(t, poses[t], twists[t]), frames)
-        return dict(zip(frames, evidence, strict=True))
-
-    def compare(
-        self, frames: Sequence[int], poses: np.ndarray, twists: np.ndarray, camera: np.ndarray
-    ) -> dict[int, ViewReport]:
-        """Agreement of one view per frame with the object's pose.
-
-        Frames whose camera has no image or no pose are left out.
-
-        Args:
-            poses: (T, 4, 4) master_from_object.
-            twists: (T, 6) motion per second.
-            camera: (T,) index of the camera.
-        """
-        place = {c: number for number, c in enumerate(self.cameras)}
-        shown = [t for t in frames if int(camera[t]) in place]
-
-        def report(t: int) -> ViewReport:
-            number = place[int(camera[t])]
-            kept = self._views.kept(t)
-            view = self._recording.view(t, number) if kept is None else kept[number]
-            seen = view.through(self._geometry[number])
-            return report_at(self._context, seen, poses[t], twists[t])
-
-        return dict(zip(shown, self._threads.map(report, shown), strict=True))
-
-    def _look(self, t: int, pose: np.ndarray, twist: np.ndarray) -> ImageEvidence:
-        views = [
-            view.through(geometry)
-            for view, geometry in zip(self._views(t), self._geometry, strict=True)
-        ]
-        found = evidence_at(self._context, views, pose, twist)
-        turns = free_turns(self.mesh, pose)
-        depth = without_turns(found.of_depth, found.depth_gradient, turns)
-        contour = without_turns(
-            found.information - found.of_depth, found.gradient - found.depth_gradient, turns
-        )
-        return ImageEvidence(
-            depth[0] + contour[0], depth[1] + contour[1], depth[0], depth[1], found.reports
-        )
-
-    def rays(self, place: np.ndarray) -> np.ndarray:
-        """Displacement (V, 3) of a point at ``place`` (3,) per metre of depth bias of each view."""
-        poses = np.array(
-            [
-                geometry.master_from_depth if geometry.camera.depth else geometry.master_from_colour
-                for geometry in self._geometry
-            ]
-        )
-        away = place - poses[:, :3, 3]
-        return away / (away * poses[:, :3, 2]).sum(axis=1, keepdims=True)
-
-    def centres(self) -> np.ndarray:
-        """Centres (V, 3) of the cameras, master frame."""
-        return np.array([geometry.master_from_colour[:3, 3] for geometry in self._geometry])
 
 
 @dataclass(frozen=True, eq=False)
 class _Form:
     """Quadratic form of a frame's evidence by the object's step, at the best error of the mesh."""
 
-    matrix: np.ndarray
-    """(6, 6) I - I K I."""
-    slope: np.ndarray
-    """(6,) gradient at the best error of the mesh."""
-    weight: float
-    """Robust weight of the evidence."""
-    mesh: np.ndarray
-    """(6, 6) K."""
-    gradient: np.ndarray
-    """(6,) weighted gradient without an error of the mesh."""
+    matrix: np.ndarray  # (6, 6) I - I K I
+    slope: np.ndarray  # (6,) gradient at the best error of the mesh
+    weight: float  # Robust weight of the evidence
+    mesh: np.ndarray  # (6, 6) K
+    gradient: np.ndarray  # (6,) weighted gradient without an error of the mesh
 
 
 @dataclass(frozen=True, eq=False)
 class _ByCameras:
     """The same form by the corrections of the frame's V views, D = 7 V."""
 
-    hessian: np.ndarray
-    """(D, D)."""
-    gradient: np.ndarray
-    """(D,)."""
-    cross: np.ndarray
-    """(6, D) with the object's step."""
+    hessian: np.ndarray  # (D, D)
+    gradient: np.ndarray  # (D,)
+    cross: np.ndarray  # (6, D) with the object's step
 
 
 class ObjectImagesData(JointTerm):
@@ -215,8 +111,10 @@ class ObjectImagesData(JointTerm):
     )
 
     def __init__(self, tracked: TrackedPoses, images: ObjectImages, share: float) -> None:
-        """``share`` is the share of an independent observation that a frame is."""
+        """``share`` is the weight of a frame as evidence of the cameras."""
         self._tracked, self._images, self._share = tracked, images, share
+        self._cameras = images.recording.cameras
+        self._geometry = list(images.recording.geometry)
         self._compared = rigid(tracked.rotation, tracked.translation)  # poses of the comparison
         self._matrix = tracked.information
         self._gradient = np.zeros((len(tracked.seen), 6))
@@ -226,17 +124,25 @@ class ObjectImagesData(JointTerm):
         self._noise = 1.0
 
     def take_cameras(self, cameras: Cameras) -> None:
-        """Use these cameras from the next :meth:`refresh` on."""
-        self._images.take_cameras(cameras)
+        """Use these poses and depth biases from the next :meth:`refresh` on."""
+        self._geometry = [
+            given.corrected(
+                cameras.rig[c], float(np.nan_to_num(cameras.depth_bias[c])), given.time_offset_s
+            )
+            for c, given in zip(self._cameras, self._geometry, strict=True)
+        ]
 
     def take_offsets(self, time_offset: np.ndarray) -> None:
         """Use these time offsets (C,), seconds, from the next :meth:`refresh` on."""
-        self._images.take_offsets(time_offset)
+        self._geometry = [
+            given.corrected(given.camera, given.depth_bias_m, float(time_offset[c]))
+            for c, given in zip(self._cameras, self._geometry, strict=True)
+        ]
 
     def refresh(self, state: State) -> None:
         """Compare the images with ``state``."""
         poses = rigid(state.rotation, state.translation)
-        self._evidence = self._look(poses)
+        self._evidence = self._compare_images(poses)
         self._agreeing = {
             t: evidence for t, evidence in self._evidence.items() if not _contradicts(evidence)
         }
@@ -248,19 +154,38 @@ class ObjectImagesData(JointTerm):
         self._by_cameras = {}
         for t, evidence in self._agreeing.items():
             self._compared[t] = poses[t]
-            self._take(t, evidence)
+            self._set_form(t, evidence)
 
     def contradicted(self, state: State) -> np.ndarray:
         """Mask (T,) of tracked frames whose images contradict the object's pose at ``state``."""
-        looked = self._look(rigid(state.rotation, state.translation))
-        wrong = np.zeros(len(state), bool)
-        wrong[[t for t, evidence in looked.items() if _contradicts(evidence)]] = True
-        return wrong
+        compared = self._compare_images(rigid(state.rotation, state.translation))
+        contradicted = np.zeros(len(state), bool)
+        contradicted[[t for t, evidence in compared.items() if _contradicts(evidence)]] = True
+        return contradicted
 
-    def _look(self, poses: np.ndarray) -> dict[int, ImageEvidence]:
-        """Evidence of the tracked frames at these poses (T, 4, 4)."""
-        frames = np.flatnonzero(self._tracked.seen).tolist()
-        return self._images.look(frames, poses, self._motion(poses))
+    def _compare_images(self, poses: np.ndarray) -> dict[int, ImageEvidence]:
+        """Evidence of the tracked frames about these poses (T, 4, 4)."""
+        frames, twists = np.flatnonzero(self._tracked.seen).tolist(), self._motion(poses)
+        evidence = self._images.threads.map(
+            lambda t: self._compare_frame(t, poses[t], twists[t]), frames
+        )
+        return dict(zip(frames, evidence, strict=True))
+
+    def _compare_frame(self, t: int, pose: np.ndarray, twist: np.ndarray) -> ImageEvidence:
+        """Evidence of frame ``t``; none for turns about the axes of a round object."""
+        views = [
+            view.through(geometry)
+            for view, geometry in zip(self._images.views(t), self._geometry, strict=True)
+        ]
+        full = evidence_at(self._images.context, views, pose, twist)
+        turns = free_turns(self._images.mesh, pose)
+        depth = without_turns(full.of_depth, full.depth_gradient, turns)
+        contour = without_turns(
+            full.information - full.of_depth, full.gradient - full.depth_gradient, turns
+        )
+        return ImageEvidence(
+            depth[0] + contour[0], depth[1] + contour[1], depth[0], depth[1], full.reports
+        )
 
     def _motion(self, poses: np.ndarray) -> np.ndarray:
         """Motion per second (T, 6) of the object through poses (T, 4, 4)."""
@@ -269,11 +194,11 @@ class ObjectImagesData(JointTerm):
         motion[tracked.resting] = 0
         return motion
 
-    def _take(self, t: int, evidence: ImageEvidence) -> None:
+    def _set_form(self, t: int, evidence: ImageEvidence) -> None:
         """Set the quadratic form of frame ``t``."""
         form = self._form(t, evidence.information.sum(0), evidence.gradient.sum(0))
         self._matrix[t], self._gradient[t] = form.matrix, form.slope
-        self._by_cameras[t] = self._seen_by(
+        self._by_cameras[t] = self._linearise_cameras(
             t, evidence, form.weight / self._noise, form.mesh, form.gradient
         )
 
@@ -287,14 +212,16 @@ class ObjectImagesData(JointTerm):
         freed = np.eye(6) - information @ mesh
         return _Form(freed @ information, freed @ gradient, weight, mesh, gradient)
 
-    def of_views(self, used: np.ndarray, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def linearise_views(
+        self, used: np.ndarray, state: State
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """E_O's matrix (T, 6, 6), gradient (T, 6) and energy (T,) at ``state`` of some views.
 
         ``used`` (T, C) masks the views; the images are those of the last :meth:`refresh`.
         """
         matrix, gradient = self._matrix.copy(), self._gradient.copy()
         for t, evidence in self._agreeing.items():
-            views = used[t, list(self._images.cameras)]
+            views = used[t, list(self._cameras)]
             form = self._form(
                 t, evidence.information[views].sum(0), evidence.gradient[views].sum(0)
             )
@@ -304,30 +231,45 @@ class ObjectImagesData(JointTerm):
     def compare(self, state: State, camera: np.ndarray) -> Iterator[tuple[int, int, ViewReport]]:
         """Agreement of one view of each tracked frame with ``state``: frame, camera, report.
 
-        ``camera`` (T,) names the views. The result of the last :meth:`refresh` stays.
+        ``camera`` (T,) is the index of the view's camera; a frame whose camera has no image or no
+        pose is left out. The result of the last :meth:`refresh` stays.
         """
-        poses = rigid(state.rotation, state.translation)
-        frames = np.flatnonzero(self._tracked.seen).tolist()
-        for t, report in self._images.compare(frames, poses, self._motion(poses), camera).items():
-            yield t, int(camera[t]), report
+        images, poses = self._images, rigid(state.rotation, state.translation)
+        twists = self._motion(poses)
+        place = {c: number for number, c in enumerate(self._cameras)}
+        frames = [t for t in np.flatnonzero(self._tracked.seen).tolist() if camera[t] in place]
+
+        def report(t: int) -> ViewReport:
+            number = place[int(camera[t])]
+            cached = images.views.kept(t)
+            view = images.recording.view(t, number) if cached is None else cached[number]
+            return report_at(
+                images.context, view.through(self._geometry[number]), poses[t], twists[t]
+            )
+
+        for t, result in zip(frames, images.threads.map(report, frames), strict=True):
+            yield t, int(camera[t]), result
 
     def reports(self) -> Iterator[tuple[int, int, ViewReport]]:
         """Agreement of all views at the last :meth:`refresh`: frame, camera, report."""
         for t, evidence in self._evidence.items():
-            for camera, report in zip(self._images.cameras, evidence.reports, strict=True):
+            for camera, report in zip(self._cameras, evidence.reports, strict=True):
                 yield t, camera, report
 
-    def _seen_by(
-        self,
-        t: int,
-        evidence: ImageEvidence,
-        weight: float,
-        mesh: np.ndarray,
-        gradient: np.ndarray,
+    def _linearise_cameras(
+        self, t: int, evidence: ImageEvidence, weight: float, mesh: np.ndarray, gradient: np.ndarray
     ) -> _ByCameras:
         """Form of frame ``t`` by the corrections of all views, at the best error of the mesh."""
         place = self._compared[t, :3, 3]
-        arms, rays = place - self._images.centres(), self._images.rays(place)
+        arms = place - np.array([g.master_from_colour[:3, 3] for g in self._geometry])
+        depth_poses = np.array(
+            [
+                g.master_from_depth if g.camera.depth else g.master_from_colour
+                for g in self._geometry
+            ]
+        )
+        away = place - depth_poses[:, :3, 3]
+        rays = away / (away * depth_poses[:, :3, 2]).sum(axis=1, keepdims=True)
         count = len(arms)
         steps = np.zeros((2, count, 6, FREEDOMS))  # A_v of silhouettes and of depth
         steps[:, :, :3, TURN] = np.eye(3)
@@ -363,16 +305,12 @@ class ObjectImagesData(JointTerm):
 
     def camera_evidence(self, state: State) -> CameraEvidence:
         """Evidence of the cameras at ``state``, of the last :meth:`refresh`."""
-        offset, count = self._offset(state), self._images.count
+        offset, size = self._offset(state), FREEDOMS * self._images.recording.count
         columns = np.concatenate(
-            [np.arange(FREEDOMS * c, FREEDOMS * (c + 1)) for c in self._images.cameras]
+            [np.arange(FREEDOMS * c, FREEDOMS * (c + 1)) for c in self._cameras]
         )
-        size = FREEDOMS * count
-        hessian, pull, cross = (
-            np.zeros((size, size)),
-            np.zeros(size),
-            np.zeros((len(offset), 6, size)),
-        )
+        hessian, pull = np.zeros((size, size)), np.zeros(size)
+        cross = np.zeros((len(offset), 6, size))
         for t, form in self._by_cameras.items():
             hessian[np.ix_(columns, columns)] += form.hessian
             pull[columns] += form.gradient + form.cross.T @ offset[t]

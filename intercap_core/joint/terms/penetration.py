@@ -1,18 +1,15 @@
-"""Body in object and object in body, beside equation 6 ("as done in PROX"), without a symbol.
+"""Body in object and object in body, besides equation 6 ("as done in PROX"), without a symbol.
 
-Equation 6 sums E_P of equation 5, the body's self-penetration, which is part of the body's data.
-The text adds "we also penalize the body-object interpenetration, as done in PROX". These two terms
-do that, against the moving object, and by distances to its mesh instead of a voxel grid. Both are
-weighed by the setting ``penetration_weight``.
+Equation 6 contains E_P of equation 5, the body's self-penetration, in the body's data; the text
+adds a penalty of body-object interpenetration, here by distances to the object's mesh:
 
     body in object:  E = sum over vertices v of the body inside the object (depth(v) - tolerance)^2
     object in body:  E = sum over vertices v of the hands of a_v (depth(x_v) - tolerance)^2
 
 x_v is the deepest of the object's points that lie nearest to v, and a_v the area of those that are
 inside. A rim or a thin handle lies between the body's sparse vertices: none of them is inside the
-object while its points are inside the body. The second term covers the hands alone: a seated
-person is in the seat by what clothes and flesh yield, and would be lifted off it. It leaves out
-vertices that are inside the object themselves, which the first term pushes out.
+object while its points are inside the body. The second term covers the hands alone, as a seated
+person is in the seat by what clothes and flesh yield. Setting ``penetration_weight``.
 """
 
 from __future__ import annotations
@@ -31,25 +28,13 @@ from intercap_core.joint.skin import VERTICES_PER_MEASUREMENT
 from intercap_core.joint.state import ALL, State
 from intercap_core.joint.terms.term import Data, Equation, JointTerm, TermContext
 
-# Standard deviation of a depth beyond the tolerance, metres. Tuned on the studio.
-PENETRATION_SIGMA = 0.003
-# Depth that costs nothing, metres: skin yields. Tuned on the studio.
-PENETRATION_TOLERANCE = 0.001
-# Spacing of the points on the object's surface, metres, so that a rim shows on a fingertip, and
-# their largest number.
-OBJECT_SPACING = 0.006
-MAX_OBJECT_POINTS = 6000
-# Area of the object inside the body that is one measurement, m^2: a hand's breadth of a handle.
-# Tuned on the studio.
-OBJECT_AREA_PER_MEASUREMENT = 1e-3
-# Distance of a skin sample to the object beyond which the skin around it has none of the object
-# inside, metres: half the spacing of samples, a thickness and the way of a round.
+PENETRATION_SIGMA = 0.003  # of a depth beyond the tolerance, metres; tuned on the studio
+PENETRATION_TOLERANCE = 0.001  # depth that costs nothing, metres: skin yields; tuned on the studio
+# Half the spacing of samples, a thickness and the motion of a round, m; tuned on the studio.
 NEAR_SKIN = 0.05
-# Depth beyond which points of the object are left out, metres: half of a hand's thickness
-# (anatomy). Beyond it the nearest skin may be that of the far side.
+# Half of a hand's thickness, m (anatomy): deeper points may be nearest to the skin of the far side.
 DEEPEST_IN_BODY = 0.015
-# Height above the skin up to which points may enter it during a round, metres. Tuned on the studio.
-WATCHED_OUTSIDE = 0.003
+WATCHED_OUTSIDE = 0.003  # metres above the skin: points that may enter during a round; tuned
 
 # Joints that carry the hands' skin.
 _HANDS = [
@@ -82,7 +67,6 @@ class Penetration(JointTerm):
         self._scale = weight / PENETRATION_SIGMA**2 / VERTICES_PER_MEASUREMENT
 
     def add(self, state: State, equations: BandedEquations) -> None:
-        """Add the depths at ``state``."""
         posed = self.geometry.at(state)
         near = posed.proximity
         depth = excess_depth(near.distance)
@@ -94,20 +78,15 @@ class Penetration(JointTerm):
 class EmbeddedPoints:
     """K points of the object inside one body's skin, or just outside."""
 
-    point: np.ndarray
-    """(K,) indices among the object's points."""
-    vertex: np.ndarray
-    """(K,) nearest vertex of the skin."""
-    normal: np.ndarray
-    """(K, 3) direction out of the body."""
-    distance: np.ndarray
-    """(K,) metres, negative inside."""
+    point: np.ndarray  # (K,) indices among the object's points
+    vertex: np.ndarray  # (K,) nearest vertex of the skin
+    normal: np.ndarray  # (K, 3) direction out of the body
+    distance: np.ndarray  # (K,) metres, negative inside
 
 
 def find_embedded(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> EmbeddedPoints:
     """Find points (N, 3) inside a piece of skin, or just outside.
 
-    Points deeper than ``DEEPEST_IN_BODY`` are left out: they may be behind the skin's far side.
     ``vertices`` (V, 3) and outward ``faces`` (F, 3) are the skin.
     """
     closest = DistanceField(vertices, faces).closest(points)
@@ -128,16 +107,11 @@ def find_embedded(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -
 class _DeepestPoints:
     """The deepest points of the object at K vertices of the body, in one frame or in T frames."""
 
-    vertex: np.ndarray
-    """(K,) of the body."""
-    local: np.ndarray
-    """(..., K, 3) points in the object's frame."""
-    normal: np.ndarray
-    """(..., K, 3) out of the body, master frame."""
-    beside: np.ndarray
-    """(..., K) n . (v - p): height of the vertex v above the nearest skin p along the normal n."""
-    share: np.ndarray
-    """(..., K) number of points that each stands for."""
+    vertex: np.ndarray  # (K,) of the body
+    local: np.ndarray  # (..., K, 3) points in the object's frame
+    normal: np.ndarray  # (..., K, 3) out of the body, master frame
+    offset: np.ndarray  # (..., K) n . (v - p): height of vertex v over the nearest skin p.
+    share: np.ndarray  # (..., K) number of points that each stands for
 
     @classmethod
     def none(cls, *frames: int, vertex: np.ndarray | None = None) -> _DeepestPoints:
@@ -145,11 +119,7 @@ class _DeepestPoints:
         vertex = np.zeros(0, int) if vertex is None else vertex
         shape = (*frames, len(vertex))
         return cls(
-            vertex,
-            np.zeros((*shape, 3)),
-            np.zeros((*shape, 3)),
-            np.zeros(shape),
-            np.zeros(shape),
+            vertex, np.zeros((*shape, 3)), np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape)
         )
 
 
@@ -176,17 +146,19 @@ class ObjectInBody(JointTerm):
         mesh = geometry.mesh
         a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
         area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
-        count = int(np.clip(area / OBJECT_SPACING**2, 1, MAX_OBJECT_POINTS))
+        # a point every 6 mm, so that a rim shows on a fingertip; at most 6,000
+        count = int(np.clip(area / 0.006**2, 1, 6000))
         samples = sample_surface(mesh.vertices, mesh.faces, count)
         self._points = samples.of(mesh.vertices, mesh.faces)
-        self._scale = weight / PENETRATION_SIGMA**2 * area / count / OBJECT_AREA_PER_MEASUREMENT
+        # 10 cm^2 are one measurement (tuned on the studio): a hand's breadth of a handle
+        self._scale = weight / PENETRATION_SIGMA**2 * area / count / 1e-3
         model = geometry.model
         self._faces = model.faces.cpu().numpy().astype(np.int64)
         template = model.template.double().cpu().numpy()
         carrier = model.skinning_weights.argmax(1).cpu().numpy()
         self._hands = np.isin(carrier, _HANDS)[geometry.skin.vertices]
         self._sample_of = cKDTree(template[geometry.skin.vertices]).query(template)[1]
-        self._held = _DeepestPoints.none(0)
+        self._deepest = _DeepestPoints.none(0)
 
     def refresh(self, state: State) -> None:
         """Search the object's points inside the hands."""
@@ -199,16 +171,18 @@ class ObjectInBody(JointTerm):
         by_frame = []
         for t in range(frames):
             faces = place[self._faces[near[t][self._sample_of[self._faces]].all(axis=1)]]
-            by_frame.append(self._search(t, state, skin[t], ids, faces, posed.skin[t, near[t]]))
-        vertex = np.unique(np.concatenate([found.vertex for found in by_frame]))
-        held = _DeepestPoints.none(frames, vertex=vertex)
-        for t, found in enumerate(by_frame):
-            at = np.searchsorted(vertex, found.vertex)
-            held.local[t, at], held.normal[t, at] = found.local, found.normal
-            held.beside[t, at], held.share[t, at] = found.beside, found.share
-        self._held = held
+            by_frame.append(
+                self._search_frame(t, state, skin[t], ids, faces, posed.skin[t, near[t]])
+            )
+        vertex = np.unique(np.concatenate([frame.vertex for frame in by_frame]))
+        deepest = _DeepestPoints.none(frames, vertex=vertex)
+        for t, frame in enumerate(by_frame):
+            at = np.searchsorted(vertex, frame.vertex)
+            deepest.local[t, at], deepest.normal[t, at] = frame.local, frame.normal
+            deepest.offset[t, at], deepest.share[t, at] = frame.offset, frame.share
+        self._deepest = deepest
 
-    def _search(
+    def _search_frame(
         self,
         t: int,
         state: State,
@@ -252,15 +226,15 @@ class ObjectInBody(JointTerm):
 
     def add(self, state: State, equations: BandedEquations) -> None:
         """Add the depths at ``state`` of the points of the last :meth:`refresh`."""
-        posed, held = self.geometry.at(state), self._held
-        points = held.local @ state.rotation.transpose(0, 2, 1) + state.translation[:, None]
-        skin = posed.posed(held.vertex) if len(held.vertex) else points
-        residual = excess_depth(((points - skin) * held.normal).sum(axis=2) + held.beside)
-        weight = np.where(residual < 0, held.share, 0.0) * self._scale
+        posed, deepest = self.geometry.at(state), self._deepest
+        points = deepest.local @ state.rotation.transpose(0, 2, 1) + state.translation[:, None]
+        skin = posed.posed(deepest.vertex) if len(deepest.vertex) else points
+        residual = excess_depth(((points - skin) * deepest.normal).sum(axis=2) + deepest.offset)
+        weight = np.where(residual < 0, deepest.share, 0.0) * self._scale
 
         def rows(frames: slice, index: np.ndarray) -> np.ndarray:
-            normals = held.normal[frames, index]
-            by_body = posed.vertices_by_body(frames, held.vertex[index], -normals[:, :, None])
+            normals = deepest.normal[frames, index]
+            by_body = posed.vertices_by_body(frames, deepest.vertex[index], -normals[:, :, None])
             by_object = along_by_object(points[frames, index], normals, state.translation[frames])
             return np.concatenate([by_body, by_object[:, :, None]], axis=3)
 

@@ -19,26 +19,13 @@ from intercap_core.joint.state import BODY, State
 from intercap_core.joint.terms.term import Equation, JointTerm, TermContext
 from intercap_core.schemas import CONTACT_REGIONS
 
-# Creep of a sole: a random walk, metres in one second. Tuned on the studio.
-PLANT_WALK = 0.003
-# Slip that counts a quarter, m/s: above the jitter of the fits. Tuned on the studio.
-PLANT_OUTLIER = 0.15
-# Vertices that represent each half of a sole, at most: they move nearly as one.
-SOLE_VERTICES = 6
-# Standard deviations of speed, m/s, and height above the floor, metres, of a part of a sole that
-# stands, after errors of the fits, and of one that swings. Tuned on the studio.
-STANDING_SPEED = 0.06
-SWING_SPEED = 0.6
-STANDING_HEIGHT = 0.02
-SWING_HEIGHT = 0.15
-# Share of standing soles that stand on something else than the floor. Tuned on the studio.
-STANDING_ELSEWHERE = 0.2
+PLANT_WALK = 0.003  # creep of a sole: a random walk, metres in one second; tuned on the studio
+PLANT_OUTLIER = 0.15  # slip that counts a quarter, m/s, above the fits' jitter; tuned on the studio
 
 _SOLES = tuple(
     JOINT_INDEX[f"{side}_{name}"] for side in ("left", "right") for name in ("ankle", "foot")
 )
-# A sole that swings comes to stand 0.18 times a second, and stands for a second. Tuned on the
-# studio.
+# A swinging sole comes to stand 0.18 times per second, and stands for 0.98 s. Tuned on the studio.
 _STANDING = DwellChain(begins=0.18, durations=(0.98,), shares=(1.0,))
 
 
@@ -60,9 +47,9 @@ def sole_parts(patches: Patches, count: int) -> list[np.ndarray]:
 def standing_probability(sole: np.ndarray, height: np.ndarray | None, fps: float) -> np.ndarray:
     """Probability (T - 1,) that a part of a sole stands from each frame to the next.
 
-    Posterior of a two-state chain with half-normal speeds and normal heights. A standing sole is on
-    the floor, or on something of any height that a foot reaches (a beam, a step), where only the
-    speed is informative.
+    Posterior of a two-state chain with half-normal speeds and heights, of 0.06 m/s and 20 mm while
+    the sole stands, 0.6 m/s and 150 mm while it swings. One standing sole in five is not on the
+    floor but on a beam or a step, where only the speed is informative. All are tuned on the studio.
 
     Args:
         sole: (T, S, 3) vertices, metres.
@@ -71,13 +58,11 @@ def standing_probability(sole: np.ndarray, height: np.ndarray | None, fps: float
     if len(sole) < 2:
         return np.zeros(0)
     speed = np.linalg.norm(np.diff(sole, axis=0), axis=2).mean(1) * fps
-    odds = _log_ratio(speed, STANDING_SPEED, SWING_SPEED)
+    odds = _log_ratio(speed, 0.06, 0.6)
     if height is not None:
         low = np.abs(height).mean(1)
-        on_floor = _log_ratio(np.maximum(low[1:], low[:-1]), STANDING_HEIGHT, SWING_HEIGHT)
-        odds = odds + np.logaddexp(
-            np.log1p(-STANDING_ELSEWHERE) + on_floor, np.log(STANDING_ELSEWHERE)
-        )
+        on_floor = _log_ratio(np.maximum(low[1:], low[:-1]), 0.02, 0.15)
+        odds = odds + np.logaddexp(np.log1p(-0.2) + on_floor, np.log(0.2))
     return _STANDING.posterior(odds[:, None], fps)[:, 0]
 
 
@@ -102,7 +87,7 @@ class Plant(JointTerm):
         super().__init__(context)
         self._floor, self._fps = context.floor, context.fps
         self._scale = context.settings.plant_weight * context.fps / PLANT_WALK**2
-        parts = sole_parts(self.geometry.patches, SOLE_VERTICES)
+        parts = sole_parts(self.geometry.patches, 6)  # vertices that move nearly as one
         self._parts = [self.geometry.skin.patch[part] for part in parts]
         self._index = np.concatenate([np.zeros(0, int), *self._parts])  # (K,) of the skin samples
         self._weight = np.zeros((0, len(self._index)))  # (T - 1, K)

@@ -21,20 +21,10 @@ from intercap_core.joint.terms.contact import Contact
 from intercap_core.joint.terms.term import Data, Equation, JointTerm, TermContext
 from intercap_core.schemas import CONTACT_REGIONS
 
-# Creep of a grip: a random walk, metres in one second. Tuned on the studio.
-STICK_WALK = 0.003
-# Slip that counts a quarter, m/s: above the jitter of the fits. Tuned on the studio.
-STICK_OUTLIER = 0.15
-# Way over the object that counts a quarter, metres, and the time over which it is measured,
-# seconds: jitter averages to zero displacement, a sliding contact does not. Tuned on the studio.
-GLIDE_M = 0.02
-GLIDE_S = 0.4
-# Probability below which a patch does not hold the object. Tuned on the studio.
-LEAST_HOLD = 0.02
-# Share of the largest probability of a patch's vertices above which a vertex represents it.
-NEAR_LARGEST = 0.1
-# Vertices that represent a patch, at most: they move nearly as one.
-STICK_VERTICES = 24
+STICK_WALK = 0.003  # creep of a grip: a random walk, metres in one second; tuned on the studio
+STICK_OUTLIER = 0.15  # slip that counts a quarter, m/s, above the fits' jitter; tuned on the studio
+NEAR_LARGEST = 0.1  # share of a patch's largest probability: its vertices represent it; tuned
+STICK_VERTICES = 24  # that represent a patch: they move nearly as one; tuned on the studio
 
 # Hands grip and soles stand; what sits or leans glides as it settles.
 _GRIPPING = [i for i, name in enumerate(CONTACT_REGIONS) if name.endswith(("_hand", "_foot"))]
@@ -89,7 +79,7 @@ class Stick(JointTerm):
 
         The vertices that hold it most represent their patch, with the weight of all of it.
         """
-        holds = self._contact.holding()
+        holds = self._contact.holding_probability()
         both = np.minimum(holds[1:], holds[:-1])
         patch = self.geometry.patches.patch
         if self._steady is None:
@@ -99,7 +89,7 @@ class Stick(JointTerm):
         for number in np.unique(patch[self._grips]):
             members = np.flatnonzero(patch == number)
             own = both[:, members]
-            if own.sum(axis=1).max(initial=0.0) > LEAST_HOLD:
+            if own.sum(axis=1).max(initial=0.0) > 0.02:  # probability; tuned on the studio
                 some, weight = _representatives(own)
                 kept.append(members[some])
                 weights.append(weight)
@@ -107,14 +97,18 @@ class Stick(JointTerm):
         self._weight = np.concatenate(weights, axis=1) * self._scale
 
     def _weigh_glides(self, state: State) -> np.ndarray:
-        """Weights (T - 1, M) of the patch vertices by their way over the object around a step."""
+        """Weights (T - 1, M) of patch vertices by their displacement over the object in 0.4 s.
+
+        Jitter averages to zero displacement, a sliding contact does not. 20 mm count a quarter.
+        Both are tuned on the studio.
+        """
         points = self.geometry.at(state).skin[:, self.geometry.skin.patch]
         local = local_points(points, state.rotation, state.translation)
-        half = max(1, round(GLIDE_S * self._fps / 2))
+        half = max(1, round(0.4 * self._fps / 2))
         step = np.arange(max(len(state) - 1, 0))
         before, after = np.maximum(step - half + 1, 0), np.minimum(step + half, len(state) - 1)
         way = np.square(local[after] - local[before]).sum(axis=2)
-        return geman_mcclure_weight(way, GLIDE_M)
+        return geman_mcclure_weight(way, 0.02)
 
     def add(self, state: State, equations: BandedEquations) -> None:
         """Add the slip of the vertices of the last :meth:`refresh`."""

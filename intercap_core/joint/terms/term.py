@@ -1,7 +1,7 @@
 """Base class of the terms of the joint energy, and rows that several terms add alike.
 
-A term is a class in a file of this package. It states its equation and its settings, and stands in
-``TERMS`` of :mod:`intercap_core.joint.problem`. ``docs/extending.md`` shows a complete example.
+A term states its equation and its settings, and is listed in ``TERMS`` of
+:mod:`intercap_core.joint.problem`. ``docs/extending.md`` shows a complete example.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Equation:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TermContext:
-    """What terms are built from: the start of the fit, and what is known of the recording."""
+    """Inputs of the terms' constructors: start of the fit, settings, data of the recording."""
 
     geometry: Geometry
     """Meshes of body and object; terms share one instance."""

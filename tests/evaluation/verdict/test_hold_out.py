@@ -123,7 +123,7 @@ def test_one_step_agrees_with_an_iterated_refit(capture: fitted.Capture, held: H
                     if term is not assembly.body and term is not assembly.object_:
                         term.add(state, equations)
                 for columns, data in ((BODY, assembly.body), (OBJECT, assembly.object_)):
-                    equations.add_blocks(data.name, columns, *data.of_views(used, state))
+                    equations.add_blocks(data.name, columns, *data.linearise_views(used, state))
                 step = equations.step(np.full(len(state), 1e-6))
                 assert step is not None
                 state = state.moved(limited(step))

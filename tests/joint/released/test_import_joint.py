@@ -25,7 +25,7 @@ MEASURED = ("frames", "scene", "detections", "person", "object_track", "body_fit
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
+def capture(tmp_path_factory) -> fitted.Capture:
     made = fitted.make_capture(tmp_path_factory.mktemp("ours"), name=NAME)
     _measure(made)
     return made
@@ -43,7 +43,7 @@ def _measure(capture: fitted.Capture) -> None:
 
 
 @pytest.fixture(scope="module")
-def results(capture: fitted.Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def results(capture, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("export") / "files"
     export.run(
         paths=capture.inputs(*STAGES["export"].reads),
@@ -68,17 +68,13 @@ def _import(capture: fitted.Capture, results: Path, folder: Path) -> fitted.Capt
 
 
 @pytest.fixture(scope="module")
-def imported(
-    capture: fitted.Capture, results: Path, tmp_path_factory: pytest.TempPathFactory
-) -> fitted.Capture:
+def imported(capture, results, tmp_path_factory) -> fitted.Capture:
     made = _import(capture, results, tmp_path_factory.mktemp("theirs"))
     _measure(made)
     return made
 
 
-def test_bodies_and_objects_are_those_of_the_file(
-    capture: fitted.Capture, imported: fitted.Capture
-) -> None:
+def test_bodies_and_objects_equal_those_of_the_file(capture, imported):
     with (
         artefacts.read(capture.paths["joint"], JOINT) as ours,
         artefacts.read(imported.paths["joint"], JOINT) as theirs,
@@ -96,9 +92,7 @@ def test_bodies_and_objects_are_those_of_the_file(
     assert line("joint", imported.paths["joint"]).startswith("made by another program")
 
 
-def test_metrics_measure_them_and_state_no_error(
-    capture: fitted.Capture, imported: fitted.Capture
-) -> None:
+def test_metrics_are_those_of_our_fit_without_a_verdict(capture, imported):
     ours, theirs = (SequenceMetrics.read(c.paths["metrics"]) for c in (capture, imported))
     assert (ours.made_by, theirs.made_by) == ("", "another program: res.pkl")
     assert not any(key.startswith("verdict/") for key in theirs.values)
@@ -106,7 +100,7 @@ def test_metrics_measure_them_and_state_no_error(
         assert theirs.values[key] == pytest.approx(ours.values[key], abs=1e-5), key
 
 
-def test_report_and_viewer_say_whose_they_are(imported: fitted.Capture, tmp_path: Path) -> None:
+def test_report_names_the_other_program(imported, tmp_path):
     out = write_site({NAME: imported}, tmp_path / "site")
     overview = (out / "site" / "index.html").read_text()
     page = (out / "site" / "sequences" / NAME / "index.html").read_text()
@@ -115,14 +109,12 @@ def test_report_and_viewer_say_whose_they_are(imported: fitted.Capture, tmp_path
     assert "1 sequences have results of another program" in (out / "card.md").read_text()
 
 
-def test_gaps_are_filled_and_flagged(
-    capture: fitted.Capture, results: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    found = pickle.loads((results / "res.pkl").read_bytes())
-    del found["about"], found["left_hand_pose_axis_angle"], found["right_hand_pose_axis_angle"]
-    found["transl"][1] = np.nan
-    found["betas"][3] += 3.0
-    (tmp_path / "theirs.pkl").write_bytes(pickle.dumps(found))
+def test_gaps_are_filled_and_flagged(capture, results, tmp_path, caplog):
+    values = pickle.loads((results / "res.pkl").read_bytes())
+    del values["about"], values["left_hand_pose_axis_angle"], values["right_hand_pose_axis_angle"]
+    values["transl"][1] = np.nan
+    values["betas"][3] += 3.0
+    (tmp_path / "theirs.pkl").write_bytes(pickle.dumps(values))
     with caplog.at_level(logging.WARNING):
         made = _import(capture, tmp_path / "theirs.pkl", tmp_path)
     assert "varies by frame" in caplog.text
@@ -140,18 +132,16 @@ def _left_hand(capture: fitted.Capture) -> np.ndarray:
         return ours["left_hand_pose"]
 
 
-def test_results_of_another_recording_are_refused(
-    capture: fitted.Capture, results: Path, tmp_path: Path
-) -> None:
-    found = pickle.loads((results / "res.pkl").read_bytes())
+def test_results_of_another_recording_are_refused(capture, results, tmp_path):
+    values = pickle.loads((results / "res.pkl").read_bytes())
     short = {
-        key: value[:3] if len(value) == 5 else value for key, value in found.items()
+        key: value[:3] if len(value) == 5 else value for key, value in values.items()
         if key != "about"
-    } | {"body_pose": found["body_pose"][:, : 63 * 3]}  # fmt: skip
+    } | {"body_pose": values["body_pose"][:, : 63 * 3]}  # fmt: skip
     (tmp_path / "res.pkl").write_bytes(pickle.dumps(short))
     with pytest.raises(UserError, match="holds 3 frames, sequence 's01_o03' has 5"):
         _import(capture, tmp_path, tmp_path)
-    many = found | {"betas": np.zeros((5, 600))}
+    many = values | {"betas": np.zeros((5, 600))}
     (tmp_path / "res.pkl").write_bytes(pickle.dumps(many))
     with pytest.raises(UserError, match="600"):
         _import(capture, tmp_path, tmp_path)

@@ -12,7 +12,7 @@ from intercap_core.body.loading import load_body_file
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import NUM_POSE, TRANSL
 from intercap_core.formats.released import Skin
-from intercap_core.joint.released.surface_fit import _Problem, _Rows, fit_surfaces
+from intercap_core.joint.released.surface_fit import _Planes, _Problem, fit_surfaces
 from tests.helpers.bodies import random_normal
 
 PLAIN, CORRECTED = False, True  # with pose blend shapes, as licensed files have them
@@ -38,19 +38,19 @@ def _vectors(model: BodyModel, count: int, dtype: torch.dtype) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("corrected", [PLAIN, CORRECTED])
-def test_the_gradient_is_that_of_the_cost(corrected: bool) -> None:
+def test_the_gradient_is_that_of_the_cost(corrected: bool):
     model = _model(corrected, torch.float64)
     base = _vectors(model, 2, torch.float64)
     columns = torch.tensor([i for i in range(TRANSL.stop) if not 66 <= i < 75])
     ids = np.arange(0, model.num_vertices, 97)
     sizes = (2, len(ids), 2)
     normal = torch.nn.functional.normalize(random_normal(*sizes, 3, seed=4), dim=3)
-    rows = _Rows(normal, random_normal(*sizes, seed=5), random_normal(*sizes, seed=6).abs())
+    planes = _Planes(normal, random_normal(*sizes, seed=5), random_normal(*sizes, seed=6).abs())
     own, shared = base[:, columns], base[0, TRANSL.stop : TRANSL.stop + 10]
     about = own + 0.1 * random_normal(*own.shape, seed=7)
     stiffness = random_normal(len(columns), seed=8).abs()
     shape = slice(TRANSL.stop, TRANSL.stop + 10)
-    problem = _Problem(model, ids, columns, shape, base, about, stiffness, rows)
+    problem = _Problem(model, ids, columns, shape, base, about, stiffness, planes)
     every = torch.arange(2)
     found = problem.linearise(own, shared, every)
     assert found.cost == pytest.approx(problem.cost(own, shared, every))
@@ -66,7 +66,7 @@ def test_the_gradient_is_that_of_the_cost(corrected: bool) -> None:
 
 
 @pytest.mark.parametrize("corrected", [PLAIN, CORRECTED])
-def test_a_surface_of_the_body_itself_is_found_again(corrected: bool) -> None:
+def test_a_surface_of_the_body_itself_is_found_again(corrected: bool):
     model = _model(corrected, torch.float32)
     true = _vectors(model, 2, torch.float32)
     with torch.no_grad():
