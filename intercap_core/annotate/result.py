@@ -121,8 +121,8 @@ def _data_of_page(opened: Opened) -> str:
     if record is None or not script.is_file():
         return ""
     for stage, identity in record.artefacts.items():
-        own = read_manifest(opened.paths[stage]) if opened.has(stage) else None
-        if own is None or own.fingerprint != identity:
+        made = read_manifest(opened.paths[stage]) if opened.has(stage) else None
+        if made is None or made.fingerprint != identity:
             return ""
     _, called, data = script.read_text(encoding="utf-8").rpartition(_CALL)
     return data.partition('"')[0] if called else ""

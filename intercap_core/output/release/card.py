@@ -173,8 +173,8 @@ def _records(table: pd.DataFrame) -> list[dict[str, Any]]:
     columns = ["sequences", "frames", "minutes", "contact_percent", "flagged_percent"]
     rows = []
     for row in table.to_dict("records"):
-        own = {str(table.columns[0]): row[table.columns[0]]}
-        rows.append(own | {name: _plain(row[name]) for name in columns if name in row})
+        group = {str(table.columns[0]): row[table.columns[0]]}
+        rows.append(group | {name: _plain(row[name]) for name in columns if name in row})
     return rows
 
 
@@ -238,12 +238,9 @@ def _split_to_json(
 ) -> dict[str, Any]:
     entries: dict[str, Any] = {"why_not": split_.why}
     for part, groups in (("train", split_.train), ("test", split_.test)):
-        own = [s for s in measured if getattr(s, attribute) in groups]
-        entries[part] = {
-            "groups": list(groups),
-            "sequences": len(own),
-            "frames": sum(len(s) for s in own),
-        }
+        members = [s for s in measured if getattr(s, attribute) in groups]
+        frames = sum(len(s) for s in members)
+        entries[part] = {"groups": list(groups), "sequences": len(members), "frames": frames}
     return entries
 
 

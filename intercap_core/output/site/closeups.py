@@ -226,9 +226,9 @@ def _forearm_faces(model: BodyModel) -> np.ndarray:
         for name, index in JOINT_INDEX.items()
         if name.endswith(("_elbow", "_wrist")) or index >= JOINT_INDEX["left_index1"]
     ]
-    own = np.isin(model.skinning_weights.cpu().numpy().argmax(1), parts)
+    shown = np.isin(model.skinning_weights.cpu().numpy().argmax(1), parts)
     faces = model.faces.cpu().numpy()
-    return faces[own[faces].all(1)]
+    return faces[shown[faces].all(1)]
 
 
 def _viewpoints(

@@ -117,9 +117,8 @@ def gather(paths: SequencePaths, models: SequenceModels, *, truth: Path | None =
             clouds = read_clouds(images, rig, bias, image_of, paths)
             _add_clouds(content, clouds, shown, objects, moments, zup)
         if truth is not None and truth.is_file():
-            vertices_of = shown.model.num_vertices
-            true = Truth.load(truth, images.time_s, images.fps, vertices_of)
-            _add_truth(content, true, zup)
+            count = shown.model.num_vertices
+            _add_truth(content, Truth.load(truth, images.time_s, images.fps, count), zup)
     return content
 
 
