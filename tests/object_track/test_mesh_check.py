@@ -56,7 +56,10 @@ def squares(tmp_path_factory):
     folder = tmp_path_factory.mktemp("size")
     shape = (4, RIG[0].depth.height, RIG[0].depth.width)
     wall = np.full(shape, round(AWAY_M * 1000), np.uint16)
-    frames = write_frames(folder / "frames.h5", RIG, num_sets=4, depths=[wall, wall])
+    images = [[b"not read"] * 4] * 2
+    frames = write_frames(
+        folder / "frames.h5", RIG, num_sets=4, depths=[wall, wall], colours=images
+    )
     x, y = 900, 500
     corners = [x, y, x + SIDE_PX, y, x + SIDE_PX, y + SIDE_PX, x, y + SIDE_PX]
     square = {"category_name": "cup", "score": 1.0, "segmentation": [corners]}
