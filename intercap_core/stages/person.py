@@ -17,7 +17,7 @@ from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import (
     FROM_DETECTOR,
     FROM_IMAGES,
-    NOBODY_LOOKED,
+    NOT_SEGMENTED,
     Detections,
 )
 from intercap_core.formats.recordings.frames import Frames
@@ -223,9 +223,9 @@ def _write(output: Path, detections: Detections, result: _Result, settings: Pers
     subject, points = result.subject, result.points
     masks, beside = list(result.masks), list(result.beside)
     sets, views = subject.people.shape
-    mask_source = np.where(detections.candidates_found, FROM_DETECTOR, NOBODY_LOOKED)
+    mask_source = np.where(detections.candidates_found, FROM_DETECTOR, NOT_SEGMENTED)
     if settings.segmentation == "images":
-        mask_source[:] = NOBODY_LOOKED
+        mask_source[:] = NOT_SEGMENTED
         masks, beside = [b""] * len(masks), [b""] * len(masks)
     candidates: list[list[ImageCandidate]] = [[] for _ in masks]
     for (t, c), segments in result.segmented.items():

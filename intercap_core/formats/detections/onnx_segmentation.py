@@ -12,10 +12,10 @@ model's grid, and only within the box.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from collections.abc import Hashable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -44,113 +44,32 @@ from intercap_core.inputs.files import quoted
 MAX_INSTANCES = 100  # of one image, as in COCO's evaluation
 
 
-def decode_yolo(
-    rows: np.ndarray,
-    prototypes: np.ndarray,
-    fit: Fit,
-    input_size: tuple[int, int],
-    *,
-    min_score: float,
-    names: Mapping[int, str],
-) -> list[Instance]:
-    """Instances of a YOLO-seg export.
+class _Region(NamedTuple):
+    """A detected box with the grid that holds its mask."""
 
-    ``rows`` are (4 + classes + M, N) of box (middle, width, height), class scores and M
-    coefficients; or (N, 6 + M) of corners, score, class and coefficients, if the model itself
-    suppresses overlaps. ``prototypes`` (M, h, w) cover the whole input. Raises ValueError if the
-    rows have neither shape.
-    """
-    count = len(prototypes)
-    ends_itself = rows.shape[1] == 6 + count
-    if not ends_itself:
-        rows = rows.T
-        if rows.shape[1] < 5 + count:
-            raise ValueError(f"{rows.shape[1]} columns are too few for {count} prototypes")
-    coefficients = rows[:, -count:]
-    if ends_itself:
-        corners, scores, classes = rows[:, :4], rows[:, 4], rows[:, 5].astype(int)
-        kept = np.flatnonzero(scores >= min_score)
-        kept = kept[np.argsort(-scores[kept], kind="stable")]
-    else:
-        by_class = rows[:, 4:-count]
-        classes = by_class.argmax(1)
-        scores = by_class[np.arange(len(rows)), classes]
-        half = rows[:, 2:4] / 2
-        corners = np.concatenate([rows[:, :2] - half, rows[:, :2] + half], 1)
-        kept = np.flatnonzero(scores >= min_score)
-        kept = kept[suppress_overlaps(corners[kept], scores[kept], classes[kept])]
-    kept = kept[:MAX_INSTANCES]
-    boxes = fit.to_image(corners[kept])
-    logits = np.tensordot(coefficients[kept], prototypes, 1)
-    steps = input_size[0] / prototypes.shape[2], input_size[1] / prototypes.shape[1]
-    # Image to grid, in pixel edges: (image * scale + shift) / step
-    across = (fit.scale[0] / steps[0], fit.left / steps[0])
-    down = (fit.scale[1] / steps[1], fit.top / steps[1])
-    instances = []
-    for k, box, logit in zip(kept.tolist(), boxes, logits, strict=True):
-        label = names.get(int(classes[k]), f"category {int(classes[k])}")
-        score = float(scores[k])
-        instances.append(_instance(label, score, box, logit, across, down, fit.size, 0.0))
-    return [instance for instance in instances if instance is not None]
+    number: int
+    """Number of the class."""
+    score: float
+    """From 0 to 1."""
+    box: np.ndarray
+    """(4,) two corners in the image, px."""
+    grid: np.ndarray
+    """(h, w) mask as logits (YOLO) or probabilities (R-CNN)."""
+    across: tuple[float, float]
+    """Scale and shift of x from the image's to the grid's pixel edges."""
+    down: tuple[float, float]
+    """The same of y."""
 
 
-def decode_rcnn(
-    corners: np.ndarray,
-    classes: np.ndarray,
-    scores: np.ndarray,
-    probabilities: np.ndarray,
-    fit: Fit,
-    input_size: tuple[int, int],
-    *,
-    min_score: float,
-    names: Mapping[int, str],
-) -> list[Instance]:
-    """Instances of a Mask R-CNN or PointRend export; see :func:`decode_yolo`.
-
-    ``corners`` (N, 4), ``classes`` (N,) and ``scores`` (N,). The masks' ``probabilities`` (N, h, w)
-    are over the whole input if they have its size, else over the box.
-    """
-    kept = np.flatnonzero(scores >= min_score)
-    kept = kept[np.argsort(-scores[kept], kind="stable")][:MAX_INSTANCES]
-    whole = probabilities.shape[1:] == input_size[::-1]
-    boxes = fit.to_image(corners[kept])
-    instances = []
-    for k, box in zip(kept.tolist(), boxes, strict=True):
-        mask = probabilities[k].astype(np.float32)
-        if whole:
-            across, down = (fit.scale[0], float(fit.left)), (fit.scale[1], float(fit.top))
-        else:
-            x0, y0, x1, y1 = (
-                (float(v) - shift) / scale
-                for v, shift, scale in zip(
-                    corners[k], (fit.left, fit.top) * 2, fit.scale * 2, strict=True
-                )
-            )
-            if not (x1 - x0 > 0 and y1 - y0 > 0):
-                continue
-            height, width = mask.shape
-            across = (width / (x1 - x0), -x0 * width / (x1 - x0))
-            down = (height / (y1 - y0), -y0 * height / (y1 - y0))
-        label = names.get(int(classes[k]), f"category {int(classes[k])}")
-        instances.append(_instance(label, float(scores[k]), box, mask, across, down, fit.size, 0.5))
-    return [instance for instance in instances if instance is not None]
-
-
-def _instance(
-    label: str,
-    score: float,
-    box: np.ndarray,
-    grid: np.ndarray,
-    across: tuple[float, float],
-    down: tuple[float, float],
-    size: tuple[int, int],
-    threshold: float,
+def _make_instance(
+    region: _Region, label: str, size: tuple[int, int], threshold: float
 ) -> Instance | None:
-    """The instance of the pixels in ``box`` (x0, y0, x1, y1) where ``grid`` (h, w) > threshold.
+    """The instance of the pixels in the region's box whose grid exceeds the threshold.
 
-    ``across`` and ``down`` are scale and shift from the image's to the grid's pixel edges. The
-    box of the result is that of its mask. None if no pixel is set.
+    The box of the result is that of its mask. None if no pixel is set. ``size``: width and height
+    of the image.
     """
+    _, score, box, grid, across, down = region
     if not np.isfinite(box).all():
         return None
     x0, y0 = int(np.floor(box[0])), int(np.floor(box[1]))
@@ -222,7 +141,6 @@ class Segmenter:
 
     def __init__(self, model: OnnxModel, kind: _Kind, min_score: float) -> None:
         self._model, self._kind, self._min_score = model, kind, min_score
-        self._read: Callable[..., list[Instance]] = self._yolo if kind.yolo else self._rcnn
 
     @classmethod
     def load(cls, settings: DetectionsSettings) -> Segmenter:
@@ -292,45 +210,96 @@ class Segmenter:
         images = np.stack([values for _, _, values in waiting])
         outputs = self._model.run(images)
         size = (images.shape[3], images.shape[2])
+        decode = self._decode_yolo if self._kind.yolo else self._decode_rcnn
         for index, (key, fit, _) in enumerate(waiting):
-            yield key, self._read(outputs, index, fit, size)
+            instances = []
+            for region in decode(outputs, index, fit, size):
+                if region.score > MAX_SCORE:
+                    raise UserError(
+                        f"{self._model.path}: gives scores up to {region.score:.4g}, expected 0 "
+                        "to 1; export it with its last activation"
+                    )
+                label = self._kind.names.get(region.number, f"category {region.number}")
+                threshold = 0.0 if self._kind.yolo else 0.5
+                instances.append(_make_instance(region, label, fit.size, threshold))
+            yield key, [instance for instance in instances if instance is not None]
 
-    def _yolo(
+    def _decode_yolo(
         self, outputs: list[np.ndarray], index: int, fit: Fit, size: tuple[int, int]
-    ) -> list[Instance]:
+    ) -> Iterator[_Region]:
+        """Regions of image ``index`` in the outputs of a YOLO-seg, best first.
+
+        Rows are (4 + classes + M, N) of box (middle, width, height), class scores and M
+        coefficients; or (N, 6 + M) of corners, score, class and coefficients, if the model itself
+        suppresses overlaps. Prototypes (M, h, w) cover the whole input.
+        """
         rows, prototypes = (outputs[self._kind.outputs[k]] for k in ("rows", "prototypes"))
         shaped = rows.ndim == 3 and prototypes.ndim == 4 and min(len(rows), len(prototypes)) > index
         if not shaped or not _is_grid(prototypes.shape[2:]) or not prototypes.shape[1]:
             raise _unknown(self._model, [str(list(v.shape)) for v in outputs])
-        self._check_numbers(rows[index], prototypes[index])
-        score, names = self._min_score, self._kind.names
-        try:
-            instances = decode_yolo(
-                rows[index], prototypes[index], fit, size, min_score=score, names=names
-            )
-        except ValueError:
-            raise _unknown(self._model, [str(list(v.shape)) for v in outputs]) from None
-        return self._plausible(instances)
+        rows, prototypes = rows[index], prototypes[index]
+        self._check_numbers(rows, prototypes)
+        count = len(prototypes)
+        ends_itself = rows.shape[1] == 6 + count
+        rows = rows if ends_itself else rows.T
+        coefficients = rows[:, -count:]
+        if ends_itself:
+            corners, scores, classes = rows[:, :4], rows[:, 4], rows[:, 5].astype(int)
+            kept = np.flatnonzero(scores >= self._min_score)
+            kept = kept[np.argsort(-scores[kept], kind="stable")]
+        elif rows.shape[1] < 5 + count:
+            raise _unknown(self._model, [str(list(v.shape)) for v in outputs])
+        else:
+            by_class = rows[:, 4:-count]
+            classes = by_class.argmax(1)
+            scores = by_class[np.arange(len(rows)), classes]
+            half = rows[:, 2:4] / 2
+            corners = np.concatenate([rows[:, :2] - half, rows[:, :2] + half], 1)
+            kept = np.flatnonzero(scores >= self._min_score)
+            kept = kept[suppress_overlaps(corners[kept], scores[kept], classes[kept])]
+        kept = kept[:MAX_INSTANCES]
+        boxes = fit.to_image(corners[kept])
+        logits = np.tensordot(coefficients[kept], prototypes, 1)
+        steps = size[0] / prototypes.shape[2], size[1] / prototypes.shape[1]
+        # Image to grid, in pixel edges: (image * scale + shift) / step
+        across = (fit.scale[0] / steps[0], fit.left / steps[0])
+        down = (fit.scale[1] / steps[1], fit.top / steps[1])
+        for k, box, logit in zip(kept.tolist(), boxes, logits, strict=True):
+            yield _Region(int(classes[k]), float(scores[k]), box, logit, across, down)
 
-    def _rcnn(
+    def _decode_rcnn(
         self, outputs: list[np.ndarray], index: int, fit: Fit, size: tuple[int, int]
-    ) -> list[Instance]:
-        boxes, classes, scores, soft = (
+    ) -> Iterator[_Region]:
+        """Regions of image ``index`` in the outputs of a Mask R-CNN or PointRend, best first.
+
+        Masks cover the whole input if they have its size, else the box.
+        """
+        corners, classes, scores, soft = (
             outputs[self._kind.outputs[k]] for k in ("boxes", "classes", "scores", "masks")
         )
-        if boxes.ndim == 3 and min(len(v) if v.ndim else 0 for v in outputs[:4]) > index:
-            boxes, classes, scores, soft = (v[index] for v in (boxes, classes, scores, soft))
+        if corners.ndim == 3 and min(len(v) if v.ndim else 0 for v in outputs[:4]) > index:
+            corners, classes, scores, soft = (v[index] for v in (corners, classes, scores, soft))
         soft = soft[:, 0] if soft.ndim == 4 and soft.shape[1] == 1 else soft
-        counts = {len(v) if v.ndim else -1 for v in (boxes, classes, scores, soft)}
-        shaped = len(counts) == 1 and boxes.shape[1:] == (4,) and scores.ndim == classes.ndim == 1
+        counts = {len(v) if v.ndim else -1 for v in (corners, classes, scores, soft)}
+        shaped = len(counts) == 1 and corners.shape[1:] == (4,) and scores.ndim == classes.ndim == 1
         if not shaped or soft.ndim != 3 or (len(soft) and not _is_grid(soft.shape[1:])):
             raise _unknown(self._model, [str(list(v.shape)) for v in outputs])
-        self._check_numbers(boxes, classes, scores)
-        score, names = self._min_score, self._kind.names
-        instances = decode_rcnn(
-            boxes, classes, scores, soft, fit, size, min_score=score, names=names
-        )
-        return self._plausible(instances)
+        self._check_numbers(corners, classes, scores)
+        kept = np.flatnonzero(scores >= self._min_score)
+        kept = kept[np.argsort(-scores[kept], kind="stable")][:MAX_INSTANCES]
+        across, down = (fit.scale[0], float(fit.left)), (fit.scale[1], float(fit.top))
+        for k, box in zip(kept.tolist(), fit.to_image(corners[kept]), strict=True):
+            if soft.shape[1:] != size[::-1]:
+                shifts, scales = (fit.left, fit.top) * 2, fit.scale * 2
+                edges = zip(corners[k], shifts, scales, strict=True)
+                x0, y0, x1, y1 = ((float(v) - shift) / scale for v, shift, scale in edges)
+                if not (x1 - x0 > 0 and y1 - y0 > 0):
+                    continue
+                height, width = soft.shape[1:]
+                across = (width / (x1 - x0), -x0 * width / (x1 - x0))
+                down = (height / (y1 - y0), -y0 * height / (y1 - y0))
+            mask = soft[k].astype(np.float32)
+            yield _Region(int(classes[k]), float(scores[k]), box, mask, across, down)
 
     def _check_numbers(self, *outputs: np.ndarray) -> None:
         for values in outputs:
@@ -339,16 +308,6 @@ class Segmenter:
                     f"{self._model.path}: its outputs hold values that are no numbers; export it "
                     "again, with float32 where it was float16"
                 )
-
-    def _plausible(self, instances: list[Instance]) -> list[Instance]:
-        """Return the instances; raises UserError if their scores are no probabilities."""
-        most = max((instance.score for instance in instances), default=0.0)
-        if most > MAX_SCORE:
-            raise UserError(
-                f"{self._model.path}: gives scores up to {most:.4g}, expected 0 to 1; export it "
-                "with its last activation"
-            )
-        return instances
 
 
 def _is_grid(shape: tuple[int, ...]) -> bool:

@@ -16,7 +16,7 @@ from intercap_core.geometry.camera.masks import Runs
 from intercap_core.schemas import DETECTIONS, PERSON
 
 UNKNOWN_LABEL = ""  # of a candidate that no detector named
-NOBODY_LOOKED, FROM_DETECTOR, FROM_IMAGES = 0, 1, 2  # who segmented an image
+NOT_SEGMENTED, FROM_DETECTOR, FROM_IMAGES = 0, 1, 2  # who segmented an image
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ import numba
 import numpy as np
 
 CELL_M = 0.02  # some ten points of each of three depth cameras; half and double take longer
-MOST_CELLS = 1 << 21  # larger cells beyond: what lies far apart is not dense
+MAX_CELLS = 1 << 21  # beyond, cells are larger: points far apart are sparse
 
 
 class PointGrid:
@@ -47,7 +47,7 @@ def sort_into_cells(points, cell):
         for k in range(3):
             number[k] = np.int64((high[k] - low[k]) / size) + 1
             cells *= number[k]
-        if cells <= MOST_CELLS:
+        if cells <= MAX_CELLS:
             break
         size *= 1.25
     inverse = 1 / size

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from intercap_core.geometry.rigid.point_grid import MOST_CELLS, PointGrid, sort_into_cells
+from intercap_core.geometry.rigid.point_grid import MAX_CELLS, PointGrid, sort_into_cells
 
 RANDOM = np.random.default_rng(0)
 SHAPES = {
@@ -38,7 +38,7 @@ def test_distances_equal_a_k_d_tree(name: str, cell: float) -> None:
 def test_every_point_is_in_its_cell(name: str) -> None:
     points = SHAPES[name].astype(np.float32)
     placed, starts, low, number, size = sort_into_cells(points, 0.02)
-    assert len(starts) - 1 == number.prod() <= MOST_CELLS
+    assert len(starts) - 1 == number.prod() <= MAX_CELLS
     assert starts[0] == 0 and starts[-1] == len(points) and (np.diff(starts) >= 0).all()
     order, own = np.lexsort(placed), np.lexsort(points.T)
     np.testing.assert_array_equal(placed.T[order], points[own])
