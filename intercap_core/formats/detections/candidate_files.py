@@ -123,10 +123,7 @@ def _add_file(
     candidates: CandidatesByImage, content: CandidateFile, images: CameraImages, path: Path
 ) -> None:
     """Sort one file's results by image."""
-    useless = bool(content.entries) and len(content.faults) == content.entries
-    by_image, absent = sort_by_image(
-        content.results, content.images, content.faulty, images, useless=useless
-    )
+    by_image, absent = sort_by_image(content, images)
     for place, instances in by_image.items():
         candidates.by_image.setdefault(place, []).extend(instances)
     name = short_name(path)

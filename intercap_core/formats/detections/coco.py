@@ -13,13 +13,15 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 from intercap_core.formats.detections.class_names import check_label, parse_class_names
 from intercap_core.formats.detections.instance import Instance, to_rle
 from intercap_core.geometry.camera import masks
 from intercap_core.inputs.documents import json_decoder, parse_json
 from intercap_core.inputs.files import UnreadableFile, quoted, read_bytes
+
+Result = TypeVar("Result")
 
 MAX_JSON_BYTES = 1 << 29  # parsed JSON takes about six times its file size in memory
 HEAD_BYTES = 1 << 18  # of a long file, parsed for a preview
@@ -39,13 +41,13 @@ class ImageKey(NamedTuple):
 
 
 @dataclass
-class CandidateFile:
+class DetectionFile(Generic[Result]):
     """The results of one file."""
 
-    results: list[tuple[ImageKey, Instance]] = field(default_factory=list)
-    """Image and instance of each result, in the file's order."""
+    results: list[tuple[ImageKey, Result]] = field(default_factory=list)
+    """Image and result of each entry, in the file's order."""
     images: list[ImageKey] | None = None
-    """Images that the file lists. None = it lists none; then an image without results has none."""
+    """Images that the file lists; None = it lists none, so it is about all images."""
     faults: list[str] = field(default_factory=list)
     """Entries that are left out, with the reason."""
     faulty: list[ImageKey] = field(default_factory=list)
@@ -54,6 +56,20 @@ class CandidateFile:
     """Number of entries with at least the least score."""
     scaled: int = 0
     """Number of masks of another resolution than the images."""
+
+    @property
+    def is_useless(self) -> bool:
+        """Whether there are entries, none of which can be used."""
+        return bool(self.entries) and len(self.faults) == self.entries
+
+    def add_fault(self, where: str, image: ImageKey, error: ValueError) -> None:
+        """Report an entry that is left out."""
+        name = image.name if image.name is not None else image.number
+        self.faults.append(f"{where}{f' (image {name})' if name is not None else ''}: {error}")
+        self.faulty.append(image)
+
+
+CandidateFile = DetectionFile[Instance]
 
 
 @dataclass(frozen=True)
@@ -119,10 +135,7 @@ def parse_candidates(
                 continue
             instance, scaled = _instance(entry, score, image, head, form.size)
         except ValueError as error:
-            name = image.name if image.name is not None else image.number
-            where = f"entry {index}{f' (image {name})' if name is not None else ''}"
-            result.faults.append(f"{where}: {error}")
-            result.faulty.append(image)
+            result.add_fault(f"entry {index}", image, error)
         else:
             result.results.append((image, instance))
             result.scaled += scaled

@@ -6,20 +6,17 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import TypeVar
 
 import numpy as np
 
 from intercap_core import artefacts
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
-from intercap_core.formats.detections.coco import ImageKey
+from intercap_core.formats.detections.coco import DetectionFile, ImageKey, Result
 from intercap_core.formats.recordings.image_files import FilesRecording
 from intercap_core.formats.recordings.intercap import numbers_from_times
 from intercap_core.formats.recordings.plain import PlainLayout
 from intercap_core.inputs.files import printable
-
-Result = TypeVar("Result")
 
 FILES_NAMED = 3  # broken files or entries that a note names; the others are only counted
 _SUFFIX = re.compile(r"\.(jpe?g|png|bmp|tiff?|webp|json)$", re.IGNORECASE)
@@ -144,26 +141,15 @@ def find_json_files(folder: Path) -> list[Path]:
 
 
 def sort_by_image(
-    results: list[tuple[ImageKey, Result]],
-    listed: list[ImageKey] | None,
-    faulty: list[ImageKey],
-    images: CameraImages,
-    *,
-    useless: bool,
+    file: DetectionFile[Result], images: CameraImages
 ) -> tuple[dict[int, list[Result]], list[str]]:
     """Sort a file's results by image number.
 
     Returns the results by number, and the names of images that were not recorded. An image that
-    the detector processed has a list, which may be empty.
-
-    Args:
-        results: image and result of each entry.
-        listed: images that the file lists; None = it lists none, so it is about all images.
-        faulty: images of entries that could not be used. They have a list only with results.
-        images: the recorded images.
-        useless: no entry could be used. Then the file says nothing about images it does not list.
+    the detector processed has a list, which may be empty. Images of faulty entries have a list
+    only with results, and so have unlisted images if no entry can be used.
     """
-    keys = [*(key for key, _ in results), *faulty, *(listed or ())]
+    keys = [*(key for key, _ in file.results), *file.faulty, *(file.images or ())]
     by_name = images.match_names(key.name for key in keys if key.name is not None)
     ids = {key.number for key in keys if key.number is not None}
     if len(images.recorded & ids) > len(images.recorded.intersection(by_name.values())):
@@ -174,16 +160,14 @@ def sort_by_image(
             return by_name.get(key.name)
         return key.number
 
-    if useless and listed is None:
-        known: set[int] = set()
-    elif listed is None:
-        known = set(images.recorded)
+    if file.images is not None:
+        known = {n for n in map(number, file.images) if n is not None}
     else:
-        known = {n for n in map(number, listed) if n is not None}
-    known -= {n for n in map(number, faulty) if n is not None}
+        known = set() if file.is_useless else set(images.recorded)
+    known -= {n for n in map(number, file.faulty) if n is not None}
     by_image: dict[int, list[Result]] = {n: [] for n in sorted(known & images.recorded)}
     absent = []
-    for key, result in results:
+    for key, result in file.results:
         place = number(key)
         if place is not None and place in images.recorded:
             by_image.setdefault(place, []).append(result)

@@ -220,14 +220,11 @@ def _add_camera_file(
     except UnreadableDetections as error:
         reading.faults.append(f"{short_name(path)} {error}")
         return
-    useless = bool(content.entries) and len(content.faults) == content.entries
-    by_image, absent = sort_by_image(
-        content.results, content.images, content.faulty, images, useless=useless
-    )
+    by_image, absent = sort_by_image(content, images)
     for number, persons in by_image.items():
         people = np.stack(persons) if persons else NOBODY
         reading.people.by_image[number] = reading.cleaner.clean(people)
-    reading.used |= not useless
+    reading.used |= not content.is_useless
     reading.faults += [f"{short_name(path)}, {fault}" for fault in content.faults]
     note_absent(reading.people.notes, absent, images, short_name(path))
 

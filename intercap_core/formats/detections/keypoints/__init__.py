@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,11 @@ from typing import Any
 import numpy as np
 
 from intercap_core.body.keypoints import KEYPOINT_NAMES, NUM_KEYPOINTS
-from intercap_core.formats.detections.coco import ImageKey, UnreadableDetections, read_json
+from intercap_core.formats.detections.coco import (
+    DetectionFile,
+    UnreadableDetections,
+    read_json,
+)
 from intercap_core.inputs.files import quoted
 from intercap_core.plugins import modules_of
 
@@ -38,20 +42,8 @@ class KeypointLayout:
     only if another layout has the same number of points."""
 
 
-@dataclass
-class PeopleFile:
-    """The people of one file."""
-
-    results: list[tuple[ImageKey, np.ndarray]] = field(default_factory=list)
-    """Image and keypoints (135, 3) of each person: x, y (px) and confidence as written."""
-    images: list[ImageKey] | None = None
-    """Images that the detector processed; None if the file does not list them."""
-    faults: list[str] = field(default_factory=list)
-    """Entries that are left out, with the reason."""
-    faulty: list[ImageKey] = field(default_factory=list)
-    """Images of these entries."""
-    entries: int = 0
-    """Number of all entries."""
+# Keypoints (135, 3) of each person: x, y (px) and confidence as written.
+PeopleFile = DetectionFile[np.ndarray]
 
 
 @dataclass(frozen=True)

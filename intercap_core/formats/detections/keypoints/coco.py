@@ -156,9 +156,7 @@ def _add(
         key = image(entry)
         result.results.append((key, _person(entry, entry.get(LAYOUT_KEY, layout))))
     except ValueError as error:
-        name = key.name if key.name is not None else key.number
-        result.faults.append(f"{where}{f' (image {name})' if name is not None else ''}: {error}")
-        result.faulty.append(key)
+        result.add_fault(where, key, error)
 
 
 def _person(entry: dict[str, Any], layout: str | None) -> np.ndarray:
