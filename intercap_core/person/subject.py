@@ -131,16 +131,16 @@ def _chosen(
     first, doubts = _of_named(tracks, named, times)
     people = join_tracks(tracks, times, first)
     if first:
-        return people[0].whole, "named", [*doubts, *people[0].doubts]
+        return people[0].track, "named", [*doubts, *people[0].doubts]
     if not people:
         return PersonTrack(), "alone", doubts
-    scores = [_score(person.whole, middle) for person in people]
+    scores = [_score(person.track, middle) for person in people]
     order = np.argsort(scores)[::-1].tolist()
     least = RIVAL_SHARE / (1 + HANDLING_WEIGHT) * scores[order[0]]
     likely = {k: scores[k] for k in order if scores[k] > least}
     by = "alone"
     if len(likely) > 1:
-        handling = {k: _handling(people[k].whole, touches) if touches else 0.0 for k in likely}
+        handling = {k: _handling(people[k].track, touches) if touches else 0.0 for k in likely}
         most = max(handling.values())
         by = "handling" if most >= 0.05 else "middle"  # share of the images; untuned
         if by == "handling":
@@ -151,7 +151,7 @@ def _chosen(
     doubts += people[best].doubts
     if others and likely[others[0]] > RIVAL_SHARE * likely[best]:
         doubts.append(_rival(people[others[0]], times, by))
-    return people[best].whole, by, doubts
+    return people[best].track, by, doubts
 
 
 def _of_named(
@@ -210,8 +210,8 @@ def _handling(track: PersonTrack, touches: Touches) -> float:
 def _rival(rival: Person, times: np.ndarray, by: str) -> str:
     why = "touches the object more" if by == "handling" else "is seen more, or nearer the middle"
     return (
-        f"another person is seen in {len(rival.whole.sets)} of {len(times)} frames, from frame "
-        f"{rival.whole.sets[0]} on; the subject is taken to be the one who {why}, which is not "
+        f"another person is seen in {len(rival.track.sets)} of {len(times)} frames, from frame "
+        f"{rival.track.sets[0]} on; the subject is taken to be the one who {why}, which is not "
         "clear: name it by a point in an image (annotation 'subject')"
     )
 

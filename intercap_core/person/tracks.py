@@ -127,13 +127,13 @@ class Person:
     """Evidence against their being one person."""
 
     @cached_property
-    def whole(self) -> PersonTrack:
+    def track(self) -> PersonTrack:
         """All parts as one track."""
-        whole = PersonTrack()
+        joined = PersonTrack()
         for part in self.parts:
-            whole.sets += part.sets
-            whole.groups += part.groups
-        return whole
+            joined.sets += part.sets
+            joined.groups += part.groups
+        return joined
 
     def meets(self, other: Person) -> bool:
         """Whether parts of two people overlap in time, so that they are two."""
@@ -192,7 +192,7 @@ def _likelihood(first: Person, second: Person, times: np.ndarray) -> float:
         if apart > LINK_SLACK_M + MAX_BODY_SPEED_M_S * gap:
             return NEVER
         result -= 0.5 * (apart / (LINK_SLACK_M + 1.2 * gap)) ** 2  # m/s, a usual walk
-    alike = same_build(first.whole, second.whole)
+    alike = same_build(first.track, second.track)
     # log likelihood ratio by build; tuned on the studio
     return result + alike if alike > -3.0 else NEVER
 
@@ -209,7 +209,7 @@ def _doubt(first: Person, second: Person, times: np.ndarray) -> tuple[str, ...]:
     gap, start = min(
         (float(times[b.sets[0]] - times[a.sets[-1]]), b.sets[0]) for a, b in _seams(first, second)
     )
-    if gap <= MAX_LINK_GAP_S or same_build(first.whole, second.whole) >= 1.0:
+    if gap <= MAX_LINK_GAP_S or same_build(first.track, second.track) >= 1.0:
         return ()
     return (
         f"the subject was not seen for {gap:.1f} s, and the build does not tell whether who is "

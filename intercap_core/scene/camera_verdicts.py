@@ -73,7 +73,7 @@ class PoseVerdict:
     """Comparison by kind of data."""
 
     @property
-    def in_doubt(self) -> bool:
+    def doubtful(self) -> bool:
         """Whether the given pose is not far worse."""
         if not self.evidence:
             return False
@@ -136,7 +136,7 @@ class PoseJudge:
             apart = _with_camera_of(self._refined, self._given, c)
             halved = None if self._halved is None else _with_camera_of(self._halved, self._given, c)
             verdicts[c] = self._compare(c, apart, halved)
-        doubtful = [c for c, verdict in verdicts.items() if verdict.in_doubt]
+        doubtful = [c for c, verdict in verdicts.items() if verdict.doubtful]
         if doubtful:
             free = np.ones(len(self._given.poses), bool)
             free[doubtful] = False

@@ -128,7 +128,7 @@ class LensExchange:
 
     cameras: tuple[int, int]
     """Camera indices."""
-    whole: bool
+    with_distortion: bool
     """The distortion is exchanged as well."""
     before: float
     """Median distance of both backgrounds to those of the other cameras, as given, metres; NaN if
@@ -161,19 +161,19 @@ def exchange_lenses(
             if set(pair.cameras) <= set(blind):
                 exchanges.append(LensExchange(pair.cameras, True, np.nan, np.nan))
     for exchange in exchanges:
-        rig = swap_lenses(rig, *exchange.cameras, whole=exchange.whole)
+        rig = swap_lenses(rig, *exchange.cameras, with_distortion=exchange.with_distortion)
     return rig, exchanges
 
 
-def swap_lenses(rig: Rig, first: int, second: int, *, whole: bool) -> Rig:
-    """Exchange the lenses of two cameras, without the distortion unless ``whole``.
+def swap_lenses(rig: Rig, first: int, second: int, *, with_distortion: bool) -> Rig:
+    """Exchange the lenses of two cameras, without the distortion unless ``with_distortion``.
 
     Depth on the colour grid is exchanged with them.
     """
     cameras = list(rig.cameras)
     for own, other in ((first, second), (second, first)):
         camera, lens = rig[own], rig[other].colour
-        if not whole:
+        if not with_distortion:
             lens = replace(camera.colour, fx=lens.fx, fy=lens.fy, cx=lens.cx, cy=lens.cy)
         depth = lens if camera.aligned else camera.depth
         cameras[own] = replace(camera, colour=lens, depth=depth)
@@ -198,7 +198,7 @@ class _BackgroundTest:
         while len(free) >= 2 and (best := self._best(rig, free)) is not None:
             exchanges.append(best)
             free = [c for c in free if c not in best.cameras]
-            rig = swap_lenses(rig, *best.cameras, whole=best.whole)
+            rig = swap_lenses(rig, *best.cameras, with_distortion=best.with_distortion)
         return exchanges
 
     def _best(self, rig: Rig, cameras: list[int]) -> LensExchange | None:
@@ -211,15 +211,17 @@ class _BackgroundTest:
         suspects = [c for c in cameras if _mean_of(given, c) > 1.3 * usual]  # tuned on the studio
         suspects = sorted(sorted(suspects, key=lambda c: -_mean_of(given, c))[:4])
         better = []
-        for (a, b), whole in product(combinations(suspects, 2), (True, False)):
+        for (a, b), distorted in product(combinations(suspects, 2), (True, False)):
             own, other = rig[a].colour, rig[b].colour
             same_size = (own.width, own.height) == (other.width, other.height)
             if not same_size or np.array_equal(own.parameters, other.parameters):
                 continue
             before = _mean_of(given, a, b)
-            after = _mean_of(self._residuals(swap_lenses(rig, a, b, whole=whole)), a, b)
+            after = _mean_of(
+                self._residuals(swap_lenses(rig, a, b, with_distortion=distorted)), a, b
+            )
             if after < 0.8 * before:  # tuned on the studio
-                better.append(LensExchange((a, b), whole, before, after))
+                better.append(LensExchange((a, b), distorted, before, after))
         return min(better, key=lambda exchange: exchange.after, default=None)
 
     def _residuals(self, rig: Rig) -> dict[tuple[int, int], float]:

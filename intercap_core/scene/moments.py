@@ -13,7 +13,7 @@ from intercap_core.scene.keypoint_timing import TIMING_INFLATION, TimeOffsets, f
 from intercap_core.scene.slips import Slips, constant_slip, find_slips
 from intercap_core.scene.start_times import find_starts
 from intercap_core.scene.starts import (
-    DENIED_SIGMAS,
+    REJECTED_SIGMAS,
     AlignedPeople,
     StartTimes,
     StatedStarts,
@@ -31,9 +31,9 @@ def check_stated_starts(
     ``slips`` are relative to ``starts``, ``timing`` to both.
     """
     late, sigma = starts.late.copy(), starts.sigma.copy()
-    denied, step = starts.denied.copy(), starts.step_s
+    rejected, step = starts.rejected.copy(), starts.step_s
     constant = constant_slip(slips.slip)
-    for c in np.flatnonzero(stated.known & ~denied):
+    for c in np.flatnonzero(stated.known & ~rejected):
         start_sigma = TIMING_INFLATION * timing.sigma[c]
         if not np.isfinite(start_sigma):
             if constant[c] == 0:
@@ -41,14 +41,18 @@ def check_stated_starts(
             start_sigma = step / 2
         start = (starts.sets[c] + constant[c]) * step - timing.offset[c]
         away = np.hypot(start_sigma, stated.sigma[c])
-        if abs(start - stated.late[c]) > DENIED_SIGMAS * away:
-            denied[c], sigma[c] = True, np.nan
+        if abs(start - stated.late[c]) > REJECTED_SIGMAS * away:
+            rejected[c], sigma[c] = True, np.nan
             late[c] = starts.sets[c] * step - timing.offset[c]
         elif constant[c] != 0:
             late[c] = stated.late[c] - constant[c] * step
             sigma[c] = stated.sigma[c]
     return replace(
-        starts, late=late, sigma=sigma, denied=denied, apart=starts.apart or bool(denied.any())
+        starts,
+        late=late,
+        sigma=sigma,
+        rejected=rejected,
+        apart=starts.apart or bool(rejected.any()),
     )
 
 
@@ -69,7 +73,7 @@ def describe_stated_start(
     source, late = stated.source[camera], float(stated.late[camera])
     whole = starts.sets[camera] + constant_slip(slips.slip)[camera]
     start = float(whole * starts.step_s - offset)
-    if starts.denied[camera]:
+    if starts.rejected[camera]:
         return (
             f"{source} has it start {describe_start(late)}; the keypoints deny that and were "
             f"followed: {describe_start(start)}"

@@ -53,13 +53,15 @@ class SlipInterval:
     """Frames by which the images are late."""
     gain: float
     """Log likelihood ratio."""
-    sure: float
+    robust_gain: float
     """The same without the keypoints that gain most."""
 
     @property
-    def beyond_doubt(self) -> bool:
+    def significant(self) -> bool:
         """Whether the gain is significant."""
-        return self.sure >= MIN_SLIP_GAIN + MIN_SLIP_GAIN_OF_SET / (self.last - self.first + 1)
+        return self.robust_gain >= MIN_SLIP_GAIN + MIN_SLIP_GAIN_OF_SET / (
+            self.last - self.first + 1
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +109,7 @@ def find_slips(
         if best:
             for interval in _apart(best, times):
                 _apply(slip, interval)
-                if _whole(interval, len(times)):
+                if _spans_all(interval, len(times)):
                     always.append(interval)
             motion = build_motion(
                 keypoints_by_moment(keypoints, slip), rig, times, motion.paths.points
@@ -131,7 +133,7 @@ def find_slips(
     return Slips(slip - np.int32(of_master), tuple(intervals))
 
 
-def _whole(interval: SlipInterval, sets: int) -> bool:
+def _spans_all(interval: SlipInterval, sets: int) -> bool:
     return interval.last - interval.first + 1 == sets
 
 
@@ -144,7 +146,7 @@ def _apply(slip: np.ndarray, interval: SlipInterval) -> None:
     """Add an interval to ``slip`` (T, C), in place, for the images that show its moments so far."""
     moment = np.arange(len(slip)) - slip[:, interval.camera]
     late = (moment >= interval.first) & (moment <= interval.last)
-    slip[late | _whole(interval, len(slip)), interval.camera] += interval.slip
+    slip[late | _spans_all(interval, len(slip)), interval.camera] += interval.slip
 
 
 def _apart(intervals: list[SlipInterval], times: np.ndarray) -> list[SlipInterval]:
@@ -189,7 +191,7 @@ def _polished(
             shown = with_keypoints(motion, keypoints_by_moment(keypoints, before))
             interval = _Evidence(shown.at_offsets(offset), steps, fps).best(c)
             result[run, c] = constant
-            if interval is not None and not _whole(interval, len(slip)):
+            if interval is not None and not _spans_all(interval, len(slip)):
                 _apply(result, interval)
                 intervals.append(interval)
     return result, intervals
@@ -206,7 +208,7 @@ def _tolerant(motion: KeypointMotion, moved: np.ndarray) -> KeypointMotion:
     return replace(motion, valid=motion.seen & (size < OUTLIER_SIGMA * motion.sigma))
 
 
-def _sure(gains: np.ndarray) -> float:
+def _robust_gain(gains: np.ndarray) -> float:
     """Sum of the keypoints' gains (K,) without the best four.
 
     Limbs that a detector confuses fit a slip by chance, but never all over the body.
@@ -252,11 +254,11 @@ class _Evidence:
             if interval is not None and (top is None or interval.gain > top.gain):
                 first, last = part.start + interval.first, part.start + interval.last
                 top = replace(interval, camera=camera, first=first, last=last)
-        step = max(self._steps, key=lambda s: _sure(always[s]))
+        step = max(self._steps, key=lambda s: _robust_gain(always[s]))
         whole = SlipInterval(
-            camera, 0, sets - 1, step, float(always[step].sum()), _sure(always[step])
+            camera, 0, sets - 1, step, float(always[step].sum()), _robust_gain(always[step])
         )
-        if whole.beyond_doubt and (top is None or whole.gain > top.gain - CLEAR_SLIP_GAIN):
+        if whole.significant and (top is None or whole.gain > top.gain - CLEAR_SLIP_GAIN):
             return whole
         return top
 
@@ -264,7 +266,7 @@ class _Evidence:
 def _best_of_window(cases: dict[int, _Slipped]) -> SlipInterval | None:
     """The interval, by place in the window, with the greatest gain, if significant."""
     intervals = [case.best(step) for step, case in cases.items()]
-    intervals = [interval for interval in intervals if interval.beyond_doubt]
+    intervals = [interval for interval in intervals if interval.significant]
     if not intervals:
         return None
     most = max(intervals, key=lambda i: i.gain)
@@ -343,7 +345,7 @@ class _Slipped:
         gain = interval_gains(self.linear.sum(0) - 1.0, energy)
         first, end = (int(i) for i in np.unravel_index(int(np.argmax(gain)), gain.shape))
         gains = self.gains(first, end)
-        return SlipInterval(0, first, end - 1, step, float(gains.sum()), _sure(gains))
+        return SlipInterval(0, first, end - 1, step, float(gains.sum()), _robust_gain(gains))
 
 
 def interval_gains(linear: np.ndarray, quadratic: np.ndarray) -> np.ndarray:

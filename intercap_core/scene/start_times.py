@@ -63,16 +63,16 @@ def find_starts(
     search = _Search(
         PairCosts.of(rays, rig, reach, fewest), master, step, known.bounds(step, reach), known.known
     )
-    late, denied = search.agreed()
+    late, rejected = search.agreed()
     others = [c for c in range(views) if c != master]
-    certain = {c: bool(denied[c]) or search.is_apart(late, c) for c in others}
+    certain = {c: bool(rejected[c]) or search.is_apart(late, c) for c in others}
     # if one camera certainly started apart, the cameras were not started together
     result = replace(
-        as_stated, apart=any(certain.values()) or known.says_apart(step), denied=denied
+        as_stated, apart=any(certain.values()) or known.states_apart(step), rejected=rejected
     )
     shown = search.shown(late)
     for c in others:
-        if known.known[c] and not denied[c] and not shown[c]:
+        if known.known[c] and not rejected[c] and not shown[c]:
             continue
         if not known.known[c] and not result.apart:
             continue
@@ -84,7 +84,7 @@ def find_starts(
                 continue
         result.late[c] = (result.sets[c] + late[c] + search.between(late, c)) * step
         result.sets[c] += late[c]
-        if denied[c]:
+        if rejected[c]:
             result.sigma[c] = np.nan
         elif known.known[c] and known.sigma[c] > step / 2:
             result.sigma[c] = step / 2  # the views are more accurate
@@ -117,26 +117,26 @@ class _Search:
         Statements are rejected one after another, the clearest first, because a wrong one disturbs
         the others.
         """
-        denied = np.zeros(len(self.bounds), bool)
+        rejected = np.zeros(len(self.bounds), bool)
         bounds = self.bounds.copy()
         while True:
             late = self._descended(bounds)
-            doubtful = self.stated & ~denied & (late != 0)
+            doubtful = self.stated & ~rejected & (late != 0)
             doubtful &= ~self.shown(late)
             if doubtful.any():  # no certain evidence against the statement
                 bounds[doubtful] = 0
                 continue
-            denials = {
-                c: denial
-                for c in np.flatnonzero(self.stated & ~denied).tolist()
-                if (denial := self._denial(late, c)) > 0
+            gains = {
+                c: gain
+                for c in np.flatnonzero(self.stated & ~rejected).tolist()
+                if (gain := self._rejection_gain(late, c)) > 0
             }
-            if not denials:
-                return late, denied
-            denied[max(denials, key=lambda c: denials[c])] = True
-            bounds = np.where(denied, self.pairs.reach, self.bounds)
+            if not gains:
+                return late, rejected
+            rejected[max(gains, key=lambda c: gains[c])] = True
+            bounds = np.where(rejected, self.pairs.reach, self.bounds)
 
-    def _denial(self, late: np.ndarray, camera: int) -> float:
+    def _rejection_gain(self, late: np.ndarray, camera: int) -> float:
         """Decrease of the cost if a camera leaves its bounds; 0 = not significant."""
         profile = self.pairs.profile(camera, self._others(camera), late)
         tried = np.arange(-self.pairs.reach, self.pairs.reach + 1)

@@ -20,7 +20,7 @@ FEWEST_SETS_APART = 2  # sets; a smaller shift is a slip or an offset, not a lat
 MIN_SHARED_S = 1.0  # least overlap of two recordings to determine a start; tuned on the studio
 # Combined standard deviations beyond which keypoints overrule a stated start. A smaller bound would
 # overrule about one correct statement in a thousand.
-DENIED_SIGMAS = 4.0
+REJECTED_SIGMAS = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,12 +89,12 @@ class StatedStarts:
 
         ``step_s``: seconds per set. ``reach``: the bound for cameras without a statement.
         """
-        away = DENIED_SIGMAS * np.hypot(np.nan_to_num(self.sigma), step_s / 2) / step_s
+        away = REJECTED_SIGMAS * np.hypot(np.nan_to_num(self.sigma), step_s / 2) / step_s
         return np.where(self.known, np.minimum(away, reach), reach).astype(int)
 
-    def says_apart(self, step_s: float) -> bool:
+    def states_apart(self, step_s: float) -> bool:
         """Whether a camera started clearly later or earlier than its images' times imply."""
-        least = FEWEST_SETS_APART * step_s + DENIED_SIGMAS * self.sigma
+        least = FEWEST_SETS_APART * step_s + REJECTED_SIGMAS * self.sigma
         return bool((np.abs(self.late) > least)[self.known].any())
 
     def unless_in_step(self) -> StatedStarts:
@@ -131,7 +131,7 @@ class StatedStarts:
             if not self.known[c]:
                 late[c], sigma[c], source[c] = other.late[c], other.sigma[c], other.source[c]
                 continue
-            if abs(late[c] - other.late[c]) > DENIED_SIGMAS * np.hypot(sigma[c], other.sigma[c]):
+            if abs(late[c] - other.late[c]) > REJECTED_SIGMAS * np.hypot(sigma[c], other.sigma[c]):
                 odd[c] = (
                     f"{source[c]} has it start {describe_start(late[c])}, {other.source[c]} "
                     f"{describe_start(other.late[c])}: the first was taken"
@@ -176,7 +176,7 @@ class StartTimes:
     """Seconds per frame set."""
     sigma: np.ndarray
     """(C,) standard deviation of ``late`` if it rests on a statement, else NaN."""
-    denied: np.ndarray
+    rejected: np.ndarray
     """(C,) bool: the keypoints contradict the stated start."""
 
     @classmethod

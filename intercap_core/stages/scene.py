@@ -312,7 +312,7 @@ def _notes(
     """Notes (C,) on the lens, pose, time and slips of each camera."""
     notes = [[note] if note else [] for note in refined.notes]
     for swap in exchanges:
-        part = "its lens" if swap.whole else "its focal length and principal point"
+        part = "its lens" if swap.with_distortion else "its focal length and principal point"
         evidence = "by the keypoints"
         if np.isfinite(swap.before):
             evidence = f"background {1e3 * swap.before:.1f} to {1e3 * swap.after:.1f} mm"

@@ -29,7 +29,7 @@ def test_camera_is_refined_only_if_significantly_better() -> None:
     assert PoseVerdict.of([_evidence(0.1, 0.1), _evidence(*[1.02] * 100)]).refined
     assert not PoseVerdict.of([_evidence(0.9, 0.9), _evidence(*[1.02] * 100)]).refined
     nothing = PoseVerdict.of([])
-    assert nothing.refined and not nothing.in_doubt and "nothing" in str(nothing)
+    assert nothing.refined and not nothing.doubtful and "nothing" in str(nothing)
 
 
 def test_evidence_pairs_units_that_both_have() -> None:

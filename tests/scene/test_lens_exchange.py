@@ -61,10 +61,10 @@ def test_right_lenses_are_unchanged(seen):
     assert exchanges == [] and result is rig
 
 
-@pytest.mark.parametrize("whole", [True, pytest.param(False, marks=pytest.mark.full)])
-def test_exchanged_lenses_are_corrected(seen, whole):
+@pytest.mark.parametrize("with_distortion", [True, pytest.param(False, marks=pytest.mark.full)])
+def test_exchanged_lenses_are_corrected(seen, with_distortion):
     rig, backgrounds, nobody = seen
-    given = swap_lenses(rig, 2, 3, whole=whole)
+    given = swap_lenses(rig, 2, 3, with_distortion=with_distortion)
     result, exchanges = exchange_lenses(given, backgrounds, nobody, ONE_SET, 0)
     assert [exchange.cameras for exchange in exchanges] == [(2, 3)]
     assert exchanges[0].after < 0.5 * exchanges[0].before
@@ -75,7 +75,7 @@ def test_exchanged_lenses_are_corrected(seen, whole):
 
 def test_devices_with_their_own_lenses_are_not_tested(seen):
     rig, backgrounds, nobody = seen
-    given = swap_lenses(rig, 2, 3, whole=True)
+    given = swap_lenses(rig, 2, 3, with_distortion=True)
     apart = Rig(tuple(replace(c, colour_from_depth=RING[0].colour_from_depth) for c in given))
     assert exchange_lenses(apart, backgrounds, nobody, ONE_SET, 0) == (apart, [])
 
@@ -106,7 +106,7 @@ def test_keypoints_reveal_only_exchanged_lenses(seed):
     keypoints = observed(rig, rng)
     claimed = perturbed(rig, rng, 0.003, 0.1)
     assert choose_pairs(lens_gains(keypoints, claimed, TIMES, SIGMA)) == []
-    wrong = swap_lenses(claimed, 3, 4, whole=True)
+    wrong = swap_lenses(claimed, 3, 4, with_distortion=True)
     pairs = choose_pairs(lens_gains(keypoints, wrong, TIMES, SIGMA))
     assert [pair.cameras for pair in pairs] == [(3, 4)]
 
@@ -114,7 +114,7 @@ def test_keypoints_reveal_only_exchanged_lenses(seed):
 def test_uncertain_poses_hide_the_exchange():
     rng = np.random.default_rng(5)
     rig = unequal(rng)
-    keypoints, wrong = observed(rig, rng), swap_lenses(rig, 3, 4, whole=True)
+    keypoints, wrong = observed(rig, rng), swap_lenses(rig, 3, 4, with_distortion=True)
     certain, uncertain = (
         {pair.cameras: pair.gain for pair in lens_gains(keypoints, wrong, TIMES, sigma)}
         for sigma in (SIGMA, (0.02, 0.03))

@@ -187,7 +187,7 @@ def test_stated_starts_align_cameras_that_see_no_motion():
     people = walk(late, 15.0, 3.0, moving=False)
     stated = stated_by_annotation(late + 0.01)
     starts = moments_of(people, 15.0, stated).starts
-    assert not starts.in_doubt.any() and not starts.denied.any()
+    assert not starts.in_doubt.any() and not starts.rejected.any()
     assert (starts.sets == stated.sets(1 / 15)).all()
     np.testing.assert_allclose(starts.late[1:], late[1:] + 0.01, atol=1e-9)
     np.testing.assert_allclose(starts.offset_sigma[1:], 0.028)
@@ -198,7 +198,7 @@ def test_keypoints_correct_a_slightly_wrong_statement():
     """The master's own statement is wrong by a set and a third, and so are all the others."""
     late = delays(7, 0.8)
     result = moments_of(walk(late, 30.0, 3.0), 30.0, stated_by_annotation(late + 0.044))
-    assert not result.starts.denied.any() and not result.slips.intervals
+    assert not result.starts.rejected.any() and not result.slips.intervals
     np.testing.assert_allclose(result.slip.mean(0) / 30 - result.timing.offset, late, atol=0.004)
 
 
@@ -207,7 +207,7 @@ def test_stated_start_may_lie_beyond_the_search_range():
     late = np.zeros(VIEWS)
     late[2] = 0.55 * 4.0
     starts = starts_of(walk(late, 15.0, 4.0), 15.0, stated_by_annotation(late + 0.01))
-    assert starts.apart and not starts.in_doubt.any() and not starts.denied.any()
+    assert starts.apart and not starts.in_doubt.any() and not starts.rejected.any()
     assert np.abs(starts.late - late).max() < 0.03
 
 
@@ -220,7 +220,7 @@ def test_keypoints_of_a_walker_reject_a_wrong_statement(fps, wrong):
     stated = stated_by_annotation(late + wrong * (np.arange(VIEWS) == 2))
     result = moments_of(walk(late, fps, 4.0), fps, stated)
     starts = result.starts
-    assert np.flatnonzero(starts.denied).tolist() == [2] and np.isnan(starts.sigma[2])
+    assert np.flatnonzero(starts.rejected).tolist() == [2] and np.isnan(starts.sigma[2])
     assert np.abs(starts.late - late).max() < 0.5 / fps + 0.02
 
     def note(c: int) -> str:
@@ -237,7 +237,7 @@ def test_offsets_reject_a_precise_but_wrong_statement():
     """Stated to a millisecond and wrong by 20 ms: less than a set, so only offsets reveal it."""
     people = walk(np.zeros(VIEWS), 15.0, 4.0)
     result = moments_of(people, 15.0, stated_by_annotation(np.array([0, 0.02, 0, 0, 0, 0]), 0.001))
-    assert np.flatnonzero(result.starts.denied).tolist() == [1]
+    assert np.flatnonzero(result.starts.rejected).tolist() == [1]
     late = result.slip.mean(0) / 15 - result.timing.offset
     assert np.abs(late).max() < 0.004
     assert np.abs(result.starts.offset - result.timing.offset)[1] < 1e-9
@@ -259,7 +259,7 @@ def test_stated_starts_are_relative_to_the_times_of_the_files():
     stated = StatedStarts.of(seconds, names, 0, np.array([0.0, 0.5, 0.0]), "the annotation")
     np.testing.assert_allclose(stated.late, [np.nan, -1.5, np.nan])
     np.testing.assert_allclose(stated.sigma, [np.nan, 0.05, np.nan])
-    assert stated.sets(0.1).tolist() == [0, -15, 0] and stated.says_apart(0.1)
+    assert stated.sets(0.1).tolist() == [0, -15, 0] and stated.states_apart(0.1)
     assert describe_start(stated.late[1]) == "1.500 s later than its times say"
     with pytest.raises(UserError, match=r"annotation has camera k2 start 1\.500 s later"):
         stated.check_common(np.array([0, 1.6]), names)
