@@ -31,7 +31,9 @@ def _protruding(
     local = np.stack([np.full(9, x), np.linspace(-0.3, 0.3, 9), np.full(9, 2.0)], 1)
     points = apply(CAMERA.master_from_depth, local)
     normals = np.tile(CAMERA.master_from_depth[:3, :3] @ normal, (9, 1))
-    return find_protruding(window, CAMERA, 0.0, points, normals)
+    return find_protruding(
+        window, CAMERA, 0.0, points.astype(np.float32), normals.astype(np.float32)
+    )
 
 
 @pytest.mark.parametrize("out_m", [0.02, 0.03, 0.045])

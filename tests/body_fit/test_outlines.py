@@ -50,11 +50,10 @@ def _touching(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Samples and distances of a ball of this radius, displaced along the camera's x, metres."""
     turn, shift = MASTER_FROM_COLOUR[:3, :3], MASTER_FROM_COLOUR[:3, 3]
-    vertices = (radius * BALL.vertices + CENTRE) @ turn.T + shift
+    vertices = ((radius * BALL.vertices + CENTRE) @ turn.T + shift).astype(np.float32)
+    normals = (BALL.vertices @ turn.T).astype(np.float32)
     moved = np.broadcast_to(displacement * turn[:, 0], (len(vertices), 3))
-    return find_touched(
-        rim, MASTER_FROM_COLOUR, vertices, BALL.vertices @ turn.T, SAMPLES, 0.05, moved
-    )
+    return find_touched(rim, MASTER_FROM_COLOUR, vertices, normals, SAMPLES, 0.05, moved)
 
 
 def test_planes_touch_the_masked_ball() -> None:
