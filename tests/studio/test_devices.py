@@ -22,7 +22,7 @@ from intercap_core.studio.noise import NoiseSource
 from intercap_core.studio.recording import Kinect
 from intercap_core.studio.rig import Failures, StudioRig, build_rig, started_apart
 from intercap_core.studio.room import build_room
-from intercap_core.studio.stage import check_capture, check_faults
+from intercap_core.studio.stage import check_capture
 
 FRAMES, FPS = 8, 5
 
@@ -176,13 +176,15 @@ def test_detectors_find_both_people(broken_capture: Path) -> None:
         ({"sound": True, "layout": "plain"}, "only videos carry sound"),
         ({"every": {"k2": 3}, "layout": "behave"}, "'behave' all have one rate"),
         ({"shoes": "heavy", "interaction": "skateboard_ride"}, "bare soles meet the object"),
+        ({"faults": ("dead_half",), "cameras": 1}, "need a second camera"),
     ],
 )
 def test_impossible_captures_are_refused(capture: dict[str, object], says: str) -> None:
     values = {"interaction": "stool_sit", "subject": "s02", "seed": 1} | capture
+    settings = StudioSettings(captures={}, cameras=values.pop("cameras", 6))  # type: ignore[arg-type]
+    name = "skateboard" if "shoes" in capture else "stool"
     with pytest.raises(UserError, match=says):
-        name = "skateboard" if "shoes" in capture else "stool"
-        check_capture(StudioCapture(**values), StudioSettings(captures={}), name)  # type: ignore[arg-type]
+        check_capture(StudioCapture(**values), settings, name)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("layout", ["k4a", "intercap", "behave"])
@@ -207,11 +209,6 @@ def test_a_sparse_room_has_a_floor_and_two_low_pieces() -> None:
         room = build_room(np.random.default_rng(4), [], eyes, furnishing=furnishing)
         assert len(room.vertices) == 4 + 8 * boxes
         assert room.vertices[:, 2].max() <= top
-
-
-def test_faults_need_a_second_camera() -> None:
-    with pytest.raises(UserError, match="need a second camera"):
-        check_faults(("dead_half",), layout="k4a", cameras=1, frames=9)
 
 
 def test_redrawn_detections_keep_the_recording() -> None:

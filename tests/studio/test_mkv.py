@@ -112,12 +112,6 @@ def test_seeking_uses_the_index(tmp_path):
         assert next(container.demux(stream)).pts == 1000 + 4 * PERIOD_US
 
 
-def test_same_calls_same_bytes(tmp_path):
-    write_recording(tmp_path / "a.mkv")
-    write_recording(tmp_path / "b.mkv")
-    assert (tmp_path / "a.mkv").read_bytes() == (tmp_path / "b.mkv").read_bytes()
-
-
 def test_mkvtoolnix_accepts_it(tmp_path):
     if not (shutil.which("mkvmerge") and shutil.which("mkvinfo")):
         pytest.skip("mkvmerge and mkvinfo (mkvtoolnix) are not installed")

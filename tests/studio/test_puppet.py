@@ -11,7 +11,7 @@ from intercap_core.studio.hands import OPEN, Hand, shape
 from intercap_core.studio.interactions.grasps import Hollow
 from intercap_core.studio.interactions.handling import HandlingScript
 from intercap_core.studio.motion import RIGHT
-from intercap_core.studio.skeleton import REACH_FREE, PuppetSkeleton, turn
+from intercap_core.studio.skeleton import REACH_FREE, PuppetSkeleton
 from intercap_core.studio.subjects import Subject
 from tests.studio.conftest import MakeStage
 
@@ -42,11 +42,6 @@ def test_fingers_flex_towards_the_palm(side: int) -> None:
     )
     assert (fist_tips - open_tips) @ hand.palm > 0.01
     assert (fist_tips - open_tips) @ hand.out < -0.02
-
-
-def test_turn_is_a_rotation_about_its_vector() -> None:
-    vector = np.array([0.3, -0.2, 0.9])
-    np.testing.assert_allclose(turn(vector) @ vector, vector, atol=1e-12)
 
 
 def test_walls_block_half_of_all_directions_shells_all() -> None:
