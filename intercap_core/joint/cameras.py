@@ -86,8 +86,8 @@ class CameraFit:
         """
         self._given = start, covariance
         self.now, self.covariance, self.refused = start, covariance, False
-        self._away = np.zeros((len(start.rig), FREEDOMS))
-        flat = covariance.reshape(self._away.size, -1)
+        self._correction = np.zeros((len(start.rig), FREEDOMS))
+        flat = covariance.reshape(self._correction.size, -1)
         self._free = np.flatnonzero(flat.diagonal() > 0)
         self._sigma = np.sqrt(flat.diagonal()[self._free])
         own = flat[np.ix_(self._free, self._free)]
@@ -96,25 +96,25 @@ class CameraFit:
 
     def take(self, correction: CameraStep) -> bool:
         """Apply a plausible correction and return True; otherwise reset all cameras."""
-        away = self._away + correction.step
-        if not self._is_plausible(away):
-            (self.now, self.covariance), self._away = self._given, np.zeros_like(away)
+        total = self._correction + correction.step
+        if not self._is_plausible(total):
+            (self.now, self.covariance), self._correction = self._given, np.zeros_like(total)
             self.refused = True
             return False
-        self.now, self._away = self.now.moved(correction.step), away
+        self.now, self._correction = self.now.moved(correction.step), total
         self.covariance = correction.covariance
         return True
 
-    def _is_plausible(self, away: np.ndarray) -> bool:
+    def _is_plausible(self, total: np.ndarray) -> bool:
         """Whether corrections (C, 7) are below 5 of the scene's standard deviations and 30 mm.
 
         The standard deviations bound each correction and all together; the 30 mm are those of a
         point at 2.5 m. Both are two to three times the largest correction on the studio.
         """
-        free = away.ravel()[self._free]
+        free = total.ravel()[self._free]
         together = np.sqrt(free @ self._information @ free / max(len(free), 1))
-        size = np.linalg.norm(away[:, TURN], axis=1) * 2.5
-        size += np.linalg.norm(away[:, SHIFT], axis=1) + np.abs(away[:, BIAS])
+        size = np.linalg.norm(total[:, TURN], axis=1) * 2.5
+        size += np.linalg.norm(total[:, SHIFT], axis=1) + np.abs(total[:, BIAS])
         return bool(
             (np.abs(free) < 5.0 * self._sigma).all() and together < 5.0 and (size < 0.03).all()
         )
@@ -122,7 +122,7 @@ class CameraFit:
     def solve(self, evidence: Sequence[CameraEvidence]) -> CameraStep:
         """Find the minimum of ``evidence`` and prior over the unknowns that are not fixed."""
         free = self._free
-        total, pull = self._information, self._information @ self._away.ravel()[free]
+        total, pull = self._information, self._information @ self._correction.ravel()[free]
         follows = []
         for form in evidence:
             cross = form.cross[..., free]
@@ -136,7 +136,7 @@ class CameraFit:
             pull = pull + form.share * own
             follows.append(solved[..., :-1])
         covariance = np.linalg.inv(total)
-        step = np.zeros(self._away.size)
+        step = np.zeros(self._correction.size)
         step[free] = -covariance @ pull
         stated = np.zeros((step.size, step.size))
         stated[np.ix_(free, free)] = covariance
@@ -144,5 +144,5 @@ class CameraFit:
         for form, follow in zip(evidence, follows, strict=True):
             along[:, form.columns] -= follow @ step[free]
         return CameraStep(
-            step.reshape(self._away.shape), along, stated.reshape(self.covariance.shape)
+            step.reshape(self._correction.shape), along, stated.reshape(self.covariance.shape)
         )

@@ -16,7 +16,7 @@ from intercap_core.joint.state import State
 UNTRACKED_SIGMA = 0.5  # of a lost object's position, metres: wide open; tuned on the studio
 
 POSE_NAMES = (*(name for name, _ in POSE_BLOCKS), "transl")
-"""Arrays of an artefact that are an unknown of a frame, in the order of the parameter vector."""
+"""Datasets with a frame's pose and translation, in the order of the parameter vector."""
 
 
 @dataclass(frozen=True)
@@ -65,11 +65,10 @@ class TrackedPoses:
             times: (T,) seconds.
             time_offset: (C,) seconds.
         """
-        # standard deviations of turn (rad) and shift (m), tuned on the studio: at least, as the
-        # mesh differs from the object; ambiguous, mostly in rotation; interpolated
-        smallest = np.repeat([radians(0.05), 0.0005], 3)
-        ambiguous = np.hypot(smallest, np.repeat([radians(10.0), 0.002], 3))
-        interpolated = np.repeat([0.5, 0.15], 3)
+        # standard deviations of turn (rad) and shift (m), tuned on the studio
+        smallest = np.repeat([radians(0.05), 0.0005], 3)  # the mesh differs from the object
+        ambiguous = np.hypot(smallest, np.repeat([radians(10.0), 0.002], 3))  # mostly the rotation
+        interpolated = np.repeat([0.5, 0.15], 3)  # frames without a measurement
         tracked = ~marks.lost & np.isfinite(covariance).all(axis=(1, 2))
         total = np.where(tracked[:, None, None], covariance, 0.0)
         # the covariance of a carried pose contains its ambiguity

@@ -30,7 +30,8 @@ from intercap_core.joint.terms.term import Data, Equation, JointTerm, TermContex
 
 PENETRATION_SIGMA = 0.003  # of a depth beyond the tolerance, metres; tuned on the studio
 PENETRATION_TOLERANCE = 0.001  # depth that costs nothing, metres: skin yields; tuned on the studio
-# Half the spacing of samples, a thickness and the motion of a round, m; tuned on the studio.
+# Skin samples this near to the object are searched for points of it, m: half the spacing of the
+# samples, a thickness and the motion of a round. Tuned on the studio.
 NEAR_SKIN = 0.05
 # Half of a hand's thickness, m (anatomy): deeper points may be nearest to the skin of the far side.
 DEEPEST_IN_BODY = 0.015
