@@ -66,7 +66,7 @@ def body_views(subject: SubjectViews, times: np.ndarray) -> BodyViews:
     good = (subject.views[:, BODY_POINTS].ravel() >= enough) & np.isfinite(points[:, 0])
     gap = float(np.median(np.diff(times))) if len(times) > 1 else KEYPOINT_ERROR_TIME_S
     weights = by_point[..., 2] * inlier * min(1.0, gap / KEYPOINT_ERROR_TIME_S)
-    velocity = np.zeros((len(times), len(BODY_POINTS), 3))
+    velocity: np.ndarray = np.zeros((len(times), len(BODY_POINTS), 3))
     if len(times) > 2:
         change = subject.joints[2:, BODY_POINTS] - subject.joints[:-2, BODY_POINTS]
         velocity[1:-1] = np.nan_to_num(change / (times[2:] - times[:-2])[:, None, None])
