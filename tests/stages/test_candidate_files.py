@@ -41,7 +41,7 @@ GOOD = [result(image) for image in range(SETS)]
 
 @pytest.fixture
 def candidates(tmp_path) -> Path:
-    write_frames(tmp_path / "frames.h5", RIG, num_sets=SETS)
+    write_frames(tmp_path / "frames.h5", RIG, num_sets=SETS, colours=[[b"unread"] * SETS] * 2)
     folder = tmp_path / "candidates"
     folder.mkdir()
     (folder / "k2.json").write_text(json.dumps(GOOD))

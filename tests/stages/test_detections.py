@@ -50,7 +50,10 @@ def result(image: int, width: int, label: str) -> dict:
 def test_files_reach_the_sets_that_hold_their_image(tmp_path):
     index = np.array([[0, 0], [1, 2], [2, -1], [3, 3]])
     dropped = np.array([False, False, False, True])
-    write_frames(tmp_path / "frames.h5", RIG, num_sets=4, colour_index=index, dropped=dropped)
+    write_frames(
+        tmp_path / "frames.h5", RIG, num_sets=4, colour_index=index, dropped=dropped,
+        colours=[[b"unread"] * 4] * 2,
+    )  # fmt: skip
     keypoints, candidates = tmp_path / "keypoints", tmp_path / "candidates"
     people_file(keypoints / "k1" / "000000000000_keypoints.json", [10])
     people_file(keypoints / "k1" / "000000000001_keypoints.json", [11, 12])
