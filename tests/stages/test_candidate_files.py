@@ -219,5 +219,5 @@ def test_invalid_mask_images_are_noted(candidates, image, words):
     cv2.imwrite(str(folder / "9000__cup.png"), 255 * square(300))
     read = run(candidates)
     assert "masks not readable: k1/0001__cup.png " in read.notes[0]
-    assert words in read.notes[0] and "named after no image (first: 9000)" in read.notes[0]
+    assert words in read.notes[0] and "belong to no image (first: 9000)" in read.notes[0]
     assert read.candidates_found[:, 0].tolist() == [False, False, True, False]
