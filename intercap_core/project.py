@@ -134,7 +134,11 @@ class Project:
         return None
 
     def annotation_made(self, sequence: str) -> bool:
-        """Whether the studio writes this sequence's annotation along with its recordings."""
+        """Whether the studio writes this sequence's annotation along with its recordings.
+
+        It holds the truth with errors (``annotate``), the cameras' starts (``states_starts``), or
+        both.
+        """
         captures = self.config.studio.captures if self.config.studio else {}
         if sequence not in captures:
             return False
@@ -256,15 +260,18 @@ def _check_files(project: Project) -> None:
         if not file.is_file():
             raise UserError(
                 f"{project.path}: joint.lemo is {project.config.joint.lemo}, and there is no file "
-                f"{file}; name the folder of LEMO's release, or remove the line for small "
-                "accelerations of the joints"
+                f"{file}; name the folder of LEMO's release, or remove the line to penalise the "
+                "joints' accelerations instead"
             )
     _check_bodies(project)
     _check_detectors(project)
 
 
 def _check_bodies(project: Project) -> None:
-    """Who names body files must name one for everybody: two meshes in a dataset mix badly."""
+    """Raise UserError if body files are named, but none for some subject.
+
+    That subject would get the open body, whose mesh differs from the files'.
+    """
     models = project.config.body_models
     named = [gender for gender in ("female", "male") if getattr(models, gender) is not None]
     if not named or models.neutral is not None:
@@ -280,7 +287,7 @@ def _check_bodies(project: Project) -> None:
 
 
 def _check_detectors(project: Project) -> None:
-    """The models and the class names are shared by sequences as well."""
+    """Raise UserError if a detector's model or file of class names is missing or unreadable."""
     settings = project.config.detections
     models = ("segmentation_model", "keypoint_model")
     for field in (*models, "segmentation_labels", "category_names"):

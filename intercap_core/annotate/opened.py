@@ -25,7 +25,9 @@ T = TypeVar("T")
 class Opened:
     """Open artefacts of one sequence, with a cache of results that are valid until a file changes.
 
-    Thread-safe. Hold ``lock`` to keep the images open.
+    A set is what the cameras recorded together, frame t the moment of set t: a camera whose images
+    are late shows it in a later set (``image_of`` of the scene artefact). Thread-safe. Hold
+    ``lock`` to keep the images open.
 
     Args:
         paths: artefacts by stage, by default those of the project.
@@ -65,7 +67,7 @@ class Opened:
 
     @contextlib.contextmanager
     def images(self) -> Iterator[Frames]:
-        """Open the images by the frame that they show; by set if there is no scene artefact.
+        """Open the images, indexed by the frame that they show, or by set without a scene artefact.
 
         Raises UserError if the artefact of frames cannot be read.
         """
@@ -79,7 +81,7 @@ class Opened:
             yield self._opened()[0]
 
     def dropped(self) -> np.ndarray:
-        """Return which sets (T,) were dropped by annotation when the frames were read."""
+        """Return the mask (T,) of the sets that the annotation dropped when stage frames ran."""
         with self.lock:
             return self._opened()[2]
 

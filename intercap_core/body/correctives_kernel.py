@@ -5,11 +5,12 @@ the moved points and write their gradient p = dE / dx by each point at rest. The
 the gradient by the parameters follows with dR / d theta_c = skew(J_l e_c) R and the left Jacobian
 J_l.
 
-The Gauss-Newton matrices of keypoints and cloud contain these derivatives by the joints of a
-point's own limb (:class:`.selection.Limbs`), that of self-penetration does not contain them. In
-full they would couple every point with every joint, for millimetres per radian, and assembling the
-normal equations would take 2 times as long for the body alone, 3.5 times with hands and face. The
-minima do not change, since the gradient is exact.
+The gradient is complete, the Gauss-Newton matrices are not. Those of keypoints and cloud have a
+point's derivatives through its blend shapes only by the joints of its own limb
+(:class:`.selection.Limbs`), that of self-penetration has none. In full they would couple every
+point with every joint, for millimetres per radian, and assembling the normal equations would take 2
+times as long for the body alone, 3.5 times with hands and face. The minima do not change, since the
+gradient is exact.
 """
 
 from __future__ import annotations
@@ -112,7 +113,7 @@ def features(vectors):
 def move(correctives, feature, used, rest):
     """Move the points at rest (B,N,3) that are ``used`` (B,N) by feature (B,486).
 
-    Written out for the same reason as :func:`.skeleton_kernel.rest_points`.
+    Written out: a library's product would start threads, and round by the number of bodies.
     """
     ids, tables = correctives
     for first in range(0, len(ids), _TOGETHER):
@@ -191,10 +192,11 @@ def add_gradient(by_pose, by_feature, place, gradient):
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
 def add_to_row(row, local, joints, t, table, by_pose):
-    """Add the derivatives of a point's correctives by ``joints`` to its row.
+    """Add the derivatives of a point's blend shapes by ``joints`` to a row n^T dx of the Jacobian.
 
-    t (3,): direction of the row, turned back to the point at rest. table (3,486), by_pose
-    (54,3,9). local (P,): column of each parameter in the row, -1 = none.
+    t (3,): R^T n, the row's direction n turned back to the point at rest. table (3,486): of the
+    point. by_pose (54,3,9): of the body, by :func:`rotation_derivatives`. local (P,): column of
+    each parameter in the row, -1 = none.
     """
     for joint in joints:
         first, by = 9 * (joint - 1), by_pose[joint - 1]

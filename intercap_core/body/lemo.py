@@ -35,8 +35,9 @@ COORDINATES = 3 * len(MARKER_NAMES)
 _ROWS, _COLUMNS = 1, 8  # of reflection, at each side
 _CHANNELS = (1, 32, 64, 64, 64, 64)
 LATENT = _CHANNELS[-1] * (COORDINATES + 2 * _ROWS)
-FEWEST_FRAMES = _COLUMNS + 2  # a reflection repeats other columns than the one at the border
-_HINT = "take the release's file, or leave joint.lemo out for small accelerations of the joints"
+# F frames have F - 1 steps, and a reflection by _COLUMNS needs one column more than that
+FEWEST_FRAMES = _COLUMNS + 2
+_HINT = "take the release's file, or remove joint.lemo to penalise joint accelerations instead"
 
 
 @dataclass(frozen=True)

@@ -163,8 +163,8 @@ def _motion_encoder(
         problem = "has no ground, and LEMO's encoder must know what is up; annotate the ground"
     if problem:
         raise UserError(
-            f"{scene.path}: sequence {scene.attributes['sequence']!r} {problem}; or leave "
-            "joint.lemo out for small accelerations of the joints"
+            f"{scene.path}: sequence {scene.attributes['sequence']!r} {problem}; or remove "
+            "joint.lemo to penalise joint accelerations instead"
         )
     weights, statistics = settings.lemo_files
     # E_S is a small difference of large latents, and GPU convolutions may round to ten bits

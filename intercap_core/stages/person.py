@@ -46,7 +46,10 @@ from intercap_core.schemas import PERSON, SCENE
 
 @dataclass(frozen=True, eq=False)
 class _Result:
-    """Contents of the person artefact; T frame sets, C cameras."""
+    """Contents of the person artefact; T frame sets, C cameras.
+
+    Images are indexed by the moment that they show: that of set t (scene's ``image_of``).
+    """
 
     subject: SubjectDetections
     """The subject's detections."""
@@ -119,7 +122,8 @@ def run(
         stated = images_with_stated_sides(left_right, rig.names, image_of, found.sequence)
         keypoints = given = exchange_stated(keypoints, stated)
         keypoints = steady_sides(keypoints, rig, min_confidence=confident)
-        # the moved points are triangulated, those as seen are written
+        # Points moved to the sets' times are triangulated. x, y as seen are appended as columns 3
+        # and 4, so that sides are exchanged in both alike, and then written.
         moved = at_set_times(keypoints, times, time_offset, rig, min_confidence=confident)
         moved, points = triangulate_people(
             np.concatenate([moved, keypoints[..., :2]], -1),

@@ -1,6 +1,7 @@
-"""Curves of which scripts are made: ramps, plateaus, footsteps, small involuntary motion.
+"""Curves of which the studio's interactions are made: ramps, plateaus, footsteps, small sway.
 
-Everything is a smooth function of time in seconds, vectorised over moments (N,).
+Everything is a smooth function of script time in seconds, vectorised over moments (N,). Positions
+are in the script's frame (z up, the floor at z = 0), in metres. Headings turn about z, 0 faces +x.
 """
 
 from __future__ import annotations
@@ -74,9 +75,9 @@ class WristPose:
     """Target of a wrist over N moments."""
 
     position: np.ndarray
-    """(N, 3)."""
+    """(N, 3) metres."""
     rotation: np.ndarray
-    """(N, 3, 3) stage_from_rest."""
+    """(N, 3, 3) from the T-pose to the script's frame."""
 
     @property
     def matrices(self) -> np.ndarray:
@@ -115,13 +116,13 @@ class Step:
     foot: int
     """0 left, 1 right."""
     start: float
-    """S."""
+    """Seconds."""
     end: float
-    """S."""
+    """Seconds."""
     place: tuple[float, float]
-    """Where it ends."""
+    """x, y of the ankle at the end, metres."""
     heading: float = 0.0
-    """Rad."""
+    """Heading of the foot at the end, rad."""
     height: float = 0.0
     """Of the support above the floor, metres."""
     aside: float = 0.0
@@ -130,7 +131,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Guide:
-    """From ``start`` to ``end``, a foot moves to a path of its own."""
+    """From ``start`` to ``end`` a foot blends from its steps into ``path``, and then follows it."""
 
     foot: int
     """0 left, 1 right."""
@@ -156,7 +157,8 @@ class Footwork:
     """Lead feet that leave the floor."""
     grid_step_s = 0.005  # sampling of the pelvis track
     grid_margin_s = 1.0  # of the track before and after the script
-    body_lag_s = 0.11  # the trunk follows the feet, smoothed by this standard deviation
+    # standard deviation of the smoothing by which the trunk follows the feet, without delay
+    body_smoothing_s = 0.11
     sway_to_stance = 0.35  # share of the way to the standing foot that the pelvis shifts in a step
     step_lift_m = 0.075  # height of a foot in the middle of a step, metres
     step_up_share = 0.55  # share of a step's time in which a foot is brought up, or down, an edge
@@ -177,6 +179,7 @@ class Footwork:
             ankle[:, step.foot, :2] += share[:, None] * (np.array(step.place) - placed[step.foot])
             heading[:, step.foot] += share * (step.heading - turned[step.foot])
             length = float(np.linalg.norm(np.array(step.place) - placed[step.foot]))
+            # toes down as the foot leaves, up as it lands; less in steps below 0.4 m
             roll = np.sin(np.pi * u) ** 3 * np.cos(np.pi * u) * min(1.0, length / 0.4)
             roll = np.where((u > 0) & (u < 1), roll * (0.9 + 0.25 * np.cos(np.pi * u)), 0)
             pitch[:, step.foot] += roll
@@ -233,9 +236,9 @@ class Footwork:
             middle = (
                 middle + self.sway_to_stance * bump(grid, step.start, step.end)[:, None] * stance
             )
-        lag = self.body_lag_s / self.grid_step_s
-        middle = gaussian_filter1d(middle, lag, axis=0, mode="nearest")
-        facing = gaussian_filter1d(heading.mean(1), lag, mode="nearest")
+        sigma = self.body_smoothing_s / self.grid_step_s
+        middle = gaussian_filter1d(middle, sigma, axis=0, mode="nearest")
+        facing = gaussian_filter1d(heading.mean(1), sigma, mode="nearest")
         across = np.stack([-np.sin(facing), np.cos(facing)], 1)
         top = stand + self._level(grid)
         for foot, sign in ((0, 1.0), (1, -1.0)):
@@ -243,6 +246,7 @@ class Footwork:
             far = np.linalg.norm(ankle[:, foot, :2] - hip, axis=1)
             reach = np.sqrt(np.maximum(leg**2 - far**2, 0.01)) + ankle[:, foot, 2] + hip_drop
             top = np.minimum(top, reach)
+        # smoothed by 0.05 s; the minimum over the filter's width keeps the result within reach
         window = int(6 * 0.05 / self.grid_step_s) | 1
         lowest = minimum_filter1d(top, window, mode="nearest")
         top = gaussian_filter1d(lowest, 0.05 / self.grid_step_s, mode="nearest", truncate=3.0)

@@ -127,7 +127,7 @@ class StudioStage:
         place = self.stage_from_script
         pelvis = played.pelvis @ place[:3, :3].T + place[:3, 3]
         prop = (
-            (place @ played.stage_from_object)[:, :2, 3] if self.prop else np.full((1, 2), np.inf)
+            (place @ played.script_from_object)[:, :2, 3] if self.prop else np.full((1, 2), np.inf)
         )
         return PasserBy(
             self.noise,
@@ -143,7 +143,7 @@ class StudioStage:
     def _highlight(self) -> np.ndarray:
         """Place (2,) of the object on the floor plan at the highlight."""
         played = self.interaction.perform(np.array([self.interaction.highlight]))
-        return (self.stage_from_script @ played.stage_from_object[0])[:2, 3]
+        return (self.stage_from_script @ played.script_from_object[0])[:2, 3]
 
     @cached_property
     def set_times(self) -> np.ndarray:
@@ -167,7 +167,7 @@ class StudioStage:
         place = self.stage_from_script
         world = place[:3, :3] @ played.world
         pelvis = played.pelvis @ place[:3, :3].T + place[:3, 3]
-        stage_from_object = place @ played.stage_from_object
+        stage_from_object = place @ played.script_from_object
         posed = self.puppet.skin(world, pelvis)
         body, clothed = posed.vertices.copy(), posed.clothed.copy()
         for n in range(len(times) if self.prop else 0):

@@ -144,7 +144,7 @@ def test_penetration_before_deformation_is_limited(played: Played) -> None:
     skin = stage.puppet.skin(performed.world, performed.pelvis).vertices
     deepest = min(
         near_object(stage, points, pose).min(initial=0.0)
-        for points, pose in zip(skin, performed.stage_from_object, strict=True)
+        for points, pose in zip(skin, performed.script_from_object, strict=True)
     )
     assert -deepest < played.case.pressed_m
 
@@ -191,7 +191,7 @@ def test_planted_feet_do_not_slide_or_sink(played: Played) -> None:
 
 def test_a_resting_object_does_not_move(played: Played) -> None:
     times = np.arange(0.0, 3.0, 1 / FPS)
-    poses = played.stage.interaction.perform(times).stage_from_object
+    poses = played.stage.interaction.perform(times).script_from_object
     for start, end in played.case.rests:
         assert end - start >= 0.4
         resting = poses[(times >= start) & (times <= end)]
@@ -204,7 +204,7 @@ def test_a_resting_object_does_not_move(played: Played) -> None:
 def test_object_and_joints_move_without_a_jump(played: Played) -> None:
     case, stage, step = played.case, played.stage, 0.01
     performed = stage.interaction.perform(np.arange(0, 3, step))
-    speed = np.linalg.norm(np.diff(performed.stage_from_object[:, :3, 3], axis=0), axis=1) / step
+    speed = np.linalg.norm(np.diff(performed.script_from_object[:, :3, 3], axis=0), axis=1) / step
     assert speed.max() < case.object_m_s
     joints = stage.puppet.skeleton.forward(performed.world, performed.pelvis)
     assert np.linalg.norm(np.diff(joints, axis=0), axis=-1).max() / step < case.joint_m_s
@@ -214,7 +214,7 @@ def test_object_and_joints_move_without_a_jump(played: Played) -> None:
 def test_a_kicked_ball_slides_then_rolls_then_stops(make_stage: MakeStage) -> None:
     case = CASES["football_kick"]
     stage = make_stage("football_kick", case.subject, case.seed)
-    pose = stage.interaction.perform(np.arange(2.0, 3.0, 0.02)).stage_from_object
+    pose = stage.interaction.perform(np.arange(2.0, 3.0, 0.02)).script_from_object
     speed = np.linalg.norm(np.diff(pose[:, :2, 3], axis=0), axis=1) / 0.02
     between = np.swapaxes(pose[:-1, :3, :3], 1, 2) @ pose[1:, :3, :3]
     spin = np.arccos(np.clip((np.trace(between, axis1=1, axis2=2) - 1) / 2, -1, 1)) / 0.02

@@ -69,7 +69,8 @@ class PoseModel:
         full_confidence: float,
         grid: HeatmapGrid,
     ) -> None:
-        """``outputs``: positions of the model's columns and rows, or of its heatmaps."""
+        """``outputs``: positions of the model's columns and rows, or of its heatmaps.
+        ``full_confidence``: the model's response to a point that is certain."""
         assert model.size is not None
         self._model, self._outputs, self._size = model, outputs, model.size
         self._full_confidence, self._grid = full_confidence, grid
@@ -95,7 +96,9 @@ class PoseModel:
         )
 
     def find(self, picture: np.ndarray, instances: list[Instance]) -> np.ndarray:
-        """Find people (P, 135, 3) in a picture (H, W, 3) uint8 BGR, with the model's confidence.
+        """Find the keypoints (P, 135, 3) of P people in a picture (H, W, 3) uint8 BGR.
+
+        They are x, y and the model's own confidence, ordered as in ``body.keypoints``.
 
         The model looks at the people among ``instances``, best first. Without any, it looks at
         tiles of the whole image and then at the people found in them.
@@ -112,8 +115,9 @@ class PoseModel:
     def _distinct(self, people: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Confident people among (P, 135, 3), each once, best first, and their boxes (N, 4).
 
-        A person needs six confident points of the body. Two detections are one person if half of
-        the points of the worse one lie within 5 % of the person's size. Tuned on the studio.
+        A person needs six confident points of the body. A detection is left out if half of its
+        confident points lie near the same points of better detections, closer than 5 % of the
+        diagonal of its box. Tuned on the studio.
         """
         sure = people[..., 2] >= 0.3 * self._full_confidence
         accepted = sure[:, BODY].sum(1) >= 6
@@ -284,8 +288,8 @@ def decode_heatmaps(maps: np.ndarray, size: tuple[int, int], grid: HeatmapGrid) 
 def find_peaks(maps: np.ndarray) -> np.ndarray:
     """Peaks (N, 2) of x, y in cells of maps (N, h, w), finer than cells (DARK, Zhang et al. 2020).
 
-    The result is the highest cell at the border, and if the second-order expansion of the logarithm
-    has no maximum within one cell.
+    The maximum of the logarithm's second-order expansion about the highest cell. The result is the
+    highest cell itself if that lies at the border, or if there is no maximum within one cell of it.
     """
     number, height, width = maps.shape
     row, column = np.divmod(maps.reshape(number, -1).argmax(1), width)

@@ -21,7 +21,7 @@ class SurfaceTree:
     """The order of a mesh's faces, determined once on one shape of the mesh.
 
     ``vertices`` (V, 3) and ``faces`` (F, 3), F > 0. Searches in very different shapes are correct
-    but slower.
+    but slower. ``closed``: every edge belongs to an even number of faces.
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
@@ -158,9 +158,10 @@ def _signed(points, triangles, boxes, levels, reach, deepest):
     """Return the signed distance (M,), metres, of points (M, 3) float32 to a closed mesh.
 
     Negative inside, at most ``reach``, at least -``deepest``; points that are not finite are at
-    ``reach``. Inside is where a ray crosses the mesh an odd number of times. A ball that does not
-    reach the mesh lies on one side of it. A ray is cast only if neither this point's ball contains
-    the last decided point, nor that point's ball contains this one.
+    ``reach``. Inside is where a ray crosses the mesh an odd number of times. Rays are saved: the
+    ball around a point whose radius is its distance contains no surface, so all of it lies on one
+    side. A point in the ball of the last decided point, or whose ball contains that point, is on
+    the same side; only for others a ray is cast.
     """
     signed = np.empty(len(points), np.float64)
     stack, ahead = np.empty(levels + 2, np.int32), np.empty(levels + 2, np.float32)
@@ -180,7 +181,7 @@ def _signed(points, triangles, boxes, levels, reach, deepest):
         if not off < max(distance, clear) - _ROUNDING:
             within = _odd(x, y, z, triangles, boxes, levels, stack)
             clear = -np.inf
-        if distance > clear - off:
+        if distance > clear - off:  # this point's ball leaves more room around it
             cx, cy, cz, clear = np.float64(x), np.float64(y), np.float64(z), distance
         if within and far:
             square, last = _search(
@@ -214,10 +215,10 @@ def _block(starts, ends, triangles, boxes, levels, blocked):
         while size:
             size -= 1
             node = stack[size]
-            near, far = 0.0, 1.0
+            near, far = 0.0, 1.0  # part of the segment within the box, as shares of its length
             for k in range(3):
-                at, over = (x, a) if k == 0 else ((y, b) if k == 1 else (z, c))
-                entry, leave = (boxes[node, k] - at) * over, (boxes[node, 3 + k] - at) * over
+                o, over = (x, a) if k == 0 else ((y, b) if k == 1 else (z, c))
+                entry, leave = (boxes[node, k] - o) * over, (boxes[node, 3 + k] - o) * over
                 near, far = max(near, min(entry, leave)), min(far, max(entry, leave))
             if near > far + _ROUNDING:
                 continue
@@ -266,7 +267,8 @@ def _meets(x, y, z, u, v, w, triangles, at):
 def _search(x, y, z, triangles, boxes, levels, most, last, stack, reach):
     """Return the squared distance of a point to the mesh, at most ``most``, and its nearest face.
 
-    The search starts at face ``last``.
+    The search starts at face ``last``. ``stack`` and ``reach`` are working memory: the nodes that
+    remain, and the squared distances of their boxes.
     """
     leaves, count = 1 << levels, len(triangles)
     best = min(_to_triangle(x, y, z, triangles, last), most)

@@ -63,7 +63,8 @@ class BodyData(JointTerm):
         symbol="E_B",
         source="6",
         formula="equation 2; shape, thickness of clothing and keypoint offsets stay as fitted; "
-        "E_theta_h counts once in the half second that a hand's pose lasts",
+        "E_theta_h counts 1/n in each frame, n the frames of the half second that a hand's pose "
+        "lasts",
     )
 
     def __init__(self, fitter: Fitter, problem: BodyProblem, trusted: np.ndarray) -> None:

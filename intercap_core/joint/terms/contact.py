@@ -8,8 +8,8 @@ appendix) or the faces between labelled vertices (its text); see the setting ``c
 
 Q_t, binary in the paper, is the probability that a region touches; lambda_Q is the setting
 ``contact_weight``. Equation 6 also has an E_C without Q_t, which is left out: a body that does not
-touch is not drawn to the object. Beyond the paper each region is cut into patches (a palm, each
-finger, a sole). The nearest patches and vertices carry the weight, and far patches are outliers
+touch is not drawn to the object. Beyond the paper the hands are cut into patches (a palm, each
+finger). The nearest patches and vertices carry the weight, and far patches are outliers
 (Geman-McClure): a hand that holds a handle with three fingers does not pull the other two along.
 """
 

@@ -29,7 +29,8 @@ class ObjectData(JointTerm):
     equation = Equation(
         symbol="E_O of the track",
         source="6",
-        formula="d^T C^-1 d / 2, d the offset from the tracked pose and C the track's covariance",
+        formula="instead of E_O if `joint.look_again` is false: d^T C^-1 d / 2, d the offset from "
+        "the tracked pose and C the track's covariance",
         settings=("look_again",),
     )
 

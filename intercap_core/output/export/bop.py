@@ -31,8 +31,9 @@ def object_id(mesh_path: Path) -> int:
 def write(folder: Path, scenes: Scenes, obj_id: int, about: About, *, masks: bool) -> None:
     """Write ``models/``, one scene folder per camera in the rig's order, and the targets.
 
-    Images are numbered by their frame set. Each has the pose at its own exposure. ``masks`` also
-    draws masks and boxes with occlusion by the body.
+    An image has the number of the set in which it was recorded. A late image shows an earlier
+    frame, which ``scene_about.json`` names. Poses are those at the image's own exposure. ``masks``
+    also writes masks and boxes of the object, with occlusion by the body.
     """
     mesh = scenes.mesh
     assert mesh is not None

@@ -54,9 +54,12 @@ class CameraFacts:
     turned_deg: float
     """Angle by which refinement rotated the camera."""
     slide: float
-    """Standard deviation of the pose in its least certain direction."""
+    """Displacement of the rig's centre by one standard deviation of the pose, in its least certain
+    direction."""
     verdict: str
+    """Why the refined or the given pose is used, in words; "" = not judged."""
     note: str
+    """Remarks of stages frames and scene."""
 
     @property
     def recorded(self) -> int:
@@ -66,7 +69,10 @@ class CameraFacts:
 
 @dataclass(frozen=True)
 class Pair:
-    """Residuals of two cameras with overlapping views, metres; NaN without overlap."""
+    """Distances of the surfaces that two cameras measure, before and after refinement, metres.
+
+    Medians over held-out points; NaN without overlap.
+    """
 
     name: str
     before: float
@@ -174,7 +180,7 @@ def _cameras(recorded: artefacts.Artefact, refined: artefacts.Artefact) -> list[
         refined[key] for key in ("time_offset", "time_offset_sigma", "depth_bias")
     )
     has_depth = refined["depth_size"][:, 0] > 0
-    variance = np.einsum("cici->ci", refined["camera_covariance"])[:, 6]
+    variance = np.einsum("cici->ci", refined["camera_covariance"])[:, 6]  # of the depth bias
     bias_sigma = np.sqrt(np.maximum(variance, 0))  # 0 = not stated
     notes = zip(recorded.text("note"), refined.text("note"), strict=True)
     judged = "camera_verdict" in refined  # absent in artefacts of earlier versions

@@ -54,9 +54,10 @@ class ColourSegmenter:
         moved = find_foreground(image, *background)
         # the volume fills in clothes of the wall's colour, and places that the person never left
         body = draw_volume(bones, camera, moved.shape, 0)
-        # the numbers of margins are tuned on the studio
+        # 0, 1, 2 and 5 margins (uncertainties of the volume's surface) are tuned on the studio
         person = body | (moved & draw_volume(bones, camera, moved.shape, 2.0))
-        # borders of the volume, of the cut, and of unknown background are no outline
+        # where the mask ends at the filled-in volume, at the two margins or at unknown background,
+        # its border is not the person's outline
         assumed = cv2.dilate((body & ~moved).view(np.uint8), np.ones((9, 9), np.uint8)) > 0
         unsure = assumed | (moved & ~person) | ~background[1]
         objects = moved & ~draw_volume(bones, camera, moved.shape, 1.0)
@@ -66,7 +67,7 @@ class ColourSegmenter:
         areas = stats[:, cv2.CC_STAT_AREA]
         # at least 60 pixels of the reduced image; tuned on the studio
         large = [k for k in np.argsort(-areas, kind="stable") if k and areas[k] >= 60]
-        candidates = [
+        candidates = [  # score undecided, size in space unknown, no component common to the views
             ImageCandidate(self._rle(label == k, camera), 0.5, float("nan"), -1) for k in large[:5]
         ]
         if not person.any():
@@ -179,9 +180,10 @@ def _gain(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
 def draw_volume(
     bones: np.ndarray, camera: Camera, shape: tuple[int, ...], margins: float
 ) -> np.ndarray:
-    """Mask (H, W) of the person's volume, enlarged by ``margins``, in the reduced colour image.
+    """Mask (H, W) of the person's volume in the reduced colour image.
 
-    ``bones``: (B, 9), master frame, of :func:`.person_volume.build_bones`.
+    ``bones``: (B, 9) ends, radii and margin of :func:`.person_volume.build_bones`, master frame.
+    Each is drawn as a line, thicker by ``margins`` of its own margin on either side.
     """
     mask = np.zeros(shape[:2], np.uint8)
     if not len(bones):

@@ -78,14 +78,15 @@ class BeamWalk(Interaction):
         world, pelvis = self.on_feet(self._trunk(times, balance), times)
         swing = self.arm_swing(times)
         for side, sign in ((LEFT, 1.0), (RIGHT, -1.0)):
-            outward = sign * world[:, 9, :, 0] * (1, 1, 0)
+            outward = sign * world[:, 9, :, 0] * (1, 1, 0)  # to the chest's (spine3) side, level
+            # on the beam the wrists go 26 cm out and 16 cm up, and bob by four times their swing
             out = balance[:, None] * (0.26 * outward + (0, 0, 0.16))
             unsteady = 4 * balance[:, None] * swing[:, [side]] * (0, 0, 1)
             puppet.swing_arm(world, pelvis, side, swing[:, side], out, unsteady)
         return Performance(world, pelvis, np.full((len(times), 4, 4), np.nan))
 
 
-FLAT = shape((4, 2, 2), (8, 3, -8), 10, 0)
+WAVING = shape((4, 2, 2), (8, 3, -8), 10, 0)  # straight, closed fingers
 
 
 class WalkAndWave(Interaction):
@@ -140,6 +141,7 @@ class WalkAndWave(Interaction):
         world, pelvis = self.on_feet(self._trunk(times), times)
         up = plateau(times, *self.raised_s)
         walking = plateau(times, -0.4, 0.1, 1.1, 1.5)
+        # arms swing by 13 cm; one period is two steps (0.82 s) and begins with the first
         stride = 0.13 * walking * np.sin(2 * np.pi * (times - 0.05) / 0.82)
         for side, sign in ((LEFT, 1.0), (RIGHT, -1.0)):
             swing = sign * stride + self.arm_swing(times)[:, side]
@@ -147,7 +149,7 @@ class WalkAndWave(Interaction):
             keys = []
             if side == self.side:
                 wrist, raised = wrist.towards(self._waving(world, pelvis, times), up), 0.3 * up
-                keys = [(up, FLAT)]
+                keys = [(up, WAVING)]
             puppet.arm_to(world, pelvis, side, wrist, raised)
             puppet.fingers(world, side, puppet.finger_track(side, RELAXED, keys))
         return Performance(world, pelvis, np.full((len(times), 4, 4), np.nan))

@@ -26,7 +26,7 @@ class Performance:
     """(N, 55, 3, 3) joint rotations."""
     pelvis: np.ndarray
     """(N, 3)."""
-    stage_from_object: np.ndarray
+    script_from_object: np.ndarray
     """(N, 4, 4)."""
 
 
@@ -99,14 +99,14 @@ class Interaction(ABC):
 
 
 def upright(x: float, y: float, z: float, heading: float) -> np.ndarray:
-    """stage_from_object (4, 4) of an object that stands, turned about the vertical."""
+    """script_from_object (4, 4) of an object that stands, turned about the vertical."""
     return rigid(about_z(heading), np.array([x, y, z]))
 
 
 def held_object(
     puppet: Puppet, world: np.ndarray, pelvis: np.ndarray, side: int, object_from_wrist: np.ndarray
 ) -> np.ndarray:
-    """stage_from_object (N, 4, 4) of an object in the hand, from the posed wrist.
+    """script_from_object (N, 4, 4) of an object in the hand, from the posed wrist.
 
     ``object_from_wrist``: (4, 4) or (N, 4, 4).
     """

@@ -128,7 +128,7 @@ class FootballKick(Interaction):
             self.turned[n] = self.turned[n - 1] + spin * self.integration_s
 
     def _ball(self, times: np.ndarray) -> np.ndarray:
-        """stage_from_object (N, 4, 4): the lowest point of the ball is on the floor."""
+        """script_from_object (N, 4, 4): the lowest point of the ball is on the floor."""
         pose = np.broadcast_to(np.eye(4), (len(times), 4, 4)).copy()
         axis = np.cross([0, 0, 1.0], self.ahead)
         turned = np.interp(times, self.clock, self.turned)

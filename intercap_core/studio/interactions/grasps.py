@@ -45,7 +45,7 @@ def backed_off(
     hand: Hand,
     hand_shape: HandShape,
     surface: DistanceField,
-    stage_from_object: np.ndarray,
+    script_from_object: np.ndarray,
     wrist: np.ndarray,
     away: np.ndarray,
     gap: float,
@@ -53,13 +53,13 @@ def backed_off(
 ) -> np.ndarray:
     """A wrist (4, 4) of the stage moved along ``away`` (3,), at most a quarter of a metre, until
     the hand's vertices ``ids`` are ``gap`` from the object (negative: pressed)."""
-    object_from_stage = invert(stage_from_object)
+    object_from_script = invert(script_from_object)
 
     def moved(way: float) -> np.ndarray:
         return rigid(wrist[:3, :3], wrist[:3, 3] + way * away)
 
     def is_too_near(way: float) -> bool:
-        return hand.gap(hand_shape, surface, object_from_stage @ moved(way), ids) < gap
+        return hand.gap(hand_shape, surface, object_from_script @ moved(way), ids) < gap
 
     return moved(bisect(0.0, 0.25, 16, is_too_near)[1])
 
@@ -115,7 +115,7 @@ class Approach:
         side: int,
         hand_shape: HandShape,
         surface: DistanceField,
-        stage_from_object: np.ndarray,
+        script_from_object: np.ndarray,
         *,
         thumb: bool = False,
     ) -> np.ndarray:
@@ -128,7 +128,7 @@ class Approach:
         place = np.asarray(self.at) - skin[hand.palm_ids].mean(0) - self.along * fingers
         place[2] = max(place[2], self.floor - skin[:, 2].min())
         ids = slice(None) if thumb else hand.but_thumb_ids
-        return backed_off(hand, hand_shape, surface, stage_from_object,
+        return backed_off(hand, hand_shape, surface, script_from_object,
                           rigid(rotation, place), -palm, -PALM_PRESSED_M, ids)  # fmt: skip
 
 
@@ -143,13 +143,13 @@ def laid_on(
     puppet: Puppet,
     side: int,
     surface: DistanceField,
-    stage_from_object: np.ndarray,
+    script_from_object: np.ndarray,
     approach: Approach,
 ) -> Grip:
     """A flat hand laid on the object, the thumb along it, fingers bent until they meet it."""
     hand = puppet.hands[side]
-    wrist = approach.wrist(puppet, side, LAID, surface, stage_from_object, thumb=True)
-    pose = invert(stage_from_object) @ wrist
+    wrist = approach.wrist(puppet, side, LAID, surface, script_from_object, thumb=True)
+    pose = invert(script_from_object) @ wrist
     closed, gaps = hand.close(LAID, LAID_LIMITS, surface, pose)
     return Grip(LAID, closed, pose, gaps)
 
@@ -159,7 +159,7 @@ def wrapped(
     side: int,
     open_shape: HandShape,
     surface: DistanceField,
-    stage_from_object: np.ndarray,
+    script_from_object: np.ndarray,
     approaches: Iterable[Approach],
 ) -> Grip:
     """Palm against the object, fingers around it, then the thumb from where it has room.
@@ -172,8 +172,8 @@ def wrapped(
     four = (1, 3, 0, 2)
     best: tuple[float, Grip] | None = None
     for approach in approaches:
-        wrist = approach.wrist(puppet, side, open_shape, surface, stage_from_object)
-        pose = invert(stage_from_object) @ wrist
+        wrist = approach.wrist(puppet, side, open_shape, surface, script_from_object)
+        pose = invert(script_from_object) @ wrist
         around, _ = hand.close(open_shape, WRAP_LIMITS, surface, pose, fingers=four)
         for bend, opposition in product(THUMB_BENDS, OPPOSITIONS_DEG):
             opened = replace(open_shape, opposition=opposition)
