@@ -19,7 +19,7 @@ from intercap_core.schemas import CONTACT_REGIONS
 MIN_FLOOR_SPREAD_M = 0.02  # points closer to one line do not determine a plane
 
 # A start that is read off a time code or a clap has the uniform error of one frame,
-# 1/25/sqrt(12) s = 12 ms, once in the image and once on the clock.
+# 1/25/sqrt(12) s = 12 ms, once in the image and once on the clock: together 16 ms, rounded up.
 START_SIGMA_S = 0.02
 
 StartSigma = Annotated[float, Field(strict=True, gt=0.0, le=10.0)]
@@ -113,7 +113,10 @@ def _no_camera(name: str, names: Sequence[str]) -> str:
 
 
 def floor_spread(points: Sequence[Position] | np.ndarray) -> float:
-    """Root mean square distance of points (N, 3) from their best-fitting line, metres."""
+    """Root mean square distance of points (N, 3) from their best-fitting line, metres.
+
+    It is measured within their best-fitting plane.
+    """
     at = np.array(points, np.float64)
     values = np.linalg.svd(at - at.mean(0), compute_uv=False)
     return float(values[1] / np.sqrt(len(at)))
@@ -215,7 +218,7 @@ class Annotation(Model):
         return tuple(sorted(given, key=lambda pose: pose.frame))
 
     def check_object(self, name: str | None) -> str | None:
-        """Error message if the sequence has no object (``name`` None) but an annotated one."""
+        """Error message if the sequence has no object (``name`` None) but annotations of one."""
         if name is None:
             for section in ("contact", "object_pose", "object_poses"):
                 if getattr(self, section):

@@ -2,9 +2,10 @@
 
 An artefact is the output of one stage for one sequence. It is written under a temporary name in
 its folder, synced and renamed; the attribute ``complete`` is set last. Every dataset has a
-fletcher32 checksum, units and a coordinate frame. Text attributes have a fixed length, so that they
-are covered by the checksums of HDF5's headers; the heap of variable-length texts has none. The same
-input gives the same bytes: no time, host or path is stored.
+fletcher32 checksum and units, and a coordinate frame if its values have one. Text attributes have a
+fixed length, so that they are covered by the checksums of HDF5's headers; the heap of
+variable-length texts has none. The same input gives the same bytes: no time, host or path is
+stored.
 """
 
 from __future__ import annotations
@@ -40,7 +41,8 @@ class Field:
     """Declaration of one dataset."""
 
     dims: tuple[str, ...]
-    """Name of each axis. Axes of one name have the same length in a file; digits are a length."""
+    """Name of each axis. Axes of one name have the same length in a file, or in the group of a
+    camera unless the name is in ``_SHARED_DIMS``; digits are a length."""
     dtype: str
     """Numpy type, or "str"."""
     doc: str
@@ -399,6 +401,8 @@ def schema_name(path: Path) -> str:
 @contextlib.contextmanager
 def read(path: Path, schema: Schema) -> Iterator[Artefact]:
     """Validate an artefact against ``schema`` and open it for reading.
+
+    Datasets of single cameras are not validated before they are read.
 
     Raises :class:`Unreadable`, which names the file, its fault and the stage to re-run.
     """

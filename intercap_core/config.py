@@ -113,8 +113,8 @@ class BodyFitSettings(Model):
     face: bool = True
     """Fit jaw and expression from the face keypoints."""
     shape: Literal["shared", "per_frame"] = "shared"
-    """One body shape for the sequence, or a free shape in every frame as in the paper's first
-    stage."""
+    """shared = one body shape for the sequence; per_frame = a free shape in every frame, as in the
+    paper's first stage."""
     betas: Annotated[int, Field(ge=1, le=300)] = 10
     """Number of shape coefficients. Most readers of SMPL-X expect ten. The open body has 30, which
     reduce its distance to the data by about 4 %; a licensed file has up to 300."""
@@ -155,7 +155,8 @@ class JointSettings(Model):
     object_smoothness: Annotated[float, Field(ge=0)] = 1.0
     """Weight of the object's acceleration (lambda_A)."""
     drift_weight: Annotated[float, Field(ge=0)] = 1.0
-    """Weight of slowly varying corrections of the sequential fits (no symbol in equation 6)."""
+    """Weight against fast changes of the corrections of the sequential fits (no symbol in equation
+    6)."""
     look_again: bool = True
     """Compare the object with the images in each round; otherwise use the object track's poses
     and covariances as observations."""

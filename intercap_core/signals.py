@@ -37,9 +37,9 @@ def unbroken(*functions: Callable[..., Any]) -> None:
 
 
 def raise_pending() -> None:
-    """Raise :class:`Terminated` if a signal was deferred."""
+    """Raise :class:`Terminated` if a signal was deferred, or raised where C code ignored it."""
     if _pending:
-        raise Terminated(_pending.pop())
+        raise Terminated(_pending[0])
 
 
 def _is_within(frame: FrameType | None) -> bool:
@@ -62,20 +62,21 @@ def raise_on_signals() -> Iterator[None]:
         return
 
     def end(number: int, frame: FrameType | None) -> None:
+        _pending.append(number)
         if _is_within(frame):
-            _pending.append(number)
             return
         for other in before:
             signal.signal(other, signal.SIG_IGN)
         raise Terminated(number)
 
-    before = {one: signal.getsignal(one) for one in _ENDING}
-    before = {one: h for one, h in before.items() if h is not None and h is not signal.SIG_IGN}
+    handlers = {number: signal.getsignal(number) for number in _ENDING}
+    before = {n: h for n, h in handlers.items() if h is not None and h is not signal.SIG_IGN}
     _pending.clear()
-    for one in before:
-        signal.signal(one, end)
+    for number in before:
+        signal.signal(number, end)
     try:
         yield
     finally:
-        for one, handler in before.items():
-            signal.signal(one, handler)
+        _pending.clear()
+        for number, handler in before.items():
+            signal.signal(number, handler)

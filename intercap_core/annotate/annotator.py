@@ -83,7 +83,7 @@ class Annotator:
                 run = shlex.join(["intercap", "run", str(self.settings), "--", "--until", "frames"])
                 raise UserError(f"no images of this recording have been read: run it, or `{run}`")
             description = result.describe(opened)
-        except UserError as error:  # a run may read the images again
+        except UserError as error:  # shown in the page, from which a run can read the images again
             description = {
                 "sequence": name, "frames": 0, "notes": [str(error)], "result": opened.stamp(),
             }  # fmt: skip
@@ -301,7 +301,7 @@ class SequenceList:
         self._summaries: dict[Path, tuple[tuple[int, int], SequenceMetrics | str]] = {}
 
     def rows(self, project: Project) -> list[dict[str, Any]]:
-        """Return a row per sequence, worst first by the site's rank, without a result last."""
+        """Return a row per sequence, worst first by the site's rank; without a result: last."""
         rows, measured = [], []
         for name, row in project.sequences.items():
             summary = self._summary(project.artefact(name, "summary"))

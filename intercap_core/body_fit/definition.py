@@ -1,6 +1,6 @@
 """A detector's definition of body keypoints such as "hip" or "ankle": offsets from the body model.
 
-Detectors mean points up to 3 cm apart by one name. Depth determines the offsets in every frame.
+By one name, detectors mean points that are up to 3 cm apart. Depth makes the offsets observable.
 The offsets of recordings with depth, averaged over people, are the prior of recordings without
 depth, together with their standard deviation over people.
 """

@@ -4,7 +4,7 @@ Beyond the paper. A vertex that faces a camera, and behind which that camera mea
 clearly farther away, sticks out of the person. It has to move inward along its normal until the
 measured person begins:
 
-    e = -d - c,    d = distance along -n, in the image, to the first pixel that is not farther away
+    e = -d - c,    d = distance along -n after which the pixel there is no longer farther away
 
 with the thickness c of the covering as in :mod:`.cloud_term`. The person's mask is not used, so a
 mask that is too small or lacks a hand adds no bias. An occluder is nearer than the vertex, and
@@ -23,7 +23,8 @@ from intercap_core.geometry.camera.rig import Camera
 
 # Metres behind a vertex from which a depth is not the person's surface. Tuned on the studio.
 _BEHIND_M = 0.06
-# Largest cosine of the normal and the viewing direction: about 84 degrees. Tuned on the studio.
+# Largest cosine of the normal and the viewing direction, -1 = facing the camera: up to 6 degrees
+# beyond the rim. Tuned on the studio.
 _FACING = 0.1
 # Smallest depth of a vertex, metres: the Azure Kinect (NFOV) measures from 0.5 m (data sheet).
 _NEAREST_M = 0.3
@@ -58,7 +59,7 @@ def find_protruding(
         normals: (N, 3) unit normals.
 
     Returns:
-        (M,) index of each point that sticks out of the person by at most 5 cm.
+        (M,) index of each point that sticks out of the person by 1 to 5 cm.
         (M,) distance by which it sticks out, metres, > 0.
     """
     assert camera.depth is not None
@@ -99,10 +100,10 @@ def _find_protruding(depth, top, left, lens, pose, behind, points, normals):
             inward = x - way * nx, y - way * ny, z - way * nz
             if _is_measured_behind(depth, top, left, lens, *inward, behind):
                 continue
-            # one step is within the error of the image: counting only errors outward would make
-            # every person thinner
+            # A single step is left out as within the error of the image: errors outward would
+            # count and errors inward would not, which makes every person thinner.
             if s > 1:
-                # the middle of the last step that is not the person's and the first that is
+                # the middle between the last point outside the person and the first one inside
                 index[count], away[count] = i, way - step / 2
                 count += 1
             break

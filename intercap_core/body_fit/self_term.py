@@ -1,7 +1,7 @@
 """Self-penetration of the body, E_P = E_P_self: equation 5, a part of equations 2 and 6.
 
-    E_P_self = sum over samples p inside another part of the body of w rho(d - tolerance) / 2,
-    d = -n_q . (p - q)
+    E_P_self = sum over p of w rho(d - tolerance) / 2,   d = -n_q . (p - q),
+    p: the samples of the skin that are inside another part of the body
 
 PROX penalises colliding triangles by the distance fields of Tzionas et al. 2016. Here a sample p of
 the skin that lies behind the surface of another part of the body is pushed out along the normal n_q
@@ -141,7 +141,7 @@ class CompiledSelfPenetration:
         self._cached: tuple[Pairs, PointSource] | None = None
 
     def prepare(self, inputs: TermInputs, bodies: Bodies, derivatives: bool) -> CompiledTerm | None:
-        """Return the term at these bodies, None if it is switched off."""
+        """Return the term at these bodies, None if it is switched off or there are no frames."""
         if inputs.pairs is None or not len(bodies.frames):
             return None
         if self._cached is None or self._cached[0] is not inputs.pairs:
@@ -204,7 +204,7 @@ def add_equations(points, pairs, frames, equations, rest_gradient):
     """Add the normal equations of E_P_self to those of the frames (B,).
 
     equations: :class:`.term_inputs.BatchEquations`, filled in place.
-    rest_gradient (B,N,3): gradient by the points at rest, filled in place; B = 0 without pose blend
+    rest_gradient (B,N,3): gradient by the points at rest, filled in place; empty without pose blend
     shapes.
     """
     place, cost = equations.place, equations.cost

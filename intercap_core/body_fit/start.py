@@ -58,7 +58,7 @@ def interpolate_unknown(placement: np.ndarray, times: np.ndarray) -> np.ndarray:
 
 
 def turn_around(placement: np.ndarray) -> np.ndarray:
-    """Return placements (T, 6) with the body turned by half a turn about its y."""
+    """Return placements (T, 6) with the body turned by half a turn about its vertical axis y."""
     result = placement.copy()
     known = np.isfinite(placement).all(1)
     turn = Rotation.from_rotvec([0.0, np.pi, 0.0])
@@ -70,7 +70,7 @@ def fit_start(evidence: Evidence, problem: BodyProblem) -> torch.Tensor:
     """Return parameters (N, P) fitted to the triangulated body keypoints of each frame.
 
     ``problem`` provides the keypoints, offsets and terms; each frame has its own shape. Frames that
-    cost 1.5 times the median (tuned on the studio) are also tried facing the other way.
+    cost more than 1.5 times the median (tuned on the studio) are also tried facing the other way.
     """
     model = evidence.model
     rest = model.zeros()

@@ -29,7 +29,7 @@ class Comparison:
     """Differences between two versions, millimetres and degrees."""
 
     sequences: pd.DataFrame
-    """One row per sequence of either version, most changed first."""
+    """One row per sequence of either version: incomparable ones, then the most changed first."""
     frames: pd.DataFrame
     """One row per changed frame."""
     figures: pd.DataFrame
@@ -81,7 +81,7 @@ def compare(old: Path, new: Path) -> Comparison:
 
 
 def _figures(old: Path, new: Path) -> pd.DataFrame:
-    """Figures that the summary.json of both versions has."""
+    """Numbers that the summary.json of both versions contain."""
     both = []
     for folder in (old, new):
         try:

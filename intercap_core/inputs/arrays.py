@@ -29,7 +29,7 @@ _HEADS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
 }
-# What zipfile, zlib and numpy's parser of heads raise for damaged archives.
+# What zipfile, zlib and numpy's parser of headers raise for damaged archives.
 _ARCHIVE_ERRORS = (
     zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OSError,
     ValueError, OverflowError, TypeError, SyntaxError, tokenize.TokenError, KeyError,

@@ -63,10 +63,11 @@ class Geometry:
 
     @cached_property
     def moments(self) -> np.ndarray:
-        """Points (6, 3) with the object's moments, object frame.
+        """Six points (6, 3) that stand for the object's vertices, object frame.
 
-        They are at least 0.3 m from its centre (tuned on the studio): hands turn an object with
-        20 rad/s^2 if they move it with 6 m/s^2. Points of a thin object would not bound its spin.
+        They have the mean and covariance of the vertices, but are at least 0.3 m from the centre
+        (tuned on the studio): hands that accelerate an object by 6 m/s^2 turn it by 6 / 0.3 =
+        20 rad/s^2. Closer points, as those of a thin object, would not penalise its spin enough.
         """
         return moment_points(self.mesh.vertices, 0.3)
 
@@ -174,7 +175,7 @@ class PosedGeometry:
 
     @cached_property
     def moments(self) -> tuple[np.ndarray, np.ndarray]:
-        """Points (T, 6, 3) with the object's moments, and their derivative (T, 6, 3, 6) by it."""
+        """Points :attr:`Geometry.moments` (T, 6, 3), and (T, 6, 3, 6) by the object's motion."""
         state = self.state
         return points_by_object(self._geometry.moments, state.rotation, state.translation)
 
@@ -189,8 +190,8 @@ def moment_points(vertices: np.ndarray, least: float = 0.0) -> np.ndarray:
     """Six points (6, 3) with the mean and covariance of ``vertices`` (V, 3).
 
     They are mean + and - sqrt(3 lambda_i) e_i along the principal axes. A sum of squares of an
-    affine map over the vertices is V / 6 times the same sum over these points. None is nearer to
-    the mean than ``least``, metres.
+    affine map over the vertices is V / 6 times the same sum over these points. Points nearer to the
+    mean than ``least``, metres, are moved out to it, which increases the covariance.
     """
     mean = vertices.mean(axis=0)
     covariance = np.cov((vertices - mean).T, bias=True)

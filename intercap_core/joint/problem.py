@@ -44,7 +44,7 @@ TERMS: tuple[type[JointTerm], ...] = (
     ObjectDrift,
     ObjectGround,
 )
-"""All other terms. A term of which data are missing is left out."""
+"""All other terms. A term that needs data that the recording lacks is left out."""
 
 
 def build_terms(context: TermContext, data: Sequence[JointTerm]) -> tuple[JointTerm, ...]:
@@ -57,7 +57,7 @@ def build_terms(context: TermContext, data: Sequence[JointTerm]) -> tuple[JointT
 
 @dataclass(frozen=True)
 class JointProblem:
-    """The sum of ``terms``, whose rows ``threads`` compute."""
+    """The sum of ``terms``; ``threads`` compute their equations."""
 
     terms: tuple[JointTerm, ...]
     threads: ThreadPool = field(default_factory=ThreadPool)

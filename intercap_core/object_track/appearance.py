@@ -4,7 +4,8 @@ They decide between rotations that the shape leaves ambiguous. The surface is di
 The colour of a patch is stated in logarithms of linear light, where a camera's gain and shading
 add: a brightness and two ratios of channels. The log-likelihood ratio of a pose x is
 
-    log p(colours | those learnt, moved with x) - log p(colours | any of the object's)
+    log p(colours | colours learnt for these patches at pose x)
+        - log p(colours | colours of the object as a whole)
 
 so an object of one colour decides nothing, and neither does a side that was never seen.
 """
@@ -82,7 +83,7 @@ class Appearance:
         Args:
             sightings: colours of the frames, each with another pose.
             views: number of views.
-            paint: colours of the mesh; they count if they explain the learnt ones.
+            paint: colours of the mesh; ignored if they do not explain the learnt ones.
             size: size of a patch, metres.
         """
         self.sightings = tuple(sightings)
@@ -107,7 +108,7 @@ class Appearance:
     def log_ratio(self, seen: SurfaceColours, apart: int) -> float:
         """Return the log-likelihood ratio of a pose, nats.
 
-        Only colours of frames at least ``apart`` from its own count.
+        Only colours of frames at least ``apart`` frames from its own count.
         """
         return self._ratio(seen, self._known(np.abs(self._frames - seen.frame) >= apart))
 
@@ -133,7 +134,8 @@ class Appearance:
                 colour = seen.colour - self._gain[seen.view] - known.mean[at]
                 left.append(self._unshaded(seen, colour))
             residual = np.concatenate(left)
-            # a camera may have seen one side only: its gain is not what may be colour
+            # shrunk toward 0: in a camera that has seen one side only, the residual may be that
+            # side's colour instead of a gain
             share = gain_sigma**2 / (gain_sigma**2 + self._noise)
             for camera in cameras:
                 left_over = residual[views == camera] + self._gain[camera]
@@ -175,7 +177,8 @@ class Appearance:
     def _unshaded(self, seen: SurfaceColours, colour: np.ndarray) -> np.ndarray:
         """Remove shading and exposure from differences of colour (N, 3).
 
-        Ridge regression on the normals: light from one side, and the exposure of each view.
+        Each view has an offset of all colours (exposure) and a gradient of brightness along the
+        normals (light from one side), both estimated by ridge regression.
         """
         # standard deviations, logarithms of light: exposure and white balance of a view from frame
         # to frame, and light from one side relative to the other
@@ -184,7 +187,8 @@ class Appearance:
         starts = np.flatnonzero(np.diff(seen.view, prepend=-1))
         for start, stop in zip(starts, [*starts[1:], len(seen.view)], strict=True):
             own = slice(start, stop)
-            # patches of a view err together: a view of one side only must keep its colour
+            # Errors of a view's patches are correlated: all its pixels count as COLOUR_SAMPLES
+            # samples. With more, the colour of a view of one side would be taken for exposure.
             weight = COLOUR_SAMPLES * seen.pixels[own, None] / seen.pixels[own].sum()
             light = np.concatenate(
                 [np.full((stop - start, 1), exposure_sigma), shading_sigma * seen.normal[own]], 1
@@ -251,7 +255,7 @@ def _cost(residual: np.ndarray, variance: np.ndarray) -> np.ndarray:
 
 
 def _mean_square(residual: np.ndarray) -> np.ndarray:
-    """Return the mean square (3,) of residuals (N, 3), each bounded by 2: from white to black."""
+    """Return the mean square (3,) of residuals (N, 3), each bounded by 2 (a factor of 7)."""
     return (np.clip(residual, -2.0, 2.0) ** 2).mean(0)
 
 

@@ -17,7 +17,7 @@ from intercap_core.object_track.motion import shift_twist
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.turns import distinct_poses, find_near_symmetries
 
-SEED_SURE_LOG_RATIO = 40.0  # nats at which the search for a frame to start from ends; tuned
+SEED_SURE_LOG_RATIO = 40.0  # nats of a first frame that is good enough to search no other; tuned
 KEY_FRAME_S = 0.2  # time between frames in which near symmetries and colours are compared; tuned
 DOUBTFUL_PROBABILITY = 0.9  # of the chosen hypothesis, below which a frame is uncertain; tuned
 # Log-likelihood ratio at which the images of a frame clearly contradict an annotated pose: two or
@@ -47,7 +47,8 @@ class Proposals:
     def start(self) -> int:
         """Search the three most promising frames, more while none shows the object, ten at most.
 
-        All hypotheses are followed. Returns the best frame; raises NotFound if there is none.
+        A frame that certainly shows the object ends the search at once. All hypotheses
+        are followed. Returns the best frame; raises NotFound if there is none.
         """
         results: list[tuple[float, int, list[FittedPose]]] = []
         for tried, t in enumerate(self._observer.frames_to_search()):
@@ -77,8 +78,8 @@ class Proposals:
         """Follow an annotated pose, unless the images clearly contradict it.
 
         Returns:
-            The pose if the images support it or hide the object. If they contradict it, the same
-            pose in a neighbouring frame that shows it; None if no frame does.
+            The pose if the images support it or hide the object. If they contradict it, the pose
+            fitted to a neighbouring frame that shows it; None if no frame does.
         """
         t, pose = given.frame, given.pose
         wide = self._fit(t, pose)
@@ -127,10 +128,12 @@ class Proposals:
 
         1. From the poses of neighbouring frames, outwards from sure frames.
         2. With all rotations, once in each visible run and near annotated poses.
-        3. If nothing is new, with all rotations in some frames: six, and one more each 0.5 s.
+        3. If nothing is new, with all rotations in frames about 0.5 s apart.
 
-        A frame is uncertain if its hypothesis is improbable or has less than half of the weight
-        that is usual in this recording.
+        All searches with all rotations but those near annotated poses share a budget: six frames,
+        and one more for each 0.5 s of the recording. A frame is uncertain if the object is hidden
+        in it, or if its hypothesis is improbable or has less than half of the weight that is usual
+        in this recording.
         """
         fits, hidden = self._hypotheses.fits, decoded.path == HIDDEN
         weight, probability = np.zeros(len(fits)), np.zeros(len(fits))
@@ -156,7 +159,7 @@ class Proposals:
         if new:
             return True
         apart = self._observer.frames_in(every_s) // 2
-        # a hidden pose that motion makes sure is not elsewhere
+        # a pose that is certain from the motion needs no search, though little of it is visible
         is_open = (probability < DOUBTFUL_PROBABILITY) | (weight < 0.25 * usual)
         uncertain = [t for t in uncertain if is_open[t]]
         while len(self._searched) < budget and not new:
@@ -203,7 +206,7 @@ class Proposals:
     def _unsearched_runs(self, path: np.ndarray, weight: np.ndarray) -> list[int]:
         """Return the likeliest frame of every visible run of 0.2 s without a searched frame.
 
-        An object that reappears may have turned out of sight.
+        An object that reappears may have been rotated while it was hidden.
         """
         seen = np.flatnonzero(path != HIDDEN)
         runs = np.split(seen, np.flatnonzero(np.diff(seen) > 1) + 1)

@@ -17,8 +17,8 @@ from intercap_core.object_track.reduced_mask import EMPTY, ReducedMask, covers
 from intercap_core.object_track.view import FitContext, MaskCandidate, View
 
 MIN_RENDERED_PX = 12  # renderings with fewer pixels are not compared; tuned
-# Depth this much behind (nearer than) the render is background (an occluder): above the sensor's
-# systematic error and that of the pose.
+# Depth that is measured farther than the render by this much shows the background, nearer by this
+# much an occluder. Above the systematic errors of sensor and pose.
 FREE_SPACE_M = 0.03  # metres; tuned
 AGREEMENT_SCALE_M = 0.010  # a pixel this far off agrees by half (Azure Kinect's data sheet)
 ASSESS_MIN_OVERLAP = 0.1  # smallest IoU of a candidate to compare an unfitted pose with; tuned
@@ -29,8 +29,8 @@ def choose_candidate(
 ) -> MaskCandidate | None:
     """Choose the candidate with the largest overlap with the visible render.
 
-    One of the object's labels adds 0.05, which breaks ties. Returns None if no overlap reaches
-    ``min_overlap``.
+    A candidate with one of the object's labels gets 0.05 more, which breaks ties. Returns None if
+    no overlap reaches ``min_overlap``.
     """
     best, best_rank = None, 0.0
     if predicted.area < MIN_RENDERED_PX:
@@ -44,7 +44,10 @@ def choose_candidate(
 
 
 def mask_overlap(image: Rendering, mask: ReducedMask, person: ReducedMask) -> float:
-    """Return the IoU of a mask and the part of a render that no person outside the mask hides."""
+    """Return the IoU of a mask and the visible part of a render.
+
+    A rendered pixel is visible if the mask shows it or no person is there.
+    """
     if not image.meets(mask.x0, mask.y0, *mask.mask.shape):
         return 0.0
     visible, common = _compare(*_window(image), *_window(person), *_window(mask))
@@ -66,7 +69,10 @@ def _window(image: Rendering | ReducedMask) -> tuple[np.ndarray, int, int]:
 
 @numba.njit(cache=True, nogil=True)
 def _compare(face, x0, y0, person, px, py, mask, mx, my):
-    """Count the visible rendered pixels, and those in the mask; windows with their origins."""
+    """Count the rendered pixels that are visible, and those in the mask (:func:`mask_overlap`).
+
+    The three images are windows, each followed by the column and row of its first pixel.
+    """
     visible, common = 0, 0
     for v in range(face.shape[0]):
         own, other = v + y0 - my, v + y0 - py
@@ -160,8 +166,8 @@ def count_unoccluded(silhouette: Rendering, visible: int, free: int, compared: i
     Args:
         silhouette: rendering in the colour image.
         visible: pixels that no person's mask covers.
-        free: pixels of the depth image without an occluder ...
-        compared: ... of this many.
+        free: rendered pixels of the depth image that nothing nearer occludes.
+        compared: rendered pixels of the depth image that have a measurement.
     """
     if compared <= MIN_RENDERED_PX:
         return visible

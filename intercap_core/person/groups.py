@@ -47,7 +47,8 @@ class PersonGroup:
     support: float
     """Weighted number of points seen, over all views."""
     errors: np.ndarray
-    """(C,) distance of the points from each detection, as a share of the limit."""
+    """(C,) distance of the points from each detection, as a share of the limit; inf = none within
+    it."""
 
     @property
     def views(self) -> int:
@@ -155,7 +156,7 @@ def _grow(
     seen: list[np.ndarray],
     rig: Rig,
 ) -> PersonGroup | None:
-    """Add to a proposal the person of each view that it reprojects onto."""
+    """Add the detection of each view that is closest to the reprojected points of a proposal."""
     members = np.full(len(rig), NOBODY, np.int32)
     members[first[0]], members[second[0]] = first[1], second[1]
     pixels = reproject(np.nan_to_num(points), rig)

@@ -136,6 +136,7 @@ def _chosen(
         return PersonTrack(), "alone", doubts
     scores = [_score(person.track, middle) for person in people]
     order = np.argsort(scores)[::-1].tolist()
+    # whoever has less could not become a rival even by handling the object in all images
     least = RIVAL_SHARE / (1 + HANDLING_WEIGHT) * scores[order[0]]
     likely = {k: scores[k] for k in order if scores[k] > least}
     by = "alone"
@@ -197,7 +198,7 @@ def _score(track: PersonTrack, middle: np.ndarray) -> float:
 
 
 def _handling(track: PersonTrack, touches: Touches) -> float:
-    """Share of the images of a person and the object in which they touch."""
+    """Share of the images showing both a person and the object in which they touch."""
     contacts = [
         touches(t, c, int(group.members[c]))
         for t, group in zip(track.sets, track.groups, strict=True)
@@ -225,8 +226,9 @@ def _add_single_views(
     times: np.ndarray,
     min_confidence: float,
 ) -> None:
-    """Add the detection closest to the last known points in sets without agreeing views.
+    """Add single detections of the subject in sets without agreeing views.
 
+    In each view, the one closest to the subject's points in the nearest known set is taken.
     People whom agreeing views locate elsewhere are excluded.
     """
     if not chosen.sets:
@@ -240,7 +242,7 @@ def _add_single_views(
         points = chosen.groups[place].points
         pixels = reproject(np.nan_to_num(points), rig)
         for c in range(len(rig)):
-            best = 2.0 * limits[c]  # the subject has moved since
+            best = 2.0 * limits[c]  # the subject moves in between
             placed = {int(group.members[c]) for group in groups[t] if group.views > 1}
             for i, person in enumerate(detections.people(t, c)):
                 if i in placed:

@@ -13,7 +13,7 @@ from intercap_core.scene.up import UpDirection, degrees_between
 
 FOOT_HEIGHT_M = 0.014  # of the lowest keypoint of a foot, measured on the open body, standing
 FOOT_TOLERANCE_M = 0.05  # feet that differ by more do not stand on one floor; tuned on the studio
-MIN_FOOT_SPREAD_M = 0.15  # standard deviation, of feet that show a tilt; tuned on the studio
+MIN_FOOT_SPREAD_M = 0.15  # least standard deviation of feet that show a tilt; tuned on the studio
 FLOOR_COSINE = 0.94  # 20 degrees: of a floor point's normal with the plane's; tuned on the studio
 FLOOR_HYPOTHESIS_TOLERANCE_M = 0.03  # inliers of a hypothesis of the floor; tuned on the studio
 BELOW_FLOOR_M = 0.10  # a point this far under the plane speaks against it; tuned on the studio
@@ -124,9 +124,10 @@ def _lowest(
 def _covered(
     points: np.ndarray, lower: GroundPlane, upper: GroundPlane, tolerance_m: float
 ) -> float:
-    """Share of the lower plane, by cells of 15 cm, above which the upper one was measured.
+    """Share of the lower plane, in cells of 15 cm, above which the upper one was measured.
 
-    No camera looks through a platform, but a misplaced camera shows the same floor a second time.
+    It is small under a platform, which no camera looks through, and large if a misplaced camera
+    shows one floor a second time.
     """
     across = np.linalg.svd(upper.normal[None])[2][1:]
 
@@ -218,9 +219,9 @@ def fit_ground_to_feet(feet: np.ndarray, up: UpDirection) -> GroundPlane:
 
     ``feet``: (T, F, 3) heels and toes, NaN = unknown. The lowest foot point of each set stands. If
     feet stand on several levels (a beam, stairs), the lowest well supported level is the floor.
-    The normal is measured gravity or a stated up, else it is fitted to the feet, where they are
-    spread enough: a walk along a line shows the tilt along it. The height is as accurate as the
-    keypoints, one to two centimetres.
+    The normal is measured gravity or a stated up. Without them it is fitted to the feet, in each
+    direction in which they are spread enough: a walk along a line shows only the tilt along it. The
+    height is as accurate as the keypoints, one to two centimetres.
     """
     standing = _standing(feet, up.direction)
     if len(standing) < MIN_FOOT_SETS:
@@ -320,7 +321,7 @@ def _one_slope(standing: np.ndarray, up: np.ndarray) -> np.ndarray | None:
     kept = np.ones(len(standing), bool)
     for _ in range(5):
         normal = _normal_of(standing[kept], up)
-        # treads of 12 by 40 cm rise by 17 degrees
+        # steeper feet stand on levels: even low stairs, 12 by 40 cm, rise by 17 degrees
         if normal is None or degrees_between(normal, up) > 15.0:
             return None
         distance = (standing - standing[kept].mean(0)) @ normal

@@ -1,4 +1,4 @@
-"""Epipolar cost of a time lag between two cameras, along the people that both follow.
+"""Epipolar cost of a time lag between two cameras, from the motion of people whom both see.
 
 People are followed in the images of each camera separately, so no two views have to be in step.
 Only body points are used that do not depend on left and right (nose, neck, middle of the hips,
@@ -66,7 +66,7 @@ def follow_rays(
                 continue
             pixels = np.stack([body_middles(people[i]) for i in surest])
             _place(rays[:, c], t, rig[c].colour.unproject(pixels)[..., :2], times)
-        if usual >= 1.5:  # half way to half the rate
+        if usual >= 1.5:  # sets from image to image: 1 at the full frame rate, 2 at half of it
             _carry_on(rays[:, c], images, usual)
     return rays
 
@@ -107,8 +107,9 @@ def _last_seen(rays: np.ndarray) -> int:
 def _carry_on(rays: np.ndarray, images: np.ndarray, usual: float) -> None:
     """Interpolate the ``rays`` (T, P, K, 2) of a camera with a lower frame rate, in place.
 
-    Otherwise adjacent lags would be compared by different sets. ``images``: (N,) sets with an
-    image, usually ``usual`` sets apart.
+    Without it, the costs of adjacent lags would come from different sets, since a lag uses only the
+    sets in which both cameras have rays. ``images``: (N,) sets with an image, usually ``usual``
+    sets apart.
     """
     for first, last in pairwise(images.tolist()):
         if last - first > 2 * usual:
@@ -123,8 +124,8 @@ class PairCosts:
     """Disagreement of pairs of cameras, by lag and set."""
 
     cost: dict[tuple[int, int], np.ndarray]
-    """(4 reach + 1, T) by cameras a < b: cost, 0 to 1, of b's image of set t + lag showing the same
-    moment as a's image of set t. Lags begin at -2 reach; NaN = unknown."""
+    """(4 reach + 1, T) by cameras a < b. Row lag + 2 reach, column t: disagreement, 0 to 1, between
+    a's image of set t and b's image of set t + lag if both show the same moment; NaN = unknown."""
     views: int
     """Number of cameras."""
     reach: int
@@ -147,7 +148,8 @@ class PairCosts:
     def series(self, camera: int, late: int, others: Sequence[int], sets: np.ndarray) -> np.ndarray:
         """Mean cost (T + 2 reach,) of a camera's pairs with ``others``, by moment.
 
-        ``late``: delay of the camera, sets. ``sets``: (C,) delays of the others.
+        Moment t is at t + reach; a camera with a delay of d sets shows it in set t + d. ``late``:
+        delay of the camera, sets. ``sets``: (C,) delays of all cameras.
         """
         rows = []
         for other in others:

@@ -84,9 +84,9 @@ def run(
 
 
 def _hands_of_few_views(person: Path) -> np.ndarray:
-    """Mask (T, 2) of left and right hands whose median keypoint at most two views see.
+    """Mask (T, 2): left and right hand, if at most two views see most of its keypoints.
 
-    The object that occludes the hand in the other views occludes fingers in these.
+    The object that occludes the hand in all other views also occludes some fingers in those two.
     """
     with artefacts.read(person, PERSON) as artefact:
         views = artefact["joint_views"]

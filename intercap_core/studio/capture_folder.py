@@ -48,8 +48,9 @@ class Aligner:
         return np.where(np.isfinite(aligned), np.rint(aligned * 1000), 0).astype(np.uint16)
 
 
-# Corners of one surface differ by less than this share of their depth: two pixels of the wide
-# binned image (0.23 degrees apart) on a surface that is 85 degrees off the ray.
+# Corners of a triangle belong to one surface if they differ by less than this share of their depth.
+# Neighbouring pixels of the coarsest mode (wide, binned: 0.23 degrees) differ by as much on a
+# surface whose normal is 85 degrees off the ray.
 STEEPEST = 0.0469
 
 
@@ -167,7 +168,7 @@ class CaptureFolder(ABC):
 
     @abstractmethod
     def write_calibration(self, claimed: Rig, fps: int) -> None:
-        """Write the erring calibration."""
+        """Write the calibration with its errors, ``claimed``."""
 
     def image_number(self, t: int, order: int, fps: int) -> int:
         """Return the image number that files of detections use for set ``t``, the ``order``-th

@@ -1,8 +1,8 @@
 """A puppet's hands: finger flexion, and grasps closed against the true object's surface.
 
-A grasp does not use the contact term and regions of the fits. Joint after joint flexes until the
-skin of its finger meets the object (Miller and Allen 2004, "GraspIt!", auto-grasp). The hand stays
-in its rest frame; the object is moved relative to it.
+Joint after joint flexes until the skin of its finger meets the object (Miller and Allen 2004,
+"GraspIt!", auto-grasp). The contact term and regions of the fits are not used, so that the truth
+does not favour them. The hand stays in its rest frame; the object is moved relative to it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class HandShape:
     flexion: np.ndarray
     """(5, 3) FINGERS by joint from the knuckle."""
     spread: np.ndarray
-    """(5,) away from the middle finger."""
+    """(5,) of the fingers at the knuckles, positive towards the thumb; the thumb's is not used."""
     opposition: float
     """Rotation of the thumb's base towards the palm."""
 
@@ -148,7 +148,7 @@ class Hand:
             fingers: the fingers that are closed, in this order.
 
         Returns:
-            The shape, and the least signed distance (5,) of each finger.
+            The shape, and the least signed distance (5,) of each finger to the object, metres.
         """
         flexion = start.flexion.copy()
         for f in fingers:
@@ -206,7 +206,7 @@ class Hand:
 
 
 def part_of(subject: Subject, ids: np.ndarray) -> Subject:
-    """The same person with a part (n,) of the vertices and the faces between them."""
+    """The same person reduced to the vertices ``ids`` (n,) and the faces between them."""
     place = np.full(len(subject.rest), -1)
     place[ids] = np.arange(len(ids))
     faces = place[subject.faces]

@@ -25,7 +25,7 @@ def gaussian(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class NoiseSource:
-    """Random processes with a seed, scale and family; each name has its own stream."""
+    """Random processes with a seed, scale and family; each name has its own random numbers."""
 
     seed: int
     scale: float

@@ -19,7 +19,7 @@ from intercap_core.studio.render import Cast, RoomView
 from intercap_core.studio.stage import StudioStage
 
 # Nearest and farthest distance of a depth mode, metres, slightly beyond the data sheet's, and its
-# noise relative to the first
+# noise relative to that of the first mode
 LIMITS = {
     "NFOV_UNBINNED": (0.45, 4.3, 1.0),
     "NFOV_2X2BINNED": (0.45, 6.0, 0.7),
@@ -64,7 +64,7 @@ class DepthSensor:
         self._static_holes = blotches < np.where(np.isfinite(risk), risk, 1)
 
     def _risk(self, depth: np.ndarray, cosine: np.ndarray, albedo: np.ndarray) -> np.ndarray:
-        """Probability (...) of holes on surfaces at grazing angles and on dark surfaces."""
+        """Threshold (...) of :func:`_blotches` below which grazing and dark surfaces have holes."""
         scale = self._noise.scale
         risk = 0.9 * np.clip(1 - np.abs(cosine) / (self.grazing_cosine * (0.5 + 0.5 * scale)), 0, 1)
         risk += np.clip(1 - albedo / self.dark, 0, 1) * np.clip(depth / 4 - 0.2, 0, 0.7)
@@ -98,7 +98,7 @@ class DepthSensor:
         phase = depth * np.float32(2 * np.pi / self.ripple_period_m) + np.float32(self._ripple)
         error += np.float32(self.ripple_m) * np.sin(phase)
         error *= scale
-        error += depth
+        error += depth  # from here on the measured depth
         error += np.float32(self.bias)
         invalid |= (error <= near) | (error >= far)
         error[invalid] = 0
@@ -123,7 +123,11 @@ class DepthSensor:
 def _blotches(
     rng: np.random.Generator, shape: tuple[int, ...], size: float, contrast: float
 ) -> np.ndarray:
-    """Smooth random values in [0, 1] (H, W) that change over ``size`` pixels."""
+    """Smooth random values in [0, 1] (H, W) that change over ``size`` pixels.
+
+    ``contrast``: about twice the standard deviation of the blurred noise, which keeps most values
+    within 0.5 +- 0.3.
+    """
     smooth = cv2.GaussianBlur(gaussian(rng, shape), (0, 0), size)
     return 0.5 + 0.5 * np.tanh(smooth / contrast / 1.2)
 
@@ -171,7 +175,7 @@ def heard(stage: StudioStage, index: int, first_s: float, seconds: float) -> np.
             direct[there] += event.samples[there.start - start : there.stop - start] / far
     sound = signal.fftconvolve(direct, _room(stage, rng))[lead : lead + count]
     power = float((sound**2).mean())
-    noise = np.sqrt(power * 10 ** (-rng.uniform(5.0, 20.0) / 10)) if power > 0 else 1e-4  # dB
+    noise = np.sqrt(power * 10 ** (-rng.uniform(5.0, 20.0) / 10)) if power > 0 else 1e-4  # SNR, dB
     sound += rng.normal(0, noise, count)
     return (0.5 * sound / max(np.abs(sound).max(initial=0.0), 1e-9)).astype(np.float32)
 
@@ -182,7 +186,7 @@ def _room(stage: StudioStage, rng: np.random.Generator) -> np.ndarray:
     times = np.arange(round(fall * RATE)) / RATE
     tail = rng.normal(size=len(times)) * 10 ** (-3 * times / fall)
     tail[: round(0.002 * RATE)] = 0
-    tail *= np.sqrt(rng.uniform(0.5, 1.2) / (tail**2).sum())  # energy, of the direct sound's
+    tail *= np.sqrt(rng.uniform(0.5, 1.2) / (tail**2).sum())  # energy relative to the direct sound
     tail[0] = 1.0
     return tail
 

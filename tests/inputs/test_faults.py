@@ -129,7 +129,7 @@ REFUSED = {
         ("settings", text("config.yaml", "objects.yaml", "x" * 300)), "setting objects",
     ),
     "weights of zeros": (
-        ("vposer", lambda folder: _reweighted(folder, lambda w: w * 0)), "layer of zeros",
+        ("vposer", lambda folder: _reweighted(folder, lambda w: w * 0)), "is zero, so that every",
     ),
     "weights of 1e30": (
         ("vposer", lambda folder: _reweighted(folder, lambda w: w * 1e30)), "expected at most 1000",

@@ -226,7 +226,7 @@ def test_another_processor_is_reported_and_reruns_nothing(flow: Flow) -> None:
     assert flow.pending() == set()
     output = flow.intercap("status", flow.settings).stdout
     assert "2 done of 2 sequences" in output
-    assert "1 results were made on another machine or device (cuda, another)" in output
+    assert "1 results were computed on another machine or device (cuda, another)" in output
     path.write_bytes(whole)
 
 

@@ -1,4 +1,4 @@
-"""Which colour image of a camera a file, or an entry of a file, is about."""
+"""Match files of detections, and entries of such files, to the colour images of a camera."""
 
 from __future__ import annotations
 
@@ -34,7 +34,8 @@ class CameraImages:
     number: np.ndarray
     """(T,) number by which files call the image of each set; -1 = no image."""
     time_us: np.ndarray
-    """(T,) device time of the image."""
+    """(T,) device time of the image, microseconds; -1 = no image, or a recording of layout k4a,
+    whose times are not needed."""
     recorded: frozenset[int] = frozenset()
     """Numbers of all images of the camera, including those in no set."""
     stems: tuple[str, ...] = ()
@@ -145,9 +146,11 @@ def sort_by_image(
 ) -> tuple[dict[int, list[Result]], list[str]]:
     """Sort a file's results by image number.
 
-    Returns the results by number, and the names of images that were not recorded. An image that
-    the detector processed has a list, which may be empty. Images of faulty entries have a list
-    only with results, and so have unlisted images if no entry can be used.
+    Returns the results by number, and the names of images that were not recorded. An empty list
+    means that the detector processed the image and found nothing. Images without a list are
+    unknown: images with a faulty entry and no other result, images that are missing in the file's
+    list of images, and, if the file has no such list, all images if none of its entries can be
+    used.
     """
     keys = [*(key for key, _ in file.results), *file.faulty, *(file.images or ())]
     by_name = images.match_names(key.name for key in keys if key.name is not None)

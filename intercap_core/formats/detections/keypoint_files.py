@@ -52,7 +52,7 @@ class KeypointCleaner:
     """Number of people with normalised coordinates."""
 
     def clean(self, people: np.ndarray) -> np.ndarray:
-        """Return the people (P, 135, 3) with any visible point, as float32.
+        """Return the people (P, 135, 3) with any visible point and pixel coordinates, as float32.
 
         A point becomes zeros if it is not finite, lies outside the image or exactly at (0, 0), or
         has no confidence. Confidence beyond the full one is clipped to 1.
@@ -125,7 +125,7 @@ class _Reading:
     """Whether anything could be used."""
 
     def finish(self, folder: Path, camera: str) -> PeopleByImage:
-        """The people, with notes; raises UserError if there are files and none can be used."""
+        """The people, with notes; raises UserError if files can be loaded and none can be used."""
         notes = self.people.notes
         note_broken(notes, "keypoint files", self.broken)
         if self.faults and not self.used:
@@ -172,7 +172,8 @@ def has_keypoints(folder: Path, camera: str) -> bool:
 def read_camera(folder: Path, images: CameraImages, *, full_confidence: float) -> PeopleByImage:
     """Read all keypoints of one camera.
 
-    Raises UserError if there are keypoints and none can be used, or two files of one image.
+    Raises UserError if files can be loaded and none can be used, or for two files of one image.
+    Files that cannot be loaded are noted.
 
     Args:
         folder: folder of keypoints of the sequence.

@@ -72,11 +72,12 @@ def preview_video(path: Path, stream_index: int, fps: float) -> RecordingPreview
     """Inspect one track of a video file that opens.
 
     This takes milliseconds for files with an index (mp4, mov, avi) and for Matroska, which states
-    its length. Other files are read from the last image to which FFmpeg can seek.
+    its length. Other files are read from the last image to which FFmpeg can seek. A file that was
+    cut off holds only a share of what it states.
     """
     with open_container(path) as container:
         stream: Any = container.streams[stream_index]
-        # The stream of a closed container is freed memory.
+        # read here: after its container is closed, the stream is freed memory
         stated, frames = float(container.duration or 0) / av.time_base, int(stream.frames)
         length = os.path.getsize(path)
         entries = getattr(stream, "index_entries", None) or ()
@@ -300,7 +301,7 @@ class VideoRecording(CameraRecording):
         faults = inspect_files(self._shots, self.camera.depth)
         if self._times is not None and seen.images is not None:
             stated = len(self._times)
-            if abs(stated - seen.images) > max(1, 0.02 * stated):  # a number from duration and rate
+            if abs(stated - seen.images) > max(1, 0.02 * stated):  # images may be estimated
                 faults.append(f"has {stated} timestamps for about {seen.images} images")
         return seen._replace(faults=tuple(faults))
 

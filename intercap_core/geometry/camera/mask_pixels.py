@@ -1,7 +1,9 @@
 """The depth pixels that show the surface covered by a mask of the colour image.
 
-The kernel is the look-up of :mod:`intercap_core.geometry.camera.clouds` in single precision,
-restricted to pixels that can reach the mask.
+Each depth pixel is projected into the colour image. It is one of the mask's if it falls on the mask
+and no nearer pixel falls beside it, which would hide it from the colour camera. The same is done in
+:mod:`intercap_core.geometry.camera.clouds` for whole images; here in single precision, and only for
+pixels that can reach the mask.
 """
 
 from __future__ import annotations
@@ -63,7 +65,7 @@ def mask_pixels(
         camera: camera with depth.
         mask: mask of the colour image; not empty.
         window: rows and columns that are searched.
-        background: (H, W) mm, 0 = unknown. Only pixels that are nearer count, and only they hide
+        background: (H, W) mm, 0 = unknown. Only pixels nearer than it count, and only they hide
             others.
         before_m: distance by which a pixel must be nearer than the background, metres.
         every: step between the rows and columns of the result. All pixels may hide others.
@@ -112,7 +114,7 @@ def _mask_pixels(
     Args:
         depth: (H, W) uint16 mm.
         background: (H, W) mm, or empty.
-        before_mm: pixels that are less than this nearer than the background do not count.
+        before_mm: a pixel counts if it is nearer than the background by more than this.
         rows, columns: first and end of the window.
         rays: (H, W, 2) of the depth lens.
         pose: (4, 4) colour_from_depth.
@@ -135,7 +137,7 @@ def _mask_pixels(
         np.empty((height, width), np.float32),
         np.empty((height, width), np.float32),
     )
-    counts = np.empty(width, np.bool_)
+    counts = np.empty(width, np.bool_)  # whether a pixel counts
     for r in range(height):
         near = depth[rows[0] + r, columns[0] : columns[1]]
         if background.size:

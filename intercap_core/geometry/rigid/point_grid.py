@@ -1,7 +1,7 @@
-"""The nearest of many points that lie on surfaces: points in cubic cells.
+"""Search of the nearest of many points on surfaces, by a grid of cubic cells.
 
-Cells that are consecutive along the last axis hold points that are consecutive in memory, so that
-the part of a row of cells that a ball reaches is one loop.
+Points are sorted by cell. Cells that are consecutive along the last axis are consecutive in memory,
+so that the part of a row of cells that a ball reaches is one loop.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-CELL_M = 0.02  # some ten points of each of three depth cameras; half and double take longer
+CELL_M = 0.02  # holds some ten points of each of three depth cameras; half or double is slower
 MAX_CELLS = 1 << 21  # beyond, cells are larger: points far apart are sparse
 
 
@@ -76,8 +76,10 @@ def sort_into_cells(points, cell):
 def _nearest(queries, points, starts, low, number, size):
     """Return the squared distance (M,) of finite queries (M, 3) float32 to the nearest point.
 
-    The other arguments are results of :func:`sort_into_cells`. Each search starts at the last
-    nearest point.
+    The other arguments are results of :func:`sort_into_cells`. Each search starts with the nearest
+    point of the query before. Layers of cells along the first axis, and rows of a layer along the
+    second, are visited outwards from the query's own, in turn on both sides. The visit ends when
+    three in succession are farther away than the nearest point so far.
     """
     xs, ys, zs = points[0], points[1], points[2]
     inverse = 1 / size
@@ -89,31 +91,31 @@ def _nearest(queries, points, starts, low, number, size):
         gx, gy, gz = (x - low[0]) * inverse, (y - low[1]) * inverse, (z - low[2]) * inverse
         own_i = min(max(np.int64(np.floor(gx)), 0), number[0] - 1)
         own_j = min(max(np.int64(np.floor(gy)), 0), number[1] - 1)
-        side_i = -1
+        beyond_i = -1  # successive layers that are too far away, less one
         for a in range(2 * number[0]):  # own layer of cells first, then those around in turn
             i = own_i + ((a + 1) >> 1) * (1 if a & 1 else -1)
             off_x = max(i - gx, gx - i - 1, 0.0) * size
             if off_x * off_x >= best:
-                side_i += 1
-                if side_i > 1:
+                beyond_i += 1
+                if beyond_i > 1:
                     break
                 continue
             if i < 0 or i >= number[0]:
                 continue
-            side_i = -1
-            side_j = -1
+            beyond_i = -1
+            beyond_j = -1
             for b in range(2 * number[1]):
                 j = own_j + ((b + 1) >> 1) * (1 if b & 1 else -1)
                 off_y = max(j - gy, gy - j - 1, 0.0) * size
                 rest = best - off_x * off_x - off_y * off_y
                 if rest <= 0:
-                    side_j += 1
-                    if side_j > 1:
+                    beyond_j += 1
+                    if beyond_j > 1:
                         break
                     continue
                 if j < 0 or j >= number[1]:
                     continue
-                side_j = -1
+                beyond_j = -1
                 along = np.sqrt(rest) * inverse
                 first = max(np.int64(np.floor(gz - along)), 0)
                 stop = min(np.int64(np.floor(gz + along)), number[2] - 1)

@@ -28,8 +28,9 @@ from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations, mi
 from intercap_core.geometry.solve.robust import geman_mcclure_weight
 
 SHAPE_FRAMES = 16  # evenly spread; the skin is within 0.1 mm of that of 48, measured on the studio
-# Difference between two body models at equal pose and shape, metres. Measured on the studio: people
-# on another mesh end 1.4 to 2.7 mm from the open body (mean), 4 to 8 mm (95th percentile).
+# Difference between two body models at equal pose and shape, metres. Measured on the studio: after
+# the fit, the open body is 1.4 to 2.7 mm (mean) and 4 to 8 mm (95th percentile) from the skin of
+# people on another mesh.
 SURFACE_SIGMA_M = 0.004
 REACH_M = 0.20  # distance of the farthest correspondence: arms start that far away; tuned
 FAR_M = 0.03  # distance at which a correspondence counts a quarter (Geman-McClure); tuned
@@ -131,7 +132,7 @@ class _SurfaceFit:
         return np.array(statistics)
 
     def _stiffness(self, fingers: bool) -> Tensor:
-        """Precision (n,) of the pose about the expected one, 1/rad^2.
+        """Precision (n,) of the pose about the expected one, 1/rad^2. ``fingers``: they are free.
 
         Rest poses and joints of two body models differ by some degrees. Measured on the studio:
         from rotations 8 degrees off, joints end 3 mm from the true ones in the mean.
@@ -162,7 +163,12 @@ class _SurfaceFit:
     def _match_frame(
         self, target: _Target, vertices: Tensor, normals: Tensor, far: Tensor
     ) -> _Planes:
-        """Planes of one frame, to the other surface and back; at ``far`` (S, 1) one counts 1/4."""
+        """Two planes for each sample of the body in one frame, toward the other surface.
+
+        The first touches the other surface at its point that is closest to the sample. The second
+        is perpendicular to the sample's own normal, at the mean height of the other surface's
+        vertices that have matched the sample. At the distance ``far`` (S, 1) a plane counts 1/4.
+        """
         samples, along = vertices[self.skin.sample], normals[self.skin.sample]
         closest = target.field.closest(samples.numpy())
         nearest, facing = (
@@ -176,6 +182,7 @@ class _SurfaceFit:
         zeros = torch.zeros(len(samples), dtype=samples.dtype)
         mean, count = average(matches, ones, zeros, huber=FAR_M)
         both = torch.stack([facing, along], 1)
+        # height of the sample above either plane, metres
         height = torch.stack([(facing * (samples - nearest)).sum(1), -mean], 1)
         valid = torch.stack([agrees, count > 0.5], 1)
         size = torch.stack([distance, mean.abs()], 1)
@@ -194,7 +201,7 @@ class _Target:
 
 
 class _Planes(NamedTuple):
-    """Planes to which S samples of N frames are drawn, in both directions (2)."""
+    """Planes to which S samples of N frames are drawn, two for each; see :meth:`_match_frame`."""
 
     normal: Tensor  # (N, S, 2, 3)
     offset: Tensor  # (N, S, 2) normal . v of the vertices v on the plane, metres.

@@ -1,13 +1,15 @@
 """Body data: E_B of equation 6, which is equation 2 with the constants of the body fit.
 
 Shape, thickness of clothing and keypoint offsets are those of the body fit. The terms of E_B and
-their weights are those of :mod:`intercap_core.body_fit.problem`, except for E_theta_h: a hand's
-pose lasts, so that its prior in successive frames is one observation. With full weight in every
-frame, fingers stay tens of millimetres short of the pose on which several views agree.
+their weights are those of :mod:`intercap_core.body_fit.problem`, except for E_theta_h, the prior of
+the hands' pose. A hand keeps its pose for about half a second, so that the prior counts once in
+this time and not in every frame. With full weight in every frame, fingers stay tens of millimetres
+short of the pose on which several views agree.
 
 E_J and E_D (equations 3 and 4) also depend on the cameras. A camera that is turned by w about its
 centre s, shifted by v and whose depth bias grows by b displaces a point p by w x (p - s) + v - b r,
-with r the ray to p per metre of depth. For keypoints it is as if the body had moved the other way.
+with r the ray to p per metre of depth. These are displacements of measured points; a reprojected
+keypoint moves as if the body had been displaced by the opposite.
 """
 
 from __future__ import annotations
@@ -71,7 +73,7 @@ class BodyData(JointTerm):
         self._fitter, self._problem = fitter, problem
         self._trusted = trusted[fitter.frames]
         self._index = torch.arange(len(fitter.frames), device=fitter.model.device)
-        self._interpolated: np.ndarray | None = None
+        self._interpolated: np.ndarray | None = None  # bodies at the first refresh
 
     @classmethod
     def load(
@@ -259,6 +261,7 @@ def add_by_cameras(
 def _add_keypoints(
     evidence: Evidence, problem: BodyProblem, part: np.ndarray, seen: CameraEvidence
 ) -> None:
+    """Add E_J by the cameras, and by cameras and body, in the frames ``part``."""
     views = problem.views
     if views is None:
         return
@@ -302,6 +305,7 @@ def _add_keypoints(
 def _add_clouds(
     evidence: Evidence, problem: BodyProblem, part: np.ndarray, seen: CameraEvidence
 ) -> None:
+    """Add E_D by the cameras, and by cameras and body, in the frames ``part``."""
     rows, by_view = problem.rows, evidence.by_view
     if rows is None or by_view is None:
         return
@@ -319,6 +323,7 @@ def _add_clouds(
     by_camera[..., TURN], by_camera[..., SHIFT] = torch.linalg.cross(arm, facing), facing
     by_camera[..., BIAS] = -(facing * ray).sum(-1)
     number = by_view.points[part]
+    # a sample's distance is the mean over the points of all cameras: each moves it by its share
     share = number / number.sum(1, keepdim=True).clamp_min(1e-6)
     flat = (by_camera * share[..., None]).transpose(1, 2).flatten(2)  # (b, S, D)
     weighted = flat * own.weight[..., None]

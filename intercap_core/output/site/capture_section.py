@@ -54,8 +54,8 @@ class CameraFacts:
     turned_deg: float
     """Angle by which refinement rotated the camera."""
     slide: float
-    """Displacement of the rig's centre by one standard deviation of the pose, in its least certain
-    direction."""
+    """Distance by which the rig's centre is displaced if the camera's pose is off by one standard
+    deviation in its least certain direction."""
     verdict: str
     """Why the refined or the given pose is used, in words; "" = not judged."""
     note: str

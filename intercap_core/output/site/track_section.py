@@ -47,8 +47,8 @@ def read_track(
         kept: returns the RLE of the candidate that the track uses in frame t and camera c, b"" if
             it uses none.
 
-    If an image is unreadable, ``sheet`` is None and ``note`` has the reason. Raises UserError as
-    :func:`artefacts.read` does.
+    Without a track, or if an image is unreadable, ``sheet`` is None and ``note`` has the reason.
+    Raises UserError as :func:`artefacts.read` does.
     """
     with artefacts.read(paths.object_track, OBJECT_TRACK) as track:
         poses = np.array(
@@ -148,6 +148,7 @@ def _states(**flags: np.ndarray) -> list[str]:
 
 
 def _chart(values: np.ndarray, label: str, least: float, most: float) -> str:
+    """Plot values (T,), clipped to ``most``; the axis reaches up to ``least`` or more."""
     known = np.isfinite(values)
     shown = np.minimum(values, most)
     top = max(least, 1.1 * float(shown[known].max(initial=0.0)))
@@ -199,7 +200,7 @@ def track_sheet(
     """Draw the outlines of track and candidate over crops of the images.
 
     Args:
-        images: images by the frame that they show.
+        images: images indexed by the frame that they show.
         poses: (T, 4, 4) master_from_object.
         kept: as in :func:`read_track`.
     """

@@ -99,7 +99,7 @@ class StaticObject:
     """A component of the static scene."""
 
     extent_m: float
-    """Size, metres."""
+    """Diagonal of its bounding box, metres."""
     away_m: float
     """Smallest distance to the person's path, metres."""
     on_top: bool
@@ -124,8 +124,8 @@ def find_static_objects(
     ``joints``: (N, 3) keypoints of the person at all times, same frame.
 
     Returns:
-        Possible objects, the closest to the person first, and the cells in which any view measures
-        the scene.
+        At most eight possible objects, the closest to the person first, and the cells in which any
+        view measures the scene.
     """
     parts, owner, index = [], [], []
     for number, (view, background) in enumerate(zip(views, backgrounds, strict=True)):

@@ -34,11 +34,13 @@ class HandlingScript(Interaction):
     """
 
     lead = RIGHT
-    grip_height_m: float | None = 0.0  # of the palm above the object's origin; None: both palms
+    # of the palm above the object's origin; None: the object is held between both palms
+    grip_height_m: float | None = 0.0
     attach_s: float  # grasp, script time
     release_s: float  # release, script time
-    clear_m = 0.075  # an open hand leaves the object by this much, away from its palm,
-    back_m = 0.03  # and towards the wrist
+    # just before and after a grip, the open hand is this far off the object, metres:
+    clear_m = 0.075  # against the direction of its palm
+    back_m = 0.03  # against the direction of its fingers
     rests_until_s = 0.0  # the object stays where it is until then, held or not
     pick_pose: np.ndarray
     place_pose: np.ndarray
@@ -50,7 +52,7 @@ class HandlingScript(Interaction):
     def __post_init__(self) -> None:
         self.grips: dict[int, Grip] = {}
         self.hold_s: dict[int, tuple[float, float]] = {}
-        self.haste: dict[int, float] = {}  # a hand takes this part of the usual time to come
+        self.haste: dict[int, float] = {}  # share of the usual time in which a hand comes and goes
         super().__post_init__()
 
     @abstractmethod
@@ -102,7 +104,7 @@ class HandlingScript(Interaction):
         top: float,
         heading: float = 0.0,
     ) -> None:
-        """Place a block: ``middle`` and ``half`` its sizes on the floor, its ``top``, metres."""
+        """Place a block: its ``middle`` and ``half`` sizes on the floor, its ``top``, metres."""
         low = (middle[0] - half[0], middle[1] - half[1], 0.0)
         high = (middle[0] + half[0], middle[1] + half[1], top)
         self.furniture.append(Box(low, high, heading, "wood"))
@@ -170,7 +172,8 @@ class HandlingScript(Interaction):
         off = at.copy()
         off[:, :3, 3] += at[:, :3, :3] @ (-self.clear_m * hand.palm - self.back_m * hand.out)
         over = off.copy()
-        raised = 1 - np.clip(at[:, 2:3, :3] @ hand.palm, 0, 1)  # a palm below stays below
+        # a hand under the object, palm up, does not pass over it
+        raised = 1 - np.clip(at[:, 2:3, :3] @ hand.palm, 0, 1)
         over[:, :3, 3] += raised * self.over_m - 0.06 * (at[:, :3, :3] @ hand.out)
         goal, near, far = (WristPose.of(matrices) for matrices in (at, off, over))
         wrist = idle.towards(far, ramp(times, on - 0.90 * q, on - 0.38 * q))
@@ -198,7 +201,7 @@ class HandlingScript(Interaction):
         trunk, feet = self.trunk(times), self.footwork.feet(times)
         world = puppet.trunk(trunk)
         needs = self.needs(times)
-        for _ in range(2):
+        for _ in range(2):  # the object's path follows the trunk, which bends for the object
             prop = self.path(world, trunk.pelvis, times).matrices
             targets = {
                 side: (self.wrist(side, world, trunk.pelvis, times, prop), needs[side])

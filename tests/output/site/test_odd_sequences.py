@@ -66,7 +66,7 @@ DAMAGES: dict[str, tuple[Damage, list[str]]] = {
         lambda folder: _set(folder / "metrics.h5", schema_version=METRICS.version + 1),
         ["other_version/metrics.h5", f"version {METRICS.version + 1}", "re-run stage 'metrics'"],
     ),
-    "other_vertices": (_of_another_body, ["a body of 1000 vertices", "not in the body's heatmap"]),
+    "other_vertices": (_of_another_body, ["has 1000 vertices", "excluded from the body's heatmap"]),
     "other_body": (
         lambda folder: _set(folder / "joint.h5", body_model="0123"),
         ["another body file"],
