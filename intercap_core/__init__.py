@@ -2,4 +2,4 @@
 
 from intercap_core.kernel_cache import use_kernel_cache
 
-use_kernel_cache()  # before numba is there
+use_kernel_cache()  # before numba is imported

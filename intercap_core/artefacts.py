@@ -29,7 +29,7 @@ from intercap_core.errors import UserError
 MADE_FROM = "made_from"  # attribute with the manifest of pipeline.provenance
 PART = ".part"  # suffix of incomplete outputs
 _LIBVER = ("v110", "v110")  # headers with checksums, attributes of any size
-CHUNK_BYTES = 1 << 20  # fits into HDF5's default chunk cache
+CHUNK_BYTES = 1 << 20  # one chunk fits into HDF5's default chunk cache
 
 
 class Unreadable(UserError):
@@ -64,7 +64,7 @@ class Schema:
     name: str
     """Name of the schema, stored in the file."""
     version: int
-    """Version of its meaning; other versions are rejected."""
+    """Version of the schema; files with another version are rejected."""
     stage: str
     """Stage that writes it."""
     fields: Mapping[str, Field]
@@ -117,6 +117,10 @@ class Writer:
         self.attributes: dict[str, Any] = {}
 
     def _check(self, key: str, shape: tuple[int, ...], free_first: bool = False) -> Field:
+        """Return the declaration of a dataset; raises ValueError if the shape contradicts it.
+
+        ``free_first``: the first axis may have any length, because rows are appended to it.
+        """
         declared = self._schema.field_of(key)
         if len(shape) != len(declared.dims):
             raise ValueError(f"{key}: shape {shape} does not fit dims {declared.dims}")
@@ -190,6 +194,7 @@ _SHARED_DIMS = frozenset({"T", "T+1", "C"})
 
 
 def _template(schema: Schema, declared: Field) -> str:
+    """Key of a declaration in the schema, which may contain ``{camera}``."""
     return next(key for key, value in schema.fields.items() if value is declared)
 
 
@@ -290,7 +295,7 @@ def _finish(file: h5py.File, writer: Writer, schema: Schema, settings_digest: st
         if not declared.optional and "{camera}" not in key and key not in file
     ]
     set_here = set(writer.attributes) - set(schema.optional_attributes)
-    unset = sorted(set(schema.attributes) ^ set_here)
+    unset = sorted(set(schema.attributes) ^ set_here)  # missing or not declared
     if missing or unset:
         raise ValueError(f"artefact {schema.name!r}: missing {missing}, attributes off: {unset}")
     _set(file, "schema", schema.name)

@@ -176,7 +176,7 @@ class JointSettings(Model):
             return None
         statistics = "preprocess_stats_smooth_withHand_global_markers.npz"
         return (
-            self.lemo / "runs" / "15217" / "Enc_last_model.pkl",
+            self.lemo / "runs" / "15217" / "Enc_last_model.pkl",  # the released run's number
             self.lemo / "preprocess_stats" / statistics,
         )
 
@@ -343,6 +343,8 @@ class StudioSettings(Model):
     timestamps."""
 
 
+# The open body: the package's own body model, with SMPL-X's parameters and another mesh
+# (docs/body.md).
 class BodyModels(Model):
     """SMPL-X files; without one, the open body is used."""
 

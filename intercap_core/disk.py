@@ -1,6 +1,7 @@
-"""Disks that are full, over a quota or not writable: recognised in errors, and hidden from HDF5.
+"""Disks that are full, over a quota or not writable: finding and describing these faults.
 
-HDF5 ends the process when it cannot write its buffers.
+HDF5 crashes the process if it cannot write its buffers. :class:`PartFile` hides failed writes from
+HDF5 and reports them afterwards.
 """
 
 from __future__ import annotations
@@ -134,6 +135,7 @@ def free_bytes(place: Path) -> int:
 
 
 def _chain(error: BaseException | None) -> Iterator[BaseException]:
+    """Yield the error, its cause, the cause of that, and so on."""
     seen: set[int] = set()
     while error is not None and id(error) not in seen:
         seen.add(id(error))

@@ -82,7 +82,7 @@ class PosedSequence:
         return self.model.faces.cpu().numpy()
 
     def at(self, frame: int) -> Moment:
-        """The frame with this index; raises IndexError if there is none."""
+        """The frame with this index, negative from the end; raises IndexError if there is none."""
         if not -len(self) <= frame < len(self):
             raise IndexError(f"frame {frame} of {len(self)}")
         one = [frame % len(self)]

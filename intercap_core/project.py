@@ -31,10 +31,15 @@ class Project:
     """Settings file with its tables."""
 
     config: Config
+    """Settings, with absolute or working-directory-relative paths."""
     path: Path
+    """Path of the settings file."""
     sequences: dict[str, SequenceEntry]
+    """Rows of the table of sequences by name, without excluded sequences."""
     subjects: dict[str, SubjectEntry]
+    """Rows of the table of subjects by name."""
     objects: dict[str, ObjectEntry]
+    """Entries of the objects file by name."""
 
     @property
     def results(self) -> Path:
@@ -154,8 +159,8 @@ class Project:
 def load_project(path: Path, overrides: Mapping[str, Any] | None = None) -> Project:
     """Read and check a settings file and all its tables.
 
-    ``overrides`` are settings that win over the file's, nested as in the file. Raises UserError
-    naming the file, row and field of the first mistake.
+    ``overrides`` are settings that replace those of the file, nested as in the file. Raises
+    UserError naming the file, row and field of the first mistake.
     """
     path = Path(path)
     values = _or_empty(read_yaml(path))
@@ -215,7 +220,7 @@ def load_project(path: Path, overrides: Mapping[str, Any] | None = None) -> Proj
 
 
 def _some(names: Iterable[str]) -> str:
-    """Names in order, the first of many."""
+    """Sorted names as text, at most the first ``MAX_NAMES``."""
     found = sorted(names)
     more = f" and {len(found) - MAX_NAMES} more" if len(found) > MAX_NAMES else ""
     return ", ".join(found[:MAX_NAMES]) + more

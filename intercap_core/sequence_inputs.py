@@ -1,4 +1,4 @@
-"""What the late stages share of one sequence: paths of its artefacts, models and fit settings."""
+"""Inputs of one sequence that several stages take: artefacts, models and settings of the fits."""
 
 from __future__ import annotations
 
@@ -66,6 +66,6 @@ class FitSettings:
     joint: JointSettings
     """Settings of the joint fit."""
     body_fit: BodyFitSettings
-    """Settings of the body fit: residuals that the joint fit uses again."""
+    """Settings of the body fit, whose residuals the joint fit uses again."""
     object_track: ObjectTrackSettings
-    """Settings of the object track: how rendered and observed images are compared."""
+    """Settings of the object track: comparison of rendered and observed images."""

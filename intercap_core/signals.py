@@ -9,8 +9,8 @@ from contextlib import contextmanager
 from types import CodeType, FrameType
 from typing import Any
 
-_UNBROKEN: set[CodeType] = set()
-_pending: list[int] = []
+_UNBROKEN: set[CodeType] = set()  # functions inside which no signal raises
+_pending: list[int] = []  # signals that arrived, for raise_pending
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -43,6 +43,7 @@ def raise_pending() -> None:
 
 
 def _is_within(frame: FrameType | None) -> bool:
+    """Whether the frame or a caller of it is a function of ``_UNBROKEN``."""
     while frame is not None:
         if frame.f_code in _UNBROKEN:
             return True

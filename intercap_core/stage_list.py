@@ -1,7 +1,7 @@
 """The stages of one sequence, in the order in which data flows through them.
 
-This list holds every fact that the rest of the program knows about a stage: the command line, the
-run decision, the rules of the workflow, the resources of jobs and the report read it. A new stage
+The command line, the decision on what a run computes, the rules of the workflow, the resources of
+jobs and the report read all facts about a stage from this list. A new stage
 needs an entry here, a module ``stages/<name>.py`` with a function ``run``, a schema, a section of
 settings and a rule.
 """
@@ -42,7 +42,7 @@ class JobResources:
     mb_per_image: float = 0.0
     """Additional megabytes per image."""
     seconds: float = 10.0
-    """Time independent of the recording."""
+    """Time independent of the recording, seconds."""
     seconds_per_image: float = 0.0
     """Additional seconds per image."""
 
@@ -81,6 +81,7 @@ class Stage:
     """True if it writes a folder of other tools' files instead of an artefact."""
 
 
+# Artefacts that the joint fit reads, and artefacts of all stages up to the metrics.
 _FITS = ("frames", "scene", "detections", "person", "object_track", "body_fit")
 _ALL = ("frames", "detections", "scene", "person", "object_track", "body_fit", "joint", "metrics")
 

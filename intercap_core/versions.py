@@ -1,4 +1,4 @@
-"""Versions of this program, Python and the libraries that decide numbers."""
+"""Versions of this program, Python and the libraries that influence numerical results."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ _LIBRARIES = ("numpy", "torch", "open3d", "opencv-python-headless", "h5py", "sci
 
 
 def versions() -> list[tuple[str, str]]:
-    """Name and version of each that is installed."""
+    """Names and versions of this program, Python and the installed libraries."""
     rows = [("intercap-core", version("intercap-core")), ("Python", platform.python_version())]
     for name in _LIBRARIES:
         try:

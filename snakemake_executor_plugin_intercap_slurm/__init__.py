@@ -1,11 +1,11 @@
 """Slurm executor for datasets of hundreds of sequences.
 
-The executor ``intercap-slurm`` submits, polls and cancels jobs by
-``snakemake-executor-plugin-slurm``, whose settings it has under its own prefix. In addition:
+The executor ``intercap-slurm`` extends ``snakemake-executor-plugin-slurm``, which submits, polls
+and cancels jobs. It has the same settings under its own prefix. In addition:
 
 - A job that failed by a user's mistake is not submitted again; a job that was killed is.
-- Jobs that outlived their Snakemake are adopted instead of started twice; if their inputs or
-  parameters have changed since, they are cancelled.
+- Jobs that a killed Snakemake has left in Slurm are adopted instead of submitted twice; if their
+  inputs or parameters have changed since, they are cancelled.
 - If the controller does not answer, submissions wait for it.
 - A job starts Snakemake once on its node instead of twice.
 - A job that Slurm has lost, or holds after a failed launch, is reported as failed.
@@ -51,14 +51,17 @@ class Executor(SlurmExecutor):
     def __init__(self, workflow: Any, logger: Any) -> None:
         # Set before the base class starts to poll jobs.
         self._ledger = Ledger(Path(".snakemake") / "slurm_jobs")
+        # Jobs of earlier runs by their outputs; None = not queried yet.
         self._left: dict[tuple[str, ...], JobEntry] | None = None
         self._adoption_lock = threading.Lock()
-        self._ending = threading.Event()
-        self._entries: dict[JobExecutorInterface, JobEntry] = {}
+        self._ending = threading.Event()  # set when Ctrl-C ends the run
+        self._entries: dict[JobExecutorInterface, JobEntry] = {}  # of jobs being submitted
+        # Jobs whose submission did not reach the controller.
         self._not_reached: set[JobExecutorInterface] = set()
-        self._polled: list[SubmittedJobInfo] = []
-        self._over: set[int] = set()
-        self._final: set[JobExecutorInterface] = set()
+        self._polled: list[SubmittedJobInfo] = []  # jobs of the last poll
+        self._over: set[int] = set()  # ``id`` of the jobs whose end was reported since that poll
+        self._final: set[JobExecutorInterface] = set()  # jobs that are not submitted again
+        # Monotonic time at which Slurm first did not know a job, by job number.
         self._missing_since: dict[str, float] = {}
         self._last_submission = time.monotonic()
         super().__init__(workflow, logger)

@@ -51,7 +51,7 @@ def endings(job: Any, entry: JobEntry, slurm_log: Path) -> list[Ending]:
     for part in members(job):
         log = Path(str(next(iter(part.log))))
         name = ": ".join([*part.wildcards, part.rule.name])
-        now = stamp(log)
+        now = stamp(log)  # unchanged since the submission: the stage did not begin
         if now is None or now == entry.logs.get(str(log)):
             found.append(Ending(name, "waiting", _slurms_reason(slurm_log)))
         else:

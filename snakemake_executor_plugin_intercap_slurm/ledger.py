@@ -44,7 +44,8 @@ class JobEntry:
     outputs: tuple[str, ...]
     """Files that it writes."""
     digest: str
-    """Digest of its rules, parameters and inputs; a job with another digest is outdated."""
+    """Digest of its rules, parameters and inputs. A submitted job whose digest differs from the
+    present one is outdated."""
     logs: dict[str, Stamp | None]
     """Stamps of its stages' logs before the submission, by path."""
     slurm_id: str = ""
@@ -54,7 +55,7 @@ class JobEntry:
 
     @classmethod
     def of(cls, job: Any) -> JobEntry:
-        """JobEntry of a job before its submission."""
+        """Entry of a job before its submission, without the fields of Slurm."""
         parts = members(job)
         outputs = sorted({str(path) for part in parts for path in part.output})
         content = [

@@ -23,7 +23,7 @@ LIVE = {
 
 
 def states(name: str) -> dict[str, str] | None:
-    """State by number of the jobs with the name ``name``; None if the controller does not answer.
+    """States of the jobs named ``name``, by job number; None if the controller does not answer.
 
     Includes ended jobs as long as the controller keeps them (``MinJobAge``).
     """

@@ -1,10 +1,10 @@
 """Checksums of input files and of outputs, computed again only if size or date has changed.
 
 A recording has gigabytes. The checksum of each input is stored with its size and date next to the
-results of the sequence: a start with nothing to do reads no recording, and a touched or copied file
-is read once and makes nothing stale. The checksum of each artefact is stored in the same way, so
-that an artefact that was truncated or overwritten is noticed by its date and found damaged by its
-content. All stored values may be lost without harm.
+results of the sequence. A start with nothing to do therefore reads no recording; a touched or
+copied file is read once and makes nothing stale. The checksum of each artefact is stored in the
+same way: another size or date shows that an artefact may be truncated or overwritten, and only then
+is its content compared. All stored values may be lost without harm.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from intercap_core.artefacts import part_of
 from intercap_core.stages.folders import EXPORT_MARKER
 
 INPUTS_FILE = ".inputs.json"
-_SUFFIX = ".left"  # of the file with the checksum of an artefact
+_SUFFIX = ".left"  # suffix of the file that stores the checksum of an output
 _MANIFEST = "record"  # key of the digest of the manifest in that file
 _MAX_LISTED = 200  # files of a folder up to which each file's size and date are compared
-_LARGE_BYTES = 100_000_000  # above it, another size alone means another content
+_LARGE_BYTES = 100_000_000  # a larger file with another size counts as changed, unread
 _ROWS = 64  # rows read at a time, so that memory stays flat
 
 
@@ -176,6 +176,7 @@ def _find_damaged_file(folder: Path) -> str:
 
 
 def _manifest_digest(output: Path) -> str:
+    """Digest of an artefact's manifest; "" for other files."""
     if output.suffix != ".h5":
         return ""
     return hashlib.sha256(artefacts.made_from(output).encode()).hexdigest()

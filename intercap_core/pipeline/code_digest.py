@@ -1,4 +1,4 @@
-"""Digests of the code that each stage uses: a change of the core makes stale what it concerns.
+"""Digests of the code that each stage uses: a change makes only outputs of its users stale.
 
 The modules that a stage reaches are found by following imports, including those inside functions,
 and calls of ``plugins.modules_of``.
@@ -33,8 +33,8 @@ DECLARATIONS = frozenset(
         "annotation", "config", "config_types", "entries", "project", "schemas", "sequence_inputs",
     )
 )  # fmt: skip
-# Modules that change no result: caches, messages, and the list of stages, of which the manifest
-# holds what concerns a stage (the artefacts that it reads and its row).
+# Modules that change no result: caches, messages, and the list of stages. The parts of that list
+# that concern a stage (its artefacts and columns) are in the stage's manifest.
 NEUTRAL = frozenset(
     f"{PACKAGE}.{name}" for name in ("disk", "kernel_cache", "progress", "signals", "stage_list")
 )
@@ -47,7 +47,7 @@ MODULES = {
     "dataset": "stages.dataset",
     "studio": "studio.capture",
 }
-_MAX_CACHED = 16  # digests of other versions of the code, the newest
+_MAX_CACHED = 16  # cache files kept, one per version of the code, the newest
 
 
 @dataclass(frozen=True)
@@ -155,6 +155,7 @@ def code_digests(module: str, *, root: Path = ROOT) -> dict[str, str]:
 
 
 def _subpackage(module: str) -> str:
+    """Second part of a module's name, e.g. "joint"; the package's name for the package itself."""
     return [*module.split("."), PACKAGE][1]
 
 
@@ -206,6 +207,7 @@ def _used(module: str, names: frozenset[str], root: Path) -> list[_Statement]:
 
 @cache
 def _statements(module: str, path: Path, mtime_ns: int, root: Path) -> tuple[_Statement, ...]:
+    """Top-level statements of a module; ``mtime_ns`` invalidates the cache after an edit."""
     tree = ast.parse(path.read_bytes(), str(path))
     for node in ast.walk(tree):
         body = getattr(node, "body", None)
@@ -231,6 +233,7 @@ def _is_text(node: ast.AST) -> bool:
 
 
 def _defines(statement: ast.stmt) -> set[str]:
+    """Names that a statement binds; empty for statements with other effects."""
     if isinstance(statement, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
         return {statement.name}
     if isinstance(statement, ast.Assign | ast.AnnAssign):
@@ -242,6 +245,7 @@ def _defines(statement: ast.stmt) -> set[str]:
 
 
 def _uses(statement: ast.stmt) -> set[str]:
+    """Names that a statement mentions, and all texts in it."""
     names = set()
     for node in ast.walk(statement):
         if isinstance(node, ast.Name):
@@ -252,6 +256,10 @@ def _uses(statement: ast.stmt) -> set[str]:
 
 
 def _imports(node: ast.stmt, module: str, root: Path) -> list[tuple[str, str]]:
+    """Pairs (module, name) that a statement imports from the package, with parent packages.
+
+    ``from a import b`` counts both as the name b of module a and as a module a.b, if that exists.
+    """
     found: list[tuple[str, str]] = []
     for inner in ast.walk(node):
         if isinstance(inner, ast.Import):
@@ -284,6 +292,7 @@ def _discovered(call: ast.Call, root: Path) -> list[str]:
 
 
 def _absolute(node: ast.ImportFrom, module: str, root: Path) -> str:
+    """Absolute name of the module from which ``module`` imports."""
     if not node.level:
         return node.module or ""
     package = module.split(".")

@@ -29,7 +29,7 @@ FINISHED = "finished in"
 FAILED = "failed:"
 WARNED = "warning:"
 UNEXPECTED = "unexpected"  # begins the reason of a failure that the input did not cause
-ENDED = f"{UNEXPECTED} end"  # by a signal
+ENDED = f"{UNEXPECTED} end"  # begins the reason of a job that a signal ended
 
 
 def set_threads(threads: int) -> None:
@@ -103,7 +103,7 @@ def warnings_of(log: Path) -> list[str]:
 
 
 def last_words(log: Path) -> str:
-    """The last line of a log without its time of day; "" if the log is empty."""
+    """The last line of a log without its time of day; "" for an empty log."""
     lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
     return lines[-1].partition(" ")[2] if lines else ""
 
@@ -111,8 +111,8 @@ def last_words(log: Path) -> str:
 def _print_error(line: str) -> None:
     """Write a line to standard error.
 
-    Snakemake ends its messages by a second write. One write that begins with a newline is never
-    appended to such a message.
+    Snakemake writes a message and its newline separately. The line therefore begins with a newline,
+    so that it never continues a message of Snakemake.
     """
     sys.stderr.write(f"\n{line}\n")
     sys.stderr.flush()

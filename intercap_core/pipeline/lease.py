@@ -145,7 +145,7 @@ def try_acquire(path: Path) -> Lease | LeaseOwner:
             expired = _read_owner(path)
             part = path.with_name(f"{path.name}.{owner.token}")
             part.write_text(text, encoding="utf-8")
-            os.replace(part, path)  # of two that take it over, the first notices in is_held
+            os.replace(part, path)  # of two processes, the first finds the other's token in is_held
     except OSError as error:
         raise UserError(disk.describe_fault(error, path.parent)) from None
     return Lease(path, owner, expired)

@@ -18,7 +18,7 @@ _CHOSEN_BY = {
     "handling": ", the subject handles the object",
     "middle": ", the subject is seen most",
 }
-_CONTACT_PROBABILITY = 0.5
+_CONTACT_PROBABILITY = 0.5  # a region with a larger probability counts as touching
 _MAX_NAMED = 5  # left-out sequences named in a line
 
 
@@ -48,9 +48,9 @@ def dataset_line(results: Path) -> str:
 
 
 def notes(stage: str, path: Path) -> list[str]:
-    """Distinct degradations that an artefact states; raises UserError as :func:`line`.
+    """Distinct degradations that an artefact states, in words; raises UserError as :func:`line`.
 
-    [] for a summary, which repeats the metrics.
+    The list is empty for a summary, which repeats the metrics.
     """
     if stage == "summary":
         return []
@@ -65,6 +65,7 @@ def notes(stage: str, path: Path) -> list[str]:
             ]
         for name in ("ground_note", "doubts"):
             text = str(artefact.attributes.get(name, ""))
+            # without an object, the track's doubts only repeat that there is none
             alone = name == "doubts" and not artefact.attributes.get("object", name)
             found += [text] if text and not alone else []
         if stage == "scene" and not artefact.attributes["ground_found"]:
@@ -240,6 +241,7 @@ _LINES: dict[str, Callable[[Artefact], str]] = {
 
 
 def _share(which: Any) -> str:
+    """Text such as "5 of 6" of a boolean array."""
     return f"{int(which.sum())} of {which.size}"
 
 

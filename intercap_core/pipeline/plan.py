@@ -1,7 +1,7 @@
-"""Which outputs are up to date, missing or stale, and why: the one decision on what a run computes.
+"""Decides which outputs are up to date, missing or stale, and thereby what a run computes.
 
 An output is up to date if its manifest has the fingerprint that the output would get now. Dates of
-files and other bookkeeping do not count, so the decision holds wherever the results lie. An
+files do not count, so results may be moved or copied. An
 artefact whose size or date differs from the stored ones is read through, and is stale if it is
 damaged. See docs/reruns.md.
 """
@@ -45,7 +45,7 @@ DATASET_OUTPUTS = (
 )  # fmt: skip
 MARKS = Path(".snakemake") / "out_of_date"
 _CACHE_FILE = ".records.json"  # manifests by output, with its size and date
-_LATER_S = 1.0  # by which a mark is newer than the output
+_LATER_S = 1.0  # time by which a mark is newer than its output
 
 
 class OutputStatus(StrEnum):
@@ -67,7 +67,7 @@ class OutputState:
     fingerprint: str
     """Fingerprint that it would get now; later stages are made from it."""
     made_on: str = ""
-    """Device and processor, if an up-to-date output was made on others than this machine's."""
+    """Device and processor that made an up-to-date output; "" if they are those of this machine."""
 
 
 class Plan:
@@ -133,9 +133,10 @@ class Plan:
         return self._annotation_faults.get(sequence, "")
 
     def mark(self, sequence: str, stage: str) -> list[Path]:
-        """Path of a file that is newer than the stale output of a stage; [] if it is not stale.
+        """Write the mark of a stale output, a file that is newer than the output.
 
-        Snakemake runs a job because of this file alone; the dates of all other inputs are ignored.
+        Returns a list of its path; [] if the output is not stale. Snakemake runs the job of an
+        existing output only because of its mark: without one, the dates of all inputs are ignored.
         """
         path = mark_of(self.project, sequence, stage)
         if not self.is_stale(sequence, stage):
@@ -171,6 +172,7 @@ class Plan:
         return self.dataset if stage == DATASET else self.states(sequence)[stage]
 
     def _decide(self, sequence: str) -> Iterator[tuple[str, OutputState]]:
+        """Yield each stage and the state of its output, in the order of the stages."""
         checksums = InputChecksums(self.project.results / sequence / INPUTS_FILE)
         new_recording = ""
         if self.project.recordings_made(sequence) is not None:
@@ -201,7 +203,9 @@ class Plan:
                 before=before,
             )
             state = _compare(path, before, current)
-            if new_recording:  # its content is not known yet
+            # The content of a new recording is not known yet: "+" makes the fingerprint, and those
+            # of all later stages, differ from every stored one.
+            if new_recording:
                 missing = state.status is OutputStatus.missing
                 status = OutputStatus.missing if missing else OutputStatus.stale
                 state = OutputState(status, (new_recording,), f"{current.fingerprint}+")
@@ -225,7 +229,7 @@ class Plan:
     def _wait_for_annotation(
         self, sequence: str, error: UserError
     ) -> Iterator[tuple[str, OutputState]]:
-        """No stage is up to date while the annotation is broken."""
+        """Yield all stages as stale or missing, because the annotation is invalid."""
         self._annotation_faults[sequence] = str(error)
         for stage in STAGES:
             exists = self.output(sequence, stage).exists()
@@ -234,13 +238,13 @@ class Plan:
 
 
 def failures(project: Project) -> dict[str, str]:
-    """Reason by sequence that the settings exclude and that failed."""
+    """Reason of the last failure of each excluded sequence; without those that did not fail."""
     reasons = {name: last_failure(project.logs / name) for name in project.config.exclude}
     return {name: reason for name, reason in reasons.items() if reason}
 
 
 def checked_files(files: Iterable[Path]) -> list[Path]:
-    """Those outputs of all sequences whose checksums are stored: files outside the site."""
+    """The existing files outside the site among ``files``: checksums are stored of these only."""
     return [file for file in files if file.parent.name != "site" and file.is_file()]
 
 
@@ -309,7 +313,7 @@ class _ManifestCache:
             if find_damage(output):
                 return None
             remember_output(output)
-        if manifest is not None:  # an unreadable one may be a fault that passes
+        if manifest is not None:  # an unreadable one may be readable later
             self._known[key] = [stamp, manifest.to_text()]
             self._changed = True
         return manifest

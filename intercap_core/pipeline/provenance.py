@@ -1,4 +1,4 @@
-"""Manifests: what each output was made from. They alone decide whether an output is up to date.
+"""Manifests: lists of everything that an output was made from, by which outputs are compared.
 
 An artefact holds its manifest in an attribute, a folder in a file, so that results stay valid when
 they are moved or copied. The same inputs give the same manifest, byte by byte.
@@ -39,15 +39,15 @@ class Manifest:
     sequence: str
     """Sequence; "" for outputs of all sequences."""
     given: Mapping[str, Any]
-    """Settings, table entries and annotation by the stage's name for each."""
+    """Settings, table entries and annotation, by the argument of the stage's ``run``."""
     files: Mapping[str, Mapping[str, str]]
-    """Checksums of files, by the same names and the name of the file."""
+    """Checksums of files, by argument and by the file's name without its folder."""
     artefacts: Mapping[str, str]
     """Fingerprint of each artefact that was read, by stage."""
     code: Mapping[str, str]
     """Digests of the code, by package."""
     libraries: Mapping[str, str]
-    """Versions of the libraries that decide numbers."""
+    """Versions of the libraries that influence numerical results."""
     machine: Mapping[str, str] = field(default_factory=dict)
     """Device and processor; reported, not part of the fingerprint."""
 
@@ -58,13 +58,13 @@ class Manifest:
         return hashlib.sha256(_json(compared).encode()).hexdigest()[:24]
 
     def to_text(self) -> str:
-        """A line with a checksum (HDF5 has none for long attributes), then JSON."""
+        """Serialize: a line with a checksum (HDF5 has none for long attributes), then JSON."""
         text = _json({"format": FORMAT, **asdict(self)})
         return f"{_checksum(text)}\n{text}"
 
     @classmethod
     def from_text(cls, text: str) -> Manifest | None:
-        """None if the text is damaged or of another version."""
+        """Parse the text of :meth:`to_text`; None if it is damaged or has another version."""
         checksum, _, text = text.partition("\n")
         if checksum != _checksum(text):
             return None
@@ -124,7 +124,7 @@ def write_manifest(output: Path, manifest: Manifest) -> None:
 
 @cache
 def library_versions() -> dict[str, str]:
-    """Versions of the libraries that decide numbers, without the build of torch."""
+    """Versions of the installed ``LIBRARIES``, without the build tag after "+" (torch)."""
     versions = {}
     for name in LIBRARIES:
         with contextlib.suppress(PackageNotFoundError):

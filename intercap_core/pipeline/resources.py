@@ -21,10 +21,10 @@ from intercap_core.stage_list import STAGES, Extent, JobResources
 SNAKEMAKE_MB = 300.0  # the process that starts the stage and waits for it: 230 measured
 MEMORY_MARGIN = 1.4  # recordings differ in how much moves; measured recordings differ by less
 TIME_MARGIN = 5.0  # a busy node, a slow file system
-LEAST_MINUTES = 10
-CUDA_MB = 3000.0  # of the driver and the libraries, in a process that uses a GPU
-MODEL_MB, MODEL_SECONDS = 3000.0, 2.0  # of a detector, and for an image on 8 cores
-READ_MB_PER_SECOND = 40.0  # of recordings, decoded, on one core: half of what was measured
+LEAST_MINUTES = 10  # added to every request
+CUDA_MB = 3000.0  # memory of the driver and the libraries in a process that uses a GPU
+MODEL_MB, MODEL_SECONDS = 3000.0, 2.0  # memory of a detector; time of an image on 8 cores
+READ_MB_PER_SECOND = 40.0  # reading and decoding on one core: half of the measured rate
 
 # Extent assumed before a recording has been read; only dry runs show requests made from it.
 UNKNOWN = Extent(1000, 6)
@@ -119,7 +119,7 @@ class DiskUsage:
     free: int
     """Free space on the disk of the results."""
     basis: str
-    """Words that say what the estimate is based on; "" if outputs of this project were measured."""
+    """Basis of the estimate in words; "" if outputs of this project were measured."""
 
 
 def disk_usage(project: Project) -> DiskUsage:

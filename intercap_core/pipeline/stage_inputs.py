@@ -30,13 +30,15 @@ STUDIO = "studio"
 
 
 def restrict_row(stage: str, row: SequenceEntry) -> SequenceEntry:
-    """The row with its name and the columns that the stage declares; other columns are no
-    attributes of it."""
+    """Return a copy of the row with the sequence's name and the columns that the stage declares.
+
+    Access to any other column raises AttributeError.
+    """
     declared = STAGES[stage]
     names = (*declared.columns, *declared.layout_columns.get(row.layout, ()))
     values = {name: getattr(row, name) for name in ("sequence", *names)}
     restricted = SequenceEntry.model_construct({*values}, **values)
-    for name in restricted.__dict__.keys() - values.keys():  # which have their defaults
+    for name in restricted.__dict__.keys() - values.keys():  # columns with defaults
         del restricted.__dict__[name]
     return restricted
 

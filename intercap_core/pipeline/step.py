@@ -52,7 +52,7 @@ def run_step(
     Args:
         inputs: artefacts by the stage that wrote them.
         output: an artefact, or a folder for the export and the page.
-        keep: leave an output that is up to date by the time the lease is acquired.
+        keep: do not run the stage if the output is up to date once the lease is acquired.
     """
     annotation = project.annotation(sequence, look_at_frames=stage != "frames")
     _return_freed_memory()
@@ -84,7 +84,7 @@ def _current_manifest(
     annotation: Annotation,
     inputs: Mapping[str, Path],
 ) -> Manifest:
-    """Manifest of the output that the stage writes now."""
+    """Manifest of the output that the stage would write from these inputs."""
     manifests = {name: read_manifest(inputs[name]) for name in STAGES[stage].reads}
     checksums = InputChecksums(project.results / sequence / INPUTS_FILE)
     current = stage_inputs.stage_manifest(
@@ -174,6 +174,7 @@ def check_device(project: Project) -> None:
 
 
 def _check_inputs(stage: str, sequence: str, inputs: Mapping[str, Path]) -> None:
+    """Raise UserError if an input is unreadable or belongs to another sequence."""
     for name in STAGES[stage].reads:
         with artefacts.read(inputs[name], getattr(schemas, name.upper())) as source:
             actual = source.attributes["sequence"]

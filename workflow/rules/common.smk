@@ -56,7 +56,7 @@ wildcard_constraints:
 
 
 def existing(*paths):
-    """Existing paths among ``paths``. A missing file fails the job of its sequence only."""
+    """Existing paths among ``paths``; the job that reads a missing file then reports it."""
     return [path for path in paths if path is not None and Path(path).exists()]
 
 
@@ -113,7 +113,7 @@ def annotation_input(wildcards):
 def out_of_date(stage):
     """Input function: for a stale output, a mark that is newer than the output.
 
-    Only this mark makes Snakemake run a job again; all other inputs are ``ancient``. See
+    Only this mark makes Snakemake run a job again; without it, all inputs are ``ancient``. See
     docs/reruns.md.
     """
     return lambda wildcards: PLAN.mark(getattr(wildcards, "sequence", ""), stage)
@@ -127,8 +127,8 @@ def identity_of(stage):
 def artefacts_read(stage):
     """Input function: the artefacts that a stage reads, by stage.
 
-    Their dates count only if the stage's output is stale. Otherwise they are remade with the same
-    content, if at all, and the output stays up to date.
+    Their dates count only if the stage's output is stale. If it is not, an artefact that is made
+    again gets the same content, and the output stays up to date.
     """
 
     def files(wildcards):

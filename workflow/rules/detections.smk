@@ -1,4 +1,4 @@
-# Files that the settings name for all sequences: models, and what classes are called.
+# Files that the settings name for all sequences: models and class names.
 DETECTORS = [
     path
     for path in (

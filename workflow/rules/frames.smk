@@ -1,5 +1,5 @@
 rule broken_annotation:
-    """Fails with what is wrong; a job only where the sequence's annotation file is broken."""
+    """Fails with the reason. A job of the run only if the sequence's annotation is invalid."""
     output:
         checked=f"{RESULTS}/{{sequence}}/annotation.checked",
     log:

@@ -2,7 +2,7 @@ _recordings = f"{RESULTS}/recordings/{{sequence}}"
 
 
 rule studio:
-    """Make one virtual recording whose truth is known; never claims a real one.
+    """Make one virtual recording whose truth is known; never matches a real recording.
 
     Its files depend on the layout: the manifest, written last, stands for all of them.
     """

@@ -40,7 +40,7 @@ _VERDICT_MEANING = (
 
 @dataclass(frozen=True)
 class ExportBody:
-    """The body file whose mesh the parameters move. They give another person with another mesh."""
+    """The body file of the parameters. With another file, they describe another person."""
 
     path: Path
     gender: str
@@ -77,12 +77,16 @@ class ExportBody:
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """Errors that the verdict without truth states of P judged parts over T frames."""
+    """Errors of P parts (such as body, hands and object) over T frames, estimated without truth.
+
+    The metrics estimate them by repeating the fits without each camera: see
+    :mod:`intercap_core.evaluation.verdict`.
+    """
 
     stated: Sequence[StatedError]
     """Stated error of each part."""
     per_frame_mm: np.ndarray
-    """(P, T) stated error of each part by frame, millimetres, NaN if none is stated."""
+    """(P, T) stated error of each part by frame, millimetres; NaN = none is stated."""
     cameras: Sequence[HeldOutCamera]
     """Cameras that were held out."""
 
@@ -180,11 +184,11 @@ class Deviations:
     """
 
     joint: np.ndarray
-    """(T, 55) of each body joint, metres."""
+    """(T, 55) standard deviation of each body joint, metres."""
     object_position: np.ndarray | None
-    """(T,) metres, NaN where the track is lost; None without an object."""
+    """(T,) that of the object's position, metres; NaN = lost track; None without an object."""
     object_turn: np.ndarray | None
-    """(T,) radians, NaN where the track is lost; None without an object."""
+    """(T,) that of its rotation, radians; NaN = lost track; None without an object."""
 
     @classmethod
     def read(cls, body_fit: Path, object_track: Path, motion: Motion) -> Deviations:
@@ -261,7 +265,7 @@ class About:
     touching: ContactVertices | None = None
     """Contact by vertex; None without an object."""
     deviations: Deviations | None = None
-    """None for imported results, which state no deviations."""
+    """Standard deviations; None for imported results, which state none."""
     made_by: str = ""
     """The other program that made an imported result."""
 

@@ -19,7 +19,7 @@ from intercap_core.body.joints import JOINT_NAMES
 from intercap_core.body.maps import maps_path
 from intercap_core.output.export.about import ExportBody
 
-_POSE_DIRECTIONS = 9 * (len(JOINT_NAMES) - 1)  # a rotation matrix for each joint but the pelvis
+_POSE_DIRECTIONS = 9 * (len(JOINT_NAMES) - 1)  # a 3x3 matrix per joint except the pelvis
 _FRAME = "rest pose of the body: y up, facing z, x to its left; origin near the chest"
 
 
@@ -73,7 +73,7 @@ def write(folder: Path, body: ExportBody) -> Sequence[WrittenBody]:
     shutil.copyfile(maps_path(body.path), maps_path(folder / body.path.name))
     with np.load(body.path, allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
-    half = arrays["shapedirs"].shape[2] // 2
+    half = arrays["shapedirs"].shape[2] // 2  # shape columns; the others are the expression
     written = [
         WrittenBody(body.path.name, file_digest(body.path), f"0:{half}", f"{half}:{2 * half}")
     ]

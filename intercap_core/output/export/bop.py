@@ -31,9 +31,12 @@ def object_id(mesh_path: Path) -> int:
 def write(folder: Path, scenes: Scenes, obj_id: int, about: About, *, masks: bool) -> None:
     """Write ``models/``, one scene folder per camera in the rig's order, and the targets.
 
-    An image has the number of the set in which it was recorded. A late image shows an earlier
-    frame, which ``scene_about.json`` names. Poses are those at the image's own exposure. ``masks``
-    also writes masks and boxes of the object, with occlusion by the body.
+    An image has the number of its frame set. The image of a delayed camera shows an earlier frame,
+    which ``scene_about.json`` names. Poses are those at the image's own exposure.
+
+    Args:
+        obj_id: number of the object's model.
+        masks: also write masks and boxes of the object, with occlusion by the body.
     """
     mesh = scenes.mesh
     assert mesh is not None
@@ -71,7 +74,7 @@ def write(folder: Path, scenes: Scenes, obj_id: int, about: About, *, masks: boo
         targets += [
             {"scene_id": number, "im_id": image, "obj_id": obj_id, "inst_count": 1}
             for image in poses
-            if not info or info[str(image)][0]["visib_fract"] >= 0.1  # BOP Challenge 2019
+            if not info or info[str(image)][0]["visib_fract"] >= 0.1  # as BOP 2019
         ]
     _dump(folder / "test_targets_bop19.json", targets)
     _dump(folder / "lenses.json", lenses)

@@ -24,6 +24,7 @@ KEYPOINTS = (
 )  # fmt: skip
 # Indices of these points among the body's 135, whose first 25 are in OpenPose's order
 _PLACES = np.array([0, 16, 15, 18, 17, 5, 2, 6, 3, 7, 4, 12, 9, 13, 10, 14, 11])
+# Edges between these points as COCO publishes them, numbered from 1
 _SKELETON = [
     [16, 14], [14, 12], [17, 15], [15, 13], [12, 13], [6, 12], [7, 13], [6, 7], [6, 8], [7, 9],
     [8, 10], [9, 11], [2, 3], [1, 2], [1, 3], [2, 4], [3, 5], [4, 6], [5, 7],
@@ -109,8 +110,8 @@ def _annotations(
 def _with_visibility(drawn: Silhouettes, camera: Camera, points: np.ndarray) -> np.ndarray:
     """Return x, y and COCO's visibility (17, 3) of points (17, 3) in the master frame.
 
-    Visibility is 0 outside of the image. Inside it is 2, or 1 if the visible surface is more than
-    a body's thickness in front of the point.
+    Visibility is 0 outside of the image, 1 = hidden, 2 = visible. A point lies inside the body, so
+    it counts as visible unless the visible surface is more than 0.15 m in front of it.
     """
     lens = camera.colour
     local = apply(camera.colour_from_master, points.astype(np.float64))

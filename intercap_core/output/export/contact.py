@@ -1,4 +1,4 @@
-"""Contact by body region, as the joint stage states it, and by vertex, as the meshes have it."""
+"""Contact by body region (probability of the joint fit) and by vertex (distance of the meshes)."""
 
 from __future__ import annotations
 
@@ -45,7 +45,10 @@ class StatedContact:
             )
 
     def intervals(self) -> list[tuple[str, int, int]]:
-        """Return region, first frame and first frame after it of each contact, by region."""
+        """Return (region, start, end) of each contact, region by region.
+
+        In the frames from start to end - 1, the probability is at least 0.5.
+        """
         intervals = []
         for r, region in enumerate(self.regions):
             on = np.concatenate([[False], self.probability[:, r] >= 0.5, [False]])

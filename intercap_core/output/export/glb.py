@@ -23,6 +23,7 @@ from intercap_core.output.export.about import About
 from intercap_core.output.export.motion import Coordinates, Motion, rest_pose
 
 _ARRAY, _ELEMENTS = 34962, 34963  # buffer targets, glTF 2.0 specification
+# Type of an accessor by its number of columns, and component type by numpy's type
 _SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 _COMPONENTS = {"<f4": 5126, "<u2": 5123, "<u4": 5125, "|u1": 5121}
 # glTF's frame (x right, y up, z towards the viewer) from the motion's frame
@@ -50,7 +51,10 @@ class _Document:
     def accessor(
         self, values: np.ndarray, *, target: int | None = None, bounds: bool = False
     ) -> int:
-        """Append an array (N,) or (N, k); return its accessor. ``bounds`` adds min and max."""
+        """Append an array (N,) or (N, k); return the index of its accessor.
+
+        ``target`` is the kind of buffer, None for animation data; ``bounds`` adds min and max.
+        """
         values = np.ascontiguousarray(values)
         data = values.tobytes()
         view: dict[str, Any] = {
@@ -85,7 +89,7 @@ class _Document:
         text = json.dumps(self.json, separators=(",", ":")).encode()
         text += b" " * (-len(text) % 4)
         binary = b"".join(self._chunks)
-        total = 12 + 8 + len(text) + 8 + len(binary)
+        total = 12 + 8 + len(text) + 8 + len(binary)  # file header, and one for each chunk
         return b"".join(
             [
                 struct.pack("<4sII", b"glTF", 2, total),
@@ -131,7 +135,10 @@ def coordinates(motion: Motion, *, z_up: bool) -> Coordinates:
 def _body(
     document: _Document, motion: Motion, animation: dict[str, Any], times: int
 ) -> tuple[int, int]:
-    """Add the skinned mesh and its skeleton; return the nodes of pelvis and mesh."""
+    """Add the skinned mesh, its skeleton and motion; return the indices of pelvis and mesh node.
+
+    ``times`` is the accessor of the frames' times.
+    """
     vertices, joints = rest_pose(motion.model, motion.parameters)
     faces = motion.model.faces.numpy()
     weights = motion.model.skinning_weights.numpy()

@@ -26,14 +26,15 @@ def write(
     kind: Kind,
     every: int,
 ) -> None:
-    """Write every ``every``-th frame into ``Mesh`` as <frame>_second.<kind>, the body, and
-    <frame>_second_obj.<kind>, the object if it has a pose; and ``about.json``.
+    """Write the meshes of every ``every``-th frame into ``Mesh``, and ``about.json``.
 
-    Vertices keep their order and number. In a ply file, ``contact`` of each vertex says whether it
-    touches the other mesh.
+    The body is <frame>_second.<kind>; the object, in frames with a pose, is
+    <frame>_second_obj.<kind>. Vertices keep their order and number. In a ply file, the property
+    ``contact`` of a vertex is 1 if it touches the other mesh.
 
     Args:
-        bodies: vertices (V, 3) for each written frame, in the motion's frame.
+        bodies: vertices (V, 3) for each written frame, in the motion's frame, metres.
+        mesh: mesh of the object; None without an object.
     """
     files = folder / "Mesh"
     files.mkdir(parents=True)

@@ -98,7 +98,8 @@ def read_motion(
     """Read a joint artefact in the master camera's frame.
 
     Args:
-        zup_from_master: (4, 4) of the scene, None if the direction up is unknown.
+        zup_from_master: (4, 4) transform of the scene; its third row is the direction up. None if
+            that is unknown.
 
     Raises UserError as :func:`artefacts.read` does.
     """
@@ -112,6 +113,7 @@ def read_motion(
     # The expression does not measurably move the joints, so the first frame's is used for all.
     rest = replace(model.zeros(1), betas=single.betas[:1], expression=single.expression[:1])
     with torch.no_grad():
+        # one vertex, because only the joints are needed
         pelvis = model.forward(rest, vertex_ids=np.array([0])).joints[0, 0].double().numpy()
     return Motion(
         sequence=str(attributes["sequence"]),

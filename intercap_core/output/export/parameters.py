@@ -18,7 +18,7 @@ NUM_HAND_COMPONENTS = 12  # of a hand's pose in the InterCap release (SMPLify-X'
 def write_amass(folder: Path, motion: Motion, about: About) -> None:
     """Write ``body.npz`` and, with an object, ``object.npz`` into the new ``folder``.
 
-    The bytes repeat, because numpy dates all entries 1980.
+    Equal input gives equal bytes: numpy stores the year 1980 as the date of every entry.
     """
     folder.mkdir()
     coordinates = Coordinates.of(motion)
@@ -111,7 +111,10 @@ def intercap_result(motion: Motion) -> dict[str, Any]:
 
 
 def hand_components(motion: Motion, side: int) -> np.ndarray:
-    """Fit PCA coefficients (T, 12) over the hand's mean pose to the full pose."""
+    """Return the PCA coefficients (T, 12), relative to the mean pose, nearest to a hand's pose.
+
+    ``side``: 0 = left, 1 = right.
+    """
     params = motion.parameters
     pose = (params.left_hand_pose, params.right_hand_pose)[side].numpy()
     mean = motion.model.hand_mean[side].numpy().astype(np.float64)

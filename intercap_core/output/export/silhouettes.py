@@ -22,10 +22,12 @@ from intercap_core.output.export.motion import Motion, posed_batches
 
 @dataclass(frozen=True, eq=False)
 class Mask:
-    """Part of an image."""
+    """Mask of an image, stored as the window that contains all set pixels."""
 
     x0: int
+    """Column of the window's left edge in the image."""
     y0: int
+    """Row of the window's upper edge in the image."""
     pixels: np.ndarray
     """(h, w) bool; pixel [0, 0] is image pixel (x0, y0)."""
 
@@ -144,4 +146,5 @@ def body_vertices(motion: Motion) -> np.ndarray:
 
 
 def _visible_part(rendering: Rendering, number: int) -> Mask:
+    """Pixels in which the drawable ``number`` (0 = body, 1 = object) is the nearest surface."""
     return Mask(rendering.x0, rendering.y0, rendering.body == number)

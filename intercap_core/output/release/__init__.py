@@ -1,1 +1,1 @@
-"""What goes with a dataset that is given away: splits, its card, and the list of its files."""
+"""Files that accompany a published dataset: its card with splits, and the list of its files."""
