@@ -18,13 +18,13 @@ from intercap_core.body.vposer import VPoser
 from intercap_core.config import BodyModels
 from intercap_core.errors import UserError
 
-# Bodies by file, digest, numbers of coefficients and device, as long as they are referenced: a
-# stage that reads several artefacts has one body.
+# Cache of bodies by file and digest, numbers of betas and expression coefficients, and device. An
+# entry lives as long as the body is referenced, so a stage that reads several artefacts loads once.
 _LOADED: WeakValueDictionary[tuple[str, int, int, str], BodyModel] = WeakValueDictionary()
 
 
 def file_digest(path: Path) -> str:
-    """Return the digest of a body file that artefacts of fitted bodies contain."""
+    """Return the digest of a body file that is stored in artefacts of fitted bodies."""
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 
 

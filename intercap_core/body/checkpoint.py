@@ -1,7 +1,7 @@
-"""Read the tensors of a PyTorch checkpoint without executing anything that the file names.
+"""Read the tensors of a PyTorch checkpoint without executing code that the file names.
 
-Training frameworks also store callbacks and settings, as objects of their own classes, which
-PyTorch's restricted reader rejects. Here such objects become :class:`_Inert`.
+Training frameworks also store callbacks and settings as objects of their own classes. PyTorch's
+restricted reader rejects such files. Here these objects become :class:`_Inert` placeholders.
 """
 
 from __future__ import annotations
@@ -93,9 +93,15 @@ def read_tensors(path: Path, *, advice: str) -> dict[str, Tensor]:
 
 
 def tensor_fault(value: Tensor, shape: tuple[int, ...], largest: float) -> str | None:
-    """Return why a tensor cannot be weights of ``shape``, to follow its name in a message, or None.
+    """Return the reason why a tensor cannot be weights of ``shape``, or None.
 
-    The shape is checked first: a file may state any, and a wrong one may not fit in memory.
+    The reason continues a message "NAME has ...". The shape is checked first: a damaged file may
+    state one that does not fit in memory.
+
+    Args:
+        value: the tensor.
+        shape: expected shape.
+        largest: largest absolute value that is accepted.
     """
     if tuple(value.shape) != shape:
         return f"{tuple(value.shape)}, expected {shape}"

@@ -1,16 +1,16 @@
-"""Pose blend shapes of chosen points, compiled: points at rest, and the exact gradient.
+"""Compiled kernels for the pose blend shapes of chosen points and their exact gradient.
 
-A point at rest moves by P vec(R - I), with the 54 local rotations R below the root. The terms use
-the moved points and write their gradient p = dE / dx by each point at rest. Then dE/dR = P^T p, and
-the gradient by the parameters follows with dR / d theta_c = skew(J_l e_c) R and the left Jacobian
-J_l.
+A point x at rest moves by P vec(R - I), with the 54 local rotations R below the root. vec(R - I),
+486 numbers, is the "feature" of a pose. Each term of the energy E uses the moved points and writes
+its gradient p = dE / dx by each point at rest. Then dE / dR = P^T p. The gradient by the parameters
+follows with dR / d theta_c = skew(J_l e_c) R, the left Jacobian J_l and the unit vector e_c.
 
-The gradient is complete, the Gauss-Newton matrices are not. Those of keypoints and cloud have a
-point's derivatives through its blend shapes only by the joints of its own limb
-(:class:`.selection.Limbs`), that of self-penetration has none. In full they would couple every
-point with every joint, for millimetres per radian, and assembling the normal equations would take 2
-times as long for the body alone, 3.5 times with hands and face. The minima do not change, since the
-gradient is exact.
+The gradient is exact, the Gauss-Newton matrices are approximate. Those of keypoints and cloud
+contain the derivatives of a point's blend shapes only by the joints of its own limb
+(:class:`.selection.Limbs`). That of self-penetration contains none. Exact matrices would couple
+every point with every joint, for millimetres per radian. Their assembly would take 2 times as long
+for the body alone, 3.5 times with hands and face. The minima do not change, since the gradient is
+exact.
 """
 
 from __future__ import annotations
@@ -27,16 +27,18 @@ from intercap_core.body.skeleton_kernel import _rodrigues, rest_points
 
 NUM_FEATURES = 486  # nine numbers of each of the 54 rotations below the root (SMPL-X)
 _FIRST = 3  # parameter of the first joint below the root (SMPL-X)
-_TOGETHER = 16  # points whose tables, 6 kB each, stay in a core's cache for all bodies: speed
+# Number of points that are processed for all bodies in turn: their tables, 6 kB each, then stay in
+# the cache of a core.
+_TOGETHER = 16
 
 
 class Correctives(NamedTuple):
     """Pose blend shapes of N points."""
 
     ids: np.ndarray
-    """(n,) points that they move."""
+    """(n,) indices of the points with a nonzero table."""
     tables: np.ndarray
-    """(N, 3, 486) metres."""
+    """(N, 3, 486) P of each point: metres per unit of the feature."""
 
     @classmethod
     def of(cls, tables: np.ndarray) -> Correctives:
@@ -69,7 +71,13 @@ class RestPoints(NamedTuple):
         return empty if self.correctives is None else self.correctives.tables
 
     def move(self, feature: np.ndarray, at: slice, used: np.ndarray) -> None:
-        """Move the points of the bodies ``at`` (B) that are ``used`` (B, N) by feature (B, 486)."""
+        """Move points by their pose blend shapes, in place.
+
+        Args:
+            feature: (B, 486) vec(R - I).
+            at: places of the B bodies.
+            used: (B, N) bool, points that are moved.
+        """
         move(self.correctives, feature, used, self.points[at])
 
 
@@ -111,9 +119,10 @@ def features(vectors):
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
 def move(correctives, feature, used, rest):
-    """Move the points at rest (B,N,3) that are ``used`` (B,N) by feature (B,486).
+    """Add P feature to the points at rest (B,N,3) that are ``used`` (B,N) bool; feature (B,486).
 
-    Written out: a library's product would start threads, and round by the number of bodies.
+    The loops replace a BLAS product, which would start its own threads and whose rounding would
+    depend on the number of bodies.
     """
     ids, tables = correctives
     for first in range(0, len(ids), _TOGETHER):
@@ -123,7 +132,7 @@ def move(correctives, feature, used, rest):
                 if not used[b, ids[i]]:
                     continue
                 t0, t1, t2 = tables[ids[i], 0], tables[ids[i], 1], tables[ids[i], 2]
-                x = y = z = by[0] * np.float32(0)  # of the same type
+                x = y = z = by[0] * np.float32(0)  # zeros of the feature's type
                 for k in range(NUM_FEATURES):
                     x += t0[k] * by[k]
                     y += t1[k] * by[k]
@@ -135,7 +144,7 @@ def move(correctives, feature, used, rest):
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
 def gather(correctives, rest_gradient, by_feature):
-    """Add the gradient by the features to by_feature (B,486), from rest_gradient (B,N,3)."""
+    """Add P^T p of all points to by_feature (B,486), with p = rest_gradient (B,N,3)."""
     ids, tables = correctives
     for first in range(0, len(ids), _TOGETHER):
         for b in range(len(rest_gradient)):
@@ -155,7 +164,7 @@ def gather(correctives, rest_gradient, by_feature):
 
 @numba.njit(cache=True, nogil=True)
 def rotation_derivatives(vectors):
-    """Return d R / d axis-angle (B,54,3,9) at parameters (B,P), by axis and entry of R."""
+    """Return d R / d theta (B,54,3,9) at parameters (B,P): joint, axis of theta, entry of R."""
     out = np.empty((len(vectors), NUM_FEATURES // 9, 3, 9), vectors.dtype)
     local, jacobian = np.empty((3, 3)), np.empty((3, 3))
     for b in range(len(vectors)):
@@ -176,10 +185,12 @@ def rotation_derivatives(vectors):
 
 @numba.njit(cache=True, nogil=True)
 def add_gradient(by_pose, by_feature, place, gradient):
-    """Add a gradient by the features (B,486) to that by the parameters (B,n).
+    """Convert a gradient by the feature to one by the parameters, and add it.
 
-    by_pose (B,54,3,9): :func:`rotation_derivatives`. place (P,): column of each parameter, -1 =
-    fixed.
+    by_pose (B,54,3,9): :func:`rotation_derivatives`.
+    by_feature (B,486): gradient by the feature.
+    place (P,): column of each parameter, -1 = fixed.
+    gradient (B,n): gradient by the parameters, filled in place.
     """
     for b in range(len(by_pose)):
         for joint in range(by_pose.shape[1]):
@@ -194,13 +205,15 @@ def add_gradient(by_pose, by_feature, place, gradient):
 def add_to_row(row, local, joints, t, table, by_pose):
     """Add the derivatives of a point's blend shapes by ``joints`` to a row n^T dx of the Jacobian.
 
-    t (3,): R^T n, the row's direction n turned back to the point at rest. table (3,486): of the
-    point. by_pose (54,3,9): of the body, by :func:`rotation_derivatives`. local (P,): column of
-    each parameter in the row, -1 = none.
+    local (P,): column of each parameter in the row, -1 = none.
+    joints: numbers of joints below the root.
+    t (3,): R^T n, the row's direction n rotated to the rest pose.
+    table (3,486): P of the point.
+    by_pose (54,3,9): :func:`rotation_derivatives` of the body.
     """
     for joint in joints:
         first, by = 9 * (joint - 1), by_pose[joint - 1]
-        s0 = s1 = s2 = t[0] * np.float32(0)  # of the same type
+        s0 = s1 = s2 = t[0] * np.float32(0)  # zeros of the type of t
         for k in range(9):
             along = (
                 t[0] * table[0, first + k] + t[1] * table[1, first + k] + t[2] * table[2, first + k]

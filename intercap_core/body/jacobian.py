@@ -1,10 +1,13 @@
 """Posed points and their exact derivatives with respect to every parameter.
 
-A rotation of joint k by the world vector w about the joint moves a point by w x a_k, where
-a_k = sum over bones m below k of w_m (R_m x + t_m - p_k): the geometric Jacobian of a manipulator,
-blended. A change of the axis-angle theta_k is the rotation w = R_parent J_l(theta_k) d theta_k with
-the left Jacobian J_l of the rotation group. Shape moves a point by T S_n + sum_k w_k d t_k with the
-blended rotation T. Pose blend shapes add T P d R_k / d theta_k.
+A point x at rest is posed to sum_m w_m (R_m x + t_m) by the bones m with skinning weights w_m.
+- Pose: a rotation of joint k, at p_k, by the world rotation vector omega moves the point by
+  omega x a_k with the lever arm a_k = sum over bones m below k of w_m (R_m x + t_m - p_k). This is
+  the geometric Jacobian of a manipulator, blended. A change of the axis-angle theta_k is the
+  rotation omega = R_parent J_l(theta_k) d theta_k with the left Jacobian J_l of the rotation group.
+- Shape: the point moves by M S + sum_m w_m d t_m with the blended rotation M = sum_m w_m R_m and
+  the point's shape directions S.
+- Pose blend shapes P add M P d vec(R_k) / d theta_k, with the local rotation R_k.
 """
 
 from __future__ import annotations
@@ -27,8 +30,10 @@ from intercap_core.body.selection import Selection
 
 
 def shaped_points(selection: Selection, shape: Tensor, local: Tensor) -> Tensor:
-    """Return points (B,N,3) at rest, after shape (B,S) and the pose blend shapes of local
-    (B,55,3,3)."""
+    """Return points (B,N,3) at rest, metres: the template after shape and pose blend shapes.
+
+    shape (B,S): betas and expression. local (B,55,3,3): rotations of the joints.
+    """
     batch, count = shape.shape[0], selection.template.shape[0]
     size = selection.directions.shape[-1]
     points = selection.template + (shape @ selection.directions.reshape(-1, size).T).reshape(
@@ -51,13 +56,15 @@ class Linearisation:
     points: Tensor
     """(B, N, 3) metres."""
     turns: Tensor
-    """(B, N, L, 3) a_k of each joint in ``selection.chain``."""
+    """(B, N, L, 3) lever arm a_k of each joint in ``selection.chain``, metres."""
     frames: Tensor
-    """(B, 55, 3, 3) world rotation of a joint for a change of its axis-angle."""
+    """(B, 55, 3, 3) R_parent J_l: maps a change of a joint's axis-angle to its rotation vector in
+    the world."""
     shape: Tensor
     """(B, N, 3, S) derivatives by betas and expression."""
     correctives: Tensor | None
-    """(B, N, 3, 54, 3) derivatives of the pose blend shapes."""
+    """(B, N, 3, 54, 3) derivatives of the pose blend shapes by the axis-angles of the 54 joints
+    below the root; None without pose blend shapes."""
     selection: Selection
 
     @property
@@ -75,8 +82,10 @@ class Linearisation:
         return self.points[:, self.selection.num_vertices :]
 
     def with_correctives_of(self, joints: np.ndarray | None) -> Linearisation:
-        """Keep the pose blend shapes by the flagged ``joints`` (N,55) of each point; None = by no
-        joint."""
+        """Return a copy with the derivatives of the pose blend shapes by some joints only.
+
+        joints (N,55) bool: joints that count, for each point; None = none.
+        """
         if self.correctives is None or joints is None:
             return replace(self, correctives=None)
         flags = torch.as_tensor(joints[:, 1:], device=self.points.device)
@@ -97,7 +106,7 @@ class Linearisation:
         batch, count, rows = directions.shape[:3]
         out = directions.new_zeros(batch, count, rows, self.num_parameters)
         chain = self.selection.chain
-        # n . (w x a) = w . (a x n)
+        # n . (omega x a) = omega . (a x n)
         twist = _cross(self.turns[:, :, :, None], directions[:, :, None])
         frame = self.frames[:, chain]
         columns = torch.einsum("bnlrc,bnlcd->bnrld", twist, frame)
@@ -119,8 +128,13 @@ class Linearisation:
     ) -> tuple[Tensor, Tensor]:
         """Return J^T W J (B,P,P) and J^T W r (B,P) with the rows J of :meth:`along`.
 
-        directions (B,N,R,3), weights (B,N,R), residuals (B,N,R). The points of a limb depend on few
-        joints, so each limb is one dense product over their columns.
+        The points of a limb depend on few joints, so each limb (:class:`.selection.Limbs`) is one
+        dense product over the columns of these joints.
+
+        Args:
+            directions: (B, N, R, 3)
+            weights: (B, N, R)
+            residuals: (B, N, R)
         """
         batch = self.points.shape[0]
         size = self.num_parameters
@@ -149,7 +163,14 @@ class Linearisation:
         return hessian, gradient
 
     def _rows(self, at: slice, rows: Tensor, active: Tensor, directions: Tensor) -> Tensor:
-        """Return the rows (b, n*R, 3m + 3 + S) of some points, by the columns of some joints."""
+        """Return the rows (b, n*R, 3m + 3 + S) of some points.
+
+        Args:
+            at: the b bodies.
+            rows: (n,) points.
+            active: (m,) joints, whose columns come first; all 55 with pose blend shapes.
+            directions: (B, N, R, 3)
+        """
         place = torch.zeros(NUM_JOINTS, dtype=torch.long, device=rows.device)
         place[active] = torch.arange(len(active), device=rows.device)
         chain = self.selection.chain[rows]
@@ -183,7 +204,15 @@ def linearise(
     axis_angle: Tensor,
     joint_directions: Tensor,
 ) -> Linearisation:
-    """Pose and differentiate rest points (B,N,3); axis_angle (B,55,3), directions (55,3,S)."""
+    """Pose points and differentiate them.
+
+    Args:
+        selection: skinning and directions of the N points.
+        points: (B, N, 3) at rest, metres.
+        posed: the posed joints.
+        axis_angle: (B, 55, 3) local rotations.
+        joint_directions: (55, 3, S) derivatives of the rest joints by the shape.
+    """
     batch, count = points.shape[:2]
     both = torch.cat([posed.rotations.reshape(batch, NUM_JOINTS, 9), posed.offsets], 2)
     blended = selection.weights @ both
@@ -197,7 +226,7 @@ def linearise(
     turns = torch.einsum("nlk,bnki->bnli", selection.below, parts)
     turns = turns - selection.below.sum(2)[..., None] * posed.joints[:, selection.chain]
 
-    # rotations of a joint for a change of its axis-angle: in its parent's frame, in the world
+    # J_l in the frame of the parent; frames = R_parent J_l in the world
     turn_of_local = left_jacobian(axis_angle)
     around = posed.rotations[:, [max(parent, 0) for parent in PARENTS]]
     around[:, 0] = torch.eye(3, dtype=axis_angle.dtype, device=axis_angle.device)
@@ -207,14 +236,14 @@ def linearise(
     shape = (selection.weights @ moved_offsets.reshape(batch, NUM_JOINTS, -1)).reshape(
         batch, count, 3, size
     )
-    for axis in range(3):  # matrix @ directions in three dense passes: speed
+    for axis in range(3):  # adds matrix @ directions; three dense passes are faster than one matmul
         shape = torch.addcmul(
             shape, matrix[..., axis : axis + 1], selection.directions[:, None, axis]
         )
 
     correctives = None
     if selection.posedirs is not None:
-        # d R / d theta_c = skew(J_l e_c) R
+        # d R / d theta_c = skew(J_l e_c) R, with the unit vector e_c
         change = skew(turn_of_local[:, 1:].transpose(-1, -2)) @ posed.local[:, 1:, None]
         change = change.reshape(batch, NUM_JOINTS - 1, 3, 9)
         tables = selection.posedirs.reshape(count, 3, NUM_JOINTS - 1, 9)

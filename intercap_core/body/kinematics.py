@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 from intercap_core.body.joints import NUM_JOINTS, PARENTS
 
 SMALL_ANGLE_SQUARED = 1e-4  # rad^2; below it the next term of the series is under 1e-10
-_CACHE_BYTES = 2 << 20  # blended bones in memory at once, the cache of a core: speed
+_CACHE_BYTES = 2 << 20  # size of the blended bones of one piece, bytes: fits the cache of a core
 
 
 def skew(v: Tensor) -> Tensor:
@@ -24,7 +24,10 @@ def skew(v: Tensor) -> Tensor:
 
 
 def _coefficients(theta_squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """sin(t)/t, (1-cos t)/t^2, (t-sin t)/t^3, smooth (also for autograd) through zero."""
+    """Return sin(t)/t, (1 - cos t)/t^2 and (t - sin t)/t^3 of squared angles t^2.
+
+    Below a small angle they are Taylor series, so autograd is finite at zero.
+    """
     small = theta_squared < SMALL_ANGLE_SQUARED
     t2 = torch.where(small, torch.ones_like(theta_squared), theta_squared)
     t = t2.sqrt()
@@ -55,15 +58,18 @@ def left_jacobian(axis_angle: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class _Level:
-    """The joints of one depth of the tree."""
+    """The n joints of one depth of the tree."""
 
     own: Tensor
+    """(n,) the joints."""
     parents: Tensor
+    """(n,) their parents."""
     parent_place: Tensor
-    """Place of the parents in the order by depth."""
+    """(n,) places of the parents in the list of joints sorted by depth."""
 
 
 def _levels() -> tuple[tuple[_Level, ...], Tensor]:
+    """Return the levels below the root, and the place (55,) of each joint sorted by depth."""
     depth = [0] * NUM_JOINTS
     for joint in range(1, NUM_JOINTS):
         depth[joint] = depth[PARENTS[joint]] + 1
@@ -134,18 +140,24 @@ def joint_shape_derivatives(posed: PosedJoints, directions: Tensor) -> tuple[Ten
 def skin(points: Tensor, rotations: Tensor, offsets: Tensor, weights: Tensor) -> Tensor:
     """Return posed points (B,N,3), metres: v_n = sum over bones m of w_nm (R_m x_n + t_m).
 
-    points (B,N,3) at rest, rotations (B,J,3,3), offsets (B,J,3), weights (N,J), which are constant.
-    Differentiable once by points, rotations and offsets. Blending the 12 numbers of the bones is
-    one dense product, 12 times as large as the result; a few bodies at a time stay in the cache.
+    Differentiable once, by points, rotations and offsets. The 12 numbers of each bone are blended
+    by one dense product. Its result (B,12,N) is large, so a few bodies are processed at a time.
+
+    Args:
+        points: (B, N, 3) at rest, metres.
+        rotations: (B, J, 3, 3)
+        offsets: (B, J, 3) t_m, metres.
+        weights: (N, J) skinning weights.
     """
     bones = torch.cat([rotations.permute(0, 2, 3, 1).flatten(1, 2), offsets.transpose(1, 2)], 1)
     return _Skin.apply(points, bones, weights)
 
 
 class _Skin(torch.autograd.Function):
-    """points (B,N,3), bones (B,12,J): rows of the rotation, then the offset; weights (N,J).
+    """Linear blend skinning of points (B,N,3) by bones (B,12,J) with weights (N,J).
 
-    The pull-back blends again instead of keeping the blended bones M:
+    The 12 numbers of a bone are its rotation, row by row, then its offset. The backward pass blends
+    again instead of storing the blended rotations M_n:
     dE/dx_n = M_n^T dE/dv_n, dE/d(R_m | t_m) = sum over n of w_nm dE/dv_n (x_n | 1)^T.
     """
 
@@ -177,7 +189,7 @@ class _Skin(torch.autograd.Function):
 
 
 def _blended(bones: Tensor, weights: Tensor) -> Tensor:
-    """(b,12,N)"""
+    """Return the bones blended for each point, (b,12,N)."""
     return (bones.flatten(0, 1) @ weights.mT).unflatten(0, (-1, 12))
 
 

@@ -1,14 +1,15 @@
 """F_S of A.2: the motion encoder of LEMO (Zhang et al. 2021), from the user's own weights.
 
-Its input is an image of the steps of 81 markers of the skin (:attr:`BodyModel.markers`) between
-frames at 30 Hz: one row for each coordinate (marker by marker; x, y, z), one column for each step.
-Coordinates are in the frame of the first body: x from the left hip to the right, z up. Steps are
-divided by the standard deviation of the marker coordinates in the training data. The image is
-padded by reflection, one row and eight columns at each side. Ten convolutions of 3 x 3, each with a
-leaky ReLU, keep its size and end in 64 channels. A column is the latent vector of a step.
+A step is the displacement of the 81 skin markers (:attr:`BodyModel.markers`) from one frame to the
+next at 30 Hz. The encoder's input is an image: one column for each step, one row for each
+coordinate (marker by marker; x, y, z). Coordinates are in the frame of the first body: x from the
+left hip to the right, z up. Steps are divided by the standard deviation of the marker coordinates
+in the training data. The image is padded by reflection, one row and eight columns at each side. Ten
+convolutions of 3 x 3, each with a leaky ReLU, keep its size and end in 64 channels. A column of the
+output is the latent vector of a step.
 
 All this follows the release (github.com/sanweiliti/LEMO); the code is our own. The means of the
-training data are not needed: they cancel in steps.
+training data are not needed: they cancel in the displacements.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ class MotionEncoder:
     """LEMO's motion encoder."""
 
     blocks: tuple[tuple[Tensor, Tensor, Tensor, Tensor], ...]
-    """Weights and biases of the five pairs of convolutions."""
+    """Weight, bias, weight, bias of each of the five pairs of convolutions."""
     spread: Tensor
     """(243,) standard deviation of the coordinates, metres."""
 
@@ -79,7 +80,10 @@ class MotionEncoder:
         return cls(tuple(blocks), torch.as_tensor(spread, dtype=dtype, device=device))
 
     def latents(self, steps: Tensor) -> Tensor:
-        """Return latent vectors (N, 15680) of N > 8 consecutive steps (N, 243), metres."""
+        """Return latent vectors (N, 15680), 64 channels x 245 rows, of N > 8 consecutive steps.
+
+        steps (N, 243): marker displacements, metres.
+        """
         image = (steps / self.spread).T[None, None]
         image = functional.pad(image, (_COLUMNS, _COLUMNS, _ROWS, _ROWS), mode="reflect")
         for block in self.blocks:

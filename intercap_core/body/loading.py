@@ -1,9 +1,10 @@
 """Read and check an SMPL-X-format npz, and the prior of a subject's shape, E_beta.
 
-The open body is of both genders. Its file ``open_body_genders.npz`` has the mean and covariance of
-the shape among women and among men. A licensed file is of its own gender: its betas are standard
-normal by definition. A height is one linear measurement of the betas, between the vertices at the
-crown and at the soles of the rest pose, and narrows the Gaussian (Kalman's update).
+The open body is one model for women and men. ``open_body_genders.npz`` contains the mean and
+covariance of its betas among women and among men. A licensed file is made for one gender: its betas
+are standard normal by definition. A stated height narrows the Gaussian by a Kalman update. It is a
+linear measurement of the betas: the difference in y between the highest vertex (crown) and the
+lowest (sole) of the rest pose.
 """
 
 from __future__ import annotations
@@ -34,13 +35,13 @@ _REQUIRED = (
     "hands_meanr", "hands_componentsl", "hands_componentsr", "lmk_faces_idx", "lmk_bary_coords",
     "dynamic_lmk_faces_idx", "dynamic_lmk_bary_coords",
 )  # fmt: skip
-_OTHER_MODELS = {5: "FLAME", 16: "MANO", 24: "SMPL", 52: "SMPL-H"}  # by their joints
+_OTHER_MODELS = {5: "FLAME", 16: "MANO", 24: "SMPL", 52: "SMPL-H"}  # by number of joints
 _HINT = "name an SMPLX_NEUTRAL/MALE/FEMALE.npz as body model, or none for the open body"
 
 
 @dataclass(frozen=True)
 class BodyArrays:
-    """The arrays of a file in float64."""
+    """The arrays of a body file in float64, with V vertices and F faces."""
 
     path: Path
     template: np.ndarray
@@ -64,13 +65,13 @@ class BodyArrays:
     hand_deviation: np.ndarray | None
     """(2, H) standard deviations of the components; None = unknown."""
     landmark_faces: np.ndarray
-    """(51,)"""
+    """(51,) face of each facial landmark, dlib 17 to 67."""
     landmark_barycentric: np.ndarray
-    """(51, 3)"""
+    """(51, 3) its barycentric coordinates in that face."""
     contour_faces: np.ndarray
-    """(79, 17)"""
+    """(79, 17) faces of the jaw line, for each of 79 turns of the head; 0 = frontal."""
     contour_barycentric: np.ndarray
-    """(79, 17, 3)"""
+    """(79, 17, 3) barycentric coordinates in these faces."""
 
 
 def load_body_file(
@@ -133,7 +134,7 @@ def _read(path: Path) -> dict[str, np.ndarray]:
 
 
 def _check(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Raise UserError for the first fault."""
+    """Raise UserError that names the first fault, if there is one."""
     for faults in (_find_wrong_shapes(arrays), _find_wrong_values(arrays)):
         for fault in faults:
             raise UserError(f"Body file {path} {fault}: {_HINT}.")
@@ -218,7 +219,10 @@ def _find_wrong_values(arrays: dict[str, np.ndarray]) -> Iterator[str]:
 def _select_directions(
     path: Path, table: np.ndarray, num_betas: int, num_expression: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return columns 0.. and 300.. of a full file, or the two halves of one with 20 columns."""
+    """Return the first columns of shape (V,3,num_betas) and of expression (V,3,num_expression).
+
+    The expression starts at column 300 of a full file, else (10+10) at half of the columns.
+    """
     columns = table.shape[2]
     start = 300 if columns > 300 else columns // 2  # where the expression starts
     if num_betas > start or num_expression > columns - start:
@@ -232,7 +236,10 @@ def _select_directions(
 def _select_hands(
     path: Path, arrays: dict[str, np.ndarray], count: int, flat: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Return mean (2,45), first components (2,count,45) and their deviations (2,count)."""
+    """Return mean (2,45), the first components (2,count,45) and their deviations (2,count).
+
+    The deviations are None if the file does not state them. ``flat``: the mean becomes zero.
+    """
     if not 6 <= count <= 45:
         raise UserError(
             f"Body file {path}: {count} hand components were requested; expected 6 to 45."
@@ -251,8 +258,10 @@ def _select_hands(
 
 
 def _hand_deviation(arrays: dict[str, np.ndarray]) -> np.ndarray | None:
-    """Return the standard deviations (2,45) of the hand components: stored, or of the registered
-    hands. SMPL-X files contain the coefficients of the scans that the hand space was learnt from.
+    """Return the standard deviations (2,45) of the hand components; None if the file has none.
+
+    They are stored, or computed from the coefficients of the scans that the hand space was learnt
+    from, which SMPL-X files contain.
     """
     stored = [arrays.get(f"hands_deviation{s}") for s in "lr"]
     if all(x is not None and x.shape == (45,) for x in stored):
@@ -265,12 +274,12 @@ def _hand_deviation(arrays: dict[str, np.ndarray]) -> np.ndarray | None:
 
 @dataclass(frozen=True, eq=False)
 class ShapePrior:
-    """betas = mean + root z, with z standard normal."""
+    """Gaussian prior of the betas: betas = mean + root z, with z standard normal."""
 
     mean: np.ndarray
     """(S,)"""
     root: np.ndarray
-    """(S, S)"""
+    """(S, S) Cholesky factor of the covariance."""
 
     @classmethod
     def of(cls, file: BodyArrays, gender: str, height_m: float | None = None) -> ShapePrior:
@@ -290,13 +299,13 @@ class ShapePrior:
         return cls(mean, np.linalg.cholesky((covariance + covariance.T) / 2))
 
     def centred(self, file: BodyArrays) -> BodyArrays:
-        """Return the body with z in place of betas: shapes in units of this prior."""
+        """Return the body whose shape parameters are z, which is standard normal."""
         directions = file.shape_directions
         template = file.template + directions @ self.mean
         return replace(file, template=template, shape_directions=directions @ self.root)
 
     def betas(self, z: Tensor) -> Tensor:
-        """Return the file's betas (...,S) of shapes (...,S) in units of this prior."""
+        """Return the file's betas (...,S) of shape parameters z (...,S)."""
         mean, root = (torch.as_tensor(values).to(z) for values in (self.mean, self.root))
         return mean + z @ root.T
 

@@ -32,7 +32,8 @@ _SMPLX_POINTS = {
     "right_pinky": 8022,
 }  # fmt: skip
 
-# Markers of the LEMO motion prior on SMPL-X: the SSM2 set's 67, then 4 of the face, 10 finger tips.
+# Vertex ids of the 81 markers of the LEMO motion prior on SMPL-X: 67 of the SSM2 marker set, 4 of
+# the face, 10 finger tips.
 _SMPLX_MARKERS = {
     "C7": 3832, "CLAV": 5533, "LANK": 5882, "LFWT": 3486, "LBAK": 3336, "LBCEP": 4029,
     "LBSH": 4137, "LBUM": 5694, "LBUST": 3228, "LCHEECK": 2081, "LELB": 4302, "LELBIN": 4363,
@@ -129,7 +130,10 @@ def find_regions(
     joints: np.ndarray,
     mouth_outline: np.ndarray,
 ) -> dict[str, np.ndarray]:
-    """Return the vertex ids of each region, ascending; regions are disjoint.
+    """Return the vertex ids of each region, ascending.
+
+    Regions are disjoint: a vertex belongs to the first region below that claims it. Shares are sums
+    of skinning weights; limits of ``normals`` are cosines with the named direction.
 
     Args:
         vertices: (V, 3) of the T-posed template, y up, facing +z, metres.
@@ -156,8 +160,8 @@ def find_regions(
     torso = share("pelvis", "spine1", "spine2", "spine3", "left_collar", "right_collar")
 
     outline = mouth_outline[:, :2]
-    outline = outline.mean(0) + (outline - outline.mean(0)) * 1.06
-    front = vertices[:, 2] > mouth_outline[:, 2].min() - 0.012
+    outline = outline.mean(0) + (outline - outline.mean(0)) * 1.06  # enlarged by 6 %
+    front = vertices[:, 2] > mouth_outline[:, 2].min() - 0.012  # 12 mm behind the lips
     claim(
         "mouth",
         (share("head", "jaw") > 0.6)
@@ -170,8 +174,8 @@ def find_regions(
         hand = share(f"{side}_wrist", *fingers) > 0.5
         past_wrist = out * (vertices[:, 0] - at[f"{side}_wrist"][0]) > 0
         thumb = share(*(n for n in fingers if "thumb" in n)) > 0.5
-        down = np.array([0.0, -1, 0])
-        # The pad of the thumb faces the little finger and down
+        down = np.array([0.0, -1, 0])  # of palms in the T-pose
+        # the pad of the thumb faces the little finger (-z) and down: a unit vector
         across = np.array([0.0, -0.55, -0.83])
         pad = np.where(thumb[:, None], across, down)
         claim(f"{side}_hand", hand & past_wrist & ((normals * pad).sum(1) > 0.15))
@@ -187,12 +191,12 @@ def find_regions(
         & (vertices[:, 1] > seat_low)
         & (vertices[:, 1] < seat_high)
         & (normals[:, 2] < 0.1)
-        & (vertices[:, 2] < joints[[1, 2], 2].mean()),
+        & (vertices[:, 2] < joints[[1, 2], 2].mean()),  # behind the hips
     )
     arm_length = np.linalg.norm(at["left_elbow"] - at["left_shoulder"])
     for side, out in (("left", 1.0), ("right", -1.0)):
         near = np.linalg.norm(vertices - at[f"{side}_shoulder"], axis=1) < 0.42 * arm_length
-        upper_outer = normals @ np.array([0.35 * out, 0.94, 0.0])
+        upper_outer = normals @ np.array([0.35 * out, 0.94, 0.0])  # up and slightly outward
         claim(
             f"{side}_shoulder",
             (share(f"{side}_collar", f"{side}_shoulder") > 0.4) & near & (upper_outer > 0.3),

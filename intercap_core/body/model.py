@@ -1,7 +1,9 @@
-"""The body: a file in SMPL-X's format, posed, with exact derivatives.
+"""The SMPL-X body model: poses vertices and joints, with exact derivatives.
 
 Loper et al. 2015 (SMPL) and Pavlakos et al. 2019 (SMPL-X):
-v = W(T + S [betas, expression] + P vec(R(theta) - I), J(T + S [betas, expression]), theta).
+v = W(T + S [betas, expression] + P vec(R(theta) - I), J(T + S [betas, expression]), theta)
+with the template T, shape directions S, pose blend shapes P, local joint rotations R(theta), joint
+regressor J and linear blend skinning W. The argument of W, before skinning, is "at rest".
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ class BodyOutput:
     """Posed bodies, metres."""
 
     vertices: Tensor
-    """(B, V, 3), or of the requested vertices."""
+    """(B, V, 3), or (B, N, 3) of N requested vertices."""
     joints: Tensor
     """(B, 55, 3)"""
 
@@ -81,7 +83,8 @@ class BodyModel:
         self.hand_components = tensor(file.hand_components)
         deviation = file.hand_deviation
         if deviation is None:
-            deviation = np.full(file.hand_components.shape[:2], 0.35)  # usual, rad (open body)
+            # rad; typical of the open body, for files that state none
+            deviation = np.full(file.hand_components.shape[:2], 0.35)
         self.hand_deviation = tensor(deviation)
 
         maps = load_maps(file.path, len(file.template))
@@ -112,8 +115,8 @@ class BodyModel:
             path: body file; None = the open body.
             num_betas: number of shape components.
             num_expression: number of expression components.
-            num_hand_components: 6 to 45 components of each hand's pose space. A fit of the whole
-                pose needs all.
+            num_hand_components: number of components of each hand's pose space, 6 to 45. A fit
+                needs all 45.
             flat_hand_mean: coefficients are relative to the flat hand, not to the mean hand.
             device: device of the model.
             dtype: floating type of the model.
@@ -180,8 +183,10 @@ class BodyModel:
         return self.keypoints(self.forward(params, vertex_ids=self.keypoint_map.vertex_ids))
 
     def select(self, vertex_ids: Tensor | np.ndarray | None, *, joints: bool = False) -> Selection:
-        """Return the rest pose and the bones of vertices (None = all), then of the joints if
-        ``joints``. The last eight selections are cached."""
+        """Return template, blend shapes and skinning of ``vertex_ids`` (N,), None = all vertices.
+
+        With ``joints``, those of the 55 joints follow. The last eight selections are cached.
+        """
         if vertex_ids is None:
             ids, key = None, b"all"
         else:
@@ -205,7 +210,7 @@ class BodyModel:
     def _rest(
         self, selection: Selection, params: BodyParameters
     ) -> tuple[Tensor, PosedJoints, Tensor]:
-        """Return points at rest (B,N,3), posed joints, axis-angles (B,55,3)."""
+        """Return points at rest (B,N,3), metres, posed joints, and axis-angles (B,55,3)."""
         batch = params.batch
         axis_angle = params.full_pose()
         shape = torch.cat([params.betas.expand(batch, -1), params.expression.expand(batch, -1)], 1)
@@ -223,6 +228,7 @@ class BodyModel:
 
 
 def _regions(file: BodyArrays, rest_joints: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the vertex ids of each contact region, found on the template."""
     corners = file.template[file.faces[file.landmark_faces]]
     landmarks = np.einsum("nk,nkc->nc", file.landmark_barycentric, corners)
     mouth_outline = landmarks[31:43]  # landmarks 48 to 59 of dlib's 68
@@ -241,13 +247,15 @@ def check_body(model: BodyModel) -> None:
     width = float((high - low).amax())
     beyond = float(torch.maximum(low - joints, joints - high).amax())
     area = _area(template, model.faces)
+    # share of the skin's width (x) and height (y) that the joints span, the smaller one
     span = float(((joints.amax(0) - joints.amin(0)) / (high - low))[:2].amin())
     weight = float(model.skinning_weights.amin())
     lengths = model.hand_components.norm(dim=2)
     shortest, longest = float(lengths.amin()), float(lengths.amax())
     move = _largest_move(model)
+    # sums of barycentric weights, of the keypoints on the mesh
     corners = model.keypoint_map.weights.sum(1)[model.keypoint_map.joint < 0]
-    # anatomy with a wide margin: the span of the arms, the skin of a newborn and of a clothed giant
+    # limits are anatomy with a wide margin: arm span, skin of a newborn and of a clothed giant
     problems = (
         (width > 3.0, f"a body {width:.3g} m wide, expected at most 3 m"),
         (not 0.3 < area < 6.0, f"{area:.3g} m2 of skin, expected 0.3 to 6"),

@@ -4,7 +4,8 @@ E_theta_b and E_theta_f (:func:`rest_pose`), E_theta_h (:func:`hand_pose`), E_al
 (:func:`bending`), and beyond the paper :func:`joint_limits`. E_beta and E_psi are standard normal.
 All are weighted and summed in :mod:`intercap_core.body_fit.prior_term`; VPoser's E_theta_b is in
 :mod:`.vposer`. The functions take parameter vectors (B,P) in the order of `BodyParameters.vector`
-and return rows that add themselves to normal equations. Weights enter squared, as in SMPLify-X.
+and return rows: residuals r with their Jacobian. A weight w contributes w^2 r^2 / 2, squared as in
+SMPLify-X.
 
 Ranges of motion are components of the axis-angle from the T-pose. They are the means plus about two
 standard deviations of
@@ -35,14 +36,15 @@ from torch import Tensor
 from intercap_core.body.joints import JOINT_NAMES
 from intercap_core.body.parameters import NUM_POSE
 
-# Elbows and knees (Bogo et al. 2016, SMPLify, "unnatural bending"): full-pose column, sign of the
-# wrong way.
+# Elbows (y) and knees (x), left and right: column in the parameter vector, sign of the unnatural
+# direction (Bogo et al. 2016, SMPLify).
 BENDING: tuple[tuple[int, int], ...] = ((55, 1), (58, -1), (12, -1), (15, -1))
 _HAND_COLUMNS = (slice(75, 120), slice(120, 165))  # left and right, of SMPL-X's pose
 
 _Range = tuple[float, float]
 _FREE: _Range = (-180.0, 180.0)
-# x, y, z in degrees; left limbs (right ones are mirrored: y and z change sign)
+# Lower and upper limit of x, y, z in degrees. Limbs are left ones; right ones are mirrored: y and z
+# change sign.
 _TABLE: dict[str, tuple[_Range, _Range, _Range]] = {
     "pelvis": (_FREE, _FREE, _FREE),
     "spine1": ((-20, 45), (-15, 15), (-20, 20)),
@@ -68,8 +70,8 @@ _TABLE: dict[str, tuple[_Range, _Range, _Range]] = {
     "thumb3": ((-50, 50), (-30, 85), (-85, 40)),
 }  # fmt: skip
 
-# Mean and standard deviation in degrees of the 25 joints that are not fingers, of a standing person
-# with hanging arms: broad estimates of everyday poses
+# Mean and standard deviation of x, y, z in degrees of the 25 joints that are not fingers: estimates
+# of everyday poses, about a standing person with hanging arms. Limbs are left ones, as above.
 _REST: dict[str, tuple[tuple[float, float], tuple[float, float], tuple[float, float]]] = {
     "shoulder": ((10, 40), (-20, 45), (-55, 40)),
     "elbow": ((0, 30), (-40, 45), (0, 12)),
@@ -99,6 +101,7 @@ def _kind(joint: str) -> tuple[str, bool]:
 
 
 def _limits(joint: str) -> tuple[_Range, _Range, _Range]:
+    """Return lower and upper limit of x, y, z, degrees."""
     kind, mirror = _kind(joint)
     x, y, z = _TABLE[kind]
     if mirror:
@@ -107,6 +110,7 @@ def _limits(joint: str) -> tuple[_Range, _Range, _Range]:
 
 
 def _rest(joint: str) -> tuple[_Range, _Range, _Range]:
+    """Return mean and standard deviation of x, y, z, degrees."""
     kind, mirror = _kind(joint)
     if kind.startswith("spine"):
         kind = "spine"
@@ -119,9 +123,9 @@ def _rest(joint: str) -> tuple[_Range, _Range, _Range]:
 
 
 LIMITS_DEG = tuple(_limits(joint) for joint in JOINT_NAMES)
-"""(55, 3 axes, lower and upper)"""
+"""(55, 3 axes, 2: lower and upper limit)"""
 REST_SPREAD_DEG = tuple(_rest(joint) for joint in JOINT_NAMES)
-"""(55, 3 axes, mean and standard deviation)"""
+"""(55, 3 axes, 2: mean and standard deviation); entries of fingers are not used."""
 
 
 @dataclass(frozen=True)
@@ -182,7 +186,7 @@ def joint_limits(vector: Tensor) -> DiagonalRows:
 
 
 def bending(vector: Tensor) -> DiagonalRows:
-    """E_alpha: elbows and knees do not bend backward, r = exp(sign * theta); its sum of squares."""
+    """E_alpha: penalty on elbows and knees that bend backward, r = exp(sign * theta)."""
     columns = torch.tensor([c for c, _ in BENDING], device=vector.device)
     sign = torch.tensor([float(s) for _, s in BENDING], dtype=vector.dtype, device=vector.device)
     residuals = torch.exp(sign * vector[:, columns])
@@ -192,10 +196,10 @@ def bending(vector: Tensor) -> DiagonalRows:
 def rest_pose(vector: Tensor, *, first: int = 1) -> DiagonalRows:
     """E_theta_b (21 body joints) and E_theta_f (jaw, eyes) from joint ``first`` on.
 
-    r = (theta - mean) / sigma with `REST_SPREAD_DEG`: so weak that it only determines parts without
-    observations.
+    r = (theta - mean) / sigma with `REST_SPREAD_DEG`. The prior is weak: it determines only parts
+    of the body without observations.
     """
-    columns = torch.arange(3 * first, 75, device=vector.device)
+    columns = torch.arange(3 * first, 75, device=vector.device)  # 75: the hands start
     table = torch.deg2rad(torch.tensor(REST_SPREAD_DEG, dtype=vector.dtype, device=vector.device))[
         first:25
     ].reshape(-1, 2)

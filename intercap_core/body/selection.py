@@ -1,6 +1,6 @@
-"""The points of a body that are evaluated: some or all vertices, and the joints if requested.
+"""Selection of the points of a body that are evaluated: vertices, and the joints if requested.
 
-A joint is a point that follows its parent alone, so the same code poses both.
+A joint is a point that follows only the bone of its parent, so the same code poses both.
 """
 
 from __future__ import annotations
@@ -15,8 +15,9 @@ from torch import Tensor
 
 from intercap_core.body.joints import NUM_JOINTS, PARENTS, ancestors
 
-# Points that follow nearly the same joints share one dense block of the normal equations, a limb.
-# This is the limb of a point by the joint with the largest weight.
+# A limb is a group of points that follow nearly the same joints. They share one dense block of the
+# normal equations. The table maps the joint with the largest weight of a point to its limb, which
+# is named by one of its joints.
 _LIMB_OF_JOINT: tuple[int, ...] = (
     0, 1, 2, 0, 4, 5, 0, 4, 5, 9, 4, 5, 12, 9, 9, 12, 16, 17, 16, 17, 20, 21, 12, 12, 12,
     *(25 + 3 * (i // 3) for i in range(30)),
@@ -27,15 +28,20 @@ class Limbs(NamedTuple):
     """N points grouped into L limbs, whose points follow nearly the same joints."""
 
     order: np.ndarray
-    """(N,) points, limb by limb."""
+    """(N,) indices of the points, limb by limb."""
     starts: np.ndarray
-    """(L + 1,) start of each limb in the order, and the end."""
+    """(L + 1,) start of each limb in ``order``, then N."""
     moved_by: np.ndarray
     """(L, 55) bool, the joints that move a point of the limb."""
 
     @classmethod
     def of(cls, groups: Sequence[np.ndarray], moved_by: np.ndarray) -> Limbs:
-        """Return the limbs of groups of points, which the joints ``moved_by`` (N, 55) bool move."""
+        """Return one limb for each group of points.
+
+        Args:
+            groups: indices of the points of each limb.
+            moved_by: (N, 55) bool, the joints that move each point.
+        """
         return cls(
             np.concatenate(groups),
             np.cumsum([0, *map(len, groups)]),
@@ -43,7 +49,7 @@ class Limbs(NamedTuple):
         )
 
     def moved_by_point(self) -> np.ndarray:
-        """Flag the joints (N, 55) of each point's own limb."""
+        """Return (N, 55) bool, the joints that move the limb of each point."""
         flags = np.zeros((len(self.order), NUM_JOINTS), bool)
         flags[self.order] = self.moved_by.repeat(np.diff(self.starts), 0)
         return flags
@@ -56,15 +62,15 @@ class Selection:
     template: Tensor
     """(N, 3) metres."""
     directions: Tensor
-    """(N, 3, S) by shape and expression."""
+    """(N, 3, S) derivatives by betas and expression."""
     posedirs: Tensor | None
-    """(N, 3, 486) pose blend shapes."""
+    """(N, 3, 486) pose blend shapes; zero for joints."""
     weights: Tensor
     """(N, 55) skinning weights."""
     bones: Tensor
-    """(N, K) joints with weight."""
+    """(N, K) joints with a positive weight, padded with 0."""
     bone_weights: Tensor
-    """(N, K) their weights, padded with zero."""
+    """(N, K) weights of these joints, padded with zero."""
     chain: Tensor
     """(N, L) all joints whose rotation moves the point, padded with 0."""
     below: Tensor
@@ -94,7 +100,15 @@ def select_points(
     weights: Tensor,
     joints: tuple[Tensor, Tensor] | None,
 ) -> Selection:
-    """Join vertices (N,...), and the joints' rest (55,3) and directions (55,3,S) if given."""
+    """Return the selection of N vertices, and of the joints if given.
+
+    Args:
+        template: (N, 3) vertices, metres.
+        directions: (N, 3, S)
+        posedirs: (N, 3, 486), or None.
+        weights: (N, 55) skinning weights.
+        joints: rest positions (55, 3) and directions (55, 3, S) of the joints, or None.
+    """
     count = template.shape[0]
     if joints is not None:
         rest, moves = joints

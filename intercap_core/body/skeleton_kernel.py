@@ -1,9 +1,10 @@
-"""Posed skeletons and the derivatives of single points, compiled.
+"""Compiled kernels that pose skeletons and differentiate single points.
 
-The skeleton is posed once for all terms, as :mod:`intercap_core.body.kinematics` does, joint by
-joint. Rows of derivatives are n^T d point / d parameters, equal to
-:class:`.jacobian.Linearisation` to rounding for bodies without pose blend shapes. ``place`` (P,) is
-the column of a parameter in a row, -1 = none. All arrays have one floating type.
+A skeleton is posed once for all terms, joint by joint from the root, with the formulas of
+:mod:`intercap_core.body.kinematics`. The derivative of a point x along a vector n (3,) is the row
+n^T dx / d parameters; :mod:`.jacobian` derives it. Without pose blend shapes the rows equal those
+of :class:`.jacobian.Linearisation` to rounding. ``place`` (P,) is the column of each parameter in a
+row, -1 = none. All arrays have one floating type.
 """
 
 from __future__ import annotations
@@ -38,22 +39,34 @@ class RestJoints(NamedTuple):
 
 
 class PosedPoints(NamedTuple):
-    """B posed bodies and N of their points, for kernels: :class:`Skeleton` and
-    :class:`.selection.Selection` as arrays."""
+    """B posed bodies and N of their points, as arrays for kernels.
+
+    ``rotations`` to ``moved`` are the fields of :class:`Skeleton`, the others those of
+    :class:`.selection.Selection`.
+    """
 
     rest: np.ndarray
-    """(B, N, 3) points at rest."""
+    """(B, N, 3) points at rest, metres."""
     rotations: np.ndarray
+    """(B, 55, 3, 3)"""
     offsets: np.ndarray
+    """(B, 55, 3)"""
     joints: np.ndarray
+    """(B, 55, 3)"""
     frames: np.ndarray
+    """(B, 55, 3, 3)"""
     moved: np.ndarray
+    """(B, 55, 3, S)"""
     directions: np.ndarray
+    """(N, 3, S)"""
     bones: np.ndarray
+    """(N, K)"""
     shares: np.ndarray
-    """(N, K) ``bone_weights`` of the selection."""
+    """(N, K) skinning weights: ``bone_weights`` of the selection."""
     chain: np.ndarray
+    """(N, L)"""
     below: np.ndarray
+    """(N, L, K)"""
 
 
 class Skeleton(NamedTuple):
@@ -67,8 +80,8 @@ class Skeleton(NamedTuple):
     joints: np.ndarray
     """(B, 55, 3) metres."""
     frames: np.ndarray
-    """(B, 55, 3, 3) world rotation of a joint for a change of its axis-angle; B = 0 without
-    derivatives."""
+    """(B, 55, 3, 3) R_parent J_l: maps a change of a joint's axis-angle to its rotation vector in
+    the world; B = 0 without derivatives."""
     moved: np.ndarray
     """(B, 55, 3, S) derivatives of the offsets by the shape; B = 0 without derivatives."""
 
@@ -84,8 +97,8 @@ class Skeleton(NamedTuple):
 def rest_points(template, directions, shape):
     """Return points (B,N,3) of bodies of shape (B,S); template (N,3), directions (N,3,S).
 
-    Written out: the product of a library would start its threads, and its rounding would depend on
-    the number of bodies.
+    The loops replace a BLAS product, which would start its own threads and whose rounding would
+    depend on the number of bodies.
     """
     points = np.empty((len(shape), *template.shape), template.dtype)
     for b in range(len(shape)):
@@ -100,17 +113,19 @@ def rest_points(template, directions, shape):
 
 @numba.njit(cache=True, nogil=True)
 def columns_of_limb(moved_by, place, local, to):
-    """Write the columns of a limb and return their number.
+    """Number the fitted parameters that move a limb, and return their count m.
+
+    A limb's rows have one column for each of these parameters (:class:`.selection.Limbs`).
 
     moved_by (55,) bool: the joints that move the limb.
     place (P,): column of each parameter in the normal equations, -1 = fixed.
-    local (P,): filled with its column in the limb's rows, -1 = none.
-    to: filled with the column in the normal equations of each column of the rows.
+    local (P,): filled with the column of each parameter in the limb's rows, -1 = none.
+    to: its first m entries are filled with the columns of these parameters in the normal equations.
     """
     local[:] = -1
     m = 0
     for p in range(len(place)):
-        if place[p] >= 0 and (p >= _TRANSL or moved_by[p // 3]):
+        if place[p] >= 0 and (p >= _TRANSL or moved_by[p // 3]):  # joint k has 3k to 3k+2
             local[p], to[m] = m, place[p]
             m += 1
     return m
@@ -128,8 +143,8 @@ def add_symmetric(block, to, hessian):
 
 @numba.njit(cache=True, nogil=True)
 def turned_back(points, b, i, n):
-    """Return the blended R^T n: a vector n at point i of body b, turned back to rest."""
-    t0 = t1 = t2 = n[0] * np.float32(0)  # of the same type
+    """Return sum_k w_k R_k^T n: a world vector n at point i of body b, rotated to the rest pose."""
+    t0 = t1 = t2 = n[0] * np.float32(0)  # zeros of the type of n
     for k in range(points.bones.shape[1]):
         w = points.shares[i, k]
         if w == 0:
@@ -186,12 +201,17 @@ def _product(a, b, i, c):
 
 @numba.njit(cache=True, nogil=True)
 def _pose(rest, directions, parents, vectors, rotations, offsets, joints, frames, moved):
-    """Fill the arrays of :class:`Skeleton`; sums along the tree are in float64."""
+    """Fill the arrays of :class:`Skeleton`; sums along the tree are in float64.
+
+    Joint j with parent p: R_j = R_p local_j, x_j = x_p + R_p (rest_j - rest_p),
+    offset_j = x_j - R_j rest_j. ``frames`` is R_p times the left Jacobian of the axis-angle.
+    ``moved`` is d offset_j / d shape = d x_j / d shape - R_j d rest_j / d shape.
+    """
     size = directions.shape[2]
     local, jacobian = np.empty((3, 3)), np.empty((3, 3))
     world = np.empty((len(parents), 3, 3))
     placed, at_rest = np.empty((len(parents), 3)), np.empty((len(parents), 3))
-    ahead = np.empty((len(parents), 3, size), vectors.dtype)  # derivatives of the joints
+    ahead = np.empty((len(parents), 3, size), vectors.dtype)  # d x_j / d shape
     for b in range(len(vectors)):
         x = vectors[b]
         for j in range(len(parents)):
@@ -251,7 +271,10 @@ def _pose(rest, directions, parents, vectors, rotations, offsets, joints, frames
 
 @numba.njit(cache=True, nogil=True)
 def _add_turn(row, place, joint, frame, scale, a, n):
-    """Add scale n^T (w x a) for the rotations w of one joint; a, n (3,)."""
+    """Add scale n^T (omega x a) to the row, for the three columns omega of ``frame`` (3,3).
+
+    a (3,): lever arm from the joint to the point, blended. n (3,): direction of the row.
+    """
     t0 = scale * (a[1] * n[2] - a[2] * n[1])
     t1 = scale * (a[2] * n[0] - a[0] * n[2])
     t2 = scale * (a[0] * n[1] - a[1] * n[0])
@@ -265,7 +288,8 @@ def _add_turn(row, place, joint, frame, scale, a, n):
 def add_point(row, place, shape, c, b, i, scale, n, arms):
     """Add scale n^T d point i / d parameters of body b to the row; return scale n^T point.
 
-    shape: fitted shape components. arms (L,3): scratch.
+    c: :class:`PosedPoints`. shape: indices of the fitted shape components. arms (L,3): scratch, for
+    the lever arm from each joint of the point's chain.
     """
     arms[:] = 0
     x = c.rest[b, i]

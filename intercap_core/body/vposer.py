@@ -4,13 +4,14 @@ Version 1 (`TR00_E096.pt`) and version 2 (`V02_05`, a Lightning checkpoint) deco
 numbers to the 21 body rotations by three linear layers. They differ in key names and in the slope
 of the leaky ReLU, and their codes are not interchangeable. The prior of a code is standard normal.
 
-The parameter of the fit remains the pose, which may differ from the decoded one by some degrees, so
-that observations can determine poses that the network does not reconstruct exactly:
+The paper fits the code z. Here the parameter of the fit remains the pose theta, which may differ
+from a decoded pose by some degrees. Observations can then determine poses that the network does not
+reconstruct exactly:
 
     E_theta_b(theta) = min over z of |z|^2 / 2 + |theta - decode(z)|^2 / (2 s^2),
 
-with the code z and the standard deviation s from a decoded pose. For s = 0 this is the paper's
-|z|^2, up to its weight. Around the best code it is a Gaussian over theta.
+with the standard deviation s of the difference. For s = 0 this is the paper's |z|^2, up to its
+weight. Linearised at the best code, it is a Gaussian over theta (:class:`PoseGaussian`).
 """
 
 from __future__ import annotations
@@ -27,14 +28,15 @@ from intercap_core.body.checkpoint import read_tensors, tensor_fault
 from intercap_core.errors import UserError
 from intercap_core.inputs.files import UnreadableFile
 
-LATENT = 32  # numbers of a code (Pavlakos et al. 2019)
+LATENT = 32  # length of a code (Pavlakos et al. 2019)
 _JOINTS = 21  # of SMPL-X's body_pose
+# Version: names of the three layers, slope of the leaky ReLU (published code).
 _VERSIONS = {
     1: (("bodyprior_dec_fc1", "bodyprior_dec_fc2", "bodyprior_dec_out"), 0.2),
     2: (("decoder_net.0", "decoder_net.3", "decoder_net.5"), 0.01),
 }
 _PREFIXES = ("module.", "vp_model.")
-_SPREAD = 0.1  # rad; poses of AMASS are reconstructed to about 5 degrees (paper)
+_SPREAD = 0.1  # s, rad; poses of AMASS are reconstructed to about 5 degrees (paper)
 _ADVICE = (
     "expected TR00_E096.pt (version 1) or a V02_05 .ckpt (version 2): take the published file, or "
     "leave the setting out to use joint limits only"
@@ -42,12 +44,12 @@ _ADVICE = (
 
 
 class PoseGaussian(NamedTuple):
-    """A pose prior around B poses."""
+    """A Gaussian prior of the body pose, for each of B bodies."""
 
     mean: Tensor
-    """(B, 63) rad."""
+    """(B, 63) axis-angles of the 21 body joints, rad."""
     precision: Tensor
-    """(B, 63, 63)"""
+    """(B, 63, 63) inverse covariance, 1/rad^2."""
 
     def of_frames(self, index: Tensor) -> PoseGaussian:
         """Return the prior of the frames ``index``."""
@@ -107,7 +109,10 @@ class VPoser:
         )
 
     def rotations(self, code: Tensor) -> Tensor:
-        """Decode codes (B,32) to rotations (B,21,3,3), from two orthonormalised columns."""
+        """Decode codes (B,32) to rotations (B,21,3,3).
+
+        The network outputs two columns of each rotation, which are orthonormalised (Gram-Schmidt).
+        """
         x = code
         for weight, bias in self.layers[:-1]:
             x = functional.leaky_relu(functional.linear(x, weight, bias), self.slope)
@@ -123,12 +128,15 @@ class VPoser:
         return axis_angle_from_rotation(self.rotations(code)).reshape(*code.shape[:-1], 63)
 
     def linearise(self, body_pose: Tensor) -> PoseGaussian:
-        """Return the prior around poses (B,63), at their most likely codes (Gauss-Newton)."""
+        """Return the prior at poses (B,63), linearised at their most likely codes.
+
+        Twelve Levenberg-Marquardt steps, batched over the poses, find the codes.
+        """
         code = body_pose.new_zeros(len(body_pose), LATENT)
         eye = torch.eye(LATENT, dtype=code.dtype, device=code.device)
         decoded, by_code = self.decode_with_jacobian(code)
         cost = self._cost(code, decoded, body_pose)
-        # in units of the prior: the decoder is far from linear
+        # in units of the prior's precision; it starts above 0, since the decoder is not linear
         damping = torch.full_like(cost, 0.3)
         for _ in range(12):
             gradient = code - (by_code.mT @ (body_pose - decoded)[..., None])[..., 0] / _SPREAD**2
@@ -142,7 +150,8 @@ class VPoser:
             by_code = torch.where(better[:, None, None], trial_by, by_code)
             cost = torch.where(better, trial_cost, cost)
             damping = torch.where(better, 0.3 * damping, 10 * damping + 1)
-        # theta = decoded + J (z - code) + noise, z standard normal: the noise's and z's covariance
+        # theta = decoded + J (z - code) + noise with z standard normal and noise of deviation s, so
+        # theta has the covariance J J^T + s^2 I
         mean = decoded - (by_code @ code[..., None])[..., 0]
         pose_eye = torch.eye(body_pose.shape[1], dtype=code.dtype, device=code.device)
         covariance = by_code @ by_code.mT + _SPREAD**2 * pose_eye
@@ -150,6 +159,7 @@ class VPoser:
         return PoseGaussian(mean, 0.5 * (precision + precision.mT))
 
     def _cost(self, code: Tensor, decoded: Tensor, body_pose: Tensor) -> Tensor:
+        """Return the cost (B,) of codes (B,32) that decode to ``decoded`` (B,63)."""
         away = (body_pose - decoded) / _SPREAD
         return 0.5 * ((code**2).sum(1) + (away**2).sum(1))
 
@@ -179,6 +189,7 @@ def axis_angle_from_rotation(rotation: Tensor) -> Tensor:
 
 
 def _bare(name: str) -> str:
+    """Return the name of a weight without the prefixes of training frameworks."""
     for prefix in _PREFIXES:
         name = name.removeprefix(prefix)
     return name
