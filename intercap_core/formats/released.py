@@ -71,13 +71,14 @@ class Results:
     turns: Mapping[str, np.ndarray]
     """Rotation vectors by SMPL-X's names, (T, 3) or (T, 63)."""
     hands: tuple[np.ndarray, np.ndarray]
-    """Left and right: full poses (T, 45), or components (T, n) over the hand's mean pose."""
+    """Left and right: full poses (T, 45), or coefficients (T, n) of the hand's pose components
+    about its mean pose."""
     transl: np.ndarray
-    """(T, 3)."""
+    """(T, 3) translation of SMPL-X."""
     betas: np.ndarray
-    """(T, n)."""
+    """(T, n) shape coefficients."""
     expression: np.ndarray
-    """(T, n)."""
+    """(T, n) coefficients of facial expression."""
     rotation: np.ndarray
     """(T, 3, 3) of master_from_object; NaN without an object."""
     translation: np.ndarray
@@ -87,15 +88,15 @@ class Results:
     reasons: Sequence[str] = ()
     """(T,) why a frame has no result or is not trusted, "" = no reason; () = no frame has one."""
     surface_distance: np.ndarray | None = None
-    """(T, 2) mean and 95th percentile of the distance between the converted and the released body
-    surface; None if the body was not converted."""
+    """(T, 2) mean and 95th percentile, metres, of the distance between the converted and the
+    released body surface; None if the body was not converted."""
 
     def __len__(self) -> int:
         return len(self.transl)
 
     @property
     def known(self) -> np.ndarray:
-        """(T,) bool: all numbers of the frame are finite, including those of an object."""
+        """(T,) bool: all numbers of the frame are finite, with the object's if there is one."""
         body = [*self.turns.values(), *self.hands, self.transl, self.betas, self.expression]
         parts = [np.isfinite(part).all(axis=1) for part in body]
         if np.isfinite(self.translation).any():

@@ -1,7 +1,7 @@
 """Calibrations of COLMAP: a folder with ``cameras`` and ``images``, both ``.bin`` or both ``.txt``.
 
-Poses are x_camera = R x_world + T with OpenCV's axes and a quaternion w x y z. The world has no
-scale. The centre of the first pixel is (0.5, 0.5); here it is (0, 0).
+Poses are x_camera = R x_world + T with OpenCV's axes; R is a quaternion w x y z. The unit of length
+is arbitrary. COLMAP's centre of the first pixel is (0.5, 0.5); in this package it is (0, 0).
 """
 
 from __future__ import annotations
@@ -42,11 +42,12 @@ class LensModel(NamedTuple):
     parameters: int
     """How many parameters it has."""
     matrix: tuple[int, int, int, int]
-    """Positions of fx, fy, cx, cy among them."""
+    """Positions of fx, fy, cx, cy among the parameters."""
     distortion: tuple[int, ...]
-    """Positions of OpenCV's coefficients."""
+    """Positions of OpenCV's coefficients k1, k2, p1, p2, k3, ... among the parameters."""
 
 
+# By COLMAP's number of the model.
 MODELS = {
     0: LensModel("SIMPLE_PINHOLE", 3, (0, 0, 1, 2), ()),
     1: LensModel("PINHOLE", 4, (0, 1, 2, 3), ()),
@@ -55,7 +56,7 @@ MODELS = {
     4: LensModel("OPENCV", 8, (0, 1, 2, 3), (4, 5, 6, 7)),
     6: LensModel("FULL_OPENCV", 12, (0, 1, 2, 3), (4, 5, 6, 7, 8, 9, 10, 11)),
 }
-# These are no polynomial or rational function of the tangent of the angle.
+# Models whose distortion cannot be converted to OpenCV's rational model.
 UNSUPPORTED = {
     5: "OPENCV_FISHEYE", 7: "FOV", 8: "SIMPLE_RADIAL_FISHEYE", 9: "RADIAL_FISHEYE",
     10: "THIN_PRISM_FISHEYE", 11: "RAD_TAN_THIN_PRISM_FISHEYE",
@@ -64,6 +65,8 @@ NUMBERS = {model.name: number for number, model in MODELS.items()}
 
 
 class _Image(NamedTuple):
+    """One image of the model: pose as in the header, number of its camera, path."""
+
     quaternion: tuple[float, ...]
     translation: tuple[float, ...]
     camera: int
@@ -71,7 +74,7 @@ class _Image(NamedTuple):
 
 
 def _suffix(folder: Path) -> str | None:
-    """Suffix of the model's files. Binary files go first, as in COLMAP itself."""
+    """Suffix of the model's files; None = no model. Binary files go first, as in COLMAP itself."""
     for suffix in (".bin", ".txt"):
         if all((folder / f"{name}{suffix}").is_file() for name in ("cameras", "images")):
             return suffix
@@ -190,13 +193,14 @@ def _text_images(path: Path) -> Iterator[_Image]:
 
 
 class _Bytes:
-    """A little-endian file, read from its start; raises UserError at an early end."""
+    """A little-endian file, read from its start; raises UserError if the file ends too early."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._at = path, 0
         self._content = read_bytes(path, MAX_MODEL_BYTES, advice="export the model again")
 
     def take(self, form: str) -> tuple[Any, ...]:
+        """Read the next values; ``form`` is a format of :mod:`struct` without byte order."""
         end = self._at + struct.calcsize("<" + form)
         if end > len(self._content):
             raise UserError(f"{self._path}: is cut off; copy or export it again")
@@ -205,7 +209,8 @@ class _Bytes:
         return values
 
     def name(self) -> str:
-        end = self._content.find(b"\0", self._at, self._at + 4096)  # longer than any path
+        """Read a text that ends with a zero byte."""
+        end = self._content.find(b"\0", self._at, self._at + 4096)  # paths are shorter
         if end < 0:
             raise UserError(f"{self._path}: an image has no name; copy or export it again")
         name = decode_text(self._path, self._content[self._at : end])

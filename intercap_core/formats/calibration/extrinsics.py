@@ -31,7 +31,7 @@ class Extrinsics:
     master_from_colour: dict[str, np.ndarray]
     """(4, 4) of each camera by name, metres; exactly the identity for the master."""
     master_from_world: np.ndarray = field(default_factory=lambda: np.eye(4))
-    """(4, 4), metres: from the frame in which the file states its poses."""
+    """(4, 4), metres: to the master's frame from the frame in which the file states its poses."""
 
 
 def read_extrinsics(path: Path) -> Extrinsics:
@@ -146,10 +146,10 @@ def check_distance(path: Path, camera: str, translation: np.ndarray) -> None:
 def relate_to_master(
     path: Path, master: str, world_from_camera: dict[str, np.ndarray]
 ) -> Extrinsics:
-    """Express poses (4, 4) in the master's frame.
+    """Express poses (4, 4), metres, in the master's frame.
 
-    Raises UserError, naming the file, if two cameras are in one place or a camera is farther from
-    the master than a hall is long.
+    Raises UserError, naming the file ``path``, if two cameras are in one place, or a camera is
+    farther than ``MAX_TO_MASTER_M`` from the master.
     """
     master_from_world = invert(world_from_camera[master])
     poses = {name: master_from_world @ pose for name, pose in world_from_camera.items()}

@@ -1,7 +1,7 @@
-"""Calibrations in any supported form, and what the readers of other tools' files share.
+"""Read calibrations in any supported form; functions that the readers of single tools share.
 
-``read_calibration`` asks the reader of each tool whether it recognises the file or folder; what no
-reader recognises is read in OpenCV's terms. A module of this package that defines ``READER``, a
+``read_calibration`` asks the reader of each tool whether it recognises the file or folder. If none
+does, the path is read by :mod:`.opencv`. A module of this package that defines ``READER``, a
 :class:`CalibrationReader`, adds a tool.
 """
 
@@ -83,8 +83,8 @@ def read_calibration(
 ) -> Calibration:
     """Read a calibration in OpenCV's terms or of another tool.
 
-    Raises UserError as the format's reader does, and for a scale with a file that is in metres by
-    its own definition.
+    Raises UserError as the format's reader does. :mod:`.opencv` defines its files in metres, so a
+    ``scale`` for them raises UserError too.
 
     Args:
         path: file or folder.
@@ -137,7 +137,8 @@ def to_calibration(
         cameras: the cameras in the file's order.
         recorded: names of the recorded cameras.
         scale: metres for one unit of the file, as the user states it.
-        unit: what is known of a unit that the file does not fix; None if it is the metre.
+        unit: why the file's unit of length is unknown, as a clause for the message; None if the
+            file is in metres.
     """
     if not cameras:
         raise UserError(f"{path}: holds no camera; calibrate again, or name another file")
@@ -175,11 +176,12 @@ def group_images_by_camera(
     *,
     scale: float | None,
 ) -> list[ToolCamera]:
-    """Return one camera for all images of each fixed camera, in order of the cameras' names.
+    """Merge the images of each fixed camera into one camera; sorted by the cameras' names.
 
-    An image belongs to the recorded camera that a folder of its path or its own name states;
-    otherwise to its folder, or to itself. Raises UserError for a camera whose images were taken
-    from several places.
+    An image belongs to the recorded camera after which a folder of its path (innermost first) or
+    the file is named. Otherwise its camera is named after its innermost folder, or after the file
+    if there is no folder. Lens and pose are those of the camera's first image. Raises UserError for
+    a camera whose images were taken from several places.
 
     Args:
         path: the calibration, for messages.
@@ -222,6 +224,7 @@ def _camera_of(image: str, recorded: Collection[str]) -> str:
 
 
 def _check_size(path: Path, centres: np.ndarray, scale: float | None) -> None:
+    """Raise UserError if the cameras' centres (C, 3), metres, lie too far apart or too close."""
     extent = np.linalg.norm(centres[:, None] - centres[None], axis=-1).max()
     farthest = np.abs(centres).max()
     stated = "" if scale is None else f" with calibration_scale {scale:g}"

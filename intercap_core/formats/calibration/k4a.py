@@ -34,7 +34,7 @@ ACCELEROMETER = "CALIBRATION_InertialSensorType_Accelerometer"
 
 @dataclass(frozen=True)
 class Mode:
-    """How the image of a mode is cut from the binned sensor: (width, height), pixels."""
+    """How the image of a mode is cut from the binned sensor. Pairs are x and y, pixels."""
 
     binned: tuple[int, int]
     """Size of the binned sensor."""
@@ -81,7 +81,7 @@ def make_lens(entry: dict[str, Any], mode: Mode) -> Intrinsics:
         raise ValueError("its centre of distortion (codx, cody) is not 0, which is not supported")
     (binned_w, binned_h), (crop_x, crop_y) = mode.binned, mode.crop
     radius = float(entry.get("MetricRadius", 0.0))
-    # NaN stays, and is refused below.
+    # The negated comparison keeps a radius of NaN, which find_lens_fault rejects below.
     lens = Intrinsics(
         *mode.size,
         fx=values[2] * binned_w,
@@ -164,6 +164,7 @@ def colour_from_accelerometer(content: bytes, *, source: str) -> np.ndarray | No
 
 
 def _sensors(content: bytes, group: str, key: str) -> dict[str, dict[str, Any]]:
+    """Entries of the JSON's list ``group``, by the value of their field ``key``."""
     # Some firmware pads the JSON with zero bytes.
     parsed = parse_json(content.rstrip(b"\0").decode("utf-8"))
     information = parsed["CalibrationInformation"]

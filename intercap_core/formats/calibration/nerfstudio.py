@@ -1,9 +1,9 @@
 """Calibrations of nerfstudio: ``transforms.json``.
 
 Each frame has a ``transform_matrix``, world from camera with OpenGL's axes (x right, y up, z
-backwards). Lenses are stated in the frame or above all frames. The world has the unit of the
-program that made the file: metres of a phone's tracking, or COLMAP's without a scale. The centre of
-the first pixel is (0.5, 0.5); here it is (0, 0).
+backwards). Lenses are stated in the frame, or for all frames at the top level of the file. The unit
+of length is that of the program that made the file: metres if a phone tracked itself, arbitrary if
+COLMAP did. Nerfstudio's centre of the first pixel is (0.5, 0.5); in this package it is (0, 0).
 """
 
 from __future__ import annotations
@@ -37,7 +37,10 @@ MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 
 
 def _recognises(path: Path) -> bool:
-    """Whether JSON content lists frames and is no calibration of another form."""
+    """Whether the path is a folder with transforms.json, or JSON with frames.
+
+    JSON that also has ``cameras`` is a calibration in OpenCV's terms.
+    """
     if path.is_dir():
         return (path / TRANSFORMS).is_file()
     if path.suffix.lower() != ".json":

@@ -103,9 +103,10 @@ def read_opencv_calibration(path: Path) -> Calibration:
 def opencv_lens(size: tuple[int, int], matrix: Any, coefficients: Any, where: str) -> Intrinsics:
     """Make a lens of ``size`` (width, height) from a matrix (3, 3) and 4, 5 or 8 coefficients.
 
-    Its metric radius ends at the angle beyond which the distortion turns back, so that nothing
-    outside the view is projected into the image. Raises UserError, beginning with ``where``, for
-    numbers that describe no lens.
+    Its metric radius is 1.1 times the radius of the farthest corner of the image, at least
+    ``DEFAULT_METRIC_RADIUS`` and at most :func:`turning_radius`. Otherwise points outside the view
+    could be projected into the image. Raises UserError, beginning with ``where``, for numbers that
+    describe no lens.
     """
     k, d = (
         parse_numbers(matrix, where, "camera_matrix"),
@@ -138,9 +139,10 @@ def opencv_lens(size: tuple[int, int], matrix: Any, coefficients: Any, where: st
 
 
 def check_resolution(centre: np.ndarray, size: tuple[int, int], most: float, where: str) -> None:
-    """Raise UserError if a principal point (2,) is that of images of another size.
+    """Raise UserError if a principal point (2,), px, is too far from the image's middle.
 
-    ``most`` is the largest distance from the middle, as a share of the image; 0.03 is usual.
+    The calibration is then of another resolution. ``most`` is the largest distance allowed, as a
+    share of the image's width or height. Cameras have up to about 0.03.
     """
     if (np.abs(centre / size - 0.5) > most).any():
         x, y = centre
@@ -159,9 +161,9 @@ def pad_distortion(coefficients: np.ndarray) -> np.ndarray:
 
 
 def turning_radius(distortion: np.ndarray) -> float:
-    """Radius up to which a point that lies farther out is also imaged farther out.
+    """Radius in the normalised image plane up to which the distorted radius increases.
 
-    The result is at most 5, which is at 79 degrees. ``distortion`` has the shape (8,).
+    The result is at most 5, which is 79 degrees off the axis. ``distortion`` has the shape (8,).
     """
     radius = np.linspace(0, 5, 50001)
     bad = np.flatnonzero(~_distort_radius(radius, distortion)[1])
@@ -171,8 +173,10 @@ def turning_radius(distortion: np.ndarray) -> float:
 def _distort_radius(radius: np.ndarray, distortion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Apply the radial part of OpenCV's model, r d(r^2), to increasing radii (N,).
 
-    Returns the distorted radii (N,), and where (N - 1,) they grow and stay finite.
+    Returns the distorted radii (N,), and for each interval (N - 1,) whether they grow and stay
+    finite.
     """
+    # A lens as radial_fraction takes it: fx, fy, cx, cy, distortion, metric radius.
     lens = np.concatenate([(1, 1, 0, 0), distortion, (np.inf,)])
     with np.errstate(all="ignore"):
         above, below = radial_fraction(radius * radius, lens)
@@ -193,8 +197,9 @@ def find_lens_fault(lens: Intrinsics) -> str | None:
     """Why the lens is impossible, for a message; None if it is possible."""
     if not np.isfinite(lens.parameters).all():
         return "the lens has a value that is not a finite number"
-    # 0.2 sides see 136 degrees across, about the limit of a pinhole with distortion (the wide depth
-    # mode of the Azure Kinect has 0.49). 20 see 3 degrees, as 800 mm before a full-frame sensor.
+    # A focal length of 0.2 sides sees 136 degrees, about the limit of a pinhole with distortion
+    # (the wide depth mode of the Azure Kinect has 0.49). 20 sides see 3 degrees, like an 800 mm
+    # lens on a full-frame sensor.
     side = max(lens.width, lens.height)
     low, high = 0.2 * side, 20.0 * side
     for name, focal in (("fx", lens.fx), ("fy", lens.fy)):
@@ -220,8 +225,9 @@ def find_lens_fault(lens: Intrinsics) -> str | None:
 def _distortion_fault(lens: Intrinsics) -> str | None:
     """Why the distortion is impossible; None if it is possible.
 
-    A point that lies farther out must be imaged farther out within a quarter of the shorter side
-    around the centre; otherwise the coefficients are in another order or of another lens.
+    The distorted radius must increase up to a quarter of the shorter side from the centre;
+    otherwise the coefficients are in another order or of another lens. Within half of the shorter
+    side, the scale and the tangential shift are limited.
     """
     focal = min(lens.fx, lens.fy)
     edge = min(lens.width, lens.height) / 2 / focal  # radius of the normalised image plane
@@ -244,6 +250,7 @@ def _distortion_fault(lens: Intrinsics) -> str | None:
             f"the distortion {shown} scales the image's edge {steepest:.3g} times its centre, "
             "expected at most 4"
         )
+    # p (r^2 + 2 x^2) is at most 3 p r^2, divided by r.
     tangential = 3 * float(np.abs(distortion[2:4]).max()) * min(edge, radius[turn])
     if tangential > 0.5:  # of the image's radius; a lens that is mounted askew has 0.01
         return f"the tangential distortion {shown} moves the image's edge by {tangential:.0%}"
@@ -277,7 +284,9 @@ def parse_image_size(size: Any, where: str) -> tuple[int, int]:
 
 
 def opencv_pose(rotation: Any, translation: Any, where: str) -> np.ndarray:
-    """Camera from world (4, 4) of a rotation, a matrix (3, 3) or vector (3,), and a translation.
+    """Camera from world (4, 4) of a rotation and a translation (3,).
+
+    The rotation is a matrix (3, 3) or a rotation vector (3,).
 
     Raises UserError, beginning with ``where``, for numbers that are no pose.
     """
@@ -332,7 +341,7 @@ def _lens(entry: dict[str, Any], where: str) -> Intrinsics:
 
 
 def _pose(entry: dict[str, Any], where: str, path: Path, *, is_master: bool) -> np.ndarray:
-    """World from camera (4, 4)."""
+    """World from camera (4, 4), metres; the identity for a master without a pose."""
     rotation, translation = (
         entry.get(key, entry.get(other)) for key, other in (("R", "rvec"), ("T", "tvec"))
     )
@@ -383,9 +392,10 @@ def _json_object(entry: dict[str, Any]) -> Any:
 
 
 def load_opencv(path: Path) -> dict[str, Any]:
-    """Read a JSON or YAML file, by hand or of ``cv2.FileStorage``: matrices become nested lists.
+    """Read a JSON or YAML file, written by hand or by ``cv2.FileStorage``.
 
-    Raises UserError if it is neither, or holds no names and values.
+    Matrices become nested lists. Raises UserError if the file is neither, or if its top level is
+    not a mapping.
     """
     try:
         if path.suffix.lower() == ".json":

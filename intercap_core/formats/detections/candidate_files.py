@@ -152,6 +152,7 @@ def _add_image_files(
         except UnreadableDetections as error:
             broken.append(f"{short_name(path)} {error}")
             continue
+        # An image all of whose entries are faulty stays unknown instead of empty.
         if content.results or not content.entries:
             instances = [instance for _, instance in content.results]
             candidates.by_image.setdefault(place, []).extend(instances)

@@ -35,7 +35,11 @@ COCO_NAMES_FROM_1: dict[int, str] = dict(enumerate(_CLASSES, start=1))
 
 
 def parse_class_names(content: Any) -> dict[int, str]:
-    """Class names by number of parsed JSON or YAML; raises ValueError if there are none."""
+    """Return class names by number from parsed JSON or YAML; raises ValueError without names.
+
+    The content is a list of names (numbered from 0), a mapping of numbers to names, COCO's list of
+    objects with ``id`` and ``name``, or one of these under ``categories`` or ``names``.
+    """
     if isinstance(content, dict):
         for key in ("categories", "names"):
             if isinstance(content.get(key), list | dict):
@@ -79,7 +83,9 @@ BUILT_IN = {"coco": COCO_NAMES, "coco80": COCO_NAMES_FROM_0}
 
 
 def class_names(setting: str | Path) -> dict[int, str]:
-    """Names by number of the setting ``category_names``: a built-in numbering or a file.
+    """Return class names by number for the setting ``category_names``.
+
+    The setting is a key of ``BUILT_IN`` or the path of a file.
 
     Raises UserError as :func:`read_label_map` does.
     """

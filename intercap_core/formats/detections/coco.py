@@ -49,11 +49,11 @@ class DetectionFile(Generic[Result]):
     images: list[ImageKey] | None = None
     """Images that the file lists; None = it lists none, so it is about all images."""
     faults: list[str] = field(default_factory=list)
-    """Entries that are left out, with the reason."""
+    """Entries that are left out because they cannot be used, with the reason."""
     faulty: list[ImageKey] = field(default_factory=list)
-    """Images of these entries."""
+    """Image of each of these entries."""
     entries: int = 0
-    """Number of entries with at least the least score."""
+    """Number of entries, without those whose score is too low."""
     scaled: int = 0
     """Number of masks of another resolution than the images."""
 
@@ -97,7 +97,7 @@ class _FileHead:
     size: tuple[int, int] | None
     """Size of all images."""
     corners: bool
-    """Boxes are x, y of two corners."""
+    """Whether boxes are x, y of two opposite corners; otherwise x, y, width, height."""
 
 
 def parse_candidates(

@@ -1,4 +1,9 @@
-"""Match files of detections, and entries of such files, to the colour images of a camera."""
+"""Match files of detections, and entries of such files, to the colour images of a camera.
+
+A frame set holds one image of each camera, all taken at nearly the same time. The number of an
+image is its position among the camera's images, for layout ``plain`` among its image files
+(damaged ones included), for ``intercap`` the number in the file's name.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +37,7 @@ class CameraImages:
     size: tuple[int, int]
     """Width and height."""
     number: np.ndarray
-    """(T,) number by which files call the image of each set; -1 = no image."""
+    """(T,) number of the image of each set; -1 = no image."""
     time_us: np.ndarray
     """(T,) device time of the image, microseconds; -1 = no image, or a recording of layout k4a,
     whose times are not needed."""
@@ -50,9 +55,9 @@ class CameraImages:
     def match_names(self, names: Iterable[str]) -> dict[str, int]:
         """Numbers of the images that names of files refer to; other names are left out.
 
-        If any name is that of an image file, only such names count. Otherwise the number at the
-        end of a name counts (``frame_0012.jpg`` is image 12), provided that no two names end in the
-        same number.
+        If any name is that of an image file, only names of image files are matched. Otherwise the
+        number at the end of a name counts (``frame_0012.jpg`` is image 12). If two names end in the
+        same number, the result is empty.
         """
         stems = {name: strip_suffix(name) for name in sorted(set(names))}
         places = {stem: place for place, stem in enumerate(self.stems)}
@@ -148,9 +153,11 @@ def sort_by_image(
 
     Returns the results by number, and the names of images that were not recorded. An empty list
     means that the detector processed the image and found nothing. Images without a list are
-    unknown: images with a faulty entry and no other result, images that are missing in the file's
-    list of images, and, if the file has no such list, all images if none of its entries can be
-    used.
+    unknown:
+
+    - images with a faulty entry and no other result;
+    - images that are missing in the file's list of images;
+    - all images, if the file has no such list and none of its entries can be used.
     """
     keys = [*(key for key, _ in file.results), *file.faulty, *(file.images or ())]
     by_name = images.match_names(key.name for key in keys if key.name is not None)
@@ -208,7 +215,7 @@ def note_unmatched(notes: list[str], what: str, names: list[str]) -> None:
 
 
 def short_name(path: Path) -> str:
-    """The file's name with that of its folder, which is a camera or a moment."""
+    """The file's name with that of its folder, which names the camera or BEHAVE's frame."""
     return printable(f"{path.parent.name}/{path.name}")
 
 

@@ -76,7 +76,7 @@ def to_rle(
 ) -> tuple[bytes, tuple[float, float]]:
     """Compressed RLE of a segmentation, and the factors (x, y) by which the mask was scaled.
 
-    Raises ValueError, in words that follow the entry's name.
+    Raises ValueError, whose message continues a sentence that begins with the entry's name.
 
     Args:
         segmentation: an RLE with size and counts (compressed, also as the text of Python's bytes;

@@ -28,8 +28,8 @@ from intercap_core.formats.detections.image_numbers import (
 )
 from intercap_core.formats.detections.keypoints import KeypointReader, read_people, readers
 
-# A person whose points all have smaller coordinates, px, has normalised ones: 0 to 1, and somewhat
-# more outside the image.
+# If all coordinates of a person are smaller, they are not pixels but shares of the image's size: 0
+# to 1, somewhat more outside the image.
 MAX_NORMALISED_PX = 2.0
 NOBODY = np.zeros((0, NUM_KEYPOINTS, 3), np.float32)
 
@@ -43,7 +43,7 @@ class KeypointCleaner:
     full_confidence: float = 1.0
     """Confidence that counts as 1."""
     seen: int = 0
-    """Number of points that are stated as seen."""
+    """Number of points with finite coordinates and a confidence above 0."""
     outside: int = 0
     """Number of points outside the image."""
     beyond: int = 0
@@ -52,10 +52,11 @@ class KeypointCleaner:
     """Number of people with normalised coordinates."""
 
     def clean(self, people: np.ndarray) -> np.ndarray:
-        """Return the people (P, 135, 3) with any visible point and pixel coordinates, as float32.
+        """Return the usable people (P, 135, 3) as float32: x, y (px), confidence from 0 to 1.
 
-        A point becomes zeros if it is not finite, lies outside the image or exactly at (0, 0), or
-        has no confidence. Confidence beyond the full one is clipped to 1.
+        People without a visible point or with normalised coordinates are left out. A point becomes
+        zeros if it is not finite, lies outside the image or exactly at (0, 0), or if it has no
+        confidence. Confidence beyond the full one is clipped to 1.
         """
         x, y, confidence = np.moveaxis(np.asarray(people, np.float64), -1, 0)
         with np.errstate(invalid="ignore"):
@@ -148,7 +149,10 @@ def find_camera_file(folder: Path, camera: str) -> tuple[Path, KeypointReader] |
 
 
 def find_image_files(folder: Path) -> tuple[dict[str, Path], KeypointReader] | None:
-    """Files of single images in a camera's folder by the image's name, and their reader."""
+    """Files of single images in a camera's folder, by the image's name, and their reader.
+
+    None if the folder has no such file.
+    """
     visible = [path for path in folder.iterdir() if not path.name.startswith(".")]
     for reader in readers():
         matched = reader.match_images(sorted(visible))

@@ -3,7 +3,8 @@
 The input of such a model is one person, cut out around a box. The output for every point is its
 likelihood in each column and each row, in bins finer than pixels (SimCC), or in each cell of a map
 that is coarser than the input (heatmap). Cropping and decoding follow mmpose: the box is enlarged
-by a quarter and widened to the input's aspect ratio, pixels are RGB minus ImageNet's mean.
+by a quarter and widened to the input's aspect ratio; pixels are RGB, normalised by ImageNet's mean
+and standard deviation.
 """
 
 from __future__ import annotations
@@ -115,9 +116,10 @@ class PoseModel:
     def _distinct(self, people: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Confident people among (P, 135, 3), each once, best first, and their boxes (N, 4).
 
-        A person needs six confident points of the body. A detection is left out if half of its
-        confident points lie near the same points of better detections, closer than 5 % of the
-        diagonal of its box. Tuned on the studio.
+        A point is confident from 0.3 of the full confidence. A person needs six confident points of
+        the body. A detection is a duplicate if half of its confident points lie near the same
+        points of better detections: closer than 5 % of the diagonal of its box. Tuned on the
+        studio.
         """
         sure = people[..., 2] >= 0.3 * self._full_confidence
         accepted = sure[:, BODY].sum(1) >= 6
@@ -181,8 +183,8 @@ def choose_person_boxes(instances: list[Instance]) -> np.ndarray:
 def tiles(size: tuple[int, int], shape: tuple[int, int]) -> np.ndarray:
     """Boxes (N, 4) with the aspect ratio of an input's ``shape`` that cover an image of ``size``.
 
-    They are as high or as wide as the image. Each overlaps the next by half, so that a person who
-    is less than half as wide lies entirely within one box.
+    The boxes are as high or as wide as the image. Each overlaps the next by at least half, so that
+    a person who is less than half as wide as a box lies entirely within one box.
     """
     scale = min(size[0] / shape[0], size[1] / shape[1])
     tile = (shape[0] * scale, shape[1] * scale)
@@ -286,10 +288,11 @@ def decode_heatmaps(maps: np.ndarray, size: tuple[int, int], grid: HeatmapGrid) 
 
 
 def find_peaks(maps: np.ndarray) -> np.ndarray:
-    """Peaks (N, 2) of x, y in cells of maps (N, h, w), finer than cells (DARK, Zhang et al. 2020).
+    """Peaks (N, 2) of maps (N, h, w) with a resolution below one cell (DARK, Zhang et al. 2020).
 
-    The maximum of the logarithm's second-order expansion about the highest cell. The result is the
-    highest cell itself if that lies at the border, or if there is no maximum within one cell of it.
+    A peak, x and y in cells, is the maximum of the second-order expansion of the blurred map's
+    logarithm about the highest cell. It is the highest cell itself if that lies at the border, or
+    if the expansion has no maximum within one cell.
     """
     number, height, width = maps.shape
     row, column = np.divmod(maps.reshape(number, -1).argmax(1), width)
@@ -315,9 +318,9 @@ def find_peaks(maps: np.ndarray) -> np.ndarray:
 
 
 def _smooth_around(maps: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-    """Blur maps (N, h, w) and return (N, 5, 5) around a cell of each.
+    """Blur maps (N, h, w) and return the (N, 5, 5) cells around the given cell of each map.
 
-    The blur joins the several maxima that noise causes. Maps are zero beyond the border, as in
+    The blur merges separate maxima that noise causes. Maps are zero beyond the border, as in
     mmpose.
     """
     # mmpose blurs over 11 cells of a map of 48, over 17 of 72.

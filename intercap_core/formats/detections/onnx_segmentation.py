@@ -1,12 +1,14 @@
 """Instance segmentation by a user's ONNX model: YOLO-seg, Mask R-CNN or PointRend.
 
-The kind of a model is recognised by its outputs. YOLO-seg (ultralytics) has two: rows of boxes,
-class scores and coefficients (B, 4 + classes + M, N), and M prototypes of masks (B, M, h, w). Mask
-R-CNN and PointRend have boxes (N, 4), classes (N,), scores (N,) and masks, over the box (N, 1, 28,
-28) or over the image (N, 1, H, W); those of detectron2 also have the image's size.
+The kind of a model is recognised by its outputs, for B images and N boxes:
 
-Boxes are two corners in the model's input. Masks are sampled where the image's pixels lie in the
-model's grid, and only within the box.
+- YOLO-seg (ultralytics) has two: rows (B, 4 + classes + M, N) of box, class scores and M
+  coefficients, and M mask prototypes (B, M, h, w). A mask is the prototypes' weighted sum.
+- Mask R-CNN and PointRend have boxes (N, 4), classes (N,), scores (N,) and masks, over the box (N,
+  1, 28, 28) or over the image (N, 1, H, W). Exports of detectron2 also have the image's size.
+
+Boxes of R-CNN are two corners in the model's input. Masks are interpolated at the pixels of the
+image that lie within the box.
 """
 
 from __future__ import annotations
@@ -48,7 +50,7 @@ class _Region(NamedTuple):
     """A detected box with the grid that holds its mask."""
 
     number: int
-    """Number of the class."""
+    """The model's number of the class."""
     score: float
     """From 0 to 1."""
     box: np.ndarray
@@ -100,8 +102,9 @@ def _make_instance(
 def suppress_overlaps(corners: np.ndarray, scores: np.ndarray, classes: np.ndarray) -> np.ndarray:
     """Indices (K,) of the boxes (N, 4) that greedy non-maximum suppression keeps, best first.
 
-    A box is removed if a better one of its class overlaps it by more than 0.7, the default of
-    ultralytics' predictors.
+    Boxes are two corners. A box is removed if a better box of its class has an intersection over
+    union of more than 0.7 with it, the default of ultralytics' predictors. Only the 3,000 best
+    boxes are considered.
     """
     order = np.argsort(-scores, kind="stable")[: 30 * MAX_INSTANCES]
     boxes, kinds = corners[order], classes[order]
@@ -220,7 +223,7 @@ class Segmenter:
                         "to 1; export it with its last activation"
                     )
                 label = self._kind.names.get(region.number, f"category {region.number}")
-                threshold = 0.0 if self._kind.yolo else 0.5
+                threshold = 0.0 if self._kind.yolo else 0.5  # logits or probabilities
                 instances.append(_make_instance(region, label, fit.size, threshold))
             yield key, [instance for instance in instances if instance is not None]
 

@@ -1,4 +1,9 @@
-"""The detections artefact, opened for reading: people and candidates of any image."""
+"""The detections artefact, opened for reading: people and candidates of any image.
+
+Images are indexed by camera c and frame set t, the images that the recordings' clocks put at one
+time. After :meth:`Detections.showing`, t is a moment instead: the scene stage has corrected the
+clocks and chosen the image of each camera that shows the moment.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +21,8 @@ from intercap_core.geometry.camera.masks import Runs
 from intercap_core.schemas import DETECTIONS, PERSON
 
 UNKNOWN_LABEL = ""  # of a candidate that no detector named
-NOT_SEGMENTED, FROM_DETECTOR, FROM_IMAGES = 0, 1, 2  # who segmented an image
+# Values of the person artefact's mask_source: what segmented the person in an image.
+NOT_SEGMENTED, FROM_DETECTOR, FROM_IMAGES = 0, 1, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +30,7 @@ class Candidate:
     """One segmented instance of one image."""
 
     index: int
-    """Counts within the image."""
+    """Position among the candidates of the image."""
     label: str
     """Name of the class; "" = unknown."""
     score: float
@@ -54,7 +60,7 @@ class PeopleOfImages(Protocol):
 
     @property
     def num_sets(self) -> int:
-        """T."""
+        """Number T of frame sets or moments."""
         ...
 
     def people(self, t: int, c: int) -> np.ndarray:
@@ -64,6 +70,8 @@ class PeopleOfImages(Protocol):
 
 @dataclass(frozen=True)
 class _CameraTable:
+    """Datasets of one camera. Image i has the rows from ``offsets[i]`` up to ``offsets[i + 1]``."""
+
     people_offsets: np.ndarray
     people: np.ndarray
     candidate_offsets: np.ndarray
@@ -135,9 +143,9 @@ class Detections:
     def with_candidates_of(self, person: Path) -> Detections:
         """Return the detections with the candidates that stage ``person`` found in the images.
 
-        They are appended to a detector's, or replace them if the stage used the images alone.
-        Call this for detections by moment (:meth:`showing`). Raises UserError if the
-        artefact cannot be read or is of another recording.
+        These are appended to the detector's candidates, or replace them if the stage used the
+        images alone. The detections must be indexed by moment (:meth:`showing`). Raises UserError
+        if the artefact cannot be read or is of another recording.
         """
         with artefacts.read(person, PERSON) as artefact:
             source = artefact["mask_source"]
@@ -185,7 +193,7 @@ class Detections:
 
     @property
     def num_sets(self) -> int:
-        """T."""
+        """Number T of frame sets or moments."""
         return int(self.keypoints_found.shape[0])
 
     def people(self, t: int, c: int) -> np.ndarray:

@@ -2,9 +2,9 @@
 
 ``recordings`` is a sequence's folder of frame folders ``t<seconds>`` that hold
 ``k<n>.color.jpg`` and ``k<n>.depth.png`` (16 bits, millimetres, on the colour image's grid) of the
-Kinects 0 to 3. ``calibration`` is ``calibs/<date>/config``: ``<n>/config.json`` with the pose of
-each colour camera in the frame of Kinect 1's. Lenses are in ``calibs/intrinsics/<n>/
-calibration.json``. Cameras are named k0, k1, ... and k1 is the master.
+Kinects 0 to 3. ``calibration`` is ``calibs/<date>/config``: ``<n>/config.json`` has the pose of
+each colour camera. Lenses are in ``calibs/intrinsics/<n>/calibration.json``. Cameras are named k0,
+k1, ... and k1 is the master, to whose colour camera poses are related.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def frame_rate(times_us: list[int]) -> float:
     if len(times_us) < 2:
         return 1.0
     fps = 1e6 / float(np.median(np.diff(times_us)))
-    # Rates of Azure Kinects. Names of folders round times to milliseconds, 3 % of a period.
+    # Rates of Azure Kinects. Folder names round times to milliseconds, 3 % of a period at 30 Hz.
     return next((n for n in (30.0, 15.0, 5.0) if abs(fps / n - 1) < 0.05), fps)
 
 

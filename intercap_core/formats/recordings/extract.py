@@ -1,4 +1,8 @@
-"""Copies one camera's images into the frames artefact and notes what is degraded."""
+"""Copy one camera's images into the frames artefact, with notes on missing or damaged data.
+
+A frame set holds one image of each camera, all taken at nearly the same time. Sets are formed later
+from the times and the masks ``colour_usable`` and ``depth_usable`` of the images copied here.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +39,7 @@ class ExtractedCamera:
     serial: str = ""
     """Serial number of the device; "" = unknown."""
     depth_delay_us: int = 0
-    """Device time of a depth image minus that of its colour image, by design."""
+    """Device time of a depth image minus that of its colour image, by design, microseconds."""
     fingerprint: int = 0
     """Checksum over the ends of all colour images."""
     gravity: np.ndarray = field(default_factory=lambda: np.full(3, np.nan))
@@ -43,15 +47,15 @@ class ExtractedCamera:
     truncated: bool = False
     """The recording was cut off."""
     notes: list[str] = field(default_factory=list)
-    """What is degraded, for the user."""
+    """Messages for the user about missing or damaged data."""
     colour_times: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     """(N,) device times, microseconds, in the order of the artefact's images."""
     depth_times: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
-    """(M,) the same of depth, including its delay."""
+    """(M,) the same of depth images; ``depth_delay_us`` is not subtracted."""
     colour_usable: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
-    """(N,) frame sets may use the image."""
+    """(N,) whether frame sets may use the colour image."""
     depth_usable: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
-    """(M,) frame sets may use the image."""
+    """(M,) whether frame sets may use the depth image."""
     sound: Sound | None = None
     """Sound track of the recording."""
 
@@ -96,7 +100,7 @@ def extract(
 
 
 def _without_folders(text: str, layout: RecordingLayout) -> str:
-    """Shorten paths to what is below the sequence's folders: artefacts hold no absolute paths."""
+    """Make paths relative to the sequence's folders, because artefacts hold no absolute paths."""
     recordings, calibration = layout.sequence.recordings, layout.sequence.calibration
     for folder in (recordings, calibration.parent):
         text = text.replace(f"{folder}/", "")
@@ -130,9 +134,10 @@ class _Copy:
         self.damaged = self.other_size = 0
 
     def run(self) -> None:
-        """Copy all images, write their times and note what is degraded.
+        """Copy all images, write their times and note missing or damaged data.
 
-        Raises UserError if the first image has another size than the calibration.
+        Raises UserError if the first image has another size than the calibration, or if the
+        recording fails before its first colour image.
         """
         view, recording = self.view, self.recording
         progress = Progress(log, f"{view.name}: read", None, "images")

@@ -1,4 +1,8 @@
-"""Reader of the frames artefact: images of every camera by frame set."""
+"""Reader of the frames artefact: images of every camera by frame set or by moment.
+
+A frame set holds the images that the recordings' clocks put at one time. The scene stage corrects
+the clocks and chooses for each moment, and each camera, the frame set whose image shows it.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +28,10 @@ _DECODED = {
 
 
 class Frames:
-    """An open frames artefact. ``t`` is a frame set (0 <= t < T), ``c`` a camera of the rig."""
+    """An open frames artefact. ``c`` is a camera of the rig, ``t`` a frame set (0 <= t < T).
+
+    After :meth:`showing`, ``t`` is a moment.
+    """
 
     def __init__(self, artefact: artefacts.Artefact, image_of: np.ndarray | None = None) -> None:
         self._artefact = artefact
@@ -63,7 +70,7 @@ class Frames:
 
     @property
     def num_sets(self) -> int:
-        """T."""
+        """Number T of frame sets or moments."""
         return len(self.time_s)
 
     @property
@@ -100,6 +107,7 @@ class Frames:
         return self._by_moment(self._artefact["depth_index"], -1)
 
     def _by_moment(self, values: np.ndarray, none: float) -> np.ndarray:
+        """Values (T, C) of frame sets, rearranged if ``t`` is a moment; ``none`` without image."""
         if self._image_of is None:
             return values
         shown = np.take_along_axis(values, np.maximum(self._image_of, 0), 0)
@@ -156,10 +164,10 @@ class Frames:
 
     @property
     def sound_starts(self) -> dict[str, tuple[float, float]]:
-        """Starts of cameras by the sound, and their standard deviations, seconds, by name.
+        """Start of each camera and its standard deviation, seconds, as estimated from sound.
 
-        A start is the time of the first image on a clock of any zero. Cameras that share no sound
-        are left out.
+        A start is the time of the camera's first image on a common clock with an arbitrary zero.
+        Keys are names of cameras; cameras that share no sound are left out.
         """
         if "sound_start" not in self._artefact:
             return {}

@@ -107,7 +107,7 @@ class DamagedImage(Exception):
 
 
 class ImagePair(NamedTuple):
-    """Colour and depth file of one camera at one moment; None = no file."""
+    """Colour and depth file of one camera at one time; None = no file."""
 
     time_us: int
     """Device time, microseconds."""
@@ -170,6 +170,7 @@ class FilesRecording(CameraRecording):
     """One camera's image files: colour files are copied, depth is decoded.
 
     Depth images have the size of the camera's depth lens. Without a depth lens they are not read.
+    ``shots``: files in order of time; ``fps``: nominal images a second.
     """
 
     def __init__(self, source: Path, camera: Camera, shots: list[ImagePair], fps: float) -> None:

@@ -2,9 +2,9 @@
 
 Knapp and Carter, IEEE Trans. ASSP 24(4), 1976: the cross-spectrum of two tracks is divided by its
 magnitude (phase transform), so that a broad-band sound gives one sharp peak at its delay in spite
-of reverberation. Windows of one track are each searched for in the whole other track. There is a
-result only if several windows agree on a delay, each by a peak that is far above chance and clearly
-the highest. Silence, unrelated sounds and repetitive music give no result.
+of reverberation. Each of several windows of one track is searched for in the whole other track. A
+delay is returned only if several windows agree on it, each by a peak that is far above chance and
+clearly the highest. Silence, unrelated sounds and repetitive music give no result.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SOUND_SIGMA_S = 0.03
 
 @dataclass(frozen=True)
 class Delay:
-    """Delay of a sound in the second track against the first."""
+    """Time of a sound in the second track minus its time in the first."""
 
     seconds: float
     """Delay; times count from the first image of each track."""
@@ -68,12 +68,17 @@ def sound_starts(sounds: Sequence[Sound | None]) -> tuple[np.ndarray, np.ndarray
 
 
 def estimate_delay(first: Sound, second: Sound) -> Delay | None:
-    """The delay of two tracks; None if it is not certain that they share sounds."""
+    """The delay of two tracks; None if it is not certain that they share sounds.
+
+    Up to eight windows of the shorter track are searched for in the longer one. The delay is the
+    median of the largest subset of windows that agree.
+    """
     short, long = sorted((first, second), key=lambda sound: len(sound.samples))
-    # A second holds several steps or words; within 10 s two clocks of 100 ppm drift by 1 ms.
+    # Length of a window: 1 s holds several steps or words; within 10 s two clocks of 100 ppm drift
+    # by 1 ms.
     size = min(max(len(short.samples) // 4, SOUND_RATE), 10 * SOUND_RATE)
     last = len(short.samples) - size
-    if last < size:  # fewer than two separate windows cannot disagree
+    if last < size:  # overlapping windows are no independent evidence
         return None
     places = np.unique(np.linspace(0, last, 8).astype(int))
     nfft = fft.next_fast_len(len(long.samples) + size, real=True)
@@ -113,7 +118,7 @@ def _lag(window: np.ndarray, whole: np.ndarray, nfft: int, count: int) -> int | 
     power = np.roll(power, len(window) - 1)[: count + len(window) - 1]
     power = np.convolve(power, np.ones(smooth) / smooth, mode="same")
     best = int(power.argmax())
-    near = round(0.03 * SOUND_RATE)  # first echoes of a room: 10 m of detour
+    near = round(0.03 * SOUND_RATE)  # first echoes of a room: a detour of 10 m
     others = np.concatenate([power[: max(0, best - near)], power[best + near + 1 :]])
     # The mean over eight samples of unrelated noise (chi square) exceeds the average eight times
     # by chance once in 1e10 delays. The factor to the next highest peak is tuned on the studio.
@@ -141,7 +146,7 @@ def _largest_group(delays: dict[tuple[int, int], Delay], views: int) -> list[int
 
 
 def _solved(delays: dict[tuple[int, int], Delay], group: list[int]) -> dict[int, float]:
-    """Starts of a ``group``'s cameras by least squares; that of the first is 0.
+    """Starts, seconds, of a ``group``'s cameras by least squares; that of the first is 0.
 
     A sound comes earlier in the track of a camera that starts later.
     """

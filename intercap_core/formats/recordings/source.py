@@ -1,7 +1,7 @@
 """Interface of all layouts of recordings: cameras, their poses, and their images one at a time.
 
 A :class:`RecordingLayout` is made for one sequence and opens a :class:`CameraRecording` for each
-camera. To add a layout, derive from both and name it in ``config.LayoutName`` and in
+camera. To add a layout, derive from both and name it in ``config_types.LayoutName`` and in
 :mod:`intercap_core.formats.recordings.layouts`.
 """
 
@@ -56,7 +56,8 @@ class Image(NamedTuple):
     kind: Literal["colour", "depth"]
     """Kind of the image."""
     time_us: int
-    """Device time of the camera, microseconds. Depth that is late by design keeps its own time."""
+    """Device time of the camera, microseconds. A depth image's time includes its delay by design
+    (``CameraRecording.depth_delay_us``)."""
     content: bytes | np.ndarray
     """Colour: a whole JPEG or PNG file. Depth: (H, W) uint16 in the size of the depth lens, mm,
     0 = invalid."""
@@ -88,11 +89,11 @@ class CameraRecording(ClosedOnExit, ABC):
     serial: str
     """The device's serial number, "" = not known."""
     depth_delay_us: int
-    """Device time of a depth image minus that of its colour image, by design."""
+    """Device time of a depth image minus that of its colour image, by design, microseconds."""
     truncated: bool
     """The recording was cut off. Final after :meth:`images`."""
     notes: list[str]
-    """What is degraded, for the user. Final after :meth:`images`."""
+    """Messages for the user about missing or damaged data. Final after :meth:`images`."""
     gravity: np.ndarray
     """(3,) direction down, unit, colour camera's frame; NaN = unknown. Set by :meth:`images`."""
 
@@ -130,7 +131,7 @@ class RecordingLayout(ABC):
     """
 
     extrinsics: Extrinsics
-    """Poses of the cameras, in the order of every C axis."""
+    """Poses of the cameras. Their order is that of every axis C of the sequence's arrays."""
     names: list[str]
     """Cameras with a recording, including those without a pose."""
 

@@ -1,4 +1,8 @@
-"""Frame sets: images that several cameras took at one moment, by device time."""
+"""Frame sets: one image of each camera, taken at one time according to the cameras' clocks.
+
+Clocks may be wrong. The scene stage then finds that an image shows the moment of another set; the
+difference is its slip, in sets. :func:`images_of_moments` rearranges the images accordingly.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# Of a period: an image that is farther from every set starts a new one. More than half, so that an
-# image never starts a set between two regular ones.
+# In periods: an image that is farther from every set starts a new set. More than half, so that no
+# set starts between two regular ones.
 NEW_SET_GAP = 0.6
 
 
@@ -26,7 +30,7 @@ class SetTable:
     """(C,) number of images in no set."""
 
     def gaps(self, period_us: float) -> list[tuple[int, int]]:
-        """Gaps without any image: (set before the gap, number of missing sets)."""
+        """Gaps in which no camera has an image: (set before the gap, number of missing sets)."""
         steps = np.rint(np.diff(self.times_us) / period_us).astype(int)
         return [(int(at), int(steps[at]) - 1) for at in np.flatnonzero(steps > 1)]
 
@@ -100,7 +104,7 @@ def images_of_moments(slip: np.ndarray, available: np.ndarray) -> np.ndarray:
     sets = len(slip)
     for camera in range(slip.shape[1]):
         images = np.flatnonzero(available[:, camera])
-        late = slip[images, camera]
+        late = slip[images, camera]  # sets by which the image is too late; negative = too early
         moments = images - late
         order = np.argsort(-np.abs(late), kind="stable")  # the least slip is written last
         order = order[(moments[order] >= 0) & (moments[order] < sets)]
@@ -150,8 +154,8 @@ def split_into_epochs(times_us: np.ndarray) -> np.ndarray:
     """Epoch (N,) of each image, from 0: a new one begins where the device's clock was reset.
 
     ``times_us`` (N,) int64 are device times in the order of recording. An epoch ends where time
-    jumps back. A single time that contradicts its neighbours on both sides is an ``OUTLIER`` and
-    ends no epoch.
+    jumps back. If leaving out a single image makes time increase again, that image is an
+    ``OUTLIER`` and ends no epoch.
     """
     epoch = np.zeros(len(times_us), np.int64)
     times = times_us.tolist()
@@ -178,8 +182,8 @@ def choose_epoch(
 ) -> int:
     """The epoch that overlaps the other cameras' times; the longest one if none does.
 
-    A reset takes a clock out of step with the others, so that the first of several overlapping
-    epochs is right: the first with at least half as many images near a reference time as any other.
+    Only the clock before its reset agrees with the other cameras. Therefore the result is the first
+    epoch with at least half as many images near a reference time as any other epoch.
 
     Args:
         times_us: (N,) device times.
@@ -195,7 +199,7 @@ def choose_epoch(
 
 
 def clock_drift_us(times_us: np.ndarray, skew_us: np.ndarray) -> float:
-    """Drift of a camera's clock against the sets' over the recording, microseconds.
+    """Drift of a camera's clock against the sets' times over the recording, microseconds.
 
     It is the difference between the median skews of the last and the first quarter, extrapolated
     to the whole recording.

@@ -87,8 +87,8 @@ def pair_images(
         depth: depth files.
         fps: images a second; the number in a name divided by it is the time. None = unknown.
         offset_s: seconds that are added to all times.
-        times: times of :func:`read_timestamps`, which go before ``fps``: by name, by name without
-            suffix, by number, or one for each colour image in order.
+        times: times of :func:`read_timestamps`, which take precedence over ``fps``: by name, by
+            name without suffix, by number, or one for each colour image in order.
         source: folder or video, for messages.
     """
     pairs = _by_key(colour, depth, source)
@@ -118,6 +118,7 @@ def pair_images(
 def _by_key(
     colour: list[Path], depth: list[Path], source: Path
 ) -> dict[int, tuple[Path | None, Path | None]]:
+    """Colour and depth file by number or, if any name has no number of its own, by position."""
     by_number = [{_number(path): path for path in paths} for paths in (colour, depth)]
     are_numbered = all(
         len(numbers) == len(paths) and None not in numbers
@@ -147,7 +148,11 @@ def _number(path: Path) -> int | None:
 def _stated(
     pairs: Mapping[int, tuple[Path | None, Path | None]], times: Timestamps, source: Path
 ) -> dict[int, float]:
-    """The stated time of each key. The depth files of a video go by position in the list."""
+    """The stated time, seconds, of each key.
+
+    Times without names belong to the colour images in order. If there are none, as for the depth
+    files of a video, the key is the position of the time in the list.
+    """
     coloured = [key for key in sorted(pairs) if pairs[key][0] is not None]
     if all(isinstance(name, int) for name in times):
         if not coloured:

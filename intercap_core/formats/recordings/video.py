@@ -102,7 +102,10 @@ def preview_video(path: Path, stream_index: int, fps: float) -> RecordingPreview
 
 
 def _first_size(container: Any, stream: Any) -> tuple[int, int] | None:
-    """Size of the first image that decodes, rotated as the file states."""
+    """Width and height of the first image that decodes, after the rotation that the file states.
+
+    None if no image decodes.
+    """
     try:
         for number, packet in enumerate(container.demux(stream)):
             if number > 60:  # two seconds, within which an image must decode
@@ -150,7 +153,8 @@ def segment_end(head: bytes) -> int | None:
     at = head.find(b"\x18\x53\x80\x67")  # the id of a Segment
     if at < 0 or at + 5 > len(head):
         return None
-    width = 9 - head[at + 4].bit_length()  # of the length that follows the id
+    # EBML: the number of leading zero bits states how many bytes follow; all ones = unknown length.
+    width = 9 - head[at + 4].bit_length()  # bytes of the length that follows the id
     field = head[at + 4 : at + 4 + width]
     stated = int.from_bytes(field, "big") & ((1 << 7 * width) - 1)
     return None if stated == (1 << 7 * width) - 1 else at + 4 + width + stated
@@ -296,7 +300,7 @@ class VideoRecording(CameraRecording):
         self._container.close()
 
     def preview(self) -> RecordingPreview:
-        """Inspect the head, the first image, the index or the last image, and the depth files."""
+        """Inspect the head, the first image, the length as :func:`preview_video`, depth files."""
         seen = preview_video(self.source, self._stream.index, self.fps)
         faults = inspect_files(self._shots, self.camera.depth)
         if self._times is not None and seen.images is not None:
@@ -348,12 +352,14 @@ class VideoRecording(CameraRecording):
         return demux(self._container, self._stream, cut_off)
 
     def _copied(self) -> Iterator[tuple[float | None, bytes]]:
+        """Yield time on the file's clock, seconds, None = not stated, and JPEG of each packet."""
         for packet in self._packets():
             if packet.size:
                 stamp = None if packet.pts is None else float(packet.pts * packet.time_base)
                 yield stamp, bytes(packet)
 
     def _decoded(self) -> Iterator[tuple[float | None, bytes]]:
+        """The same of each decoded image, encoded as JPEG."""
         for packet in self._packets():
             try:
                 frames = packet.decode()

@@ -99,7 +99,8 @@ def readers() -> tuple[KeypointReader, ...]:
 def find_layout(count: int, name: str | None = None) -> KeypointLayout:
     """The layout of a person with ``count`` points.
 
-    Raises ValueError, in words that follow the person's or the model's name, if there is none.
+    Raises ValueError if there is none. The message continues a sentence that begins with the name
+    of the person or the model.
 
     Args:
         count: number of points.
