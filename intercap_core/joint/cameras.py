@@ -1,14 +1,16 @@
-"""Small corrections of the cameras from the evidence of body and object (beyond the paper).
+"""Small corrections of the cameras from the images of body and object (beyond the paper).
 
-Image residuals that body and object have in common over all frames are errors of the cameras. Each
-camera's turn about its centre, shift and depth bias d minimise the images' evidence over all poses
-x (Schur complement), with the scene's covariance P^-1 as prior:
+Image residuals that body and object have in common over all frames are errors of the cameras. The
+unknowns d are a turn about its centre, a shift and a depth bias of each camera. The unknowns x of
+all frames (poses of body and object) are eliminated by the Schur complement. The prior of d is
+Gaussian about the scene's cameras, with the scene's covariance P^-1:
 
     S = P + sum a (H_dd - H_dx H_xx^-1 H_xd)
     step = -S^-1 (P d + sum a (g_d - H_dx H_xx^-1 g_x))
 
-summed over frames, body (E_B) and object (E_O). The poses follow by -H_xx^-1 H_xd step, S^-1 is the
-covariance of the corrections, and a the weight of a frame, as errors last over frames.
+The sums run over all frames, of the body (E_B) and of the object (E_O). H and g are the blocks of
+their Gauss-Newton matrices and gradients. a is the weight of a frame, below 1 because errors last
+over several frames. The poses follow by -H_xx^-1 H_xd step. S^-1 is the covariance of d.
 """
 
 from __future__ import annotations
@@ -22,7 +24,8 @@ from scipy.spatial.transform import Rotation
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.joint.state import ALL
 
-# Unknowns of a camera: turn about its centre, shift, depth bias.
+# Unknowns of a camera: turn about its centre (rad), shift (m), both in the master frame, depth bias
+# (m).
 FREEDOMS = 7
 TURN, SHIFT, BIAS = slice(0, 3), slice(3, 6), 6
 
@@ -44,7 +47,10 @@ class Cameras:
 
 @dataclass(frozen=True, eq=False)
 class CameraEvidence:
-    """Quadratic form of the images' evidence: n unknowns of each frame, D = 7 C of the cameras."""
+    """Gauss-Newton form of E_B or E_O by n unknowns x of each frame and D = 7 C of the cameras.
+
+    Symbols are those of the module's header.
+    """
 
     columns: slice  # The n unknowns of a frame
     matrix: np.ndarray  # (T, n, n) H_xx
@@ -52,7 +58,7 @@ class CameraEvidence:
     cross: np.ndarray  # (T, n, D) H_xd
     hessian: np.ndarray  # (D, D) H_dd, summed over frames
     pull: np.ndarray  # (D,) g_d, summed over frames
-    share: float  # Weight of a frame: 1 / number of frames that err together
+    share: float  # a, weight of a frame: 1 / number of frames with the same errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,12 +66,12 @@ class CameraStep:
     """A correction of the cameras."""
 
     step: np.ndarray  # (C, 7)
-    along: np.ndarray  # (T, N) step of the frames' unknowns that follows
+    along: np.ndarray  # (T, 174) step of the frames' unknowns that follows from ``step``
     covariance: np.ndarray  # (C, 7, C, 7) of the cameras' corrections after the step
 
     @property
     def shift(self) -> float:
-        """Largest displacement of a point at one metre from its camera, metres."""
+        """Largest displacement of a point at one metre from its camera (estimate), metres."""
         size = np.abs(self.step)
         return float((size[:, TURN].max(1) + size[:, SHIFT].max(1) + size[:, BIAS]).max())
 
@@ -106,10 +112,11 @@ class CameraFit:
         return True
 
     def _is_plausible(self, total: np.ndarray) -> bool:
-        """Whether corrections (C, 7) are below 5 of the scene's standard deviations and 30 mm.
+        """Whether the sum (C, 7) of all corrections is plausible.
 
-        The standard deviations bound each correction and all together; the 30 mm are those of a
-        point at 2.5 m. Both are two to three times the largest correction on the studio.
+        Each unknown must stay below 5 standard deviations of the scene, and so must the root mean
+        square of all in units of the scene's covariance. A point at 2.5 m must move by less than
+        30 mm. Both limits are two to three times the largest correction on the studio.
         """
         free = total.ravel()[self._free]
         together = np.sqrt(free @ self._information @ free / max(len(free), 1))
@@ -120,7 +127,7 @@ class CameraFit:
         )
 
     def solve(self, evidence: Sequence[CameraEvidence]) -> CameraStep:
-        """Find the minimum of ``evidence`` and prior over the unknowns that are not fixed."""
+        """Return the step to the minimum of ``evidence`` and prior; fixed unknowns have step 0."""
         free = self._free
         total, pull = self._information, self._information @ self._correction.ravel()[free]
         follows = []

@@ -44,7 +44,11 @@ def estimate_contact(
     intervals: Sequence[ContactInterval] | None,
     state: State,
 ) -> ContactEstimate:
-    """Estimate contact at ``state``. ``intervals`` are annotated contacts; None to detect it."""
+    """Estimate contact at ``state``.
+
+    ``intervals`` are the annotated contacts. If they are None, contact is detected, or 0 everywhere
+    if the setting ``detect_contact`` is off.
+    """
     geometry, sequential = inputs.geometry, inputs.sequential
     shape = (len(state), len(CONTACT_REGIONS))
     labels = np.full(shape, -1, np.int8)

@@ -15,21 +15,27 @@ ACCELERATION = (1.0, -2.0, 1.0)  # stencil over frames t, t+1, t+2
 RATE = (-1.0, 1.0)  # stencil over frames t, t+1
 
 Rows = Callable[[slice, np.ndarray], np.ndarray]
-"""Derivatives (F, K, R, m) of K of a term's N values, R numbers each, in F frames (a slice)."""
+"""Function (frames, index) that returns the Jacobian (F, K, R, m) of some of a term's values.
+
+``frames`` is a slice of F frames, ``index`` (K,) selects among the term's N values (for example
+points). Each value has R components, and m is the number of unknowns on which it depends.
+"""
 
 _CHUNK = 8  # frames whose rows are computed at a time: few enough to stay in the cache
 
 
 class BandedEquations:
-    """Sums of weighted J^T J and J^T r of all terms.
+    """Sums of weighted J^T J and J^T r of all terms, by the n = 174 unknowns of T frames.
 
     Attributes:
-        bands: (w+1, T, n, n) as in :class:`BandedSystem`, w = 2 or less for short recordings.
-        damped: (T, n) diagonal without the stiff rows: damping by their large values would freeze
-            an object that has to move as one over many frames.
-        gradient: (T, n).
+        bands: (w+1, T, n, n) blocks of J^T J as in :class:`BandedSystem`: ``bands[d, t]`` couples
+            frame t + d with frame t. w = 2, less for recordings of one or two frames.
+        damped: (T, n) diagonal of J^T J to which the damping is relative. It omits stiff rows:
+            damping by their large values would freeze an object that has to move as one over many
+            frames.
+        gradient: (T, n) J^T r.
         energies: (T,) of each term, one half of the weighted sum of squares; the energy of a
-            difference between frames is divided among them.
+            difference between frames is divided equally among them.
     """
 
     def __init__(self, frames: int, threads: ThreadPool | None = None) -> None:
@@ -51,8 +57,8 @@ class BandedEquations:
     def step(self, damping: np.ndarray) -> np.ndarray | None:
         """The Gauss-Newton step (T, n), or None if the matrix is not positive definite.
 
-        ``damping`` (T,) is a share of the diagonal. The step consumes ``bands`` to save memory:
-        another step needs new equations.
+        ``damping`` (T,) times ``damped`` is added to the diagonal. The step consumes ``bands`` to
+        save memory: another step needs new equations.
         """
         matrix, self.bands = torch.from_numpy(self.bands), np.zeros((0, 0, 0, 0))
         damped = torch.from_numpy(damping[:, None] * self.damped)
@@ -78,7 +84,7 @@ class BandedEquations:
         return np.sum(list(self.energies.values()), axis=0)
 
     def hold(self, columns: slice) -> None:
-        """Keep ``columns``, which no term constrains, where they are."""
+        """Give unknowns ``columns`` that no term constrains the step 0, by ones on the diagonal."""
         own = self.bands[0][:, columns, columns]
         own += np.eye(own.shape[-1])
 
@@ -108,16 +114,21 @@ class BandedEquations:
         stencil: tuple[float, ...] = (1.0,),
         stiff: bool = False,
     ) -> None:
-        """Add values of each frame, or differences of values over neighbouring frames.
+        """Add residuals of each frame, or of differences over w + 1 neighbouring frames.
+
+        With f(t) a term's values in frame t, the residual of a difference is the sum over k of
+        ``stencil[k]`` f(t + k). The Jacobian of f is computed once for each frame. The block of
+        frames t + d and t is the product of their Jacobians, weighted by the sum over all
+        differences that contain both frames.
 
         Args:
             term: name of the energy.
-            columns: unknowns on which the values depend.
-            rows: derivatives of the values by these unknowns.
-            weights: (T-w, N) of the differences.
+            columns: unknowns of a frame on which its values depend.
+            rows: Jacobian of the values by these unknowns.
+            weights: (T-w, N) of the differences, including robust weights.
             residuals: (T-w, N, R) of the differences.
             energy: (T-w,) of a robust term; None for plain least squares.
-            stencil: (w+1,) factors of the frames t .. t+w.
+            stencil: (w+1,) factors of the frames t .. t+w; the default is the value itself.
             stiff: leave these rows out of the damping.
         """
         frames, ahead = len(self.gradient), len(stencil) - 1
@@ -130,12 +141,12 @@ class BandedEquations:
         if frames <= ahead:
             return
         forces = _over_stencil(stencil, weights[..., None] * residuals)
-        # of the values of frame t with those of frames t, t + 1, ..
+        # [d] (T - d, N): weight of the product of the Jacobians of frames t + d and t
         couplings = [
             _over_stencil([f * g for f, g in zip(stencil, stencil[d:], strict=False)], weights)
             for d in range(ahead + 1)
         ]
-        # the tail of a Gaussian over a contact patch would have a row of each of its vertices
+        # leave out negligible weights, as of most vertices of a contact patch, to save their rows
         counts = couplings[0] > 1e-7 * couplings[0].max(initial=0.0)
 
         def add_chunk(start: int) -> None:
@@ -157,7 +168,7 @@ class BandedEquations:
                     ahead_of = (jacobian[d : d + count] * weight).transpose(0, 2, 1)
                     self.bands[d, here, columns, columns] += ahead_of @ jacobian[:count]
                     continue
-                # numpy computes half of the product of a matrix with its own transpose
+                # numpy computes only one triangle of a product A^T A, which is twice as fast
                 scaled = jacobian[:count] * np.sqrt(weight)
                 block = scaled.transpose(0, 2, 1) @ scaled
                 self.bands[0, here, columns, columns] += block
@@ -168,7 +179,10 @@ class BandedEquations:
 
 
 def _over_stencil(factors: Sequence[float] | np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Sum over k of ``factors`` (k,) times ``values`` (T - w, ...) of k frames before."""
+    """Return out[t] = sum over k of factors[k] values[t - k], with values 0 outside of their range.
+
+    ``factors`` (m,) and ``values`` (n, ...) give the result (n + m - 1, ...).
+    """
     out = np.zeros((len(values) + len(factors) - 1, *values.shape[1:]))
     for k, factor in enumerate(factors):
         out[k : k + len(values)] += factor * values

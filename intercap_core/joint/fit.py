@@ -1,4 +1,8 @@
-"""The joint fit: rounds of minimising equation 6, each with new contact, time offsets, cameras."""
+"""The joint fit: rounds of minimising equation 6 (:mod:`.problem`) over all frames at once.
+
+Each round starts with new contact probabilities, time offsets and correspondences, and with
+corrected cameras if the setting ``refine_cameras`` is on.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +29,7 @@ from intercap_core.joint.terms.object_data import NoObject, ObjectData
 from intercap_core.joint.terms.object_images import ObjectImagesData
 from intercap_core.joint.terms.term import TermContext
 
-ROUND_STEPS = (6, 4, 3)  # accepted steps of each round at most; tuned on the studio
+ROUND_STEPS = (6, 4, 3)  # steps that each round tries at most; tuned on the studio
 
 log = logging.getLogger(__name__)
 
@@ -42,7 +46,7 @@ class Assembly:
     object_: ObjectTerm  # E_O
     contact: Contact | None  # E_C; None without an object
     against_floor: str  # Why the scene's floor is not used; "" if it is, or if there is none
-    share: float  # Weight of a frame as evidence of the cameras
+    share: float  # Weight of a frame in the correction of the cameras
 
 
 def assemble(inputs: JointInputs, settings: JointSettings) -> Assembly:
@@ -63,7 +67,7 @@ def assemble(inputs: JointInputs, settings: JointSettings) -> Assembly:
         encoder=inputs.encoder,
         up=floor.normal if floor else None,
     )
-    share = min(1.0, 1 / (inputs.fps * 0.3))  # masks and keypoints err alike for 0.3 s; tuned
+    share = min(1.0, 1 / (inputs.fps * 0.3))  # errors of masks and keypoints last 0.3 s; tuned
     object_data: ObjectTerm = NoObject()
     if sequential.tracked is not None:
         object_data = (
@@ -87,8 +91,9 @@ def fit(
 ) -> JointFit:
     """Minimise equation 6 from the sequential fits.
 
+    There are at most three rounds (``ROUND_STEPS``), fewer if a round changes nothing.
     ``intervals`` are the annotated contacts; None to detect contact. If the sequential fits
-    contradict the floor, every frame is flagged.
+    contradict the floor, it is not used, and every frame is flagged.
     """
     alone = not inputs.geometry.has_object
     if settings.refine_cameras and not (settings.look_again or alone):
@@ -193,9 +198,10 @@ class _Rounds:
         self._unchanged = bool(converged and contact_change < 0.1 and offset_change < 0.001)
 
     def correct_cameras(self, cameras: CameraFit) -> None:
-        """Correct ``cameras`` by the evidence of the body and of images of the object."""
+        """Correct ``cameras`` by the residuals of the body and of images of the object."""
         body, images = self._assembly.body, self._assembly.object_
-        # a twentieth (tuned): detectors' errors follow view and pose, clothing hides the skin
+        # the body weighs a twentieth (tuned): errors of keypoints and clothing depend on the view
+        # and the pose, and so resemble errors of a camera
         evidence = [body.camera_evidence(self.state, 0.05 * self._assembly.share)]
         if isinstance(images, ObjectImagesData):
             evidence.append(images.camera_evidence(self.state))

@@ -30,9 +30,9 @@ class FloorPlane:
         return (points - self.point) @ self.normal
 
     def depths(self, points: np.ndarray) -> np.ndarray:
-        """Heights (..., N) of points below the floor, 0 for those above it; metres.
+        """Return min(height, 0) (..., N) of points (..., N, 3), metres: 0 above the floor.
 
-        The derivative by a point is the normal where the height is negative, 0 elsewhere.
+        The derivative by a point is the normal if the height is negative, 0 otherwise.
         """
         return np.minimum(self.heights(points), 0.0)
 
@@ -40,9 +40,9 @@ class FloorPlane:
 def contradiction(geometry: Geometry, sequential: SequentialFits, floor: FloorPlane) -> str:
     """Describe how the sequential fits contradict ``floor``; "" if they do not.
 
-    They do if the lower foot is below the floor in most frames, or if feet and object are far above
-    it in 90 % of the frames (jumps end). Frames with an interpolated body do not count, nor does
-    the object while it is lost.
+    The floor is too high if it is ``CONTRADICTION_M`` or more above the lower foot in most frames.
+    It is too low if it is as far below both feet and object in 90 % of the frames, more than a jump
+    lasts. Frames with an interpolated body do not count, nor does the object while it is lost.
     """
     posed = geometry.at(sequential.state)
     feet = geometry.skin.patch[np.isin(geometry.patches.region, _FEET)]

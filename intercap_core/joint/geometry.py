@@ -65,14 +65,15 @@ class Geometry:
     def moments(self) -> np.ndarray:
         """Six points (6, 3) that stand for the object's vertices, object frame.
 
-        They have the mean and covariance of the vertices, but are at least 0.3 m from the centre
-        (tuned on the studio): hands that accelerate an object by 6 m/s^2 turn it by 6 / 0.3 =
-        20 rad/s^2. Closer points, as those of a thin object, would not penalise its spin enough.
+        They have the mean and covariance of the vertices (:func:`moment_points`), but are at least
+        0.3 m from the centre (tuned on the studio). Closer points, such as those of a thin object,
+        would penalise its spin too little. At 0.3 m a hand's usual acceleration of 6 m/s^2 is
+        6 / 0.3 = 20 rad/s^2.
         """
         return moment_points(self.mesh.vertices, 0.3)
 
     def at(self, state: State) -> PosedGeometry:
-        """Geometry at ``state``; the last one is cached by the identity of its state."""
+        """Return the geometry at ``state``; that of the last state object is cached."""
         if self._last is None or self._last.state is not state:
             self._last = PosedGeometry(self, state)
         return self._last
@@ -141,13 +142,14 @@ class PosedGeometry:
         return proximity(touched, self.skin, state.rotation, state.translation)
 
     def skin_by_body(self, frames: slice, index: np.ndarray, axes: np.ndarray) -> np.ndarray:
-        """Derivative (F, K, R, 168) of the skin samples ``index`` (K,); see the next method."""
+        """As :meth:`vertices_by_body`, of the skin samples with these indices (K,)."""
         return self.vertices_by_body(frames, self._geometry.skin.vertices[index], axes)
 
     def vertices_by_body(self, frames: slice, ids: np.ndarray, axes: np.ndarray) -> np.ndarray:
-        """Derivative (F, K, R, 168) of vertices ``ids`` (K,) by the body in F ``frames``.
+        """Derivative (F, K, R, 168) of coordinates of vertices ``ids`` (K,) by the body's unknowns.
 
-        ``axes`` (F, K, R, 3) are the directions along which the points are measured.
+        ``frames`` is a slice of F frames. The coordinates are axis . vertex, with R ``axes``
+        (F, K, R, 3) for each vertex.
         """
         model = self._geometry.model
         parameters = model.parameters(self._parameters.vector()[frames])
@@ -159,7 +161,7 @@ class PosedGeometry:
 
     @cached_property
     def joints(self) -> tuple[np.ndarray, np.ndarray]:
-        """Joints (T, 55, 3) and their derivative (T, 55, 3, 168) by the body, single precision."""
+        """Joints (T, 55, 3), and their derivative (T, 55, 3, 168) by the body as float32."""
         g = self._geometry
         vector = self._parameters.vector()
         points = np.empty((len(vector), NUM_JOINTS, 3))
@@ -175,7 +177,7 @@ class PosedGeometry:
 
     @cached_property
     def moments(self) -> tuple[np.ndarray, np.ndarray]:
-        """Points :attr:`Geometry.moments` (T, 6, 3), and (T, 6, 3, 6) by the object's motion."""
+        """Points :attr:`Geometry.moments` (T, 6, 3) and their derivative (T, 6, 3, 6)."""
         state = self.state
         return points_by_object(self._geometry.moments, state.rotation, state.translation)
 
@@ -189,9 +191,10 @@ class PosedGeometry:
 def moment_points(vertices: np.ndarray, least: float = 0.0) -> np.ndarray:
     """Six points (6, 3) with the mean and covariance of ``vertices`` (V, 3).
 
-    They are mean + and - sqrt(3 lambda_i) e_i along the principal axes. A sum of squares of an
-    affine map over the vertices is V / 6 times the same sum over these points. Points nearer to the
-    mean than ``least``, metres, are moved out to it, which increases the covariance.
+    They are mean + and - sqrt(3 lambda_i) e_i, with lambda_i and e_i the eigenvalues and
+    eigenvectors of the covariance. A sum of squares of an affine map over the vertices is V / 6
+    times the same sum over these points. Points nearer to the mean than ``least``, metres, are
+    moved out to this distance, which increases the covariance.
     """
     mean = vertices.mean(axis=0)
     covariance = np.cov((vertices - mean).T, bias=True)
@@ -203,9 +206,10 @@ def moment_points(vertices: np.ndarray, least: float = 0.0) -> np.ndarray:
 def points_by_object(
     points: np.ndarray, rotation: np.ndarray, translation: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Object points (N, 3) in all frames (T, N, 3), and their derivative (T, N, 3, 6).
+    """Place object points (N, 3) in all frames; return them (T, N, 3) and their derivative.
 
-    The derivative is by (w, d) of the motion X' = exp(w)(X - t) + t + d.
+    The derivative (T, N, 3, 6) is by the turn w (rad, columns 0 to 2) and the shift d (m, columns 3
+    to 5) of the object, X' = exp(w)(X - t) + t + d, with t its translation.
     """
     arm = np.einsum("tij,nj->tni", rotation, points)
     jacobian = np.zeros((*arm.shape, 6))

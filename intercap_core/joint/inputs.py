@@ -103,7 +103,7 @@ def open_inputs(
         mesh = None
     geometry = _geometry(model, mesh, settings)
     threads = ThreadPool(torch.get_num_threads() if model.device.type == "cpu" else 1)
-    # numpy would use threads too: small products gain nothing, and threads would block each other
+    # one BLAS thread: small matrix products gain nothing from more, and would block ``threads``
     with Frames.open(paths.frames) as recording, threadpool_limits(1, user_api="blas"):
         images = None
         if settings.look_again and object_ is not None and mesh is not None:
@@ -154,7 +154,7 @@ def _motion_encoder(
     problem = ""
     if frames < FEWEST_FRAMES:
         problem = f"has {frames} frames, and LEMO's encoder needs {FEWEST_FRAMES} or more"
-    elif abs(fps / FRAMES_PER_SECOND - 1) > 0.1:  # walks in AMASS, its data, differ by more
+    elif abs(fps / FRAMES_PER_SECOND - 1) > 0.1:  # walking speeds in LEMO's data differ by more
         problem = (
             f"has {fps:g} frames a second, and LEMO's encoder knows steps of motion at "
             f"{FRAMES_PER_SECOND:g}"
@@ -167,12 +167,16 @@ def _motion_encoder(
             "joint.lemo to penalise joint accelerations instead"
         )
     weights, statistics = settings.lemo_files
-    # E_S is a small difference of large latents, and GPU convolutions may round to ten bits
+    # double precision: E_S is a small difference of large latents, and GPU convolutions in single
+    # precision may round to ten bits
     return MotionEncoder.load(weights, statistics, device=model.device, dtype=torch.float64)
 
 
 def read_cameras(scene: Artefact) -> CameraFit:
-    """The scene's cameras with their covariance."""
+    """The scene's cameras with their covariance, 0 for absent cameras and unknown depth biases.
+
+    Raises UserError if the covariance is not positive definite.
+    """
     start = Cameras(Rig.from_artefact(scene), scene["depth_bias"])
     covariance = scene["camera_covariance"]
     usable = scene["present"] & np.isfinite(start.rig.master_from_colour).all((1, 2))

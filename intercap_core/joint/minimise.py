@@ -36,8 +36,10 @@ def minimise(
     """Try at most ``max_steps`` steps from ``state``; a step is accepted if it lowers the energy.
 
     Each frame has its own damping, which grows if the energy rose there in a refused step: a badly
-    linearised frame slows down its neighbourhood alone. Convergence is relative to the gain of this
-    round, since most of the energy is noise. Factors and tolerances are tuned on the studio.
+    linearised frame slows down its neighbourhood alone. The round has converged if a step lowers
+    the energy by less than 3 % of what all its steps have gained, since most of the energy is
+    noise; or if a refused step would have gained less than 0.1 % of the energy. Factors and
+    tolerances are tuned on the studio.
     """
     accepted, refused, gained, converged = 0, 0, 0.0, False
     damping, moved = np.full(len(state), 1e-3), np.zeros(len(state), bool)
@@ -77,9 +79,10 @@ def minimise(
 
 
 def _risen(change: np.ndarray) -> np.ndarray:
-    """Mask (T,) of frames around which the energy rose by ``change`` (T,) or is not finite.
+    """Mask (T,) of frames t for which the energy of frames t - 1 to t + 1 rose or is not finite.
 
-    All frames if the energy rose in no particular one.
+    ``change`` (T,) is the energy after a step minus the one before. The mask contains all frames if
+    none rose.
     """
     around = np.convolve(np.nan_to_num(change, nan=np.inf), np.ones(3))[1:-1]
     rose = ~(around <= 0)

@@ -1,8 +1,9 @@
 """Signed distances of body points to the moving object, with derivatives.
 
-d = n . (x - q), with q the point of the object's surface closest to x and n the outward direction
-from q to x. E_C of equation 6 (A.4) and the term body in object are functions of d. Far from the
-object, where no term needs d, q is the nearest point of the object's box, which is cheap.
+d = n . (x - q), with q the point of the object's surface closest to x and n the unit vector along
+x - q that points out of the object. E_C of equation 6 (A.4) and the term body in object are
+functions of d. Farther than 0.25 m from the object's bounding box no term needs d: there q is the
+nearest point of the box, which is cheap to compute.
 """
 
 from __future__ import annotations
@@ -28,9 +29,9 @@ SearchableSurface = DistanceField | SurfacePart
 class Proximity:
     """Signed distances of N points in T frames to the object's surface; master frame, metres.
 
-    The derivative by the object is minus that of a point at the same place that moves with it
-    (:func:`along_by_object`): x - q is parallel to n, so that turning n changes nothing to first
-    order.
+    The derivative of d by the object's motion is minus that of n . x for a point x that moves with
+    the object (:func:`along_by_object`). The turn of n adds nothing to first order, because x - q
+    is parallel to n.
     """
 
     distance: np.ndarray  # (T, N), negative inside

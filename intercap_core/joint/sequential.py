@@ -13,7 +13,7 @@ from intercap_core.geometry.camera.transforms import apply_step, rigid
 from intercap_core.geometry.solve.time_series import rigid_velocity
 from intercap_core.joint.state import State
 
-UNTRACKED_SIGMA = 0.5  # of a lost object's position, metres: wide open; tuned on the studio
+UNTRACKED_SIGMA = 0.5  # stated for the position of a lost object, metres; tuned on the studio
 
 POSE_NAMES = (*(name for name, _ in POSE_BLOCKS), "transl")
 """Datasets with a frame's pose and translation, in the order of the parameter vector."""
@@ -36,13 +36,13 @@ class TrackedPoses:
     rotation: np.ndarray  # (T, 3, 3) of master_from_object
     translation: np.ndarray  # (T, 3) of master_from_object, metres
     information: np.ndarray  # (T, 6, 6) inverse covariance of turn (left) and shift
-    twist: np.ndarray  # (T, 6) motion per second; 0 at rest
-    share: np.ndarray  # (T, C) share of each camera in the evidence for a pose
+    twist: np.ndarray  # (T, 6) turn and shift per second; 0 at rest
+    share: np.ndarray  # (T, C) 1 / n for each of the n cameras that show the object, else 0
     time_offset: np.ndarray  # (C,) time offsets of the cameras that the tracker assumed, seconds
     seen: np.ndarray  # (T,) frames whose images determine the pose
     resting: np.ndarray  # (T,) frames in which the object rests
     times: np.ndarray  # (T,) seconds
-    spread: np.ndarray  # (T, 6) variance of the pose beyond what the images of its frame leave open
+    spread: np.ndarray  # (T, 6) variance added to the images': mesh, ambiguity, interpolation
 
     @classmethod
     def from_track(
@@ -59,7 +59,7 @@ class TrackedPoses:
 
         Args:
             poses: (T, 4, 4) master_from_object.
-            covariance: (T, 6, 6) around these poses, without the spread between several poses.
+            covariance: (T, 6, 6) around these poses, without the spread between rival poses.
             marks: lost frames and others.
             visible: (T, C) views that show the object.
             times: (T,) seconds.
@@ -95,7 +95,9 @@ class TrackedPoses:
     def at(self, time_offset: np.ndarray) -> TrackedPoses:
         """The poses if the cameras had these time offsets (C,), seconds.
 
-        A pose is earlier by the mean change of the offsets of the views that show the object.
+        If the cameras expose later than assumed, the tracked pose is that of a later time, and the
+        object is moved back along its twist. The delay is the mean change of the offsets of the
+        views that show the object.
         """
         late = self.share @ (time_offset - self.time_offset)
         poses = apply_step(rigid(self.rotation, self.translation), -late[:, None] * self.twist)
@@ -110,7 +112,7 @@ class Trust:
 
     body: np.ndarray  # (T,) frames with a fit of the body
     object_: np.ndarray  # (T,) frames in which the object is tracked
-    still: np.ndarray  # (T - 1,) steps over which the object rests
+    still: np.ndarray  # (T - 1,) steps to the next frame over which the object rests
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,7 @@
-"""Vertices compared with object and floor: samples, and contact patches, H of E_C (A.4)."""
+"""Vertices of the body that are compared with object and floor.
+
+They are an even sample of the skin, and the contact patches, which are H of E_C (A.4).
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from intercap_core.body.model import BodyModel
 from intercap_core.body_fit.surface import choose_samples
 from intercap_core.schemas import CONTACT_REGIONS
 
-VERTICES_PER_MEASUREMENT = 10.0  # neighbouring vertices err together; tuned on the studio
+VERTICES_PER_MEASUREMENT = 10.0  # neighbours have the same error and count as one; tuned
 
 _FIRST_FINGER_JOINT = JOINT_INDEX["left_index1"]  # three joints per finger from here on
 
@@ -32,8 +35,8 @@ class Patches:
 def contact_patches(model: BodyModel) -> Patches:
     """Cut hands into palm and fingers; each of the other regions is one patch.
 
-    A region keeps at most 240 vertices (tuned on the studio): fingers are thin and wrap around
-    objects, and a large region that sits on an edge touches it with few vertices.
+    A region keeps at most 240 vertices, evenly spread (tuned on the studio). Fewer would miss thin
+    fingers around an object, or the few vertices of a large region that touch an edge.
     """
     template = model.template.cpu().numpy()
     joint_of = model.skinning_weights.cpu().numpy().argmax(axis=1)
@@ -45,7 +48,7 @@ def contact_patches(model: BodyModel) -> Patches:
         part = np.full(len(kept), -1)  # the palm, or the only patch
         if name.endswith("_hand"):
             finger = joint_of[kept] >= _FIRST_FINGER_JOINT
-            part[finger] = (joint_of[kept][finger] - _FIRST_FINGER_JOINT) // 3
+            part[finger] = (joint_of[kept][finger] - _FIRST_FINGER_JOINT) // 3  # number of finger
         for value in np.unique(part):
             members = kept[part == value]
             vertices.append(members)

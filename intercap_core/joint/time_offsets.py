@@ -28,7 +28,7 @@ from intercap_core.geometry.camera import projection
 from intercap_core.geometry.solve.robust import SIGMA_PER_MAD, geman_mcclure_weight
 
 LOOSE_OFFSET_SIGMA_S = 0.010  # without a prior: a third of the time between frames; tuned
-POINT_SIGMA_M = 0.03  # error of the fit, large: only disagreement of views counts; tuned
+POINT_SIGMA_M = 0.03  # prior of e, wide, so that only disagreement of views counts; tuned
 INNOVATION_OUTLIER = 3.0  # standard deviations at which an innovation counts a quarter; tuned
 
 
@@ -66,11 +66,15 @@ def estimate_offsets(
     current: np.ndarray,
     prior: OffsetPrior,
 ) -> OffsetEstimate:
-    """Estimate the time offsets of all cameras.
+    """Estimate the time offsets of all cameras by four Gauss-Newton steps.
+
+    The covariance contains the observed scatter of the gradient (sandwich estimator).
 
     Args:
+        observations: predicted and observed keypoints and clouds.
         times: (T,) of the frames, seconds.
         current: (C,) offsets with which the predictions were made, seconds.
+        prior: prior of the offsets.
     """
     count = len(current)
     has_prior = np.isfinite(prior.sigma)
@@ -100,14 +104,17 @@ def estimate_offsets(
 
 @dataclass(eq=False)
 class _Innovations:
-    """Innovations over time of the N points that any view saw, in units of their deviation."""
+    """Innovations over time, in standard deviations, of points that any view saw.
+
+    A row is one point in one frame: N rows.
+    """
 
     residual: np.ndarray  # (N, C, D) less its mean over time
     velocity: np.ndarray  # (N, C, D) less its mean over time
     by_point: np.ndarray  # (N, C, D, P)
     weight: np.ndarray  # (N, C)
     part: np.ndarray  # (N,) part of the body
-    frame: np.ndarray  # (N,) frame
+    frame: np.ndarray  # (N,) number of the frame
 
     @classmethod
     def of(cls, seen: PointObservations, times: np.ndarray) -> _Innovations | None:
@@ -180,7 +187,7 @@ class _Innovations:
         return np.diag(own) - shared, -(along * remaining).sum((0, 2))
 
     def spread(self, change: np.ndarray) -> np.ndarray:
-        """Covariance (C, C) of g from its scatter over body parts and over frames.
+        """Covariance (C, C) of g: its scatter over body parts plus its scatter over frames.
 
         The former contains lasting errors, the latter errors of single frames.
         """

@@ -36,6 +36,7 @@ def annotation_evidence(
     and the geometry decides. The middle between two ends always has evidence.
     """
     labels = np.zeros((frames, len(regions)), np.int8)
+    # intervals of an unnamed part come first: those of a named part overwrite their labels
     for interval in sorted(intervals, key=lambda interval: interval.part != ANY_REGION):
         during = slice(interval.start, interval.end)
         if interval.part == ANY_REGION:
@@ -51,7 +52,7 @@ def annotation_evidence(
             finishes = end - inside if end < frames else np.full(end - start, np.inf)
             away = np.minimum(begins, finishes)
             certain[start:end, r] = away > min(uncertainty, (end - start) / 2 - 1)
-    sign = np.choose(labels + 1, (0.0, -1.0, 1.0))
+    sign = np.choose(labels + 1, (0.0, -1.0, 1.0))  # of the labels -1, 0, 1
     return sign * certain * ANNOTATED_LOGIT, labels
 
 
@@ -89,7 +90,7 @@ def find_issues(
 
 
 def _find_overlaps(intervals: Sequence[ContactInterval]) -> list[AnnotationIssue]:
-    """Overlapping intervals of one part, which count once."""
+    """Find overlapping intervals of one part, which count once."""
     by_part = sorted(intervals, key=lambda i: (i.part, i.start, i.end))
     issues = []
     for part, group in groupby(by_part, key=lambda i: i.part):
@@ -103,7 +104,7 @@ def _find_overlaps(intervals: Sequence[ContactInterval]) -> list[AnnotationIssue
 
 
 def _find_unseen_ends(interval: ContactInterval, unseen: np.ndarray) -> list[AnnotationIssue]:
-    """Ends in unseen frames: the annotation alone determines when the contact changes."""
+    """Find ends in unseen frames: the annotation alone determines when the contact changes."""
     ends = {"begins": interval.start, "ends": interval.end}
     return [
         AnnotationIssue(
@@ -117,7 +118,7 @@ def _find_unseen_ends(interval: ContactInterval, unseen: np.ndarray) -> list[Ann
 def _find_far(
     interval: ContactInterval, regions: Sequence[str], distance: np.ndarray, unseen: np.ndarray
 ) -> list[AnnotationIssue]:
-    """Frames in which the annotated part is far from the object."""
+    """Find runs of frames in which the annotated part is far from the object."""
     of_part = (
         distance.min(axis=1)
         if interval.part == ANY_REGION

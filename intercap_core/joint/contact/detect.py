@@ -17,8 +17,8 @@ from intercap_core.joint.proximity import Proximity
 from intercap_core.joint.skin import Patches
 
 # Standard deviations of a region's distance beyond those of the fits.
-LASTING_SIGMA = 0.006  # m, of shape, clothing and the two meshes; tuned on the studio
-FRAME_SIGMA = 0.004  # m, of single frames; tuned on the studio
+LASTING_SIGMA = 0.006  # m, the same in all frames: shape, clothing, two meshes; tuned on the studio
+FRAME_SIGMA = 0.004  # m, different in each frame; tuned on the studio
 MOVING_SPEED = (
     0.12  # of an object's surface, m/s: the track's jitter is slower; tuned on the studio
 )
@@ -101,7 +101,7 @@ def contact_probability(
 
     ``given`` (T, R) are further log odds, from annotations.
     """
-    correlated = max(1.0, 0.07 * fps)  # frames that err together: for 0.07 s, tuned on the studio
+    correlated = max(1.0, 0.07 * fps)  # frames with the same error: 0.07 s, tuned on the studio
     slip = _motion_evidence(motion)
 
     def posterior(error: np.ndarray, sigma: np.ndarray) -> np.ndarray:
@@ -138,9 +138,9 @@ def lasting_error(
 def _distance_evidence(distance: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     """Log odds (T, R) of distances: normal about the surface against uniform within 0.1 m.
 
-    A region inside the object touches it: its depth is error. For unknown distances both
-    likelihoods are wide, and the log odds near zero. 1 % of distances are outliers. Both numbers
-    are tuned on the studio.
+    A region inside the object counts as distance 0: its depth is error. If ``sigma`` is large, both
+    likelihoods are wide, and the log odds near zero. A touching region has an outlier as distance
+    with probability 1 %. Both numbers are tuned on the studio.
     """
     free = np.log(0.10 + np.sqrt(2 * np.pi) * sigma)
     outside = np.maximum(distance, 0.0)

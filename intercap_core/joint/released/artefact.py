@@ -63,8 +63,9 @@ def import_joint(
 ) -> None:
     """Write joint.h5 from another program's results.
 
-    Cameras are the given ones, to which the results belong. The artefact has no contact
-    probabilities and no energies. Frames without a result get the nearest result and are flagged.
+    The cameras are those of the calibration, to which the results refer, without corrections of
+    stage ``scene``. Contact probabilities are NaN, and there are no energies. Frames without a
+    result get the nearest result and are flagged.
     Raises UserError if the results have another number of frames, or more shape parameters than
     the body file.
 

@@ -132,10 +132,10 @@ def _match_folders(folder: Path, recording: Recording) -> dict[int, Path]:
 
 
 def _match_times(times: np.ndarray, known: list[int]) -> dict[int, int]:
-    """Nearest ``known`` time, microseconds, of each frame that has one; by frame number.
+    """Return the ``known`` time (microseconds) within 5 ms of each frame, by frame number.
 
-    ``times`` (T,) are seconds. BEHAVE rounds times to milliseconds; its images are at least 33 ms
-    apart.
+    Frames without such a time are missing. ``times`` (T,) are seconds. BEHAVE rounds times to
+    milliseconds; its images are at least 33 ms apart.
     """
     if not known or not np.isfinite(times).all():
         return {}

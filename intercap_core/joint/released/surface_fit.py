@@ -137,12 +137,12 @@ class _SurfaceFit:
         Rest poses and joints of two body models differ by some degrees. Measured on the studio:
         from rotations 8 degrees off, joints end 3 mm from the true ones in the mean.
         """
-        stiffness = torch.full((len(self.columns),), 0.25**-2)
+        stiffness = torch.full((len(self.columns),), 0.25**-2)  # standard deviation 0.25 rad
         stiffness[:3] = 0.0  # turn of the pelvis
         stiffness[(self.columns >= _FINGERS.start) & (self.columns < _FINGERS.stop)] = (
             0.08 if fingers else 0.01
         ) ** -2
-        stiffness[self.columns >= TRANSL.start] = 0.0
+        stiffness[self.columns >= TRANSL.start] = 0.0  # translation
         return stiffness
 
     def _match(self, targets: Sequence[_Target], vectors: Tensor, fingers: bool) -> _Planes:
@@ -225,7 +225,7 @@ class _Problem:
     planes: _Planes
 
     def vectors(self, own: Tensor, shared: Tensor, index: Tensor) -> Tensor:
-        """Parameters (b, P)."""
+        """Parameters (b, P) of the frames ``index``."""
         vectors = self.base[index].clone()
         vectors[:, self.columns] = own
         if len(shared):
@@ -233,7 +233,7 @@ class _Problem:
         return vectors
 
     def cost(self, own: Tensor, shared: Tensor, index: Tensor) -> Tensor:
-        """Cost (b,)."""
+        """Cost (b,) of the frames ``index``."""
         vectors, off = self.vectors(own, shared, index), own - self.expected[index]
         result = 0.5 * (off * off * self.stiffness).sum(1)
         for at in _chunks(len(own)):

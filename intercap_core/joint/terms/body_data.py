@@ -129,9 +129,10 @@ class BodyData(JointTerm):
     def linearise_views(
         self, used: np.ndarray, state: State
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """E_B's matrix (T, 168, 168), gradient (T, 168) and energy (T,) at ``state`` of some views.
+        """E_B's matrix (T, 168, 168), gradient (T, 168), energy (T,) at ``state`` by some views.
 
-        ``used`` (T, C) masks the views; correspondences are those of the last :meth:`refresh`.
+        Only views in the mask ``used`` (T, C) count. Correspondences are those of the last
+        :meth:`refresh`.
         """
         problem, evidence = self._problem, self._fitter.evidence
         counted = torch.as_tensor(used[self._fitter.frames], device=problem.base.device)[..., None]
@@ -183,7 +184,7 @@ class BodyData(JointTerm):
             evidence.observations = replace(evidence.observations, time_offset=time_offset)
 
     def camera_evidence(self, state: State, share: float) -> CameraEvidence:
-        """Evidence of keypoints and clouds about the cameras; ``share`` is a frame's weight."""
+        """Form of E_B by body and cameras (:mod:`.cameras`); ``share`` is a frame's weight."""
         self._place(state)
         count = FREEDOMS * len(self._fitter.evidence.observations.rig)
         hessian, gradient, _ = self._equations(state)
@@ -250,7 +251,11 @@ class BodyData(JointTerm):
 def add_by_cameras(
     evidence: Evidence, problem: BodyProblem, trusted: np.ndarray, seen: CameraEvidence
 ) -> None:
-    """Add the evidence of the ``trusted`` (N,) frames at the problem's bodies to ``seen``."""
+    """Add the derivatives of E_J and E_D by the cameras to ``seen``, at the problem's bodies.
+
+    ``trusted`` (N,) masks the frames of the problem that count. Symbols as in
+    :mod:`intercap_core.joint.cameras`.
+    """
     frames = np.flatnonzero(trusted)
     for part in np.array_split(frames, max(1, -(-len(frames) // 32))):
         if len(part):
@@ -261,7 +266,7 @@ def add_by_cameras(
 def _add_keypoints(
     evidence: Evidence, problem: BodyProblem, part: np.ndarray, seen: CameraEvidence
 ) -> None:
-    """Add E_J by the cameras, and by cameras and body, in the frames ``part``."""
+    """Add H_dd, g_d and H_xd of E_J in the frames ``part`` of the problem."""
     views = problem.views
     if views is None:
         return
@@ -291,6 +296,8 @@ def _add_keypoints(
     nothing = by_point.new_zeros(*by_point.shape[:-1], 1)
     rows = -torch.cat([torch.linalg.cross(arm, by_point), by_point, nothing], -1)
     weighted = rows * weight[..., None, None]
+    # b frames, c cameras, k keypoints, a pixel axes, f and g unknowns of a camera, n of the body,
+    # x coordinates of a point
     hessian = torch.einsum("bckaf,bckag->cfg", weighted, rows)
     gradient = torch.einsum("bckaf,bcka->cf", weighted, residual)
     by_keypoint = torch.einsum("bckaf,bckax->bkxcf", weighted, by_point)
@@ -305,7 +312,7 @@ def _add_keypoints(
 def _add_clouds(
     evidence: Evidence, problem: BodyProblem, part: np.ndarray, seen: CameraEvidence
 ) -> None:
-    """Add E_D by the cameras, and by cameras and body, in the frames ``part``."""
+    """Add H_dd, g_d and H_xd of E_D in the frames ``part`` of the problem."""
     rows, by_view = problem.rows, evidence.by_view
     if rows is None or by_view is None:
         return

@@ -4,9 +4,9 @@
 
 Errors of a sequential fit last: those of calibration, clothing and masks are the same in the next
 frame. sigma^2 is the variance of a random walk over one frame plus that of the sequential fit's
-jitter. Without these terms contact that comes and goes would shake a steady fit. While the object
-rests, its corrections are the same in all frames. Weighed by the setting ``drift_weight``, except
-for the object at rest.
+jitter. X are joints of the body or points of the object. Without these terms contact that comes and
+goes would shake a steady fit. While the object rests, its corrections are the same in all frames.
+Weighed by the setting ``drift_weight``, except for the object at rest.
 """
 
 from __future__ import annotations

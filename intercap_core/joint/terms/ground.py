@@ -18,8 +18,8 @@ from intercap_core.joint.state import BODY, OBJECT, State
 from intercap_core.joint.terms.term import Data, Equation, JointTerm, TermContext
 
 GROUND_SIGMA = 0.005  # of the floor's height, metres; tuned on the studio
-# An object's vertices below the floor are one measurement; fewer than this, an edge that just
-# touches the floor, are less. Tuned on the studio.
+# An object's vertices below the floor weigh together as one measurement. Fewer vertices than this,
+# such as an edge that just touches the floor, weigh proportionally less. Tuned on the studio.
 MIN_STANDING_VERTICES = 4
 
 
@@ -74,7 +74,7 @@ class ObjectGround(_Ground):
 
     def __init__(self, context: TermContext) -> None:
         super().__init__(context)
-        self._standing: np.ndarray | None = None  # (T, 1) vertices below the floor
+        self._standing: np.ndarray | None = None  # (T, 1) number of vertices below the floor
 
     def refresh(self, state: State) -> None:
         """Count the vertices on which the object stands."""

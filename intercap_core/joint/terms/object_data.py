@@ -47,10 +47,10 @@ class ObjectData(JointTerm):
     def linearise_views(
         self, used: np.ndarray, state: State
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """E_O's matrix (T, 6, 6), gradient (T, 6) and energy (T,) at ``state`` of some views.
+        """E_O's matrix (T, 6, 6), gradient (T, 6) and energy (T,) at ``state`` by some views.
 
-        The track states no information of single views: the views in the mask ``used`` (T, C) have
-        their share of it.
+        The track states no information of single views. All views that show the object have equal
+        shares of it, and those in the mask ``used`` (T, C) count.
         """
         seen = self._poses.share.sum(axis=1) > 0
         kept = np.where(seen, (self._poses.share * used).sum(axis=1), 1.0)

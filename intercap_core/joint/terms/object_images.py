@@ -5,11 +5,14 @@ small step x of the object's pose and of corrections d_v of the cameras,
 
     E(x, d, e) = sum_v |x + e - A_v d_v|^2 by I_v / 2 + g_v (x + e - A_v d_v),    e ~ N(0, F)
 
-A_v is the apparent step of the object under a correction of camera v, and e the difference between
-mesh and object. At the best e the matrix of x is I - I K I with K = (I + F^-1)^-1, I = sum I_v. The
-scale of I_v follows from the disagreement of the views. Evidence far from its own pose has little
-weight (Geman-McClure). Frames in which the object is lost, or whose images contradict the pose,
-stay near the tracked pose, as in :mod:`.object_data`.
+where |y|^2 by I_v stands for y^T I_v y, and I_v and g_v are the matrix and gradient of view v. A_v
+d_v is the apparent step of the object under a correction of camera v. e is the difference between
+mesh and object, with the variances F that the track adds to its covariance (``spread``). At the
+best e the matrix of x is I - I K I with K = (I + F^-1)^-1, I = sum I_v.
+
+The scale of I_v follows from the disagreement of the views. A frame whose own minimum is far from
+the compared pose has little weight (Geman-McClure). Frames in which the object is lost, or whose
+images contradict the pose, stay near the tracked pose, as in :mod:`.object_data`.
 """
 
 from __future__ import annotations
@@ -70,7 +73,7 @@ class ObjectImages:
         threads: ThreadPool,
     ) -> None:
         self.recording, self.threads = recording, threads
-        self.views = ViewCache(recording.views, 200_000_000)  # bytes: 100s of frames of 6 cameras
+        self.views = ViewCache(recording.views, 200_000_000)  # bytes: some 100 frames of 6 cameras
         self.mesh = mesh.simplified(TRACKING_FACES)
         renderer = open_renderer(settings.render_on, threads=1)
         self.context = FitContext(
@@ -111,7 +114,7 @@ class ObjectImagesData(JointTerm):
     )
 
     def __init__(self, tracked: TrackedPoses, images: ObjectImages, share: float) -> None:
-        """``share`` is the weight of a frame as evidence of the cameras."""
+        """``share`` is the weight of a frame in the correction of the cameras."""
         self._tracked, self._images, self._share = tracked, images, share
         self._cameras = images.recording.cameras
         self._geometry = list(images.recording.geometry)
@@ -215,9 +218,9 @@ class ObjectImagesData(JointTerm):
     def linearise_views(
         self, used: np.ndarray, state: State
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """E_O's matrix (T, 6, 6), gradient (T, 6) and energy (T,) at ``state`` of some views.
+        """E_O's matrix (T, 6, 6), gradient (T, 6) and energy (T,) at ``state`` by some views.
 
-        ``used`` (T, C) masks the views; the images are those of the last :meth:`refresh`.
+        Only views in the mask ``used`` (T, C) count, as compared in the last :meth:`refresh`.
         """
         matrix, gradient = self._matrix.copy(), self._gradient.copy()
         for t, evidence in self._agreeing.items():
@@ -259,7 +262,15 @@ class ObjectImagesData(JointTerm):
     def _linearise_cameras(
         self, t: int, evidence: ImageEvidence, weight: float, mesh: np.ndarray, gradient: np.ndarray
     ) -> _ByCameras:
-        """Form of frame ``t`` by the corrections of all views, at the best error of the mesh."""
+        """Form of frame ``t`` by the corrections of all views, at the best error of the mesh.
+
+        Args:
+            t: frame.
+            evidence: matrices and gradients of its views, as compared.
+            weight: factor of the evidence: robust weight over noise.
+            mesh: (6, 6) K of the module's header.
+            gradient: (6,) weighted gradient by the object's step.
+        """
         place = self._compared[t, :3, 3]
         arms = place - np.array([g.master_from_colour[:3, 3] for g in self._geometry])
         depth_poses = np.array(
@@ -268,6 +279,7 @@ class ObjectImagesData(JointTerm):
                 for g in self._geometry
             ]
         )
+        # rays from the depth cameras to the object, per metre of depth
         away = place - depth_poses[:, :3, 3]
         rays = away / (away * depth_poses[:, :3, 2]).sum(axis=1, keepdims=True)
         count = len(arms)
@@ -304,7 +316,10 @@ class ObjectImagesData(JointTerm):
         equations.add_blocks(self.name, OBJECT, *form)
 
     def camera_evidence(self, state: State) -> CameraEvidence:
-        """Evidence of the cameras at ``state``, of the last :meth:`refresh`."""
+        """Form of E_O by object and cameras (:mod:`.cameras`) at ``state``.
+
+        The images are those of the last :meth:`refresh`.
+        """
         offset, size = self._offset(state), FREEDOMS * self._images.recording.count
         columns = np.concatenate(
             [np.arange(FREEDOMS * c, FREEDOMS * (c + 1)) for c in self._cameras]
@@ -317,7 +332,8 @@ class ObjectImagesData(JointTerm):
             cross[t][:, columns] = form.cross
         gradient = np.einsum("tij,tj->ti", self._matrix, offset) + self._gradient
         matrix = self._matrix + np.diag(UNKNOWN_SIGMA**-2)
-        # lasting errors do not show in the disagreement of the views: the variance as stated
+        # the noise cancels the scale of the matrices: errors that all views have in common do not
+        # show in their disagreement, so that the stated variance counts here
         share = self._share * self._noise
         return CameraEvidence(OBJECT, matrix, gradient, cross, hessian, pull, share)
 
@@ -328,12 +344,14 @@ class ObjectImagesData(JointTerm):
 def _equations(
     matrix: np.ndarray, slope: np.ndarray, offset: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Matrix, gradient and energy (T,) of quadratic forms, with energy 0 at the minimum.
+    """Matrix (T, 6, 6), gradient (T, 6) at ``offset`` and energy (T,) of quadratic forms.
+
+    The energy is 0 at the minimum.
 
     Args:
         matrix: (T, 6, 6).
         slope: (T, 6) gradient at the compared poses.
-        offset: (T, 6) from the compared poses.
+        offset: (T, 6) step (turn, shift) from the compared poses to the state.
     """
     bent = np.einsum("tij,tj->ti", matrix, offset)
     lowest = np.linalg.solve(matrix + np.diag(UNKNOWN_SIGMA**-2), slope[..., None])[..., 0]

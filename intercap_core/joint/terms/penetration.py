@@ -215,6 +215,7 @@ class ObjectInBody(JointTerm):
         at, normal = skin[used[vertex]], embedded.normal[deepest]
         point = some[embedded.point[deepest]]
         along = ((points[point] - at) * normal).sum(axis=1)
+        # vertices that are inside the object themselves belong to the term body in object
         own = self.geometry.field.signed_distance((at - translation) @ rotation)
         kept = own > -PENETRATION_TOLERANCE
         return _DeepestPoints(

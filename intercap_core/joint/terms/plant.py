@@ -67,7 +67,7 @@ def standing_probability(sole: np.ndarray, height: np.ndarray | None, fps: float
 
 
 def _log_ratio(values: np.ndarray, narrow: float, wide: float) -> np.ndarray:
-    """Log-likelihood ratio of two half-normal distributions of these standard deviations."""
+    """Log-likelihood ratio, ``narrow`` over ``wide``, of half-normal standard deviations."""
     return 0.5 * (values**2) * (wide**-2 - narrow**-2) + np.log(wide / narrow)
 
 

@@ -3,7 +3,8 @@
     E = sum over steps t, vertices i of Q_i a_i rho(|q_i(t+1) - q_i(t)|^2) / 2 sigma^2
     q = R^T (x - t)
 
-q is the vertex x in the object's frame, constant while the skin sticks to the object. Q is the
+q is the vertex x in the frame of the object, whose pose is R and t (not the step t). It is constant
+while the skin sticks to the object. Q is the
 probability that the vertex's region touches in both frames, a the vertex's share of its patch, and
 sigma^2 the variance of a random walk over one step, as real grips creep. rho is robust
 (Geman-McClure), so that skin may slide or grasp again. Vertices that have glided over the object
@@ -23,8 +24,9 @@ from intercap_core.schemas import CONTACT_REGIONS
 
 STICK_WALK = 0.003  # creep of a grip: a random walk, metres in one second; tuned on the studio
 STICK_OUTLIER = 0.15  # slip that counts a quarter, m/s, above the fits' jitter; tuned on the studio
-NEAR_LARGEST = 0.1  # share of a patch's largest probability: its vertices represent it; tuned
-STICK_VERTICES = 24  # that represent a patch: they move nearly as one; tuned on the studio
+# Vertices that represent a patch have at least this share of its largest probability; tuned.
+NEAR_LARGEST = 0.1
+STICK_VERTICES = 24  # at most for a patch, whose vertices move nearly as one; tuned on the studio
 
 # Hands grip and soles stand; what sits or leans glides as it settles.
 _GRIPPING = [i for i, name in enumerate(CONTACT_REGIONS) if name.endswith(("_hand", "_foot"))]

@@ -1,4 +1,4 @@
-"""Base class of the terms of the joint energy, and rows that several terms add alike.
+"""Base class of the terms of the joint energy, and equations that several terms share.
 
 A term states its equation and its settings, and is listed in ``TERMS`` of
 :mod:`intercap_core.joint.problem`. ``docs/extending.md`` shows a complete example.
@@ -122,7 +122,7 @@ class JointTerm(ABC):
 
         Args:
             near: the distances and their derivatives.
-            residual: (T, N) metres; its derivative is that of the distance where ``weight`` > 0.
+            residual: (T, N) metres; where ``weight`` > 0 its derivative is that of the distance.
             weight: (T, N) 1/m^2.
             energy: (T,) energy of a robust term; None for plain least squares.
         """
