@@ -27,7 +27,7 @@ from intercap_core.project import Project, load_project
 from intercap_core.schemas import CONTACT_REGIONS, SUMMARY
 
 _LARGEST = 1e9  # largest number that the page may send
-_OPEN_SEQUENCES = 6  # sequences, current or before the last run, that stay open
+_OPEN_SEQUENCES = 6  # sequences whose files stay open; current and previous results count apart
 
 
 class Annotator:
@@ -59,7 +59,7 @@ class Annotator:
         return {"dataset": self.project.config.dataset, "by": self.by, "sequences": rows}
 
     def opened(self, name: str, version: str = "now") -> Opened:
-        """Return the sequence's artefacts, "now" or "before" the last run.
+        """Return a sequence's artefacts: the present ones ("now") or the backup ("before").
 
         Raises HTTPException if the table has no such sequence.
         """
@@ -76,7 +76,7 @@ class Annotator:
             return self._opened[key]
 
     def sequence(self, name: str) -> dict[str, Any]:
-        """Return everything about a sequence but images and meshes."""
+        """Return everything that the page shows of a sequence, except images and meshes."""
         opened = self.opened(name)
         try:
             if not opened.has("frames"):
@@ -181,11 +181,11 @@ class Annotator:
         return {"point": snap.point_under(opened, str(request["camera"]), frame, x, y)}
 
     def read_surface(self, name: str) -> dict[str, Any]:
-        """Return where people are likely to touch the sequence's object."""
+        """Return the vertices of likely contact of the sequence's object."""
         return objects.read_surface(self.project, self._object(name))
 
     def surface(self, name: str, request: dict[str, Any]) -> dict[str, Any]:
-        """Save where people are likely to touch the object, for all of its sequences."""
+        """Save the vertices of likely contact of the object, for all of its sequences."""
         vertices = request["vertices"]
         if not isinstance(vertices, list) or not all(type(v) is int for v in vertices):
             raise UserError("vertices must be a list of vertex numbers")
@@ -252,7 +252,10 @@ class Annotator:
         return document.faults(document.parsed(text)), text
 
     def _contradictions(self, name: str, annotation: Annotation) -> list[dict[str, str]]:
-        """Return contradictions between an annotation and the recording."""
+        """Return contradictions between an annotation and the recording.
+
+        ``where`` is the section, which begins each message, such as "contact" of "contact[2].end".
+        """
         recorded = self.project.recording_extent(name)
         messages = [
             annotation.check_object(self.project.sequences[name].object),
@@ -301,7 +304,7 @@ class SequenceList:
         self._summaries: dict[Path, tuple[tuple[int, int], SequenceMetrics | str]] = {}
 
     def rows(self, project: Project) -> list[dict[str, Any]]:
-        """Return a row per sequence, worst first by the site's rank; without a result: last."""
+        """Return a row per sequence, worst first as on the site, then those without a result."""
         rows, measured = [], []
         for name, row in project.sequences.items():
             summary = self._summary(project.artefact(name, "summary"))

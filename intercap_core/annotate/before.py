@@ -89,9 +89,10 @@ class Backup:
         return comparison
 
     def _succeeded(self, state: Mapping[str, Any]) -> bool:
-        """Return whether the run succeeded, or all its artefacts were written since.
+        """Return whether the run succeeded, or all its artefacts were written after the backup.
 
-        The latter happens if the server was killed, or by a run in a terminal.
+        The artefacts decide if the server was killed before the run ended, or if the user completed
+        the run in a terminal.
         """
         outputs = [path for stage, path in self.artefacts.items() if stage in state["stages"]]
         return bool(state["ended"]) or (

@@ -78,7 +78,7 @@ def read(path: Path) -> Document:
     Raises UserError if the file cannot be read at all.
     """
     note = ""
-    if _parts(path):
+    if _parts(path):  # temporary files of an interrupted save
         note = f"a save of {path} was interrupted; the file is unchanged"
     if not path.exists():
         return Document(path, "", NO_FILE, {}, note=note)
@@ -100,8 +100,8 @@ def read(path: Path) -> Document:
 def patched(document: Document, changes: Mapping[str, Any]) -> str:
     """Return the annotation's text with changed sections.
 
-    None removes a section, as does an empty list, except in sections of ``STATED_EMPTY``, where it
-    is a statement. Raises UserError if the file cannot be changed without loss.
+    None removes a section. So does an empty list, except in the sections of ``STATED_EMPTY``, where
+    it has a meaning. Raises UserError if the file cannot be changed without loss.
     """
     unknown = sorted(set(changes) - set(Annotation.model_fields))
     if unknown:
@@ -116,7 +116,7 @@ def sections_with(document: Document, changes: Mapping[str, Any]) -> dict[str, A
 
 
 def _stated(changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Replace empty values that are no statement by None."""
+    """Replace empty values by None, except in sections where an empty list has a meaning."""
     return {k: None if v in ([], ()) and k not in STATED_EMPTY else v for k, v in changes.items()}
 
 

@@ -28,7 +28,7 @@ _CHANGED = "{}: was changed by another annotator; reload the page"
 
 
 def read_surface(project: Project, entry: ObjectEntry) -> dict[str, Any]:
-    """Return the painted vertices, the path of their list, and its digest."""
+    """Return the vertices of likely contact, which the user paints, and their file."""
     mesh = ObjectMesh.load(entry)
     ids = mesh.contact_vertices if entry.contact_vertices is not None else np.zeros(0, int)
     path = _vertex_list(entry)
@@ -55,7 +55,8 @@ def save_surface(
         raise UserError(_CHANGED.format(path))
     in_file = np.asarray(load_mesh(Path(entry.mesh)).vertices, np.float64)
     away, nearest = cKDTree(mesh.vertices).query(np.nan_to_num(in_file, nan=1e9))
-    same = away <= 1e-6 * mesh.diameter  # loading merges equal vertices
+    # loading merges equal vertices: each vertex of the file gets the paint of its merged vertex
+    same = away <= 1e-6 * mesh.diameter
     chosen = np.flatnonzero(painted[nearest] & same)
     document.replace(path, json.dumps(contact_list(chosen, in_file)) + "\n")
     if entry.contact_vertices != path:

@@ -25,9 +25,11 @@ T = TypeVar("T")
 class Opened:
     """Open artefacts of one sequence, with a cache of results that are valid until a file changes.
 
-    A set is what the cameras recorded together, frame t the moment of set t: a camera whose images
-    are late shows it in a later set (``image_of`` of the scene artefact). Thread-safe. Hold
-    ``lock`` to keep the images open.
+    Set t contains the images that the cameras recorded at the same device time. Frame t is what
+    happened at the time of set t. A delayed camera shows frame t in the image of a later set
+    (``image_of`` of the scene artefact).
+
+    Thread-safe. Hold ``lock`` to keep the images open.
 
     Args:
         paths: artefacts by stage, by default those of the project.

@@ -35,8 +35,8 @@ def propose(opened: Opened, answered: Sequence[Mapping[str, Any]]) -> list[dict[
     """Return open questions, those that change most frames first.
 
     Each has ``kind``, ``part``, frames ``first`` to ``last`` (``from_s`` to ``to_s`` in seconds),
-    the ``frame`` to look at, ``message``, ``weight`` (expected number of changed frames) and
-    ``choices``.
+    the ``frame`` to look at, ``message``, ``weight`` (number of frames that an answer may change,
+    times a factor by kind) and ``choices``.
     """
     questions: list[dict[str, Any]] = []
     with opened.lock:
@@ -185,8 +185,9 @@ def _ask_contact(opened: Opened, object_: str, times: np.ndarray) -> list[dict[s
         p = probability[:, r]
         uncertain = (p > 0.25) & (p < 0.75) & (labels[:, r] < 0)
         for first, last in _runs(uncertain):
-            if (last - first + 1) * step < 0.1:  # too short to matter
+            if (last - first + 1) * step < 0.1:  # seconds; too short to matter
                 continue
+            # weight: each frame counts 4 p (1 - p), which is 1 at p = 0.5 and 0 if p is certain
             run = p[first : last + 1]
             frame = first + int(np.abs(run - 0.5).argmin())
             message = f"Does the {region.replace('_', ' ')} touch the {object_} here?"

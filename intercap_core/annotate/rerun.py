@@ -182,7 +182,7 @@ class RunManager:
     def _stage(self, project: Project, stage: str) -> dict[str, str]:
         log = project.logs / self._sequence / f"{stage}.log"
         try:
-            if log.stat().st_mtime >= self._start - 1.0:
+            if log.stat().st_mtime >= self._start - 1.0:  # some file systems store whole seconds
                 state, message = read_state(log)
                 return {"state": state, "message": message or last_words(log)}
         except FileNotFoundError:

@@ -1,6 +1,8 @@
-"""Description of a sequence for the page: cameras, frames, drawn result and doubts about it.
+"""Description of a sequence for the page: cameras, frames, result, and places to check.
 
-Artefacts that cannot be read are reported in ``notes``; everything else is shown.
+A place is a run of frames in which the result may be wrong, with a reason and a weight; the page
+lists the largest weights first. Artefacts that cannot be read are reported in ``notes``; everything
+else is shown.
 """
 
 from __future__ import annotations
@@ -46,6 +48,7 @@ def describe(opened: Opened) -> dict[str, Any]:
                 "master": images.master,
                 "stamp": opened.stamp("frames", "scene"),
                 "result": opened.stamp(),
+                # by camera a text of T characters: 1 = the frame has an image, 0 = it has none
                 "images": ["".join(map(str, c)) for c in images.colour_available.T.astype(int)],
                 "image_of": None,
                 "zup_from_master": np.eye(4)[:3].tolist(),
@@ -103,7 +106,7 @@ def viewer_payload(opened: Opened) -> str:
 def _final_result(
     header: dict[str, Any], arrays: dict[str, np.ndarray]
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Remove earlier fits and truth, which halves the data."""
+    """Return the data without the fits before the final one and without truth: half the size."""
     shown, *others = header["versions"]
     removed = tuple(f"{name}/" for name in (*others, "truth"))
     versions = {shown: header["versions"][shown]}
@@ -275,7 +278,12 @@ _READERS: dict[str, tuple[_Reader, artefacts.Schema, str]] = {
 
 
 def _doubtful(part: str, error: float, by_frame: np.ndarray) -> Iterator[dict[str, Any]]:
-    """Return runs of frames with a stated error well above the sequence's, at their worst frame."""
+    """Return places whose stated error exceeds ``DOUBTFUL`` times that of the whole sequence.
+
+    Args:
+        error: stated error of the part over the sequence, metres; NaN = none is stated.
+        by_frame: (T,) stated error by frame, metres.
+    """
     if not np.isfinite(error):
         return
     high = np.nan_to_num(by_frame) > DOUBTFUL * error
@@ -287,6 +295,7 @@ def _doubtful(part: str, error: float, by_frame: np.ndarray) -> Iterator[dict[st
 
 
 def _runs(mask: np.ndarray, kind: str, message: str, weight: float) -> list[dict[str, Any]]:
+    """Return a place for each run of set frames (T,)."""
     runs = ranges([message if value else "" for value in mask])
     return [_place(first, last, kind, message, weight) for first, last, _ in runs]
 
@@ -294,7 +303,10 @@ def _runs(mask: np.ndarray, kind: str, message: str, weight: float) -> list[dict
 def _place(
     first: int, last: int, kind: str, message: str, weight: float, frame: int | None = None
 ) -> dict[str, Any]:
-    """Return a run of frames to check, and the frame to show."""
+    """Return a place for JSON; the logarithm of its length is a factor of its weight.
+
+    ``frame``: frame to show; by default the middle one.
+    """
     middle = (first + last) // 2 if frame is None else frame
     return {
         "first": int(first), "last": int(last), "frame": int(middle), "kind": kind,

@@ -27,6 +27,7 @@ BONES = ((0, 1), (1, 2), (3, 4), (4, 5), (5, 6))
 # below 2, mirrored bodies exceed 2.5 in two of three frames.
 MIRRORED_BUILD = 2.5
 _KEYPOINTS = [KEYPOINT_NAMES.index(f"{s}_{p}") for s in ("left", "right") for p in POINTS]
+# Joints of the body model for these points; the foot joint stands for the big toe
 _JOINTS = [JOINT_INDEX[f"{s}_{p}"] for s in ("left", "right") for p in (*POINTS[:-1], "foot")]
 _STAGES = ("detections", "scene", "person", "joint", "body_fit")
 
@@ -45,11 +46,12 @@ class Sides:
     source: str
     """Stage of ``result``."""
     against: np.ndarray
-    """(T,) by how much exchanged sides suit the body's build better, negative log likelihood."""
+    """(T,) negative log likelihood of the body's build minus that of the best exchange of arms,
+    legs and head, >= 0; 0 = no exchange suits the build better."""
     jumped: np.ndarray
-    """(T,) the result's limbs jump to the other side and back."""
+    """(T,) bool, the result's limbs jump to the other side and back."""
     image_of: np.ndarray
-    """(T, C) set whose image shows each frame."""
+    """(T, C) index of the frame set whose image shows each frame; -1 = none."""
 
 
 @dataclass(frozen=True)
@@ -90,9 +92,9 @@ def sides_payload(opened: Opened) -> str:
 def doubts(opened: Opened) -> list[Doubt]:
     """Return runs of frames with doubtful sides.
 
-    Sides are doubtful if stage person contradicted the detector in most views (unless the
-    annotation states the exchange), if the body's build suits exchanged sides better, or if limbs
-    of the result jump from side to side.
+    Sides are doubtful if stage person contradicted the detector in half of the views or more
+    (unless the annotation states the exchange), if the body's build clearly suits exchanged sides
+    better, or if limbs of the result jump from side to side.
     """
     sides = sides_of(opened)
     stated = np.zeros(sides.image_of.shape, bool)
@@ -175,6 +177,7 @@ def _runs(limbs: np.ndarray, sides: Sides) -> list[Doubt]:
             why.append("knees, feet or head suit exchanged sides better")
         if jumped[run].any():
             why.append("the body's limbs jump to the other side and back")
+        # the frame to show; a contradiction in all views costs 3, as in person.left_right
         worst = first + int((against[run] + 3.0 * share[run].max(1)).argmax())
         most = int((limbs[run] > 0).sum((0, 2)).argmax())
         message = f"left and right: {'; '.join(why)}"

@@ -84,9 +84,10 @@ def _fitted(
     settings: ObjectTrackSettings,
     labels: tuple[str, ...],
 ) -> FittedPose:
-    """Fit from ``start`` (4, 4); if the images do not support the result, also from poses around.
+    """Fit from ``start`` (4, 4); if the images do not support the result, also from shifted starts.
 
-    Returns the fit with the highest likelihood.
+    The shifts are 0.35, 0.7 and 1.2 diameters of the mesh in the 26 directions of a cube's faces,
+    edges and corners. The four most likely of these starts are fitted. Returns the most likely fit.
     """
     context = FitContext(
         mesh, labels, settings.min_overlap, settings.background_term, open_renderer("cpu")
@@ -137,11 +138,13 @@ def point_under(opened: Opened, camera: str, frame: int, x: float, y: float) -> 
         points = master_points(depth, rig[c]).points.astype(np.float64)
         seen = apply(rig[c].colour_from_master, points)
         away = np.linalg.norm(lens.project(seen) - pixel, axis=1)
+        # measured points within 5 pixels of the click
         near = np.flatnonzero((away < 5.0) & lens.inside_model(seen))
         if len(near):
             ahead = seen[near, 2]
             kept = near[ahead < ahead.min() + 0.03]  # points within 30 mm are one surface
             middle = np.median(seen[kept], axis=0)
+            # subtract the depth bias along the ray
             middle *= 1 - float(np.nan_to_num(bias[c])) / middle[2]
             return apply(rig[c].master_from_colour, middle[None])[0].round(4).tolist()
     ray = rig[c].master_from_colour[:3, :3] @ lens.unproject(pixel)

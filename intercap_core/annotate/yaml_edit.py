@@ -39,6 +39,7 @@ def replace_section(text: str, section: str, value: Any) -> str:
     end = ends.most_common(1)[0][0] if ends else "\n"
     new = _replaced(old, section, value)
     lines = [line + end for line in new]
+    # unchanged lines get their own line ends back
     matcher = difflib.SequenceMatcher(None, old, new, autojunk=False)
     for a, b, size in matcher.get_matching_blocks():
         lines[b : b + size] = old_lines[a : a + size]
@@ -69,9 +70,9 @@ def _replaced(lines: list[str], section: str, value: Any) -> list[str]:
 
 
 def _section_spans(lines: list[str]) -> dict[str, tuple[int, int]] | None:
-    """Return first line and line after the last of each section, without comments below it.
+    """Return (first line, line after the last) of each section, without comments below it.
 
-    None if a section does not begin its own line.
+    None if a section does not begin at the start of a line of its own.
     """
     root = yaml.compose("\n".join(lines), Loader=yaml.SafeLoader)
     if root is None or root.value == "":  # an empty document
@@ -122,7 +123,7 @@ def _changed_section(lines: list[str], section: str, value: Any) -> list[str]:
             new.append((k, _new_entry(old.entries[0], entry, flow=flow)))
         elif old_values[k] == entry:
             new.append((k, old.entries[k].lines))
-        else:
+        else:  # the entry's lines become the value of a section named x
             new.append((k, _merged(["x:", *old.entries[k].lines], "x", entry)[1:]))
     joined = join_entries(old, new)
     if not value:  # an empty list, before the section's comment
@@ -239,7 +240,7 @@ def _node(name: str, value: Any, *, flow: bool = False, inner: bool = False) -> 
 
 
 def _merge(node: Any, value: Any, name: str) -> Any:
-    """Return ``node`` with the differing parts of ``value``."""
+    """Return ``node`` with another value; parts that stay equal keep their nodes and format."""
     if node == value:
         return node
     flow = bool(hasattr(node, "fa") and node.fa.flow_style())

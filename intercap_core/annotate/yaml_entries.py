@@ -36,6 +36,7 @@ class EntryLines:
     lead: list[str]
     """Comments directly above."""
     lines: list[str]
+    """Lines of the entry, with comments on them and indented below."""
 
 
 @dataclass(frozen=True)
@@ -43,9 +44,10 @@ class SectionLines:
     """Lines of a section."""
 
     header: list[str]
-    """Down to the first entry."""
+    """Lines from the section's name down to the lead of the first entry."""
     entries: list[EntryLines]
     tail: list[str]
+    """Lines below the last entry."""
 
 
 def comment_columns(text: str) -> dict[int, int]:
@@ -111,11 +113,11 @@ def split_entries(lines: Sequence[str], node: yaml.CollectionNode) -> SectionLin
 def join_entries(old: SectionLines, new: Sequence[tuple[int | None, list[str]]]) -> list[str]:
     """Join the lines of a section with other entries.
 
-    A removed entry takes its comments along. A comment above it stays if it may be a heading, of
-    the list or of remaining entries below.
+    The comments of a removed entry are removed with it. A comment above it stays if it may be a
+    heading of the list or of remaining entries below.
 
     Args:
-        new: index of the old entry, None for a new entry, and lines.
+        new: (index in ``old.entries``, or None for a new entry; lines) of each entry.
     """
     place = {k: j for j, (k, _) in enumerate(new) if k is not None}
     header = list(old.header)
@@ -188,6 +190,7 @@ def _same_identity(a: Any, b: Any, keys: Sequence[str]) -> bool:
 
 
 def _distance(a: Mapping[str, Any], b: Mapping[str, Any]) -> float:
+    """Sum of the differences of start and end, frames; 0 for entries without an interval."""
     pairs = [(a.get(key), b.get(key)) for key in ("start", "end")]
     return sum(
         abs(x - y) for x, y in pairs if isinstance(x, int | float) and isinstance(y, int | float)

@@ -25,6 +25,7 @@ from intercap_core.schemas import FRAMES
 from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
 
 REPEATS = 3  # measured runs, after one that imports and compiles
+# Stages from the frames to the metrics
 MEASURED = SEQUENCE_STAGES[: SEQUENCE_STAGES.index("metrics") + 1]
 
 

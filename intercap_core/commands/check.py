@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault of one sequence or of the project."""
+    """A finding on one sequence or on the project: a fault, a note or a summary."""
 
     sequence: str
-    """Name of the sequence; "" for a fault of the project."""
+    """Name of the sequence; "" for a finding on the project."""
     message: str
     """Text that names file, finding, expectation and next step."""
 

@@ -18,7 +18,7 @@ from intercap_core.formats.recordings.source import RecordingLayout, RecordingPr
 # Length of a recording as a share of the other cameras' or of the length that its header states.
 MIN_LENGTH_SHARE = 0.5  # a shorter one is a fault
 FULL_LENGTH_SHARE = 0.95  # a shorter one is noted
-MIN_IMAGE_SHARE = 0.9  # of the expected images or detections; recordings lose a few images
+MIN_IMAGE_SHARE = 0.9  # smallest share of the expected images; recordings lose a few images
 _IMAGE_ID = re.compile(rb'"(?:image_id|file_name)"\s*:\s*("[^"]*"|[^,}\s]+)')
 
 
@@ -88,9 +88,9 @@ def check_recordings(
 
 
 def _expected_seconds(recordings: dict[str, CheckedRecording]) -> dict[str, float]:
-    """Duration of each camera's recording by the others: median of their longer half, seconds.
+    """Expected duration of each camera's recording, seconds, from those of the other cameras.
 
-    The longer half, because most recordings of a sequence may be cut off.
+    It is the median of the longer half of the others, because some of them may be cut off.
     """
     seconds = {name: recording.preview.seconds for name, recording in recordings.items()}
     expected = {}

@@ -1,4 +1,4 @@
-"""`intercap compare`: what changed between two versions of a dataset."""
+"""`intercap compare`: differences between two versions of a dataset."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from intercap_core.evaluation.compare import SAME, Comparison, compare
 
 ROWS = 40  # sequences printed; all are in the tables
 TABLES = ("compare_sequences.csv", "compare_frames.csv", "compare_figures.csv")
+# Heading, column of the table of sequences, and digits
 _COLUMNS = (
     ("frames", "frames", 0), ("changed", "changed_frames", 0), ("body mm", "body_mm", 1),
     ("most", "body_max_mm", 1), ("hands mm", "hands_mm", 1), ("object mm", "object_mm", 1),

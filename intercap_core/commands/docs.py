@@ -70,6 +70,8 @@ def default_settings() -> str:
     return "\n".join(lines) + "\n"
 
 
+# The functions below read the JSON schema of a pydantic model. ``top`` is the whole schema, with
+# the definitions of inner models; ``schema`` is a model in it; ``entry`` is a property of a model.
 def _settings(
     top: dict[str, Any],
     schema: dict[str, Any],

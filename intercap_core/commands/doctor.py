@@ -97,7 +97,7 @@ def _disk(project: Project) -> Iterator[Finding]:
         f"the results have {usage.present / 1e9:.1f} GB, {usage.missing / 1e9:.1f} GB more are "
         f"expected{usage.basis}, {usage.free / 1e9:.1f} GB are free"
     )
-    enough = usage.free >= 1.2 * usage.missing
+    enough = usage.free >= 1.2 * usage.missing  # margin of the estimate
     yield Finding("disk", GOOD if enough else BAD, words)
     share = 100 * usage.per_output["frames"] / max(sum(usage.per_output.values()), 1)
     yield Finding(

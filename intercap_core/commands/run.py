@@ -35,10 +35,11 @@ POLL_SECONDS = 0.5
 ROWS = 24  # rows of the table: a standard terminal's height
 DRY_RUN = {"-n", "--dry-run", "--dryrun"}
 ENDS_WITHIN_S = 90.0  # time for jobs to end; the executor has 60 s to cancel a cluster's jobs
-SLURM_COMMANDS = {"sbatch", "scancel", "squeue", "sacct", "scontrol"}  # they end by themselves
+# Child processes that are not terminated, because they end by themselves
+SLURM_COMMANDS = {"sbatch", "scancel", "squeue", "sacct", "scontrol"}
 GO_ON = "Slurm's jobs go on"  # begins the executor's line if it could not cancel jobs
 STEPS = re.compile(r"(\d+) of (\d+) steps \(")  # Snakemake's progress line
-AGGREGATES = ("site/index.html", "summary.json")
+AGGREGATES = ("site/index.html", "summary.json")  # outputs of all sequences, as targets
 
 
 @dataclass(frozen=True)
@@ -329,7 +330,10 @@ class Watcher:
         return f"[green]{escape(job.words)}[/green]" if finished else "[red]failed[/red]"
 
     def print_changes(self) -> None:
-        """Print each job when it has ended, and every 30 s the progress; without a terminal."""
+        """Print each job that has ended since the last call, and every 30 s the progress.
+
+        Used if the output is no terminal.
+        """
         jobs = self.jobs()
         for name, job in jobs.items():
             if job.state != "running" and name not in self._printed:

@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 ROWS = 40  # printed sequences that are not done
 DONE, RUNNING, FAILED, STALE, MISSING = "done", "running", "failed", "out of date", "missing"
-WAITING = "waits"  # an artefact that the stage reads is not done
+WAITING = "waits"  # for an artefact that the stage reads and that is not done
 _MARKS = {
     DONE: "[green]✓[/green]", RUNNING: "[yellow]▶[/yellow]", FAILED: "[red]✗[/red]",
     STALE: "[yellow]≠[/yellow]", MISSING: "·", WAITING: "[dim]…[/dim]",
@@ -37,11 +37,11 @@ class StageStatus:
     """State of one output."""
 
     state: str
-    """One of the constants above."""
+    """``DONE``, ``RUNNING``, ``FAILED``, ``STALE``, ``MISSING`` or ``WAITING``."""
     words: tuple[str, ...] = ()
     """Reasons of a stale or failed output, or the process that is computing it."""
     made_on: str = ""
-    """Device and processor, if the output was computed on another machine's."""
+    """Device and processor that computed the output; "" if they are those of this machine."""
 
 
 @dataclass(frozen=True)

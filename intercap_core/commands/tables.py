@@ -45,7 +45,7 @@ def write_tables(
         root: folder of the release.
         dataset: name of the dataset; default: the layout.
         sources: folders of the release outside ``root``.
-        objects: folder for the meshes.
+        objects: objects.yaml to use if the release's meshes are not given.
         replace: overwrite existing files.
     """
     name = dataset or layout

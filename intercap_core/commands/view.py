@@ -1,4 +1,4 @@
-"""`intercap view`: show a sequence in the browser; needs at least its body_fit artefact."""
+"""`intercap view`: show a sequence in the browser; needs its frames, scene and body_fit."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from intercap_core.project import Project
 def view(project: Project, sequence: str, output: Path | None = None, *, show: bool = True) -> Path:
     """Write a page with the sequence's viewer; returns its path.
 
-    Raises UserError if the sequence has no body_fit artefact or an artefact is damaged.
+    Raises UserError if the artefact of frames, scene or body_fit is missing, or one is damaged.
 
     Args:
         output: folder of the page; default: ``view`` next to the sequence's artefacts.

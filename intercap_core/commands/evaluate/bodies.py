@@ -1,4 +1,8 @@
-"""Part ``bodies`` of `intercap evaluate`: body fits compared with truth."""
+"""Part ``bodies`` of `intercap evaluate`: body fits compared with truth.
+
+The reference is the dataset named ``object`` (or ``body``). Datasets such as ``object_noise2`` and
+``body_two_view`` are its variants.
+"""
 
 from __future__ import annotations
 
@@ -28,6 +32,8 @@ from intercap_core.project import Project
 Bodies = Measured[BodyErrors]
 AREA = "body"
 OTHER_AREAS = ("object",)  # datasets whose recordings are measured here too
+# Heading of each column, key of its figure and digits. "floor" is the distance of the true body to
+# the cloud, the noise floor of the column before; "norm." is the error over its stated deviation.
 _COLUMNS = {
     "PVE": ("pve_mm", 1), "p95": ("pve_p95_mm", 1), "seen": ("pve_visible_mm", 1),
     "MPJPE": ("mpjpe_mm", 1), "hands": ("hand_mpjpe_mm", 1), "grasp": ("hand_grasp_mpjpe_mm", 1),

@@ -1,4 +1,6 @@
-"""Part ``field`` of `intercap evaluate`: metrics and held-out verdict under field conditions.
+"""Part ``field`` of `intercap evaluate`: metrics and verdict under field conditions.
+
+The verdict estimates errors without truth by fits without each camera.
 
 Recordings without depth, other definitions of joints, other body builds, boots, few cameras, people
 without an object (taken to the export), a balance beam, a second person in the room.
@@ -50,9 +52,9 @@ class FieldSequence:
 
     metrics: SequenceMetrics
     bones: np.ndarray
-    """(B,) relative errors of the lengths of the limbs' bones."""
+    """(B,) relative errors of the lengths of the limbs' bones, fitted / true - 1."""
     height_m: float
-    """Error of the person's height."""
+    """Fitted minus true height of the person, metres."""
     subject_right: float
     """Share of the images with a chosen person that show the subject."""
     exported_alone: bool

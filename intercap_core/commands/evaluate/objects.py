@@ -27,7 +27,7 @@ from intercap_core.project import Project
 
 Objects = Measured[ObjectErrors]
 AREA = "object"
-# The dataset ``object`` and its copies with redrawn detector errors
+# The dataset ``object`` and its copies with other random errors of the detector
 REDRAWN = re.compile(rf"{AREA}(_redrawn\d+)?")
 _COLUMNS = {
     "mm": ("translation_median_mm", 1), "p95": ("translation_p95_mm", 1),

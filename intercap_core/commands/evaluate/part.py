@@ -40,10 +40,11 @@ class Measured(Generic[Errors]):
     """Errors of the recordings of one project."""
 
     dataset: str
+    """Name of the project's dataset."""
     errors: Sequence[Errors]
-    """One per recording that reached the stage."""
+    """Errors of each recording that has an artefact of the stage."""
     missing: Sequence[str] = ()
-    """Names of the recordings that did not."""
+    """Names of the recordings without one."""
     rig: str = ""
     """Description of the cameras and data that the settings select."""
 
@@ -130,8 +131,8 @@ def _measure_recording(part: str, settings: Path, sequence: str) -> Any:
 def measure_cached(part: EvaluationPart[Errors], project: Project, sequence: str) -> Errors:
     """Errors of one recording, from the cache if all inputs are unchanged.
 
-    The cache file is next to the artefacts; its name holds the digest of the inputs: files, the
-    project's tables and settings, and code.
+    The cache file is next to the artefacts. Its name contains the digest of the inputs: artefacts,
+    truth, mesh, the entries of object and subject, the setting body_models, and code.
     """
     truth = truth_of(project, sequence)
     if not truth.is_file():
@@ -203,7 +204,10 @@ def require_truth(project: Project) -> None:
 
 
 def variant(dataset: str, *areas: str) -> str:
-    """Prefix of a measure's name: "noise2_" for the dataset object_noise2 in the area object."""
+    """Prefix of the figures of a dataset that varies the conditions of another one.
+
+    "noise2_" for the dataset object_noise2 in the area object, "" for the dataset object.
+    """
     for area in areas:
         if dataset == area or dataset.startswith(f"{area}_"):
             dataset = dataset.removeprefix(area)

@@ -44,6 +44,7 @@ def _written(project: Project, seed: int) -> Path:
     }
     for capture in ((values.get("studio") or {}).get("captures") or {}).values():
         drawn = np.random.SeedSequence([int(capture["seed"]), seed]).generate_state(1)[0]
+        # 31 bits, so that the seed fits into any integer type
         capture |= {"seed": int(drawn >> 1), "subject": people[capture["subject"]]}
     for table in TABLES:
         source = tidy(project.path.parent / getattr(project.config, table))

@@ -115,7 +115,7 @@ def areas(sequences: Sequence[SequenceMetrics]) -> Areas:
 
 
 def _extra_joint_figures(sequences: Sequence[SequenceMetrics], found: Areas) -> Figures:
-    """Figures with which the joint stage is compared, and figures by object."""
+    """Further figures of the area ``joint``: those of the sequential fits, and by object."""
     first = found["body_fit"]
     extra = {as_: first[name] for name, as_ in SEQUENTIAL.items() if name in first}
     if any(s.object_ for s in sequences):

@@ -139,6 +139,7 @@ def bring_up_to_date(wanted: Mapping[str, Targets], *, cores: int = 0) -> int:
             raise UserError(
                 "another evaluation is running in this folder; wait for it or end it"
             ) from None
+        # exit statuses by the convention of shells: 128 + 15 (SIGTERM), 128 + 2 (SIGINT)
         previous_handler = signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
         try:
             _run(runs, parallel, cores, lock.fileno(), console)
@@ -169,6 +170,7 @@ def plan_runs(wanted: Mapping[str, Targets]) -> list[ProjectRun]:
     for key, project in projects.items():
         seconds: dict[str, list[float]] = {}
         for job in list_jobs(project, stages[key]):
+            # 45 frames, the studio's default, for recordings that none of the projects renders
             count = frames.get(project.sequences[job.sequence].recordings.resolve(), 45)
             seconds.setdefault(job.stage, []).append(expected_seconds(job, count))
         runs.append(ProjectRun(project, stages[key], seconds))
@@ -218,10 +220,11 @@ def _run(runs: list[ProjectRun], parallel: int, cores: int, lock: int, console: 
 def progress(runs: Sequence[ProjectRun], parallel: int, elapsed: float) -> str:
     """Report of the completed projects and the remaining minutes at the present pace.
 
-    The minutes are an upper bound: all jobs of a workflow count until it has planned its jobs.
+    The minutes are an upper bound: until a workflow has planned its jobs, all of them count.
     """
+    # expected CPU seconds of remaining and of completed jobs
     left, done = (sum(values) for values in zip(*(o.left() for o in runs), strict=True))
-    pace = elapsed * parallel / done if done > 60 else 1.0
+    pace = elapsed * parallel / done if done > 60 else 1.0  # seconds per expected second
     ended = sum(run.status is not None for run in runs)
     return (
         f"{ended} of {len(runs)} projects done after {elapsed / 60:.0f} minutes, at most "

@@ -30,7 +30,7 @@ from intercap_core.versions import versions
 Facts = dict[str, Any]
 
 _TEMPLATES = Path(__file__).parent / "data"
-_NUMBER = re.compile(r"\d+(\.\d+)?")  # numbers in reasons differ between frames
+_NUMBER = re.compile(r"\d+(\.\d+)?")  # replaced in reasons, which are counted without numbers
 _MAX_REASONS = 12  # most frequent reasons of flags
 # Size categories of dataset hubs: upper limit in frames, name
 _SIZES = (
@@ -279,13 +279,15 @@ class Split:
 
 
 def split(frames: Mapping[str, int], *, share: float, named: Sequence[str] = ()) -> Split:
-    """Hold out groups whose ``frames`` are about ``share`` of all.
+    """Choose groups for the test part that have about ``share`` of all frames.
 
-    Groups are chosen in the order of a digest of their names. The choice is therefore independent
-    of their numbering, and the same groups give the same split.
+    Groups are visited in the order of a digest of their names. A group is added if that brings the
+    number of frames nearer to the goal; if none is added, the group with the fewest frames is.
+    The choice is independent of the groups' numbering, and the same groups give the same split.
 
     Args:
-        named: groups to hold out instead; unknown names are ignored.
+        frames: number of frames by group.
+        named: groups to choose instead; unknown names are ignored.
     """
     groups = sorted(frames, key=lambda name: hashlib.sha256(name.encode()).digest())
     if named:

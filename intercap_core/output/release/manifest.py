@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 MANIFEST, SUMS = "release.json", "release.sha256"
 FORMAT = 1
 KINDS = ("card", "tables", "site", "export", "artefact")
-_RECORDINGS = "recordings"  # inputs that the studio made, with their truth
+_RECORDINGS = "recordings"  # folder of the studio's recordings and truth, not released
 _BLOCK = 1 << 22  # bytes read at a time
 
 
@@ -28,7 +28,7 @@ class ReleasedFile:
     """One released file."""
 
     path: str
-    """Relative to the dataset's folder."""
+    """Path relative to the dataset's folder."""
     kind: str
     """One of KINDS."""
     bytes: int
@@ -45,6 +45,7 @@ class Differences:
     """Files that the manifest does not list."""
 
     def __bool__(self) -> bool:
+        """True if a listed file is missing or changed; unknown files do not count."""
         return bool(self.missing or self.changed)
 
 

@@ -1,4 +1,4 @@
-"""Section of a page on the body's fit: its evidence, and the stated deviation of every joint."""
+"""Section of a page on the body fit: images, residuals, and standard deviation of every joint."""
 
 from __future__ import annotations
 
@@ -112,7 +112,10 @@ def _timeline(states: list[str], cloud_mm: np.ndarray, keypoint_px: np.ndarray, 
 
 
 def _over_time(sigma_mm: np.ndarray) -> str:
-    """Plot the largest deviation (T, 55) of body joints and of each hand over the frames."""
+    """Plot the largest deviation of the body joints and of each hand in every frame.
+
+    ``sigma_mm``: (T, 55) standard deviation of each joint, millimetres.
+    """
     left, right = FINGER_JOINTS
     total = len(sigma_mm)
     lines = [
@@ -132,7 +135,10 @@ def _over_time(sigma_mm: np.ndarray) -> str:
 
 
 def _by_joint(sigma_mm: np.ndarray) -> str:
-    """Plot median and largest deviation (T, 55) of each joint; fingers are pooled by hand."""
+    """Plot median and largest deviation over the frames of each joint, and of each hand's mean.
+
+    ``sigma_mm``: (T, 55) standard deviation of each joint, millimetres.
+    """
     rows = [
         (JOINT_NAMES[j].replace("_", " "), sigma_mm[:, j]) for j in range(*BODY_JOINTS.indices(55))
     ]
@@ -191,6 +197,7 @@ def _cell(
 ) -> np.ndarray | None:
     lens = camera.colour
     local = apply(camera.colour_from_master, body.vertices)
+    # the square around the visible vertices
     crop = _crop(lens.project(local[seen])) if (seen := lens.sees(local)).any() else None
     if crop is None:
         return None
@@ -203,7 +210,7 @@ def _cell(
     for a, b in _BONES:
         if known[a] and known[b]:
             cv2.line(cell, _pixel(at[a]), _pixel(at[b]), FIT_COLOUR, 1, cv2.LINE_AA)
-    confident = detected[BODY][detected[BODY, 2] >= 0.3]
+    confident = detected[BODY][detected[BODY, 2] >= 0.3]  # default of person.min_confidence
     for dot in crop.to_cell(confident[:, :2]):
         cv2.circle(cell, _pixel(dot), 2, KEYPOINT_COLOUR, -1, cv2.LINE_AA)
     return cell

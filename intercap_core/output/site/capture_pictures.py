@@ -25,11 +25,12 @@ CAMERA_COLOURS = (
     "#4e9bde", "#f28e2b", "#59a14f", "#e15759", "#b07aa1", "#d4b13a", "#3fa7a3", "#ff7fa5",
     "#9c755f", "#8c8c8c", "#7570b3", "#a0c15a", "#c0448f", "#5b7fd1", "#c97b3d", "#4f8f74",
 )  # fmt: skip
-_GROUND = np.array((0.075, 0.086, 0.105), np.float32)  # RGB
+_GROUND = np.array((0.075, 0.086, 0.105), np.float32)  # RGB of the background
 _INK, _SHADOW = (235, 235, 235), (10, 12, 16)  # RGB
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _SHIFT = 4  # fractional bits of the coordinates that OpenCV draws
-_SIDES = (("front", 22.0, 20.0), ("other side, from above", 200.0, 48.0))  # from the master, deg
+# Name, azimuth from the first camera and elevation of each viewpoint, degrees
+_SIDES = (("front", 22.0, 20.0), ("other side, from above", 200.0, 48.0))
 _SLICE_SIZE = (840, 520)  # px
 _SLICE_THICK_M = 0.05
 
@@ -113,12 +114,13 @@ def choose_set(images: Frames) -> int:
 def floor_profiles(cloud: FusedCloud, centre: np.ndarray) -> list[FloorProfile]:
     """Return median heights of the floor along a strip parallel to x, camera by camera.
 
-    The strip is near ``centre`` (2,), where the fewest points are above the floor.
+    Of five strips near ``centre`` (2,), the one with the fewest points between 0.08 and 0.4 m above
+    the floor is used, because they belong to legs and furniture.
     """
     half_width, bin_m, highest = 0.15, 0.08, 0.08  # metres; points above are not floor
     height, offset = cloud.points[:, 2], cloud.points[:, 1] - centre[1]
     standing = offset[(height > highest) & (height < 0.4)]
-    strips = (0.0, 0.3, -0.3, 0.6, -0.6)
+    strips = (0.0, 0.3, -0.3, 0.6, -0.6)  # y of their middle from the centre, metres
     least = min(strips, key=lambda at: int((np.abs(standing - at) < half_width).sum()))
     low = (np.abs(height) < highest) & (cloud.normals[:, 2] > 0.9)
     low &= np.abs(offset - least) < half_width
@@ -128,7 +130,7 @@ def floor_profiles(cloud: FusedCloud, centre: np.ndarray) -> list[FloorProfile]:
         bins = np.floor((points[:, 0] - centre[0]) / bin_m).astype(int)
         order = np.lexsort((points[:, 2], bins))
         places, first, count = np.unique(bins[order], return_index=True, return_counts=True)
-        kept = count >= 5
+        kept = count >= 5  # fewer points give no reliable median
         middle = (first + count // 2)[kept]
         if kept.sum() >= 2:
             along = (places[kept] + 0.5) * bin_m
@@ -141,11 +143,11 @@ class _ShownRoom:
     """The part of the room that is shown, z up."""
 
     centre: np.ndarray
-    """(2,) on the floor, metres."""
+    """(2,) middle of the shown part on the floor, metres."""
     radius: float
-    """On the floor, metres."""
+    """Radius of the shown part on the floor, metres."""
     azimuth: float
-    """Of the first camera seen from the centre, radians."""
+    """Azimuth of the first camera as seen from the centre, radians."""
     gain: float
     """Factor that brightens dark images."""
 
@@ -162,7 +164,7 @@ class _ShownRoom:
         return cls(centre.astype(np.float64), radius, azimuth, gain)
 
     def contains(self, points: np.ndarray) -> np.ndarray:
-        """Return which points (N, 3) are shown."""
+        """Return a mask (N,) of the points (N, 3) within the radius and -0.25 to 2.6 m high."""
         near = np.linalg.norm(points[:, :2] - self.centre.astype(points.dtype), axis=1)
         return (near < self.radius) & (points[:, 2] > -0.25) & (points[:, 2] < 2.6)
 
@@ -176,12 +178,12 @@ class _ShownRoom:
     ) -> EncodedImage:
         """Draw the coloured cloud with the floor's grid and the cameras."""
         name, azimuth, elevation = side
-        target = np.append(self.centre, 0.65)
+        target = np.append(self.centre, 0.65)  # metres above the floor
         places = [_frustum(camera, world @ camera.master_from_colour) for camera in rig]
         for distance in np.arange(2.2, 4.0, 0.1) * self.radius:  # the nearest that shows all
             view = Viewpoint.towards(
                 target, self.azimuth + np.radians(azimuth), np.radians(elevation), distance,
-                900.0, (840, 560),
+                900.0, (840, 560),  # focal length and image size, pixels
             )  # fmt: skip
             if view.contains(np.concatenate(places), 24):
                 break
@@ -213,6 +215,7 @@ class _ShownRoom:
              / view.focal, np.ones(len(rows))]
         )  # fmt: skip
         up = view.view_from_world[:3, 2]
+        # depth at which each pixel's ray meets the plane z = 0
         floor_z = -(view.eye[2]) / np.minimum(local @ up, -1e-6)
         shown = floor_z < depth[rows, columns] + 0.04
         share = 0.30 * layer[rows, columns][shown, None] / np.float32(255)
@@ -221,7 +224,10 @@ class _ShownRoom:
 
 
 def _frustum(camera: Camera, pose: np.ndarray) -> np.ndarray:
-    """Return apex and corners (5, 3) of a camera's viewing pyramid under ``pose`` (4, 4)."""
+    """Return apex and corners (5, 3) of a camera's viewing pyramid, 0.28 m long.
+
+    ``pose``: (4, 4) transform of the camera to the frame of the result.
+    """
     lens = camera.colour
     half = 0.5 * np.array([lens.width / lens.fx, lens.height / lens.fy])
     corners = [[x * half[0], y * half[1], 1] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
@@ -272,9 +278,10 @@ class Slice:
 
     @classmethod
     def of(cls, cloud: FusedCloud, centre: np.ndarray) -> Slice | None:
-        """Choose the height at which most cameras have points near the centre, then most points.
+        """Choose the height, from 0.3 to 1.7 m, at which most cameras see points near the centre.
 
-        None if no two cameras have points at the same height.
+        A camera counts with 40 points. Among equal heights, the one with most points is chosen.
+        None if no two cameras see points at the same height.
         """
         near = np.abs(cloud.points[:, :2] - centre).max(1) < 0.9
         best, chosen = (1, 0), None
@@ -298,7 +305,7 @@ class Slice:
         at = np.rint(2**_SHIFT * (at + np.array(_SLICE_SIZE) / 2)).astype(int)
         cameras = cloud.camera[inside]
         picture = np.full((height, width, 3), np.rint(_GROUND * 255), np.uint8)
-        # Cameras take turns, so that none covers all others
+        # Drawn in a pseudo-random order (multiplicative hash), so that no camera covers the others
         order = np.argsort(np.arange(len(at)) * 2654435761 % 2**32, kind="stable")
         for place, c in zip(at[order].tolist(), cameras[order].tolist(), strict=True):
             cv2.circle(picture, place, 2 << _SHIFT, _rgb(c), -1, cv2.LINE_AA, _SHIFT)

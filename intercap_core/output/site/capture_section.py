@@ -35,18 +35,21 @@ _WORDS = {
 
 @dataclass(frozen=True, eq=False)
 class CameraFacts:
-    """One camera of a capture of T frame sets; seconds and metres, unknown values are NaN."""
+    """One camera of a capture of T frame sets; seconds and metres; NaN = unknown."""
 
     name: str
     state: Sequence[str]
     """(T,) keys of STATES."""
     slip: Sequence[int]
-    """(T,) whole frames by which images are late."""
+    """(T,) whole frames by which the images are older than their device times."""
     start: float
+    """Time of the first image."""
     end: float
+    """Time of the last image."""
     offset: float
-    """Seconds by which the camera exposes later."""
+    """Exposure time minus the set's time."""
     offset_sigma: float
+    """Standard deviation of ``offset``; NaN = not estimated."""
     depth_bias: float
     depth_bias_sigma: float
     moved: float
@@ -79,9 +82,9 @@ class Pair:
     after: float
     points: int
     weak: bool
-    """Few points support the pair."""
+    """Few points, or distances well above those of the other pairs."""
     moving: tuple[float, float, int]
-    """Before, after and number of points of moving surfaces."""
+    """Before, after and number of points, on moving surfaces."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,14 +94,21 @@ class CaptureFacts:
     name: str
     fps: float
     times: np.ndarray
+    """(T,) time of each frame set."""
     master: str
+    """Name of the master camera."""
     cameras: Sequence[CameraFacts]
     pairs: Sequence[Pair]
     ground: str
+    """Source and accuracy of the floor, in words."""
     verdict: str
+    """Result of the refinement of the extrinsics, in words."""
     pictures: CapturePictures | None
+    """None if an image is unreadable."""
     note: str = ""
+    """Why there are no pictures."""
     gaps: Sequence[tuple[int, int]] = ()
+    """As :func:`gaps` returns them."""
 
 
 def read_capture(frames: Path, scene: Path) -> CaptureFacts:
@@ -132,7 +142,13 @@ def read_capture(frames: Path, scene: Path) -> CaptureFacts:
 def camera_states(
     colour: np.ndarray, depth: np.ndarray, slip: np.ndarray, dropped: np.ndarray
 ) -> list[str]:
-    """Return the state of one camera in each set, a key of STATES; arguments are (T,)."""
+    """Return the state of one camera in each set, one of STATES.
+
+    Args:
+        colour, depth: (T,) bool, whether the set has such an image.
+        slip: (T,) whole frames by which the image is older than its device time.
+        dropped: (T,) bool, dropped by annotation.
+    """
     state = np.full(len(colour), "missing", object)
     state[colour | depth] = "part"
     state[colour & (depth | (not depth.any()))] = "recorded"
@@ -142,7 +158,7 @@ def camera_states(
 
 
 def gaps(times: np.ndarray, fps: float) -> list[tuple[int, int]]:
-    """Return gaps without any image: (set before the gap, number of missing sets)."""
+    """Return gaps without any image: (index of the set before, number of missing sets)."""
     steps = np.diff(times) * fps
     return [(int(t), round(float(steps[t])) - 1) for t in np.flatnonzero(steps > 1.5)]
 
@@ -298,7 +314,7 @@ def _row_label(camera: CameraFacts) -> str:
 
 
 def _slipped(camera: CameraFacts) -> str:
-    """Describe by how many frames images are late, such as "slipped by 2 or 3"."""
+    """Describe by how many frames the images slipped, such as "slipped by 2 or 3"."""
     late = {
         slip for state, slip in zip(camera.state, camera.slip, strict=True) if state == "slipped"
     }

@@ -11,8 +11,8 @@ import numpy as np
 
 from intercap_core.evaluation import flags
 
-_WIDTH = 440  # of a line chart, px; readable on a phone
-_LEFT = 56  # of its axes, px
+_WIDTH = 440  # width of a line chart, px; readable on a phone
+_LEFT = 56  # left edge of its axes, px
 _ROW = 22  # height of a row of a timeline, px
 
 
@@ -156,7 +156,10 @@ def timeline(rows: Sequence[TimelineRow], total: int, marks: Sequence[tuple[int,
 
 
 def _steps(levels: np.ndarray) -> list[tuple[int, float]]:
-    """Return frames at which levels (T,), rounded to fiftieths, change; NaN counts as 0."""
+    """Return the frames at which levels (T,) change, with the new level.
+
+    Levels are rounded to fiftieths; NaN counts as 0.
+    """
     rounded = np.rint(50 * np.nan_to_num(levels)) / 50
     changed = np.flatnonzero(np.diff(rounded, prepend=-1.0))
     return [(int(t), float(rounded[t])) for t in changed]
@@ -215,7 +218,7 @@ def bar_pairs(rows: Sequence[BarPair], unit: str, description: str = "before and
 
 
 def ticks(low: float, high: float, count: int = 6) -> list[float]:
-    """Return about ``count`` round numbers from ``low`` to ``high``."""
+    """Return the multiples of a round step from ``low`` to ``high``, about ``count`` or fewer."""
     step = (high - low) / count
     size = 10 ** math.floor(math.log10(step)) if step > 0 else 1.0
     step = min((s * size for s in (1, 2, 5, 10) if s * size >= step * 0.999), default=size)
@@ -242,6 +245,7 @@ def _stroke(colour: str) -> str:
 
 
 def _same(axis: str, value: float) -> str:
+    """Attributes x1 and x2, or y1 and y2, with the same value."""
     return f'{axis}1="{value:.1f}" {axis}2="{value:.1f}"'
 
 

@@ -1,7 +1,8 @@
 """Close-ups of hand contacts: the joint fit next to the sequential fits and, if known, truth.
 
-A hold is a run of frames in which the joint stage states contact of a hand. It is drawn at its
-middle frame from the two viewpoints that show most of hand and object, the same for all columns.
+A hold is a run of frames in which the joint fit's probability of contact of a hand exceeds 0.5. It
+is drawn at its middle frame from two viewpoints that show most of hand and object. A column of the
+picture is one result; all columns have the same viewpoints.
 """
 
 from __future__ import annotations
@@ -179,7 +180,7 @@ def read_handling(
 
 
 def holds(probability: np.ndarray) -> list[Hold]:
-    """Return runs of frames with a probability (T, 2) above 0.5, longest first."""
+    """Return the holds of both hands by their probability of contact (T, 2), longest first."""
     runs = [
         Hold(side, first, last)
         for side, values in zip(SIDES, probability.T, strict=True)
@@ -234,11 +235,15 @@ def _forearm_faces(model: BodyModel) -> np.ndarray:
 def _viewpoints(
     fitted: PosedPair, hand: np.ndarray, arms: np.ndarray, up: np.ndarray
 ) -> list[np.ndarray]:
-    """Choose camera_from_master (4, 4) of two viewpoints that show most skin and object."""
+    """Choose camera_from_master (4, 4) of two viewpoints at least 60 degrees apart.
+
+    The score of a viewpoint is the geometric mean of the visible areas of the hand's skin near the
+    object and of the object. The object counts at most as much as the skin.
+    """
     target = fitted.body[hand].mean(0)
     near = np.zeros(len(fitted.body), bool)
-    near[hand[fitted.distance(hand) < 0.03]] = True
-    showing = near[arms].any(1)
+    near[hand[fitted.distance(hand) < 0.03]] = True  # skin within 30 mm of the object
+    showing = near[arms].any(1)  # by face
     lens, candidates = _lens(48), []
     for direction in _directions(up):
         pose = _look_at(target, direction, up)
@@ -247,7 +252,7 @@ def _viewpoints(
         )
         skin = int(showing[drawn.face[drawn.body == 0]].sum())
         visible = int((drawn.body == 1).sum())
-        score = np.sqrt(skin * min(visible, skin)) + 1e-3 * skin
+        score = np.sqrt(skin * min(visible, skin)) + 1e-3 * skin  # ranks views without object too
         candidates.append((score, direction, pose))
     order = sorted(range(len(candidates)), key=lambda i: (-candidates[i][0], i))
     chosen = order[:1]
@@ -260,7 +265,7 @@ def _viewpoints(
 
 
 def _directions(up: np.ndarray) -> list[np.ndarray]:
-    """Return unit viewing directions all around, from slightly below to steeply above."""
+    """Return 48 unit viewing directions all around, from slightly below to steeply above."""
     side = np.cross(up, [0.0, 0.0, 1.0] if abs(up[2]) < 0.9 else [1.0, 0.0, 0.0])
     side /= np.linalg.norm(side)
     front = np.cross(side, up)

@@ -109,6 +109,7 @@ def _barycentric(p: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> 
 
 
 def _mix(values: np.ndarray, corners: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Interpolate values (V, 3) of vertices: ``corners`` (N, 3) indices, ``weights`` (N, 3)."""
     return sum(values[corners[:, k]] * weights[:, k, None] for k in range(3))
 
 
@@ -135,11 +136,13 @@ class SquareCrop:
     """A square part of an image, shown at another size."""
 
     x0: int
+    """Left edge in the image, pixels; may be negative."""
     y0: int
+    """Upper edge in the image, pixels; may be negative."""
     size: int
-    """Side in image pixels."""
+    """Side in pixels of the image."""
     cell: int
-    """Side in shown pixels."""
+    """Side in pixels of the cell in which it is shown."""
 
     def extract(self, rgb: np.ndarray) -> np.ndarray:
         """Cut the square out of an image (H, W, 3); border pixels are repeated beyond its edge."""
@@ -150,7 +153,10 @@ class SquareCrop:
     def outline(
         self, cell: np.ndarray, mask: np.ndarray, x: int, y: int, colour: tuple[int, int, int]
     ) -> None:
-        """Draw the contour of a mask (h, w) whose corner is at image pixel (x, y)."""
+        """Draw the contour of a mask (h, w) into the ``cell`` that :meth:`extract` returned.
+
+        The mask's upper left corner is at image pixel (x, y).
+        """
         square = np.zeros((self.size, self.size), np.uint8)
         height, width = mask.shape
         x, y = x - self.x0, y - self.y0

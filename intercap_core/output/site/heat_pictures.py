@@ -36,7 +36,7 @@ def body_surfaces(
     """
     params = model.zeros(1)
     for index, turn in ((JOINT_INDEX["left_shoulder"], -1), (JOINT_INDEX["right_shoulder"], 1)):
-        params.body_pose[:, 3 * (index - 1) + 2] = turn
+        params.body_pose[:, 3 * (index - 1) + 2] = turn  # radians about z lower the arm
     with torch.no_grad():
         standing = model.forward(params).vertices[0].numpy().astype(np.float64)
     faces, top = model.faces.numpy(), highest(likelihood)
@@ -72,7 +72,11 @@ def highest(likelihood: np.ndarray) -> float:
 def object_pictures(
     vertices: np.ndarray, faces: np.ndarray, heat: SurfaceHeat, top: float
 ) -> list[EncodedImage]:
-    """Draw two opposite views of an object (V, 3), (F, 3) from above; its frame is z up."""
+    """Draw two opposite views of an object (V, 3), (F, 3) from above; its frame is z up.
+
+    ``top``: likelihood of the last colour.
+    """
+    # edges of at most 12 mm, because colours are interpolated between vertices
     fine, triangles = trimesh.remesh.subdivide_to_size(vertices, faces, 0.012, max_iter=12)
     paint = colours(_interpolate(heat, fine), top)
     up = np.array([0, 0, 1.0])
@@ -83,7 +87,10 @@ def object_pictures(
 
 
 def _interpolate(heat: SurfaceHeat, points: np.ndarray) -> np.ndarray:
-    """Interpolate the likelihood at points (N, 3) of the surface by a Gaussian kernel."""
+    """Interpolate the likelihood at points (N, 3) from the 12 nearest samples of the surface.
+
+    The weights are a Gaussian kernel with a standard deviation of 6 mm.
+    """
     distance, near = cKDTree(heat.points).query(points, k=min(12, len(heat.points)))
     weight = np.exp(-0.5 * (distance / 0.006) ** 2) + 1e-12
     return (weight * heat.likelihood[near]).sum(1) / weight.sum(1)

@@ -1,4 +1,7 @@
-"""Measures on the pages: truth, penetration, distances to clouds, cameras and verdict."""
+"""Measures on the pages: truth, penetration, distances to clouds, cameras and verdict.
+
+The verdict is the estimate of errors without truth (:mod:`intercap_core.evaluation.verdict`).
+"""
 
 from __future__ import annotations
 
@@ -94,6 +97,7 @@ def truth(sequences: Sequence[SequenceMetrics]) -> dict[str, Any] | None:
 
 
 def _sweep(known: Sequence[SequenceMetrics]) -> str:
+    """Plot F1 of contact by vertex over the distance below which a vertex counts as touching."""
     lines = []
     for stage, colour in (("body_fit", "c2"), ("joint", "c1")):
         f1 = figures.contact_sweep(known, stage)
@@ -202,7 +206,10 @@ def accelerations(sequences: Sequence[SequenceMetrics]) -> str:
 
 
 def clouds(dataset: str, sequences: Sequence[SequenceMetrics]) -> list[dict[str, Any]]:
-    """Return rows of distances to the clouds: measured, noise floor, published; millimetres."""
+    """Return rows of distances to the clouds, millimetres: measured, noise floor, published.
+
+    The noise floor is the distance of the true surfaces to the clouds.
+    """
     names = ("body_mm", "object_mm", "body_visible_mm", "object_visible_mm")
     measured = figures.cloud_figures(sequences)
     floor = figures.floor_figures(sequences)
@@ -219,7 +226,11 @@ def cameras(
     sequences: Sequence[SequenceMetrics],
     residuals: Mapping[str, Sequence[tuple[str, float, float]]],
 ) -> dict[str, Any]:
-    """Return residuals before and after refinement, by pair of cameras or by sequence."""
+    """Return residuals before and after refinement: by pair for one sequence, else by sequence.
+
+    Args:
+        residuals: by sequence (name of the pair, before, after) of each pair of cameras, metres.
+    """
     if len(residuals) == 1:
         rows = [(n, 1e3 * a, 1e3 * b) for n, a, b in next(iter(residuals.values()))]
     else:

@@ -91,11 +91,14 @@ def choose_frames(residual: np.ndarray, count: int) -> list[int]:
 
 
 def choose_cameras(fit: PosedFit, rig: Rig, frames: Sequence[int], count: int) -> list[int]:
-    """Choose cameras that see most of the object, from different sides, best first."""
+    """Choose cameras that see most of the object, best first; of the body, if these are equal.
+
+    Viewing directions are at least 50 degrees apart, as long as there are such cameras.
+    """
     seen = np.zeros(len(rig))
     posed = [fit.at(t) for t in frames]
     for c, camera in enumerate(rig):
-        lens = camera.colour.scaled(0.15)
+        lens = camera.colour.scaled(0.15)  # small images suffice to count pixels
         for meshes in posed:
             drawables = [
                 Drawable(m.vertices, m.faces, camera.colour_from_master @ m.master_from_mesh)
@@ -131,7 +134,7 @@ def overlays(
         if window is None:
             continue
         x0, y0, width, height = window
-        scale = min(1.0, 420 / height)
+        scale = min(1.0, 420 / height)  # pictures of at most 420 rows
         lens = camera.colour.cropped(x0, y0, width, height).scaled(scale)
         for t, meshes in posed.items():
             image = images.colour(t, c)
@@ -155,7 +158,7 @@ def overlays(
 
 
 def _window(camera: Camera, meshes: Sequence[PosedMesh]) -> tuple[int, int, int, int] | None:
-    """Return x, y, width, height of the image part that shows all meshes.
+    """Return x, y, width, height of the part of the image that shows all meshes with a margin.
 
     None if they are not in view.
     """

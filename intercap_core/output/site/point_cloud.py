@@ -13,7 +13,8 @@ from intercap_core.geometry.camera.clouds import colour_lookup
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import apply
 
-_BEHIND_M = 0.03  # a point hides those of neighbouring pixels this much farther away
+_BEHIND_M = 0.03  # a pixel covers neighbours that are more than this farther away
+# Row and column offsets of a pixel's neighbours
 _NEIGHBOURS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
 
 
@@ -28,7 +29,7 @@ class CameraPoints:
     normals: np.ndarray
     """(N, 3) unit vectors."""
     rays: np.ndarray
-    """(N, 3) with z = 1."""
+    """(N, 3) viewing rays with z = 1: points = depth x rays."""
     colours: np.ndarray
     """(N, 3) RGB in 0..1."""
 
@@ -58,9 +59,9 @@ class Viewpoint:
     """A pinhole camera (x right, y down, z forward) and its image size."""
 
     view_from_world: np.ndarray
-    """(4, 4)"""
+    """(4, 4) transform to the camera's frame."""
     focal: float
-    """Pixels."""
+    """Focal length, pixels."""
     width: int
     height: int
 
@@ -144,7 +145,8 @@ def splat(cloud: FusedCloud, view: Viewpoint) -> tuple[np.ndarray, np.ndarray]:
     """Render the cloud; return RGB (H, W, 3) and depth (H, W), infinite where it is empty.
 
     Only surfaces that face the viewer are drawn, so that a room is open towards the viewer. A pixel
-    is the mean of the points of its nearest surface, and covers its neighbours to close surfaces.
+    has the mean colour of its points within 15 mm of the nearest one. Drawn pixels also cover empty
+    or farther neighbours (:func:`_spread`), so that surfaces have no holes.
     """
     to_viewer = view.eye.astype(np.float32) - cloud.points
     facing = np.flatnonzero(np.einsum("ij,ij->i", to_viewer, cloud.normals) > 0)
@@ -180,7 +182,10 @@ def _spread(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _cover(
     source: np.ndarray, depth: np.ndarray, coverable: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Replace a pixel by its nearest neighbour if that is in front of ``coverable`` (H, W)."""
+    """Replace a pixel by its nearest neighbour if that covers it; returns source and depth.
+
+    A neighbour covers a pixel if its depth plus ``_BEHIND_M`` is below ``coverable`` (H, W).
+    """
     height, width = depth.shape
     result, near, limit = source.copy(), depth.copy(), coverable.copy()
     padded = np.pad(depth, 1, constant_values=np.inf)
@@ -196,6 +201,10 @@ def _cover(
 def _camera_points(
     c: int, camera: Camera, depth: np.ndarray, image: np.ndarray | None, most: int
 ) -> CameraPoints:
+    """Points of a depth image in millimetres, thinned to at most ``most``, with their colours.
+
+    Points without a visible pixel in the colour image are left out; without an image, all are grey.
+    """
     step = max(1, int(np.ceil(np.sqrt(depth.size / most))))
     thin = _thinned(camera, depth[::step, ::step].shape, step)
     depth = np.ascontiguousarray(depth[::step, ::step])
@@ -204,7 +213,7 @@ def _camera_points(
     z = depth.astype(np.float32) * np.float32(1e-3)
     rays = np.dstack([rays, np.ones_like(z)])
     normals, kept = _normals(rays * z[..., None])
-    # depth of surfaces at a grazing angle is noise
+    # depth at a grazing angle is noise: the cosine of normal and ray must exceed 0.12 (83 degrees)
     kept &= -np.einsum("ijk,ijk->ij", normals, rays) > 0.12 * np.linalg.norm(rays, axis=2)
     if image is None:
         index = np.flatnonzero(kept)

@@ -26,7 +26,7 @@ _MILLIMETRES = {
     "ground_penetration", "body_to_cloud", "object_to_cloud", "body_visible_to_cloud",
     "object_visible_to_cloud", "cloud_to_body",
 }  # fmt: skip
-_RANKED = {  # columns of the table of sequences, and the measures that they rank
+_RANKED = {  # columns of the table of sequences, and their names in worst_first
     "vertex_to_cloud.body_visible_mm": "body_to_cloud",
     "vertex_to_cloud.object_visible_mm": "object_to_cloud",
     "penetration.p98_mm": "penetration",
@@ -138,7 +138,11 @@ def group_table(
 
 
 def camera_table(summaries: Sequence[SequenceSummary]) -> pd.DataFrame:
-    """Return one row per sequence and camera; milliseconds, millimetres, pixels, NaN if unknown."""
+    """Return one row per sequence and camera, in the units that end the columns' names.
+
+    Unknown values are NaN. Columns ``verdict.*`` are medians of the camera's errors over all
+    frames, those with ``_held_out`` over the frames that were fitted without the camera.
+    """
     rows = []
     for summary in summaries:
         rig, values = summary.rig, summary.metrics.values

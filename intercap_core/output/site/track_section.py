@@ -1,4 +1,4 @@
-"""Section of a page on the object's track: start, evidence and stated deviation."""
+"""Section of a page on the object's track: first pose, images and standard deviation."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from intercap_core.output.site.overlays import choose_frames
 from intercap_core.schemas import OBJECT_TRACK, SCENE
 from intercap_core.sequence_inputs import SequencePaths
 
-GOOD_OVERLAP = 0.7  # a view agrees from this IoU
+GOOD_OVERLAP = 0.7  # smallest IoU of a view that agrees
 VIEW_STATES = {
     "agrees": f"candidate used, IoU {GOOD_OVERLAP:g} or more",
     "partly": "candidate used, smaller IoU",
@@ -148,7 +148,7 @@ def _states(**flags: np.ndarray) -> list[str]:
 
 
 def _chart(values: np.ndarray, label: str, least: float, most: float) -> str:
-    """Plot values (T,), clipped to ``most``; the axis reaches up to ``least`` or more."""
+    """Plot values (T,), clipped to ``most``; the axis reaches at least to ``least``."""
     known = np.isfinite(values)
     shown = np.minimum(values, most)
     top = max(least, 1.1 * float(shown[known].max(initial=0.0)))
@@ -177,7 +177,7 @@ def _mean(values: np.ndarray, axis: int) -> np.ndarray:
 
 
 def _largest(covariance: np.ndarray) -> np.ndarray:
-    """Return the largest deviation (T,) of covariances (T, 3, 3); NaN where they are."""
+    """Return the largest standard deviation (T,) of any axis of covariances (T, 3, 3), or NaN."""
     result = np.full(len(covariance), np.nan)
     known = np.isfinite(covariance).all((1, 2))
     result[known] = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance[known])[:, -1], 0))

@@ -39,17 +39,21 @@ class Content:
     """The viewer's data of T frames."""
 
     header: dict[str, Any] = field(default_factory=dict)
-    """Serialized as JSON."""
+    """Values that are serialized as JSON."""
     arrays: dict[str, np.ndarray] = field(default_factory=dict)
-    """By name."""
+    """Arrays by name."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Body:
+    """Body and object of one result over T frames, master frame."""
+
     model: BodyModel
     parameters: BodyParameters
     rotation: np.ndarray
+    """(T, 3, 3) master_from_object; NaN = no pose."""
     translation: np.ndarray
+    """(T, 3) master_from_object, metres; NaN = no pose."""
 
 
 def gather(paths: SequencePaths, models: SequenceModels, *, truth: Path | None = None) -> Content:
@@ -99,7 +103,7 @@ def gather(paths: SequencePaths, models: SequenceModels, *, truth: Path | None =
             _add_poses(content, name, body.rotation, body.translation, zup)
     with Frames.open(paths.frames) as recorded:
         images = recorded.showing(image_of)
-        moments = _spread(total, 40)  # frames with clouds and images
+        moments = _spread(total, 40)  # the frames that have clouds and images
         content.header |= {
             "name": images.sequence,
             "fps": images.fps,
@@ -223,7 +227,7 @@ def _add_cameras(content: Content, rig: Rig, zup: np.ndarray) -> None:
 
 
 def _add_images(content: Content, images: Frames, rig: Rig, moments: np.ndarray) -> None:
-    """Add concatenated undistorted JPEGs by frame and camera, and the offset of each."""
+    """Add concatenated undistorted JPEGs of the frames ``moments`` by camera, and their offsets."""
     data, starts = [], [0]
     names = [camera["name"] for camera in content.header["cameras"]]
     for t in moments:
@@ -255,13 +259,16 @@ def _add_clouds(
     moments: np.ndarray,
     zup: np.ndarray,
 ) -> None:
-    """Add quantised points of person and object by frame, and the offset of each frame."""
+    """Add quantised points of person and object by frame, and the offset of each frame.
+
+    At most 2500 points of the person and 800 of the object are drawn at random in each frame.
+    """
     random = np.random.default_rng(0)
     parts: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     for t in moments:
         with torch.no_grad():
             body = shown.model.forward(shown.parameters.frames(slice(int(t), int(t) + 1)))
-        near = body.vertices[0, ::7].double().numpy()
+        near = body.vertices[0, ::7].double().numpy()  # points far from the meshes are left out
         if mesh is not None and np.isfinite(shown.translation[t]).all():
             at = mesh.vertices @ shown.rotation[t].T + shown.translation[t]
             near = np.concatenate([near, at])
@@ -279,7 +286,7 @@ def _add_clouds(
 
 
 def _add_truth(content: Content, true: Truth, zup: np.ndarray) -> None:
-    """Add the true body in every n-th frame and the true object."""
+    """Add the true body in at most 60 frames, and the true object in all frames."""
     if true.vertices is not None:
         chosen = _spread(len(true.vertices), 60)
         vertices = apply(zup, true.vertices[chosen].reshape(-1, 3).astype(np.float64))
@@ -301,7 +308,10 @@ def _spread(total: int, most: int) -> np.ndarray:
 
 
 def quantised(points: np.ndarray) -> tuple[np.ndarray, list[float], float]:
-    """Quantise points (..., 3); return uint16 steps, their origin (3,) and step size, metres."""
+    """Quantise points (..., 3) to 16 bits: points = low + step * steps.
+
+    Returns the steps (..., 3) uint16, ``low`` (3,) and ``step``, metres.
+    """
     flat = points.reshape(-1, 3)
     low = flat.min(0) if len(flat) else np.zeros(3)
     extent = float((flat.max(0) - low).max()) if len(flat) else 1.0

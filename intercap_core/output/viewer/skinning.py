@@ -2,8 +2,8 @@
 
 Vertices are skinned by their four largest weights. The residual (smaller weights, pose correctives,
 changes of shape or expression) is transformed to the rest pose and approximated by a truncated
-singular value decomposition: modes over all vertices with an amount per frame. The number of modes
-is the smallest that brings every vertex within tolerance.
+singular value decomposition: modes over all vertices with an amount per frame. Modes are added,
+largest singular value first, until every vertex is within ``CLOSE_M``, at most ``_MOST_MODES``.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ class SkinnedBody:
     transforms: np.ndarray
     """A: (T, 55, 3, 4) posed_from_rest of the joints."""
     modes: np.ndarray
-    """(K, V, 3)"""
+    """(K, V, 3) displacements of the vertices in the rest pose."""
     amounts: np.ndarray
-    """(T, K)"""
+    """(T, K) factor of each mode in each frame."""
     error_m: float
     """Largest distance of a vertex from the model's, over all frames."""
 
@@ -84,6 +84,7 @@ def _global_rotations(pose: np.ndarray) -> np.ndarray:
 
 
 def _blended(transforms: np.ndarray, joints: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Blend the joints' transforms (55, 3, 4) to one transform (V, 3, 4) of each vertex."""
     return np.einsum("vk,vkab->vab", weights, transforms[joints])
 
 
@@ -103,13 +104,15 @@ def _unskinned(
 
 
 def _modes(residual: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the fewest modes (K, V, 3) with amounts (T, K) that bring all vertices within CLOSE_M.
+    """Approximate residuals (T, V, 3) by the leading singular vectors.
 
-    Also returns the largest remaining distance, metres.
+    Returns modes (K, V, 3), amounts (T, K) and the largest remaining distance, metres. It exceeds
+    ``CLOSE_M`` only if ``_MOST_MODES`` modes do not suffice.
     """
     frames = len(residual)
     rows = residual.reshape(frames, -1)
-    # The small matrix over frames is precise enough in float64 for a tenth of a millimetre
+    # Eigenvectors of the (T, T) Gram matrix are the left singular vectors. Squaring the singular
+    # values costs precision, but float64 leaves a tenth of a millimetre.
     values, vectors = np.linalg.eigh(rows @ rows.T)
     order = np.argsort(values)[::-1]
     kept = [k for k in order[:_MOST_MODES] if values[k] > 0]
