@@ -1,8 +1,8 @@
 """A detector's definition of body keypoints such as "hip" or "ankle": offsets from the body model.
 
-By one name, detectors mean points that are up to 3 cm apart. Depth makes the offsets observable.
-The offsets of recordings with depth, averaged over people, are the prior of recordings without
-depth, together with their standard deviation over people.
+The points that two detectors call "hip" may be 3 cm apart. Depth makes the offsets observable.
+Recordings with depth are averaged over people. The mean offsets and their standard deviation over
+people are the prior for recordings without depth.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from intercap_core.schemas import BODY_FIT
 POINTS = tuple(KEYPOINT_NAMES[BODY])
 _COLUMNS = ("point", "x_mm", "y_mm", "z_mm", "sigma_mm")
 UNKNOWN_SIGMA_M = 0.010  # of an offset without a definition; tuned on the studio
-FITTED_SIGMA_M = 0.003  # least value with a definition: offsets are fitted to 3 mm, measured
+FITTED_SIGMA_M = 0.003  # least value of a definition: offsets are fitted to 3 mm, measured
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,16 +100,20 @@ def _numbers(path: Path, row: Sequence[str]) -> list[float]:
 
 
 def average_offsets(fits: Sequence[Path]) -> tuple[Definition, list[str]]:
-    """Return the definition from body_fit artefacts of recordings with depth, and the names of the
-    people.
+    """Average the offsets of body_fit artefacts; recordings without depth are left out.
 
     The recordings of a person are averaged first, so each person counts once. Raises UserError if
     there are fewer than three people: the definition cannot be separated from one person's shape.
+
+    Returns:
+        The definition.
+        The names of the people, sorted.
     """
     of_person: dict[str, list[np.ndarray]] = {}
     no_depth = []
     for path in fits:
         with artefacts.read(path, BODY_FIT) as fit:
+            # depth in more than half of the frames
             measured = np.isfinite(fit["cloud_residual"]).mean() > 0.5
             subject = str(fit.attributes["subject"])
             if measured:

@@ -1,6 +1,8 @@
-"""Observations at the current bodies: pixels of E_J, correspondences of E_D, contacts of E_P_self.
+"""Observations of all frames as inputs of the energy terms, at the current bodies.
 
-They are updated between rounds of the solver, together with the noise of each kind of observation.
+These are the detected keypoints (E_J), the correspondences of the clouds (E_D) and the contacts of
+body parts (E_P_self). They are updated between the solver's runs, together with the standard
+deviation of each kind of observation, which is estimated from residuals.
 """
 
 from __future__ import annotations
@@ -39,24 +41,25 @@ from intercap_core.geometry.solve.robust import SIGMA_PER_MAD
 from intercap_core.geometry.solve.thread_pool import ThreadPool
 from intercap_core.geometry.solve.time_series import limited_velocity
 
-# Standard deviation of a keypoint whose constant offset is known, metres: the start, which is
-# refined from the residuals. Tuned on the studio.
+# Initial standard deviation of a keypoint whose constant offset is known, metres. It is refined
+# from the residuals. Tuned on the studio.
 KEYPOINT_SIGMA_M = (
     (BODY, 0.02),
     (LEFT_HAND, 0.01),
     (RIGHT_HAND, 0.01),
     (slice(FACE.start, CONTOUR.stop), 0.008),
 )
-# Factor of sigma for errors that persist over frames, which residuals hide. Tuned on the studio.
+# Factor of sigma for errors that persist over frames: the fit absorbs them, so residuals do not
+# show them. Tuned on the studio.
 PERSISTENCE = 1.5
-_LEAST_CONFIDENCE = 0.1  # below it, sigma no longer grows; tuned on the studio
+_LEAST_CONFIDENCE = 0.1  # confidence below which sigma no longer grows; tuned on the studio
 
 
 def fit_confidence_exponent(confidence: Tensor, error: Tensor) -> float:
-    """Return the exponent a >= 0 of errors (M,) that grow as confidence^-a.
+    """Fit errors (M,) by a multiple of confidence^-a, confidence (M,), and return a.
 
-    It is the slope of the medians in six bins of confidence, 0 with less than 30 errors in a bin,
-    and at most 2. Tuned on the studio.
+    -a is the slope of log median error over log median confidence, in six bins of confidence. a is
+    limited to 0 to 2, and 0 if a bin has less than 30 errors. Tuned on the studio.
     """
     bins = torch.tensor_split(confidence.argsort(), 6)
     if len(bins[0]) < 30:
@@ -69,12 +72,13 @@ def fit_confidence_exponent(confidence: Tensor, error: Tensor) -> float:
 
 
 class ViewDistances(NamedTuple):
-    """Measured points at S samples, by camera, in N frames."""
+    """Measurements at S samples of the skin, by camera, in N frames."""
 
     distance: Tensor
-    """(N, C, S) mean distance, metres."""
+    """(N, C, S) mean signed distance of the matched points from the skin, outside positive,
+    metres."""
     points: Tensor
-    """(N, C, S) effective number of points, 0 = none."""
+    """(N, C, S) effective number of matched points, 0 = none."""
     where: Tensor
     """(N, S, 3) position of the samples."""
     normal: Tensor
@@ -82,16 +86,18 @@ class ViewDistances(NamedTuple):
 
 
 class Evidence:
-    """Observations of the N usable frames, and their noise.
+    """Observations of the N usable frames, and their standard deviations.
+
+    :mod:`.surface` defines the S samples of the skin and the G coverings.
 
     Attributes:
-        frames: (N,) frames of the sequence.
+        frames: (N,) indices of the usable frames in the sequence.
         keypoint_sigma: (135,) standard deviation of a keypoint of median confidence, metres.
-        keypoint_doubt: (135,) exponent by which sigma grows as confidence falls.
-        cloud_noise: (G,) noise of the samples of each covering, metres.
+        keypoint_doubt: (135,) exponent a: sigma is proportional to confidence^-a.
+        cloud_noise: (G,) standard deviation of a sample's mean distance, by covering, metres.
         cloud_residual: (N,) median distance of points at the last matching, metres, NaN = none.
-        measured: (N, S) bool, samples with depth points.
-        by_view: measurements of each camera at the last matching, or None.
+        measured: (N, S) bool, samples with depth points at the last matching.
+        by_view: measurements of each camera at the last matching; None before the first.
     """
 
     def __init__(
@@ -138,7 +144,7 @@ class Evidence:
         return torch.as_tensor(values, dtype=self.model.dtype, device=self.model.device)
 
     def take_cameras(self, rig: Rig, depth_bias: np.ndarray) -> None:
-        """Replace camera poses and depth biases (C,), metres."""
+        """Replace camera poses and depth biases (C,), metres, and move the clouds accordingly."""
         observations = self.observations
         self.clouds = [
             None
@@ -158,9 +164,15 @@ class Evidence:
         face: bool = False,
         widened: float = 1.0,
     ) -> None:
-        """Set up E_J at the problem's bodies: keypoints, their sigma in pixels, shifts.
+        """Set the problem's keypoints and views (:class:`.term_inputs.Views`) at its bodies.
 
-        ``widened`` multiplies sigma, and with it the error from which a keypoint is an outlier.
+        Sigma in metres becomes pixels by focal length and depth of the current bodies.
+
+        Args:
+            problem: the problem, changed in place.
+            hands: include the keypoints of the hands.
+            face: include the keypoints of the face.
+            widened: factor of sigma, and so of the error from which a keypoint is an outlier.
         """
         observations, frames = self.observations, self.frames
         problem.keypoints = self.keypoints(hands=hands, face=face)
@@ -172,6 +184,7 @@ class Evidence:
         z = points[:, None] @ pose[:, 2, :3, None]
         z = z[..., 0] + pose[:, 2, 3][:, None]
         confidence = self._tensor(observations.confidence[at])
+        # lenses[:, 0]: focal length, px; depths below 0.3 m count as 0.3 m
         sigma = widened * self.keypoint_sigma[chosen] * lenses[:, None, 0] / z.clamp_min(0.3)
         sigma = sigma * self._sigma_factor(confidence, chosen)
         problem.views = Views(
@@ -186,7 +199,7 @@ class Evidence:
     def keypoints(self, *, hands: bool = False, face: bool = False) -> KeypointSet:
         """Return the keypoints of the body, and if requested of hands and face.
 
-        The jaw line is left out: its landmarks slide over the cheek with the view.
+        The jaw line is left out: its landmarks slide over the cheek as the view changes.
         """
         index = list(range(BODY.start, BODY.stop))
         if hands:
@@ -212,8 +225,10 @@ class Evidence:
         return keypoint_term.pixel_residuals(self.points(problem), problem.views)
 
     def _shift(self, points: Tensor) -> Tensor | None:
-        """Return the displacement (N, C, ..., 3) of points (N, ..., 3) until each camera exposes;
-        None if all cameras expose at the time of the frame."""
+        """Return the displacement (N, C, K, 3) of points (N, K, 3) until each camera exposes.
+
+        It is the velocity of the points times the camera's time offset; None if all offsets are 0.
+        """
         offset = self.observations.time_offset
         if not np.any(offset):
             return None
@@ -229,16 +244,23 @@ class Evidence:
         return self._tensor(velocity)
 
     def _sigma_factor(self, confidence: Tensor, index: Tensor) -> Tensor:
-        """Return the factor of sigma (N, C, K) of the keypoints ``index`` (K,)."""
+        """Return the factor (N, C, K) of sigma by confidence (N, C, K); index (K,): keypoints.
+
+        It is (confidence / median confidence)^-a, see `keypoint_doubt`.
+        """
         share = confidence.clamp_min(_LEAST_CONFIDENCE) / self.median_confidence[index]
         return share ** -self.keypoint_doubt[index]
 
     def refine_sigma(self, problem: BodyProblem) -> None:
-        """Estimate sigma and its dependence on confidence from residuals, for each group of
-        keypoints. Sigma is limited to 0.1 and 4 times its start; tuned on the studio."""
+        """Estimate sigma and its dependence on confidence from the residuals.
+
+        Each group of `KEYPOINT_SIGMA_M` has one estimate, from the median absolute residual. Sigma
+        is limited to 0.1 to 4 times its initial value; tuned on the studio.
+        """
         views = problem.views
         assert views is not None
         index = problem.keypoints.index
+        # residuals in metres, at median confidence and without the factor ``widened``
         scaled = self.pixel_residuals(problem).abs() / views.sigma[..., None]
         scaled = scaled * self.keypoint_sigma[index, None]
         scaled = scaled * self._sigma_factor(views.confidence, index)[..., None]
@@ -256,8 +278,10 @@ class Evidence:
     # --- cloud -------------------------------------------------------------------------------
 
     def refine_cloud_noise(self, problem: BodyProblem) -> None:
-        """Estimate the noise of each covering's samples from residuals, limited to 0.1 and 1.5
-        times its start; tuned on the studio."""
+        """Estimate the noise of each covering from the median absolute residual of its samples.
+
+        It is limited to 0.1 to 1.5 times its initial value; tuned on the studio.
+        """
         rows = problem.rows
         assert rows is not None
         params = self.model.parameters(problem.base)
@@ -275,13 +299,13 @@ class Evidence:
     def _bodies(self, base: Tensor) -> Iterator[tuple[int, Tensor, Tensor]]:
         """Pose the bodies ``base`` (N, P), a few at a time.
 
-        Yields the place of the first one, vertices and normals (b, R, 3) of the surface. Those of
-        short sequences are kept for the next call.
+        Yields the index of the first of these bodies, and vertices and normals (b, R, 3) of their
+        surfaces. Those of at most 256 bodies are cached for the next call.
         """
         if self._posed is not None and torch.equal(self._posed[0], base):
             yield from self._posed[1]
             return
-        together, kept = 16, 256  # frames: memory; the surface of a frame has 250 kB
+        together, kept = 16, 256  # frames, limited by memory: the surface of one has 250 kB
         self._posed, parts = None, []
         params = self.model.parameters(base)
         for start in range(0, len(base), together):
@@ -293,8 +317,10 @@ class Evidence:
             self._posed = (base.clone(), parts)
 
     def find_pairs(self, problem: BodyProblem) -> Pairs | None:
-        """Find the samples inside another part of the body; None if there are none or the term is
-        switched off."""
+        """Return the samples inside another part of the body (:class:`.term_inputs.Pairs`).
+
+        None if there are none or the term is switched off.
+        """
         if not problem.self_weight:
             return None
         ids = torch.as_tensor(self.surface.ids, device=self.model.device)
@@ -309,12 +335,12 @@ class Evidence:
     def match(
         self, problem: BodyProblem, reach: float, only: np.ndarray | None = None
     ) -> CloudRows:
-        """Match the points of all frames to the problem's bodies.
+        """Match the points of all frames to the problem's bodies, and return the rows of E_D.
 
         Args:
             problem: the bodies.
             reach: largest valid distance, metres.
-            only: (N,) the one camera of each frame that counts; None = all cameras.
+            only: (N,) index of the only camera used in each frame; None = all cameras.
         """
         count, size, views = len(self.frames), len(self.samples.vertex), len(self.observations.rig)
         params = self.model.parameters(problem.base)
@@ -355,9 +381,10 @@ class Evidence:
         return self.rows(points)
 
     def rows(self, points: Tensor) -> CloudRows:
-        """Return the rows of the last :meth:`match` with these numbers of points (N, C, S).
+        """Return the rows of E_D of the last :meth:`match`, averaged over cameras.
 
-        Samples with 0 points have no weight.
+        points (N, C, S): effective number of points, which weights each camera's distance. Samples
+        with 0 points in all cameras have no weight.
         """
         by_view = self.by_view
         assert by_view is not None, "call match first"

@@ -1,7 +1,9 @@
-"""First intersections of a few thousand rays with a mesh, compiled, without a tree.
+"""First intersections of a few thousand rays with a mesh, by a compiled loop without a tree.
 
-Triangles are tested in groups of neighbours. A group is skipped if the ray misses its bounding
-sphere or has a nearer intersection already. Moeller and Trumbore 1997, double precision.
+Triangles are grouped with their neighbours. For each ray, a group is skipped if the ray misses the
+group's bounding sphere, or if the sphere begins behind the nearest intersection so far. The others
+are tested triangle by triangle (Moeller and Trumbore 1997) in double precision. The result is
+exact, since only groups without a nearer intersection are skipped.
 """
 
 from __future__ import annotations
@@ -9,8 +11,8 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-# Share of their size by which triangles are enlarged, so that no ray passes between two: some
-# thousand times the rounding of double precision (IEEE 754).
+# Share of their size by which triangles are enlarged, so that no ray passes between two of them.
+# It is some million times the rounding of double precision, 1e-16 (IEEE 754).
 _MARGIN = 1e-9
 
 
@@ -31,10 +33,14 @@ def first_hits(
 
 
 def _group_triangles(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Order points (N, 3) along Morton's curve, and group them.
+    """Sort points (N, 3) along Morton's curve and cut the curve into groups.
 
-    Returns the order (N,), the start of each group in it, and the end. A group starts where the
-    curve enters another cube of 1/32 of the size of the mesh, and after 48 points.
+    A group ends if the curve enters another cube, of 1/32 of the size of the mesh, and at every
+    48th point.
+
+    Returns:
+        (N,) order of the points.
+        (G + 1,) start of each group in the order, then N.
     """
     bits, cube_bits = 9, 4  # of each coordinate: along the curve, and within a cube
     size_of_group = 48  # triangles: speed
@@ -52,6 +58,10 @@ def _group_triangles(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _first_hits(corners, starts, origins, directions):
+    """Compiled form of :func:`first_hits`.
+
+    corners (F,3,3): corners of the triangles, group by group. starts (G + 1,): of the groups.
+    """
     groups = len(starts) - 1
     x, y, z, radius = np.zeros(groups), np.zeros(groups), np.zeros(groups), np.zeros(groups)
     for g in range(groups):

@@ -4,13 +4,14 @@
 
 with Geman and McClure's rho_J, the projection Pi^v of view v, the detection J_i^v, the confidence w
 of the detector and the precision k = 1 / sigma^2 of a keypoint. Beyond the paper: X_i is the
-model's keypoint plus an offset o_i that is constant in the frame of the bone that carries it.
+model's keypoint plus an offset o_i that is constant in the frame of one bone, its carrier.
 Detectors and body models mean different points by the same name ("hip"), and the difference is the
 same in every frame. o_i is estimated with a Gaussian prior (:class:`.problem.ParameterLayout`).
-Also beyond the paper: triangulated keypoints count in the same way, by their distance in metres.
+Also beyond the paper: triangulated keypoints are added as residuals in metres with the same rho_J.
 
-The residuals of all views depend on the body through the 3D point alone. They are summed into one
-gradient (3,) and one matrix (3, 3) by the point before the derivatives of the body are applied.
+The residuals of all views depend on the body only through the 3D point X_i. They are summed into
+one gradient (3,) and one Gauss-Newton matrix (3, 3) by the point. Then the derivatives of the point
+by the body are applied.
 """
 
 from __future__ import annotations
@@ -45,8 +46,7 @@ from intercap_core.geometry.camera import projection
 from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
 from intercap_core.geometry.solve.robust import geman_mcclure
 
-# Standard deviations from which a keypoint counts as an outlier: scale of rho_J. Tuned on the
-# studio.
+# Scale of rho_J, standard deviations: a larger residual is an outlier. Tuned on the studio.
 KEYPOINT_SCALE = 4.0
 
 
@@ -109,7 +109,8 @@ def evaluate(
     full = linear.with_correctives_of(None).full()
     batch, _, _, size = full.shape
     by = (chosen.matrix @ full.reshape(batch, full.shape[1], -1)).reshape(batch, -1, 3, size)
-    # a turn w of joint l moves the arm R o by w x R o, for every joint l above the carrier
+    # a rotation omega of joint l moves the rotated offset R o by omega x R o, if l is the carrier
+    # or an ancestor of it
     moved = (offsets != 0).any(1).nonzero()[:, 0]
     turned = -skew(arms[:, moved])[:, :, None] @ linear.frames[:, None]
     turned = turned * chosen.turned_by[moved][None, :, :, None, None]
@@ -128,8 +129,10 @@ def evaluate(
 
 
 def reprojection(points: Tensor, views: Views) -> PointTerm:
-    """Return sum w rho(|r / sigma|^2) / 2 of points (B, K, 3), master frame, in the views of the B
-    bodies."""
+    """Return the cost sum w rho(|r / sigma|^2) / 2 over the views, with pixel residuals r.
+
+    points (B, K, 3): keypoints, master frame, metres.
+    """
     pose, lenses = views.colour_from_master, views.lenses
     pixels, by_point = projection.project_with_jacobian(
         _in_cameras(points, pose, views.shift), lenses[:, None]
@@ -153,13 +156,16 @@ def pixel_residuals(points: Tensor, views: Views) -> Tensor:
 
 
 def _in_cameras(points: Tensor, pose: Tensor, shift: Tensor | None) -> Tensor:
-    """Return points (B, K, 3) in the frames of C cameras, (B, C, K, 3)."""
+    """Return points (B, K, 3) in the frames of C cameras, (B, C, K, 3), when each camera exposes.
+
+    pose (C, 4, 4): colour_from_master. shift (B, C, K, 3): displacement until then, or None.
+    """
     moved = points[:, None] if shift is None else points[:, None] + shift
     return moved @ pose[:, :3, :3].transpose(1, 2) + pose[:, None, :3, 3]
 
 
 def triangulated(points: Tensor, targets: Targets) -> PointTerm:
-    """Return sum w rho(|(X - target) / sigma|^2) / 2 of points X (B, K, 3), metres."""
+    """Return the cost sum w rho(|(X - target) / sigma|^2) / 2 of points X (B, K, 3), metres."""
     known = targets.confidence > 0
     residual = torch.where(known[..., None], (points - targets.points) / targets.sigma, 0)
     robust = geman_mcclure((residual**2).sum(-1), KEYPOINT_SCALE)
@@ -211,7 +217,7 @@ class KeypointTerm:
 
 
 def _by_points(inputs: TermInputs, frames: Tensor, points: Tensor) -> PointTerm:
-    """Sum views and targets of the frames (B,)."""
+    """Return E_J of the frames (B,) as a function of the points: views plus targets."""
     terms = []
     if inputs.views is not None:
         terms.append(reprojection(points, inputs.views.frames(frames)))
@@ -225,7 +231,10 @@ def _by_points(inputs: TermInputs, frames: Tensor, points: Tensor) -> PointTerm:
 def _add_offsets(
     term: PointTerm, keypoints: Keypoints, columns: Columns, equations: NormalEquations
 ) -> None:
-    """Add the blocks of the offsets, and those that they share with the parameters."""
+    """Add the blocks of the offsets, and the blocks of offsets by parameters.
+
+    An offset moves its keypoint by the rotation of the carrier.
+    """
     count, n, at = columns.offsets, len(columns.parameters), columns.offsets_at
     assert keypoints.own_limb is not None
     rotation = keypoints.rotations[:, :count]
@@ -283,7 +292,7 @@ class CompiledKeypoints:
 
 
 def _keypoint_data(inputs: TermInputs, like: Tensor) -> KeypointData:
-    """Return the observations in the floating type of ``like``; absent ones have no frame."""
+    """Return the observations in the floating type of ``like``; absent ones have length 0."""
     if inputs.views is None and inputs.targets is None:
         raise ValueError("the problem has neither views nor targets")
 

@@ -1,9 +1,11 @@
-"""Assign one frame's depth points and mask rims to the samples of the skin, camera by camera: E_D.
+"""Correspondences of E_D: assign the measurements of a frame to the samples of the skin, by camera.
 
-Points of the person are matched to the surface. Vertices in front of a surface that a camera
-measured farther away stick out of the person (:mod:`.free_space`). Rims of masks touch the surface
-(:mod:`.outlines`). The distances at each sample are averaged to one residual of
-:mod:`.cloud_term`.
+There are three kinds of measurements, each a signed distance at a sample:
+- depth points of the person, matched to the surface here;
+- samples in front of a surface that a camera measured farther away (:mod:`.free_space`);
+- rims of the person's masks, whose rays touch the surface (:mod:`.outlines`).
+The distances at each sample and camera are averaged. :class:`.evidence.Evidence` averages them over
+the cameras to one residual of :mod:`.cloud_term`.
 """
 
 from __future__ import annotations
@@ -22,8 +24,10 @@ from intercap_core.body_fit.outlines import RimSamples, find_touched
 from intercap_core.body_fit.surface import MATCH_SIDEWAYS_M, NORMAL_LENGTH_M, Samples, SkinSurface
 from intercap_core.geometry.camera.rig import Rig
 
-MATCH_COSINE = 0.3  # smallest, between the normals of a point and its vertex; tuned on the studio
-# Distance from the covering beyond which a point has less weight, metres. Tuned on the studio.
+# Smallest cosine between the normals of a point and of its vertex. Tuned on the studio.
+MATCH_COSINE = 0.3
+# Distance of a point from the outside of the covering beyond which it loses weight, metres. Tuned
+# on the studio.
 CLOUD_HUBER_M = 0.012
 
 
@@ -46,9 +50,11 @@ def match_points(
     surface: SkinSurface,
     reach: float,
 ) -> Matches:
-    """Match points to the sample that is nearest in position and orientation.
+    """Match each point to the sample that is nearest in position and normal.
 
-    A point can only match a surface that faces the same way: the vertices that its camera sees.
+    The distance to be minimised is |p - v|^2 + L^2 |n_p - n_v|^2 with L = `NORMAL_LENGTH_M`. The
+    signed distance is then measured from the vertex of the sample's patch that is nearest in
+    position. Normals must agree, so a point matches only a surface that faces its camera.
 
     Args:
         points: (M, 3) measured points, metres.
@@ -72,14 +78,16 @@ def match_points(
 def average(
     matches: Matches, trust: Tensor, expected: Tensor, *, huber: float
 ) -> tuple[Tensor, Tensor]:
-    """Return the mean distance (N,) at each sample and the effective number of points (N,).
+    """Return the weighted mean distance (N,) at each sample, and the sum of the weights (N,).
+
+    The sum of weights is the effective number of points.
 
     Args:
         matches: of M points.
         trust: (M,) weight of each point.
         expected: (N,) thickness of the covering at each sample, metres.
-        huber: distance from ``expected`` beyond which a point has less weight, metres (one
-            iteration of Huber's weight).
+        huber: distance from ``expected`` beyond which a point loses weight, metres: one
+            iteration of reweighting by Huber's function.
     """
     excess = (matches.distance - expected[matches.sample]).abs()
     weight = trust * matches.valid * (huber / excess.clamp_min(huber))
@@ -142,19 +150,19 @@ class Matcher:
         expected: Tensor,
         reach: float,
     ) -> FrameMatches:
-        """Match one frame.
+        """Match one frame; returns distances by camera and sample.
 
         Args:
             cloud: points, depth windows and outlines of the person.
             rig: cameras.
-            depth_bias: (C,) distance that each camera measures too much, metres.
+            depth_bias: (C,) excess of the depth that each camera measures, metres.
             skin: the posed body.
-            expected: (C * S,) thickness of the covering, metres.
+            expected: (C * S,) thickness of the covering, by camera and sample, metres.
             reach: largest valid distance, metres.
         """
         points = self._match_points(cloud, skin, reach)
         parts = [
-            # by camera and sample: samples that several cameras see determine their offsets
+            # by camera, since samples that several cameras see determine the errors of the cameras
             (points._replace(sample=self._row(cloud.view, points.sample)), cloud.trust),
             self._find_protruding(cloud, rig, depth_bias, skin),
             self._find_on_rims(cloud, rig, skin, reach),
@@ -172,6 +180,7 @@ class Matcher:
         )
 
     def _row(self, view: Tensor | int, sample: Tensor) -> Tensor:
+        """Return the index of a camera's sample among the C * S rows."""
         return view * len(self.sample) + sample
 
     def _match_points(self, cloud: PersonCloud, skin: PosedSkin, reach: float) -> Matches:
@@ -217,7 +226,7 @@ class Matcher:
     def _join(
         self, parts: list[tuple[int, np.ndarray, np.ndarray]], skin: PosedSkin
     ) -> tuple[Matches, Tensor]:
-        """Join samples (M,) and distances (M,) of all views, with the trust of one depth point."""
+        """Join (camera, samples, distances) of all views to matches with a trust of 1 each."""
         like = skin.samples
         sample, distance = [self.sample[:0]], [like[:0, 0]]
         for view, index, away in parts:
@@ -235,9 +244,14 @@ class Matcher:
 def _match(points, point_normals, vertices, normals, samples, patch, order, starts, reach):
     """Return sample (M,), signed distance (M,) and validity (M,); see :func:`match_points`.
 
+    Nearest-neighbour search in 6D, of position and scaled normal. Neighbouring samples form groups
+    with a bounding sphere. For each point all groups are visited. A group is skipped if its sphere
+    is farther than the best sample so far, so the search is exact. The match of the previous point
+    is the first candidate.
+
     points, point_normals (M,3): measured. vertices, normals (R,3): posed surface.
-    samples (S,), patch (S,20): vertices. order (S,), starts (G + 1,): groups of samples; a group
-    whose bounding sphere is farther than the best match so far is skipped.
+    samples (S,), patch (S,20): indices of vertices. order (S,): samples by group. starts (G + 1,):
+    start of each group in the order.
     """
     groups, kind = len(starts) - 1, vertices.dtype
     length = kind.type(NORMAL_LENGTH_M)
@@ -261,7 +275,7 @@ def _match(points, point_normals, vertices, normals, samples, patch, order, star
     sample = np.empty(len(points), np.int64)
     distance = np.empty(len(points), kind)
     valid = np.zeros(len(points), np.bool_)
-    best = 0  # place in the order; the match of one point is the first guess for the next
+    best = 0  # place in the order
     for m in range(len(points)):
         for d in range(3):
             here[d] = points[m, d]
@@ -320,7 +334,7 @@ def _squares(values, first, count, here, out):
 
 @numba.njit(cache=True, nogil=True)
 def _nearest_of_patch(point, vertices, patch):
-    """Return the vertex of ``patch`` nearest to a point (3,), and the gap to the point."""
+    """Return the vertex of ``patch`` nearest to a point (3,), and the point minus that vertex."""
     px, py, pz = point[0], point[1], point[2]
     best, gx, gy, gz = patch[0], px * 0, px * 0, px * 0
     least = px * 0 + np.inf

@@ -43,21 +43,22 @@ class Observations:
     joint_views: np.ndarray
     """(T, K) number of views of each triangulated keypoint."""
     masks: list[bytes]
-    """RLE of the person's mask in each of T * C images, empty = none."""
+    """RLE of the person's mask in each of T * C images (index t C + c), empty = none."""
     mask_source: np.ndarray
-    """(T, C) origin of each mask, as in the person artefact."""
+    """(T, C) source of each mask: 0 none, 1 detector, 2 foreground segmentation."""
     other_masks: list[bytes]
     """RLE of other detected objects in each of T * C images, empty = none."""
     background: list[np.ndarray | None]
-    """Depth of the empty room in each camera, mm."""
+    """Depth image of the empty room in each camera, mm; None = unknown."""
     depth_bias: np.ndarray
-    """(C,) distance that each camera measures too much, metres."""
+    """(C,) excess of the depth that each camera measures, metres."""
     image_of: np.ndarray
-    """(T, C) frame set whose image of a camera shows each frame, -1 = none."""
+    """(T, C) index of the recorded frame set whose image of camera c was exposed at the time of
+    frame t, -1 = none."""
     time_offset: np.ndarray
-    """(C,) seconds by which each camera exposes later than the time of the frame."""
+    """(C,) delay of each camera's exposure after the time of the frame, seconds."""
     times: np.ndarray
-    """(T,) seconds."""
+    """(T,) time of each frame, seconds."""
 
     @property
     def num_frames(self) -> int:
@@ -71,9 +72,11 @@ class Observations:
 
     @property
     def usable(self) -> np.ndarray:
-        """(T,) bool: a body can be placed, or six keypoints are known within 1 s of such a frame.
+        """(T,) bool: frames that are fitted.
 
-        One view from the side or over a table may see only one shoulder. Tuned on the studio.
+        A frame is usable if a body can be placed (:attr:`placed`). It also is if six body keypoints
+        are triangulated and a body can be placed in a frame within 1 s: a single view from the side
+        or over a table may see only one shoulder. Both numbers are tuned on the studio.
         """
         placed = self.placed
         if not placed.any():
@@ -112,7 +115,8 @@ def read_observations(scene: Path, person: Path) -> Observations:
         if "beside_offsets" in read:
             others = unpack_ragged(read["beside_offsets"], read["beside_rle"])
     confidence = np.clip(np.nan_to_num(keypoints[..., 2]), 0.0, 1.0)
-    # a view that disagrees with the triangulated point; the factor is tuned on the studio
+    # keypoints of a view that disagree with the triangulated point lose most of their confidence;
+    # the factor is tuned on the studio
     outlier = (views >= 2)[:, None] & ~inlier
     confidence = np.where(outlier, 0.2 * confidence, confidence)
     confidence[~np.isfinite(keypoints[..., :2]).all(-1)] = 0
@@ -141,15 +145,15 @@ class PersonCloud:
     points: Tensor
     """(M, 3) float32, metres."""
     normals: Tensor
-    """(M, 3) float32, towards the camera."""
+    """(M, 3) float32 unit normals, towards the camera."""
     trust: Tensor
-    """(M,) weight in (0, 1]."""
+    """(M,) weight in (0, 1], lower at depth edges."""
     view: Tensor
     """(M,) camera index."""
     windows: tuple[DepthWindow, ...] = ()
     """Depth around the person, by camera."""
     outlines: tuple[MaskRim, ...] = ()
-    """Rims of the person's masks that a detector drew, by camera."""
+    """Rims of the person's masks, by camera."""
 
     def of_view(self, view: int) -> PersonCloud:
         """Return the part of camera ``view``."""
@@ -166,7 +170,14 @@ class PersonCloud:
     def through(
         self, rig: Rig, bias: np.ndarray, before: Rig, bias_before: np.ndarray
     ) -> PersonCloud:
-        """Return the same pixels through other camera poses and depth biases (C,), metres."""
+        """Return the same pixels, back-projected with other camera poses and depth biases.
+
+        Args:
+            rig: new camera poses.
+            bias: (C,) new depth biases, metres.
+            before: camera poses of this cloud.
+            bias_before: (C,) depth biases of this cloud, metres.
+        """
         points, normals = self.points.clone(), self.normals.clone()
         for view in np.unique(self.view.cpu().numpy()):
             mine = self.view == int(view)
@@ -182,7 +193,7 @@ class PersonCloud:
 def person_clouds(
     frames: Path, observations: Observations, count: int, device: torch.device
 ) -> list[PersonCloud | None]:
-    """Return the cloud of every frame, of about ``count`` points; None = no mask."""
+    """Return the cloud of each frame, of about ``count`` points; None = no usable mask."""
     with Frames.open(frames) as reader:
         reader = reader.showing(observations.image_of)
         return ThreadPool(torch.get_num_threads()).map(
@@ -193,6 +204,7 @@ def person_clouds(
 def _fuse(
     reader: Frames, observations: Observations, t: int, count: int, device: torch.device
 ) -> PersonCloud | None:
+    """Return the depth points of frame t within the person's masks, and the rims of the masks."""
     seen_by: list[tuple[int, np.ndarray, np.ndarray]] = []  # camera, depth image, pixels
     windows, outlines = [], []
     for c, camera in enumerate(observations.rig):
@@ -201,7 +213,8 @@ def _fuse(
         if mask is None:
             continue
         depth = None if camera.depth is None else reader.depth(t, c)
-        # a mask without a detector counts only if there is no depth and other objects are known
+        # The rim of a detector's mask is used. That of a foreground segmentation is used only if
+        # there is no depth, and if masks of other objects tell where they cover the person.
         if observations.mask_source[t, c] == FROM_DETECTOR or (
             depth is None and observations.other_masks[at]
         ):
@@ -268,10 +281,16 @@ def _place_pixels(
 def _measure_normals(
     depth: np.ndarray, camera: Camera, index: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return points and unit normals (M, 3), depth camera's frame, and edge flags (M,)."""
+    """Measure surface normals by differences of depth along rows and columns.
+
+    Returns:
+        (M, 3) points, depth camera's frame, metres.
+        (M, 3) unit normals towards the camera.
+        (M,) bool: the pixel is at a depth edge.
+    """
     assert camera.depth is not None
-    base = 3  # px, half the base over which a normal is measured; tuned on the studio
-    edge_m = 0.04  # a larger step of depth within this base is an edge; tuned on the studio
+    base = 3  # px, half the distance over which a normal is measured; tuned on the studio
+    edge_m = 0.04  # a larger change of depth within ``base`` px is an edge; tuned on the studio
     height, width = depth.shape
     rays = camera.depth.rays
     row, column = np.divmod(index, width)

@@ -18,9 +18,9 @@ from intercap_core.geometry.solve.levenberg_marquardt import minimise
 
 # Half of the window around a frame, seconds: six frames at 30 Hz. Tuned on the studio.
 JUMP_WINDOW_S = 0.21
-# Largest distance from the median of the window that is no jump, metres: within 0.1 s hands leave
-# the straight path by half of 30 m/s^2 times (0.1 s)^2 = 0.15 m (anatomy), and fits scatter by less
-# than 0.1 m (measured on the studio).
+# Distance from the median of the window beyond which a joint jumps, metres. Hands accelerate by up
+# to 30 m/s^2 (anatomy): within 0.1 s they leave a straight path by 30 / 2 * 0.1^2 = 0.15 m. Fits
+# scatter by less than 0.1 m (measured on the studio).
 JUMP_M = 0.25
 
 _BODY_JOINTS = slice(0, JOINT_INDEX["right_wrist"] + 1)
@@ -29,14 +29,15 @@ _BODY_JOINTS = slice(0, JOINT_INDEX["right_wrist"] + 1)
 def measure_jumps(
     joints: np.ndarray, times: np.ndarray, least: np.ndarray | float = JUMP_M
 ) -> np.ndarray:
-    """Return the distance (N, J) of joints from their median over the frames around, metres.
+    """Return the distance (N, J) of joints from their median over the surrounding frames, metres.
 
-    It is 0 if it does not exceed ``least``, and in frames without a frame before and after.
+    The window has as many frames before as after. Distances up to ``least`` are returned as 0, also
+    those of frames without a frame before or after within the window.
 
     Args:
         joints: (N, J, 3) metres.
         times: (N,) seconds.
-        least: (N, J) metres, or one value for all.
+        least: threshold, metres: (N, J), or one value for all.
     """
     result = np.zeros(joints.shape[:2])
     for t, time in enumerate(times):
@@ -49,7 +50,7 @@ def measure_jumps(
 
 
 def recover(problem: BodyProblem, times: np.ndarray) -> np.ndarray:
-    """Refit the frames that jump, from an interpolation of the others.
+    """Refit the frames that jump, starting from an interpolation of the others.
 
     Args:
         problem: a problem with views, whose ``base`` is changed in place. Shared parameters do not
@@ -74,7 +75,8 @@ def recover(problem: BodyProblem, times: np.ndarray) -> np.ndarray:
     nothing = base.new_zeros(0)
     before = again.cost(problem.base[at][:, again.columns], nothing, everyone)
     solution = minimise(again, again.own_start(), max_trials=10, cost_tolerance=1e-3)
-    kept = solution.cost <= 1.2 * before + 5.0  # tuned on the studio
+    # keep the refit unless it costs clearly more; tuned on the studio
+    kept = solution.cost <= 1.2 * before + 5.0
     rows = problem.base[at].clone()
     again.accept(solution.own, nothing)
     rows[kept] = again.base[kept]
@@ -85,8 +87,10 @@ def recover(problem: BodyProblem, times: np.ndarray) -> np.ndarray:
 
 
 def _of_frames(problem: BodyProblem, at: torch.Tensor, base: torch.Tensor) -> BodyProblem:
-    """Return E_J and the priors of the frames ``at`` (n,), at bodies ``base`` (n, P), shape
-    fixed."""
+    """Return a problem of the frames ``at`` (n,) with E_J and the priors, without E_D and E_P_self.
+
+    base (n, P): bodies, whose shape is fixed.
+    """
     shape = torch.arange(base.shape[1], device=base.device)[problem.layout.shape]
     return replace(
         problem,

@@ -1,10 +1,14 @@
-"""The body's fit in five steps, each from the result of the step before.
+"""Schedule of the body's fit: five stages, each of which starts from the result of the last.
 
 1. The trunk is placed rigidly, then each frame is fitted to triangulated keypoints (:mod:`.start`).
-2. E_J: all frames with shared shape, first with wide sigmas.
-3. E_J + E_D: keypoint offsets and clothing become free; frames that jump are refitted.
-4. Hands and face, with the rest of the body fixed.
+2. E_J of all frames. Sigmas are wide at first if the depth of a single view locates keypoints.
+3. E_J + E_D: keypoint offsets and the thickness of clothing become free; frames that jump are
+   refitted (:mod:`.recover`).
+4. Hands and face, with the rest of the body fixed except the wrists.
 5. All terms and parameters.
+
+E_P_self is part of stage 5 only. The priors are part of all stages. With the setting
+``shape: shared``, all frames have the same betas from stage 2 on.
 """
 
 from __future__ import annotations
@@ -36,28 +40,29 @@ from intercap_core.progress import Progress
 
 log = logging.getLogger(__name__)
 
-# Largest valid distance of correspondences by round, metres. Tuned on the studio.
-_CLOUD_REACH_M = (0.10, 0.06, 0.05)
-# Factors of the keypoints' sigma in the first rounds, while the limbs are far off. Tuned on the
+# Largest valid distance of correspondences, metres: twice in stage 3, then in stage 5. Tuned on the
 # studio.
+_CLOUD_REACH_M = (0.10, 0.06, 0.05)
+# Factors of the keypoints' sigma in successive minimisations, while limbs may be far off. Tuned on
+# the studio.
 _WIDENED = (5.0, 2.0)
 _WRISTS = ("left_wrist", "right_wrist")
 
 
 @dataclass(frozen=True)
 class Settled:
-    """Quantities that all frames share, in addition to the shape."""
+    """Estimated quantities that all frames share, in addition to the shape."""
 
     offsets: Tensor
     """(25, 3) offsets of the body keypoints in the frames of their bones, metres."""
     covering: Tensor
     """(G,) logarithm of each covering's thickness over the usual one."""
     keypoint_sigma: Tensor
-    """(K,) metres."""
+    """(135,) standard deviation of a keypoint of median confidence, metres."""
     cloud_noise: Tensor
-    """(G,) metres."""
+    """(G,) standard deviation of a sample's mean distance, by covering, metres."""
     keypoint_doubt: Tensor
-    """(K,) exponent by which sigma grows as confidence falls."""
+    """(135,) exponent a: sigma is proportional to confidence^-a."""
 
 
 @dataclass(frozen=True)
@@ -65,23 +70,25 @@ class BodyFit:
     """The fit of N of the sequence's T frames."""
 
     frames: np.ndarray
-    """(N,) frames."""
+    """(N,) indices of the fitted frames."""
     vectors: Tensor
     """(N, P) parameters."""
     columns: Tensor
-    """(n,) own parameters of a frame."""
+    """(n,) columns of a frame's own parameters in ``vectors``."""
     hessian: Tensor
-    """(N, n + m, n + m) of the energy by own and shared parameters, the latter betas first."""
+    """(N, n + m, n + m) Gauss-Newton matrix of each frame's energy by n own and m shared
+    parameters; see :mod:`.problem` for their order."""
     one_shape: bool
     """The betas are shared."""
     shared_counts: Tensor
     """(m,) how many times the prior of each shared parameter counts in a frame."""
     excess: Tensor
-    """(N,) mean square of the keypoints' residuals over their variance, >= 1."""
+    """(N,) ratio of the variance of the keypoints' residuals to the assumed one, estimated from
+    their median, >= 1."""
     pixel_residual: Tensor
-    """(N, C) median keypoint error, px, NaN = nothing seen."""
+    """(N, C) median error of the body keypoints, px, NaN = none detected."""
     cloud_residual: Tensor
-    """(N,) median distance of the points, metres, NaN = none."""
+    """(N,) median distance of the depth points from the skin, metres, NaN = none."""
     settled: Settled
     """Quantities that all frames share."""
     parts: PartEvidence
@@ -120,7 +127,7 @@ class Fitter:
         self.one_shape = settings.shape == "shared"
 
     def run(self) -> BodyFit:
-        """Fit all frames by the steps of the module."""
+        """Fit all frames by the stages of the module."""
         evidence, hands, face = self.evidence, self.settings.hands, self.settings.face
         base = self.model.zeros(len(self.frames)).vector()
         problem = self._problem(
@@ -165,7 +172,10 @@ class Fitter:
         return self._report(problem, solution.normal.hessian)
 
     def resume(self, base: Tensor, settled: Settled) -> BodyProblem:
-        """Return the problem of the last step at other bodies ``base`` (N, P)."""
+        """Return the problem of stage 5 at other bodies ``base`` (N, P), without observations.
+
+        Shape and the quantities of ``settled`` are fixed.
+        """
         self.evidence.keypoint_sigma = settled.keypoint_sigma.to(base)
         self.evidence.cloud_noise = settled.cloud_noise.to(base)
         self.evidence.keypoint_doubt = settled.keypoint_doubt.to(base)
@@ -187,17 +197,22 @@ class Fitter:
         self.evidence.observe_keypoints(problem, hands=self.settings.hands, face=self.settings.face)
 
     def observe_only(self, problem: BodyProblem, view: np.ndarray) -> None:
-        """Update correspondences and keypoints as :meth:`observe`, with one camera of each frame.
+        """Update correspondences and body keypoints only, with the points of one camera per frame.
 
-        view (N,): index of the camera, whose points, masks and body keypoints count.
+        view (N,): index of the camera whose depth points and mask rims are used. Keypoints are
+        those of all cameras.
         """
         if self.evidence.has_cloud:
             problem.rows = self.evidence.match(problem, _CLOUD_REACH_M[-1], view)
         self.evidence.observe_keypoints(problem)
 
     def residuals(self, problem: BodyProblem) -> tuple[Tensor, Tensor]:
-        """Return the median pixel error (N, C) and cloud distance (N,), metres; NaN = nothing
-        seen."""
+        """Return the median errors of the body keypoints and of the cloud; NaN = none.
+
+        Returns:
+            (N, C) median error of the body keypoints, px.
+            (N,) median distance of the depth points from the skin, metres.
+        """
         pixels = self._body_errors(problem, self.evidence.pixel_residuals(problem))
         return pixels.nanmedian(2).values, self.evidence.cloud_residual
 
@@ -213,8 +228,10 @@ class Fitter:
         )
 
     def _body_errors(self, problem: BodyProblem, residuals: Tensor) -> Tensor:
-        """Return errors (N, C, 25) of the body keypoints, px, NaN = not seen, from ``residuals``
-        (N, C, K, 2)."""
+        """Return errors (N, C, 25) of the body keypoints, px, NaN = not detected.
+
+        residuals (N, C, K, 2): px.
+        """
         assert problem.views is not None
         pixels = residuals[:, :, BODY].norm(dim=-1)
         return torch.where(problem.views.confidence[:, :, BODY] > 0, pixels, torch.nan)
@@ -276,8 +293,8 @@ class Fitter:
     def _lift_by_depth(self) -> Targets | None:
         """Return the body keypoints that only the depth of one view locates; None = no keypoints.
 
-        They constrain the body until its cloud does. The depth of an occluded keypoint is that of
-        the occluder: its pixels, with a wide sigma at first, bring the limb to the right place.
+        They constrain the body until its cloud does. The depth at an occluded keypoint is that of
+        the occluder. The pixels of E_J correct this error, for which their sigma is wide at first.
         """
         observations = self.evidence.observations
         joints = observations.joints[self.frames][:, BODY]
@@ -293,7 +310,8 @@ class Fitter:
     def _fit_extremities(self, problem: BodyProblem) -> None:
         """Fit wrists, fingers, jaw and expression without the cloud; the rest of the body is fixed.
 
-        No earlier step rotates the wrists, so hands may be far off: sigmas are wide at first.
+        No keypoint of earlier stages depends on the wrists, so hands may be far off: sigmas are
+        wide at first.
         """
         hands, face = self.settings.hands, self.settings.face
         columns = columns_of(self.model, hands=hands, face=face, betas=False)

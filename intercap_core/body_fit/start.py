@@ -48,8 +48,10 @@ def place_trunk(rest: np.ndarray, joints: np.ndarray, pelvis: np.ndarray) -> np.
 
 
 def interpolate_unknown(placement: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Return placements (N, 6) at times (N,) with unknown ones (NaN) interpolated. At least one is
-    known."""
+    """Return placements (N, 6), see :func:`place_trunk`, with unknown ones (NaN) interpolated.
+
+    times (N,): seconds. At least one placement must be known.
+    """
     known = np.isfinite(placement).all(1)
     vectors = np.zeros((len(placement), NUM_POSE + 3))
     vectors[:, :3], vectors[:, NUM_POSE:] = placement[:, :3], placement[:, 3:]
@@ -58,7 +60,7 @@ def interpolate_unknown(placement: np.ndarray, times: np.ndarray) -> np.ndarray:
 
 
 def turn_around(placement: np.ndarray) -> np.ndarray:
-    """Return placements (T, 6) with the body turned by half a turn about its vertical axis y."""
+    """Return placements (T, 6) with the body rotated by 180 degrees about its vertical axis y."""
     result = placement.copy()
     known = np.isfinite(placement).all(1)
     turn = Rotation.from_rotvec([0.0, np.pi, 0.0])
@@ -90,17 +92,26 @@ def fit_start(evidence: Evidence, problem: BodyProblem) -> torch.Tensor:
 
 
 def _fit_triangulated(problem: BodyProblem, placed: np.ndarray, joints: np.ndarray) -> Solution:
-    """Fit bodies placed at (n, 6) to keypoints (n, K, 3); ``own`` of the solution is (n, P)."""
+    """Fit n bodies to triangulated keypoints.
+
+    Args:
+        problem: provides the model, keypoints, offsets and terms.
+        placed: (n, 6) placements at the start.
+        joints: (n, K, 3) keypoints, NaN = unknown.
+
+    Returns:
+        The solution, whose ``own`` are whole parameter vectors (n, P).
+    """
     model = problem.model
 
     def tensor(values: np.ndarray) -> torch.Tensor:
         return torch.as_tensor(values, dtype=model.dtype, device=model.device)
 
     base = model.zeros(len(placed)).vector().clone()
-    base[:, 75:120], base[:, 120:165] = model.hand_mean[0], model.hand_mean[1]
+    base[:, 75:120], base[:, 120:165] = model.hand_mean[0], model.hand_mean[1]  # left, right
     base[:, 0:3], base[:, TRANSL] = tensor(placed[:, :3]), tensor(placed[:, 3:])
     for name, sign in (("left_shoulder", -1.0), ("right_shoulder", 1.0)):
-        base[:, 3 * JOINT_INDEX[name] + 2] = sign * 0.8  # arms hang
+        base[:, 3 * JOINT_INDEX[name] + 2] = sign * 0.8  # rad about z: lowers the arms
     joints = joints[:, BODY]
     known = np.isfinite(joints).all(2)
     own = BodyProblem(
