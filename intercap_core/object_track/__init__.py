@@ -23,4 +23,15 @@ Files in the order of a run:
 
 Poses are master_from_object, in metres. The quality of a pose is a log-likelihood ratio in nats.
 Constants that are marked as tuned were tuned on the studio's recordings.
+
+Terms:
+
+- Frame set: the images of all cameras of one frame; view: one camera's colour and depth image in
+  it; candidate: an instance mask that a detector found in a view.
+- Reduced image: every n-th pixel of an image, on which the tracker works.
+- Step (6,): a small motion of a pose. A turn (rotation vector, radians) on the left about the
+  object's origin, then a shift (metres), in the master frame. Twist (6,): step per second.
+- Evidence: what the images say about a pose. In ``likelihood`` and ``decoder`` it is a
+  log-likelihood ratio, in ``evidence``, ``rest`` and ``smooth`` a quadratic form of steps.
+- Share: independent observations per frame, at most 1, because errors of masks last 0.3 s.
 """

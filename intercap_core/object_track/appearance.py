@@ -1,8 +1,9 @@
 """Colours of the object's surface, learnt while it is tracked.
 
 They decide between rotations that the shape leaves ambiguous. The surface is divided into patches.
-The colour of a patch is stated in logarithms of linear light, where a camera's gain and shading
-add: a brightness and two ratios of channels. The log-likelihood ratio of a pose x is
+The colour of a patch is three logarithms of linear light, to which a camera's gain and shading add:
+mean of the channels (brightness), red over green, blue over green. The log-likelihood ratio of a
+pose x is
 
     log p(colours | colours learnt for these patches at pose x)
         - log p(colours | colours of the object as a whole)
@@ -22,8 +23,8 @@ from intercap_core.geometry.rigid.mesh import Paint
 from intercap_core.object_track.reduced_mask import covers
 
 COLOUR_SAMPLES = 2.0  # independent samples of a view's colours at most; tuned on the studio
-# Standard deviations of measured colours at least, in logarithms of light: shadows and lamps change
-# the brightness more than the two ratios.
+# Lower limits of the standard deviations of measured colours (brightness, two ratios), in logarithms
+# of light: shadows and lamps change the brightness more than the two ratios.
 COLOUR_MIN_SIGMA = np.array([0.25, 0.08, 0.08])  # tuned
 LEVELS_USED = slice(10, 251)  # grey levels; darker ones are noise, brighter ones saturated; tuned
 
@@ -51,25 +52,25 @@ class SurfaceColours:
     frame: int
     """Frame."""
     patch: np.ndarray
-    """(N,) numbers of the patches."""
+    """(N,) numbers of the patches (:func:`patch_of`)."""
     colour: np.ndarray
-    """(N, 3) mean colours."""
+    """(N, 3) mean colours: brightness and two ratios, logarithms of light."""
     normal: np.ndarray
     """(N, 3) unit normals of the patches, master frame."""
     view: np.ndarray
-    """(N,) view of each patch, ascending."""
+    """(N,) index of the view that shows each patch, ascending."""
     pixels: np.ndarray
-    """(N,) pixels of each patch."""
+    """(N,) number of pixels of each patch."""
 
 
 @dataclass(frozen=True, eq=False)
 class _PatchColours:
-    """Colours of P patches."""
+    """Colours of P patches as Gaussians, one per channel."""
 
     mean: np.ndarray
-    """(P, 3)."""
+    """(P, 3) means."""
     variance: np.ndarray
-    """(P, 3)."""
+    """(P, 3) variances of the means, without the noise of a measurement."""
 
 
 class Appearance:
@@ -81,7 +82,7 @@ class Appearance:
         """Learn the colours.
 
         Args:
-            sightings: colours of the frames, each with another pose.
+            sightings: colours of one frame each, at its pose.
             views: number of views.
             paint: colours of the mesh; ignored if they do not explain the learnt ones.
             size: size of a patch, metres.
@@ -102,22 +103,26 @@ class Appearance:
 
     @property
     def is_coloured(self) -> bool:
-        """Whether the object has more than one colour."""
+        """Whether the patches' colours vary: their variance exceeds half of the noise."""
         return bool((self._spread > 0.5 * self._noise).any())
 
     def log_ratio(self, seen: SurfaceColours, apart: int) -> float:
         """Return the log-likelihood ratio of a pose, nats.
 
-        Only colours of frames at least ``apart`` frames from its own count.
+        The learnt colours are those of frames at least ``apart`` frames away.
         """
         return self._ratio(seen, self._known(np.abs(self._frames - seen.frame) >= apart))
 
     def paint_log_ratio(self, seen: SurfaceColours) -> float:
-        """Return the same for the mesh's own colours; 0 if they are not the object's."""
+        """Return the ratio for the mesh's own colours, nats; 0 if they are not the object's."""
         return 0.0 if self._painted is None else self._ratio(seen, self._painted)
 
     def _learn(self) -> None:
-        """Estimate colours, gains of the cameras, and the noise of both in turns."""
+        """Estimate colours, gains of the cameras, noise and spread alternately, four times.
+
+        The colour of each frame is compared with those learnt in all other frames. The residual
+        gives the gains and the noise; the rest of the colours' variance is their spread.
+        """
         gain_sigma = 0.15  # of a camera's gain, logarithm of light
         views = np.concatenate([s.view for s in self.sightings])
         cameras = np.unique(views)
@@ -149,8 +154,8 @@ class Appearance:
     def _add_up(self, plain: Sequence[np.ndarray]) -> None:
         """Average the colours of the patches by frame.
 
-        All views of a frame count as one observation. ``plain`` are the differences from the
-        average.
+        All views of a frame count as one observation. ``plain`` [frames] (N, 3) are unshaded
+        differences from the average colour.
         """
         count = len(self._patches)
         for number, (seen, colour) in enumerate(zip(self.sightings, plain, strict=True)):
@@ -214,7 +219,7 @@ class Appearance:
         for camera in np.unique(seen.view):
             here = seen.view == camera
             pixels = float(seen.pixels[here].sum())
-            samples = COLOUR_SAMPLES * pixels / (pixels + 60)
+            samples = COLOUR_SAMPLES * pixels / (pixels + 60)  # half of them at 60 pixels
             total += samples * float(seen.pixels[here] @ ratio[here]) / pixels
         return total
 
@@ -263,7 +268,8 @@ def _mean_square(residual: np.ndarray) -> np.ndarray:
 def patch_of(point, normal, size):
     """Return the number of the patch of a surface point.
 
-    A patch is a cell of a grid of ``size`` metres and the axis that the surface faces most.
+    A patch is a cell of a grid of ``size`` metres, split by the direction (+ or - x, y or z of the
+    object) that the surface faces most. The number has 1024 cells along each axis.
     """
     facing = 0
     for axis in range(1, 3):
@@ -292,7 +298,9 @@ def seen_patches(
 ):  # fmt: skip
     """Return the patches of all pixels that show the object, with faces and colours.
 
-    A pixel counts if it and its neighbours lie in the rendering and in the candidate's mask.
+    The loop runs over the pixels of the rendering. A pixel counts if it and its four neighbours lie
+    in the rendering and in the candidate's mask, if no channel is too dark or saturated, and if the
+    surface is not too oblique. Its depth gives the surface point, and so the patch.
 
     Args:
         depth, face: (h, w) of the rendering, whose first pixel is (x0, y0) of the image.
@@ -303,10 +311,10 @@ def seen_patches(
         object_from_camera: (4, 4).
         face_normals: (F, 3), object frame.
         size: size of a patch, metres.
-        steep: least cosine between surface and ray.
+        steep: least cosine between the surface's normal and the ray to the camera.
 
     Returns:
-        Patches (n,), faces (n,) and colours (n, 3): brightness, red to green and blue to green.
+        Patches (n,), faces (n,) and colours (n, 3): brightness, red over green, blue over green.
     """
     height, width = face.shape
     patches = np.empty(height * width, np.int64)

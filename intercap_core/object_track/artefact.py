@@ -43,7 +43,7 @@ def track_datasets(track: Track, cameras: list[int], count: int) -> dict[str, np
 
     Args:
         track: the track.
-        cameras: places in the rig of the cameras with views.
+        cameras: indices in the rig of the cameras with views.
         count: number of cameras of the rig; cameras without a view have -1 and NaN.
     """
     frames = track.frames

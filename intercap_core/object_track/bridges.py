@@ -31,8 +31,7 @@ from intercap_core.object_track.likelihood import CONTRADICTED_LOG_RATIO
 from intercap_core.object_track.motion import estimate_hand_motions, unwrap_symmetry
 from intercap_core.object_track.observer import Observer
 
-# Standard deviations, or distances, at which a pose is as good as lost: one frame in six would be
-# off by more.
+# A pose with a larger standard deviation is lost; poses that are farther apart are different.
 UNSURE_M = 0.035  # metres; tuned on the studio
 UNSURE_RAD = np.radians(15)  # radians; tuned on the studio
 
@@ -50,7 +49,7 @@ class Bridge:
     log_ratio: float
     """Log-probability of the motion from the known frame before to the one after, nats."""
     information: np.ndarray
-    """(N, 6, 6) of (turn on the left, shift) by the motion of the hand, zero without a hand."""
+    """(N, 6, 6) inverse covariance of the poses by the motion of the hand, zero without a hand."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +81,7 @@ class Gap:
         frames = np.arange(a + 1, b)
         hands = [] if self.joints is None else estimate_hand_motions(self.joints[[a, b]])
         modes = mode_log_ratios(self.mesh, self.poses[[a]], self.poses[[b]], self.seconds, hands)
-        ratio = modes[:, 0, 0]
+        ratio = modes[:, 0, 0]  # (M,) of rest, free motion and each hand
         end = same(self.poses[b], self.poses[a])
         direct = self._straight(end)
         nothing = np.zeros((len(frames), 6, 6))
@@ -109,9 +108,10 @@ class Gap:
         return rigid(turns, np.stack(line, axis=1))
 
     def _in_hand(self, hand: int, t: int, end: np.ndarray) -> np.ndarray | None:
-        """Return the pose (4, 4) of frame ``t`` as the hand carries it from both sides.
+        """Return the pose (4, 4) of frame ``t`` in this hand; None if its motion is unknown.
 
-        ``end`` (4, 4) is the pose after the gap. None if the motion of the hand is unknown.
+        The hand carries the pose before the gap forwards, and ``end`` (4, 4), the pose after the
+        gap, backwards. The result is interpolated between the two by time.
         """
         assert self.joints is not None
         carried = []
@@ -124,7 +124,10 @@ class Gap:
         return apply_step(carried[0], share * step_between(*carried))
 
     def _hand_information(self, t: int) -> np.ndarray:
-        """Return the information (6, 6) of a hold on frame ``t``; it falls with the time."""
+        """Return the inverse covariance (6, 6) of the pose of frame ``t`` in a hand.
+
+        Its standard deviations grow with the time to the nearer known frame.
+        """
         nearer = min(
             self.times[t] - self.times[self.before], self.times[self.after] - self.times[t]
         )
@@ -134,21 +137,21 @@ class Gap:
 
 @dataclass(frozen=True)
 class FilledTrack:
-    """A track whose lost frames are filled in. Forms are zero outside of hand-carried frames."""
+    """A track whose lost frames are filled in. Matrices are zero in frames that no hand bridges."""
 
     poses: np.ndarray
     """(T, 4, 4) poses."""
     hand: np.ndarray
-    """(T, 6, 6) information of the hand's motion."""
+    """(T, 6, 6) J'J of the hand's motion, by steps of the pose."""
     images: np.ndarray
-    """(T, 6, 6) information of the images in the same frames."""
+    """(T, 6, 6) J'J of the images in the same frames."""
     pull: np.ndarray
-    """(T, 6) J'r of the hand; that of the images is the opposite, as their sum is minimal."""
+    """(T, 6) J'r of the hand. J'r of the images is the opposite, as the fit minimised both."""
     sure: np.ndarray
     """(T,) lost frames through which a hand surely carried the object."""
 
     def evidence(self, share: float, noise: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return information (T, 6, 6) and gradient (T, 6) of hand and images together.
+        """Return J'J (T, 6, 6) and J'r (T, 6) of hand and images together.
 
         Args:
             share: independent observations per frame: the hand's evidence in successive frames is
@@ -197,9 +200,10 @@ def _choose_path(observer: Observer, paths: list[Bridge]) -> tuple[Bridge, list[
     """Choose the path with the highest likelihood of motion and images.
 
     Returns:
-        The path; the fits of its frames, none if there is no other path; and whether it is sure:
-            the odds against any different path are above seven to one (2 nats), and the images do
-            not contradict it.
+        The path.
+        The fits of its frames; none if there is only one path.
+        Whether the path is sure: the odds against any different path are above seven to one (2
+            nats), and the images do not contradict it.
     """
     if len(paths) == 1:
         return paths[0], [], False

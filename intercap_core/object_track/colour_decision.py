@@ -1,9 +1,14 @@
 """Decision by the surface's colours between hypotheses that shape and motion leave ambiguous.
 
-Colours that are learnt while tracking are relative to the poses they are learnt with. If a turn is
-ambiguous in all frames alike they decide nothing, but they keep a side of the object from being
-confused with another halfway. Therefore colours are learnt once for each ambiguous pose of one
-frame, and each result counts by its evidence. Colours of the mesh itself are absolute.
+Colours are learnt with the poses of the track. If a turn is ambiguous in all frames, the learnt
+colours turn along and cannot decide it. They decide whether two frames show the same side of the
+object. Colours of the mesh itself are absolute. The method:
+
+1. The reference frame is the one with the most probable hypothesis.
+2. For each of its likely hypotheses: decode the recording given that this hypothesis is true, learn
+   the colours in certain frames, add their log-likelihood ratios in ambiguous frames, and decode
+   again.
+3. Average the results, weighted by their evidence. The mesh's own colours add to it.
 """
 
 from __future__ import annotations
@@ -43,7 +48,12 @@ class ColourDecision:
     def decide(
         self, emissions: Sequence[np.ndarray], steps: Sequence[np.ndarray], decoded: Decoded
     ) -> Decoded:
-        """Return ``decoded`` (see :func:`.decoder.decode`) with the evidence of colours."""
+        """Return the decision with the evidence of colours, or ``decoded`` if they cannot help.
+
+        Args:
+            emissions, steps: arguments of :func:`.decoder.decode`.
+            decoded: its result without colours.
+        """
         sure = np.array(
             [
                 0.0 if k == HIDDEN else p[k]
@@ -54,7 +64,7 @@ class ColourDecision:
         if self._observer.pictures is None or not sure[first]:
             return decoded
         own = decoded.probability[first][:-1]
-        # colours are learnt relative to the likeliest poses of one frame
+        # gauges: up to three likely hypotheses of the reference frame
         gauges = [int(k) for k in np.argsort(-own)[:3] if own[k] > RIVAL_PROBABILITY]
         relative = {k: decode_given(emissions, steps, first, k, self._absent) for k in gauges}
         rivals = self._ambiguous(list(relative.values()))
@@ -74,9 +84,9 @@ class ColourDecision:
         return mix_decisions(results) if results else decoded
 
     def _ambiguous(self, relative: Sequence[Decoded]) -> dict[int, np.ndarray]:
-        """Return the ambiguous hypotheses of each frame in any of these results.
+        """Return the hypotheses to compare, by frame, for frames that any result leaves ambiguous.
 
-        Frames that are near others are skipped. The same hypotheses are compared in all results.
+        Only one frame in 1/15 s is tested. The same hypotheses are compared in all results.
         """
         every = self._observer.frames_in(1 / 15)  # nearer frames show the same colours
         rivals = {}
@@ -127,7 +137,7 @@ class ColourDecision:
                     for k, colours in seen.items()
                     if colours is not None
                 }
-                # hypotheses that were not compared gain nothing
+                # hypotheses that were not compared get the worst ratio, at most 0
                 values[t] += min([0.0, *ratios.values()])
                 for k, ratio in ratios.items():
                     values[t][k] = emissions[t][k] + ratio

@@ -22,22 +22,22 @@ from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.motion import HandMotion
 
 # Standard deviations of the motion between frames.
-STANDING_M = 0.015  # of fits of an object at rest, metres; tuned
-STANDING_RAD = np.radians(8)  # radians; tuned
-HELD_M = 0.02  # of fits and joints in a hand, metres; tuned
-HELD_RAD = np.radians(10)  # radians; tuned
-HELD_M_S = 0.3  # of slipping in a hand, m/s; tuned
-HELD_RAD_S = 1.0  # rad/s; tuned
+STANDING_M = 0.015  # shift at rest: errors of fits, metres; tuned
+STANDING_RAD = np.radians(8)  # turn at rest, radians; tuned
+HELD_M = 0.02  # shift in a hand: errors of fits and joints, metres; tuned
+HELD_RAD = np.radians(10)  # turn in a hand, radians; tuned
+HELD_M_S = 0.3  # speed of slipping in a hand, m/s; tuned
+HELD_RAD_S = 1.0  # the same of turns, rad/s; tuned
 # Costs are minus log-likelihoods, nats.
 FREE_COST_S = 30.0  # of free motion, nats/s: rest and hands explain most recordings; tuned
 MODE_CHANGES_S = 1.0  # changes from one mode of motion to another per second; tuned
 JUMP_COST = 10.0  # of a step that no motion explains, nats; tuned
 VANISH_COST = 7.0  # of going out of sight, and of coming into sight, nats; tuned
 LEAVE_COST = 4.0  # of leaving the room or coming back, in addition, nats; tuned
-# Cost of going out of reach between two sure frames, and of coming back: clutter is anywhere in a
-# room, of which the reachable part is a hundredth.
+# Cost of a step to a place that the object cannot reach between two sure frames, and of the step
+# back: about log 100, since the reachable part of a room is a hundredth.
 EXCURSION_COST = 5.0  # nats; tuned
-REACH_M = 0.2  # error of either pose of two that can be reached from each other, metres; tuned
+REACH_M = 0.2  # tolerance of distances between reachable poses, for their errors, metres; tuned
 
 FIRST_HAND = 2  # first mode that is a hand, after rest and free motion
 HIDDEN = -1  # index in paths: no hypothesis is true
@@ -64,8 +64,9 @@ def step_log_ratios(
         free_cost_s: cost of free motion, nats per second.
 
     Returns:
-        (M, M, K + 1, L + 1) by the mode of the step before, the mode of this step, and the states;
-            M = 2 + H. The last state of either frame is that no hypothesis is true.
+        (M, M, K + 1, L + 1), indexed by the mode of the step before, the mode of this step, the
+            state before and the state after. The M = 2 + H modes are rest, free motion and each
+            hand. The last state of either frame is that no hypothesis is true.
     """
     modes = FIRST_HAND + len(hands)
     steps = np.zeros((modes, modes, len(before) + 1, len(after) + 1))
@@ -75,7 +76,7 @@ def step_log_ratios(
     own = mode_log_ratios(mesh, before, after, seconds, hands, free_cost_s)
     changes = np.full((modes, modes), np.log(-np.expm1(-MODE_CHANGES_S * seconds)))
     np.fill_diagonal(changes, 0.0)
-    # one of the modes that are possible from a pose is true
+    # normalised over the modes that are possible from a pose: one of them is true
     possible = np.where(np.isfinite(own).any(2), 0.0, -np.inf)
     share = changes[:, :, None] - logsumexp(changes[:, :, None] + possible, axis=1, keepdims=True)
     steps[..., :-1, :-1] = share[..., None] + own
@@ -90,11 +91,14 @@ def mode_log_ratios(
     hands: Sequence[HandMotion | None],
     free_cost_s: float = FREE_COST_S,
 ) -> np.ndarray:
-    """Return log-probabilities (M, K, L) of the steps between poses in each mode of motion."""
+    """Return log-probabilities (M, K, L) of the steps between poses in each mode of motion.
+
+    Modes and arguments are those of :func:`step_log_ratios`. -inf: the hand is out of reach.
+    """
     turn, shift = pose_distances(mesh, before, after)
-    rad_s, m_s = 7.0, 2.5  # free motion: a swing, a kick
+    rad_s, m_s = 7.0, 2.5  # standard deviations of free motion: a swing, a kick
     moved = (turn / (rad_s * seconds)) ** 2 + (shift / (m_s * seconds)) ** 2
-    # free motion costs for 0.1 s at most: the object may have rested meanwhile
+    # free motion costs for 0.1 s at most: in a longer gap the object may have rested
     ratios = [
         -0.5 * ((turn / STANDING_RAD) ** 2 + (shift / STANDING_M) ** 2),
         -np.minimum(0.5 * moved, JUMP_COST) - free_cost_s * min(seconds, 0.1),
@@ -140,10 +144,10 @@ def pose_distances(
 def find_excursions(
     centres: Sequence[np.ndarray], path: np.ndarray, sure: np.ndarray, times: np.ndarray
 ) -> list[np.ndarray]:
-    """Find hypotheses that cannot be reached from the sure frames around.
+    """Find hypotheses that the object cannot reach between the sure frames before and after.
 
-    A hypothesis is out of reach if it is too far from the sure frame before or after, provided that
-    one of these can be reached from the other.
+    A hypothesis is out of reach if it is too far from either of the two. If the two cannot be
+    reached from each other, nothing is out of reach.
 
     Args:
         centres: [T] (K_t, 3) of the hypotheses, metres.
@@ -152,7 +156,7 @@ def find_excursions(
         times: (T,) seconds.
 
     Returns:
-        [T] (K_t,) bool.
+        [T] (K_t,) bool, true if out of reach.
     """
 
     def reaches(a: np.ndarray, b: np.ndarray, seconds: float) -> np.ndarray:
@@ -215,7 +219,7 @@ def decode(
     """
     modes = len(steps[0]) if steps else 1
     states = [np.append(np.repeat(own, modes), [0.0, absent]) for own in emissions]
-    states[0][:-2] -= np.log(modes)
+    states[0][:-2] -= np.log(modes)  # all modes are equally likely in the first frame
     for end in (0, -1):
         states[end][-1] -= LEAVE_COST
     transitions = [_transitions(step) for step in steps]
@@ -270,7 +274,7 @@ def _forward_backward(
         The probability of each state [T], and the log-likelihood of all frames.
     """
     matrices = [np.exp(transition) for transition in transitions]
-    # exp(-600) is the least, so that no state becomes impossible
+    # exp(-600) at least, so that no state becomes impossible by underflow
     likelihoods = [np.exp(np.maximum(own - own.max(), -600.0)) for own in emissions]
     evidence = float(sum(own.max() for own in emissions))
     forward: list[np.ndarray] = []
@@ -302,7 +306,7 @@ def decode_given(
 
 
 def mix_decisions(results: Sequence[Decoded]) -> Decoded:
-    """Average results that exclude each other, weighted by their evidence."""
+    """Average results given different hypotheses of one frame, weighted by their evidence."""
     evidence = np.array([result.evidence for result in results])
     share = np.exp(evidence - logsumexp(evidence))
     probability = [

@@ -1,4 +1,8 @@
-"""Evidence of the views of a frame set on small motions of a pose, as quadratic forms."""
+"""Evidence of the views of a frame set as quadratic forms of small motions of a pose.
+
+About a pose, minus log-likelihood of a step x = (turn on the left, shift) is x^T H x / 2 + g^T x,
+with H = J'J (``information``) and g = J'r (``gradient``) of the terms of equation 1.
+"""
 
 from __future__ import annotations
 
@@ -18,17 +22,17 @@ from intercap_core.object_track.view import FitContext, View
 from intercap_core.object_track.view_fit import NormalEquations, ViewFit
 from intercap_core.object_track.view_report import ViewReport
 
-# Total variance of the views' errors (common and independent) over the independent part, of shifts
-# and of turns: errors common to all views (calibration, masks that are too large) shift the object
-# rather than rotate it.
+# Total variance of the views' errors over the part that is independent between views. Errors that
+# all views have in common (calibration, masks that are too large) shift the object rather than
+# rotate it.
 COMMON_ERROR_VARIANCE = 4.0  # of shifts; tuned
 COMMON_TURN_VARIANCE = 1.5  # of turns; tuned
 TURN_SCALE = np.repeat([np.sqrt(COMMON_TURN_VARIANCE / COMMON_ERROR_VARIANCE), 1.0], 3)
-"""(6,) factor of the standard deviations that were computed with ``COMMON_ERROR_VARIANCE``."""
+"""(6,) corrects standard deviations (turn, shift) computed with ``COMMON_ERROR_VARIANCE`` alone."""
 # Duration of errors of masks, seconds: frames within it are one independent observation.
 ERROR_LASTING_S = 0.3  # tuned
-# Standard deviations (rad, metres) of an unobserved pose: a uniform angle; a room.
-UNKNOWN_SIGMA = np.repeat([np.pi / np.sqrt(3), 1.0], 3)  # standard deviation of a uniform angle
+# Standard deviations (turn, shift) of an unobserved pose: a uniform angle, radians; a room, metres.
+UNKNOWN_SIGMA = np.repeat([np.pi / np.sqrt(3), 1.0], 3)
 
 
 @dataclass(frozen=True)
@@ -58,7 +62,10 @@ class ImageEvidence:
 def evidence_at(
     context: FitContext, views: list[View], pose: np.ndarray, twist: np.ndarray | None = None
 ) -> ImageEvidence:
-    """Evaluate the evidence of the images at ``pose`` (4, 4) with the last robust scales."""
+    """Evaluate the evidence of the images at ``pose`` (4, 4) with the last robust scales of a fit.
+
+    ``twist`` (6,) is the motion of the object as in :func:`.fit.fit_pose`.
+    """
     fits = view_fits(context, views, pose, twist)
 
     def terms(fit: ViewFit) -> tuple[NormalEquations, NormalEquations, ViewReport]:
@@ -84,12 +91,11 @@ def report_at(
 
 
 def views_noise(evidences: Sequence[ImageEvidence]) -> float:
-    """Estimate the factor of the stated variance from how far the gradients of the views disagree.
+    """Estimate s^2, the true over the stated variance of a view, from the disagreement of views.
 
-    At the minimum each view v of a frame still has a gradient g_v. If its errors are independent
-    with s^2 times its stated variance, E[g_v g_v'] = s^2 H_v less its share in the minimum. Errors
-    that all views have in common (calibration, masks that are too large) do not show and come on
-    top.
+    At the minimum each view v of a frame still has a gradient g_v. If the errors of views are
+    independent, E[g_v g_v'] = s^2 H_v, less the share of v in the minimum. Errors that all views
+    have in common do not show; ``COMMON_ERROR_VARIANCE`` adds them.
     """
     squares = freedom = 0.0
     for evidence in evidences:
@@ -125,6 +131,8 @@ def without_turns(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Remove the evidence on ``steps`` (N, 6), which the facets of a round mesh seem to give.
 
+    For each step s, information H becomes H - H s s^T H / (s^T H s), so that H s = 0.
+
     Args:
         information: (..., 6, 6).
         gradient: (..., 6).
@@ -155,7 +163,7 @@ class FrameEvidence:
 
         The translations become the positions of the centre.
         """
-        # the origin's shift is the centre's and what the turn adds
+        # the shift of the origin is that of the centre plus that by the turn
         to_origin = steps_about_point(self.poses[:, :3, :3] @ centre)
         back = to_origin.transpose(0, 2, 1)
         poses = self.poses.copy()
@@ -166,7 +174,7 @@ class FrameEvidence:
 
     @property
     def own(self) -> np.ndarray:
-        """Steps (T, 6) to the minimum of the evidence of each frame alone."""
+        """Steps (T, 6) to the minimum of the evidence of each frame alone, from its pose."""
         damped = self.information + np.diag(UNKNOWN_SIGMA**-2)
         return -np.linalg.solve(damped, self.gradient[..., None])[..., 0]
 
@@ -174,7 +182,7 @@ class FrameEvidence:
 def steps_about_point(arms: np.ndarray) -> np.ndarray:
     """Return matrices (T, 6, 6) from steps about one point to steps about another.
 
-    The second point lies ``arms`` (T, 3) before the first, so its shift gains turn x -arm.
+    The second point is the first minus ``arms`` (T, 3), so its shift gains turn x -arm.
     """
     result = np.tile(np.eye(6), (len(arms), 1, 1))
     result[:, 3:, :3] = np.cross(np.eye(3), arms[:, None])

@@ -22,7 +22,7 @@ from intercap_core.object_track.view_report import ViewReport, quick_report
 DEPTH_SCALES_M = (0.050, 0.012)  # metres; tuned
 CONTOUR_SCALES_PX = (30.0, 6.0)  # pixels at full resolution; tuned
 REPORT_CONTOUR_PX = 4.0 * CONTOUR_SCALES_PX[1]  # scale of the residuals in a report, pixels
-FIT_ROUNDS = (4, 5)  # Gauss-Newton steps at most after each choice of candidates; tuned
+FIT_ROUNDS = (4, 5)  # at most this many Gauss-Newton steps after each choice of candidates; tuned
 
 
 @dataclass(frozen=True)
@@ -34,9 +34,9 @@ class MotionPrior:
 
     pose: np.ndarray
     """(4, 4) master_from_object."""
-    sigma_m: float = 0.06  # tuned on the studio, as the next
+    sigma_m: float = 0.06  # tuned on the studio
     """Standard deviation of the translation along each axis, metres."""
-    sigma_rad: float = float(np.radians(15))
+    sigma_rad: float = float(np.radians(15))  # tuned on the studio
     """Standard deviation of the turn about each axis, radians."""
 
 
@@ -51,7 +51,7 @@ class FittedPose:
     views: tuple[ViewReport, ...]
     """Agreement of each view."""
     twist: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    """(6,) motion per second with which each view saw the object (:func:`fit_pose`)."""
+    """(6,) motion of the object per second that was assumed (:func:`fit_pose`)."""
 
     @property
     def log_ratio(self) -> float:
@@ -66,7 +66,10 @@ class FittedPose:
 
     @property
     def support(self) -> int:
-        """Number of views with a candidate, or whose depth agrees in enough visible pixels."""
+        """Number of views that support the pose.
+
+        These have a candidate, or 36 visible pixels and a mean agreement of depth above 0.5.
+        """
         return sum(
             not np.isnan(view.overlap) or (view.visible_px >= 36 and view.depth_agreement > 0.5)
             for view in self.views
@@ -85,8 +88,13 @@ def fit_pose(
 ) -> FittedPose:
     """Fit the pose (4, 4) to all views, starting from ``pose``.
 
-    The pivot of the rotation is the origin of the mesh. To first order in the motion until a view
-    exposes, a step of the pose is the same step of what that view sees.
+    In each round every view chooses its candidate, then Gauss-Newton steps follow until they are
+    small or the round's limit is reached. Robust scales halve with each step. The views are
+    rendered again only if a step is larger than a quarter of a pixel. The rotation's pivot is the
+    origin of the mesh.
+
+    A view that exposes later sees a moved object. To first order in that motion, a step of the pose
+    moves the seen object by the same step.
 
     Args:
         context: object and settings.
@@ -97,7 +105,7 @@ def fit_pose(
         start_scale: factor of the first robust scales; below 1 if the start is better than from a
             search.
         twist: (6,) turn and shift of the object per second (rad, m), None = at rest. Each view sees
-            the object moved by it until the view exposes.
+            the object moved by the twist times its time offset.
     """
     pool = context.renderer.pool
     depth_scale, contour_scale = DEPTH_SCALES_M[0], CONTOUR_SCALES_PX[0]
@@ -120,11 +128,11 @@ def fit_pose(
             settled = depth_scale <= DEPTH_SCALES_M[1] and contour_scale <= CONTOUR_SCALES_PX[1]
             depth_scale = max(depth_scale * 0.5, DEPTH_SCALES_M[1])
             contour_scale = max(contour_scale * 0.5, CONTOUR_SCALES_PX[1])
-            # 0.2 px of 1080p at 2.5 m
+            # 0.5 mm: 0.2 px of 1080p at 2.5 m
             done = settled and _is_below(step - last, 5e-4, np.radians(0.1))
             if done:
                 break
-            # a quarter of a pixel: residuals are linear in the step, no new renderings are needed
+            # below a quarter of a pixel residuals are linear in the step: no new renderings
             if _is_below(step, 1.5e-3, np.radians(0.3)):
                 last = step
             else:
@@ -165,7 +173,7 @@ def _is_below(step: np.ndarray, metres: float, radians: float) -> bool:
 def view_fits(
     context: FitContext, views: list[View], pose: np.ndarray, twist: np.ndarray | None
 ) -> list[ViewFit]:
-    """Create the fit of each view at ``pose`` (4, 4), moved by ``twist`` until it exposes."""
+    """Create the fit of each view at ``pose`` (4, 4), moved by ``twist`` (6,) to its exposure."""
     seen = seen_by(pose, views, twist)
     return [
         ViewFit(context, view, own, drawn)
@@ -226,8 +234,8 @@ def _limited(step: np.ndarray) -> np.ndarray:
 def seen_by(pose: np.ndarray, views: list[View], twist: np.ndarray | None) -> list[np.ndarray]:
     """Return the pose (4, 4) at the exposure of each view.
 
-    ``twist`` (6,) is the motion of the object per second. Views until whose exposure the object
-    moves by less than 0.4 mm and 0.08 degrees share the array ``pose``, and so one rendering.
+    ``twist`` (6,) is the motion of the object per second. If the object moves by less than 0.4 mm
+    and 0.08 degrees until a view exposes, the view gets the array ``pose`` itself.
     """
     if twist is None:
         return [pose] * len(views)

@@ -73,7 +73,7 @@ class ObjectImages:
         threads: ThreadPool,
     ) -> None:
         self.recording, self.threads = recording, threads
-        self.views = ViewCache(recording.views, 200_000_000)  # bytes: some 100 frames of 6 cameras
+        self.views = ViewCache(recording.views, 200_000_000)  # bytes: 22 to 350 frames of 6 cameras
         self.mesh = mesh.simplified(TRACKING_FACES)
         renderer = open_renderer(settings.render_on, threads=1)
         self.context = FitContext(
