@@ -1,7 +1,8 @@
 """Annotated poses of the object as evidence on their frames and on the frames around.
 
-An annotated pose is an observation of its frame with the stated standard deviations. While the
-object is not seen, the pose is carried on from there with deviations that grow with time.
+An annotated pose is an observation of its frame with the stated standard deviations. In the frames
+before and after in which no image shows the object (unseen frames), the pose of the track is
+carried: it counts as an observation whose standard deviations grow with time.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from intercap_core.object_track.likelihood import SEEN_LOG_RATIO
 from intercap_core.object_track.motion import GROWTH_LOST_M_S, GROWTH_LOST_RAD_S
 from intercap_core.object_track.turns import SAME_POSE_DEG, SAME_POSE_M
 
-UNSEEN_S = 0.8  # for which an object is followed without being seen; tuned on the studio
+UNSEEN_S = 0.8  # time that an object is followed without being seen, seconds; tuned on the studio
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +62,7 @@ class GivenEvidence:
     """Annotated poses as quadratic forms of (turn on the left, shift of the origin) of T frames."""
 
     reference: np.ndarray
-    """(T, 4, 4) poses about which the forms are."""
+    """(T, 4, 4) poses at which the quadratic forms are minimal."""
     information: np.ndarray
     """(T, 6, 6) J'J, zero in frames without evidence."""
     carried: np.ndarray
@@ -146,9 +147,9 @@ class GivenEvidence:
 
 
 def seconds_since(frames: Sequence[int], unseen: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Return the time (T,) to the nearest of ``frames`` that unseen frames alone lead to.
+    """Return the seconds (T,) to the nearest of ``frames`` that is connected by unseen frames.
 
-    It is 0 in these frames and infinite where there is no such frame.
+    It is 0 in ``frames`` themselves, and infinite if no frame is connected.
 
     Args:
         frames: frames of annotated poses.
@@ -169,10 +170,11 @@ def seconds_since(frames: Sequence[int], unseen: np.ndarray, times: np.ndarray) 
 def flag_edges(
     fits: Sequence[FittedPose], unseen: np.ndarray, frames: Sequence[int], times: np.ndarray
 ) -> np.ndarray:
-    """Find frames (T,) next to unseen ones, near annotated ``frames``, that only one view shows.
+    """Find visible frames (T,) next to unseen ones, near annotated ``frames``, with one view only.
 
-    An object that moves out of sight there moves fast. Its motion until that view exposes is known
-    from one side only: a swung racquet moves by a decimetre in 19 ms. No covariance states this.
+    An object that moves out of sight there moves fast: a swung racquet moves by a decimetre in
+    19 ms, a possible time offset of a view. The unseen side does not constrain its velocity, and so the
+    pose at the frame's time is less certain than the covariance states.
 
     Args:
         fits: fit of each frame.

@@ -40,10 +40,10 @@ _COMPASS = _unit_circle(OUTLINE_DIRECTIONS)
 
 @dataclass(frozen=True, eq=False)
 class MaskOutline:
-    """Support function of one view's mask, at z = 1 of its colour camera, without distortion."""
+    """Support function of one view's mask, in the plane z = 1 of its undistorted colour camera."""
 
     support: np.ndarray
-    """(D,) extent in each direction."""
+    """(D,) h(d) of each direction."""
     known: np.ndarray
     """(D,) bool, false where the mask is cut off."""
     middle: np.ndarray
@@ -55,7 +55,7 @@ class MaskOutline:
 
     @classmethod
     def of(cls, view: View, candidate: MaskCandidate) -> MaskOutline | None:
-        """Compute the outline of a candidate's mask; None if all of it is cut off."""
+        """Compute the outline of a candidate's mask; None if it is cut off in all directions."""
         mask, lens = candidate.mask, view.geometry.lens
         row, column = np.nonzero(rim_mask(np.pad(mask.mask, 1)))
         x, y = column + mask.x0 - 1, row + mask.y0 - 1
@@ -71,6 +71,7 @@ class MaskOutline:
         known = ~_is_cut_off(view, candidate, x[ends], y[ends])
         if not known.any():
             return None
+        # Steiner point of the convex hull: 2 x the mean over directions d of h(d) d
         middle = (support[:, None] * _COMPASS).sum(0) * 2 / OUTLINE_DIRECTIONS
         pose = view.geometry.camera.colour_from_master
         return cls(support, known, middle, float(width.max()), pose)
@@ -109,15 +110,18 @@ def hull_vertices(mesh: ObjectMesh) -> np.ndarray:
 def outline_residuals(
     outline: MaskOutline, hull: np.ndarray, rotation: np.ndarray, translation: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute how far the object extends beyond a mask, and the Jacobian.
+    """Compute how far the object extends beyond a mask, and the Jacobian, for N poses.
+
+    The difference of the two support functions is multiplied by the object's depth, which gives
+    metres at the object.
 
     Args:
-        outline: of the mask.
+        outline: outline of the mask.
         hull: (H, 3) vertices of the convex hull, object frame.
         rotation, translation: (N, 3, 3) and (N, 3) of master_from_object.
 
     Returns:
-        residual: (N, D) metres, zero in directions in which the mask is cut off.
+        residual: (N, D) metres, negative if the mask extends farther, zero where it is cut off.
         jacobian: (N, D, 6) by the step (turn, shift) in the object frame: pose <- pose * exp(step).
     """
     pose = outline.colour_from_master
@@ -146,7 +150,7 @@ class LocatedCandidate:
     """One candidate of one view, with the position that it gives."""
 
     view: int
-    """Number of the view."""
+    """Index of the view."""
     candidate: MaskCandidate
     """The candidate."""
     label_prior: float
@@ -164,10 +168,10 @@ class LocatedCandidate:
         return MaskOutline.of(self.image, self.candidate)
 
     def away(self, point: np.ndarray, diameter: float) -> float:
-        """Return the distance of the candidate from a point (3,).
+        """Return the distance of the candidate from a point (3,); below 1 it may be the object.
 
-        The unit is the largest distance within one object; infinite if the mask's width is not that
-        of the object at the point.
+        The unit is the largest distance that is possible within one object. Infinite if the mask's
+        width is not that of the object at the point.
         """
         slack_m = 0.03  # added to all sizes; tuned on the studio, as the shares below
         if self.centre is not None:  # two sides of one object are 0.6 of its diameter apart
@@ -176,7 +180,7 @@ class LocatedCandidate:
         assert outline is not None
         towards = point - outline.eye
         along = float(towards @ outline.ray)
-        # from seen end on or half hidden to smeared by motion
+        # narrow if seen end on or half hidden, wide if smeared by motion
         if not 0.12 * diameter < outline.extent * along < 1.25 * diameter + slack_m:
             return np.inf
         across = float(np.linalg.norm(towards - along * outline.ray))
@@ -195,6 +199,10 @@ def find_groups(
     limit: int = 3,
 ) -> list[Group]:
     """Find groups of candidates that may be the object.
+
+    The points of a candidate with depth give a place, and so does each crossing of the rays of two
+    views. The nearest candidate of every other view joins the place if it is near enough. Groups
+    are ranked by the sum of their candidates' label priors times the prior of the place.
 
     Args:
         mesh: the object.
@@ -245,7 +253,7 @@ def locate_group(group: Group) -> np.ndarray:
 
 
 def _distinct_groups(groups: list[Group], limit: int) -> list[Group]:
-    """Keep the first groups that do not share most of their members with an earlier one."""
+    """Keep the first ``limit`` groups that share at most half of their members with a kept one."""
     kept: list[Group] = []
     for group in groups:
         if len(kept) == limit:
@@ -291,7 +299,7 @@ def _possible_candidates(view: View) -> list[MaskCandidate]:
 
 def _label_prior(label: str, labels: tuple[str, ...]) -> float:
     if label == "":
-        return 0.8
+        return 0.8  # tuned, as below
     # detectors err, so the label of another class does not exclude a candidate
     return 1.0 if label in labels or (not labels and label != PERSON_LABEL) else 0.5
 

@@ -33,12 +33,12 @@ from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.turns import distinct_poses, same_pose
 
 BASIN = (0.04, 15.0)  # metres and degrees within which all fits lead to one pose; tuned
-MAX_HYPOTHESES = 12  # of a frame: turns of a mug with a hidden handle, 30 degrees apart (tuned)
-RIVAL_PROBABILITY = 0.01  # of a hypothesis, below which it is not considered further; tuned
-RIVAL_LOG_RATIO = 5.0  # nats of independent evidence below the best, up to which to follow; tuned
+MAX_HYPOTHESES = 12  # in a frame, enough for a mug with hidden handle turned by 30 degrees; tuned
+RIVAL_PROBABILITY = 0.01  # hypotheses below this probability are not considered further; tuned
+RIVAL_LOG_RATIO = 5.0  # hypotheses this much worse than the best are not followed, nats; tuned
 UPRIGHT_LOG_RATIO = 2.0  # nats times the cosine of the angle to the standing pose; tuned on studio
-# Nats of one frame for its annotated pose, and for all poses within reach of it. The latter is the
-# cost of a jump there and back for that frame alone.
+# Evidence that an annotated pose adds in its frame: for this pose, and for all poses within REACH_M
+# of it. The latter outweighs the cost of a jump there and back for that frame alone.
 ANNOTATION_LOG_RATIO = 10.0  # nats; tuned
 ANNOTATED_LOG_RATIO = 2 * (JUMP_COST + EXCURSION_COST)
 
@@ -57,7 +57,7 @@ class Prior:
     def near_annotated(self, hidden: np.ndarray) -> np.ndarray:
         """Find frames (T,) bool near annotated poses that are near ``hidden`` frames (T,) as well.
 
-        Near is the time for which an object is followed without being seen.
+        Near is less than ``UNSEEN_S`` away.
         """
         times = self._observer.times
         result = np.zeros(len(times), bool)
@@ -70,8 +70,9 @@ class Prior:
     def weigh(self, t: int, fits: list[FittedPose]) -> np.ndarray:
         """Return the evidence (K,) for hypotheses of frame t relative to none being true, nats.
 
-        Hypotheses that explain one object share the prior of its place
-        (:meth:`.places.Places.weigh`) and differ by the evidence of the images.
+        The evidence is the sum of the images' log-likelihood ratio, limited by the prior of the
+        place (:meth:`.places.Places.weigh`), of the upright prior and of an annotated pose. All
+        hypotheses that explain the same candidates have the place of the likeliest of them.
         """
         mesh, places, share = self._observer.mesh, self._observer.places, self._observer.share
         ratio = np.array([fit.log_ratio for fit in fits])
@@ -85,6 +86,7 @@ class Prior:
             result[members] -= own - places.weigh(t, place, own, share)
         if self._observer.up is not None:
             up = self._observer.up / np.linalg.norm(self._observer.up)
+            # column 2 of the rotation is the object's z axis
             result += UPRIGHT_LOG_RATIO * np.array([fit.pose[:3, 2] @ up for fit in fits])
         if t in self.given and fits:
             poses = np.array([fit.pose for fit in fits])
@@ -96,9 +98,10 @@ class Prior:
 
 
 def group_by_candidates(fits: list[FittedPose]) -> np.ndarray:
-    """Number (K,) the objects that the hypotheses of a frame explain.
+    """Return for each hypothesis of a frame the number (K,) of the object that it explains, from 0.
 
-    Hypotheses that mostly choose the same candidates explain the same object.
+    A hypothesis explains the object of a likelier one if both chose the same candidate in at least
+    half of the views in which it has one.
     """
     number = np.zeros(len(fits), int)
     leaders: list[np.ndarray] = []
@@ -136,19 +139,19 @@ class Hypotheses:
         return None
 
     def seen(self, t: int, pose: np.ndarray) -> int | None:
-        """Return :meth:`known` if the images support that hypothesis."""
+        """Return the hypothesis of frame t at this pose (4, 4) if the images support it."""
         k = self.known(t, pose)
         return k if k is not None and self.fits[t][k].log_ratio > SEEN_LOG_RATIO else None
 
     def best(self, t: int) -> float:
-        """Return the weight of the likeliest hypothesis of frame t, nats, at least 0."""
+        """Return the evidence (:meth:`Prior.weigh`) of the likeliest hypothesis of frame t, or 0."""
         return float(self._prior.weigh(t, self.fits[t]).max(initial=0.0))
 
     def add(self, t: int, fit: FittedPose) -> None:
         """Add a hypothesis to frame t.
 
-        The likelier of two at one pose is kept. Of too many hypotheses one is dropped so that
-        ambiguous turns stay evenly spread.
+        Of two at the same pose the likelier one is kept. If there are too many, one is dropped so
+        that ambiguous turns stay evenly spread.
         """
         own = self.fits[t]
         k = self.known(t, fit.pose)
@@ -160,10 +163,11 @@ class Hypotheses:
             own[k] = fit
 
     def _most_redundant(self, t: int) -> int:
-        """Return the hypothesis of frame t to drop.
+        """Return the hypothesis of frame t to drop: the least likely of the first of these groups.
 
-        The least likely one, first among those that the images do not support, then among those
-        with a likelier one within 4 cm and 20 degrees, then among all.
+        1. Hypotheses that the images do not support, if they support another one.
+        2. Hypotheses with a likelier one within 4 cm and 20 degrees.
+        3. All hypotheses.
         """
         own, mesh = self.fits[t], self._observer.mesh
         order = [int(k) for k in np.argsort(self._prior.weigh(t, own))]
@@ -177,18 +181,18 @@ class Hypotheses:
     def follow(self, t: int, fit: FittedPose) -> None:
         """Add a fit of frame t and follow it through the frames before and after.
 
-        It ends where it meets a known hypothesis, is unseen for long or is hopelessly worse than
-        another one.
+        It ends where it meets a known hypothesis, is unseen for ``UNSEEN_S``, or where the best
+        hypotheses are better by ``RIVAL_LOG_RATIO`` in total since its start.
         """
         self.add(t, fit)
         for frames in (range(t + 1, self._observer.count), range(t - 1, -1, -1)):
             self._follow(t, fit.pose, frames)
 
     def refit_moving(self, decoded: Decoded) -> set[int]:
-        """Fit moving objects again as each view saw them at its exposure.
+        """Fit moving objects again, with the motion between the frame's time and each exposure.
 
-        The motion is that of the decided poses around, which is better known than at the first fit.
-        Rivals move as the decided hypothesis.
+        The twist follows from the decided poses of the frames around, which are better known than
+        at the first fit. All hypotheses of a frame get the twist of the decided one.
 
         Returns:
             The frames that changed.
@@ -215,7 +219,7 @@ class Hypotheses:
                 if again.log_ratio > fit.log_ratio:
                     self.fits[t][k] = again
                     changed.add(t)
-            if t in changed:  # of hypotheses that have become one pose, the likeliest stays
+            if t in changed:  # hypotheses may have become equal: keep the likeliest
                 fits = sorted(self.fits[t], key=lambda fit: -fit.log_ratio)
                 distinct = distinct_poses(self._observer.mesh, [fit.pose for fit in fits])
                 self.fits[t] = [fits[k] for k in distinct]
@@ -248,9 +252,10 @@ class Hypotheses:
                 unseen += 1
 
     def _predict(self, t: int, last: int, before: np.ndarray, now: np.ndarray) -> np.ndarray:
-        """Predict the pose (4, 4) of frame t that its images support best.
+        """Predict the pose (4, 4) of frame t: of several predictions, the likeliest by its images.
 
-        Predictions are constant velocity, the pose of frame ``last``, and with each hand.
+        Predictions are constant velocity, rest, and motion with each hand. ``before`` and ``now``
+        (4, 4) are the last two poses, ``now`` in frame ``last``.
         """
         poses = np.array([extrapolate(before, now), now, *self._observer.carried(last, t, now)])
         starts = poses[distinct_poses(self._observer.mesh, poses, BASIN)]
@@ -263,8 +268,8 @@ class Hypotheses:
     def _fit(self, t: int, start: np.ndarray, prior: MotionPrior, twist: np.ndarray) -> FittedPose:
         """Fit frame t from ``start`` (4, 4).
 
-        A fit that ends 1.5 standard deviations of its prior away is repeated with a prior that is
-        four times as wide: the object started to move or stopped.
+        A fit that ends 1.5 standard deviations away from the prior's mean is repeated with a prior
+        that is four times as wide: the object started to move or stopped.
         """
         fit = self._observer.fit(t, start, prior, twist=twist)
         step = np.abs(step_between(prior.pose, fit.pose))

@@ -102,17 +102,18 @@ def _mask(
     visible_px: int,
     labels: tuple[str, ...],
 ) -> float:
-    missed = LOG_MISSED * visible_px / (visible_px + 300)
+    missed = LOG_MISSED * visible_px / (visible_px + 300)  # half of it at 300 visible pixels
     if candidate is None:
         return missed
     lens, step = view.geometry.lens, view.geometry.step
     mask, person = candidate.mask, view.person
+    # a pixel costs at most 4.5, as three standard deviations
     cost, count = outline_cost(
         silhouette.face, silhouette.x0, silhouette.y0, mask.mask, mask.x0, mask.y0,
         person.mask, person.x0, person.y0, lens.width, lens.height,
         max(CONTOUR_SIGMA_PX / step, 1.0), 4.5,
     )  # fmt: skip
-    samples = VIEW_SAMPLES * count / (count + 60)
+    samples = VIEW_SAMPLES * count / (count + 60)  # half of them at 60 pixels
     named = 0.0
     if labels and candidate.label:
         named = LABEL_LOG_RATIO if candidate.label in labels else -LABEL_LOG_RATIO
@@ -128,8 +129,11 @@ def depth_log_ratio(
 ):  # fmt: skip
     """Sum log p(depth | object there) - log p(depth | not there) over a rendering's pixels.
 
-    Outside of the mask, pixels that a person explains are no evidence, and pixels that the
-    background explains are no evidence for the object: a flat object fits any floor.
+    Without the object, depth is uniform over ``clutter_m``. With it, a pixel shows the surface
+    (Gaussian of ``sigma`` along its normal) or, if this is less likely, background behind it
+    (``log_past``) or an occluder (``log_hidden``). Pixels outside of the mask that a person
+    explains are no evidence. Pixels outside of the mask that the background explains are no
+    evidence for the object, since a flat object fits any floor.
 
     Args:
         rendered, face: (h, w) of the rendering, whose first pixel is (x0, y0) of the depth image.
@@ -142,7 +146,7 @@ def depth_log_ratio(
         sigma: standard deviation of depth from the surface, metres.
         background_m: largest difference from the empty room at which depth shows the room, metres.
         clutter_m: range in which other surfaces are measured uniformly, metres.
-        log_past, log_hidden: log-probabilities of background and occlusion at a pixel.
+        log_past, log_hidden: least values of a pixel, of background and of occlusion.
 
     Returns:
         The sum, and the number of pixels with a measurement.
@@ -182,8 +186,9 @@ def depth_log_ratio(
 def outline_cost(face, x0, y0, mask, mx, my, person, px, py, width, height, sigma, most):
     """Compare the outlines of a rendering and a mask.
 
-    Pixels where a person next to the mask or the edge of the image ends the outline do not count.
-    All windows are given with their first pixels in the image.
+    The nearest pixel of the other outline is searched exactly for each pixel of either outline.
+    Pixels next to a person outside of the mask, or at the edge of the image, do not count, since
+    the outline may be cut off there. Windows are given with their first pixels (x, y) in the image.
 
     Args:
         face: (h, w) face number of the rendering, -1 outside.

@@ -1,9 +1,9 @@
 """Warnings about the mesh and the labels of the object, before and after tracking.
 
-Before: whether the detector knows the object's class, and whether the mesh has the size of the
-detected object. A mesh in decimetres passes every check of the file alone; where depth lies under a
-candidate's mask, the extent of the mask in pixels is one in metres. After: whether the images show
-this mesh, in this size, with this symmetry.
+Before tracking: whether the detector knows the object's class, and whether the mesh has the size of
+the detected object. A mesh in decimetres passes every check of the file alone. Depth under a
+candidate's mask converts the mask's extent from pixels to metres. After tracking: whether the
+images show this mesh, in this size, with this symmetry.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ def _extents(
 
 
 def mesh_doubts(observer: Observer, frames: list[FrameResult]) -> list[str]:
-    """Return warnings about the mesh by the final track; ``frames`` (T)."""
+    """Return warnings about the mesh by the final track of T ``frames``."""
     believed = [t for t, frame in enumerate(frames) if not (frame.lost or frame.carried)]
     doubts = []
     if believed:

@@ -12,10 +12,10 @@ from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 from intercap_core.object_track.fit import MotionPrior
 
-# Standard deviation of the change of the velocity from one frame to the next.
+# Standard deviation of the change of velocity from one frame to the next.
 ONSET_M_S = 0.6  # m/s; tuned
 ONSET_RAD_S = np.radians(60)  # rad/s; tuned
-# Standard deviation added per second without observation.
+# Growth of a pose's standard deviation while the object is not observed.
 GROWTH_LOST_M_S = 1.2  # m/s; tuned
 GROWTH_LOST_RAD_S = np.radians(240)  # rad/s; tuned
 HOLDING_REACH_M = 0.20  # from a wrist to the surface of a held object: a hand's length (anatomy)
@@ -47,8 +47,8 @@ def predict_prior(
 ) -> MotionPrior:
     """Return the prior around a prediction: the object may start to move, turn or stop.
 
-    Its standard deviations are the sum of an onset of motion from rest, half of the last step
-    (which may stop or double), and a growth with the time without observation.
+    Its standard deviations are the sum of three parts: an onset of motion from rest, half of the
+    last step (the motion may stop or double), and a growth with the time without observation.
 
     Args:
         before, now: last two poses (4, 4).
@@ -70,14 +70,14 @@ class HandMotion:
     """Motion of a hand between two frames."""
 
     turn: np.ndarray
-    """(3, 3) rotation about the wrist."""
+    """(3, 3) rotation about the wrist, master frame."""
     start: np.ndarray
     """(3,) position of the wrist before, metres."""
     end: np.ndarray
     """(3,) position of the wrist after."""
 
     def reaches(self, centres: np.ndarray, radius: float) -> np.ndarray:
-        """Return whether the hand may hold an object before the motion.
+        """Return whether the hand is near enough to hold an object before the motion, (...) bool.
 
         Args:
             centres: (..., 3) of the object, metres.
@@ -115,7 +115,7 @@ def estimate_hand_motions(joints: np.ndarray) -> list[HandMotion | None]:
 
 
 def unwrap_symmetry(symmetry: SymmetryGroup, poses: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Replace known poses by equivalent ones that follow each other as closely as possible.
+    """Replace known poses (T, 4, 4) by symmetric equivalents, each closest to the known one before.
 
     Args:
         symmetry: of the object.
@@ -130,9 +130,9 @@ def unwrap_symmetry(symmetry: SymmetryGroup, poses: np.ndarray, known: np.ndarra
 
 
 def shift_twist(twist: np.ndarray, point: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Express a motion by the shift of another point.
+    """Express a motion (turn, shift per second) about another point of the body.
 
-    ``twist`` (6,) states the shift of ``point`` (3,), the result that of ``other`` (3,).
+    ``twist`` (6,) contains the shift of ``point`` (3,), the result that of ``other`` (3,).
     """
     return np.append(twist[:3], twist[3:] + np.cross(twist[:3], other - point))
 
@@ -159,7 +159,8 @@ def carry_in_hands(
 def _palm(index: np.ndarray, pinky: np.ndarray) -> np.ndarray | None:
     """Return the axes (3, 3), in columns, of a palm from the directions (3,) to its knuckles.
 
-    None if the directions are unknown or parallel: the sine of their angle is usually 0.3.
+    None if the directions are unknown or nearly parallel: the sine of their angle is below 0.1,
+    usually it is 0.3.
     """
     normal = np.cross(index, pinky)
     size = float(np.linalg.norm(normal))

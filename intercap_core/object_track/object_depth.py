@@ -21,8 +21,9 @@ def residuals(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute point-to-plane residuals n . (observed - hit) (N,) and their Jacobian (N, 6), metres.
 
-    A residual is positive if the measured surface lies outside the rendered one. The Jacobian is
-    exact for the motion X' = exp(w) (X - origin) + origin + d; its columns are w (rad), then d (m).
+    A residual is positive if the measured point lies outside of the rendered surface. The Jacobian
+    is exact for the motion X' = exp(w) (X - origin) + origin + d; its columns are w (rad), then d
+    (m).
 
     Args (master frame, metres):
         observed: (N, 3) measured points, fixed.
@@ -43,7 +44,9 @@ def normal_equations(
 ):  # fmt: skip
     """Sum the depth term over a rendering: J'WJ (6, 6), J'Wr (6,) and the number of pixels used.
 
-    Columns as in :func:`residuals`; all lengths in metres.
+    The loop runs over the pixels that the rendering and the patch of measurements share. A pixel
+    whose depths differ by ``gate`` or more is left out. Columns as in :func:`residuals`; all
+    lengths in metres.
 
     Args:
         rendered, face: (h, w) depth and face number of the rendering, -1 outside.
@@ -121,7 +124,8 @@ def matches(rendered, face, shift, measured, points, face_normals, rotation, eye
 def agreement(rendered, face, x0, y0, measured, rays, face_normals, rotation, free_m, scale):
     """Compare a rendering with the whole depth image.
 
-    A pixel agrees by scale^2 / (scale^2 + r^2); r is the point-to-plane distance in metres.
+    The agreement of a pixel is scale^2 / (scale^2 + r^2), from 0 to 1; r is the point-to-plane
+    distance in metres.
 
     Args:
         rendered, face: (h, w) of the rendering, whose first pixel is (x0, y0) of the image.

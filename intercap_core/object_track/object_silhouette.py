@@ -93,9 +93,10 @@ def rim_pixels(mask):
 
 @numba.njit(cache=True, nogil=True)
 def nearest(pixels, starts, x, y, limit):
-    """Find the pixel of :func:`rim_pixels` nearest to (x, y), the first of equals.
+    """Find the pixel of :func:`rim_pixels` nearest to (x, y), the first of equals; exact.
 
-    Returns its index, or -1 if none is nearer than ``limit`` pixels.
+    Rows are searched outwards from row y, until their distance exceeds the best one. Returns the
+    pixel's index, or -1 if none is nearer than ``limit`` pixels.
     """
     height = starts.shape[0] - 1
     best, best_square = -1, limit * limit
@@ -176,10 +177,10 @@ def correspondences(
 
 @numba.njit(cache=True, nogil=True)
 def sees_past(at, depth, corner, rays, depth_from_colour, lens, measured, place, free_m):
-    """Test whether depth behind rim pixels of the render shows background, (N,) bool.
+    """Test whether measured depth confirms background at rim pixels of the render, (N,) bool.
 
-    A rim point that is measured nearer is occluded. A rim point that is measured at its own depth
-    belongs to the object whatever the mask says. Without a measurement the mask is believed.
+    False if the measurement is nearer than the rim point (an occluder) or at its depth (the object,
+    although the mask does not show it). True if it is farther, or without a measurement.
 
     Args:
         at: (N, 2) rim pixels of the colour image.

@@ -38,7 +38,7 @@ class Observer:
     load: Callable[[int], list[View]]
     """Returns the views of frame t, one per camera."""
     labels_by_view: list[list[list[str]]]
-    """Labels [T][C][candidates]."""
+    """Labels of the candidates, [T][C][candidates]."""
     settings: ObjectTrackSettings
     """Settings of stage ``object_track``."""
     times: np.ndarray
@@ -78,7 +78,7 @@ class Observer:
 
     @cached_property
     def share(self) -> float:
-        """Independent observations per frame."""
+        """Independent observations per frame, at most 1: errors last ``ERROR_LASTING_S``."""
         return min(1.0, self.step_s / ERROR_LASTING_S)
 
     def frames_in(self, seconds: float) -> int:
@@ -162,11 +162,11 @@ class Observer:
         )  # fmt: skip
 
     def evidence(self, t: int, pose: np.ndarray, twist: np.ndarray) -> ImageEvidence:
-        """Evaluate the evidence of frame t on a pose (4, 4) that moves by ``twist`` (6,)."""
+        """Evaluate the quadratic form of frame t at a pose (4, 4) that moves by ``twist`` (6,)."""
         return evidence_at(self.context, self.views(t), pose, twist)
 
     def carried(self, t: int, u: int, pose: np.ndarray) -> np.ndarray:
-        """Return poses (N, 4, 4) in frame u of an object in hands, from its ``pose`` in frame t."""
+        """Predict poses (N, 4, 4) of frame u from ``pose`` (4, 4) of frame t, one per near hand."""
         if self.joints is None:
             return np.zeros((0, 4, 4))
         centre, radius = self.mesh.centre_at(pose), self.mesh.diameter / 2
