@@ -173,8 +173,8 @@ def flag_edges(
     """Find visible frames (T,) next to unseen ones, near annotated ``frames``, with one view only.
 
     An object that moves out of sight there moves fast: a swung racquet moves by a decimetre in
-    19 ms, a possible time offset of a view. The unseen side does not constrain its velocity, and so the
-    pose at the frame's time is less certain than the covariance states.
+    19 ms, a possible time offset of a view. The unseen side does not constrain its velocity, so
+    that the pose at the frame's time is less certain than the covariance states.
 
     Args:
         fits: fit of each frame.

@@ -144,7 +144,7 @@ class Hypotheses:
         return k if k is not None and self.fits[t][k].log_ratio > SEEN_LOG_RATIO else None
 
     def best(self, t: int) -> float:
-        """Return the evidence (:meth:`Prior.weigh`) of the likeliest hypothesis of frame t, or 0."""
+        """Return the evidence of frame t's likeliest hypothesis (:meth:`Prior.weigh`), or 0."""
         return float(self._prior.weigh(t, self.fits[t]).max(initial=0.0))
 
     def add(self, t: int, fit: FittedPose) -> None:
