@@ -68,6 +68,7 @@ def parse_integer(text: str) -> int:
 
 
 def _bounded(text: str) -> int | float:
+    """Parse an integer; one that exceeds 64 bits becomes a floating-point number."""
     number = int(text) if len(text) <= 40 else None
     return number if number is not None and MIN_INTEGER <= number <= MAX_INTEGER else float(text)
 

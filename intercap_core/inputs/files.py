@@ -130,7 +130,7 @@ def printable(text: str) -> str:
 
 
 def parse_numbers(value: Any, where: str, field: str) -> np.ndarray:
-    """Convert to an array of finite numbers; raises UserError that begins with ``where``."""
+    """Convert to an array of finite numbers; raises UserError, beginning with ``where``."""
     try:
         numbers = np.array(value, np.float64)
     except (TypeError, ValueError, OverflowError):

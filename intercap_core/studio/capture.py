@@ -41,9 +41,9 @@ def write_truth(
     capture: StudioCapture,
     recorded: Sequence[CameraRecord],
 ) -> np.ndarray:
-    """Write the truth artefact of the moments ``moment`` at the set times.
+    """Write the truth artefact; ``moment`` is the state of the stage at the times of the T sets.
 
-    Returns the true region contact (T, R).
+    Returns the true contact (T, R) of the object with each region of the body.
     """
     rig = stage.rig
     master = rig.master_from_stage
@@ -54,7 +54,7 @@ def write_truth(
     whole = np.stack([camera.object_whole for camera in recorded], 1)
     # a view sees the object if it shows 40 pixels and 5 % of it
     views = (seen >= 40) & (seen >= 0.05 * np.maximum(whole, 1))
-    normal = master[:3, 2]
+    normal = master[:3, 2]  # the stage's z axis
     with artefacts.write(
         path,
         TRUTH,
@@ -109,7 +109,7 @@ def _faults(stage: StudioStage, capture: StudioCapture) -> list[str]:
 
 
 def region_contact(stage: StudioStage, moment: StageState) -> np.ndarray:
-    """(T, R): a point of the region is within ``CONTACT_M`` of the object."""
+    """Mask (T, R): a point of the region's skin is within ``CONTACT_M`` of the object."""
     regions = stage.fitted.regions
     result = np.zeros((len(moment.body), len(CONTACT_REGIONS)), bool)
     if not stage.prop:
@@ -125,7 +125,10 @@ def region_contact(stage: StudioStage, moment: StageState) -> np.ndarray:
 
 
 def support_height(stage: StudioStage, moment: StageState) -> np.ndarray:
-    """(T, 2) height above the floor of the highest surface of the room below each sole."""
+    """Height (T, 2), metres, of the room's highest surface below the left and the right sole.
+
+    Rays go down from 3 cm above the skin of the foot.
+    """
     room, regions = stage.room, stage.fitted.regions
     scene = scene_of((room.vertices, room.faces))
     result = np.zeros((len(moment.body), 2))
@@ -140,8 +143,10 @@ def support_height(stage: StudioStage, moment: StageState) -> np.ndarray:
 
 
 def visible(stage: StudioStage, moment: StageState) -> tuple[np.ndarray, np.ndarray]:
-    """Masks of body vertices (T, V), clothed, and object vertices (T, Vo) that a camera truly
-    sees."""
+    """Masks of body vertices (T, V), clothed, and object vertices (T, Vo) that any camera sees.
+
+    A vertex is visible if it faces the camera, is in its image, and nothing occludes the ray.
+    """
     prop, faces = stage.prop, stage.subject.faces
     count = moment.clothed.shape[1]
     result = np.zeros((len(moment.clothed), count + len(prop.vertices)), bool)
@@ -175,7 +180,11 @@ def visible(stage: StudioStage, moment: StageState) -> tuple[np.ndarray, np.ndar
 def erring_annotation(
     stage: StudioStage, moment: StageState, contact: np.ndarray
 ) -> dict[str, Any]:
-    """An annotation with a person's errors: up to 10 mm, 5 degrees, 5 frames."""
+    """An annotation with the errors of a person who annotates.
+
+    Contact intervals are off by up to 5 frames, the object's pose by 10 mm and 5 degrees, and
+    points on the floor by 10 mm; noise below 1 scales these limits.
+    """
     rng, scale = stage.noise.rng("annotation"), min(stage.noise.scale, 1.0)
 
     def off(size: float) -> np.ndarray:

@@ -78,6 +78,10 @@ def _warp(pixels, z, aligned):
 
 @numba.njit(cache=True)
 def _triangle(a, b, c, za, zb, zc, aligned):
+    """Draw a triangle with corners (2,) px and depths, metres; the nearest depth of a pixel stays.
+
+    A pixel's weights wa, wb, wc are its barycentric coordinates times twice the triangle's area.
+    """
     area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
     if area <= 0:  # seen from behind: something nearer hides it
         return
@@ -107,8 +111,9 @@ class Device:
     """One camera of the rig."""
 
     index: int
+    """Position in the rig; 0 = master."""
     camera: Camera
-    """As calibrated, always with depth."""
+    """As calibrated (with errors), always with depth."""
     serial: str
     colour_mode: str
     depth_mode: str
@@ -116,7 +121,7 @@ class Device:
     """Whether the device records depth."""
     fps: int
     first_us: int
-    """Its first device time."""
+    """Its first device time, microseconds."""
     sound: np.ndarray | None = None
     """(N,) float32 from its first image on at :data:`SOUND_RATE`, None without sound."""
 
@@ -131,7 +136,7 @@ class DeviceFrame:
     depth: np.ndarray | None
     """(H, W) uint16 mm, or None."""
     inertial: list[tuple[np.ndarray, np.ndarray, int]]
-    """Acceleration (3,), turning rate (3,), device time."""
+    """Acceleration (3,), m/s^2, turning rate (3,), rad/s, and device time, microseconds."""
 
 
 class CameraFiles(ABC):

@@ -18,7 +18,7 @@ from intercap_core.studio.skeleton import blend
 
 
 def ramp(times: np.ndarray, start: float, end: float) -> np.ndarray:
-    """0 before ``start``, 1 after ``end``, least jerk between (Flash and Hogan 1985)."""
+    """0 before ``start``, 1 after ``end``, minimum jerk between (Flash and Hogan 1985)."""
     u = np.clip((np.asarray(times, float) - start) / max(end - start, 1e-9), 0, 1)
     return u**3 * (10 - 15 * u + 6 * u * u)
 
@@ -37,7 +37,10 @@ def plateau(times: np.ndarray, start: float, full: float, wane: float, end: floa
 def bisect(
     low: float, high: float, steps: int, is_below: Callable[[float], bool]
 ) -> tuple[float, float]:
-    """Bounds, halved ``steps`` times, of the value from which ``is_below`` is false."""
+    """Bounds of the value at which ``is_below`` changes from True to False, halved ``steps`` times.
+
+    ``is_below`` is taken to be True at ``low`` and False at ``high``.
+    """
     for _ in range(steps):
         middle = (low + high) / 2
         if is_below(middle):
@@ -131,14 +134,17 @@ class Step:
 
 @dataclass(frozen=True)
 class Guide:
-    """From ``start`` to ``end`` a foot blends from its steps into ``path``, and then follows it."""
+    """A foot that leaves its steps: it blends into ``path`` and then follows it."""
 
     foot: int
     """0 left, 1 right."""
     start: float
+    """Start of the blend, seconds."""
     end: float
+    """End of the blend, seconds."""
     path: Callable[[np.ndarray], np.ndarray] | None = None
-    """Times (N,) to ankle x, y, z, pitch, heading (N, 5); None: back to the steps."""
+    """Function of times (N,) that returns ankle x, y, z, pitch, heading (N, 5); None: blend back to
+    the steps."""
 
 
 @dataclass(frozen=True)
@@ -148,13 +154,15 @@ class Footwork:
     start: np.ndarray
     """(2, 2) first places of the ankles, left and right."""
     heading: float
-    """Rad."""
+    """First heading of both feet, rad."""
     steps: Sequence[Step]
+    """Steps in order of time."""
     ankle_height: np.ndarray
-    """(2,) above the floor, metres."""
+    """(2,) height of a standing foot's ankle above its support, metres."""
     end_s: float
+    """End of the script, seconds."""
     guides: Sequence[Guide] = ()
-    """Lead feet that leave the floor."""
+    """Motions of feet that are no steps, in order of time."""
     grid_step_s = 0.005  # sampling of the pelvis track
     grid_margin_s = 1.0  # of the track before and after the script
     # standard deviation of the smoothing by which the trunk follows the feet, without delay
@@ -221,6 +229,9 @@ class Footwork:
 
     def pelvis(self, leg: float, hip_width: float, hip_drop: float, stand: float) -> CubicSpline:
         """Pelvis position and heading (4 channels) over time, low enough for both legs to reach.
+
+        The pelvis is above the middle of both ankles, shifted towards the standing foot in a step,
+        and smoothed. It is as high as the straighter leg permits, at most ``stand``.
 
         Args:
             leg: usable length from hip to ankle, metres.

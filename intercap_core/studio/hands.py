@@ -19,7 +19,7 @@ from intercap_core.studio.controls import bisect
 from intercap_core.studio.skeleton import PuppetSkeleton, turn, unit
 from intercap_core.studio.subjects import Subject
 
-FINGERS = ("index", "middle", "pinky", "ring", "thumb")  # in the order of the joints
+FINGERS = ("index", "middle", "pinky", "ring", "thumb")  # in the order of SMPL-X's joints
 THUMB = FINGERS.index("thumb")
 # Largest flexion of MCP, PIP, DIP, and of the thumb's CMC, MCP, IP, degrees (AAOS tables)
 LIMITS = {"finger": (85.0, 100.0, 65.0), "thumb": (35.0, 50.0, 65.0)}
@@ -51,9 +51,17 @@ def shape(
     opposition: float,
     spread: float = 3.0,
 ) -> HandShape:
-    """A shape with the same flexion in all four fingers."""
+    """A shape with nearly the same flexion in all four fingers; all angles in degrees.
+
+    Args:
+        fingers: flexion of MCP, PIP and DIP.
+        thumb: flexion of CMC, MCP and IP.
+        opposition: rotation of the thumb's base towards the palm.
+        spread: angle between neighbouring fingers, roughly.
+    """
     flexion = np.array([fingers] * 4 + [thumb], float)
-    flexion[1:4] += np.array([[2.0, 2, 1], [6, 4, 2], [4, 3, 2]])  # towards the little finger
+    # Middle, little and ring finger: flexion grows towards the little finger.
+    flexion[1:4] += np.array([[2.0, 2, 1], [6, 4, 2], [4, 3, 2]])
     return HandShape(flexion, np.array([1.0, 0, -1.4, -0.7, 0]) * spread, opposition)
 
 
@@ -70,7 +78,7 @@ class Hand:
     def __init__(self, subject: Subject, side: int) -> None:
         self.side = side
         self.name = ("left", "right")[side]
-        self.first = 25 + 15 * side
+        self.first = 25 + 15 * side  # SMPL-X: joints 25 to 39 are left fingers, 40 to 54 right ones
         self.wrist = JOINT_INDEX[f"{self.name}_wrist"]
         self.rest = PuppetSkeleton(subject.rest_joints)
         self.out = np.array([1.0 if side == 0 else -1.0, 0, 0])  # where the fingers point at rest
@@ -145,7 +153,8 @@ class Hand:
         Args:
             object_from_wrist: (4, 4) from the hand's rest frame at the wrist.
             tissue: depth to which the skin is pressed in, metres.
-            fingers: the fingers that are closed, in this order.
+            limits: largest flexions of "finger" and "thumb", as ``LIMITS``.
+            fingers: indices in ``FINGERS`` of the fingers that are closed, in this order.
 
         Returns:
             The shape, and the least signed distance (5,) of each finger to the object, metres.
@@ -194,7 +203,10 @@ class Hand:
         object_from_wrist: np.ndarray,
         ids: np.ndarray | slice = slice(None),
     ) -> float:
-        """Least signed distance of the hand, or of its vertices ``ids``, to the object, metres."""
+        """Least signed distance of the hand, or of its vertices ``ids``, to the object, metres.
+
+        Negative: the hand penetrates the object.
+        """
         skin = self.skin(self.local(hand)[None])[:, ids]
         return float(self._distance(skin, surface, object_from_wrist)[0])
 

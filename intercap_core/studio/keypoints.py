@@ -3,6 +3,9 @@
 Errors of a joint: a fixed bias in the body (a detector's joints differ from the skeleton's), a bias
 of the view, lasting jitter, exchanges of left and right, and a plausible wrong place when the joint
 is occluded. The confidence depends on the error only partly.
+
+Of the 135 points, 0 to 24 are the body (8 = middle of the hips), 25 to 45 the left hand, 46 to 66
+the right hand and 67 to 134 the face.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ from intercap_core.body.keypoints import BODY, CONTOUR, FACE, KEYPOINT_NAMES, LE
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.studio.noise import NoiseSource
 
-_SWAPPED = np.arange(135)
+_SWAPPED = np.arange(135)  # index of the same point on the other side; the face stays
 for _i, _name in enumerate(KEYPOINT_NAMES[:25]):
     if _name.startswith("left_"):
         _j = KEYPOINT_NAMES.index("right_" + _name[5:])
@@ -30,19 +33,24 @@ _LEGS = np.array(
 
 @dataclass(frozen=True)
 class Detector:
-    """A detector over one recording."""
+    """A detector over one recording.
+
+    Errors in px hold for a person 2.5 m away in 1080p and grow with the person's size in the image.
+    """
 
     noise: NoiseSource
+    """Random numbers and the scale of all errors."""
     frames: int
+    """Number T of frame sets."""
     body_bias: np.ndarray
     """(135, 3) fixed biases in the body's own axes, metres."""
     body_bias_m = (0.010, 0.020)  # range of the fixed bias of each body joint, metres
     hand_bias_m = (0.002, 0.005)  # of each hand joint, metres
     face_bias_m = (0.001, 0.004)  # of each face point, metres
-    view_bias_px = 2.0  # standard deviation of the bias of a view, px at 1080p
-    jitter_px = 2.4  # of body joints, px at 1080p
-    hand_jitter_px = 2.0  # of hand joints, px at 1080p
-    face_jitter_px = 1.2  # of face points, px at 1080p
+    view_bias_px = 2.0  # standard deviation of the bias of a view
+    jitter_px = 2.4  # standard deviation of the jitter of body joints
+    hand_jitter_px = 2.0  # of hand joints
+    face_jitter_px = 1.2  # of face points
     fast_jitter = 0.4  # share of the jitter that is independent from frame to frame
     jitter_s = 0.5  # correlation time of the rest
     hidden_shift_m = 0.045  # error of a hidden body joint, metres
@@ -75,8 +83,8 @@ class Detector:
         """Keypoints (T, 135, 3) x, y, confidence of one person in one camera.
 
         Args:
-            points: (T, 135, 3) true points, master frame.
-            axes: (T, 3, 3) rotation of the pelvis, master frame.
+            points: (T, 135, 3) true points, master frame, metres.
+            axes: (T, 3, 3) rotation of the pelvis from the rest pose to the master frame.
             hidden: (T, 135) mask of occluded points.
             who: name of the person's random stream; none for the subject.
         """
@@ -87,7 +95,8 @@ class Detector:
         pose = camera.colour_from_master
         at = biased @ pose[:3, :3].T + pose[:3, 3]
         pixels = camera.colour.project(at)
-        unit_px = per_metre / 370.0  # 1 where the subject is as large as at 2.5 m in 1080p
+        # 1 if the subject is as large as at 2.5 m in 1080p, which is 370 px for a metre
+        unit_px = per_metre / 370.0
 
         jitter = np.empty(135)
         jitter[BODY], jitter[25:67], jitter[67:] = (
@@ -122,7 +131,7 @@ class Detector:
         return np.concatenate([pixels, confidence[..., None]], -1)
 
     def _pixels_per_metre(self, camera: Camera, points: np.ndarray) -> np.ndarray:
-        """Scale (T, 1, 1) of the image at the pelvis."""
+        """Scale (T, 1, 1) of the image at the pelvis, px for a metre."""
         pose = camera.colour_from_master
         depth = points[:, 8] @ pose[2, :3] + pose[2, 3]
         return (camera.colour.fx / np.maximum(depth, 0.3))[:, None, None]
@@ -130,7 +139,10 @@ class Detector:
     def _confidence(
         self, rng: np.random.Generator, error: np.ndarray, hidden: np.ndarray
     ) -> np.ndarray:
-        """Confidence (T, 135) in [0, 1], which decreases with the error."""
+        """Confidence (T, 135) in [0, 1], which decreases with the error and if a point is hidden.
+
+        ``guess`` depends on the true error (px); ``ignorant`` does not.
+        """
         size = np.linalg.norm(error, axis=-1)
         chance = self.noise.process(rng, self.frames, 135, 0.3)
         guess = 0.86 - 0.012 * size - 0.22 * hidden + 0.08 * chance
@@ -155,7 +167,10 @@ class Detector:
         return pixels, confidence
 
     def people(self, camera: Camera, subject: np.ndarray) -> list[list[np.ndarray]]:
-        """People (135, 3) of each frame's file: the subject, with misses and false persons."""
+        """People (135, 3) of each frame's file: the subject unless missed, and a false person.
+
+        The false person is a shifted and shrunk copy of the subject, present in episodes.
+        """
         noise = self.noise
         rng = noise.detector_rng("people", camera.name)
         one = np.ones((self.frames, 1))

@@ -1,7 +1,7 @@
 """Instance candidates with the errors of a segmentation network, in COCO's result format.
 
 Errors last for 0.3 to 1 s and partly agree between views: borders, labels, misses, merged person
-and object, false instances. Score and order carry no information.
+and object, false instances. The order is random, and scores hardly tell true from false instances.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ CATEGORY_IDS = {
     "cup": 47, "bowl": 51, "apple": 53, "chair": 62, "potted plant": 64, "dining table": 67,
     "toilet": 70, "tv": 72, "refrigerator": 82, "book": 84, "clock": 85, "vase": 86,
 }  # fmt: skip
-EPISODE_S = (0.3, 1.0)
-AGREEMENT = 0.5
+EPISODE_S = (0.3, 1.0)  # range of the duration of an error
+AGREEMENT = 0.5  # share of the errors' variance that all views have in common
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,8 @@ class Labels:
     """True labels of one camera's image."""
 
     identity: np.ndarray
-    """(h, w) in a window at (x0, y0) of the image."""
+    """(h, w) surface in each pixel (:data:`.render.BODY`, ...; 0 = room) of a window of the image
+    whose first pixel is (x0, y0)."""
     x0: int
     y0: int
     size: tuple[int, int]
@@ -52,7 +53,7 @@ class Labels:
     visible: float
     """Share of the object that is not occluded."""
     blur_px: float
-    """Motion of the object during the exposure."""
+    """Motion of the object during the exposure, px."""
 
 
 class MaskSimulator:
@@ -74,7 +75,7 @@ class CameraMasks:
     """Candidates of one camera.
 
     Args:
-        clutter: (H, W) mask of an object in the room with the object's class, or None.
+        clutter: (H, W) mask of the twin, another object of the same class in the room, or None.
         size: width and height of the images.
     """
 
@@ -216,7 +217,11 @@ class CameraMasks:
         }
 
     def _bordered(self, truth: Labels, kind: int, t: int) -> np.ndarray | None:
-        """Mask (h + 2m, w + 2m) with its border moved; None if too few pixels are visible."""
+        """Mask (h + 2m, w + 2m), m = ``margin_px``, with its border moved; None if it is too small.
+
+        The border moves by a sum of random plane waves over the image, added to the signed distance
+        from the border. ``kind``: BODY, OBJECT or PASSER_BY.
+        """
         mask = truth.identity == kind
         if mask.sum() < self.min_pixels:
             return None
@@ -235,7 +240,7 @@ class CameraMasks:
         step = max(1, int(size / 24))  # the waves are long: drawn coarsely, then enlarged
         y, x = np.mgrid[: padded.shape[0] : step, : padded.shape[1] : step]
         x, y = (x - columns.mean()) / size, (y - rows.mean()) / size
-        which = kind - 1
+        which = kind - 1  # kinds count from 1
         coarse = np.zeros(x.shape)
         for k in range(12):
             direction = self._directions[which, k] * (2.0 + 0.5 * k)

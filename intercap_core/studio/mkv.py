@@ -124,7 +124,7 @@ class MkvWriter:
         self.close()
 
     def write_colour(self, image: bytes, device_time_us: int) -> None:
-        """Add one JPEG image, or the bytes of a raw one where ``colour_format`` is raw."""
+        """Add one JPEG image, or the bytes of a raw image if ``colour_format`` is not MJPG."""
         self._write("COLOR", image, device_time_us)
 
     def write_depth(self, depth: np.ndarray, device_time_us: int) -> None:
@@ -145,7 +145,7 @@ class MkvWriter:
         self._write("IMU", stamp + acc + stamp + gyro, device_time_us)
 
     def turn_back(self) -> None:
-        """Let the next image be older than the last: a device's clock jumped back."""
+        """Allow the next image to be older than the last one, as after a jump of the clock."""
         self._flush_cluster()
 
     def close(self) -> None:
@@ -158,6 +158,7 @@ class MkvWriter:
             positions[_CUES] = self._file.tell() - self._segment_start
             self._file.write(_element(_CUES, b"".join(self._cues)))
         end = self._file.tell()
+        # Seek: SeekID, SeekPosition
         entries = b"".join(
             _element(0x4DBB, _element(0x53AB, _id(number)) + _unsigned(0x53AC, position, 8))
             for number, position in positions.items()
@@ -177,7 +178,7 @@ class MkvWriter:
     def _tags(
         self, colour_mode: str, depth_mode: str | None, calibrated: bool
     ) -> dict[str, tuple[str, str]]:
-        """Tags of tracks and attachment: name -> (value, what it is about)."""
+        """Tags: name -> (value, track or attachment that the tag describes; "" = the file)."""
         tags = {
             "K4A_COLOR_TRACK": (str(self._uid("COLOR")), "COLOR"),
             "K4A_COLOR_MODE": (f"{self._colour_format}_{colour_mode}", "COLOR"),
@@ -233,6 +234,7 @@ class MkvWriter:
         self._top(_TAGS, b"".join(self._tag(name, *value) for name, value in tags.items()))
 
     def _top(self, number: int, payload: bytes) -> None:
+        """Write an element of the Segment and remember its position for the index."""
         self._positions[number] = self._file.tell() - self._segment_start
         self._file.write(_element(number, payload))
 
@@ -253,6 +255,7 @@ class MkvWriter:
             assert self._depth_size is not None
             (width, height), four_cc, bits = self._depth_size, b"b16g", 16
         image_bytes = 0 if four_cc == b"MJPG" else width * height * bits // 8
+        # BITMAPINFOHEADER: size 40, width, height, planes 1, bits, codec, bytes, four unused fields
         header = struct.pack(
             "<IiiHH4sIiiII", 40, width, height, 1, bits, four_cc, image_bytes, 0, 0, 0, 0
         )
@@ -265,6 +268,7 @@ class MkvWriter:
         return _element(0xAE, entry)
 
     def _tag(self, name: str, value: str, about: str) -> bytes:
+        # Tag: Targets (TargetType; TagTrackUID or TagAttachmentUID), SimpleTag (TagName, TagString)
         target = b""
         if about in self._tracks:
             target = _text(0x63CA, "TRACK") + _unsigned(0x63C5, self._uid(about))
@@ -313,6 +317,7 @@ class MkvWriter:
         self._file.write(_id(_CLUSTER) + _size(length, 8) + time)
         self._file.writelines(self._cluster)
         track = min(self._cluster_tracks, default=self._tracks["COLOR"])
+        # CuePoint: CueTime, CueTrackPositions (CueTrack, CueClusterPosition)
         where = _element(0xB7, _unsigned(0xF7, track) + _unsigned(0xF1, position))
         self._cues.append(_element(0xBB, _unsigned(0xB3, self._cluster_us) + where))
         self._cluster, self._cluster_us = [], None

@@ -1,6 +1,8 @@
 """A puppet plays controls: trunk first, then legs to the planted feet, then arms to the wrists.
 
-Headings turn about the stage's z axis; a person with heading 0 faces +x.
+Headings turn about the stage's z axis; a person with heading 0 faces +x. "Stage" is any frame with
+z up and the floor at z = 0; scripts use their own. World rotations (N, 55, 3, 3) are
+stage_from_rest of SMPL-X's joints; see :mod:`.skeleton`.
 """
 
 from __future__ import annotations
@@ -44,8 +46,14 @@ def facing(heading: np.ndarray) -> np.ndarray:
 
 
 def foot_rotations(heading: np.ndarray, pitch: np.ndarray, splay: float = SPLAY) -> np.ndarray:
-    """stage_from_rest rotations (N, 2, 2, 3, 3), by side, of ankle and toes of feet with headings
-    and pitch (N, 2)."""
+    """stage_from_rest rotations (N, 2, 2, 3, 3) by side (left, right) and joint (ankle, toes).
+
+    Args:
+        heading: (N, 2) of each foot, rad.
+        pitch: (N, 2) rad, positive: heel above toes. The toes then follow by 35 %; a negative
+            pitch lifts the whole foot's front.
+        splay: outward rotation of each foot, rad.
+    """
     result = np.empty((*heading.shape, 2, 3, 3))
     for side, sign in enumerate((1.0, -1.0)):
         ahead = facing(heading[:, side] + sign * splay)
@@ -62,9 +70,9 @@ class Trunk:
     """Pose of pelvis, trunk and head over N moments."""
 
     pelvis: np.ndarray
-    """(N, 3)."""
+    """(N, 3) position of the pelvis joint, metres."""
     heading: np.ndarray
-    """(N,)."""
+    """(N,) rad."""
     bend: np.ndarray
     """(N, 3) rotation vectors of the trunk in the person's axes (x left, y up, z forward)."""
     head: np.ndarray
@@ -72,23 +80,27 @@ class Trunk:
 
 
 def _sole_depth(subject: Subject, side: int) -> float:
-    """How far the ankle is above the sole of a level foot, in its shoe, metres."""
+    """Height of the ankle (joint 7 or 8) above the sole of a level foot in its shoe, metres."""
     share = np.asarray(subject.weights[:, [7 + side, 10 + side]].sum(1)).ravel()
     return float(subject.rest_joints[7 + side, 1] - subject.rest_clothed[share > 0.5, 1].min())
 
 
 def _girth(subject: Subject) -> float:
-    """How far hips and thighs reach to the side of the pelvis, metres."""
+    """Largest distance of the skin of hips and thighs to the side of the pelvis, metres."""
+    # joints: pelvis, hips and knees
     legs = np.asarray(subject.weights[:, [0, 1, 2, 4, 5]].sum(1)).ravel() > 0.5
     return float(np.abs(subject.rest[legs, 0] - subject.rest_joints[0, 0]).max())
 
 
 def _thigh_height(subject: Subject, side: int) -> float:
-    """How far the front of the thigh's further half is from the line of hip and knee, metres."""
+    """Height of the front of a bent thigh above the line from hip to knee, metres.
+
+    It is measured from 45 to 85 % of the way to the knee.
+    """
     hip, knee = subject.rest_joints[1 + side], subject.rest_joints[4 + side]
     own = np.asarray(subject.weights[:, [1 + side]].todense()).ravel() > 0.5
     share = (subject.rest[own, 1] - hip[1]) / (knee[1] - hip[1])
-    flexed = subject.rest[own, 2] + subject.bulges[4 + side, own, 2]  # a bent hip thickens it
+    flexed = subject.rest[own, 2] + subject.bulges[4 + side, own, 2]  # driver 4 + side: the hip
     height = flexed - hip[2] - share * (knee[2] - hip[2])
     return float(height[(share > 0.45) & (share < 0.85)].max())
 
@@ -142,6 +154,7 @@ class Puppet:
                 world[:, _J[f"{side}_{name}"]] = rotation
             for name in ("hip", "knee", "ankle", "foot"):
                 world[:, _J[f"{side}_{name}"]] = world[:, 0]
+        # the fingers follow the wrists, joints 20 and 21
         world[:, 25:40] = world[:, 20:21]
         world[:, 40:55] = world[:, 21:22]
         return world
@@ -155,7 +168,10 @@ class Puppet:
         return footwork.pelvis(self.leg_reach * self.leg, width, self.hip_drop, self.stand)
 
     def settled(self, trunk: Trunk, ankle: np.ndarray) -> Trunk:
-        """The same trunk, lower where a leg cannot reach its ankle (N, 2, 3)."""
+        """The same trunk, lowered at moments when a leg cannot reach its ankle (N, 2, 3).
+
+        The pelvis sinks by a smooth maximum of 0 and the excess height (softplus).
+        """
         rotation = self.trunk(trunk)[:, 0]
         excess = np.full(len(trunk.pelvis), -np.inf)
         for side, name in enumerate(SIDES):
@@ -213,7 +229,7 @@ class Puppet:
     ) -> WristPose:
         """The wrist of an arm that hangs and swings by ``swing`` (N,) metres forward."""
         sign = (1.0, -1.0)[side]
-        # where the chest's left is: its front may point down and back in a deep stoop
+        # the heading from the chest's left side: its front may point down and back in a deep stoop
         base = facing(np.arctan2(-world[:, 9, 0, 0], world[:, 9, 1, 0]))
         left, up, forward = base[..., 0], base[..., 1], base[..., 2]
         shoulder = self.shoulder(world, pelvis, side)
@@ -234,9 +250,11 @@ class Puppet:
         return carry(hand.out, hand.palm, fingers, palm)
 
     def assist(self, trunk: Trunk, targets: dict[int, tuple[WristPose, np.ndarray]]) -> Trunk:
-        """Bend the trunk where an arm cannot reach its target.
+        """Bend the trunk at moments when an arm cannot reach its target.
 
-        ``targets``: wrist target and weight (N,) in [0, 1] for each side.
+        Each iteration turns the trunk about the pelvis, so that the shoulder moves towards the
+        target by the missing length (softened by 1 cm). ``targets``: wrist target and weight (N,)
+        in [0, 1] for each side.
         """
         bend = trunk.bend.copy()
         for _ in range(self.assist_steps):
@@ -338,7 +356,7 @@ class Foot:
         self._part = part_of(self.subject, np.flatnonzero(share > 0.5))
 
     def skin(self, places: np.ndarray) -> np.ndarray:
-        """(N, 5) -> skin, or the shoe round it, (N, n, 3) of the stage."""
+        """Clothed skin (N, n, 3) of the foot at places (N, 5)."""
         foot = foot_rotations(places[:, [4, 4]], places[:, [3, 3]])[:, self.side]
         local = np.broadcast_to(np.eye(3), (len(places), 55, 3, 3)).copy()
         local[:, self.ankle] = foot[:, 0]
@@ -353,8 +371,17 @@ class Foot:
         gap: float,
         distance: Callable[[np.ndarray], float],
     ) -> np.ndarray:
-        """The place (5,) moved along ``way`` (5,) until the skin is ``gap`` metres off by
-        ``distance`` of skin (n, 3)."""
+        """Move a foot until it has a gap to an object.
+
+        Args:
+            place: (5,) first place.
+            way: (5,) largest change of the place.
+            gap: wanted result of ``distance``, metres.
+            distance: function of the skin (n, 3) that returns its least signed distance.
+
+        Returns:
+            (5,) place.
+        """
 
         def is_too_near(share: float) -> bool:
             return distance(self.skin((place + share * way)[None])[0]) < gap

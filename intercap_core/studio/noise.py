@@ -16,9 +16,9 @@ _QUANTILES = ndtri((np.arange(1 << 16) + 0.5) / (1 << 16)).astype(np.float32)
 
 
 def gaussian(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    """Standard normal values in float32 for images: one of 65536 quantiles each.
+    """Standard normal values in float32, drawn from 65536 quantiles.
 
-    Takes a quarter of the time of the generator's own method.
+    For images: it takes a quarter of the time of the generator's own method.
     """
     return _QUANTILES[rng.integers(0, 1 << 16, shape, np.uint16)]
 
@@ -28,10 +28,15 @@ class NoiseSource:
     """Random processes with a seed, scale and family; each name has its own random numbers."""
 
     seed: int
+    """Seed of all streams."""
     scale: float
+    """Factor of all errors; 1 = normal, 0 = none."""
     family: str
+    """"a" or "b"; see the header of the module."""
     fps: float
+    """Frames a second of the processes."""
     redrawn: int = 0
+    """Number of the detectors' random stream; another number redraws their errors alone."""
 
     def rng(self, *name: object) -> np.random.Generator:
         """Generator of the stream ``name``."""
@@ -70,7 +75,7 @@ class NoiseSource:
         return path
 
     def tails(self, gaussian: np.ndarray) -> np.ndarray:
-        """In family "b", map Gaussian values to Laplace values of unit variance."""
+        """In family "b", map standard normal values to Laplace values of unit variance."""
         if self.family != "b":
             return gaussian
         rank = np.clip(ndtr(gaussian), 1e-6, 1 - 1e-6) - 0.5
@@ -88,8 +93,9 @@ class NoiseSource:
         """(frames, n) on/off episodes of about ``correlation_s`` that views partly share.
 
         Args:
-            probability: (frames, n) of being on.
+            probability: (frames, n) of being on, multiplied by ``scale``.
             shared: (frames,) process common to all views.
+            correlation_s: correlation time of the views' own processes, seconds.
             agreement: share of the variance that ``shared`` explains.
         """
         own = self.process(rng, frames, probability.shape[1], correlation_s)

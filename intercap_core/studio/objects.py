@@ -16,11 +16,11 @@ from intercap_core.entries import ObjectEntry
 from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh_files import load_mesh
 
-# RMS of the smooth displacement along the normal, in parts of the object's radius (root mean square
-# distance of its surface from its origin): 0.3 mm of a cup, 0.7 of a football, 1.4 of a suitcase,
-# 1.9 of a chair. Waves are as long as the radius says, so a cup is no more crumpled than a chair.
+# RMS of the smooth displacement along the normal, as a share of the object's radius (root mean
+# square distance of its surface from its origin): 0.3 mm for a cup, 0.7 for a football, 1.4 for a
+# suitcase, 1.9 for a chair. Wavelengths are proportional to the radius too.
 SURFACE_ERROR = 0.006
-WAVES = 48
+WAVES = 48  # number of random plane waves whose sum is the displacement
 
 
 PAINTS = ((0.92, 0.91, 0.88), (0.13, 0.13, 0.14), (0.70, 0.12, 0.13), (0.11, 0.28, 0.60),
@@ -103,9 +103,10 @@ def _split_edges(
 def _smooth_displacement(
     vertices: np.ndarray, faces: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
-    """A random smooth vector field (V, 3) without rigid motion, in metres.
+    """A random smooth displacement (V, 3) without rigid motion, metres.
 
-    A field over space moves both sides of a thin wall together, so nothing intersects.
+    It is a function of the place, so that both sides of a thin wall move together and nothing
+    intersects.
     """
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     area_normal = np.cross(b - a, c - a) / 2
@@ -123,7 +124,7 @@ def _smooth_displacement(
     phase = vertices @ (2 * np.pi * direction / wavelength[:, None]).T
     field = np.cos(phase + rng.uniform(0, 2 * np.pi, WAVES)) @ rng.normal(size=(WAVES, 3))
 
-    # least squares of normal displacement = n . (omega x v + t): what a tracker would take as pose
+    # Rigid part, which a tracker would take as pose: least squares of n . field = n . (w x v + t)
     rigid = np.concatenate([np.cross(vertices, normals), normals], 1)
     root = np.sqrt(weight)[:, None]
     motion = np.linalg.lstsq(root * rigid, root[:, 0] * (field * normals).sum(1), rcond=1e-4)[0]
@@ -140,8 +141,6 @@ def press_out(
     points: np.ndarray, surface: DistanceField, stage_from_object: np.ndarray, bounds: np.ndarray
 ) -> np.ndarray:
     """Move points (N, 3) of the stage that are inside the object to its surface.
-
-    The displacement equals the depth of the point: it fades out where the skin leaves the object.
 
     Args:
         bounds: (2, 3) bounding box of the object in its own frame.

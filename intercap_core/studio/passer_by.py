@@ -26,11 +26,11 @@ class Passing:
     """State of the second person at N moments, stage frame, metres."""
 
     present: np.ndarray
-    """(N,) bool."""
+    """(N,) bool: the person is inside the room; other values are 0 if not."""
     body: np.ndarray
-    """(N, V, 3)."""
+    """(N, V, 3) skin."""
     clothed: np.ndarray
-    """(N, V, 3)."""
+    """(N, V, 3) surface of the clothes."""
     joints: np.ndarray
     """(N, 55, 3)."""
     pelvis: np.ndarray
@@ -42,11 +42,11 @@ class Way:
     """A straight path, or the place of a person who stands."""
 
     place: np.ndarray
-    """(2,) at time ``when``."""
+    """(2,) x, y on the floor at time ``when``, metres."""
     heading: float
-    """Rad."""
+    """Direction in which the person faces and walks, rad."""
     when: float
-    """Recording time, s."""
+    """Recording time, seconds."""
 
     def at(self, times: np.ndarray, speed: float) -> np.ndarray:
         """Places (N, 2) at recording times (N,) for a walking speed, m/s."""
@@ -70,7 +70,7 @@ class PasserBy:
     clear_of_object_m = 0.65
     clear_of_furniture_m = 0.33  # from furniture, metres
     clear_of_cameras_m = 0.45  # from cameras, metres
-    passes_within = (0.3, 0.7)  # when the least distance is reached, share of the recording
+    passes_within = (0.3, 0.7)  # range of the time of least distance, share of the recording
     tries = 3000  # random ways that are tried
     step_range_s = (0.46, 0.54)  # duration of a step
     stride_range = (0.72, 0.84)  # stride, in leg lengths
@@ -170,7 +170,7 @@ class PasserBy:
     def _pose(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Joint rotations (N, 55, 3, 3) and pelvis (N, 3) in the stage."""
         puppet = self.puppet
-        # the middle of the walk is where the way is given
+        # the middle of the walk is at ``way.place`` at time ``way.when``
         own = times - self.way.when + self.seconds / 2
         track, feet = self.track(own), self.footwork.feet(own)
         phase = np.pi * own / self.step_s  # a half turn is a step, the left foot's first
@@ -192,7 +192,10 @@ class PasserBy:
 
 
 def _obstacles(room: Room) -> np.ndarray:
-    """Floor points (N, 2), on a grid, of surfaces above the floor and inside the walls."""
+    """Floor points (N, 2), on a grid, below surfaces above the floor and inside the walls.
+
+    Each triangle is sampled at 15 points; the nearest walls are 3 m from the middle.
+    """
     shares = np.array([[a, b, 4 - a - b] for a in range(5) for b in range(5 - a)]) / 4
     corners = room.vertices[room.faces]
     points = np.einsum("sk,fkc->fsc", shares, corners).reshape(-1, 3)

@@ -1,4 +1,7 @@
-"""Recording of one Kinect, and the detections on its images."""
+"""Recording of one Kinect, and the detections on its images.
+
+T frame sets are evenly spaced in time; t is a set. A camera's image of a set may be missing.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,8 @@ from intercap_core.studio.stage import StageState, StudioStage
 from intercap_core.studio.subjects import body_colours
 
 EXPOSURE_S = 1 / 60  # of a colour image in a lit room
-# A joint lies inside the body: it is hidden only by what is nearer by more than this (metres)
+# Joints lie inside the body, whose own surface does not occlude them: a surface occludes a joint
+# only if it is nearer by more than this, metres.
 COVER_M = {"body": 0.13, "hand": 0.03, "face": 0.02}
 
 
@@ -85,7 +89,7 @@ class Kinect:
         return "backwards_clock" in self.broken and t >= self.stage.frames // 2
 
     def device_time_us(self, t: int) -> int:
-        """Device time of the image of set ``t``."""
+        """Device time of the image of set ``t``, microseconds."""
         stagger = round(STAGGER_S * 1e6) * self.index
         jitter = round(self.stage.failures.jitter_s[t, self.index] * 1e6)
         if self.fallen_back(t):
@@ -188,7 +192,7 @@ class Kinect:
     def _inertial(
         self, t: int, rng: np.random.Generator
     ) -> list[tuple[np.ndarray, np.ndarray, int]]:
-        """Acceleration, turning rate and device time of the samples of set ``t``.
+        """Acceleration (m/s^2), turning rate (rad/s) and device time (us) of the samples of a set.
 
         The device does not move: its accelerometer measures the reaction to gravity.
         """
@@ -260,7 +264,12 @@ def _blur_px(view: RoomView, times: np.ndarray, points: np.ndarray) -> np.ndarra
 
 
 def _hidden(cast: Cast, view: RoomView, points: np.ndarray) -> np.ndarray:
-    """Mask (135,) of keypoints that another surface occludes."""
+    """Mask (135,) of keypoints (135, 3), stage frame, that another surface occludes.
+
+    The moving surface on a keypoint's ray occludes it if it is nearer along the ray by more than
+    ``COVER_M``, the room if its depth is smaller by more than 3 cm. Points 25 to 66 are the hands,
+    67 to 134 the face, and 0 and 15 to 18 are nose, eyes and ears.
+    """
     cover = np.full(135, COVER_M["body"])
     cover[25:67], cover[67:] = COVER_M["hand"], COVER_M["face"]
     cover[[0, 15, 16, 17, 18]] = COVER_M["face"] * 2

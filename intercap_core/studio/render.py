@@ -22,8 +22,8 @@ from intercap_core.geometry.rigid.shots import Drawable
 from intercap_core.studio.noise import gaussian
 from intercap_core.studio.room import Room
 
-BODY, OBJECT, PASSER_BY = 1, 2, 3  # what an identity image holds; 0 is the room
-# Directions to the lamps and their strength: two ceiling lamps
+BODY, OBJECT, PASSER_BY = 1, 2, 3  # values of an identity image; 0 is the room
+# Directions to two ceiling lamps, stage frame, and their strength as a share of full brightness
 LAMPS = (((0.45, 0.3, 0.85), 0.42), ((-0.6, -0.25, 0.75), 0.30))
 CAMERA_GAMMA = 2.2  # grey levels are linear light to the power 1 / 2.2, as nearly in sRGB
 
@@ -48,7 +48,10 @@ class MovingSurface:
 
 @dataclass(frozen=True)
 class Cast:
-    """Drawn moving surfaces in a window whose first pixel is (``x0``, ``y0``)."""
+    """Drawn moving surfaces in a window of the image whose first pixel is (``x0``, ``y0``).
+
+    The n pixels of the window that show a moving surface have depth, normal and colour.
+    """
 
     x0: int
     y0: int
@@ -61,7 +64,7 @@ class Cast:
     normal: np.ndarray
     """(n, 3) stage frame."""
     colour: np.ndarray
-    """(n, 3) float32."""
+    """(n, 3) float32 RGB in [0, 1], not yet shaded."""
 
     @property
     def window(self) -> tuple[slice, slice]:
@@ -88,7 +91,10 @@ def scene_of(*meshes: tuple[np.ndarray, np.ndarray]) -> o3d.t.geometry.Raycastin
 
 
 def shade(normals: np.ndarray) -> np.ndarray:
-    """Factor (...,) of the grey levels of surfaces with unit normals (..., 3)."""
+    """Brightness (...,) of surfaces with unit normals (..., 3), as a factor of their grey levels.
+
+    Lambertian shading by the lamps and by ambient light.
+    """
     light = np.full(normals.shape[:-1], 0.42, np.float32)  # from all directions
     for direction, strength in LAMPS:
         lamp = np.array(direction, np.float32) / np.float32(np.linalg.norm(direction))
@@ -268,6 +274,7 @@ class Photographer:
         # sensor noise: a tile that is shifted at random in each image
         size = (view.lens.height + 64, view.lens.width + 64, 3)
         tile = gaussian(rng, size) * np.float32(self.sensor_noise)
+        # the blur correlates neighbours and halves the deviation, which the factor partly restores
         tile = np.rint(cv2.GaussianBlur(tile, (0, 0), 0.6) * np.float32(1.6))
         self._brighter = np.maximum(tile, 0).astype(np.uint8)
         self._darker = np.maximum(-tile, 0).astype(np.uint8)

@@ -1,6 +1,6 @@
-"""Azure Kinects in a ring: true lenses and poses, what they claim, when they expose, what fails.
+"""Azure Kinects in a ring: true and claimed lenses and poses, times of exposure, failures.
 
-Lens values are typical of devices' own calibrations; no two devices are the same."""
+Lens values are typical of the calibrations that devices have; no two devices are the same."""
 
 from __future__ import annotations
 
@@ -33,13 +33,14 @@ class StudioRig:
     master_from_stage: np.ndarray
     """(4, 4)."""
     offset_s: np.ndarray
-    """(C,) exposure after the device time, without the stagger."""
+    """(C,) exposure minus device time, seconds, without the stagger and slips."""
     missing: tuple[frozenset[int], ...]
     """Sets that each camera did not record."""
     slip: np.ndarray
     """(T, C) whole frames by which an image is older than its device time says."""
     late_s: np.ndarray
-    """(C,) part of slip and offset that comes from starting the cameras apart."""
+    """(C,) seconds by which images are older than their times say because the cameras were started
+    by hand; ``slip`` and ``offset_s`` include it."""
 
 
 def build_rig(
@@ -153,7 +154,8 @@ def _colour_lens(rng: np.random.Generator, mode: str) -> Intrinsics:
     distortion = np.array([0.42, -2.55, 3e-4, -2e-4, 1.50, 0.30, -2.37, 1.42])
     distortion[:2] += rng.normal(0, (0.03, 0.05))
     distortion[2:4] += rng.normal(0, 2e-4, 2)
-    distortion[5:7] += distortion[:2] - (0.42, -2.55)  # lenses differ by far less than numbers
+    # k4 and k5 follow k1 and k2: they nearly cancel, so that lenses differ far less than numbers
+    distortion[5:7] += distortion[:2] - (0.42, -2.55)
     distortion[5] += rng.normal(0, 0.004)
     return Intrinsics(
         width, height, focal, focal * (1 + rng.normal(0, 3e-4)),
@@ -207,9 +209,11 @@ def _recalibrated(lens: Intrinsics, rng: np.random.Generator, noise: float) -> I
 def _slips(
     rng: np.random.Generator, frames: int, settings: StudioSettings
 ) -> tuple[tuple[frozenset[int], ...], np.ndarray]:
-    """Missing frames, or silent slips (T, C), in two subordinate cameras.
+    """Sets without an image for each camera, and slips (T, C).
 
-    One camera starts late and one ends early.
+    Two subordinate cameras lose one to four frames, or, if ``settings.slips`` is "silent", their
+    images are older by as many frames for a while. In addition, one camera starts late and one
+    ends early.
     """
     cameras = settings.cameras
     missing: list[set[int]] = [set() for _ in range(cameras)]
@@ -219,7 +223,7 @@ def _slips(
         return tuple(frozenset(m) for m in missing), slip
     for camera in rng.permutation(others)[:2]:
         length = int(rng.integers(1, 5))
-        first = max(2, length)  # nothing is shown that was before the recording
+        first = max(2, length)  # so that no image is older than the recording
         start = int(rng.integers(first, max(first + 1, frames - length - 2)))
         if settings.slips == "silent":
             end = start + int(rng.integers(5, 20))
@@ -243,11 +247,11 @@ class Failures:
     """Failures of every camera of a capture."""
 
     jitter_s: np.ndarray
-    """(T, C) deviation of device times from an even beat."""
+    """(T, C) deviation of device times from even spacing, seconds."""
     depth_empty: np.ndarray
-    """(T, C) the depth image holds nothing."""
+    """(T, C) bool: the depth image is zero everywhere."""
     depth_away: np.ndarray
-    """(T, C) there is no depth image."""
+    """(T, C) bool: there is no depth image."""
     broken: dict[str, int] = field(default_factory=dict)
     """Camera index of each fault of :data:`ONE_CAMERA_EACH`."""
 

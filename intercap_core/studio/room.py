@@ -23,13 +23,13 @@ class Box:
     """A piece of static furniture: an upright box."""
 
     low: tuple[float, float, float]
-    """Corner."""
+    """Lower corner before the rotation, metres."""
     high: tuple[float, float, float]
-    """Corner."""
+    """Upper corner before the rotation, metres."""
     heading: float = 0.0
-    """Rad about the middle."""
+    """Rotation about the vertical through its middle, rad."""
     material: str = "wood"
-    """Names its look."""
+    """Name of its look in :func:`_look`."""
 
     def moved(self, transform: np.ndarray) -> Box:
         """The box rotated about the vertical and shifted by a transform (4, 4)."""
@@ -76,7 +76,7 @@ def build_room(
         eyes: (C, 2) places of the cameras; their view of the middle stays free.
         furnishing: "bare" adds only a floor, "sparse" also two low pieces, "furnished" walls,
             posters and five pieces.
-        twin: another object of the class that stands in the room.
+        twin: mesh of another object of the tracked object's class, to stand in the room.
         hidden: (2,) place that a few pillars hide from some cameras.
     """
     boxes, mesh = list(furniture), None
@@ -206,9 +206,10 @@ NOISE_TABLE = np.random.default_rng(0).random((256, 256)).astype(np.float32)
 
 
 def value_noise(points: np.ndarray, scale: float, seed: int) -> np.ndarray:
-    """Smooth pseudo-random values in [0, 1] of points (N, 3), features of ``scale`` metres.
+    """Smooth pseudo-random values in [0, 1] of points (N, 3); they change over ``scale`` metres.
 
-    A wrapped table looked up along two slanted directions, so that no wall looks striped.
+    Values are interpolated in a periodic table along two slanted directions, so that no wall looks
+    striped.
     """
     start = np.random.default_rng(seed).uniform(0, 256, 2)
     u = (points[:, 0] + 0.53 * points[:, 2]) / scale + start[0]
@@ -236,6 +237,10 @@ def _hash(cell: np.ndarray, seed: int) -> np.ndarray:
 
 
 def _look(name: str, rng: np.random.Generator) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """The function of a material that returns colours (N, 3) of points and normals (N, 3).
+
+    Its numbers are sizes of the pattern, metres, and colours, chosen by eye.
+    """
     seed = int(rng.integers(1 << 30))
     tint = rng.uniform(-0.06, 0.06, 3)
 

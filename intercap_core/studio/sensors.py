@@ -148,6 +148,8 @@ REVERBERATION_S = (0.25, 0.6)  # time of a fall by 60 dB, in furnished and in ba
 
 @dataclass(frozen=True)
 class _Event:
+    """One sound: start, seconds since the first set; samples (N,); source (3,), stage frame."""
+
     time_s: float
     samples: np.ndarray
     place: np.ndarray

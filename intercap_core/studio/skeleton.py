@@ -1,8 +1,8 @@
 """The puppet's skeleton: forward kinematics and closed-form inverse kinematics of the limbs.
 
-Frame "stage": z up, the floor at z = 0, metres. A joint's rotation is ``stage_from_rest`` (3, 3):
-what turns the T-pose (x to the person's left, y up, facing +z) into the stage. All functions take
-any number N of moments at once, so a pose can be asked for at the exposure time of any camera.
+"Stage" is any frame with z up and the floor at z = 0, metres, such as that of a script. A joint's
+rotation ``stage_from_rest`` (3, 3) turns the axes of the T-pose (x to the person's left, y up, z
+ahead) to the stage. All functions take N moments at once.
 """
 
 from __future__ import annotations
@@ -15,8 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core.body.joints import JOINT_INDEX, PARENTS
 
-# Shares of a limb's length. Targets beyond the first are met in part, up to the second: knees and
-# elbows never lock, where they would snap.
+# Shares of a limb's length. A limb reaches targets up to the first share exactly. Beyond it, the
+# limb stretches less and less, at most to the second share: knees and elbows that become straight
+# would snap.
 REACH_FREE = 0.972
 REACH_MOST = 0.994
 
@@ -46,8 +47,8 @@ def blend(a: np.ndarray, b: np.ndarray, share: np.ndarray) -> np.ndarray:
 
 
 def frame(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Rotations (..., 3, 3) with columns ``first``, the part of ``second`` across it, their
-    product."""
+    """Rotations (..., 3, 3) by Gram-Schmidt: columns are ``first``, ``second`` made orthogonal to
+    it, and their cross product, all of unit length."""
     x = unit(first)
     y = unit(second - x * (x * second).sum(-1, keepdims=True))
     return np.stack([x, y, np.cross(x, y)], -1)
@@ -95,9 +96,10 @@ class PuppetSkeleton:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Two bones from ``root`` to ``target``, both (N, 3), bent towards ``pole`` (N, 3).
 
-        ``rest_hinge`` (3,) is the axis about which the joint bends in the T-pose. Returns the
-        rotations (N, 3, 3) of the upper and the lower bone. A target beyond ``free`` of the
-        limb's length is met in direction only.
+        The law of cosines gives the angle at the root. ``rest_hinge`` (3,) is the axis about which
+        the middle joint bends in the T-pose. Returns the rotations (N, 3, 3) of the upper and the
+        lower bone. A target farther than ``free`` of the limb's length is not quite reached
+        (``REACH_MOST``).
         """
         upper, lower = self.bone(names[0], names[1]), self.bone(names[1], names[2])
         a, b = np.linalg.norm(upper), np.linalg.norm(lower)

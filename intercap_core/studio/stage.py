@@ -37,20 +37,20 @@ ANY_LAYOUT = frozenset({"dead_half", "no_depth", "zero_depth", "no_overlap"})
 
 @dataclass(frozen=True)
 class StageState:
-    """N moments in the stage frame, metres; poses are NaN without an object."""
+    """State at N moments in the stage frame, metres."""
 
     body: np.ndarray
-    """(N, V, 3)."""
+    """(N, V, 3) skin."""
     clothed: np.ndarray
-    """(N, V, 3)."""
+    """(N, V, 3) surface of the clothes."""
     joints: np.ndarray
     """(N, 55, 3)."""
     tips: np.ndarray
-    """(N, 10, 3) thumb to little finger, left then right."""
+    """(N, 10, 3) fingertips, thumb to little finger, left then right."""
     pelvis: np.ndarray
-    """(N, 3, 3) stage_from_rest."""
+    """(N, 3, 3) stage_from_rest rotation of the pelvis."""
     stage_from_object: np.ndarray
-    """(N, 4, 4)."""
+    """(N, 4, 4) object poses; NaN without an object."""
 
 
 class StudioStage:
@@ -182,7 +182,7 @@ class StudioStage:
         )
 
     def keypoints(self, moment: StageState | Passing) -> np.ndarray:
-        """True keypoints (N, 135, 3) in the stage; all people share one mesh."""
+        """True keypoints (N, 135, 3) in the stage. All people have the same mesh topology."""
         chart = self.fitted.keypoint_map
         corners = self.subject.faces[self.subject.fitted_face[chart.vertex_ids]]
         weights = self.subject.fitted_bary[chart.vertex_ids]

@@ -1,9 +1,12 @@
 """The studio's true bodies: people whose shape, mesh, skinning and clothes the fit does not know.
 
-Joint names, axes and the rest pose are SMPL-X's, so that a pose means the same for both; all else
-differs from the fitted body: identities lie 3 to 8 mm outside its shape space, on another mesh with
-other skinning weights, half dual-quaternion skinned (Kavan et al. 2008, "Geometric skinning with
-approximate dual quaternion blending"), with muscles that bulge and 5 to 20 mm of clothing.
+Joint names, axes and the rest pose are SMPL-X's, so that a pose means the same for both. All else
+differs from the fitted body:
+
+- Shapes lie 3 to 8 mm outside its shape space, on another mesh with other skinning weights.
+- Skinning is half linear, half by dual quaternions (Kavan et al. 2008, "Geometric skinning with
+  approximate dual quaternion blending").
+- Muscles bulge, and clothes are 5 to 20 mm thick.
 """
 
 from __future__ import annotations
@@ -19,10 +22,10 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core.body.joints import JOINT_INDEX, NUM_JOINTS, PARENTS
 
-# The usual dozen, and people of other builds on the same mesh: their file holds what is their own
+# The twelve standard people; people of other builds, whose file has only the arrays that differ.
 SUBJECTS_FILE = Path(__file__).parent / "data" / "subjects.npz"
 BUILDS_FILE = SUBJECTS_FILE.with_name("builds.npz")
-# Each driver's angle thickens and creases what hangs on it (the file's `bulges`, at 90 degrees)
+# Drivers: joints whose flexion displaces the skin around them by `bulges`, stated for 90 degrees
 _DRIVERS = tuple(
     JOINT_INDEX[f"{side}_{joint}"]
     for joint in ("elbow", "knee", "hip", "shoulder")
@@ -55,25 +58,25 @@ class Subject:
     gender: str
     height_m: float
     rest: np.ndarray
-    """(V,3)."""
+    """(V,3) vertices."""
     faces: np.ndarray
     """(F,3)."""
     rest_joints: np.ndarray
     """(55,3)."""
     rest_tips: np.ndarray
-    """(10,3)."""
+    """(10,3) fingertips in the order of :class:`PosedSubject`."""
     weights: csr_matrix
-    """(V,55)."""
+    """(V,55) skinning weights."""
     bulges: np.ndarray
-    """(8,V,3) at a right angle of each driver."""
+    """(8,V,3) displacement of the skin at a right angle of each of ``_DRIVERS``."""
     clothing: np.ndarray
-    """(V,) thickness."""
+    """(V,) thickness of the clothes."""
     fitted_face: np.ndarray
     """(N,) face of this mesh below each vertex of the open body."""
     fitted_bary: np.ndarray
     """(N,3) barycentric coordinates in it."""
     sole_m: float = 0.0
-    """How far soles of shoes are below the lowest skin."""
+    """Distance of the soles of shoes below the lowest skin."""
 
     @classmethod
     def load(cls, name: str) -> Subject:
@@ -205,7 +208,7 @@ def _normals(vertices, faces):
 
 @numba.njit(cache=True)
 def _face_parents(quaternions, parents):
-    """Flip quaternions (B,55,4) to their parents' hemisphere, in place."""
+    """Flip signs of quaternions (B,55,4), so that blends with the parents' are short, in place."""
     for b in range(len(quaternions)):
         for k in range(1, quaternions.shape[1]):
             if (quaternions[b, k] * quaternions[b, parents[k]]).sum() < 0:

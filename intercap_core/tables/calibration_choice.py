@@ -22,7 +22,7 @@ class CalibrationChoice:
     """Result of :func:`choose_calibration`."""
 
     best: str | None
-    """Name of the calibration with the clearly smallest residual; None if none is."""
+    """Name of the calibration with the clearly smallest residual; None if there is no such one."""
     residual_m: dict[str, float]
     """Residual of each calibration that could be compared, metres."""
 
@@ -32,10 +32,11 @@ def choose_calibration(
 ) -> CalibrationChoice:
     """Compare the calibration folders on the background depth of one recording.
 
-    Only pairs of cameras to which two calibrations give different relative poses are compared. The
-    residual is the median distance along the ray between a camera's points and the surface that
-    the other camera measured, averaged over the pairs. The best residual must be at most 90 % of
-    the next. Calibrations and cameras that cannot be read are left out.
+    Only pairs of cameras to which two calibrations give different relative poses are compared. One
+    camera's background points are transformed to the other camera; a point's error is the
+    difference of its depth from the depth that the other camera measured there. The residual is
+    the median error, averaged over the pairs. The best residual must be at most 90 % of the next.
+    Calibrations and cameras that cannot be read are left out.
     """
     rigs: dict[str, dict[str, Camera]] = {}
     depths: dict[str, np.ndarray] = {}
@@ -93,11 +94,14 @@ def _differ(rigs: Mapping[str, dict[str, Camera]], a: str, b: str) -> bool:
 
 
 def _residual(a: Camera, b: Camera, depth_a: np.ndarray, depth_b: np.ndarray) -> float:
-    """Median distance, metres, from points of a to the surface seen by b; NaN = no overlap."""
+    """Median difference, metres, of the depth of points of a and the depth measured by b.
+
+    NaN if fewer than 500 points can be compared.
+    """
     lens = b.depth
     assert lens is not None
     thinned = np.zeros_like(depth_a)
-    thinned[::4, ::4] = depth_a[::4, ::4]
+    thinned[::4, ::4] = depth_a[::4, ::4]  # one pixel of 16 is enough
     points = apply(b.depth_from_master, master_points(thinned, a).points)
     points = points[lens.sees(points)]
     column, row = np.rint(lens.project(points)).astype(np.int64).T

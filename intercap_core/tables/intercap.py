@@ -49,7 +49,7 @@ class Sources:
 
 def find_stated_calibration(subject: int, object_number: int) -> str | None:
     """The calibration that the release states for a subject and an object; None = not stated."""
-    early = object_number <= 7
+    early = object_number <= 7  # the release states calibrations by ranges of subjects and objects
     if (subject <= 3 and early) or (subject == 4 and object_number <= 4):
         return "first"
     if (subject == 3 and not early) or (subject in (5, 6, 7) and early):

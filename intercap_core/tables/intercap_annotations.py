@@ -113,7 +113,7 @@ def _contact(
 
 
 def _object_pose(path: Path, numbers: np.ndarray, faults: list[str]) -> dict[str, Any] | None:
-    """The object's pose in the frame that the release's tracker starts from."""
+    """The object's pose in the frame from which the release's tracker starts; None without one."""
     if not path.is_file():
         return None
     parser = configparser.ConfigParser(interpolation=None)

@@ -1,4 +1,4 @@
-"""Writes a project's settings, tables and annotations for existing recordings."""
+"""Write a project's settings, tables and annotations for existing recordings."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Row:
 
 @dataclass
 class Draft:
-    """Content of a project."""
+    """Content of a project's files."""
 
     dataset: str
     """Name of the project."""

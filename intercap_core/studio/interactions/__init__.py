@@ -1,4 +1,7 @@
-"""The scripts that the studio can play: a table of their objects and of what is their own."""
+"""The scripts that the studio can play, by name: class, object and differing class attributes.
+
+Several scripts share a class, whose attributes are documented there.
+"""
 
 from __future__ import annotations
 
@@ -26,6 +29,7 @@ BY_THE_WALL = dict(top_of_height=0.555, aside=-0.10)
 BOTTLE_CHECK = dict(
     **BY_THE_WALL, grip_height_m=0.01, before_eyes=(0.06, -0.42, 0.64), tip_deg=20.0
 )
+# Each key has the wrist's place, the directions of fingers and thumb, and start and end.
 RACQUET = dict(  # a forehand: back, through the ball's place at the right, over the left shoulder
     handle_m=-0.27,
     turn_back_rad=0.45,

@@ -125,7 +125,7 @@ class WalkAndWave(Interaction):
         return trunk
 
     def _waving(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> WristPose:
-        """The raised wrist (N), the palm ahead."""
+        """Poses (N) of the raised wrist, the palm facing ahead."""
         puppet, sign = self.puppet, (1.0, -1.0)[self.side]
         left, up, ahead = (world[:, 9, :, axis] for axis in range(3))
         wave = self.wave_m * np.sin(2 * np.pi * self.wave_hz * (times - self.raised_s[1]))[:, None]

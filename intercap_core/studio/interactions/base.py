@@ -1,4 +1,14 @@
-"""Base class of all scripts: puppet, true object, furniture and times."""
+"""Base class of all scripts: puppet, true object, furniture and times.
+
+Conventions of all scripts:
+
+- Numbers without a comment are choreography, set by eye: metres, radians, and seconds of script
+  time in :func:`.ramp`, :func:`.bump`, :func:`.plateau`, steps and guides.
+- Columns 0, 1, 2 of ``Trunk.bend`` and ``Trunk.head`` are rotations about the person's left, up and
+  forward axes. Positive values bend forward, turn to the left and lean to the right.
+- ``world[:, 9]`` is the rotation of the chest (joint spine3). Its columns are the directions to the
+  person's left, up and ahead.
+"""
 
 from __future__ import annotations
 
@@ -20,14 +30,14 @@ SCRIPT_S = 3.0  # length of a script; longer recordings play it slower
 
 @dataclass(frozen=True)
 class Performance:
-    """N moments of a script; poses are NaN without an object."""
+    """State at N moments of a script, script frame, metres."""
 
     world: np.ndarray
-    """(N, 55, 3, 3) joint rotations."""
+    """(N, 55, 3, 3) script_from_rest rotations of SMPL-X's joints."""
     pelvis: np.ndarray
-    """(N, 3)."""
+    """(N, 3) positions of the pelvis joint."""
     script_from_object: np.ndarray
-    """(N, 4, 4)."""
+    """(N, 4, 4) object poses; NaN without an object."""
 
 
 @dataclass

@@ -79,9 +79,11 @@ class HandleCarry(Interaction):
         return wrist - float((self.pick_pose @ self.object_from_wrist)[2, 3])
 
     def _grasp(self) -> None:
-        """Fingers level under the handle's bar where they have most room, then curled up.
+        """Put the fingers level under the handle's bar where they have most room, and curl them up.
 
-        The hand comes from the object's +y, its thumb towards -x.
+        All combinations of knuckle flexion, wrist tilt and place are tried. The best one has the
+        largest clearance at the grasp and on the way in, less ``strain_m`` for each 10 degrees of
+        tilt. The hand comes from the object's +y, its thumb towards -x.
         """
         hand, surface = self.puppet.hands[RIGHT], self.prop.surface
         near = (np.abs(self.prop.vertices[:, :2]) < (0.04, 0.02)).all(1)
@@ -129,6 +131,10 @@ class HandleCarry(Interaction):
         return trunk
 
     def _right_wrist(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> WristPose:
+        """Wrist (N): hanging, over and beside the handle, on it, carrying, and back the same way.
+
+        ``first`` and ``last`` are the wrist's poses on the handle at pick-up and put-down.
+        """
         count = len(times)
         swing = 0.10 * bump(times, 0.35, 0.9) + self.arm_swing(times)[:, 0]
         idle = self.puppet.idle_wrist(world, pelvis, RIGHT, swing)
@@ -172,7 +178,7 @@ class HandleCarry(Interaction):
         trunk, feet = self._trunk(times), self.footwork.feet(times)
         world = puppet.trunk(trunk)
         needs = plateau(times, 0.2, 1.0, 2.6, 3.4)
-        for _ in range(2):
+        for _ in range(2):  # the wrist's path follows the trunk, which bends for the wrist
             right = self._right_wrist(world, trunk.pelvis, times)
             trunk = puppet.assist(trunk, {RIGHT: (right, needs)})
             trunk = puppet.settled(trunk, feet[0])

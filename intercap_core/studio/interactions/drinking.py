@@ -39,7 +39,10 @@ class Drinking(HandlingScript):
         self._hovering_place()
 
     def _drinking_place(self) -> None:
-        """Plan head_from_prop (4, 4): the tilted rim at the lips, rest axes at the head joint."""
+        """Plan head_from_prop (4, 4), which puts the rim of the tilted vessel at the lips.
+
+        The head's frame has the axes of the rest pose and its origin at the head joint.
+        """
         subject = self.puppet.subject
         head = JOINT_INDEX["head"]
         share = np.asarray(subject.weights[:, [head, JOINT_INDEX["jaw"]]].sum(1)).ravel()

@@ -57,7 +57,7 @@ class FootballKick(Interaction):
         return far if far > self.near_m else float(self.prop.surface.signed_distance(local).min())
 
     def _pushed(self, skin: np.ndarray, rolled: float) -> float:
-        """How far the ball is after the foot has pushed it away, metres."""
+        """Distance, metres, of the ball from its first place after the foot has pushed it away."""
         if self._gap(skin, rolled) >= -self.pressed_m:
             return rolled
         return bisect(
@@ -65,6 +65,10 @@ class FootballKick(Interaction):
         )[1]
 
     def _footwork(self, sole_gap: float) -> None:
+        """Plan the steps and the right foot's path; ``sole_gap`` is between sole and ball, metres.
+
+        Places of a foot are ankle x, y, z, pitch (positive: toes down) and heading.
+        """
         puppet, w, (x, y, _) = self.puppet, self.puppet.hip_width, self.spot
         sole = puppet.ankle_height[RIGHT]
         on_ball = np.array([x - 0.11, y, self.radius, -0.10, 0.0])
@@ -103,11 +107,11 @@ class FootballKick(Interaction):
         return path
 
     def _roll(self, sliding: float, rolling: float) -> None:
-        """How far the ball has moved, metres, and turned, rad, by time; ``sliding`` and
-        ``rolling`` are how fast friction slows it, m/s^2.
+        """Integrate how far the ball has moved, metres, and turned, rad, at the times ``clock``.
 
-        A foot that comes nearer pushes it away; friction with the floor slows the ball and spins
-        it up until it rolls.
+        Each step applies friction with the floor, which slows the ball and spins it up until it
+        rolls. Then the foot pushes the ball out of the way, and the ball gets at least the speed
+        of the push. ``sliding`` and ``rolling`` are the decelerations by friction, m/s^2.
         """
         self.clock = np.arange(self.swing_s, SCRIPT_S + 1.0, self.integration_s)
         self.moved, self.turned = np.zeros((2, len(self.clock)))

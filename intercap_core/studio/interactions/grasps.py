@@ -1,7 +1,7 @@
 """Grasps planned on the true object's surface, without the contact term and regions of the fits.
 
-A hand approaches until its skin is pressed in, then its fingers close. The try with the smallest
-gaps between fingers and object is kept.
+A hand approaches until its skin is pressed in, then its fingers close. Of several tries, the one
+with the smallest gaps between fingers and object is kept.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ class Grip:
     """Shape before the grasp."""
     closed: HandShape
     object_from_wrist: np.ndarray
-    """(4, 4)"""
+    """(4, 4) pose of the wrist in the object's frame."""
     gaps: np.ndarray
-    """Least signed distance (5,) of each finger, metres."""
+    """(5,) least signed distance of each finger to the object, metres."""
 
 
 def backed_off(
@@ -51,8 +51,16 @@ def backed_off(
     gap: float,
     ids: np.ndarray | slice = slice(None),
 ) -> np.ndarray:
-    """A wrist (4, 4) of the stage moved along ``away`` (3,), at most a quarter of a metre, until
-    the hand's vertices ``ids`` are ``gap`` from the object (negative: pressed)."""
+    """Move a wrist away from the object until the hand has a gap.
+
+    Args:
+        wrist: (4, 4) first pose, script frame.
+        away: (3,) unit direction, script frame; the wrist moves at most a quarter of a metre.
+        gap: distance of the object from the hand's vertices ``ids``, metres; negative: pressed in.
+
+    Returns:
+        (4, 4) pose of the wrist, script frame.
+    """
     object_from_script = invert(script_from_object)
 
     def moved(way: float) -> np.ndarray:
@@ -65,7 +73,10 @@ def backed_off(
 
 
 class Hollow:
-    """The inside of vessels, and of all else that surrounds a point without being solid there."""
+    """Test whether points are inside the hollow of an object, such as a vessel.
+
+    A point is in a hollow if most of the rays from it, evenly over all directions, hit the object.
+    """
 
     off_wall_m = 0.0015  # points nearer to the surface are not tested, metres
     # share of directions that meet the object from inside a hollow: 0.5 before a flat wall, 0.6 a
@@ -83,20 +94,20 @@ class Hollow:
         )  # even over the sphere (Fibonacci's spiral)
 
     def share(self, points: np.ndarray) -> np.ndarray:
-        """Share (n,) of all directions from points (n, 3), the object's frame, that meet it."""
+        """Share (n,) of the rays from points (n, 3), object frame, that hit the object."""
         start = np.repeat(points, self.directions, 0)
         hit = self._surface.met(start, np.tile(self._directions, (len(points), 1)))
         return hit.reshape(len(points), self.directions).mean(1)
 
     def holds(self, points: np.ndarray) -> bool:
-        """Whether one of the points (n, 3), the object's frame, is in a hollow."""
+        """Whether any of the points (n, 3), object frame, is in a hollow."""
         off = points[self._surface.signed_distance(points) > self.off_wall_m]
         return bool(len(off) and self.share(off).max() > self.hollow_share)
 
 
 @dataclass(frozen=True)
 class Approach:
-    """Straight approach of a palm to an object, stage frame."""
+    """Straight approach of a palm to an object, script frame."""
 
     at: np.ndarray
     """Goal (3,) of the palm."""
@@ -119,8 +130,10 @@ class Approach:
         *,
         thumb: bool = False,
     ) -> np.ndarray:
-        """The wrist (4, 4) of the stage once the palm or a finger (with ``thumb``: or the thumb) is
-        pressed against the object."""
+        """The wrist (4, 4), script frame, at which the hand is pressed against the object.
+
+        The palm or a finger touches the object first; the thumb counts only with ``thumb``.
+        """
         hand = puppet.hands[side]
         fingers, palm = unit(np.asarray(self.fingers)), unit(np.asarray(self.palm))
         rotation = puppet.wrist_rotation(side, fingers, palm)
@@ -162,14 +175,15 @@ def wrapped(
     script_from_object: np.ndarray,
     approaches: Iterable[Approach],
 ) -> Grip:
-    """Palm against the object, fingers around it, then the thumb from where it has room.
+    """Plan a grip with the palm against the object, the fingers around it, then the thumb.
 
-    No finger is in a hollow of the object, open or closed.
-    Of ``approaches`` the first is kept in which all fingers meet the object or nearly do, else the
-    best.
+    For each approach, several bends and oppositions of the thumb are tried. A try is dropped if the
+    open thumb penetrates the object, or if part of the hand, open or closed, is in a hollow. The
+    score is the negative sum of the gaps of all fingers. The search ends at a try in which every
+    finger meets the object, or after an approach with a nearly closed grip.
     """
     hand, hollow = puppet.hands[side], Hollow(surface)
-    four = (1, 3, 0, 2)
+    four = (1, 3, 0, 2)  # middle, ring, index, little finger
     best: tuple[float, Grip] | None = None
     for approach in approaches:
         wrist = approach.wrist(puppet, side, open_shape, surface, script_from_object)

@@ -34,7 +34,7 @@ class HandlingScript(Interaction):
     """
 
     lead = RIGHT
-    # of the palm above the object's origin; None: the object is held between both palms
+    # height of the palm above the object's origin, metres; None: held between both palms
     grip_height_m: float | None = 0.0
     attach_s: float  # grasp, script time
     release_s: float  # release, script time
@@ -57,7 +57,10 @@ class HandlingScript(Interaction):
 
     @abstractmethod
     def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> WristPose:
-        """Planned poses (N) of the object, from ``pick_pose`` to ``place_pose``."""
+        """Planned poses (N) of the object, from ``pick_pose`` to ``place_pose``.
+
+        :class:`WristPose` serves here as a rigid pose over time.
+        """
 
     @abstractmethod
     def trunk(self, times: np.ndarray) -> Trunk:

@@ -17,7 +17,8 @@ class Checking(HandlingScript):
     centre = (0.20, 0.0)
     top_of_height = 0.52
     aside = 0.0
-    before_eyes = (0.0, -0.35, 0.72)  # from the head's joint: left, up, ahead, arm lengths
+    # place of the object relative to the head's joint: left, up, ahead, in arm lengths
+    before_eyes = (0.0, -0.35, 0.72)
     second_hand = False  # the left palm comes below an object that the right hand holds
     tip_deg = 35.0  # towards the eyes, and half of it away
     spin_deg = 25.0  # about the vertical
@@ -30,7 +31,7 @@ class Checking(HandlingScript):
 
     def plan(self) -> None:
         self.set_out(self.top_of_height, self.aside)
-        self.size = self.rng.uniform(0.8, 1.2, 3)  # of each turn
+        self.size = self.rng.uniform(0.8, 1.2, 3)  # factor of each turn's angle
         self.order = self.rng.choice([-1.0, 1.0], 2)  # to which side first
         self.grasp()
         if self.second_hand:

@@ -30,23 +30,23 @@ class Sitting(Interaction):
 
     highlight = 1.75
     centre = (0.15, 0.0)
-    rise_s, risen_s = 2.10, 2.90
-    palm_at: tuple[float, float]  # where the right palm feels for the edge, metres
-    hanging = 0.0  # how much the trunk helps the left hand while the person sits
+    rise_s, risen_s = 2.10, 2.90  # start and end of rising, script time
+    palm_at: tuple[float, float]  # x, y where the right palm feels for the edge, metres
+    hanging = 0.0  # weight from 0 to 1 with which the trunk helps the left hand of a sitting person
     sat_back = 0.005  # where the pelvis sits, metres ahead of the seat's middle
     recline = 0.10  # rad
     front_edge = 0.0  # the seat's front from its middle, metres; 0 where the legs may spread
-    back_by_s = 0.30  # before the person sits, the pelvis is above its place
-    on_thigh_s = 1.74  # when the hands lie on the thighs
+    back_by_s = 0.30  # the pelvis is above its place this long before the person sits, seconds
+    on_thigh_s = 1.74  # the hands lie on the thighs from then on, script time
     sit_s = 0.68  # start of sitting down, script time
     seated_s = 1.50  # end of sitting down, script time
-    calf_m = 0.055  # half the calf's thickness at the knee
-    thigh_m = 0.065  # half the thigh's thickness at the knee
-    around_m = 0.14  # sideways detour of a hand between lap and hanging
-    palm_m = 0.056  # from the wrist to the surface below a level palm, trousers included
-    steepest_rad = 0.75  # pitch of a foot that stands on its ball, at most
-    pressed_m = 0.014  # depth to which the seat presses the flesh
-    touch_m = 0.0006  # depth to which the palm presses the seat
+    calf_m = 0.055  # half the calf's thickness at the knee, metres
+    thigh_m = 0.065  # half the thigh's thickness at the knee, metres
+    around_m = 0.14  # sideways detour of a hand between lap and hanging, metres
+    palm_m = 0.056  # from the wrist to the surface below a level palm with trousers, metres
+    steepest_rad = 0.75  # largest pitch of a foot that stands on its ball
+    pressed_m = 0.014  # depth to which the seat presses the flesh, metres
+    touch_m = 0.0006  # depth to which the palm presses the seat, metres
 
     def plan(self) -> None:
         rng, puppet = self.rng, self.puppet
@@ -71,7 +71,11 @@ class Sitting(Interaction):
         self.palm_place = self._palm_on_seat()
 
     def _heels(self, steps: Sequence[Step]) -> list[Guide]:
-        """Feet of people whose knees are lower than the seat stand on their balls meanwhile."""
+        """Guides that lift the heels of people whose knees are lower than the seat.
+
+        Their feet stand on the balls while they sit. The pitch lifts the knee by the missing
+        height, at most to ``steepest_rad``.
+        """
         puppet, guides = self.puppet, []
         knee = puppet.skeleton.length("left_knee", "left_ankle") + float(puppet.ankle_height[0])
         missing = self.seat_top + self.thigh_m - knee if self.front_edge else 0.0
@@ -89,7 +93,10 @@ class Sitting(Interaction):
         """The seat's heading, rad."""
 
     def sit(self) -> None:
-        """Lower the pelvis until the flesh is pressed in by ``pressed_m``."""
+        """Find ``seated_height``: lower the pelvis until the seat presses the flesh in.
+
+        The depth is ``pressed_m``.
+        """
         puppet, subject = self.puppet, self.puppet.subject
         low_part = [JOINT_INDEX[n] for n in ("pelvis", "left_hip", "right_hip", "spine1")]
         share = np.asarray(subject.weights[:, low_part].sum(1)).ravel()
@@ -219,7 +226,7 @@ class Sitting(Interaction):
         puppet.legs(world, trunk.pelvis, *feet)
         feel = plateau(times, 0.90, 1.20, 1.30, 1.60)
         hanging = self.hanging * plateau(times, 1.3, 1.6, 1.95, 2.25)
-        for _ in range(2):
+        for _ in range(2):  # the wrists' paths follow the trunk, which bends for the wrists
             right = self._wrist(world, trunk.pelvis, times, RIGHT)
             left = self._wrist(world, trunk.pelvis, times, LEFT)
             trunk = puppet.assist(trunk, {RIGHT: (right, feel), LEFT: (left, hanging)})
@@ -294,7 +301,10 @@ class ChairSit(Sitting):
         return np.pi / 2 + self.rng.normal(0, 0.03)
 
     def sit(self) -> None:
-        """Sit as far back as an upright back has room, then lean until it is pressed."""
+        """Sit as far back as an upright back has room, then lean back until the slats press it.
+
+        Finds ``sat_back``, ``recline`` and ``seated_height``.
+        """
         subject = self.puppet.subject
         bones = [JOINT_INDEX[name] for name in ("pelvis", "spine1", "spine2", "spine3")]
         share = np.asarray(subject.weights[:, bones].sum(1)).ravel()

@@ -55,7 +55,10 @@ class SkateboardRide(Interaction):
         self.walk(start, steps, heading=heading, guides=guides)
 
     def _on_deck(self, side: int, heading: float) -> np.ndarray:
-        """The place (5,) of a foot that stands on the board, its sole lightly pressed."""
+        """The place of a foot that stands on the board, its sole lightly pressed.
+
+        Places (5,) are ankle x, y, z, pitch and heading.
+        """
         foot = Foot(self.puppet, side)
         sign = (-1.0, 1.0)[side]
         ahead = np.array([np.cos(heading), np.sin(heading)])
@@ -100,7 +103,7 @@ class SkateboardRide(Interaction):
         ]
 
     def _rolled(self, times: np.ndarray) -> np.ndarray:
-        """How far the board has rolled (N,): pushed evenly, then slowed evenly to a stop."""
+        """Distance (N,), metres, rolled with constant acceleration, then constant deceleration."""
         pushed = np.clip(times - self.push_s, 0, self.pushed_s - self.push_s)
         slowed = np.clip(times - self.pushed_s, 0, self.stop_s - self.pushed_s)
         first = self.speed * pushed**2 / (2 * (self.pushed_s - self.push_s))

@@ -33,11 +33,11 @@ class GlidingSwing(Swinging):
     """The hand glides along the grip towards the head as the racquet goes back, and back to the
     butt as it swings through."""
 
-    glide_s = (1.14, 1.44, 1.66, 1.98)  # from, until, back from, until
+    glide_s = (1.14, 1.44, 1.66, 1.98)  # start and end of gliding, and of gliding back, script time
     glide_m = 0.032  # along the grip, towards the head and back, metres
 
     def slide(self, times: np.ndarray) -> np.ndarray:
-        """Along the grip, which is as thick everywhere."""
+        """Along the grip, which has the same thickness everywhere."""
         along = self.glide_m * plateau(times, *self.glide_s)
         return along_and_about(along, np.zeros(len(times)), np.zeros(2))
 
@@ -45,7 +45,7 @@ class GlidingSwing(Swinging):
 class TurningSwing(Swinging):
     """The straight handle turns in the fingers while it points ahead, and back."""
 
-    turn_s = (1.16, 1.50, 1.62, 2.02)
+    turn_s = (1.16, 1.50, 1.62, 2.02)  # start and end of turning, and of turning back, script time
     turn_deg = 55.0  # about the handle, and back
 
     def slide(self, times: np.ndarray) -> np.ndarray:
@@ -64,7 +64,7 @@ class Regrasp(Checking):
     """
 
     regrasp_s = (1.04, 1.12, 1.26, 1.36)  # opens from, is open, closes from, is closed
-    rests_until_s = 1.36
+    rests_until_s = 1.36  # the bottle stands on the plinth until then, script time
     regrasp_up_m = 0.022  # shift of the hand along the bottle, metres
     regrasp_deg = 28.0  # turn of the hand about the bottle
     regrasp_off_m = 0.012  # gap between the open hand and the bottle meanwhile, metres

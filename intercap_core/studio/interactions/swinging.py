@@ -44,6 +44,7 @@ class Swinging(HandlingScript):
     clear_m, back_m = 0.045, 0.075  # the thumb is behind the handle
     keys: tuple[Key, ...] = ()
     turn_back_rad, turn_through_rad = 0.0, 0.0  # of the chest, to the right and to the left
+    # times of these turns as :func:`plateau` takes them, script time
     back_s, through_s = (1.0, 1.35, 1.4, 1.7), (1.45, 1.75, 1.9, 2.3)
     attach_s = 0.96  # grasp, script time
     release_s = 2.56  # release, script time
@@ -114,10 +115,14 @@ class Swinging(HandlingScript):
         return trunk
 
     def path(self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray) -> WristPose:
-        """The hand's way through the keys, as the object sees it."""
+        """Poses of the object that follow from the hand's way through the keys.
+
+        Keys are relative to where the right shoulder of a standing person is at rest.
+        """
         count, puppet = len(times), self.puppet
         grip = self.grips[RIGHT].object_from_wrist
         rest = puppet.subject.rest_joints
+        # Joint 17 is the right shoulder, 0 the pelvis; the rest pose has x to the left and y up.
         shoulder = np.array([0.0, rest[17, 0], rest[17, 1] - rest[0, 1]])
         shoulder = pelvis * (1, 1, 0) + (0, 0, puppet.stand) + shoulder
         wrist = WristPose.still(self.pick_pose @ grip, count)
