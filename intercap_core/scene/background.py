@@ -20,10 +20,12 @@ from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.solve.time_series import sample_evenly
 
-# Distance from a bone to skin, clothing and hair, metres, in the order of LIMB_BONES. Wider than
-# the radii of the segmentation: the region only has to contain the person. Tuned on the studio.
+# Largest distance from a bone to skin, clothing and hair, metres, in the order of LIMB_BONES. These
+# radii exceed those of the segmentation, because pixels left out here do no harm. Tuned on the
+# studio.
 LIMB_REACH_M = (0.16, 0.14, 0.18, 0.15, 0.14, 0.14)
-# The same for trunk and head, which have no bones of their own; hands reach past the wrist.
+# The same for trunk and head, whose bones LIMB_BONES lacks. A pair of equal names is a ball: the
+# hand around the wrist.
 TRUNK_REACH_M: dict[tuple[str, str], float] = {
     ("neck", "mid_hip"): 0.26,
     ("right_shoulder", "right_hip"): 0.20,
@@ -42,10 +44,15 @@ _REACH = np.array([*TRUNK_REACH_M.values(), *LIMB_REACH_M, *LIMB_REACH_M])
 def mask_person(
     depth: np.ndarray, lens: Intrinsics, depth_from_master: np.ndarray, joints: np.ndarray
 ) -> np.ndarray:
-    """Mask (H, W) of the pixels of a depth image (H, W), uint16 mm, that lie near a bone.
+    """Return the mask (H, W) of depth pixels that lie within reach of a bone.
 
-    ``joints``: (K, 3) keypoints in the 135-point order, at least the body's 25, master frame,
-    metres; NaN = unknown.
+    Every eighth pixel in both directions is tested; the mask is enlarged by nearest neighbour.
+
+    Args:
+        depth: (H, W) uint16 mm.
+        depth_from_master: (4, 4).
+        joints: (K, 3) keypoints in the 135-point order, at least the body's 25, master frame,
+            metres; NaN = unknown.
     """
     ends = [apply(depth_from_master, joints[index]) for index in (_FIRST, _SECOND)]
     known = np.isfinite(ends[0]).all(1) & np.isfinite(ends[1]).all(1)
@@ -53,7 +60,7 @@ def mask_person(
     if not known.any():
         return result
     start, along, reach = ends[0][known], (ends[1] - ends[0])[known], _REACH[known]
-    small = np.s_[4::8, 4::8]  # every eighth pixel is enough for so coarse a mask
+    small = np.s_[4::8, 4::8]
     z = depth[small].astype(np.float64) * 1e-3
     points = np.dstack([lens.rays[small] * z[..., None], z])
     low = np.minimum(start, start + along).min(0) - reach.max()
@@ -75,17 +82,18 @@ class Background:
     depth: np.ndarray
     """(H, W) uint16 mm; 0 = unknown."""
     static: np.ndarray
-    """(H, W) bool: most samples show the background."""
+    """(H, W) bool: most sampled images show the background in this pixel."""
 
 
 def camera_background(frames: Frames, c: int, joints: np.ndarray) -> Background | None:
     """Background of camera ``c``; None if it has no depth image.
 
-    ``joints``: (T, 135, 3) the subject's keypoints at the moment that the camera's image of each
-    set shows, master frame, metres; NaN = unknown. Pixels near them are not background.
+    ``joints``: (T, 135, 3) keypoints of the subject, master frame, metres; NaN = unknown. Row t
+    belongs to the moment that the camera's image of set t shows. Pixels near them are ignored.
     """
     camera = frames.rig[c]
-    sets = sample_evenly(frames.depth_available[:, c], 25)  # bounds the memory for the images
+    # at most 25 images, evenly spaced in time, which bounds the memory
+    sets = sample_evenly(frames.depth_available[:, c], 25)
     if not len(sets) or camera.depth is None:
         return None
     images = np.stack([image for t in sets if (image := frames.depth(int(t), c)) is not None])
@@ -97,12 +105,15 @@ def camera_background(frames: Frames, c: int, joints: np.ndarray) -> Background 
 
 
 def steady_background(images: np.ndarray, person: np.ndarray) -> Background:
-    """Background of one camera's depth images (S, H, W), uint16 mm.
+    """Background of one camera, pixel by pixel.
 
-    A fifth of a pixel's valid samples must agree. If less than three quarters are valid, the pixel
-    looks past the scene and a passing surface may repeat: 80 % must agree. Tuned on the studio.
+    The background is the farthest depth on which 20 % of a pixel's valid samples agree. If less
+    than 75 % of the samples are valid, 80 % must agree: the pixel looks past the scene, and a
+    passing surface may repeat. The thresholds are tuned on the studio.
 
-    ``person``: (S, H, W) bool, samples that may show a person and are ignored.
+    Args:
+        images: (S, H, W) uint16 mm; 0 = invalid.
+        person: (S, H, W) bool, samples that may show a person and are ignored.
     """
     samples, height, width = images.shape
     usable = samples - person.reshape(samples, -1).sum(0)
@@ -121,9 +132,13 @@ def steady_background(images: np.ndarray, person: np.ndarray) -> Background:
 
 
 def _farthest_cluster(ordered: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Median (N,) and size (N,) of the farthest ``count`` or more samples that agree.
+    """Median (N,), mm, and size (N,) of the farthest cluster of samples of each pixel.
 
-    ``ordered`` (N, S) ascending mm, 0 = invalid. Both are 0 if no such samples agree.
+    A window of ``count`` successive sorted samples slides from the farthest sample to the nearest.
+    The first window whose range is within the tolerance is chosen. The cluster consists of all
+    samples within the tolerance of the window's middle. Median and size are 0 without a cluster.
+
+    ``ordered``: (N, S) ascending mm; 0 = invalid.
     """
     values = ordered.astype(np.float32)
     samples = values.shape[1]

@@ -1,9 +1,13 @@
 """Compares the refined pose of each camera with its given pose on held-out data.
 
-Each camera in turn gets its given pose back while the others stay refined. If that is not far
-worse, the others are also refined with this camera fixed. The two are compared on the held-out
-points of each pair with this camera (background and moving surfaces separately), and on keypoints
-of the half of the recording that a second refinement did not use.
+For each camera, the refined rig is compared with the same rig in which this camera has its given
+pose. The comparison uses data that the refinement did not use:
+
+- held-out surface points of each pair with this camera, background and moving surfaces separately;
+- keypoints of half of the recording, with a second refinement that used only the other half.
+
+If the given pose is not far worse, the other cameras are refined again with this camera fixed, and
+the comparison is repeated with that rig.
 """
 
 from __future__ import annotations
@@ -17,8 +21,12 @@ import numpy as np
 from intercap_core.scene.constraints import MIN_BODY_POINTS, BodyConstraint, BodyViews
 from intercap_core.scene.registration import MOVING, STATIC, Registration, RigEstimate
 
-MUST_IMPROVE = 0.98  # of the start's held-out cost, in one group at least; tuned on the studio
-DOUBTFUL_RATIO = 0.5  # refined over given error from which a camera is judged again; tuned
+# Largest ratio of held-out errors, refined over given, that counts as an improvement. Tuned on the
+# studio.
+MUST_IMPROVE = 0.98
+# Ratio of refined over given error above which the given pose is not far worse and the camera is
+# compared again. Tuned on the studio.
+DOUBTFUL_RATIO = 0.5
 
 Unit = TypeVar("Unit", bound=Hashable)
 _KINDS = (("background", STATIC), ("moving surfaces", MOVING))
@@ -31,14 +39,14 @@ class HeldOutComparison:
     kind: str
     """Name of the kind of data."""
     log_ratio: np.ndarray
-    """(N,) log of refined over given error, by independent unit: a pair of cameras, or a joint for
-    half a second."""
+    """(N,) natural logarithm of refined over given error, one for each independent unit. A unit is
+    a pair of cameras, or one joint during half a second."""
 
     @classmethod
     def of(
         cls, kind: str, given: Mapping[Unit, float], refined: Mapping[Unit, float]
     ) -> HeldOutComparison:
-        """Compare errors by unit, over the units that both have."""
+        """Compare the errors of those units that occur in both ``given`` and ``refined``."""
         both = [
             np.log(max(error, 1e-6) / max(given[unit], 1e-6))
             for unit, error in refined.items()
@@ -53,8 +61,8 @@ class HeldOutComparison:
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of the mean; of few units at least the usual one."""
-        # few units may agree by chance; tuned on the studio
+        """Standard deviation of the mean."""
+        # the scatter is at least 0.25, because few units may agree by chance; tuned on the studio
         spread = max(float(self.log_ratio.std()), 0.25)
         return spread / np.sqrt(len(self.log_ratio))
 
@@ -65,16 +73,16 @@ class HeldOutComparison:
 
 @dataclass(frozen=True)
 class PoseVerdict:
-    """Whether a camera's refined pose is significantly better."""
+    """Decision between a camera's refined and given pose."""
 
     refined: bool
-    """The refined pose is kept."""
+    """True: the refined pose is significantly better and is kept."""
     evidence: tuple[HeldOutComparison, ...]
-    """Comparison by kind of data."""
+    """Comparison by kind of data; empty = no held-out data show this camera."""
 
     @property
     def doubtful(self) -> bool:
-        """Whether the given pose is not far worse."""
+        """Whether the given pose may be right: it was chosen, or is not far worse."""
         if not self.evidence:
             return False
         mean = np.mean([e.mean for e in self.evidence])
@@ -82,8 +90,8 @@ class PoseVerdict:
 
     @classmethod
     def of(cls, evidence: Sequence[HeldOutComparison]) -> PoseVerdict:
-        """Decide from the evidence; every kind has the same weight."""
-        if not evidence:  # the rig as a whole is better refined
+        """Decide from the evidence; every kind of data has the same weight."""
+        if not evidence:  # verdicts are only asked for if the refined rig as a whole is better
             return cls(True, ())
         mean = np.mean([e.mean for e in evidence])
         sigma = np.sqrt(sum(e.sigma**2 for e in evidence)) / len(evidence)
@@ -111,13 +119,16 @@ class PoseJudge:
     ) -> None:
         """
         Args:
-            refine: estimates the rig from keypoints (None = all) and free cameras (C,).
+            registration: gives the residuals of held-out surface points.
+            refine: estimates the rig. Its arguments are the keypoints to use (None = all) and a
+                mask (C,) of the cameras whose poses are estimated.
             views: keypoints of the subject; None = too few.
             given: given poses, with biases and offsets estimated for them.
             refined: all poses refined.
         """
         self._registration, self._refine = registration, refine
         self._given, self._refined = given, refined
+        # half of the keypoints, the rig refined with them, and the other half for evaluation
         self._seen = self._halved = self._held_out = None
         if views is not None:
             seen, unseen = views.halves()
@@ -129,7 +140,8 @@ class PoseJudge:
     def verdicts(self, cameras: Sequence[int]) -> dict[int, PoseVerdict]:
         """Verdict of each of the ``cameras``.
 
-        Doubtful cameras are judged again, with the rest of the rig refined for their given poses.
+        Doubtful cameras are compared a second time. All of them then have their given poses, and
+        the rest of the rig is refined anew around them.
         """
         verdicts = {}
         for c in cameras:
@@ -148,8 +160,9 @@ class PoseJudge:
     def _compare(self, camera: int, apart: RigEstimate, halved: RigEstimate | None) -> PoseVerdict:
         """Compare one camera's poses.
 
-        ``apart``: estimate with this camera as given. ``halved``: the same without the held-out
-        keypoints.
+        Args:
+            apart: estimate in which this camera has its given pose.
+            halved: the same without the held-out keypoints; None = too few keypoints.
         """
         evidence = []
         for name, kind in _KINDS:
@@ -178,15 +191,18 @@ def _with_camera_of(at: RigEstimate, other: RigEstimate, camera: int) -> RigEsti
 def weakest_motion(
     covariance: np.ndarray, pose: np.ndarray, centre: np.ndarray
 ) -> tuple[float, np.ndarray]:
-    """Largest standard deviation of the rig's centre due to one camera's pose, and its direction.
+    """Direction in which one camera sees the rig's centre least accurately.
+
+    The pose's covariance is propagated to the position of the centre. The result is the largest
+    principal axis of that covariance (3, 3).
 
     Args:
-        covariance: (7, 7) of the camera.
+        covariance: (7, 7) of the camera: rotation about its centre, rad, translation, depth bias.
         pose: (4, 4) master from camera.
-        centre: (3,) of the rig.
+        centre: (3,) of the rig, master frame, metres.
 
     Returns:
-        Standard deviation, metres, and unit direction (3,).
+        Standard deviation, metres, and unit direction (3,), master frame.
     """
     across = np.cross(np.eye(3), centre - pose[:3, 3])  # row i: the shift by a turn about axis i
     by_pose = np.concatenate([across.T, np.eye(3)], axis=1)
@@ -195,9 +211,12 @@ def weakest_motion(
 
 
 def describe_direction(direction: np.ndarray, pose: np.ndarray, up: np.ndarray) -> str:
-    """Name a unit ``direction`` (3,) as seen by a camera at ``pose`` (4, 4), ``up`` (3,) unit."""
+    """Describe a unit ``direction`` (3,) relative to the view of a camera and to the floor.
+
+    ``pose``: (4, 4) master from camera. ``up``: (3,) unit, master frame.
+    """
     steep = abs(float(direction @ up))
-    if steep > 0.8:  # cosine
+    if steep > 0.8:  # cosine: within 37 degrees
         return "up and down"
     ahead = pose[:3, 2] - (pose[:3, 2] @ up) * up
     ahead /= max(float(np.linalg.norm(ahead)), 1e-9)

@@ -1,8 +1,10 @@
 """Further terms of the registration of a rig: body keypoints and one common floor.
 
-Each constraint returns the normal equations of its residuals with respect to the cameras' poses.
-Its own unknowns (points of the body, the plane) are eliminated by the Schur complement, so the
-camera system stays small.
+Each constraint returns the normal equations of its residuals with respect to the cameras' poses:
+the matrix J' W J (C, 6, C, 6) and the gradient J' W r (C, 6). A pose has 6 parameters: rotation
+vector about the camera's centre, applied on the left, rad, and translation of
+``master_from_colour``, metres. The constraint's own unknowns (points of the body, the plane) are
+eliminated by the Schur complement, so the camera system stays small.
 
 - :class:`BodyConstraint`: bundle adjustment of the subject's keypoints.
 - :class:`FloorConstraint`: all cameras see the same plane. It fixes height and tilt of cameras that
@@ -26,29 +28,34 @@ from intercap_core.scene.ground import FLOOR_COSINE, GroundPlane
 from intercap_core.scene.subject_views import SubjectViews
 from intercap_core.scene.surfaces import DepthSurface
 
-FLOOR_SIGMA_M = 0.005  # floors are not flat and depth is biased; tuned on the studio
+# Standard deviation of floor points from the common plane: floors are not flat and depth is biased.
+# Tuned on the studio.
+FLOOR_SIGMA_M = 0.005
 ROBUST_SIGMA = 3.0  # scale of Geman and McClure's function, standard deviations; tuned
 KEYPOINT_ERROR_TIME_S = 0.5  # how long an error at one joint lasts; tuned on the studio
-MIN_BODY_POINTS = 50  # fewer do not constrain a rig; tuned on the studio
+MIN_BODY_POINTS = 50  # joints times sets; fewer do not constrain a rig; tuned on the studio
 
 
 @dataclass(frozen=True, eq=False)
 class BodyViews:
-    """Keypoints of the subject in all views: N points of all sets."""
+    """Body keypoints of the subject in all views. A point n is one joint in one set."""
 
     pixels: np.ndarray
     """(N, C, 2) detected pixels."""
     weights: np.ndarray
-    """(N, C) weight of each detection; 0 = not seen."""
+    """(N, C) weight of each detection; 0 = not seen or outlier. The confidence is multiplied by the
+    interval of sets over :data:`KEYPOINT_ERROR_TIME_S`, because successive detections of one joint
+    share an error."""
     points: np.ndarray
     """(N, 3) points triangulated at the given poses, metres."""
     velocity: np.ndarray
     """(N, 3) m/s, by central differences; 0 = unknown."""
     unit: np.ndarray
-    """(N,) number shared by the points of one joint for as long as a detector's error lasts."""
+    """(N,) number of joint and time span: ``NUM_KEYPOINTS`` * span + keypoint index. Spans last
+    :data:`KEYPOINT_ERROR_TIME_S`, so the points of one unit share one detector error."""
 
     def halves(self) -> tuple[BodyViews, BodyViews]:
-        """The points of every second span of time, and the others."""
+        """The points of the even time spans, and those of the odd ones."""
         odd = self.unit // NUM_KEYPOINTS % 2 == 1
         fields = (self.pixels, self.weights, self.points, self.velocity, self.unit)
         return BodyViews(*(f[~odd] for f in fields)), BodyViews(*(f[odd] for f in fields))
@@ -60,8 +67,9 @@ def body_views(subject: SubjectViews, times: np.ndarray) -> BodyViews:
     by_point = np.swapaxes(subject.keypoints[:, :, BODY_POINTS], 1, 2).reshape(-1, views, 3)
     inlier = np.swapaxes(subject.inlier[:, :, BODY_POINTS], 1, 2).reshape(-1, views)
     points = subject.joints[:, BODY_POINTS].reshape(-1, 3)
-    # Two views of a larger rig hardly constrain their relative pose. In a rig of two they determine
-    # five of its six parameters, and the prior holds the distance.
+    # In rigs of three and more, points of only two views are left out: they hardly constrain the
+    # relative pose. A rig of two must use them; they determine five of six parameters of the
+    # relative pose, and the prior of the registration its scale.
     enough = min(3, views)
     good = (subject.views[:, BODY_POINTS].ravel() >= enough) & np.isfinite(points[:, 0])
     gap = float(np.median(np.diff(times))) if len(times) > 1 else KEYPOINT_ERROR_TIME_S
@@ -78,7 +86,10 @@ def body_views(subject: SubjectViews, times: np.ndarray) -> BodyViews:
 
 
 class BodyConstraint:
-    """Adds the normal equations of reprojection to a rig's poses."""
+    """Normal equations of the keypoints' reprojection errors.
+
+    The object keeps the 3D points between calls: each call starts from the last points.
+    """
 
     def __init__(self, views: BodyViews, rig: Rig) -> None:
         self._views = views
@@ -86,9 +97,14 @@ class BodyConstraint:
         self._points = views.points.copy()
 
     def __call__(self, poses: np.ndarray, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Matrix (C, 6, C, 6) and gradient (C, 6) at ``poses`` (C, 4, 4) of cameras that expose
-        ``offset`` (C,) s after the set's time: rotation about the camera's centre, applied on the
-        left, and translation of ``master_from_colour``."""
+        """Matrix (C, 6, C, 6) and gradient (C, 6) with the points eliminated.
+
+        The points are first adapted to the poses by two Gauss-Newton steps.
+
+        Args:
+            poses: (C, 4, 4) master_from_colour.
+            offset: (C,) seconds by which each camera exposes after the set's time.
+        """
         for _ in range(2):  # Gauss-Newton steps of the points at fixed poses
             residual, by_point, weight, _ = self._linearised(poses, offset)
             normal, slope = _normal_of_points(residual, by_point, weight)
@@ -110,9 +126,10 @@ class BodyConstraint:
     def unit_errors(
         self, poses: np.ndarray, offset: np.ndarray, camera: int
     ) -> dict[Hashable, float]:
-        """Mean reprojection error in all views, px, by unit of the points that ``camera`` sees.
+        """Mean reprojection error, px, of each unit (see :class:`BodyViews`).
 
-        The points are first adapted to the poses.
+        Only points that ``camera`` sees count, each with its mean error over all views. The points
+        are first adapted to the poses.
         """
         self(poses, offset)
         residual, _, _, _ = self._linearised(poses, offset)
@@ -134,8 +151,14 @@ class BodyConstraint:
     def _linearised(
         self, poses: np.ndarray, offset: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Residual (N, C, 2), its derivatives by the point (N, C, 2, 3) and by the camera's motion
-        (N, C, 2, 6), and weights (N, C)."""
+        """Linearise the reprojection errors.
+
+        Returns:
+            Residual (N, C, 2), expected minus detected pixel.
+            Its derivatives by the point (N, C, 2, 3).
+            Weights (N, C): detection weight times robust weight over variance.
+            Derivatives by the camera's pose (N, C, 2, 6).
+        """
         colour_from_master = invert(poses)
         velocity = self._views.velocity[:, None]
         seen = self._points[:, None] + offset[:, None] * velocity  # (N, C, 3), at the exposure
@@ -149,7 +172,8 @@ class BodyConstraint:
         residual = pixels - self._views.pixels
         size = np.linalg.norm(residual, axis=-1)
         known = self._views.weights > 0
-        # from a Rayleigh median; 3 px at least, for joint biases (tuned on the studio)
+        # The length of a 2D Gaussian error has the median 1.177 sigma (Rayleigh). At least 3 px,
+        # for the detector's bias at each joint; tuned on the studio.
         sigma = max(3.0, float(np.median(size[known])) / 1.177)
         robust = geman_mcclure_weight(size**2, ROBUST_SIGMA * sigma)
         return residual, by_point, self._views.weights * robust / sigma**2, by_pose
@@ -158,6 +182,7 @@ class BodyConstraint:
 def _normal_of_points(
     residual: np.ndarray, by_point: np.ndarray, weight: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
+    """Normal matrix (N, 3, 3), slightly damped, and gradient (N, 3) of each point."""
     weighted = by_point * weight[..., None, None]
     normal = np.einsum("ncij,ncik->njk", weighted, by_point)
     damping = 1e-6 * np.trace(normal, axis1=1, axis2=2) + 1e-9
@@ -174,24 +199,32 @@ def _cross_matrix(vectors: np.ndarray) -> np.ndarray:
 
 
 class FloorConstraint:
-    """Adds the normal equations of one common floor; ``points`` by camera, its depth frame."""
+    """Normal equations of one common floor: distances of floor points from the plane that fits
+    the points of all cameras best."""
 
     def __init__(self, rig: Rig, points: dict[int, np.ndarray], up: np.ndarray) -> None:
+        """
+        Args:
+            points: (n, 3) floor points by camera, in its depth frame, metres.
+            up: (3,) approximate normal of the floor, master frame.
+        """
         self._rig = rig
         self._points = points
         self._up = up
 
     @property
     def cameras(self) -> frozenset[int]:
-        """Those that see the floor."""
+        """Cameras with floor points."""
         return frozenset(self._points)
 
     @classmethod
     def of(
         cls, rig: Rig, surfaces: dict[int, DepthSurface], ground: GroundPlane
     ) -> FloorConstraint | None:
-        """The floor points near ``ground`` at the rig's poses; None if fewer than two cameras see
-        it."""
+        """Select the points of ``surfaces`` that lie on the plane ``ground`` at the given poses.
+
+        Returns None without a floor, or if fewer than two cameras have enough points on it.
+        """
         if not ground.found:
             return None
         points = {}
@@ -202,12 +235,16 @@ class FloorConstraint:
             # within 6 cm, because poses are not refined yet; tuned on the studio
             rows = np.flatnonzero((np.abs(height) < 0.06) & (facing > FLOOR_COSINE))
             if len(rows) >= 200:  # cells of 3 cm: a fifth of a square metre
-                rows = np.random.default_rng(0).permutation(rows)[:1000]
+                rows = np.random.default_rng(0).permutation(rows)[:1000]  # bounds the time
                 points[c] = surface.points[rows]
         return cls(rig, points, ground.normal) if len(points) >= 2 else None
 
     def __call__(self, poses: np.ndarray, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Matrix (C, 6, C, 6) and gradient (C, 6) at ``poses`` (C, 4, 4); ``offset`` is unused."""
+        """Matrix (C, 6, C, 6) and gradient (C, 6) at ``poses`` (C, 4, 4), plane eliminated.
+
+        The plane is fitted to all points by least squares. Its three unknowns are two tilts about
+        the centroid and the height. ``offset`` is unused.
+        """
         count = len(self._rig)
         moved = self._rig.moved(poses)
         own = {c: apply(moved[c].master_from_depth, points) for c, points in self._points.items()}

@@ -34,16 +34,17 @@ from intercap_core.scene.surfaces import DepthSurface
 
 @dataclass(frozen=True, eq=False)
 class PairTable:
-    """Held-out residuals by pair of cameras, each for background and moving surfaces."""
+    """Held-out residuals of P pairs of cameras. Column 0 is for background, column 1 for moving
+    surfaces."""
 
     pairs: np.ndarray
     """(P, 2) camera indices."""
     points: np.ndarray
-    """(P, 2) correspondences."""
+    """(P, 2) number of held-out correspondences."""
     before: np.ndarray
     """(P, 2) median residual at the given poses, metres; NaN = no overlap."""
     after: np.ndarray
-    """(P, 2) the same at the refined poses."""
+    """(P, 2) median residual at the resulting poses, metres; NaN = no overlap."""
     weak: np.ndarray
     """(P,) bool: few points, or residuals that remain large."""
 
@@ -57,13 +58,14 @@ class Refinement:
     bias: np.ndarray
     """(C,) metres to subtract from depth."""
     covariance: np.ndarray
-    """(C, 7, C, 7) of rotation about the camera's centre, rad, translation and depth bias, m."""
+    """(C, 7, C, 7). Rows of a camera: 0-2 rotation about its centre, rad; 3-5 translation, metres;
+    6 depth bias, metres."""
     offset: np.ndarray
     """(C,) seconds by which each camera exposes after the set's time."""
     offset_sigma: np.ndarray
     """(C,) standard deviation of ``offset``, seconds; NaN = unknown."""
     converged: bool
-    """The last step moved no viewed point by more than a millimetre."""
+    """The last iteration moved no point seen by a camera by more than a millimetre."""
     pairs: PairTable
     """Held-out residuals."""
     verdict: str
@@ -89,14 +91,20 @@ def refine(
 ) -> Refinement:
     """Refine the poses of all cameras but the ``master``, depth biases and time offsets.
 
-    The given poses are kept if held-out points and keypoints together do not improve.
+    1. Biases and offsets are estimated at the given poses, then together with all poses.
+    2. All given poses are kept unless one kind of held-out data improves and none gets worse.
+    3. Otherwise each camera's refined and given pose are compared (:mod:`.camera_verdicts`). If
+       some keep the given pose, the others are refined around them.
 
     Args:
+        rig: cameras as given.
+        master: index of the camera whose pose is fixed.
         static: background surfaces by camera.
         moving: moving surfaces by camera, of several sets.
         moments: images by moment, time offsets of the keypoints, and the subject.
         times: (T,) seconds of the sets.
-        floor: connects cameras that share no surface with the others.
+        floor: constraint of a common floor; None = no floor. It is used only if some camera shares
+            no surface with the others.
         free_poses: False keeps all given poses.
     """
     starts, timing = moments.starts, moments.timing
@@ -110,7 +118,7 @@ def refine(
     linked = _linked(overlapping, master)
     constraints: list[Constraint] = [body] if body else []
     if floor is not None and len(linked) < len(rig):
-        constraints.append(floor)  # overlapping surfaces constrain more
+        constraints.append(floor)  # unnecessary if all overlap, which constrains more
     unmoved = registration.solve(given, (), known, free_poses=False)
     result, ratios, covariance = unmoved, [], unmoved.covariance
     verdicts: dict[int, PoseVerdict] = {}
@@ -139,10 +147,12 @@ def refine(
             refined = np.array([c in verdicts and verdicts[c].refined for c in range(len(rig))])
             if refined.any():
                 result = freed if refined.sum() == len(verdicts) else solve(None, refined)
-                covariance = freed.covariance  # given poses are as certain as they would be refined
+                # a kept given pose is assumed to be as accurate as a refined one
+                covariance = freed.covariance
     pairs = _pair_table(registration, unmoved.estimate, result.estimate)
     sigma = np.sqrt(np.diagonal(result.covariance[:, OFFSET, :, OFFSET]))
-    # above 8 ms the offset of a synchronised device is unknown (tuned), stated times are known
+    # An offset whose standard deviation exceeds 8 ms (tuned) is unknown: the given value is kept.
+    # Offsets of cameras with a stated start are always known.
     unknown = (sigma > 0.008) & np.isnan(starts.sigma)
     sigma = np.where(unknown, np.nan, sigma)
     sigma[master] = 0.0
@@ -175,8 +185,9 @@ def _verdicts(rig: Rig, master: int, own: dict[int, PoseVerdict], of_rig: str) -
 def _stated_covariance(solved: np.ndarray, master: int) -> np.ndarray:
     """Covariance (C, 7, C, 7) of poses and depth bias from the solver's (C, 8, C, 8).
 
-    The variance is three times that of the normal equations, because the points of a surface share
-    errors of its lens and its material; tuned on the studio. Fixed poses get that of the prior.
+    The solver's covariance is multiplied by three, because the points of a surface share errors of
+    lens and material; tuned on the studio. Poses that were not estimated get the variance of the
+    prior, except the master's, whose variance is 0.
     """
     stated = 3.0 * solved[:, :OFFSET, :, :OFFSET]
     given = np.repeat([PRIOR_ROTATION_RAD, PRIOR_TRANSLATION_M], 3) ** 2
@@ -192,9 +203,10 @@ def _ratios(
     start: RigEstimate,
     refined: RigEstimate,
 ) -> list[float]:
-    """Held-out costs over those of the start: background, moving surfaces and keypoints, if any.
+    """Ratios of held-out cost, refined over start, for background, moving surfaces and keypoints.
 
-    The start has the depth biases and time offsets that fit it best, so only poses are compared.
+    A kind without data has no entry. The start has the depth biases and time offsets that fit it
+    best, so only poses are compared.
     """
     ratios = []
     for kind in (STATIC, MOVING):
@@ -211,6 +223,11 @@ def _ratios(
 
 
 def _pair_table(registration: Registration, start: RigEstimate, refined: RigEstimate) -> PairTable:
+    """Held-out residuals by pair, before and after.
+
+    A pair is weak with fewer than 120 points, or with more than twice the median residual of all
+    pairs; both untuned.
+    """
     kinds = [
         [registration.residuals(at, kind) for at in (start, refined)] for kind in (STATIC, MOVING)
     ]
@@ -265,9 +282,14 @@ def _notes(
     refined: np.ndarray,
     on_floor: Collection[int],
 ) -> tuple[str, ...]:
-    """Describe what the pose of each weakly connected camera rests on; "" = connected.
+    """Describe which data determine the pose of each camera that shares no surface with others.
 
-    ``refined``: (C,) refined cameras. ``on_floor``: cameras with the common floor's constraint.
+    The result (C,) is "" for cameras that a chain of overlapping pairs connects to the master.
+
+    Args:
+        body_weights: (N, C) weights of the keypoints, see :class:`BodyViews`.
+        refined: (C,) bool, cameras with refined poses.
+        on_floor: cameras with points in the constraint of the common floor.
     """
     linked = _linked(pairs.pairs.tolist(), master)
     notes = []

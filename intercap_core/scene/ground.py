@@ -11,14 +11,17 @@ from intercap_core.errors import UserError
 from intercap_core.geometry.camera.rig import Rig, ring_centre
 from intercap_core.scene.up import UpDirection, degrees_between
 
-FOOT_HEIGHT_M = 0.014  # of the lowest keypoint of a foot, measured on the open body, standing
-FOOT_TOLERANCE_M = 0.05  # feet that differ by more do not stand on one floor; tuned on the studio
-MIN_FOOT_SPREAD_M = 0.15  # least standard deviation of feet that show a tilt; tuned on the studio
-FLOOR_COSINE = 0.94  # 20 degrees: of a floor point's normal with the plane's; tuned on the studio
-FLOOR_HYPOTHESIS_TOLERANCE_M = 0.03  # inliers of a hypothesis of the floor; tuned on the studio
-BELOW_FLOOR_M = 0.10  # a point this far under the plane speaks against it; tuned on the studio
-MIN_FLOOR_AREA_M2 = 0.5  # of visible floor; tuned on the studio
-MIN_FOOT_SETS = 5  # sets with feet seen, for a floor; tuned on the studio
+# Height above the floor of the lowest foot keypoint (heel or toe) of a standing person, measured on
+# the open body.
+FOOT_HEIGHT_M = 0.014
+# Thresholds, all tuned on the studio:
+FOOT_TOLERANCE_M = 0.05  # feet whose heights differ by more do not stand on one floor
+MIN_FOOT_SPREAD_M = 0.15  # least standard deviation of foot positions that determine a tilt
+FLOOR_COSINE = 0.94  # largest angle of a floor point's normal to the plane's, 20 degrees
+FLOOR_HYPOTHESIS_TOLERANCE_M = 0.03  # distance of inliers from a hypothesis of the floor
+BELOW_FLOOR_M = 0.10  # depth under a plane from which a point is evidence against it as the floor
+MIN_FLOOR_AREA_M2 = 0.5  # least visible area of a floor
+MIN_FOOT_SETS = 5  # least number of sets with visible feet, for a floor
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,15 +29,16 @@ class GroundPlane:
     """Floor plane in the master's frame."""
 
     point: np.ndarray
-    """(3,) metres; NaN = no floor."""
+    """(3,) any point of the plane, metres; NaN = no floor."""
     normal: np.ndarray
     """(3,) unit, upwards; NaN = no floor."""
     rms: float
     """Root mean square distance of the inliers, metres; NaN = none."""
     inliers: int
-    """Number of points, or of sets with a standing foot, within the tolerance."""
+    """Number of background points within the tolerance; for "feet", number of sets; for "stated",
+    0."""
     source: str
-    """"fitted", "annotated", "stated", "feet" or "none"."""
+    """"fitted" to depth, "annotated", "stated" by the user, fitted to "feet", or "none"."""
     note: str = ""
     """What is unusual about the floor; "" = nothing."""
 
@@ -59,9 +63,17 @@ def fit_ground(
     """Fit the floor to background points (N, 3) with normals (N, 3), master frame.
 
     The floor is the lowest large plane that faces up, below the cameras, with few points under it.
-    Each point with its normal is a hypothesis; the best is refined by iterated weighted least
-    squares. A platform may be larger than the visible floor around it: the lowest plane parallel
-    to it that is large enough is the floor. ``cell_m``: spacing of the points, metres.
+
+    1. Up to 400 upward-facing points with their normals are plane hypotheses. Each is scored on
+       6000 sampled points: inliers minus three times the points clearly below.
+    2. The best hypothesis is refined by iterated weighted least squares.
+    3. A platform may be larger than the visible floor around it. The search therefore continues to
+       the lowest parallel plane that is large enough.
+
+    Args:
+        up: approximate up direction. Normals of hypotheses lie within its cone.
+        tolerance_m: largest distance of inliers of the result, metres.
+        cell_m: spacing of the points, metres; each stands for an area of its square.
     """
     cone = up.cone_deg
     facing = normals @ up.direction >= np.cos(np.radians(cone) + np.arccos(FLOOR_COSINE))
@@ -93,7 +105,11 @@ def fit_ground(
 def _lowest(
     points: np.ndarray, normals: np.ndarray, ground: GroundPlane, tolerance_m: float, cell_m: float
 ) -> GroundPlane:
-    """The lowest large plane parallel to ``ground`` among points (N, 3) that face up, or itself."""
+    """The lowest large plane below and parallel to ``ground``, or ``ground`` if there is none.
+
+    Points (N, 3) with normals (N, 3) that face up. Each round looks for the densest layer, 6 cm
+    thick, at least :data:`BELOW_FLOOR_M` below the current plane, and refines a plane there.
+    """
     upper = ground
     while True:
         facing = normals @ ground.normal >= FLOOR_COSINE
@@ -107,7 +123,7 @@ def _lowest(
         first = int(np.argmax(count))
         start = points[order[first : first + count[first]]].mean(0)
         lower = _refined(points, normals, start, ground.normal, tolerance_m)
-        parallel = degrees_between(lower.normal, ground.normal) <= 3.0  # both are level
+        parallel = degrees_between(lower.normal, ground.normal) <= 3.0  # two level surfaces
         deep = (lower.point - ground.point) @ ground.normal < -BELOW_FLOOR_M
         if lower.inliers * cell_m**2 < MIN_FLOOR_AREA_M2 or not (parallel and deep):
             break
@@ -124,10 +140,10 @@ def _lowest(
 def _covered(
     points: np.ndarray, lower: GroundPlane, upper: GroundPlane, tolerance_m: float
 ) -> float:
-    """Share of the lower plane, in cells of 15 cm, above which the upper one was measured.
+    """Share of the lower plane's cells, 15 cm wide, above which the upper plane was measured too.
 
-    It is small under a platform, which no camera looks through, and large if a misplaced camera
-    shows one floor a second time.
+    A camera cannot look through a platform, so the share is small there. If a misplaced camera
+    shows the one floor at two heights, the share is large.
     """
     across = np.linalg.svd(upper.normal[None])[2][1:]
 
@@ -147,7 +163,11 @@ def _refined(
     normal: np.ndarray,
     tolerance_m: float,
 ) -> GroundPlane:
-    """Weighted total least squares, with a gate that narrows from 6 cm to the tolerance."""
+    """Refine a plane (``point``, ``normal``) by weighted total least squares.
+
+    Eight iterations; the largest distance of points that take part (gate) narrows from 6 cm to the
+    tolerance. Weights are Tukey's biweight of the distance.
+    """
     for gate in np.geomspace(max(0.06, tolerance_m), tolerance_m, 8):
         distance = (points - point) @ normal
         weight = np.maximum(0, 1 - (distance / gate) ** 2) ** 2
@@ -169,7 +189,7 @@ def annotated_ground(
 ) -> GroundPlane:
     """Plane through annotated floor points (M, 3), M >= 3, master frame.
 
-    Background ``points`` (N, 3) are only counted.
+    Background ``points`` (N, 3) only provide the inlier count and the RMS distance.
 
     Raises:
         UserError: the annotated points lie on one line. The message lacks the sequence.
@@ -194,10 +214,10 @@ def stated_ground(up: np.ndarray, floor: np.ndarray) -> GroundPlane:
 
 
 def zup_from_master(ground: GroundPlane, rig: Rig, up_hint: UpDirection) -> np.ndarray:
-    """Transform (4, 4) to z up, with the origin on the floor under the ring's centre.
+    """Transform (4, 4) from the master's frame to one with z up, y along the master's view.
 
-    y is the horizontal viewing direction of the master. Without a floor, up is ``up_hint`` and the
-    origin is the master camera.
+    The origin lies on the floor under the centre of the ring of cameras. Without a floor, z is the
+    direction ``up_hint`` and the origin is the master camera.
     """
     up, point = ground.normal, ground.point
     if not ground.found:
@@ -217,11 +237,13 @@ def zup_from_master(ground: GroundPlane, rig: Rig, up_hint: UpDirection) -> np.n
 def fit_ground_to_feet(feet: np.ndarray, up: UpDirection) -> GroundPlane:
     """Floor under standing feet, for scenes whose floor no camera measures.
 
-    ``feet``: (T, F, 3) heels and toes, NaN = unknown. The lowest foot point of each set stands. If
-    feet stand on several levels (a beam, stairs), the lowest well supported level is the floor.
-    The normal is measured gravity or a stated up. Without them it is fitted to the feet, in each
-    direction in which they are spread enough: a walk along a line shows only the tilt along it. The
-    height is as accurate as the keypoints, one to two centimetres.
+    - The lowest foot point of each set is taken to stand on the floor. If feet stand on several
+      levels (a beam, stairs), the lowest level with enough sets is the floor.
+    - The normal is measured gravity or a stated up, if there is one. Else it is fitted to the feet.
+      A walk along a line determines only the tilt along the line; across it, ``up`` is kept.
+    - The height is as accurate as the keypoints, one to two centimetres.
+
+    ``feet``: (T, F, 3) heels and toes, master frame, metres; NaN = unknown.
     """
     standing = _standing(feet, up.direction)
     if len(standing) < MIN_FOOT_SETS:
@@ -249,7 +271,10 @@ def fit_ground_to_feet(feet: np.ndarray, up: UpDirection) -> GroundPlane:
 
 
 def describe_raised_feet(feet: np.ndarray, ground: GroundPlane) -> str:
-    """Report if the lower of the feet (T, F, 3) often stands above or below ``ground``; "" = no."""
+    """Report if the lowest foot point often lies 10 cm or more above or below ``ground``.
+
+    Returns "" if not. ``feet``: (T, F, 3), metres; NaN = unknown.
+    """
     standing = _standing(feet, ground.normal)
     if len(standing) < MIN_FOOT_SETS:
         return ""
@@ -272,7 +297,9 @@ def _standing(feet: np.ndarray, up: np.ndarray) -> np.ndarray:
 def _one_level(standing: np.ndarray, up: np.ndarray, *, sloping: bool) -> tuple[np.ndarray, str]:
     """Mask (S,) of the standing feet (S, 3) on the floor's level, and a note on other levels.
 
-    ``sloping``: one tilted plane explains them all, so there are no levels.
+    The floor's level is the median height, or a lower one on which enough feet stand.
+
+    ``sloping``: one tilted plane explains all feet, so they do not stand on several levels.
     """
     height = standing @ up
     middle = np.median(height)
@@ -289,9 +316,11 @@ def _one_level(standing: np.ndarray, up: np.ndarray, *, sloping: bool) -> tuple[
 
 
 def _lowest_level(height: np.ndarray, need: int) -> float:
-    """Lowest height around which ``need`` of the heights (S,) lie, with a gap above it.
+    """Lowest level of the heights (S,), metres, if it is separate from the median, else the median.
 
-    The median if there is no gap: noise about a single level has none.
+    A level is the median of the lowest 10 cm interval with at least ``need`` heights. It is
+    separate if the density of heights between it and the median falls below half of its own. Noise
+    about a single level leaves no such gap.
     """
     order, middle = np.sort(height), float(np.median(height))
     ends = np.searchsorted(order, order + 2 * FOOT_TOLERANCE_M, side="right")
@@ -304,6 +333,7 @@ def _lowest_level(height: np.ndarray, need: int) -> float:
 
 
 def _levels(off: np.ndarray, height: np.ndarray, side: str) -> str:
+    """Note on the sets ``off`` (S,) bool whose feet are ``height`` (S,) metres off the floor."""
     return (
         f"feet do not stand on one plane: in {100 * off.mean():.0f} % of the sets the lower one is "
         f"{np.median(height[off]):.2f} m {side} the floor (a beam, stairs, jumps)"
@@ -316,12 +346,14 @@ def _supporting(count: int) -> int:
 
 
 def _one_slope(standing: np.ndarray, up: np.ndarray) -> np.ndarray | None:
-    """Normal (3,) of a slightly tilted plane that explains nearly all standing feet (S, 3), or
-    None."""
+    """Normal (3,) of a plane through nearly all standing feet (S, 3).
+
+    None if the feet are too close together, or no plane tilted by at most 15 degrees fits them.
+    """
     kept = np.ones(len(standing), bool)
     for _ in range(5):
         normal = _normal_of(standing[kept], up)
-        # steeper feet stand on levels: even low stairs, 12 by 40 cm, rise by 17 degrees
+        # a steeper plane fits feet on stairs: even low ones, 12 cm high and 40 cm deep, rise by 17
         if normal is None or degrees_between(normal, up) > 15.0:
             return None
         distance = (standing - standing[kept].mean(0)) @ normal
@@ -334,7 +366,8 @@ def _one_slope(standing: np.ndarray, up: np.ndarray) -> np.ndarray | None:
 def _normal_of(standing: np.ndarray, up: np.ndarray) -> np.ndarray | None:
     """Unit normal (3,) of the plane through points (S, 3); None if they are all in one place.
 
-    Across points on a line, the normal is that of ``up``.
+    Points on a line determine one tilt only: the normal is then ``up`` made perpendicular to the
+    line.
     """
     _, spread, axes = np.linalg.svd(standing - standing.mean(0), full_matrices=False)
     along, across = spread[:2] / np.sqrt(len(standing))

@@ -5,9 +5,11 @@ differences. The stiffness of each path is chosen by restricted maximum likeliho
 too stiff underestimates speeds, a path that follows the noise overestimates them, and both would
 bias time offsets.
 
-Detectors err by a constant for each joint and view, and the camera poses are not yet refined.
-The median residual of each keypoint in each view is therefore subtracted: what remains are changes
-over time.
+A detector has a constant error for each joint and view, and the camera poses are not yet refined.
+The median residual of each keypoint in each view is therefore subtracted, so residuals contain only
+changes over time.
+
+Axes: T sets, C views, K keypoints (:data:`POINTS`, a subset of the 135).
 """
 
 from __future__ import annotations
@@ -26,14 +28,15 @@ from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.camera.triangulation import pixel_scale, triangulate
 
 MAX_PATH_GAP_S = 0.35  # a path bridges at most this time without samples; tuned on the studio
-MIN_CONFIDENCE = 0.3  # keypoints below are ignored; tuned on the studio
-OUTLIER_SIGMA = 4.0  # beyond, a residual is an outlier; tuned on the studio
-STIFFNESS = 10.0 ** np.arange(-3, 4)  # of third differences between sets, tried by likelihood
-# Likelihood mistakes lasting errors for motion; this factor removes the bias of the speeds. Tuned
-# on the studio.
+MIN_CONFIDENCE = 0.3  # keypoints of lower confidence are ignored; tuned on the studio
+OUTLIER_SIGMA = 4.0  # length of an outlier's residual, standard deviations; tuned on the studio
+# Weights of the squared third differences that are tried; the likelihood selects one.
+STIFFNESS = 10.0 ** np.arange(-3, 4)
+# Factor on the selected weight. The likelihood takes detector errors that last for several sets for
+# motion; the factor removes the resulting bias of the speeds. Tuned on the studio.
 STIFFER = 4.0
-MIN_PATH_SAMPLES = 6  # more than third differences need
-ORDER = 3  # of the differences
+MIN_PATH_SAMPLES = 6  # third differences need four samples
+ORDER = 3  # order of the differences
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,9 +51,9 @@ class SmoothPaths:
     """(T, K, 3) m/s; NaN = unknown."""
 
     def at(self, wanted: np.ndarray) -> np.ndarray:
-        """Points (N, K, 3) at times ``wanted`` (N,), by cubic interpolation.
+        """Points (N, K, 3) at times ``wanted`` (N,) seconds, by cubic Hermite interpolation.
 
-        NaN outside the paths and in long gaps.
+        NaN outside the paths and in gaps longer than :data:`MAX_PATH_GAP_S`.
         """
         times, last = self.times, len(self.times) - 1
         left = np.clip(np.searchsorted(times, wanted, side="right") - 1, 0, max(last - 1, 0))
@@ -66,7 +69,15 @@ class SmoothPaths:
 
 
 def smooth_paths(times: np.ndarray, points: np.ndarray) -> SmoothPaths:
-    """Smooth ``points`` (T, K, 3), NaN = unknown, at increasing ``times`` (T,) seconds."""
+    """Smooth the paths of K points.
+
+    Gaps up to :data:`MAX_PATH_GAP_S` are bridged. A path is NaN in longer gaps, and everywhere with
+    fewer than :data:`MIN_PATH_SAMPLES` known points.
+
+    Args:
+        times: (T,) seconds, increasing.
+        points: (T, K, 3) metres; NaN = unknown.
+    """
     sets = len(points)
     known = np.isfinite(points[..., 0])
     smooth = np.full(points.shape, np.nan)
@@ -84,7 +95,8 @@ def smooth_paths(times: np.ndarray, points: np.ndarray) -> SmoothPaths:
 
 
 def _penalty(times: np.ndarray) -> np.ndarray:
-    """D'D in upper banded form (4, T); D: third divided differences in units of the median gap."""
+    """D'D in SciPy's upper banded form (4, T). D (T - 3, T) gives third derivatives by divided
+    differences, with time in units of the median interval."""
     gap = float(np.median(np.diff(times)))
     scaled = (times - times[0]) / gap
     rows = len(times) - ORDER
@@ -102,7 +114,10 @@ def _penalty(times: np.ndarray) -> np.ndarray:
 
 
 def _smoothed(points: np.ndarray, known: np.ndarray, penalty: np.ndarray) -> np.ndarray:
-    """Smooth one path (T, 3), :data:`STIFFER` than by restricted maximum likelihood."""
+    """Smooth one path (T, 3).
+
+    The stiffness of greatest restricted likelihood is multiplied by :data:`STIFFER`.
+    """
     right = points * known[:, None]
     samples, sets = int(known.sum()), len(points)
     costs = []
@@ -118,6 +133,8 @@ def _smoothed(points: np.ndarray, known: np.ndarray, penalty: np.ndarray) -> np.
 
 
 def _factor(stiffness: float, known: np.ndarray, penalty: np.ndarray) -> np.ndarray:
+    """Banded Cholesky factor (4, T) of the smoother's matrix: the penalty, plus 1 at each known
+    sample."""
     matrix = stiffness * penalty
     matrix[-1] += known + 1e-9
     return cholesky_banded(matrix)
@@ -136,7 +153,8 @@ def _near_known(times: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 _HAND = np.array([0, 4, 5, 8, 9, 13, 17, 20])  # wrist, knuckles and finger tips
 _FACE = np.array([0, 9, 10, 13, 19, 28, 31, 37])  # corners of brows, eyes, nose, mouth
-# The keypoints that are compared. The others move with these and would double the cost.
+# Indices of the K compared keypoints. The other keypoints move with these, so they would add little
+# information and double the run time.
 POINTS = np.r_[BODY, LEFT_HAND.start + _HAND, RIGHT_HAND.start + _HAND, FACE.start + _FACE]
 
 
@@ -149,21 +167,21 @@ class KeypointMotion:
     times: np.ndarray
     """(T,) seconds."""
     paths: SmoothPaths
-    """In the master's frame."""
+    """Paths of the K points, master frame."""
     residual: np.ndarray
-    """(T, C, K, 2) detected less expected pixels, without bias; 0 = not ``seen``."""
+    """(T, C, K, 2) detected minus expected pixel minus ``bias``; 0 = not ``seen``."""
     seen: np.ndarray
-    """(T, C, K) bool: has a residual."""
+    """(T, C, K) bool: the keypoint is detected and its path is known."""
     valid: np.ndarray
-    """(T, C, K) bool: has a residual that is no outlier."""
+    """(T, C, K) bool: ``seen`` and no outlier."""
     sigma: np.ndarray
-    """(C, K) standard deviation of the residuals, px."""
+    """(C, K) standard deviation of the residuals per coordinate, px."""
     bias: np.ndarray
-    """(C, K, 2) median residual, px, which is subtracted."""
+    """(C, K, 2) median of detected minus expected pixel, px."""
 
     @cached_property
     def by_point(self) -> np.ndarray:
-        """d pixel / d point (T, C, K, 2, 3), px/m."""
+        """Derivatives (T, C, K, 2, 3) of the pixels by the point, px/m."""
         return _project(self.paths.points, self.rig)[1]
 
     @cached_property
@@ -177,15 +195,16 @@ class KeypointMotion:
         return np.nan_to_num(np.einsum("tckij,tkj->tcki", self.by_point, self.paths.velocity))
 
     def at_offsets(self, offset: np.ndarray) -> KeypointMotion:
-        """The same motion seen by cameras that expose ``offset`` (C,) seconds late."""
+        """The same motion, with the effect of known time offsets removed from the residuals.
+
+        ``offset``: (C,) seconds by which each camera exposes late.
+        """
         along = np.where(self.seen[..., None], self.speed_px * offset[:, None, None], 0.0)
         return replace(self, residual=self.residual - along)
 
     def shifted(self, seconds: float) -> np.ndarray:
-        """Displacement (T, C, K, 2), px, of the points in images that are ``seconds`` older.
-
-        NaN = the path is unknown.
-        """
+        """Displacement (T, C, K, 2), px, of the points in images that are ``seconds`` older than
+        their sets. NaN = the path is unknown there."""
         points = self.paths.at(self.times - seconds)
         return _pixels_of(points, self.rig) - self.expected
 
@@ -193,7 +212,8 @@ class KeypointMotion:
     def projector(self) -> np.ndarray:
         """(T, K, 2C, 2C) projector that removes the point's position from weighted residuals.
 
-        With A = W^(1/2) J it is (I - A (A'A)^-1 A') W^(1/2), W the inverse variances.
+        Rows and columns are x and y of each view. With A = W^(1/2) J it is
+        (I - A (A'A)^-1 A') W^(1/2), with the inverse variances W and J = :attr:`by_point`.
         """
         sets, views, count = self.valid.shape
         root = np.where(self.valid, 1 / self.sigma, 0.0)  # (T, C, K)
@@ -207,12 +227,12 @@ class KeypointMotion:
         return (np.eye(2 * views) - onto) * root[:, :, None, :]
 
     def projected(self, values: np.ndarray) -> np.ndarray:
-        """Weighted pixel differences (T, K, 2C) of all views' values (T, C, K, 2)."""
+        """Apply :attr:`projector` to pixel differences (T, C, K, 2) of all views: (T, K, 2C)."""
         flat = np.moveaxis(np.nan_to_num(values), 1, 2).reshape(*self.projector.shape[:3])
         return np.einsum("tkef,tkf->tke", self.projector, flat)
 
     def projected_of(self, camera: int, values: np.ndarray) -> np.ndarray:
-        """The same for one camera's values (T, K, 2), with 0 for all others."""
+        """Apply :attr:`projector` to differences (T, K, 2) of one camera, 0 in the others."""
         columns = self.projector[..., 2 * camera : 2 * camera + 2]
         return np.einsum("tkef,tkf->tke", columns, np.nan_to_num(values))
 
@@ -220,9 +240,15 @@ class KeypointMotion:
 def build_motion(
     keypoints: np.ndarray, rig: Rig, times: np.ndarray, start: np.ndarray | None = None
 ) -> KeypointMotion:
-    """Fit moving points to ``keypoints`` (T, C, 135, 3): x, y, confidence; 0 = not seen.
+    """Fit moving points to keypoints.
 
-    ``start``: (T, K, 3) points of nearly the same keypoints, NaN = unknown.
+    Alternates two or three times: smooth the paths, estimate bias and scatter of the residuals,
+    reject outliers, and move each point by one Gauss-Newton step.
+
+    Args:
+        keypoints: (T, C, 135, 3) x, y, confidence; 0 = not seen.
+        times: (T,) seconds.
+        start: (T, K, 3) points of nearly the same keypoints, NaN = unknown; None = triangulate.
     """
     pixels, seen = _chosen(keypoints)
     scale = pixel_scale(rig)[:, None]
@@ -248,7 +274,8 @@ def build_motion(
 
 
 def with_keypoints(motion: KeypointMotion, keypoints: np.ndarray) -> KeypointMotion:
-    """The same motion with other ``keypoints`` (T, C, 135, 3)."""
+    """The same paths, biases and scatter, with the residuals of other ``keypoints``
+    (T, C, 135, 3)."""
     pixels, seen = _chosen(keypoints)
     return _seeing(pixels, seen, motion.rig, motion.paths, motion.sigma, motion.bias)
 
@@ -261,6 +288,7 @@ def _seeing(
     sigma: np.ndarray,
     bias: np.ndarray,
 ) -> KeypointMotion:
+    """The motion with residuals of ``pixels`` (T, C, K, 2) where ``seen`` (T, C, K)."""
     expected = _pixels_of(paths.points, rig)
     seen = seen & np.isfinite(expected[..., 0])
     residual = np.where(seen[..., None], pixels - expected - bias, 0.0)
@@ -275,13 +303,14 @@ def _chosen(keypoints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _triangulated(pixels: np.ndarray, seen: np.ndarray, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
-    """Points (T, K, 3) of each set by itself, and the views that agree with them (T, C, K)."""
+    """Triangulate each set by itself: points (T, K, 3), and inlier views (T, C, K)."""
     sets, views, count = seen.shape
     triangulation = triangulate(
         np.swapaxes(pixels, 1, 2).reshape(-1, views, 2),
         np.swapaxes(seen, 1, 2).reshape(-1, views).astype(float),
         rig,
-        max_error_px=60.0,  # at 1080p: moving limbs in views that are frames late
+        # at 1080p; so large because a moving limb is displaced in a view that is some frames late
+        max_error_px=60.0,
     )
     inlier = np.swapaxes(triangulation.inlier.reshape(sets, count, views), 1, 2)
     return triangulation.points.reshape(sets, count, 3), inlier
@@ -335,7 +364,8 @@ def _refitted(
 def _scatter(size: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Robust standard deviation (C, K) per coordinate of residuals of length ``size`` (T, C, K).
 
-    Keypoints with few samples are shrunk to the median of their view.
+    The value of a keypoint with n samples is averaged with the median of its view, with weights n
+    and 5.
     """
     of_point = known_median(np.where(known, size, np.nan)) / 1.177  # of a Rayleigh median
     number = known.sum(0)

@@ -1,13 +1,15 @@
 """Constant time offset of each camera, estimated from the motion of the subject's keypoints.
 
-An image exposed late shows every keypoint further along its path. The residual is parallel to the
-pixel velocity, which neither a wrong joint position, a constant detector error nor, over time, a
-wrong camera pose explains. All offsets are estimated jointly by generalised least squares, with
+An image exposed late shows every keypoint further along its path, so the residual is parallel to
+the pixel velocity. Wrong joint positions, constant detector errors and wrong camera poses cause
+different patterns over time. All offsets are estimated jointly by generalised least squares, with
 joint positions and pose errors as further unknowns.
 
-The covariance of a residual series is the sum of a constant of any size, a process correlated over
-time, and white noise. Kind and length of the correlated part are chosen by likelihood from a short
-list, for all keypoints and views together.
+A residual series is one coordinate of one keypoint in one view over time. Its covariance is the sum
+of a constant of any size, a process correlated over time, and white noise. Kind and length of the
+correlated part are chosen by likelihood from a short list, in common for all keypoints and views.
+
+Axes: T sets, C views, K keypoints, W sets of a window.
 """
 
 from __future__ import annotations
@@ -22,10 +24,15 @@ from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.solve.time_series import filled_linearly
 from intercap_core.scene.keypoint_motion import KeypointMotion, build_motion
 
-CONSTANT_VARIANCE = 100.0  # of a series' constant, over its other variance: nearly unconstrained
-TIMING_INFLATION = 2.0  # of sigmas: keypoints of one person err together; tuned on the studio
-WINDOW_SETS = 96  # covariances over time are dense within a window; bounds memory and time
-MIN_TIMING_SETS = 8  # sets; fewer give no estimate; tuned on the studio
+# Variance of the constant part of a series, relative to the rest: large enough to be nearly free.
+CONSTANT_VARIANCE = 100.0
+# Factor that users of TimeOffsets apply to ``sigma``: errors of one person's keypoints are
+# correlated. Tuned on the studio.
+TIMING_INFLATION = 2.0
+# Largest length of a window, sets. Covariances over time are dense within a window and 0 between
+# windows, which bounds memory and time.
+WINDOW_SETS = 96
+MIN_TIMING_SETS = 8  # least number of sets for an estimate; tuned on the studio
 
 
 @dataclass(frozen=True)
@@ -33,24 +40,26 @@ class TimeNoise:
     """Covariance of a residual over time."""
 
     kind: str
-    """"rough", exp(-|d| / length), or "smooth", exp(-d^2 / (2 length^2))."""
+    """Correlation at a time difference d: "rough", exp(-|d| / length), or "smooth",
+    exp(-d^2 / (2 length^2))."""
     length: float
     """Correlation time, seconds."""
     fast: float
-    """Share of the variance that is independent in each image."""
+    """Share of the variance that is white noise, 0 to 1."""
     scale: float
-    """Standard deviation."""
+    """Standard deviation, in units of the series."""
     constant: float = CONSTANT_VARIANCE
     """Variance of the constant part, relative to the rest."""
 
     def covariance(self, times: np.ndarray) -> np.ndarray:
-        """(T, T) covariance of unit ``scale``, with the constant part."""
+        """Covariance (T, T) for ``scale`` 1, with the constant part."""
         return _covariance(times, self.kind, self.length, self.fast) + self.constant
 
     def precision(self, times: np.ndarray, variance: np.ndarray) -> np.ndarray:
-        """Inverse covariances (N, T, T) of N series, in units of ``scale``.
+        """Inverse covariances (N, T, T) of N series.
 
-        ``variance``: (N, T) is added to each sample; very large if the sample is missing.
+        ``variance``: (N, T) added to the variance of each sample, in units of ``scale`` squared;
+        very large for a missing sample.
         """
         unique, of_series = np.unique(variance, axis=0, return_inverse=True)
         whole = np.broadcast_to(self.covariance(times), (*unique.shape, len(times))).copy()
@@ -60,7 +69,16 @@ class TimeNoise:
 
 
 def fit_noise(times: np.ndarray, series: np.ndarray, valid: np.ndarray) -> TimeNoise:
-    """Choose the noise model for ``series`` (N, T) of unit variance, from those with few gaps."""
+    """Choose the noise model of greatest likelihood.
+
+    Only series with at least 90 % valid samples are used; their gaps are interpolated. With fewer
+    than 10 of them or fewer than 8 sets, the result is a fixed usual model.
+
+    Args:
+        times: (T,) seconds.
+        series: (N, T) residuals divided by their standard deviations.
+        valid: (N, T) bool.
+    """
     whole = np.flatnonzero(valid.mean(1) >= 0.9)
     if len(whole) < 10 or len(times) < 8:
         return TimeNoise("rough", 0.5, 0.25, 1.0)
@@ -75,7 +93,9 @@ def fit_noise(times: np.ndarray, series: np.ndarray, valid: np.ndarray) -> TimeN
                 covariance = _covariance(times, kind, length, fast) + CONSTANT_VARIANCE
                 low = np.linalg.cholesky(covariance)
                 energy = (np.linalg.solve(low, rows.T) ** 2).sum(0)
-                # Median over series: some are of occluded joints, some of an unsynchronised camera.
+                # The median over series is robust to occluded joints and unsynchronised cameras.
+                # 1.7: the median of chi-square with n degrees of freedom is about n - 2/3, and the
+                # free constant takes one.
                 scale = max(float(np.median(energy)) / max(len(times) - 1.7, 1), 1e-6)
                 likelihood = -np.log(np.diag(low)).sum() - len(times) / 2 * np.log(scale)
                 if likelihood > best:
@@ -84,12 +104,14 @@ def fit_noise(times: np.ndarray, series: np.ndarray, valid: np.ndarray) -> TimeN
 
 
 def _covariance(times: np.ndarray, kind: str, length: float, fast: float) -> np.ndarray:
+    """Covariance (T, T) of unit variance: correlated part and white noise, without constant."""
     apart = np.abs(times[:, None] - times) / length
     lasting = np.exp(-apart) if kind == "rough" else np.exp(-(apart**2) / 2)
     return (1 - fast) * lasting + fast * np.eye(len(times))
 
 
-# Groups of POINTS with correlated errors: each body point on its own, each hand, the face.
+# (K,) group of each of POINTS with correlated errors: each of the 25 body points on its own, the 8
+# points of each hand, and the 8 points of the face.
 CLUSTER = np.r_[np.arange(25), np.repeat([25, 26, 27], 8)]
 
 
@@ -103,7 +125,7 @@ class TimeOffsets:
     offset: np.ndarray
     """(C,) seconds."""
     sigma: np.ndarray
-    """(C,) standard deviation, seconds; NaN = too little evidence."""
+    """(C,) standard deviation, seconds; NaN = undetermined, and ``offset`` is 0."""
     information: np.ndarray
     """(C, C) 1/s^2."""
     vector: np.ndarray
@@ -125,6 +147,7 @@ def find_offsets(
         keypoints: (T, C, 135, 3) x, y, confidence of the subject by image; 0 = not seen.
         slip: (T, C) whole sets by which an image is older than its set.
         times: (T,) seconds.
+        master: camera whose offset is 0.
         start: (C,) seconds, approximate offsets; None = nearly 0.
     """
     shown = keypoints_by_moment(keypoints, slip)
@@ -142,7 +165,12 @@ def find_offsets(
 
 
 def estimate_offsets(motion: KeypointMotion, master: int) -> TimeOffsets:
-    """The time offsets that explain a motion's residuals."""
+    """The time offsets that explain a motion's residuals best.
+
+    Generalised least squares for 7C unknowns: C offsets, then 6 pose errors of each camera. The
+    points are already eliminated by the motion's projector. ``information`` and ``vector`` of the
+    result are the equations of the offsets with the poses eliminated.
+    """
     views = len(motion.rig)
     # derivatives (7C, T, K, 2C) of the projected residuals by offsets, then by pose errors
     by_offset = [motion.projected_of(c, motion.speed_px[:, c]) for c in range(views)]
@@ -185,10 +213,18 @@ def _inflation(
     free: np.ndarray,
     own: np.ndarray,
 ) -> float:
-    """Factor by which the offsets' variance exceeds that of the noise model.
+    """Factor, at least 1, by which the offsets' variance exceeds that of the noise model.
 
-    From how the keypoints disagree at the solution (the sandwich estimator with clusters: a hand's
-    or the face's points err together), as a mean over the cameras.
+    Cluster-robust sandwich variance over model variance, mean over the cameras. A cluster is a
+    group of :data:`CLUSTER`; its score is the sum of its keypoints' gradients at the solution.
+
+    Args:
+        matrices: (K, n, n) normal matrix of each keypoint, n = 7C.
+        vectors: (K, n).
+        solution: (n,).
+        covariance: (m, m) of the free unknowns.
+        free: (m,) indices of the free unknowns.
+        own: indices of the offsets among the free unknowns.
     """
     scores = (vectors - matrices @ solution)[:, free]
     groups = np.zeros((CLUSTER.max() + 1, len(free)))
@@ -210,18 +246,19 @@ def keypoints_by_moment(keypoints: np.ndarray, slip: np.ndarray) -> np.ndarray:
 
 
 def windows(sets: int) -> list[slice]:
-    """Slices of about equal length, at most :data:`WINDOW_SETS` long."""
+    """Divide the indices of ``sets`` sets into slices of about equal length, at most
+    :data:`WINDOW_SETS`."""
     edges = np.linspace(0, sets, -(-sets // WINDOW_SETS) + 1).round().astype(int)
     return [slice(a, b) for a, b in pairwise(edges.tolist())]
 
 
 def as_series(values: np.ndarray) -> np.ndarray:
-    """(T, K, 2C) to (K, 2C, T)."""
+    """Move the time axis last: (T, K, 2C) to (K, 2C, T)."""
     return np.moveaxis(values, 0, 2)
 
 
 def estimate_noise(motion: KeypointMotion) -> TimeNoise:
-    """The detector's noise over time, from the first window."""
+    """Noise model of the motion's projected residuals in the first window."""
     part = windows(len(motion.times))[0]
     series = as_series(motion.projected(motion.residual))[..., part]
     valid = np.repeat(np.moveaxis(motion.valid, (0, 1, 2), (2, 1, 0)), 2, axis=1)[..., part]
@@ -244,19 +281,20 @@ def keypoint_equations(
     columns: np.ndarray,
     constant: float = CONSTANT_VARIANCE,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Each keypoint's normal matrix (K, n, n) and vector (K, n).
+    """Normal matrix (K, n, n) and vector (K, n) of each keypoint, for n unknowns.
 
     Args:
-        residual: (T, C, K, 2) px.
+        residual: (T, C, K, 2) px, not projected.
         columns: (n, T, K, 2C) derivatives of the projected residuals by the unknowns.
-        constant: see :class:`TimeNoise`.
+        constant: variance of the series' constant part, see :class:`TimeNoise`.
     """
     noise = replace(estimate_noise(motion), constant=constant)
     series = as_series(motion.projected(residual))
     size, _, count, _ = columns.shape
     matrices, vectors = np.zeros((count, size, size)), np.zeros((count, size))
     parts = windows(len(motion.times))
-    # A constrained constant is common to all windows, so their information does not add up.
+    # If the constant is not free, it is the same in all windows: their information about a constant
+    # pattern is then averaged, not added.
     share = 1.0 if constant >= CONSTANT_VARIANCE else 1 / len(parts)
     for part in parts:
         precision = precisions(motion, noise, part) * share
@@ -277,7 +315,7 @@ def pose_columns(motion: KeypointMotion) -> np.ndarray:
     for c, camera in enumerate(motion.rig):
         arm = np.nan_to_num(motion.paths.points - camera.master_from_colour[:3, 3])
         by_point = motion.by_point[:, c]
-        # Turning the camera by w about its centre moves the point in it by w x arm, reversed.
+        # Turning the camera by w about its centre moves the point, as seen by it, by -(w x arm).
         turned = -np.cross(np.eye(3)[:, None, None], arm)
         moved = np.concatenate([turned, np.broadcast_to(-np.eye(3)[:, None, None], turned.shape)])
         pixels = np.einsum("tkij,ptkj->ptki", by_point, moved)

@@ -1,16 +1,17 @@
-"""Detects and corrects cameras that were given each other's intrinsics.
+"""Detects and corrects pairs of cameras whose intrinsics were exchanged in the calibration files.
 
-In the InterCap release two sets of files have focal lengths and principal points of cameras 4 and 5
-exchanged, but not the distortion. Two tests:
+In the InterCap release, two groups of files have the focal lengths and principal points of cameras
+4 and 5 exchanged, but not the distortion. Two tests:
 
-- Where depth lies on the colour grid, wrong intrinsics bend every measured surface. An exchange is
-  accepted if it brings the backgrounds of both cameras much closer to the others'.
+- Cameras with depth on the colour image's pixel grid: wrong colour intrinsics also bend their
+  surfaces. An exchange is accepted if it brings the backgrounds of both cameras much closer to the
+  backgrounds of the other cameras.
 - Cameras without depth are tested by the keypoints. An exchange shifts the expected pixels of both
-  cameras by a known pattern; its gain is a log likelihood ratio in which points, camera poses (as
-  far as they are uncertain) and a constant error of each keypoint in each view are integrated out.
-  A wrong principal point looks like a rotated camera, so the result is as good as the poses.
+  cameras by a known pattern. Its gain is a log likelihood ratio in which points, pose errors (with
+  a prior) and a constant error of each keypoint in each view are marginalised. A wrong principal
+  point resembles a rotation of the camera, so the test relies on accurate given poses.
 
-Devices that bring their own intrinsics are not tested.
+Cameras with depth on its own grid are not tested: their devices store both intrinsics themselves.
 """
 
 from __future__ import annotations
@@ -40,22 +41,23 @@ from intercap_core.scene.surfaces import background_surfaces
 
 @dataclass(frozen=True)
 class LensPair:
-    """Hypothesis that two cameras have each other's lenses."""
+    """Hypothesis that the intrinsics of two cameras are exchanged."""
 
     cameras: tuple[int, int]
     """Camera indices."""
     gain: float
-    """Log likelihood ratio, reduced if keypoints disagree by more than their noise."""
+    """Log likelihood ratio against no exchange; less if keypoints disagree beyond their noise."""
     share: float
-    """Share of the expected pattern that the residuals contain; 1 = all of it."""
+    """Least-squares amplitude of the expected pattern in the residuals: 1 if the lenses are
+    exchanged, 0 if not."""
 
 
 def choose_pairs(pairs: Sequence[LensPair]) -> list[LensPair]:
-    """Pairs that are exchanged beyond chance; each camera at most once."""
+    """Pairs with significant gain and fitting amplitude, best first; each camera at most once."""
     chosen: list[LensPair] = []
     for pair in sorted(pairs, key=lambda p: -p.gain):
         used = {c for other in chosen for c in other.cameras}
-        # on the studio, chance brings gains of up to 9
+        # on the studio, gains of correct lenses reach 9; the range of the amplitude is tuned there
         good = pair.gain >= 15.0 and 0.5 <= pair.share <= 1.5
         if good and not used & set(pair.cameras):
             chosen.append(pair)
@@ -67,10 +69,19 @@ def lens_gains(
 ) -> list[LensPair]:
     """Test each exchange of two different lenses for images of one size.
 
+    For each ordered pair (a, b), the pattern is the displacement of camera a's pixels by the lens
+    of b. One linear system holds the amplitudes of all patterns and the pose errors of all cameras.
+    The exchange of a and b means amplitude 1 for (a, b) and (b, a). The pose errors are eliminated.
+    With the remaining squared norm e of the pattern and its product l with the residuals, the
+    amplitude is l / e, and the log likelihood ratio of amplitude 1 against 0 is l - e / 2.
+
     Args:
         keypoints: (T, C, 135, 3) x, y, confidence of the subject by moment.
         times: (T,) seconds.
         pose_sigma: standard deviations of the poses about each axis, rad, and along it, metres.
+
+    Returns:
+        One result for each unordered pair.
     """
     size = [(camera.colour.width, camera.colour.height) for camera in rig]
     lenses = rig.colour_parameters
@@ -131,10 +142,10 @@ class LensExchange:
     with_distortion: bool
     """The distortion is exchanged as well."""
     before: float
-    """Median distance of both backgrounds to those of the other cameras, as given, metres; NaN if
-    the keypoints decided."""
+    """Distance of both backgrounds to those of the other cameras with the given lenses, metres:
+    mean over pairs of cameras of the median held-out residual. NaN if the keypoints decided."""
     after: float
-    """The same once corrected."""
+    """The same with the lenses exchanged."""
 
 
 def exchange_lenses(
@@ -147,15 +158,15 @@ def exchange_lenses(
     """Return the rig with exchanged lenses corrected, and the exchanges.
 
     Args:
-        backgrounds: of the C cameras.
-        subject: by moment.
+        backgrounds: of the C cameras; None = no depth.
+        subject: the subject's keypoints, by moment.
         times: (T,) seconds.
         master: camera whose pose is fixed.
     """
     exchanges = _BackgroundTest(backgrounds, body_views(subject, times), master).exchanges(rig)
     blind = [c for c, camera in enumerate(rig) if camera.depth is None]
     if len(blind) >= 2:
-        # Poses as calibrated, before anybody touched the tripods; tuned on the studio.
+        # errors of poses from a calibration, 0.3 degrees and 6 mm; tuned on the studio
         gains = lens_gains(subject.keypoints, rig, times, (np.radians(0.3), 0.006))
         for pair in choose_pairs(gains):
             if set(pair.cameras) <= set(blind):
@@ -166,9 +177,9 @@ def exchange_lenses(
 
 
 def swap_lenses(rig: Rig, first: int, second: int, *, with_distortion: bool) -> Rig:
-    """Exchange the lenses of two cameras, without the distortion unless ``with_distortion``.
+    """Exchange focal lengths and principal points of two cameras, and optionally the distortion.
 
-    Depth on the colour grid is exchanged with them.
+    The intrinsics of depth on the colour image's pixel grid change with them.
     """
     cameras = list(rig.cameras)
     for own, other in ((first, second), (second, first)):
@@ -206,10 +217,13 @@ class _BackgroundTest:
         given = self._residuals(rig)
         if not given:
             return None
-        # A wrong lens also biases the poses of its neighbours: the lowest quartile is usual.
+        # A wrong lens also raises the residuals of other pairs through the refined poses, so the
+        # lowest quartile is the reference.
         usual = np.quantile(list(given.values()), 0.25)
         suspects = [c for c in cameras if _mean_of(given, c) > 1.3 * usual]  # tuned on the studio
-        suspects = sorted(sorted(suspects, key=lambda c: -_mean_of(given, c))[:4])
+        suspects = sorted(
+            sorted(suspects, key=lambda c: -_mean_of(given, c))[:4]
+        )  # bounds the time
         better = []
         for (a, b), distorted in product(combinations(suspects, 2), (True, False)):
             own, other = rig[a].colour, rig[b].colour
@@ -235,6 +249,6 @@ class _BackgroundTest:
 
 
 def _mean_of(residuals: dict[tuple[int, int], float], *cameras: int) -> float:
-    """Mean over the pairs with one of the cameras; NaN if there are none."""
+    """Mean residual of the pairs that contain one of ``cameras``; NaN if there are none."""
     own = [value for pair, value in residuals.items() if set(pair) & set(cameras)]
     return float(np.mean(own)) if own else float("nan")

@@ -1,4 +1,8 @@
-"""Assigns every image to the frame set whose moment it shows: late starts, slips, time offsets."""
+"""Assigns every image to the frame set whose moment it shows.
+
+Corrects three errors of device times: cameras that started late (:mod:`.start_times`), images that
+are whole frames late (:mod:`.slips`), and sub-frame offsets (:mod:`.keypoint_timing`).
+"""
 
 from __future__ import annotations
 
@@ -28,7 +32,11 @@ def check_stated_starts(
 ) -> StartTimes:
     """Reject stated starts that slips and time offsets contradict.
 
-    ``slips`` are relative to ``starts``, ``timing`` to both.
+    Args:
+        starts: starts found so far.
+        stated: starts from sound or the user.
+        slips: late images, counted after correction of ``starts``.
+        timing: time offsets, counted after correction of ``starts`` and ``slips``.
     """
     late, sigma = starts.late.copy(), starts.sigma.copy()
     rejected, step = starts.rejected.copy(), starts.step_s
@@ -66,7 +74,8 @@ def describe_stated_start(
 ) -> str:
     """Describe how a stated start was used; "" if there is nothing to report.
 
-    ``offset`` and ``offset_sigma``: seconds by which the start differs from whole sets.
+    ``offset``, ``offset_sigma``: time offset that remains after correction by whole sets, and its
+    standard deviation, seconds.
     """
     if not stated.known[camera]:
         return ""
@@ -98,9 +107,9 @@ class Moments:
     starts: StartTimes
     """Start of each camera."""
     slips: Slips
-    """Late images, relative to ``starts``."""
+    """Late images, counted after correction of ``starts``."""
     slip: np.ndarray
-    """(T, C) whole sets by which images are older than their set, by starts and slips together."""
+    """(T, C) total delay by start and slip: whole sets by which images are older than their set."""
     image_of: np.ndarray
     """(T, C) set whose image shows each set's moment; -1 = none."""
     timing: TimeOffsets
@@ -121,10 +130,11 @@ def find_moments(
 ) -> Moments:
     """Synchronise the views: starts of recordings, then late images, then sub-frame offsets.
 
-    A camera with an undetermined start shows no moment.
+    Images of a camera with an undetermined start are not assigned to any moment.
 
     Args:
         times: (T,) seconds of the sets.
+        fps: nominal sets per second.
         available: (T, C) bool, the set has an image of the camera.
         stated: starts from other sources than the keypoints.
     """

@@ -1,10 +1,15 @@
 """Joint registration of all cameras of a rig on the surfaces that several of them see.
 
-One robust Gauss-Newton problem (point-to-plane ICP over all pairs at once). Residuals: distances
-between the surfaces of every overlapping pair. Unknowns of each camera: rotation, translation,
-depth bias and time offset; pose and time of the master are fixed, and a weak prior holds the start.
-Further terms on the poses (:mod:`.constraints`) are passed in: a bare floor alone leaves three
-degrees of freedom undetermined. Moving surfaces also observe the exposure times.
+Point-to-plane ICP over all pairs of cameras at once, solved by robust Gauss-Newton iterations.
+
+- Residuals: distances between the surfaces of every overlapping pair, along the surface normal.
+- Unknowns of each camera: rotation, translation, depth bias and time offset. Pose and time of the
+  master are fixed. A weak prior keeps the others near the start.
+- Moving surfaces also determine the time offsets, through their speed.
+- Further terms on the poses (:mod:`.constraints`) are passed in, because surfaces alone may not
+  suffice: a bare floor leaves three degrees of freedom undetermined.
+
+A quarter of the points is held out of the fit and serves to compare poses.
 """
 
 from __future__ import annotations
@@ -23,21 +28,27 @@ from intercap_core.geometry.solve.robust import SIGMA_PER_MAD
 from intercap_core.scene.starts import PRIOR_OFFSET_S
 from intercap_core.scene.surfaces import DepthSurface
 
-SURFACE_SIGMA_FLOOR_M = 0.003  # of point-to-plane residuals; tuned on the studio
+# Smallest standard deviation assumed for point-to-plane residuals; tuned on the studio.
+SURFACE_SIGMA_FLOOR_M = 0.003
 PRIOR_TRANSLATION_M = 0.01  # error of a careful calibration; tuned on the studio
 PRIOR_ROTATION_RAD = np.radians(0.5)  # error of a careful calibration; tuned on the studio
-HELD_OUT_EVERY = 4  # cells of a surface for each that is held out; untuned
-SURFACE_SEARCH_M = 0.12  # to the nearest cell, beyond the widest gate; tuned on the studio
-MAX_DIRECTION_SHARE = 0.8  # of a pair's weight, for one direction of normals; tuned on the studio
-MAX_DIRECTION_GAIN = 3.0  # factor of the weight of other directions; tuned on the studio
-MIN_PAIR_POINTS = 60  # fewer correspondences are chance; tuned on the studio
+HELD_OUT_EVERY = 4  # one of so many points is held out; untuned
+# Largest distance of a point to the nearest point of the other surface; exceeds the widest gate.
+# Tuned on the studio.
+SURFACE_SEARCH_M = 0.12
+# See balance_directions; both tuned on the studio.
+MAX_DIRECTION_SHARE = 0.8
+MAX_DIRECTION_GAIN = 3.0
+MIN_PAIR_POINTS = 60  # with fewer correspondences a pair is ignored; tuned on the studio
 
 
 def balance_directions(weight: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Rescale weights (N,) of points with unit normals (N, 3) so that no direction dominates.
 
-    One direction keeps at most ``MAX_DIRECTION_SHARE`` of the total, which is unchanged. The others
-    grow at most by ``MAX_DIRECTION_GAIN``: specks at the edge of a bare floor are no wall.
+    Points whose normals are within 20 degrees of the dominant direction keep together at most
+    ``MAX_DIRECTION_SHARE`` of the total weight. The other weights are multiplied so that the total
+    is unchanged, but at most by ``MAX_DIRECTION_GAIN``: a few stray points at the edge of a bare
+    floor must not count as a wall.
     """
     total = weight.sum()
     inside = np.ones(len(weight), bool)
@@ -51,13 +62,14 @@ def balance_directions(weight: np.ndarray, normals: np.ndarray) -> np.ndarray:
     return weight * np.where(inside, (1 - (1 - share) * gain) / share, gain)
 
 
-# Unknowns of a camera: rotation 0:3, translation 3:6, depth bias, time offset
+# Unknowns of a camera: 0:3 rotation vector about the camera's centre, applied on the left, rad;
+# 3:6 translation, metres; 6 depth bias, metres; 7 time offset, seconds
 BIAS = 6
 OFFSET = 7
 FREEDOMS = 8
 
-# Adds a group's normal equations: (poses (C, 4, 4), offset (C,)) -> matrix (C, 6, C, 6), gradient
-# (C, 6) of rotation and translation
+# Returns the normal equations of further residuals at poses (C, 4, 4) and time offsets (C,): matrix
+# (C, 6, C, 6) and gradient (C, 6) of rotation and translation
 Constraint = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
@@ -66,12 +78,11 @@ class SurfaceKind:
     """How surfaces of one kind, background or foreground, enter the registration."""
 
     effective_points: float
-    """Independent measurements of a pair of cameras, each way, at most. Neighbouring residuals are
-    correlated (lens, multipath, bias)."""
+    """Largest number of independent measurements that the points of one camera on another count
+    for. Neighbouring residuals are correlated (lens, multipath, bias)."""
     rounded: bool
-    """Two cameras see different flanks of such a surface. The points of one lie off the tangent
-    planes of the other by a constant which is no misalignment, so each pair's weighted mean
-    residual is subtracted."""
+    """Subtract each pair's weighted mean residual. Two cameras see different sides of a rounded
+    body; the points of one lie off the tangent planes of the other even with correct poses."""
 
 
 # Numbers of points tuned on the studio; moving surfaces are seen at many moments and places.
@@ -79,7 +90,7 @@ STATIC = SurfaceKind(effective_points=10.0, rounded=False)
 MOVING = SurfaceKind(effective_points=50.0, rounded=True)
 
 Layers = Mapping[SurfaceKind, Sequence[dict[int, DepthSurface]]]
-"""By kind, the surfaces of each moment by camera index, in the depth camera's frame."""
+"""Surfaces by kind: a list over moments of dictionaries by camera index, depth camera's frame."""
 
 
 @dataclass
@@ -95,7 +106,7 @@ class RigEstimate:
 
     @classmethod
     def start(cls, rig: Rig, offset: np.ndarray | None = None) -> RigEstimate:
-        """The rig as given, exposing ``offset`` (C,) s late."""
+        """The given poses, no bias, and ``offset`` (C,) seconds; None = 0."""
         none = np.zeros(len(rig))
         late = none.copy() if offset is None else offset.copy()
         return cls(rig.master_from_colour.copy(), none, late)
@@ -110,7 +121,7 @@ class RigSolution:
     covariance: np.ndarray
     """(C, 8, C, 8) of rotation about the camera's centre, translation, bias, offset; 0 = fixed."""
     last_step_m: float
-    """Displacement of a viewed point by the last step, metres."""
+    """Largest displacement of a point 2.5 m from its camera by the last iteration, metres."""
 
 
 @dataclass(frozen=True)
@@ -118,19 +129,20 @@ class _Seen:
     """Surfaces of one kind of one camera at all moments, with a search tree."""
 
     surface: DepthSurface
-    """All points."""
+    """All N points."""
     moment: np.ndarray
-    """(N,) fourth coordinate in the search tree, which separates the moments."""
+    """(N,) 10 m times the index of the moment: fourth coordinate in the search tree, so that points
+    of different moments are never matched."""
     tree: cKDTree
-    """Of points and moments."""
+    """Search tree over points and moments (N, 4)."""
     queries: np.ndarray
-    """Rows that are matched with other cameras."""
+    """Rows of the points that are matched for the fit."""
     held_out: np.ndarray
-    """Rows that are matched for evaluation only."""
+    """Rows of the points that are matched for evaluation only."""
 
     @classmethod
     def of(cls, surfaces: Sequence[tuple[int, DepthSurface]]) -> _Seen:
-        """Join ``surfaces`` by moment; at most 2500 points are matched, and 625 held out."""
+        """Join (moment, surface) pairs; at most 2500 random points are matched and 625 held out."""
         surface = DepthSurface.joined([surface for _, surface in surfaces])
         # 10 m: beyond any search radius
         moment = np.repeat([10.0 * at for at, _ in surfaces], [len(s) for _, s in surfaces])
@@ -150,7 +162,7 @@ class _Match:
     """Correspondences of one camera's points with another's surface, master frame."""
 
     residual: np.ndarray
-    """(n,) distance to the plane, metres."""
+    """(n,) signed distance to the plane, corrected for motion between the exposures, metres."""
     points: np.ndarray
     """(n, 3) metres."""
     normals: np.ndarray
@@ -158,9 +170,9 @@ class _Match:
     own_ray: np.ndarray
     """(n, 3) displacement of the point per metre of its own depth."""
     other_ray: np.ndarray
-    """(n, 3) the same for the target."""
+    """(n, 3) displacement of the matched point per metre of the other camera's depth."""
     speed: np.ndarray
-    """(n,) m/s along the normal."""
+    """(n,) speed of the surface along the normal, m/s."""
 
 
 class Registration:
@@ -237,7 +249,7 @@ class Registration:
         covariance = np.zeros((count * FREEDOMS, count * FREEDOMS))
         covariance[np.ix_(rows, rows)] = np.linalg.inv(system)
         last = np.abs(step.reshape(count, FREEDOMS))
-        # In a ring, a camera is about 2.5 m from the scene.
+        # points are about 2.5 m from the cameras of a ring
         moved = 2.5 * last[:, :3].max(1) + last[:, 3:6].max(1)
         return RigSolution(
             current, covariance.reshape(count, FREEDOMS, count, FREEDOMS), float(moved.max())
@@ -246,9 +258,10 @@ class Registration:
     def residuals(
         self, at: RigEstimate, kind: SurfaceKind, camera: int | None = None
     ) -> dict[tuple[int, int], np.ndarray]:
-        """Distances (n,) of held-out points to the other surface, metres, by pair of cameras.
+        """Absolute distances (n,) of held-out points to the other surface, metres, by camera pair.
 
-        Only the pairs with ``camera``, if given.
+        ``camera``: only pairs with this camera; None = all pairs. Pairs with fewer than
+        :data:`MIN_PAIR_POINTS` / :data:`HELD_OUT_EVERY` correspondences are left out.
         """
         result = {}
         for a, b in combinations(self._seen.get(kind, {}), 2):
@@ -280,13 +293,16 @@ class Registration:
         *,
         held_out: bool = False,
     ) -> _Match:
-        """Correspondences within reach of camera a's points on camera b's surface."""
+        """Match the points of camera a with the nearest points of camera b.
+
+        A match needs normals within 32 degrees and a residual of at most ``gate``, metres.
+        """
         source, target = (self.rig[c].moved(at.poses[c]).master_from_depth for c in (a, b))
         own, other = self._seen[kind][a], self._seen[kind][b]
         rows = own.held_out if held_out else own.queries
         queries, surface = own.surface.subset(rows), other.surface
         points = apply(source, queries.points - at.bias[a] * queries.rays)
-        # The tree holds the target's points as measured: its bias is undone for the search.
+        # the tree holds b's points with their depth bias, so the queries get the same bias
         in_target = apply(invert(target), points)
         depth = np.maximum(in_target[:, 2:], 0.1)
         sought = np.column_stack([in_target * (1 + at.bias[b] / depth), own.moment[rows]])
@@ -298,8 +314,8 @@ class Registration:
         on_target = apply(target, surface.points[nearest] - at.bias[b] * surface.rays[nearest])
         speed = (queries.speed[hit] + surface.speed[nearest]) / 2
         good = (normals * own_normals).sum(1) >= 0.85  # 32 degrees; tuned on the studio
-        # The mean normal: two points of one circle are then at distance 0, however far apart
-        # (Rusinkiewicz, A symmetric objective function for ICP, 2019).
+        # Mean of both normals: the residual of two points on one circle is then 0 (Rusinkiewicz, A
+        # symmetric objective function for ICP, 2019).
         normals = normals + own_normals
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
         residual = (normals * (points - on_target)).sum(1)
@@ -317,6 +333,7 @@ class Registration:
     def _add_surfaces(
         self, matrix: np.ndarray, gradient: np.ndarray, at: RigEstimate, gate: float
     ) -> None:
+        """Add the residuals of all pairs and kinds to the normal equations, in place."""
         pairs = [
             (kind, *pair) for kind, seen in self._seen.items() for pair in combinations(seen, 2)
         ]
@@ -346,10 +363,12 @@ class Registration:
     def _add_prior(
         self, matrix: np.ndarray, gradient: np.ndarray, at: RigEstimate, start: RigEstimate
     ) -> None:
+        """Add the prior around ``start`` to the normal equations, in place."""
         precision = np.r_[
             np.full(3, PRIOR_ROTATION_RAD**-2.0),
             np.full(3, PRIOR_TRANSLATION_M**-2.0),
-            # the systematic depth error is at most 11 mm + 0.1 % (Azure Kinect DK data sheet)
+            # standard deviation of the depth bias, 3 mm: about a quarter of the largest systematic
+            # error, 11 mm + 0.1 % of depth (Azure Kinect DK data sheet)
             0.003**-2.0,
             0.0,
         ]
@@ -367,10 +386,11 @@ class Registration:
 
 
 def _derivatives(m: _Match, at: RigEstimate, a: int, b: int) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives (n, 8) of r = n . (p - q) - (offset_a - offset_b) speed by the cameras' unknowns.
+    """Derivatives (n, 8) of the residuals by the unknowns of camera a, and of camera b.
 
-    Turning the target about its centre moves n and q: together that is minus the source's
-    derivative, taken at p with the target's centre.
+    The residual is r = n . (p - q) - (offset_a - offset_b) * speed for a point p of camera a, a
+    point q of camera b and a normal n. A rotation of camera b moves both q and n. Its derivative is
+    that of camera a with opposite sign, if the lever arm is p minus the centre of b.
     """
     centres = at.poses[:, :3, 3]
 
@@ -382,6 +402,7 @@ def _derivatives(m: _Match, at: RigEstimate, a: int, b: int) -> tuple[np.ndarray
 
 
 def _stepped(at: RigEstimate, step: np.ndarray) -> RigEstimate:
+    """The estimate after a step (C, 8) of the unknowns."""
     poses = at.poses.copy()
     poses[:, :3, :3] = Rotation.from_rotvec(step[:, :3]).as_matrix() @ poses[:, :3, :3]
     poses[:, :3, 3] += step[:, 3:6]

@@ -1,10 +1,16 @@
-"""Detects images that are whole frames older than their device times, from the body's motion.
+"""Detects slips: images that are whole frames older than their device times, by the body's motion.
 
-While a camera's images are late, moving keypoints are seen at their earlier positions. For each
-camera, each number of frames and each interval of sets, the gain in log likelihood of the
-keypoints is computed under the detector's own noise over time. The images of the best intervals are
-reassigned to the sets that they show, and the search is repeated until no interval is significant.
-While nobody moves a slip cannot be seen, and none is reported.
+A late image shows moving keypoints at their earlier positions. The hypothesis that the images of
+one camera in one interval of sets are late by one number of frames changes the expected keypoints.
+Its *gain* is the log likelihood ratio against no slip, with the detector's noise correlated over
+time (:mod:`.keypoint_timing`).
+
+1. Gains are computed for each camera, number of frames and interval.
+2. The images of the best intervals are reassigned to the sets that they show.
+3. Both are repeated until no interval is significant, at most 12 times.
+
+A temporary slip is always late. A slip of the whole recording may have either sign, because the
+master itself may be late. Without motion no slip is detectable, and none is reported.
 """
 
 from __future__ import annotations
@@ -31,12 +37,15 @@ from intercap_core.scene.keypoint_timing import (
     windows,
 )
 
-# Gains are log likelihood ratios, tuned on the studio. False detections are short, so the required
-# gain is MIN_SLIP_GAIN + MIN_SLIP_GAIN_OF_SET / (number of sets).
+# All tuned on the studio. False detections are short, so the required gain of an interval is
+# MIN_SLIP_GAIN + MIN_SLIP_GAIN_OF_SET / (number of sets).
 MIN_SLIP_GAIN = 15.0
 MIN_SLIP_GAIN_OF_SET = 60.0
-CLEAR_SLIP_GAIN = 10.0  # of an interval over a delay of the whole recording; tuned on the studio
-SLIPS_APART_S = 1.0  # closer in time, one slip may cause the evidence for another; tuned
+# Gain by which a temporary slip must exceed a constant delay of the camera to be preferred.
+CLEAR_SLIP_GAIN = 10.0
+# Distance in time up to which a slip distorts the triangulated motion, and so the gains of other
+# cameras.
+SLIPS_APART_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -52,13 +61,13 @@ class SlipInterval:
     slip: int
     """Frames by which the images are late."""
     gain: float
-    """Log likelihood ratio."""
+    """Log likelihood ratio, summed over keypoints."""
     robust_gain: float
-    """The same without the keypoints that gain most."""
+    """The same without the four keypoints of greatest gain."""
 
     @property
     def significant(self) -> bool:
-        """Whether the gain is significant."""
+        """Whether ``robust_gain`` reaches the threshold for the number of sets."""
         return self.robust_gain >= MIN_SLIP_GAIN + MIN_SLIP_GAIN_OF_SET / (
             self.last - self.first + 1
         )
@@ -71,14 +80,15 @@ class Slips:
     slip: np.ndarray
     """(T, C) int32: whole frames by which each image is older than its set."""
     intervals: tuple[SlipInterval, ...]
-    """By decreasing gain."""
+    """Detected intervals, by decreasing gain."""
 
 
 def longest_slip(fps: float) -> int:
     """Largest number of frames by which an image may be late at ``fps`` frames per second.
 
-    InterCap's recordings have slips of up to 4 frames at 30 per second. The cause is a queue of
-    images or a busy computer, so the larger of 4 frames and 4/30 s applies at other rates.
+    InterCap's recordings have slips of up to 4 frames at 30 per second. A full image queue loses a
+    number of frames, a busy computer a time. At other rates the larger of 4 frames and 4/30 s is
+    used.
     """
     return max(4, round(4 / 30 * fps))
 
@@ -88,7 +98,9 @@ def find_slips(
 ) -> Slips:
     """Find slips of up to :func:`longest_slip` frames, temporary or constant.
 
-    A constant delay of a camera is relative to the ``master``.
+    A constant delay of a camera is relative to the ``master``. Time offsets are estimated once
+    nothing else is significant, and the search continues with their effect removed. Finally each
+    interval is estimated again, from a motion that does not use the late images.
 
     Args:
         keypoints: (T, C, 135, 3) x, y, confidence of the subject by image; 0 = not seen.
@@ -115,7 +127,7 @@ def find_slips(
                 keypoints_by_moment(keypoints, slip), rig, times, motion.paths.points
             )
         elif offset is None:
-            # Offsets hide weak slips: search again without them.
+            # sub-frame offsets hide weak slips: remove their effect and search again
             offset = estimate_offsets(motion, master).offset
         else:
             break
@@ -143,17 +155,20 @@ def constant_slip(slip: np.ndarray) -> np.ndarray:
 
 
 def _apply(slip: np.ndarray, interval: SlipInterval) -> None:
-    """Add an interval to ``slip`` (T, C), in place, for the images that show its moments so far."""
+    """Add an interval to ``slip`` (T, C), in place.
+
+    The interval counts moments. It applies to the images that show them by the slips so far.
+    """
     moment = np.arange(len(slip)) - slip[:, interval.camera]
     late = (moment >= interval.first) & (moment <= interval.last)
     slip[late | _spans_all(interval, len(slip)), interval.camera] += interval.slip
 
 
 def _apart(intervals: list[SlipInterval], times: np.ndarray) -> list[SlipInterval]:
-    """The best interval and those whose evidence it cannot have caused.
+    """The intervals that are accepted in one round: the best, and others unrelated to it.
 
-    A late camera makes others look late. Much weaker intervals, and those close in time, are left
-    to the next round.
+    A late camera distorts the triangulated motion, which makes other cameras look late. Intervals
+    that are much weaker than the best or close to an accepted one in time wait for the next round.
     """
     ordered = sorted(intervals, key=lambda i: -i.gain)
     chosen: list[SlipInterval] = []
@@ -181,7 +196,17 @@ def _polished(
     steps: list[int],
     fps: float,
 ) -> tuple[np.ndarray, list[SlipInterval]]:
-    """Estimate each interval again, from the motion without the late images."""
+    """Estimate each temporary slip again with the given ``motion``, which excludes late images.
+
+    Args:
+        slip: (T, C) slips found so far.
+        keypoints: (T, C, 135, 3) by image.
+        offset: (C,) time offsets, seconds.
+        steps: tried numbers of frames.
+
+    Returns:
+        Slips (T, C), and the intervals.
+    """
     result, intervals = slip.copy(), []
     for c in range(slip.shape[1]):
         constant = constant_slip(slip)[c]
@@ -198,9 +223,9 @@ def _polished(
 
 
 def _tolerant(motion: KeypointMotion, moved: np.ndarray) -> KeypointMotion:
-    """The motion with residuals that a slip explains counted as valid.
+    """The motion with outliers made valid whose residual one of the tried slips explains.
 
-    ``moved``: (S, T, C, K, 2) displacements by slips, px.
+    ``moved``: (S, T, C, K, 2) displacements by the S slips, px.
     """
     size = np.linalg.norm(motion.residual, axis=-1)
     for late in moved:
@@ -209,21 +234,25 @@ def _tolerant(motion: KeypointMotion, moved: np.ndarray) -> KeypointMotion:
 
 
 def _robust_gain(gains: np.ndarray) -> float:
-    """Sum of the keypoints' gains (K,) without the best four.
+    """Sum of the keypoints' gains (K,) without the four greatest.
 
-    Limbs that a detector confuses fit a slip by chance, but never all over the body.
+    A limb that the detector confuses may fit a slip by chance; a true slip moves the whole body.
     """
     return float(np.sort(gains)[:-4].sum())
 
 
 class _Evidence:
-    """Evidence of the residuals for slips of ``steps`` frames."""
+    """Gains of all slips for one motion.
+
+    Intervals are searched within windows of at most 96 sets, and within windows shifted by half of
+    their length, so that an interval across a border is found as well.
+    """
 
     def __init__(self, motion: KeypointMotion, steps: list[int], fps: float) -> None:
         self._steps = steps
         self._late = np.stack([np.nan_to_num(motion.shifted(s / fps)) for s in steps])
         self._motion = _tolerant(motion, self._late)
-        # a camera of half the rate slips by two sets at a time
+        # (C,) sets between two images; a camera of half the rate can only slip by even numbers
         self._own_steps = np.rint(usual_steps(np.any(motion.seen, -1))).astype(int)
         noise = estimate_noise(self._motion)
         whole = windows(len(motion.times))
@@ -234,7 +263,11 @@ class _Evidence:
         self._precisions = [precisions(self._motion, noise, part) for part, _ in self._parts]
 
     def best(self, camera: int) -> SlipInterval | None:
-        """The interval of one camera with the greatest gain, if significant."""
+        """The significant interval of one camera with the greatest gain; None = there is none.
+
+        An interval of all sets stands for a constant delay, which is preferred to a temporary slip
+        of slightly greater gain.
+        """
         sets, own_step = len(self._motion.times), self._own_steps[camera]
         root, series = _own_series(self._motion, camera)
         always = {step: np.zeros(series.shape[1]) for step in self._steps}
@@ -270,18 +303,19 @@ def _best_of_window(cases: dict[int, _Slipped]) -> SlipInterval | None:
     if not intervals:
         return None
     most = max(intervals, key=lambda i: i.gain)
-    # the gain shows best that and when images are late, the misfit by how much
+    # The gain determines the interval. The number of frames is that of the least misfit in it.
     return min(intervals, key=lambda i: cases[i.slip].misfit(most.first, most.last + 1))
 
 
 def _own_series(motion: KeypointMotion, camera: int) -> tuple[np.ndarray, np.ndarray]:
-    """One camera's residuals given all other views.
+    """One camera's residuals, given the keypoints of all other views.
 
-    Returns the matrices ``root`` (T, K, 2, 2) that whiten its pixels, and the whitened residuals
-    (T, K, 2).
+    The projector of the motion is N = (I - P) W^(1/2). The information matrix of the camera's pixel
+    is w (I - P)_cc w with w = 1 / sigma, where (I - P)_cc is its 2 x 2 diagonal block.
 
-    With the projector N = (I - P) W^(1/2), the information on the camera's own pixels is
-    w (I - P)_cc w; its symmetric root is ``root``.
+    Returns:
+        Matrices (T, K, 2, 2) that whiten the camera's pixels: root of (I - P)_cc times w.
+        Whitened residuals (T, K, 2).
     """
     both = slice(2 * camera, 2 * camera + 2)
     scale = np.where(motion.valid[:, camera], 1 / motion.sigma[camera], 0.0)[..., None, None]
@@ -304,7 +338,8 @@ class _Slipped:
     change: np.ndarray
     """(K, W, 2) their change by the slip."""
     linear: np.ndarray
-    """(K, W) product of the two, whitened over time."""
+    """(K, W) product of ``change`` with the residuals times ``precision``; its sum over an interval
+    is the linear part of the gain."""
     precision: np.ndarray
     """(K, W, W) inverse covariance over time."""
 
@@ -331,17 +366,18 @@ class _Slipped:
         return self.linear[:, part].sum(1) - energy / 2
 
     def misfit(self, first: int, end: int) -> float:
-        """Truncated squares of the remaining residuals.
+        """Sum of truncated squared residuals that remain with the slip, in sets ``first`` to
+        ``end`` - 1.
 
-        Not whitened over time, which would weight the fast errors of the paths as much as motion.
+        They are not whitened over time, because whitening amplifies fast errors of the paths.
         """
         left = self.series[:, first:end] - self.change[:, first:end]
         return float(np.minimum((left**2).sum(-1), OUTLIER_SIGMA**2).sum())
 
     def best(self, step: int) -> SlipInterval:
-        """The interval of greatest gain, by place in the window, of camera 0."""
+        """The interval of greatest gain. Sets are counted within the window; ``camera`` is 0."""
         energy = (self.precision * (self.change @ np.swapaxes(self.change, 1, 2))).sum(0)
-        # each set of an interval must gain 1; tuned on the studio
+        # a cost of 1 for each set keeps intervals short; tuned on the studio
         gain = interval_gains(self.linear.sum(0) - 1.0, energy)
         first, end = (int(i) for i in np.unravel_index(int(np.argmax(gain)), gain.shape))
         gains = self.gains(first, end)
@@ -349,9 +385,10 @@ class _Slipped:
 
 
 def interval_gains(linear: np.ndarray, quadratic: np.ndarray) -> np.ndarray:
-    """Gains (W + 1, W + 1) of all intervals [first, end); -inf for empty ones.
+    """Gains (W + 1, W + 1) of all intervals [first, end), by first (row) and end; -inf = empty.
 
-    A gain is the sum of ``linear`` (W,) less half that of ``quadratic`` (W, W) over the interval.
+    A gain is the sum of ``linear`` (W,) minus half the sum of ``quadratic`` (W, W) over the
+    interval. All are computed at once from cumulative sums.
     """
     size = len(linear)
     sums = np.r_[0.0, np.cumsum(linear)]

@@ -1,8 +1,10 @@
 """Epipolar cost of a time lag between two cameras, from the motion of people whom both see.
 
-People are followed in the images of each camera separately, so no two views have to be in step.
+People are followed in each camera's images separately, so the cameras need not be synchronised.
 Only body points are used that do not depend on left and right (nose, neck, middle of the hips,
 middle between both knees, ...), because a detector may exchange the sides.
+
+Axes: T sets, C cameras, P places for people, K body points.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ from intercap_core.person.subject_joints import MAX_IMAGE_SPEED_RAD_S
 from intercap_core.person.tracks import MAX_LINK_GAP_S
 from intercap_core.scene.keypoint_motion import MIN_CONFIDENCE, known_median
 
-MAX_PEOPLE = 3  # of an image, the most confident; untuned
+MAX_PEOPLE = 3  # used people of an image, those of greatest confidence; untuned
 
 _LEFT, _RIGHT = (
     [
@@ -36,9 +38,10 @@ _ALONE = [KEYPOINT_INDEX[name] for name in ("nose", "neck", "mid_hip")]
 
 
 def body_middles(person: np.ndarray) -> np.ndarray:
-    """Pixels (K, 2) of keypoints (135, 3) that do not depend on left and right.
+    """Pixels (K, 2) of the body points of a person (135, 3) that do not depend on left and right.
 
-    NaN if one of the two points of a middle is not seen.
+    They are nose, neck and mid hip, and the middles of left and right shoulder, elbow, wrist, hip,
+    knee and ankle. NaN if a point or one of both sides is not seen.
     """
     known = np.where(person[:, 2:] >= MIN_CONFIDENCE, person[:, :2], np.nan)
     return np.concatenate([known[_ALONE], (known[_LEFT] + known[_RIGHT]) / 2])
@@ -47,10 +50,11 @@ def body_middles(person: np.ndarray) -> np.ndarray:
 def follow_rays(
     detections: PeopleOfImages, rig: Rig, times: np.ndarray, available: np.ndarray
 ) -> np.ndarray:
-    """Rays (T, C, P, K, 2), x and y at z = 1, of the middles of people; NaN = not seen.
+    """Follow people in each camera's images; returns the rays of their :func:`body_middles`.
 
-    Each of the P places holds one person of a camera's images for as long as they can be followed.
-    Places of different cameras are unrelated.
+    Rays (T, C, P, K, 2) are x and y at z = 1 in the colour camera's frame; NaN = not seen. Each of
+    the P = :data:`MAX_PEOPLE` places holds one person for as long as they can be followed. Places
+    of different cameras are unrelated.
 
     Args:
         times: (T,) seconds of the sets.
@@ -72,9 +76,10 @@ def follow_rays(
 
 
 def _place(rays: np.ndarray, t: int, people: np.ndarray, times: np.ndarray) -> None:
-    """Assign an image's ``people`` (N, K, 2) to the places of ``rays`` (T, P, K, 2), in place.
+    """Write an image's ``people`` (N, K, 2) into row ``t`` of ``rays`` (T, P, K, 2), in place.
 
-    Each is assigned to the place whose person was last seen nearby, else to the longest unused one.
+    A person is assigned to the place whose last person was recently seen nearby, closest pairs
+    first. The remaining people take the places that were unused for longest.
     """
     count = rays.shape[1]
     last = [_last_seen(rays[:t, place]) for place in range(count)]
@@ -87,7 +92,7 @@ def _place(rays: np.ndarray, t: int, people: np.ndarray, times: np.ndarray) -> N
     free, waiting = set(range(count)), set(range(len(people)))
     for apart, i, place in options:
         gap = float(times[t] - times[last[place]])
-        reach = 0.05 + MAX_IMAGE_SPEED_RAD_S * gap  # rad: a few pixels of noise
+        reach = 0.05 + MAX_IMAGE_SPEED_RAD_S * gap  # rad; 0.05 for detector noise, untuned
         if i in waiting and place in free and gap <= MAX_LINK_GAP_S and apart <= reach:
             rays[t, place] = people[i]
             waiting.remove(i)
@@ -99,7 +104,7 @@ def _place(rays: np.ndarray, t: int, people: np.ndarray, times: np.ndarray) -> N
 
 
 def _last_seen(rays: np.ndarray) -> int:
-    """Last set with rays (T, K, 2); -1 = none."""
+    """Index of the last set in which a person's rays (T, K, 2) are known; -1 = none."""
     seen = np.flatnonzero(np.isfinite(rays[..., 0]).any(1))
     return int(seen[-1]) if len(seen) else -1
 
@@ -107,9 +112,12 @@ def _last_seen(rays: np.ndarray) -> int:
 def _carry_on(rays: np.ndarray, images: np.ndarray, usual: float) -> None:
     """Interpolate the ``rays`` (T, P, K, 2) of a camera with a lower frame rate, in place.
 
-    Without it, the costs of adjacent lags would come from different sets, since a lag uses only the
-    sets in which both cameras have rays. ``images``: (N,) sets with an image, usually ``usual``
-    sets apart.
+    A lag uses only the sets in which both cameras have rays. Without interpolation, the costs of
+    adjacent lags would come from different sets and would not be comparable.
+
+    Args:
+        images: (N,) sets with an image.
+        usual: usual number of sets from image to image.
     """
     for first, last in pairwise(images.tolist()):
         if last - first > 2 * usual:
@@ -121,19 +129,27 @@ def _carry_on(rays: np.ndarray, images: np.ndarray, usual: float) -> None:
 
 @dataclass(frozen=True, eq=False)
 class PairCosts:
-    """Disagreement of pairs of cameras, by lag and set."""
+    """Disagreement of pairs of cameras, by lag and set.
+
+    A delay of camera c by d sets means that it shows moment t in its image of set t + d. The lag of
+    a pair (a, b) is the delay of b minus that of a.
+    """
 
     cost: dict[tuple[int, int], np.ndarray]
-    """(4 reach + 1, T) by cameras a < b. Row lag + 2 reach, column t: disagreement, 0 to 1, between
-    a's image of set t and b's image of set t + lag if both show the same moment; NaN = unknown."""
+    """Costs (4 reach + 1, T), 0 to 1, by cameras (a, b) with a < b. Row lag + 2 reach, column t
+    compares a's image of set t with b's image of set t + lag; NaN = unknown."""
     views: int
     """Number of cameras."""
     reach: int
-    """Largest delay of a camera, sets."""
+    """Largest delay of a camera that is tried, sets."""
 
     @classmethod
     def of(cls, rays: np.ndarray, rig: Rig, reach: int, fewest: float) -> PairCosts:
-        """Compute costs of ``rays`` (T, C, P, K, 2); NaN at lags with fewer than ``fewest``."""
+        """Compute costs of ``rays`` (T, C, P, K, 2).
+
+        ``fewest``: least number of sets in which two people must be seen together at a lag; costs
+        of others are NaN.
+        """
         lags = range(-2 * reach, 2 * reach + 1)
         occupied = np.isfinite(rays[..., 0]).any((0, 3))  # (C, P)
         people = [rays[:, c, places] for c, places in enumerate(occupied)]
@@ -148,8 +164,11 @@ class PairCosts:
     def series(self, camera: int, late: int, others: Sequence[int], sets: np.ndarray) -> np.ndarray:
         """Mean cost (T + 2 reach,) of a camera's pairs with ``others``, by moment.
 
-        Moment t is at t + reach; a camera with a delay of d sets shows it in set t + d. ``late``:
-        delay of the camera, sets. ``sets``: (C,) delays of all cameras.
+        Moment t is at index t + reach.
+
+        Args:
+            late: tried delay of the camera, sets.
+            sets: (C,) delays of all cameras, used for the others.
         """
         rows = []
         for other in others:
@@ -166,7 +185,10 @@ class PairCosts:
     def profile(
         self, camera: int, others: Sequence[int], sets: np.ndarray, bound: int | None = None
     ) -> np.ndarray:
-        """Mean cost (2 reach + 1,) by a camera's delay; NaN if unknown or beyond ``bound`` sets."""
+        """Mean cost (2 reach + 1,) of a camera by its delay, -reach to reach.
+
+        NaN if unknown, or if the delay exceeds ``bound`` sets.
+        """
         tried = range(-self.reach, self.reach + 1)
         cost = known_mean(np.array([self.series(camera, k, others, sets) for k in tried]).T)
         if bound is not None:
@@ -181,12 +203,21 @@ def _cost(
     lag: int,
     fewest: float,
 ) -> np.ndarray:
-    """Costs (T,) of one lag, see :class:`PairCosts`.
+    """Costs (T,) of one lag of cameras a and b, see :class:`PairCosts`.
 
-    Each person of camera a is compared with the person of camera b who agrees best over the whole
-    recording. The cost is the deviation of their epipolar distances from the median over time,
-    averaged over people with their amount of motion as weight: a person who stands still agrees at
-    any lag. ``epipolar``: see :func:`_epipolar_geometry`.
+    1. Each person of camera a is compared with the person of camera b who has the least mean
+       epipolar distance over the whole recording.
+    2. The median over time is subtracted from the distance x of each body point. The cost is
+       Geman and McClure's x^2 / (x^2 + s^2) with s = 6 px at 1080p, averaged over body points.
+    3. Costs of people are averaged with their amount of motion as weight, because a person who
+       stands still agrees at any lag.
+
+    Args:
+        rays_a: (T, P, K, 2).
+        rays_b: (T, Q, K, 2).
+        epipolar: see :func:`_epipolar_geometry`.
+        lag: sets.
+        fewest: least number of sets.
     """
     sets = len(rays_a)
     result = np.full(sets, np.nan)
@@ -204,7 +235,7 @@ def _cost(
     for p in np.flatnonzero(np.isfinite(size).any(1)):
         own = distance[:, p, np.nanargmin(size[p])]
         own = own[:, np.isfinite(own).any(0)]
-        change = (own - known_median(own)) / 6.0  # px at 1080p, at the right lag; tuned
+        change = (own - known_median(own)) / 6.0  # px at 1080p, error at the right lag; tuned
         cost[p] = known_mean((change**2 / (1 + change**2)).T)
         motion = 1e-6 + float(np.nanmean(np.sqrt(np.nanvar(first[:, p], axis=0).sum(-1))))  # rad
         weight[p] = np.where(np.isfinite(cost[p]), motion, np.nan)
@@ -213,8 +244,10 @@ def _cost(
 
 
 def _epipolar_geometry(rig: Rig, a: int, b: int) -> tuple[np.ndarray, float]:
-    """Essential matrix E (3, 3), with ``y' E x`` = 0 for rays x of camera a and y of camera b, and
-    the mean focal length, pixels at 1080p."""
+    """Essential matrix E (3, 3), and the mean focal length of both cameras, pixels at 1080p.
+
+    ``y' E x`` = 0 for rays x of camera a and y of camera b to one point.
+    """
     b_from_a = invert(rig[b].master_from_colour) @ rig[a].master_from_colour
     x, y, z = b_from_a[:3, 3]
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ b_from_a[:3, :3]
@@ -225,8 +258,14 @@ def _epipolar_geometry(rig: Rig, a: int, b: int) -> tuple[np.ndarray, float]:
 def _sampson_distances(
     first: np.ndarray, second: np.ndarray, essential: np.ndarray, focal: float
 ) -> np.ndarray:
-    """Signed distances (T, P, Q, K) of rays (T, P, K, 2) of a and (T, Q, K, 2) of b from each
-    other's epipolar lines, pixels at 1080p."""
+    """Signed Sampson distances (T, P, Q, K) between people of two cameras, pixels at 1080p.
+
+    Args:
+        first: (T, P, K, 2) rays of camera a.
+        second: (T, Q, K, 2) rays of camera b.
+        essential: (3, 3).
+        focal: focal length, pixels at 1080p.
+    """
     x, y = (np.concatenate([rays, np.ones_like(rays[..., :1])], -1) for rays in (first, second))
     line, back = (x @ essential.T)[:, :, None], (y @ essential)[:, None]
     size = np.sqrt((line[..., :2] ** 2).sum(-1) + (back[..., :2] ** 2).sum(-1))

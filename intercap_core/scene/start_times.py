@@ -1,14 +1,16 @@
 """Start times of cameras that were not started together: recordings late by up to seconds.
 
-The method needs no synchronised views. The rays of two cameras to a moving person meet only where
-both show the same moment, so the epipolar distance is low at the right lag. For each pair of
-cameras and each lag the truncated distances are summed (:mod:`.start_costs`); the median of each
-body point is subtracted, since it stems from the calibration. The lags of all pairs together give
-the start times. If the person hardly moves, or the motion repeats itself, no start is returned.
+The rays of two cameras to a moving person meet only if both images show the same moment, so the
+epipolar distance is low at the right lag. For each pair of cameras and each lag, robust costs of
+these distances are averaged (:mod:`.start_costs`). The median distance of each body point is
+subtracted first, since it stems from the calibration. The delay of each camera minimises the costs
+of all its pairs. If the person hardly moves, or the motion is periodic, no start is returned.
 
-The search begins at a stated start if there is one, else at the device times. A camera leaves this
-point only if the views clearly agree better elsewhere; if that is far away, the stated start is
-rejected.
+The search begins at a stated start if there is one, else at the device times. The result differs
+from this initial value only if the cost is clearly lower elsewhere. If the difference exceeds the
+accuracy of a stated start, the statement is rejected.
+
+Significance is tested on blocks of 0.3 s, whose cost differences count as independent.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ from intercap_core.scene.starts import (
     shift_images,
 )
 
-FEWEST_BLOCKS = 4  # fewer do not decide; tuned on the studio
+FEWEST_BLOCKS = 4  # least number of blocks for a significance test; tuned on the studio
 
 
 def find_starts(
@@ -46,6 +48,8 @@ def find_starts(
     Args:
         times: (T,) seconds of the sets.
         available: (T, C) bool, the set has an image of the camera.
+        master: camera whose delay is 0.
+        stated: starts from sound or the user; None = no statements.
     """
     views, sets = len(rig), len(times)
     step = float(np.median(np.diff(times))) if sets > 1 else 0.0
@@ -53,8 +57,8 @@ def find_starts(
     as_stated = StartTimes.as_stated(known, step)
     if sets < 2 or views < 2:
         return as_stated
-    # cameras are started by hand, or by one command that reaches them in turn: delays of up to
-    # 1.5 s and 40 % of the recording; tuned on the studio
+    # Largest delay: cameras are started by hand, or by one command that reaches them in turn.
+    # 1.5 s, at most 40 % of the recording; tuned on the studio.
     reach = min(round(1.5 / step), int(0.4 * sets))
     fewest = max(MIN_SHARED_S / step, 1)
     if reach < 1 or sets - reach < fewest:
@@ -77,7 +81,7 @@ def find_starts(
         if not known.known[c] and not result.apart:
             continue
         if not known.known[c]:
-            # if only a statement says "apart", it is unknown whether anybody moves
+            # a delay near 0 is only believed if the motion of some camera decided something
             moves = any(certain.values()) or abs(late[c]) < FEWEST_SETS_APART
             if not moves or not search.is_clear(late, c):
                 result.in_doubt[c] = True
@@ -87,7 +91,7 @@ def find_starts(
         if rejected[c]:
             result.sigma[c] = np.nan
         elif known.known[c] and known.sigma[c] > step / 2:
-            result.sigma[c] = step / 2  # the views are more accurate
+            result.sigma[c] = step / 2  # the estimate replaces the less accurate statement
         elif known.known[c]:
             result.late[c], result.sigma[c] = combine_estimates(
                 (result.late[c], step / 2), (known.late[c], known.sigma[c])
@@ -107,12 +111,12 @@ class _Search:
     step: float
     """Seconds per set."""
     bounds: np.ndarray
-    """(C,) largest delays that do not contradict a stated start."""
+    """(C,) largest delays, sets, that do not contradict a stated start; ``reach`` without one."""
     stated: np.ndarray
     """(C,) bool: the start is stated."""
 
     def agreed(self) -> tuple[np.ndarray, np.ndarray]:
-        """Delays (C,) at which the views agree best, and the cameras (C,) with rejected statements.
+        """Delays (C,), sets, of least cost, and a mask (C,) of rejected statements.
 
         Statements are rejected one after another, the clearest first, because a wrong one disturbs
         the others.
@@ -123,7 +127,7 @@ class _Search:
             late = self._descended(bounds)
             doubtful = self.stated & ~rejected & (late != 0)
             doubtful &= ~self.shown(late)
-            if doubtful.any():  # no certain evidence against the statement
+            if doubtful.any():  # the motion does not confirm the deviation: keep the stated start
                 bounds[doubtful] = 0
                 continue
             gains = {
@@ -154,14 +158,15 @@ class _Search:
     def _descended(self, bounds: np.ndarray) -> np.ndarray:
         """Delays (C,), in sets, that minimise the cost of all pairs within ``bounds`` (C,).
 
-        Cameras are added one after another, the clearest first. Then coordinate descent.
+        Cameras are added one after another, the deepest minimum first. Then each camera's delay is
+        improved in turn, at most five times (coordinate descent).
         """
         pairs, master = self.pairs, self.master
         sets, joined = np.zeros(pairs.views, int), [master]
         waiting = [c for c in range(pairs.views) if c != master]
         while waiting:
             profiles = {c: pairs.profile(c, joined, sets, int(bounds[c])) for c in waiting}
-            # a stated start needs no motion
+            # a camera with a stated start is added even if its profile is flat
             least = np.where(self.stated, np.finfo(float).tiny, 0.0)
             gains = {
                 c: max(_gain(profile), least[c]) if np.isfinite(profile).any() else 0.0
@@ -183,7 +188,8 @@ class _Search:
         return sets
 
     def is_apart(self, sets: np.ndarray, camera: int, instead: int = 0) -> bool:
-        """Whether a camera's delay certainly differs from ``instead``, beyond slips and offsets."""
+        """Whether a camera's delay significantly differs from ``instead``, by at least
+        :data:`FEWEST_SETS_APART` sets. Smaller differences are slips or time offsets."""
         if abs(sets[camera] - instead) < FEWEST_SETS_APART:
             return False
         return self._significant(self._worse(sets, camera, instead), sets, camera)
@@ -204,7 +210,8 @@ class _Search:
     def shown(self, sets: np.ndarray) -> np.ndarray:
         """Mask (C,) of the cameras whose delays the motion confirms.
 
-        If it is certain for one camera, somebody moves, and a clear minimum suffices for others.
+        If the delay of one camera is significant, somebody moves. For the others a clear minimum of
+        the cost then suffices.
         """
         views = range(len(sets))
         certain = np.array([c != self.master and self._is_shown(sets, c) for c in views])
@@ -213,7 +220,7 @@ class _Search:
         return certain | [c != self.master and self.is_clear(sets, c, if_few=False) for c in views]
 
     def _is_shown(self, sets: np.ndarray, camera: int) -> bool:
-        """Whether a camera's delay is certain, or at least certainly differs from the statement."""
+        """Whether a camera's delay significantly differs from 0, or from the next best delay."""
         if self.is_apart(sets, camera):
             return True
         next_best = self._next_best(sets, camera)
@@ -222,7 +229,8 @@ class _Search:
         )
 
     def _next_best(self, sets: np.ndarray, camera: int) -> int | None:
-        """Best delay of a camera outside the minimum of its own; None if either is unknown."""
+        """Best other delay, sets, more than 0.15 s from a camera's own; None if either cost is
+        unknown."""
         pairs = self.pairs
         profile = pairs.profile(camera, self._others(camera), sets)
         tried = np.arange(-pairs.reach, pairs.reach + 1)
@@ -233,7 +241,7 @@ class _Search:
         return int(tried[far][profile[far].argmin()])
 
     def is_clear(self, sets: np.ndarray, camera: int, *, if_few: bool = True) -> bool:
-        """Whether the cost has a clear minimum at a camera's delay.
+        """Whether the cost at a camera's delay is one standard error below that at the next best.
 
         ``if_few``: the answer if there are too few blocks.
         """
@@ -246,7 +254,10 @@ class _Search:
         return bool(worse.mean() > worse.std(ddof=1) / np.sqrt(len(worse)))
 
     def _worse(self, sets: np.ndarray, camera: int, late: int) -> np.ndarray:
-        """Increase (N,) of the cost, by block, from a camera's own delay to ``late`` sets."""
+        """Cost at a delay of ``late`` sets minus that at the camera's own delay, by block (N,).
+
+        Blocks with fewer than half of their sets known are left out.
+        """
         others = self._others(camera)
         own = self.pairs.series(camera, int(sets[camera]), others, sets)
         change = self.pairs.series(camera, late, others, sets) - own
@@ -271,6 +282,6 @@ class _Search:
 
 
 def _gain(profile: np.ndarray) -> float:
-    """Depth of a profile's minimum below its median; 0 if nothing is known."""
+    """Median minus minimum of a profile's known costs; 0 if none is known."""
     known = profile[np.isfinite(profile)]
     return float(np.median(known) - known.min()) if len(known) else 0.0

@@ -15,7 +15,9 @@ from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import PeopleOfImages
 
-PRIOR_OFFSET_S = 0.01  # synchronised devices expose within a third of 1/30 s; tuned on the studio
+# Standard deviation of the time offset of synchronised devices: a third of 1/30 s. Tuned on the
+# studio.
+PRIOR_OFFSET_S = 0.01
 FEWEST_SETS_APART = 2  # sets; a smaller shift is a slip or an offset, not a late start; tuned
 MIN_SHARED_S = 1.0  # least overlap of two recordings to determine a start; tuned on the studio
 # Combined standard deviations beyond which keypoints overrule a stated start. A smaller bound would
@@ -54,7 +56,8 @@ class StatedStarts:
         Returns no statement at all if the master's start is not stated.
 
         Args:
-            stated: seconds of any common clock and their standard deviation, by camera.
+            stated: by camera, time of its first image on any clock common to all, and its standard
+                deviation, seconds.
             names: camera names, in the order of the rig.
             master: index of the master.
             first_image_s: (C,) time of the first image by the recording's own clock; NaN = none.
@@ -93,15 +96,17 @@ class StatedStarts:
         return np.where(self.known, np.minimum(away, reach), reach).astype(int)
 
     def states_apart(self, step_s: float) -> bool:
-        """Whether a camera started clearly later or earlier than its images' times imply."""
+        """Whether a statement contradicts the images' own times by at least
+        :data:`FEWEST_SETS_APART` sets beyond its accuracy."""
         least = FEWEST_SETS_APART * step_s + REJECTED_SIGMAS * self.sigma
         return bool((np.abs(self.late) > least)[self.known].any())
 
     def unless_in_step(self) -> StatedStarts:
         """These statements, or none if they all agree with the images' own times.
 
-        The images' times are more accurate if they come from one clock. One of five synchronised
-        cameras exceeds three standard deviations in one recording of 75.
+        If the cameras share one clock, the images' own times are the more accurate ones. Statements
+        that agree with them within three standard deviations are therefore dropped. With five
+        synchronised cameras, chance exceeds this bound in one of 75 recordings.
         """
         apart = (np.abs(self.late) > 3.0 * self.sigma)[self.known].any()
         return self if apart else StatedStarts.nothing(len(self.late))
@@ -169,19 +174,20 @@ class StartTimes:
     sets: np.ndarray
     """(C,) nearest whole number of frame sets to ``late``."""
     in_doubt: np.ndarray
-    """(C,) bool: the cameras did not start together, and this one's start is undetermined."""
+    """(C,) bool: the cameras did not start together, and this camera's start is undetermined."""
     apart: bool
     """True if the cameras did not start together."""
     step_s: float
     """Seconds per frame set."""
     sigma: np.ndarray
-    """(C,) standard deviation of ``late`` if it rests on a statement, else NaN."""
+    """(C,) standard deviation of ``late``, seconds, of cameras with an accepted statement; else
+    NaN."""
     rejected: np.ndarray
     """(C,) bool: the keypoints contradict the stated start."""
 
     @classmethod
     def as_stated(cls, stated: StatedStarts, step_s: float) -> StartTimes:
-        """The stated starts; the times of the images for other cameras."""
+        """The stated starts; 0 (the images' own times) for cameras without a statement."""
         none = np.zeros(len(stated.late), bool)
         late = np.nan_to_num(stated.late)
         return cls(late, stated.sets(step_s), none, False, step_s, stated.sigma.copy(), none.copy())
@@ -203,7 +209,8 @@ class StartTimes:
     def with_slips(self, slip: np.ndarray) -> np.ndarray:
         """Delay (T, C) of each image, in sets, by start and slip together.
 
-        ``slip``: (T, C) by moment, of images that were moved by ``sets``.
+        ``slip``: (T, C) slips of the images after they were moved ``sets`` sets earlier, see
+        :func:`shift_images`.
         """
         last = len(slip) - 1
         place = np.clip(np.arange(len(slip))[:, None] - self.sets, 0, last)
@@ -211,7 +218,10 @@ class StartTimes:
 
 
 def shift_images(values: np.ndarray, by: np.ndarray, fill: float = 0) -> np.ndarray:
-    """Values (T, C, ...) of images, moved ``by`` (C,) sets earlier; ``fill`` without an image."""
+    """Values (T, C, ...) of images, moved ``by`` (C,) sets earlier.
+
+    Row t of camera c of the result is row t + by[c]; ``fill`` if there is none.
+    """
     sets = len(values)
     result = np.full_like(values, fill)
     for c, shift in enumerate(by.tolist()):
@@ -225,7 +235,9 @@ class AlignedPeople:
     """The people of the images that show each set's moment."""
 
     detections: PeopleOfImages
+    """People by image."""
     starts: StartTimes
+    """Delays of the cameras. Cameras in doubt show nobody."""
 
     @property
     def num_sets(self) -> int:

@@ -1,8 +1,8 @@
 """Detections of the subject in all views, and its joints triangulated at the poses as given.
 
-The search for the subject requires that views agree within a set. In an image that is some frames
-late a walking person is a step behind, so the search rejects it. :func:`add_late_views` adds such
-images by the position in which the other views saw the subject shortly before.
+The search for the subject requires that the views of a set agree. In an image that is some frames
+late, a walking person is at an earlier position, so the search rejects the detection.
+:func:`add_late_views` adds a detection if it fits the subject's position shortly before.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ def add_late_views(
 ) -> np.ndarray:
     """Add detections at earlier positions of the subject, as far back as slips reach.
 
+    Returns ``index`` (T, C) with these detections.
+
     Args:
         index: (T, C) the subject's detection in each image; -1 = not seen.
         joints: (T, 135, 3) triangulated from the views with a detection, metres; NaN = unknown.
@@ -37,7 +39,7 @@ def add_late_views(
     reach_s = longest_slip(fps) / fps
     result = index.copy()
     body = joints[:, BODY_POINTS]
-    # joint biases, unrefined poses and half a frame of motion; tuned on the studio
+    # px at 1080p, for joint biases, unrefined poses and half a frame of motion; tuned on the studio
     limit = 45.0 * pixel_scale(rig)
     for t, c in np.argwhere(index == NOBODY).tolist():
         people = detections.people(t, c)
@@ -54,9 +56,10 @@ def add_late_views(
 
 
 def _distance(person: np.ndarray, expected: np.ndarray, known: np.ndarray) -> float:
-    """Least median distance, px, of a person (135, 3) from N bodies (N, 25, 2).
+    """Least median distance, px, of a person (135, 3) from the ``expected`` bodies (N, 25, 2).
 
-    Left and right of the person are also exchanged. ``known``: (N, 25) bool.
+    The person is tried as detected and with left and right exchanged; inf with too few points.
+    ``known``: (N, 25) bool.
     """
     best = np.inf
     for body in (person[BODY_POINTS], swap_sides(person)[BODY_POINTS]):
@@ -79,17 +82,23 @@ class SubjectViews:
     joints: np.ndarray
     """(T, 135, 3) triangulated body, master frame, metres; NaN = unknown, as are hands and face."""
     views: np.ndarray
-    """(T, 135) number of agreeing views; 0 for a neck or mid hip filled in between other joints."""
+    """(T, 135) number of agreeing views; 0 for a neck or mid hip computed from other joints."""
 
     def showing(self, image_of: np.ndarray, rig: Rig) -> SubjectViews:
-        """The same by moment. ``image_of``: (T, C) set whose image shows each moment."""
+        """Reorder from images to moments and triangulate again.
+
+        ``image_of``: (T, C) set whose image shows each moment; -1 = none.
+        """
         shown = self.keypoints[np.maximum(image_of, 0), np.arange(image_of.shape[1])]
         shown[image_of < 0] = 0
         return triangulate_views(shown, rig)
 
 
 def find_subject_views(detections: PeopleOfImages, rig: Rig, times: np.ndarray) -> SubjectViews:
-    """Find the subject at the given poses; all 0 and NaN if no two views agree on anybody."""
+    """Find the subject at the given poses.
+
+    Keypoints are 0 and joints NaN if no two views agree on any person.
+    """
     index = find_subject(detections, rig, times, min_confidence=MIN_CONFIDENCE).people
     views = triangulate_views(subject_keypoints(detections, index), rig)
     if len(times) < 2:
@@ -105,7 +114,7 @@ def triangulate_views(keypoints: np.ndarray, rig: Rig) -> SubjectViews:
     sets, views = keypoints.shape[:2]
     body = np.zeros_like(keypoints)
     body[:, :, BODY_POINTS] = keypoints[:, :, BODY_POINTS]
-    # the poses as given are a centimetre off; tuned on the studio
+    # the limit allows for errors of the given poses, about a centimetre; tuned on the studio
     body, points = triangulate_people(body, rig, min_confidence=MIN_CONFIDENCE, max_error_px=40.0)
     keypoints = keypoints.copy()
     keypoints[:, :, BODY_POINTS] = body[:, :, BODY_POINTS]

@@ -1,8 +1,9 @@
 """Depth images as thinned surfaces: points with normals, and for the foreground their speed.
 
-Moving surfaces (the person and the object) stand in the middle of the ring and are seen from all
-sides: they connect cameras that share no background. They also observe *when* each camera exposed:
-between two cameras a surface is displaced by its normal speed times the difference in exposure.
+Moving surfaces (the person and the object) are in the middle of the ring of cameras and seen from
+all sides, so they connect cameras that share no background. They also determine *when* each camera
+exposed: a surface seen by two cameras is displaced by its speed along the normal times the
+difference of their exposure times.
 """
 
 from __future__ import annotations
@@ -19,8 +20,10 @@ from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.solve.time_series import sample_evenly
 from intercap_core.scene.background import Background
 
-MOVING_MAX_DEPTH_M = 4.0  # beyond, the error exceeds the motion of a body between sets
-MOVING_SEARCH_M = 0.15  # from one set to the next: 2 m/s at 15 sets a second
+# Largest depth of moving surfaces: farther, the depth error exceeds the motion between two sets.
+MOVING_MAX_DEPTH_M = 4.0
+# Largest displacement from one set to the next: 2 m/s at 15 sets per second.
+MOVING_SEARCH_M = 0.15
 BACKGROUND_CELL_M = 0.03  # side of the cells of thinned backgrounds; tuned on the studio
 
 
@@ -58,8 +61,10 @@ def surface_from_depth(
 ) -> DepthSurface:
     """Thin a depth image (H, W), uint16 mm, to one mean point and normal per cell.
 
-    Edges, grazing views and points beyond ``max_depth_m`` are left out. ``cell_m``: side of a cell,
-    metres.
+    Normals are cross products of central differences. Points at edges, on surfaces seen at more
+    than 75 degrees from their normal, and beyond ``max_depth_m`` are left out. Speeds are 0.
+
+    ``cell_m``: side of a cubic cell, metres.
     """
     rows, columns = np.flatnonzero(depth.any(1)), np.flatnonzero(depth.any(0))
     if not len(rows):
@@ -69,8 +74,8 @@ def surface_from_depth(
     usable = (depth > 0) & (depth <= max_depth_m * 1000)
     z = depth.astype(np.float32) * np.float32(1e-3)
     grid = np.dstack([table * z[..., None], z])
-    # Baseline of a normal, one way: 4 px of the unbinned narrow depth camera (f = 504 px). Shorter
-    # is noise, longer crosses edges; tuned on the studio.
+    # Distance of the neighbours on either side: 4 px of the unbinned narrow mode (f = 504 px).
+    # With closer ones noise dominates, with farther ones edges; tuned on the studio.
     step = max(1, round(0.008 * lens.fx))
     middle = np.s_[step:-step, step:-step]
     left, right = np.s_[step:-step, : -2 * step], np.s_[step:-step, 2 * step :]
@@ -79,7 +84,7 @@ def surface_from_depth(
     for one, other in ((left, right), (up, down)):
         flat &= usable[one] & usable[other]
         kink = np.abs((z[one] + z[other]) / 2 - z[middle])
-        flat &= kink <= 0.008 * z[middle]  # tuned on the studio
+        flat &= kink <= 0.008 * z[middle]  # share of depth; tuned on the studio
     row, column = np.nonzero(flat)
     row, column = row + step, column + step
     points = grid[row, column].astype(np.float64)
@@ -96,9 +101,10 @@ def surface_from_depth(
 
 
 def thin_surface(surface: DepthSurface, cell_m: float) -> DepthSurface:
-    """One mean point, normal and ray for each cell of ``cell_m``, in a fixed order."""
+    """One mean point, normal, ray and speed for each cell of ``cell_m``, ordered by cell."""
     if not len(surface):
         return surface
+    # one integer key per cell: 20 bits for each coordinate, which is made positive
     cell = np.floor(surface.points / cell_m).astype(np.int64) + (1 << 19)
     key = (cell[:, 0] << 40) + (cell[:, 1] << 20) + cell[:, 2]
     _, inverse, counts = np.unique(key, return_inverse=True, return_counts=True)
@@ -129,8 +135,7 @@ def background_surfaces(
                 np.where(background.static, background.depth, 0),
                 lens,
                 cell_m=BACKGROUND_CELL_M,
-                # beyond, the error of the depth exceeds a centimetre
-                max_depth_m=5.0,
+                max_depth_m=5.0,  # farther, the depth error exceeds a centimetre
             )
     return surfaces
 
@@ -138,14 +143,16 @@ def background_surfaces(
 def moving_surfaces(
     frames: Frames, rig: Rig, image_of: np.ndarray, backgrounds: list[Background | None]
 ) -> list[dict[int, DepthSurface]]:
-    """Return the moving surfaces of up to 16 frame sets, by camera index.
+    """Return the moving surfaces of up to 16 moments, by camera index.
 
-    Points are in the depth camera's frame. Surfaces without a neighbouring set on both sides are
-    omitted, because their speed is unknown.
+    Points are in the depth camera's frame. A camera is used at a moment only if it also has depth
+    at the moments before and after, which are needed for the speed. A moment needs two cameras.
 
     Args:
-        rig: lenses of the cameras.
+        frames: read by image, not by moment.
+        rig: gives the lenses of the depth cameras.
         image_of: (T, C) set whose image of camera c shows moment t; -1 = none.
+        backgrounds: of the C cameras; None = no depth.
     """
     has_depth = frames.depth_available[np.maximum(image_of, 0), np.arange(image_of.shape[1])]
     depth_image = np.where((image_of >= 0) & has_depth, image_of, -1)
@@ -171,7 +178,8 @@ def moving_surfaces(
 def _moving(
     images: list[np.ndarray | None], background: Background, lens: Intrinsics, gaps: np.ndarray
 ) -> DepthSurface:
-    """Surface with speeds in the second of three depth images, ``gaps`` (2,) seconds apart."""
+    """Foreground surface of the second of three depth images, with the mean speed over both
+    ``gaps`` (2,), seconds."""
     before, now, after = (_foreground(image, background) for image in images)
     surface = surface_from_depth(now, lens, cell_m=0.02, max_depth_m=MOVING_MAX_DEPTH_M)
     if not len(surface):
@@ -193,6 +201,7 @@ def _foreground(image: np.ndarray | None, background: Background) -> np.ndarray:
 
 
 def _points(image: np.ndarray, lens: Intrinsics) -> np.ndarray:
+    """Points (N, 3), metres, of the valid pixels of a depth image (H, W), uint16 mm."""
     thin = np.s_[::2, ::2]  # every second pixel is enough
     z = image[thin].astype(np.float64) * 1e-3
     keep = (z > 0) & (z < MOVING_MAX_DEPTH_M + 0.3)
@@ -203,8 +212,8 @@ def _points(image: np.ndarray, lens: Intrinsics) -> np.ndarray:
 def _along_normals(surface: DepthSurface, points: np.ndarray) -> np.ndarray:
     """Displacement (N,) of the surface along each point's normal, metres; NaN = not found.
 
-    The nearest point is closer than the surface along the normal, so the search is repeated from
-    the displaced point.
+    The nearest of the other ``points`` lies beside the normal. The displacement is its distance
+    along the normal, and the search is repeated twice from the displaced point.
     """
     away, lost = np.zeros(len(surface)), np.zeros(len(surface), bool)
     if not len(points):

@@ -1,4 +1,4 @@
-"""Which way is up before a floor is known: gravity sensors, what the user states, the cameras."""
+"""Up direction before a floor is known: from gravity sensors, the user, or the cameras' poses."""
 
 from __future__ import annotations
 
@@ -11,9 +11,12 @@ from intercap_core.body.keypoints import KEYPOINT_INDEX
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.rig import Rig
 
-GRAVITY_CONE_DEG = 10.0  # error of an accelerometer on a tripod, or of a board laid on the floor
-CAMERA_UP_CONE_DEG = 40.0  # error of the cameras' mean up direction; tuned on the studio
-WRONG_UP_DEG = 60.0  # another axis is 90 degrees away; a person who bends leans by less
+# Largest error of an accelerometer on a tripod, or of a calibration board laid on the floor.
+GRAVITY_CONE_DEG = 10.0
+CAMERA_UP_CONE_DEG = 40.0  # largest error of the cameras' mean up direction; tuned on the studio
+# Deviation from which a stated up is taken for a wrong axis. A wrong axis is 90 degrees off; the
+# cameras' mean up and the trunk of a bending person deviate by less than 60.
+WRONG_UP_DEG = 60.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,9 +32,9 @@ class UpDirection:
 
 
 def rough_up(rig: Rig, gravity: np.ndarray, stated: np.ndarray | None = None) -> UpDirection:
-    """Approximate direction up: measured, else stated, else by the cameras.
+    """Approximate up direction: by gravity sensors, else as stated, else by the cameras.
 
-    The upward directions of the images are averaged, because tilts cancel around a ring.
+    The last is the mean upward direction of the images: tilts cancel around a ring of cameras.
 
     Args:
         gravity: (C, 3) down in each colour camera; NaN = not measured.
@@ -65,14 +68,17 @@ def trunk_direction(joints: np.ndarray) -> np.ndarray:
 def check_stated_up(
     stated: np.ndarray, rig: Rig, gravity: np.ndarray, trunk: np.ndarray
 ) -> list[str]:
-    """Report where the ``stated`` up (3,) contradicts the sensors, or the cameras and a person.
+    """Return messages if the ``stated`` up (3,) contradicts the sensors, the cameras or the person.
 
-    ``trunk``: see :func:`trunk_direction`.
+    Args:
+        stated: unit vector, master frame; NaN = not stated.
+        gravity: (C, 3) down in each colour camera; NaN = not measured.
+        trunk: see :func:`trunk_direction`.
 
     Raises:
         UserError: gravity was not measured, and both the cameras and the person contradict the
-            statement: any surface perpendicular to it could be mistaken for the floor. The message
-            lacks the sequence.
+            statement. With a wrong up, a wall could be mistaken for the floor. The message lacks
+            the name of the sequence; callers add it.
     """
     if not np.isfinite(stated).all():
         return []
@@ -100,14 +106,14 @@ def check_stated_up(
 def compare_with_stated(
     point: np.ndarray, normal: np.ndarray, up: np.ndarray, floor: np.ndarray, middle: np.ndarray
 ) -> list[str]:
-    """Report where a floor deviates from the stated one; all in the master's frame.
+    """Return messages if a floor deviates from the stated one; all in the master's frame, metres.
 
-    The stated floor is a board, laid by hand and a few centimetres thick; feet show a tilt to about
-    3 degrees.
+    The limits are 4 degrees and 6 cm: the stated floor is a board laid by hand, a few centimetres
+    thick, and a floor fitted to feet is tilted by up to about 3 degrees.
 
     Args:
-        point: (3,) of the floor.
-        normal: (3,) of the floor.
+        point: (3,) point of the floor.
+        normal: (3,) normal of the floor, upwards.
         up: (3,) stated up; NaN = not stated.
         floor: (3,) point of the stated floor; NaN = not stated.
         middle: (3,) where heights are compared.
@@ -124,5 +130,5 @@ def compare_with_stated(
 
 
 def degrees_between(a: np.ndarray, b: np.ndarray) -> float:
-    """Angle between two unit vectors (3,), degrees; NaN if one of them is."""
+    """Angle between two unit vectors (3,), degrees; NaN if one of them is NaN."""
     return float(np.degrees(np.arccos(np.clip(a @ b, -1.0, 1.0))))
