@@ -2,6 +2,7 @@
  * is stored for this tab and sent in a header, which pages of other origins cannot set. */
 const KEY = "intercap-token";
 
+/* Move the token from the address into this tab's storage, and return it; null if there is none. */
 export function readToken() {
   const token = /[#&]token=([\w-]+)/.exec(location.hash)?.[1];
   if (token) {
@@ -37,6 +38,7 @@ async function request(path, options = {}) {
 
 export const get = async (path) => (await request(path)).json();
 
+/* Send JSON; returns the JSON of the answer. Raises RequestError, as do `get` and `blob`. */
 export const post = async (path, content) =>
   (await request(path, {
     method: "POST", body: JSON.stringify(content), headers: { "content-type": "application/json" },

@@ -1,6 +1,7 @@
 /* Contact by body part: the intervals that the program estimated, and those of the annotation.
- * If an annotation states contact, nothing touches outside of its intervals. The first edit therefore
- * copies all estimated intervals into the draft. */
+ * An interval is { part, start, end }: contact in the frames from start to end - 1. If an annotation
+ * states contact, nothing touches outside of its intervals. The first edit therefore copies all
+ * estimated intervals into the draft. */
 import { fromBase64 } from "./api.js";
 import { UNCONFIRMED } from "./draft.js";
 
@@ -21,12 +22,14 @@ export class Contact {
     return this.probability && r >= 0 ? this.probability[frame * this.regions.length + r] / 255 : null;
   }
 
+  /* Mean probability of contact over an interval. */
   mean(interval) {
     let sum = 0;
     for (let t = interval.start; t < interval.end; t += 1) sum += this.probabilityAt(interval.part, t) ?? 0;
     return sum / Math.max(1, interval.end - interval.start);
   }
 
+  /* Runs of frames of each part with a probability of at least TOUCHING. */
   estimated() {
     const intervals = [];
     for (const part of this.regions) {
@@ -54,11 +57,13 @@ export class Contact {
 
   isConfirmed(interval) { return this.stated !== null && !this.app.draft.get(UNCONFIRMED)?.includes(id(interval)); }
 
+  /* Put intervals into the draft as one undo step; `unconfirmed` are the ids of unconfirmed ones. */
   #store(intervals, unconfirmed, label) {
     intervals.sort((a, b) => order(this.regions, a) - order(this.regions, b) || a.start - b.start);
     this.app.draft.put({ contact: intervals, [UNCONFIRMED]: intervals.map(id).filter((key) => unconfirmed.has(key)) }, label);
   }
 
+  /* Move the ends of an interval, which confirms it. */
   change(interval, start, end) {
     const { all, unconfirmed } = this.#editable(), k = all.findIndex((other) => id(other) === id(interval));
     if (k < 0) return;

@@ -40,7 +40,8 @@ function access(act) {
   try { return act(localStorage); } catch { return null; }
 }
 
-/* A duplicated tab has a copy of the storage, and therefore gets a new name. */
+/* Return the name of this tab. A duplicated tab has a copy of the tab's storage, with the name of a tab
+ * that is open, and therefore gets a new name. */
 async function nameTab() {
   let name = sessionStorage.getItem(TAB) ?? crypto.randomUUID();
   if (!(await lock(name))) await lock(name = crypto.randomUUID());
@@ -48,6 +49,7 @@ async function nameTab() {
   return name;
 }
 
+/* Hold a lock until the tab is closed; resolves to false if another tab holds it. */
 const lock = (name) => new Promise((resolve) => {
   navigator.locks.request(LOCK + name, { ifAvailable: true }, (granted) => {
     resolve(granted !== null);

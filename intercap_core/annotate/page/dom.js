@@ -1,6 +1,8 @@
 /* Creation of page elements. Text from files and users is inserted as text, never as HTML. */
 export const find = (id) => document.getElementById(id);
 
+/* Create an element. Properties are `class`, `data` (data attributes), `on...` (listeners), properties of
+ * the element, or else attributes. */
 export function make(tag, properties = {}, ...children) {
   const element = document.createElement(tag);
   for (const [name, value] of Object.entries(properties)) {
@@ -32,7 +34,8 @@ export function refill(box, ...children) {
   (next ?? now[0])?.focus({ preventScroll: true });
 }
 
-/* Show a dialog; resolves to the value of the pressed button, "" if the dialog was closed. */
+/* Show a dialog; resolves to the value of the pressed button, "" if the dialog was closed.
+ * `choices`: [value, text, whether it is the main button] of each button. */
 export function ask(title, body, choices) {
   const dialog = find("dialog");
   find("dialog-title").textContent = title;
@@ -60,6 +63,7 @@ export function banner(id, text, actions = []) {
   find("banners").append(box);
 }
 
+/* A unified diff as an element with coloured lines. */
 export function diff(text) {
   const block = make("pre", { class: "diff", tabIndex: 0 });
   for (const line of text.split("\n")) {

@@ -1,4 +1,5 @@
-/* The edited annotation: its sections, and undo and redo. A copy is stored in this browser. */
+/* The edited annotation (draft): its sections, with undo and redo. `file` is the annotation file that the
+ * page has read last, `saved` its sections. A copy of unsaved edits is stored in this browser. */
 export const SECTIONS = ["contact", "object_poses", "object_pose", "floor", "subject", "drop_frames", "left_right"];
 /* Not a section of the file: ids of estimated contact intervals that nobody has confirmed. */
 export const UNCONFIRMED = "unconfirmed";
@@ -108,6 +109,7 @@ export class Draft extends EventTarget {
     this.discard(copy);
   }
 
+  /* Delete the edits of a closed tab. */
   discard(copy) {
     this.copies.orphans = this.copies.orphans.filter((other) => other !== copy);
     this.copies.drop(copy.key);

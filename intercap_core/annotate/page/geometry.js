@@ -1,5 +1,6 @@
-/* Rigid transforms as rows of a 3x4 matrix, rotation vectors, and the lens model of
- * intercap_core/geometry/camera/projection.py. */
+/* Rigid transforms, stored as the three rows of a 3x4 matrix, rotation vectors, and the lens model of
+ * intercap_core/geometry/camera/projection.py. A lens is the array fx, fy, cx, cy, k1, k2, p1, p2, k3, k4,
+ * k5, k6 (OpenCV), and the largest sqrt(x^2 + y^2) at z = 1 at which the model is valid. */
 export const IDENTITY = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]];
 
 export const compose = (a, b) => a.map((row) => [0, 1, 2, 3].map((k) =>
@@ -14,9 +15,11 @@ export const rotate = (a, [x, y, z]) => a.map((row) => row[0] * x + row[1] * y +
 
 export const norm = (v) => Math.hypot(...v);
 
+/* The 4x4 matrix in WebGL's order. */
 export const columnMajor = (a) => new Float32Array([
   a[0][0], a[1][0], a[2][0], 0, a[0][1], a[1][1], a[2][1], 0, a[0][2], a[1][2], a[2][2], 0, a[0][3], a[1][3], a[2][3], 1]);
 
+/* A transform from 12 numbers in row-major order. */
 export const rows = (flat) => [flat.slice(0, 4), flat.slice(4, 8), flat.slice(8, 12)].map((row) => [...row]);
 
 /* Transform of a rotation vector (axis times angle) and a translation. */
@@ -32,6 +35,7 @@ export function rigid(vector, translation) {
   ];
 }
 
+/* Rotation vector of a transform, radians. */
 export function rotationVector(a) {
   const trace = a[0][0] + a[1][1] + a[2][2];
   const angle = Math.acos(Math.max(-1, Math.min(1, (trace - 1) / 2)));
@@ -53,7 +57,8 @@ export function rotateAbout(pose, vector, point) {
   return compose(turn.map((row, i) => [row[0], row[1], row[2], shift[i]]), pose);
 }
 
-/* Project a point of the camera's frame: [x, y] in pixels and depth. */
+/* Project a point of the camera's frame, metres: [x, y in pixels, depth]. Beyond the valid radius, the
+ * distortion at the radius is used. */
 export function project(lens, [px, py, pz]) {
   const [fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, limit] = lens;
   const depth = Math.max(pz, 1e-3);

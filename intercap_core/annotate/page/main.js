@@ -1,4 +1,12 @@
-/* The page: the shown frame, layers, modes and panels. */
+/* The page: the shown frame, layers, modes and panels.
+ *
+ * - A frame is a moment of the sequence, a set the images that the cameras recorded together. A delayed
+ *   camera shows a frame in a later set; annotations that name an image use the number of its set.
+ * - A view is the canvas of one camera (views.js); `brush` is its 2D context.
+ * - A place is a run of frames with a flag or doubt: { first, last, frame to show, kind, message, weight }.
+ * - A mode (subject, floor, pose, paint) gets the pointer's events: hint is its text, press(view, event)
+ *   returns { move, end } for a drag, {} for a click, or null to pan the view instead; wheel is optional.
+ * - Everything that is drawn over the images has mark(view, brush). */
 import { fetchArrays, get, readToken } from "./api.js";
 import { banner, button, find, make, refill } from "./dom.js";
 import { Contact } from "./contact.js";
@@ -78,6 +86,7 @@ class App {
     document.body.dataset.ready = "yes";
   }
 
+  /* Load the result before the last run, and show its layer. */
   async loadBefore() {
     await this.space.loadBefore();
     this.layers.before = true;
@@ -85,6 +94,7 @@ class App {
     this.redraw();
   }
 
+  /* Read the changed results; edits are kept. */
   async reload() {
     const again = [["Try again", () => this.reload()]];
     let info;
@@ -140,6 +150,7 @@ class App {
     this.redraw();
   }
 
+  /* Draw in the next animation frame. */
   redraw() {
     if (this.waits) return;
     this.waits = true;
@@ -175,6 +186,7 @@ class App {
     if (this.playing) this.show(this.frame >= this.info.frames - 1 ? 0 : this.frame + 1);
   }
 
+  /* While playing, show the next frame when its time has come. */
   #tick() {
     if (this.frame >= this.info.frames - 1) { this.play(); return; }
     const wait = Math.max(0, 1000 / this.info.fps - (this.steps.at(-1) ?? 0));
@@ -206,6 +218,7 @@ class App {
     return meshes;
   }
 
+  /* Draw all marks over the image of a view. */
   mark(view, brush) {
     if (this.layers.contact && !this.layers.sides && !(this.paint && this.mode === this.paint)) this.space.markContact(view, brush);
     if (this.layers.marks) {
@@ -271,7 +284,7 @@ class App {
     this.panels();
   }
 
-  /* The file now has this content, by our own or another annotator's save (`theirs`). */
+  /* Take over the file's new content after a save, by this page or by another annotator (`theirs`). */
   saved(annotation, theirs = false) {
     this.info.annotation = annotation;
     const unedited = !this.draft.dirty;
@@ -333,6 +346,7 @@ class App {
   }
 }
 
+/* The panel of stated errors, doubts and places to check. */
 function doubts(app) {
   const { info } = app, verdict = info.verdict ?? [];
   const warnings = [info.track?.doubts, info.subject?.doubts].filter(Boolean);

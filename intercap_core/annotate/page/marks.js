@@ -87,7 +87,7 @@ export class FloorMarks {
     }
   }
 
-  /* Grid lines of the plane through the points, or of the known floor. */
+  /* Grid lines, 0.5 m apart, of the plane through the points, or of the known floor. */
   grid() {
     const points = this.app.draft.get("floor") ?? [];
     const known = this.app.info.ground;

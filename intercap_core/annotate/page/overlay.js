@@ -5,6 +5,9 @@ import { columnMajor } from "./geometry.js";
 const CELLS_M = [0.01, 0.02, 0.04]; // cell sizes of the simplified meshes
 const COARSE_PX = 4; // largest size of a cell in a view
 
+// The vertex shader projects as `project` in geometry.js: `lens` are the 13 numbers of a lens, `crop` the
+// shown part of the image (x, y, width, height in pixels). Depths of 0.05 to 20 m fill the depth buffer.
+// The fragment shader lights each face by its angle to the viewing direction.
 const VERTEX = `#version 300 es
 in vec3 place; in vec3 colour;
 uniform mat4 master_from_mesh, camera_from_master;
@@ -53,8 +56,8 @@ export class Overlay {
     gl.enable(gl.SCISSOR_TEST);
   }
 
-  /* Add a mesh: faces, and one colour (3,) or, by `move`, a colour per vertex. With vertices of a rest
-   * pose (metres), simplified meshes are made for views that show it small. */
+  /* Add a mesh with one colour (3,), which `move` can replace by a colour per vertex. If the vertices of
+   * a rest pose (metres) are given, simplified meshes are made for views that show the mesh small. */
   mesh(name, faces, colour, rest = null) {
     const gl = this.gl;
     const mesh = { colour, vao: gl.createVertexArray(), place: gl.createBuffer(), paint: null, levels: [] };
@@ -73,6 +76,7 @@ export class Overlay {
     this.meshes.set(name, mesh);
   }
 
+  /* Set the positions (3 V numbers, metres) and, if given, the colours of a mesh's vertices. */
   move(name, places, colours = null) {
     const gl = this.gl, mesh = this.meshes.get(name);
     gl.bindBuffer(gl.ARRAY_BUFFER, mesh.place);

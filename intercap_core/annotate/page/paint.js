@@ -5,7 +5,8 @@ import { ask, button, make } from "./dom.js";
 import { apply, rotate } from "./geometry.js";
 
 const BRUSH_PX = 14; // radius on the screen
-const DEPTH_RANGE = 0.04; // share of the object's diameter; vertices farther behind the nearest are not painted
+// Share of the object's diameter: vertices that are farther behind the nearest one are not painted.
+const DEPTH_RANGE = 0.04;
 
 export class Paint {
   /* `before`: the earlier instance, whose unsaved strokes are kept if the mesh is the same. */
@@ -129,6 +130,7 @@ export class Paint {
   }
 }
 
+/* Normals of the vertices, not of unit length: sums of the faces' normals, weighted by area. */
 function normalsOf(vertices, faces) {
   const normals = new Float32Array(vertices.length);
   const at = (v) => [vertices[3 * v], vertices[3 * v + 1], vertices[3 * v + 2]];

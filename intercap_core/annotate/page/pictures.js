@@ -1,7 +1,7 @@
 /* Cache of decoded images by camera, frame and width, with prefetching. */
 import { RequestError, blob } from "./api.js";
 
-const MAX_BYTES = 300e6; // of decoded images
+const MAX_BYTES = 300e6; // size of all cached images, decoded
 const MAX_REQUESTS = 6; // browsers open at most six connections to a server
 const WIDTHS = [240, 320, 480, 640, 960, 1280]; // pixels, as in opened.py
 
@@ -16,7 +16,7 @@ export class Pictures {
     this.running = 0;
   }
 
-  /* Width to fetch for an image that is shown `pixels` wide; 0 = full size. */
+  /* Width to fetch for an image that is shown `pixels` wide, enlarged by up to 11 %; 0 = full size. */
   width(pixels) { return WIDTHS.find((width) => width >= 0.9 * pixels) ?? 0; }
 
   #key(camera, frame, width) { return `${camera}/${frame}/${width}`; }

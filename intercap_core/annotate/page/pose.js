@@ -5,7 +5,7 @@ import { button, make } from "./dom.js";
 import { IDENTITY, apply, invert, rigid, rotationVector, rows, rotate, rotateAbout } from "./geometry.js";
 
 const ROTATION_PER_PX = 0.008; // radians per pixel of a drag
-const WHEEL_STEP = 0.01; // change of the distance per notch of the wheel, share
+const WHEEL_STEP = 0.01; // share by which the distance changes per notch of the wheel
 
 /* --- poses in the annotation: a list with at most one per frame, or a single pose --------------- */
 const posesOf = (draft) => {
@@ -14,6 +14,7 @@ const posesOf = (draft) => {
     .map((entry) => ({ ...entry, frame: entry.frame ?? 0 })).sort((a, b) => a.frame - b.frame);
 };
 
+/* The annotated pose of a frame, master_from_object; null if there is none. */
 export function poseAt(draft, frame) {
   const stored = posesOf(draft).find((entry) => entry.frame === frame);
   return stored ? rigid(stored.rotation_vector, stored.translation) : null;
@@ -64,6 +65,7 @@ export class PoseEditor {
   /* Pose of the result in a frame; null if there is none. */
   resultAt(frame) { return objectPose(this.object.arrays, frame); }
 
+  /* The edited, else the annotated, else the result's pose of a frame. */
   at(frame) {
     if (this.editing) return this.pose;
     return poseAt(this.app.draft, frame) ?? this.resultAt(frame);
@@ -182,6 +184,7 @@ export class PoseEditor {
     }, { capture: true });
   }
 
+  /* Fit the pose to the images on the server. */
   async snap() {
     if (!this.editing) this.start();
     const { app } = this, frame = app.frame;

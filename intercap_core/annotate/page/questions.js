@@ -59,6 +59,7 @@ export class Questions {
 
   next() { if (this.list.length) this.ask(this.list[0]); else this.app.say("there is no open question"); }
 
+  /* Apply an answer: edit the annotation, start the mode in which the user edits it, or only store it. */
   async answer(question, answer) {
     const { app } = this, { contact, pose, draft } = app;
     const edits = (question.kind === "sides" ? ["view", "all", "mark"] : ["yes", "no", "place"]).includes(answer);

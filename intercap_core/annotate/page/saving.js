@@ -5,7 +5,7 @@ import { ask, banner, button, diff, find, make, readable } from "./dom.js";
 import { normalize, same } from "./draft.js";
 
 const CHECK_MS = 250; // delay from an edit to its check
-const POLL_MS = 4000; // interval at which changes of file and results are looked for
+const POLL_MS = 4000; // interval of checks for changes of file and results by others
 const RUN_MS = 1000; // interval at which the progress of a run is read
 const IN_PROGRESS = ["running", "ending"];
 const POSES = ["object_poses", "object_pose"]; // two forms of one section; a file has at most one
@@ -39,7 +39,8 @@ export class Saving {
       ["Restore", () => this.restore(copy)], ["Discard", () => { draft.discard(copy); this.offerOrphans(); }]]);
   }
 
-  /* If the file has changed since, the edits are handled like a conflict with another annotator. */
+  /* Restore the edits of a closed tab. If the file has changed since, they are handled like a conflict
+   * with another annotator. */
   async restore(copy) {
     const { app } = this, now = app.draft.file;
     if (copy.digest !== now.digest && app.draft.dirty) {
@@ -58,6 +59,7 @@ export class Saving {
     this.showStatus();
   }
 
+  /* Let the server check the edits, and show the first fault. */
   async check() {
     const { app } = this, request = this.lastCheck = {}; // answers may arrive out of order
     let faults;
@@ -171,6 +173,7 @@ export class Saving {
     await this.resolveConflict({ now, difference: lineDiff(app.draft.file.text, now.text) });
   }
 
+  /* List the stages that a run would compute. */
   async plan() {
     try { this.stale = (await post(`${this.path}/check`, { changes: {}, plan: true })).stale ?? []; } catch (error) { this.app.say(error.message); }
     this.app.panels();
@@ -257,6 +260,7 @@ export class Saving {
   }
 }
 
+/* Lines that only one of two texts contains, as a diff. */
 function lineDiff(before, now) {
   const [a, b] = [before.split(/\r?\n/), now.split(/\r?\n/)];
   return [...a.filter((line) => !b.includes(line)).map((line) => `-${line}`), ...b.filter((line) => !a.includes(line)).map((line) => `+${line}`)].join("\n");

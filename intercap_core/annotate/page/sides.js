@@ -1,5 +1,6 @@
 /* Left and right of the subject: as detected in each view, as in the result, and the frames in which
- * the annotation states that the detector exchanged them. */
+ * the annotation states that the detector exchanged them. The limbs have 14 points: shoulder, elbow,
+ * wrist, hip, knee, ankle and big toe of the left side (0 to 6), then of the right side (7 to 13). */
 import { fetchArrays } from "./api.js";
 import { apply, project } from "./geometry.js";
 import { make } from "./dom.js";
@@ -8,8 +9,10 @@ import { same } from "./draft.js";
 export const LEFT = "#56b4ff", RIGHT = "#ff8c1a"; // distinguishable with all common kinds of colour blindness
 const LETTERED = [2, 5]; // points with a letter: wrist and ankle
 const ARM = [0, 1, 2], LEG = [3, 4, 5, 6];
-const MAX_RATIO = 0.6; // of the distances to both sides; with a larger ratio, the comparison is undecided
-const MIN_DISTANCE = 0.012; // of the sides in the image, share of its height
+// A limb agrees with a side if its distance from that side is below this share of the distance from the
+// other side; otherwise the comparison is undecided.
+const MAX_RATIO = 0.6;
+const MIN_DISTANCE = 0.012; // share of the image's height by which both sides must be apart
 const AGREES = 1, DIFFERS = 2;
 
 export class Sides {
@@ -41,7 +44,7 @@ export class Sides {
   async reload() { if (this.loading || this.app.layers.sides) { this.data = null; this.loading = null; await this.load(); } }
 
   // ---------------------------------------------------------------- stated exchanges, by image set
-  /* Mask (C, sets) of images with stated exchanges. */
+  /* Mask of images with stated exchanges, by camera and set. */
   #matrix() {
     const { info, draft } = this.app;
     const rows = info.cameras.map(() => new Uint8Array(info.frames));
@@ -51,7 +54,7 @@ export class Sides {
     return rows;
   }
 
-  /* Entries of the annotation from such a mask: one for all cameras where all are set, else by camera. */
+  /* Entries of the annotation from such a mask: sets of all cameras give an entry without a camera. */
   #entries(rows) {
     const { info } = this.app, all = rows[0].map((_, s) => (rows.every((row) => row[s]) ? 1 : 0));
     const toEntries = (row, more) => intervals(row).map(([start, end]) => ({ start, end, ...more }));
@@ -74,6 +77,7 @@ export class Sides {
     return set >= 0 ? set : frame;
   }
 
+  /* Whether the annotation states an exchange in camera c and a frame. */
   stated(c, frame) {
     const set = this.#set(c, frame), { name } = this.app.info.cameras[c];
     return (this.app.draft.get("left_right") ?? []).some((entry) => (!entry.camera || entry.camera === name) && entry.start <= set && set < entry.end);
@@ -139,12 +143,14 @@ export class Sides {
   }
 
   // ---------------------------------------------------------------- comparison and drawing
+  /* Detected point i in camera c and frame t, pixels; null if it is not visible. */
   #detected(c, t, i) {
     const n = this.data.header.cameras.length, k = 2 * ((t * n + this.cells[c]) * 14 + i);
     const { detected } = this.data.arrays;
     return detected[k] < 0 ? null : [detected[k], detected[k + 1]];
   }
 
+  /* Point i of the result in frame t, master frame, metres; null if unknown. */
   #result(t, i) {
     const p = this.data.arrays.result.subarray(3 * (t * 14 + i), 3 * (t * 14 + i) + 3);
     return Number.isFinite(p[0]) ? [...p] : null;

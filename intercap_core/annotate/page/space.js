@@ -1,11 +1,11 @@
-/* The 4D viewer, and what the overlay uses of it: vertices and colours of the body in a frame, and the
- * parts in contact; also the result before the last run. */
+/* The 4D viewer. The overlay takes the body's vertices and colours from it, and the parts in contact. The
+ * result before the last run is loaded here as well. */
 import { toBase64, fetchArrays } from "./api.js";
 import { find, make } from "./dom.js";
 import { apply, compose, invert } from "./geometry.js";
 import { posedFrames } from "./pose.js";
 
-export const GREY = [0.62, 0.62, 0.64]; // of the body while left and right are coloured
+export const GREY = [0.62, 0.62, 0.64]; // colour of the body while left and right are coloured
 const BODY = [0.42, 0.66, 0.92], TOUCHING = [0.86, 0.2, 0.26], STATED = [0.95, 0.62, 0.25];
 export const BEFORE = [0.72, 0.5, 0.95];
 
@@ -160,6 +160,7 @@ export class Space {
     }
   }
 
+  /* Centres of the body parts whose probability of contact is at least 0.25, master frame. */
   #centres() {
     const { app } = this, { regions } = app.contact, region = this.regionOf, vertices = this.viewer.versions[this.main].mesh.geometry.attributes.position.array;
     if (!region) return [];
@@ -175,7 +176,8 @@ export class Space {
   }
 }
 
-/* Colours of vertices (V, 3): red where the meshes touch, orange where the result states contact. */
+/* Returns a function of the frame for the colours of the body's vertices (3 V numbers): red = the meshes
+ * touch, orange = the part's probability of contact is at least 0.5 (128 / 255). */
 function skinPaint(header, arrays) {
   const region = arrays["contact/region"], probability = arrays["contact/probability"], touching = arrays["contact/touching"];
   const count = header.regions?.length ?? 0, total = arrays.faces.reduce((most, v) => Math.max(most, v), 0) + 1;

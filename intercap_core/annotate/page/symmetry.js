@@ -5,6 +5,7 @@ import { get, post } from "./api.js";
 import { ask, button, make } from "./dom.js";
 import { rigid, compose } from "./geometry.js";
 
+// Choices of the page: text, entry `symmetry` of objects.yaml, and axis of the slider
 const AXES = { x: [1, 0, 0], y: [0, 1, 0], z: [0, 0, 1] };
 const half = ([x, y, z]) => [[2 * x - 1, 0, 0, 0], [0, 2 * y - 1, 0, 0], [0, 0, 2 * z - 1, 0], [0, 0, 0, 1]].flat();
 const CHOICES = {

@@ -4,7 +4,7 @@ import { id } from "./contact.js";
 import { posedFrames } from "./pose.js";
 import { sidesRows } from "./sides_panel.js";
 
-const SHOWN = 0.25; // parts that reach this probability have a row
+const SHOWN = 0.25; // a part has a row if its probability of contact reaches this value
 
 export class Timeline {
   constructor(app) {
@@ -21,6 +21,7 @@ export class Timeline {
     this.draw();
   }
 
+  /* CSS position of a frame on a lane. */
   at(t) { return `${(100 * t) / this.app.info.frames}%`; }
 
   #frameAt(event) {
@@ -37,6 +38,7 @@ export class Timeline {
     window.addEventListener("pointerup", end);
   }
 
+  /* Body parts that have a row. */
   parts() {
     const { regions } = this.contact, intervals = this.contact.intervals();
     const shown = regions.filter((part) => {

@@ -25,6 +25,7 @@ export class Views {
     const figure = make("figure", { class: "view", data: { camera: camera.name } }, canvas,
       make("figcaption", {}, camera.name));
     const [w, h] = camera.size;
+    // crop: shown part of the recorded image (x, y, width, height, pixels); last: the image drawn last
     const view = { camera, index, figure, canvas, brush: canvas.getContext("2d"), crop: [0, 0, w, h], last: null };
     view.pixel = (event) => { // pixel of the recorded image under the pointer
       const box = canvas.getBoundingClientRect();
@@ -96,7 +97,7 @@ export class Views {
     view.crop[1] = Math.min(Math.max(0, view.crop[1]), h - view.crop[3]);
   }
 
-  /* Zoom all views to a point of the room; null shows whole images. */
+  /* Zoom all views to a sphere (centre in the master frame, radius, metres); null shows whole images. */
   zoomTo(point, radius) {
     for (const view of this.views) {
       const [w, h] = view.camera.size;

@@ -27,7 +27,7 @@ for (const table of document.querySelectorAll("table.sortable")) {
     });
   });
 }
-/* Filters of the table of sequences. */
+/* Filters of the table of sequences: text fields search, other fields compare whole values. */
 for (const form of document.querySelectorAll("form.filters")) {
   const rows = [...document.getElementById(form.dataset.filters).tBodies[0].rows];
   const fields = [...form.querySelectorAll("[data-column]")];
@@ -50,7 +50,7 @@ for (const form of document.querySelectorAll("form.filters")) {
   update();
 }
 
-/* Only areas that scroll can be reached by the keyboard. */
+/* Give areas a tab stop only while they can be scrolled. */
 const observer = new ResizeObserver((entries) => {
   for (const { target } of entries) {
     const area = target.closest(".scroll");

@@ -1,6 +1,8 @@
 "use strict";
 /* Show a sequence in 4D (body, object, point clouds, cameras, contact) in the element with class "viewer".
- * `payload` is the result of `payload` in intercap_core/output/viewer/page.py. */
+ * `payload` is the result of `payload` in intercap_core/output/viewer/page.py. A version is one result
+ * (joint, sequential or truth); the first one is opaque and shows contact. Clouds and images exist only in
+ * the frames `header.moments`; a moment is an index into that list. Coordinates are z up, metres. */
 async function showInterCap(payload) {
   const root = document.querySelector(".viewer");
   const find = (name) => root.querySelector(`[data-part="${name}"]`);
@@ -125,6 +127,7 @@ async function showInterCap(payload) {
   });
   scene.add(frusta, planes);
   let through = -1; // camera whose view is shown, -1 = free view
+  /* Show the image of a moment on the camera's plane. */
   const showImage = (camera, moment) => {
     const starts = arrays["images/starts"];
     const place = moment * cameras.length + camera.index;
@@ -243,10 +246,12 @@ async function showInterCap(payload) {
 
   // ------------------------------------------------------------------ drawing
   const moments = header.moments;
+  /* The moment nearest to a frame. */
   const momentOf = (frame) => moments.reduce(
     (best, at, i) => (Math.abs(at - frame) < Math.abs(moments[best] - frame) ? i : best), 0);
   const reasons = new Map(header.flags);
   let moment = -1;
+  /* Show a frame; `redraw` also updates clouds and images if the moment is the same. */
   const show = (number, redraw = false) => {
     const frame = Math.max(0, Math.min(header.frames - 1, Math.round(number)));
     state.frame = frame;
@@ -273,6 +278,7 @@ async function showInterCap(payload) {
     if (!state.playing) updateAddress();
     draw();
   };
+  /* Colour the vertices that touch the object, and regions with a probability of contact from 0.5. */
   const paintContact = (version, frame) => {
     const colours = version.mesh.geometry.attributes.color;
     const base = COLOURS[names[0]];
@@ -309,6 +315,7 @@ async function showInterCap(payload) {
     sun.position.copy(eye.position).add(new THREE.Vector3(0.6, 0.3, 1.5));
     renderer.render(scene, eye);
   };
+  /* Look through camera c; -1 = free view. */
   const look = (c) => {
     if (through >= 0) cameras[through].place(0.28);
     through = c;
@@ -357,7 +364,7 @@ async function showInterCap(payload) {
   controls.addEventListener("change", draw);
   new ResizeObserver(draw).observe(renderer.domElement);
 
-  // ------------------------------------------------------------------ #t=3.2
+  // ------------------------------------------------------------------ time in the address: #t=3.2 (seconds)
   const timeInAddress = () => /(?:^#|&)t=([0-9.]+)/.exec(location.hash)?.[1];
   const updateAddress = () => {
     const hash = `#t=${(state.frame / header.fps).toFixed(2)}`;
@@ -385,6 +392,7 @@ async function showInterCap(payload) {
   window.intercapViewer = { header, show, look, play, pause, state, versions, cameras, eye, draw };
 }
 
+/* Header and arrays by name from the base64 text that `payload` in viewer/page.py makes. */
 async function unpack(payload) {
   const packed = Uint8Array.from(atob(payload), (letter) => letter.charCodeAt(0));
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
@@ -401,6 +409,7 @@ async function unpack(payload) {
   return { header, arrays };
 }
 
+/* A mesh of `count` vertices, all with one colour; their positions are set later. */
 function meshOf(count, faces, colour) {
   const geometry = new THREE.BufferGeometry();
   const place = new THREE.BufferAttribute(new Float32Array(3 * count), 3).setUsage(THREE.DynamicDrawUsage);
@@ -422,7 +431,8 @@ function centreOf(mesh) {
   };
 }
 
-/* Linear blend skinning with modes of the residual, see intercap_core/output/viewer/skinning.py. */
+/* Linear blend skinning with modes of the residual, see SkinnedBody in
+ * intercap_core/output/viewer/skinning.py. `transforms` holds 12 numbers (3x4, row by row) per joint. */
 function skinnedBody(name, header, arrays) {
   const COLOUR = { joint: [0.42, 0.66, 0.92], sequential: [0.66, 0.6, 0.78] }[name];
   const [rest, joints, weights, transforms, modes, amounts] = [
@@ -473,7 +483,8 @@ function skinnedBody(name, header, arrays) {
   return { mesh, pose, facing, centre: centreOf(mesh) };
 }
 
-/* The true body has no skeleton: vertices in some frames, stored as differences to the previous frame. */
+/* The true body has no skeleton. Its vertices are stored in the frames `moments`, as quantised positions in
+ * the first of them and as differences to the previous one in the others. */
 function trueBody(header, arrays) {
   const { moments, low, step } = header.truth;
   const moved = arrays["truth/vertices"];
@@ -492,6 +503,7 @@ function trueBody(header, arrays) {
   return { mesh, pose, centre: centreOf(mesh) };
 }
 
+/* The object of a version (joint, sequential or truth); null if it has no poses. */
 function objectOf(name, header, arrays) {
   const poses = arrays[`${name}/object`];
   const prefix = name === "truth" ? "truth/object_" : "object/";
