@@ -1,14 +1,15 @@
-"""The opposite direction of E_D (equation 4): from visible vertices to the measured depth.
+"""Free space as a measurement of E_D (equation 4), from visible vertices to the measured depth.
 
-Beyond the paper. A vertex that faces a camera, and behind which that camera measured a surface
-clearly farther away, sticks out of the person. It has to move inward along its normal until the
-measured person begins:
+Beyond the paper; E_D itself leads from measured points to vertices. A camera measures free space in
+front of each depth pixel. A vertex that faces the camera and projects to a pixel whose depth is
+clearly larger than the vertex's lies in free space: it protrudes from the person. It has to move
+inward along its normal n until it reaches a pixel whose depth is no longer larger:
 
-    e = -d - c,    d = distance along -n after which the pixel there is no longer farther away
+    e = -d - c,    d = this distance along -n, found by steps of 1 cm
 
 with the thickness c of the covering as in :mod:`.cloud_term`. The person's mask is not used, so a
-mask that is too small or lacks a hand adds no bias. An occluder is nearer than the vertex, and
-pixels without depth are unknown: neither has a residual.
+mask that is too small or lacks a hand adds no bias. A vertex behind an occluder, or at a pixel
+without depth, has no residual.
 """
 
 from __future__ import annotations
@@ -21,12 +22,14 @@ import numpy as np
 from intercap_core.geometry.camera.projection_kernels import project_point
 from intercap_core.geometry.camera.rig import Camera
 
-# Metres behind a vertex from which a depth is not the person's surface. Tuned on the studio.
+# A depth that exceeds a vertex's by more than this is not the person's surface, metres. Tuned on
+# the studio.
 _BEHIND_M = 0.06
-# Largest cosine of the normal and the viewing direction, -1 = facing the camera: up to 6 degrees
-# beyond the rim. Tuned on the studio.
+# Largest cosine of the normal and the viewing direction, -1 = facing the camera, 0 = on the rim: up
+# to 6 degrees beyond the rim. Tuned on the studio.
 _FACING = 0.1
-# Smallest depth of a vertex, metres: the Azure Kinect (NFOV) measures from 0.5 m (data sheet).
+# Smallest depth of a vertex, metres, with a margin: the Azure Kinect (NFOV) measures from 0.5 m
+# (data sheet).
 _NEAREST_M = 0.3
 
 
@@ -49,18 +52,19 @@ def find_protruding(
     points: np.ndarray,
     normals: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find points that stick out of the person in one view.
+    """Find points that protrude from the person in one view.
 
     Args:
         window: depth around the person.
         camera: the camera.
-        depth_bias: distance that the camera measures too much, metres.
+        depth_bias: excess of the depth that the camera measures, metres.
         points: (N, 3) master frame, metres.
         normals: (N, 3) unit normals.
 
     Returns:
-        (M,) index of each point that sticks out of the person by 1 to 5 cm.
-        (M,) distance by which it sticks out, metres, > 0.
+        (M,) index of each point that protrudes by 1 to 5 cm. Points that protrude farther are
+            left out.
+        (M,) distance by which it protrudes, metres, > 0.
     """
     assert camera.depth is not None
     return _find_protruding(
@@ -73,9 +77,9 @@ def find_protruding(
 def _find_protruding(depth, top, left, lens, pose, behind, points, normals):
     """Compiled form of :func:`find_protruding`.
 
-    depth (h,w) uint16 mm, whose first pixel is at row ``top`` and column ``left`` of the image;
-    lens: thirteen parameters; pose (4,4): depth_from_master; behind: metres behind a vertex from
-    which a depth is not the person's.
+    depth (h,w): uint16, mm. top, left: row and column of its first pixel in the image.
+    lens: thirteen intrinsic parameters. pose (4,4): depth_from_master.
+    behind: a depth that exceeds a vertex's by more than this, metres, is not the person's.
     """
     index, away = np.empty(len(points), np.int64), np.empty(len(points))
     count = 0
@@ -100,8 +104,8 @@ def _find_protruding(depth, top, left, lens, pose, behind, points, normals):
             inward = x - way * nx, y - way * ny, z - way * nz
             if _is_measured_behind(depth, top, left, lens, *inward, behind):
                 continue
-            # A single step is left out as within the error of the image: errors outward would
-            # count and errors inward would not, which makes every person thinner.
+            # A single step is ignored: it is within the error of the image. Since only errors
+            # outward would count, not errors inward, every person would become thinner.
             if s > 1:
                 # the middle between the last point outside the person and the first one inside
                 index[count], away[count] = i, way - step / 2
@@ -112,7 +116,10 @@ def _find_protruding(depth, top, left, lens, pose, behind, points, normals):
 
 @numba.njit(cache=True, nogil=True)
 def _is_measured_behind(depth, top, left, lens, x, y, z, behind):
-    """Return whether a camera's depth at a point of its frame is ``behind`` metres farther."""
+    """Return whether the depth measured at a point's pixel exceeds its z by ``behind``, metres.
+
+    x, y, z: the point in the frame of the depth camera, metres.
+    """
     u, v = project_point(x, y, z, lens)
     if not (np.isfinite(u) and np.isfinite(v)):
         return False

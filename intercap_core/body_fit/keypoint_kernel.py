@@ -1,9 +1,14 @@
-"""E_J (equation 3) of :mod:`.keypoint_term`, compiled: one pass over the keypoints of each body.
+"""E_J (equation 3) of :mod:`.keypoint_term`, compiled.
 
-A keypoint is a sum of pieces, each of which follows one bone. The derivatives of a piece are zero
-but for the columns of few joints. Keypoints on the same chain of joints, a limb, share one dense
-block. Equal to the torch form to rounding, pose blend shapes included
-(:mod:`intercap_core.body.correctives_kernel`).
+Linear blend skinning makes a keypoint a sum of pieces, each of which follows one bone rigidly. A
+piece depends only on the bone's joint and that joint's ancestors. For each body the kernel visits
+the keypoints limb by limb; a limb is a group of keypoints on the same chain of joints. For each
+keypoint:
+1. :func:`evaluate_keypoint` sums the views to a gradient (3,) and a matrix (3, 3) by the point;
+2. `_fill_rows` computes the derivatives (3, m) of the point by the m parameters of the limb;
+3. their product is added to the dense block (m, m) of the limb.
+The block is added to the normal equations at the end of the limb. The result equals that of the
+torch form to rounding, with pose blend shapes (:mod:`intercap_core.body.correctives_kernel`) too.
 """
 
 from __future__ import annotations
@@ -32,23 +37,36 @@ class KeypointData(NamedTuple):
     of the model. Without observations of a kind, its arrays are empty."""
 
     observed: np.ndarray
+    """(T, C, K, 2) px."""
     confidence: np.ndarray
+    """(T, C, K), 0 = not detected."""
     sigma: np.ndarray
+    """(T, C, K) px."""
     lenses: np.ndarray
+    """(C, 13)"""
     colour_from_master: np.ndarray
+    """(C, 4, 4)"""
     shift: np.ndarray
+    """(T, C, K, 3) metres."""
     targets: np.ndarray
+    """(T, K, 3) metres."""
     targets_confidence: np.ndarray
+    """(T, K), 0 = no target."""
     targets_sigma: float
+    """Metres."""
     scale: float
     """Scale of the robust penalty, standard deviations."""
 
 
 class Pieces(NamedTuple):
-    """E pieces of K keypoints, at R x + share t with R and t of the bone and x at rest."""
+    """E pieces of K keypoints.
+
+    A piece is posed to R x + share t, with R and t of its bone. x is the part of the keypoint at
+    rest that follows this bone, times its share.
+    """
 
     starts: np.ndarray
-    """(K + 1,) start of the pieces of each keypoint, and the end."""
+    """(K + 1,) start of the pieces of each keypoint, then E."""
     bone: np.ndarray
     """(E,) joint that moves the piece."""
     share: np.ndarray
@@ -60,7 +78,7 @@ class Pieces(NamedTuple):
     carrier: np.ndarray
     """(K,) piece on the bone that carries the offset of the keypoint."""
     limb_starts: np.ndarray
-    """(L + 1,) start of each limb in the order, and the end."""
+    """(L + 1,) start of each limb in ``order``, then K."""
     order: np.ndarray
     """(K,) keypoints, limb by limb."""
     moved_by: np.ndarray
@@ -98,7 +116,10 @@ class Pieces(NamedTuple):
 
 @numba.njit(cache=True, nogil=True)
 def _project(px, py, pz, lens):
-    """Project as :func:`.projection_kernels.project_point_with_jacobian`, by the inverse depth."""
+    """Return u, v, du/d(x, y, z) and dv/d(x, y, z) of a point in the camera's frame.
+
+    The same as :func:`.projection_kernels.project_point_with_jacobian`, with one division.
+    """
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     free = pz > MIN_DEPTH_M
     inverse = 1 / pz if free else 1 / MIN_DEPTH_M
@@ -142,7 +163,7 @@ def evaluate_keypoint(data, t, k, p, derivatives, gradient, matrix):
         ru = (u - data.observed[t, c, k, 0]) * sharp
         rv = (v - data.observed[t, c, k, 1]) * sharp
         squared = ru * ru + rv * rv
-        share = square / (squared + square)
+        share = square / (squared + square)  # Geman and McClure: rho = share * squared
         cost += 0.5 * confidence * share * squared
         if not derivatives:
             continue
@@ -173,7 +194,7 @@ def evaluate_keypoint(data, t, k, p, derivatives, gradient, matrix):
 
 @numba.njit(cache=True, nogil=True)
 def _piece(skeleton, pieces, rest, b, e):
-    """Return the position (3,) of piece e of body b, times its share, metres."""
+    """Return piece e of body b, posed: R x + share t (3,), metres."""
     m, w = pieces.bone[e], pieces.share[e]
     x, y, z = rest[b, e, 0], rest[b, e, 1], rest[b, e, 2]
     turn, offset = skeleton.rotations, skeleton.offsets
@@ -209,8 +230,8 @@ def add_cost(skeleton, pieces, rest, data, frames, cost):
 def _fill_rows(skeleton, pieces, rest, b, k, local, shape, rows, moved):
     """Write the derivatives (3,m) of keypoint k to ``rows``.
 
-    local (P,): column of each parameter in the rows, -1 = none. shape: fitted shape components.
-    moved (3,S): scratch.
+    local (P,): column of each parameter in the rows, -1 = none. shape: indices of the fitted shape
+    components. moved (3,S): scratch, for the derivatives by all shape components.
     """
     rows[:] = 0
     moved[:] = 0
@@ -224,7 +245,7 @@ def _fill_rows(skeleton, pieces, rest, b, k, local, shape, rows, moved):
             a2 = q2 - w * skeleton.joints[b, up, 2]
             for d in range(3):
                 place = local[3 * up + d]
-                if place >= 0:  # a turn f of the joint moves the piece by f x a
+                if place >= 0:  # a rotation f of the joint moves the piece by f x a
                     f0 = skeleton.frames[b, up, 0, d]
                     f1 = skeleton.frames[b, up, 1, d]
                     f2 = skeleton.frames[b, up, 2, d]
@@ -256,8 +277,13 @@ def _fill_rows(skeleton, pieces, rest, b, k, local, shape, rows, moved):
 def _add_correctives(
     skeleton, pieces, b, k, by_keypoint, rest_gradient, rows, local, joints, by_pose
 ):
-    """Add the gradient by the pieces of keypoint k at rest, and the derivatives of its pose blend
-    shapes by ``joints`` to its rows (3,m). by_keypoint (3,): gradient of the cost by the keypoint.
+    """Add the contributions of the pose blend shapes of keypoint k.
+
+    by_keypoint (3,): gradient of the cost by the keypoint.
+    rest_gradient (B,E,3): the gradient by the pieces at rest is added.
+    rows (3,m): the derivatives of the blend shapes by ``joints`` are added.
+    local (P,): column of each parameter in the rows, -1 = none.
+    by_pose (54,3,9): see :func:`.correctives_kernel.rotation_derivatives`.
     """
     for e in range(pieces.starts[k], pieces.starts[k + 1]):
         turn = skeleton.rotations[b, pieces.bone[e]]
@@ -269,7 +295,7 @@ def _add_correctives(
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
 def _weigh(matrix, rows, weighted):
-    """weighted = matrix rows, (3,m)."""
+    """Write the product of matrix (3,3) and rows (3,m) to ``weighted`` (3,m)."""
     for i in range(3):
         m0, m1, m2 = matrix[i, 0], matrix[i, 1], matrix[i, 2]
         for q in range(rows.shape[1]):
@@ -290,6 +316,8 @@ def _add_offset(turn, by_keypoint, matrix, weighted, to, first, gradient, hessia
     """Add the blocks of a keypoint's offset, whose three columns start at ``first``.
 
     turn (3,3): rotation of the bone that carries the offset.
+    by_keypoint (3,), matrix (3,3): gradient and Gauss-Newton matrix by the keypoint.
+    weighted (3,m): matrix times the keypoint's rows, whose columns in the hessian are ``to``.
     """
     for d in range(3):
         r0, r1, r2 = turn[0, d], turn[1, d], turn[2, d]

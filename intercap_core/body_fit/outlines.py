@@ -1,14 +1,15 @@
 """The rim of the person's mask as a measurement of E_D (equation 4), with depth or without.
 
-Beyond the paper. A ray through the rim grazes the surface of the person's clothes. The plane of
-this ray and the rim's tangent touches the surface where the normals agree. There the distance is
+Beyond the paper. The rim is the contour of the mask. A ray through the rim grazes the surface of
+the person's clothes. The plane spanned by this ray and the rim's tangent touches the surface at a
+point whose normal is that of the plane. There the distance is
 
     e = N . (o - v) - c,
 
 with the camera centre o, the outward normal N of the plane, the vertex v whose normal and place in
-the image are nearest, and the thickness c of the covering as in :mod:`.cloud_term`. A rim at the
-border of the image is not the person's, nor one where another detected object begins, which may be
-in front.
+the image are nearest, and the thickness c of the covering as in :mod:`.cloud_term`. Two parts of
+the rim are not the contour of the person and are left out: those at the border of the image, and
+those where another detected object begins, which may be in front.
 """
 
 from __future__ import annotations
@@ -25,8 +26,9 @@ from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.mask_pixels import decode_box
 from intercap_core.geometry.camera.masks import Runs
 
-# Largest cosine between the line of sight and the normal of a sample on the rim: two thirds of the
-# spacing of samples on a limb. Tuned on the studio.
+# Largest absolute cosine between the line of sight and the normal of a sample on the rim. Samples
+# are sparse, so few have a cosine of 0: this is two thirds of their spacing on a limb. Tuned on the
+# studio.
 _FACING = 0.6
 # Smallest cosine between the normals of the rim's plane and its vertex. Tuned on the studio.
 _COSINE = 0.8
@@ -45,16 +47,22 @@ class MaskRim:
 
 
 def trace_outline(mask: Runs, others: Runs | None, lens: Intrinsics, view: int) -> MaskRim | None:
-    """Return points evenly along the rim of the mask, or None if there are none.
+    """Return about 400 rays evenly along the rim of the mask, or None if there are none.
 
-    Points next to ``others``, the mask of other detected objects, are left out: the person may
-    continue behind them.
+    Args:
+        mask: mask of the person.
+        others: mask of other detected objects. Points next to it are left out: the person may
+            continue behind these objects.
+        lens: intrinsics of the colour camera.
+        view: camera index.
     """
     pixels, outward = _rim(mask)
+    # away from the border of the image, 3 px wide
     inside = (pixels > 2) & (pixels < np.array([mask.width, mask.height]) - 3)
     own = inside.all(1)
     if others is not None:
-        # masks of touching objects are some pixels apart; px of 720 lines, tuned on the studio
+        # masks of touching objects are some pixels apart: look 1, 4 and 7 px outward, at an image
+        # height of 720; tuned on the studio
         for away in (1.0, 4.0, 7.0):
             ahead = np.rint(pixels + away * mask.height / 720 * outward).astype(int)
             own &= ~others.sample(*ahead.T)
@@ -64,7 +72,7 @@ def trace_outline(mask: Runs, others: Runs | None, lens: Intrinsics, view: int) 
     # about 400 points, a third of the pixels of a person who fills 720 lines: speed
     keep = keep[:: max(1, round(len(keep) / 400))]
     pixels, outward = pixels[keep], outward[keep]
-    along = outward[:, ::-1] * (-1, 1)
+    along = outward[:, ::-1] * (-1, 1)  # tangent: outward rotated by 90 degrees
     rays = lens.unproject(pixels)
     ahead = lens.unproject(pixels + along) - lens.unproject(pixels - along)
     out = lens.unproject(pixels + outward) - rays
@@ -78,9 +86,13 @@ def trace_outline(mask: Runs, others: Runs | None, lens: Intrinsics, view: int) 
 
 
 def _rim(mask: Runs) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (M, 2) along the rim, px, and outward unit directions (M, 2)."""
-    blur = 3.0  # px over which the direction of the rim is measured; tuned on the studio
-    shortest = 40  # px; rims of smaller spots and holes are errors of the network; tuned likewise
+    """Return points (M, 2) along the rim, x and y in px, and outward unit directions (M, 2).
+
+    The directions are gradients of the blurred mask.
+    """
+    blur = 3.0  # px, standard deviation of the blur; tuned on the studio
+    # px; shorter rims, of spots and holes, are errors of the detector; tuned on the studio
+    shortest = 40
     x, y, width, height = mask.box
     pad = round(3 * blur)
     window = np.zeros((height + 2 * pad, width + 2 * pad), np.uint8)
@@ -98,7 +110,7 @@ def _rim(mask: Runs) -> tuple[np.ndarray, np.ndarray]:
     length = np.linalg.norm(outward, axis=1)
     steep = length > 0
     outward = outward[steep] / length[steep, None]
-    # the rim runs between a pixel that is set and its neighbour
+    # the rim is half a pixel outside the outermost pixel of the mask
     return at[steep] + (x - pad, y - pad) + 0.5 * outward, outward
 
 
@@ -108,9 +120,9 @@ class RimSamples(NamedTuple):
     number: np.ndarray
     """(S,) index among all samples."""
     vertex: np.ndarray
-    """(S,) index in the surface."""
+    """(S,) index of the sample among the vertices of the surface."""
     patch: np.ndarray
-    """(S, 20) indices in the surface."""
+    """(S, 20) indices of the sample's patch among the vertices of the surface."""
 
     @classmethod
     def of(cls, samples: Samples, surface: SkinSurface) -> RimSamples:
@@ -136,10 +148,11 @@ def find_touched(
         normals: (R, 3)
         samples: samples that a rim can touch.
         reach: largest valid distance, metres.
-        displacement: (S, 3) displacement of the samples until the camera exposes, or None.
+        displacement: (N, 3) displacement of all N samples until the camera exposes, metres, or
+            None.
 
     Returns:
-        (M,) index of each touched sample.
+        (M,) index of each touched sample among all samples.
         (M,) distance, outside positive, metres.
     """
     pose = master_from_colour.astype(vertices.dtype)
@@ -158,9 +171,15 @@ def find_touched(
 def _find_touched(centre, rays, planes, vertices, normals, samples, patch, reach):
     """Return sample (M,), signed outward distance (M,) and validity (M,) of rays through a rim.
 
-    centre (3,) of the camera; unit rays (M,3) and normals (M,3) of their planes; vertices and
-    normals (R,3) of one body; samples (S,) and their patch (S,20): vertices; reach: largest
-    distance along the plane's normal, metres.
+    Candidates are the samples on the rim as the camera sees it: their normals are nearly
+    perpendicular to the line of sight. For each ray all candidates are compared. The best one
+    minimises height^2 + sideways^2 + L^2 |n - N|^2 with the distances ``height`` from the plane and
+    ``sideways`` from the ray within the plane, and L = `NORMAL_LENGTH_M`. In its patch, the vertex
+    that minimises sideways^2 + L^2 |n - N|^2 gives the distance.
+
+    centre (3,): of the camera. rays, planes (M,3): unit rays, and unit normals N of their planes.
+    vertices, normals (R,3): one body. samples (S,), patch (S,20): indices of vertices.
+    reach: largest distance along the plane's normal, metres.
     """
     kind, where = vertices.dtype, np.empty((6, len(samples)), vertices.dtype)
     rim = np.empty(len(samples), np.int64)
@@ -202,7 +221,7 @@ def _find_touched(centre, rays, planes, vertices, normals, samples, patch, reach
             z = vertices[v, 2] - centre[2]
             height, sideways = x * nx + y * ny + z * nz, x * tx + y * ty + z * tz
             cosine = normals[v, 0] * nx + normals[v, 1] * ny + normals[v, 2] * nz
-            # a vertex nearer to the plane is not more on the rim
+            # without height, which is the distance to be measured
             far = sideways * sideways - turn * cosine
             if far < least:
                 least = far

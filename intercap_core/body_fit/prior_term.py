@@ -1,12 +1,15 @@
 """Priors of the body (equation 2): E_theta_b, E_theta_h, E_theta_f, E_alpha, E_beta and E_psi.
 
 :mod:`intercap_core.body.priors` has the rows of each prior; here they are weighted and summed. The
-observations are weighted by their noise, so Gaussian priors are in units of their own standard
-deviation and have weight 1, where the paper sets its lambdas empirically. E_theta_b is VPoser if
-the user has it; the open default is a broad Gaussian about standing at ease. E_psi, of the
-expression, is the paper's curly E. E_beta of a shape that all frames share is in
-:class:`.problem.ParameterLayout`. Beyond the paper: anatomical limits of the joints, with either
-pose prior.
+paper sets the weights lambda empirically. Here observations are weighted by their noise. Gaussian
+priors are therefore in units of their own standard deviation, with weight 1.
+
+- E_theta_b is VPoser if the user has it; the open default is a broad Gaussian about a person who
+  stands at ease.
+- E_psi, the prior of the expression, is the paper's curly E.
+- E_beta is here if each frame has its own shape. For a shape that all frames share it is in
+  :class:`.problem.ParameterLayout`.
+- Beyond the paper: anatomical limits of the joints, with either pose prior.
 """
 
 from __future__ import annotations
@@ -59,15 +62,15 @@ class PriorTerm:
             hand_share: factor of E_theta_h in one frame.
         """
         model = self.model
-        # some hand components hardly vary among grasps: at least 0.03, tuned on the studio
+        # some hand components hardly vary among grasps; at least 0.03 rad, tuned on the studio
         deviation = model.hand_deviation.clamp_min(0.03)
         own = (model.hand_mean, model.hand_components, deviation)
         hands = [(priors.hand_pose(vectors, *own, side=side), hand_share**0.5) for side in (0, 1)]
-        # ranges of joints are means plus two standard deviations of people: their edge is soft, 4
-        # degrees (tuned on the studio)
+        # The ranges of joints are those of most people, not of all, so their limits are soft: an
+        # excess of 4 degrees is one standard deviation (tuned on the studio).
         limits = 1 / math.radians(4)
-        # the penalty exp(sign theta) is 1 at the straight limb, where it should cost little (tuned
-        # on the studio)
+        # The residual exp(sign theta) is 1 for a straight limb, which should cost little: the
+        # weight is small (tuned on the studio).
         bending = 1 / 6
         return [
             (priors.rest_pose(vectors, first=1 if body_pose else JOINT_INDEX["jaw"]), 1.0),
@@ -124,19 +127,19 @@ class PriorArrays(NamedTuple):
     mean: np.ndarray
     """(P,)"""
     own: np.ndarray
-    """(P,) precision of each parameter without the hands."""
+    """(P,) precision of each parameter; 0 for hands and parameters without a Gaussian prior."""
     hands: np.ndarray
-    """(2, 45, 45) precision of the hands."""
+    """(2, 45, 45) precision of the hands, left then right."""
     ranges: np.ndarray
-    """(165, 2) limits of the pose, rad."""
+    """(165, 2) lower and upper limit of each pose parameter, rad."""
     outside: float
-    """Precision outside of the limits."""
+    """Precision of the excess over the limits, 1/rad^2."""
     bends: np.ndarray
     """(R,) columns of elbows and knees."""
     sign: np.ndarray
-    """(R,) sign of the wrong direction."""
+    """(R,) sign of the unnatural direction."""
     bending: float
-    """Squared weight of bending."""
+    """Squared weight of E_alpha."""
     pose: np.ndarray
     """(T, 63) mean of the learned prior; T = 0 without a learned prior."""
     pose_precision: np.ndarray
@@ -216,7 +219,10 @@ class CompiledPriors:
 
 @numba.njit(cache=True, nogil=True)
 def _add_block(deviation, precision, first, place, gradient, hessian, derivatives):
-    """Add a Gaussian of adjacent parameters, ``deviation`` (m,) from its mean; return its cost."""
+    """Add a Gaussian of the m adjacent parameters from ``first`` on, and return its cost.
+
+    deviation (m,): parameters minus mean. precision (m,m). place (P,): column of each parameter.
+    """
     total = 0.0
     for i in range(len(deviation)):
         derivative = np.float64(0)

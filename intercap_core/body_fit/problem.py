@@ -1,10 +1,12 @@
 """The body's energy E_B (equation 2) over all frames, as the solver expects it.
 
-The own parameters of a frame are chosen columns of the body's parameter vector. All frames share,
-in this order: betas (if one shape is fitted), the offsets of the 25 body keypoints, and the
-logarithms u of the thickness of the coverings. The priors of the shared parameters are here: E_beta
-of a shared shape, and beyond the paper Gaussians of offsets and u. The other terms are listed in
-:mod:`.terms`.
+Each frame has own parameters: chosen columns of the body's parameter vector. The shared parameters
+of all frames are, in this order:
+- the betas, if one shape is fitted;
+- the offsets of the 25 body keypoints (:mod:`.keypoint_term`);
+- the logarithms u of the thickness of the coverings (:mod:`.cloud_term`).
+The priors of the shared parameters are here: E_beta of a shared shape, and beyond the paper
+Gaussians of offsets and u. The other terms are listed in :mod:`.terms`.
 """
 
 from __future__ import annotations
@@ -33,9 +35,12 @@ NUM_OFFSETS = 25  # OpenPose's body keypoints
 
 
 def columns_of(model: BodyModel, *, hands: bool, face: bool, betas: bool) -> Tensor:
-    """Return the own parameters (n,): trunk and limbs, and if requested hands, jaw and expression,
-    betas."""
-    pose = list(range(0, 66))
+    """Return the columns (n,) of a frame's own parameters in the parameter vector.
+
+    They are global orientation, body pose and translation, and if requested those of hands, of the
+    face (jaw and expression) and the betas.
+    """
+    pose = list(range(0, 66))  # columns: see BodyParameters
     if face:
         jaw = 3 * JOINT_INDEX["jaw"]
         pose += list(range(jaw, jaw + 3))
@@ -68,9 +73,9 @@ class ParameterLayout:
     """Places of n own and m shared parameters in the solver's vectors, and the shared priors."""
 
     columns: Tensor
-    """(n,) own parameters."""
+    """(n,) columns of the own parameters in a parameter vector."""
     num_betas: int
-    """Length of the shape."""
+    """Number of betas."""
     one_shape: bool
     """The betas are shared."""
     fit_shared: bool
@@ -125,7 +130,7 @@ class ParameterLayout:
         return vectors
 
     def prior_cost(self, shared: Tensor) -> Tensor:
-        """Return the cost (scalar) of the shared parameters (m,) in each frame."""
+        """Return the cost (scalar) of the shared parameters (m,) that each frame adds."""
         mean, precision, _ = self.prior(shared)
         return 0.5 * (precision * (shared - mean) ** 2).sum()
 
@@ -141,13 +146,14 @@ class ParameterLayout:
     def prior(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the Gaussian prior of the m shared parameters in the floating type of ``like``.
 
-        Errors of clothing and detector persist over frames, so a recording is worth fewer
-        independent measurements than it has frames: the prior counts in every frame.
+        Errors of clothing and detector persist over frames, so T frames are fewer than T
+        independent measurements. To balance that, each frame adds the prior with a factor, the
+        count. A recording then weighs as much as 1 / count independent frames.
 
         Returns:
             (m,) means.
-            (m,) precisions in each frame.
-            (m,) how many times the prior counts in each frame; tuned on the studio.
+            (m,) precisions that each frame adds: count / sigma^2.
+            (m,) counts; tuned on the studio.
         """
         mean, sigma, counts = [like.new_zeros(0)], [like.new_zeros(0)], [like.new_zeros(0)]
         if self.one_shape:
@@ -176,9 +182,9 @@ class BodyProblem(TermInputs):
     samples: Samples
     """Samples of the skin for E_D and E_P_self."""
     base: Tensor
-    """(T, P) parameters. Those that are not fitted keep these values."""
+    """(T, P) current parameters. Those that are not fitted keep these values."""
     columns: Tensor
-    """(n,) own parameters."""
+    """(n,) columns of the own parameters in ``base``."""
     offsets: Tensor
     """(25, 3) keypoint offsets, metres."""
     u: Tensor
@@ -212,7 +218,7 @@ class BodyProblem(TermInputs):
         return self.layout.shared(self.base, self.offsets, self.u)
 
     def accept(self, own: Tensor, shared: Tensor) -> None:
-        """Set base, offsets and u to a solution."""
+        """Set ``base``, ``offsets`` and ``u`` to a solution: own (T, n) and shared (m,)."""
         betas, offsets, u = self.layout.split(shared, self.offsets, self.u)
         self.base = self.layout.vectors(self.base, own, betas)
         self.offsets, self.u = offsets.clone(), u.clone()

@@ -8,10 +8,11 @@
 | priors | 2 | prior_term.py | PriorTerm | CompiledPriors |
 
 :class:`TorchTerms` is the readable form and the one that runs on a GPU. :class:`CompiledTerms` has
-the same cost, gradient and Gauss-Newton matrix on the CPU. With a licensed body file, costs and
-gradients contain pose blend shapes in full. The Gauss-Newton matrices of E_J and E_D contain them
-by the joints of a point's own limb, that of E_P_self not at all, since they would make every block
-of the normal equations dense: see :mod:`intercap_core.body.correctives_kernel`.
+the same cost, gradient and Gauss-Newton matrix on the CPU. The body of a licensed file has pose
+blend shapes. Costs and gradients contain their derivatives in full. The Gauss-Newton matrices of
+E_J and E_D contain only the derivatives by the joints of a point's own limb, that of E_P_self
+contains none. In full they would make every block of the normal equations dense: see
+:mod:`intercap_core.body.correctives_kernel`.
 """
 
 from __future__ import annotations
@@ -91,7 +92,7 @@ def _part(bodies: Bodies, at: slice) -> Bodies:
 
 
 def _chunks(count: int) -> list[slice]:
-    """Divide frames so that the dense rows of 32 are in memory at once."""
+    """Divide frames into chunks of 32, whose dense Jacobians fit into memory."""
     return [slice(i, i + 32) for i in range(0, count, 32)]
 
 
