@@ -139,8 +139,8 @@ class Writer:
     def put(self, key: str, values: Any) -> None:
         """Write a dataset; ``values`` are cast to the declared type.
 
-        Raises ValueError if the shape contradicts the schema or another dataset, KeyError if the
-        schema does not declare the dataset, and OSError if the disk is full.
+        Raises KeyError if the schema does not declare the dataset, ValueError if the shape
+        contradicts the schema or another dataset, OSError if the disk is full.
         """
         declared = self._schema.field_of(key)
         if declared.dtype == "str":
@@ -289,6 +289,7 @@ def _value(stored: Any) -> Any:
 
 
 def _finish(file: h5py.File, writer: Writer, schema: Schema, settings_digest: str) -> None:
+    """Check that the artefact is complete, and write its attributes, ``complete`` last."""
     missing = [
         key
         for key, declared in schema.fields.items()
@@ -475,6 +476,10 @@ def _check_dataset(
     path: Path,
     again: str,
 ) -> None:
+    """Raise Unreadable unless a dataset has the declared type and number of axes.
+
+    Axes of one name must have the same length; ``lengths`` holds the lengths found so far.
+    """
     if not isinstance(dataset, h5py.Dataset) or dataset.shape is None:
         raise Unreadable(f"{path}: {key!r} holds no values, expected a dataset; {again}")
     text = declared.dtype == "str"

@@ -488,6 +488,8 @@ def studio(settings: Settings, sequence: SequenceName) -> None:
 
 
 def _stage_command(stage: str, purpose: str) -> Callable[..., None]:
+    """Command that runs one stage of one sequence; its help begins with ``purpose``."""
+
     def command(
         settings: Settings,
         sequence: SequenceName,

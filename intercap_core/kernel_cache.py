@@ -189,6 +189,7 @@ def _assert_own(folder: Path) -> None:
 
 
 def _temporary(name: str, error: OSError) -> Path | None:
+    """Folder of the kernels among the temporary files; None if it cannot be used either."""
     import logging
     import tempfile
 
@@ -227,6 +228,10 @@ def remove_unused(base: Path, *, now_s: float | None = None) -> None:
 
 
 def _empty(folder: Path, now_s: float, *, folders_too: bool) -> None:
+    """Delete the files of a folder that are older than a day, and with ``folders_too`` the folder.
+
+    The folder keeps its date, which is that of its last use.
+    """
     mark = folder.stat()
     for place, _, files in os.walk(folder, topdown=False):
         for name in files:

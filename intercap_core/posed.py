@@ -168,6 +168,7 @@ def open_sequence(
 def _from_master(
     frame: str, names: Sequence[str], cameras: np.ndarray, zup: np.ndarray, sequence: str
 ) -> np.ndarray:
+    """Transform (4, 4) from the master frame to the named one; UserError if it is unknown."""
     if frame == Z_UP:
         return zup
     if frame == MASTER:

@@ -94,8 +94,8 @@ class Project:
     def annotation(self, sequence: str, *, look_at_frames: bool = True) -> Annotation:
         """Load the sequence's annotation; an empty one if there is no file.
 
-        Raises UserError that names file and field if the file is invalid, if the table names a
-        missing file, or if an entry lies outside of the recording.
+        Raises UserError, with file and field, if the file is invalid, if the table names a missing
+        file, or if an entry lies outside of the recording.
 
         Args:
             look_at_frames: compare the entries with the frames artefact, if it exists.
@@ -227,6 +227,7 @@ def _some(names: Iterable[str]) -> str:
 
 
 def _merged(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """Values with overrides; nested mappings are merged."""
     merged = dict(values)
     for key, value in overrides.items():
         old = merged.get(key)
@@ -307,6 +308,7 @@ def _check_detectors(project: Project) -> None:
 
 
 def _check_studio(project: Project, rows: dict[str, SequenceEntry], table: Path) -> None:
+    """Raise UserError if a capture contradicts its row of the table of sequences."""
     captures = project.config.studio.captures if project.config.studio else {}
     for sequence in captures:
         if sequence not in rows:
@@ -344,6 +346,10 @@ def _or_empty(values: Any) -> Any:
 
 
 def _parse(model: type[M], values: Any, where: str, what: str) -> M:
+    """Validate values by a model; raises UserError with the first fault.
+
+    ``where`` is the place in the message, ``what`` the kind of entry, such as "setting".
+    """
     if not isinstance(values, dict):
         raise UserError(f"{where}: expected names and values, found {quoted(values)}; correct it")
     try:
@@ -362,6 +368,10 @@ def _parse(model: type[M], values: Any, where: str, what: str) -> M:
 
 
 def _read_table(path: Path, model: type[M], key: str, settings: Path) -> list[M]:
+    """Read a tab-separated table with a header; ``key`` is the column with unique names.
+
+    Empty lines and lines that begin with # are skipped.
+    """
     try:
         lines = read_text(path, MAX_TABLE_BYTES).splitlines()
     except UnreadableFile as error:
@@ -394,6 +404,7 @@ def _read_table(path: Path, model: type[M], key: str, settings: Path) -> list[M]
 
 
 def _check_header(path: Path, line: int, found: Sequence[str], model: type[BaseModel]) -> None:
+    """Raise UserError if a table's header lacks, repeats or does not know a column."""
     fields = model.model_fields
     required = [name for name, field in fields.items() if field.is_required()]
     problems = [
@@ -411,6 +422,7 @@ def _check_header(path: Path, line: int, found: Sequence[str], model: type[BaseM
 
 
 def _read_objects(path: Path) -> dict[str, ObjectEntry]:
+    """Read the objects file: entries by name, with resolved paths."""
     values = _or_empty(read_yaml(path))
     if not isinstance(values, dict):
         raise UserError(

@@ -219,6 +219,7 @@ OBJECT_TRACK = Schema(
 
 
 def _body(*, one_shape: bool) -> dict[str, Field]:
+    """Body parameters and residuals; ``one_shape``: one shape of the sequence, not per frame."""
     rotation = ("rad", "parent joint")
     return {
         "betas": Field(("S",) if one_shape else ("T", "S"), "float32", "shape coefficients"),

@@ -89,6 +89,7 @@ class Executor(SlurmExecutor):
             self._report_job_error_threadsafe(SubmittedJobInfo(job), words)
 
     def _submit_or_adopt(self, job: JobExecutorInterface) -> None:
+        """Wait for the controller, then adopt the same job of an earlier run, or submit the job."""
         wait_for_controller(self.logger, self._ending)
         if self._ending.is_set():
             return

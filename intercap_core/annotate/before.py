@@ -119,6 +119,7 @@ def _isoformat(seconds: float) -> str:
 
 
 def _figures(paths: Mapping[str, Path]) -> dict[str, float | None]:
+    """Figures of a result that the page compares, by label; None = not stated."""
     rows: dict[str, float | None] = {}
     with contextlib.suppress(artefacts.Unreadable):
         metrics = SequenceMetrics.read(paths["metrics"])

@@ -34,9 +34,12 @@ def answers_path(annotation: Path) -> Path:
 def propose(opened: Opened, answered: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Return open questions, those that change most frames first.
 
-    Each has ``kind``, ``part``, frames ``first`` to ``last`` (``from_s`` to ``to_s`` in seconds),
-    the ``frame`` to look at, ``message``, ``weight`` (number of frames that an answer may change,
-    times a factor by kind) and ``choices``.
+    Entries of a question:
+        ``kind``, ``part``: subject, sides, lost, turn or contact; and the body part of contact.
+        ``first``, ``last``: frames that it is about; ``from_s``, ``to_s`` their times, seconds.
+        ``frame``: frame to look at.
+        ``message``, ``choices``: texts for the user.
+        ``weight``: number of frames that an answer may change, times a factor by kind.
     """
     questions: list[dict[str, Any]] = []
     with opened.lock:
@@ -117,6 +120,7 @@ def _question(
 
 
 def _ask_subject(opened: Opened, object_: str, times: np.ndarray) -> list[dict[str, Any]]:
+    """Ask whether the chosen person is the subject, at the most confident image of the hips."""
     with artefacts.read(opened.paths["person"], PERSON) as person:
         doubts, by = str(person.attributes["doubts"]), str(person.attributes["chosen_by"])
         if by in ("alone", "named") and not doubts:
@@ -139,6 +143,7 @@ def _ask_subject(opened: Opened, object_: str, times: np.ndarray) -> list[dict[s
 
 
 def _ask_sides(opened: Opened, object_: str, times: np.ndarray) -> list[dict[str, Any]]:
+    """Ask about doubtful left and right (:func:`.sides.doubts`)."""
     return [
         _question(
             "sides", "", doubt.first, doubt.last, doubt.frame,
@@ -154,6 +159,7 @@ def _ask_sides(opened: Opened, object_: str, times: np.ndarray) -> list[dict[str
 
 
 def _ask_object(opened: Opened, object_: str, times: np.ndarray) -> list[dict[str, Any]]:
+    """Ask where the object is in lost frames, and whether ambiguous rotations are right."""
     if not object_:
         return []
     with artefacts.read(opened.paths["object_track"], OBJECT_TRACK) as track:
@@ -176,6 +182,7 @@ def _ask_object(opened: Opened, object_: str, times: np.ndarray) -> list[dict[st
 
 
 def _ask_contact(opened: Opened, object_: str, times: np.ndarray) -> list[dict[str, Any]]:
+    """Ask about contact that is not annotated and whose probability is between 0.25 and 0.75."""
     with artefacts.read(opened.paths["joint"], JOINT) as joint:
         probability, labels = joint["contact_probability"], joint["contact_annotated"]
         regions = joint.text("region_names")

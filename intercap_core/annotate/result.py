@@ -178,6 +178,7 @@ def _check_frames(
 
 
 def _scene(opened: Opened, info: dict[str, Any]) -> Rig:
+    """Add transforms, image assignment and floor; returns the refined cameras."""
     with artefacts.read(opened.paths["scene"], SCENE) as scene:
         info["zup_from_master"] = scene["zup_from_master"][:3].tolist()
         info["image_of"] = scene["image_of"].T.tolist()
@@ -188,6 +189,7 @@ def _scene(opened: Opened, info: dict[str, Any]) -> Rig:
 
 
 def _person(opened: Opened, info: dict[str, Any]) -> None:
+    """Add the choice of the subject, and places without the subject or with doubtful sides."""
     with artefacts.read(opened.paths["person"], PERSON) as person:
         info["subject"] = {
             "chosen_by": str(person.attributes["chosen_by"]),
@@ -203,6 +205,7 @@ def _person(opened: Opened, info: dict[str, Any]) -> None:
 
 
 def _track(opened: Opened, info: dict[str, Any]) -> None:
+    """Add the object's track, and places with a lost object or an ambiguous rotation."""
     with artefacts.read(opened.paths["object_track"], OBJECT_TRACK) as track:
         info["track"] = {
             "object": str(track.attributes["object"]),
@@ -221,12 +224,14 @@ def _track(opened: Opened, info: dict[str, Any]) -> None:
 
 
 def _body(opened: Opened, info: dict[str, Any]) -> None:
+    """Add places in which the body fit failed."""
     with artefacts.read(opened.paths["body_fit"], BODY_FIT) as fit:
         failed = fit["failed"]
     info["places"] += _runs(failed, "body", "the body fit failed", 2.5)
 
 
 def _joint(opened: Opened, info: dict[str, Any]) -> Rig | None:
+    """Add contact and flags of the joint fit; returns its cameras, None without a scene."""
     with artefacts.read(opened.paths["joint"], JOINT) as joint:
         probability = joint["contact_probability"]
         if np.isfinite(probability).any():
@@ -243,6 +248,7 @@ def _joint(opened: Opened, info: dict[str, Any]) -> Rig | None:
 
 
 def _metrics(opened: Opened, info: dict[str, Any]) -> None:
+    """Add flags and stated errors, and places with flags or large stated errors."""
     with artefacts.read(opened.paths["metrics"], METRICS) as metrics:
         info["flags"] = ranges(metrics.text("flag_reason"))
         if "verdict/error" in metrics:

@@ -92,9 +92,11 @@ def sides_payload(opened: Opened) -> str:
 def doubts(opened: Opened) -> list[Doubt]:
     """Return runs of frames with doubtful sides.
 
-    Sides are doubtful if stage person contradicted the detector in half of the views or more
-    (unless the annotation states the exchange), if the body's build clearly suits exchanged sides
-    better, or if limbs of the result jump from side to side.
+    Sides are doubtful in a frame if one of these holds:
+    - Stage person contradicted the detector in half of the views or more, and the annotation does
+      not state the exchange.
+    - The body's build clearly suits exchanged sides better (``MIRRORED_BUILD``).
+    - Limbs of the result jump to the other side and back.
     """
     sides = sides_of(opened)
     stated = np.zeros(sides.image_of.shape, bool)
@@ -108,6 +110,7 @@ def doubts(opened: Opened) -> list[Doubt]:
 
 
 def _sides(opened: Opened) -> Sides:
+    """Compare the detected keypoints with those that stage person has kept."""
     detections = Detections.load(opened.paths["detections"])
     with artefacts.read(opened.paths["scene"], SCENE) as scene:
         image_of = scene["image_of"]

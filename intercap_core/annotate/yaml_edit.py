@@ -48,6 +48,7 @@ def replace_section(text: str, section: str, value: Any) -> str:
 
 
 def _replaced(lines: list[str], section: str, value: Any) -> list[str]:
+    """Return the lines of a text with another value of a section; None removes it."""
     spans = _section_spans(lines)
     if spans is None:
         return _rewritten(lines, section, value)

@@ -32,9 +32,9 @@ MEASURED = SEQUENCE_STAGES[: SEQUENCE_STAGES.index("metrics") + 1]
 def measure(settings: Path, output: Path, *, cores: int = 0) -> None:
     """Measure the project's first sequence and write flat JSON with the keys ``area.measure``.
 
-    Makes a virtual recording first, then runs all stages up to the metrics through the workflow, so
-    that process starts are included and the studio is not. Keeps the figures of other commands in
-    the file. Raises UserError if a stage fails.
+    Makes a virtual recording first, which is not measured. Then the workflow runs all stages up to
+    the metrics, so that the starts of processes are included. Keeps the figures of other commands
+    in the file. Raises UserError if a stage fails.
 
     - ``STAGE.seconds_per_frame``, ``STAGE.peak_memory_mb``: job of one stage.
     - ``verdict.seconds_per_frame``: duration of the held-out evaluation, see :func:`time_hold_out`.

@@ -169,6 +169,7 @@ def notes_of_sequences(project: Project) -> list[Fault]:
 
 
 def _notes_of_cameras(project: Project, row: SequenceEntry) -> list[str]:
+    """Notes on cameras without recordings, keypoints or candidates, and on the files' contents."""
     from intercap_core.formats.detections.candidate_files import has_candidates
     from intercap_core.formats.detections.keypoint_files import has_keypoints, preview_keypoints
     from intercap_core.formats.recordings.layouts import open_layout
@@ -302,6 +303,7 @@ class _LogTexts(logging.Handler):
 
 
 def _faults_of_capture(project: Project, name: str) -> list[str]:
+    """Error message if the studio cannot make the recording; [] otherwise."""
     from intercap_core.studio.stage import check_capture
 
     settings = project.config.studio
@@ -314,6 +316,7 @@ def _faults_of_capture(project: Project, name: str) -> list[str]:
 
 
 def _check_files(row: SequenceEntry, settings: FramesSettings) -> RecordingFindings:
+    """Check that the files of a row exist, then its recordings."""
     from intercap_core.commands.check_recordings import RecordingFindings
 
     faults = []
@@ -347,6 +350,7 @@ def faults_of_truth(path: Path) -> list[str]:
 
 
 def _check_recordings(row: SequenceEntry, settings: FramesSettings) -> RecordingFindings:
+    """Check the names and poses of a row's cameras, then the recordings of those with a pose."""
     from intercap_core.commands.check_recordings import RecordingFindings, check_recordings
     from intercap_core.formats.recordings.layouts import open_layout
 

@@ -108,6 +108,10 @@ def _check_recording(
     recording: CheckedRecording,
     expected_s: float | None,
 ) -> None:
+    """Add the findings on one camera: image size, length, and number of images.
+
+    ``expected_s``: duration by the other cameras, seconds; None if there are none.
+    """
     source, preview = recording.source, recording.preview
     if preview.size is None:
         findings.faults.append(

@@ -79,6 +79,7 @@ def _settings(
     pad: str,
     lines: list[str],
 ) -> None:
+    """Append the lines of config.yaml for the properties of ``schema``, indented by ``pad``."""
     for name, entry in schema["properties"].items():
         if name == "studio" and not pad:  # for virtual recordings only
             continue
@@ -232,6 +233,7 @@ def artefacts_page() -> str:
 
 
 def _artefact(schema: Schema) -> list[str]:
+    """Lines of docs/artefacts.md about one artefact."""
     lines = [
         "",
         f"## {schema.name}",

@@ -108,6 +108,7 @@ def _disk(project: Project) -> Iterator[Finding]:
 
 
 def _file_system(results: Path) -> Finding:
+    """Whether the results lie on a file system that other machines can share."""
     place = next(path for path in (results, *results.resolve().parents) if path.exists()).resolve()
     kind, at = "unknown", ""
     try:

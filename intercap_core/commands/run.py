@@ -147,6 +147,10 @@ def _run(
     arguments: Sequence[str],
     console: Console,
 ) -> int:
+    """Run Snakemake until nothing is stale, print failures and remarks; returns the exit status.
+
+    If some sequences fail, the outputs of all sequences are made from the others.
+    """
     plan = Plan(project)
     done = not arguments and plan.all_done()
     plan.save()

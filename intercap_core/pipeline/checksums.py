@@ -128,7 +128,7 @@ def is_unchanged(output: Path) -> bool:
 
 
 def find_damage(output: Path) -> str:
-    """Read a whole artefact, or all files of an export; returns what is wrong, "" if nothing.
+    """Read a whole artefact, or all files of an export; returns an error message, "" if intact.
 
     An artefact is intact if it has the stored checksum. If it is another artefact (with another
     manifest) or no checksum is stored, the checksums inside the HDF5 file decide. Raises OSError if

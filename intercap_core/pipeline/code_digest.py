@@ -4,8 +4,8 @@ The modules that a stage reaches are found by following imports, including those
 and calls of ``plugins.modules_of``.
 The digest covers their syntax trees without docstrings and comments, and the data files next to
 them: a reworded docstring makes nothing stale. Modules of declarations that all stages share
-(settings, tables, schemas, project) are followed name by name, so that a new setting of one
-stage does not make the others stale. The digests are cached in the user's cache folder under a
+(settings, tables, schemas, project) are followed name by name. A new setting of one stage therefore
+does not make the others stale. The digests are cached in the user's cache folder under a
 checksum of the whole package, because walking the syntax trees takes seconds.
 """
 
@@ -68,6 +68,7 @@ def stage_code(name: str) -> StageCode:
 
 @cache
 def _all_stage_code() -> dict[str, StageCode]:
+    """Code of all stages by name, from the cache if the package is unchanged."""
     folder = cache_base() / "code"
     path = folder / f"{_package_checksum()}.json"
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):

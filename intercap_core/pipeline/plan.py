@@ -125,7 +125,7 @@ class Plan:
         return self._state(sequence, stage).fingerprint
 
     def annotation_fault(self, sequence: str) -> str:
-        """What is wrong with the sequence's annotation, "" if nothing.
+        """Error message about the sequence's annotation, "" if it is valid.
 
         Frame numbers are checked only while the frames artefact is up to date.
         """

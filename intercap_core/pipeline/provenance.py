@@ -158,6 +158,7 @@ def _changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
 
 
 def _changed_values(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Reasons in words for changed settings, table entries and annotations."""
     reasons = []
     for name in _changed(before, now):
         old, new = before.get(name), now.get(name)
@@ -204,6 +205,7 @@ def _short(value: Any) -> str:
 def _changed_files(
     before: Mapping[str, Mapping[str, str]], now: Mapping[str, Mapping[str, str]]
 ) -> list[str]:
+    """Reasons in words for changed files, at most ``_MAX_CHANGES`` and their number."""
     reasons = []
     for role in sorted({*before, *now}):
         old, new = before.get(role, {}), now.get(role, {})

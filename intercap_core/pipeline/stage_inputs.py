@@ -1,6 +1,6 @@
 """The arguments of each stage, and the manifest of its output.
 
-Both are derived from the signature of the stage's ``run``, so that a stage cannot depend on a
+Both are derived from the signature of the stage's ``run``. A stage can therefore not depend on a
 setting, table entry or annotation that its manifest does not record.
 """
 
@@ -152,6 +152,7 @@ def _manifest(
     before: Manifest | None,
     machine: Mapping[str, str],
 ) -> Manifest:
+    """Manifest of an output; paths in ``given`` become checksums of the files."""
     values: dict[str, Any] = {}
     files: dict[str, dict[str, str]] = {}
     for name, value in given.items():

@@ -2,8 +2,8 @@
 
 The verdict estimates errors without truth by fits without each camera.
 
-Recordings without depth, other definitions of joints, other body builds, boots, few cameras, people
-without an object (taken to the export), a balance beam, a second person in the room.
+The conditions are: no depth, other definitions of joints, other body builds, boots, few cameras, a
+person without an object (also exported), a balance beam, and a second person in the room.
 """
 
 from __future__ import annotations

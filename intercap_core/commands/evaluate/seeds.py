@@ -32,6 +32,7 @@ def redraw_settings(settings: Mapping[str, Sequence[Path]], seed: int) -> dict[s
 
 
 def _written(project: Project, seed: int) -> Path:
+    """Write one project's settings and tables with new seeds and subjects; returns the settings."""
     root = project.config.results / f"seed_{seed}"
     folder = root / "settings"
     folder.mkdir(parents=True, exist_ok=True)

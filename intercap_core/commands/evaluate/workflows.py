@@ -198,6 +198,7 @@ def plan_runs(wanted: Mapping[str, Targets]) -> list[ProjectRun]:
 
 
 def _run(runs: list[ProjectRun], parallel: int, cores: int, lock: int, console: Console) -> None:
+    """Run the workflows in their order, ``parallel`` at a time, until all have ended."""
     begin = reported = time.monotonic()
     while any(run.status is None for run in runs):
         running = [o for o in runs if o.process is not None and o.status is None]
@@ -233,6 +234,7 @@ def progress(runs: Sequence[ProjectRun], parallel: int, elapsed: float) -> str:
 
 
 def _start(run: ProjectRun, cores: int, lock: int, console: Console) -> None:
+    """Start a workflow on ``cores`` cores; ``lock`` is the file descriptor of the system lock."""
     project = run.project
     targets = [
         str(project.artefact(name, stage)) for stage in run.stages for name in project.sequences

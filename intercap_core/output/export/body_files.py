@@ -95,6 +95,7 @@ def write(folder: Path, body: ExportBody) -> Sequence[WrittenBody]:
 def _laid_out(
     arrays: dict[str, np.ndarray], body: ExportBody, layout: Layout
 ) -> dict[str, np.ndarray]:
+    """Return the arrays of the body file with shape and expression in the columns of a layout."""
     table = arrays["shapedirs"]
     vertices, half = len(table), table.shape[2] // 2
     columns = np.zeros((vertices, 3, layout.shape + layout.expression), table.dtype)

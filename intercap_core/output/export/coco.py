@@ -87,6 +87,10 @@ def _keypoints(motion: Motion) -> np.ndarray:
 def _annotations(
     drawn: Silhouettes, camera: Camera, points: np.ndarray
 ) -> Iterator[dict[str, Any]]:
+    """Yield COCO's entries of person and object in one image, if they have a visible pixel.
+
+    ``points``: (17, 3) keypoints in the master frame, metres.
+    """
     for category, mask in ((PERSON, drawn.body), (OBJECT, drawn.object_)):
         if not mask.area:
             continue

@@ -185,6 +185,7 @@ def _body(
 def _object(
     document: _Document, motion: Motion, mesh: ObjectMesh, animation: dict[str, Any], times: int
 ) -> int:
+    """Add the object's mesh and motion; return the index of its node."""
     geometry = _geometry(document, mesh.vertices, mesh.faces)
     colours = np.column_stack([mesh.colours, np.full(len(mesh.colours), 255, np.uint8)])
     geometry["attributes"]["COLOR_0"] = document.accessor(
@@ -223,6 +224,7 @@ def _channel(
     path: str,
     values: np.ndarray,
 ) -> None:
+    """Animate a property of a node: one row of ``values`` per frame, linear interpolation."""
     output = document.accessor(values.astype("<f4"))
     animation["samplers"].append({"input": times, "output": output, "interpolation": "LINEAR"})
     animation["channels"].append(

@@ -170,7 +170,7 @@ class Coordinates:
 
     @property
     def up_axis(self) -> str:
-        """The axis that points up, such as ``z`` or ``-y``, or why no axis does."""
+        """The axis that points up, such as ``z`` or ``-y``; "none..." or "unknown" otherwise."""
         for axis, value in zip("xyz", self.up, strict=True):
             if abs(abs(value) - 1) < 1e-8:  # within 1e-4 rad
                 return axis if value > 0 else f"-{axis}"

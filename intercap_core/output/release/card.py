@@ -185,6 +185,7 @@ def _plain(value: Any) -> int | float | None:
 
 
 def _accuracy(summaries: Sequence[SequenceSummary]) -> dict[str, Any]:
+    """Return stated errors, distances to the clouds, penetration and, if known, true errors."""
     measured = [s.metrics for s in summaries]
     clouds, depth = figures.cloud_figures(measured), figures.penetration_figures(measured)
     accuracy: dict[str, Any] = {
@@ -203,6 +204,7 @@ def _accuracy(summaries: Sequence[SequenceSummary]) -> dict[str, Any]:
 
 
 def _flagged(summaries: Sequence[SequenceSummary]) -> dict[str, Any]:
+    """Count flagged frames, and the frames with each reason."""
     counted: Counter[str] = Counter()
     for s in summaries:
         for reasons in s.metrics.values["flag_reason"]:

@@ -100,6 +100,7 @@ def _file_set(name: str) -> dict[str, Any]:
 
 
 def _records(name: str, table: pd.DataFrame) -> dict[str, Any]:
+    """Describe the columns of a table."""
     return {
         "@type": "cr:RecordSet",
         "@id": name,

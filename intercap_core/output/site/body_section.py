@@ -195,6 +195,10 @@ def body_sheet(
 def _cell(
     camera: Camera, rgb: np.ndarray, body: PosedBody, faces: np.ndarray, detected: np.ndarray
 ) -> np.ndarray | None:
+    """Draw the crop around the body in one image; None if the body is not in view.
+
+    ``detected``: (135, 3) x, y, confidence.
+    """
     lens = camera.colour
     local = apply(camera.colour_from_master, body.vertices)
     # the square around the visible vertices

@@ -114,8 +114,8 @@ def choose_set(images: Frames) -> int:
 def floor_profiles(cloud: FusedCloud, centre: np.ndarray) -> list[FloorProfile]:
     """Return median heights of the floor along a strip parallel to x, camera by camera.
 
-    Of five strips near ``centre`` (2,), the one with the fewest points between 0.08 and 0.4 m above
-    the floor is used, because they belong to legs and furniture.
+    Five strips near ``centre`` (2,) are compared. The one with the fewest points between 0.08 and
+    0.4 m above the floor is used, because such points belong to legs and furniture.
     """
     half_width, bin_m, highest = 0.15, 0.08, 0.08  # metres; points above are not floor
     height, offset = cloud.points[:, 2], cloud.points[:, 1] - centre[1]

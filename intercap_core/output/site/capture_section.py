@@ -187,6 +187,7 @@ def context(facts: CaptureFacts) -> dict[str, Any]:
 
 
 def _cameras(recorded: artefacts.Artefact, refined: artefacts.Artefact) -> list[CameraFacts]:
+    """Collect the facts of each camera from the artefacts of frames and scene."""
     start, end = refined["master_from_colour_start"], refined["master_from_colour"]
     turn = np.swapaxes(start[:, :3, :3], 1, 2) @ end[:, :3, :3]
     cosine = np.clip((np.trace(turn, axis1=1, axis2=2) - 1) / 2, -1, 1)

@@ -226,6 +226,7 @@ def _over_frames(
 def _chart(
     lines: Sequence[tuple[str, str, np.ndarray]], unit: str, caption: str
 ) -> tuple[str, str] | None:
+    """Plot lines (name, colour, values (T,)) over the frames; None if no value is finite."""
     series = []
     for name, colour, values in lines:
         known = np.flatnonzero(np.isfinite(values))

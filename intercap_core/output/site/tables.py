@@ -199,9 +199,13 @@ def camera_groups(cameras: pd.DataFrame) -> pd.DataFrame:
 def worst_first(table: pd.DataFrame) -> pd.Series:
     """Return the rank of each sequence, 1 = worst, by its mean rank in several measures.
 
-    The measures are: share of flagged frames, distances of the visible body and object to the
-    cloud, 98th percentile of penetration, and the stated error of each part (worst if none is
-    stated). Measures of the object are omitted without an object.
+    The measures are:
+    - share of flagged frames
+    - distances of the visible body and object to the cloud
+    - 98th percentile of penetration
+    - stated error of each part; the worst rank if none is stated
+
+    Measures of the object are omitted without an object.
     """
     measures = pd.DataFrame(
         {

@@ -129,6 +129,7 @@ def gather(paths: SequencePaths, models: SequenceModels, *, truth: Path | None =
 def _sequential(
     body_fit: Path, existing: Mapping[str, Path], body_models: BodyModels, gender: str
 ) -> _Body:
+    """Read the sequential fits; the object has no pose without an object track."""
     with artefacts.read(body_fit, BODY_FIT) as fit:
         model, parameters = load_model(body_models, gender, fit), read_parameters(fit)
     rotation = np.full((parameters.batch, 3, 3), np.nan)
@@ -182,6 +183,7 @@ def _simplified(mesh: ObjectMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _add_body(content: Content, name: str, body: _Body, zup: np.ndarray) -> None:
+    """Add a skinned body, with its transforms in the z-up frame, quantised for the viewer."""
     skin = skinned(body.model, body.parameters)
     transforms = np.einsum("ab,tjbc->tjac", zup[:3, :3], skin.transforms)
     transforms[..., 3] += zup[:3, 3]
