@@ -1,14 +1,16 @@
 """Released results: their common form, and the files of BEHAVE.
 
-BEHAVE has registrations in the folders of frames, and parameters at 30 frames a second.
+BEHAVE has registrations of single frames, and parameters at 30 frames a second. A frame's folder,
+such as ``t0003.000``, holds:
 
-A frame's folder ``t0003.000`` holds ``person/fit02/person_fit.ply`` (6,890 vertices, SMPL-H's) and
-``.pkl`` (``pose``: 156 numbers of SMPL-H's 52 joints, or 72 of SMPL's 24), and of the object
-``<name>/fit01/<name>_fit.pkl`` (``angle``, a rotation vector, and ``trans``) and ``.ply``. The
-folder's name is the object's, or that of its kind, "chair" or "sports ball". The parameters at
-30 fps are ``smpl_fit_all.npz`` (``poses``, ``frame_times``) and ``object_fit_all.npz`` (``angles``,
-``trans``, ``frame_times``) of a sequence; times are texts such as "t0003.033". Everything is in the
-frame of Kinect 1's colour camera, metres and radians.
+- ``person/fit02/person_fit.ply``: mesh of 6,890 vertices (SMPL-H's);
+- ``person/fit02/person_fit.pkl``: ``pose`` of 156 numbers (SMPL-H's 52 joints) or 72 (SMPL's 24);
+- ``<name>/fit01/<name>_fit.pkl``: the object's ``angle``, a rotation vector, and ``trans``;
+- ``<name>/fit01/<name>_fit.ply``: its mesh. ``<name>`` is the object, "chair" or "sports ball".
+
+A sequence's parameters are in ``smpl_fit_all.npz`` (``poses``, ``frame_times``) and in
+``object_fit_all.npz`` (``angles``, ``trans``, ``frame_times``). Times are texts such as
+"t0003.033". All poses are in the frame of Kinect 1's colour camera, metres and radians.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ PERSON_MESH = Path("person", "fit02", "person_fit.ply")  # in the folder of a fr
 
 
 def intercap_file(path: Path) -> Path:
-    """The file of results in a folder; a file, or a folder without such a file, as it is."""
+    """Return the file of results in a folder; any other path is returned unchanged."""
     return next((path / name for name in INTERCAP if (path / name).is_file()), path)
 
 

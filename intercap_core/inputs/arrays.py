@@ -29,18 +29,18 @@ _HEADS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
 }
-# What zipfile, zlib and numpy's parser of headers raise for damaged archives.
+# Exceptions of zipfile, zlib and numpy's parser of headers for damaged archives.
 _ARCHIVE_ERRORS = (
     zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OSError,
     ValueError, OverflowError, TypeError, SyntaxError, tokenize.TokenError, KeyError,
 )  # fmt: skip
-# What unpickling raises for damaged files.
+# Exceptions of the unpickler for damaged files.
 PICKLE_ERRORS = (
     pickle.UnpicklingError, ValueError, TypeError, KeyError, IndexError, AttributeError, EOFError,
     OverflowError, RecursionError, ImportError, AssertionError, SystemError,
     MemoryError,  # a damaged index of the unpickler's memo asks for any amount of memory
 )  # fmt: skip
-# What pickles of numpy arrays and plain values name. numpy 2.0 moved its own from core to _core.
+# Names that pickles of numpy arrays and plain values hold. numpy 2.0 renamed core to _core.
 _PICKLE_NAMES = {
     *((f"numpy.{core}.multiarray", name) for core in ("core", "_core")
       for name in ("_reconstruct", "scalar")),

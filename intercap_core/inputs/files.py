@@ -12,7 +12,7 @@ import numpy as np
 
 from intercap_core.errors import UserError
 
-# Size limits in bytes by kind of file, several times the size of the largest real file of the kind.
+# Size limits, bytes: several times the size of the largest real file of each kind.
 MAX_SETTINGS_BYTES = 1 << 20  # written by hand; YAML is parsed at about a megabyte a second
 MAX_TABLE_BYTES = 1 << 24  # a line for each of 100,000 recordings
 MAX_CALIBRATION_BYTES = 1 << 24  # JSON, YAML or TOML of a hundred cameras
@@ -125,7 +125,7 @@ def quoted(value: Any, most: int = 80) -> str:
 
 
 def printable(text: str) -> str:
-    """Replace what UTF-8 cannot encode, such as bytes of file names, by ``?``."""
+    """Replace characters that UTF-8 cannot encode, such as bytes of file names, by ``?``."""
     return text.encode("utf-8", "replace").decode("utf-8", "replace")
 
 

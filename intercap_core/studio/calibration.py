@@ -64,6 +64,7 @@ def write_calibration(camera: Camera, *, colour_mode: str, depth_mode: str, seri
 def _lens(
     lens: Intrinsics, mode: Mode, location: str, pose: np.ndarray, sensor: tuple[int, int]
 ) -> dict[str, Any]:
+    """Camera entry of the JSON. ``pose``: location from depth; ``sensor``: its full size, px."""
     if (lens.width, lens.height) != mode.size:
         raise ValueError(f"a {lens.width}x{lens.height} lens in a mode of {mode.size}")
     width, height = mode.binned

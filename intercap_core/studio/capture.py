@@ -1,4 +1,8 @@
-"""Make one virtual capture: recordings, detections, calibration, truth and an erring annotation."""
+"""Make one virtual capture: recordings, detections, calibration, truth and annotation.
+
+Parameters named ``moment`` hold the true state at the T set times (:class:`.stage.StageState`).
+The annotation has the errors that a person makes.
+"""
 
 from __future__ import annotations
 

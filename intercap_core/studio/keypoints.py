@@ -1,11 +1,14 @@
 """2D keypoints with the errors of a detector like OpenPose, in its file format.
 
-Errors of a joint: a fixed bias in the body (a detector's joints differ from the skeleton's), a bias
-of the view, lasting jitter, exchanges of left and right, and a plausible wrong place when the joint
-is occluded. The confidence depends on the error only partly.
+Errors of a joint:
 
-Of the 135 points, 0 to 24 are the body (8 = middle of the hips), 25 to 45 the left hand, 46 to 66
-the right hand and 67 to 134 the face.
+- a fixed bias in the body, because a detector's joints differ from the skeleton's;
+- a bias of the view, and jitter that is correlated over time;
+- exchanges of left and right;
+- a plausible wrong place if the joint is occluded.
+
+The confidence depends on the error only partly. The 135 points are body (0 to 24; 8 = middle of the
+hips), left hand (25 to 45), right hand (46 to 66) and face (67 to 134).
 """
 
 from __future__ import annotations

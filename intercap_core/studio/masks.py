@@ -199,6 +199,7 @@ class CameraMasks:
         return [(self.network.label, _encode(left, 0, 0, self.size)), *self._clutter]
 
     def _object_label(self, t: int) -> str:
+        """Label of the object in set ``t``; a wrong label stays for up to eight sets."""
         label = self.network.label
         if not self._wrong_label[t]:
             return label
@@ -206,6 +207,7 @@ class CameraMasks:
         return others[self._wrong[t // 8] % len(others)]
 
     def _result(self, label: str, rle: dict[str, Any], score: float) -> dict[str, Any]:
+        """An instance in COCO's result format, with the category's name."""
         box = [round(float(v), 2) for v in coco.toBbox(rle)]
         counts = rle["counts"].decode() if isinstance(rle["counts"], bytes) else rle["counts"]
         return {

@@ -239,6 +239,7 @@ class MkvWriter:
         self._file.write(_element(number, payload))
 
     def _track_entry(self, name: str, number: int, fps: int) -> bytes:
+        """The TrackEntry of a track."""
         entry = (
             _unsigned(0xD7, number)  # TrackNumber
             + _unsigned(0x73C5, self._uid(name))  # TrackUID
@@ -268,6 +269,7 @@ class MkvWriter:
         return _element(0xAE, entry)
 
     def _tag(self, name: str, value: str, about: str) -> bytes:
+        """The element of a tag, for the whole file if ``about`` is ""."""
         # Tag: Targets (TargetType; TagTrackUID or TagAttachmentUID), SimpleTag (TagName, TagString)
         target = b""
         if about in self._tracks:
@@ -284,6 +286,7 @@ class MkvWriter:
         self._write(name, image.astype(">u2").tobytes(), device_time_us)
 
     def _write(self, name: str, payload: bytes, device_time_us: int) -> None:
+        """Add a block. A second image of its track, or a time too far away, ends the cluster."""
         if name not in self._tracks:
             raise ValueError(f"this recording was opened without {name} track")
         track = self._tracks[name]
@@ -309,6 +312,7 @@ class MkvWriter:
         self._last_us = max(self._last_us, time_us)
 
     def _flush_cluster(self) -> None:
+        """Write the collected blocks as one cluster, and note its position for the index."""
         if not self._cluster or self._cluster_us is None:
             return
         position = self._file.tell() - self._segment_start

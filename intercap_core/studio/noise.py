@@ -66,6 +66,7 @@ class NoiseSource:
     def _first_order(
         self, rng: np.random.Generator, frames: int, channels: int, correlation_s: float
     ) -> np.ndarray:
+        """First-order process (frames, channels) of unit variance."""
         keep = np.exp(-1 / max(correlation_s * self.fps, 1e-3))
         steps = rng.normal(size=(frames, channels))
         path = np.empty_like(steps)

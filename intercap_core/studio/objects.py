@@ -1,7 +1,7 @@
-"""True objects of the studio: the catalogue's meshes made a little different from what is tracked.
+"""True objects of the studio: meshes that differ a little from the catalogue's, which are tracked.
 
-A real object is never the scanned mesh: it is scaled by half a percent, its surface is off by a
-smooth part of its size, and another scan would have other triangles."""
+A real object never equals its scan. Therefore the true mesh is 0.5 % larger or smaller, has a
+smooth error of the surface, and has other triangles."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ SURFACE_ERROR = 0.006
 WAVES = 48  # number of random plane waves whose sum is the displacement
 
 
+# RGB of objects that do not have the mesh's own colours.
 PAINTS = ((0.92, 0.91, 0.88), (0.13, 0.13, 0.14), (0.70, 0.12, 0.13), (0.11, 0.28, 0.60),
           (0.84, 0.42, 0.17), (0.16, 0.46, 0.31), (0.88, 0.76, 0.24),
           (0.50, 0.51, 0.53))  # fmt: skip

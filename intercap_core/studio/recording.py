@@ -266,9 +266,9 @@ def _blur_px(view: RoomView, times: np.ndarray, points: np.ndarray) -> np.ndarra
 def _hidden(cast: Cast, view: RoomView, points: np.ndarray) -> np.ndarray:
     """Mask (135,) of keypoints (135, 3), stage frame, that another surface occludes.
 
-    The moving surface on a keypoint's ray occludes it if it is nearer along the ray by more than
-    ``COVER_M``, the room if its depth is smaller by more than 3 cm. Points 25 to 66 are the hands,
-    67 to 134 the face, and 0 and 15 to 18 are nose, eyes and ears.
+    A moving surface occludes a keypoint if it is nearer along the ray by more than ``COVER_M``. The
+    room occludes it if the room's depth is smaller by more than 3 cm. Points 25 to 66 are the
+    hands, 67 to 134 the face, and 0 and 15 to 18 are nose, eyes and ears.
     """
     cover = np.full(135, COVER_M["body"])
     cover[25:67], cover[67:] = COVER_M["hand"], COVER_M["face"]

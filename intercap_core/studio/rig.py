@@ -148,6 +148,7 @@ def _about_centre(master_from_colour: np.ndarray, error: np.ndarray) -> np.ndarr
 
 
 def _colour_lens(rng: np.random.Generator, mode: str) -> Intrinsics:
+    """Draw a colour lens; its values are those of images 1,920 px wide, scaled to the mode."""
     width, height = COLOUR_MODES[mode].size
     scale = width / 1920
     focal = (913 + rng.normal(0, 4)) * scale
@@ -165,6 +166,7 @@ def _colour_lens(rng: np.random.Generator, mode: str) -> Intrinsics:
 
 
 def _depth_lens(rng: np.random.Generator, mode: str) -> Intrinsics:
+    """Draw a depth lens; its values are those of the mode NFOV_UNBINNED."""
     narrow = DEPTH_MODES["NFOV_UNBINNED"]
     width, height = narrow.size
     focal = 504.5 + rng.normal(0, 1.0)

@@ -1,4 +1,8 @@
-"""The stage of one capture: subject, object, room and cameras, and their state at any moment."""
+"""The stage of one capture: subject, object, room and cameras, and their state at any time.
+
+Stage frame: z up, the floor at z = 0, metres. Scripts have a frame of their own
+(``stage_from_script``); the cameras' poses are in the master's colour frame.
+"""
 
 from __future__ import annotations
 
@@ -29,9 +33,9 @@ from intercap_core.studio.room import Furnishing, build_room
 from intercap_core.studio.skeleton import about_z
 from intercap_core.studio.subjects import Subject, build_names, in_heavy_shoes, subject_names
 
-LOOKS = ("mesh", "plain", "printed")  # equally likely
+LOOKS = ("mesh", "plain", "printed")  # of the object, equally likely
 
-
+# Faults that recordings of any layout can have.
 ANY_LAYOUT = frozenset({"dead_half", "no_depth", "zero_depth", "no_overlap"})
 
 
@@ -121,6 +125,7 @@ class StudioStage:
         )
 
     def _passer_by(self, eyes: np.ndarray, *, stands: bool) -> PasserBy:
+        """The second person; ``eyes``: (C, 2) places of the cameras on the floor."""
         played = self.interaction.perform(
             self.interaction.script_times(self.set_times, self.duration)
         )

@@ -137,6 +137,7 @@ class Subject:
         return self.rest + self.normals(self.rest[None])[0] * self.clothing[:, None]
 
     def _chain(self, local: np.ndarray, transl: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """World rotations (B,55,3,3) and joints (B,55,3) of local rotations (B,55,3,3)."""
         world = np.empty_like(local)
         joints = np.empty((len(local), NUM_JOINTS, 3))
         world[:, 0], joints[:, 0] = local[:, 0], self.rest_joints[0] + transl

@@ -22,7 +22,7 @@ class CalibrationChoice:
     """Result of :func:`choose_calibration`."""
 
     best: str | None
-    """Name of the calibration with the clearly smallest residual; None if there is no such one."""
+    """Name of the calibration whose residual is clearly the smallest; None if there is none."""
     residual_m: dict[str, float]
     """Residual of each calibration that could be compared, metres."""
 

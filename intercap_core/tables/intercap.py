@@ -99,6 +99,7 @@ def draft(root: Path, sources: Sources, *, dataset: str, objects: Path) -> Draft
 
 
 def _sequence_folders(images: Path) -> dict[Key, Path]:
+    """Folders of images by subject, object and segment, sorted."""
     folders: dict[Key, Path] = {}
     for subject in _numbered_folders(images):
         for object_folder in _numbered_folders(subject):
@@ -125,6 +126,7 @@ def _find_folder(images: Path, name: str) -> Path | None:
 
 
 def _calibrations(given: Path | None, images: Path) -> dict[str, Path]:
+    """The existing folders of calibrations by name: first, second, third."""
     names = {name: f"calibration_{name}" for name in CALIBRATIONS}
     if given is not None:
         folders = {name: given / folder for name, folder in names.items()}
@@ -141,6 +143,7 @@ def _calibrations(given: Path | None, images: Path) -> dict[str, Path]:
 
 
 def _row(key: Key, folder: Path, sources: Sources) -> Row:
+    """Row of a sequence, without calibration and annotation."""
     subject, number, segment = key
     name = f"s{subject:02d}_o{number:02d}_seg{segment}"
     columns: dict[str, str | Path] = {
@@ -177,6 +180,7 @@ def _frame_numbers(folder: Path) -> np.ndarray:
 
 
 def _calibration(key: Key, folder: Path, known: dict[str, Path], row: Row) -> Path:
+    """The folder that the release states for a sequence, or else one that fits its depth."""
     stated = find_stated_calibration(*key[:2])
     if stated is not None:
         if stated not in known:

@@ -33,7 +33,7 @@ class Converted:
     text: str
     """The annotation as YAML; "" if nothing can be used."""
     faults: list[str] = field(default_factory=list)
-    """What was left out, and why."""
+    """Parts that were left out, with the reason."""
 
 
 def find_annotation_folders(root: Path) -> dict[Key, list[Path]]:

@@ -114,6 +114,7 @@ READER = CalibrationReader(
 
 
 def _pose(image: _Image, path: Path) -> np.ndarray:
+    """Camera from world (4, 4), in the model's unit of length."""
     w, x, y, z = image.quaternion
     numbers = np.array([*image.quaternion, *image.translation])
     if not np.isfinite(numbers).all() or abs(np.linalg.norm(image.quaternion) - 1) > 0.01:
@@ -125,6 +126,7 @@ def _pose(image: _Image, path: Path) -> np.ndarray:
 
 
 def _lens(number: int, size: tuple[int, int], values: list[float], where: str) -> Intrinsics:
+    """The lens of model ``number`` from its parameters ``values``; ``where`` begins messages."""
     model = MODELS[number]
     if len(values) != model.parameters:
         raise UserError(
@@ -154,6 +156,7 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def _text_lenses(path: Path) -> Iterator[tuple[int, Intrinsics]]:
+    """Yield number and lens of each camera: CAMERA_ID MODEL WIDTH HEIGHT and parameters."""
     for number, line in _lines(path):
         if not line:
             continue
@@ -173,6 +176,7 @@ def _text_lenses(path: Path) -> Iterator[tuple[int, Intrinsics]]:
 
 
 def _text_images(path: Path) -> Iterator[_Image]:
+    """Yield the images. Each has a line of pose, camera and name, and a line of points."""
     lines = _lines(path)
     for number, line in lines:
         if not line:
@@ -219,6 +223,7 @@ class _Bytes:
 
 
 def _binary_lenses(content: _Bytes, path: Path) -> Iterator[tuple[int, Intrinsics]]:
+    """Yield number and lens of each camera: numbers of camera and model, size, parameters."""
     for _ in range(content.take("Q")[0]):
         camera, model, width, height = content.take("iiQQ")
         where = f"{path}: camera {camera}"
@@ -229,6 +234,7 @@ def _binary_lenses(content: _Bytes, path: Path) -> Iterator[tuple[int, Intrinsic
 
 
 def _binary_images(content: _Bytes) -> Iterator[_Image]:
+    """Yield the images: number, pose, camera, name and points, which are skipped."""
     for _ in range(content.take("Q")[0]):
         _, *values, camera = content.take("i7di")
         name = content.name()

@@ -74,6 +74,7 @@ def _entry(content: dict[str, Any], key: str, where: str) -> Any:
 def _size(
     content: dict[str, Any], name: str, where: str, recorded: RecordedCameras
 ) -> tuple[int, int]:
+    """Width and height that the file states, or else those of the camera's recording."""
     stated = [content.get(f"{key}_{name}") for key in "WH"]
     if None not in stated:
         return parse_image_size(stated, where)
@@ -87,6 +88,7 @@ def _size(
 
 
 def _pose(content: dict[str, Any], name: str, where: str) -> np.ndarray:
+    """Camera from world (4, 4), metres; raises UserError if ``R`` and ``Rot`` disagree."""
     translation = _entry(content, f"T_{name}", where)
     rotations = [content.get(f"{key}_{name}") for key in ("R", "Rot")]
     rotations = [rotation for rotation in rotations if rotation is not None]

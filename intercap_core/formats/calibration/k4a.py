@@ -1,9 +1,8 @@
 """Lenses of Azure Kinects from their calibration JSON, for every colour and depth mode.
 
-Lenses in the JSON are unitised: multiplied by the size of the binned sensor they give pixels of the
-whole image (4:3 for colour, square for depth) with (0, 0) at the *corner* of the first pixel. Each
-mode then crops. Sizes and crops are those of the Azure Kinect Sensor SDK (MIT),
-``src/transformation``.
+Lenses in the JSON are normalised. Multiplied by the size of the binned sensor (4:3 for colour,
+square for depth), they are in pixels with (0, 0) at the *corner* of the first pixel. Each mode then
+crops. Sizes and crops are those of the Azure Kinect Sensor SDK (MIT), ``src/transformation``.
 """
 
 from __future__ import annotations

@@ -65,6 +65,7 @@ READER = CalibrationReader(tool="nerfstudio", rank=2, recognises=_recognises, re
 
 
 def _images(path: Path, content: dict[str, Any]) -> Iterator[tuple[str, Intrinsics, np.ndarray]]:
+    """Yield path, lens and camera_from_world (4, 4) of each frame."""
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
         raise UserError(f"{path}: 'frames' is no list of frames; correct it")
@@ -89,6 +90,7 @@ def _pose(frame: dict[str, Any], where: str) -> np.ndarray:
 
 
 def _lens(entry: dict[str, Any], where: str) -> Intrinsics:
+    """The lens of a frame's fields, to which those at the top level were added."""
     model = entry.get("camera_model", MODELS[0])
     if model not in MODELS or entry.get("is_fisheye"):
         shown = "is_fisheye" if model in MODELS else f"camera_model {quoted(model, 40)}"

@@ -300,6 +300,7 @@ def opencv_pose(rotation: Any, translation: Any, where: str) -> np.ndarray:
 
 
 def _camera(entry: dict[str, Any], where: str, fps: float | None) -> CalibratedCamera:
+    """Read all of a camera's entry but its pose; ``fps`` is the rate stated for all cameras."""
     colour = _lens(entry, where)
     offset = parse_number(entry.get("time_offset", 0.0), where, "time_offset", "seconds")
     if abs(offset) > 1e9:  # clocks that count from 1970 are above it

@@ -83,6 +83,7 @@ READER = CalibrationReader(
 
 
 def _camera_tables(path: Path) -> dict[str, dict[str, Any]]:
+    """The tables that describe cameras, by their names."""
     content = read_toml(path)
     tables = {
         name: table

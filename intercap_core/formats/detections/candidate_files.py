@@ -47,7 +47,7 @@ class CandidatesByImage:
     by_image: dict[int, list[Instance]] = field(default_factory=dict)
     """Instances by image number; an empty list if the detector found none in the image."""
     notes: list[str] = field(default_factory=list)
-    """What was left out, for the user."""
+    """Messages for the user about entries and files that were left out."""
 
 
 @dataclass
@@ -55,7 +55,7 @@ class CandidatePreview:
     """The beginning of one camera's candidates."""
 
     notes: list[str] = field(default_factory=list)
-    """What is wrong, for the user."""
+    """Messages for the user about faults."""
     labels: set[str] = field(default_factory=set)
     """Labels of the instances."""
 
@@ -171,6 +171,7 @@ def _add_image_files(
 def _add_masks_of_camera(
     candidates: CandidatesByImage, folder: Path, images: CameraImages, layout: str
 ) -> None:
+    """Add masks from image files of the InterCap release, or of any detector."""
     if layout == "intercap":
         person = find_release_masks(folder, images.name)
         if person is None:

@@ -37,8 +37,11 @@ COCO_NAMES_FROM_1: dict[int, str] = dict(enumerate(_CLASSES, start=1))
 def parse_class_names(content: Any) -> dict[int, str]:
     """Return class names by number from parsed JSON or YAML; raises ValueError without names.
 
-    The content is a list of names (numbered from 0), a mapping of numbers to names, COCO's list of
-    objects with ``id`` and ``name``, or one of these under ``categories`` or ``names``.
+    The content is one of the following, itself or under ``categories`` or ``names``:
+
+    - a list of names, numbered from 0;
+    - a mapping of numbers to names;
+    - COCO's list of objects with ``id`` and ``name``.
     """
     if isinstance(content, dict):
         for key in ("categories", "names"):
@@ -54,6 +57,7 @@ def parse_class_names(content: Any) -> dict[int, str]:
 
 
 def _unique(pairs: Sequence[tuple[Any, Any]]) -> dict[int, str]:
+    """Names by number; raises ValueError for an invalid or repeated entry, and for none."""
     names: dict[int, str] = {}
     for number, name in pairs:
         if isinstance(number, str) and number.isdecimal() and len(number) < 10:

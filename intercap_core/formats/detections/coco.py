@@ -1,10 +1,13 @@
 """Instance segmentations as JSON: COCO's result format and the variants that detectors write.
 
 A file is a list of results or a data set (``images``, ``annotations``, ``categories``). A result
-states its image (``image_id``, a number or a name, or ``file_name``) unless the file holds one
-image, its class by number or by name, a score, and a segmentation in any form that
-:func:`intercap_core.formats.detections.instance.to_rle` reads. Keys are those of detectron2,
-torchvision, ultralytics, Segment Anything and Grounded SAM.
+states:
+
+- its image, unless the file holds one image: ``image_id``, a number or a name, or ``file_name``;
+- its class by number or by name, and a score;
+- a segmentation in any form that :func:`intercap_core.formats.detections.instance.to_rle` reads.
+
+Keys are those of detectron2, torchvision, ultralytics, Segment Anything and Grounded SAM.
 """
 
 from __future__ import annotations
@@ -188,6 +191,7 @@ def _bytes(path: Path, head: int | None = None) -> bytes:
 def _read_file_head(
     content: dict[str, Any], names: Mapping[int, str]
 ) -> tuple[_FileHead, list[ImageKey] | None]:
+    """Return what a data set states for all entries, and the images that it lists."""
     own: dict[int, str] = {}
     if content.get("categories"):
         try:
@@ -299,6 +303,7 @@ def _instance(
 
 
 def _score(entry: dict[str, Any]) -> float:
+    """Score of an entry; 1 if the entry states none."""
     keys = ("score", "confidence", "predicted_iou")
     value = next((entry[key] for key in keys if key in entry), 1.0)
     if isinstance(value, list) and len(value) == 1:

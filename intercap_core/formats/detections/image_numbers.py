@@ -1,8 +1,11 @@
 """Match files of detections, and entries of such files, to the colour images of a camera.
 
-A frame set holds one image of each camera, all taken at nearly the same time. The number of an
-image is its position among the camera's images, for layout ``plain`` among its image files
-(damaged ones included), for ``intercap`` the number in the file's name.
+A frame set holds one image of each camera, all taken at nearly the same time. The number by which
+files refer to an image depends on the layout of the recording:
+
+- ``k4a``, ``behave``, videos: its position among the camera's copied images, from 0;
+- ``plain``: its position among the camera's image files, damaged ones included;
+- ``intercap``: the number in the image file's name.
 """
 
 from __future__ import annotations

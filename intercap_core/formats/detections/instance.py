@@ -99,6 +99,7 @@ def to_rle(
 def _from_rle(
     segmentation: dict[str, Any], size: tuple[int, int]
 ) -> tuple[bytes, tuple[float, float]]:
+    """Convert an object with ``size`` (height, width) and ``counts``; see :func:`to_rle`."""
     stated = segmentation.get("size")
     if (
         not isinstance(stated, list)
@@ -120,6 +121,7 @@ def _from_rle(
 
 
 def _compressed(counts: Any, height: int, width: int) -> bytes:
+    """Compressed RLE of ``counts`` that are compressed, text, or a list of run lengths."""
     if isinstance(counts, bytes):
         return counts
     if isinstance(counts, str):

@@ -78,7 +78,7 @@ class KeypointCleaner:
         return result[present & ~normalised]
 
     def notes(self) -> list[str]:
-        """What was changed, for the user."""
+        """Messages for the user about points and people that were changed or left out."""
         notes = []
         width, height = self.size
         if self.outside:
@@ -109,7 +109,7 @@ class PeopleByImage:
     by_image: dict[int, np.ndarray] = field(default_factory=dict)
     """People (P, 135, 3) by image number; P = 0 if the detector found none in the image."""
     notes: list[str] = field(default_factory=list)
-    """What was left out, for the user."""
+    """Messages for the user about people and files that were left out."""
 
 
 @dataclass
@@ -278,7 +278,7 @@ def _add_files(reading: _Reading, files: Mapping[int, Path | None], reader: Keyp
 def preview_keypoints(
     folder: Path, camera: str, *, size: tuple[int, int], full_confidence: float
 ) -> list[str]:
-    """What is wrong with the beginning of one camera's file, or its first file of one image.
+    """Faults in the beginning of one camera's file, or in its first file of one image.
 
     Args:
         folder: folder of keypoints of the sequence.

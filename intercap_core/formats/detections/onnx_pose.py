@@ -1,10 +1,11 @@
 """Whole-body keypoints by a user's ONNX model: RTMPose, DWPose, HRNet or ViTPose exports, top down.
 
-The input of such a model is one person, cut out around a box. The output for every point is its
-likelihood in each column and each row, in bins finer than pixels (SimCC), or in each cell of a map
-that is coarser than the input (heatmap). Cropping and decoding follow mmpose: the box is enlarged
-by a quarter and widened to the input's aspect ratio; pixels are RGB, normalised by ImageNet's mean
-and standard deviation.
+The input of such a model is one person, cut out around a box. The output is the likelihood of every
+point, in one of two forms. SimCC has one value for each column and one for each row, in bins finer
+than pixels. A heatmap has one value for each cell of a map that is coarser than the input.
+
+Cropping and decoding follow mmpose: the box is enlarged by a quarter and widened to the input's
+aspect ratio; pixels are RGB, normalised by ImageNet's mean and standard deviation.
 """
 
 from __future__ import annotations

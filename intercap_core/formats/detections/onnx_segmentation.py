@@ -191,6 +191,7 @@ class Segmenter:
             yield from self._run(waiting)
 
     def _prepared(self, picture: np.ndarray) -> tuple[Fit, np.ndarray]:
+        """Fit a picture into the input: its place there, and the input's values (3, h, w)."""
         picture_size = (picture.shape[1], picture.shape[0])
         size = self._model.size
         if size is None and self._kind.yolo:
@@ -210,6 +211,7 @@ class Segmenter:
     def _run(
         self, waiting: list[tuple[Key, Fit, np.ndarray]]
     ) -> Iterator[tuple[Key, list[Instance]]]:
+        """Run the model on the waiting pictures and yield the instances of each."""
         images = np.stack([values for _, _, values in waiting])
         outputs = self._model.run(images)
         size = (images.shape[3], images.shape[2])

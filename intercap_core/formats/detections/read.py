@@ -97,7 +97,7 @@ class Detections:
     candidates_found: np.ndarray
     """(T, C) bool: a detector of instances processed the image."""
     notes: tuple[str, ...]
-    """What was left out, by camera."""
+    """Note of each of the C cameras on missing detections, "" = nothing is missing."""
 
     def __init__(self, artefact: artefacts.Artefact) -> None:
         self.path = artefact.path

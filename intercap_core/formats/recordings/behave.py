@@ -1,10 +1,10 @@
 """Layout ``behave``: the folders of the BEHAVE data set.
 
-``recordings`` is a sequence's folder of frame folders ``t<seconds>`` that hold
-``k<n>.color.jpg`` and ``k<n>.depth.png`` (16 bits, millimetres, on the colour image's grid) of the
-Kinects 0 to 3. ``calibration`` is ``calibs/<date>/config``: ``<n>/config.json`` has the pose of
-each colour camera. Lenses are in ``calibs/intrinsics/<n>/calibration.json``. Cameras are named k0,
-k1, ... and k1 is the master, to whose colour camera poses are related.
+``recordings`` is the folder of a sequence, with a folder ``t<seconds>`` for each frame. The latter
+holds ``k<n>.color.jpg`` and ``k<n>.depth.png`` of Kinects 0 to 3; depth has 16 bits, in millimetres
+on the colour image's grid. ``calibration`` is ``calibs/<date>/config``: ``<n>/config.json`` has the
+pose of each colour camera. Lenses are in ``calibs/intrinsics/<n>/calibration.json``. Cameras are
+named k0, k1, ... and k1 is the master, to whose colour camera poses are related.
 """
 
 from __future__ import annotations
@@ -195,6 +195,7 @@ def read_lens(calibration: Path, number: int) -> Intrinsics:
 
 
 def _kinect_folders(folder: Path) -> dict[int, Path]:
+    """The folders of single Kinects by number; raises UserError without ``folder``."""
     if not folder.is_dir():
         raise UserError(
             f"{folder}: there is no such folder of camera poses; correct 'calibration' in the "

@@ -158,6 +158,7 @@ class _Copy:
         self._note_images()
 
     def _take_colour(self, image: Image) -> None:
+        """Copy a colour image; count one that is damaged or of another size."""
         content = bytes(image.content)
         size = encoded_size(content)
         if size != self.colour_size:
@@ -175,6 +176,7 @@ class _Copy:
             self._flush()
 
     def _take_depth(self, image: Image) -> None:
+        """Copy a depth image if depth is wanted; count one of another size."""
         depth = np.asarray(image.content)
         lens = self.recording.camera.depth
         if self.depth is None or lens is None:
@@ -216,6 +218,7 @@ class _Copy:
             self.writer.put(f"{self.group}/depth_time", view.depth_times)
 
     def _note_images(self) -> None:
+        """Note what was left out; a camera whose depth is all zero loses its depth lens."""
         view = self.view
         if not self.colour_times:
             view.notes.append("holds no colour image")

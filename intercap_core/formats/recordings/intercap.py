@@ -110,6 +110,7 @@ def find_images(folder: Path) -> tuple[dict[int, Path], dict[int, Path]]:
 
 
 def _numbered(folder: Path | None, suffixes: tuple[str, ...]) -> dict[int, Path]:
+    """Image files of a folder by the number in their names; {} without the folder."""
     images: dict[int, Path] = {}
     for path in sorted(folder.iterdir()) if folder is not None else ():
         match = NUMBERED.fullmatch(path.name)
@@ -128,9 +129,9 @@ def _numbered(folder: Path | None, suffixes: tuple[str, ...]) -> dict[int, Path]
 def read_lens(path: Path, size: tuple[int, int]) -> Intrinsics:
     """Read a lens from a ``Color*.json`` for images of ``size``, which the file does not state.
 
-    ``f`` and ``c`` are focal length and principal point (x, y) in pixels, ``k`` the coefficients
-    k1, k2, p1, p2 and, if there are more, k3 to k6, in OpenCV's order. Raises UserError for a
-    broken file and for a principal point that belongs to images of another size.
+    ``f`` and ``c`` are focal length and principal point (x, y) in pixels. ``k`` has 4, 5 or 8
+    coefficients in OpenCV's order (k1, k2, p1, p2, k3, ...). Raises UserError for a broken file,
+    and for a principal point that belongs to images of another size.
     """
     where = f"{path.parent.name}/{path.name}"
     try:

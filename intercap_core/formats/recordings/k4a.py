@@ -47,7 +47,8 @@ from intercap_core.inputs.files import quoted, read_bytes
 
 CALIBRATION_NAME = "calibration.json"
 IMU_SAMPLE = struct.Struct("<Q3fQ3f")  # time ns, m/s^2, time ns, rad/s
-LONGEST_DELAY_US = 1_000_000  # of depth or of a subordinate; the SDK allows one frame's period
+# Largest delay of depth, or of a subordinate, that is accepted; the SDK allows one frame's period.
+LONGEST_DELAY_US = 1_000_000
 
 Kind = Literal["colour", "depth", "imu"]
 TRACKS: dict[Kind, str] = {"colour": "COLOR", "depth": "DEPTH", "imu": "IMU"}
@@ -93,9 +94,9 @@ class KinectFileInfo:
 class KinectFile(ClosedOnExit):
     """One open recording; use as a context manager.
 
-    Raises UserError, naming the file, if the file is missing, empty or no Matroska file, if it has
-    no colour track or no calibration, and if the SDK does not know its mode. A file that was cut
-    off can be opened if its head is complete; ``info.truncated`` is then True.
+    Raises UserError, naming the file, if it is missing, empty or no Matroska file. It is also
+    raised without a colour track or a calibration, and for a mode that the SDK does not know. A
+    file that was cut off can be opened if its head is complete; ``info.truncated`` is then True.
     """
 
     def __init__(self, path: Path) -> None:
@@ -146,6 +147,7 @@ class KinectFile(ClosedOnExit):
         self.broken_packets += 1
 
     def _is_complete(self, kind: Kind, content: bytes) -> bool:
+        """Whether a packet holds one complete image, or inertial samples."""
         if kind == "colour" and self.info.colour_format == "MJPG":
             return image_files.encoded_size(content) is not None
         if kind == "colour":
@@ -263,6 +265,7 @@ class KinectFile(ClosedOnExit):
         return name
 
     def _microseconds(self, tag: str, most: int) -> int:
+        """A tag that states nanoseconds, in microseconds; 0 without the tag."""
         value = self._container.metadata.get(tag, "0")
         microseconds = round(int(value) / 1000) if re.fullmatch("-?[0-9]{1,18}", value) else None
         if microseconds is not None and abs(microseconds) <= most:
@@ -273,6 +276,7 @@ class KinectFile(ClosedOnExit):
         )
 
     def _calibration(self) -> bytes:
+        """The calibration JSON, which is attached to the file."""
         attached: list[Any] = [s for s in self._container.streams if s.type == "attachment"]
         tagged = [s for s in attached if "K4A_CALIBRATION_FILE" in s.metadata]
         named = [s for s in attached if s.metadata.get("filename") == CALIBRATION_NAME]

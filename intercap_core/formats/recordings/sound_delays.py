@@ -1,8 +1,8 @@
 """Starts of cameras from the sound that they share: generalised cross-correlation (GCC-PHAT).
 
 Knapp and Carter, IEEE Trans. ASSP 24(4), 1976: the cross-spectrum of two tracks is divided by its
-magnitude (phase transform), so that a broad-band sound gives one sharp peak at its delay in spite
-of reverberation. Each of several windows of one track is searched for in the whole other track. A
+magnitude (phase transform). A broad-band sound then gives one sharp peak at its delay, in spite of
+reverberation. Each of several windows of one track is searched for in the whole other track. A
 delay is returned only if several windows agree on it, each by a peak that is far above chance and
 clearly the highest. Silence, unrelated sounds and repetitive music give no result.
 """
@@ -78,7 +78,7 @@ def estimate_delay(first: Sound, second: Sound) -> Delay | None:
     # by 1 ms.
     size = min(max(len(short.samples) // 4, SOUND_RATE), 10 * SOUND_RATE)
     last = len(short.samples) - size
-    if last < size:  # overlapping windows are no independent evidence
+    if last < size:  # all windows would overlap, so that their agreement proves nothing
         return None
     places = np.unique(np.linspace(0, last, 8).astype(int))
     nfft = fft.next_fast_len(len(long.samples) + size, real=True)

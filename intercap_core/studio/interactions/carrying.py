@@ -114,6 +114,7 @@ class HandleCarry(Interaction):
         )
 
     def _trunk(self, times: np.ndarray) -> Trunk:
+        """Stoop to the object, walk upright, and stoop to put it down; the head looks at it."""
         trunk = self.standing(times, head=1.5)
         pelvis, bend, head = trunk.pelvis, trunk.bend, trunk.head
         stoop = plateau(times, self.stoop_from, 1.02, 1.10, self.lifted_s - 0.05)

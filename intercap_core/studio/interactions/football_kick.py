@@ -143,6 +143,7 @@ class FootballKick(Interaction):
         return pose
 
     def _trunk(self, times: np.ndarray) -> Trunk:
+        """Trunk (N): bends forward and turns right in the backswing, turns left in the kick."""
         trunk = self.standing(times)
         pelvis, bend, head = trunk.pelvis, trunk.bend, trunk.head
         back = bump(times, 1.05, 1.62)

@@ -28,9 +28,13 @@ SIDES = (RIGHT, LEFT)
 class HandlingScript(Interaction):
     """One object is taken by the leading hand, moved along a path, and put down.
 
-    ``plan`` sets the object's first pose ``pick_pose`` and last pose ``place_pose`` (4, 4), a grip
-    for each hand that holds it, and the times of each grip in ``hold_s``. The object follows the
-    leading hand; the other hand follows the object.
+    ``plan`` sets:
+
+    - ``pick_pose`` and ``place_pose``: (4, 4) first and last pose of the object, script frame;
+    - ``grips``: a grip for each hand that holds the object;
+    - ``hold_s``: times of grasp and release of each of these hands, script time.
+
+    The object follows the leading hand; the other hand follows the object.
     """
 
     lead = RIGHT

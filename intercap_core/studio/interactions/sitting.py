@@ -143,6 +143,7 @@ class Sitting(Interaction):
         return rigid(rotation, place + way * away)
 
     def trunk(self, times: np.ndarray, *, still: bool = False) -> Trunk:
+        """Trunk (N) of sitting down and rising; ``still`` leaves out sway and weight shift."""
         track = self.pelvis_track(times)
         sway = self.sway(times) * (0.0 if still else 1.0)
         shift = self.weight_shift(times) * (0.0 if still else 1.0)
@@ -186,6 +187,7 @@ class Sitting(Interaction):
     def _wrist(
         self, world: np.ndarray, pelvis: np.ndarray, times: np.ndarray, side: int
     ) -> WristPose:
+        """Wrist (N): hanging, at the seat's edge (right hand), on the thigh, hanging."""
         count = len(times)
         swing = 0.06 * bump(times, 0, 0.5) * (1, -1)[side] + self.arm_swing(times)[:, side]
         idle = self.puppet.idle_wrist(world, pelvis, side, swing)

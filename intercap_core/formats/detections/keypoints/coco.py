@@ -148,6 +148,7 @@ def _add(
     image: Callable[[dict[str, Any]], ImageKey],
     layout: str | None,
 ) -> None:
+    """Add one person to ``result``, or a fault; ``image`` returns the image of an entry."""
     key = ImageKey(None, None)
     result.entries += 1
     try:
