@@ -1,4 +1,7 @@
-"""Interpolation of frames without a valid fit between their neighbours."""
+"""Interpolation of frames without a valid fit.
+
+A bridge is the interpolated run of frames between two frames with a valid fit, the known ones.
+"""
 
 from __future__ import annotations
 
@@ -9,16 +12,23 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core.body.parameters import NUM_POSE
 
-_FEWEST_BRIDGES = 5  # over known frames, to estimate the error of a bridge; tuned on the studio
+# Smallest number of trial bridges over known frames to estimate the error of a bridge. Tuned on the
+# studio.
+_FEWEST_BRIDGES = 5
 
 
 def bridge(vectors: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Interpolate the rows of parameter vectors (T, P) that are not ``known`` (T,).
+    """Return parameter vectors with the unknown rows interpolated.
 
-    Between known neighbours parameters follow a cubic Hermite curve with the velocities at its
-    ends, rotations in the tangent space of the first neighbour, by the shortest way. Before the
-    first and after the last known frame the body is at rest. At least one frame is known.
-    ``times`` (T,) seconds.
+    Between two known frames each parameter follows a cubic Hermite curve, whose velocities at both
+    ends are estimated from known frames nearby. Rotations are interpolated in the tangent space of
+    the first of the two frames, by the shortest way. Before the first and after the last known
+    frame the body does not move.
+
+    Args:
+        vectors: (T, P) parameter vectors.
+        known: (T,) bool; at least one frame is known.
+        times: (T,) seconds.
     """
     result = vectors.copy()
     at = np.flatnonzero(known)
@@ -39,7 +49,7 @@ def bridge(vectors: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.ndar
             _rotation_vectors(poses[2], poses[0]),
             _rotation_vectors(poses[1], poses[3]),
         )
-        # in the tangent space of the first neighbour, where it is at 0
+        # the four knots in the tangent space of the first one: ``start`` is 0, ``end`` is moved
         placed = np.stack([np.zeros_like(moved), moved, -leaving, moved + coming])
         path = np.tensordot(weights, placed, 1)
         first = Rotation.from_matrix(np.tile(poses[0], (len(gap), 1, 1)))
@@ -49,17 +59,21 @@ def bridge(vectors: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.ndar
 
 
 def _rotation_vectors(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return the turns (J, 3) from rotations (J, 3, 3) to others, in the frames of the first."""
+    """Return rotation vectors (J, 3) v with end = start exp(v), of rotations (J, 3, 3)."""
     return np.asarray(Rotation.from_matrix(start.swapaxes(1, 2) @ end).as_rotvec())
 
 
 def _velocity_frames(start: int, end: int, known: np.ndarray, times: np.ndarray) -> tuple[int, int]:
-    """Return the known frames before ``start`` and after ``end`` that determine the velocities
-    there; ``start`` or ``end`` itself if no frame is near enough."""
+    """Return the known frames that determine the velocities at ``start`` and ``end``.
+
+    They are the nearest ones before ``start`` and after ``end`` at a distance of 0.045 to 0.15 s;
+    ``start`` or ``end`` itself if there is none.
+    """
     at = np.flatnonzero(known)
 
     def nearest(frame: int, seconds: np.ndarray) -> int:
-        # nearer frames show the noise of the fit, farther ones another motion; tuned on the studio
+        # velocities from nearer frames are noise of the fit, those from farther ones belong to
+        # another motion; tuned on the studio
         near = (seconds >= 0.045) & (seconds <= 0.15)
         return int(at[near][seconds[near].argmin()]) if near.any() else frame
 
@@ -67,9 +81,9 @@ def _velocity_frames(start: int, end: int, known: np.ndarray, times: np.ndarray)
 
 
 def _hermite(when: np.ndarray, knots: np.ndarray) -> np.ndarray:
-    """Return the weights (N, 4) at times ``when`` (N,) of the values at the times ``knots`` (4,).
+    """Return weights (N, 4): values at the times ``when`` (N,) are weights @ values at the knots.
 
-    The knots are start and end of a bridge, and the frames of :func:`_velocity_frames`.
+    knots (4,): times of start and end of a bridge, and of the frames of :func:`_velocity_frames`.
     """
     length = knots[1] - knots[0]
     s = ((when - knots[0]) / length)[:, None]
@@ -79,8 +93,9 @@ def _hermite(when: np.ndarray, knots: np.ndarray) -> np.ndarray:
         slopes[0] = np.array([1.0, 0.0, -1.0, 0.0]) / (knots[0] - knots[2])
     if knots[3] > knots[1]:
         slopes[1] = np.array([0.0, -1.0, 0.0, 1.0]) / (knots[3] - knots[1])
-    # weight of the velocities against the mean: 0.7 to 1 is best on gaps of 1 to 15 frames at 15 Hz
-    # (measured on the studio); bridges longer than 1 s were not measured
+    # Weight of the velocities at the ends against the mean velocity of the bridge. 0.7 to 1 is best
+    # on gaps of 1 to 15 frames at 15 Hz (measured on the studio). Bridges longer than 1 s were not
+    # measured; their weight decreases.
     weight = 0.85 * min(1.0, 1.0 / length)
     first, last = (mean + weight * (slope - mean) for slope in slopes)
     rise = s**2 * (3 - 2 * s)
@@ -90,10 +105,11 @@ def _hermite(when: np.ndarray, knots: np.ndarray) -> np.ndarray:
 
 
 def unwrap_turns(rotation_vectors: np.ndarray) -> np.ndarray:
-    """Return rotation vectors (T, 3) of the same turns without jumps of a full turn.
+    """Return rotation vectors (T, 3) of the same rotations, continuous over frames.
 
-    Each is v or v - 2 pi v / |v|, whichever is nearer to that of the frame before. Both are equally
-    long at half a turn, which is the pose of an upright person if the camera's y points down.
+    v and v - 2 pi v / |v| are the same rotation. The one nearer to the vector of the previous frame
+    is returned. Both have the same length at 180 degrees, where fitted vectors jump. This is the
+    orientation of an upright person in a master frame whose y points down.
     """
     result = rotation_vectors.copy()
     for t in range(1, len(result)):
@@ -109,11 +125,12 @@ def unwrap_turns(rotation_vectors: np.ndarray) -> np.ndarray:
 def bridged_sigma(
     joints: np.ndarray, known: np.ndarray, sigma: np.ndarray, times: np.ndarray
 ) -> np.ndarray:
-    """Return the standard deviation (T, J) of joints, metres, whose unknown frames were bridged.
+    """Return the standard deviation (T, J) of joints after bridging, metres.
 
-    The error of a bridge is measured on the known frames, by all bridges of the same length between
-    them. With less than five, it is the usual speed of the joint times the time to the nearest
-    known frame.
+    The error of a bridged frame is measured on the known frames: all trial bridges with the same
+    knots relative to the frame are compared with the fits. If less than five are possible, the
+    error is the usual speed of the joint times the time to the nearest known frame. The larger
+    deviation of the two ends is added in quadrature.
 
     Args:
         joints: (T, J, 3) metres.
@@ -149,6 +166,7 @@ def _speed(joints: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.ndarr
     """Return the usual speed (J,) along one coordinate, m/s, between adjacent known frames."""
     pairs = np.flatnonzero(known[1:] & known[:-1])
     if len(pairs) < _FEWEST_BRIDGES:
-        return np.full(joints.shape[1], 1.0)  # a walk
+        return np.full(joints.shape[1], 1.0)  # speed of a walk
     moved = (joints[pairs + 1] - joints[pairs]) / np.diff(times)[pairs, None, None]
-    return np.maximum(np.sqrt((moved**2).mean((0, 2))), 0.1)  # a standing person sways
+    # at least 0.1 m/s: a standing person sways
+    return np.maximum(np.sqrt((moved**2).mean((0, 2))), 0.1)

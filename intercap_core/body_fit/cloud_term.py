@@ -9,10 +9,10 @@ surface is clothing and hair, not skin,
     c_g = c0_g exp(u_g),                                 u_g ~ N(0, spread_g^2)
 
 with the sample v_s of the skin, the normal n_s there, and target_s, the mean of n_s . p over the
-points p that were matched to the sample. One thickness c_g > 0 for each covering g (trunk, thighs,
-hair, ...) is shared by all frames; c0_g is that of everyday garments (:mod:`.surface`). Errors of
-neighbouring points come from one fold of cloth, so a sample counts as one measurement however many
-points it has. :mod:`.matching` finds the points of each sample.
+points p that were matched to the sample. Each covering g (trunk, thighs, hair, ...) has one
+thickness c_g > 0 in all frames. c0_g is the usual thickness, of everyday garments
+(:mod:`.surface`). Errors of neighbouring points come from one fold of cloth, so a sample counts as
+one measurement however many points it has. :mod:`.matching` finds the points of each sample.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _SHAPE, _TRANSL = TRANSL.stop, TRANSL.start
 
 
 def residuals(points: Tensor, rows: CloudRows, thickness: Tensor, group: Tensor) -> Tensor:
-    """Return e (B, N), metres: positive where the measured surface is outside skin and covering.
+    """Return e (B, N), metres; positive if the measured surface is outside of the covering.
 
     Args:
         points: (B, N, 3) samples, metres.
@@ -179,10 +179,13 @@ def add_cost(points, rows, frames, cost):
 
 @numba.njit(cache=True, nogil=True)
 def _find_columns(moved_by, place, group, place_u, local, local_u, to):
-    """Write the columns of a limb and return their number.
+    """Number the columns of a limb's rows and return their count m: parameters, then coverings.
 
-    local (P,), local_u (G,): the column of each parameter and covering in the limb's rows, -1 =
-    none. ``to``: the column in the normal equations of each column of the rows.
+    moved_by (55,) bool: the joints that move the limb. group: coverings of the limb's samples.
+    place (P,), place_u (G,): column of each parameter and covering in the normal equations, -1 =
+    fixed.
+    local (P,), local_u (G,): filled with their columns in the limb's rows, -1 = none.
+    to: its first m entries are filled with the columns of the rows in the normal equations.
     """
     m = columns_of_limb(moved_by, place, local, to)
     local_u[:] = -1
@@ -197,8 +200,12 @@ def _find_columns(moved_by, place, group, place_u, local, local_u, to):
 def _fill_row(row, local, shape, c, b, i, n, arms, by_shape):
     """Write n . d point i / d parameters of body b to ``row``, and return n . point.
 
-    local (P,): column of each parameter in the row, -1 = none. shape: fitted shape components.
-    arms (L,3), by_shape (S,): scratch.
+    The same as :func:`.skeleton_kernel.add_point` on an empty row with scale 1, but faster.
+
+    local (P,): column of each parameter in the row, -1 = none.
+    shape: indices of the fitted shape components.
+    c: :class:`.skeleton_kernel.PosedPoints`.
+    arms (L,3), by_shape (S,): scratch, for lever arms and the derivatives by the shape.
     """
     x0, x1, x2, along = c.rest[b, i, 0], c.rest[b, i, 1], c.rest[b, i, 2], 0.0
     n0, n1, n2 = n
@@ -239,7 +246,7 @@ def _fill_row(row, local, shape, c, b, i, n, arms, by_shape):
         a0, a1, a2, joint = arms[j, 0], arms[j, 1], arms[j, 2], c.chain[i, j]
         if (a0 == 0 and a1 == 0 and a2 == 0) or local[3 * joint] < 0:
             continue
-        # n . (w x a) = w . (a x n)
+        # n . (omega x a) = omega . (a x n)
         u0, u1, u2 = a1 * n2 - a2 * n1, a2 * n0 - a0 * n2, a0 * n1 - a1 * n0
         for d in range(3):
             if local[3 * joint + d] >= 0:
@@ -275,6 +282,10 @@ def _add_squares(rows, weights, block):
 def add_equations(points, limbs, arrays, frames, equations, rest_gradient, tables):
     """Add the normal equations of E_D to those of the frames (B,).
 
+    For each body and limb, the rows n . dv of the limb's samples are computed and their weighted
+    squares are added to one dense block (m,m), four rows at a time. The block is added to the
+    normal equations at the end of the limb. Samples without weight are skipped.
+
     limbs: :class:`.selection.Limbs` of the samples. arrays: :class:`CloudArrays`.
     equations: :class:`.term_inputs.BatchEquations`, filled in place.
     rest_gradient (B,N,3): gradient by the points at rest, filled in place; tables (N,3,486): see
@@ -286,7 +297,7 @@ def add_equations(points, limbs, arrays, frames, equations, rest_gradient, table
     order, starts, moved_by = limbs
     dtype = hessian.dtype
     shape = np.flatnonzero(place[_SHAPE:] >= 0)
-    together = 4  # rows that are added to a block at once: speed
+    together = 4  # rows that are added to a block at once, for speed
     arms = np.empty((points.chain.shape[1], 3), dtype)
     by_shape = np.empty(len(place) - _SHAPE, dtype)
     weights, weighted = np.empty(together, dtype), np.empty(1, dtype)

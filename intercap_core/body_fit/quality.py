@@ -1,4 +1,8 @@
-"""Reliability of the parts of a fitted body: are they determined by consistent observations?"""
+"""Reliability of the parts of a fitted body.
+
+A part (`BODY_PARTS`: trunk, face, and left and right arm, leg and hand) is undetermined if its
+standard deviation is large or if most of its observations are outliers.
+"""
 
 from __future__ import annotations
 
@@ -16,22 +20,24 @@ from intercap_core.schemas import BODY_PARTS
 # Median length of a normal error in three dimensions, in standard deviations along one coordinate.
 MEDIAN_CHI_3 = 1.5382
 
-# Standard deviation along one coordinate from which a part is undetermined, metres: half of its
-# joints are more than 40 mm off (MEDIAN_CHI_3), a bad body.
+# Standard deviation along one coordinate beyond which a part is undetermined, metres. At this
+# value half of its joints have errors above 40 mm (MEDIAN_CHI_3).
 LARGEST_SIGMA_M = 0.026
-# The same for hands: fingers are 20 mm apart (anatomy), half of the joints then are on a
-# neighbouring finger.
+# The same for hands: half of the joints have errors above 20 mm, the distance between fingers
+# (anatomy).
 LARGEST_HAND_SIGMA_M = 0.013
-_DISAGREEING_SHARE = 0.5  # a part is wrong if the majority of its keypoints are outliers
-# Share of a part's samples with points from which depth determines it: half of the third of a limb
-# that one view sees. Tuned on the studio.
+_DISAGREEING_SHARE = 0.5  # share of outliers among a part's keypoints beyond which it is disputed
+# Smallest share of a part's skin samples with depth points at which depth determines the part. One
+# view sees a third of a limb; this is about half of it. Tuned on the studio.
 _MEASURED_SHARE = 0.15
-# A limb seen by one view may lean towards it or away, mirrored. The ends of a forearm are then up
-# to 2 x 0.25 m apart, of a leg's segment 2 x 0.4 m, of a finger 2 x 0.08 m (anatomy). These are the
-# standard deviations along one coordinate, metres; estimated, not measured.
+# A limb in a single view without depth may lean towards the camera or away from it: both poses have
+# the same image. The end of a forearm differs by up to 2 x 0.25 m between them, that of a leg's
+# segment by 2 x 0.4 m, of a finger by 2 x 0.08 m (anatomy). These are the standard deviations along
+# one coordinate, metres; estimated, not measured.
 MIRRORED_SIGMA_M = {"arm": 0.10, "leg": 0.15, "hand": 0.03}
-# A limb that no view supports may be anywhere within its reach, a wrist 0.55 m from the shoulder,
-# an ankle 0.85 m from the hip (anatomy). The linear covariance of prior and fit is smaller.
+# Standard deviation along one coordinate of a limb that no view supports, metres. It may be
+# anywhere within its reach: a wrist is up to 0.55 m from the shoulder, an ankle up to 0.85 m from
+# the hip (anatomy). The linearised covariance of prior and fit is smaller.
 UNSEEN_SIGMA_M = {"arm": 0.20, "leg": 0.25}
 
 
@@ -39,13 +45,15 @@ class _Part(NamedTuple):
     """A part of the body."""
 
     keypoints: list[int]
+    """Indices among the 135 keypoints."""
     joints: list[int]
+    """Indices among the 55 joints."""
     carriers: list[int]
     """Joints whose bones carry the skin of the part."""
 
 
 def _find_part(name: str) -> _Part:
-    """Return the keypoints and joints of one of `BODY_PARTS`; those of the face are its head's."""
+    """Return the keypoints and joints of one of `BODY_PARTS`; joints of the face: head, jaw."""
     side, _, limb = name.partition("_")
     if limb == "hand":
         first = JOINT_INDEX[f"{side}_index1"]
@@ -78,19 +86,19 @@ _PARTS = {name: _find_part(name) for name in BODY_PARTS}
 
 
 class PartEvidence(NamedTuple):
-    """Support of each of the 8 parts by the observations of N frames."""
+    """Support of each of the 8 `BODY_PARTS` by the observations of N frames."""
 
     outlier_share: Tensor
-    """(N, 8) share of outliers among the part's observations, weighted by confidence; of arms and
-    legs that of their worst keypoint. NaN = not visible."""
+    """(N, 8) share of outliers among the detections of the part's keypoints, weighted by
+    confidence; for arms and legs that of the worst keypoint. NaN = no detection."""
     distance: Tensor
-    """(N, 8) median distance of the observations, metres, NaN = not visible."""
+    """(N, 8) median distance of the detections from the fit, metres, NaN = no detection."""
     visible_share: Tensor
-    """(N, 8) share of the part's keypoints that are inliers in some view."""
+    """(N, 8) share of the part's keypoints that are inliers in at least one view."""
     views: Tensor
     """(N, 8) number of views in which a keypoint is an inlier, median over the keypoints."""
     measured_share: Tensor
-    """(N, 8) share of the part's samples with depth points."""
+    """(N, 8) share of the part's skin samples with depth points."""
 
 
 def compare_parts(
@@ -105,7 +113,7 @@ def compare_parts(
     Args:
         whitened: (N, C, K) residuals in standard deviations.
         confidence: (N, C, K), 0 = not detected.
-        index: (K,) index of each keypoint.
+        index: (K,) index of each keypoint among the 135.
         sigma: (K,) standard deviation of each keypoint, metres.
         samples: joint (S,) of each sample of the cloud, and whether depth measured it (N, S) bool;
             None without clouds.
@@ -119,6 +127,7 @@ def compare_parts(
         if not bool(at.any()):
             continue
         weight, good = confidence[:, :, at], whitened[:, :, at] <= KEYPOINT_SCALE
+        # axes of the sums: views, and keypoints except for arms and legs
         over = (1,) if part.endswith(("arm", "leg")) else (1, 2)
         share = 1 - (weight * good).sum(over) / weight.sum(over)
         # a correct elbow does not imply a correct wrist
@@ -145,7 +154,7 @@ def trunk_distance(evidence: PartEvidence) -> np.ndarray:
 
 
 def flag_unmeasured(evidence: PartEvidence) -> np.ndarray:
-    """Flag limbs and hands (N, 8) that only one view supports, without depth points."""
+    """Flag limbs and hands (N, 8) that a single view supports, with few depth points or none."""
     flags = (
         (evidence.views < 2)
         & (evidence.measured_share < _MEASURED_SHARE)
@@ -157,7 +166,7 @@ def flag_unmeasured(evidence: PartEvidence) -> np.ndarray:
 
 
 def flag_unmeasured_joints(evidence: PartEvidence) -> np.ndarray:
-    """Flag the joints (N, 55) of these limbs and hands."""
+    """Flag the joints (N, 55) of the parts of :func:`flag_unmeasured`."""
     flags = flag_unmeasured(evidence)
     result = np.zeros((len(flags), len(JOINT_NAMES)), bool)
     for column, part in enumerate(BODY_PARTS):
@@ -168,7 +177,8 @@ def flag_unmeasured_joints(evidence: PartEvidence) -> np.ndarray:
 def _leaning(evidence: PartEvidence) -> np.ndarray:
     """Return the standard deviation (N, 8), metres, of parts that one view or no view supports.
 
-    The mirrored pose of a part in one view is as likely.
+    In one view, the pose mirrored in depth is as likely: `MIRRORED_SIGMA_M`, reduced by depth
+    points. In no view it is `UNSEEN_SIGMA_M`. For other parts it is 0.
     """
     known = np.clip(evidence.measured_share.cpu().numpy() / _MEASURED_SHARE, 0, 1)
     limbs = [part.partition("_")[2] for part in BODY_PARTS]
@@ -179,11 +189,12 @@ def _leaning(evidence: PartEvidence) -> np.ndarray:
 
 
 def widen_sigma(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
-    """Return standard deviations (N, 55), metres, of fits that may be one of several minima.
+    """Return standard deviations (N, 55), metres, that allow for fits in a wrong local minimum.
 
-    Added in quadrature: if most observations contradict a part, the deviation that corresponds to
-    their distance in two dimensions; of a limb that only one view sees, its possible lean towards
-    the camera or away, which its depth points reduce. An error of an arm is also one of its hand.
+    Two deviations are added to ``sigma`` (N, 55) in quadrature:
+    - of a part whose detections are mostly outliers: their median distance, as a deviation;
+    - of a limb that one view or no view supports: the possible lean (`_leaning`).
+    A hand has at least the added deviation of its arm.
     """
     # the median length of a normal error in two dimensions is 1.1774 standard deviations
     disputed = evidence.outlier_share.cpu().numpy() > _DISAGREEING_SHARE
@@ -221,7 +232,7 @@ def expected_error(sigma: np.ndarray, share: np.ndarray) -> np.ndarray:
 
     share (55,): share of the surface that follows each joint.
     """
-    # the mean length of a normal error in three dimensions
+    # 1.5958 = sqrt(8 / pi): mean length of a normal error in three dimensions, in sigmas
     return 1.5958 * sigma @ share
 
 

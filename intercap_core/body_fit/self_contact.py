@@ -1,9 +1,9 @@
 """Search for parts of the body that penetrate each other, for E_P_self (equation 5).
 
 A sample of the skin penetrates another part if it lies behind the nearest surface of that part.
-Parts are the trunk, the head, the segments of the limbs, the palms and the fingers. Where two parts
-join, skin meets skin in every pose: samples that are close to each other along the surface,
-relative to the thickness of their parts, never count as touching.
+Parts are the trunk, the head, the segments of the limbs, the palms and the fingers. At a joint the
+skin of two parts touches in every pose. Two samples are therefore compared only if their geodesic
+distance on the template exceeds a multiple of the thickness of their parts.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from intercap_core.body_fit.surface import Samples
 from intercap_core.body_fit.term_inputs import Pairs
 from intercap_core.geometry.rigid.surfaces import vertex_normals
 
-# Metres outside another part within which a sample also becomes a pair: it may penetrate the part
-# before the next search. Tuned on the studio.
+# A sample less than this outside of another part also becomes a pair, metres, since it may
+# penetrate the part before the next search. Tuned on the studio.
 _MARGIN_M = 0.004
 
 _TRUNK = ("pelvis", "spine1", "spine2", "spine3", "left_collar", "right_collar")
@@ -33,6 +33,7 @@ _HINGES = ("shoulder elbow", "elbow wrist", "wrist thumb", "hip knee", "knee ank
 
 
 def _part(joint: str) -> str:
+    """Return the part that a joint's skin belongs to: trunk, head, or named by a joint."""
     if joint in _TRUNK:
         return "trunk"
     if joint in _HEAD:
@@ -44,6 +45,7 @@ def _part(joint: str) -> str:
 
 _PART_NAMES = tuple(dict.fromkeys(_part(joint) for joint in JOINT_NAMES))
 _PART_OF_JOINT = np.array([_PART_NAMES.index(_part(joint)) for joint in JOINT_NAMES])
+# 0 left hand, 1 right hand, -1 no hand
 _HAND_OF_PART = np.array(
     [
         -1 if not name.endswith(_HAND_PARTS) else int(name.startswith("right"))
@@ -69,9 +71,9 @@ class SelfContact(NamedTuple):
     """Which of the N samples of a body may touch each other, and their depth limits."""
 
     vertex: np.ndarray
-    """(N,) index of each sample among the posed vertices, see :class:`.surface.Samples`."""
+    """(N,) index of each sample among the posed vertices, see :class:`.surface.SkinSurface`."""
     patch: np.ndarray
-    """(N, 20) indices of the vertices around each sample."""
+    """(N, 20) indices of the vertices of each sample's patch among the posed vertices."""
     part: np.ndarray
     """(N,) part of each sample."""
     patch_part: np.ndarray
@@ -79,11 +81,12 @@ class SelfContact(NamedTuple):
     hand: np.ndarray
     """(N,) 0 left hand, 1 right hand, -1 none."""
     apart: np.ndarray
-    """(N, N) bool: the two samples may touch."""
+    """(N, N) bool: the two samples are compared; others may touch in every pose."""
     deepest: np.ndarray
-    """(N,) greatest depth behind the surface at which a point counts as inside, metres."""
+    """(N,) greatest depth behind a sample's surface at which a point counts as inside, metres."""
     sideways: np.ndarray
-    """(N,) greatest distance from the normal line at which a point counts as inside, metres."""
+    """(N,) greatest distance of such a point from the line through the vertex along its normal,
+    metres."""
 
     @classmethod
     def of(cls, model: BodyModel, samples: Samples) -> SelfContact:
@@ -93,15 +96,16 @@ class SelfContact(NamedTuple):
         part = _PART_OF_JOINT[model.skinning_weights.argmax(1).cpu().numpy()]
         thickness = _thickness(template, faces, samples.vertex)
         own = part[samples.vertex]
-        # samples closer along the surface than this times the mean thickness of their parts may
-        # always touch; more at a hinge, where flesh meets flesh as it closes; tuned on the studio
+        # Smallest geodesic distance of samples that are compared, over the mean thickness of their
+        # parts. It is larger at a hinge, where flesh touches when it closes. Tuned on the studio.
         factor = np.where(_hinged()[own[:, None], own], 3.2, 1.6)
         joined = factor * (thickness[:, None] + thickness) / 2
         joined[own[:, None] == own] = 0  # parts do not collide with themselves
         apart = _geodesic_distances(template, faces, part, samples.vertex, joined) > joined
         apart &= own[:, None] != own
         around = np.linalg.norm(template[samples.patch] - template[samples.vertex, None], axis=2)
-        spacing = np.sort(around, 1)[:, 6]  # a vertex has six neighbours (Euler)
+        # distance of the sixth neighbour; a vertex has six on average (Euler's formula)
+        spacing = np.sort(around, 1)[:, 6]
         dtype = model.template.cpu().numpy().dtype
         return cls(
             vertex=samples.vertex,
@@ -110,7 +114,8 @@ class SelfContact(NamedTuple):
             patch_part=part[samples.patch],
             hand=_HAND_OF_PART[own],
             apart=apart,
-            # a deeper point is behind the far side (geometry), in the trunk tuned on the studio
+            # beyond half of the thickness the far side is nearer (geometry); the limit of 0.06 m,
+            # for the trunk, is tuned on the studio
             deepest=np.minimum(0.5 * thickness, 0.06).astype(dtype),
             sideways=spacing.astype(dtype),
         )
@@ -125,11 +130,18 @@ def _thickness(points: np.ndarray, faces: np.ndarray, vertex: np.ndarray) -> np.
 def _geodesic_distances(
     points: np.ndarray, faces: np.ndarray, part: np.ndarray, vertex: np.ndarray, limit: np.ndarray
 ) -> np.ndarray:
-    """Return distances (N, N) between vertices along the surface, metres.
+    """Return geodesic distances (N, N) between the N samples, metres.
 
-    Distances are correct up to ``limit`` (N, N); larger ones only exceed it. They are measured in
-    a graph of the N vertices: two are neighbours if an edge of the mesh connects the regions
-    nearest to them, each on its own part (V,) of the body.
+    They are shortest paths in a graph of the samples. Each vertex of the mesh belongs to the
+    nearest sample on its part of the body. Two samples are neighbours if an edge of the mesh
+    connects their vertices. Distances above ``limit`` are not exact, but they exceed it.
+
+    Args:
+        points: (V, 3) template, metres.
+        faces: (F, 3)
+        part: (V,) part of each vertex.
+        vertex: (N,) vertex ids of the samples.
+        limit: (N, N) metres.
     """
     import scipy.sparse.csgraph
     import scipy.spatial.distance
@@ -143,7 +155,8 @@ def _geodesic_distances(
     length = np.linalg.norm(points[vertex[edges[:, 0]]] - points[vertex[edges[:, 1]]], axis=1)
     count = len(vertex)
     graph = scipy.sparse.csr_matrix((length, (edges[:, 0], edges[:, 1])), shape=(count, count))
-    # the geodesic distance is at least the Euclidean one
+    # A path is at least as long as the straight line, so Dijkstra's search may stop at the largest
+    # limit of the samples whose straight distance is within their limit.
     straight = scipy.spatial.distance.cdist(points[vertex], points[vertex])
     farthest = np.where(straight <= limit, limit, 0).max(1)
     distances = np.full((count, count), np.inf)
@@ -157,11 +170,11 @@ def _geodesic_distances(
 # --- search ----------------------------------------------------------------------------------
 
 Contacts = tuple[Tensor, Tensor, Tensor]
-"""Vertex ids (M,) of penetrating samples, vertex ids (M,) and normals (M, 3) of the surface."""
+"""Vertices p (M,) of penetrating samples, vertices q (M,) of surfaces, and normals (M, 3) at q."""
 
 
 def join_frames(contacts: list[Contacts]) -> Pairs | None:
-    """Join the contacts of all frames, in order; None if there are none."""
+    """Join the contacts of all frames, one element for each frame; None if there are none."""
     counts = torch.tensor([len(inner) for inner, _, _ in contacts])
     if not int(counts.sum()):
         return None
@@ -174,13 +187,16 @@ def join_frames(contacts: list[Contacts]) -> Pairs | None:
 def find_contacts(contact: SelfContact, vertices: Tensor, normals: Tensor) -> Contacts:
     """Find the samples of one body inside another part, or less than 4 mm outside of it.
 
-    Fingers of one hand are searched separately: the next finger is closer than other parts that a
-    hand may penetrate.
+    A sample of a hand can have two pairs, one with another part of the same hand and one with the
+    rest of the body. They are searched separately, since the next finger is always closest.
 
     Args:
         contact: the samples.
-        vertices: (V, 3) posed vertices, metres.
-        normals: (V, 3) unit normals.
+        vertices: (R, 3) posed vertices, metres.
+        normals: (R, 3) unit normals.
+
+    Returns:
+        Indices of the vertices p and q, and normals at q.
     """
     parts = len(_PART_NAMES)
     indices = _find(parts, vertices.cpu().numpy(), normals.cpu().numpy(), contact)
@@ -190,9 +206,16 @@ def find_contacts(contact: SelfContact, vertices: Tensor, normals: Tensor) -> Co
 
 @numba.njit(cache=True, nogil=True)
 def _find(parts, vertices, normals, contact):
-    """Return the vertices (K,) of penetrating samples and (K,) of the surfaces around them.
+    """Return the vertices p (K,) of penetrating samples and the vertices q (K,) of the surfaces.
 
-    parts: number of parts; vertices, normals (V,3): one posed body.
+    1. For each sample, the nearest sample of another part is searched among those with ``apart``.
+       All samples of a part are visited, unless the bounding box of the part is farther than the
+       best sample so far. Samples outside of the boxes of all other parts are skipped.
+    2. q is the vertex nearest to p in the patch of that sample.
+    3. The pair is kept if p is behind q's surface within the limits of depth and sideways distance,
+       or less than the margin in front of it.
+
+    parts: number of parts; vertices, normals (R,3): one posed body.
     """
     samples, patch, part, patch_part, hand, apart, deepest, sideways = contact
     count, kind = len(samples), vertices.dtype
@@ -207,7 +230,7 @@ def _find(parts, vertices, normals, contact):
             where[at, d] = x
             low[part[i], d] = min(low[part[i], d], x)
             high[part[i], d] = max(high[part[i], d], x)
-    nearest = np.full((2, count), -1)  # sample of another part; second row: of the same hand
+    nearest = np.full((2, count), -1)  # sample of another part; row 1: of the same hand, row 0: not
     for i in range(count):
         here = vertices[samples[i]]
         if not _in_a_box(here, part[i], low, high):
@@ -253,7 +276,7 @@ def _find(parts, vertices, normals, contact):
                 continue
             if not np.sqrt(sx * sx + sy * sy + sz * sz) < sideways[j]:
                 continue
-            # normals agree where two fingers join: no collision
+            # the normals of two fingers agree near the place where they join: no collision
             if same_hand and (normals[v, 0] * nx + normals[v, 1] * ny + normals[v, 2] * nz >= 0):
                 continue
             inner[pairs], outer[pairs] = v, at
@@ -263,7 +286,7 @@ def _find(parts, vertices, normals, contact):
 
 @numba.njit(cache=True, nogil=True)
 def _in_a_box(here, own, low, high):
-    """Return whether a point (3,) is in the box of a part other than ``own``, or near it."""
+    """Return whether a point (3,) is in the box of a part other than ``own``, with the margin."""
     for p in range(len(low)):
         if p != own and (
             here[0] > low[p, 0] - _MARGIN_M and here[0] < high[p, 0] + _MARGIN_M

@@ -3,12 +3,12 @@
     E_P_self = sum over p of w rho(d - tolerance) / 2,   d = -n_q . (p - q),
     p: the samples of the skin that are inside another part of the body
 
-PROX penalises colliding triangles by the distance fields of Tzionas et al. 2016. Here a sample p of
-the skin that lies behind the surface of another part of the body is pushed out along the normal n_q
-of that surface at its nearest vertex q, and the surface is pushed the other way. w is the weight of
-a sample and rho is Geman and McClure's. Where the observations put one part deep inside another,
-either they are outliers or the body is thinner than its model; a repulsion would correct neither.
-:mod:`.self_contact` finds the pairs.
+PROX penalises colliding triangles by the distance fields of Tzionas et al. 2016. Here a sample p
+inside another part is paired with the nearest vertex q of that part's surface. d is its depth along
+the normal n_q. The term pushes p out and q the other way. w is the weight of a sample and rho is
+Geman and McClure's, which levels off with depth: if the observations put one part deep inside
+another, they are outliers or the person is thinner than the model, and a repulsion would correct
+neither. :mod:`.self_contact` finds the pairs.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
 from intercap_core.geometry.solve.robust import geman_mcclure
 
 SELF_TOLERANCE_M = 0.003  # skin yields by some millimetres under pressure; tuned on the studio
-_REACH_M = 0.015  # depth at which the penalty levels off: scale of rho; tuned on the studio
-_WEIGHT = SAMPLE_SHARE / 0.008**2  # 1/m^2; the skin is fitted to 8 mm (measured on the studio)
+_REACH_M = 0.015  # scale of rho, the depth at which it levels off; tuned on the studio
+_WEIGHT = SAMPLE_SHARE / 0.008**2  # w, 1/m^2; the skin is fitted to 8 mm (measured on the studio)
 
 _SHAPE = TRANSL.stop
 
@@ -122,13 +122,13 @@ class PairArrays(NamedTuple):
     """:class:`.term_inputs.Pairs` for the kernels."""
 
     starts: np.ndarray
-    """(T + 1,) start of the pairs of each frame, and the end."""
+    """(T + 1,) start of the pairs of each frame, then M."""
     inner: np.ndarray
-    """(M,)"""
+    """(M,) index of the sample p among the term's points."""
     outer: np.ndarray
-    """(M,)"""
+    """(M,) index of the vertex q among the term's points."""
     normal: np.ndarray
-    """(M, 3)"""
+    """(M, 3) n_q"""
     weight: float
     """1/m^2"""
 
@@ -180,7 +180,7 @@ class CompiledSelfPenetration:
 
 @numba.njit(cache=True, nogil=True)
 def _depth(points, pairs, b, at):
-    """Return the depth of pair ``at`` beyond the tolerance, metres; <= 0 = no contact."""
+    """Return the depth of pair ``at`` beyond the tolerance, metres; <= 0 has no cost."""
     n = pairs.normal[at]
     outer = project_on_direction(points, b, pairs.outer[at], n)
     return outer - project_on_direction(points, b, pairs.inner[at], n) - SELF_TOLERANCE_M
@@ -202,6 +202,9 @@ def add_cost(points, pairs, frames, cost):
 @numba.njit(cache=True, nogil=True)
 def add_equations(points, pairs, frames, equations, rest_gradient):
     """Add the normal equations of E_P_self to those of the frames (B,).
+
+    For each frame the rows of all pairs are computed first. The columns that are zero in every row
+    are dropped, and the rest is one dense product.
 
     equations: :class:`.term_inputs.BatchEquations`, filled in place.
     rest_gradient (B,N,3): gradient by the points at rest, filled in place; empty without pose blend
@@ -252,7 +255,7 @@ def add_equations(points, pairs, frames, equations, rest_gradient):
         for r in range(count):
             for q in range(m):
                 dense[r, q] = root[r] * rows[r, used[q]]
-        # a BLAS product would start its threads for each frame
+        # loops, since a BLAS product would start its own threads for each frame
         block = np.zeros((m, m), hessian.dtype)
         for r in range(count):
             for p in range(m):

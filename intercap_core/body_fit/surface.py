@@ -1,7 +1,8 @@
 """The part of the skin that E_D and E_P_self (equations 4 and 5) use: samples and their patches.
 
 Points of the measured clouds are assigned to a sparse set of skin vertices, the samples. Each
-sample counts as one measurement. Every sample belongs to a covering, a kind of clothing or hair.
+sample is one measurement, however many points it has. The 20 outer vertices nearest to a sample are
+its patch. Every sample belongs to a covering: a kind of clothing, hair, or bare skin.
 """
 
 from __future__ import annotations
@@ -21,14 +22,17 @@ from intercap_core.body.parameters import BodyParameters
 from intercap_core.body_fit.first_hit import first_hits
 from intercap_core.geometry.rigid import surfaces as rigid_surfaces
 
-# Length in metres that one radian between two normals counts as, in a match. Tuned on the studio.
+# Scale of unit normals n in the distance of a match, |p - q|^2 + (scale |n_p - n_q|)^2: metres per
+# radian. Tuned on the studio.
 NORMAL_LENGTH_M = 0.06
-# Largest distance of a match from the normal line of its vertex, metres. Tuned on the studio.
+# Largest distance of a matched point from the line through its vertex along the normal, metres.
+# Tuned on the studio.
 MATCH_SIDEWAYS_M = 0.03
 
 
-# Weight of a sample: neighbours lie on one fold of cloth and penetrate together, so four samples
-# make one measurement. Tuned on the studio.
+# Weight of a sample in E_D and E_P_self. Errors of neighbouring samples are correlated, since they
+# lie on one fold of cloth and penetrate together: four samples count as one independent
+# measurement. Tuned on the studio.
 SAMPLE_SHARE = 0.25
 
 
@@ -42,8 +46,8 @@ class Covering:
     spread: float
     """Standard deviation of the logarithm of the thickness."""
     noise: float
-    """Standard deviation of a sample's mean distance, metres: folds, and errors of the body
-    model."""
+    """Initial standard deviation of a sample's mean distance, metres, due to folds and errors of
+    the body model."""
 
 
 # Light indoor clothing is 1-2 mm of fabric that stands off by folds and air: mean air gaps of
@@ -78,9 +82,9 @@ class Samples:
     vertex: np.ndarray
     """(N,) vertex ids."""
     patch: np.ndarray
-    """(N, 20) ids of the nearest outer vertices, the sample itself first."""
+    """(N, 20) ids of the nearest vertices of the outer skin, the sample itself first."""
     group: np.ndarray
-    """(N,) index into COVERINGS."""
+    """(N,) covering of each sample, an index into COVERINGS."""
     hand: np.ndarray
     """(N,) bool: the sample is on a hand."""
 
@@ -92,10 +96,11 @@ def choose_samples(model: BodyModel) -> Samples:
     template = model.template.double().cpu().numpy()
     faces = model.faces.cpu().numpy()
     joint = model.skinning_weights.argmax(1).cpu().numpy()
+    # wrists and the 30 finger joints, 25 to 54
     hand_joints = [i for i, name in enumerate(JOINT_NAMES) if i >= 25 or name.endswith("wrist")]
     hand = np.isin(joint, hand_joints)
     outer = _flag_outer_skin(template, faces, joint)
-    # metres; that of hands is the width of a finger (anatomy), the other is tuned on the studio
+    # spacing in metres; on hands the width of a finger (anatomy), elsewhere tuned on the studio
     chosen = [
         _thin_by_grid(template, np.flatnonzero(outer & part), spacing)
         for part, spacing in ((~hand, 0.045), (hand, 0.015))
@@ -114,12 +119,16 @@ def choose_samples(model: BodyModel) -> Samples:
 
 
 def _covering(joint: int, names: list[str]) -> int:
+    """Return the index among ``names`` of the covering of the skin that follows a joint."""
     name = JOINT_NAMES[joint].removeprefix("left_").removeprefix("right_")
     return names.index(_COVERING_OF_JOINT.get(name, "bare"))
 
 
 def _flag_face(template: np.ndarray, joint: np.ndarray, model: BodyModel) -> np.ndarray:
-    """Flag the front of the head in the box of the face landmarks, from the brows down."""
+    """Flag the vertices (V,) of the face: the front of the head within the box of the landmarks.
+
+    The landmarks reach from the brows to the mouth; the box is 10 mm larger.
+    """
     landmarks = template[model.keypoint_map.ids[FACE].reshape(-1)]
     low, high = landmarks.min(0), landmarks.max(0)
     inside = (template[:, :2] > low[:2] - 0.01) & (template[:, :2] < high[:2] + 0.01)
@@ -128,7 +137,10 @@ def _flag_face(template: np.ndarray, joint: np.ndarray, model: BodyModel) -> np.
 
 
 def _thin_by_grid(points: np.ndarray, ids: np.ndarray, spacing: float) -> np.ndarray:
-    """Choose one id for each occupied cube of a grid: the point nearest to the cube's centre."""
+    """Return one of the ``ids`` for each occupied cube of a grid: the point nearest to its centre.
+
+    spacing: size of a cube, metres.
+    """
     cell = np.floor(points[ids] / spacing).astype(np.int64)
     from_middle = np.abs(points[ids] / spacing - cell - 0.5).max(1)
     order = np.lexsort((from_middle, cell[:, 2], cell[:, 1], cell[:, 0]))
@@ -162,7 +174,8 @@ def _flag_outer_skin(points: np.ndarray, faces: np.ndarray, joint: np.ndarray) -
 
 @dataclass(frozen=True, eq=False)
 class SkinSurface:
-    """The R vertices of a body whose faces touch a sample's patch, with F faces."""
+    """The part of the mesh around the N samples: the F faces that touch a patch, and their R
+    vertices."""
 
     model: BodyModel
     ids: np.ndarray
@@ -174,13 +187,13 @@ class SkinSurface:
     patch: np.ndarray
     """(N, 20) indices of each sample's patch in ``ids``."""
     around: np.ndarray
-    """Faces at each vertex, vertex by vertex. Vertices outside of all patches have none."""
+    """(A,) faces at each vertex, vertex by vertex. Vertices outside of all patches have none."""
     starts: np.ndarray
-    """(R + 1,) start of each vertex's faces in ``around``, and the end."""
+    """(R + 1,) start of each vertex's faces in ``around``, then A."""
     order: np.ndarray
-    """(N,) samples, ordered by groups of neighbours."""
+    """(N,) samples, ordered by groups of neighbours (not by coverings)."""
     groups: np.ndarray
-    """(G + 1,) start of each group in ``order``, and the end."""
+    """(G + 1,) start of each group of neighbours in ``order``, then N."""
 
     @classmethod
     def around_samples(cls, model: BodyModel, samples: Samples) -> SkinSurface:
@@ -209,8 +222,10 @@ class SkinSurface:
         )
 
     def posed(self, params: BodyParameters) -> tuple[Tensor, Tensor]:
-        """Return vertices and unit normals (B, R, 3), metres. Only the normals of samples and
-        patches are correct."""
+        """Return vertices (B, R, 3), metres, and unit normals (B, R, 3) of B posed bodies.
+
+        Normals of vertices outside of all patches are zero.
+        """
         vertices = self.model.forward(params, vertex_ids=self.ids).vertices
         posed = vertices.cpu()
         normals = torch.empty_like(posed)
@@ -219,9 +234,13 @@ class SkinSurface:
 
 
 def _group_samples(model: BodyModel, samples: Samples) -> tuple[np.ndarray, np.ndarray]:
-    """Halve the samples by place and normal at rest until the groups are small.
+    """Halve the samples by position and scaled normal at rest until groups have at most 24 samples.
 
-    Returns the order (N,) of the samples, and the start of each group and the end (G + 1,).
+    Each half is split along the coordinate of largest extent, as in a k-d tree.
+
+    Returns:
+        (N,) order of the samples, group by group.
+        (G + 1,) start of each group in the order, then N.
     """
     template = model.template[None]
     rest = torch.cat([template, NORMAL_LENGTH_M * vertex_normals(template, model.faces)], 2)[0]
@@ -240,10 +259,10 @@ def _group_samples(model: BodyModel, samples: Samples) -> tuple[np.ndarray, np.n
 
 @numba.njit(cache=True, nogil=True)
 def _vertex_normals(vertices, faces, starts, around, out):
-    """Write area-weighted unit normals (B,V,3) of vertices (B,V,3) to ``out``.
+    """Write area-weighted unit normals (B,R,3) of vertices (B,R,3) to ``out``.
 
-    ``around`` lists the faces (F,3) at each vertex, those of v from ``starts[v]`` to
-    ``starts[v + 1]``. A vertex without faces gets a zero normal.
+    ``around[starts[v] : starts[v + 1]]`` are the faces at vertex v, indices into faces (F,3). A
+    vertex without faces gets a zero normal.
     """
     cross = np.empty((len(faces), 3), vertices.dtype)
     for b in range(len(vertices)):

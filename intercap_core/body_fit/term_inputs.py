@@ -71,10 +71,10 @@ class Targets:
 
 
 class CloudRows(NamedTuple):
-    """Residual rows of E_D: the points of each of N samples, for T frames."""
+    """Residual rows of E_D, one for each of N samples, for T frames; see :mod:`.cloud_term`."""
 
     target: Tensor
-    """(T, N) mean of normal . point over the matched points, metres."""
+    """(T, N) mean of normal . point over the points matched to the sample, metres."""
     normal: Tensor
     """(T, N, 3) normal of the surface at the sample."""
     weight: Tensor
@@ -86,10 +86,11 @@ class CloudRows(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """M samples inside or close to another part of the body, until the next search."""
+    """M pairs for E_P_self: a sample inside or close to another part of the body, and a vertex of
+    that part. Pairs and normals are fixed between two searches (:mod:`.self_contact`)."""
 
     frame: Tensor
-    """(M,) frame of each pair, ascending."""
+    """(M,) index of the frame of each pair, ascending."""
     inner: Tensor
     """(M,) index of the sample in ``vertices``."""
     outer: Tensor
@@ -103,8 +104,8 @@ class Pairs(NamedTuple):
         """Return the pairs of the frames ``index`` (b,), or None if there are none.
 
         Returns:
-            The pairs, whose ``frame`` counts the F frames with pairs.
-            (F,) the place of these frames in ``index``.
+            The pairs; their ``frame`` is an index 0 to F - 1 of the F frames with pairs.
+            (F,) places of these frames in ``index``.
         """
         place = self.frame.new_full((int(max(self.frame.max(), index.max())) + 1,), -1)
         place[index] = torch.arange(len(index), device=index.device)
@@ -139,9 +140,10 @@ class KeypointSet:
 
 
 def keypoint_set(model: BodyModel, index: Sequence[int] | range) -> KeypointSet:
-    """Choose keypoints by ``index``.
+    """Return the keypoints ``index`` of the 135.
 
-    A joint is carried by the bone of its parent, a vertex by the bone with the largest weight.
+    The carrier of a keypoint at a joint is the joint's parent. That of a keypoint on the mesh is
+    the joint with the largest skinning weight.
     """
     keypoints, rows = model.keypoint_map, np.asarray(index)
     heaviest = model.skinning_weights.argmax(1).cpu().numpy()
@@ -176,12 +178,15 @@ def keypoint_set(model: BodyModel, index: Sequence[int] | range) -> KeypointSet:
 
 
 def _chain(bones: np.ndarray) -> frozenset[int]:
-    """Return all joints that move any of the bones."""
+    """Return all joints that move any of the ``bones``: these joints and their ancestors."""
     return frozenset().union(*(ancestors(bone) for bone in bones.tolist()))
 
 
 def _limbs(chains: list[frozenset[int]]) -> Limbs:
-    """Group keypoints: each joins the first of the longest chains that contains its own chain."""
+    """Group keypoints into limbs, from the longest chain of joints to the shortest.
+
+    A keypoint joins the first limb whose chain contains its own; otherwise it starts a limb.
+    """
     limbs: list[list[int]] = []
     for k in sorted(range(len(chains)), key=lambda k: (-len(chains[k]), k)):
         home = next((limb for limb in limbs if chains[k] <= chains[limb[0]]), None)
@@ -217,7 +222,7 @@ class TermInputs:
     one_shape: bool
     """All frames share the betas; else each frame has its own betas, with their prior."""
     hand_share: float = 1.0
-    """Factor of E_theta_h in one frame: 1 if the frames are independent."""
+    """Factor of E_theta_h in one frame: 1 if frames are independent, less if hand poses last."""
 
 
 class Bodies(NamedTuple):
@@ -285,10 +290,10 @@ class TorchTerm(Protocol):
 
 
 class Batch(NamedTuple):
-    """Some of the b bodies of an evaluation, which one thread computes."""
+    """B of the b bodies of an evaluation, which one thread computes."""
 
     at: slice
-    """Their places among the b bodies."""
+    """Places of the B bodies among the b bodies."""
     vectors: np.ndarray
     """(B, P) parameter vectors."""
     frames: np.ndarray
@@ -325,7 +330,7 @@ class CompiledTerm(NamedTuple):
     rest: RestPoints | None
     """Points of the term at rest, which pose blend shapes move; None = no points."""
     used: Callable[[np.ndarray], np.ndarray]
-    """Returns which of these N points the frames (B,) use, (B, N) bool."""
+    """Returns which of the N points of ``rest`` the term uses in the frames (B,), (B, N) bool."""
     add_cost: Callable[[Batch, np.ndarray], None]
     """Adds the cost (B,) in place."""
     add: Callable[[Batch, BatchEquations], None]

@@ -19,15 +19,17 @@ _MODEL_SIGMA_M = 0.001
 def joint_covariance(model: BodyModel, fit: BodyFit) -> Tensor:
     """Return the covariance (N, 55, 3, 3) of each joint's position, master frame, square metres.
 
-    With own parameters o, shared ones s, and the blocks H of the Hessian of the whitened energy,
-    the covariance of a joint J(o, s) is
+    With own parameters o of a frame, shared parameters s, and the blocks H of the Gauss-Newton
+    matrix of the frame's energy, the covariance of a joint J(o, s) is
 
-        J_o H_oo^-1 J_o' e  +  G S^-1 G',   G = J_s - J_o H_oo^-1 H_os
+        J_o H_oo^-1 J_o' e  +  G S^-1 G'  +  sigma_m^2 I,   G = J_s - J_o H_oo^-1 H_os
 
-    The first term is that of a frame whose shape, offsets and coverings are known, scaled by the
-    ``excess`` e of its residuals. S is the mean over frames of H_ss - H_so H_oo^-1 H_os: errors of
-    the shared parameters are the same in every frame, so a recording is worth as many independent
-    frames as its priors count for, not as many as it has.
+    The first term is the covariance if shape, offsets and coverings are known, scaled by the
+    ``excess`` e of the frame's residuals. The second is that of the shared parameters, with the
+    information S_ij = mean over frames of (H_ss - H_so H_oo^-1 H_os)_ij / sqrt(k_i k_j). k are the
+    counts of the shared priors (:meth:`.problem.ParameterLayout.prior`). Errors of shared
+    parameters are the same in every frame, so a recording counts as 1 / k independent frames, not
+    as its number of frames. sigma_m is the error of the body model.
     """
     own = len(fit.columns)
     betas = torch.arange(TRANSL.stop, TRANSL.stop + model.num_betas, device=fit.vectors.device)
@@ -59,16 +61,19 @@ def deviation(covariance: np.ndarray) -> np.ndarray:
 
 
 def widen(covariance: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """Add the same variance in all directions until the deviation is ``sigma`` (...).
+    """Return covariances (..., 3, 3) with the same variance added in all directions.
 
-    covariance: (..., 3, 3).
+    It is chosen such that the :func:`deviation` becomes ``sigma`` (...).
     """
     more = sigma**2 - deviation(covariance) ** 2
     return covariance + more[..., None, None] * np.eye(3)
 
 
 def _eliminated(hessian: Tensor, own: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the Cholesky factor of H_oo, H_oo^-1 H_os and H_ss - H_so H_oo^-1 H_os."""
+    """Return the Cholesky factor of H_oo, H_oo^-1 H_os and H_ss - H_so H_oo^-1 H_os.
+
+    own: number of own parameters, the first rows and columns of hessian (b, n + m, n + m).
+    """
     hessian = hessian.double()
     factor = torch.linalg.cholesky(hessian[:, :own, :own])
     mixed = hessian[:, :own, own:]
@@ -87,5 +92,5 @@ def _covariance(factor: Tensor, by: Tensor) -> Tensor:
 
 
 def _chunks(count: int) -> list[slice]:
-    """Divide frames so that the derivatives of 16 are in memory at once."""
+    """Divide frames into chunks of 16, whose derivatives fit into memory."""
     return [slice(start, start + 16) for start in range(0, count, 16)]
