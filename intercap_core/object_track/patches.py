@@ -1,6 +1,6 @@
-"""The part of a view around the object that a fit compares with: measured points and contours.
+"""Windows of a view around the object with which a fit compares renderings: points and contours.
 
-A patch is cut when a fit begins, with room for the pose to move. Renderings change inside it.
+A patch is cut when a view chooses its candidate, with a margin within which the pose may move.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class DepthPatch:
     points: np.ndarray
     """(h, w, 3) float32, master frame."""
     trust: np.ndarray
-    """(h, w) weight: 1 inside the candidate, less outside, 0 on a person."""
+    """(h, w) weight: 1 inside the candidate, 0 on a person, else ``OUTSIDE_MASK_WEIGHT``."""
     on_person: np.ndarray
     """(h, w) bool, pixels on a person."""
 
@@ -149,7 +149,9 @@ def _lift(
 ):  # fmt: skip
     """Compute depth, points, trust and on_person of a :class:`DepthPatch`.
 
-    Masks are given with their first pixels, in pixels of the reduced colour lens with parameters
+    Each pixel of the window of ``image`` (left and top inclusive, right and bottom exclusive) is
+    lifted along its ray and projected into the colour image, whose masks decide its weight. Masks
+    are given with their first pixels, in pixels of the reduced colour lens with parameters
     ``colour`` (13,).
     """
     height, width = bottom - top, right - left

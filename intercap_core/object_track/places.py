@@ -24,9 +24,10 @@ SOMETIMES_PRESENT = 0.5  # tuned
 MOVED_PRIOR = 0.8  # prior of an object that was not in its place all the time; tuned
 MIN_PLACE_PRIOR = 0.1  # prior of an object that stands far from the person all the time; tuned
 UNHANDLED_LOG_RATIO = 10.0  # nats of a frame against an object that moves with nobody near; tuned
-RIVAL_FRAMES = 2  # frames with the place occupied while the object is elsewhere; tuned
-# Largest evidence, nats, that a similar object takes off the evidence for the object in its place:
-# a part of furniture, not a twin that the track may have mistaken.
+# A place that is occupied in this many frames while the object is elsewhere holds another object.
+RIVAL_FRAMES = 2  # tuned
+# Largest reduction of the evidence in a place where a similar object was seen while the tracked one
+# was elsewhere. It is limited, because the track may have mistaken one for the other.
 CLUTTER_LOG_RATIO = 10.0  # nats; tuned
 
 
@@ -59,8 +60,9 @@ class Places:
         self._same = _same_place_m(mesh)
         self._joints = None if joints is None else joints[:, :67]  # body and hands, no face
         self._standing = [(s, self._standing_prior(s)) for s in standing]
+        # places (3,) of similar objects, each with its log-likelihood ratio by frame
         self._clutter: list[tuple[np.ndarray, dict[int, float]]] = []
-        self._others: list[np.ndarray] = []
+        self._others: list[np.ndarray] = []  # places (3,) that annotated poses exclude
 
     @classmethod
     def survey(
@@ -97,7 +99,11 @@ class Places:
         return places, [frames[i] for i in order if best[i] > 0]
 
     def prior(self, t: int, place: np.ndarray) -> float:
-        """Return the prior, 0.1 to 1, that the tracked object is at ``place`` (3,) in frame t."""
+        """Return the prior, 0.1 to 1, that the tracked object is at ``place`` (3,) in frame t.
+
+        Away from known places it is ``MOVED_PRIOR``, or more near the person. In a known place it
+        is that of the whole recording, or ``MIN_PLACE_PRIOR`` if another object stands there.
+        """
         nearest = self._nearest(place)
         if nearest is None:
             return max(MOVED_PRIOR, _closeness(self._gaps(place, slice(t, t + 1))))
@@ -107,9 +113,12 @@ class Places:
     def weigh(self, t: int, place: np.ndarray, ratio: float, share: float) -> float:
         """Combine the images' evidence for the object at ``place`` (3,) in frame t with its prior.
 
-        In a place that is occupied for most of the recording, the images count no more than the
-        prior: another object of the class looks like the tracked one. Away from such places the
-        object moves, and mostly somebody moves it.
+        1. In an excluded place the images count only against the object, and the place costs
+           ``CLUTTER_LOG_RATIO``. Elsewhere the evidence of a similar object there is subtracted.
+        2. In a place that is occupied for most of the recording, the result is at most the log odds
+           of the prior: another object of the class looks like the tracked one.
+        3. Elsewhere the object moves: up to ``UNHANDLED_LOG_RATIO`` is subtracted if the person is
+           not near.
 
         Args:
             t: frame.
@@ -118,7 +127,7 @@ class Places:
             share: independent observations per frame.
 
         Returns:
-            Nats.
+            Log-likelihood ratio with the prior, nats.
         """
         if self._index(self._others, place) is not None:
             return min(ratio, 0.0) - CLUTTER_LOG_RATIO
@@ -136,13 +145,16 @@ class Places:
         return None if index is None else self._standing[index]
 
     def _index(self, places: list[np.ndarray], place: np.ndarray) -> int | None:
-        """Return the number of the nearest of ``places`` that is the same place, if any."""
+        """Return the index of the nearest of ``places`` if it is the same place as ``place``."""
         away = [float(np.linalg.norm(other - place)) for other in places]
         nearest = int(np.argmin(away)) if away else 0
         return nearest if away and away[nearest] < self._same else None
 
     def claim(self, place: np.ndarray) -> None:
-        """Mark the object at ``place`` (3,) as the tracked one, wherever the person is."""
+        """Treat the object at ``place`` (3,) as the tracked one, even if nobody is near it.
+
+        Its place is removed from the known places.
+        """
         self._standing = [
             (s, place_prior)
             for s, place_prior in self._standing
@@ -197,6 +209,10 @@ class Places:
         return min(float(np.mean(list(clutter[1].values()))), CLUTTER_LOG_RATIO)
 
     def _standing_prior(self, standing: OccupiedPlace) -> float:
+        """Return the prior of a known place over the recording.
+
+        It is high if the person comes near, or if the place was vacant for a part of the time.
+        """
         handled = _closeness(self._gaps(standing.place, slice(None)))
         left = MOVED_PRIOR * min(
             (ALWAYS_PRESENT - standing.share) / (ALWAYS_PRESENT - SOMETIMES_PRESENT), 1.0
@@ -204,7 +220,10 @@ class Places:
         return max(handled, left, MIN_PLACE_PRIOR)
 
     def _gaps(self, place: np.ndarray, frames: slice) -> np.ndarray:
-        """Return distances (N,) of the person from an object at ``place``, metres, where known."""
+        """Return the person's distance from an object at ``place`` in N frames, metres.
+
+        Frames without known joints are left out.
+        """
         if self._joints is None:
             return np.zeros(0)
         distance = np.linalg.norm(self._joints[frames] - place, axis=-1)
@@ -213,15 +232,18 @@ class Places:
 
 
 def _same_place_m(mesh: ObjectMesh) -> float:
-    """Return the distance within which positions are one place: views see different sides."""
+    """Return the distance, metres, within which two positions are the same place.
+
+    Positions of one object differ, since views see different sides of it.
+    """
     return 0.3 * mesh.diameter + 0.05
 
 
 def _closeness(gaps: np.ndarray) -> float:
     """Return the prior from distances (N,) to the person, metres.
 
-    It is 1 within reach and 0.1 out of reach or if no distance is known. The approach is the lowest
-    tenth of the distances, because nobody is near the object all the time.
+    It is 1 within reach and 0.1 out of reach or if no distance is known. The 10 % quantile of the
+    distances decides, because nobody is near the object all the time.
     """
     at_hand_m, out_of_reach_m = 0.10, 0.45
     gap = float(np.quantile(gaps, 0.1)) if len(gaps) else np.inf
@@ -232,7 +254,11 @@ def _closeness(gaps: np.ndarray) -> float:
 def _cluster_places(
     frames: list[int], seen: list[list[tuple[np.ndarray, float]]], same: float
 ) -> list[OccupiedPlace]:
-    """Cluster the candidates that were seen in more than one of the ``frames``."""
+    """Cluster the positions of candidates; return clusters seen in two or more of the ``frames``.
+
+    The position with neighbours (within ``same`` metres) in most frames forms a cluster with them;
+    this is repeated for the rest. ``seen`` [frames] lists positions (3,) and their label priors.
+    """
     every = [(t, place) for t, here in zip(frames, seen, strict=True) for place, _ in here]
     places = np.array([place for _, place in every]).reshape(-1, 3)
     frame = np.array([t for t, _ in every], int)

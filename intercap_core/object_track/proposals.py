@@ -1,4 +1,8 @@
-"""Sources of hypotheses: annotated poses, searches, neighbouring frames, near symmetries."""
+"""Sources of hypotheses: annotated poses, searches, neighbouring frames, near symmetries.
+
+Weight is the evidence for a hypothesis with its prior (:meth:`.hypotheses.Prior.weigh`), nats. A
+frame is sure or uncertain by the rule of :meth:`Proposals.search_uncertain`.
+"""
 
 from __future__ import annotations
 
@@ -17,9 +21,9 @@ from intercap_core.object_track.motion import shift_twist
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.turns import distinct_poses, find_near_symmetries
 
-SEED_SURE_LOG_RATIO = 40.0  # nats of a first frame that is good enough to search no other; tuned
+SEED_SURE_LOG_RATIO = 40.0  # a first frame with this weight ends the search, nats; tuned
 KEY_FRAME_S = 0.2  # time between frames in which near symmetries and colours are compared; tuned
-DOUBTFUL_PROBABILITY = 0.9  # of the chosen hypothesis, below which a frame is uncertain; tuned
+DOUBTFUL_PROBABILITY = 0.9  # below this probability of its hypothesis a frame is uncertain; tuned
 # Log-likelihood ratio at which the images of a frame clearly contradict an annotated pose: two or
 # three views see past the object. An occluded frame reaches -6, and so does chance.
 DENIED_LOG_RATIO = -25.0  # nats; tuned on five objects at noise 2 with two cameras of the studio
@@ -47,8 +51,8 @@ class Proposals:
     def start(self) -> int:
         """Search the three most promising frames, more while none shows the object, ten at most.
 
-        A frame that certainly shows the object ends the search at once. All hypotheses
-        are followed. Returns the best frame; raises NotFound if there is none.
+        A frame that certainly shows the object ends the search at once. All hypotheses are
+        followed. Returns the frame with the largest weight; raises NotFound if there is none.
         """
         results: list[tuple[float, int, list[FittedPose]]] = []
         for tried, t in enumerate(self._observer.frames_to_search()):
@@ -127,8 +131,9 @@ class Proposals:
         """Search the uncertain frames; returns whether a hypothesis is new.
 
         1. From the poses of neighbouring frames, outwards from sure frames.
-        2. With all rotations, once in each visible run and near annotated poses.
-        3. If nothing is new, with all rotations in frames about 0.5 s apart.
+        2. With all rotations, once in each run of visible frames and near annotated poses.
+        3. If nothing is new, with all rotations in frames that are at least 0.25 s from searched
+           ones, until a hypothesis is new.
 
         All searches with all rotations but those near annotated poses share a budget: six frames,
         and one more for each 0.5 s of the recording. A frame is uncertain if the object is hidden
@@ -159,7 +164,7 @@ class Proposals:
         if new:
             return True
         apart = self._observer.frames_in(every_s) // 2
-        # a pose that is certain from the motion needs no search, though little of it is visible
+        # a probable pose of small weight follows from the motion, although little is visible
         is_open = (probability < DOUBTFUL_PROBABILITY) | (weight < 0.25 * usual)
         uncertain = [t for t in uncertain if is_open[t]]
         while len(self._searched) < budget and not new:
@@ -180,7 +185,7 @@ class Proposals:
         return self._follow(t, self._observer.search(t))
 
     def _fit(self, t: int, pose: np.ndarray, twist: np.ndarray | None = None) -> FittedPose:
-        """Fit frame t from a pose (4, 4) that is as far off as the result of a search."""
+        """Fit frame t from an inaccurate pose (4, 4), with wide robust scales."""
         return self._observer.fit(t, pose, MotionPrior(pose), FIT_ROUNDS, 1.0, twist=twist)
 
     def _search_near_annotated(self, frames: list[int], sure: dict[int, np.ndarray]) -> bool:
@@ -204,9 +209,10 @@ class Proposals:
         self._searched_nearby -= {t + step for t in changed for step in near}
 
     def _unsearched_runs(self, path: np.ndarray, weight: np.ndarray) -> list[int]:
-        """Return the likeliest frame of every visible run of 0.2 s without a searched frame.
+        """Return a frame of each run of visible frames in which no frame was searched.
 
-        An object that reappears may have been rotated while it was hidden.
+        It is the frame with the largest ``weight`` (T,). Runs shorter than 0.2 s are left out. An
+        object that reappears may have been rotated while it was hidden.
         """
         seen = np.flatnonzero(path != HIDDEN)
         runs = np.split(seen, np.flatnonzero(np.diff(seen) > 1) + 1)
@@ -231,6 +237,7 @@ class Proposals:
                 break
         best = max(fits, key=lambda fit: fit.log_ratio)
         if best.log_ratio < SEARCH_GOOD_LOG_RATIO:
+            # no turn, and 35 degrees about each axis either way
             turns = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]) * np.radians(35)
             around = rotation_exp(turns)[:, None] @ starts[None, :, :3, :3]
             places = [mesh.centre_at(start) for start in starts]
@@ -241,7 +248,8 @@ class Proposals:
     def _starts(self, t: int, sure: dict[int, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Predict poses (N, 4, 4) of frame t and their twists (N, 6) from neighbouring frames.
 
-        From either side: at rest, at constant velocity, in a hand; and between both sides.
+        From the frames before and from those after: at rest, at constant velocity, in a hand. From
+        both: interpolated.
         """
         fits, times = self._hypotheses.fits, self._times
         same = self._observer.mesh.symmetry.nearest_equivalent_pose
@@ -251,7 +259,7 @@ class Proposals:
                 poses[u] = sure[u]
             elif u != t and self._hypotheses.best(u) > SEARCH_GOOD_LOG_RATIO:
                 poses[u] = fits[u][int(self._prior.weigh(u, fits[u]).argmax())].pose
-        before = [u for u in poses if u < t][:-3:-1]
+        before = [u for u in poses if u < t][:-3:-1]  # the last two, the nearest first
         after = [u for u in poses if u > t][:2]
         starts, rates = [], []
         for near in (before, after):
@@ -275,9 +283,9 @@ class Proposals:
         return np.array(starts).reshape(-1, 4, 4), np.array(rates).reshape(-1, 6)
 
     def add_near_symmetries(self, decoded: Decoded) -> bool:
-        """Follow near symmetries of the object where they look as likely as the chosen hypothesis.
+        """Follow poses that near symmetries make as likely as the chosen hypothesis.
 
-        Returns whether a hypothesis is new.
+        One frame in ``KEY_FRAME_S`` is tested. Returns whether a hypothesis is new.
         """
         turns = find_near_symmetries(self._observer.mesh, self._observer.field)
         every = self._observer.frames_in(KEY_FRAME_S)

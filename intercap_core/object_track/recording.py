@@ -25,7 +25,18 @@ log = logging.getLogger(__name__)
 
 
 class ObjectRecording:
-    """Views, pictures and labels of every moment of a recording."""
+    """Views, pictures and labels of every moment of a recording.
+
+    Moment t is the time of frame set t. A camera's image of it may belong to another frame set, if
+    that image is nearer in time (``image_of`` of the scene artefact).
+
+    Attributes:
+        up: (3,) vertical in the master frame.
+        joints: (T, K, 3) of the person, master frame, NaN where unknown.
+        count: number of cameras of the rig.
+        cameras: indices in the rig of the usable cameras, which have images and a pose.
+        geometry: reduced lenses of the usable cameras.
+    """
 
     def __init__(
         self, frames: Frames, detections: Detections, scene: Path, person: Path, diameter_m: float
@@ -118,7 +129,7 @@ class ObjectRecording:
     def _candidates(self, t: int, c: int) -> list[Candidate]:
         """Return the candidates that have the object's size, or whose size is unknown.
 
-        They may be partly hidden, or include something that the object touches.
+        The limits allow for candidates that are partly hidden or include what the object touches.
         """
         low, high = 0.25 * self._diameter_m, 1.4 * self._diameter_m + 0.05  # tuned on the studio
         candidates = self._detections.candidates(t, c)

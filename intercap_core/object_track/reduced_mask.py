@@ -97,7 +97,11 @@ def decode(rle: bytes, lens: Intrinsics, step: int) -> ReducedMask:
 
 @numba.njit(cache=True, nogil=True)
 def _bounds(ends: np.ndarray, height: int, step: int) -> tuple[int, int, int, int]:
-    """Return left, right, top, bottom (inclusive) of the reduced pixels set."""
+    """Return left, right, top, bottom (inclusive) of the reduced pixels set.
+
+    ``ends`` (R,) are the ends of runs that are alternately unset and set, column by column: pixel
+    number = column * height + row, at full resolution.
+    """
     left, right, top, bottom = 1 << 30, -1, 1 << 30, -1
     for i in range(1, len(ends), 2):
         start, end = ends[i - 1], ends[i]
@@ -116,7 +120,7 @@ def _bounds(ends: np.ndarray, height: int, step: int) -> tuple[int, int, int, in
 
 @numba.njit(cache=True, nogil=True)
 def _fill(ends: np.ndarray, height: int, step: int, left: int, top: int, mask: np.ndarray) -> None:
-    """Set the pixels of the runs in ``mask``, whose first pixel is (left, top)."""
+    """Set the pixels of runs (see :func:`_bounds`) in ``mask``; its first pixel is (left, top)."""
     for i in range(1, len(ends), 2):
         start, end = ends[i - 1], ends[i]
         if end > start:

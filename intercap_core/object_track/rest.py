@@ -1,10 +1,11 @@
 """Segments in which the object is at rest: a change-point test on the evidence of the images.
 
 A segment is at rest if one pose explains all its frames within their evidence. Errors of masks and
-calibration last and make a resting object seem to creep. A moving frame therefore costs more than
-lasting errors would gain by a pose of their own. The cheapest partition of the recording into rests
-and motions is found exactly by dynamic programming (Jackson et al. 2005). The variance of estimates
-at rest is measured on the rests themselves, once, so that slow motions are found too.
+calibration last for some time and make a resting object seem to creep. A frame in motion, which has
+a pose of its own, therefore costs more than such errors would gain by it. The cheapest partition of
+the recording into rests and motions is found exactly by dynamic programming (Jackson et al. 2005).
+It runs twice: the first result gives the variance of poses at rest, with which the second finds
+slow motions too.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ from intercap_core.geometry.camera.transforms import rotation_exp, step_between
 from intercap_core.object_track.evidence import ERROR_LASTING_S, FrameEvidence
 
 MIN_REST_S = 0.25  # shortest rest; tuned on the studio, as all values below
-BLIP_FRAMES = 2  # within these nothing moves away and back: 0.1 s at 30 Hz; tuned
-MAX_REST_FRAMES = 900  # tested against one pose: half a minute at 30 Hz; bounds the time
+BLIP_FRAMES = 2  # nothing moves away and back in so few frames, 0.1 s at 30 Hz; tuned
+MAX_REST_FRAMES = 900  # longest rest of the partition, half a minute at 30 Hz; limits the run time
 # Costs are minus log-likelihoods of one independent observation.
 MOVING_COST = 9.0  # of a pose of its own: six numbers that must differ from noise; tuned
 REST_COST = 8.0  # of one more rest: its pose, its begin and its end; tuned
@@ -65,18 +66,23 @@ def _partition(
     share: float,
     shortest: int,
 ) -> tuple[np.ndarray, float | None]:
-    """Find the cheapest partition.
+    """Find the cheapest partition into rests and motions, by dynamic programming.
+
+    ``best_rest[e]`` and ``best_move[e]`` are the costs of the cheapest partition of the frames
+    before e whose last frame rests or moves. A rest from a to e costs ``REST_COST`` and half of the
+    squared distances of its frames from their mean pose; a moving frame costs ``MOVING_COST``.
+    Between two rests at least one frame moves. The partition is traced back from the last frame.
 
     Args:
-        poses, information: (T, 4, 4) and (T, 6, 6) evidence.
+        poses, information: (T, 4, 4) and (T, 6, 6) of each frame's own minimum.
         seen: (T,) frames with evidence.
         weight: factor of the squared residuals.
         share: independent observations per frame.
         shortest: frames of the shortest rest.
 
     Returns:
-        Segments (T,), and the mean squared residual per degree of freedom at rest, None without
-            rest.
+        Number (T,) of the rest segment, -1 in motion; and the mean squared residual per degree of
+            freedom at rest, None without rest.
     """
     count = len(poses)
     moving = np.where(seen, MOVING_COST, 1.0) * share  # a frame without evidence costs 1
@@ -94,8 +100,8 @@ def _partition(
         until = min(a + MAX_REST_FRAMES, count)
         spread = _spread(poses[a:until], information[a:until], seen[a:until])
         ends = a + 1 + np.arange(len(spread))
-        # The recording may show only a part of its first and its last rest. Such a rest costs less
-        # than a whole one; how much more a longer one costs is less than motion in these frames.
+        # A rest at the start or the end of the recording may be cut off, and then costs less than a
+        # whole one: 5, and for each frame beyond the shortest rest a little less than motion.
         length = ends - a
         cut = (a == 0) | (ends == count)
         longer = np.maximum(length - shortest + 1, 0) * MOVING_COST * share * 0.9
@@ -126,9 +132,10 @@ def _partition(
 
 
 def _spread(poses: np.ndarray, information: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Return squared normalised distances (L,) of the first 1, 2, ... frames from their mean pose.
+    """Return for the first 1, 2, ... L frames the sum of squared distances from their mean pose.
 
-    L ends at the first frame that is too far away for a rest: 0.35 rad or 10 cm.
+    Distances are in standard deviations, and the mean pose is that of minimal sum. The L frames end
+    before the first one that is too far from frame 0 for a rest: 0.35 rad or 10 cm.
     """
     offset = step_between(np.broadcast_to(poses[0], poses.shape), poses)
     offset[~seen] = 0
@@ -144,9 +151,9 @@ def _spread(poses: np.ndarray, information: np.ndarray, seen: np.ndarray) -> np.
 
 
 def _trim(segments: np.ndarray, poses: np.ndarray, information: np.ndarray) -> np.ndarray:
-    """Remove frames from the ends of segments (T,) in which the object already moves.
+    """Remove frames from both ends of segments (T,) if they are far from the segment's mean pose.
 
-    Correlated errors do not begin just when a motion does.
+    Such a frame already moves: lasting errors would not begin just at the end of a rest.
     """
     result = segments.copy()
     for number in range(segments.max(initial=-1) + 1):
@@ -172,9 +179,9 @@ def _trim(segments: np.ndarray, poses: np.ndarray, information: np.ndarray) -> n
 def _merge(
     segments: np.ndarray, poses: np.ndarray, information: np.ndarray, seen: np.ndarray
 ) -> np.ndarray:
-    """Merge neighbouring segments (T,) that one pose explains.
+    """Merge neighbouring segments (T,) if one pose for both costs less than another rest.
 
-    A single outlier or the limit of a rest's length may have split a rest.
+    A single outlier or ``MAX_REST_FRAMES`` may have split a rest.
     """
     result = np.full_like(segments, -1)
     number, last = -1, np.zeros(0, int)
@@ -196,8 +203,9 @@ def _merge(
 def _remove_blips(poses: np.ndarray, information: np.ndarray) -> np.ndarray:
     """Return the information (T, 6, 6), zero for outliers.
 
-    An outlier is one or two frames at another pose between frames at equal ones, by chi square with
-    6 degrees of freedom.
+    An outlier is one or two frames at another pose between two frames at equal poses. Poses are
+    equal below a squared distance of 10, and different above 25. For equal poses it is a chi square
+    with 6 degrees of freedom, of mean 6.
     """
     result = information.copy()
     for width in range(1, BLIP_FRAMES + 1):
@@ -214,7 +222,10 @@ def _remove_blips(poses: np.ndarray, information: np.ndarray) -> np.ndarray:
 
 
 def _squared_distance(poses: np.ndarray, information: np.ndarray, a: np.ndarray, b: np.ndarray):
-    """Return squared distances (N,) of frames a and b in the evidence of the weaker one."""
+    """Return squared distances (N,) of frames a and b (N,), in standard deviations.
+
+    They are measured in the information of the frame that gives the smaller distance.
+    """
     offset = step_between(poses[a], poses[b])
     both = [np.einsum("ni,nij,nj->n", offset, information[i], offset) for i in (a, b)]
     return np.minimum(*both)

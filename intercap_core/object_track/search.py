@@ -1,12 +1,13 @@
-"""Search of the object's pose in a frame set without a start.
+"""Search of the object's pose in a frame set without a start pose.
 
 Candidates of different views are joined to groups. A grid of rotations over SO(3) modulo the
 symmetry group is aligned to each group. The best poses are rendered and compared with every view,
 and the best of those are fitted.
 
-The alignment is point-to-plane ICP to the measured points for all rotations at once. The outlines
-of the masks are added where views have no depth, or where few views leave many poses that fit the
-points. Weights are Geman-McClure with a scale that shrinks from the error of the grid.
+The alignment is point-to-plane ICP to the measured points for all rotations at once. Outlines of
+masks are added for views without depth, and for all views of a group of at most two, whose points
+many poses fit. Weights are Geman-McClure with a scale that shrinks from the error
+of the grid to the noise.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ from intercap_core.object_track.turns import axis_turns, distinct_poses, rotatio
 from intercap_core.object_track.view import FitContext, View
 
 ICP_MAX_RESIDUAL_M = 0.05  # larger residuals of the alignment count as this; tuned on the studio
-# Nats by which a start may be worse than a fit and still lead to a rival of it: a fit gains up to
-# 15 nats, measured on the studio (bottle to chair).
+# A start that is this much worse than the best fit, nats, is not fitted: a fit gains up to 15 nats,
+# measured on the studio (bottle to chair).
 HOPELESS_LOG_RATIO = 15.0
 
 
@@ -143,6 +144,10 @@ def align(
 ) -> np.ndarray:
     """Align rotations to a group of candidates (ICP with successive halving).
 
+    All rotations start at the position of the group and take seven Gauss-Newton steps together, on
+    points and outlines. The worst rotations are dropped after the second and the fourth step. Steps
+    are in the object's frame.
+
     Args:
         mesh, field: the object and its distance field.
         group: candidates of the object.
@@ -163,7 +168,7 @@ def align(
     translation = locate_group(group) - rotation @ middle
     # Geman-McClure scales, metres: from the error of the grid to the noise
     scales = [*np.geomspace(0.08, 0.015, 6), 0.015]
-    survivors = {1: 96, 3: 48}  # rotations that continue after a step
+    survivors = {1: 96, 3: 48}  # number of rotations that continue after step 1 and step 3 (from 0)
     residual = np.zeros(len(rotation))
     for number, scale in enumerate(scales):
         few_points = slice(None, None, 3 if number < 2 else 1)
@@ -223,7 +228,17 @@ def _to_points(
     translation: np.ndarray,
     scale: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the cost (N, P) of each point, the normal matrix (N, 6, 6) and the gradient (N, 6)."""
+    """Linearise the distances of P points from the surface at N poses, by steps in its own frame.
+
+    Args:
+        field: distance field of the mesh.
+        cloud, eyes: (P, 3) points and the camera centre of each, master frame.
+        rotation, translation: (N, 3, 3) and (N, 3) of master_from_object.
+        scale: Geman-McClure scale, metres.
+
+    Returns:
+        The cost (N, P) of each point in metres, J'WJ (N, 6, 6), and -J'Wr (N, 6).
+    """
     count = len(rotation)
     local = np.einsum("nji,npj->npi", rotation, cloud[None] - translation[:, None])
     closest = field.closest(local.reshape(-1, 3))

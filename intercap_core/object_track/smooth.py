@@ -1,10 +1,11 @@
 """Most probable track over all frames from the evidence of each frame.
 
 Around the pose at which a frame was evaluated, its evidence is a quadratic form of small motions.
-Neighbouring frames are coupled by the accelerations that hands and gravity cause. Both are robust:
-a frame that was evaluated at a wrong pose, a kick or a drop cost little. Frames of one node share
-one pose: an object at rest. The track is solved by Gauss-Newton with a banded Cholesky factor,
-whose inverse is the covariance. Beyond the paper, whose tracker ends with equation 1.
+Neighbouring frames are coupled by their accelerations, whose standard deviations are those that
+hands and gravity cause. Both parts are robust: a frame that was evaluated at a wrong pose, a kick
+or a drop cost little. The unknowns are nodes: a node is the pose of one moving frame, or of all
+frames of one rest. The track is solved by Gauss-Newton with a banded Cholesky factor, and the
+inverse of the matrix is the covariance. Beyond the paper, whose tracker ends with equation 1.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ ACCELERATION_M_S2 = 6.0  # m/s^2; tuned on the studio
 ACCELERATION_RAD_S2 = 20.0  # rad/s^2; tuned on the studio
 IMPACT_SIGMAS = 3.0  # standard deviations beyond which an acceleration is an impact; tuned
 OUTLIER_SIGMAS = 5.0  # evidence this many standard deviations away counts a quarter; tuned
-BAND = 2  # nodes before to which an acceleration couples a node
+BAND = 2  # an acceleration couples a node with at most two nodes before it
 
 
 def smooth(
@@ -87,10 +88,10 @@ def smooth(
 
 
 def _typical_frames(evidence: FrameEvidence, node: np.ndarray) -> np.ndarray:
-    """Return the frame (N,) of each node that is near most of its evidence.
+    """Return for each node the frame (N,) whose position is near most of the node's frames.
 
-    A robust fit that starts at the one wrong frame of a rest would stay there. ``node`` (T,) as in
-    :func:`smooth`.
+    The robust fit of a node starts there: from the one wrong frame of a rest it would not leave it.
+    ``node`` (T,) as in :func:`smooth`.
     """
     reach_m = 0.03  # frames of a rest farther apart do not show one place; tuned on the studio
     weight = np.sqrt(np.trace(evidence.information, axis1=1, axis2=2))
@@ -108,10 +109,10 @@ def _typical_frames(evidence: FrameEvidence, node: np.ndarray) -> np.ndarray:
 
 
 def _remove_blips(poses: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Move frames that jump away and back between their neighbours; poses (T, 4, 4).
+    """Return poses (T, 4, 4) with single frames that jump away and back moved between neighbours.
 
     A robust fit that starts at a wrong pose would stay there. A kick or a drop changes the velocity
-    once, a wrong frame three times back and forth.
+    once, a wrong frame three times in alternating directions.
     """
     result = poses.copy()
     if len(poses) < 5:
@@ -137,7 +138,10 @@ def _remove_blips(poses: np.ndarray, times: np.ndarray) -> np.ndarray:
 def _add_motion(
     state: np.ndarray, node: np.ndarray, times: np.ndarray, bands: np.ndarray, gradient: np.ndarray
 ) -> None:
-    """Add the accelerations of frames t-1, t, t+1 to the normal equations."""
+    """Add the robust accelerations of frames t-1, t, t+1 to ``bands`` and ``gradient`` in place.
+
+    ``state`` (N, 4, 4) are the nodes' poses. Frames of one node have no acceleration.
+    """
     if len(node) < 3:
         return
     moving = node[2:] > node[:-2]
@@ -192,9 +196,10 @@ def _banded(bands: np.ndarray) -> np.ndarray:
 
 
 def _covariance(banded: np.ndarray, count: int) -> np.ndarray:
-    """Return the diagonal blocks (N, 6, 6) of the inverse.
+    """Return the diagonal blocks (N, 6, 6) of the inverse, an approximation.
 
-    64 nodes are inverted at a time, with the 40 before and after that matter to them.
+    64 nodes are inverted at a time, together with 40 nodes before and after. The influence of nodes
+    farther away is neglected.
     """
     covariance = np.zeros((count, 6, 6))
     for start in range(0, count, 64):

@@ -1,9 +1,11 @@
 """Track of the object: hypotheses in every frame and one decision over all frames.
 
-Poses that a search finds in a few frames are followed forwards and backwards. A hidden Markov model
-(:mod:`.decoder`) decides which hypothesis is true in every frame. Frames that stay uncertain are
-searched, and the model decides again. :mod:`.whole` then refines the decided poses: rest,
-smoothness and covariance.
+1. Poses that a search finds in a few frames, and annotated poses, are followed forwards and
+   backwards through the frames.
+2. A hidden Markov model (:mod:`.decoder`) decides which hypothesis is true in every frame.
+3. Uncertain frames are searched, and the model decides again, until no hypothesis is new. Near
+   symmetries, new fits of moving objects and colours add to the decision in the same way.
+4. :mod:`.whole` refines the decided poses: rest, smoothness and covariance.
 """
 
 from __future__ import annotations
@@ -36,12 +38,14 @@ from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.proposals import DOUBTFUL_PROBABILITY, NotFound, Proposals
 from intercap_core.object_track.whole import FrameResult, FrameStatus, WholeTrack, flag_frames
 
-# Having left is likelier than being hidden from all cameras by this, nats of an independent
-# observation: after about two seconds.
+# Log-likelihood ratio, per independent observation, of an object that has left to one that is
+# hidden from all cameras. It outweighs the costs of leaving and of coming back after about two
+# seconds.
 ABSENT_LOG_RATIO = 1.0  # nats; tuned
-AMBIGUOUS_PROBABILITY = 0.2  # of different poses, above which a frame is ambiguous; tuned
-# Nats of all believed frames, as independent observations, below which there is no object. False
-# detections reach 8; the least of real objects (a cup behind a hand without depth) is about 25.
+AMBIGUOUS_PROBABILITY = 0.2  # of different poses together; above it a frame is ambiguous; tuned
+# Total log-likelihood ratio of the frames that are not lost, as independent observations, below
+# which the recording shows no object. False detections reach 8 nats; the least of real objects (a
+# cup behind a hand without depth) is about 25.
 NOTHING_LOG_RATIO = 12.0  # nats; tuned
 
 
@@ -56,9 +60,9 @@ class Track:
     annotated: bool
     """Whether poses were annotated."""
     evidence: float
-    """Log-likelihood ratio of all believed frames as independent observations, nats."""
+    """Log-likelihood ratio of all frames that are not lost, as independent observations, nats."""
     agrees: bool = True
-    """Whether the track agrees with an annotated pose, if there is one."""
+    """Whether the track agrees with at least one annotated pose; True if there is none."""
     doubts: tuple[str, ...] = ()
     """Warnings about the mesh and annotated poses."""
 
@@ -162,14 +166,18 @@ class Tracker:
         return decoded
 
     def _decode(self) -> Decoded:
-        """Decide over all frames, and update the prior of places where the object surely was."""
+        """Decide between the hypotheses of all frames, and update the prior of places accordingly.
+
+        The model decides up to three times: with the usual motions; with free motion at no cost
+        near annotated poses of a hidden object; and with the costs of places that are out of reach.
+        """
         times, fits = self._observer.times, self._hypotheses.fits
         weights = [self._prior.weigh(t, own) for t, own in enumerate(fits)]
         poses = [np.array([fit.pose for fit in own]).reshape(-1, 4, 4) for own in fits]
         steps = self._step_log_ratios(poses, np.full(len(poses) - 1, FREE_COST_S))
         self._emissions = [self._observer.share * weight for weight in weights]
         decoded = decode(self._emissions, steps, self._absent)
-        # near annotated poses of a hidden object the usual motions explain nothing
+        # near annotated poses of a hidden object any motion is possible
         near = self._prior.near_annotated(decoded.path == HIDDEN)
         if near.any():
             free = np.where(near[1:] | near[:-1], 0.0, FREE_COST_S)
@@ -183,9 +191,10 @@ class Tracker:
         return decoded
 
     def _step_log_ratios(self, poses: list[np.ndarray], free: np.ndarray) -> list[np.ndarray]:
-        """Return the steps [T - 1] between the poses [T] (K, 4, 4) of the hypotheses.
+        """Return :func:`.decoder.step_log_ratios` [T - 1] between the hypotheses of all frames.
 
-        ``free`` (T - 1,) is the cost of free motion, nats per second.
+        ``poses`` [T] (K, 4, 4) are those of the hypotheses, ``free`` (T - 1,) is the cost of free
+        motion, nats per second.
         """
         return [
             step_log_ratios(
@@ -221,7 +230,11 @@ class Tracker:
                 self._observer.places.exclude(centres[k])
 
     def _results(self, decoded: Decoded) -> list[FrameResult]:
-        """Return the chosen hypotheses (T) with what the others add to their covariance."""
+        """Return the chosen hypothesis of each frame, with the spread of its rivals.
+
+        Rivals are hypotheses more than 20 degrees or 5 cm away. They add to the covariance if their
+        probability exceeds half of ``AMBIGUOUS_PROBABILITY``.
+        """
         result = []
         for t, (own, k) in enumerate(zip(self._hypotheses.fits, decoded.path, strict=True)):
             probability = decoded.probability[t]
@@ -233,7 +246,7 @@ class Tracker:
             poses = np.array([symmetry.nearest_equivalent_pose(fit.pose, pose) for fit in own])
             steps = step_between(np.broadcast_to(pose, poses.shape), poses)
             centres = np.array([self._mesh.centre_at(pose) for pose in poses])
-            # hypotheses farther apart are different poses
+            # rivals
             far = np.linalg.norm(steps[:, :3], axis=1) > np.radians(20)
             far |= np.linalg.norm(centres - centres[k], axis=1) > 0.05
             other = float(probability[:-1][far].sum())

@@ -26,8 +26,10 @@ NEAR_TURN_CHANGED_SHARE = 0.3  # of the surface that near symmetries clearly dis
 def find_near_symmetries(mesh: ObjectMesh, field: DistanceField) -> np.ndarray:
     """Find turns (N, 4, 4) of the object that hardly change it, the identity first.
 
-    These are all angles about an axis of near symmetry, and single angles that map the surface onto
-    itself. Elements of the symmetry group are left out. ``field`` is the mesh's distance field.
+    Angles in steps of 30 degrees about each of the object's axes are tried, with the best shift. If
+    all angles about an axis displace less than ``NEAR_TURN_CHANGED_SHARE`` of the surface, all are
+    returned; otherwise those that displace less than this and no more than the next angles.
+    Elements of the symmetry group are left out. ``field`` is the mesh's distance field.
     """
     kept = [np.eye(4)]
     if mesh.symmetry.sphere:
@@ -42,9 +44,9 @@ def find_near_symmetries(mesh: ObjectMesh, field: DistanceField) -> np.ndarray:
     for about, (_, *share) in zip(
         placed.reshape(len(axes), -1, 4, 4), shares.reshape(len(axes), -1), strict=True
     ):
-        # the inverse rotation moves the surface as far
+        # angles of 30 to 330 degrees: beyond 180 the inverses, which displace as much
         turns = [*about[1:], *(np.linalg.inv(turn) for turn in about[-2:0:-1])]
-        changed = np.array([0.0, *share, *share[-2::-1]])
+        changed = np.array([0.0, *share, *share[-2::-1]])  # of 0 to 330 degrees
         if changed.max() < NEAR_TURN_CHANGED_SHARE and mesh.symmetry.axis is None:
             kept += [about[0], np.linalg.inv(about[0]), *turns]
             continue
@@ -62,7 +64,7 @@ def find_near_symmetries(mesh: ObjectMesh, field: DistanceField) -> np.ndarray:
 
 
 def changed_share(mesh: ObjectMesh, field: DistanceField, motion: np.ndarray) -> float:
-    """Return the share of the surface that a motion (4, 4) of the object clearly displaces."""
+    """Return the share (0 to 1) of the surface that a motion (4, 4) moves clearly off the mesh."""
     moved = _surface(mesh) @ motion[:3, :3].T + motion[:3, 3]
     return float((field.distance(moved) > _far(mesh)).mean())
 
@@ -70,14 +72,17 @@ def changed_share(mesh: ObjectMesh, field: DistanceField, motion: np.ndarray) ->
 def _align_turned(
     mesh: ObjectMesh, field: DistanceField, rotations: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Shift turned surfaces so that most of each falls onto the surface itself.
+    """Shift turned surfaces so that most of each falls onto the original surface.
+
+    Robust point-to-plane ICP in the shift alone, five steps with a scale that shrinks from 6 times
+    the distance of a clearly displaced point to once this distance.
 
     Args:
         mesh, field: the object and its distance field.
         rotations: (N, 3, 3).
 
     Returns:
-        The turns (N, 4, 4), and the share (N,) of the surface that each displaces.
+        The turns with their shifts (N, 4, 4), and the share (N,) of the surface that is displaced.
     """
     points, far = _surface(mesh), _far(mesh)
     turned = points @ rotations.transpose(0, 2, 1)
@@ -186,7 +191,7 @@ def distinct_poses(
     limits: tuple[float, float] = (SAME_POSE_M, SAME_POSE_DEG),
     count: int | None = None,
 ) -> list[int]:
-    """Return the first ``count`` poses (4, 4) that differ from all before, by their numbers."""
+    """Return indices of the first ``count`` poses (4, 4) that differ from all returned before."""
     kept: list[int] = []
     for k, pose in enumerate(poses):
         if len(kept) == count:

@@ -1,4 +1,4 @@
-"""One frame set as the tracker sees it: reduced masks and depth of every view."""
+"""The images of a frame set as the tracker uses them: reduced masks and depth of every view."""
 
 from __future__ import annotations
 
@@ -158,9 +158,9 @@ class View:
     candidates: tuple[MaskCandidate, ...]
     """Candidates, each with its reduced mask."""
     detected: bool = True
-    """Whether candidates are known for this image, so that their absence is evidence."""
+    """Whether the detector processed this image, so that the absence of candidates is evidence."""
     background: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), np.float32))
-    """(h, w) depth of the empty room in the same form; (0, 0) if unknown."""
+    """(h, w) depth of the empty room in the form of ``depth``; (0, 0) if unknown."""
 
     def through(self, geometry: ViewGeometry) -> View:
         """Return the same image with :meth:`ViewGeometry.corrected` geometry."""
@@ -233,6 +233,6 @@ class FitContext:
     min_overlap: float = 0.3
     """Smallest IoU with the render at which a fit uses a candidate."""
     background_term: bool = True
-    """Whether fits penalise render over known background (beyond the paper)."""
+    """Whether fits penalise rendered pixels over known background (beyond the paper)."""
     renderer: Renderer = field(default_factory=default_renderer)
     """Draws the mesh, and runs the views in parallel."""

@@ -1,8 +1,8 @@
 """One view's part of E_O (equation 1) during a fit: weighted silhouette and depth terms.
 
 The paper sets its lambdas empirically. Here they follow from the noise and from the number of
-independent pixels of a view. In units of its standard deviation, each term counts as a number of
-samples:
+independent pixels of a view. Squared residuals are divided by their variance, and the pixels of a
+term together count as a number of independent samples:
 
     lambda_depth = DEPTH_SAMPLES n / (n + DEPTH_HALF_SAMPLES_PX) / n / DEPTH_SIGMA_M^2
     lambda_segm = trust CONTOUR_SAMPLES / m / CONTOUR_SIGMA_PX^2
@@ -48,9 +48,7 @@ NormalEquations = tuple[np.ndarray, np.ndarray]
 
 
 def shots_of(view: View, pose: np.ndarray) -> list[Shot]:
-    """List what is rendered of a pose (4, 4): the colour image and, if there is one, the depth
-    image.
-    """
+    """Return the shots to render at a pose (4, 4): colour image, then depth image if present."""
     geometry = view.geometry
     shots = [Shot(geometry.lens, geometry.colour_from_master @ pose)]
     if view.depth is not None and geometry.depth_lens is not None:
@@ -61,8 +59,8 @@ def shots_of(view: View, pose: np.ndarray) -> list[Shot]:
 class ViewFit:
     """One view during a fit: its chosen candidate and the measurements around it.
 
-    It looks at one pose and its renderings at a time, set by the constructor and :meth:`see`.
-    Before :meth:`choose` it has no candidate. Views may run on different threads.
+    All terms refer to the current pose and its renderings, set by the constructor and :meth:`see`.
+    Before :meth:`choose` there is no candidate. Views may run on different threads.
     """
 
     def __init__(
@@ -76,7 +74,7 @@ class ViewFit:
         self.see(pose, drawn)
 
     def see(self, pose: np.ndarray, drawn: list[Rendering]) -> None:
-        """Look at a pose (4, 4) with its renderings, in the order of :func:`shots_of`."""
+        """Set the current pose (4, 4) and its renderings, in the order of :func:`shots_of`."""
         self._pose = pose
         self._silhouette = drawn[0]
         self._drawn_depth = drawn[1] if len(drawn) > 1 else None
@@ -100,7 +98,7 @@ class ViewFit:
     def _cut(self) -> None:
         mask = self._candidate.mask if self._candidate else EMPTY
         overlap = mask_overlap(self._silhouette, mask, self._view.person)
-        # from an IoU of 0.34 to one of 0.7; tuned on the studio
+        # rises linearly from 0.1 at an IoU of 0.34 to 1 at 0.7; tuned on the studio
         self._contour_trust = float(np.clip((overlap - 0.3) / 0.4, 0.1, 1.0))
         self._contour_patch = self._depth_patch = None
         if self._candidate is not None:
@@ -142,7 +140,7 @@ class ViewFit:
         """
         nothing = np.zeros((6, 6)), np.zeros(6), np.zeros(0)
         patch, drawn, geometry = self._contour_patch, self._silhouette, self._view.geometry
-        # outside of the window only depth is used, until the window is cut again
+        # if the rendering leaves the patch, only depth is used until the patch is cut again
         if patch is None or not patch.holds(drawn):
             return nothing
         scale = scale_px / geometry.step
@@ -165,8 +163,7 @@ class ViewFit:
             at, target, drawn.depth, corner, geometry.lens.rays, geometry.lens.parameters,
             geometry.master_from_colour, self._pose[:3, 3], scale,
         )  # fmt: skip
-        # normalised by the whole rim: a few outlier pixels weigh less than a rim that is off all
-        # around
+        # normalised by the whole rim: a few pixels that are off weigh less than a whole rim
         samples = CONTOUR_SAMPLES / max(len(patch.contour), rim_size)
         weight = self._contour_trust * samples / (CONTOUR_SIGMA_PX / geometry.step) ** 2
         return weight * hessian, weight * gradient, residuals
@@ -189,7 +186,7 @@ class ViewFit:
                 self._pose[:3, :3], view.geometry.master_from_depth[:3, 3],
             )  # fmt: skip
             column, row = where.T
-            # pixels that are farther from the render show something else
+            # in metres; pixels whose depth differs by more show something else
             own = (patch.trust[row, column] == 1.0) & (np.abs(gap) < 0.1)
             if own.sum() >= MIN_RENDERED_PX:
                 depth_residual = float(np.median(across[own]))

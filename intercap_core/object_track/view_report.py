@@ -1,6 +1,7 @@
 """Agreement of a view with a pose: overlap of the masks, and depth where nothing is in front.
 
-The candidate that shows the object is chosen by render-compare-and-preserve as in the paper.
+The candidate that shows the object is the one that overlaps the rendered object most, as in the
+paper (render-compare-and-preserve).
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ from intercap_core.object_track.reduced_mask import EMPTY, ReducedMask, covers
 from intercap_core.object_track.view import FitContext, MaskCandidate, View
 
 MIN_RENDERED_PX = 12  # renderings with fewer pixels are not compared; tuned
-# Depth that is measured farther than the render by this much shows the background, nearer by this
-# much an occluder. Above the systematic errors of sensor and pose.
+# Depth that differs from the render by more than this shows the background (farther) or an occluder
+# (nearer). The value is above the systematic errors of sensor and pose.
 FREE_SPACE_M = 0.03  # metres; tuned
 AGREEMENT_SCALE_M = 0.010  # a pixel this far off agrees by half (Azure Kinect's data sheet)
 ASSESS_MIN_OVERLAP = 0.1  # smallest IoU of a candidate to compare an unfitted pose with; tuned
@@ -29,8 +30,8 @@ def choose_candidate(
 ) -> MaskCandidate | None:
     """Choose the candidate with the largest overlap with the visible render.
 
-    A candidate with one of the object's labels gets 0.05 more, which breaks ties. Returns None if
-    no overlap reaches ``min_overlap``.
+    0.05 is added to the overlap of candidates with one of the object's labels, which breaks ties.
+    Returns None if no overlap reaches ``min_overlap``.
     """
     best, best_rank = None, 0.0
     if predicted.area < MIN_RENDERED_PX:
@@ -62,14 +63,14 @@ def visible_pixels(image: Rendering, person: ReducedMask) -> int:
 
 
 def _window(image: Rendering | ReducedMask) -> tuple[np.ndarray, int, int]:
-    """Return the faces or the mask in the window, and its first pixel."""
+    """Return the face numbers or the mask of a window (h, w), and its first pixel (x0, y0)."""
     pixels = image.face if isinstance(image, Rendering) else image.mask
     return pixels, image.x0, image.y0
 
 
 @numba.njit(cache=True, nogil=True)
 def _compare(face, x0, y0, person, px, py, mask, mx, my):
-    """Count the rendered pixels that are visible, and those in the mask (:func:`mask_overlap`).
+    """Count the rendered pixels that are visible (:func:`mask_overlap`), and those in the mask.
 
     The three images are windows, each followed by the column and row of its first pixel.
     """

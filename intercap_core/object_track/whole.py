@@ -5,7 +5,7 @@
    further quadratic forms (:mod:`.given_poses`).
 3. Rest segments are found (:mod:`.rest`), and the most probable track is solved for
    (:mod:`.smooth`).
-4. The status of a frame (:class:`FrameStatus`) says what its pose rests on.
+4. Each frame gets a status (:class:`FrameStatus`), the source of its pose.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from intercap_core.object_track.smooth import smooth
 
 
 class FrameStatus(IntEnum):
-    """What the pose of a frame rests on."""
+    """Source of the pose of a frame."""
 
     SEEN = 0
     """The images of the frame."""
@@ -57,9 +57,9 @@ class FrameStatus(IntEnum):
     CARRIED = 2
     """Annotated poses; the images do not show the object."""
     LOST = 3
-    """Nothing; no hypothesis is believed."""
+    """None: no hypothesis is accepted, and the pose is interpolated."""
     GONE = 4
-    """Nothing; all frames together say that the object has left the room."""
+    """None: by the evidence of all frames the object has left the room."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class FrameResult:
     fit: FittedPose
     """Pose, covariance and agreement with the views."""
     status: FrameStatus = FrameStatus.SEEN
-    """What the pose rests on."""
+    """Source of the pose."""
     ambiguous: bool = False
     """Whether a different pose may be the true one."""
     probability: float = 1.0
@@ -85,7 +85,7 @@ class FrameResult:
 
     @property
     def lost(self) -> bool:
-        """Whether the pose rests on nothing."""
+        """Whether the pose has no source: the object is lost or gone."""
         return self.status >= FrameStatus.LOST
 
     @property
@@ -102,13 +102,13 @@ class FrameResult:
 def flag_frames(mesh: ObjectMesh, frames: list[FrameResult]) -> list[FrameResult]:
     """Flag the frames (T) of a refined track by their covariance.
 
-    A frame is lost if its position is uncertain, and ambiguous if its turn is. A carried frame is
-    ambiguous if either is uncertain, and lost beyond 15 cm: the joint fit bridges it as well. The
-    first frame after lost ones is recovered.
+    A frame is lost if the standard deviation of its position exceeds ``UNSURE_M``, and ambiguous if
+    that of its turn exceeds ``UNSURE_RAD``. A carried frame is ambiguous in both cases, and lost
+    only beyond 15 cm. The first frame after lost ones is recovered.
     """
     result: list[FrameResult] = []
     for frame in frames:
-        # other hypotheses count by their probability, not by their distance
+        # without the spread of rivals, which flag a frame by their probability instead
         shift, turn = _deviations(mesh, frame.fit.pose, frame.fit.covariance)
         lost = frame.lost or shift > (0.15 if frame.carried else UNSURE_M)
         unsure = frame.ambiguous or turn > UNSURE_RAD or shift > UNSURE_M
@@ -181,9 +181,9 @@ class WholeTrack:
             given: annotated poses that the decided frames agree with.
 
         Returns:
-            The frames with refined pose, covariance and status. Ambiguous are also carried frames
-            without an annotated pose, and frames next to them in which only one view shows the
-            object.
+            The frames with refined pose, covariance and status. Carried frames without an annotated
+            pose are flagged as ambiguous, and so are frames next to unseen ones in which only one
+            view shows the object (:func:`.given_poses.flag_edges`).
         """
         fits = [frame.fit for frame in frames]
         lost = np.array([frame.lost for frame in frames])
@@ -239,7 +239,10 @@ class WholeTrack:
         )
 
     def _between_equal_poses(self, poses: np.ndarray, lost: np.ndarray) -> np.ndarray:
-        """Find frames (T,) in gaps of 0.3 s between equal poses: the object stayed in place."""
+        """Find frames (T,) in gaps of less than 0.3 s between equal poses.
+
+        There the object stayed in place. ``poses`` (T, 4, 4), ``lost`` (T,) frames of the gaps.
+        """
         result = np.zeros(len(lost), bool)
         for a, b in pairwise(np.flatnonzero(~lost).tolist()):
             if b - a > 1 and self._times[b] - self._times[a] < 0.3:
@@ -250,7 +253,13 @@ class WholeTrack:
     def _smooth(
         self, fits: list[FittedPose], lost: np.ndarray, given: Sequence[GivenPose]
     ) -> _SmoothedTrack:
-        """Solve for the track, evaluate the images at the solution, and solve again."""
+        """Solve for the track, evaluate the images at the solution, and solve again.
+
+        Args:
+            fits: decided fit of each frame.
+            lost: (T,) frames whose pose is filled in and whose images are no evidence.
+            given: annotated poses.
+        """
         count = len(fits)
         filled = fill_lost(self._observer, np.array([fit.pose for fit in fits]), lost)
         poses = filled.poses
@@ -332,7 +341,7 @@ class WholeTrack:
         return poses, covariance, segment
 
     def _frames_to_reevaluate(self, segment: np.ndarray) -> list[int]:
-        """Return all moving frames and 12 of each rest."""
+        """Return all moving frames, and 12 frames of each rest segment (T,), evenly spread."""
         frames = list(np.flatnonzero(segment < 0))
         for number in range(segment.max(initial=-1) + 1):
             rest = np.flatnonzero(segment == number)
@@ -341,7 +350,7 @@ class WholeTrack:
         return sorted(map(int, frames))
 
     def _without_symmetry(self, evidence: FrameEvidence) -> FrameEvidence:
-        """Remove the spurious information of a round mesh's facets on its spin."""
+        """Remove the information that a round mesh's facets cause on turns about its axis."""
         information, gradient = evidence.information.copy(), evidence.gradient.copy()
         for t, pose in enumerate(evidence.poses):
             steps = free_turns(self._mesh, pose)
