@@ -20,11 +20,14 @@ CONTACT_REGIONS = (
     "left_hand", "right_hand", "left_foot", "right_foot", "left_thigh", "right_thigh", "seat",
     "back", "chest", "left_forearm", "right_forearm", "mouth", "left_shoulder", "right_shoulder",
 )  # fmt: skip
-METRIC_REGIONS = CONTACT_REGIONS[:12]
+METRIC_REGIONS = CONTACT_REGIONS[:12]  # regions compared with the truth: axes of length 12
 BODY_PARTS = (
     "trunk", "left_arm", "right_arm", "left_leg", "right_leg", "left_hand", "right_hand", "face",
 )  # fmt: skip
 
+# Axes that the header does not name belong to one file or to the group of one camera: B bytes, N or D
+# images or other items, M = T * C images, P people, parts or pairs of cameras, X expression
+# coefficients, E energy terms, G coverings, W thresholds, F features or faces. "NAME+1" are offsets.
 _CAMERA_MODELS = {
     "camera_names": Field(("C",), "str", "camera names, in the order of all C axes"),
     "colour_size": Field(("C", "2"), "int32", "width and height of the colour image", "px"),

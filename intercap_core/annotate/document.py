@@ -57,6 +57,7 @@ class Document:
     digest: str
     """SHA-256 of the file's bytes."""
     sections: dict[str, Any]
+    """Values of the file by top-level key."""
     problem: str = ""
     """Why the file cannot be used, "" if it can."""
     note: str = ""

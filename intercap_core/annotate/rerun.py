@@ -32,6 +32,7 @@ class EditedProject(Project):
     """A project with an unsaved annotation of one sequence."""
 
     edited: Mapping[str, Annotation] = field(default_factory=dict)
+    """Unsaved annotation by sequence."""
 
     @classmethod
     def of(cls, project: Project, sequence: str, annotation: Annotation) -> EditedProject:

@@ -37,6 +37,7 @@ class Sides:
     """Sides of the subject's limbs over T frames and C cameras."""
 
     cameras: list[str]
+    """Names of the C cameras."""
     detected: np.ndarray
     """(T, C, 14, 2) int16 pixels of the detector's left, then right limbs; -1 = not visible."""
     exchanged: np.ndarray
@@ -59,12 +60,15 @@ class Doubt:
     """A run of frames with doubtful sides."""
 
     first: int
+    """First frame."""
     last: int
+    """Last frame, included."""
     frame: int
     """Frame to look at."""
     camera: str
     """Camera with most exchanged sides."""
     message: str
+    """Reasons in words."""
 
 
 def sides_of(opened: Opened) -> Sides:

@@ -17,6 +17,7 @@ from intercap_core import disk
 from intercap_core.errors import UserError
 from intercap_core.signals import Terminated, raise_on_signals
 
+# Environment variables that limit the threads of the numerical libraries
 THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
     "MKL_NUM_THREADS",

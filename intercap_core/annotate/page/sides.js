@@ -12,7 +12,9 @@ const ARM = [0, 1, 2], LEG = [3, 4, 5, 6];
 // A limb agrees with a side if its distance from that side is below this share of the distance from the
 // other side; otherwise the comparison is undecided.
 const MAX_RATIO = 0.6;
-const MIN_DISTANCE = 0.012; // share of the image's height by which both sides must be apart
+// Smallest mean distance from the farther side, share of the image's height: sides that nearly coincide in
+// the image are undecided.
+const MIN_DISTANCE = 0.012;
 const AGREES = 1, DIFFERS = 2;
 
 export class Sides {

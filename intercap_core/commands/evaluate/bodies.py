@@ -81,6 +81,7 @@ class _Projects(NamedTuple):
 
 
 def _sort(evaluations: Sequence[Bodies]) -> _Projects:
+    """Sort the projects by whether they have the recordings of the reference."""
     reference = next((e for e in evaluations if not _variant(e)), None)
     known = {e.truth for e in reference.errors} if reference else set()
     separate: list[Bodies] = []

@@ -70,9 +70,10 @@ def jobs_by_part(parts: Mapping[str, Targets]) -> dict[str, list[Job]]:
 
 
 def minutes_of_parts(parts: Mapping[str, Targets]) -> Figures:
-    """``<part>_minutes_budget``, ``<part>_minutes_taken`` on two fully used cores.
+    """Figures ``<part>_minutes_budget`` and ``<part>_minutes_taken``, on two fully used cores.
 
-    ``_taken`` sums every job's last run, whether in this evaluation or an earlier one.
+    ``_taken`` is the sum over all jobs of the last run's duration, halved; the last run may belong
+    to an earlier evaluation.
     """
     minutes: Figures = {}
     for part, jobs in jobs_by_part(parts).items():

@@ -38,8 +38,10 @@ from intercap_core.schemas import FRAMES, JOINT, TRUTH
 from intercap_core.stages.export import MARKER
 from intercap_core.studio.subjects import Subject
 
+# Datasets of the conditions
 NO_DEPTH, ALONE, BEAM = "field_no_depth", "field_alone", "field_beam"
 BUILDS, SHOES, PASSER_BY = "field_builds", "field_shoes", "field_passer_by"
+# Errors per stage in the metrics artefact that are averaged over the recordings with a beam
 _BEAM_KEYS = ("body_pve", "planted_height", "planted_speed", "foot_swing")
 _BONES = (
     ("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist"),

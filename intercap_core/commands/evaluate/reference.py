@@ -46,6 +46,7 @@ class GatedFigure:
     spread: float
     """Variation that is tolerated, same unit."""
     higher_is_better: bool
+    """Direction in which a change is an improvement."""
 
     def judge(self, now: float | None) -> GateResult:
         """Compare the figure of a run (None = not measured) with the recorded value."""

@@ -70,8 +70,11 @@ class ProjectRun:
     after: list[ProjectRun] = field(default_factory=list)
     """Projects that must end before this one starts."""
     watcher: Watcher | None = None
+    """Follows the jobs; None until the workflow has started."""
     process: subprocess.Popen[bytes] | None = None
+    """Snakemake's process; None until the workflow has started."""
     transcript: IO[str] | None = None
+    """Open file of Snakemake's output."""
     status: int | None = None
     """Exit status; None until the workflow has ended."""
 

@@ -43,6 +43,7 @@ class ExportBody:
     """The body file of the parameters. With another file, they describe another person."""
 
     path: Path
+    """Body file."""
     gender: str
     num_vertices: int
     num_betas: int

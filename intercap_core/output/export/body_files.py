@@ -43,7 +43,9 @@ class WrittenBody:
     """A body file of an export."""
 
     name: str
+    """File name."""
     digest: str
+    """Digest of the file."""
     betas: str
     """Columns of the shape, as start:stop."""
     expression: str

@@ -28,6 +28,7 @@ class StatedContact:
 
     sequence: str
     regions: tuple[str, ...]
+    """Names of the R regions."""
     probability: np.ndarray
     """(T, R) probability that each region touches the object."""
     annotated: np.ndarray
@@ -92,7 +93,9 @@ class ContactVertices:
     """Vertices of the body that touch the object, and of the object that touch the body."""
 
     body: VertexRuns
+    """Vertices of the body that touch the object."""
     object_: VertexRuns
+    """Vertices of the object that touch the body."""
 
     @classmethod
     def read(cls, metrics: Path, motion: Motion, mesh: ObjectMesh) -> ContactVertices:

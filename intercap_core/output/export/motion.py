@@ -37,9 +37,12 @@ class Motion:
     object_: str
     """Name of the object, "" without one."""
     gender: str
+    """Gender of the body file."""
     fps: float
+    """Frames per second."""
     model: BodyModel
     parameters: BodyParameters
+    """Body parameters of the T frames in ``frame``."""
     pelvis: np.ndarray
     """(3,) pelvis joint in the shaped rest pose, metres."""
     rotation: np.ndarray
@@ -162,6 +165,7 @@ class Coordinates:
     up: np.ndarray
     """(3,) unit vector up in the frame, NaN if unknown."""
     units: str = METRES
+    """Units of all numbers, in words."""
 
     @classmethod
     def of(cls, motion: Motion, units: str = METRES) -> Coordinates:

@@ -82,6 +82,7 @@ class Scenes:
     """A motion in the master camera's frame with the images that show its T frames."""
 
     motion: Motion
+    """The motion, in the master camera's frame."""
     rig: Rig
     mesh: ObjectMesh | None
     """None without an object."""

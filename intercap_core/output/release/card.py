@@ -269,7 +269,9 @@ class Split:
     """Groups (subjects or objects) for training and for test."""
 
     train: tuple[str, ...]
+    """Groups for training, sorted."""
     test: tuple[str, ...]
+    """Groups for test, sorted."""
     why: str = ""
     """Why there is no split, "" if there is one."""
 

@@ -40,7 +40,9 @@ class Differences:
     """Paths that differ between a folder and its manifest."""
 
     missing: list[str] = field(default_factory=list)
+    """Listed files that do not exist."""
     changed: list[str] = field(default_factory=list)
+    """Listed files with another size or checksum."""
     unknown: list[str] = field(default_factory=list)
     """Files that the manifest does not list."""
 

@@ -44,7 +44,7 @@ class FloorProfile:
     along: np.ndarray
     """(N,) position along the strip, metres."""
     height: np.ndarray
-    """(N,) metres."""
+    """(N,) median height over the floor, metres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +52,7 @@ class CapturePictures:
     """Pictures of one frame set, before and after refinement."""
 
     frame: int
+    """Index of the drawn set."""
     when: tuple[str, ...]
     """("before", "after"), or ("",) if refinement changed nothing."""
     views: tuple[tuple[EncodedImage, ...], ...]

@@ -51,7 +51,9 @@ class CameraFacts:
     offset_sigma: float
     """Standard deviation of ``offset``; NaN = not estimated."""
     depth_bias: float
+    """Bias that is subtracted from the depth; NaN = no depth."""
     depth_bias_sigma: float
+    """Standard deviation of ``depth_bias``; NaN = not stated."""
     moved: float
     """Distance by which refinement moved the camera."""
     turned_deg: float
@@ -78,9 +80,11 @@ class Pair:
     """
 
     name: str
+    """Names of both cameras."""
     before: float
     after: float
     points: int
+    """Number of points on static surfaces."""
     weak: bool
     """Few points, or distances well above those of the other pairs."""
     moving: tuple[float, float, int]

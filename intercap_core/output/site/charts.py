@@ -102,6 +102,7 @@ class TimelineRow:
     """A row of a timeline."""
 
     name: str
+    """Text at the beginning of the row."""
     runs: Sequence[tuple[int, int, str, str]]
     """First and last frame, CSS classes and tooltip of each run of frames."""
     label: str = ""
@@ -181,6 +182,7 @@ class BarPair:
     first: float
     second: float
     label: str
+    """Text at the end of the row."""
     weak: bool = False
     """The values have little support."""
 

@@ -55,6 +55,7 @@ class Column:
     faces: np.ndarray
     """(Fo, 3) of the object."""
     watertight: bool
+    """Whether the object's mesh is closed."""
     rotation: np.ndarray
     """(T, 3, 3) master_from_object."""
     translation: np.ndarray
@@ -96,6 +97,7 @@ class Handling:
     columns: tuple[Column, ...]
     """The last column is the truth if ``has_truth``."""
     has_truth: bool
+    """Whether the truth is known."""
     probability: np.ndarray
     """(T, 2) probability of contact of the left and right hand."""
     up: np.ndarray

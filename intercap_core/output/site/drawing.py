@@ -22,10 +22,12 @@ class EncodedImage:
     """A compressed image for a page."""
 
     data: bytes
+    """Content of the image file."""
     kind: Literal["jpeg", "png"]
     width: int
     height: int
     caption: str = ""
+    """Caption on the page, "" for none."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,8 @@ from intercap_core.output.site.heat_pictures import COLOUR_STOPS, STOP_AT
 from intercap_core.versions import versions
 
 _MAX_RUNS = 400  # rows of the list of flagged frames
-# Labels and units of table columns
+# Label and unit of table columns. Columns with a dot in their name that are not listed here are not
+# printed.
 _FIGURES = {
     "acceleration_body_mm": ("acceleration, body", "mm/frame²"),
     "acceleration_object_mm": ("acceleration, object", "mm/frame²"),
@@ -56,6 +57,7 @@ class Heat:
     top: float
     """Likelihood of the last colour."""
     frames: int
+    """Number of frames in the heatmap."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,6 +42,7 @@ class SequenceContent:
 
     metrics: SequenceMetrics
     intent: str
+    """Instruction to the person, "" if not stated."""
     overlays: Sequence[Overlay]
     """In the order of cameras."""
     note: str
@@ -61,7 +62,9 @@ class SequenceContent:
     made_by: Mapping[str, str]
     """Schema version and digest of settings by stage."""
     body_file: str
+    """File name of the body file."""
     viewer: ViewerParts | None = None
+    """Parts for the 4D viewer; None without one."""
 
 
 def page(content: SequenceContent) -> str:

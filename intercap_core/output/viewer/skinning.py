@@ -27,7 +27,7 @@ class SkinnedBody:
     """Body motion: posed = sum_k weights_k A_k (rest + sum_m amounts_m modes_m), metres."""
 
     rest: np.ndarray
-    """(V, 3) vertices."""
+    """(V, 3) vertices in the rest pose: shape of the first frame, plus the mean residual."""
     joints: np.ndarray
     """(V, 4) indices of the joints that move each vertex."""
     weights: np.ndarray
