@@ -1,5 +1,9 @@
 """Stage ``person``: the subject's detections, left and right corrected, keypoints triangulated.
 
+The *subject* is the person who is reconstructed; other people may be visible. A *detection* is one
+person in one image, with 135 keypoints (x, y, confidence). A *candidate* is one mask that a
+detector or the segmentation proposes. Sets are reordered by moment (:mod:`intercap_core.scene`).
+
 In the order of a run:
 
 1. ``groups`` matches the people of one set over views by geometry, ``tracks`` follows them over

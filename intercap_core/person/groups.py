@@ -1,7 +1,14 @@
 """The people of one frame set, matched over its views by geometry.
 
-The order of people in a detector's file carries no information: detections whose rays meet are one
-person. In a set without intersecting rays, depth locates the people of each single view.
+Detections of two views whose rays meet belong to one person. The order of people in a detector's
+file carries no information.
+
+1. Each pair of detections of two views is a proposal if their rays meet within
+   :data:`SAME_PERSON_GAP_M`. The midpoints are the points of the proposed person.
+2. A proposal is extended by the closest detection of each other view.
+3. The best supported proposals are kept. A detection belongs to one person only.
+
+In a set without intersecting rays, depth locates the people of each single view.
 """
 
 from __future__ import annotations
@@ -22,18 +29,22 @@ from intercap_core.geometry.camera.triangulation import (
 from intercap_core.person.sides import BODY_POINTS, PARTNER
 
 MIN_COMMON_POINTS = 5  # body points that two detections must share; tuned on the studio
-# Median distance within which a view shows the same person, px. Detector biases and calibration
-# errors are much smaller; half a metre is 160 px at 2.6 m. Tuned on the studio.
+# Largest median distance of a detection from the reprojected points of its person, px. Detector
+# biases and calibration errors are much smaller; a person half a metre away is 160 px off at 2.6 m.
+# Tuned on the studio.
 SAME_PERSON_PX_AT_1080P = 60.0
-SAME_PERSON_GAP_M = 0.12  # median distance of two views' rays; tuned on the studio
+# Largest median distance between the rays of two views to one person; tuned on the studio.
+SAME_PERSON_GAP_M = 0.12
 
-NOBODY = -1
+NOBODY = -1  # index of a person in a view that does not see it
 
 _MIRRORED = PARTNER[BODY_POINTS]  # the body's points with left and right exchanged
 _Proposal = tuple[float, np.ndarray, tuple[int, int], tuple[int, int]]
 Lift = Callable[[int, int, np.ndarray], np.ndarray]
-"""Points (P, 25, 3), master frame, NaN = not known, of the people (P, 25, 3) that view c sees in
-set t, by its depth alone: called with t, c and the people."""
+"""Function that locates the people of one view by its depth.
+
+Called with set t, camera c and the body keypoints (P, 25, 3) of its people; returns their points
+(P, 25, 3), master frame, metres, NaN = unknown."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,10 +56,10 @@ class PersonGroup:
     points: np.ndarray
     """(25, 3) body points, metres; NaN = unknown."""
     support: float
-    """Weighted number of points seen, over all views."""
+    """Number of visible points, summed over views with the weight 1 - ``errors``."""
     errors: np.ndarray
-    """(C,) distance of the points from each detection, as a share of the limit; inf = none within
-    it."""
+    """(C,) median distance of each view's detection from the reprojected points, divided by the
+    limit :data:`SAME_PERSON_PX_AT_1080P`; inf = no detection within the limit."""
 
     @property
     def views(self) -> int:
@@ -57,7 +68,7 @@ class PersonGroup:
 
     @cached_property
     def centre(self) -> np.ndarray:
-        """Median of the known points (3,)."""
+        """Coordinate-wise median (3,) of the known points, metres."""
         return np.nanmedian(self.points, 0)
 
     def without(self, views: np.ndarray) -> PersonGroup:
@@ -66,7 +77,12 @@ class PersonGroup:
 
 
 def group_set(people: list[np.ndarray], rig: Rig, min_confidence: float) -> list[PersonGroup]:
-    """Group one set's people (P, 25, 3) of each view; best supported first."""
+    """Group the people of one set; the person with most support first.
+
+    Args:
+        people: (P, 25, 3) x, y, confidence of the P people of each view.
+        min_confidence: keypoints of lower confidence are ignored.
+    """
     rays, seen = [], []
     for c, own in enumerate(people):
         directions = rig[c].colour.unproject(own[..., :2]) if len(own) else np.zeros((0, 25, 3))
@@ -78,7 +94,7 @@ def group_set(people: list[np.ndarray], rig: Rig, min_confidence: float) -> list
     for _, points, first, second in sorted(proposals, key=lambda p: p[0]):
         (a, i), (b, j) = first, second
         if any(group.members[a] == i and group.members[b] == j for group in grown):
-            continue  # a better pair of views has led to these two already
+            continue  # a proposal with a smaller gap was already extended by both detections
         group = _grow(points, first, second, people, seen, rig)
         if group is not None:
             grown.append(group)
@@ -90,9 +106,10 @@ def group_set(people: list[np.ndarray], rig: Rig, min_confidence: float) -> list
 
 
 def _with_another(groups: list[PersonGroup], group: PersonGroup) -> list[PersonGroup]:
-    """Add a person with at least two detections of their own.
+    """Add a person, if at least two of the detections belong to no other person.
 
-    A detection shared by two people is assigned to the one it fits better.
+    A detection shared by two people is assigned to the person it fits better. The new person is
+    dropped if someone is then left with a single detection.
     """
     shared = [(group.members == g.members) & (group.members != NOBODY) for g in groups]
     if group.views - int(np.any(shared, axis=0).sum() if shared else 0) < 2:
@@ -100,7 +117,7 @@ def _with_another(groups: list[PersonGroup], group: PersonGroup) -> list[PersonG
     result = []
     for other, both in zip(groups, shared, strict=True):
         if both.any() and np.linalg.norm(group.centre - other.centre) < 0.3:
-            return groups  # nobody stands closer to another person than 0.3 m
+            return groups  # the same person again: two people are at least 0.3 m apart
         worse = group.errors >= other.errors
         group = group.without(both & worse)
         result.append(other.without(both & ~worse))
@@ -108,7 +125,11 @@ def _with_another(groups: list[PersonGroup], group: PersonGroup) -> list[PersonG
 
 
 def lifted_groups(t: int, people: list[np.ndarray], lift: Lift) -> list[PersonGroup]:
-    """Every person (P, 25, 3) of each view as a group of its own; best supported first."""
+    """Groups of single detections, located by depth; the person with most support first.
+
+    Detections of one person in several views are not merged. Arguments as in :data:`Lift`, with
+    the people of each view.
+    """
     result = []
     for c, detections in enumerate(people):
         for i, points in enumerate(lift(t, c, detections) if len(detections) else ()):
@@ -116,7 +137,7 @@ def lifted_groups(t: int, people: list[np.ndarray], lift: Lift) -> list[PersonGr
             if count >= MIN_COMMON_POINTS:
                 members = np.full(len(people), NOBODY, np.int32)
                 members[c] = i
-                support = 0.5 * count  # a triangulated point counts about two
+                support = 0.5 * count  # less than half of a triangulated point, seen by two views
                 result.append(PersonGroup(members, points, support, np.zeros(len(people))))
     return sorted(result, key=lambda group: -group.support)
 
@@ -124,14 +145,23 @@ def lifted_groups(t: int, people: list[np.ndarray], lift: Lift) -> list[PersonGr
 def _pair_proposals(
     pairs: list[tuple[int, int]], rays: list[np.ndarray], seen: list[np.ndarray], rig: Rig
 ) -> list[_Proposal]:
-    """Pairs of people of two views whose rays meet: median gap, metres, points (25, 3), and
-    (view, person) of both."""
+    """Find pairs of detections of two views whose rays meet.
+
+    Args:
+        pairs: pairs of views.
+        rays: (P, 25, 3) directions of the people of each view, master frame.
+        seen: (P, 25) bool, visible points of the people of each view.
+
+    Returns:
+        For each proposal the median gap of the rays, metres, points (25, 3), and (view, person) of
+        both detections.
+    """
     centres = rig.master_from_colour[:, :3, 3]
     result = []
     for a, b in pairs:
         if not len(rays[a]) or not len(rays[b]):
             continue
-        # A detector may take a back for a front: also try one view mirrored.
+        # a detector may take a back for a front: one view is also tried with the sides exchanged
         other = np.stack([rays[b], rays[b][:, _MIRRORED]])
         other_seen = np.stack([seen[b], seen[b][:, _MIRRORED]])
         points, gap = midpoints(rays[a][:, None], other[:, None], centres[a], centres[b])
@@ -156,7 +186,10 @@ def _grow(
     seen: list[np.ndarray],
     rig: Rig,
 ) -> PersonGroup | None:
-    """Add the detection of each view that is closest to the reprojected points of a proposal."""
+    """Extend a proposal by the detection of each view that is closest to its reprojected points.
+
+    ``first``, ``second``: (view, person) of the proposal. None if no detection is close enough.
+    """
     members = np.full(len(rig), NOBODY, np.int32)
     members[first[0]], members[second[0]] = first[1], second[1]
     pixels = reproject(np.nan_to_num(points), rig)
@@ -179,7 +212,16 @@ def _grow(
 def distance_to(
     pixels: np.ndarray, known: np.ndarray, person: np.ndarray, seen: np.ndarray
 ) -> tuple[float, int]:
-    """Median distance, px, of reprojected points (25, 2) to a person, sides exchanged if better."""
+    """Median distance, px, of reprojected points from a detection, and the number of common points.
+
+    The detection is also tried with left and right exchanged. (inf, 0) with too few common points.
+
+    Args:
+        pixels: (25, 2) reprojected points.
+        known: (25,) bool, known points.
+        person: (25, 3) detection.
+        seen: (25,) bool, visible points of the detection.
+    """
     best, count = np.inf, 0
     for candidate, visible in ((person, seen), (person[_MIRRORED], seen[_MIRRORED])):
         common = known & visible

@@ -1,17 +1,21 @@
 """Left and right of the body: made consistent over views, and chosen by build and motion.
 
 A detector that mistakes a back for a front exchanges left and right in a whole view, often in
-several views at once; points triangulated from inconsistent views are wrong.
+several views at once. Points triangulated from inconsistent views are wrong. "Limbs" are here the
+four groups arms, legs, head and hands (``LIMBS``), each with left and right points.
 
-:func:`make_views_agree` tries, for each limb, all 2^(C-1) assignments of sides to views and chooses
-the one of least cost: truncated squared gaps between the rays of every pair of views, plus a cost
-for each exchanged view. Which of the two mirrored bodies is the true one remains open.
+:func:`make_views_agree` works on single sets. For each limb it tries all 2^(C-1) assignments of
+sides to views. Their cost is the sum of truncated squared gaps between the rays of all pairs of
+views, plus a constant for each exchanged view. The result may still be mirrored in all views.
 
-:func:`find_mirrored` decides it for arms, legs and head of all sets together, by the Viterbi
-algorithm over the eight ways of exchanging them. Unary costs: knees and ankles bend one way, the
-nose is in front of the ears and of the chest, shoulders and hips face the same way, detectors are
-mostly right. Pairwise costs: motion from set to set, and a change of sides. A hand belongs to the
-arm whose wrist is nearer.
+:func:`find_mirrored` then decides, for all sets together, which limbs are mirrored. It runs the
+Viterbi algorithm over the eight ways of exchanging arms, legs and head:
+
+- Unary costs: knees and ankles bend one way only, the nose is in front of the ears and of the
+  chest, shoulders and hips face the same way, detectors are mostly right.
+- Pairwise costs: motion from set to set, and a change of sides.
+
+Each hand is assigned to the arm whose wrist is nearer.
 """
 
 from __future__ import annotations
@@ -34,30 +38,35 @@ from intercap_core.person.sides import (
     exchange_points,
 )
 
-# Truncation of the gap between two rays, metres, for arms, legs, head and hands. Rays of one point
-# miss each other by a few centimetres (detector bias, calibration), those of a left and a right
-# point by up to the breadth of the body, or of the face. Tuned on the studio.
+# Gap between two rays at which the cost is truncated, metres, for arms, legs, head and hands. Rays
+# to one point miss each other by a few centimetres (detector bias, calibration), rays to a left and
+# a right point by up to the breadth of the body or face. Tuned on the studio.
 SIDE_GAPS_M = (0.12, 0.12, 0.05, 0.12)
-EXCHANGED_VIEW_COST = 0.5  # of each exchanged view, above the gain by noise; tuned on the studio
-CHANGE_COST = 1.0  # of a limb's sides changing from set to set; tuned on the studio
+# Cost of each exchanged view; exceeds what noise alone gains by an exchange. Tuned on the studio.
+EXCHANGED_VIEW_COST = 0.5
+CHANGE_COST = 1.0  # cost of a limb that changes sides between two sets; tuned on the studio
 
 
 def make_views_agree(keypoints: np.ndarray, rig: Rig, *, min_confidence: float) -> np.ndarray:
     """Exchange limbs of ``keypoints`` (T, C, 135, 3 or more) in place, set by set.
 
-    Of two mirrored solutions the one that exchanges fewer views is chosen; for head and hands, if
-    that is closer, the one that exchanges the same views as the arms. Returns the exchanged limbs,
-    (T, C, 4) bool in the order of LIMBS.
+    Two assignments that differ in every view (the body and its mirror image) have equal gaps. Of
+    these, the one with fewer exchanged views is chosen. For head and hands it may instead be the
+    one closer to the assignment of the arms.
+
+    Returns the exchanged limbs, (T, C, 4) bool in the order of LIMBS.
     """
     sets, views = keypoints.shape[:2]
     exchanged = np.zeros((sets, views, len(LIMBS)), bool)
     weight = np.where(keypoints[..., 2] >= min_confidence, keypoints[..., 2], 0)
-    seeing = np.argsort(-(weight > 0).sum((0, 2)), kind="stable")[:10]  # of 2^9 ways
+    # the ten views with most keypoints: at most 2^9 assignments
+    seeing = np.argsort(-(weight > 0).sum((0, 2)), kind="stable")[:10]
     order = np.sort(seeing[(weight[:, seeing] > 0).any((0, 2))])
     if len(order) < 2:
         return exchanged
     rays = np.swapaxes(rays_of(keypoints[..., :2], rig), 0, 1)
     centres = rig.master_from_colour[:, :3, 3]
+    # (W, V) the assignments of V views, True = exchanged; the first view keeps its sides
     ways = np.array([(False, *rest) for rest in product((False, True), repeat=len(order) - 1)])
     for number, (limb, gap) in enumerate(zip(LIMBS, SIDE_GAPS_M, strict=True)):
         cost = np.zeros((sets, len(ways)))
@@ -98,15 +107,23 @@ def make_views_agree(keypoints: np.ndarray, rig: Rig, *, min_confidence: float) 
 def _cost(
     first: np.ndarray, second: np.ndarray, centres: np.ndarray, weight: np.ndarray, limit: float
 ) -> np.ndarray:
-    """Truncated squared gaps (T,) of rays (T, n, 3) from two ``centres`` (2, 3), by ``weight``
-    (T, n)."""
+    """Weighted sum (T,) of truncated squared gaps between the rays of two views.
+
+    Args:
+        first, second: (T, n, 3) directions of the rays.
+        centres: (2, 3) camera centres, metres.
+        weight: (T, n).
+        limit: gap of the truncation, metres.
+    """
     _, gap = midpoints(first, second, *centres)
     square = np.minimum(np.nan_to_num(gap, nan=limit) / limit, 1.0) ** 2
-    # relative to the cost of an unknown gap; tuned on the studio
+    # 0.25 is the neutral value: a smaller squared gap is evidence for this assignment, a larger one
+    # against it; tuned on the studio
     return (weight * (square - 0.25)).sum(1)
 
 
 _LIMBS = (ARMS, LEGS, HEAD)
+# (8, 3) the states: exchange of arms, legs and head
 _STATES = np.array(list(product((False, True), repeat=len(_LIMBS))))
 
 
@@ -115,8 +132,8 @@ def find_mirrored(points: np.ndarray, share: np.ndarray, times: np.ndarray | Non
 
     Args:
         points: (T, 135, 3), NaN = unknown.
-        share: (T, 3) share of the views of arms, legs and head in which they are already exchanged.
-        times: (T,) seconds; None = each set by itself.
+        share: (T, 3) share of the views in which arms, legs and head were exchanged already.
+        times: (T,) seconds; None = decide each set by itself.
     """
     result = np.zeros((len(points), len(LIMBS)), bool)
     if not len(points):
@@ -132,16 +149,16 @@ def find_mirrored(points: np.ndarray, share: np.ndarray, times: np.ndarray | Non
 
 
 def excess_build_cost(points: np.ndarray) -> np.ndarray:
-    """Negative log likelihood (T,) of triangulated points (T, 135, 3), by the body's build, above
-    that of the best exchange of arms, legs and head."""
+    """Anatomical cost (T,) of triangulated points (T, 135, 3) minus the least cost of any exchange
+    of arms, legs and head. The costs are negative log likelihoods; 0 = no exchange is better."""
     cost = _build(points)
     return np.asarray(cost[:, 0] - cost.min(1))
 
 
 def _detected(points: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Cost (T, 8) of contradicting the detector, by the share of views.
+    """Cost (T, 8) of each state by the share of views in which it contradicts the detector.
 
-    In all views it is 3 = -log(1/20); tuned on the studio.
+    Three for each limb that is exchanged in all views: 3 = -log(1/20), tuned on the studio.
     """
     known = np.stack([np.isfinite(points[:, limb, 0]).any(1) for limb in _LIMBS], 1)
     wrong = np.where(_STATES, 1 - share[:, None], share[:, None])
@@ -149,10 +166,12 @@ def _detected(points: np.ndarray, share: np.ndarray) -> np.ndarray:
 
 
 def _build(points: np.ndarray) -> np.ndarray:
-    """Cost (T, 8) of anatomically impossible bodies, for each way of exchanging limbs.
+    """Cost (T, 8) of anatomically impossible bodies, for each state.
 
-    The factors are negative log likelihoods, tuned on the studio. Knees and ankles are certain, a
-    turned head and a twisted back (each up to some 80 degrees) less so.
+    Each test gives a cosine, positive for a possible body. The cost is minus the cosine where it is
+    negative, times a factor tuned on the studio (a negative log likelihood). The factors are 8 for
+    knees and ankles, 6 for back and head, 3 for the nose above the chest: the head turns and the
+    back twists by up to some 80 degrees.
     """
 
     def between(start: str, end: str) -> np.ndarray:
@@ -164,7 +183,7 @@ def _build(points: np.ndarray) -> np.ndarray:
     nose = points[:, KEYPOINT_INDEX["nose"]] - points[
         :, [KEYPOINT_INDEX["left_ear"], KEYPOINT_INDEX["right_ear"]]
     ].mean(1)
-    # knee and ankle turn about the line of the hips
+    # knees and ankles bend about an axis parallel to the line from right to left hip
     hinges = np.zeros(len(points))
     for side in ("left", "right"):
         thigh, shin = (
@@ -187,7 +206,10 @@ def _build(points: np.ndarray) -> np.ndarray:
 
 
 def _steps(points: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Cost (T - 1, 8, 8) of transitions between states of the sides: change and motion."""
+    """Cost (T - 1, 8, 8) of the transitions from state to state: change of sides, and motion.
+
+    Each point is compared with its last known position, at most half a second old.
+    """
     steps = np.empty((len(points) - 1, len(_STATES), len(_STATES)))
     steps[:] = CHANGE_COST * (_STATES[:, None] != _STATES[None]).sum(2)
     last, when = points[0].copy(), np.full(points.shape[1], times[0])
@@ -205,7 +227,7 @@ def _steps(points: np.ndarray, times: np.ndarray) -> np.ndarray:
 
 
 def _motion(before: np.ndarray, now: np.ndarray) -> float:
-    """Cost of the motion of points (n, 3); 0 if fewer than two are known."""
+    """Cost of the motion of points (n, 3), metres; 0 if fewer than two are known."""
     step = np.linalg.norm(now - before, axis=1)
     step = step[np.isfinite(step)]
     # a step of 4 cm costs 1, truncated at 30 cm; tuned on the studio
@@ -221,18 +243,18 @@ def _other_hands(points: np.ndarray) -> np.ndarray:
     both = np.isfinite(own) & np.isfinite(other)
     count = np.maximum(both.sum(1), 1)
     own, other = (np.where(both, d, 0).sum(1) / count for d in (own, other))
-    # wrists of body and hand of one arm differ by less than 8 cm
+    # the wrist keypoints of body and hand of one arm are less than 8 cm apart; untuned
     return both.any(1) & (own > 0.08) & (other < 0.5 * own)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
-    """Directions (..., 3); NaN for vectors below 3 cm, which have no reliable direction."""
+    """Unit vectors (..., 3); NaN for vectors shorter than 3 cm, whose direction is unreliable."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.where(length > 0.03, vectors / np.maximum(length, 0.03), np.nan)
 
 
 def _hinge(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """The axis (T, 3) about which one bone (T, 3) turns into another, by the sine of the turn."""
+    """Rotation axis (T, 3) from one bone (T, 3) to another; its length is the sine of the angle."""
     return np.cross(_unit(first), _unit(second))
 
 
@@ -243,9 +265,9 @@ def _perpendicular(vectors: np.ndarray, axis: np.ndarray) -> np.ndarray:
 
 
 def _cosine(weighted: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Scalar product (T,) of vectors, shortened to length one, and unit directions; 0 = unknown.
+    """Scalar product (T,) of ``weighted`` (T, 3) and the unit vector of ``direction``; 0 = unknown.
 
-    ``weighted`` keeps its length where that is less than one.
+    ``weighted`` is scaled to length one if it is longer; a shorter vector lowers the result.
     """
     length = np.linalg.norm(weighted, axis=-1, keepdims=True)
     return np.nan_to_num((weighted / np.maximum(length, 1.0) * _unit(direction)).sum(-1))

@@ -1,9 +1,11 @@
 """Keypoints seen by a single view, lifted to 3D by the depth around their pixels.
 
-Depth measures the skin, a keypoint is a joint inside the body: the point lies deeper on the pixel's
-ray by an inset that depends on the joint. The depth at an occluded joint is of another surface:
-pixels of the scene's background are skipped, and if a side view shows both shoulders or hips in one
-place, the limb with less confidence is left out as occluded.
+Depth measures the skin, but a keypoint is a joint inside the body. The point therefore lies deeper
+on the pixel's ray by an inset that depends on the joint.
+
+The depth at an occluded joint belongs to another surface. Pixels that show the background of the
+scene are skipped. If both shoulders or hips are lifted to nearly one place, as in a side view, the
+limb with less confidence is occluded and left out.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from intercap_core.geometry.camera.triangulation import Triangulation
 from intercap_core.person.groups import NOBODY
 from intercap_core.person.sides import ARMS, BODY_POINTS, LEGS
 
-MIN_DEPTH_SAMPLES = 4  # depth pixels; tuned on the studio
+MIN_DEPTH_SAMPLES = 4  # least number of depth pixels around a keypoint; tuned on the studio
 # Depth of a keypoint below the skin, metres: measured on the open body, standing, as the median
 # over all horizontal directions. Keypoints without an entry lie on the skin.
 INSET_M = {
@@ -47,7 +49,7 @@ class DepthRelief:
     """Depth pixels projected into the colour image."""
 
     camera: Camera
-    """Has depth and colour."""
+    """A camera with depth and colour."""
     pixels: np.ndarray
     """(N, 2) in the colour image."""
     distance: np.ndarray
@@ -63,7 +65,7 @@ class DepthRelief:
 
         Args:
             depth: (H, W) uint16 mm.
-            bias_m: subtracted from the depth.
+            bias_m: systematic error to subtract from the depth, metres.
             background: (H, W) uint16 mm of the scene; None = unknown.
         """
         thinned = np.zeros_like(depth)
@@ -73,7 +75,7 @@ class DepthRelief:
         room = np.zeros(len(index), bool)
         if background is not None:
             behind, here = background.ravel()[index].astype(int), depth.ravel()[index].astype(int)
-            room = (behind > 0) & (here > behind - 40)  # mm; tuned on the studio
+            room = (behind > 0) & (here > behind - 40)  # tolerance 40 mm; tuned on the studio
         if bias_m:
             points = points * (1 - np.float32(bias_m) / points[:, 2:])
         assert camera.colour_from_depth is not None
@@ -84,14 +86,16 @@ class DepthRelief:
         return cls(camera, camera.colour.project(points), distance, room[inside])
 
     def lift(self, pixels: np.ndarray, seen: np.ndarray, inset_m: np.ndarray) -> np.ndarray:
-        """Points (K, 3), master frame, of keypoints at ``pixels`` (K, 2); NaN = unknown.
+        """Points (K, 3), master frame, metres, of keypoints at ``pixels`` (K, 2); NaN = unknown.
 
-        A person who stands still for long is part of the background. Background samples are used
-        if they are at the distance of the rest of the body, or if there is hardly any rest.
+        The surface at a keypoint is the median depth of the nearest layer, 5 cm thick, within 3 cm
+        of its pixel. Background pixels are only used if too few others are near. Such a point is
+        kept if its distance is within 25 cm of the median of the other points, or if there are
+        fewer than six others: a person who stands still for long is part of the background.
 
         Args:
             seen: (K,) bool, keypoints to lift.
-            inset_m: (K,) depth of each below the skin.
+            inset_m: (K,) depth of each keypoint below the skin, metres.
         """
         result, of_room = np.full((len(pixels), 3), np.nan), np.zeros(len(pixels), bool)
         rays = self.camera.colour.unproject(pixels)
@@ -99,7 +103,7 @@ class DepthRelief:
         wanted = np.flatnonzero(seen & np.isfinite(rays).all(1))
         if not len(wanted) or not len(self.distance):
             return result
-        reach = self.camera.colour.fx * 0.03 / self.distance  # 3 cm; tuned on the studio
+        reach = self.camera.colour.fx * 0.03 / self.distance  # px of 3 cm; tuned on the studio
         around = self._tree.query_ball_point(pixels[wanted], reach.max(), p=np.inf)
         for k, near in zip(wanted, around, strict=True):
             away = np.abs(self.pixels[near] - pixels[k]).max(1)
@@ -109,7 +113,7 @@ class DepthRelief:
             distances = self.distance[around_it if of_room[k] else before]
             if len(distances) < MIN_DEPTH_SAMPLES:
                 continue
-            nearest = np.quantile(distances, 0.2)  # closer samples may be flying pixels
+            nearest = np.quantile(distances, 0.2)  # the closest samples may be flying pixels
             surface = np.median(
                 distances[distances < nearest + 0.05]
             )  # metres; tuned on the studio
@@ -127,7 +131,10 @@ class DepthRelief:
 
 
 class Lifter:
-    """Lifts keypoints of single views, by frames read by moment and the scene artefact."""
+    """Lifts keypoints of single views.
+
+    ``frames`` must be read by moment. ``scene`` gives calibration, depth biases and backgrounds.
+    """
 
     def __init__(self, frames: Frames, scene: Artefact, *, min_confidence: float) -> None:
         self._frames, self._min_confidence = frames, min_confidence
@@ -147,7 +154,7 @@ class Lifter:
 
     def people(self, t: int, c: int, people: np.ndarray) -> np.ndarray:
         """Points (P, 25, 3) of body keypoints (P, 25, 3) in view ``c`` of set ``t``; see
-        :data:`intercap_core.person.subject.Lift`."""
+        :data:`intercap_core.person.groups.Lift`."""
         relief = self._relief(t, c)
         if relief is None:
             return np.full(people.shape, np.nan)
@@ -160,12 +167,13 @@ class Lifter:
     def fill(
         self, person: np.ndarray, keypoints: np.ndarray, triangulation: Triangulation
     ) -> np.ndarray:
-        """Lift missing points of sets with few triangulated ones, in place.
+        """Lift missing points of sets with fewer than 8 triangulated body points.
 
-        Each set uses the view that gives most points, which becomes their only inlier.
+        Each such set uses the one view that yields most points; it becomes the only inlier of the
+        new points. ``triangulation`` is changed in place.
 
         Args:
-            person: (T, C) the subject's detections.
+            person: (T, C) index of the subject's detection; -1 = not seen.
             keypoints: (T, C, 135, 3) of the subject.
             triangulation: triangulation of T * 135 points.
 
@@ -197,8 +205,9 @@ class Lifter:
 def _hidden_side(points: np.ndarray, confidence: np.ndarray) -> np.ndarray:
     """Mask (135,) of lifted ``points`` (135, 3) that the body itself must occlude.
 
-    If the shoulders or the hips are closer than half of an adult's breadth, metres (anatomy), the
-    limb with less confidence is occluded.
+    If both shoulders (hips) are closer than half of an adult's breadth, 18 cm (9 cm), one arm (leg)
+    is occluded. It is the one whose shoulder (hip) has less confidence. Of that limb, the points
+    with less confidence than those of the other side are masked.
     """
     hidden = np.zeros(len(points), bool)
     for limb, breadth in ((ARMS, 0.18), (LEGS, 0.09)):

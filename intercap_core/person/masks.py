@@ -1,4 +1,4 @@
-"""The candidate that is the subject, chosen by the keypoints inside it rather than by its label."""
+"""Chooses the subject's candidate mask, by the keypoints inside it rather than by its label."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from intercap_core.formats.detections.instance import PERSON_LABEL
 from intercap_core.formats.detections.read import Candidate
 from intercap_core.geometry.camera.masks import Runs
 
-# Points between joints: wrists and ankles lie on a mask's rim, the middle of a limb does not.
-BONES = keypoint_pairs(SKELETON)  # (14, 2) of the 25 body points
+# (14, 2) indices of the 25 body points. The middles of bones are samples too: wrists and ankles lie
+# at a mask's edge, the middle of a limb does not.
+BONES = keypoint_pairs(SKELETON)
 
 
 def choose_mask(
@@ -21,7 +22,8 @@ def choose_mask(
     """RLE of the subject's candidate in one image; empty if none fits.
 
     At least half of the subject's points must lie inside the mask. Of several such candidates, the
-    best contains most points and covers least outside the subject's box. The weights are untuned.
+    one of greatest score is chosen: share of points inside, minus half of the share of the mask
+    outside the subject's box, plus 0.15 for the label of a person. The weights are untuned.
 
     Args:
         points: (25, 2) pixels of the body.
@@ -56,10 +58,10 @@ def choose_mask(
 
 
 def merge_other_candidates(candidates: list[Candidate], person: bytes) -> bytes:
-    """RLE of the union of all other candidates; empty if there are none.
+    """RLE of the union of all candidates but the person; empty if there are none.
 
-    Candidates that lie at least half within the ``person``'s mask are parts of the same person and
-    left out. The RLEs must be valid, see :func:`choose_mask`.
+    Candidates with at least half of their area inside the mask ``person`` are parts of the person
+    and left out. The RLEs must be valid, see :func:`choose_mask`.
     """
     if not person or not candidates:
         return b""
@@ -72,14 +74,17 @@ def merge_other_candidates(candidates: list[Candidate], person: bytes) -> bytes:
     ]
     if not others:
         return b""
-    # with iscrowd, the share of the first that lies within the second
+    # with iscrowd = 1, pycocotools returns intersection over the area of the first mask
     within = coco_mask.iou(others, [mask], [1])[:, 0]
     apart = [other for other, share in zip(others, within, strict=True) if share < 0.5]
     return bytes(coco_mask.merge(apart)["counts"]) if apart else b""
 
 
 def _share_outside(runs: Runs, samples: np.ndarray) -> float:
-    """Share of the mask outside the points' box with a margin, read on a coarse grid."""
+    """Share of the mask's area outside the box of ``samples`` (N, 2), px, with a margin.
+
+    The mask is sampled on a grid of at most about 64 x 64 points.
+    """
     low, high = samples.min(0), samples.max(0)
     margin = 0.25 * float((high - low).max())  # for hair, soles and clothes; untuned
     x0, y0, width, height = runs.box

@@ -1,7 +1,8 @@
 """Left and right keypoints: index tables, exchange of sides, and sides stated by the user.
 
-The annotation ``left_right`` lists images in which a detector exchanged the sides. They are
-exchanged back before any other step, and decide in the end which side of their set is left.
+The annotation ``left_right`` lists images in which a detector exchanged the sides. Their keypoints
+are exchanged back before all other steps (:func:`exchange_stated`). If the automatic correction
+later exchanges them again, its result is reversed in that set (:func:`hold_sides`).
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ def _partner(name: str) -> str:
     return name
 
 
-# (135,) the keypoint of the other side; itself if there is none, and for the face, which detectors
-# recognise as a whole.
+# (135,) index of the same keypoint of the other side. A keypoint without sides is its own partner,
+# and so are those of the face, which detectors recognise as a whole.
 PARTNER = np.array([KEYPOINT_INDEX[_partner(name)] for name in KEYPOINT_INDEX])
 
 
@@ -34,6 +35,7 @@ def _both_sides(*names: str) -> np.ndarray:
     )
 
 
+# Keypoint indices, (2n,): n of the left side, then the same n of the right side.
 ARMS = _both_sides("shoulder", "elbow", "wrist")
 LEGS = _both_sides("hip", "knee", "ankle", "big_toe", "small_toe", "heel")
 HEAD = _both_sides("eye", "ear")
@@ -43,7 +45,7 @@ BODY_POINTS = np.arange(BODY.start, BODY.stop)
 
 
 def swap_sides(keypoints: np.ndarray, limb: np.ndarray | None = None) -> np.ndarray:
-    """Keypoints (..., 135, n) with left and right of ``limb`` (or of everything) exchanged."""
+    """Keypoints (..., 135, n) with left and right of the indices ``limb`` exchanged; None = all."""
     order = np.arange(len(PARTNER))
     chosen = order if limb is None else limb
     order[chosen] = PARTNER[chosen]
@@ -62,9 +64,12 @@ def exchange_points(values: np.ndarray, which: np.ndarray) -> np.ndarray:
 def exchange_everywhere(
     keypoints: np.ndarray, points: Triangulation, which: np.ndarray
 ) -> tuple[np.ndarray, Triangulation]:
-    """Exchange left and right of the limbs ``which`` (T, 4) bool in all views and in the points.
+    """Return keypoints and triangulation with left and right exchanged, in all views of a set.
 
-    ``keypoints``: (T, C, 135, n). ``points``: triangulation of T * 135 points.
+    Args:
+        keypoints: (T, C, 135, n).
+        points: triangulation of T * 135 points.
+        which: (T, 4) bool, limbs to exchange in each set, in the order of :data:`LIMBS`.
     """
     keypoints = np.swapaxes(exchange_points(np.swapaxes(keypoints, 1, 2), which), 1, 2)
     parts = (points.points, points.inlier, points.error, points.view_error)
@@ -74,8 +79,10 @@ def exchange_everywhere(
 
 
 def exchange_limb(keypoints: np.ndarray, t: np.ndarray, c: np.ndarray, limb: np.ndarray) -> None:
-    """Exchange in place left and right of ``limb`` in images (t, c) (N,) of ``keypoints``
-    (T, C, 135, n)."""
+    """Exchange left and right of ``limb`` in N images of ``keypoints`` (T, C, 135, n), in place.
+
+    ``t``, ``c``: (N,) set and camera of each image.
+    """
     keypoints[t[:, None], c[:, None], limb] = keypoints[t[:, None], c[:, None], PARTNER[limb]]
 
 
@@ -85,11 +92,13 @@ def images_with_stated_sides(
     """Mask (T, C) of the images in which the user states that left and right are exchanged.
 
     Args:
+        stated: entries of the annotation; their ranges count recorded frames.
         names: camera names.
-        image_of: (T, C) frame whose image shows each moment.
+        image_of: (T, C) recorded frame whose image shows each moment; -1 = none.
+        sequence: name, for messages.
 
     Raises:
-        UserError: the statement names an unknown camera.
+        UserError: an entry names an unknown camera.
     """
     result = np.zeros(image_of.shape, bool)
     for number, sides in enumerate(stated):
@@ -111,13 +120,13 @@ def exchange_stated(keypoints: np.ndarray, stated: np.ndarray) -> np.ndarray:
 def hold_sides(
     keypoints: np.ndarray, points: Triangulation, given: np.ndarray, stated: np.ndarray
 ) -> tuple[np.ndarray, Triangulation]:
-    """Apply the sides stated by the user to the result.
+    """Apply the sides stated by the user to the corrected keypoints and points.
 
-    In sets in which a limb was exchanged in most of the stated images, it is exchanged again in all
-    views.
+    If the correction exchanged a limb in most of a set's stated images, the limb is exchanged back
+    in all views of the set.
 
     Args:
-        keypoints: (T, C, 135, 3) result.
+        keypoints: (T, C, 135, 3) keypoints after automatic correction.
         points: triangulation of T * 135 points.
         given: (T, C, 135, 3) keypoints with the stated sides.
         stated: (T, C) bool, images with stated sides.

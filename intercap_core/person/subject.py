@@ -1,8 +1,9 @@
 """The subject among the people of a recording: named by the user, or chosen by their actions.
 
 People are matched over views (:mod:`.groups`), followed over time and recognised after an absence
-(:mod:`.tracks`). The subject is the named person; else the one with most support by views and sets,
-near the centre of the ring, who touches the object.
+(:mod:`.tracks`). The subject is the person named by the user, if any. Otherwise it is the person of
+greatest score: support summed over sets, weighted by the distance from the centre of the ring of
+cameras, and multiplied by up to 5 for contact with the object.
 """
 
 from __future__ import annotations
@@ -35,12 +36,17 @@ from intercap_core.person.tracks import (
     link_groups,
 )
 
-HANDLING_WEIGHT = 4.0  # additional support of the person who touches the object most; untuned
-RIVAL_SHARE = 0.5  # of the subject's support, from which another person is reported; untuned
+# The score of the person who touches the object most is multiplied by 1 + HANDLING_WEIGHT, that of
+# others in proportion to their contact. Untuned.
+HANDLING_WEIGHT = 4.0
+RIVAL_SHARE = (
+    0.5  # another person of at least this share of the subject's score is reported; untuned
+)
 
 Touches = Callable[[int, int, int], bool | None]
-"""Whether person i of view c in set t touches the object, called with t, c and i; None = the object
-is not seen."""
+"""Function of set t, camera c and person i of that image: whether the person touches the object.
+
+None = the object is not visible there."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +58,7 @@ class NamedDetection:
     c: int
     """Camera index."""
     index: int
-    """Person in the image."""
+    """Index of the person in the image."""
     words: str
     """Entry of the annotation, for messages."""
 
@@ -66,9 +72,10 @@ class SubjectDetections:
     others: np.ndarray
     """(T,) int32: number of other located people."""
     chosen_by: str
-    """"alone", "named", "handling" or "middle"."""
+    """How the subject was chosen: "named" by the user, "alone" (nobody else is likely), "handling"
+    (contact with the object), or "middle" (support and position)."""
     doubts: tuple[str, ...]
-    """Evidence against the choice, for messages."""
+    """Reasons why the choice may be wrong, as messages."""
 
 
 def find_subject(
@@ -81,12 +88,14 @@ def find_subject(
     touches: Touches | None = None,
     named: Sequence[NamedDetection] = (),
 ) -> SubjectDetections:
-    """Find the subject in every image; nobody if nobody can be located in any set.
+    """Find the subject in every image; -1 everywhere if no person can be located in any set.
 
     Args:
+        detections: people of each image, by moment.
         times: (T,) seconds.
-        lift: locates people of single views in sets in which no two views agree on anybody.
-        touches: contact with the object.
+        min_confidence: keypoints of lower confidence are ignored.
+        lift: locates people of single views in sets in which no two views agree on a person.
+        touches: contact with the object; None = not evaluated.
         named: detections named by the user.
 
     Raises:
@@ -127,7 +136,10 @@ def _chosen(
     touches: Touches | None,
     named: Sequence[NamedDetection],
 ) -> tuple[PersonTrack, str, list[str]]:
-    """The subject's track, how it was chosen, and doubts."""
+    """The subject's track, how it was chosen, and doubts; see :class:`SubjectDetections`.
+
+    ``middle``: (3,) centre of the ring of cameras, metres.
+    """
     first, doubts = _of_named(tracks, named, times)
     people = join_tracks(tracks, times, first)
     if first:
@@ -136,7 +148,7 @@ def _chosen(
         return PersonTrack(), "alone", doubts
     scores = [_score(person.track, middle) for person in people]
     order = np.argsort(scores)[::-1].tolist()
-    # whoever has less could not become a rival even by handling the object in all images
+    # people of a lower score stay below RIVAL_SHARE even if they touch the object most
     least = RIVAL_SHARE / (1 + HANDLING_WEIGHT) * scores[order[0]]
     likely = {k: scores[k] for k in order if scores[k] > least}
     by = "alone"
@@ -190,7 +202,11 @@ def _has(track: PersonTrack, named: NamedDetection) -> bool:
 
 
 def _score(track: PersonTrack, middle: np.ndarray) -> float:
-    """Support of a track, halved at 1.5 m from the ring's centre ``middle`` (3,); tuned."""
+    """Support of a track, summed over sets.
+
+    A set at a distance of 1.5 m from the ring's centre ``middle`` (3,) counts half; tuned on the
+    studio.
+    """
     return sum(
         group.support / (1 + (float(np.linalg.norm(group.centre - middle)) / 1.5) ** 2)
         for group in track.groups
@@ -198,7 +214,7 @@ def _score(track: PersonTrack, middle: np.ndarray) -> float:
 
 
 def _handling(track: PersonTrack, touches: Touches) -> float:
-    """Share of the images showing both a person and the object in which they touch."""
+    """Share of contact among the images that show both the person and the object; 0 = no images."""
     contacts = [
         touches(t, c, int(group.members[c]))
         for t, group in zip(track.sets, track.groups, strict=True)
@@ -209,6 +225,7 @@ def _handling(track: PersonTrack, touches: Touches) -> float:
 
 
 def _rival(rival: Person, times: np.ndarray, by: str) -> str:
+    """Message that another person may be the subject; ``by``: how the subject was chosen."""
     why = "touches the object more" if by == "handling" else "is seen more, or nearer the middle"
     return (
         f"another person is seen in {len(rival.track.sets)} of {len(times)} frames, from frame "
@@ -226,10 +243,10 @@ def _add_single_views(
     times: np.ndarray,
     min_confidence: float,
 ) -> None:
-    """Add single detections of the subject in sets without agreeing views.
+    """Add detections to ``people`` (T, C), in place, in sets in which the subject has no group.
 
-    In each view, the one closest to the subject's points in the nearest known set is taken.
-    People whom agreeing views locate elsewhere are excluded.
+    In each view the detection closest to the subject's points of the nearest known set is added, if
+    it is within twice the usual limit. Detections of people whom several views locate are excluded.
     """
     if not chosen.sets:
         return

@@ -24,11 +24,15 @@ def named_people(
     *,
     min_confidence: float,
 ) -> list[NamedDetection]:
-    """Find the person at each point: the one with the closest bones, relative to their size.
+    """Find the detection at each point that the user set in an image.
+
+    It is the person whose bones are closest to the point, relative to the person's size in pixels.
 
     Args:
+        points: entries of the annotation ``subject``; they count recorded frames.
         detections: by moment.
-        image_of: (T, C) frame whose image shows each moment.
+        image_of: (T, C) recorded frame whose image shows each moment; -1 = none.
+        min_confidence: keypoints of lower confidence are ignored.
 
     Raises:
         UserError: unknown camera, frame without an image, point outside the image, or nobody there.
@@ -54,7 +58,7 @@ def named_people(
         people = detections.people(t, c)[:, BODY_POINTS]
         away = [_distance(person, at, min_confidence) for person in people]
         nearest = int(np.argmin(away)) if away else -1
-        if nearest < 0 or away[nearest] > 0.15:  # of the height; untuned
+        if nearest < 0 or away[nearest] > 0.15:  # share of the person's size; untuned
             seen = [person[person[:, 2] >= min_confidence, :2] for person in people]
             places = ", ".join(
                 f"({x:.0f}, {y:.0f})" for x, y in (np.median(body, 0) for body in seen if len(body))
@@ -68,7 +72,10 @@ def named_people(
 
 
 def _distance(person: np.ndarray, point: np.ndarray, min_confidence: float) -> float:
-    """Distance of a point (2,) from the bones of a person (25, 3), relative to the size."""
+    """Distance of a point (2,) px from the bones of a person (25, 3), over the person's size.
+
+    The size is the longer side of the box around the visible keypoints. inf without a bone.
+    """
     seen = person[:, 2] >= min_confidence
     bones = _BONES[seen[_BONES].all(1)]
     if not len(bones):
@@ -81,6 +88,7 @@ def _distance(person: np.ndarray, point: np.ndarray, min_confidence: float) -> f
     return float(away / max(np.ptp(person[seen, :2], axis=0).max(), 1.0))
 
 
+# Tested keypoints, and offsets (9, 2) of the pixels tested around each: itself and a circle.
 _POINTS = np.r_[BODY, LEFT_HAND, RIGHT_HAND]
 _AROUND = np.array([(0, 0), *((np.cos(a), np.sin(a)) for a in np.arange(8) * np.pi / 4)])
 
@@ -88,10 +96,11 @@ _AROUND = np.array([(0, 0), *((np.cos(a), np.sin(a)) for a in np.arange(8) * np.
 def touch_test(
     detections: Detections, labels: tuple[str, ...], *, min_confidence: float
 ) -> Touches:
-    """Test for contact with a candidate with one of the object's ``labels``; none = any but people.
+    """Return a function that tests a person for contact with the object in one image.
 
-    A person touches it if keypoints, or pixels a hand's breadth around them, lie in its mask. One
-    view may show this by occlusion, most views do not.
+    The object is any candidate with one of the ``labels``; without labels, any candidate that is
+    not a person. A person touches it if a keypoint, or a pixel a hand's breadth from it, lies in
+    the candidate's mask. Occlusion also causes such overlaps, but in few views only.
     """
 
     def touches(t: int, c: int, person: int) -> bool | None:

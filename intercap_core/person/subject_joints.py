@@ -3,10 +3,10 @@
 1. :func:`steady_sides`: with few views, limbs that jump between the sides are corrected in each
    view by the least image motion.
 2. :func:`at_set_times`: keypoints are moved from each camera's exposure to the time of the set.
-3. :func:`triangulate_people`: the views of each set are made consistent, the sides of all sets are
-   chosen (:mod:`.left_right`), then a limb of a view counts as exchanged if its reprojection error
-   is much lower with the sides exchanged.
-4. :func:`fill_middles`: neck and mid hip from shoulders and hips.
+3. :func:`triangulate_people`: the views of each set are made consistent and the sides of all sets
+   are chosen (:mod:`.left_right`). Then a limb of a view is exchanged if that makes its
+   reprojection error much lower.
+4. :func:`fill_middles`: missing necks and mid hips are computed from shoulders and hips.
 """
 
 from __future__ import annotations
@@ -25,10 +25,11 @@ from intercap_core.geometry.solve.time_series import cheapest_sequence, limited_
 from intercap_core.person.left_right import find_mirrored, make_views_agree
 from intercap_core.person.sides import LIMBS, PARTNER, exchange_everywhere, exchange_limb
 
-# Hands reach 5 m/s in everyday tasks, and people stand two metres from the cameras of a ring:
-# faster motion in an image is another detection. Radians per second.
+# Largest angular speed of a keypoint, rad/s: hands reach 5 m/s in everyday tasks, at two metres
+# from the cameras of a ring. Faster jumps in an image are wrong detections.
 MAX_IMAGE_SPEED_RAD_S = 2.5
-MUCH_BETTER = 0.5  # cost exchanged over cost as detected, at most; tuned on the studio
+# A limb is exchanged if its cost falls at least to this share; tuned on the studio.
+MUCH_BETTER = 0.5
 
 
 def at_set_times(
@@ -41,8 +42,13 @@ def at_set_times(
 ) -> np.ndarray:
     """Move keypoints (T, C, K, 3) from each camera's exposure to ``times`` (T,).
 
-    Uses the velocity in the image, from neighbouring sets and limited at jumps. ``time_offset``:
-    (C,) seconds by which cameras expose late.
+    Uses the velocity in the image, from neighbouring sets and limited at jumps.
+
+    Args:
+        keypoints: (T, C, K, 3) x, y, confidence.
+        times: (T,) seconds of the sets.
+        time_offset: (C,) seconds from the time of a set to the exposure of each camera.
+        min_confidence: keypoints of lower confidence have no velocity.
     """
     result = keypoints.copy()
     known = keypoints[..., 2] >= min_confidence
@@ -55,12 +61,12 @@ def at_set_times(
 
 
 def fill_middles(points: np.ndarray) -> None:
-    """Fill a missing neck and mid hip of ``points`` (..., 135, 3), in place, by shoulders and hips.
+    """Fill a missing (NaN) neck and mid hip of ``points`` (..., 135, 3), in place.
 
-    Only in space: the initial pose and the volume of the body use these points. The fit uses
-    keypoints in images, where they would count the errors of shoulders and hips twice.
+    They become the middles of the shoulders and of the hips, as OpenPose defines them on COCO. Only
+    3D points are filled; the initial pose and the volume of the person use them. Keypoints in
+    images are not, because the fit would then count errors of shoulders and hips twice.
     """
-    # OpenPose learnt both points as these middles of COCO's
     for middle, end in (("neck", "shoulder"), ("mid_hip", "hip")):
         at = points[..., KEYPOINT_INDEX[middle], :]
         ends = [KEYPOINT_INDEX[f"left_{end}"], KEYPOINT_INDEX[f"right_{end}"]]
@@ -75,12 +81,12 @@ def triangulate_people(
     min_confidence: float,
     max_error_px: float,
 ) -> tuple[np.ndarray, Triangulation]:
-    """Triangulate the subject, with sides exchanged by views, build or motion.
+    """Triangulate the subject, with left and right corrected by views, anatomy and motion.
 
     Args:
         keypoints: (T, C, 135, 3 or more) x, y, confidence, and further values of each point.
         times: (T,) seconds; None = motion from set to set is not evaluated.
-        min_confidence: keypoints below are ignored.
+        min_confidence: keypoints of lower confidence are ignored.
         max_error_px: largest reprojection error of an inlier, px at 1080p.
 
     Returns:
@@ -105,13 +111,14 @@ def triangulate_people(
 
 
 def steady_sides(keypoints: np.ndarray, rig: Rig, *, min_confidence: float) -> np.ndarray:
-    """Exchange back limbs that jump to the other side for a while, in sets with up to four views.
+    """Exchange back limbs that jump to the other side for some time, in sets of up to four views.
 
-    Each view and limb is considered on its own: dynamic programming selects the sides that move
-    least over all sets.
+    For each view and limb, dynamic programming selects the sides of least image motion over all
+    sets. With more views, their agreement decides (:mod:`.left_right`).
 
     Args:
         keypoints: (T, C, 135, 3).
+        min_confidence: keypoints of lower confidence have no motion.
 
     Returns:
         (T, C, 135, 3) keypoints with corrected sides.
@@ -131,15 +138,21 @@ def steady_sides(keypoints: np.ndarray, rig: Rig, *, min_confidence: float) -> n
 
 
 def _least_motion(options: np.ndarray, scale: float, min_confidence: float) -> np.ndarray:
-    """Sets (S,) bool in which the second of the limb's ``options`` (2, S, n, 3) moves less.
+    """Mask (S,) of the sets that are exchanged in the sequence of least motion.
 
-    Costs are pixels at 1080p, tuned on the studio.
+    Costs are pixels at 1080p, times ``scale``; tuned on the studio.
+
+    Args:
+        options: (2, S, n, 3) the limb's keypoints as detected, and with the sides exchanged.
+        scale: pixels of the camera per pixel at 1080p.
+        min_confidence: keypoints of lower confidence have no motion.
     """
-    price = np.array([0.0, 3.0 * scale])  # of an exchanged set: detectors are mostly right
-    # at the start or end of the recording an exchange has only one jump, as a fast turn
+    price = np.array([0.0, 3.0 * scale])  # for each exchanged set: detectors are mostly right
+    # For an exchange in the first or last set. It has a single jump, which may also be a fast turn
+    # of the body.
     at_an_end = np.array([0.0, 100.0 * scale])
     seen, pixels = options[..., 2] >= min_confidence, options[..., :2]
-    # (before, now, S - 1, n)
+    # axes: option in the set before, option in this set, S - 1, n
     both = seen[:, None, :-1] & seen[None, :, 1:]
     moved = np.linalg.norm(pixels[:, None, :-1] - pixels[None, :, 1:], axis=-1)
     moved = np.where(both, np.minimum(moved, 120.0 * scale), 0).sum(-1)
@@ -150,8 +163,11 @@ def _least_motion(options: np.ndarray, scale: float, min_confidence: float) -> n
 def _exchange(
     keypoints: np.ndarray, points: np.ndarray, rig: Rig, min_confidence: float, max_error_px: float
 ) -> bool:
-    """Exchange in place the limbs of ``keypoints`` (T, C, 135, 3 or more) that fit ``points``
-    (T, 135, 3) much better the other way. Returns whether there are any."""
+    """Exchange the limbs of ``keypoints`` (T, C, 135, 3 or more), in place, that fit the
+    triangulated ``points`` (T, 135, 3) much better with the sides exchanged.
+
+    Returns whether any limb was exchanged.
+    """
     sets, views = keypoints.shape[:2]
     known = np.isfinite(points[..., 0])
     pixels = reproject(np.nan_to_num(points.reshape(-1, 3), nan=1.0), rig)
@@ -169,7 +185,7 @@ def _exchange(
             )
             for side in (limb, PARTNER[limb])
         )
-        # half of the limb's points are off by the limit or more
+        # 0.25: the root mean square error is half of the limit; tuned on the studio
         t, c = np.nonzero((detected > 0.25) & (other < MUCH_BETTER * detected))
         exchange_limb(keypoints, t, c, limb)
         exchanged |= len(t) > 0
@@ -179,9 +195,10 @@ def _exchange(
 def _cost(
     expected: np.ndarray, detected: np.ndarray, valid: np.ndarray, limit: np.ndarray
 ) -> np.ndarray:
-    """Mean truncated squared error (T, C) in units of the limit; NaN with fewer than two points.
+    """Mean squared reprojection error (T, C) of a limb over the squared ``limit``.
 
-    Truncated well beyond the limit, so that exchanged sides differ from other errors.
+    NaN with fewer than two valid points. Errors are truncated at four times the limit: a lower
+    bound would give exchanged sides the same cost as other large errors.
     """
     error = np.linalg.norm(expected - detected, axis=-1) / limit
     square = np.where(valid, np.minimum(error, 4.0) ** 2, 0).sum(-1)
@@ -192,6 +209,7 @@ def _cost(
 def _triangulate(
     keypoints: np.ndarray, rig: Rig, min_confidence: float, max_error_px: float
 ) -> Triangulation:
+    """Triangulate keypoints (T, C, 135, 3 or more), weighted by their confidence."""
     points = np.swapaxes(keypoints[..., :3], 1, 2).astype(np.float64)
     by_point = points.reshape(-1, len(rig), 3)
     weights = np.where(by_point[..., 2] >= min_confidence, by_point[..., 2], 0)

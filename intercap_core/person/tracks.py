@@ -1,8 +1,9 @@
 """People followed over time, and tracks of one person joined across gaps.
 
-A person who cannot be followed (occluded, out of view, missed by the detector) is recognised again
-by place and build: lengths of limbs, shoulders and trunk, which differ between people by more than
-the error of a track's median. The most likely pair is joined first.
+A *track* is a person followed without long gaps. After a gap (occluded, out of view, missed by the
+detector) a new track begins. Tracks of one person are joined by position and build, the most likely
+pair first. Build means the lengths of limbs, shoulders and trunk: they differ between people by
+more than the error of their median over a track.
 """
 
 from __future__ import annotations
@@ -20,14 +21,14 @@ from intercap_core.person.groups import PersonGroup
 # Standard deviations of thigh, shank, upper arm, forearm, shoulder width and trunk among adults,
 # metres, measured over the shapes of the open body.
 BUILD_SPREADS_M = (0.034, 0.027, 0.015, 0.023, 0.033, 0.025)
-MAX_BODY_SPEED_M_S = 4.0  # of a body's centre; people run slower indoors; untuned
-# Longest gap over which a single view identifies a person by position, and after which a joined
-# track is not doubted; tuned on the studio.
+MAX_BODY_SPEED_M_S = 4.0  # largest speed of a body's centre; people run slower indoors; untuned
+# Longest gap over which position alone identifies a person: for a detection in a single view, and
+# for joined tracks to be free of doubt. Tuned on the studio.
 MAX_LINK_GAP_S = 2.0
 LINK_SLACK_M = 0.25  # noise of a person's centre between sets; tuned on the studio
 
-# Pairs of keypoints (1 or 2, 2), in the order of BUILD_SPREADS_M; of bones on both sides, the mean
-# length counts.
+# Keypoint pairs of each length, (1 or 2, 2), in the order of BUILD_SPREADS_M. A limb has one pair
+# for each side, whose lengths are averaged.
 _BONES = (
     *(
         keypoint_pairs([*of_side("left", [bone]), *of_side("right", [bone])])
@@ -40,16 +41,19 @@ _BONES = (
 
 @dataclass(eq=False)
 class PersonTrack:
-    """One person from set to set."""
+    """One person followed from set to set."""
 
     sets: list[int] = field(default_factory=list)
     """Frame sets, ascending."""
     groups: list[PersonGroup] = field(default_factory=list)
-    """The person in each of them."""
+    """The person in each of ``sets``."""
 
     @cached_property
     def build(self) -> tuple[np.ndarray, np.ndarray]:
-        """Median lengths (B,) of bones, metres, and their variances; infinite with few sets."""
+        """Median lengths (B,) of bones, metres, and their variances, m^2.
+
+        Lengths known in fewer than five sets are 0 with infinite variance.
+        """
         points = np.stack([group.points for group in self.groups])
         lengths = np.stack([_lengths(points, bone) for bone in _BONES], axis=1)  # (N, B)
         count = np.isfinite(lengths).sum(0)
@@ -66,7 +70,7 @@ class PersonTrack:
 
 
 def _lengths(points: np.ndarray, bone: np.ndarray) -> np.ndarray:
-    """Lengths (N,) of a bone in points (N, 25, 3), averaged over the known sides."""
+    """Lengths (N,) of a bone in points (N, 25, 3), averaged over the known sides; NaN = unknown."""
     sides = np.stack([np.linalg.norm(points[:, a] - points[:, b], axis=1) for a, b in bone])
     known = np.isfinite(sides)
     total = np.where(known, sides, 0.0).sum(0)
@@ -74,7 +78,11 @@ def _lengths(points: np.ndarray, bone: np.ndarray) -> np.ndarray:
 
 
 def link_groups(groups: Sequence[Sequence[PersonGroup]], times: np.ndarray) -> list[PersonTrack]:
-    """Follow the people of each set (T lists) over short gaps, nearest first; ``times`` (T,) s."""
+    """Follow people from set to set, over gaps of at most 0.4 s; the closest pairs are linked
+    first.
+
+    ``groups``: people of each of the T sets. ``times``: (T,) seconds.
+    """
     tracks: list[PersonTrack] = []
     for t, in_set in enumerate(groups):
         # within 0.4 s position alone identifies a person; tuned on the studio
@@ -102,9 +110,10 @@ def link_groups(groups: Sequence[Sequence[PersonGroup]], times: np.ndarray) -> l
 
 
 def same_build(first: PersonTrack, second: PersonTrack) -> float:
-    """Log likelihood ratio, by the lengths of bones, of one person against two; 0 = unknown.
+    """Log likelihood ratio of one person against two, by the lengths of bones; 0 = unknown.
 
-    Errors of the tracks and spreads among people are normal.
+    The difference of two lengths is normal. Its variance is the sum of the tracks' variances; for
+    two people, that plus twice the squared spread among adults.
     """
     (a, own), (b, theirs) = first.build, second.build
     known = np.isfinite(own + theirs)
@@ -122,9 +131,9 @@ class Person:
     """Tracks of one person."""
 
     parts: tuple[PersonTrack, ...]
-    """Tracks that do not overlap, in order of time."""
+    """Tracks that do not overlap in time, in order of time."""
     doubts: tuple[str, ...] = ()
-    """Evidence against their being one person."""
+    """Messages on doubtful joins."""
 
     @cached_property
     def track(self) -> PersonTrack:
@@ -136,7 +145,7 @@ class Person:
         return joined
 
     def meets(self, other: Person) -> bool:
-        """Whether parts of two people overlap in time, so that they are two."""
+        """Whether the two overlap in time, so that they are certainly different people."""
         return any(
             a.sets[0] <= b.sets[-1] and b.sets[0] <= a.sets[-1]
             for a in self.parts
@@ -147,11 +156,13 @@ class Person:
 def join_tracks(
     tracks: Sequence[PersonTrack], times: np.ndarray, together: Sequence[PersonTrack] = ()
 ) -> list[Person]:
-    """Join the tracks of a recording to people.
+    """Join the tracks of a recording to people, by agglomerative clustering.
+
+    The pair of greatest likelihood is joined, until all remaining pairs are :data:`NEVER`.
 
     Args:
         times: (T,) seconds.
-        together: tracks that do not overlap and are one person regardless of the evidence; this
+        together: tracks that do not overlap and belong to one person by the user's statement. This
             person is the first of the result.
     """
     rest = [track for track in tracks if track not in together]
@@ -191,21 +202,22 @@ def _likelihood(first: Person, second: Person, times: np.ndarray) -> float:
         gap = float(times[after.sets[0]] - times[before.sets[-1]])
         if apart > LINK_SLACK_M + MAX_BODY_SPEED_M_S * gap:
             return NEVER
-        result -= 0.5 * (apart / (LINK_SLACK_M + 1.2 * gap)) ** 2  # m/s, a usual walk
+        # 1.2 m/s: a usual walk
+        result -= 0.5 * (apart / (LINK_SLACK_M + 1.2 * gap)) ** 2
     alike = same_build(first.track, second.track)
-    # log likelihood ratio by build; tuned on the studio
+    # below a ratio of -3 the builds contradict; tuned on the studio
     return result + alike if alike > -3.0 else NEVER
 
 
 def _seams(first: Person, second: Person) -> list[tuple[PersonTrack, PersonTrack]]:
-    """Pairs of successive parts, in order of time, that belong to different people."""
+    """Pairs of successive tracks, in order of time, of which one belongs to each person."""
     own = set(map(id, first.parts))
     parts = _ordered((*first.parts, *second.parts))
     return [(a, b) for a, b in pairwise(parts) if (id(a) in own) != (id(b) in own)]
 
 
 def _doubt(first: Person, second: Person, times: np.ndarray) -> tuple[str, ...]:
-    """Message on joining two people after a long gap, if their build does not decide."""
+    """Message on joining two people after a gap of over 2 s whose builds do not clearly agree."""
     gap, start = min(
         (float(times[b.sets[0]] - times[a.sets[-1]]), b.sets[0]) for a, b in _seams(first, second)
     )
