@@ -20,8 +20,8 @@ from intercap_core.formats.calibration.k4a import (
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera
 
-# The accelerometer's axes in the depth camera's, as in real devices but without their 6 degrees
-# of tilt: its x is the camera's -z, its y the camera's -x, its z the camera's y (down).
+# Rotation from the depth camera's to the accelerometer's axes, as in real devices but without their
+# 6 degrees of tilt: its x is the camera's -z, its y the camera's -x, its z the camera's y (down).
 ACCELEROMETER_FROM_DEPTH = np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]])
 GYROSCOPE = "CALIBRATION_InertialSensorType_Gyro"
 

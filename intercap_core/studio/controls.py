@@ -2,6 +2,7 @@
 
 Everything is a smooth function of script time in seconds, vectorised over moments (N,). Positions
 are in the script's frame (z up, the floor at z = 0), in metres. Headings turn about z, 0 faces +x.
+Numbers without a comment shape the motion and are set by eye.
 """
 
 from __future__ import annotations

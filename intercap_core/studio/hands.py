@@ -108,6 +108,7 @@ class Hand:
         axes = np.empty((5, 3, 3))
         for f in range(5):
             chain = np.vstack([rest[self.first + 3 * f : self.first + 3 * f + 3], self._tips[f]])
+            # the thumb bends towards the palm's middle
             bend_to = self.palm if f < 4 else unit(0.55 * self.palm - self.radial)
             axes[f] = unit(np.cross(np.diff(chain, axis=0), bend_to))
         return axes
@@ -120,6 +121,7 @@ class Hand:
             sideways = np.cross(self.out, self.radial) * np.radians(hand.spread[f])
             first = Rotation.from_rotvec(sideways) * bent
         else:
+            # The thumb's first bone rolls about itself and is lifted to the palm; then it flexes.
             bone = self.rest.rest[self.first + 13] - self.rest.rest[self.first + 12]
             lift = unit(np.cross(bone, self.palm)) * np.radians(hand.opposition)
             roll = unit(bone) * np.radians(0.5 * hand.opposition) * self.out[0]

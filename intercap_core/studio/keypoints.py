@@ -54,10 +54,11 @@ class Detector:
     jitter_px = 2.4  # standard deviation of the jitter of body joints
     hand_jitter_px = 2.0  # of hand joints
     face_jitter_px = 1.2  # of face points
-    fast_jitter = 0.4  # share of the jitter that is independent from frame to frame
+    fast_jitter = 0.4  # share of the jitter's deviation that is independent from frame to frame
     jitter_s = 0.5  # correlation time of the rest
-    hidden_shift_m = 0.045  # error of a hidden body joint, metres
-    hidden_hand_shift_m = 0.030  # error of a hidden hand joint, metres
+    # standard deviation, in x and in y, of the error of a hidden body joint, metres
+    hidden_shift_m = 0.045
+    hidden_hand_shift_m = 0.030  # the same of a hidden hand joint
     swap_probability = 0.015  # of an exchange of left and right
     swap_s = 0.3  # duration of an exchange
     miss_probability = 0.012  # of a person who is not detected
@@ -109,6 +110,7 @@ class Detector:
         )
         slow = noise.process(rng, self.frames, 270, self.jitter_s).reshape(-1, 135, 2)
         fast = noise.tails(rng.normal(size=slow.shape))
+        # of all points of the left and of the right hand together
         group = noise.process(rng, self.frames, 4, self.jitter_s).reshape(-1, 2, 2)
         wander = np.sqrt(1 - self.fast_jitter**2) * slow + self.fast_jitter * fast
         wander[:, LEFT_HAND] += 0.9 * group[:, :1]
@@ -121,7 +123,7 @@ class Detector:
         hidden_share = noise.process(rng, self.frames, 270, self.jitter_s).reshape(-1, 135, 2)
         shift = np.full(135, self.hidden_shift_m)
         shift[25:67], shift[67:] = self.hidden_hand_shift_m, 0.015
-        hallucinated = hidden_share * shift[:, None] * 370.0 * scale
+        hallucinated = hidden_share * shift[:, None] * 370.0 * scale  # px at 2.5 m in 1080p
         error += np.where(hidden[..., None], hallucinated, 0)
         pixels = pixels + error * unit_px
 

@@ -37,7 +37,7 @@ from intercap_core.studio.capture_folder import (
 from intercap_core.studio.mkv import MkvWriter
 from intercap_core.studio.rig import STAGGER_S
 
-BEHAVE_DATE = "Date01"
+BEHAVE_DATE = "Date01"  # folder of the calibration
 
 
 class KinectFolder(CaptureFolder):
@@ -57,6 +57,8 @@ class KinectFolder(CaptureFolder):
 
 
 class _KinectFile(CameraFiles):
+    """One MKV recording."""
+
     def __init__(self, path: Path, device: Device) -> None:
         self._writer = MkvWriter(
             path,
@@ -235,6 +237,8 @@ class PlainFolder(CaptureFolder):
 
 
 class _PlainFiles(ImageFiles):
+    """Numbered image files and their timestamps.csv."""
+
     def __init__(self, folder: Path) -> None:
         super().__init__(
             lambda frame: (folder / f"{frame.t:06d}.jpg", folder / "depth" / f"{frame.t:06d}.png")

@@ -124,6 +124,7 @@ class CameraMasks:
         self._clutter_on = np.stack(
             [noise.episodes(rng, frames, one * chance, miss, 0.7, 0.0)[:, 0] for chance in often], 1
         )
+        # columns: person, object, unused, fate of the object's own mask if merged, false instances
         self._score = noise.process(rng, frames, 4 + len(often), 0.3)
         if network.passer_by:
             self._expect_passer_by(noise.detector_rng("masks", name, "passer-by"))
@@ -162,7 +163,7 @@ class CameraMasks:
         score = 0.72 + 0.12 * self._score[t]
         if self._merged[t] and prop is not None and person is not None:
             person = person | prop
-            if self._score[t, 3] > 0:
+            if self._score[t, 3] > 0:  # half the time the object's own mask is missing then
                 prop = None
         if person is not None and not self._person_missed[t]:
             instances.append(("person", self._rle(person, truth), score[0] + 0.15))

@@ -2,7 +2,8 @@
 
 Headings turn about the stage's z axis; a person with heading 0 faces +x. "Stage" is any frame with
 z up and the floor at z = 0; scripts use their own. World rotations (N, 55, 3, 3) are
-stage_from_rest of SMPL-X's joints; see :mod:`.skeleton`.
+stage_from_rest of SMPL-X's joints; see :mod:`.skeleton`. Numbers without a comment are proportions
+set by eye.
 """
 
 from __future__ import annotations

@@ -103,7 +103,13 @@ def shade(normals: np.ndarray) -> np.ndarray:
 
 
 class RoomView:
-    """Rays of one lens, and its image of the empty room."""
+    """Rays of one lens, and its image of the empty room.
+
+    - ``depth``: (H, W) z, metres; inf = nothing.
+    - ``normal``: (H, W, 3) unit, towards the camera, stage frame.
+    - ``colour``: (H, W, 3) shaded RGB in [0, 1]; empty if not ``coloured``.
+    - ``material``: (H, W) index of the room's materials; -1 = nothing.
+    """
 
     def __init__(
         self, lens: Intrinsics, stage_from_camera: np.ndarray, room: Room, *, coloured: bool

@@ -122,7 +122,10 @@ def started_apart(
 
 
 def _ring(rng: np.random.Generator, cameras: int) -> list[np.ndarray]:
-    """stage_from_colour (4, 4) of each camera: x right, y down, z towards the middle."""
+    """stage_from_colour (4, 4) of each camera: x right, y down, z towards the middle.
+
+    The cameras are on a ring, evenly spaced and alternately low and high, with random deviations.
+    """
     poses = []
     first = rng.uniform(0, 2 * np.pi)
     for index in range(cameras):
@@ -152,6 +155,7 @@ def _colour_lens(rng: np.random.Generator, mode: str) -> Intrinsics:
     width, height = COLOUR_MODES[mode].size
     scale = width / 1920
     focal = (913 + rng.normal(0, 4)) * scale
+    # k1, k2, p1, p2, k3, k4, k5, k6
     distortion = np.array([0.42, -2.55, 3e-4, -2e-4, 1.50, 0.30, -2.37, 1.42])
     distortion[:2] += rng.normal(0, (0.03, 0.05))
     distortion[2:4] += rng.normal(0, 2e-4, 2)

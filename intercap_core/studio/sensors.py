@@ -64,14 +64,21 @@ class DepthSensor:
         self._static_holes = blotches < np.where(np.isfinite(risk), risk, 1)
 
     def _risk(self, depth: np.ndarray, cosine: np.ndarray, albedo: np.ndarray) -> np.ndarray:
-        """Threshold (...) of :func:`_blotches` below which grazing and dark surfaces have holes."""
+        """Threshold (...) of :func:`_blotches` below which a pixel is a hole.
+
+        It grows as surfaces become more grazing, or darker and farther away.
+        """
         scale = self._noise.scale
         risk = 0.9 * np.clip(1 - np.abs(cosine) / (self.grazing_cosine * (0.5 + 0.5 * scale)), 0, 1)
         risk += np.clip(1 - albedo / self.dark, 0, 1) * np.clip(depth / 4 - 0.2, 0, 0.7)
         return risk * min(scale, 1.5)
 
     def image(self, cast: Cast) -> np.ndarray:
-        """Depth (H, W) uint16 mm, 0 = invalid, of the room with moving surfaces."""
+        """Depth (H, W) uint16 mm, 0 = invalid, of the room with moving surfaces.
+
+        The error is noise with the deviation noise_m + noise_per_m2 z^2, a part of it correlated
+        over 3 x 3 pixels; a ripple over distance; and the camera's constant bias.
+        """
         rng, scale = self._rng, np.float32(self._noise.scale)
         depth, invalid = self._room.copy(), ~self._finite | ~self._in_field | self._static_holes
         if len(cast.pixels):
@@ -105,7 +112,10 @@ class DepthSensor:
         return np.rint(error * 1000).astype(np.uint16)
 
     def _edges(self, depth: np.ndarray, invalid: np.ndarray, scale: np.float32) -> None:
-        """Mix or invalidate depths across steps, in place."""
+        """Make some pixels at steps in depth flying pixels or invalid, in place.
+
+        A flying pixel has a depth between both sides of the step.
+        """
         kernel = np.ones((3, 3), np.uint8)
         near, far = cv2.erode(depth, kernel).ravel(), cv2.dilate(depth, kernel).ravel()
         at = np.flatnonzero((far - near > self.edge_m) & (near > 0))
@@ -133,8 +143,10 @@ def _blotches(
 
 
 def _field(lens: Intrinsics, mode: str) -> np.ndarray:
-    """Mask (H, W) of pixels that the infrared light reaches: hexagonal in narrow modes, else a
-    disc."""
+    """Mask (H, W) of pixels that the infrared light reaches.
+
+    In narrow modes the corners of the image are dark, in wide modes everything outside a disc.
+    """
     v, u = np.mgrid[: lens.height, : lens.width]
     x, y = u / (lens.width - 1) * 2 - 1, v / (lens.height - 1) * 2 - 1
     lit = abs(x) + 0.55 * abs(y) < 1.42 if mode.startswith("NFOV") else np.hypot(x, y) < 1

@@ -286,6 +286,7 @@ def in_heavy_shoes(subject: Subject, rng: np.random.Generator) -> Subject:
         across = np.sqrt(np.maximum(1 - down[own] ** 2, 1e-6))
         deep = (height[own] - ground) / np.maximum(down[own], SLOPING)
         sole = np.minimum(deep, LEATHER_M[1] / across)
+        # leather becomes thinner in the upper 2 cm; a sole is at most 45 mm thick
         sides = leather * np.clip((_top(subject) - height[own]) / 0.02, 0.3, 1)
         below = np.maximum(sides, np.minimum(sole, 0.045))
         clothing[own] = np.where(down[own] > SLOPING, below, sides)
@@ -306,7 +307,10 @@ SHOES = ((0.12, 0.12, 0.13), (0.75, 0.75, 0.74), (0.35, 0.20, 0.12))
 
 
 def body_colours(subject: Subject, rng: np.random.Generator) -> np.ndarray:
-    """Colours (V, 3) RGB in [0, 1] of the clothed surface."""
+    """Colours (V, 3) RGB in [0, 1] of the clothed surface: skin, clothes, shoes, hair, eyes, lips.
+
+    Areas follow from the skinning weights and from places relative to the eyes, metres.
+    """
     share = np.asarray(subject.weights.todense())
     rest, joints = subject.rest, subject.rest_joints
 

@@ -25,9 +25,10 @@ def draft(root: Path, *, dataset: str, results: Path | None = None) -> Draft:
     Args:
         root: folder with ``sequences``, ``calibs`` and ``objects``.
         dataset: name of the project.
-        results: the data set's own results to convert, a folder for each sequence or ``sequences``
-            with these folders: ``root``, whose frames hold registrations, or the parameters at 30
-            frames a second. None = run the joint fit.
+        results: folder of the data set's own results, which are converted instead of a joint fit:
+            ``root`` (registrations in the frames' folders), or the parameters at 30 frames a second
+            with their meshes. It has a folder for each sequence, directly or in ``sequences``.
+            None = run the joint fit.
     """
     result = Draft(dataset)
     meshes: dict[str, dict[str, Any]] = {}
@@ -64,7 +65,7 @@ def draft(root: Path, *, dataset: str, results: Path | None = None) -> Draft:
 
 
 def _row(root: Path, path: Path, date: str, subject: str, object_name: str) -> tuple[Row, str]:
-    """The row of a sequence, and why it cannot be used, "" = it can."""
+    """The row of a sequence, and the reason why it cannot be used; "" = it can be used."""
     calibration = root / "calibs" / date / "config"
     row = Row(
         {

@@ -310,7 +310,10 @@ class VideoRecording(CameraRecording):
         return seen._replace(faults=tuple(faults))
 
     def images(self) -> Iterator[Image]:
-        """Yield images in the order in which they are shown, then depth."""
+        """Yield images in the order in which they are shown, then depth.
+
+        Times are the stated timestamps, or else count from the first image.
+        """
         copied = self._stream.codec_context.name == "mjpeg"
         count = 0
         first: float | None = None

@@ -48,9 +48,13 @@ class Interaction(ABC):
     """
 
     puppet: Puppet
+    """The person."""
     prop: TrueObject
+    """The object; false in a condition if there is none."""
     rng: np.random.Generator
+    """Source of the script's random variations."""
     furniture: list[Box] = field(default_factory=list)
+    """Furniture that ``plan`` places, script frame."""
     object_class = ""
     feet_meet_object = False  # soles or insteps touch the object
     leaves_floor = False  # the feet stand on furniture

@@ -146,7 +146,10 @@ class Approach:
 
 
 def around_wall(at: np.ndarray, floor: float) -> Iterator[Approach]:
-    """Approaches of a right hand to an upright wall before it, fingers left of ahead."""
+    """Approaches of a right hand to an upright wall: the palm faces left, fingers point ahead.
+
+    ``at``: (3,) goal of the palm; ``floor``: lowest height of the hand, metres; script frame.
+    """
     for along, azimuth in product((0.030, 0.040, 0.022), np.radians((65.0, 80.0))):
         sin, cos = np.sin(azimuth), np.cos(azimuth)
         yield Approach(at, np.array([sin, cos, -0.10]), np.array([-cos, sin, 0.0]), along, floor)
@@ -206,7 +209,7 @@ def wrapped(
             best = score, Grip(opened, closed, pose, gaps)
             if gaps.max() < 0.002:  # metres: every finger meets the object
                 return best[1]
-        if best is not None and best[0] > -0.008:  # metres: the thumb is near it
+        if best is not None and best[0] > -0.008:  # metres: sum of the remaining gaps
             break
     if best is None:
         raise ValueError("no approach leaves the thumb room outside the object")

@@ -22,7 +22,7 @@ from intercap_core.studio.motion import LEFT, RIGHT, Trunk, facing
 from intercap_core.studio.room import Box
 from intercap_core.studio.skeleton import turn
 
-SIDES = (RIGHT, LEFT)
+SIDES = (RIGHT, LEFT)  # order in which hands are handled here; `motion.SIDES` has their names
 
 
 class HandlingScript(Interaction):
