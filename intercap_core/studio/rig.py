@@ -31,7 +31,7 @@ class StudioRig:
     claimed: Rig
     """Erring lenses of the recordings and erring poses of the rig file."""
     master_from_stage: np.ndarray
-    """(4, 4)."""
+    """(4, 4), metres."""
     offset_s: np.ndarray
     """(C,) exposure minus device time, seconds, without the stagger and slips."""
     missing: tuple[frozenset[int], ...]

@@ -41,7 +41,7 @@ class ExtractedCamera:
     depth_delay_us: int = 0
     """Device time of a depth image minus that of its colour image, by design, microseconds."""
     fingerprint: int = 0
-    """Checksum over the ends of all colour images."""
+    """Checksum over the ends of all colour images, which is equal for copies of one recording."""
     gravity: np.ndarray = field(default_factory=lambda: np.full(3, np.nan))
     """(3,) direction down, unit, colour camera's frame; NaN = unknown."""
     truncated: bool = False

@@ -40,8 +40,9 @@ def synchronise(
 ) -> SetTable:
     """Group the images of C cameras into sets.
 
-    Each image of the master makes a set, and so do images of the other cameras that are more than
-    ``NEW_SET_GAP`` periods away from these sets. An image joins the nearest set if it is within
+    Each image of the master makes a set. Images of other cameras that are more than ``NEW_SET_GAP``
+    periods away from these sets make further sets: images within ``max_skew_us`` of the earliest
+    one share a set at their median time. An image joins the nearest set if it is within
     ``max_skew_us`` and no other image of its camera is nearer.
 
     Args:
@@ -104,7 +105,7 @@ def images_of_moments(slip: np.ndarray, available: np.ndarray) -> np.ndarray:
     sets = len(slip)
     for camera in range(slip.shape[1]):
         images = np.flatnonzero(available[:, camera])
-        late = slip[images, camera]  # sets by which the image is too late; negative = too early
+        late = slip[images, camera]  # sets by which the image is older than its set's time
         moments = images - late
         order = np.argsort(-np.abs(late), kind="stable")  # the least slip is written last
         order = order[(moments[order] >= 0) & (moments[order] < sets)]
