@@ -30,7 +30,7 @@ class HandShape:
     """Angles of a hand's joints, degrees."""
 
     flexion: np.ndarray
-    """(5, 3) FINGERS by joint from the knuckle."""
+    """(5, 3) of each of ``FINGERS``, at its three joints from the knuckle to the tip."""
     spread: np.ndarray
     """(5,) of the fingers at the knuckles, positive towards the thumb; the thumb's is not used."""
     opposition: float
@@ -90,6 +90,7 @@ class Hand:
         self._part = part_of(subject, self.vertex_ids)
         finger = share[self.vertex_ids, 1:].reshape(-1, 5, 3)
         distal = finger[..., ::-1].cumsum(-1)[..., ::-1]  # moved by this joint or a further one
+        # vertices that move with joint j of finger f
         self.moved = [[np.flatnonzero(distal[:, f, j] > 0.5) for j in range(3)] for f in range(5)]
         self.palm_ids = np.flatnonzero(share[self.vertex_ids, 0] > 0.6)
         self.thumb_ids = self.moved[THUMB][0]

@@ -1,4 +1,7 @@
-"""Scripts without an object: balance along a beam; walk up and wave a hand."""
+"""Scripts without an object: balance along a beam; walk up and wave a hand.
+
+Conventions of numbers, columns and frames: :mod:`.base`.
+"""
 
 from __future__ import annotations
 

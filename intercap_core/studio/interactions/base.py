@@ -8,6 +8,7 @@ Conventions of all scripts:
   forward axes. Positive values bend forward, turn to the left and lean to the right.
 - ``world[:, 9]`` is the rotation of the chest (joint spine3). Its columns are the directions to the
   person's left, up and ahead.
+- Frame of a script: z up, the floor at z = 0, a person with heading 0 faces +x.
 """
 
 from __future__ import annotations
@@ -62,9 +63,9 @@ class Interaction(ABC):
     centre = (0.0, 0.0)  # middle of the action on the floor, script frame
 
     def __post_init__(self) -> None:
-        self.sway = Wander(6, 0.010, self.rng)  # rad, trunk and head
+        self.sway = Wander(6, 0.010, self.rng)  # rad; columns: trunk's bend, head's bend
         self.weight_shift = Wander(3, 0.0025, self.rng)  # metres, pelvis
-        self.arm_swing = Wander(2, 0.006, self.rng)  # metres
+        self.arm_swing = Wander(2, 0.006, self.rng)  # metres forward, of two hands
         self.plan()
 
     @abstractmethod

@@ -1,4 +1,7 @@
-"""Take an object that stands on the floor by its handle, carry it two steps, put it down."""
+"""Take an object that stands on the floor by its handle, carry it two steps, put it down.
+
+Conventions of numbers, columns and frames: :mod:`.base`.
+"""
 
 from __future__ import annotations
 

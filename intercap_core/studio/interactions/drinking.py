@@ -1,4 +1,7 @@
-"""Step up to a plinth, take a vessel around its wall, drink, put it back."""
+"""Step up to a plinth, take a vessel around its wall, drink, put it back.
+
+Conventions of numbers, columns and frames: :mod:`.base`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Step up to a ball, put the sole on it, swing back, kick it; it rolls until it stops."""
+"""Step up to a ball, put the sole on it, swing back, kick it; it rolls until it stops.
+
+Conventions of numbers, columns and frames: :mod:`.base`.
+"""
 
 from __future__ import annotations
 

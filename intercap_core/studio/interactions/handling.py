@@ -1,4 +1,7 @@
-"""Base class of scripts in which hands pick up an object, move it and put it down."""
+"""Base class of scripts in which hands pick up an object, move it and put it down.
+
+Conventions of numbers, columns and frames: :mod:`.base`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Take an object from a plinth and turn it before the eyes, or pass it to another plinth."""
+"""Take an object from a plinth and turn it before the eyes, or pass it to another plinth.
+
+Conventions of numbers, columns and frames: :mod:`.base`.
+"""
 
 from __future__ import annotations
 

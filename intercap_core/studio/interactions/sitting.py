@@ -1,4 +1,7 @@
-"""Step back to a seat, feel for its edge, sit down, rest, rise."""
+"""Step back to a seat, feel for its edge, sit down, rest, rise.
+
+Conventions of numbers, columns and frames: :mod:`.base`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Put one foot on a skateboard, push off with the other, ride until it stops, step off."""
+"""Put one foot on a skateboard, push off with the other, ride until it stops, step off.
+
+Conventions of numbers, columns and frames: :mod:`.base`.
+"""
 
 from __future__ import annotations
 

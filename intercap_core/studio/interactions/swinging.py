@@ -1,4 +1,7 @@
-"""Take a long object that lies on a block by its handle, swing it, lay it down again."""
+"""Take a long object that lies on a block by its handle, swing it, lay it down again.
+
+Conventions of numbers, columns and frames: :mod:`.base`.
+"""
 
 from __future__ import annotations
 
