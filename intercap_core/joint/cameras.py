@@ -9,8 +9,9 @@ Gaussian about the scene's cameras, with the scene's covariance P^-1:
     step = -S^-1 (P d + sum a (g_d - H_dx H_xx^-1 g_x))
 
 The sums run over all frames, of the body (E_B) and of the object (E_O). H and g are the blocks of
-their Gauss-Newton matrices and gradients. a is the weight of a frame, below 1 because errors last
-over several frames. The poses follow by -H_xx^-1 H_xd step. S^-1 is the covariance of d.
+their Gauss-Newton matrices and gradients. d is the correction so far, and a the weight of a frame,
+below 1 because errors last over several frames. The poses follow by -H_xx^-1 H_xd step. S^-1 is the
+covariance of the corrections.
 """
 
 from __future__ import annotations

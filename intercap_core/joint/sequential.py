@@ -65,10 +65,11 @@ class TrackedPoses:
             times: (T,) seconds.
             time_offset: (C,) seconds.
         """
-        # standard deviations of turn (rad) and shift (m), tuned on the studio
-        smallest = np.repeat([radians(0.05), 0.0005], 3)  # the mesh differs from the object
-        ambiguous = np.hypot(smallest, np.repeat([radians(10.0), 0.002], 3))  # mostly the rotation
-        interpolated = np.repeat([0.5, 0.15], 3)  # frames without a measurement
+        # standard deviations of turn (rad) and shift (m) to add, tuned on the studio:
+        # difference of mesh and object; ambiguity, mostly of the rotation; frames without a pose
+        smallest = np.repeat([radians(0.05), 0.0005], 3)
+        ambiguous = np.hypot(smallest, np.repeat([radians(10.0), 0.002], 3))
+        interpolated = np.repeat([0.5, 0.15], 3)
         tracked = ~marks.lost & np.isfinite(covariance).all(axis=(1, 2))
         total = np.where(tracked[:, None, None], covariance, 0.0)
         # the covariance of a carried pose contains its ambiguity

@@ -68,7 +68,10 @@ def contact_patches(model: BodyModel) -> Patches:
 
 
 def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
-    """Indices of ``count`` points spread evenly over points (N, 3); all if there are fewer."""
+    """Indices of ``count`` evenly spread points of ``points`` (N, 3), by farthest-point sampling.
+
+    All if there are fewer.
+    """
     if len(points) <= count:
         return np.arange(len(points))
     chosen = [int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmax())]

@@ -222,6 +222,7 @@ def observe_keypoints(evidence: Evidence, problem: BodyProblem) -> PointObservat
     if views is None:
         raise ValueError("the problem has no views to compare with")
     points = evidence.points(problem)
+    # shift: motion of each point until each camera exposes
     seen = points[:, None] if views.shift is None else points[:, None] + views.shift
     rotation = views.colour_from_master[:, :3, :3]
     in_camera = seen @ rotation.transpose(1, 2) + views.colour_from_master[:, None, :3, 3]

@@ -198,6 +198,7 @@ class Appearance:
             light = np.concatenate(
                 [np.full((stop - start, 1), exposure_sigma), shading_sigma * seen.normal[own]], 1
             )
+            # brightness: exposure and shading; ratios: an offset alone (white balance)
             for channels, design in ((slice(0, 1), light), (slice(1, 3), light[:, :1])):
                 noise = self._noise[channels].mean()
                 matrix = (weight * design).T @ design / noise + np.eye(design.shape[1])
@@ -206,7 +207,10 @@ class Appearance:
         return result
 
     def _ratio(self, seen: SurfaceColours, known: _PatchColours) -> float:
-        """Sum the mean log-likelihood ratios of the views times their independent samples."""
+        """Return the log-likelihood ratio of colours, nats.
+
+        It is the sum over views of the mean over pixels times the number of independent samples.
+        """
         at, is_known = self._find(seen.patch)
         colour = seen.colour - self._gain[seen.view]
         any_ = self._unshaded(seen, colour - self._average)

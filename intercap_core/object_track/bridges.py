@@ -192,6 +192,7 @@ def fill_lost(observer: Observer, poses: np.ndarray, lost: np.ndarray) -> Filled
                 pull[t] = path.information[i] @ step_between(path.poses[i], track[t])
         sure[path.frames] = in_hand & (is_sure and gap.seconds < UNSEEN_S)
     first, last = np.flatnonzero(known)[[0, -1]] if known.any() else (0, count - 1)
+    # before the first and after the last known frame the pose stays as there
     track[:first], track[last + 1 :] = track[first], track[last]
     return FilledTrack(track, hand, images, pull, sure)
 

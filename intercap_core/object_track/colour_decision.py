@@ -150,6 +150,7 @@ class ColourDecision:
         return self._seen[t, k]
 
     def _measure(self, t: int, fit: FittedPose) -> SurfaceColours | None:
+        """Return the colours of frame t at a pose, from all views; None if nothing is visible."""
         observer, mesh = self._observer, self._observer.mesh
         assert observer.pictures is not None
         if self._pictures is None or self._pictures[0] != t:

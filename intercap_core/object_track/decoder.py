@@ -244,6 +244,7 @@ def _transitions(step: np.ndarray) -> np.ndarray:
     between = step[:, :, :-1, :-1].transpose(2, 0, 3, 1)
     log[:-2, :-2] = between.reshape(count * modes, following * modes)
     log[:-2, -2] = np.repeat(step[0, 0, :-1, -1], modes)
+    # an object that reappears is in any mode with equal probability
     log[-2, :-2] = np.repeat(step[0, 0, -1, :-1], modes) - np.log(modes)
     log[-2, -2] = step[0, 0, -1, -1]
     log[:-1, -1] = log[:-1, -2] - LEAVE_COST

@@ -33,7 +33,7 @@ from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.turns import distinct_poses, same_pose
 
 BASIN = (0.04, 15.0)  # metres and degrees within which all fits lead to one pose; tuned
-MAX_HYPOTHESES = 12  # in a frame, enough for a mug with hidden handle turned by 30 degrees; tuned
+MAX_HYPOTHESES = 12  # of a frame: enough for turns of a mug in steps of 30 degrees; tuned
 RIVAL_PROBABILITY = 0.01  # hypotheses below this probability are not considered further; tuned
 RIVAL_LOG_RATIO = 5.0  # hypotheses this much worse than the best are not followed, nats; tuned
 UPRIGHT_LOG_RATIO = 2.0  # nats times the cosine of the angle to the standing pose; tuned on studio
@@ -55,9 +55,9 @@ class Prior:
         self.given: dict[int, GivenPose] = {}
 
     def near_annotated(self, hidden: np.ndarray) -> np.ndarray:
-        """Find frames (T,) bool near annotated poses that are near ``hidden`` frames (T,) as well.
+        """Find frames (T,) bool within ``UNSEEN_S`` of annotated poses near hidden frames.
 
-        Near is less than ``UNSEEN_S`` away.
+        An annotated pose counts if a frame of ``hidden`` (T,) is within ``UNSEEN_S`` of it.
         """
         times = self._observer.times
         result = np.zeros(len(times), bool)
@@ -226,6 +226,7 @@ class Hypotheses:
         return changed
 
     def _follow(self, last: int, pose: np.ndarray, frames: Iterable[int]) -> None:
+        """Follow ``pose`` (4, 4) of frame ``last`` through ``frames``, as in :meth:`follow`."""
         before = now = pose
         unseen, deficit, step_s = 0, 0.0, self._observer.step_s
         for t in frames:

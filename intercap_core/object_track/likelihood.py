@@ -72,6 +72,7 @@ def _depth(
     drawn: Rendering,
     candidate: MaskCandidate | None,
 ) -> float:
+    """Return the depth's part of :func:`log_ratio`, nats."""
     geometry = view.geometry
     assert view.depth is not None and geometry.depth_lens is not None
     colour_from_depth = geometry.camera.colour_from_depth
@@ -102,6 +103,7 @@ def _mask(
     visible_px: int,
     labels: tuple[str, ...],
 ) -> float:
+    """Return the mask's part of :func:`log_ratio`, nats."""
     missed = LOG_MISSED * visible_px / (visible_px + 300)  # half of it at 300 visible pixels
     if candidate is None:
         return missed
@@ -187,6 +189,7 @@ def outline_cost(face, x0, y0, mask, mx, my, person, px, py, width, height, sigm
     """Compare the outlines of a rendering and a mask.
 
     The nearest pixel of the other outline is searched exactly for each pixel of either outline.
+    Only pixels within half of the rendering's size around it are compared.
     Pixels next to a person outside of the mask, or at the edge of the image, do not count, since
     the outline may be cut off there. Windows are given with their first pixels (x, y) in the image.
 

@@ -1,7 +1,7 @@
 """Sources of hypotheses: annotated poses, searches, neighbouring frames, near symmetries.
 
 Weight is the evidence for a hypothesis with its prior (:meth:`.hypotheses.Prior.weigh`), nats. A
-frame is sure or uncertain by the rule of :meth:`Proposals.search_uncertain`.
+frame is sure if it is not uncertain by the rule of :meth:`Proposals.search_uncertain`.
 """
 
 from __future__ import annotations

@@ -18,8 +18,8 @@ from intercap_core.object_track.evidence import ERROR_LASTING_S, FrameEvidence
 MIN_REST_S = 0.25  # shortest rest; tuned on the studio, as all values below
 BLIP_FRAMES = 2  # nothing moves away and back in so few frames, 0.1 s at 30 Hz; tuned
 MAX_REST_FRAMES = 900  # longest rest of the partition, half a minute at 30 Hz; limits the run time
-# Costs are minus log-likelihoods of one independent observation.
-MOVING_COST = 9.0  # of a pose of its own: six numbers that must differ from noise; tuned
+# Costs are minus log-likelihoods, nats.
+MOVING_COST = 9.0  # of each independent observation in motion, for the six numbers of a pose; tuned
 REST_COST = 8.0  # of one more rest: its pose, its begin and its end; tuned
 
 
@@ -70,8 +70,12 @@ def _partition(
 
     ``best_rest[e]`` and ``best_move[e]`` are the costs of the cheapest partition of the frames
     before e whose last frame rests or moves. A rest from a to e costs ``REST_COST`` and half of the
-    squared distances of its frames from their mean pose; a moving frame costs ``MOVING_COST``.
-    Between two rests at least one frame moves. The partition is traced back from the last frame.
+    squared distances of its frames from their mean pose, weighted. A moving frame costs
+    ``MOVING_COST`` times ``share``. Between two rests at least one frame moves.
+
+    The partition is traced back from the last frame: ``began[e]`` is the first frame of the rest
+    before e, and ``rested_before[e]`` tells whether the frames before the moving frame e - 1 end
+    with a rest.
 
     Args:
         poses, information: (T, 4, 4) and (T, 6, 6) of each frame's own minimum.

@@ -110,8 +110,8 @@ def search_pose(
 def rank_frames(labels_by_view: list[list[list[str]]], labels: tuple[str, ...]) -> list[int]:
     """Order the frames for searching.
 
-    Frames in which more views have a candidate with a likely label come first; among equal frames
-    those far from the ones before.
+    Frames in which more views have a candidate with a likely label come first. Among equal frames
+    the next one is far from those already ordered.
 
     Args:
         labels_by_view: labels [T][C][candidates].

@@ -274,7 +274,7 @@ class Tracker:
 
 
 def _sure_frames(decoded: Decoded) -> np.ndarray:
-    """Return the frames (T,) bool whose chosen hypothesis is sure."""
+    """Return frames (T,) bool whose hypothesis exceeds ``DOUBTFUL_PROBABILITY``."""
     return np.array(
         [
             k != HIDDEN and decoded.probability[t][k] > DOUBTFUL_PROBABILITY

@@ -96,6 +96,7 @@ class ViewFit:
         return choose_candidate(self._view, self._silhouette, context.min_overlap, context.labels)
 
     def _cut(self) -> None:
+        """Cut the patches around the candidate, and set the trust in its mask."""
         mask = self._candidate.mask if self._candidate else EMPTY
         overlap = mask_overlap(self._silhouette, mask, self._view.person)
         # rises linearly from 0.1 at an IoU of 0.34 to 1 at 0.7; tuned on the studio

@@ -192,6 +192,8 @@ class LearnedMotion(JointTerm):
         posed, ids = self.geometry.at(state), self.geometry.model.markers
         every = slice(0, len(state))
         along = posed.vertices_by_body(every, ids, force.double().cpu().numpy()[:, :, None])
+        # exact energy and gradient without curvature; then the bound of the curvature, as rows
+        # without residuals
         columns = BODY.stop - BODY.start
         flat = np.broadcast_to(0.0, (len(state), columns, columns))
         gradient = along.sum(axis=(1, 2))

@@ -1,7 +1,8 @@
-"""Body in object and object in body, besides equation 6 ("as done in PROX"), without a symbol.
+"""Body in object and object in body: two penalties of interpenetration besides equation 6.
 
-Equation 6 contains E_P of equation 5, the body's self-penetration, in the body's data; the text
-adds a penalty of body-object interpenetration, here by distances to the object's mesh:
+E_P of equations 5 and 6 is the body's self-penetration, part of the body's data. The paper's text
+adds a penalty of body-object interpenetration ("as done in PROX") without a formula. Here it is by
+distances to the object's mesh:
 
     body in object:  E = sum over vertices v of the body inside the object (depth(v) - tolerance)^2
     object in body:  E = sum over vertices v of the hands of a_v (depth(x_v) - tolerance)^2

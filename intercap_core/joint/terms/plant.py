@@ -2,9 +2,9 @@
 
     E = sum over steps t, vertices i of P a_i rho(|x_i(t+1) - x_i(t)|^2) / 2 sigma^2
 
-P is the probability that this part of the sole stands over the step, from its height and speed, and
-a_i the vertex's share of it. rho is robust (Geman-McClure), as a foot may slide. Weighed by the
-setting ``plant_weight``.
+A step leads from frame t to frame t + 1. P is the probability that this part of the sole stands
+over the step, by its height and speed, and a_i the vertex's share of it. rho is robust
+(Geman-McClure), as a foot may slide. Weighed by the setting ``plant_weight``.
 """
 
 from __future__ import annotations

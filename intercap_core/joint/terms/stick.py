@@ -3,12 +3,12 @@
     E = sum over steps t, vertices i of Q_i a_i rho(|q_i(t+1) - q_i(t)|^2) / 2 sigma^2
     q = R^T (x - t)
 
-q is the vertex x in the frame of the object, whose pose is R and t (not the step t). It is constant
-while the skin sticks to the object. Q is the
-probability that the vertex's region touches in both frames, a the vertex's share of its patch, and
-sigma^2 the variance of a random walk over one step, as real grips creep. rho is robust
-(Geman-McClure), so that skin may slide or grasp again. Vertices that have glided over the object
-at the start of the fit have no weight. Weighed by the setting ``stick_weight``.
+A step leads from frame t to frame t + 1. q is the vertex x in the frame of the object, whose pose
+is R and t; it is constant while the skin sticks to the object. Q is the probability that the
+vertex's region touches in both frames, a the vertex's share of its patch, and sigma^2 the variance
+of a random walk over one step, as real grips creep. rho is robust (Geman-McClure), so that skin may
+slide or grasp again. Vertices that glide over the object in the sequential fits have little weight.
+Weighed by the setting ``stick_weight``.
 """
 
 from __future__ import annotations
