@@ -1,5 +1,8 @@
 """Masks of the person and candidates of the object from images alone, without a detector.
 
+Background and foreground are separated in depth, or in colour for cameras without depth. Foreground
+near the triangulated keypoints is the person, the rest are candidates of the object.
+
 - ``image_segmentation``: entry of the package; depth where a camera measures it, else colour.
 - ``depth_candidates``: background subtraction in depth, components in space over all views.
 - ``foreground``: background and foreground of one depth camera.

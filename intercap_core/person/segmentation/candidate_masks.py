@@ -14,16 +14,16 @@ from intercap_core.geometry.camera.transforms import apply
 
 @dataclass(frozen=True)
 class ImageCandidate:
-    """A possible object in one view."""
+    """Mask of a possible object in one view."""
 
     rle: bytes
     """Mask, COCO RLE."""
     score: float
-    """Probability that it is an object, 0 to 1."""
+    """Prior probability that it is a handled object, 0 to 1."""
     extent_m: float
-    """Size in space, metres."""
+    """Diagonal of the 3D bounding box, metres; NaN = unknown (colour only)."""
     component: int
-    """Number of the component, common to all views that show it."""
+    """Number of the 3D component, common to all views that show it; -1 = none (colour only)."""
 
 
 @dataclass(frozen=True)
@@ -35,12 +35,16 @@ class ViewSegments:
     candidates: list[ImageCandidate]
     """Possible objects."""
     beside: bytes = b""
-    """RLE of the pixels in which a border of the person is no evidence; empty = nowhere."""
+    """RLE of the pixels in which the border of the person's mask must not be used as the outline of
+    the body; empty = nowhere."""
 
 
 @dataclass(frozen=True, eq=False)
 class ColourCells:
-    """Cells of the colour image in which points lie."""
+    """N points projected into the colour image, which is divided into square cells.
+
+    A cell covers about one depth pixel.
+    """
 
     cell: np.ndarray
     """(N,) flat index; -1 = outside the image, or occluded."""
@@ -57,7 +61,7 @@ class ColourCells:
 
     @classmethod
     def of(cls, points: np.ndarray, camera: Camera) -> ColourCells:
-        """Project ``points`` (N, 3) float32 in the depth camera's frame."""
+        """Project ``points`` (N, 3) float32, metres, in the depth camera's frame."""
         colour, depth = camera.colour, camera.depth
         assert depth is not None and camera.colour_from_depth is not None
         scale = max(1, round(colour.fx / depth.fx))
@@ -71,7 +75,7 @@ class ColourCells:
         return cls(cell, moved[:, 2], height, width, scale, (colour.width, colour.height))
 
     def __getitem__(self, chosen: np.ndarray) -> ColourCells:
-        """Some of the points."""
+        """The points ``chosen`` by a mask or by indices."""
         return replace(self, cell=self.cell[chosen], z=self.z[chosen])
 
     @classmethod
@@ -81,14 +85,15 @@ class ColourCells:
         return replace(parts[0], cell=cell, z=z)
 
     def visible(self) -> ColourCells:
-        """The same, without the points that are clearly behind others of their cell."""
+        """The same points; those clearly behind others of their cell get the cell -1."""
         hidden = _hidden(self.cell, self.z, self.height * self.width)
         return replace(self, cell=np.where(hidden, -1, self.cell))
 
     def rle(self, chosen: np.ndarray, others: np.ndarray) -> bytes:
         """Mask of the points ``chosen`` (N,) bool as COCO RLE; empty bytes if none is visible.
 
-        Holes of the projection are closed, but not over cells of ``others`` (N,) bool.
+        Holes between projected cells are closed morphologically (3 x 3), except over cells of the
+        points ``others`` (N,) bool.
         """
         cells = self.cell[chosen & (self.cell >= 0)]
         if not len(cells):
@@ -111,10 +116,15 @@ class ColourCells:
 def encode_window(
     mask: np.ndarray, left: int, top: int, scale: int, width: int, height: int
 ) -> bytes:
-    """COCO compressed RLE of an image (height, width) that is set in a window of cells.
+    """COCO compressed RLE of an image whose mask is given by a window of cells.
 
-    ``mask``: (h, w) uint8. Cell (0, 0) covers the ``scale`` x ``scale`` pixels from (left, top) *
-    ``scale`` on. Pixels outside the image are cut off.
+    Cells that exceed the image are cut off.
+
+    Args:
+        mask: (h, w) uint8, cells of the window.
+        left, top: column and row of the window's first cell, in cells.
+        scale: side of a cell, pixels.
+        width, height: size of the image, pixels.
     """
     columns = min(mask.shape[1] * scale, width - left * scale)
     rows = min(mask.shape[0] * scale, height - top * scale)
@@ -126,9 +136,9 @@ def encode_window(
 
 @numba.njit(cache=True)
 def _hidden(cell: np.ndarray, z: np.ndarray, cells: int) -> np.ndarray:
-    """Mask (N,) of points behind the nearest one of their cell.
+    """Mask (N,) of points more than 3 cm behind the nearest point of their cell.
 
-    They are farther by more than the slope of a surface within a cell, 3 cm; tuned on the studio.
+    A surface seen at an angle varies by less within a cell; tuned on the studio.
     """
     nearest = np.full(cells, np.float32(1e9))
     for i in range(len(cell)):
@@ -144,9 +154,13 @@ def _hidden(cell: np.ndarray, z: np.ndarray, cells: int) -> np.ndarray:
 def _counts(
     mask: np.ndarray, left: int, top: int, scale: int, width: int, height: int
 ) -> np.ndarray:
-    """Lengths of the runs of the image in column-major order, zeros first."""
+    """Run lengths of the image in column-major order, the first run of zeros.
+
+    Runs are found cell by cell, without drawing the image: each column of pixels passes through one
+    column of cells, and a run ends where the cell's value changes.
+    """
     counts = np.empty(2 + 2 * mask.size * scale, np.int64)
-    number, start, inside = 0, 0, False  # runs written, where this one starts, what it is
+    number, start, inside = 0, 0, False  # runs written; start and value of the current run
     for column in range(left * scale, min((left + mask.shape[1]) * scale, width)):
         x = column // scale - left
         for y in range(mask.shape[0] + 1):
@@ -163,7 +177,10 @@ def _counts(
 
 @numba.njit(cache=True)
 def _compressed(counts: np.ndarray) -> np.ndarray:
-    """The string of run lengths (pycocotools' maskApi.c, rleToString)."""
+    """Compressed string of run lengths, as pycocotools writes it (maskApi.c, rleToString).
+
+    From the fourth run on, the difference to the run two before is stored, in groups of 5 bits.
+    """
     text = np.empty(len(counts) * 8, np.uint8)
     length = 0
     for i in range(len(counts)):

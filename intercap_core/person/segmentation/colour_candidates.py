@@ -24,13 +24,16 @@ from intercap_core.person.segmentation.candidate_masks import (
 )
 from intercap_core.person.segmentation.person_volume import MovingPerson
 
-DARK = 40.0  # grey levels below which a background has no colour direction; tuned on the studio
+# Length of the background's colour vector, grey levels, below which its direction is unreliable;
+# tuned on the studio.
+DARK = 40.0
 COLOUR_SCALE = 2  # images are decoded at half size, which takes a quarter of the time for JPEG
-MIN_COLOUR_SAMPLES = 3  # images that show a pixel without the person; untuned
+# Least number of images that show a pixel without the person, for a known background; untuned.
+MIN_COLOUR_SAMPLES = 3
 
 
 class ColourSegmenter:
-    """Segments the views of a recording without depth."""
+    """Segments the views of cameras without depth."""
 
     def __init__(
         self, frames: Frames, scene: Artefact, joints: np.ndarray, sigma: np.ndarray
@@ -52,12 +55,15 @@ class ColourSegmenter:
             return None
         camera = self._rig[c]
         moved = find_foreground(image, *background)
-        # the volume fills in clothes of the wall's colour, and places that the person never left
+        # the volume around the bones counts as person even without a change of colour: clothes of
+        # the wall's colour, and places that the person never left
         body = draw_volume(bones, camera, moved.shape, 0)
-        # 0, 1, 2 and 5 margins (uncertainties of the volume's surface) are tuned on the studio
+        # A margin is the uncertainty of the volume's surface. 0 margins: certainly person; 2:
+        # changed pixels are person; 1: changed pixels beyond may be an object; 5: kept out of the
+        # background. All tuned on the studio.
         person = body | (moved & draw_volume(bones, camera, moved.shape, 2.0))
-        # where the mask ends at the filled-in volume, at the two margins or at unknown background,
-        # its border is not the person's outline
+        # Pixels in which the mask's border is not the person's outline: around the volume without
+        # change of colour, at changed pixels beyond two margins, and at unknown background.
         assumed = cv2.dilate((body & ~moved).view(np.uint8), np.ones((9, 9), np.uint8)) > 0
         unsure = assumed | (moved & ~person) | ~background[1]
         objects = moved & ~draw_volume(bones, camera, moved.shape, 1.0)
@@ -76,6 +82,7 @@ class ColourSegmenter:
         return ViewSegments(self._rle(person, camera), candidates, beside)
 
     def _image(self, t: int, c: int) -> np.ndarray | None:
+        """Image (H, W, 3) uint8 at half size; None if it is absent or damaged."""
         jpeg = self._frames.colour_jpeg(t, c)
         if jpeg is None:
             return None
@@ -85,6 +92,7 @@ class ColourSegmenter:
         return image if image is not None and image.shape == size else None
 
     def _background(self, c: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """Background of a camera from up to 15 images, see :func:`median_background`."""
         images, people = [], []
         for t in sample_evenly(self._frames.colour_available[:, c], 15):
             image, bones = self._image(int(t), c), self._person.bones(int(t), c)
@@ -96,6 +104,7 @@ class ColourSegmenter:
         return median_background(np.stack(images), np.stack(people))
 
     def _rle(self, mask: np.ndarray, camera: Camera) -> bytes:
+        """RLE at full size of a mask (H, W) at half size that is not empty."""
         rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
         top, left = int(rows[0]), int(columns[0])
         window = mask[top : rows[-1] + 1, left : columns[-1] + 1].astype(np.uint8)
@@ -106,7 +115,7 @@ class ColourSegmenter:
 def median_background(images: np.ndarray, people: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Median colour (H, W, 3) float32 without the person, and mask (H, W) of known pixels.
 
-    Exposures are first matched to that of the first image.
+    The images are first multiplied to match the exposure of the first one.
 
     Args:
         images: (S, H, W, 3) uint8.
@@ -140,8 +149,10 @@ def find_foreground(image: np.ndarray, background: np.ndarray, known: np.ndarray
 def _changed(image: np.ndarray, background: np.ndarray, gain: np.ndarray) -> np.ndarray:
     """Mask (H, W) of changed pixels, by Horprasert, Harwood and Davis (1999).
 
-    A pixel is split into brightness along the background's colour and a deviation from it. A shadow
-    is darker and of the same colour. Thresholds are tuned on the studio.
+    A pixel's colour is split into a multiple of the background's colour (brightness) and the rest
+    (colour deviation). A pixel has changed if the deviation exceeds 14 grey levels or the
+    brightness leaves 0.5 to 1.4: a shadow only darkens to half. Where the background is dark, a
+    difference of 30 grey levels in any channel counts. Thresholds are tuned on the studio.
     """
     height, width, channels = image.shape
     changed = np.zeros((height, width), np.bool_)
@@ -159,13 +170,16 @@ def _changed(image: np.ndarray, background: np.ndarray, gain: np.ndarray) -> np.
                 changed[y, x] = largest > 30.0
                 continue
             brightness = along / power
-            off = length - brightness * along  # squared distance from the background's colour
+            off = length - brightness * along  # squared colour deviation
             changed[y, x] = off > 14.0 * 14.0 or brightness < 0.5 or brightness > 1.4
     return changed
 
 
 def _gain(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Factors (3,) float32 that match an image's exposure to the reference."""
+    """Factors (3,) float32, by channel, that match an image's exposure to the reference.
+
+    They are median ratios over every 16th pixel in both directions.
+    """
     few = np.s_[::16, ::16]
     a, b = image[few].astype(np.float32), reference[few].astype(np.float32)
     good = (a > DARK / 2) & (a < 250) & (b > DARK / 2) & (b < 250)  # neither dark nor saturated
@@ -182,8 +196,13 @@ def draw_volume(
 ) -> np.ndarray:
     """Mask (H, W) of the person's volume in the reduced colour image.
 
-    ``bones``: (B, 9) ends, radii and margin of :func:`.person_volume.build_bones`, master frame.
-    Each is drawn as a line, thicker by ``margins`` of its own margin on either side.
+    Each bone is drawn as a line of its mean radius plus ``margins`` times its own margin.
+
+    Args:
+        bones: (B, 9) of :func:`.person_volume.build_bones`, master frame, metres.
+        camera: the colour camera.
+        shape: rows and columns of the reduced image.
+        margins: widening, in margins of each bone.
     """
     mask = np.zeros(shape[:2], np.uint8)
     if not len(bones):
@@ -193,7 +212,7 @@ def draw_volume(
     radius = bones[:, 6:8].mean(1) + margins * bones[:, 8]
     distance = ends[:, 2].reshape(-1, 2).mean(1)
     shown = camera.colour.inside_model(ends).reshape(-1, 2).all(1)
-    shown &= np.abs(pixels).max(1) < 1e4  # False for what is not a number
+    shown &= np.abs(pixels).max(1) < 1e4  # also False for NaN
     width = 2 * radius[shown] * camera.colour.fx / distance[shown] / COLOUR_SCALE
     for (x0, y0, x1, y1), thick in zip(
         np.rint(pixels[shown]).astype(int).tolist(),

@@ -1,12 +1,12 @@
 """The person's mask and candidates of the object from depth images alone, one moment at a time.
 
-Background subtraction: depth before the static background is foreground. Foreground within a body
-of average build around the triangulated keypoints is the person, the rest belongs to objects. Their
-points of all views are clustered in space into connected components, and each component is a
-candidate in every view that shows it. Four kinds of component are proposed; the object's tracker
-chooses among them:
+Background subtraction: depth nearer than the static background is foreground. Foreground within a
+body of average build around the triangulated keypoints is the person, the rest belongs to objects.
+The objects' points of all views are clustered in space into connected components. Each component
+is a candidate in every view that shows it. Four kinds of component are proposed, among which the
+object's tracker chooses:
 
-- moving: foreground away from the person, cut off the body at two distances (``NEAR_CUT``,
+- moving: foreground away from the person, separated from the body at two distances (``NEAR_CUT``,
   ``FAR_CUT``), because the border between hand and object is uncertain;
 - merged: neighbouring moving components, for an object whose middle the hand occludes;
 - static: components of the background near the person's path, for an object at rest;
@@ -43,16 +43,17 @@ from intercap_core.person.segmentation.static_objects import (
     find_static_objects,
 )
 
-# Distances from a person of usual build are in margins, see :mod:`.person_volume`.
-PERSON_MARGINS = 1.5  # below, foreground is the person; tuned on the studio
-NEAR_CUT = 1.0  # first distance from which an object may begin; tuned on the studio
-FAR_CUT = 2.5  # second distance, tried as well; tuned on the studio
-CLOTHING_MARGINS = 2.2  # a component within is clothing; tuned on the studio
-AROUND_PATH_M = 1.5  # searched distance from the person's path; tuned on the studio
-MAX_COMPONENTS = 6  # of one kind, in one frame set; tuned on the studio
-CELL_M = 0.02  # points of one surface 4 m away are 8 mm apart
-FLOOR_M = 0.025  # lower points may be the floor; tuned on the studio
-MIN_POINTS = 40  # of a component, over all views; tuned on the studio
+# Distances from the person are in margins, the uncertainty of the volume's surface, see
+# :mod:`.person_volume`. All values are tuned on the studio.
+PERSON_MARGINS = 1.5  # foreground up to this distance is the person
+NEAR_CUT = 1.0  # smaller of the two distances from which an object's points are collected
+FAR_CUT = 2.5  # larger of the two distances
+CLOTHING_MARGINS = 2.2  # a component that stays within this distance is clothing
+AROUND_PATH_M = 1.5  # largest distance of objects from the person's path, metres
+MAX_COMPONENTS = 6  # largest number of components of one kind in one frame set
+CELL_M = 0.02  # side of a cluster's cells; points of one surface 4 m away are 8 mm apart
+FLOOR_M = 0.025  # points lower than this above the floor are left out
+MIN_POINTS = 40  # least number of points of a component, over all views
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,13 +63,14 @@ class _ViewPoints:
     points: np.ndarray
     """(N, 3) metres, z up."""
     cells: ColourCells
-    """Their cells in the colour image."""
+    """Cells of the N points in the colour image."""
     outside: np.ndarray
-    """(N,) distance outside the person, margins."""
+    """(N,) distance from the surface of the person's volume, margins; negative inside. 20 (FAR) for
+    points of static objects."""
     moving: np.ndarray
-    """(N,) bool: foreground."""
+    """(N,) bool: foreground that is no surface of the static scene."""
     of_static: list[np.ndarray]
-    """Indices of the points of each static object."""
+    """Indices of the visible points of each static object."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,9 +80,9 @@ class _Component:
     members: list[np.ndarray]
     """Indices of its points in each view."""
     score: float
-    """Prior probability that it is a handled object. Shaped by the studio, not calibrated."""
+    """Prior probability that it is a handled object; tuned on the studio, not calibrated."""
     extent_m: float
-    """Size, metres."""
+    """Diagonal of the bounding box, metres."""
 
 
 class DepthSegmenter:
@@ -140,7 +142,8 @@ class DepthSegmenter:
             for view, background in zip(views, backgrounds, strict=True)
         ]
         self._background = dict(zip(self.cameras, backgrounds, strict=True))
-        # with the floor, the whole scene would be one component
+        # Without a known floor there are no static objects (empty box): the floor would connect the
+        # whole scene into one component.
         bottom = self._low if grounded else self._high
         self._static, self._surface = find_static_objects(
             views, backgrounds, bottom, self._high, everywhere
@@ -150,7 +153,10 @@ class DepthSegmenter:
     def _static_points(
         self, number: int, c: int
     ) -> list[tuple[np.ndarray, np.ndarray, ColourCells]]:
-        """Flat pixels, points and cells of each static object in one camera."""
+        """Flat depth pixels, points and colour cells of each static object in camera ``c``.
+
+        ``number``: place of the camera among the segmented ones.
+        """
         view, parts = self._views[c], []
         for item in self._static:
             pixels = item.pixels[number]
@@ -181,6 +187,7 @@ class DepthSegmenter:
         }
 
     def _view_points(self, t: int, c: int, image: np.ndarray) -> _ViewPoints:
+        """Points of one depth image: its foreground, then the visible points of static objects."""
         view, background = self._views[c], self._background[c]
         index = background.before(image)
         points, local = view.points(image, index)
@@ -188,7 +195,8 @@ class DepthSegmenter:
         points, local, index = points[inside], local[inside], index[inside]
         bones = self._person.bones(t, c)
         away = distance_outside(points, bones)
-        # background that is unknown in this view may be known in another one
+        # foreground only because this view's background is unknown there: if another view measures
+        # a static surface in the same place, it is not moving
         rest = np.flatnonzero((away > NEAR_CUT) & (background.depth.ravel()[index] == 0))
         scene = rest[self._surface.holds(points[rest])]
         moving = np.ones(len(points), bool)
@@ -213,6 +221,7 @@ class DepthSegmenter:
         )
 
     def _static_components(self, seen: list[_ViewPoints]) -> list[_Component]:
+        """Components of the static objects; those on top of others are more likely handled."""
         return [
             _Component(
                 [view.of_static[k] for view in seen], 0.3 if item.on_top else 0.2, item.extent_m
@@ -249,7 +258,10 @@ class DepthSegmenter:
 def _connected(
     seen: list[_ViewPoints], chosen: list[np.ndarray], cell_m: float = CELL_M
 ) -> Iterator[tuple[list[np.ndarray], np.ndarray]]:
-    """Yield the components of the points ``chosen`` in each view: indices by view, and points."""
+    """Yield the connected components of the points with indices ``chosen`` in each view.
+
+    Each result has the indices of its points in each view, and the points (n, 3) themselves.
+    """
     ends = np.cumsum([0, *map(len, chosen)])
     points = np.concatenate([view.points[own] for view, own in zip(seen, chosen, strict=True)])
     for group in components(points, cell_m, MIN_POINTS):
@@ -259,7 +271,11 @@ def _connected(
 
 
 def _moving_components(seen: list[_ViewPoints]) -> list[_Component]:
-    """Components of the foreground beyond either cut from the person, without clothing."""
+    """Components of the foreground beyond :data:`NEAR_CUT`, then beyond :data:`FAR_CUT`.
+
+    Clothing, and components that hardly differ between the two cuts, are left out. The score is
+    1 - 0.5^(d / CLOTHING_MARGINS), d = 95th percentile of the distance from the person.
+    """
     proposed: list[_Component] = []
     for cut in (NEAR_CUT, FAR_CUT):
         kept = 0
@@ -281,7 +297,7 @@ def _moving_components(seen: list[_ViewPoints]) -> list[_Component]:
 
 
 def _merged_neighbours(seen: list[_ViewPoints], proposed: list[_Component]) -> list[_Component]:
-    """Unions of components less than a hand's breadth apart.
+    """Unions of the ``proposed`` components that are less than a hand's breadth apart.
 
     For an object held in its middle, whose ends are separate components.
     """
@@ -305,7 +321,11 @@ def _is_same(own: list[np.ndarray], other: list[np.ndarray]) -> bool:
 
 
 def _masks(seen: _ViewPoints, number: int, proposed: list[_Component]) -> ViewSegments:
-    """Masks of the person and of the components in one view, the ``number``-th of those seen."""
+    """Masks of the person and of the components in one view.
+
+    ``number``: place of the view in the members of the components. Components with fewer than 12
+    points in the view have no mask.
+    """
     visible = seen.cells.visible()
     person = seen.moving & (seen.outside < PERSON_MARGINS)
     candidates = []

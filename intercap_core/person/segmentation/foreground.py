@@ -1,13 +1,13 @@
 """Depth background of each camera, foreground against it, and removal of false background.
 
-The background of the scene is the farthest depth that a pixel measures repeatedly. If nothing
-behind is measured, or an object leaves its place only briefly, this depth belongs to the object.
-False background is removed by three tests:
+The background of the scene is the farthest depth that a pixel measures repeatedly. It is false if
+the pixel never measures the surface behind an object or person. Three tests remove false
+background (the pixel's background becomes unknown):
 
 - The pixel sometimes measures something farther, or nothing.
-- Another camera measures its background farther along the same line of sight, so that it has seen
-  free space there (space carving).
-- Small patches lie inside the person's body for much of the recording.
+- Another camera sees through the point to its own background, so the point is in free space (space
+  carving).
+- A small patch lies inside the person's body for much of the recording.
 """
 
 from __future__ import annotations
@@ -24,21 +24,24 @@ from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.geometry.solve.time_series import sample_evenly
 from intercap_core.person.segmentation.person_volume import distance_outside
 
-# Distance from the background to the foreground: five standard deviations of the sensor's random
-# error and its bias between images (Toelgyessy et al., Sensors 21(2):413, 2021).
+# A measurement is foreground if it is nearer than the background by BEFORE_MM + BEFORE_PER_DEPTH *
+# depth: five standard deviations of the sensor's random error and its bias between images
+# (Toelgyessy et al., Sensors 21(2):413, 2021).
 BEFORE_MM = 15.0
-BEFORE_PER_DEPTH = 0.005  # of depth, added to BEFORE_MM; same source
-GONE_SHARE = 0.08  # of images without the background, from which a pixel is no background; tuned
+BEFORE_PER_DEPTH = 0.005
+# A pixel has no background if this share of the images measures something farther, or nothing.
+# Tuned on the studio.
+GONE_SHARE = 0.08
 
 
 @dataclass(frozen=True, eq=False)
 class DepthBackground:
-    """Static scene of one depth camera, (H, W) uint16 mm."""
+    """Static scene of one depth camera; all arrays are (H, W) uint16, mm."""
 
     depth: np.ndarray
     """Depth of the background; 0 = unknown."""
     reach: np.ndarray
-    """Largest depth of interest."""
+    """Depth at which the pixel's ray leaves the evaluated box; 0 = misses it."""
     limit: np.ndarray
     """Depth below which a measurement is foreground."""
 
@@ -51,16 +54,16 @@ class DepthBackground:
         Args:
             background: (H, W) uint16 mm.
             images: samples of the recording, (H, W) uint16 mm.
-            reach_mm: (H, W) largest depth of interest.
+            reach_mm: (H, W) see :attr:`reach`.
         """
         tolerance = (BEFORE_MM + BEFORE_PER_DEPTH * background).astype(np.uint16)
         behind = background + tolerance
         gone = np.zeros(background.shape, np.uint8)
         for image in images:
             absent = ((image == 0) | (image > behind)).view(np.uint8)
-            gone += cv2.medianBlur(absent, 5)  # single pixels fail now and then
+            gone += cv2.medianBlur(absent, 5)  # removes single pixels without a measurement
         often = (gone >= max(2, GONE_SHARE * len(images))).view(np.uint8)
-        # narrow strips are edges of furniture, where pixels often fail
+        # narrow strips are edges of furniture, where measurements often fail: they stay background
         not_static = cv2.morphologyEx(often, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
         depth = np.where(not_static > 0, 0, background).astype(np.uint16)
         near = np.maximum(depth - (BEFORE_MM + BEFORE_PER_DEPTH * depth), 0)
@@ -70,7 +73,8 @@ class DepthBackground:
     def before(self, image: np.ndarray) -> np.ndarray:
         """Flat indices (N,) of the foreground pixels of a depth image (H, W), uint16 mm.
 
-        Includes pixels with an unknown background. Flying pixels at edges are left out.
+        They include pixels with an unknown background. Flying pixels (mixed measurements at depth
+        edges) are left out.
         """
         foreground = (image > 0) & (image < self.limit)
         index = np.flatnonzero(foreground)
@@ -90,7 +94,7 @@ class DepthBackground:
 
 
 def _floating(image: np.ndarray) -> np.ndarray:
-    """Pixels (H, W) farther than a neighbour and nearer than another, each by more than 3 cm."""
+    """Mask (H, W) of flying pixels: more than 3 cm behind one neighbour and before another one."""
     block = np.ones((3, 3), np.uint8)
     values = image.astype(np.float32)
     farthest = cv2.dilate(values, block)
@@ -109,16 +113,20 @@ class DepthView:
     """Converts a depth camera's pixels to points of a target frame."""
 
     camera: Camera
-    """The camera."""
+    """A camera with depth."""
     bias_m: float
     """Subtracted from its depth, metres."""
     target_from_depth: np.ndarray
-    """(4, 4)."""
+    """(4, 4) from the depth camera to the target frame."""
 
     def points(self, image: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Points (N, 3) float32 of flat pixels, in the target frame and in the depth camera's.
+        """Points (N, 3) float32, metres, in the target frame and in the depth camera's frame.
 
         NaN outside the range of the lens calibration.
+
+        Args:
+            image: (H, W) uint16 mm.
+            index: (N,) flat pixel indices.
         """
         z = image.ravel()[index] * np.float32(1e-3) - np.float32(self.bias_m)
         local = self._rays[index] * z[:, None]
@@ -159,10 +167,11 @@ class DepthView:
 def without_free_space(
     views: list[DepthView], backgrounds: list[DepthBackground], low: np.ndarray, high: np.ndarray
 ) -> list[DepthBackground]:
-    """Remove pixels from the backgrounds whose points lie in free space of another camera.
+    """Remove background pixels whose points another camera has seen through.
 
-    A pixel becomes unknown if its point lies clearly before the other background, in patches of
-    several pixels. Only points in the box ``low`` to ``high`` (3,), metres, z up, are tested.
+    A pixel becomes unknown if its point lies clearly before the background of another camera. Holes
+    in the resulting mask are closed and patches smaller than 5 x 5 pixels dropped. Only points in
+    the box ``low`` to ``high`` (3,), metres, z up, are tested.
     """
     nearest = [cv2.erode(background.depth, np.ones((5, 5), np.uint8)) for background in backgrounds]
     result = []
@@ -185,10 +194,10 @@ def without_free_space(
 def without_person_traces(
     view: DepthView, background: DepthBackground, bodies: list[np.ndarray]
 ) -> DepthBackground:
-    """Remove small patches that are inside the person at more than 40 % of the moments.
+    """Remove background pixels that are inside the person at more than 40 % of the moments.
 
-    Smooth surfaces of 400 pixels and more, with less than 10 cm of depth in 3 x 3 pixels, remain.
-    All thresholds are tuned on the studio.
+    Pixels of large smooth surfaces are kept: connected regions of at least 400 pixels in which
+    depth varies by less than 10 cm within 3 x 3 pixels. All thresholds are tuned on the studio.
 
     ``bodies``: bones (B, 9) of :func:`.person_volume.build_bones` at some moments, in the view's
     frame.
@@ -213,6 +222,7 @@ def without_person_traces(
 
 
 def _with_unknown(background: DepthBackground, gone: np.ndarray) -> DepthBackground:
+    """The background without the pixels ``gone`` (H, W) bool."""
     removed = gone & (background.depth > 0)
     depth = np.where(removed, np.uint16(0), background.depth)
     limit = np.where(removed, background.reach, background.limit)

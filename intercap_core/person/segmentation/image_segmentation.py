@@ -1,4 +1,4 @@
-"""Masks and candidates from images alone: by depth if the camera measures it, else by colour."""
+"""Masks and candidates from images alone: by depth if the camera has depth, else by colour."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ log = logging.getLogger(__name__)
 def segment_images(
     frames: Frames, scene: Artefact, joints: np.ndarray, sigma: np.ndarray, wanted: np.ndarray
 ) -> dict[tuple[int, int], ViewSegments]:
-    """Segment images; returns the result by moment and camera, for those that can be segmented.
+    """Segment images; returns results by (moment, camera). Images that cannot be segmented lack
+    one.
 
     Args:
         frames: read by the moment that their images show.

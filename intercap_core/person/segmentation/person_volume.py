@@ -1,10 +1,12 @@
 """Signed distance of points from a person of average build around the triangulated keypoints.
 
-The person is a union of capsules with two radii, one per bone. The position of its surface is
-uncertain by centimetres at the trunk (clothing, build) and by millimetres at the fingers. Distances
-are in units of this uncertainty ("margins"), bone by bone. :class:`MovingPerson` evaluates the
-bones at the exposure of each camera: a fast forearm moves by centimetres between the time of a set
-and the exposure.
+The person is a union of tapered capsules (two radii), one per bone. The position of its surface is
+uncertain by centimetres at the trunk (clothing, build) and by millimetres at the fingers. This
+uncertainty is the *margin* of a bone. Distances are divided by it: a distance of 2 margins is 7 cm
+at the trunk and 2.4 cm at a finger.
+
+:class:`MovingPerson` evaluates the bones at the exposure of each camera, because a fast forearm
+moves by centimetres between the time of a set and the exposure.
 """
 
 from __future__ import annotations
@@ -43,27 +45,30 @@ LIMB_RADII_M: dict[tuple[str, str], tuple[float, float, float]] = {
 }
 FINGER_RADII_M = (0.012, 0.010, 0.009)  # at the knuckle, middle, tip (anatomy)
 PALM_RADII_M = (0.024, 0.016)  # at the wrist, at the knuckles (anatomy)
-HAND_MARGIN_M = 0.012  # fingers are located within millimetres; tuned on the studio
-BONES_PER_GROUP = 5  # bones that are skipped together if a point is far from all of them
-FAR = 20.0  # largest distance that is computed, margins
+HAND_MARGIN_M = 0.012  # margin of fingers and palm; tuned on the studio
+BONES_PER_GROUP = 5  # bones with a common bounding ball, skipped together if a point is far from it
+FAR = 20.0  # distances are truncated here, margins
 
 
 def build_bones(joints: np.ndarray, sigma: np.ndarray | None = None) -> np.ndarray:
-    """Bones (B, 9) float32 of one moment: both ends, both radii, margin, metres; hands last.
+    """Bones (B, 9) float32 of one moment; hands last.
 
-    Bones with an unknown end are left out.
+    Columns 0:3 and 3:6 are the ends, 6 and 7 the radii there, 8 the margin, all in metres. Bones
+    with an unknown end are left out. Radii are scaled by the length of the trunk.
 
     Args:
         joints: (135, 3) metres; NaN = unknown.
-        sigma: (135,) standard deviations, metres, that are added to the margins of the surface.
+        sigma: (135,) standard deviations of the keypoints, metres. Their mean over both ends is
+        added
+            to the margin in quadrature.
     """
     off = np.zeros(len(joints)) if sigma is None else sigma
     points = np.column_stack([joints, off])  # (135, 4)
     at = {name: points[i] for i, name in enumerate(KEYPOINT_NAMES[:67])}
     at["middle_ear"] = _middle(at["left_ear"], at["right_ear"])
-    # neck to middle of the hips of a person with these radii (anatomy)
+    # 0.50 m: distance from neck to mid hip of a person with these radii (anatomy)
     size = float(np.linalg.norm((at["neck"] - at["mid_hip"])[:3])) / 0.50
-    # from children to the tallest adults
+    # range from children to the tallest adults
     size = float(np.clip(size, 0.6, 1.25)) if np.isfinite(size) else 1.0
     radii = list(TRUNK_RADII_M.items())
     for side in ("left", "right"):
@@ -84,6 +89,11 @@ def build_bones(joints: np.ndarray, sigma: np.ndarray | None = None) -> np.ndarr
 def _hand(
     at: dict[str, np.ndarray], side: str
 ) -> list[tuple[np.ndarray, np.ndarray, float, float, float]]:
+    """Bones of one hand: (start, end, two radii, margin) each.
+
+    Ends (4,) are x, y, z and standard deviation. With fewer than three known knuckles, the hand is
+    one capsule that prolongs the forearm.
+    """
     wrist = at[f"{side}_wrist"]
     if not np.isfinite(wrist).all():
         wrist = at[f"{side}_hand_wrist"]
@@ -99,12 +109,13 @@ def _hand(
         return rows
     along = wrist - at[f"{side}_elbow"]
     along[3] = 0.0  # as uncertain as the wrist
-    # without visible fingers: 15 cm along the forearm, 4.5 cm thick (anatomy), margin tuned
+    # 15 cm along the forearm, radius 4.5 cm (anatomy), margin tuned on the studio
     along *= 0.15 / max(float(np.linalg.norm(along)), 1e-6)
     return [(wrist, wrist + along, 0.045, 0.045, 0.02)]
 
 
 def _middle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Mean of two points; if one is unknown, the other."""
     if not np.isfinite(a).all():
         return b
     return a if not np.isfinite(b).all() else (a + b) / 2
@@ -128,6 +139,16 @@ def distance_outside(points: np.ndarray, bones: np.ndarray) -> np.ndarray:
 
 @numba.njit(cache=True, fastmath=True)
 def _outside(points: np.ndarray, bones: np.ndarray, balls: np.ndarray) -> np.ndarray:
+    """Kernel of :func:`distance_outside`: for each point, the minimum over all bones.
+
+    The distance from a bone is (distance from its axis - radius at the foot point) / margin. The
+    foot point is the nearest point of the axis, and the radius is interpolated there, which
+    slightly differs from the exact tapered capsule. A group of bones is skipped if its bounding
+    ball, widened by the current minimum times the group's largest margin, does not contain the
+    point; this is exact. Square roots are only taken for bones that lower the minimum.
+
+    ``balls``: (G, 5) centre, radius and largest margin of each group.
+    """
     result = np.empty(len(points), np.float32)
     for i in range(len(points)):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
@@ -160,7 +181,10 @@ def _outside(points: np.ndarray, bones: np.ndarray, balls: np.ndarray) -> np.nda
 
 
 class MovingPerson:
-    """Keypoints over time; ``joints`` (T, K, 3), metres, short gaps filled, NaN = unknown."""
+    """The person's volume over time.
+
+    ``joints`` (T, K, 3) are the keypoints, metres, with short gaps filled; NaN = unknown.
+    """
 
     def __init__(
         self,
@@ -183,11 +207,11 @@ class MovingPerson:
         self.joints = fill_short_gaps(joints, times, max_gap_s=0.5)
         self._sigma = np.nan_to_num(sigma)
         self._velocity = np.nan_to_num(
-            # m/s; hands reach 5 m/s in everyday tasks
+            # at most 8 m/s: hands reach 5 m/s in everyday tasks
             limited_velocity(self.joints, times, max_speed=8.0)
         )
         self._late = scene["time_offset"]
-        # seconds, of undetermined offsets: their spread over scenes
+        # undetermined offsets: 10 ms, the spread of offsets over recordings
         self._late_sigma = np.nan_to_num(scene["time_offset_sigma"], nan=0.01)
 
     def bones(self, t: int, c: int) -> np.ndarray:
@@ -197,15 +221,15 @@ class MovingPerson:
         return build_bones(joints, np.hypot(self._sigma[t], off))
 
     def bones_at(self, t: int) -> np.ndarray:
-        """Bones at the time of moment ``t``."""
+        """Bones (B, 9) at the time of set ``t``, see :func:`build_bones`."""
         return build_bones(self.joints[t], self._sigma[t])
 
 
 def fill_short_gaps(joints: np.ndarray, times: np.ndarray, *, max_gap_s: float) -> np.ndarray:
     """Fill short gaps of keypoints (T, K, 3), NaN = unknown, by linear interpolation.
 
-    Sets within ``max_gap_s`` of a known time are filled; before the first and after the last known
-    set the nearest position is repeated. ``times``: (T,) seconds.
+    A set is filled if the keypoint is known in some set within ``max_gap_s``. Before the first and
+    after the last known set, the nearest position is repeated. ``times``: (T,) seconds.
     """
     result = joints.copy()
     for k in range(joints.shape[1]):

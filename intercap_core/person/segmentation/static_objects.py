@@ -1,8 +1,8 @@
 """Objects that never move: components of the static scene above the floor, near the person's path.
 
-A chair in use or a mug on its table cannot be distinguished from furniture, so each connected
-component of the background near the person is a candidate. Objects on a level surface (a table)
-are segmented from it by height. Components are computed on a voxel grid.
+While they do not move, a chair or a mug on a table cannot be distinguished from furniture. Each
+connected component of the background near the person is therefore a candidate. Objects on a level
+surface (a table) are separated from it by height. Components are computed on a voxel grid.
 """
 
 from __future__ import annotations
@@ -19,16 +19,17 @@ from intercap_core.person.segmentation.foreground import DepthBackground, DepthV
 
 STATIC_CELL_M = 0.025  # side of the cells of components; tuned on the studio
 SURFACE_CELL_M = 0.02  # side of the cells of a surface; tuned on the studio
-SURFACE_POINTS = 2  # least number of points of a surface in a cell; tuned on the studio
-MIN_STATIC_POINTS = 60  # of a static component, over all views; tuned on the studio
-_BITS = 21  # of a coordinate in the key of a cell
+SURFACE_POINTS = 2  # least number of points in an occupied cell of a surface; tuned on the studio
+# Least number of points of a static component, over all views; tuned on the studio.
+MIN_STATIC_POINTS = 60
+_BITS = 21  # bits of each coordinate in a cell's integer key
 
 
 def label_components(points: np.ndarray, cell_m: float) -> tuple[np.ndarray, int]:
     """Component of each point, (N,) int32, and the number of components.
 
-    Points (N, 3), metres, of adjacent cells (26-neighbourhood) are one component. Components are
-    numbered by decreasing number of cells.
+    Points (N, 3), metres, in the same or in adjacent cells (26-neighbourhood) belong to one
+    component. Components are numbered by decreasing number of cells.
     """
     if not len(points):
         return np.zeros(0, np.int32), 0
@@ -41,9 +42,9 @@ def label_components(points: np.ndarray, cell_m: float) -> tuple[np.ndarray, int
 
 
 def components(points: np.ndarray, cell_m: float, min_points: int) -> list[np.ndarray]:
-    """Ascending indices of the points (N, 3) of each component with at least ``min_points``.
+    """Connected components with at least ``min_points`` points, largest number of cells first.
 
-    Components are in the order of decreasing number of cells.
+    Returns ascending indices into ``points`` (N, 3), metres, for each component.
     """
     label, count = label_components(points, cell_m)
     if not count:
@@ -56,7 +57,8 @@ def components(points: np.ndarray, cell_m: float, min_points: int) -> list[np.nd
 
 
 class OccupiedCells:
-    """Cells with points (N, 3) of a surface, and cells that share a face with them."""
+    """Cells with at least ``min_points`` of the points (N, 3), and cells that share a face with
+    one."""
 
     def __init__(self, points: np.ndarray, cell_m: float, min_points: int) -> None:
         self._cell_m = cell_m
@@ -75,16 +77,20 @@ class OccupiedCells:
 
 
 def _keys(points: np.ndarray, cell_m: float) -> np.ndarray:
-    """Key (N,) int64 of each point's cell; neighbours differ by a constant step."""
+    """Integer key (N,) int64 of each point's cell: 21 bits for each of x, y and z.
+
+    The key of a neighbouring cell differs by the same constant everywhere.
+    """
     cells = np.floor(points * np.float32(1 / cell_m)).astype(np.int64) + (1 << (_BITS - 1))
     return (cells[:, 0] << (2 * _BITS)) | (cells[:, 1] << _BITS) | cells[:, 2]
 
 
 def _label_cells(keys: np.ndarray) -> np.ndarray:
-    """Component (M,) of each cell, numbered by its first cell; ``keys`` (M,) ascending."""
+    """Component (M,) of each cell, numbered in the order of first cells. ``keys``: (M,)
+    ascending."""
     around = [(x << 2 * _BITS) + (y << _BITS) + z for x, y, z in product((-1, 0, 1), repeat=3)]
     cells, neighbours = [], []
-    for step in around[:13]:  # those with smaller keys: adjacency is symmetric
+    for step in around[:13]:  # the 13 neighbours with smaller keys suffice: adjacency is symmetric
         place = np.searchsorted(keys, keys + step)
         hit = np.flatnonzero(keys[place] == keys + step)
         cells.append(hit)
@@ -107,7 +113,7 @@ class StaticObject:
     carries: bool
     """Has another component on it."""
     pixels: list[np.ndarray]
-    """Flat depth pixels that show it in each view's background."""
+    """Flat pixel indices that show the object in the depth background of each view."""
     cells: OccupiedCells
     """Cells with its points."""
 
@@ -121,11 +127,14 @@ def find_static_objects(
 ) -> tuple[list[StaticObject], OccupiedCells]:
     """Find components of the background in the box ``low`` to ``high`` (3,), z up, metres.
 
+    An object's bounding box has a diagonal below 2.2 m, and some of its points are closer than
+    35 cm to the person's path.
+
     ``joints``: (N, 3) keypoints of the person at all times, same frame.
 
     Returns:
-        At most eight possible objects, the closest to the person first, and the cells in which any
-        view measures the scene.
+        At most eight possible objects, the closest to the person's path first.
+        Cells in which any view measures the static scene.
     """
     parts, owner, index = [], [], []
     for number, (view, background) in enumerate(zip(views, backgrounds, strict=True)):
@@ -145,7 +154,7 @@ def find_static_objects(
     def add(members: np.ndarray, on_top: bool, carries: bool) -> None:
         own = points[members]
         size, away = box_diagonal(own), _away(own, walked)
-        # size of what one person handles, and reach, metres; tuned on the studio
+        # largest size of an object that one person handles, and reach, metres; tuned on the studio
         if size < 2.2 and away < 0.35:
             pixels = [pixel[members[view_of[members] == v]] for v in range(len(views))]
             cells = OccupiedCells(own, SURFACE_CELL_M, SURFACE_POINTS)
@@ -168,7 +177,12 @@ def _away(points: np.ndarray, places: np.ndarray) -> float:
 
 
 def _above_level(points: np.ndarray, members: np.ndarray) -> np.ndarray:
-    """Members of a component above its highest large level surface; none without such a surface."""
+    """Members of a component above its highest level surface; none without a level surface.
+
+    A level surface is a layer of 2 cm with more than 12 % of the component's points.
+
+    ``members``: indices into ``points`` (N, 3), z up.
+    """
     height = points[members, 2]
     bottom = float(height.min())
     thickness = 0.02  # of a level surface, metres; tuned on the studio
@@ -182,6 +196,6 @@ def _above_level(points: np.ndarray, members: np.ndarray) -> np.ndarray:
 
 
 def box_diagonal(points: np.ndarray) -> float:
-    """Diagonal of the bounding box of points (N, 3), without the outermost two per cent."""
+    """Diagonal, metres, of the box between the 2nd and 98th percentiles of points (N, 3)."""
     low, high = np.percentile(points, (2, 98), axis=0)
     return float(np.linalg.norm(high - low))
