@@ -118,7 +118,7 @@ class BandedEquations:
 
         With f(t) a term's values in frame t, the residual of a difference is the sum over k of
         ``stencil[k]`` f(t + k). The Jacobian of f is computed once for each frame. The block of
-        frames t + d and t is the product of their Jacobians, weighted by the sum over all
+        frames t + d and t is the product of their Jacobians. Its weight is the sum over all
         differences that contain both frames.
 
         Args:

@@ -208,8 +208,8 @@ def points_by_object(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Place object points (N, 3) in all frames; return them (T, N, 3) and their derivative.
 
-    The derivative (T, N, 3, 6) is by the turn w (rad, columns 0 to 2) and the shift d (m, columns 3
-    to 5) of the object, X' = exp(w)(X - t) + t + d, with t its translation.
+    The derivative (T, N, 3, 6) is by the object's motion X' = exp(w)(X - t) + t + d, with t its
+    translation: columns 0 to 2 are the turn w (rad), columns 3 to 5 the shift d (m).
     """
     arm = np.einsum("tij,nj->tni", rotation, points)
     jacobian = np.zeros((*arm.shape, 6))

@@ -131,6 +131,7 @@ def open_inputs(
 
 
 def _geometry(model: BodyModel, mesh: ObjectMesh | None, settings: JointSettings) -> Geometry:
+    """Build the geometry; contact draws to the part of the object that ``contact_to`` names."""
     patches = contact_patches(model)
     if mesh is None:
         return Geometry(model, None, None, patches)

@@ -3,11 +3,11 @@
     E = E_B + E_O + lambda_Q Q_t E_C + stick + body in object + object in body
         + lambda_G E_G + plant + lambda_S E_S + drift + lambda_A E_A + drift + lambda_G E_G'
 
-E_B and E_O are the data of body and object, E_C is contact, E_G and E_G' keep body and object above
-the floor, E_S and E_A are the smoothness of body and object. The first drift is the body's, the
-second the object's. The paper's E_P (equation 5) is part of E_B. Body in object, object in body,
-stick, plant and drift go beyond the paper. ``TERMS`` lists all terms except E_B and E_O, in the
-order in which their equations are added; docs/extending.md shows how to add one.
+E_B and E_O are the data of body and object, and E_C is contact. E_G and E_G' keep body and object
+above the floor. E_S and E_A are the smoothness of body and object. The first drift is the body's,
+the second the object's. The paper's E_P (equation 5) is part of E_B. Body in object, object in
+body, stick, plant and drift go beyond the paper. ``TERMS`` lists all terms except E_B and E_O, in
+the order in which their equations are added; docs/extending.md shows how to add one.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Signed distances of body points to the moving object, with derivatives.
 
-d = n . (x - q), with q the point of the object's surface closest to x and n the unit vector along
+d = n . (x - q), with q the point of the object's surface closest to x. n is the unit vector along
 x - q that points out of the object. E_C of equation 6 (A.4) and the term body in object are
 functions of d. Farther than 0.25 m from the object's bounding box no term needs d: there q is the
 nearest point of the box, which is cheap to compute.

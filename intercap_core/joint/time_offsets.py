@@ -1,15 +1,15 @@
 """Each camera's time offset from the residuals of a fit of the moving body (beyond the paper).
 
 A camera c that exposes tau_c later than the fit assumes sees every point farther along its path.
-With r the prediction minus the observation of a point in a view, u the prediction's velocity in
-that view and J its derivative by the point's position,
+Let r be the prediction minus the observation of a point in a view, u the prediction's velocity in
+that view and J its derivative by the point's position. Then
 
     r_c = - u_c tau_c + J_c e + b_c + noise
 
-The fit's error e of a point in a frame, which all views share, is eliminated; a camera's constant
-bias b_c is removed with the mean over time. Errors last over many frames: r and u are replaced by
-the innovations of a first-order autoregression, weighted robustly (Geman-McClure). The master's
-offset is zero. Thresholds and weights are tuned on the studio.
+e is the fit's error of a point in a frame, which all views share; it is eliminated. b_c is a
+camera's constant bias, removed with the mean over time. Errors last over many frames: r and u are
+replaced by the innovations of a first-order autoregression, weighted robustly (Geman-McClure). The
+master's offset is zero. Thresholds and weights are tuned on the studio.
 """
 
 from __future__ import annotations
@@ -163,12 +163,14 @@ class _Innovations:
         return remaining, weight, inverse
 
     def _robust(self, residual: np.ndarray) -> np.ndarray:
+        """Return the weights (N, C) times those of Geman-McClure at ``residual`` (N, C, D)."""
         square = (residual**2).sum(-1) / residual.shape[-1]
         return self.weight * geman_mcclure_weight(square, INNOVATION_OUTLIER)
 
     def _without_point_errors(
         self, residual: np.ndarray, weight: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
+        """Return residuals (N, C, D) at the best errors e, and the points' inverses (N, P, P)."""
         count, size = len(residual), self.by_point.shape[-1]
         by_point = self.by_point.reshape(count, -1, size)
         weighted = (self.by_point * weight[..., None, None]).reshape(by_point.shape)

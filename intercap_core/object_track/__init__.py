@@ -9,10 +9,10 @@ Files in the order of a run:
 3. Candidates: ``groups`` joins candidates of several views and has their outlines; ``places`` is
    the prior of positions in the room over the recording.
 4. Search without a start: ``search`` aligns a grid of rotations (``turns``) and fits the best.
-5. Fit of a frame: ``patches`` cuts the measurements around the object, ``object_depth`` and
-   ``object_silhouette`` are the terms of equation 1, ``view_fit`` weighs them in one view, ``fit``
-   minimises their sum, ``evidence`` is the same quadratic form at a fixed pose, ``view_report``
-   compares a view with a pose.
+5. Fit of a frame: ``patches`` cuts the measurements around the object. ``object_depth`` and
+   ``object_silhouette`` are the terms of equation 1, ``view_fit`` weighs them in one view, and
+   ``fit`` minimises their sum. ``evidence`` is the same quadratic form at a fixed pose, and
+   ``view_report`` compares a view with a pose.
 6. Likelihood of a pose: ``likelihood`` by the images; ``hypotheses`` adds the prior.
 7. Track: ``hypotheses`` follows fits through time (``motion``), ``proposals`` adds hypotheses,
    ``decoder`` is the hidden Markov model, ``tracker`` runs all of it (class ``Tracker``).

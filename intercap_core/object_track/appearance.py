@@ -182,8 +182,8 @@ class Appearance:
     def _unshaded(self, seen: SurfaceColours, colour: np.ndarray) -> np.ndarray:
         """Remove shading and exposure from differences of colour (N, 3).
 
-        Each view has an offset of all colours (exposure) and a gradient of brightness along the
-        normals (light from one side), both estimated by ridge regression.
+        Each view has an offset of all colours (exposure), and a gradient of brightness along the
+        normals (light from one side). Both are estimated by ridge regression.
         """
         # standard deviations, logarithms of light: exposure and white balance of a view from frame
         # to frame, and light from one side relative to the other
@@ -272,8 +272,8 @@ def _mean_square(residual: np.ndarray) -> np.ndarray:
 def patch_of(point, normal, size):
     """Return the number of the patch of a surface point.
 
-    A patch is a cell of a grid of ``size`` metres, split by the direction (+ or - x, y or z of the
-    object) that the surface faces most. The number has 1024 cells along each axis.
+    A patch is a cell of a grid of ``size`` metres. It is split by the direction (+ or - x, y or z
+    of the object) that the surface faces most. The number has 1024 cells along each axis.
     """
     facing = 0
     for axis in range(1, 3):
@@ -303,8 +303,8 @@ def seen_patches(
     """Return the patches of all pixels that show the object, with faces and colours.
 
     The loop runs over the pixels of the rendering. A pixel counts if it and its four neighbours lie
-    in the rendering and in the candidate's mask, if no channel is too dark or saturated, and if the
-    surface is not too oblique. Its depth gives the surface point, and so the patch.
+    in the rendering and in the candidate's mask. No channel may be too dark or saturated, nor the
+    surface too oblique. Its depth gives the surface point, and so the patch.
 
     Args:
         depth, face: (h, w) of the rendering, whose first pixel is (x0, y0) of the image.

@@ -1,7 +1,7 @@
 """Decision between the hypotheses of all frames by a hidden Markov model.
 
-The states of a frame are its hypotheses, each in every mode of motion (at rest, free, in a hand),
-and two states without a hypothesis: the object is hidden, or it has left. Modes seldom change. The
+The states of a frame are its hypotheses, each in every mode of motion (at rest, free, in a hand).
+Two more states have no hypothesis: the object is hidden, or it has left. Modes seldom change. The
 most likely step of a mode has log-probability 0 whatever its standard deviation, because the states
 are a few hypotheses and not a density.
 
@@ -116,7 +116,7 @@ def _hand_log_ratios(
     turn, shift = pose_distances(mesh, hand.carry(before), after)
     centres = np.array([mesh.centre_at(pose) for pose in before])
     turn_sigma = np.hypot(HELD_RAD, HELD_RAD_S * seconds)
-    # an error of the hand's turn moves what is far from it
+    # an error of the hand's turn moves a centre in proportion to its distance from the wrist
     arm = np.linalg.norm(centres - hand.start, axis=1)
     shift_sigma = np.sqrt(HELD_M**2 + (HELD_M_S * seconds) ** 2 + (arm * turn_sigma) ** 2)
     ratio = -0.5 * ((turn / turn_sigma) ** 2 + (shift / shift_sigma[:, None]) ** 2)

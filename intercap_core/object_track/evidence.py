@@ -1,7 +1,7 @@
 """Evidence of the views of a frame set as quadratic forms of small motions of a pose.
 
-About a pose, minus log-likelihood of a step x = (turn on the left, shift) is x^T H x / 2 + g^T x,
-with H = J'J (``information``) and g = J'r (``gradient``) of the terms of equation 1.
+The negative log-likelihood of a step x = (turn on the left, shift) from the pose is
+x^T H x / 2 + g^T x. H = J'J (``information``) and g = J'r (``gradient``) are those of equation 1.
 """
 
 from __future__ import annotations

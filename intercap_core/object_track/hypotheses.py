@@ -70,8 +70,8 @@ class Prior:
     def weigh(self, t: int, fits: list[FittedPose]) -> np.ndarray:
         """Return the evidence (K,) for hypotheses of frame t relative to none being true, nats.
 
-        The evidence is the sum of the images' log-likelihood ratio, limited by the prior of the
-        place (:meth:`.places.Places.weigh`), of the upright prior and of an annotated pose. All
+        It is the images' log-likelihood ratio, limited by the prior of the place
+        (:meth:`.places.Places.weigh`), plus the upright prior, plus that of an annotated pose. All
         hypotheses that explain the same candidates have the place of the likeliest of them.
         """
         mesh, places, share = self._observer.mesh, self._observer.places, self._observer.share
@@ -181,8 +181,8 @@ class Hypotheses:
     def follow(self, t: int, fit: FittedPose) -> None:
         """Add a fit of frame t and follow it through the frames before and after.
 
-        It ends where it meets a known hypothesis, is unseen for ``UNSEEN_S``, or where the best
-        hypotheses are better by ``RIVAL_LOG_RATIO`` in total since its start.
+        It ends where it meets a known hypothesis or has been unseen for ``UNSEEN_S``. It also ends
+        when the best hypotheses have been better by ``RIVAL_LOG_RATIO`` in total.
         """
         self.add(t, fit)
         for frames in (range(t + 1, self._observer.count), range(t - 1, -1, -1)):

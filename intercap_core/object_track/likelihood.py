@@ -131,9 +131,9 @@ def depth_log_ratio(
 ):  # fmt: skip
     """Sum log p(depth | object there) - log p(depth | not there) over a rendering's pixels.
 
-    Without the object, depth is uniform over ``clutter_m``. With it, a pixel shows the surface
-    (Gaussian of ``sigma`` along its normal) or, if this is less likely, background behind it
-    (``log_past``) or an occluder (``log_hidden``). Pixels outside of the mask that a person
+    Without the object, depth is uniform over ``clutter_m``. With it, a pixel shows the surface, by
+    a Gaussian of ``sigma`` along its normal. If that is less likely, it shows background behind the
+    surface (``log_past``) or an occluder (``log_hidden``). Pixels outside of the mask that a person
     explains are no evidence. Pixels outside of the mask that the background explains are no
     evidence for the object, since a flat object fits any floor.
 

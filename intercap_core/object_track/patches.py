@@ -82,7 +82,7 @@ class ContourPatch:
     starts: np.ndarray
     """(h + 1,) index of the first rim pixel of each row."""
     contour: np.ndarray
-    """(K, 2) rim pixels where no person in front ends the mask."""
+    """(K, 2) rim pixels that are not next to a person, who may hide a part of the object."""
 
     @classmethod
     def cut(cls, view: View, mask: ReducedMask, predicted: Rendering) -> ContourPatch | None:
@@ -149,8 +149,8 @@ def _lift(
 ):  # fmt: skip
     """Compute depth, points, trust and on_person of a :class:`DepthPatch`.
 
-    Each pixel of the window of ``image`` (left and top inclusive, right and bottom exclusive) is
-    lifted along its ray and projected into the colour image, whose masks decide its weight. Masks
+    The window of ``image`` includes left and top, but not right and bottom. Each pixel is lifted
+    along its ray and projected into the colour image, whose masks decide its weight. Masks
     are given with their first pixels, in pixels of the reduced colour lens with parameters
     ``colour`` (13,).
     """

@@ -1,9 +1,9 @@
 """Prior of positions in the room: which of several similar objects is the tracked one.
 
 Another chair, a second cup: not every object of the class and size is the tracked object. The
-tracked object is the one that the person handles: it moves, or the person is near it. An object
-that stays in one place from the first to the last frame with nobody near is another one, and so is
-an object that is visible in its place while the tracked object is elsewhere.
+tracked object is the one that the person handles: it moves, or the person is near it. Two kinds of
+objects are others: those that stay in one place in all frames with nobody near, and those that are
+visible in their place while the tracked object is elsewhere.
 """
 
 from __future__ import annotations

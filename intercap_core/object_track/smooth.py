@@ -57,11 +57,13 @@ def smooth(
     given = stated.about(centre) if stated is not None else None
     for _ in range(12):
         offset = step_between(evidence.poses, state[node])
+        # squared distance of the node from the frame's own minimum, in standard deviations
         distance = np.einsum("ti,tij,tj->t", offset - own, information, offset - own)
         weight = share * geman_mcclure_weight(distance, OUTLIER_SIGMAS)
         bands = np.zeros((BAND + 1, count, 6, 6))
         gradient = np.zeros((count, 6))
         np.add.at(bands[0], node, weight[:, None, None] * information)
+        # a weak prior about the node's first pose determines what no image shows
         bands[0] += np.diag(UNKNOWN_SIGMA**-2)
         force = evidence.gradient + np.einsum("tij,tj->ti", information, offset)
         np.add.at(gradient, node, weight[:, None] * force)

@@ -74,8 +74,8 @@ def _align_turned(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Shift turned surfaces so that most of each falls onto the original surface.
 
-    Robust point-to-plane ICP in the shift alone, five steps with a scale that shrinks from 6 times
-    the distance of a clearly displaced point to once this distance.
+    Robust point-to-plane ICP in the shift alone, in five steps. The scale shrinks from six times to
+    once the distance of a clearly displaced point (:func:`_far`).
 
     Args:
         mesh, field: the object and its distance field.

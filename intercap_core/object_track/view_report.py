@@ -1,4 +1,4 @@
-"""Agreement of a view with a pose: overlap of the masks, and depth where nothing is in front.
+"""Agreement of a view with a pose: overlap of the masks, and depth of unoccluded pixels.
 
 The candidate that shows the object is the one that overlaps the rendered object most, as in the
 paper (render-compare-and-preserve).
@@ -143,7 +143,7 @@ def quick_report(
 def depth_agreement(
     gap: np.ndarray, across: np.ndarray, on_person: np.ndarray
 ) -> tuple[float, int]:
-    """Compare measured depth with the render where nothing is in front.
+    """Compare measured depth with the render in pixels that nothing in front occludes.
 
     Args:
         gap: (N,) measured minus rendered depth, metres.

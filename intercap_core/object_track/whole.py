@@ -182,8 +182,8 @@ class WholeTrack:
 
         Returns:
             The frames with refined pose, covariance and status. Carried frames without an annotated
-            pose are flagged as ambiguous, and so are frames next to unseen ones in which only one
-            view shows the object (:func:`.given_poses.flag_edges`).
+            pose are flagged as ambiguous. So are frames next to unseen ones, if only one view shows
+            the object (:func:`.given_poses.flag_edges`).
         """
         fits = [frame.fit for frame in frames]
         lost = np.array([frame.lost for frame in frames])
@@ -281,6 +281,7 @@ class WholeTrack:
         for t in reversed(self._frames_to_reevaluate(segment)):
             again = self._observer.evidence(t, track[t], motion[t])
             before = evidence[t]
+            # the old evaluation stays if the new pose explains the images clearly worse
             least = SEEN_LOG_RATIO if before is None else before.log_ratio - 2.0
             if again.log_ratio > least:
                 evidence[t], evaluated[t] = again, track[t]
@@ -290,6 +291,7 @@ class WholeTrack:
         pairs = [pose_distances(self._mesh, evaluated[[t]], track[[t]]) for t in range(count)]
         turn, shift = np.array(pairs).reshape(-1, 2).T
         known = np.array([own is not None for own in evidence])
+        # the final pose is far from the evaluated one: compare the images again
         moved_off = known & ((shift > BASIN[0]) | (turn > np.radians(BASIN[1]))) | hidden
         result = []
         for t, (fit, own) in enumerate(zip(fits, evidence, strict=True)):

@@ -6,10 +6,10 @@ the hands' pose. A hand keeps its pose for about half a second, so that the prio
 this time and not in every frame. With full weight in every frame, fingers stay tens of millimetres
 short of the pose on which several views agree.
 
-E_J and E_D (equations 3 and 4) also depend on the cameras. A camera that is turned by w about its
-centre s, shifted by v and whose depth bias grows by b displaces a point p by w x (p - s) + v - b r,
-with r the ray to p per metre of depth. These are displacements of measured points; a reprojected
-keypoint moves as if the body had been displaced by the opposite.
+E_J and E_D (equations 3 and 4) also depend on the cameras. Let a camera turn by w about its centre
+s and shift by v, and let its depth bias grow by b. A point p that it measures is then displaced by
+w x (p - s) + v - b r, with r the ray to p per metre of depth. A reprojected keypoint moves as if
+the body had been displaced by the opposite.
 """
 
 from __future__ import annotations

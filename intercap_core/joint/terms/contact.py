@@ -72,8 +72,8 @@ def evaluate_contact(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Residuals (T, M) in metres, weights (T, M) and energies (T,) in m^2.
 
-    One patch in one frame has the energy q rho(s) / 2. q is probability times gate, s the mean
-    square residual over the patch's area, and rho(s) = R^2 s / (R^2 + s) Geman-McClure's function
+    One patch in one frame has the energy q rho(s) / 2. q is probability times gate, and s the mean
+    square residual over the patch's area. rho(s) = R^2 s / (R^2 + s) is Geman-McClure's function
     with R = ``CONTACT_OUTLIER``. The weights are q rho'(s) spread over that area.
 
     Args:

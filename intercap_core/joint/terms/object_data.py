@@ -59,6 +59,7 @@ class ObjectData(JointTerm):
     def _equations(
         self, information: np.ndarray, state: State
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Matrix, gradient and energy about the tracked poses, by ``information`` (T, 6, 6)."""
         poses = self._poses
         turn = Rotation.from_matrix(state.rotation @ poses.rotation.transpose(0, 2, 1))
         offset = np.concatenate([turn.as_rotvec(), state.translation - poses.translation], axis=1)

@@ -1,7 +1,7 @@
 """Object images: E_O of equation 6 from the images, which are compared again in each round.
 
-The evidence of a frame (equation 1, silhouettes and depth of every view v) is a quadratic form of a
-small step x of the object's pose and of corrections d_v of the cameras,
+The evidence of a frame is that of equation 1: silhouettes and depth of every view v. It is a
+quadratic form of a small step x of the object's pose and of corrections d_v of the cameras,
 
     E(x, d, e) = sum_v |x + e - A_v d_v|^2 by I_v / 2 + g_v (x + e - A_v d_v),    e ~ N(0, F)
 

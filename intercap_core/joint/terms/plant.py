@@ -47,8 +47,8 @@ def sole_parts(patches: Patches, count: int) -> list[np.ndarray]:
 def standing_probability(sole: np.ndarray, height: np.ndarray | None, fps: float) -> np.ndarray:
     """Probability (T - 1,) that a part of a sole stands from each frame to the next.
 
-    Posterior of a two-state chain with half-normal speeds and heights, of 0.06 m/s and 20 mm while
-    the sole stands, 0.6 m/s and 150 mm while it swings. One standing sole in five is not on the
+    Posterior of a two-state chain. Speeds and heights are half-normal: 0.06 m/s and 20 mm while the
+    sole stands, 0.6 m/s and 150 mm while it swings. One standing sole in five is not on the
     floor but on a beam or a step, where only the speed is informative. All are tuned on the studio.
 
     Args:

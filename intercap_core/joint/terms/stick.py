@@ -5,10 +5,10 @@
 
 A step leads from frame t to frame t + 1. q is the vertex x in the frame of the object, whose pose
 is R and t; it is constant while the skin sticks to the object. Q is the probability that the
-vertex's region touches in both frames, a the vertex's share of its patch, and sigma^2 the variance
-of a random walk over one step, as real grips creep. rho is robust (Geman-McClure), so that skin may
-slide or grasp again. Vertices that glide over the object in the sequential fits have little weight.
-Weighed by the setting ``stick_weight``.
+vertex's region touches in both frames, and a the vertex's share of its patch. sigma^2 is the
+variance of a random walk over one step, as real grips creep. rho is robust (Geman-McClure), so that
+skin may slide or grasp again. Vertices that glide over the object in the sequential fits have
+little weight. Weighed by the setting ``stick_weight``.
 """
 
 from __future__ import annotations
