@@ -45,7 +45,7 @@ class Bridge:
     poses: np.ndarray
     """(N, 4, 4) poses in them."""
     end: np.ndarray
-    """(4, 4) equivalent pose of the known frame after them to which the path leads."""
+    """(4, 4) pose of the known frame after the gap, as the symmetric equivalent that is reached."""
     log_ratio: float
     """Log-probability of the motion from the known frame before to the one after, nats."""
     information: np.ndarray

@@ -218,6 +218,10 @@ def assess_all(
 
 
 def _prior_terms(prior: MotionPrior | None, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return J'J (6, 6) and J'r (6,) of the prior at ``pose``.
+
+    Without a prior J'J is the identity, which keeps the equations regular, and J'r is 0.
+    """
     if prior is None:
         return np.eye(6), np.zeros(6)
     away = step_between(prior.pose, pose)

@@ -189,9 +189,9 @@ def outline_cost(face, x0, y0, mask, mx, my, person, px, py, width, height, sigm
     """Compare the outlines of a rendering and a mask.
 
     The nearest pixel of the other outline is searched exactly for each pixel of either outline.
-    Only pixels within half of the rendering's size around it are compared.
-    Pixels next to a person outside of the mask, or at the edge of the image, do not count, since
-    the outline may be cut off there. Windows are given with their first pixels (x, y) in the image.
+    Mask pixels farther from the rendering's window than half of its size are ignored. Pixels next
+    to a person outside of the mask, or at the edge of the image, do not count: the outline may be
+    cut off there. Windows are given with their first pixels (x, y) in the image.
 
     Args:
         face: (h, w) face number of the rendering, -1 outside.

@@ -63,7 +63,7 @@ def smooth(
         bands = np.zeros((BAND + 1, count, 6, 6))
         gradient = np.zeros((count, 6))
         np.add.at(bands[0], node, weight[:, None, None] * information)
-        # a weak prior about the node's first pose determines what no image shows
+        # a weak prior about the pose of the node's typical frame determines what no image shows
         bands[0] += np.diag(UNKNOWN_SIGMA**-2)
         force = evidence.gradient + np.einsum("tij,tj->ti", information, offset)
         np.add.at(gradient, node, weight[:, None] * force)
@@ -173,7 +173,7 @@ def _add_motion(
     weight = np.ones_like(residual)
     for part in (np.s_[:, :3], np.s_[:, 3:]):
         size = (residual[part] ** 2).sum(1, keepdims=True)
-        weight[part] = 1 / (1 + size / IMPACT_SIGMAS**2)
+        weight[part] = 1 / (1 + size / IMPACT_SIGMAS**2)  # Cauchy's
     for i, row in enumerate((a, b, c)):
         weighted = parts[i].transpose(0, 2, 1) * weight[:, None]
         np.add.at(gradient, row, np.einsum("tij,tj->ti", weighted, residual))

@@ -178,7 +178,7 @@ class View:
 
     @property
     def nbytes(self) -> int:
-        """Memory of the images, bytes."""
+        """Memory of depth and masks, bytes; frames share the background."""
         masks = [self.person, *(candidate.mask for candidate in self.candidates)]
         depth = 0 if self.depth is None else self.depth.nbytes
         return depth + sum(mask.mask.nbytes for mask in masks)

@@ -362,7 +362,8 @@ class WholeTrack:
     def _free_axes(self, poses: np.ndarray, covariance: np.ndarray) -> np.ndarray:
         """Return axes (T, 3) about which a turn was not observed, 0 = none.
 
-        ``covariance`` (T, 6, 6) is widened about the axes of a continuous symmetry.
+        These are axes of a continuous symmetry, about which ``covariance`` (T, 6, 6) is widened in
+        place, or the least certain axis if its standard deviation exceeds 25 degrees.
         """
         axes = np.zeros((len(poses), 3))
         for t, pose in enumerate(poses):

@@ -61,6 +61,7 @@ def region_motion(
         object_sigma: (T,) standard deviation of the object, metres.
     """
     frames = len(points)
+    # speed of the skin in the object's frame, and speed of the object's surface next to it
     local = (points - translation[:, None]) @ rotation
     skin_speed = np.linalg.norm(_derivative(local, fps), axis=2)
     surface = points - near.distance[..., None] * near.normals

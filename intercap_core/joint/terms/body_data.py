@@ -184,7 +184,7 @@ class BodyData(JointTerm):
             evidence.observations = replace(evidence.observations, time_offset=time_offset)
 
     def camera_evidence(self, state: State, share: float) -> CameraEvidence:
-        """Form of E_B by body and cameras (:mod:`.cameras`); ``share`` is a frame's weight."""
+        """Form of E_B by body and cameras at ``state``; ``share`` is a frame's weight."""
         self._place(state)
         count = FREEDOMS * len(self._fitter.evidence.observations.rig)
         hessian, gradient, _ = self._equations(state)

@@ -5,10 +5,10 @@ quadratic form of a small step x of the object's pose and of corrections d_v of 
 
     E(x, d, e) = sum_v |x + e - A_v d_v|^2 by I_v / 2 + g_v (x + e - A_v d_v),    e ~ N(0, F)
 
-where |y|^2 by I_v stands for y^T I_v y, and I_v and g_v are the matrix and gradient of view v. A_v
-d_v is the apparent step of the object under a correction of camera v. e is the difference between
-mesh and object, with the variances F that the track adds to its covariance (``spread``). At the
-best e the matrix of x is I - I K I with K = (I + F^-1)^-1, I = sum I_v.
+where |y|^2 by I_v stands for y^T I_v y, and I_v and g_v are the matrix and gradient of view v.
+A_v d_v is the apparent step of the object under a correction of camera v. e is the difference
+between mesh and object, with the variances F that the track adds to its covariance (``spread``).
+At the best e the matrix of x is I - I K I with K = (I + F^-1)^-1, I = sum I_v.
 
 The scale of I_v follows from the disagreement of the views. A frame whose own minimum is far from
 the compared pose has little weight (Geman-McClure). Frames in which the object is lost, or whose
@@ -208,6 +208,7 @@ class ObjectImagesData(JointTerm):
     def _form(self, t: int, information: np.ndarray, gradient: np.ndarray) -> _Form:
         """Form of the sum over views, ``information`` (6, 6) and ``gradient`` (6,)."""
         information, gradient = information / self._noise, gradient / self._noise
+        # step from the compared pose to the minimum of this frame's evidence
         own = -np.linalg.solve(information + np.diag(UNKNOWN_SIGMA**-2), gradient)
         weight = geman_mcclure_weight(own @ information @ own, IMAGES_OUTLIER)
         information, gradient = weight * information, weight * gradient
@@ -316,7 +317,7 @@ class ObjectImagesData(JointTerm):
         equations.add_blocks(self.name, OBJECT, *form)
 
     def camera_evidence(self, state: State) -> CameraEvidence:
-        """Form of E_O by object and cameras (:mod:`.cameras`) at ``state``.
+        """Form of E_O by object and cameras at ``state``.
 
         The images are those of the last :meth:`refresh`.
         """

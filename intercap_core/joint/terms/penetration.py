@@ -166,12 +166,14 @@ class ObjectInBody(JointTerm):
         """Search the object's points inside the hands."""
         posed, frames = self.geometry.at(state), len(state)
         near = self._hands & (np.abs(posed.proximity.distance) < NEAR_SKIN)  # (T, N)
+        # the mesh's vertices whose nearest sample is near in some frame, and their rows in ``skin``
         ids = np.flatnonzero(near.any(axis=0)[self._sample_of])
         skin = posed.posed(ids) if len(ids) else np.zeros((frames, 0, 3))
         place = np.full(len(self._sample_of), -1)
         place[ids] = np.arange(len(ids))
         by_frame = []
         for t in range(frames):
+            # faces with three near corners, by rows of ``skin``
             faces = place[self._faces[near[t][self._sample_of[self._faces]].all(axis=1)]]
             by_frame.append(
                 self._search_frame(t, state, skin[t], ids, faces, posed.skin[t, near[t]])
@@ -209,6 +211,7 @@ class ObjectInBody(JointTerm):
             return _DeepestPoints.none()
         used, faces = np.unique(faces, return_inverse=True)
         embedded = find_embedded(points[some], skin[used], faces.reshape(-1, 3))
+        # the deepest point at each vertex, and the number of points inside there
         order = np.argsort(embedded.distance, kind="stable")
         vertex, first = np.unique(embedded.vertex[order], return_index=True)
         inside = np.bincount(embedded.vertex, embedded.distance < -PENETRATION_TOLERANCE, len(used))
