@@ -1,4 +1,4 @@
-"""Points of depth images, and the colour pixels that show the surfaces of depth pixels.
+"""Points of depth images, and the colour pixel that shows each of them.
 
 Pixels are addressed by their flat index, row * width + column, so that ``image.ravel()[index]``
 reads them.
@@ -14,10 +14,13 @@ from scipy.ndimage import minimum_filter
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import apply
 
-# A point farther behind another point of its colour cell is hidden there. More than the depth
-# change over a cell of a surface seen at 80 degrees, 3 m away.
+# A point is hidden if it is this far behind the nearest point of its cell of the colour image,
+# metres. It is more than the change of depth over a cell of a surface that is 3 m away and inclined
+# by 80 degrees.
 HIDDEN_BEHIND_M = 0.05
-CELL_SPACINGS = 1.25  # cell of the visibility test, in spacings of projected depth pixels
+# Side of a cell of the visibility test, in distances between projected depth pixels; above 1, so
+# that a surface leaves no cell empty.
+CELL_SPACINGS = 1.25
 
 
 class Cloud(NamedTuple):
@@ -50,8 +53,8 @@ class ColourLookup(NamedTuple):
 def depth_points(depth: np.ndarray, camera: Camera, index: np.ndarray | None = None) -> Cloud:
     """Return the points of a depth image (H, W) uint16 mm in the *depth camera's* frame.
 
-    ``index`` selects flat pixels. Invalid pixels (0, or outside the lens's calibrated radius) are
-    left out. Raises ValueError if the image does not fit the camera.
+    ``index`` selects flat pixels; None = all. Invalid pixels (0, or outside of the lens's metric
+    radius) are left out. Raises ValueError if the image does not fit the camera.
     """
     lens = camera.depth
     if lens is None or depth.shape != (lens.height, lens.width):
@@ -78,11 +81,12 @@ def colour_lookup(
 ) -> ColourLookup:
     """Find the colour pixel of every valid depth pixel, or of those in ``index`` (flat).
 
-    A point is hidden if the depth image holds a surface more than ``HIDDEN_BEHIND_M`` nearer in the
-    same or a neighbouring cell of the colour image. The cells form a z-buffer of all depth pixels
-    that could cover the point, coarse enough to have no holes. The neighbours err on the safe side:
-    about two depth pixels at the edge of a nearer surface count as hidden too. Depth on the colour
-    grid hides nothing. Raises ValueError as :func:`depth_points` does.
+    All depth pixels that could cover a point are projected into a coarse z-buffer of the colour
+    image, whose cells are large enough to leave no holes. A point is hidden if the z-buffer is more
+    than ``HIDDEN_BEHIND_M`` nearer in the point's own cell or a neighbouring one. Because of the
+    neighbours, about two depth pixels at the edge of a nearer surface count as hidden too. If depth
+    lies on the pixel grid of the colour image (:attr:`.rig.Camera.aligned`), nothing is hidden.
+    Raises ValueError as :func:`depth_points` does.
     """
     cloud = depth_points(depth, camera, index)
     if camera.aligned:
@@ -116,12 +120,13 @@ def _to_colour(cloud: Cloud, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 def _around(depth: np.ndarray, camera: Camera, index: np.ndarray) -> np.ndarray:
     """Return all valid depth pixels that could cover those in ``index`` in the colour camera.
 
-    Two points on one colour ray are at most the stereo parallax of the nearest one apart.
+    The depth pixels of two points on one colour ray differ by at most the stereo disparity of the
+    nearest point that the sensor measures.
     """
     assert camera.depth is not None and camera.colour_from_depth is not None
     width = camera.depth.width
     baseline = np.abs(camera.colour_from_depth[:2, 3])
-    nearest = 0.25  # metres, the sensor's own lower limit (NFOV; Azure Kinect DK specification)
+    nearest = 0.25  # metres, lower limit of the sensor (WFOV; Azure Kinect DK specification)
     pad_x, pad_y = (
         int(b * f / nearest) + 4
         for b, f in zip(baseline, (camera.depth.fx, camera.depth.fy), strict=True)

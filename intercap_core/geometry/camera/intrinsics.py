@@ -13,8 +13,8 @@ from intercap_core.geometry.camera import projection
 
 DEFAULT_METRIC_RADIUS = 1.7  # default of the Azure Kinect SDK if a calibration states 0
 
-# Rays by size and parameters, shared while a lens holds them: every reader of a recording creates
-# its own lenses.
+# Ray tables by image size and parameters. Readers of a recording create their own lenses; equal
+# lenses share one table as long as one of them refers to it.
 _TABLES: WeakValueDictionary[tuple[int, int, bytes], np.ndarray] = WeakValueDictionary()
 
 
@@ -22,9 +22,10 @@ _TABLES: WeakValueDictionary[tuple[int, int, bytes], np.ndarray] = WeakValueDict
 class Intrinsics:
     """A lens and its image; pixel (0, 0) is the centre of the first pixel.
 
-    ``distortion`` (8,) is OpenCV's k1, k2, p1, p2, k3, k4, k5, k6. The calibration holds up to
-    ``metric_radius`` = sqrt(x^2 + y^2) of the normalised plane; see :mod:`.projection` beyond it.
-    Lengths are pixels of this image. Raises ValueError for a shape or size that cannot be.
+    ``distortion`` (8,) is OpenCV's k1, k2, p1, p2, k3, k4, k5, k6. The calibration is valid up to
+    ``metric_radius`` = sqrt(x^2 + y^2) with x = X/Z, y = Y/Z; see :mod:`.projection` beyond it.
+    Sizes, focal lengths and the principal point are in pixels. Raises ValueError for impossible
+    shapes or sizes.
     """
 
     width: int
@@ -76,9 +77,9 @@ class Intrinsics:
     def unproject(self, pixels: np.ndarray) -> np.ndarray:
         """Return the undistorted rays (..., 3), z = 1, float64, of pixels (..., 2).
 
-        The exact inverse of :meth:`project` (to 1e-12 of the normalised plane), also beyond the
-        metric radius. NaN where the model has no inverse: a calibration whose image turns back
-        inside its own radius.
+        The inverse of :meth:`project`, exact to 1e-12 in X/Z and Y/Z, also beyond the metric
+        radius. NaN if the model has no inverse: the distorted radius of some calibrations decreases
+        before the metric radius.
         """
         from intercap_core.geometry.camera import projection_kernels
 
@@ -107,11 +108,11 @@ class Intrinsics:
 
     @cached_property
     def rays(self) -> np.ndarray:
-        """The ray (height, width, 2) float32 of every pixel: X/Z and Y/Z.
+        """(height, width, 2) float32: X/Z and Y/Z of the ray of every pixel.
 
-        NaN outside the metric radius. Lenses with equal parameters share the table. In a large
-        image whose calibration holds everywhere, every fourth ray is computed and the others are
-        interpolated by cubic splines, to 1e-4 px.
+        NaN outside the metric radius. Lenses with equal parameters share the table. In images of
+        more than 100,000 pixels that are all inside the metric radius, every fourth ray is computed
+        and the others are interpolated by cubic splines, to 1e-4 px.
         """
         key = (self.width, self.height, self.parameters.tobytes())
         table = _TABLES.get(key)
@@ -136,13 +137,17 @@ class Intrinsics:
         return table
 
     def _rays_at(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Rays (V, U, 2) at columns (U,) and rows (V,); NaN outside the metric radius."""
+        """Return rays (V, U, 2) of columns u (U,), rows v (V,); NaN outside the metric radius."""
         xy = self.unproject(np.stack(np.meshgrid(u, v), -1))[..., :2]
         xy[~(np.hypot(xy[..., 0], xy[..., 1]) <= self.metric_radius)] = np.nan
         return xy
 
     def scaled(self, factor: float) -> Intrinsics:
-        """Return the lens of the image resized by ``factor`` (sizes rounded, edges kept)."""
+        """Return the lens of the image resized by ``factor``.
+
+        Width and height are rounded. The borders of the image stay borders, so that the pixel
+        centres move: cx + 0.5 is scaled.
+        """
         width, height = round(self.width * factor), round(self.height * factor)
         sx, sy = width / self.width, height / self.height
         return Intrinsics(

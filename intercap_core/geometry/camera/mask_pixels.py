@@ -1,9 +1,9 @@
-"""The depth pixels that show the surface covered by a mask of the colour image.
+"""Search of the depth pixels that belong to a mask of the colour image.
 
-Each depth pixel is projected into the colour image. It is one of the mask's if it falls on the mask
-and no nearer pixel falls beside it, which would hide it from the colour camera. The same is done in
-:mod:`intercap_core.geometry.camera.clouds` for whole images; here in single precision, and only for
-pixels that can reach the mask.
+Each depth pixel is projected into the colour image. It belongs to the mask if it falls on the mask
+and is visible to the colour camera. It is hidden if a clearly nearer pixel falls close to it.
+:mod:`intercap_core.geometry.camera.clouds` does the same for whole images; here it is done in
+single precision, and only for pixels that can reach the mask.
 """
 
 from __future__ import annotations
@@ -26,7 +26,11 @@ _NO_BACKGROUND = np.zeros((0, 0), np.uint16)
 
 
 def mask_window(depth: np.ndarray, camera: Camera, mask: Runs) -> Window | None:
-    """Return the rows and columns of the depth image (H, W) that can show the mask, or None."""
+    """Return the rows and columns of the depth image (H, W) that can show the mask, or None.
+
+    A grid of 5 x 5 points of the mask's box is placed at three depths and projected into the depth
+    image.
+    """
     x, y, w, h = mask.box
     if w == 0 or camera.depth is None or camera.colour_from_depth is None:
         return None
@@ -38,7 +42,7 @@ def mask_window(depth: np.ndarray, camera: Camera, mask: Runs) -> Window | None:
     placed = np.concatenate([apply(depth_from_colour, z * rays) for z in depths])
     pixels = camera.depth.project(placed)
     height, width = depth.shape
-    margin = 6  # px
+    margin = 6  # px of the depth image
     x0, y0 = np.floor(pixels.min(0)).astype(int) - margin
     x1, y1 = np.ceil(pixels.max(0)).astype(int) + margin
     rows = slice(max(int(y0), 0), min(int(y1), height))
@@ -56,19 +60,17 @@ def mask_pixels(
     before_m: float = 0.0,
     every: int = 1,
 ) -> np.ndarray:
-    """Find the depth pixels whose surface the mask covers in the colour image.
-
-    Returns flat pixels (M,), ascending.
+    """Return the flat indices (M,), ascending, of the depth pixels that belong to the mask.
 
     Args:
         depth: (H, W) mm.
         camera: camera with depth.
         mask: mask of the colour image; not empty.
         window: rows and columns that are searched.
-        background: (H, W) mm, 0 = unknown. Only pixels nearer than it count, and only they hide
-            others.
+        background: (H, W) depth of the empty room, mm, 0 = unknown. Only pixels in front of it
+            count, and only they can hide others.
         before_m: distance by which a pixel must be nearer than the background, metres.
-        every: step between the rows and columns of the result. All pixels may hide others.
+        every: only every n-th row and column is returned. All pixels can hide others.
     """
     assert camera.depth is not None and camera.colour_from_depth is not None
     colour, (rows, columns) = camera.colour, window
@@ -109,7 +111,12 @@ def _mask_pixels(
     cell,
     hidden_m,
 ):
-    """Compute :func:`mask_pixels`; numbers that are not integers are float32.
+    """Compiled form of :func:`mask_pixels`; numbers that are not integers are float32.
+
+    Two passes over the window. The first projects each pixel that counts, and stores the smallest
+    depth in each cell of a coarse grid of the colour image (``nearest``). The second returns the
+    pixels that fall on the mask, except those that are ``hidden_m`` behind the smallest depth in
+    their own or a neighbouring cell.
 
     Args:
         depth: (H, W) uint16 mm.
@@ -186,7 +193,7 @@ def _mask_pixels(
 
 @numba.njit(cache=True, nogil=True)
 def decode_box(ends, box, height):
-    """Return the mask inside its box (w, h), column by column."""
+    """Return the mask within its box, (w, h) bool: axis 0 is the column. ends, box: of `Runs`."""
     mask = np.zeros((box[2], box[3]), np.bool_)
     for run in range(1, len(ends), 2):
         column, row = ends[run - 1] // height, ends[run - 1] % height

@@ -1,9 +1,9 @@
-"""COCO's run-length masks: validated, and read at single pixels without decoding the image.
+"""COCO's run-length masks: validation, and reading of single pixels without decoding the image.
 
-A compressed RLE is the string of pycocotools' ``maskApi``: lengths of runs in column-major order,
-zeros first. It does not contain the image's size, so every function takes the size. Strings are
-validated here first, because the C decoder writes past its buffer if the runs do not fill the
-image.
+A compressed RLE is the string of pycocotools' ``maskApi``: lengths of alternate runs of 0 and 1, in
+column-major order, beginning with 0. It does not contain the image's size, so every function takes
+the size. Strings are validated here first, because the C decoder writes past its buffer if the runs
+do not fill the image.
 """
 
 from __future__ import annotations
@@ -15,17 +15,19 @@ import numba
 import numpy as np
 from pycocotools import mask as coco_mask
 
-_FINE, _STRANGE, _CUT, _LONG, _NEGATIVE = range(5)  # results of :func:`_run_ends`
-_ZERO = 48  # first character of the alphabet
+# Results of :func:`_run_ends`: valid; or unknown character, number cut at the end, number too long,
+# negative run.
+_FINE, _STRANGE, _CUT, _LONG, _NEGATIVE = range(5)
+_ZERO = 48  # "0", the first character of COCO's alphabet
 _LONGEST_NUMBER = 7  # characters of 5 bits: enough for a run of 2^34 pixels
 
 
 class Runs:
     """A mask of one image as runs.
 
-    ``ends`` (n,) int64 is the end of each run in the column-major image; even runs are background.
-    Raises ValueError, whose message fits after a file's name, if the string is no RLE of
-    ``height`` x ``width`` pixels.
+    ``ends`` (n,) int64 is the end of each run in the column-major image: the index after its last
+    pixel. Runs 0, 2, 4, ... are background. Raises ValueError if the string is no RLE of
+    ``height`` x ``width`` pixels. Its message continues a sentence about the mask.
     """
 
     def __init__(self, rle: bytes, height: int, width: int) -> None:
@@ -50,13 +52,13 @@ class Runs:
         return x, y, width, height
 
     def sample(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Read the mask at integer pixels x, y (...): (...) bool, False outside the image."""
+        """Return the mask (...) bool at integer pixels x, y (...), False outside the image."""
         inside = (x >= 0) & (y >= 0) & (x < self.width) & (y < self.height)
         index = np.where(inside, x * np.int64(self.height) + y, 0)
         return inside & (np.searchsorted(self.ends, index, side="right") % 2 == 1)
 
     def decode(self) -> np.ndarray:
-        """The whole mask (height, width) bool."""
+        """Return the whole mask (height, width) bool."""
         lengths = np.diff(self.ends, prepend=0)
         flat = np.repeat(np.arange(len(lengths)) % 2 == 1, lengths)
         return np.ascontiguousarray(flat.reshape(self.width, self.height).T)
@@ -68,11 +70,13 @@ def encode(mask: np.ndarray) -> bytes:
 
 
 def encode_window(window: np.ndarray, x0: int, y0: int, height: int, width: int) -> bytes:
-    """Encode a mask (h, w) bool that lies at x0, y0 of an otherwise empty image.
+    """Encode an image (height, width) that is empty except for a window (h, w) bool.
 
-    The string equals that of the whole image, in the time that the window takes.
+    The first pixel of the window is at column x0 and row y0. The cost is that of the window, not of
+    the image.
     """
-    length = window.shape[0] + 1  # of a column, and an empty pixel that ends its last run
+    # a column of the window and an empty pixel, which ends the last run of the column
+    length = window.shape[0] + 1
     columns = np.zeros(window.shape[1] * length + 1, bool)
     columns[1:].reshape(-1, length)[:, :-1] = window.T
     column, row = np.divmod(np.flatnonzero(columns[1:] != columns[:-1]), length)
@@ -80,7 +84,8 @@ def encode_window(window: np.ndarray, x0: int, y0: int, height: int, width: int)
     if not len(flat):
         return encode(np.zeros((height, width), np.uint8))
     starts, ends = flat[::2], flat[1::2]
-    apart = starts[1:] != ends[:-1]  # from one column's last pixel to the next one's first
+    # runs that touch across columns are one: from the last row to the first one of the next column
+    apart = starts[1:] != ends[:-1]
     starts, ends = starts[np.append(True, apart)], ends[np.append(apart, True)]
     edges = np.concatenate([[0], np.stack([starts, ends], 1).ravel(), [height * width]])
     lengths = np.diff(edges)
@@ -104,7 +109,7 @@ def from_counts(counts: Sequence[int], height: int, width: int) -> bytes:
         raise ValueError("its counts are not a list of whole numbers")
     if lengths.size and lengths.min() < 0:
         raise ValueError(f"its counts hold {int(lengths.min())}, expected 0 or more")
-    filled = sum(int(n) for n in lengths)  # of Python's integers, which do not wrap
+    filled = sum(int(n) for n in lengths)  # Python's integers do not overflow
     if filled != height * width:
         raise ValueError(
             f"its runs hold {filled} pixels, expected {height * width} "
@@ -147,7 +152,7 @@ def _compress(segmentation: object, height: int, width: int) -> bytes:
 
 
 def _parse(rle: bytes) -> np.ndarray:
-    """Ends (n,) int64 of the runs of a compressed RLE."""
+    """Return the ends (n,) int64 of the runs of a compressed RLE."""
     if not rle:
         raise ValueError("its RLE is empty")
     ends, problem = _run_ends(np.frombuffer(rle, np.uint8))
@@ -166,8 +171,10 @@ def _parse(rle: bytes) -> np.ndarray:
 def _run_ends(characters):
     """Return the ends (n,) int64 of the runs of ``characters`` (m,) uint8, and a fault code.
 
-    Each number is written in groups of 5 bits, lowest first; bit 5 = more groups follow, bit 4 of
-    the last group = sign. From the fourth number on it is the difference to the number two before.
+    A number is written in groups of 5 bits, the lowest first, one character for each group. Bit 5
+    of a character means that more groups follow. Bit 4 of the last group is the sign. The first
+    three numbers are lengths of runs. From the fourth on, a number is the difference of a length to
+    the length two runs before.
     """
     ends = np.empty(len(characters), np.int64)
     first = ends[:0]
@@ -215,7 +222,7 @@ def _box(ends, height):
         if left < 0:
             left = start // height
         right = last // height
-        if start // height != right:  # over a column's end
+        if start // height != right:  # the run spans several columns, so first and last row
             top, bottom = 0, height - 1
         else:
             top, bottom = min(top, start % height), max(bottom, last % height)

@@ -11,10 +11,11 @@ d(s) = (1 + k1 s + k2 s^2 + k3 s^3) / (1 + k4 s + k5 s^2 + k6 s^3):
     v = fy (y d + p1 (s + 2 y^2) + 2 p2 x y) + cy
 
 (https://docs.opencv.org/4.x/d9/d0c/group__calib3d.html). The pixel (0, 0) is the *centre* of the
-first pixel. A calibration is valid up to ``metric_radius`` = sqrt(s) only; beyond it the rational
-factor may turn back into the image. There the whole map is continued by a straight line along the
-ray from the principal point (the distorted position at the radius, scaled), so that a projection
-is always finite and monotone; :func:`inside_model` tells which points the calibration covers.
+first pixel. A calibration is valid only up to ``metric_radius`` = sqrt(s). Beyond it the
+rational factor may decrease, so that points far outside would be projected into the image. There
+the map is continued linearly along the ray from the principal point: the distorted position at the
+metric radius is scaled by radius / metric_radius. Projections are therefore finite and monotone.
+:func:`inside_model` tells which points the calibration covers.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-MIN_DEPTH_M = 1e-3  # nearer (or behind) is projected as if at this depth
+MIN_DEPTH_M = 1e-3  # points nearer than this, or behind the camera, are projected as at this depth
 
 
 def _namespace(array: Any) -> Any:
@@ -44,13 +45,13 @@ def _as_parameters(parameters: Any, points: Any, xp: Any) -> Any:
 
 
 def radial_fraction(s: Any, q: Any) -> tuple[Any, Any]:
-    """Return numerator and denominator (...) of the radial factor d at s = r^2, of lenses q."""
+    """Return numerator and denominator (...) of the radial factor d at s (...), of lenses q."""
     k1, k2, k3, k4, k5, k6 = (q[..., i] for i in (4, 5, 8, 9, 10, 11))
     return 1 + s * (k1 + s * (k2 + s * k3)), 1 + s * (k4 + s * (k5 + s * k6))
 
 
 def _radial(s: Any, q: Any) -> tuple[Any, Any]:
-    """Return the radial factor d (...) at s = r^2 and 2 dd/ds, so that dd/dx = x * (2 dd/ds)."""
+    """Return the radial factor d (...) at s (...), and 2 dd/ds; dd/dx = x (2 dd/ds)."""
     k1, k2, k3, k4, k5, k6 = (q[..., i] for i in (4, 5, 8, 9, 10, 11))
     numerator, denominator = radial_fraction(s, q)
     d = numerator / denominator
@@ -92,7 +93,7 @@ def _distort(x: Any, y: Any, q: Any, xp: Any) -> tuple[Any, ...]:
 
 
 def _normalise(points: Any, xp: Any) -> tuple[Any, Any, Any, Any]:
-    """Return X/Z, Y/Z, 1/Z (Z at least ``MIN_DEPTH_M``) and where Z was not raised, each (...)."""
+    """Return X/Z, Y/Z and 1/Z with Z raised to ``MIN_DEPTH_M``, and whether Z was not raised."""
     z = points[..., 2]
     free = z > MIN_DEPTH_M
     inverse_z = 1 / xp.where(free, z, xp.full_like(z, MIN_DEPTH_M))
@@ -102,8 +103,8 @@ def _normalise(points: Any, xp: Any) -> tuple[Any, Any, Any, Any]:
 def project(points: Any, parameters: Any) -> Any:
     """Project points (..., 3), camera frame, metres, to pixels (..., 2).
 
-    Always finite: see the module's text for points outside the metric radius; a point nearer than
-    ``MIN_DEPTH_M`` (or behind the camera) is treated as if at that depth.
+    The result is finite for all points; the module describes points beyond the metric radius. A
+    point nearer than ``MIN_DEPTH_M``, or behind the camera, is treated as if at that depth.
     """
     xp = _namespace(points)
     q = _as_parameters(parameters, points, xp)
@@ -115,7 +116,7 @@ def project(points: Any, parameters: Any) -> Any:
 def project_with_jacobian(points: Any, parameters: Any) -> tuple[Any, Any]:
     """Project points (..., 3) to pixels (..., 2), with d pixel / d point (..., 2, 3), px/m.
 
-    Where :func:`project` raises the depth the pixel does not depend on Z and that column is zero.
+    If :func:`project` raises the depth of a point, its pixel does not depend on Z: column 2 is 0.
     """
     xp = _namespace(points)
     q = _as_parameters(parameters, points, xp)
@@ -139,7 +140,7 @@ def inside_model(points: Any, parameters: Any) -> Any:
 
 
 def radius_table(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return radii (N,) up to the metric radius, ascending, and their distorted radii (N,).
+    """Return radii (N,) from 0 to the metric radius, and their distorted radii (N,), ascending.
 
     The inverse of the projection starts from this table.
     """

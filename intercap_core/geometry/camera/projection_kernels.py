@@ -1,8 +1,9 @@
 """The lens model of :mod:`.projection` for compiled kernels, one point at a time.
 
-Equal to :func:`.projection.project` and :func:`.projection.project_with_jacobian` up to rounding,
-also nearer than ``MIN_DEPTH_M``, behind the camera and beyond the metric radius. Divisions follow
-IEEE 754 instead of raising, so that loops around these functions can be vectorised.
+The results equal those of :func:`.projection.project` and :func:`.projection.project_with_jacobian`
+up to rounding. This includes points nearer than ``MIN_DEPTH_M``, behind the camera and beyond the
+metric radius. Divisions by zero follow IEEE 754 instead of raising, so that loops around these
+functions can be vectorised. ``parameters`` (13,) is a lens as in :mod:`.projection`.
 """
 
 from __future__ import annotations
@@ -15,9 +16,10 @@ from intercap_core.geometry.camera.projection import MIN_DEPTH_M
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def distort(x, y, distortion):
-    """Distorted (xd, yd) of a point (x, y) of the normalised plane within the metric radius.
+    """Return the distorted (xd, yd) of a point (x, y) = (X/Z, Y/Z) within the metric radius.
 
-    ``distortion`` is the tuple k1, k2, p1, p2, k3, k4, k5, k6. In the precision of the arguments.
+    ``distortion`` is the tuple k1, k2, p1, p2, k3, k4, k5, k6. The precision is that of the
+    arguments.
     """
     k1, k2, p1, p2, k3, k4, k5, k6 = distortion
     one, two = type(x)(1), type(x)(2)  # a literal would turn single precision into double
@@ -30,8 +32,11 @@ def distort(x, y, distortion):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def distort_with_jacobian(x, y, parameters):
-    """Distorted (xd, yd) of a point of the normalised plane, continued beyond the metric radius,
-    and dxd/dx, dxd/dy, dyd/dx, dyd/dy; ``parameters`` (13,)."""
+    """Return the distorted (xd, yd) of (x, y) = (X/Z, Y/Z) and its derivatives.
+
+    The derivatives are dxd/dx, dxd/dy, dyd/dx, dyd/dy. Beyond the metric radius the map is
+    continued as in :mod:`.projection`.
+    """
     _, _, _, _, k1, k2, p1, p2, k3, k4, k5, k6, limit = parameters
     radius = np.sqrt(x * x + y * y)
     outside = radius > limit
@@ -57,7 +62,7 @@ def distort_with_jacobian(x, y, parameters):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def project_point(px, py, pz, parameters):
-    """Pixel (u, v) of one point, camera frame, metres; ``parameters`` (13,)."""
+    """Return the pixel (u, v) of one point, camera frame, metres."""
     fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, limit = parameters
     z = max(pz, MIN_DEPTH_M)
     x, y = px / z, py / z
@@ -68,10 +73,10 @@ def project_point(px, py, pz, parameters):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def project_point_with_jacobian(px, py, pz, parameters):
-    """Pixel (u, v) of one point and du/dX, du/dY, du/dZ, dv/dX, dv/dY, dv/dZ, px/m.
+    """Return the pixel (u, v) of a point, and du/dX, du/dY, du/dZ, dv/dX, dv/dY, dv/dZ, px/m.
 
-    ``px``, ``py``, ``pz`` in the camera's frame, metres; ``parameters`` (13,). Where the depth is
-    raised to ``MIN_DEPTH_M`` the pixel does not depend on Z and those derivatives are zero.
+    ``px``, ``py``, ``pz``: the point X, Y, Z in the camera's frame, metres. If Z is raised to
+    ``MIN_DEPTH_M``, the pixel does not depend on Z and these derivatives are zero.
     """
     fx, fy, cx, cy = parameters[0], parameters[1], parameters[2], parameters[3]
     z = max(pz, MIN_DEPTH_M)
@@ -89,8 +94,14 @@ def project_point_with_jacobian(px, py, pz, parameters):
 def unproject(pixels, parameters, radii, distorted_radii):
     """Return X/Z and Y/Z (N, 2) of pixels (N, 2), float64: the exact inverse of the projection.
 
-    Newton's iteration from the radial part in the lens's :func:`.projection.radius_table`. NaN
-    where the model has no inverse.
+    Newton's iteration, which starts from the inverse of the radial distortion. NaN if the model has
+    no inverse.
+
+    Args:
+        pixels: (N, 2)
+        parameters: (13,) lens.
+        radii: radii of :func:`.projection.radius_table`.
+        distorted_radii: their distorted radii.
     """
     fx, fy, cx, cy = parameters[0], parameters[1], parameters[2], parameters[3]
     converged = 1e-12  # normalised image plane; 1e-9 px at f = 1000
@@ -117,6 +128,6 @@ def unproject(pixels, parameters, radii, distorted_radii):
         if not off < converged:
             at_x, at_y, xx, xy, yx, yy = distort_with_jacobian(x, y, parameters)
             off = np.sqrt((at_x - xd) ** 2 + (at_y - yd) ** 2)
-        lost = not off < 1e-9
+        lost = not off < 1e-9  # no solution
         rays[n, 0], rays[n, 1] = (np.nan, np.nan) if lost else (x, y)
     return rays

@@ -1,4 +1,7 @@
-"""The cameras of a capture: lenses and poses, in one order."""
+"""The cameras of a capture: lenses and poses, in the order of every C axis.
+
+The master frame is the common world frame of a capture.
+"""
 
 from __future__ import annotations
 
@@ -105,7 +108,7 @@ class Rig:
         return Rig(tuple(camera.moved(pose) for camera, pose in poses))
 
     def datasets(self) -> dict[str, np.ndarray | list[str]]:
-        """Return datasets of the cameras' lenses, as the frames and scene artefacts hold them."""
+        """Return the cameras' names and lenses as datasets of the frames and scene artefacts."""
         no_lens = np.full(13, np.nan)
         no_pose = np.full((4, 4), np.nan)
         colour = self.colour_parameters
@@ -159,9 +162,13 @@ class Rig:
 
 
 def ring_centre(rig: Rig) -> np.ndarray:
-    """Return the point (3,) closest to all optical axes; 2 m ahead of parallel ones."""
+    """Return the point (3,), metres, with the least sum of squared distances to the optical axes.
+
+    If the axes are nearly parallel, it is the mean of the points 2 m in front of the cameras.
+    """
     poses = rig.master_from_colour
     axes, centres = poses[:, :3, 2], poses[:, :3, 3]
+    # projections onto the planes perpendicular to the axes
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     normal = across.sum(0)
     if np.linalg.eigvalsh(normal)[0] < 0.05 * len(rig):  # nearly parallel; tuned on the studio

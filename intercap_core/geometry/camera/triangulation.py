@@ -1,7 +1,8 @@
 """Triangulation of points from pixels of several views with outliers.
 
-Every pair of views proposes a point, the proposal that most views agree with wins, and the point
-is refined on the distorted pixels of the inlier views. All points are processed at once.
+Every pair of views proposes the midpoint between its two rays. The proposal with the least
+truncated reprojection cost over all views is chosen. It is then refined by four Gauss-Newton steps
+on the distorted pixels of the inlier views. All points are processed at once.
 """
 
 from __future__ import annotations
@@ -38,28 +39,29 @@ class Triangulation:
 
 
 def spread(triangulation: Triangulation, rig: Rig) -> np.ndarray:
-    """Return the standard error of each point (N,), metres; 0 = no point.
+    """Return the standard error (N,) of each point along one coordinate, metres; 0 = no point.
 
-    n views measure 3 coordinates by 2n values. With an RMS distance of e pixels the variance of a
-    value is n e^2 / (2n - 3), and about 2n / 3 values determine each coordinate.
+    n views determine 3 coordinates by 2n values. With an RMS reprojection error of e pixels, the
+    variance of a value is n e^2 / (2n - 3). About 2n / 3 values determine each coordinate, so its
+    variance is 1.5 e^2 / (2n - 3) square pixels.
     """
     eyes = rig.master_from_colour[:, :3, 3]
     away = np.linalg.norm(triangulation.points[:, None] - eyes, axis=2)
-    metres = away / np.array([camera.colour.fx for camera in rig])
+    metres = away / np.array([camera.colour.fx for camera in rig])  # size of a pixel at the point
     views = np.maximum(triangulation.inlier.sum(1), 2)
     pixel = np.where(triangulation.inlier, metres, 0.0).sum(1) / views
     return np.nan_to_num(triangulation.error * pixel * np.sqrt(1.5 / (2 * views - 3)))
 
 
 def pixel_scale(rig: Rig) -> np.ndarray:
-    """Return pixels (C,) of each camera per pixel of a 1080p image, by image height."""
+    """Return the number (C,) of pixels of each camera per pixel of a 1080p image, by height."""
     return np.array([camera.colour.height / 1080 for camera in rig])
 
 
 def rays_of(pixels: np.ndarray, rig: Rig) -> np.ndarray:
-    """Return directions (..., C, n, 3) float64, master frame, of pixels (..., C, n, 2).
+    """Return ray directions (..., C, n, 3) float64, master frame, of pixels (..., C, n, 2).
 
-    z = 1 in the camera's frame.
+    A direction has z = 1 in the camera's frame; it is not a unit vector.
     """
     rays = np.empty((*pixels.shape[:-1], 3))
     for c, camera in enumerate(rig):
@@ -71,10 +73,10 @@ def rays_of(pixels: np.ndarray, rig: Rig) -> np.ndarray:
 def midpoints(
     first: np.ndarray, second: np.ndarray, from_first: np.ndarray, from_second: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the midpoints (..., 3) and gaps (...) between pairs of rays, metres.
+    """Return the midpoints (..., 3) and lengths (...) of the shortest lines between rays, metres.
 
     ``first``, ``second`` (..., 3) are directions, ``from_first``, ``from_second`` their origins.
-    NaN if the rays are nearly parallel (:data:`MIN_PARALLAX_DEG`) or meet behind an origin.
+    NaN if the rays are nearly parallel (:data:`MIN_PARALLAX_DEG`) or closest behind an origin.
     """
     between = from_second - from_first
     aa, bb = (first * first).sum(-1), (second * second).sum(-1)
@@ -96,9 +98,9 @@ def midpoints(
 def view_pairs(rig: Rig) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
     """Return pairs of cameras (a, b), a < b: those to try first, and the rest.
 
-    First come each camera and the five cameras whose viewing directions differ from its own by
-    about 70 degrees. Up to six cameras these are all pairs; beyond, their number grows linearly
-    with the number of cameras.
+    The first list pairs each camera with the five cameras whose viewing directions differ most
+    nearly by 70 degrees from its own. Up to six cameras these are all pairs. For more cameras their
+    number grows linearly, not quadratically.
     """
     axes = rig.master_from_colour[:, :3, 2]
     angle = np.degrees(np.arccos(np.clip(axes @ axes.T, -1, 1)))
@@ -114,7 +116,7 @@ def view_pairs(rig: Rig) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
 
 
 def reproject(points: np.ndarray, rig: Rig) -> np.ndarray:
-    """Pixels (N, C, 2) of points (N, 3), master frame, in every view."""
+    """Return the pixels (N, C, 2) of points (N, 3), master frame, in every view."""
     seen = np.moveaxis(apply(rig.colour_from_master, points), 0, 1)
     return projection.project(seen, rig.colour_parameters)
 
@@ -124,8 +126,11 @@ def triangulate(
 ) -> Triangulation:
     """Triangulate N points from C views.
 
-    ``pixels`` (N, C, 2), distorted; ``weights`` (N, C), 0 = not seen; ``max_error_px`` is the
-    reprojection error, in pixels of a 1080p image, beyond which a view disagrees.
+    Args:
+        pixels: (N, C, 2) distorted pixels.
+        weights: (N, C) confidence, 0 = not seen.
+        rig: the cameras.
+        max_error_px: reprojection error beyond which a view is an outlier, pixels of a 1080p image.
     """
     count, views = weights.shape
     result = Triangulation(
@@ -169,7 +174,7 @@ def _triangulate_block(
 
 
 def _errors(points: np.ndarray, pixels: np.ndarray, weights: np.ndarray, rig: Rig) -> np.ndarray:
-    """Reprojection errors (N, C), px; infinite where not seen, behind the camera or no point."""
+    """Return reprojection errors (N, C), px; infinite if not seen, behind a camera, no point."""
     finite = np.isfinite(points).all(1)
     in_camera = np.moveaxis(
         apply(rig.colour_from_master, np.where(finite[:, None], points, 0)), 0, 1
@@ -181,7 +186,11 @@ def _errors(points: np.ndarray, pixels: np.ndarray, weights: np.ndarray, rig: Ri
 def _best_proposal(
     pixels: np.ndarray, weights: np.ndarray, rig: Rig, limit: np.ndarray
 ) -> np.ndarray:
-    """The pair's midpoint (N, 3) with the least truncated cost over all views; NaN = none."""
+    """Return the pair's midpoint (N, 3) with the least truncated cost over all views; NaN = none.
+
+    limit (C,): error at which the cost of a view is truncated, px. Pairs of the second list of
+    :func:`view_pairs` are tried only for points without a proposal.
+    """
     rays = rays_of(np.swapaxes(pixels, 0, 1), rig)  # (C, N, 3)
     centres = rig.master_from_colour[:, :3, 3]
     best = np.full((len(pixels), 3), np.nan)
@@ -202,11 +211,12 @@ def _best_proposal(
 
 
 def _agreed_by_chance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the cost (N,) of a proposal by rays (N, 3) that are nearly parallel.
+    """Return an additional cost (N,) of proposals by nearly parallel rays (N, 3).
 
-    Two cameras that face each other agree on some point for anything near the line between them.
-    The cost is at most that of two views of full confidence, and 0 beyond 25 degrees. Six views
-    alternately high and low hardly ever have such pairs.
+    For pixels near the line between two cameras that face each other, the two rays meet at some
+    point even if the pixels show different points. The cost decreases from 2, that of two outlier
+    views of full confidence, to 0 at an angle of 25 degrees between the lines of the rays. Six
+    views alternately high and low hardly ever have such pairs.
     """
     sine = np.linalg.norm(np.cross(first, second), axis=1)
     sine /= np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
@@ -214,7 +224,7 @@ def _agreed_by_chance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def _refined(points: np.ndarray, pixels: np.ndarray, weights: np.ndarray, rig: Rig) -> np.ndarray:
-    """One Gauss-Newton step of the Huber cost of reprojection, each point on its own."""
+    """Return points (N, 3) after one Gauss-Newton step of each point's Huber reprojection cost."""
     rows = np.flatnonzero(np.isfinite(points[:, 0]) & ((weights > 0).sum(1) >= 2))
     if not len(rows):
         return points
@@ -223,7 +233,8 @@ def _refined(points: np.ndarray, pixels: np.ndarray, weights: np.ndarray, rig: R
     projected, by_camera = projection.project_with_jacobian(in_camera, rig.colour_parameters)
     jacobian = by_camera @ rotation  # (n, C, 2, 3)
     residual = projected - pixels[rows]
-    huber = 4.0 * pixel_scale(rig)  # typical standard deviation of good 2D detectors, px at 1080p
+    # typical standard deviation of good 2D detectors: 4 px of a 1080p image
+    huber = 4.0 * pixel_scale(rig)
     size = np.linalg.norm(residual, axis=-1)
     weight = weights[rows] * np.minimum(1.0, huber / np.maximum(size, 1e-9)) / pixel_scale(rig) ** 2
     weighted = jacobian * weight[..., None, None]

@@ -1,9 +1,10 @@
-"""Masks, depth and face ids of meshes in real cameras, for many views and poses at once.
+"""Rendering of masks, depth and face ids of meshes in real cameras, for many views and poses.
 
-A pixel is covered where its undistorted ray passes through the triangle, and its depth is where the
-ray meets the triangle's plane: exact for any lens. Only the search window of a triangle comes from
-its projected corners, and only the projected box of the object is drawn. The z-buffer is compiled
-for the CPU and runs without the interpreter's lock.
+A pixel is covered if its undistorted ray passes through the triangle. Its depth is that of the
+intersection of the ray and the triangle's plane. Both are exact for any lens. The projected corners
+of a triangle determine only which pixels are tested, with a margin for the bend of its edges. Only
+the window of the image that contains the object is drawn. The z-buffer is compiled for the CPU and
+runs without the global interpreter lock.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ from intercap_core.geometry.solve.thread_pool import ThreadPool
 # Triangles with a corner nearer than this are skipped, metres: the range of the Azure Kinect begins
 # at 0.25 m (data sheet).
 NEAR_M = 0.05
-# Bound on the bend of an edge of the projected box in known lenses, pixels.
+# Margin of the window around the projected vertices: distorted edges bend outward by less than this
+# in known lenses, pixels.
 BOX_MARGIN_PX = 2
 NO_FACE = -1
 
@@ -42,7 +44,7 @@ class Renderer:
     def draw(
         self, surface: Surface, shots: Sequence[Shot], *, margin_px: int = 0
     ) -> list[Rendering]:
-        """Return each shot's smallest window that holds the mesh, widened by ``margin_px``."""
+        """Return each shot's smallest window that contains the mesh, widened by ``margin_px``."""
         vertices = np.ascontiguousarray(surface.vertices, np.float64)
         faces = np.ascontiguousarray(surface.faces, np.int32)
 
@@ -92,6 +94,7 @@ def default_renderer() -> Renderer:
 
 
 def _threads_of_job() -> int:
+    """Return the number of threads that the job may use: OMP_NUM_THREADS, else one."""
     given = os.environ.get("OMP_NUM_THREADS", "")
     return int(given) if given.isdigit() and int(given) > 0 else 1
 
@@ -113,7 +116,7 @@ def render(
 def render_scene(
     drawables: Sequence[Drawable], intrinsics: Intrinsics, *, margin_px: int = 0
 ) -> Rendering:
-    """Draw meshes that occlude each other, in the smallest window that holds them all.
+    """Draw meshes that occlude each other, in the smallest window that contains all of them.
 
     The window is widened by ``margin_px`` and clipped to the image; it is empty (0, 0) if nothing
     is in view. Rays outside the lens's calibrated radius hit nothing.
@@ -182,11 +185,16 @@ def _window_of(box, margin_px, width, height):
 def _draw(corners, pixels, x0, y0, faces, rays, focal, cull_back, number, depth, face, body):
     """Draw one mesh into the z-buffer of a window.
 
+    Camera and triangle span a pyramid. For each triangle, the pixels within the bounds of its
+    projected corners are visited row by row, with ``slack`` px for bent edges. A pixel is covered
+    if its ray (x, y, 1) is inside the three sides of the pyramid. Its depth z follows from the
+    plane of the triangle, s . (x, y, 1) z = volume with the normal s.
+
     Args:
-        corners: (V, 3) camera frame.
-        pixels: (V, 2) of the image.
+        corners: (V, 3) vertices in the camera's frame, metres.
+        pixels: (V, 2) projected vertices, pixels of the image.
         x0, y0: first pixel of the window.
-        rays: (H, W, 2) of the whole image.
+        rays: (H, W, 2) X/Z and Y/Z of the pixels of the whole image.
         focal: focal length, pixels.
         number: index of the mesh, written to ``body``.
         depth: (h, w), infinite where nothing is drawn; updated where this mesh is nearer.
@@ -201,7 +209,8 @@ def _draw(corners, pixels, x0, y0, faces, rays, focal, cull_back, number, depth,
         cx, cy, cz = corners[k, 0], corners[k, 1], corners[k, 2]
         # sides of the pyramid from the camera through the triangle: a x b, b x c, c x a
         n0x, n0y, n0z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-        volume = n0x * cx + n0y * cy + n0z * cz  # of the pyramid; negative where facing us
+        # six times the volume of the pyramid; negative if the triangle faces the camera
+        volume = n0x * cx + n0y * cy + n0z * cz
         if volume == 0.0 or (cull_back and volume > 0.0):
             continue
         if az < NEAR_M or bz < NEAR_M or cz < NEAR_M:
@@ -211,8 +220,9 @@ def _draw(corners, pixels, x0, y0, faces, rays, focal, cull_back, number, depth,
         top = min(pixels[i, 1], pixels[j, 1], pixels[k, 1]) - y0
         bottom = max(pixels[i, 1], pixels[j, 1], pixels[k, 1]) - y0
         extent = max(right - left, bottom - top)
-        # 0.1 px of rounding, and the bend of an edge of L px by at most 0.15 L^2 / f: chords
-        # between any two pixels of Azure Kinects' colour and depth images need 0.135 L^2 / f.
+        # 0.1 px for rounding, and 0.15 L^2 / f for the bend of an edge of L px by distortion.
+        # Measured between any two pixels of Azure Kinects' colour and depth images, the bend is at
+        # most 0.135 L^2 / f.
         slack = 0.1 + 0.15 * extent * extent / focal
         u0, u1 = max(left - slack, 0.0), min(right + slack, width - 1.0)
         v0, v1 = max(top - slack, 0.0), min(bottom + slack, height - 1.0)
@@ -223,7 +233,7 @@ def _draw(corners, pixels, x0, y0, faces, rays, focal, cull_back, number, depth,
         n2x, n2y, n2z = cy * az - cz * ay, cz * ax - cx * az, cx * ay - cy * ax
         sx, sy, sz = n0x + n1x + n2x, n0y + n1y + n2y, n0z + n1z + n2z  # the plane's normal
         sign = 1.0 if volume > 0.0 else -1.0
-        narrow = extent > 6.0  # px, from which it saves time that the edges bound each row
+        narrow = extent > 6.0  # px; in larger triangles it is faster to bound each row by the edges
         if narrow:
             _bound(0, pixels[i], pixels[j], pixels[k], x0, y0, slack, bounds)
             _bound(1, pixels[j], pixels[k], pixels[i], x0, y0, slack, bounds)
@@ -254,10 +264,13 @@ def _draw(corners, pixels, x0, y0, faces, rays, focal, cull_back, number, depth,
 
 @numba.njit(cache=True, nogil=True)
 def _bound(edge, p, q, opposite, x0, y0, slack, bounds):
-    """Bound the columns of a row inside the projected edge p q, or within ``slack`` px outside.
+    """Bound the columns of each row to those inside the projected edge p q, with a margin.
 
-    Writes ``bounds[edge]``: column = [0] * row + [1] is the first (1) or last (-1) column by the
-    sign in [2]; 0 = all columns. Points are pixels (2,) of the image.
+    The inner side is that of the corner ``opposite``. Columns up to ``slack`` px outside are kept.
+    Writes ``bounds[edge]`` (3,) = a, b, sign: in a row, the column a * row + b of the window is the
+    first one (sign 1) or the last one (sign -1); sign 0 = no bound.
+
+    p, q, opposite: pixels (2,) of the image. x0, y0: first pixel of the window.
     """
     du, dv = q[0] - p[0], q[1] - p[1]
     inner = du * (opposite[1] - p[1]) - dv * (opposite[0] - p[0])
@@ -292,7 +305,7 @@ def _finish(depth, face):
 
 @numba.njit(cache=True, nogil=True)
 def _draw_alone(vertices, faces, cull_back, pose, parameters, rays, margin_px):
-    """Draw one mesh in the smallest window that holds it; returns x0, y0, depth, face, body."""
+    """Draw one mesh in the smallest window that contains it; returns fields of `Rendering`."""
     box = np.array([np.inf, np.inf, -np.inf, -np.inf])
     corners, pixels = _place(vertices, pose, parameters, box)
     x0, y0, x1, y1 = _window_of(box, margin_px, rays.shape[1], rays.shape[0])

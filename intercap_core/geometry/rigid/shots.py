@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """A window of the image."""
+    """Result of rendering: a window of the image that contains all pixels hit."""
 
     x0: int
     """Image column of the window's first pixel."""
@@ -27,11 +27,11 @@ class Rendering:
     face: np.ndarray
     """(h, w) int32 index of the face, -1 where nothing is hit."""
     body: np.ndarray
-    """(h, w) int16 index of the mesh, -1 where nothing is hit."""
+    """(h, w) int16 index of the mesh among those drawn, -1 where nothing is hit."""
 
     @property
     def mask(self) -> np.ndarray:
-        """Where a mesh is hit (h, w) bool."""
+        """(h, w) bool: a mesh is hit."""
         return self.face >= 0
 
     @cached_property
@@ -93,7 +93,7 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One view of a mesh."""
+    """One view of a :class:`Surface`: lens and pose."""
 
     lens: Intrinsics
     """Lens of the image."""

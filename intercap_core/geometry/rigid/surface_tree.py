@@ -1,12 +1,15 @@
-"""Distances of many points to a mesh that moves or bends, up to a reach.
+"""Distances of many points to a mesh that moves or bends, limited to a largest distance.
 
-Embree's tree (:mod:`intercap_core.geometry.rigid.distance`) is built again for every shape and
-searches without a limit. This tree keeps the order of its faces and stops at the reach, in a third
-of the time if most points are beyond it.
+The largest distance is called ``reach``. Embree's tree
+(:mod:`intercap_core.geometry.rigid.distance`) has to be built for every shape of the mesh and
+searches without a limit. The tree of this module keeps the order of its faces for all shapes and
+stops at the reach. If most points are beyond it, it takes a third of the time.
 
-It is a perfect binary tree of boxes. Node 0 is the root, nodes 2 i + 1 and 2 i + 2 are the children
-of node i, and the leaves of the last level share the faces evenly, in an order that keeps
-neighbours together. So the tree needs no pointers, and one pass updates the boxes of a moving mesh.
+The tree is a perfect binary tree of axis-aligned boxes, with ``levels`` levels below the root. Node
+0 is the root, and nodes 2 i + 1 and 2 i + 2 are the children of node i. Each leaf has an equal
+share of the faces, in an order that keeps neighbours together: of F faces and L = 2^levels leaves,
+leaf k has the faces F k / L to F (k + 1) / L of the order. The tree therefore needs no pointers,
+and one pass over the nodes updates the boxes of a moving mesh.
 """
 
 from __future__ import annotations
@@ -14,14 +17,20 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-_ROUNDING = 1e-6  # metres, of distances in single precision
+_ROUNDING = 1e-6  # error of distances in single precision, metres
 
 
 class SurfaceTree:
     """The order of a mesh's faces, determined once on one shape of the mesh.
 
-    ``vertices`` (V, 3) and ``faces`` (F, 3), F > 0. Searches in very different shapes are correct
-    but slower. ``closed``: every edge belongs to an even number of faces.
+    Searches in very different shapes are correct but slower.
+
+    Attributes:
+        closed: every edge belongs to an even number of faces.
+
+    Args:
+        vertices: (V, 3) metres.
+        faces: (F, 3), F > 0.
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
@@ -32,7 +41,7 @@ class SurfaceTree:
         self.closed = _closed(faces)
 
     def shaped(self, vertices: np.ndarray) -> ShapedSurface:
-        """The mesh with its vertices at (V, 3)."""
+        """Return the surface of the mesh with vertices (V, 3), metres."""
         placed = np.ascontiguousarray(vertices, np.float32)
         triangles, boxes = _fitted(placed, self._corners, self._levels)
         return ShapedSurface(triangles, boxes, self._levels)
@@ -67,7 +76,7 @@ class ShapedSurface:
         )
 
     def blocks(self, starts: np.ndarray, ends: np.ndarray, blocked: np.ndarray) -> None:
-        """Set ``blocked`` (N,) bool where segments ``starts`` to ``ends`` (N, 3) hit the surface.
+        """Set ``blocked`` (N,) bool of segments ``starts`` to ``ends`` (N, 3) that hit the mesh.
 
         Entries that are already set are skipped.
         """
@@ -82,6 +91,7 @@ class ShapedSurface:
 
 
 def _closed(faces: np.ndarray) -> bool:
+    """Return whether every edge of faces (F, 3) belongs to an even number of faces."""
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     numbers = edges[:, 0] * (int(faces.max()) + 1) + edges[:, 1]
     return not (np.unique(numbers, return_counts=True)[1] % 2).any()
@@ -115,8 +125,17 @@ def _ordered(centroids, levels):
 
 @numba.njit(cache=True, nogil=True)
 def _fitted(vertices, corners, levels):
-    """Return corners (F, 3, 3) of the faces ``corners`` (F, 3) in the order of the leaves, and the
-    boxes (N, 6) of all nodes: least and largest coordinates."""
+    """Return the triangles and the boxes of all nodes, of one shape of the mesh.
+
+    Args:
+        vertices: (V, 3) float32.
+        corners: (F, 3) vertex indices of the faces, in the order of the leaves.
+        levels: of the tree.
+
+    Returns:
+        (F, 3, 3) corners of the faces.
+        (N, 6) smallest, then largest coordinates of each node.
+    """
     count, leaves = len(corners), 1 << levels
     triangles = np.empty((count, 3, 3), np.float32)
     boxes = np.empty((2 * leaves - 1, 6), np.float32)
@@ -140,7 +159,8 @@ def _fitted(vertices, corners, levels):
 def _nearest(points, triangles, boxes, levels, reach_sq):
     """Return the squared distance (M,) of points (M, 3) to the mesh, at most ``reach_sq``.
 
-    Each search starts at the face found last, so consecutive points should be close.
+    Each search starts at the nearest face of the previous point, so consecutive points should be
+    close.
     """
     squared = np.empty(len(points), np.float32)
     stack, reach = np.empty(levels + 2, np.int32), np.empty(levels + 2, np.float32)
@@ -157,16 +177,16 @@ def _nearest(points, triangles, boxes, levels, reach_sq):
 def _signed(points, triangles, boxes, levels, reach, deepest):
     """Return the signed distance (M,), metres, of points (M, 3) float32 to a closed mesh.
 
-    Negative inside, at most ``reach``, at least -``deepest``; points that are not finite are at
-    ``reach``. Inside is where a ray crosses the mesh an odd number of times. Rays are saved: the
-    ball around a point whose radius is its distance contains no surface, so all of it lies on one
-    side. A point in the ball of the last decided point, or whose ball contains that point, is on
-    the same side; only for others a ray is cast.
+    It is negative inside, at most ``reach``, and at least -``deepest``; for points that are not
+    finite it is ``reach``. A point is inside if a ray crosses the mesh an odd number of times. Most
+    rays are not needed: the ball around a point whose radius is its distance contains no surface,
+    so all of it is on one side. A point is on the same side as a previous point if it is within
+    that point's ball or its own ball contains that point. A ray is cast only for other points.
     """
     signed = np.empty(len(points), np.float64)
     stack, ahead = np.empty(levels + 2, np.int32), np.empty(levels + 2, np.float32)
     last, within = 0, False
-    # the last decided point, and the radius of its ball
+    # centre and radius of a ball whose side, ``within``, is known
     cx, cy, cz, clear = np.inf, np.inf, np.inf, -np.inf
     reach_sq, deepest_sq = np.float32(reach * reach), np.float32(deepest * deepest)
     for m in range(len(points)):
@@ -194,10 +214,11 @@ def _signed(points, triangles, boxes, levels, reach, deepest):
 
 @numba.njit(cache=True, nogil=True)
 def _block(starts, ends, triangles, boxes, levels, blocked):
-    """Set ``blocked`` (M,) bool where segments ``starts`` to ``ends`` (M, 3) float64 hit the mesh.
+    """Set ``blocked`` (M,) bool of the segments ``starts`` to ``ends`` (M, 3) that hit the mesh.
 
-    Hits count from either side, and entries that are set are skipped. Consecutive segments should
-    be close: the face that was hit last is tried first.
+    Hits count from either side, and entries that are set are skipped. The face that was hit last is
+    tried first, so consecutive segments should be close. Otherwise the tree is traversed, without
+    the nodes whose boxes the segment misses (slab test).
     """
     leaves, count = 1 << levels, len(triangles)
     stack = np.empty(levels + 2, np.int32)
@@ -267,8 +288,10 @@ def _meets(x, y, z, u, v, w, triangles, at):
 def _search(x, y, z, triangles, boxes, levels, most, last, stack, reach):
     """Return the squared distance of a point to the mesh, at most ``most``, and its nearest face.
 
-    The search starts at face ``last``. ``stack`` and ``reach`` are working memory: the nodes that
-    remain, and the squared distances of their boxes.
+    Branch and bound: the nearer child is visited first, and a node is skipped if its box is farther
+    than the nearest face so far. The search is exact. It starts with the distance to face ``last``.
+    ``stack`` and ``reach`` are scratch: the nodes that remain, and the squared distances of their
+    boxes.
     """
     leaves, count = 1 << levels, len(triangles)
     best = min(_to_triangle(x, y, z, triangles, last), most)
@@ -303,7 +326,7 @@ def _search(x, y, z, triangles, boxes, levels, most, last, stack, reach):
 
 @numba.njit(cache=True, nogil=True)
 def _odd(x, y, z, triangles, boxes, levels, stack):
-    """Return whether a ray along the third axis crosses the mesh an odd number of times."""
+    """Return whether the ray from (x, y, z) along +z crosses the mesh an odd number of times."""
     leaves, count = 1 << levels, len(triangles)
     odd = False
     size, stack[0] = 1, 0
@@ -325,11 +348,12 @@ def _odd(x, y, z, triangles, boxes, levels, stack):
 
 @numba.njit(cache=True, nogil=True)
 def _crosses(x, y, z, corners):
-    """Return whether a ray along the third axis crosses a triangle (3, 3).
+    """Return whether the ray from (x, y, z) along +z crosses a triangle (3, 3).
 
-    Computed in double precision. A point on the line of an edge is treated as moved by an
-    infinitesimal (e, e^2), so that the faces on both sides of an edge decide alike (simulation of
-    simplicity, Edelsbrunner and Mucke 1990).
+    Computed in double precision: (x, y) must be on the same side of all three projected edges, and
+    the triangle's height there above z. A point on the line of an edge is treated as moved by an
+    infinitesimal (e, e^2) in (x, y), so that exactly one of the two faces at an edge is crossed
+    (simulation of simplicity, Edelsbrunner and Mucke 1990).
     """
     total, height, sign = 0.0, 0.0, 0
     for k in range(3):
@@ -357,7 +381,7 @@ def _crosses(x, y, z, corners):
 
 @numba.njit(inline="always")
 def _to_box(x, y, z, boxes, node):
-    """Squared distance of a point to a node's box, 0 inside."""
+    """Return the squared distance of a point to a node's box, 0 inside."""
     a = max(boxes[node, 0] - x, x - boxes[node, 3], np.float32(0))
     b = max(boxes[node, 1] - y, y - boxes[node, 4], np.float32(0))
     c = max(boxes[node, 2] - z, z - boxes[node, 5], np.float32(0))
@@ -366,8 +390,11 @@ def _to_box(x, y, z, boxes, node):
 
 @numba.njit(inline="always")
 def _to_triangle(x, y, z, triangles, at):
-    """Squared distance of a point to one of triangles (F, 3, 3) (Ericson, Real-Time Collision
-    Detection, 5.1.5: by the region of the triangle's plane that the point projects to)."""
+    """Return the squared distance of a point to one of triangles (F, 3, 3).
+
+    It depends on the region of the triangle's plane that the point projects to: a corner, an edge
+    or the inside (Ericson, Real-Time Collision Detection, 5.1.5).
+    """
     ax, ay, az = triangles[at, 0, 0], triangles[at, 0, 1], triangles[at, 0, 2]
     ux, uy, uz = triangles[at, 1, 0] - ax, triangles[at, 1, 1] - ay, triangles[at, 1, 2] - az
     vx, vy, vz = triangles[at, 2, 0] - ax, triangles[at, 2, 1] - ay, triangles[at, 2, 2] - az

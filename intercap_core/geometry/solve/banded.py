@@ -1,8 +1,9 @@
-"""Exact solution of normal equations that couple neighbouring frames, in blocks.
+"""Exact solution of normal equations that couple neighbouring frames, by block Cholesky.
 
-A system of T frames with n parameters each couples frame t with frames up to t + w (w = 0 none,
-1 velocity, 2 acceleration): a block-banded matrix (T n x T n), symmetric and positive definite.
-Block Cholesky over time: O(T (w + 1)^2 n^3) work and O(T (w + 1) n^2) memory.
+A system has T frames with n parameters each. Frame t is coupled with frames up to t + w: w = 0
+without temporal terms, 1 with velocities, 2 with accelerations. Its matrix (T n x T n) is
+block-banded, symmetric and positive definite. The block Cholesky factorisation over time takes
+O(T (w + 1)^2 n^3) operations and O(T (w + 1) n^2) memory.
 """
 
 from __future__ import annotations

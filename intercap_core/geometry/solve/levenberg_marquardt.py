@@ -1,9 +1,9 @@
-"""Levenberg-Marquardt on many small problems at once, optionally tied by shared parameters.
+"""Levenberg-Marquardt on many small problems at once, optionally coupled by shared parameters.
 
 Every frame b has its own parameters x_b (n,); all frames may share parameters y (m,). The energy
 is sum_b f_b(x_b, y). With m = 0 the frames are independent: each has its own damping, accepts or
-rejects its own steps and stops on its own. With m > 0 the normal equations are an arrow, solved
-exactly by eliminating the frames:
+rejects its own steps and stops on its own. With m > 0 the matrix of the normal equations has the
+shape of an arrow. They are solved exactly by eliminating the frames (Schur complement):
 
     | H_1         B_1 |   | dx_1 |     | g_1   |
     |     ...     ... | . | ...  | = - | ...   |
@@ -26,8 +26,8 @@ _DAMPING_RANGE = (1e-8, 1e8)
 class NormalEquations(NamedTuple):
     """One linearisation of b frames with n own and m shared parameters.
 
-    A frame's own columns come first, the shared ones last. A prior on shared parameters is spread
-    over the frames (1/B of it in each).
+    A frame's own columns come first, the shared ones last. The energy is the sum over frames, so a
+    prior on shared parameters has to be distributed over the frames.
     """
 
     cost: Tensor
@@ -42,11 +42,11 @@ class Problem(Protocol):
     """Energy to minimise. ``index`` (b,) selects frames out of B."""
 
     def linearise(self, own: Tensor, shared: Tensor, index: Tensor) -> NormalEquations:
-        """Normal equations at own (b, n), shared (m,)."""
+        """Return the normal equations at own (b, n) and shared (m,)."""
         ...
 
     def cost(self, own: Tensor, shared: Tensor, index: Tensor) -> Tensor:
-        """f_b (b,) at own (b, n), shared (m,): the same energy as ``linearise`` reports."""
+        """Return f_b (b,) at own (b, n) and shared (m,), the same as ``linearise`` returns."""
         ...
 
 
@@ -61,7 +61,7 @@ class Solution:
     cost: Tensor
     """(B,) f_b at the solution."""
     converged: Tensor
-    """(B,) bool, by the size of the step or of the decrease in cost."""
+    """(B,) bool: the last step, or its decrease of the cost, was below the tolerance."""
     trials: int
     """Number of steps tried."""
     normal: NormalEquations | None = None
@@ -80,14 +80,25 @@ def minimise(
     cost_tolerance: float = 1e-6,
     keep_normal: bool = False,
 ) -> Solution:
-    """Minimise sum_b f_b(x_b, y) from own (B, n) and shared (m,), none if absent.
+    """Minimise sum_b f_b(x_b, y).
 
-    A step is damped by ``damping`` times the Hessian's diagonal (Marquardt 1963), more in frames
-    whose last step failed. A frame has converged when its accepted step is below
-    ``step_tolerance`` in every parameter, or lowers its cost by less than ``cost_tolerance`` of it;
-    tied frames converge together, when the shared step is also below 100 ``step_tolerance``. The
-    factorisations are in float64 whatever the type of the parameters. A frame whose Hessian cannot
-    be factorised stays where it is under growing damping.
+    A step is damped by a multiple of the Hessian's diagonal (Marquardt 1963). The factor of a frame
+    decreases after an accepted step and increases after a failed one. A frame has converged if its
+    accepted step is below ``step_tolerance`` in every parameter, or lowers its cost by less than
+    the share ``cost_tolerance``. With shared parameters all frames converge together, if the shared
+    step is also below 100 ``step_tolerance``. Factorisations are in float64 for every type of the
+    parameters. A frame whose Hessian cannot be factorised keeps its parameters, and its damping
+    increases.
+
+    Args:
+        problem: the energy.
+        own: (B, n) start.
+        shared: (m,) start; None = no shared parameters.
+        max_trials: largest number of steps that are tried.
+        damping: damping factor at the start.
+        step_tolerance: in units of the parameters.
+        cost_tolerance: relative decrease of the cost.
+        keep_normal: return the normal equations at the solution.
     """
     count, device = own.shape[0], own.device
     own = own.clone()
@@ -154,7 +165,19 @@ def _refresh(
 def _keep_the_better(
     problem: Problem, own: Tensor, trial: Tensor, trial_y: Tensor, new: Tensor, good: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Let frames whose step failed keep their parameters under the new shared parameters."""
+    """Replace failed steps by the old own parameters if these cost less at the new shared ones.
+
+    Args:
+        problem: the energy.
+        own: (B, n) parameters before the step.
+        trial: (B, n) parameters after it, changed in place.
+        trial_y: (m,) shared parameters after it.
+        new: (B,) cost at ``trial`` and ``trial_y``, changed in place.
+        good: (B,) bool, the step lowered the frame's cost.
+
+    Returns:
+        ``trial``, ``new``, and ``good`` after the replacement.
+    """
     bad = torch.nonzero(~good)[:, 0]
     if len(bad):
         stayed = problem.cost(own[bad], trial_y, bad)
@@ -169,7 +192,13 @@ def _keep_the_better(
 def _damped_step(
     normal: NormalEquations, lam: Tensor, num_shared: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return steps (b, n) and (m,) of the damped arrow, and which frames were factorised (b,)."""
+    """Solve the damped normal equations; lam (b,): damping factors.
+
+    Returns:
+        (b, n) own steps.
+        (m,) shared step.
+        (b,) bool, the frame's own block was factorised.
+    """
     gradient, n = normal.gradient, normal.gradient.shape[1] - num_shared
     a = normal.hessian[:, :n, :n].double()
     if a.dtype == normal.hessian.dtype:
@@ -183,7 +212,7 @@ def _damped_step(
         eye = torch.eye(n, dtype=a.dtype, device=a.device)
         factor = torch.where(solved[:, None, None], factor, eye)
         right = torch.where(solved[:, None, None], right, torch.zeros_like(right))
-    # H = L L^T; the frames are eliminated by L^-1 [g B]
+    # H = L L^T; ``half`` = L^-1 [g B] eliminates the frames from the equations of y
     half = torch.linalg.solve_triangular(factor, right, upper=False)
     shared_step = right.new_zeros(num_shared)
     if num_shared:

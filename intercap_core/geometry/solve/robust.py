@@ -1,9 +1,9 @@
-"""Robust penalties of squared residuals, as rho(s) and its slope, the weight of Gauss-Newton.
+"""Robust penalties rho(s) of squared residuals s, and their slopes: weights of Gauss-Newton.
 
 Convention of all solvers: a residual vector r with s = |r|^2 costs rho(s) / 2, whose gradient is
 w J^T r with w = d rho / d s. Replacing rho by the parabola of weight w keeps the gradient and
 leaves a positive semi-definite Hessian w J^T J (iteratively reweighted least squares). All rho have
-rho(0) = 0 and slope 1 at 0, so the scale alone determines where a residual stops counting.
+rho(0) = 0 and slope 1 at 0, so the scale alone determines from which size on residuals lose weight.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ def geman_mcclure_weight(squared: Any, scale: Any) -> Any:
 
 
 def geman_mcclure(squared: Tensor, scale: float | Tensor) -> Robust:
-    """Return the saturating penalty of Geman and McClure 1987, the paper's rho_J.
+    """Return the penalty of Geman and McClure 1987, the paper's rho_J.
 
-    rho = scale^2 s / (s + scale^2), the paper's rho^2 r^2 / (r^2 + rho^2); its slope is
-    (scale^2 / (s + scale^2))^2.
+    rho = scale^2 s / (s + scale^2), which is at most scale^2. The paper writes it as
+    rho^2 r^2 / (r^2 + rho^2). Its slope is (scale^2 / (s + scale^2))^2.
     """
     import torch
 

@@ -1,4 +1,4 @@
-"""Threads for work that runs without the interpreter's lock."""
+"""A pool of threads for functions that release the global interpreter lock."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Result = TypeVar("Result")
 
 
 class ThreadPool:
-    """A pool of ``threads`` threads, including the caller's; one thread starts none."""
+    """A pool of ``threads`` threads, one of which is the caller's: 1 starts no other."""
 
     def __init__(self, threads: int = 1) -> None:
         if threads < 1:
@@ -23,7 +23,7 @@ class ThreadPool:
     def map(self, function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
         """Return ``function`` of every item, in the order of the items.
 
-        Each thread takes the next item when it is free, so unequal items need no planning.
+        Each thread takes the next item when it is free, which balances items of unequal cost.
         """
         if self._pool is None or len(items) < 2:
             return [function(item) for item in items]

@@ -1,4 +1,4 @@
-"""Samples over time: gaps, velocities, and the cheapest sequence of states."""
+"""Functions of time series: interpolation of gaps, velocities, and Viterbi's algorithm."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from intercap_core.geometry.camera.transforms import rotation_log
 
 
 def sample_evenly(available: np.ndarray, most: int) -> np.ndarray:
-    """Indices of at most ``most`` frames, evenly spaced among those that are ``available`` (T,)."""
+    """Return at most ``most`` frame indices, spread evenly over the ``available`` (T,) frames."""
     frames = np.flatnonzero(available)
     if len(frames) <= most:
         return frames
@@ -35,15 +35,23 @@ def limited_velocity(
     max_speed: float,
     known: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return central differences (T, ..., D) of ``positions`` (T, ..., D) by ``times`` (T,) in s.
+    """Return velocities (T, ..., D) of positions (T, ..., D) by central differences.
 
-    The differences are of fourth order where two positions on each side are known, because hands
-    reverse within a few frames: of a motion at 2 Hz recorded at 15 frames a second, second order
-    recovers 89 % and fourth order 98 %. One wrong position between correct ones enlarges one of its
-    neighbours' one-sided differences. Therefore no velocity is longer than twice the
-    shorter of the two (van Leer's slope limiter, 1977, for vectors), nor than ``max_speed``.
-    Positions that are not ``known`` (T, ...) have velocity 0 and are ignored as neighbours. With
-    one known neighbour the one-sided difference is used.
+    Differences are of fourth order if two positions on each side are known, else of second order.
+    Hands reverse within a few frames: of the speed of a motion at 2 Hz, recorded at 15 frames per
+    second, second order recovers 89 % and fourth order 98 %. With one known neighbour the one-sided
+    difference is used.
+
+    A single wrong position enlarges one of the two one-sided differences at each of its neighbours.
+    Velocities are therefore limited to twice the shorter one-sided difference (van Leer's slope
+    limiter, 1977, for vectors).
+
+    Args:
+        positions: (T, ..., D) metres.
+        times: (T,) seconds.
+        max_speed: largest speed of the result, m/s.
+        known: (T, ...) bool; None = finite positions. Unknown positions have velocity 0 and are no
+            neighbours.
     """
     known = np.isfinite(positions).all(-1) if known is None else known
     change = np.diff(np.where(known[..., None], positions, 0), axis=0)
@@ -53,12 +61,20 @@ def limited_velocity(
 def limited_rate(
     change: np.ndarray, times: np.ndarray, *, max_speed: float, known: np.ndarray
 ) -> np.ndarray:
-    """Return :func:`limited_velocity` (T, ..., D) from changes (T-1, ..., D) between consecutive
-    samples, for quantities that cannot be subtracted, such as rotations."""
+    """Return rates (T, ..., D) as :func:`limited_velocity`, from changes between samples.
+
+    This serves quantities that cannot be subtracted, such as rotations.
+
+    Args:
+        change: (T - 1, ..., D) change from each sample to the next.
+        times: (T,) seconds.
+        max_speed: largest rate of the result.
+        known: (T, ...) bool, the sample is known.
+    """
     if len(times) < 2:
         return np.zeros((len(times), *change.shape[1:]))
     step = np.diff(times).reshape(-1, *[1] * (change.ndim - 1))
-    both = known[1:] & known[:-1] & (step[..., 0] < 0.25)  # seconds; a longer step is a gap
+    both = known[1:] & known[:-1] & (step[..., 0] < 0.25)  # seconds; a longer interval is a gap
     slope = np.where(both[..., None], change, 0) / step
     none, still = np.zeros((1, *both.shape[1:]), bool), np.zeros((1, *slope.shape[1:]))
     ahead, behind = np.concatenate([slope, still]), np.concatenate([still, slope])
@@ -73,10 +89,10 @@ def limited_rate(
 
 
 def rigid_velocity(poses: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Return angular velocity (rad/s) and velocity of the origin (m/s): (T, 6).
+    """Return velocities (T, 6): angular velocity (rad/s), then velocity of the origin (m/s).
 
-    Zero where nothing is known; limited, so that a single jump hardly affects its neighbours, and
-    to 20 rad/s and 8 m/s, the speed of the fastest thrown or kicked objects.
+    They are 0 for unknown poses, and limited as in :func:`limited_velocity`, with maxima of
+    20 rad/s and 8 m/s for the fastest thrown or kicked objects.
 
     Args:
         poses: (T, 4, 4) master_from_object.
@@ -93,10 +109,15 @@ def rigid_velocity(poses: np.ndarray, known: np.ndarray, times: np.ndarray) -> n
 
 
 def _fourth_order(slope: np.ndarray, both: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Return the fourth-order correction of a central difference (T, ..., D).
+    """Return what a fourth-order difference adds to a central one, (T, ..., D).
 
-    (8 (x_1 - x_-1) - (x_2 - x_-2)) / 12 minus (x_1 - x_-1) / 2, from ``slope`` and ``both``
-    (T-1, ...) between samples.
+    With the time step h it is (8 (x_1 - x_-1) - (x_2 - x_-2)) / (12 h) minus (x_1 - x_-1) / (2 h).
+    It is 0 if one of the four slopes is unknown or the steps differ by more than 20 %.
+
+    Args:
+        slope: (T - 1, ..., D) slope between consecutive samples.
+        both: (T - 1, ...) bool, both samples are known.
+        step: (T - 1, ...) seconds between them.
     """
     result = np.zeros((len(slope) + 1, *slope.shape[1:]))
     if len(slope) >= 4:
