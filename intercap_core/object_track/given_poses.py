@@ -44,7 +44,10 @@ class GivenPose:
         return np.asarray((turn[0] / self.sigma_rad) ** 2 + (shift[0] / self.sigma_m) ** 2)
 
     def holds(self, mesh: ObjectMesh, pose: np.ndarray) -> bool:
-        """Return whether a pose (4, 4) agrees with this one within three standard deviations."""
+        """Return whether a pose (4, 4) agrees with this one.
+
+        Three standard deviations plus the tolerance of equal poses (``SAME_POSE_M``) are allowed.
+        """
         turn, shift = self.distance(mesh, pose)
         return (
             shift < 3.0 * self.sigma_m + SAME_POSE_M

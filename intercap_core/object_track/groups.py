@@ -47,9 +47,9 @@ class MaskOutline:
     known: np.ndarray
     """(D,) bool, false where the mask is cut off."""
     middle: np.ndarray
-    """(2,) middle of the mask."""
+    """(2,) middle of the mask, in the plane z = 1."""
     extent: float
-    """Largest width."""
+    """Largest width, in the plane z = 1."""
     colour_from_master: np.ndarray
     """(4, 4) of the camera."""
 
@@ -240,8 +240,8 @@ def find_groups(
 def locate_group(group: Group) -> np.ndarray:
     """Return the position (3,) of a group: the mean over its views of their mean points.
 
-    The mean of means, because a near view has more points but not more of the object. Without
-    depth, the point nearest to the rays.
+    Views count equally, because a near view has more points but does not show more of the object.
+    Without depth it is the point nearest to the rays.
     """
     means = [s.points.mean(0) for s in group if len(s.points)]
     if means:

@@ -5,9 +5,9 @@ symmetry group is aligned to each group. The best poses are rendered and compare
 and the best of those are fitted.
 
 The alignment is point-to-plane ICP to the measured points for all rotations at once. Outlines of
-masks are added for views without depth, and for all views of a group of at most two, whose points
-many poses fit. Weights are Geman-McClure with a scale that shrinks from the error
-of the grid to the noise.
+masks are added for views without depth. They are added for all views of a group of at most two,
+because many poses fit the points of so few views. Weights are Geman-McClure with a scale that
+shrinks from the error of the grid to the noise.
 """
 
 from __future__ import annotations
@@ -206,7 +206,7 @@ def align(
 
 
 def _cloud(group: Group, views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
-    """Return 150 points (P, 3), equally many of each view, and the camera centre of each (P, 3)."""
+    """Return up to 150 points (P, 3), as many of each view, and their cameras' centres (P, 3)."""
     measured = [s for s in group if len(s.points)]
     if not measured:
         return np.zeros((0, 3)), np.zeros((0, 3))

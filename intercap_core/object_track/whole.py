@@ -220,7 +220,8 @@ class WholeTrack:
         Args:
             smoothed: the solution over all frames.
             decided: (T,) log-likelihood ratios of the poses before smoothing, nats.
-            gone: (T,) frames in which the object has left, unless its pose is known nevertheless.
+            gone: (T,) frames in which the object has left by the decision; such a frame is GONE
+                instead of LOST if nothing else determines its pose.
         """
         ratio = np.array([fit.log_ratio for fit in smoothed.fits])
         poses = np.array([fit.pose for fit in smoothed.fits])
