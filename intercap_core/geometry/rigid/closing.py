@@ -105,7 +105,9 @@ def close_mesh(source: Path, output: Path, *, widest_m: float | None, share: flo
 def find_holes(vertices: np.ndarray, faces: np.ndarray) -> tuple[list[Hole], int]:
     """Return the holes of a mesh, widest first, and the number of open edges in no hole.
 
-    Edges between faces of inconsistent winding, and open chains of edges, form no hole.
+    Open edges, which belong to one face, are followed from vertex to vertex. A loop is a hole if a
+    path reaches one of its own vertices again. Edges between faces of inconsistent winding, and
+    chains of edges that do not close, form no hole.
 
     Args:
         vertices: (V, 3) metres.
@@ -129,7 +131,8 @@ def find_holes(vertices: np.ndarray, faces: np.ndarray) -> tuple[list[Hole], int
             if at not in path:
                 path.append(at)
                 continue
-            loop = path[path.index(at) :]  # holes may touch at a vertex
+            # holes may touch at a vertex: the rest of the path is continued
+            loop = path[path.index(at) :]
             path = path[: path.index(at) + 1]
             if len(loop) >= 3:
                 holes.append(_hole(vertices, np.array(loop)))
@@ -139,9 +142,11 @@ def find_holes(vertices: np.ndarray, faces: np.ndarray) -> tuple[list[Hole], int
 
 
 def _hole(vertices: np.ndarray, loop: np.ndarray) -> Hole:
+    """Measure the hole of a loop (n,) of vertex indices."""
     points = vertices[loop]
     middle = points.mean(0)
     width = max(np.linalg.norm(points - point, axis=1).max() for point in points)
+    # smallest singular value: root of the summed squared distances from the plane
     across = np.linalg.svd(points - middle, compute_uv=False)[-1] if len(points) > 3 else 0.0
     return Hole(loop, float(width), middle, float(across / np.sqrt(len(points))))
 
@@ -164,12 +169,13 @@ def _with_consistent_winding(
 
 
 def _first_at_place(vertices: np.ndarray) -> np.ndarray:
-    """Return the index (V,) of the first vertex at the same place, to 0.1 micrometre."""
+    """Return the index (V,) of the first vertex at the same position, to 0.1 micrometre."""
     _, first, inverse = np.unique(vertices.round(7), axis=0, return_index=True, return_inverse=True)
     return first[inverse.reshape(-1)]
 
 
 def _is_closed(faces: np.ndarray, added: Sequence[np.ndarray]) -> bool:
+    """Return whether every edge of the faces (F, 3) and of those added joins two faces."""
     whole = np.concatenate([faces[(faces != np.roll(faces, 1, axis=1)).all(1)], *added])
     edges = np.sort(whole[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     return bool((np.unique(edges, axis=0, return_counts=True)[1] == 2).all())

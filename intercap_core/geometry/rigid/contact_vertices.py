@@ -1,8 +1,8 @@
 """Lists of the vertices of a mesh that people are likely to touch.
 
-A list is the ids alone (JSON, or a pickle as InterCap released), or ids with the mesh's number of
-vertices and digest, as :func:`contact_list` returns it (JSON or .npz). The latter detects that the
-mesh was replaced, even if all ids still exist.
+A file contains the vertex ids alone (JSON, .npz, or a pickle as InterCap released), or also the
+number of vertices and the digest of the mesh, see :func:`contact_list` (JSON or .npz). The digest
+detects that the mesh was replaced, even if all ids still exist.
 """
 
 from __future__ import annotations

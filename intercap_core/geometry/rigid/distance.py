@@ -1,10 +1,13 @@
 """Queries of a triangle mesh by Embree: distances, inside or outside, and visibility.
 
-Open3D's RaycastingScene (Embree) works in the mesh's own frame: the tree is built once and the
-query points move with the object. Inside of a surface with open edges is where its winding number
-exceeds a half (the generalised winding number of Jacobson et al. 2013, by the hierarchy of Barill
-et al. 2018), because rays through a hole would misclassify points outside. For depths inside, the
-convex hull closes its holes.
+Queries use Open3D's RaycastingScene (Embree). The search tree is built once in the mesh's own
+frame, so callers transform query points of a moving object into that frame.
+
+A point is inside a closed mesh if a ray from it crosses the surface an odd number of times. For a
+surface with holes this fails, since a ray may leave through a hole. There a point is inside if its
+generalised winding number exceeds a half (Jacobson et al. 2013, by the hierarchy of Barill et al.
+2018). The depth of such a point is limited by its distance to the convex hull, because the surface
+is missing at the holes.
 """
 
 from __future__ import annotations
@@ -25,9 +28,9 @@ import trimesh
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.rigid.surfaces import vertex_normals
 
-# Directions of rays whose crossings are counted. The first decides (no sign error on 10 k points);
-# a ray may pass along an edge, so all vote on points that it calls inside. No direction lies in a
-# plane that people model in.
+# Directions of rays whose crossings are counted. A point is outside if the first ray says so (no
+# error on 10,000 points). Else all five vote, since a ray may pass along an edge. The directions
+# are oblique to the coordinate planes, which faces of modelled objects are often parallel to.
 _DIRECTIONS = np.array(
     [[0.83, 0.31, 0.46], [-0.39, 0.77, 0.51], [0.27, -0.43, 0.86], [-0.57, -0.61, -0.55],
      [0.41, 0.53, -0.74]]
@@ -36,11 +39,11 @@ _OPEN3D_CORE = "open3d.cpu.pybind"
 
 
 def _load_open3d() -> Any:
-    """Open3D's compiled core without the package around it; the package for other builds.
+    """Return the compiled core of a CPU build of Open3D; for other builds the whole package.
 
-    ``import open3d`` takes 1.7 s, of which 1.3 s go to scikit-learn, pandas and dash, which nothing
-    here uses. The core has the same ``core``, ``t``, ``geometry`` and ``utility``, and the whole
-    package can still be imported afterwards.
+    ``import open3d`` takes 1.7 s, of which 1.3 s are for scikit-learn, pandas and dash, which are
+    not used here. The core has the same ``core``, ``t``, ``geometry`` and ``utility``, and the
+    whole package can still be imported afterwards.
     """
     if _OPEN3D_CORE in sys.modules:
         return sys.modules[_OPEN3D_CORE]
@@ -57,7 +60,7 @@ def _load_open3d() -> Any:
         import open3d
 
         return open3d
-    # as the package does before it loads the same file
+    # the package sets these variables before it loads the same file
     os.environ["KMP_DUPLICATE_LIB_OK"] = "True"
     os.environ["TCM_ENABLE"] = "1"
     spec = spec_from_file_location(_OPEN3D_CORE, files[0])
@@ -86,15 +89,18 @@ class Closest:
 
 
 class DistanceField:
-    """Signed distance to a triangle mesh, negative inside; the hollow of a cup is outside.
+    """Signed distance to a triangle mesh, negative inside the solid; a cup's hollow is outside.
 
-    Queries are in the mesh's frame, float64 in and out, computed in float32 with errors up to 1e-6
-    of the coordinates' size. ``box`` (2, 3) holds the least and largest coordinates.
+    Queries are in the mesh's frame. Arrays are float64, but computed in float32 with errors up to
+    1e-6 of the coordinates' size.
+
+    Attributes:
+        box: (2, 3) smallest and largest coordinates, metres.
 
     Args:
         vertices: (V, 3) metres.
         faces: (F, 3), wound outward.
-        watertight: whether rays suffice to decide inside and outside.
+        watertight: the mesh is closed, so rays decide inside and outside; else winding numbers.
         threads: 0 = all cores; the result does not depend on it.
     """
 
@@ -115,7 +121,10 @@ class DistanceField:
         self._open = None if watertight else _OpenSurface(vertices, faces, threads)
 
     def signed_distance(self, points: np.ndarray) -> np.ndarray:
-        """Distance (N,) of points (N, 3) to the surface, metres, negative inside."""
+        """Return the distance (N,) of points (N, 3) to the surface, metres, negative inside.
+
+        For points inside an open surface it is that to :meth:`boundary`.
+        """
         if self._open is not None:
             inside, closest = self.boundary(points)
             distance = np.linalg.norm(np.reshape(points, (-1, 3)) - closest.points, axis=1)
@@ -126,9 +135,9 @@ class DistanceField:
     def boundary(self, points: np.ndarray) -> tuple[np.ndarray, Closest]:
         """Return which points (N, 3) are inside, and the closest point of the solid's boundary.
 
-        The boundary is the surface. For points inside an open surface it is the convex hull where
-        this is closer, so that no depth exceeds the object's thickness. Faces and barycentric
-        weights always belong to the surface.
+        The boundary is the surface. For points inside an open surface it is the convex hull if that
+        is closer, so that no depth exceeds the object's thickness. Faces and barycentric weights
+        always belong to the surface.
         """
         inside, closest = self.inside(points), self.closest(points)
         if self._open is not None and inside.any():
@@ -136,7 +145,7 @@ class DistanceField:
         return inside, closest
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Distance (N,) of points (N, 3) to the surface, metres, never negative."""
+        """Return the distance (N,) of points (N, 3) to the surface, metres, never negative."""
         query = o3d.core.Tensor.from_numpy(np.ascontiguousarray(points, np.float32).reshape(-1, 3))
         return self._scene.compute_distance(query).numpy().astype(np.float64)
 
@@ -148,8 +157,9 @@ class DistanceField:
     def inside(self, points: np.ndarray) -> np.ndarray:
         """Return whether points (N, 3) are inside the solid: (N,) bool.
 
-        A watertight mesh needs one ray a point; the few points found inside are checked with more
-        rays, because a ray through an edge may count it twice or never.
+        In a watertight mesh, points outside of the bounding box need no ray, and most others one.
+        Points that this ray classifies as inside are decided by the majority of five rays, because
+        a ray through an edge may count it twice or not at all.
         """
         query = np.asarray(points, np.float32).reshape(-1, 3)
         if self._open is not None:
@@ -169,15 +179,21 @@ class DistanceField:
         return self._scene.count_intersections(rays).numpy() % 2 == 1
 
     def closest(self, points: np.ndarray) -> Closest:
-        """The closest surface points of points (N, 3)."""
+        """Return the closest surface points of points (N, 3)."""
         return _closest(self._scene, points)
 
 
 class SurfacePart:
-    """Distances to the part of a mesh's surface that its vertices ``part`` (K,) span.
+    """Distances to a part of a mesh's surface.
 
-    The part consists of the faces whose corners all belong to it, and of all faces around a vertex
-    that has no such face. ``whole`` decides what is inside the object.
+    The part consists of the faces whose corners are all among the vertices ``part``, and of all
+    faces around a vertex of ``part`` that has no such face.
+
+    Args:
+        whole: field of the whole mesh, which decides what is inside the object.
+        vertices: (V, 3) metres.
+        faces: (F, 3)
+        part: (K,) vertex indices.
     """
 
     def __init__(
@@ -198,10 +214,11 @@ class SurfacePart:
         self._face = np.flatnonzero(spanned).astype(np.int32)
 
     def boundary(self, points: np.ndarray) -> tuple[np.ndarray, Closest]:
-        """Return which points (N, 3) are inside the object below the part, and its closest points.
+        """Return which points (N, 3) are inside the object below the part, and the part's closest
+        points.
 
         A point inside the object that is nearer to another part of the surface counts as outside,
-        because the distance to this part is no depth there.
+        because its distance to this part is not its depth.
         """
         inside, nearest = self._whole.boundary(points)
         closest = _closest(self._scene, points)
@@ -209,7 +226,7 @@ class SurfacePart:
         distance = np.linalg.norm(query - closest.points, axis=1)
         depth = np.linalg.norm(query - nearest.points, axis=1)
         faces = self._face[closest.faces]
-        below = inside & (distance < depth + 1e-6)  # metres: float32 at an object's size
+        below = inside & (distance < depth + 1e-6)  # metres: rounding of float32 in an object
         return below, Closest(closest.points, faces, closest.barycentric, closest.normals)
 
 
@@ -236,8 +253,13 @@ class _OpenSurface:
         return result
 
     def nearer(self, points: np.ndarray, inside: np.ndarray, closest: Closest) -> Closest:
-        """Return ``closest`` (N) with points and normals of the hull where points (N, 3) are
-        ``inside`` (N,) and the hull is closer."""
+        """Return ``closest`` with points and normals of the convex hull if that is closer.
+
+        Args:
+            points: (N, 3) metres.
+            inside: (N,) bool; other points keep their closest point.
+            closest: closest points (N) of the surface.
+        """
         at = np.flatnonzero(inside)
         hull = _closest(self._hull, points[at])
         to_hull, to_surface = (
@@ -252,7 +274,8 @@ class _OpenSurface:
 class OcclusionScene:
     """Visibility of a mesh's vertices from cameras, occluded by the mesh itself and by others.
 
-    All meshes are in one frame. Build it once for a frame of the capture and query each camera.
+    All meshes are in one coordinate frame. Build one scene for each frame of the capture and query
+    it for every camera.
     """
 
     def __init__(

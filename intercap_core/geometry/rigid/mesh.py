@@ -52,9 +52,9 @@ class ObjectMesh:
     def load(cls, entry: ObjectEntry) -> ObjectMesh:
         """Load and check the mesh, contact vertices and symmetry of an objects.yaml entry.
 
-        Coinciding vertices are joined, inconsistent winding is turned, small holes are closed and
-        faces without area are left out, each with a warning. A mesh that stays open is used, with
-        ``watertight`` false. Raises UserError that names the file, the fault and the next step.
+        Coinciding vertices are merged, faces of inconsistent winding are turned, small holes are
+        closed and faces without area are left out, each with a warning. If holes remain,
+        ``watertight`` is false. Raises UserError that names the file, the fault and the next step.
         """
         path = Path(entry.mesh)
         mesh = read_mesh(path)
@@ -97,16 +97,17 @@ class ObjectMesh:
         if not self.watertight:
             areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
             return (areas[:, None] * centroids).sum(0) / areas.sum()
-        middle = self.vertices.mean(0)  # tetrahedra from a near point limit rounding errors
+        # sum of tetrahedra from a point near the object, which limits rounding errors
+        middle = self.vertices.mean(0)
         volumes = np.einsum("ij,ij->i", a - middle, np.cross(b - middle, c - middle))
         return (volumes[:, None] * (0.75 * centroids + 0.25 * middle)).sum(0) / volumes.sum()
 
     def simplified(self, max_faces: int, tolerance_m: float = 0.0005) -> ObjectMesh:
         """Return the object with about ``max_faces`` faces, for rendering and search.
 
-        Every vertex stays within ``tolerance_m`` of the simplified surface, with more faces if
-        necessary; the default is below the sensor's noise. Contact vertices are left out. Returns
-        the mesh itself if it is small enough.
+        Every vertex of the object is within ``tolerance_m`` of the simplified surface; the number
+        of faces is increased until that holds. The default is below the sensor's noise. Contact
+        vertices are left out. Returns the mesh itself if it is small enough.
         """
         from intercap_core.geometry.rigid.distance import DistanceField, o3d
 
@@ -135,7 +136,7 @@ class ObjectMesh:
         return float(np.linalg.norm(self.vertices - self.centre_of_mass, axis=1).max())
 
     def centre_at(self, pose: np.ndarray) -> np.ndarray:
-        """Centre of mass (3,) under a pose (4, 4), in the frame that the pose leads to, metres."""
+        """Return the centre of mass (3,) at a pose a_from_object (4, 4), in frame a, metres."""
         return pose[:3, :3] @ self.centre_of_mass + pose[:3, 3]
 
     @cached_property
@@ -149,7 +150,7 @@ class ObjectMesh:
 
 @dataclass(frozen=True, eq=False)
 class Paint:
-    """Points spread evenly over a coloured surface."""
+    """Colours of an object: points spread over its surface, with normals and colours."""
 
     points: np.ndarray
     """(N, 3) metres, object frame."""
@@ -160,9 +161,9 @@ class Paint:
 
     @classmethod
     def load(cls, path: Path, outward: ObjectMesh) -> Paint | None:
-        """Return the colours of a mesh file, or None if it has none or only one.
+        """Return the colours of a mesh file, or None if it has no colours or a single one.
 
-        A texture that cannot be read counts as none.
+        A texture that cannot be read counts as no colours.
 
         Args:
             path: mesh file.
@@ -189,7 +190,7 @@ class Paint:
 
 
 def _colours(mesh: Any, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Colours (N, 3) uint8 at barycentric ``weights`` (N, 3) of faces (N,)."""
+    """Return colours (N, 3) uint8 at barycentric ``weights`` (N, 3) of faces (N,)."""
     corners = mesh.faces[face]
     if mesh.visual.kind != "texture":
         of_corner = np.asarray(mesh.visual.vertex_colors, float)[corners, :3]
@@ -217,7 +218,8 @@ def _check_size(path: Path, mesh: trimesh.Trimesh) -> None:
             "; scale it so that its unit is the metre"
         )
     away = float(np.abs(mesh.vertices[np.unique(mesh.faces)]).max())
-    if away > 50:  # scans are off by a room's width; there, single precision ends at micrometres
+    # scans may be a room's width away from the origin; at 50 m single precision rounds to 4 um
+    if away > 50:
         raise UserError(
             f"{path}: has vertices {away:.4g} m from its origin, expected at most 50 m; move the "
             "object to its origin, in metres"
@@ -232,7 +234,7 @@ def _check_size(path: Path, mesh: trimesh.Trimesh) -> None:
 def _check_volume(path: Path, mesh: trimesh.Trimesh) -> None:
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     volume = float(mesh.volume) if len(mesh.faces) else 0.0
-    if not volume > 1e-8 * extent**3:  # a flat sheet with rounding errors
+    if not volume > 1e-8 * extent**3:  # less is a flat sheet with rounding errors
         raise UserError(
             f"{path}: encloses {volume:.3g} m^3 at {extent:.3g} m of length, expected a body with "
             "thickness; export a closed surface instead of a flat sheet"
@@ -242,9 +244,11 @@ def _check_volume(path: Path, mesh: trimesh.Trimesh) -> None:
 def _without_loose_vertices(
     path: Path, mesh: trimesh.Trimesh
 ) -> tuple[trimesh.Trimesh, np.ndarray]:
-    """Return the mesh without vertices that no face uses, which would count in its size.
+    """Remove vertices that no face uses, which would count in the size of the mesh.
 
-    Also returns the new index (V_file,) of each vertex of the file, -1 = left out.
+    Returns:
+        The mesh.
+        (V_file,) new index of each vertex of the file, -1 = removed.
     """
     count = len(mesh.vertices)
     used = np.unique(mesh.faces)
@@ -264,7 +268,12 @@ def _without_loose_vertices(
 
 
 def _repair(path: Path, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, np.ndarray]:
-    """Return a consistent mesh and the new index (V_file,) of each vertex of the file."""
+    """Repair a mesh as :meth:`ObjectMesh.load` describes.
+
+    Returns:
+        A mesh of consistent winding, perhaps with holes.
+        (V,) new index of each vertex of ``mesh``.
+    """
     new_id = np.arange(len(mesh.vertices))
     if mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0:
         return mesh, new_id
@@ -299,7 +308,8 @@ def _repair(path: Path, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, np.ndar
         edges = np.sort(mesh.edges, axis=1)
         _, count = np.unique(edges, axis=0, return_counts=True)
         open_share = float((count != 2).mean())
-        if open_share > 0.35:  # loose faces; a lidless box of few faces has a quarter
+        # more is a collection of loose faces; a box of few faces without lid has a quarter
+        if open_share > 0.35:
             raise UserError(
                 f"{path}: {open_share:.0%} of its edges do not join two faces, so it has no "
                 "inside; close the surface (e.g. with MeshLab's or Blender's remesher)"
@@ -316,13 +326,13 @@ def _repair(path: Path, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, np.ndar
 def _contact_places(
     listed: Path | None, path: Path, vertices: np.ndarray, place: np.ndarray
 ) -> np.ndarray | None:
-    """Return indices (K,) of likely-contact vertices, or None if there is no list.
+    """Return indices (K,) of likely-contact vertices after ``place``, or None without a list.
 
     Args:
         listed: file of the list.
         path: mesh file.
         vertices: (V, 3) of the mesh file.
-        place: (V,) new index of each vertex, -1 = left out.
+        place: (V,) new index of each vertex, -1 = removed.
     """
     if listed is None:
         return None

@@ -1,6 +1,7 @@
-"""Mesh files. Counts in a file's header are compared with its content.
+"""Reading of mesh files.
 
-Materials and textures are read from the folder of the mesh only, whatever path it names.
+Counts in a file's header are compared with its content. Materials and textures are read only from
+the folder of the mesh, even if the file names another path.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from intercap_core.inputs.files import (
 )
 
 SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb")
-# What trimesh and numpy raise for broken files, and Pillow for broken textures.
+# Exceptions of trimesh and numpy for damaged files, and of Pillow for damaged textures.
 TEXTURE_ERRORS = (
     AttributeError, TypeError, ValueError, IndexError, KeyError, OSError, SyntaxError,
     OverflowError, struct.error, zlib.error, Image.DecompressionBombError, EOFError,
@@ -38,7 +39,7 @@ _ERRORS = (*TEXTURE_ERRORS, ZeroDivisionError, NotImplementedError, RecursionErr
 def load_mesh(path: Path) -> Any:
     """Return the triangle mesh of a file; a scene becomes one mesh.
 
-    Raises UserError, naming the file, if it is no mesh or holds fewer faces than its header states.
+    Raises UserError that names the file if it is no mesh or has fewer faces than its header states.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -47,7 +48,7 @@ def load_mesh(path: Path) -> Any:
     stated = _stated_faces(path, content) if suffix == ".ply" else 0
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of numpy, about values that are refused below
+            warnings.simplefilter("ignore")  # NumPy's, about values that are rejected later
             mesh: Any = trimesh.load(
                 io.BytesIO(content),
                 file_type=suffix[1:],
@@ -97,14 +98,14 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
 
 
 def get_colours(mesh: trimesh.Trimesh) -> np.ndarray:
-    """Return vertex colours (V, 4) uint8: stored ones, sampled from a texture, or grey."""
+    """Return vertex colours (V, 4) uint8, sRGB and alpha: stored, from the texture, or grey."""
     visual: Any = mesh.visual
     try:
         if visual is not None and visual.kind == "texture":
             visual = visual.to_color()
         colours = np.asarray(getattr(visual, "vertex_colors", ()), np.uint8)
     except TEXTURE_ERRORS:
-        colours = np.zeros(0, np.uint8)  # a texture that is not there, or is no image
+        colours = np.zeros(0, np.uint8)  # the texture is missing or no image
     if colours.shape != (len(mesh.vertices), 4):
         return np.full((len(mesh.vertices), 4), (128, 128, 128, 255), np.uint8)
     return colours

@@ -1,7 +1,7 @@
-"""Search of the nearest of many points on surfaces, by a grid of cubic cells.
+"""Exact nearest-neighbour search among many points on surfaces, by a grid of cubic cells.
 
-Points are sorted by cell. Cells that are consecutive along the last axis are consecutive in memory,
-so that the part of a row of cells that a ball reaches is one loop.
+Points are sorted by cell. A row is the cells along the last axis, which are consecutive in memory.
+The cells of a row that a ball around the query intersects are therefore one loop over points.
 """
 
 from __future__ import annotations
@@ -9,8 +9,10 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-CELL_M = 0.02  # holds some ten points of each of three depth cameras; half or double is slower
-MAX_CELLS = 1 << 21  # beyond, cells are larger: points far apart are sparse
+# Size of a cell, metres: it contains some ten points of each of three depth cameras. Half or double
+# is slower.
+CELL_M = 0.02
+MAX_CELLS = 1 << 21  # largest number of cells; for a larger extent, cells are enlarged
 
 
 class PointGrid:
@@ -32,8 +34,12 @@ class PointGrid:
 def sort_into_cells(points, cell):
     """Sort points (N, 3) float32, N > 0, into cells of at least ``cell`` metres.
 
-    Returns coordinates (3, N) in the order of cells, the start (cells + 1,) of each cell, the
-    corner (3,) of the first cell, the number of cells along each axis (3,), and the cell size.
+    Returns:
+        (3, N) coordinates in the order of cells.
+        (cells + 1,) start of each cell, then N.
+        (3,) corner of the first cell: the smallest coordinates.
+        (3,) number of cells along each axis.
+        Size of a cell, metres.
     """
     count = len(points)
     low, high = points[0].astype(np.float64), points[0].astype(np.float64)
@@ -60,7 +66,7 @@ def sort_into_cells(points, cell):
         place[n] = (i * number[1] + j) * number[2] + k
         starts[place[n]] += 1
     end = 0
-    for at in range(len(starts)):  # where each cell's end; filled from there
+    for at in range(len(starts)):  # end of each cell, which the loop below decreases to its start
         end += starts[at]
         starts[at] = end
     placed = np.empty((3, count), np.float32)
@@ -76,10 +82,11 @@ def sort_into_cells(points, cell):
 def _nearest(queries, points, starts, low, number, size):
     """Return the squared distance (M,) of finite queries (M, 3) float32 to the nearest point.
 
-    The other arguments are results of :func:`sort_into_cells`. Each search starts with the nearest
-    point of the query before. Layers of cells along the first axis, and rows of a layer along the
-    second, are visited outwards from the query's own, in turn on both sides. The visit ends when
-    three in succession are farther away than the nearest point so far.
+    The other arguments are results of :func:`sort_into_cells`. The first bound is the distance to
+    the nearest point of the previous query. Layers of cells (first axis), and the rows of a layer
+    (second axis), are visited outwards from the query's own layer and row, alternately on both
+    sides. A layer or row farther than the nearest point so far is skipped. After three of them in
+    succession, which include both sides, all that follow are farther too, so the search is exact.
     """
     xs, ys, zs = points[0], points[1], points[2]
     inverse = 1 / size
@@ -91,8 +98,8 @@ def _nearest(queries, points, starts, low, number, size):
         gx, gy, gz = (x - low[0]) * inverse, (y - low[1]) * inverse, (z - low[2]) * inverse
         own_i = min(max(np.int64(np.floor(gx)), 0), number[0] - 1)
         own_j = min(max(np.int64(np.floor(gy)), 0), number[1] - 1)
-        beyond_i = -1  # successive layers that are too far away, less one
-        for a in range(2 * number[0]):  # own layer of cells first, then those around in turn
+        beyond_i = -1  # number of successive layers that are too far away, minus one
+        for a in range(2 * number[0]):  # offsets 0, 1, -1, 2, -2, ... from the own layer
             i = own_i + ((a + 1) >> 1) * (1 if a & 1 else -1)
             off_x = max(i - gx, gx - i - 1, 0.0) * size
             if off_x * off_x >= best:

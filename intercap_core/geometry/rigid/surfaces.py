@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# Steps of the two-dimensional golden-ratio sequence: evenly spread barycentric coordinates
-# without a random generator (Roberts 2018, "The Unreasonable Effectiveness of Quasirandom
+# Increments of the two-dimensional golden-ratio sequence, which spreads barycentric coordinates
+# evenly without a random generator (Roberts 2018, "The Unreasonable Effectiveness of Quasirandom
 # Sequences").
 _STEP_U, _STEP_V = 0.7548776662466927, 0.5698402909980532
 
@@ -31,12 +31,15 @@ class SurfaceSamples:
     """Points spread evenly over a mesh's area."""
 
     faces: np.ndarray
-    """(N,) indices."""
+    """(N,) face of each point."""
     barycentric: np.ndarray
     """(N, 3) weights of the face's corners."""
 
     def of(self, values: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-        """Interpolate values (V, ...) at the vertices of ``triangles`` (F, 3): (N, ...)."""
+        """Return values (N, ...) at the points, interpolated from vertex values (V, ...).
+
+        triangles: (F, 3) faces of the mesh.
+        """
         corners = triangles[self.faces]
         weights = self.barycentric.reshape(len(self.faces), 3, *([1] * (values.ndim - 1)))
         return sum(values[corners[:, k]] * weights[:, k] for k in range(3))
@@ -46,7 +49,10 @@ class SurfaceSamples:
 
 
 def sample_surface(vertices: np.ndarray, triangles: np.ndarray, count: int) -> SurfaceSamples:
-    """Spread ``count`` points over the area of (V, 3), (F, 3), deterministically."""
+    """Return ``count`` points spread evenly over the area of a mesh (V, 3), (F, 3).
+
+    The choice is deterministic.
+    """
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     reached = np.cumsum(area)

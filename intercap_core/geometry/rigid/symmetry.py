@@ -1,9 +1,10 @@
 """Symmetry groups of objects, as BOP's ``models_info`` states them.
 
-An element is a motion S of the object's frame that does not change the object's appearance: poses
-``master_from_object`` and ``master_from_object @ S`` are indistinguishable. Discrete elements are
-4x4 transforms. Continuous elements are all rotations about one axis through ``offset``. The group
-holds every product of the two. ``sphere`` stands for all rotations about the origin.
+An element is a rigid motion S of the object's frame that does not change the object's appearance:
+the poses ``master_from_object`` and ``master_from_object @ S`` are indistinguishable. Discrete
+elements are 4x4 transforms. Continuous elements are all rotations about one axis through
+``offset``. The group contains every product of the two. ``sphere`` stands for all rotations about
+the origin.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ import numpy as np
 from intercap_core.entries import Symmetry
 from intercap_core.geometry.camera.transforms import rigid, rotation_exp
 
-SAME_TRANSFORM = 1e-3  # per entry; transforms that differ by less are equal: tables have 4 digits
+# Transforms whose entries differ by less than this are equal: tables have 4 digits.
+SAME_TRANSFORM = 1e-3
 
 
 @dataclass(frozen=True)
@@ -25,7 +27,7 @@ class SymmetryGroup:
     discrete: np.ndarray
     """(n, 4, 4), closed under products, the identity first."""
     axis: np.ndarray | None = None
-    """(3,) unit vector of the continuous axis."""
+    """(3,) unit vector of the continuous axis; None = no continuous symmetry."""
     offset: np.ndarray | None = None
     """(3,) point on the axis, metres."""
     sphere: bool = False
@@ -33,7 +35,7 @@ class SymmetryGroup:
 
     @classmethod
     def none(cls) -> SymmetryGroup:
-        """The group of an object without symmetry."""
+        """Return the group of an object without symmetry."""
         return cls(np.eye(4)[None])
 
     @classmethod
@@ -74,9 +76,10 @@ class SymmetryGroup:
         return len(self.discrete) == 1 and self.axis is None and not self.sphere
 
     def nearest_equivalent(self, rotation: np.ndarray, reference: np.ndarray) -> np.ndarray:
-        """The rotation (..., 3, 3) equivalent to ``rotation`` that is closest to ``reference``.
+        """Return the rotation equivalent to ``rotation`` (..., 3, 3) that is closest to
+        ``reference`` (..., 3, 3).
 
-        Exact for rotations alone; for groups that do not fix the origin use
+        The translations of the group's elements are ignored. For poses use
         :meth:`nearest_equivalent_pose`.
         """
         rotation, reference = np.broadcast_arrays(
@@ -90,11 +93,13 @@ class SymmetryGroup:
         return np.take_along_axis(options, best, -3)[..., 0, :, :]
 
     def nearest_equivalent_pose(self, pose: np.ndarray, reference: np.ndarray) -> np.ndarray:
-        """The pose (4, 4) equivalent to ``pose`` whose rotation is closest to ``reference``'s."""
+        """Return the pose (4, 4) equivalent to ``pose`` with the rotation closest to that of
+        ``reference``."""
         rotation = self.nearest_equivalent(pose[:3, :3], reference[:3, :3])
         if self.sphere:
             return rigid(rotation, pose[:3, 3])
-        # The translation of the element S = pose^-1 equivalent follows from its discrete element.
+        # The nearest rotation is R S with an element S of the group. Find the discrete factor of S;
+        # the rest of S is a rotation about the axis. Both determine the translation of S.
         element = pose[:3, :3].T @ rotation
         for discrete in self.discrete:
             rest = discrete[:3, :3].T @ element
@@ -106,7 +111,7 @@ class SymmetryGroup:
         raise AssertionError("the nearest rotation is not in the group")
 
     def rotation_error_deg(self, rotation: np.ndarray, true_rotation: np.ndarray) -> np.ndarray:
-        """Smallest geodesic angle (...) in degrees over the group; 0 for a sphere."""
+        """Return the smallest geodesic angle (...), degrees, over the group; 0 for a sphere."""
         nearest = self.nearest_equivalent(rotation, true_rotation)
         chord = np.linalg.norm(nearest - np.asarray(true_rotation), axis=(-1, -2))
         return np.degrees(2 * np.arcsin(np.clip(chord / (2 * np.sqrt(2)), 0, 1)))
@@ -131,10 +136,11 @@ class SymmetryGroup:
         return rigid(rotation, self.offset - rotation @ self.offset)
 
     def _aligned(self, rotation: np.ndarray, reference: np.ndarray) -> np.ndarray:
-        """Return one candidate (..., n, 3, 3) per discrete element, rotated best about the axis.
+        """Return one candidate (..., n, 3, 3) for each discrete element D.
 
-        The angle maximises trace(M Rot(axis, angle)) with M = reference^T rotation D, which is
-        aMa + cos (trM - aMa) + sin tr(M [a]x).
+        It is rotation D Rot(a, angle) with the axis a. The angle brings it closest to the
+        reference: it maximises trace(M Rot(a, angle)) with M = reference^T rotation D, which is
+        a.Ma + cos(angle) (tr M - a.Ma) + sin(angle) tr(M [a]x).
         """
         options = rotation[..., None, :, :] @ self.discrete[:, :3, :3]
         if self.axis is None:
