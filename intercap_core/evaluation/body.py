@@ -1,4 +1,7 @@
-"""Errors of a fitted body against the true body, metres."""
+"""Errors of a fitted body against the true body, metres.
+
+Joints are the 55 of SMPL-X: 0-21 body, 22-24 jaw and eyes, 25-39 left and 40-54 right fingers.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +13,13 @@ BODY_JOINTS = slice(0, 22)
 FOOT_JOINTS = (7, 8, 10, 11)  # ankles and balls
 FINGER_JOINTS = (slice(25, 40), slice(40, 55))  # left, right
 BOTH_HANDS = slice(25, 55)
-# A three-dimensional normal error is longer than this many standard deviations half of the time
-# (the median of the chi distribution with three degrees of freedom).
+# Median length of a 3D normal error, in standard deviations of one coordinate: the median of the
+# chi distribution with three degrees of freedom.
 MEDIAN_CHI_3 = 1.5382
 
 
 def vertex_error(vertices: np.ndarray, true_vertices: np.ndarray) -> np.ndarray:
-    """PVE (...): mean distance of corresponding vertices (..., V, 3)."""
+    """Per-vertex error (PVE) (...): mean distance of corresponding vertices (..., V, 3)."""
     return np.linalg.norm(vertices - true_vertices, axis=-1).mean(-1)
 
 
@@ -25,7 +28,7 @@ def visible_vertex_error(
     true_vertices: np.ndarray,
     visible: np.ndarray,
 ) -> np.ndarray:
-    """PVE (...) over the vertices in the mask ``visible`` (..., V); NaN if the mask is empty."""
+    """Mean vertex error (...) over the mask ``visible`` (..., V); NaN if the mask is empty."""
     error = np.linalg.norm(vertices - true_vertices, axis=-1)
     count = visible.sum(-1)
     mean = (error * visible).sum(-1) / np.maximum(count, 1)
@@ -120,7 +123,10 @@ def normalised_joint_error(
     sigma: np.ndarray,
     which: slice = BODY_JOINTS,
 ) -> np.ndarray:
-    """Distance of joints from the truth over the stated deviation; its median is 1 if calibrated.
+    """Distance (..., J) of joints from the truth over the distance expected from ``sigma``.
+
+    The expected distance is :data:`MEDIAN_CHI_3` * ``sigma``, so the median of the result is 1 if
+    the stated deviations are calibrated.
 
     Args:
         joints, true_joints: (..., 55, 3).

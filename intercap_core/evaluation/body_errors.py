@@ -1,4 +1,8 @@
-"""Errors of the bodies fitted to one recording, and the figures of many such recordings."""
+"""Errors of the bodies fitted to one recording, and figures (summary numbers) of many recordings.
+
+Names that end in ``_floor`` are lower bounds: the same distance for the true body. It is not 0,
+because of clothing and depth noise.
+"""
 
 from __future__ import annotations
 
@@ -78,9 +82,10 @@ class BodyClouds:
         """Mean distances of frame ``t`` by CLOUD_KEYS, metres; NaN if no point was measured.
 
         - ``cloud_to_mesh``: from the points to the fitted mesh, vertices (V, 3).
-        - ``mesh_to_cloud_visible``: from samples of the mesh to the points. Only samples that a
-          depth image with a person mask truly shows.
-        - ``..._floor``: the same for the true body, a lower bound for a body without clothing.
+        - ``mesh_to_cloud_visible``: from samples of the mesh to the points. Only samples are used
+          that a depth image with a person mask truly shows.
+        - ``..._floor``: the same distances for the true body, which has no clothing: the lower
+          bound of a correct fit.
         """
         assert truth.vertices is not None
         true = truth.vertices[t].astype(np.float64)
@@ -111,7 +116,7 @@ class BodyClouds:
         sight = Sight(occluders)
         points = self._samples.of(true, self._faces)
         normals = face_normals(true, self._faces)[self._samples.faces]
-        # the visibility in the truth includes occlusion by furniture
+        # visibility in any camera by the truth, which includes occlusion by furniture
         anyhow = self._samples.of(truth.visible[t].astype(np.float32), self._faces) > 0.5
         return anyhow & sight.seen(points, normals, cameras)
 
@@ -124,7 +129,9 @@ class BodyErrors:
     """Errors of one body over T frames, metres; NaN = unknown."""
 
     sequence: str
+    """Name of the sequence."""
     interaction: str
+    """Script that the studio's person performs."""
     truth: Path
     """The file with the truth."""
     views: int
@@ -138,7 +145,7 @@ class BodyErrors:
     hands: np.ndarray
     """(T, 2) mean error of joints and tips of the left and right hand."""
     hands_wrist: np.ndarray
-    """(T, 2) the same with the wrist aligned."""
+    """(T, 2) the same error after translation of the fitted wrist to the true one."""
     touching: np.ndarray
     """(T, 2) whether the hand truly touches the object."""
     face: np.ndarray
@@ -146,15 +153,15 @@ class BodyErrors:
     face_aligned: np.ndarray
     """(T,) the same after rigid alignment."""
     acceleration: np.ndarray
-    """(T,) error, metres per frame^2 at 30 fps."""
+    """(T,) mean error of the joints' second differences, metres per frame^2 at 30 fps."""
     normalised: np.ndarray
-    """(T, 22) joint errors over their stated deviation."""
+    """(T, 22) joint errors over their expected size; median 1 if calibrated."""
     normalised_hands: np.ndarray
-    """(T, 30) finger joint errors over their stated deviation."""
+    """(T, 30) the same for the finger joints."""
     flagged: np.ndarray
-    """(T,) the stage marked the frame as unreliable."""
+    """(T,) bool: the stage marked the frame as unreliable."""
     clouds: dict[str, np.ndarray] = field(default_factory=dict)
-    """(N,) by CLOUD_KEYS, every EVERY."""
+    """Distances (N,) in every EVERY-th frame, by CLOUD_KEYS."""
 
     @property
     def bad(self) -> np.ndarray:
@@ -163,7 +170,7 @@ class BodyErrors:
 
     @property
     def worst(self) -> int:
-        """The frame with the largest vertex error, or joint error where the former is unknown."""
+        """The frame with the largest vertex error, or joint error if no vertex error is known."""
         known = np.isfinite(self.pve).any()
         return int(np.nanargmax(self.pve if known else self.joints.mean(1)))
 

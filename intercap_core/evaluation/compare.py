@@ -1,4 +1,8 @@
-"""Compare two versions of a dataset: changes by sequence and frame."""
+"""Compare two versions of a dataset: changes by sequence and frame.
+
+A frame has changed if body, hands or object moved by more than 1 mm, the object turned by more than
+0.5 degrees, or its contact regions or flag differ.
+"""
 
 from __future__ import annotations
 
@@ -29,11 +33,12 @@ class Comparison:
     """Differences between two versions, millimetres and degrees."""
 
     sequences: pd.DataFrame
-    """One row per sequence of either version: incomparable ones, then the most changed first."""
+    """One row per sequence of either version. Sequences that cannot be compared come first, then
+    those with the largest share of changed frames."""
     frames: pd.DataFrame
     """One row per changed frame."""
     figures: pd.DataFrame
-    """"figure", "old", "new" of summary.json; empty if a version lacks it."""
+    """Columns "figure", "old", "new": numbers of summary.json; empty if a version lacks it."""
 
 
 def compare(old: Path, new: Path) -> Comparison:
@@ -95,6 +100,7 @@ def _figures(old: Path, new: Path) -> pd.DataFrame:
 
 
 def _numbers(values: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, float]]:
+    """Yield the numbers of nested mappings with their path, "outer.inner"."""
     for name, value in values.items():
         if isinstance(value, Mapping):
             yield from _numbers(value, f"{above}{name}.")
@@ -103,6 +109,7 @@ def _numbers(values: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, 
 
 
 def _sequences(folder: Path) -> dict[str, Path]:
+    """Folders of the sequences of a version, by name."""
     if not folder.is_dir():
         raise UserError(f"{folder}: no such folder; expected a results folder, results/<dataset>")
     found = {path.parent.name: path.parent for path in sorted(folder.glob("*/joint.h5"))}
@@ -115,6 +122,7 @@ def _sequences(folder: Path) -> dict[str, Path]:
 
 
 def _compare_one(name: str, old: Path, new: Path) -> tuple[dict[str, object], pd.DataFrame]:
+    """Row of one sequence, and the table of its changed frames."""
     with (
         artefacts.read(old / "joint.h5", JOINT) as before,
         artefacts.read(new / "joint.h5", JOINT) as after,
@@ -150,6 +158,7 @@ def _compare_one(name: str, old: Path, new: Path) -> tuple[dict[str, object], pd
 
 
 def _frames(name: str, before: Artefact, after: Artefact) -> pd.DataFrame:
+    """Differences of all frames of a sequence, millimetres and degrees."""
     joints, joints_after = before["joints"], after["joints"]
     if joints.shape != joints_after.shape:
         raise UserError(
@@ -184,10 +193,12 @@ def _frames(name: str, before: Artefact, after: Artefact) -> pd.DataFrame:
 
 
 def _touching(joint: Artefact) -> np.ndarray:
+    """Mask (T, R) of the regions in contact."""
     return np.nan_to_num(joint["contact_probability"]) >= 0.5
 
 
 def _named(regions: np.ndarray, which: np.ndarray) -> Sequence[str]:
+    """Names of the regions in each row of the mask ``which`` (T, R), joined by ";"."""
     return [";".join(regions[row]) for row in which]
 
 

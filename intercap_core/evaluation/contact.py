@@ -1,8 +1,8 @@
-"""Contact by distance and depths of penetration, and how well contact agrees with the true contact.
+"""Contact by distance, depths of penetration, and agreement of contact with the true contact.
 
-A vertex is in contact when its signed distance to the other surface is at most the threshold, so
-a penetrating vertex is in contact too. The paper thresholds the unsigned distance at 4.5 mm; the
-two differ by the vertices that lie deeper than that.
+A vertex is in contact if its signed distance to the other surface (negative inside) is at most the
+threshold, so a penetrating vertex is in contact too. The paper thresholds the unsigned distance at
+4.5 mm; the two differ for vertices that are more than 4.5 mm inside.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 CONTACT_M = 0.0045  # the paper's threshold, Experiments, "Contact Heatmaps"
+# Thresholds, metres, at which agreement with the true contact is also evaluated.
 SWEEP_M = (0.002, 0.003, 0.0045, 0.006, 0.008, 0.010, 0.015, 0.020, 0.030)
 
 
@@ -63,7 +64,7 @@ def precision(found: np.ndarray, true: np.ndarray) -> float:
 
 
 class Depths(NamedTuple):
-    """Depths of the penetrating points of one frame, metres; 0 where no point penetrates."""
+    """Depths of the penetrating points of one frame, metres; 0 if no point penetrates."""
 
     mean: float
     median: float
@@ -71,7 +72,10 @@ class Depths(NamedTuple):
 
 
 def depths(signed_distance: np.ndarray) -> Depths:
-    """Depths below the surface of the points (N,) inside it, whose signed distance is negative."""
+    """Statistics of the depths of the points inside the surface.
+
+    ``signed_distance``: (N,) metres, negative inside.
+    """
     inside = -signed_distance[signed_distance < 0]
     if len(inside) == 0:
         return Depths(0.0, 0.0, 0.0)
@@ -81,7 +85,7 @@ def depths(signed_distance: np.ndarray) -> Depths:
 def ground_penetration(vertices: np.ndarray, point: np.ndarray, normal: np.ndarray) -> float:
     """Depth of the deepest vertex below the floor, metres.
 
-    0 where all vertices are above the floor, NaN if the floor is not known.
+    0 if all vertices are above the floor, NaN if the floor is unknown.
 
     Args:
         vertices: (V, 3) metres.

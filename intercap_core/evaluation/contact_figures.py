@@ -1,7 +1,7 @@
 """Figures of sequences with truth: slip, planted feet, and the contact that the joint stage states.
 
-The contact of this module is the joint stage's own probability. Contact of the fitted meshes by
-distance is in :mod:`.contact`.
+"Stated" contact is the probability that the joint stage itself computes. Contact by the distance of
+the fitted meshes is evaluated in :mod:`.contact`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from intercap_core.evaluation import contact, motion
 from intercap_core.evaluation.figures import Figures, SequenceMetrics, object_figures, pooled
 from intercap_core.schemas import METRIC_REGIONS
 
-# Bin edges of the reliability table; the first and the last bin hold the certain statements.
+# Bin edges of the reliability table. Probabilities in the first and last bin count as certain.
 RELIABILITY_BINS = (0.0, 0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 1.0)
 
 
@@ -24,9 +24,14 @@ def detected_figures(
 ) -> dict[str, float]:
     """Agreement of stated contact (probability above 0.5) with true contact.
 
-    Returns precision, recall and F1 over all frames and regions; precision among regions nearer
-    than 30 mm; F1 of each region with true contact and their minimum; the Brier score
-    (mean squared error of the probability); the calibration error.
+    Returns, with the prefix ``contact_detected_``:
+
+    - ``precision``, ``recall``, ``f1``: over all frames and regions;
+    - ``near_precision``: precision among the regions truly nearer than 30 mm;
+    - ``<region>_f1``: F1 of each region that is ever in true contact;
+    - ``worst_region_f1``: the least of these;
+    - ``brier``: Brier score, the mean squared error of the probability;
+    - ``calibration_error``: see :func:`calibration_error`.
 
     Args:
         probability: (N, R) stated by the joint stage.
@@ -77,9 +82,10 @@ def reliability(probability: np.ndarray, true: np.ndarray) -> Reliability:
 
 
 def calibration_error(probability: np.ndarray, true: np.ndarray) -> float:
-    """Expected calibration error, mean |stated - true|, over the bins of uncertain statements.
+    """Expected calibration error: mean |stated - true| over the bins of uncertain statements.
 
-    Regions that are certainly free are excluded: they are nearly all regions and would hide errors.
+    The first and last bin are excluded: nearly all regions are certainly free, and would make every
+    error seem small.
     """
     open_ = (probability >= RELIABILITY_BINS[1]) & (probability < RELIABILITY_BINS[-2])
     if not open_.any():
@@ -93,11 +99,16 @@ def _share(part: float, whole: float) -> float:
 
 
 def hold_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figures:
-    """Slip of touching skin, motion of planted feet and joint errors after ``stage``.
+    """Figures of slip, planted feet and joint errors after ``stage``; undefined ones are omitted.
 
-    ``slip_mm_s`` is the mean over objects of the means over their frames. Joint errors are RMS and
-    split into the part that is constant over a sequence and the part that varies. Figures that no
-    sequence has are omitted.
+    - ``joints_constant_mm``, ``joints_varying_mm``: RMS joint errors, split into the mean of a
+      sequence and the deviation from it;
+    - ``fingertip_touching_mm``: error of the fingertips of truly touching hands;
+    - ``acceleration_feet_mm``: error, millimetres per frame^2 at 30 fps;
+    - ``slip_mm_s``: sliding of touching skin, mean over objects of the means over their frames;
+    - ``planted_mm_s``, ``floor_mm``: speed and height error of soles that truly carry weight;
+    - ``foot_swing_mm``: error of soles while the foot swings;
+    - ``foot_lift_frames``: mean absolute delay of lifts of a foot.
     """
     key = f"truth/{stage}/"
     have = [s for s in sequences if f"{key}fingertips" in s.values]
@@ -159,9 +170,10 @@ def _stated_and_true(
 
 
 def worse_objects(sequences: Sequence[SequenceMetrics]) -> list[str]:
-    """Objects whose median or 95th percentile pose error is larger after ``joint`` than tracked.
+    """Objects whose pose error is larger after ``joint`` than after ``object_track``.
 
-    Larger by more than 5 %, and by more than 0.2 mm or 0.1 degrees.
+    Compared are median and 95th percentile of translation and rotation. Larger means by more than
+    5 %, and by more than 0.2 mm or 0.1 degrees.
     """
     limits = {
         "object_translation_mm": 0.2,
@@ -183,7 +195,10 @@ def worse_objects(sequences: Sequence[SequenceMetrics]) -> list[str]:
 
 
 def _joint_figures(sequences: Sequence[SequenceMetrics], key: str) -> Figures:
-    """RMS of the mean joint errors of each sequence, and RMS of the deviation from these means."""
+    """RMS of the sequences' mean joint errors, and RMS of the deviations from these means.
+
+    Errors are vectors (T, 22, 3); the mean is over the T frames of a sequence, weighted by T.
+    """
     constant, varying, frames = 0.0, 0.0, 0
     for s in sequences:
         offset = s.values[f"{key}joint_offset"].astype(np.float64)
@@ -198,7 +213,7 @@ def _joint_figures(sequences: Sequence[SequenceMetrics], key: str) -> Figures:
 
 
 def _lift_lags(s: SequenceMetrics, stage: str) -> list[float]:
-    """Delay in frames of each true lift of a foot (negative: early)."""
+    """Delay, frames, of the fitted foot at each true lift of a foot; negative = early."""
     fitted, true = s.values[f"truth/{stage}/foot_centre"], s.values["truth/foot_centre"]
     standing = s.values["truth/standing"]
     return [

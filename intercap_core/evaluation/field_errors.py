@@ -33,19 +33,22 @@ from intercap_core.schemas import FRAMES, PERSON, SCENE, TRUTH
 class FieldScene:
     """Errors of one recording's scene artefact; N cameras with images, without the master.
 
-    Displacements are RMS over the points of a 2 m cube at the rig's centre.
+    Displacements are RMS over the points of a 2 m cube at the rig's centre. The delay of an image
+    is how much older it is than the time of its frame set, relative to the master's delay.
     """
 
     sequence: str
+    """Name of the sequence."""
     fps: float
+    """Frame sets per second."""
     apart_s: np.ndarray
-    """(N,) true delay of the images relative to their frame sets."""
+    """(N,) true delay, median over images, seconds."""
     late_s: np.ndarray
-    """(N,) error of the estimated delay, median over images."""
+    """(N,) error of the estimated delay, median over images, seconds."""
     sigma_s: np.ndarray
-    """(N,) stated standard deviation of the delay."""
+    """(N,) stated standard deviation of the delay, seconds."""
     set_aside: np.ndarray
-    """(N,) the scene excluded the camera as its delay is undetermined."""
+    """(N,) bool: the scene stage excluded the camera because its delay is undetermined."""
     before: np.ndarray
     """(N,) displacement by the given extrinsics, metres."""
     after: np.ndarray
@@ -136,9 +139,12 @@ def floor_error(
 
 
 def stated_displacement(master_from_camera: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Stated RMS displacement (C,) of the points of a 2 m cube at the rig's centre, metres.
+    """RMS displacement (C,) of the points of a 2 m cube at the rig's centre, metres, by the stated
+    covariance of each camera.
 
-    ``covariance`` (C, 7, C, 7) is of rotation about the camera's centre, translation, depth bias.
+    Args:
+        master_from_camera: (C, 4, 4).
+        covariance: (C, 7, C, 7) of rotation about the camera's centre, translation, depth bias.
     """
     arms = rig_centre(master_from_camera) - master_from_camera[:, :3, 3]
     result = np.empty(len(arms))
@@ -156,8 +162,9 @@ def stated_displacement(master_from_camera: np.ndarray, covariance: np.ndarray) 
 def start_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
     """Figures of recordings whose cameras started at different times; milliseconds.
 
-    A camera is solved if its error is below half a frame period. ``offset_wrong`` counts the
-    cameras that are neither solved nor excluded by the scene.
+    A camera is solved if the error of its delay is below half a frame period. ``offset_wrong``
+    counts the cameras that are neither solved nor excluded by the scene stage.
+    ``offset_normalised`` is 1 if the stated standard deviations are calibrated.
     """
     if not scenes:
         return {}
@@ -187,7 +194,10 @@ def start_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
 
 
 def floor_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
-    """Figures of recordings in rooms whose measured surface is mostly floor; millimetres."""
+    """Errors of camera poses in rooms whose measured surface is mostly floor, millimetres.
+
+    ``extrinsics_normalised``: median of error over stated deviation.
+    """
     if not scenes:
         return {}
     before, after, stated = (
@@ -206,7 +216,10 @@ def floor_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
 
 
 def beam_figures(scenes: Sequence[FieldScene]) -> dict[str, float]:
-    """Floor errors of recordings in which feet leave the floor, millimetres and degrees."""
+    """Floor errors of recordings in which feet leave the floor, such as on a balance beam.
+
+    Millimetres and degrees; ``beam_floor_missing`` counts the recordings without a floor.
+    """
     if not scenes:
         return {}
     height = np.array([s.floor_m for s in scenes])
@@ -230,10 +243,10 @@ _JOINTS = [JOINT_INDEX[name] for name in _LIMBS]
 def measure_subject_share(person: Path, scene: Path, truth: Path) -> float:
     """Share of the images with a chosen person that show the subject; NaN without such images.
 
-    The chosen keypoints are compared with the true joints in the true cameras, with left and right
-    exchanged if that fits better: a detection with exchanged sides is still the subject. They show
-    the subject if their median distance is below 0.3 m; people in the studio pass at 0.8 m.
-    Raises UserError if an artefact cannot be read or the truth is of another recording.
+    The chosen keypoints are compared with the true joints in the true cameras, as detected and with
+    left and right exchanged: a detection with exchanged sides is still the subject. It shows the
+    subject if the median distance is below 0.3 m; other people in the studio come no closer than
+    0.8 m. Raises UserError if an artefact cannot be read or the truth is of another recording.
     """
     with (
         artefacts.read(person, PERSON) as chosen,
@@ -256,6 +269,9 @@ def measure_subject_share(person: Path, scene: Path, truth: Path) -> float:
 
 def _apart(keypoints: np.ndarray, camera: Camera, joints: np.ndarray) -> float:
     """Median distance of joints from the keypoints' rays, metres; infinite without keypoints.
+
+    The distance is measured across the optical axis at the joint's depth. The lesser of the values
+    with and without exchange of left and right is returned.
 
     Args:
         keypoints: (K, 3) x, y, confidence.

@@ -1,4 +1,9 @@
-"""Figures that are reported over several sequences, from their metrics; millimetres and degrees."""
+"""Figures: summary numbers over several sequences, from their metrics; millimetres and degrees.
+
+Keys of metrics are datasets of the metrics artefact. ``truth/<stage>/<key>`` is an error after a
+stage. ``truth/<name>_floor`` is the distance of the true body or object from the measured points:
+the lower bound of a correct fit.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +29,7 @@ SUMMARY_TRUTH = (
 SUMMARY_PENETRATION = (
     "mean_mm", "median_mm", "p98_mm", "share_le_5mm", "share_le_7mm", "share_le_20mm",
 )  # fmt: skip
-BAD_BODY_M = 0.040  # a frame with a larger vertex error should have been flagged
+BAD_BODY_M = 0.040  # a frame with a larger mean vertex error is bad and should have been flagged
 _PER_VERTEX = PER_VERTEX_METRICS | {"object_sample_points", "object_sample_contact"}
 
 Figures = dict[str, float]
@@ -35,12 +40,17 @@ class SequenceMetrics:
     """One sequence's metrics artefact without its distances by vertex."""
 
     name: str
+    """Name of the sequence."""
     subject: str
+    """Name of the person."""
     object_: str
+    """Name of the object; "" = none."""
     fps: float
+    """Frames per second."""
     has_truth: bool
+    """The recording is virtual and has a truth file."""
     values: dict[str, np.ndarray] = field(repr=False)
-    """By dataset of the metrics artefact."""
+    """Values by dataset of the metrics artefact."""
     made_by: str = ""
     """Program that made an imported result; "" = this one."""
 
@@ -87,7 +97,8 @@ def finite_median(values: np.ndarray) -> float:
 
 
 def penetration_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
-    """The paper's penetration figures, from each contact frame's mean depth."""
+    """The paper's penetration figures over the contact frames, from the mean depth of each
+    frame."""
     depth, touching = pooled(sequences, "penetration_mean"), pooled(sequences, "contact_frame")
     if depth is None or touching is None:
         return {}
@@ -95,6 +106,7 @@ def penetration_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
 
 
 def _cloud_distances(sequences: Sequence[SequenceMetrics], dataset: str) -> Figures:
+    """Mean of four datasets over all frames; ``dataset``: their name with a place for the part."""
     names = ("body", "object", "body_visible", "object_visible")
     return {f"{n}_mm": 1e3 * _over(sequences, dataset.format(n), np.nanmean) for n in names}
 
@@ -105,7 +117,8 @@ def cloud_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
 
 
 def floor_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
-    """The figures of :func:`cloud_figures` for the true poses; empty without truth."""
+    """The figures of :func:`cloud_figures` for the true poses (lower bounds); empty without
+    truth."""
     figures = _cloud_distances(sequences, "truth/{}_floor")
     return {name: value for name, value in figures.items() if np.isfinite(value)}
 
@@ -187,7 +200,7 @@ def extrinsics_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
 
 
 def contact_sweep(sequences: Sequence[SequenceMetrics], stage: str) -> dict[float, float]:
-    """Vertex F1 by threshold in millimetres."""
+    """F1 of vertices in contact, by threshold of the distance in millimetres."""
     counts = pooled(sequences, f"truth/{stage}/vertex_contact_counts")
     if counts is None:
         return {}
@@ -203,6 +216,7 @@ def _over(
     key: str,
     how: Callable[[np.ndarray], Any],
 ) -> float:
+    """Apply ``how`` to dataset ``key`` over all frames; NaN if it is unknown everywhere."""
     values = pooled(sequences, key)
     if values is None or not np.isfinite(values).any():
         return float("nan")
@@ -221,6 +235,7 @@ def _hand_in_grasp(sequences: Sequence[SequenceMetrics], stage: str) -> float:
 
 
 def _object_errors(s: SequenceMetrics, stage: str) -> ObjectErrors:
+    """Object errors after ``stage`` from the metrics of a sequence."""
     key = f"truth/{stage}/object_"
     of, true = s.values, "truth/object_"
     return ObjectErrors(
@@ -254,6 +269,7 @@ def object_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figures:
 
 
 def _contact_figures(sequences: Sequence[SequenceMetrics], stage: str) -> Figures:
+    """F1 of regions, F1 of vertices, and recall of contact frames, by distance after ``stage``."""
     key = f"truth/{stage}/"
     have = [s for s in sequences if f"{key}region_contact" in s.values]
     if not have:

@@ -10,9 +10,9 @@ from intercap_core.body.joints import JOINT_INDEX
 
 
 def merge_reasons(sources: Sequence[tuple[np.ndarray, str]]) -> list[str]:
-    """Join the reasons of each frame to T texts, "" = reliable.
+    """Reasons of each of T frames, joined by "; "; "" = reliable.
 
-    ``sources`` are pairs of a mask (T,) and its reason.
+    ``sources``: pairs of a mask (T,) and the reason for its frames.
     """
     frames = len(sources[0][0])
     return ["; ".join(reason for mask, reason in sources if mask[t]) for t in range(frames)]
@@ -39,10 +39,12 @@ _LIMBS = {
 
 
 def exchanged(joints: np.ndarray) -> dict[str, np.ndarray]:
-    """Mask (T,) for each pair of limbs of the frames whose sides differ from most frames.
+    """Frames in which left and right of the legs or arms are exchanged relative to most frames.
 
-    Left and right are exchanged between two frames if each side's joints jump to the previous place
-    of the other side. ``joints`` is (T, 55, 3).
+    An exchange between two frames is detected if the joints of each side jump to the previous place
+    of the other side: they move at least 15 cm, and over twice as far as with the sides exchanged.
+
+    Returns a mask (T,) for "legs" and "arms". ``joints``: (T, 55, 3) metres.
     """
     found = {}
     for limb, names in _LIMBS.items():

@@ -1,4 +1,9 @@
-"""All distances of one fitted body and object, frame by frame, for the metrics artefact."""
+"""All distances of one fitted body and object, frame by frame, for the metrics artefact.
+
+A cloud is the set of depth points that the segmentation assigns to the person or the object.
+Datasets ``truth/..._floor`` are distances of the true body or object from the clouds: the lower
+bound of a correct fit.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +34,8 @@ from intercap_core.schemas import CONTACT_REGIONS
 
 log = logging.getLogger(__name__)
 
-SAMPLE_SPACING_M = 0.006  # of the object's contact samples; resolves the touch of a fingertip
+# Distance between contact samples on the object's surface; resolves the touch of a fingertip.
+SAMPLE_SPACING_M = 0.006
 
 Values = dict[str, Any]
 
@@ -61,7 +67,7 @@ class HandledObject:
 class Measurement:
     """Distances of one body and the object that it handles, frame by frame.
 
-    Without ``handled`` the values have no dataset of an object or of contact.
+    If ``handled`` is None, datasets of the object and of contact are omitted.
     """
 
     def __init__(
@@ -85,10 +91,12 @@ class Measurement:
     def over_frames(self, floor: tuple[np.ndarray, np.ndarray], truth: Truth | None) -> Values:
         """Values by dataset of the metrics artefact.
 
-        With truth, also ``true_distance`` (T, V): distances of the true body to the true object.
+        With truth, also ``true_distance`` (T, V): signed distances of the true body's vertices from
+        the true object.
 
         Args:
-            floor: point (3,) and unit normal (3,) of the floor.
+            floor: point (3,) and unit normal (3,) of the floor; NaN = unknown.
+            truth: true body and object; None = unknown.
         """
         rows: list[Values] = []
         handled = self.handled
@@ -150,7 +158,8 @@ class Measurement:
         object_vertices = handled.posed(t, handled.mesh.vertices)
         points = handled.posed(t, handled.points)
         to_body = surface.signed_distance(object_vertices)
-        # Outside the body only contact is evaluated, so distances need no larger reach.
+        # outside the body only contact is evaluated, so distances may be clipped beyond the
+        # threshold
         point_distance = surface.signed_distance(points, reach=1.01 * self.threshold)
         track = handled.track
         to_object = handled.surface.signed_distance(
@@ -180,7 +189,8 @@ class Measurement:
     ) -> tuple[Values, tuple[MeasuredCloud, MeasuredCloud]]:
         """Distances to the clouds of frame ``t``, and the clouds of person and object.
 
-        ``seen_body`` and ``seen_object`` are masks of the visible samples; None = computed here.
+        ``seen_body``, ``seen_object``: masks of the visible surface samples, from the truth; None =
+        computed from the fitted meshes.
         """
         handled = self.handled
         near = [vertices[::10]]
@@ -223,7 +233,7 @@ class Measurement:
     def _true_body(
         self, t: int, truth: Truth, person: MeasuredCloud, seen_body: np.ndarray | None
     ) -> Values:
-        """Cloud distances of the true body: the floor of the fitted body's distances."""
+        """Cloud distances of the true body: lower bounds of the fitted body's distances."""
         if truth.vertices is None:
             return {}
         vertices = truth.vertices[t].astype(np.float64)

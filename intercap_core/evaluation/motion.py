@@ -1,7 +1,8 @@
 """Motion of a track against the true motion: jitter, acceleration, lag, slip and planted feet.
 
-A foot carries weight if enough of its true sole is near the floor, or near the furniture under it.
-The position of swinging feet is measured too, because a fit with frozen feet has no other error.
+A foot carries weight if enough of its true sole is near the floor or the furniture under it, and at
+rest. Speed and height of such soles are errors. The position of swinging feet is measured too: a
+fit whose feet never move would otherwise seem perfect.
 """
 
 from __future__ import annotations
@@ -15,10 +16,10 @@ from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 
 
 def second_difference(positions: np.ndarray, fps: float) -> np.ndarray:
-    """x[t+1] - 2 x[t] + x[t-1] of (T, ..., 3), scaled to 30 fps; NaN at both ends, metres.
+    """x[t+1] - 2 x[t] + x[t-1] of (T, ..., 3), metres per frame^2 at 30 fps; NaN at both ends.
 
-    A second difference grows with the square of the frame's duration, so one at ``fps`` is
-    multiplied by (fps / 30)^2.
+    A second difference grows with the square of the frame's duration. The one at ``fps`` is
+    therefore multiplied by (fps / 30)^2, which gives that of 30 fps.
     """
     result = np.full(positions.shape, np.nan)
     if len(positions) > 2:
@@ -28,19 +29,23 @@ def second_difference(positions: np.ndarray, fps: float) -> np.ndarray:
 
 
 def acceleration(positions: np.ndarray, fps: float) -> np.ndarray:
-    """Mean length (T,) of the second differences of points (T, N, 3), metres per frame^2."""
+    """Mean length (T,) of the second differences of N points (T, N, 3), metres per frame^2."""
     return np.linalg.norm(second_difference(positions, fps), axis=-1).mean(-1)
 
 
 def acceleration_error(positions: np.ndarray, true: np.ndarray, fps: float) -> np.ndarray:
-    """Mean length (T,) of the error of the second differences of (T, N, 3), metres per frame^2."""
+    """Mean length (T,) of the second differences of the position errors, metres per frame^2.
+
+    ``positions``, ``true``: (T, N, 3).
+    """
     return acceleration(np.asarray(positions, np.float64) - true, fps)
 
 
 def moving(rotation: np.ndarray, centre: np.ndarray, fps: float) -> np.ndarray:
     """Mask (T,) of the frames in which the true object moves.
 
-    A frame moves when the step before or after it is faster than 20 mm/s or 5 degrees/s.
+    A frame counts if the step from the frame before or to the next one is faster than 20 mm/s or
+    5 degrees/s.
 
     Args:
         rotation: (T, 3, 3) true rotations.
@@ -62,7 +67,10 @@ def resting_steps(is_moving: np.ndarray) -> np.ndarray:
 
 
 def steps(centre: np.ndarray, true_centre: np.ndarray) -> np.ndarray:
-    """Length (T-1,) of the track's steps minus the true steps, metres; both (T, 3)."""
+    """Length (T-1,) of the error of the track's displacement from frame to frame, metres.
+
+    ``centre``, ``true_centre``: (T, 3).
+    """
     return np.linalg.norm(np.diff(centre - true_centre, axis=0), axis=-1)
 
 
@@ -84,11 +92,17 @@ def motion_onset_lags(
     is_moving: np.ndarray,
     fps: float,
 ) -> list[float]:
-    """Delay of the track, in frames, each time the object starts to move (negative: early).
+    """Delay of the track, in frames, each time the true object starts to move; negative = early.
 
-    Evaluated for each rest of at least 0.2 s that ends in motion: the frame at which the track is
-    10 mm from its own mean position during that rest, minus the same frame of the truth. If the
-    track does not start before the true motion ends, the delay is the duration of the motion.
+    Evaluated for each true rest of at least 0.2 s that ends in motion. The onset is the first frame
+    in which a path is 10 mm from its own mean position during that rest. The delay is the onset of
+    the track minus that of the truth. If the track has no onset before the true motion ends, the
+    end of the motion is taken as its onset.
+
+    Args:
+        centre, true_centre: (T, 3) metres.
+        is_moving: (T,) mask of true motion.
+        fps: frames per second.
     """
     lags: list[float] = []
     start = 0
@@ -112,7 +126,7 @@ def motion_onset_lags(
 def _onset(path: np.ndarray, rest: int) -> int | None:
     """First frame at which a path (N, 3) is 10 mm from the mean of its first ``rest`` frames."""
     away = np.linalg.norm(path - path[:rest].mean(0), axis=-1) > 0.010
-    away[: max(1, rest // 2)] = False  # jitter at the start of the rest is not motion
+    away[: max(1, rest // 2)] = False  # deviations in the first half of the rest are jitter
     return int(np.argmax(away)) if away.any() else None
 
 
@@ -130,8 +144,9 @@ def slip_speed(
 ) -> np.ndarray:
     """Speed (T,) at which fitted skin slides over the fitted object beyond the true slip, m/s.
 
-    The mean over touching vertices of the tangential difference between fitted and true velocity in
-    the object's frame. NaN if no vertex touches both in the frame and :data:`SLIP_S` later.
+    It is the mean length, over touching vertices, of the tangential part of fitted minus true
+    velocity in the object's frame. Velocities are displacements over :data:`SLIP_S`. NaN if no
+    vertex touches in both the frame and :data:`SLIP_S` later.
 
     Args:
         local: (T, V, 3) fitted skin vertices in the fitted object's frame, metres.
@@ -180,8 +195,9 @@ def support(
 ) -> np.ndarray:
     """Mask (T - 1, S) of the sole vertices that carry weight from one frame to the next.
 
-    A vertex carries weight below 15 mm and 50 mm/s. A foot stands if a tenth of its vertices do:
-    toes or a heel alone suffice. All False while it does not stand.
+    A vertex carries weight if it is lower than 15 mm and slower than 50 mm/s. The foot stands if at
+    least a tenth of its vertices carry weight, so toes or a heel suffice. The mask is False while
+    the foot does not stand.
 
     Args:
         true_sole: (T, S, 3) vertices of a true sole, metres.
@@ -204,7 +220,8 @@ class FootErrors:
     height: np.ndarray
     """(T - 1,) mean height error of the vertices that carry weight, metres."""
     swing: np.ndarray
-    """(T - 1,) mean distance of the sole from the true sole while it swings."""
+    """(T - 1,) mean distance of the sole from the true sole while no vertex carries weight,
+    metres."""
 
 
 def foot_errors(
