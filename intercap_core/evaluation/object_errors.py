@@ -24,32 +24,35 @@ class ObjectErrors:
     """Errors of one object over T frames; NaN = unknown."""
 
     sequence: str
+    """Name of the sequence."""
     object_: str
+    """Name of the object."""
     fps: float
+    """Frames per second."""
     translation: np.ndarray
-    """(T,) error of the centre of mass, metres."""
+    """(T,) error of the centre of mass, metres; infinite if the object was never found."""
     rotation: np.ndarray
-    """(T,) error, degrees."""
+    """(T,) error, the least over the symmetry group, degrees; infinite as above."""
     turn: np.ndarray
     """(T,) error of the rotation since the frame before, degrees."""
     centre: np.ndarray
-    """(T, 3) centre of mass, metres."""
+    """(T, 3) fitted centre of mass, metres."""
     true_centre: np.ndarray
-    """(T, 3)."""
+    """(T, 3) true centre of mass, metres."""
     views: np.ndarray
     """(T,) number of cameras that truly see the object."""
     moves: np.ndarray
-    """(T,) whether the object truly moves."""
+    """(T,) bool: the object truly moves."""
     flagged: np.ndarray
-    """(T,) the stage marked the frame as unreliable."""
+    """(T,) bool: the stage marked the frame as unreliable."""
     add_s: np.ndarray | None = None
-    """(T,) over the diameter."""
+    """(T,) ADD-S over the object's diameter, see :func:`add_s`."""
     mssd: np.ndarray | None = None
-    """(T,) over the diameter."""
+    """(T,) MSSD over the object's diameter, see :func:`mssd`."""
     normalised: np.ndarray | None = None
-    """(T,) translation error over its stated deviation."""
+    """(T,) translation error over its expected size; median 1 if the stated covariance is right."""
     normalised_turn: np.ndarray | None = None
-    """(T,) rotation error over its stated deviation."""
+    """(T,) the same for the rotation error (not for :attr:`turn`)."""
 
     @property
     def lost(self) -> np.ndarray:
@@ -110,9 +113,11 @@ def add_s(
     true_rotation: np.ndarray,
     true_translation: np.ndarray,
 ) -> np.ndarray:
-    """ADD-S (T,): mean distance of the true surface points from the nearest estimated point.
+    """ADD-S (T,), metres: mean distance of the true surface points from the nearest estimated
+    point.
 
-    ``points`` (N, 3) are placed by poses (T, 3, 3), (T, 3). Hinterstoisser et al., ACCV 2012.
+    Hinterstoisser et al., ACCV 2012. The ``points`` (N, 3), object frame, are moved by the poses,
+    rotations (T, 3, 3) and translations (T, 3).
     """
     found = points @ np.swapaxes(rotation, 1, 2) + translation[:, None]
     true = points @ np.swapaxes(true_rotation, 1, 2) + true_translation[:, None]
@@ -127,9 +132,11 @@ def mssd(
     true_translation: np.ndarray,
     mesh: ObjectMesh,
 ) -> np.ndarray:
-    """MSSD (T,): maximal distance of corresponding points, minimised over the symmetry group.
+    """Maximum symmetry-aware surface distance (MSSD) (T,), metres.
 
-    Hodan et al., BOP challenge 2020. For a sphere it is the distance of the centres.
+    The maximal distance of corresponding points, minimised over the symmetry group (Hodan et al.,
+    BOP challenge 2020). For a sphere it is the distance of the origins. Arguments as in
+    :func:`add_s`.
     """
     if mesh.symmetry.sphere:
         return np.linalg.norm(translation - true_translation, axis=1)
@@ -145,8 +152,15 @@ def mssd(
 def figures(recordings: Sequence[ObjectErrors]) -> Figures:
     """Figures over several recordings, millimetres and degrees.
 
-    Errors are over the frames in which two or more cameras truly see the object, lost frames over
-    all frames. ``recovered_share`` is the share of lost runs that ended before the recording did.
+    Errors of translation and rotation are over the frames in which two or more cameras truly see
+    the object; all other figures are over all frames.
+
+    - ``lost_unnoticed_share``: share of frames that are lost and not flagged;
+    - ``add_s_recall``: share of frames with ADD-S below 10 % of the diameter;
+    - ``mssd_recall``: recall of MSSD averaged over thresholds of 5 % to 50 % of the diameter;
+    - ``first_frame_success``: share of recordings with a correct pose in the first frame in which
+      the object is visible;
+    - ``recovered_share``: share of the runs of lost frames that end before the recording does.
     """
     if not recordings:
         return {}

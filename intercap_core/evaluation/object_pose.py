@@ -8,8 +8,9 @@ from intercap_core.evaluation.body import MEDIAN_CHI_3
 from intercap_core.geometry.camera.transforms import rotation_log
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 
-LOST_TRANSLATION_M = 0.050  # a pose with a larger error is lost
-LOST_ROTATION_DEG = 20.0  # a pose with a larger error is lost
+# A pose with a larger error of either kind is lost.
+LOST_TRANSLATION_M = 0.050
+LOST_ROTATION_DEG = 20.0
 
 
 def posed_point(rotation: np.ndarray, translation: np.ndarray, point: np.ndarray) -> np.ndarray:
@@ -20,7 +21,7 @@ def posed_point(rotation: np.ndarray, translation: np.ndarray, point: np.ndarray
 def centre_error(centre: np.ndarray, true_centre: np.ndarray) -> np.ndarray:
     """Distance (...) of the object's centre of mass (..., 3) from the true one, metres.
 
-    Symmetries leave the centre of mass in place, so no element of the group makes it smaller.
+    Symmetries of the object leave its centre of mass in place, so they need not be considered.
     """
     return np.linalg.norm(centre - true_centre, axis=-1)
 
@@ -49,7 +50,11 @@ def first_seen_found(
 ) -> bool | None:
     """Whether the error is below 20 mm and 10 degrees in the first frame that shows the object.
 
-    All arguments are (T,). None if no camera sees the object.
+    None if no camera ever sees the object.
+
+    Args:
+        translation_error_m, rotation_error_degrees: (T,).
+        views: (T,) number of cameras that see the object.
     """
     seen = np.flatnonzero(views > 0)
     if len(seen) == 0:
@@ -63,10 +68,14 @@ def normalised_translation_error(
     true_translation: np.ndarray,
     covariance: np.ndarray,
 ) -> np.ndarray:
-    """Mahalanobis length (T,) of the translation error over its median; 1 if calibrated.
+    """Mahalanobis length (T,) of the translation error, divided by its expected median.
 
-    ``covariance`` (T, 6, 6) is of rotation vector and translation. The result is NaN if it is
-    not positive definite.
+    The median of the result is 1 if the covariance is calibrated. NaN if the covariance is not
+    positive definite.
+
+    Args:
+        translation, true_translation: (T, 3) metres.
+        covariance: (T, 6, 6) of rotation vector (rad) and translation (m), in this order.
     """
     block = covariance[:, 3:, 3:]
     error = translation - true_translation
@@ -84,9 +93,15 @@ def normalised_rotation_error(
     covariance: np.ndarray,
     symmetry: SymmetryGroup,
 ) -> np.ndarray:
-    """Mahalanobis length (T,) of the rotation error over its median; 1 if calibrated.
+    """Mahalanobis length (T,) of the rotation error, divided by its expected median.
 
-    Axes with a stated deviation above 30 degrees are undetermined and excluded. NaN if all are.
+    The error is that to the nearest equivalent true rotation. Principal axes with a stated
+    deviation above 30 degrees are undetermined and excluded; NaN if all are.
+
+    Args:
+        rotation, true_rotation: (T, 3, 3).
+        covariance: (T, 6, 6), see :func:`normalised_translation_error`.
+        symmetry: rotations that leave the object unchanged.
     """
     from scipy.stats import chi  # takes a second to import, which most processes do not need
 

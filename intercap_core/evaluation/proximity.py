@@ -28,25 +28,32 @@ class MeasuredCloud:
 
 
 def vertex_to_cloud(vertices: np.ndarray, cloud: MeasuredCloud) -> float:
-    """Mean distance of all vertices (V, 3), occluded ones included, metres: the paper's figure."""
+    """Mean distance of all vertices (V, 3) from the cloud, metres, as in the paper.
+
+    It includes occluded vertices, near which nothing was measured.
+    """
     return float(cloud.distance(vertices).mean())
 
 
 def visible_to_cloud(points: np.ndarray, visible: np.ndarray, cloud: MeasuredCloud) -> float:
-    """Mean distance of the area samples (N, 3) in the mask ``visible`` (N,); NaN if it is empty."""
+    """Mean distance of the visible surface samples from the cloud, metres; NaN if none is visible.
+
+    ``points``: (N, 3). ``visible``: (N,) bool.
+    """
     if not visible.any():
         return float("nan")
     return float(cloud.distance(points[visible]).mean())
 
 
-REACH_M = 0.10  # distances outside are capped here: no reported figure needs larger distances
-DEEPEST_M = 0.25  # depths inside are capped here
+REACH_M = 0.10  # distances outside a surface are clipped here: no figure needs larger ones
+DEEPEST_M = 0.25  # depths inside a surface are clipped here
 
 
 class PosedObject:
     """A rigid mesh (V, 3), (F, 3) in its own frame, with search trees that are built once.
 
-    ``watertight``: ray parity decides which points are inside; otherwise the winding number does.
+    ``watertight``: the mesh may be closed. Ray parity then decides which points are inside; for
+    other meshes the winding number does.
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, *, watertight: bool = True) -> None:
@@ -92,7 +99,8 @@ class BodySurface:
 
 
 class _Solid:
-    """Signed distance to a ``surface``; the ``field`` decides the sign if it is not closed."""
+    """Signed distance to a ``surface``. For a surface that is not closed, ``field`` gives the
+    sign."""
 
     def __init__(self, surface: ShapedSurface, field: DistanceField | None = None) -> None:
         self._surface, self._field = surface, field
@@ -125,7 +133,7 @@ class Sight:
     ) -> np.ndarray:
         """Mask (N,) of the surface points that at least one camera sees.
 
-        The depth lens decides; the colour lens where a camera has no depth.
+        Visibility is that of the depth camera, or of the colour camera if there is no depth.
 
         Args:
             points, normals: (N, 3) surface points and outward normals, master frame.
@@ -143,7 +151,7 @@ class Sight:
             ids = ids[lens.sees(apply(camera_from_master, points[ids]))]
             if len(ids) == 0:
                 continue
-            start = points[ids] + 0.002 * normals[ids]  # clear of its own triangle
+            start = points[ids] + 0.002 * normals[ids]  # off the surface, which must not block
             hidden = np.zeros(len(ids), bool)
             for surface in self._surfaces:
                 surface.blocks(start, np.broadcast_to(eye, start.shape), hidden)

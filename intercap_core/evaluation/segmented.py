@@ -19,8 +19,8 @@ from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.schemas import OBJECT_TRACK, PERSON
 from intercap_core.sequence_inputs import SequencePaths
 
-# Only depth pixels within this distance of the meshes are used: larger errors of a fit need no
-# exact figure.
+# Only depth pixels within this distance of the meshes are used. Larger distances would not change
+# the judgement of a fit.
 MARGIN_M = 0.25
 
 
@@ -29,12 +29,14 @@ def segmented_points(
 ) -> list[np.ndarray]:
     """Points (N, 3) float32 of each mask, master frame, metres.
 
-    A point belongs to the mask that covers its pixel in the colour image.
+    A depth point belongs to a mask if the mask covers its projection into the colour image. Only
+    depth pixels are used that lie within :data:`MARGIN_M` of the box, in image and depth, of the
+    points ``near``.
 
     Args:
         depth: (H, W) uint16 depth image, millimetres.
         masks: masks of the colour image; None = no points.
-        near: (M, 3) mesh points, master frame; only depth pixels around them are used.
+        near: (M, 3) mesh points, master frame.
         bias_m: subtracted from the depth along the ray.
     """
     points = [np.empty((0, 3), np.float32) for _ in masks]
@@ -99,7 +101,10 @@ class SegmentedClouds:
         self._bias = depth_bias
 
     def at(self, t: int, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Points of person and object (N, 3) of frame ``t``, near the meshes' points (M, 3)."""
+        """Points (N, 3) of the person and of the object in frame ``t``, master frame, metres.
+
+        ``near``: (M, 3) mesh points; see :func:`segmented_points`.
+        """
         person, object_ = [], []
         for c, camera in enumerate(self._rig):
             depth = self._frames.depth(t, c)
@@ -130,7 +135,8 @@ def read_clouds(
     Args:
         images: colour and depth, ordered by the moment that they show.
         depth_bias: (C,) metres.
-        image_of: (T, C) index of the image that shows each frame.
+        image_of: (T, C) frame set whose image shows each moment; -1 = none.
+        paths: artefacts of the sequence.
     """
     found = Detections.load(paths.detections).showing(image_of).with_candidates_of(paths.person)
     with artefacts.read(paths.object_track, OBJECT_TRACK) as track:
@@ -145,14 +151,15 @@ def read_clouds(
 
 @numba.njit(cache=True, nogil=True)
 def _extent(points, pose, lens):
-    """Minimum and maximum (2,3) of column, row and depth (metres) of the points in the image.
+    """Range (2,3) of the projected points: minimum and maximum of column, row and depth (metres).
 
-    The minimum is infinite if no point is in the image. All arrays are float64.
+    Points behind the camera or outside the lens calibration are ignored; without others the minimum
+    is infinite. All arrays are float64.
 
     Args:
         points: (M,3).
         pose: (4,4) camera_from_points.
-        lens: (13,) lens parameters.
+        lens: (13,) lens parameters; the last one is the largest calibrated radius at z = 1.
     """
     found = np.empty((2, 3))
     found[0], found[1] = np.inf, -np.inf

@@ -1,4 +1,7 @@
-"""Errors of the body and object of each stage against truth, by dataset of the metrics artefact."""
+"""Errors of the body and object of each stage against truth, by dataset of the metrics artefact.
+
+Datasets are named ``truth/<stage>/<key>`` for errors and ``truth/<key>`` for the truth itself.
+"""
 
 from __future__ import annotations
 
@@ -26,10 +29,11 @@ class _ObjectSurfaces:
     """Surfaces of the tracked and of the true object."""
 
     mesh: ObjectMesh
-    """Tracked."""
+    """Mesh of the tracked object."""
     surface: PosedObject
-    """Tracked."""
+    """Surface of the tracked object."""
     true_surface: DistanceField
+    """Surface of the true object, which may have another mesh."""
 
     def true_normals(self, points: np.ndarray) -> np.ndarray:
         """Normals (N, 3) of the true surface nearest to points (N, 3), both in its frame."""
@@ -39,7 +43,8 @@ class _ObjectSurfaces:
 class StageErrors:
     """Errors of each stage by dataset name; quantities that a stage does not estimate are omitted.
 
-    Without ``mesh`` (of the tracked object), or without a true object, only the body is evaluated.
+    If ``mesh`` (of the tracked object) is None or there is no true object, only the body is
+    evaluated. ``true_distance``: (T, V) signed distances of the true body from the true object.
     """
 
     def __init__(
@@ -88,8 +93,10 @@ class StageErrors:
         """Errors of the body after ``stage``, and of its contact with the object.
 
         Args:
+            stage: "body_fit" or "joint".
+            body_track: bodies after the stage.
             track: the object's poses; for ``body_fit`` those of ``object_track``.
-            distance: (T, V) distances of the body's vertices to the object if already known.
+            distance: (T, V) signed distances of the vertices from the object; None = compute.
         """
         errors = truths.body_errors(self._truth, body_track, self._fps)
         if self._truth.vertices is not None:
@@ -99,7 +106,10 @@ class StageErrors:
     def _vertices(
         self, body_track: BodyTrack, track: ObjectTrack, known: np.ndarray | None
     ) -> Values:
-        """Errors of skin, contact, slip and planted feet."""
+        """Errors of skin, contact, slip and feet, by dataset without the prefix.
+
+        ``known``: (T, V) signed distances from the object; None = compute.
+        """
         pve, counts, touching, skin, soles = [], [], [], [], []
         assert self._truth.vertices is not None
         regions = body_track.model.regions
@@ -136,7 +146,7 @@ class StageErrors:
         }
 
     def _slip(self, skin: np.ndarray, track: ObjectTrack) -> Values:
-        """Slip of the skin vertices (T, N, 3) that are ever in true contact."""
+        """Slip (T,) of the skin vertices (T, N, 3) that are ever in true contact."""
         assert self._true_distance is not None and self._object is not None
         if not track.known:
             return {"slip": np.full(len(skin), np.nan)}
@@ -199,6 +209,7 @@ class StageErrors:
         }
 
     def _true_skin(self, regions: Mapping[str, np.ndarray]) -> Values:
+        """Datasets of the true skin: distances of regions, standing feet and their centres."""
         truth = self._truth
         if truth.vertices is None:
             return {}

@@ -1,6 +1,7 @@
 """A sequence's contribution to the figures of the dataset, and contact heatmaps.
 
-A summary holds the metrics without distances by vertex, counts of contact, and the calibration.
+A summary holds the metrics without per-vertex distances, the number of contact frames of each
+vertex and object sample, and the calibration.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ class FittedBody:
 
     gender: str
     digest: str
-    """Of the file."""
+    """Checksum of the file."""
     num_betas: int
     """Shape coefficients that were fitted."""
     num_expression: int
@@ -35,20 +36,22 @@ class FittedBody:
 
 @dataclass(frozen=True, eq=False)
 class SequenceSummary:
-    """One sequence's summary artefact; contact is None without an object."""
+    """One sequence's summary artefact; fields of contact are None without an object."""
 
     metrics: SequenceMetrics
+    """Metrics without per-vertex distances."""
     intent: str
-    """Of the table of sequences; "" if not given."""
+    """Intent of the action, from the table of sequences; "" = not given."""
     body: FittedBody
+    """Body model of the fit."""
     rig: Mapping[str, np.ndarray] = field(repr=False)
     """Datasets ``rig/...`` of SUMMARY by name."""
     body_contact: np.ndarray | None = field(repr=False)
-    """(V,) number of frames in contact."""
+    """(V,) number of frames in which each body vertex is in contact."""
     surface: np.ndarray | None = field(repr=False)
-    """(N, 3) object samples, object frame."""
+    """(N, 3) samples of the object's surface, object frame, metres."""
     surface_contact: np.ndarray | None = field(repr=False)
-    """(N,) number of frames in contact."""
+    """(N,) number of frames in which each sample is in contact."""
     made_by: Mapping[str, tuple[int, str]]
     """Schema version and settings digest by stage."""
 
@@ -59,7 +62,8 @@ class SequenceSummary:
 
     @property
     def residuals(self) -> list[tuple[str, float, float]]:
-        """Residuals of each pair of cameras: name, before and after refinement, metres."""
+        """Held-out background residual of each camera pair: name, before and after refinement,
+        m."""
         names = self.rig["camera_names"]
         return [
             (f"{names[i]}–{names[j]}", float(before), float(after))
@@ -144,6 +148,11 @@ def write(output: Path, paths: SequencePaths, *, intent: str) -> None:
 
 
 def _rig(scene: Artefact) -> dict[str, np.ndarray | list[str]]:
+    """Datasets ``rig/...`` of the summary, without the prefix.
+
+    ``moved``: (C,) displacement from the given to the refined poses, metres; NaN for the master and
+    cameras without a pose.
+    """
     names = scene.text("camera_names")
     start, found = scene["master_from_colour_start"], scene["master_from_colour"]
     posed = np.flatnonzero(np.isfinite(found).all((1, 2)) & np.isfinite(start).all((1, 2)))
@@ -175,7 +184,7 @@ class SurfaceHeat:
     likelihood: np.ndarray
     """(N,) share of the frames in which a sample is in contact."""
     frames: int
-    """Number of frames."""
+    """Number of frames of all sequences with the object."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,19 +194,19 @@ class Heatmaps:
     body: np.ndarray
     """(V,) share of the frames in which a vertex is in contact."""
     body_frames: int
-    """Number of frames."""
+    """Number of frames in the map of the body."""
     objects: dict[str, SurfaceHeat]
-    """By name of the object."""
+    """Map of each object, by name."""
     left_out: dict[str, list[str]] = field(default_factory=dict)
-    """Reasons by excluded sequence."""
+    """By sequence, reasons why it is not in a map."""
 
 
 def collect_heatmaps(summaries: Sequence[SequenceSummary]) -> Heatmaps:
-    """Add up the sequences' contact counts at 4.5 mm.
+    """Add up the sequences' contact counts at a threshold of 4.5 mm.
 
-    Sequences without an object are skipped. All sequences of a map must share one surface: the
-    first sequence defines it. Bodies with another number of vertices and objects measured with
-    another mesh are excluded and listed in ``left_out``.
+    Sequences without an object are skipped. A map has one surface, that of its first sequence.
+    Bodies with another number of vertices, and objects measured with another mesh, are excluded and
+    listed in ``left_out``.
     """
     body, body_frames = np.zeros(0), 0
     left_out: dict[str, list[str]] = {}

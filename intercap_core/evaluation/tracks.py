@@ -29,15 +29,18 @@ class BodyTrack:
     """The T fitted bodies of a sequence, master frame, metres."""
 
     model: BodyModel
+    """Body model of the fit."""
     parameters: BodyParameters
+    """SMPL-X parameters of the T frames."""
     joints: np.ndarray
-    """(T, 55, 3)."""
+    """(T, 55, 3) joints of SMPL-X."""
     tips: np.ndarray
     """(T, 10, 3) fingertips, thumb to little finger, left hand first."""
     flagged: np.ndarray
-    """(T,) the stage marked the frame as unreliable."""
+    """(T,) bool: the stage marked the frame as unreliable."""
     sigma: np.ndarray | None = None
-    """(T, 55) stated standard deviation of the joints."""
+    """(T, 55) stated standard deviation of each joint along one coordinate; None after
+    ``joint``."""
 
     def frame(self, t: int) -> np.ndarray:
         """Posed vertices (V, 3) float32 of one frame."""
@@ -61,9 +64,9 @@ class ObjectTrack:
     translation: np.ndarray
     """(T, 3) metres."""
     flagged: np.ndarray
-    """(T,) the stage marked the frame as unreliable."""
+    """(T,) bool: the stage marked the frame as unreliable."""
     covariance: np.ndarray | None = None
-    """(T, 6, 6) of rotation vector and translation."""
+    """(T, 6, 6) of rotation vector (rad) and translation (m); None after ``joint``."""
 
     @property
     def known(self) -> bool:

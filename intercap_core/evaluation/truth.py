@@ -1,4 +1,8 @@
-"""Truth of a virtual recording, interpolated onto the fitted meshes. Only the metrics read it."""
+"""Truth of a virtual recording: true body, object, contact and cameras.
+
+The true skin is sampled at the points that correspond to the vertices of the fitted mesh. Only the
+metrics and the evaluation read it, never a fit.
+"""
 
 from __future__ import annotations
 
@@ -44,21 +48,21 @@ class Truth:
     """True body and object in the recording's T frame sets, master frame, metres.
 
     Without an object the object's mesh is empty and its pose NaN. ``vertices`` and ``visible`` are
-    None if the fitted body's topology is not the one to which the truth was matched.
+    None if the truth file has no correspondences for the topology of the fitted body.
     """
 
     vertices: np.ndarray | None
-    """(T, V, 3) points of the true skin at the fitted mesh's vertices."""
+    """(T, V, 3) points of the true skin that correspond to the vertices of the fitted mesh."""
     visible: np.ndarray | None
-    """(T, V) whether a camera truly sees them."""
+    """(T, V) whether a camera truly sees each of ``vertices``."""
     joints: np.ndarray
-    """(T, 55, 3)."""
+    """(T, 55, 3) joints of SMPL-X."""
     tips: np.ndarray
     """(T, 10, 3) fingertips, thumb to little finger, left hand first."""
     object_vertices: np.ndarray
-    """(Vo, 3) of the true object's mesh, object frame."""
+    """(Vo, 3) vertices of the true object's mesh, object frame."""
     object_faces: np.ndarray
-    """(Fo, 3)."""
+    """(Fo, 3) vertex indices."""
     object_visible: np.ndarray
     """(T, Vo) whether a camera truly sees each object vertex."""
     rotation: np.ndarray
@@ -72,9 +76,9 @@ class Truth:
     floor: Floor
     """The plane on which bare soles stand."""
     support_height: np.ndarray
-    """(T, 2) height of the surface under the left and the right sole."""
+    """(T, 2) height of the surface under the left and the right sole above the floor."""
     camera_names: tuple[str, ...]
-    """C names."""
+    """Names of the C cameras."""
     master_from_colour: np.ndarray
     """(C, 4, 4) true camera poses."""
 
@@ -101,7 +105,7 @@ class Truth:
                 seen = file["body_visible"][at].astype(np.float32)[..., None]
                 visible = body.corresponding_vertices(seen, faces, face, weights)[..., 0] > 0.5
             names = file.text("region_names")
-            # The body model's bare soles are above the ground by the thickness of the shoes' soles.
+            # the body model has bare feet, which stand above the ground by the shoes' soles
             soles = float(file.attributes.get("sole_m", 0.0))
             offset = float(file.attributes["ground_offset"]) - soles
             columns = [names.index(name) for name in METRIC_REGIONS]
@@ -135,6 +139,7 @@ class Truth:
 
 
 def _support_height(file: artefacts.Artefact, at: np.ndarray) -> np.ndarray:
+    """Height (T, 2) of the surface under the soles above the floor; 0 if the file lacks it."""
     return file["support_height"][at] if "support_height" in file else np.zeros((len(at), 2))
 
 
@@ -161,7 +166,10 @@ def _object_datasets(file: artefacts.Artefact, at: np.ndarray) -> dict[str, np.n
 
 
 def body_errors(truth: Truth, track: BodyTrack, fps: float) -> dict[str, np.ndarray]:
-    """Joint errors of T fitted bodies, by dataset of the metrics artefact."""
+    """Errors of joints, hands and accelerations of T fitted bodies, metres, by dataset.
+
+    The names are those of the metrics artefact without the prefix ``truth/<stage>/``.
+    """
     joints, tips = track.joints, track.tips
     true = truth.joints
     hands = np.r_[body.FINGER_JOINTS[0], body.FINGER_JOINTS[1]]
@@ -191,9 +199,15 @@ def object_errors(
     mesh: ObjectMesh,
     fps: float,
 ) -> dict[str, np.ndarray]:
-    """Errors of T object poses, by dataset of the metrics artefact; infinite if none was found.
+    """Errors of T object poses, by dataset of the metrics artefact without ``truth/<stage>/``.
 
-    ``rotation``: (T, 3, 3) and ``translation``: (T, 3), the true poses.
+    If the object was found in no frame, errors of translation and rotation are infinite.
+
+    Args:
+        rotation, translation: (T, 3, 3) and (T, 3), true poses master_from_object.
+        track: fitted poses.
+        mesh: mesh of the tracked object.
+        fps: frames per second.
     """
     if not track.known:
         unknown, beyond = np.full(len(rotation), np.nan), np.full(len(rotation), np.inf)

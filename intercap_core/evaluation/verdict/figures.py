@@ -1,4 +1,8 @@
-"""Figures of the held-out verdict: stated and true errors, and errors by camera."""
+"""Figures of the verdict: stated and true errors of each part, and errors by camera.
+
+The *verdict* on a sequence is an estimate of its errors without truth (:mod:`.judge`): errors in
+cameras that were held out of the fit, and a *stated* error of each part (body, hands, object).
+"""
 
 from __future__ import annotations
 
@@ -17,9 +21,9 @@ class ImageMeasure:
     """A measure of the agreement between a result and an image."""
 
     key: str
-    """Dataset within verdict/ of the metrics artefact."""
+    """Dataset of the metrics artefact, without the prefix verdict/."""
     of: str
-    """Description."""
+    """Description of the measure."""
     unit: str
     """Unit in which it is reported."""
     scale: float
@@ -36,15 +40,16 @@ IMAGE_MEASURES = (
 
 @dataclass(frozen=True)
 class HeldOutCamera:
-    """Medians over the frames for which a camera was held out; NaN if unknown."""
+    """Errors in one camera, medians over the frames for which it was held out; NaN = unknown."""
 
     camera: str
+    """Name of the camera."""
     held_in: tuple[float, ...]
-    """Errors of the result, in the order of IMAGE_MEASURES."""
+    """Errors of the result, which used the camera, in the order and units of IMAGE_MEASURES."""
     held_out: tuple[float, ...]
-    """Errors of the fit without the camera, same order."""
+    """Errors of a fit without the camera, same order."""
     shift_mm: dict[str, float]
-    """RMS displacement of each part without the camera."""
+    """RMS displacement of each part if the camera is left out, over all frames."""
 
 
 def held_out_cameras(sequence: SequenceMetrics) -> Sequence[HeldOutCamera]:
@@ -72,12 +77,13 @@ def held_out_cameras(sequence: SequenceMetrics) -> Sequence[HeldOutCamera]:
 
 
 def _rms(values: np.ndarray) -> float:
+    """Root mean square of the finite values; NaN if there is none."""
     known = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")
 
 
 WITHIN = 1.5  # factor within which a stated error counts as correct
-# the figure against truth of each part
+# By part, the figure against truth that its stated error predicts.
 TRUE = {
     "body": "body_pve_mm",
     "hands": "hand_mpjpe_mm",
@@ -87,20 +93,23 @@ TRUE = {
 
 @dataclass(frozen=True)
 class StatedError:
-    """Stated and true error of one part of a sequence, means over the frames with a statement."""
+    """Stated and true error of one part of a sequence, means over the frames with a stated
+    error."""
 
     sequence: str
+    """Name of the sequence."""
     part: str
+    """"body", "hands" or "object"."""
     stated: float
-    """Millimetres; NaN if no error is stated."""
+    """Stated error, millimetres; NaN = none is stated."""
     factor: float
     """80 % of the true errors are within this factor of ``stated``."""
     true: float
-    """Millimetres; NaN without truth."""
+    """True error, millimetres; NaN = no truth."""
     silent: str = ""
-    """Reason why no error is stated."""
+    """Reason why no error is stated; "" = one is stated."""
     repeated: float = float("nan")
-    """Mm, displacement if every other frame's images are not used."""
+    """Displacement if the images of every other frame are not used, millimetres."""
 
 
 def stated_errors(sequence: SequenceMetrics) -> Sequence[StatedError]:
@@ -110,7 +119,7 @@ def stated_errors(sequence: SequenceMetrics) -> Sequence[StatedError]:
     return _stated_cache[sequence]
 
 
-# Tables, figures and pages each need the stated errors; those with truth take long to compute.
+# Tables, figures and pages each need the stated errors, whose comparison with truth takes long.
 _stated_cache: WeakKeyDictionary[SequenceMetrics, tuple[StatedError, ...]] = WeakKeyDictionary()
 
 
@@ -175,10 +184,15 @@ def mean_stated(sequences: Sequence[SequenceMetrics]) -> dict[str, float]:
 def verdict_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
     """Agreement of stated and true errors over the sequences with truth; empty without truth.
 
-    - ``silent_share``: share of parts without a stated error; these count in no other figure.
-    - ``rank_correlation``: Spearman's, over sequences, of each part and their mean.
-    - ``within_factor_share``: share of parts whose stated error is within WITHIN of the true error.
-    - ``bad_sequence_recall``: share of the parts above 20 mm whose stated error is above it too.
+    One item is one part of one sequence.
+
+    - ``silent_share``: share of items without a stated error; these count in no other figure.
+    - ``rank_correlation``: Spearman's correlation of stated and true errors over sequences, for
+      each part, and the mean of the parts.
+    - ``within_factor_share``: share of items whose stated error is within the factor WITHIN of the
+      true error.
+    - ``bad_sequences``: number of items with a true error above 20 mm.
+    - ``bad_sequence_recall``: share of these whose stated error is above 20 mm too.
     """
     from scipy.stats import spearmanr  # takes a second to import, which most processes do not need
 

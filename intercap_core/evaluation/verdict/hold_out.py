@@ -1,14 +1,14 @@
 """Held-out evaluation of a joint fit: one camera at a time, and every other frame.
 
-The joint fit's energy at its minimum x is a sum of image terms of each camera and of terms without
-images. Leaving out the rows of camera c and solving the normal equations once gives the fit without
-this camera to first order:
+The energy of the joint fit is a sum of terms with images, one part for each camera, and of terms
+without images. At the result x it has the gradient g and the Gauss-Newton matrix H; g_c and H_c are
+the parts of camera c. The fit without this camera is, to first order,
 
     x_c = x - (H - H_c)^-1 (g - g_c) + H^-1 g
 
-The last term removes the remaining descent of the full problem. Correspondences, robust weights and
-contact stay as they are at x, so that a refit costs one linear solve. A refit iterated to
-convergence with new correspondences moves the body 4 to 10 % further.
+The last term subtracts the step that the full problem itself would still make. Correspondences,
+robust weights and contact are kept from x, so that a refit costs one linear solve. A refit iterated
+to convergence with new correspondences would move the body 4 to 10 % further.
 """
 
 from __future__ import annotations
@@ -43,7 +43,10 @@ class JudgedPart(StrEnum):
 
 
 class Refits:
-    """Refits around one ``state``; the terms of ``assembly`` must have been refreshed at it."""
+    """Refits around one ``state`` with subsets of the images.
+
+    The terms of ``assembly`` must have been refreshed (linearised) at this state.
+    """
 
     def __init__(self, assembly: Assembly, state: State) -> None:
         self.state = state
@@ -65,6 +68,7 @@ class Refits:
         return self.state.moved(limited(self._step(used) - self._descent))
 
     def _step(self, used: np.ndarray) -> np.ndarray:
+        """Gauss-Newton step with the images in the mask ``used`` (T, C); NaN if it is singular."""
         equations = self._rest.copy(self._bands)
         for columns, term in self._seen:
             equations.add_blocks(term.name, columns, *term.linearise_views(used, self.state))
@@ -74,6 +78,7 @@ class Refits:
         return step
 
 
+# Joints (slices of the 55) by which body and hands are compared.
 JOINTS = {JudgedPart.BODY: BODY_JOINTS, JudgedPart.HANDS: BOTH_HANDS}
 
 
@@ -82,13 +87,13 @@ class ViewErrors:
     """Errors of a state in each image, (T, C); NaN if the image does not show the part."""
 
     keypoint_px: np.ndarray
-    """Median reprojection error of the body's keypoints."""
+    """Median reprojection error of the body's keypoints, px."""
     person_m: np.ndarray
-    """Median distance of the person's points from the skin, less clothing."""
+    """Median distance of the person's points from the clothed skin, metres."""
     overlap: np.ndarray
-    """Intersection over union of the object's mask and its render."""
+    """Intersection over union of the object's mask and its render, 0 to 1."""
     object_depth_m: np.ndarray
-    """Median depth error of the object."""
+    """Median depth error of the object, metres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,11 +109,12 @@ class HeldOut:
     held_out: ViewErrors
     """Errors in the held-out camera of a fit that did not use it."""
     keypoint_m: np.ndarray
-    """(T,) keypoint error in the held-out camera at the person's distance."""
+    """(T,) keypoint error in the held-out camera, converted to metres at the person's distance."""
     shift: dict[JudgedPart, np.ndarray]
-    """(V, T) displacement of a part without a camera, metres."""
+    """(V, T) by part, displacement if a camera is left out, metres."""
     repeated: dict[JudgedPart, np.ndarray]
-    """(T,) displacement if this frame's images are not used."""
+    """(T,) by part, displacement if the images of this and every other frame are not used,
+    metres."""
 
 
 def hold_out(inputs: JointInputs, settings: JointSettings, result: JointResult) -> HeldOut | None:
@@ -137,8 +143,8 @@ def hold_out(inputs: JointInputs, settings: JointSettings, result: JointResult) 
         used = everything.copy()
         used[first::2] = False
         half.append(refits.with_views(used))
-    # each camera judges the frames of 0.2 s in turn: longer than the window of velocities, short
-    # enough that every camera judges a recording of two seconds
+    # For errors in images, the cameras are held out in turn for 0.2 s each: longer than the window
+    # of velocities, and short enough that each has a turn in a recording of two seconds.
     block = np.arange(len(state)) // max(1, round(inputs.fps * 0.2))
     turn = block % len(cameras)
     mixed = _select_states(without, turn)
@@ -213,7 +219,10 @@ def _pixels_to_metres(pixels: np.ndarray, result: JointResult, joints: np.ndarra
 
 
 def _select_states(states: list[State], which: np.ndarray) -> State:
-    """State whose frame t is that of ``states[which[t]]``; shapes are those of the first state."""
+    """State whose frame t is that of ``states[which[t]]``.
+
+    Parameters common to all frames (``betas``, ``expression``) are those of the first state.
+    """
     frames, first = np.arange(len(which)), states[0]
     body, rotation, translation = (
         np.stack([getattr(state, name) for state in states])[which, frames]

@@ -1,4 +1,8 @@
-"""The verdict on one sequence: held-out evaluation and stated error of each part."""
+"""The verdict on one sequence: an estimate of its errors without truth.
+
+It consists of the errors in cameras held out of the fit (:mod:`.hold_out`) and of one stated error
+for each of body, hands and object (:mod:`.stated`).
+"""
 
 from __future__ import annotations
 
@@ -29,9 +33,9 @@ class SequenceVerdict:
     cameras: tuple[str, ...]
     """Names of the C cameras."""
     frames: int
-    """T."""
+    """Number of frames T."""
     held: HeldOut | None
-    """None if fewer than two cameras show the person."""
+    """Held-out evaluation; None if fewer than two cameras show the person."""
     stated: dict[JudgedPart, ErrorEstimate]
     """Error of each part; without the object if the recording has none."""
 
@@ -132,7 +136,8 @@ def _moved(
 
 
 def _known(fits: SequentialFits, result: JointResult, part: JudgedPart) -> np.ndarray:
-    """Mask (T,) of the frames in which the part was measured and the joint fit agrees."""
+    """Mask (T,) of the frames in which the part was measured, not filled in, and the images do not
+    contradict the joint fit."""
     flags = fits.flags
     if part == JudgedPart.OBJECT:
         return ~(flags.lost | flags.carried) & ~result.contradicted

@@ -2,14 +2,17 @@
 
     error^2 = rest^2 + (a shift)^2 + (b keypoint)^2 + (c sigma)^2 + (d moved)^2
 
+The four features are in metres:
+
 - ``shift``: jackknife over the V cameras (Efron 1982), sqrt((V - 1) / V sum_v d_v^2), where d_v is
   the displacement of the part without camera v. It measures independent errors of calibration,
   masks and keypoints.
 - ``keypoint``: keypoint error in the held-out camera, at the person's distance.
 - ``sigma``: standard deviation that the sequential fits state.
 - ``moved``: displacement from the sequential fits to the joint fit.
-- ``rest``: errors that all cameras share and no held-out camera shows: clothing, the detector's
-  definition of a joint, the object's mesh.
+
+``rest`` stands for errors that all cameras share, so that no held-out camera shows them: clothing,
+the detector's definition of a joint, the object's mesh.
 
 ``python -m bench.verdict`` fits the factors to the studio's truth.
 """
@@ -36,9 +39,9 @@ class Factors(NamedTuple):
     """80 % of the true errors are within this factor of the stated error."""
 
 
-# Fitted to the virtual studio by `python -m bench.verdict`: 41 recordings with two to six cameras,
-# with and without depth, at noise scales 1 and 2, with other body builds, people without an object
-# and a balance beam. The spreads are cross-validated: each kind of recording was left out once.
+# Fitted to 41 recordings of the virtual studio by `python -m bench.verdict`: two to six cameras,
+# with and without depth, noise scales 1 and 2, other body builds, people without an object, and a
+# balance beam. The spreads are cross-validated: each kind of recording was left out once.
 FACTORS = {
     JudgedPart.BODY: Factors(0.0041, (1.55, 0.07, 0.69, 1.08), 1.28),
     JudgedPart.HANDS: Factors(0.0, (0.97, 0.15, 0.81, 1.40), 1.25),
@@ -105,5 +108,5 @@ def estimate_error(
 
 
 def _error(features: np.ndarray, rest: float, factors: tuple[float, ...]) -> np.ndarray:
-    """Errors (...,) of features (..., F)."""
+    """Errors (...,) of features (..., F) by the formula of this module, metres."""
     return np.sqrt(rest**2 + ((features * np.array(factors)) ** 2).sum(axis=-1))
