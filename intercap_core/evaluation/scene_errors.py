@@ -247,9 +247,9 @@ def measure(frames: Path, scene: Path, truth: Path) -> CaptureErrors:
 def figures(captures: Sequence[CaptureErrors]) -> dict[str, float]:
     """Figures over several captures, in millimetres, milliseconds and degrees.
 
-    Extrinsics are separate for rooms with furniture and for bare floors (``floor_only``). The shares of
-    improved and worse captures are over both; a capture counts by the mean over its cameras.
-    ``offset_normalised_median`` is 1 if the stated deviations are calibrated.
+    Extrinsics are separate for rooms with furniture and for bare floors (``floor_only``). The
+    shares of improved and worse captures are over both; a capture counts by the mean over its
+    cameras. ``offset_normalised_median`` is 1 if the stated deviations are calibrated.
     """
     if not captures:
         return {}

@@ -30,8 +30,10 @@ from intercap_core.entries import SubjectEntry
 from intercap_core.errors import UserError
 from intercap_core.schemas import BODY_FIT, BODY_PARTS
 
-WRONG_TRUNK_M = 0.06  # median trunk keypoint error of a fit to something else; tuned on the studio
-BAD_BODY_M = 0.040  # mean error of the surface that the metrics call a bad body, metres
+# Median trunk keypoint error from which the fit is not of the subject's body; tuned on the studio.
+WRONG_TRUNK_M = 0.06
+# Mean vertex error of a bad body, metres, as in the metrics (evaluation.figures).
+BAD_BODY_M = 0.040
 
 
 def run(
@@ -47,10 +49,12 @@ def run(
 ) -> None:
     """Fit the subject's body in all frames and write body_fit.h5.
 
-    Frames with too few keypoints, frames whose fit is far from the keypoints, and frames with one
-    view and no points of the person are ``failed`` and ``bridged``: interpolated between their
-    neighbours. Raises UserError if no frame can be fitted, the body file cannot be used, or the
-    artefacts do not belong together.
+    A frame fails if it has too few keypoints, if the fitted trunk is far from its keypoints, or if
+    only one view and no depth points show the person. Failed frames are marked ``failed`` and
+    ``bridged``: their bodies are interpolated from neighbouring frames.
+
+    Raises UserError if no frame can be fitted, the body file cannot be used, or the artefacts do
+    not belong together.
     """
     path = body_models.of(subject.gender) or OPEN_BODY
     file = load_body_file(path, settings.betas, num_expression=10)
@@ -73,7 +77,7 @@ def run(
     fitted = np.zeros(seen.num_frames, bool)
     # limbs may be occluded: only the trunk decides whether this is the subject's body
     on_trunk = quality.trunk_distance(fit.parts) < WRONG_TRUNK_M
-    # the keypoints of one view do not determine the body's distance, its depth points do
+    # two views, or one view and depth points: keypoints of one view do not determine the distance
     determined = (~fit.pixel_residual.isnan()).sum(1) + (~fit.cloud_residual.isnan()) >= 2
     fitted[fit.frames[on_trunk & determined.cpu().numpy()]] = True
     if not fitted.any():
@@ -122,6 +126,7 @@ def run(
 
 
 def _put_bodies(writer: artefacts.Writer, params: BodyParameters, joints: np.ndarray) -> None:
+    """Write the SMPL-X parameters and the joints (T, 55, 3)."""
     for name in (
         "betas", "expression", "global_orient", "transl", "body_pose", "jaw_pose", "leye_pose",
         "reye_pose", "left_hand_pose", "right_hand_pose",
@@ -138,23 +143,29 @@ class _Uncertainty(NamedTuple):
     covariance: np.ndarray
     """(T, 55, 3, 3) square metres."""
     undetermined: np.ndarray
-    """(T, 8) bool, parts of the body."""
+    """(T, 8) bool: the images do not determine this part, in the order of BODY_PARTS."""
     uncertain: np.ndarray
-    """(T,) bool, the expected error is that of a bad body."""
+    """(T,) bool: the expected mean vertex error exceeds BAD_BODY_M."""
 
 
 def _state_uncertainty(
     model: BodyModel, fit: BodyFit, times: np.ndarray, fitted: np.ndarray, joints: np.ndarray
 ) -> _Uncertainty:
-    """Return the uncertainty of the ``fitted`` frames (T,) and of the bridged ones.
+    """Return the uncertainty of all frames: fitted and bridged.
 
-    times (T,) seconds, joints (T, 55, 3) metres.
+    The covariance of the fit gives the direction. Its size is widened for jumps of a joint, for
+    limbs that only one view constrains, and in bridged frames.
+
+    Args:
+        times: (T,) seconds.
+        fitted: (T,) bool; other frames are bridged.
+        joints: (T, 55, 3) metres.
     """
     count = len(times)
     sigma = np.zeros((count, 55))
     stated = joint_covariance(model, fit).cpu().numpy()
-    # a jump may be a wrong minimum and widens sigma; a limb that only the pixels of one view
-    # constrain is widened by any distance from the median
+    # A jump of a joint may be a wrong minimum, so it widens sigma. Jumps count from JUMP_M on; for
+    # joints that only keypoints of one view constrain, from 0 on.
     least = np.full_like(sigma, JUMP_M)
     least[fit.frames] *= ~quality.flag_unmeasured_joints(fit.parts)
     jumped = np.zeros_like(sigma)

@@ -1,4 +1,4 @@
-"""Stage dataset: tables, heatmaps, summary, dataset card and first page of the site."""
+"""Stage ``dataset``: tables, heatmaps, summary, dataset card and first page of the site."""
 
 from __future__ import annotations
 
@@ -54,15 +54,18 @@ def run(
     UserError if no sequence is left.
 
     Args:
-        summaries: paths by sequence, in the order of the table.
+        dataset: name of the dataset.
+        summaries: summary artefacts by sequence, in the order of the table.
+        objects: the list of objects, by name.
+        body_models: body model files of the settings.
         site: folder of the site.
         summary: path of summary.json; the dataset card is written into the same folder.
         heatmaps: path of the heatmaps artefact.
         tables_folder: folder of the tables.
         card: statements of the dataset card.
         formats: formats of the exports, for the card.
-        virtual: the studio rendered all recordings.
-        failed: reason by sequence without a result.
+        virtual: True if the studio rendered all recordings.
+        failed: for sequences without a result, the reason.
         changed: name, value and default of each setting that differs from its default.
     """
     found, broken = _read(summaries)
@@ -142,9 +145,9 @@ def _read(summaries: Mapping[str, Path]) -> tuple[list[SequenceSummary], dict[st
 def _body_heat(
     summaries: Sequence[SequenceSummary], heat: Heatmaps, body_models: BodyModels
 ) -> tuple[list[Heat], dict[str, str]]:
-    """Heatmaps of the body and both hands, and remarks by sequence.
+    """Pictures of the heatmaps of the body and both hands, and remarks by sequence.
 
-    They are drawn on the body of the first sequence in the map whose body file is unchanged.
+    They are drawn on the body of the first sequence whose body file still exists unchanged.
     """
     doubts: dict[str, str] = {}
     if not heat.body_frames:
@@ -170,7 +173,7 @@ def _body_heat(
 def _unlisted(
     summaries: Sequence[SequenceSummary], objects: Mapping[str, ObjectEntry]
 ) -> dict[str, str]:
-    """Remark by sequence whose object is no longer in the list of objects."""
+    """Remarks on sequences whose object is no longer in the list of objects."""
     return {
         summary.name: f"its object {summary.metrics.object_} has no entry in the list of objects: "
         "the object's heatmap has no picture; put the entry back, or correct the sequence's row"
@@ -180,6 +183,7 @@ def _unlisted(
 
 
 def _object_heat(name: str, heat: Heatmaps, objects: Mapping[str, ObjectEntry]) -> Heat:
+    """Pictures of the heatmap of one object."""
     mesh = ObjectMesh.load(objects[name])
     found = heat.objects[name]
     top = highest(found.likelihood)
@@ -187,6 +191,7 @@ def _object_heat(name: str, heat: Heatmaps, objects: Mapping[str, ObjectEntry]) 
 
 
 def _medians(pairs: Sequence[tuple[str, float, float]]) -> tuple[float, float]:
+    """Medians before and after over camera pairs (name, before, after) with both; NaN if none."""
     known = np.array([pair[1:] for pair in pairs if np.isfinite(pair[1:]).all()])
     if not len(known):
         return float("nan"), float("nan")
@@ -195,6 +200,7 @@ def _medians(pairs: Sequence[tuple[str, float, float]]) -> tuple[float, float]:
 
 
 def _write_heatmaps(path: Path, dataset: str, heat: Heatmaps) -> None:
+    """Write the heatmaps artefact; objects are concatenated, with offsets."""
     objects = list(heat.objects.values())
     ends = np.cumsum([len(o.likelihood) for o in objects], dtype=np.int64)
     with artefacts.write(

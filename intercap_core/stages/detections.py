@@ -40,11 +40,11 @@ class CameraDetections:
     people: list[np.ndarray]
     """Keypoints (P, 135, 3) of the people: x, y (px), confidence."""
     instances: list[list[Instance]]
-    """Candidates."""
+    """Segmentation candidates of each image."""
     keypoints_found: np.ndarray
-    """(T,) bool: a detector searched for people."""
+    """(T,) bool: a detector processed the image for people, even if it found none."""
     candidates_found: np.ndarray
-    """(T,) bool: a detector searched for instances."""
+    """(T,) bool: a detector processed the image for instances, even if it found none."""
     notes: list[str] = field(default_factory=list)
     """Remarks for the user on what was left out."""
 
@@ -54,11 +54,14 @@ def run(
 ) -> None:
     """Read the sequence's files of keypoints and candidates and write the detections artefact.
 
-    Files are matched to colour images by number or name (:mod:`.image_numbers`). BEHAVE's files are
-    read from the folders of its images unless the row names others. Images without a file are
-    processed by the models of the settings: first segmentation, then keypoints. Missing or broken
-    files, unusable entries and missing cameras are noted. Raises UserError if no image has
-    keypoints or candidates, or if none of a camera's keypoints can be used.
+    Files are matched to colour images by number or name
+    (:mod:`intercap_core.formats.detections.image_numbers`). BEHAVE's files are read from the
+    folders of its images, unless the row of the sequence names other paths. Images without a file
+    are processed by the models of the settings: first segmentation, then keypoints. Missing or
+    broken files, unusable entries and missing cameras are noted.
+
+    Raises UserError if no image has keypoints or candidates, or if none of a camera's keypoints can
+    be used.
     """
     with artefacts.read(frames, FRAMES) as source:
         images = camera_images(source, sequence)
@@ -93,6 +96,7 @@ def run(
 
 
 def _identity(path: Path) -> str:
+    """Name and SHA-256 checksum of a model file."""
     with open(path, "rb") as file:
         return f"{path.name} {hashlib.file_digest(file, 'sha256').hexdigest()}"
 
@@ -114,6 +118,7 @@ def _raise_nothing(
 
 
 def _put_camera(writer: artefacts.Writer, name: str, detections: CameraDetections) -> None:
+    """Write one camera's detections as concatenated lists with offsets by frame set."""
     group = f"cameras/{name}"
     instances = [i for in_set in detections.instances for i in in_set]
     rle_offsets, rle = artefacts.pack_ragged([i.rle for i in instances])
@@ -128,6 +133,7 @@ def _put_camera(writer: artefacts.Writer, name: str, detections: CameraDetection
 
 
 def _offsets(per_set: list[np.ndarray] | list[list[Instance]]) -> np.ndarray:
+    """Offsets (T + 1,) int64 of the entries of each set in the concatenated list."""
     return np.concatenate([[0], np.cumsum([len(entries) for entries in per_set])]).astype(np.int64)
 
 
@@ -137,6 +143,7 @@ def _read_camera(
     behave: BehaveFiles | None,
     settings: DetectionsSettings,
 ) -> CameraDetections:
+    """Read the keypoint and candidate files of one camera."""
     count, name = len(images.number), images.name
     result = CameraDetections(
         people=[NOBODY] * count,
@@ -248,7 +255,10 @@ def _find_people(
 
 
 def _unknown(images: list[CameraImages], known: list[np.ndarray]) -> list[Image]:
-    """Images that no detector has processed; ``known`` (T,) of each camera."""
+    """Images (set, camera) that no detector has processed.
+
+    ``known``: for each camera a mask (T,) of the processed images.
+    """
     return [
         (t, c)
         for c, (camera, found) in enumerate(zip(images, known, strict=True))
@@ -260,7 +270,8 @@ def _unknown(images: list[CameraImages], known: list[np.ndarray]) -> list[Image]
 def _pictures(
     frames: Path, wanted: list[Image], damaged: list[int]
 ) -> Iterator[tuple[Image, np.ndarray]]:
-    """Yield the wanted images (H, W, 3); count those that do not decode in ``damaged`` (C,)."""
+    """Yield the wanted images (H, W, 3); images that do not decode are counted in ``damaged``, a
+    list with one number for each camera."""
     from intercap_core.formats.recordings.frames import Frames
 
     with Frames.open(frames) as recording:

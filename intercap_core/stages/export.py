@@ -1,4 +1,4 @@
-"""Stage export: the joint result in the file formats of other tools."""
+"""Stage ``export``: the joint result in the file formats of other tools."""
 
 from __future__ import annotations
 
@@ -47,10 +47,11 @@ def run(
 ) -> None:
     """Write the formats of the settings into the folder ``output``, replacing an earlier export.
 
-    The folder is filled under a temporary name and put in place when it is complete. README.txt
-    states the errors from the metrics, and what is omitted because no object was found. Raises
-    UserError if an artefact or the object's mesh is missing or broken, if the metrics do not belong
-    to the joint result, or if ``output`` holds anything but an export.
+    The folder is filled under a temporary name and renamed once it is complete. README.txt lists
+    the errors from the metrics, and the formats that are omitted because no object was found.
+
+    Raises UserError if an artefact or the object's mesh is missing or broken, if the metrics were
+    measured on another joint result, or if ``output`` contains anything but an earlier export.
     """
     output = Path(output)
     check_replaceable(output, marker=MARKER, what="export")
@@ -124,7 +125,10 @@ def run(
 
 
 def _about(paths: SequencePaths, motion: Motion, mesh: ObjectMesh | None) -> About:
-    """Read errors, flags and contact; imported results have no deviations."""
+    """Read the errors, flags and contact that the exported files document.
+
+    Imported results have no standard deviations.
+    """
     measured = SequenceMetrics.read(paths.metrics)
     if len(measured) != len(motion):
         raise UserError(
@@ -170,6 +174,7 @@ def _write_manifest(
     coordinates: Mapping[str, Coordinates],
     body: Sequence[WrittenBody],
 ) -> None:
+    """Write the manifest (MARKER) with the checksums of all other files of the export."""
     files = sorted(path for path in output.rglob("*") if path.is_file())
     content: dict[str, Any] = {
         "sequence": motion.sequence,

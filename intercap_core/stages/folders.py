@@ -32,10 +32,10 @@ def check_replaceable(output: Path, *, marker: str, what: str) -> None:
 
 @contextlib.contextmanager
 def replaced(output: Path) -> Iterator[Path]:
-    """An empty folder that replaces ``output`` when the block ends without an error.
+    """Context manager: yields an empty folder that replaces ``output`` when the block succeeds.
 
-    It has a temporary name next to ``output``. An ``output`` that is such a temporary folder itself
-    is filled directly.
+    The folder has a temporary name next to ``output`` and is deleted if the block raises. If
+    ``output`` has the suffix of temporary folders itself, it is filled directly.
     """
     output = output.resolve()
     part = output if output.suffix == PART else part_of(output)

@@ -1,7 +1,10 @@
 """Stage ``frames``: recordings to synchronised frame sets.
 
-Colour packets are copied as recorded and depth is lossless. Memory does not grow with the length of
-the recordings, except by 8 bytes for the time of each image.
+Colour images are copied in their recorded encoding, depth is stored without loss. Memory does not
+grow with the length of the recordings, except by 8 bytes for the time of each image.
+
+The *clock* is the camera whose device times define the frame sets, usually the master. An *epoch*
+is a stretch of images between two resets of a device's clock.
 """
 
 from __future__ import annotations
@@ -45,10 +48,12 @@ def run(
 ) -> None:
     """Write the frames artefact of one sequence.
 
-    A camera without a usable recording or a pose, or that the settings exclude, is kept with
-    ``present`` = False and a note. Poses are in the frame of the calibration's master, even if its
-    recording is missing. Sets in ``frames_to_drop`` get no image. Raises UserError if no camera can
-    be used, if the calibration is unreadable, and if a set to drop or a camera to use is missing.
+    A camera that has no usable recording or no pose, or that the settings exclude, keeps its index
+    with ``present`` = False and a note. Poses are in the frame of the calibration's master, even if
+    its recording is missing. Sets in ``frames_to_drop`` get no image.
+
+    Raises UserError if no camera can be used, if the calibration is unreadable, or if a set to drop
+    or a camera named in the settings does not exist.
     """
     layout = open_layout(sequence)
     extrinsics = layout.extrinsics
@@ -101,7 +106,10 @@ def run(
 
 
 def _stated_world(sequence: SequenceEntry, extrinsics: Extrinsics) -> dict[str, np.ndarray]:
-    """Up direction and floor point (3,) that the sequence's row states, master's frame."""
+    """Up direction and floor point (3,) that the row of the sequence states, master's frame.
+
+    Empty if the row states none.
+    """
     axis = sequence.calibration_up
     if axis is None:
         return {}
@@ -126,7 +134,8 @@ def _used(names: Sequence[str], settings: FramesSettings, sequence: SequenceEntr
 
 
 def _note_same_devices(views: list[ExtractedCamera]) -> None:
-    """Note recordings of one device; of two with the same images, exclude the second."""
+    """Note recordings with equal serial numbers; of two with the same images, exclude the
+    second."""
     for first, second in combinations([view for view in views if view.present], 2):
         if first.source is None or second.source is None or first.serial != second.serial:
             continue
@@ -158,7 +167,8 @@ def _require_usable(views: list[ExtractedCamera], sequence: SequenceEntry) -> No
 
 
 def _straighten_clocks(views: list[ExtractedCamera], master: int) -> None:
-    """If a device's clock was reset, keep the epoch of its images in the others' time."""
+    """If a device's clock was reset, keep only the epoch that overlaps the other cameras in
+    time."""
     present = [view for view in views if view.present]
     epochs = {view.name: split_into_epochs(view.colour_times) for view in present}
     straight = [view for view in present if epochs[view.name].max() == 0]
@@ -173,6 +183,12 @@ def _straighten_clocks(views: list[ExtractedCamera], master: int) -> None:
 
 
 def _keep_one_epoch(view: ExtractedCamera, epoch: np.ndarray, reference_us: np.ndarray) -> None:
+    """Mark images outside the best epoch as unusable.
+
+    Args:
+        epoch: epoch of each colour image, from 0; OUTLIER = time out of order.
+        reference_us: device times of the other cameras' images.
+    """
     period_us = 1e6 / view.fps
     kept = choose_epoch(view.colour_times, epoch, np.sort(reference_us), period_us)
     resets = int(epoch.max())
@@ -202,9 +218,9 @@ def _overlap(view: ExtractedCamera, other: ExtractedCamera) -> bool:
 
 
 def _clock_of(views: list[ExtractedCamera], master: int) -> int:
-    """The camera whose images define the sets: that which overlaps most others in time.
+    """Index of the camera whose images define the sets: it overlaps most other cameras in time.
 
-    Of equal ones it is the master, or the first that is present.
+    Of several such cameras it is the master, or the first that is present.
     """
     present = [index for index, view in enumerate(views) if view.present]
     overlaps = {i: sum(_overlap(views[i], views[other]) for other in present) for i in present}
@@ -215,7 +231,10 @@ def _clock_of(views: list[ExtractedCamera], master: int) -> int:
 
 
 def _exclude_other_clocks(views: list[ExtractedCamera], clock: int) -> None:
-    """Exclude devices without the sync cable, whose clocks count from their own start."""
+    """Exclude cameras whose device times do not overlap those of the clock.
+
+    Without a sync cable, a device counts time from its own start.
+    """
     for view in [view for view in views if view.present]:
         if _overlap(views[clock], view):
             continue
@@ -233,7 +252,10 @@ def _exclude_other_clocks(views: list[ExtractedCamera], clock: int) -> None:
 def _frame_sets(
     views: list[ExtractedCamera], clock: int, settings: FramesSettings
 ) -> tuple[SetTable, np.ndarray]:
-    """Return the table of colour images and the index (T, C) of the depth images."""
+    """Return the table of colour images and the index (T, C) of the depth images; -1 = none.
+
+    Indices count all recorded images of a camera, usable or not.
+    """
     max_skew_us = settings.max_skew_ms * 1000
     period_us = 1e6 / views[clock].fps
     if max_skew_us >= period_us / 2:
@@ -258,6 +280,7 @@ def _frame_sets(
 
 
 def _note_defects(views: list[ExtractedCamera], table: SetTable, clock: int) -> None:
+    """Note gaps, other frame rates, unmatched images, clock drift, and late or early ends."""
     period_us = 1e6 / views[clock].fps
     sets_per_s = frame_rate(table.times_us) or views[clock].fps
     gaps = table.gaps(period_us)
@@ -273,7 +296,7 @@ def _note_defects(views: list[ExtractedCamera], table: SetTable, clock: int) -> 
         seen = np.flatnonzero(table.index[:, camera] >= 0)
         own = frame_rate(view.usable_times) or sets_per_s
         ratio = own / sets_per_s
-        half_way = 1.5  # between an equal and a double frame rate
+        half_way = 1.5  # ratio of rates between equal (1) and double (2)
         if not 1 / half_way < ratio < half_way:
             view.notes.append(_other_rate(own, sets_per_s, int(table.unmatched[camera])))
         if table.unmatched[camera] and ratio < half_way:
@@ -288,14 +311,14 @@ def _note_defects(views: list[ExtractedCamera], table: SetTable, clock: int) -> 
         if not len(seen):
             continue
         drift = clock_drift_us(table.times_us, table.skew_us[:, camera])
-        if abs(drift) > 1000.0:  # less than the exposure time of an image
+        if abs(drift) > 1000.0:  # microseconds; smaller drifts are below an image's exposure time
             view.notes.append(
                 f"its clock runs away from {views[clock].name}'s by {drift / 1e3:.1f} "
                 "ms over the recording"
             )
         off = table.skew_us[seen, camera]
         uneven = float(np.median(np.abs(off - np.median(off))))
-        if uneven > 2000.0:  # a walking person moves by some millimetres; less is clock jitter
+        if uneven > 2000.0:  # microseconds: a walking person moves by some millimetres meanwhile
             view.notes.append(
                 f"the skew of its images varies by {uneven / 1e3:.1f} ms (median): fits use one "
                 "time offset for all of them"
@@ -313,7 +336,8 @@ def _note_defects(views: list[ExtractedCamera], table: SetTable, clock: int) -> 
 
 
 def _other_rate(own: float, sets: float, unmatched: int) -> str:
-    """Note for a camera with ``own`` images a second, if the frame sets have another rate."""
+    """Note on a camera with ``own`` images per second, unlike the rate ``sets`` of the frame
+    sets."""
     text = f"it has {own:.3g} images a second beside {sets:.3g} frame sets"
     if own > sets:
         return (
@@ -324,6 +348,7 @@ def _other_rate(own: float, sets: float, unmatched: int) -> str:
 
 
 def _dropped(count: int, frames_to_drop: Sequence[int], sequence: SequenceEntry) -> np.ndarray:
+    """Mask (T,) of the sets that the annotation drops."""
     dropped = np.zeros(count, bool)
     beyond = [frame for frame in frames_to_drop if not 0 <= frame < count]
     if beyond:
@@ -343,10 +368,10 @@ def _dropped(count: int, frames_to_drop: Sequence[int], sequence: SequenceEntry)
 def _camera_or_placeholder(
     view: ExtractedCamera, views: list[ExtractedCamera], extrinsics: Extrinsics
 ) -> Camera:
-    """The camera, or for an absent one a placeholder without depth that keeps its place in C.
+    """The camera, or for an absent camera a placeholder, so that camera indices stay the same.
 
-    The placeholder has the image size of a present camera and a lens without distortion. Only its
-    pose may be used.
+    The placeholder has the image size and focal length of a present camera, no distortion and no
+    depth. Only its pose may be used.
     """
     if view.present and view.camera is not None:
         return view.camera

@@ -1,6 +1,7 @@
-"""Stage joint: body, object and contact refined together over all frames (equation 6).
+"""Stage ``joint``: body, object and contact refined together over all frames (equation 6).
 
-Starts from the two sequential fits. :mod:`intercap_core.joint.problem` lists the energy terms.
+The fit starts from the sequential fits of stages ``body_fit`` and ``object_track``.
+:mod:`intercap_core.joint.problem` lists the energy terms.
 """
 
 from __future__ import annotations
@@ -84,9 +85,9 @@ def run(
 
 
 def _hands_of_few_views(person: Path) -> np.ndarray:
-    """Mask (T, 2): left and right hand, if at most two views see most of its keypoints.
+    """Mask (T, 2) of left and right hands whose keypoints have a median of at most two views.
 
-    The object that occludes the hand in all other views also occludes some fingers in those two.
+    If an object occludes the hand in the other views, it also occludes some fingers in these two.
     """
     with artefacts.read(person, PERSON) as artefact:
         views = artefact["joint_views"]

@@ -1,4 +1,4 @@
-"""Stage metrics: distances between body, object and measurements, and errors against the truth."""
+"""Stage ``metrics``: distances between body, object and depth points, and errors against truth."""
 
 from __future__ import annotations
 
@@ -45,15 +45,16 @@ def run(
     output: Path,
     truth: Path | None = None,
 ) -> None:
-    """Measure the joint result of one sequence, state its error and compare all stages with truth.
+    """Measure the joint result of one sequence, estimate its error, compare all stages with truth.
 
-    Object and contact metrics are omitted if the sequence has no object or the object was found in
-    no frame; then the errors of an object that is in the recording are infinite. Raises UserError
-    if an input artefact is missing, broken or does not match the others.
+    Object and contact metrics are omitted if the sequence has no object, or if the object was found
+    in no frame. In the second case its errors against truth are infinite.
+
+    Raises UserError if an input artefact is missing, broken or does not match the others.
 
     Args:
         fit_settings: settings of the fits, for the refits of the held-out evaluation.
-        truth: truth file of a virtual recording.
+        truth: truth file of a virtual recording; None = no truth.
     """
     object_, body_models, gender = models.object_, models.body_models, models.gender
     with artefacts.read(paths.joint, JOINT) as fitted:
@@ -105,8 +106,8 @@ def run(
             **made_by,
         }
     verdict = {}
-    # Rig and body are still referenced, so that their cached ray tables are used again. The error
-    # model of the verdict was fitted to results of this program only, not to imported ones.
+    # The error model of the verdict was fitted to results of this program, so imported results have
+    # none. Rig and body are still referenced here, so that their cached ray tables are used again.
     if settings.hold_out and not made_by:
         verdict = SequenceVerdict.reach(paths, models, fit_settings).values()
     with artefacts.write(output, METRICS, settings_digest=digest(settings), **attributes) as writer:
@@ -117,6 +118,7 @@ def run(
 
 
 def _motion(body_track: BodyTrack, handled: HandledObject | None, fps: float) -> Values:
+    """Accelerations (T,) of the body's joints and of the object, metres per frame^2 at 30 fps."""
     joints = body_track.joints[:, body.BODY_JOINTS]
     values: Values = {"acceleration_body": motion.acceleration(joints, fps)}
     if handled is not None:
@@ -127,7 +129,7 @@ def _motion(body_track: BodyTrack, handled: HandledObject | None, fps: float) ->
 
 
 def _flags(images: Frames, paths: SequencePaths) -> Values:
-    """Frames that any stage flags, with all reasons."""
+    """Mask ``flagged`` (T,) of the frames that any stage marks as unreliable, and their reasons."""
     with artefacts.read(paths.person, PERSON) as artefact:
         missing = artefact["missing"]
     with artefacts.read(paths.object_track, OBJECT_TRACK) as artefact:
@@ -167,7 +169,9 @@ def _flags(images: Frames, paths: SequencePaths) -> Values:
 def _extrinsics_errors(
     scene: artefacts.Artefact, refined: np.ndarray, truth: truths.Truth
 ) -> Values:
-    """Errors of the camera poses as given, after ``scene`` and after ``joint``.
+    """Displacement (C,) of the cameras from the truth: as given, after ``scene``, after ``joint``.
+
+    See :func:`.scene_errors.displacement`. NaN for the master and absent cameras.
 
     Args:
         refined: (C, 4, 4) master-from-colour transforms of the joint fit.
@@ -192,8 +196,8 @@ def _extrinsics_errors(
 def _warn_of_foreign_truth(path: Path | None, values: Values) -> None:
     """Warn if the true body and object are far from the segmented points.
 
-    The truth is then probably of another recording. This is no error, because segmentations that
-    are wrong throughout look the same, and such a capture must stay in the figures.
+    The truth is then probably of another recording. No error is raised, because a recording whose
+    segmentation is wrong throughout looks the same and must remain in the figures.
     """
     keys = [f"truth/{name}_floor" for name in ("body", "object")]
     floor = [values[key] for key in keys if key in values]

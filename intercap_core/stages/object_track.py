@@ -49,10 +49,14 @@ def run(
 ) -> None:
     """Track the object through the recording and write the object_track artefact.
 
-    If ``object_`` is None (a person alone) or no image shows the object, all frames are written as
-    lost, without a pose. The track agrees with the annotated ``poses`` unless the images clearly
-    contradict them; without any, the object is searched for. Raises UserError if the mesh or an
-    input artefact is unusable, or if an annotated frame does not exist.
+    If ``object_`` is None (a person alone) or the object is found in no image, all frames are
+    written as lost, without a pose.
+
+    The track agrees with the annotated ``poses``, unless the images clearly contradict them.
+    Without annotated poses, the object is searched for.
+
+    Raises UserError if the mesh or an input artefact is unusable, or if an annotated frame does not
+    exist.
     """
     if object_ is None:
         with Frames.open(frames) as recording:
@@ -113,7 +117,7 @@ def run(
 
 
 def _absence(track: Track) -> str:
-    """Reason to reject the track in all frames; "" if it is accepted in some."""
+    """Reason to reject the whole track; "" = it is accepted."""
     accepted = sum(not frame.lost for frame in track.frames)
     if accepted == 0:
         return "its track is lost in every frame"
@@ -135,7 +139,10 @@ def _write(
     track: Track | None,
     cameras: list[int],
 ) -> None:
-    """Write the artefact; without a ``track``, that there is no object."""
+    """Write the artefact; if ``track`` is None, all frames are lost.
+
+    ``cameras``: indices of the cameras that the track used.
+    """
     names = list(recording.rig.names)
     if track is None:
         datasets = absent_track(recording.num_sets, len(names))
@@ -178,6 +185,7 @@ def _given(poses: Sequence[ObjectPose], count: int, sequence: str) -> list[Given
 
 
 def _seed_source(track: Track | None) -> str:
+    """Origin of the pose from which the track started, as in the artefact."""
     if track is None:
         return SOURCE_NONE
     if not track.annotated:
@@ -186,7 +194,7 @@ def _seed_source(track: Track | None) -> str:
 
 
 def _warn_if_unsound(track: Track, warn: Callable[[str], None]) -> None:
-    """Log warnings about lost, gone and ambiguous frames."""
+    """Log a warning if the object has left for some time, or most frames are lost or ambiguous."""
     count = len(track.frames)
     lost, gone, ambiguous = (
         sum(getattr(frame, state) for frame in track.frames)

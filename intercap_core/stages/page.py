@@ -1,4 +1,4 @@
-"""Stage page: the sequence's page of the site with its recording, fits, errors and viewer."""
+"""Stage ``page``: the sequence's page of the site with its recording, fits, errors and viewer."""
 
 from __future__ import annotations
 
@@ -60,11 +60,11 @@ def run(
     """Write the page into the folder ``output``, replacing an earlier page.
 
     Raises UserError if an artefact or the object's mesh is missing or broken, or if ``output``
-    holds anything but a page.
+    contains anything but an earlier page.
 
     Args:
-        contact: annotated intervals.
-        truth: truth file, drawn next to the close-ups of hands if it is known.
+        contact: annotated intervals; None = not annotated.
+        truth: truth file, drawn next to the fits in close-ups of hands; None = no truth.
     """
     output = Path(output)
     check_replaceable(output, marker=MARKER, what="page")
@@ -113,6 +113,11 @@ def _overlays(
     image_of: np.ndarray,
     settings: PageSettings,
 ) -> list[Overlay]:
+    """Overlays of body and object on the images of some frames and cameras.
+
+    Frames are evenly spread, and include the one in which the meshes are farthest from the measured
+    points.
+    """
     worst = "object_visible_to_cloud" if measured.has_object else "body_visible_to_cloud"
     chosen = choose_frames(measured.values[worst], settings.frames)
     cameras = sorted(choose_cameras(fit, rig, chosen, settings.cameras))
@@ -121,7 +126,10 @@ def _overlays(
 
 
 def _describe_joint(joint: Artefact, rig: Rig, master: int) -> str:
-    """Iterations of the joint fit, and the displacement of the cameras of ``rig``, in words."""
+    """Text on the iterations of the joint fit, its camera corrections and undetermined hands.
+
+    ``rig``: cameras before the joint fit. ``master``: index of the master.
+    """
     if "made_by" in joint.attributes:
         return (
             f"Not fitted here: made by {joint.attributes['made_by']}, with the cameras as they "
@@ -140,7 +148,7 @@ def _describe_joint(joint: Artefact, rig: Rig, master: int) -> str:
             int(np.flatnonzero(order == master)[0]),
         )
         variance = np.einsum("cici->ci", joint["camera_covariance"])
-        sigma = np.sqrt(variance[:, 3:6].max(axis=1))  # of the shift
+        sigma = np.sqrt(variance[:, 3:6].max(axis=1))  # standard deviation of the translation
         cameras = ", ".join(
             f"{rig.names[c]} {1e3 * moved[c]:.1f} (+- {1e3 * sigma[c]:.1f})"
             for c in order
@@ -157,6 +165,7 @@ def _describe_joint(joint: Artefact, rig: Rig, master: int) -> str:
 
 
 def _energies(joint: Artefact) -> list[tuple[str, float, float]]:
+    """Name and value before and after the joint fit of each energy term."""
     return [
         (name, float(before), float(after))
         for name, before, after in zip(
@@ -177,6 +186,7 @@ def _closeups(
 
 
 def _track(paths: SequencePaths, entry: ObjectEntry) -> dict[str, Any]:
+    """Content of the page's section on the object's track."""
     with artefacts.read(paths.scene, SCENE) as scene:
         detections = Detections.load(paths.detections).showing(scene["image_of"])
     detections = detections.with_candidates_of(paths.person)
@@ -190,6 +200,7 @@ def _track(paths: SequencePaths, entry: ObjectEntry) -> dict[str, Any]:
 
 
 def _made_by(paths: SequencePaths) -> dict[str, str]:
+    """Schema version and settings digest of each stage's artefact."""
     versions = {}
     for stage, path in paths.by_stage().items():
         schema = getattr(schemas, stage.upper())

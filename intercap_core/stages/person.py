@@ -48,7 +48,8 @@ from intercap_core.schemas import PERSON, SCENE
 class _Result:
     """Contents of the person artefact; T frame sets, C cameras.
 
-    Images are indexed by the moment that they show: that of set t (scene's ``image_of``).
+    Index t counts moments: row t belongs to the images that show the moment of set t, which may
+    come from other sets (``image_of`` of the scene artefact).
     """
 
     subject: SubjectDetections
@@ -58,13 +59,13 @@ class _Result:
     points: Triangulation
     """T * 135 triangulated points."""
     missing: np.ndarray
-    """(T,) bool: the subject is not located."""
+    """(T,) bool: neither two views nor depth locate the subject."""
     masks: list[bytes]
-    """T * C person masks of the detector, RLE; empty = none."""
+    """T * C masks of the subject by the detector, RLE; empty = none."""
     beside: list[bytes]
-    """T * C unions of the other candidates, RLE; empty = none."""
+    """T * C unions of the detector's other candidates, RLE; empty = none."""
     segmented: dict[tuple[int, int], ViewSegments]
-    """Segmentation by the images alone, by moment and camera."""
+    """Segmentation without a detector, by moment and camera."""
 
 
 def run(
@@ -80,12 +81,13 @@ def run(
 ) -> None:
     """Find the subject by geometry and write the person artefact.
 
-    The subject is the person named by the user, else who handles the object, else who is seen most
-    near the centre. A set with a single view of the subject takes its points from that view's
-    depth. Sets in which neither two views nor depth locate the subject are flagged ``missing``.
+    The subject is the person named by the user. Otherwise it is the person with most support near
+    the centre who handles the object, see :mod:`intercap_core.person.subject`. In sets with few
+    triangulated points, the depth of a single view supplies the others. Sets in which neither two
+    views nor depth locate the subject are flagged ``missing``.
 
     Args:
-        object_: its labels identify candidates of the object.
+        object_: its labels identify candidates of the object; None = a person alone.
         subject_points: annotated points on the subject.
         left_right: annotated images with exchanged sides.
 
@@ -122,8 +124,9 @@ def run(
         stated = images_with_stated_sides(left_right, rig.names, image_of, found.sequence)
         keypoints = given = exchange_stated(keypoints, stated)
         keypoints = steady_sides(keypoints, rig, min_confidence=confident)
-        # Points moved to the sets' times are triangulated. x, y as seen are appended as columns 3
-        # and 4, so that sides are exchanged in both alike, and then written.
+        # Triangulated are pixels moved to the sets' times (columns 0, 1; confidence in 2). The
+        # pixels as detected are carried along as columns 3 and 4, so that their sides are exchanged
+        # alike. The columns [3, 4, 2] are then written: x, y as detected, confidence.
         moved = at_set_times(keypoints, times, time_offset, rig, min_confidence=confident)
         moved, points = triangulate_people(
             np.concatenate([moved, keypoints[..., :2]], -1),
@@ -210,7 +213,11 @@ def _from_images(
     rig: Rig,
     settings: PersonSettings,
 ) -> dict[tuple[int, int], ViewSegments]:
-    """Segment images without a detector, by moment and camera, as the settings require."""
+    """Segment images without a detector; returns results by moment and camera.
+
+    By the setting ``segmentation``: "auto" = images that no detector has processed, "detector" =
+    none, "images" = all.
+    """
     wanted = images.available
     if settings.segmentation == "auto":
         wanted = wanted & ~found.candidates_found
@@ -224,6 +231,7 @@ def _from_images(
 
 
 def _write(output: Path, detections: Detections, result: _Result, settings: PersonSettings) -> None:
+    """Write the artefact; masks of the detector take precedence over segmented ones."""
     subject, points = result.subject, result.points
     masks, beside = list(result.masks), list(result.beside)
     sets, views = subject.people.shape
@@ -269,7 +277,7 @@ def _write(output: Path, detections: Detections, result: _Result, settings: Pers
 
 
 def _put_candidates(writer: artefacts.Writer, candidates: list[list[ImageCandidate]]) -> None:
-    """Write the candidates of the images alone, one list per image in the order of (T, C)."""
+    """Write the segmented candidates: one list for each image, in the order of (T, C)."""
     every = [candidate for of_image in candidates for candidate in of_image]
     offsets, rle = artefacts.pack_ragged([candidate.rle for candidate in every])
     writer.put("candidate_offsets", np.cumsum([0, *map(len, candidates)]))

@@ -47,9 +47,11 @@ from intercap_core.scene.up import (
 )
 from intercap_core.schemas import SCENE
 
-FEET = slice(19, 25)  # toes and heels among the body's keypoints
-WEAK_CAMERA_M = 0.010  # a larger standard deviation of a camera's pose is reported
-Floor = Sequence[tuple[float, float, float]]
+FEET = slice(19, 25)  # toes and heels among the body's 25 keypoints
+# A camera is reported if its pose lets the rig's centre move by more than this (standard
+# deviation).
+WEAK_CAMERA_M = 0.010
+Floor = Sequence[tuple[float, float, float]]  # annotated floor points, master frame, metres
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,13 +69,13 @@ class _Scene:
     ground: GroundPlane
     """The floor."""
     ground_notes: list[str]
-    """What is unusual about the floor or the stated up."""
+    """Notes on the floor and the stated up direction."""
     notes: list[list[str]]
-    """Notes by camera."""
+    """Notes on each camera."""
     slides: np.ndarray
-    """(C, 3) weakest motion of each camera, see :func:`_slides`."""
+    """(C, 3) least determined displacement of each camera, see :func:`_slides`."""
     known_to: list[str]
-    """The same in words, "" = fixed."""
+    """(C,) ``slides`` in words; "" = the camera is fixed."""
 
 
 def run(
@@ -147,7 +149,7 @@ def run(
 def _stated_starts(
     source: Frames, starts: Mapping[str, tuple[float, float]], master: int
 ) -> tuple[StatedStarts, list[str]]:
-    """Starts by annotation and sound combined, and a message (C,) for each disagreement."""
+    """Starts by annotation and sound combined, and messages (C,) on disagreements; "" = none."""
     names, heard = source.rig.names, source.sound_starts
     if not starts and not heard:
         return StatedStarts.nothing(len(names)), [""] * len(names)
@@ -164,7 +166,10 @@ def _stated_starts(
 def _backgrounds(
     source: Frames, subject: SubjectViews, slip: np.ndarray
 ) -> list[Background | None]:
-    """Background of each camera, without the person at the exposure of each image."""
+    """Background of each camera.
+
+    The person is masked at the moment that each image shows. ``slip``: (T, C) delays in sets.
+    """
     last = source.num_sets - 1
     moment = np.clip(np.arange(source.num_sets)[:, None] - slip, 0, last)
     return [
@@ -173,10 +178,12 @@ def _backgrounds(
 
 
 def _up(source: Frames, rig: Rig) -> UpDirection:
+    """Approximate up direction, before a floor is known."""
     return rough_up(rig, source.gravity, source.stated_up)
 
 
 def _check_stated_up(source: Frames, subject: SubjectViews) -> list[str]:
+    """Notes on contradictions to the stated up direction; adds the sequence to errors."""
     try:
         return check_stated_up(
             source.stated_up, source.rig, source.gravity, trunk_direction(subject.joints)
@@ -190,7 +197,8 @@ def _with_feet(
 ) -> tuple[GroundPlane, list[str]]:
     """The floor, and notes about it.
 
-    If none was measured, the stated floor is used unless feet contradict it, else that of the feet.
+    If no floor was measured (``ground``), it is the stated floor. If feet contradict the stated
+    floor, or none is stated, it is the floor under the feet.
     """
     stated = source.stated_up, source.stated_floor
     middle = ring_centre(rig)
@@ -219,7 +227,13 @@ def _ground(
     settings: SceneSettings,
     floor: Floor | None,
 ) -> GroundPlane:
-    """Fit the floor to the background, or to the annotated points."""
+    """Fit the floor to the background, or to the annotated points if there are any.
+
+    Args:
+        surfaces: background of each camera, depth frame.
+        bias: (C,) depth biases, metres.
+        floor: annotated points; None = not annotated.
+    """
     points, normals = [np.zeros((0, 3))], [np.zeros((0, 3))]
     for c, surface in surfaces.items():
         pose = rig[c].master_from_depth
@@ -240,7 +254,8 @@ def _ground(
         rig,
         _up(source, rig),
         tolerance_m=tolerance,
-        # Cameras may see the same floor: count the area as if all of them did.
+        # Points of n cameras may overlap on one floor. Each therefore stands for 1 / n of a cell's
+        # area, as if all cameras saw all of it.
         cell_m=BACKGROUND_CELL_M / np.sqrt(max(1, len(surfaces))),
     )
 
@@ -348,8 +363,13 @@ def _notes(
 def _slides(
     source: Frames, rig: Rig, refined: Refinement, ground: GroundPlane
 ) -> tuple[np.ndarray, list[str]]:
-    """Weakest motion of each camera: displacement (C, 3) of the rig's centre by one standard
-    deviation, metres, and a description, "" = fixed."""
+    """Least determined displacement of each camera.
+
+    Returns:
+        Displacement (C, 3) of the rig's centre as seen by the camera, one standard deviation along
+        the least determined direction, metres; 0 = fixed.
+        Description of each; "" = fixed.
+    """
     up = ground.normal if ground.found else _up(source, rig).direction
     slides, words = np.zeros((len(rig), 3)), [""] * len(rig)
     for c, pose in enumerate(rig.master_from_colour):

@@ -1,4 +1,4 @@
-"""Stage summary: what one sequence adds to the figures of the dataset."""
+"""Stage ``summary``: one sequence's contribution to the figures of the dataset."""
 
 from __future__ import annotations
 
