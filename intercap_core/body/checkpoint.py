@@ -117,8 +117,9 @@ def tensor_fault(value: Tensor, shape: tuple[int, ...], largest: float) -> str |
 
 
 def _read(path: Path) -> Any:
+    """Return the content of a checkpoint, by PyTorch's restricted reader if it accepts the file."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # they do not concern the user of the file
+        warnings.simplefilter("ignore")  # deprecations of PyTorch, which the user cannot act on
         try:
             return torch.load(path, map_location="cpu", weights_only=True)
         except pickle.UnpicklingError:

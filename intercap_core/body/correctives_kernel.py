@@ -26,7 +26,8 @@ from intercap_core.body.selection import Selection
 from intercap_core.body.skeleton_kernel import _rodrigues, rest_points
 
 NUM_FEATURES = 486  # nine numbers of each of the 54 rotations below the root (SMPL-X)
-_FIRST = 3  # parameter of the first joint below the root (SMPL-X)
+_FIRST = 3  # column of the first joint below the root in the parameter vector (SMPL-X)
+
 # Number of points that are processed for all bodies in turn: their tables, 6 kB each, then stay in
 # the cache of a core.
 _TOGETHER = 16

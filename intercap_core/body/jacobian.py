@@ -1,10 +1,11 @@
 """Posed points and their exact derivatives with respect to every parameter.
 
 A point x at rest is posed to sum_m w_m (R_m x + t_m) by the bones m with skinning weights w_m.
-- Pose: a rotation of joint k, at p_k, by the world rotation vector omega moves the point by
-  omega x a_k with the lever arm a_k = sum over bones m below k of w_m (R_m x + t_m - p_k). This is
-  the geometric Jacobian of a manipulator, blended. A change of the axis-angle theta_k is the
-  rotation omega = R_parent J_l(theta_k) d theta_k with the left Jacobian J_l of the rotation group.
+- Pose: a rotation of joint k by the world rotation vector omega moves the point by omega x a_k. The
+  lever arm from the joint's position p_k is a_k = sum over m of w_m (R_m x + t_m - p_k), over the
+  bones m of joint k and its descendants. This is the geometric Jacobian of a manipulator, blended.
+  A change of the axis-angle theta_k is the rotation omega = R_parent J_l(theta_k) d theta_k with
+  the left Jacobian J_l of the rotation group.
 - Shape: the point moves by M S + sum_m w_m d t_m with the blended rotation M = sum_m w_m R_m and
   the point's shape directions S.
 - Pose blend shapes P add M P d vec(R_k) / d theta_k, with the local rotation R_k.

@@ -35,6 +35,7 @@ _FINGERS = ("thumb", "index", "middle", "ring", "pinky")
 
 
 def _hand(side: str) -> list[tuple[str, str]]:
+    """Return the 21 keypoints of a hand, in the form of `_BODY`."""
     rows = [(f"{side}_hand_wrist", f"{side}_wrist")]
     for finger in _FINGERS:
         rows += [(f"{side}_{finger}{i}", f"{side}_{finger}{i}") for i in (1, 2, 3)]

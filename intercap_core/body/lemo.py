@@ -97,6 +97,7 @@ class MotionEncoder:
 def _convolve(
     image: Tensor, first: Tensor, first_bias: Tensor, second: Tensor, second_bias: Tensor
 ) -> Tensor:
+    """Return the image (1, C, H, W) after two convolutions, each with a leaky ReLU."""
     image = functional.leaky_relu(functional.conv2d(image, first, first_bias, padding=1), 0.2)
     return functional.leaky_relu(functional.conv2d(image, second, second_bias, padding=1), 0.2)
 
@@ -111,6 +112,7 @@ def _read_state(path: Path) -> dict[str, Tensor]:
 
 
 def _pick_tensor(path: Path, state: dict[str, Tensor], name: str, shape: tuple[int, ...]) -> Tensor:
+    """Return a tensor of the state; raises UserError if it is missing or of another shape."""
     if name not in state:
         raise UserError(f"LEMO's encoder {path} has no {name}, expected one {shape}; {_HINT}")
     fault = tensor_fault(state[name], shape, largest=1e4)  # far beyond those of a trained network

@@ -121,6 +121,7 @@ def load_body_file(
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of a body file by name, as far as it contains them."""
     if path.suffix == ".pkl":
         raise UserError(
             f"Body file {path} is a pickle, which could run code: {_HINT} (npz of the same model)."

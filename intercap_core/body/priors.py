@@ -178,7 +178,7 @@ def joint_limits(vector: Tensor) -> DiagonalRows:
     r = max(theta - upper, 0) + min(theta - lower, 0), zero inside the range `LIMITS_DEG`.
     """
     table = torch.deg2rad(torch.tensor(LIMITS_DEG, dtype=vector.dtype, device=vector.device))
-    pose = vector[:, 3:NUM_POSE]
+    pose = vector[:, 3:NUM_POSE]  # without the global orientation, joint 0
     lower, upper = table[1:, :, 0].reshape(-1), table[1:, :, 1].reshape(-1)
     residuals = (pose - upper).clamp(min=0) + (pose - lower).clamp(max=0)
     columns = torch.arange(3, NUM_POSE, device=vector.device)

@@ -34,6 +34,7 @@ class RestJoints(NamedTuple):
 
     @classmethod
     def of(cls, model: BodyModel) -> RestJoints:
+        """Return the joints of a body: points 1 to 55 of a selection of one vertex and them."""
         selection = model.select(np.array([0]), joints=True)
         return cls(selection.template[1:].numpy(), selection.directions[1:].numpy())
 

@@ -199,6 +199,7 @@ def _check(path: Path, weights: dict[str, Tensor], layers: list[tuple[str, str]]
     """Raise UserError if the weights and biases cannot be those of a decoder."""
     first = weights[layers[0][0]]
     hidden = min(max(len(first) if first.ndim else 0, 1), 4096)  # the published files have 512
+    # the last layer outputs two columns of each rotation, 6 numbers
     sizes = ((hidden, LATENT), (hidden, hidden), (6 * _JOINTS, hidden))
     for (weight, bias), size in zip(layers, sizes, strict=True):
         for name, shape in ((weight, size), (bias, size[:1])):

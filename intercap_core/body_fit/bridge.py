@@ -98,6 +98,7 @@ def _hermite(when: np.ndarray, knots: np.ndarray) -> np.ndarray:
     # measured; their weight decreases.
     weight = 0.85 * min(1.0, 1.0 / length)
     first, last = (mean + weight * (slope - mean) for slope in slopes)
+    # cubic Hermite basis: values at both ends, then their slopes times the length
     rise = s**2 * (3 - 2 * s)
     ends = np.concatenate([1 - rise, rise, np.zeros_like(s), np.zeros_like(s)], 1)
     bends = s * (1 - s) ** 2 * first - s**2 * (1 - s) * last

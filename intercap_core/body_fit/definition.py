@@ -84,6 +84,7 @@ class Definition:
 
 
 def _numbers(path: Path, row: Sequence[str]) -> list[float]:
+    """Return x, y, z and sigma of a row of the table, mm; raises UserError if they are invalid."""
     try:
         values = [float(cell) for cell in row[1:]]
     except ValueError:

@@ -88,10 +88,12 @@ class Pieces(NamedTuple):
 
     @classmethod
     def of(cls, model: BodyModel, chosen: KeypointSet) -> Pieces:
+        """Return the pieces of chosen keypoints: one for each bone that a keypoint follows."""
         points = model.select(chosen.vertices, joints=True)
         weights = points.weights.double().numpy()
         dtype = points.template.numpy().dtype
         matrix = chosen.matrix.double().numpy()
+        # keypoint and bone of each piece
         made_of, bone = np.nonzero((matrix != 0) @ (weights != 0))
         share = matrix[made_of] * weights[:, bone].T  # (E,N), of each point in each piece
         carrier = np.flatnonzero(bone == chosen.carrier.numpy()[made_of])

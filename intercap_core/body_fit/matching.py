@@ -296,6 +296,7 @@ def _match(points, point_normals, vertices, normals, samples, patch, order, star
             bound = np.sqrt(least)
         sample[m] = order[best]
         nearest, gx, gy, gz = _nearest_of_patch(points[m], vertices, patch[sample[m]])
+        # the gap between vertex and point: ``height`` along the normal, (sx, sy, sz) sideways
         nx, ny, nz = normals[nearest, 0], normals[nearest, 1], normals[nearest, 2]
         height = nx * gx + ny * gy + nz * gz
         distance[m] = height

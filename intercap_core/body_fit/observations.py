@@ -297,6 +297,7 @@ def _measure_normals(
     z = depth[row, column].astype(np.float32) * np.float32(1e-3)
 
     def at(r: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return points (M, 3) at rows r, columns c, and whether they continue the surface."""
         r, c = np.clip(r, 0, height - 1), np.clip(c, 0, width - 1)
         there = depth[r, c].astype(np.float32) * np.float32(1e-3)
         ray = rays[r, c]

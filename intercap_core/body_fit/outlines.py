@@ -6,10 +6,10 @@ point whose normal is that of the plane. There the distance is
 
     e = N . (o - v) - c,
 
-with the camera centre o, the outward normal N of the plane, the vertex v whose normal and place in
-the image are nearest, and the thickness c of the covering as in :mod:`.cloud_term`. Two parts of
-the rim are not the contour of the person and are left out: those at the border of the image, and
-those where another detected object begins, which may be in front.
+with the camera centre o, the outward normal N of the plane and the thickness c of the covering as
+in :mod:`.cloud_term`. v is the vertex that is nearest in normal and in position in the image. Two
+parts of the rim are not the contour of the person and are left out: those at the border of the
+image, and those where another detected object begins, which may be in front.
 """
 
 from __future__ import annotations

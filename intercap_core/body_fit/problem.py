@@ -253,6 +253,7 @@ class BodyProblem(TermInputs):
         return equations
 
     def _bodies(self, own: Tensor, shared: Tensor, index: Tensor) -> Bodies:
+        """Return the bodies of the frames ``index`` (b,) at own (b, n), shared (m,) parameters."""
         betas, offsets, u = self.layout.split(shared, self.offsets, self.u)
         return Bodies(
             self.layout.vectors(self.base[index], own, betas),

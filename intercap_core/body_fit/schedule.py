@@ -271,6 +271,7 @@ class Fitter:
         )
 
     def _minimise(self, problem: BodyProblem, trials: int, keep_normal: bool = False) -> Solution:
+        """Minimise by at most ``trials`` steps, and set the problem's parameters to the result."""
         self._linearise_pose_prior(problem)
         shared = problem.shared_start()
         solution = minimise(
@@ -288,7 +289,7 @@ class Fitter:
     def _linearise_pose_prior(self, problem: BodyProblem) -> None:
         """Linearise the learned pose prior, if there is one, about the problem's poses."""
         if self.pose_prior is not None:
-            problem.pose = self.pose_prior.linearise(problem.base[:, 3:66])
+            problem.pose = self.pose_prior.linearise(problem.base[:, 3:66])  # body_pose
 
     def _lift_by_depth(self) -> Targets | None:
         """Return the body keypoints that only the depth of one view locates; None = no keypoints.

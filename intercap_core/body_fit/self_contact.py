@@ -155,8 +155,8 @@ def _geodesic_distances(
     length = np.linalg.norm(points[vertex[edges[:, 0]]] - points[vertex[edges[:, 1]]], axis=1)
     count = len(vertex)
     graph = scipy.sparse.csr_matrix((length, (edges[:, 0], edges[:, 1])), shape=(count, count))
-    # A path is at least as long as the straight line, so Dijkstra's search may stop at the largest
-    # limit of the samples whose straight distance is within their limit.
+    # A path is at least as long as the straight line. Dijkstra's search from a sample may therefore
+    # stop at its largest limit to samples whose straight distance is within their limit.
     straight = scipy.spatial.distance.cdist(points[vertex], points[vertex])
     farthest = np.where(straight <= limit, limit, 0).max(1)
     distances = np.full((count, count), np.inf)

@@ -197,6 +197,7 @@ class SkinSurface:
 
     @classmethod
     def around_samples(cls, model: BodyModel, samples: Samples) -> SkinSurface:
+        """Return the surface around the samples of a body."""
         every = model.faces.cpu().numpy()
         used = np.zeros(model.num_vertices, bool)
         used[samples.vertex] = used[samples.patch] = True

@@ -41,6 +41,7 @@ def joint_covariance(model: BodyModel, fit: BodyFit) -> Tensor:
     model_error = _MODEL_SIGMA_M**2 * torch.eye(3).to(information)
     result = information.new_zeros(len(fit.vectors), NUM_JOINTS, 3, 3)
     for at, (factor, answer, _) in zip(_chunks(len(fit.vectors)), at_rest, strict=True):
+        # one vertex in place of all, which is dropped below, then the joints
         lin = model.linearise(
             model.parameters(fit.vectors[at]), vertex_ids=np.array([0]), joints=True
         )

@@ -110,9 +110,9 @@ class Intrinsics:
     def rays(self) -> np.ndarray:
         """(height, width, 2) float32: X/Z and Y/Z of the ray of every pixel.
 
-        NaN outside the metric radius. Lenses with equal parameters share the table. In images of
-        more than 100,000 pixels that are all inside the metric radius, every fourth ray is computed
-        and the others are interpolated by cubic splines, to 1e-4 px.
+        NaN outside the metric radius. Lenses with equal parameters share the table. For images of
+        more than 100,000 pixels, rays are computed at every fourth pixel and interpolated by cubic
+        splines, to 1e-4 px. This requires that all of them are inside the metric radius.
         """
         key = (self.width, self.height, self.parameters.tobytes())
         table = _TABLES.get(key)

@@ -121,8 +121,8 @@ def from_counts(counts: Sequence[int], height: int, width: int) -> bytes:
 def from_polygons(polygons: Sequence[Sequence[float]], height: int, width: int) -> bytes:
     """Fill polygons, each x, y, x, y, ... pixels, and encode their union.
 
-    Raises ValueError for fewer than three corners, values that are not finite or farther than
-    1e5 px from the image's corner, and outlines longer than those of any shape.
+    Raises ValueError for a polygon of fewer than three corners, for coordinates that are not finite
+    or exceed 1e5 px, and for outlines of more than 1e6 px in total.
     """
     outline = 0.0
     for polygon in polygons:
@@ -147,6 +147,7 @@ def from_polygons(polygons: Sequence[Sequence[float]], height: int, width: int) 
 
 
 def _compress(segmentation: object, height: int, width: int) -> bytes:
+    """Return the compressed RLE of an uncompressed RLE, or of the union of polygons."""
     made = coco_mask.frPyObjects(segmentation, height, width)
     return bytes((coco_mask.merge(made) if isinstance(made, list) else made)["counts"])
 

@@ -155,6 +155,10 @@ def _triangulate_block(
     rig: Rig,
     max_error_px: float,
 ) -> None:
+    """Triangulate n points and write them to the rows (n,) of the result.
+
+    pixels (n, C, 2), weights (n, C): see :func:`triangulate`.
+    """
     limit = max_error_px * pixel_scale(rig)
     points = _best_proposal(pixels, weights, rig, limit)
     error = _errors(points, pixels, weights, rig)

@@ -182,6 +182,7 @@ def _is_closed(faces: np.ndarray, added: Sequence[np.ndarray]) -> bool:
 
 
 def _refusal(source: Path, wide: Sequence[Hole], limit: float, length: float) -> str:
+    """Return the message for holes wider than the limit; limit and length in metres."""
     listed = "; ".join(str(hole) for hole in wide[:4])
     more = f" and {len(wide) - 4} more" if len(wide) > 4 else ""
     return (
@@ -194,6 +195,7 @@ def _refusal(source: Path, wide: Sequence[Hole], limit: float, length: float) ->
 
 
 def _write(mesh: trimesh.Trimesh, output: Path) -> None:
+    """Write a mesh to a temporary file and rename it; raises UserError if that fails."""
     part = output.with_name(f".{output.stem}.part{output.suffix}")
     try:
         output.parent.mkdir(parents=True, exist_ok=True)

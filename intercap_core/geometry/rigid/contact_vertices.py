@@ -1,8 +1,8 @@
 """Lists of the vertices of a mesh that people are likely to touch.
 
-A file contains the vertex ids alone (JSON, .npz, or a pickle as InterCap released), or also the
-number of vertices and the digest of the mesh, see :func:`contact_list` (JSON or .npz). The digest
-detects that the mesh was replaced, even if all ids still exist.
+A file contains the vertex ids alone: JSON, .npz, or a pickle as InterCap released. A file as
+:func:`contact_list` makes it (JSON or .npz) also contains the number of vertices and the digest of
+the mesh. The digest detects that the mesh was replaced, even if all ids still exist.
 """
 
 from __future__ import annotations
@@ -88,6 +88,7 @@ def _shown(value: Any) -> str:
 
 
 def _read(path: Path) -> Any:
+    """Return the content of a list by its suffix: ids, or a mapping as of :func:`contact_list`."""
     if not path.is_file():
         raise UserError(
             f"{path}: there is no such list of contact vertices; correct 'contact_vertices' in "
@@ -106,6 +107,7 @@ def _read(path: Path) -> Any:
 
 
 def _from_npz(path: Path) -> Any:
+    """Return the arrays of an .npz; without the name of the ids, its first array has the ids."""
     arrays = read_arrays(path, advice="save the .npz of vertex ids again")
     if not arrays:
         raise UserError(f"{path}: not a readable .npz of vertex ids (it is empty); save it again")

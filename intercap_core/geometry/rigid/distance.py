@@ -158,8 +158,8 @@ class DistanceField:
         """Return whether points (N, 3) are inside the solid: (N,) bool.
 
         In a watertight mesh, points outside of the bounding box need no ray, and most others one.
-        Points that this ray classifies as inside are decided by the majority of five rays, because
-        a ray through an edge may count it twice or not at all.
+        If this ray says inside, the majority of five rays decides: a ray through an edge may count
+        it twice or not at all.
         """
         query = np.asarray(points, np.float32).reshape(-1, 3)
         if self._open is not None:

@@ -203,6 +203,7 @@ def _colours(mesh: Any, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def _check_size(path: Path, mesh: trimesh.Trimesh) -> None:
+    """Raise UserError if the size of a mesh is impossible for an object, warn if unusual."""
     extent = float(np.ptp(mesh.vertices[np.unique(mesh.faces)], axis=0).max())
     if extent > 5.0:
         fitting = [f"{unit} ({scale:g})" for unit, scale in UNITS.items()
@@ -232,6 +233,7 @@ def _check_size(path: Path, mesh: trimesh.Trimesh) -> None:
 
 
 def _check_volume(path: Path, mesh: trimesh.Trimesh) -> None:
+    """Raise UserError if the mesh encloses no volume."""
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     volume = float(mesh.volume) if len(mesh.faces) else 0.0
     if not volume > 1e-8 * extent**3:  # less is a flat sheet with rounding errors

@@ -197,8 +197,8 @@ def _draw(corners, pixels, x0, y0, faces, rays, focal, cull_back, number, depth,
         rays: (H, W, 2) X/Z and Y/Z of the pixels of the whole image.
         focal: focal length, pixels.
         number: index of the mesh, written to ``body``.
-        depth: (h, w), infinite where nothing is drawn; updated where this mesh is nearer.
-        face, body: (h, w), updated likewise.
+        depth: (h, w) metres, infinite where nothing is drawn; updated where this mesh is nearer.
+        face, body: (h, w) indices of face and mesh, updated at the same pixels.
     """
     height, width = depth.shape
     bounds = np.empty((3, 3))

@@ -351,9 +351,9 @@ def _crosses(x, y, z, corners):
     """Return whether the ray from (x, y, z) along +z crosses a triangle (3, 3).
 
     Computed in double precision: (x, y) must be on the same side of all three projected edges, and
-    the triangle's height there above z. A point on the line of an edge is treated as moved by an
-    infinitesimal (e, e^2) in (x, y), so that exactly one of the two faces at an edge is crossed
-    (simulation of simplicity, Edelsbrunner and Mucke 1990).
+    the triangle's height there above z. If (x, y) is on the line of an edge, it is treated as moved
+    by an infinitesimal (e, e^2). The two faces at an edge then give consistent answers (simulation
+    of simplicity, Edelsbrunner and Mucke 1990).
     """
     total, height, sign = 0.0, 0.0, 0
     for k in range(3):

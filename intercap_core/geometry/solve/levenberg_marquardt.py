@@ -20,7 +20,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-_DAMPING_RANGE = (1e-8, 1e8)
+_DAMPING_RANGE = (1e-8, 1e8)  # a frame whose damping reaches the maximum stops
 
 
 class NormalEquations(NamedTuple):
