@@ -112,6 +112,7 @@ def select_points(
     count = template.shape[0]
     if joints is not None:
         rest, moves = joints
+        # skinning weights of the joints: each follows its parent, the root follows itself
         follow = torch.zeros(NUM_JOINTS, NUM_JOINTS, dtype=weights.dtype, device=weights.device)
         follow[torch.arange(NUM_JOINTS), torch.tensor([max(p, 0) for p in PARENTS])] = 1
         template = torch.cat([template, rest])
@@ -125,6 +126,7 @@ def select_points(
     moved_by = (dense > 0) @ _IS_ANCESTOR
     chain = _padded(moved_by)
     limb = np.array(_LIMB_OF_JOINT)[dense.argmax(1)]
+    # [n, l, k]: bone k is joint l of the chain or a descendant of it
     hangs = _IS_ANCESTOR[np.maximum(bones, 0)[:, None, :], np.maximum(chain, 0)[:, :, None]]
     below = hangs * share[:, None, :] * (chain >= 0)[:, :, None]
 

@@ -143,11 +143,12 @@ class Fitter:
             shape = problem.layout.shape
             problem.base[:, shape] = problem.base[:, shape].median(0).values
         problem.targets = self._lift_by_depth()
+        # stage 2
         for widened in _WIDENED if problem.targets else (1.0, 1.0):
             evidence.observe_keypoints(problem, widened=widened)
             self._minimise(problem, 6)
             evidence.refine_sigma(problem)
-        problem.fit_shared = True
+        problem.fit_shared = True  # stage 3
         for reach in _CLOUD_REACH_M[:2] if evidence.has_cloud else ():
             problem.rows = evidence.match(problem, reach)
             evidence.observe_keypoints(problem)
@@ -158,8 +159,9 @@ class Fitter:
         recover(problem, evidence.observations.times[self.frames])
         if hands or face:
             self._fit_extremities(problem)
-        # Shared parameters stay free: only fitted hands determine the lengths of forearms and
-        # hands, and the place of the detector's wrist on a forearm whose twist they determine.
+        # Shared parameters stay free. The hands, which are fitted now, determine the lengths of
+        # forearms and hands. They also determine the twist of the forearm, and with it the offset
+        # of the detector's wrist, which is fixed in the frame of the forearm.
         problem.columns = columns_of(self.model, hands=hands, face=face, betas=not self.one_shape)
         for last in (False, True):
             if evidence.has_cloud:

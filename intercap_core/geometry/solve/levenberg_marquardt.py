@@ -20,7 +20,8 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-_DAMPING_RANGE = (1e-8, 1e8)  # a frame whose damping reaches the maximum stops
+# Range of damping factors. A frame stops at the maximum; with shared parameters all stop together.
+_DAMPING_RANGE = (1e-8, 1e8)
 
 
 class NormalEquations(NamedTuple):
