@@ -86,7 +86,7 @@ def hand_error(
         align_wrists: first translate the fitted hand so that its wrist is at the true wrist.
     """
     errors = []
-    for side, wrist in enumerate((20, 21)):
+    for side, wrist in enumerate((20, 21)):  # SMPL-X joints of the left and right wrist
         at = slice(5 * side, 5 * side + 5)
         fitted = np.concatenate([joints[..., FINGER_JOINTS[side], :], tips[..., at, :]], -2)
         true = np.concatenate([true_joints[..., FINGER_JOINTS[side], :], true_tips[..., at, :]], -2)

@@ -94,6 +94,7 @@ class BodyClouds:
         if not len(person):
             return dict.fromkeys(CLOUD_KEYS, np.nan)
         cloud = MeasuredCloud(person)
+        # at most 3000 points, which bounds the time
         chosen = person[:: -(-len(person) // 3000)].astype(np.float64)
         seen = self._seen(t, true, truth)
         found = {}

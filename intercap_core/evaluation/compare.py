@@ -1,7 +1,7 @@
 """Compare two versions of a dataset: changes by sequence and frame.
 
-A frame has changed if body, hands or object moved by more than 1 mm, the object turned by more than
-0.5 degrees, or its contact regions or flag differ.
+A frame has changed if body, hands or object moved by more than 1 mm, or the object turned by more
+than 0.5 degrees. It has also changed if its contact regions or flag differ.
 """
 
 from __future__ import annotations

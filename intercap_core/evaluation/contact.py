@@ -1,8 +1,8 @@
 """Contact by distance, depths of penetration, and agreement of contact with the true contact.
 
-A vertex is in contact if its signed distance to the other surface (negative inside) is at most the
-threshold, so a penetrating vertex is in contact too. The paper thresholds the unsigned distance at
-4.5 mm; the two differ for vertices that are more than 4.5 mm inside.
+A vertex is in contact if its signed distance to the other surface is at most the threshold. The
+distance is negative inside, so a penetrating vertex is in contact too. The paper thresholds the
+unsigned distance at 4.5 mm; the two differ for vertices that are more than 4.5 mm inside.
 """
 
 from __future__ import annotations

@@ -155,6 +155,7 @@ def stated_displacement(master_from_camera: np.ndarray, covariance: np.ndarray) 
         by_pose = np.concatenate([across.T, np.eye(3)], axis=1)
         at_centre = np.trace(by_pose @ own @ by_pose.T)
         turn = np.trace(own[:3, :3])
+        # The matrix of a small rotation w has the squared Frobenius norm 2 |w|^2; see displacement.
         result[c] = np.sqrt(at_centre + CUBE_SIDE_M**2 / 12 * 2 * turn)
     return result
 

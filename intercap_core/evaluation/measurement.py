@@ -53,6 +53,7 @@ class HandledObject:
             ),
             axis=1,
         ).sum()
+        # ``area`` is twice the surface; 500 to 20000 samples
         count = int(np.clip(area / 2 / SAMPLE_SPACING_M**2, 500, 20000))
         self.points = sample_surface(mesh.vertices, mesh.faces, count).of(mesh.vertices, mesh.faces)
         self.samples = sample_surface(mesh.vertices, mesh.faces, 2000)

@@ -79,7 +79,7 @@ def measure(scene: Path, object_track: Path, truth: Path, mesh: ObjectMesh) -> O
     normalised_turn = None
     add = worst = np.full(len(at), np.inf)
     if track.known:
-        points = mesh.vertices[:: -(-len(mesh.vertices) // 500)]
+        points = mesh.vertices[:: -(-len(mesh.vertices) // 500)]  # at most 500
         poses = (track.rotation, track.translation, rotation, translation)
         add = add_s(points, *poses) / mesh.diameter
         worst = mssd(points, *poses, mesh) / mesh.diameter

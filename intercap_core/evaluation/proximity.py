@@ -106,6 +106,11 @@ class _Solid:
         self._surface, self._field = surface, field
 
     def signed_distance(self, points: np.ndarray, reach: float) -> np.ndarray:
+        """Signed distance (N,) of points (N, 3), clipped to [-``DEEPEST_M``, ``reach``].
+
+        With a ``field``, unsigned distances are computed first. Only points inside that are deeper
+        than ``reach`` are computed again with the larger limit.
+        """
         if self._field is None:
             return self._surface.signed_distance(points, reach, DEEPEST_M)
         low, high = self._field.box + np.array([[-reach], [reach]])

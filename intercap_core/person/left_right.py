@@ -11,8 +11,8 @@ views, plus a constant for each exchanged view. The result may still be mirrored
 :func:`find_mirrored` then decides, for all sets together, which limbs are mirrored. It runs the
 Viterbi algorithm over the eight ways of exchanging arms, legs and head:
 
-- Unary costs: knees and ankles bend one way only, the nose is in front of the ears and of the
-  chest, shoulders and hips face the same way, detectors are mostly right.
+- Unary costs: knees and ankles bend one way only; the nose is in front of the ears and of the
+  chest; shoulders and hips face the same way; detectors are mostly right.
 - Pairwise costs: motion from set to set, and a change of sides.
 
 Each hand is assigned to the arm whose wrist is nearer.

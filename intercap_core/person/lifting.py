@@ -4,8 +4,8 @@ Depth measures the skin, but a keypoint is a joint inside the body. The point th
 on the pixel's ray by an inset that depends on the joint.
 
 The depth at an occluded joint belongs to another surface. Pixels that show the background of the
-scene are skipped. If both shoulders or hips are lifted to nearly one place, as in a side view, the
-limb with less confidence is occluded and left out.
+scene are skipped. In a side view, both shoulders or hips are lifted to nearly one place. The limb
+with less confidence is then occluded and left out.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 People are matched over views (:mod:`.groups`), followed over time and recognised after an absence
 (:mod:`.tracks`). The subject is the person named by the user, if any. Otherwise it is the person of
-greatest score: support summed over sets, weighted by the distance from the centre of the ring of
-cameras, and multiplied by up to 5 for contact with the object.
+greatest score. The score is the support summed over sets, with less weight far from the centre of
+the ring of cameras. It is multiplied by up to 5 for contact with the object.
 """
 
 from __future__ import annotations

@@ -155,6 +155,7 @@ def _least_motion(options: np.ndarray, scale: float, min_confidence: float) -> n
     # axes: option in the set before, option in this set, S - 1, n
     both = seen[:, None, :-1] & seen[None, :, 1:]
     moved = np.linalg.norm(pixels[:, None, :-1] - pixels[None, :, 1:], axis=-1)
+    # a jump counts at most 120 px at 1080p
     moved = np.where(both, np.minimum(moved, 120.0 * scale), 0).sum(-1)
     steps = np.moveaxis(moved / np.maximum(both.sum(-1), 1), 2, 0) + price
     return cheapest_sequence(at_an_end + price, steps, at_an_end).astype(bool)
@@ -163,10 +164,13 @@ def _least_motion(options: np.ndarray, scale: float, min_confidence: float) -> n
 def _exchange(
     keypoints: np.ndarray, points: np.ndarray, rig: Rig, min_confidence: float, max_error_px: float
 ) -> bool:
-    """Exchange the limbs of ``keypoints`` (T, C, 135, 3 or more), in place, that fit the
-    triangulated ``points`` (T, 135, 3) much better with the sides exchanged.
+    """Exchange limbs of single images that fit the triangulated points much better afterwards.
 
     Returns whether any limb was exchanged.
+
+    Args:
+        keypoints: (T, C, 135, 3 or more), changed in place.
+        points: (T, 135, 3) triangulated points, metres; NaN = unknown.
     """
     sets, views = keypoints.shape[:2]
     known = np.isfinite(points[..., 0])

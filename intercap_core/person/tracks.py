@@ -61,6 +61,7 @@ class PersonTrack:
         length, variance = np.zeros(len(_BONES)), np.full(len(_BONES), np.inf)
         known = lengths[:, enough]
         length[enough] = np.nanmedian(known, axis=0)
+        # 1.48 times the median absolute deviation estimates the standard deviation
         scatter = 1.48 * np.nanmedian(np.abs(known - length[enough]), axis=0)
         # variance of a median; errors of five neighbouring sets are correlated
         independent = np.maximum(count[enough] / 5, 1)

@@ -13,16 +13,20 @@ Terms of this package:
 
 In the order of a run (:mod:`intercap_core.stages.scene`):
 
-1. ``moments`` assigns each image to the set whose moment it shows. It calls ``start_times``
-   (cameras that were started separately; ``starts`` has the types, ``start_costs`` the epipolar
-   costs), ``subject_views`` (the subject's detections and triangulated joints), ``slips`` (images
-   that are whole frames late) and ``keypoint_timing`` (sub-frame time offsets). The last two share
-   ``keypoint_motion``: smooth paths of the keypoints and their residuals.
+1. ``moments`` assigns each image to the set whose moment it shows. It calls
+
+   - ``start_times``: cameras that were started separately (``starts`` has the types,
+     ``start_costs`` the epipolar costs);
+   - ``subject_views``: the subject's detections and triangulated joints;
+   - ``slips``: images that are whole frames late;
+   - ``keypoint_timing``: sub-frame time offsets.
+
+   The last two share ``keypoint_motion``: smooth paths of the keypoints and their residuals.
 2. ``background`` estimates the static depth of each camera, ``surfaces`` turns background and
    foreground into thinned points with normals.
 3. ``lens_exchange`` corrects pairs of cameras whose intrinsics were exchanged.
-4. ``extrinsics`` refines the poses. It builds the problem of ``registration`` (point-to-plane
-   residuals of all pairs of cameras), adds the terms of ``constraints`` (keypoints, common floor)
-   and keeps only results that ``camera_verdicts`` finds better on held-out data.
+4. ``extrinsics`` refines the poses. ``registration`` has the problem (point-to-plane residuals of
+   all pairs of cameras), ``constraints`` its further terms (keypoints, common floor). A refined
+   pose is kept only if ``camera_verdicts`` finds it better on held-out data.
 5. ``ground`` fits the floor and the z-up frame, ``up`` the rough up direction it starts from.
 """

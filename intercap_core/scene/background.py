@@ -148,8 +148,8 @@ def _farthest_cluster(ordered: np.ndarray, count: int) -> tuple[np.ndarray, np.n
     for first in range(samples - count, -1, -1):
         low, high = values[open_rows, first], values[open_rows, first + count - 1]
         middle = (low + high) / 2
-        # three standard deviations of the sensor's random error, about 1 mm + 0.1 % of depth, more
-        # at 4 m (Toelgyessy et al., Sensors 21(2):413, 2021, NFOV)
+        # Three standard deviations of the sensor's random error. It is about 1 mm + 0.1 % of depth,
+        # more at 4 m (Toelgyessy et al., Sensors 21(2):413, 2021, NFOV)
         tolerance = 8.0 + 0.004 * middle
         agree = (low > 0) & (high - low <= tolerance)
         rows = open_rows[agree]

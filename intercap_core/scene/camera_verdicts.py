@@ -6,8 +6,8 @@ pose. The comparison uses data that the refinement did not use:
 - held-out surface points of each pair with this camera, background and moving surfaces separately;
 - keypoints of half of the recording, with a second refinement that used only the other half.
 
-If the given pose is not far worse, the other cameras are refined again with this camera fixed, and
-the comparison is repeated with that rig.
+If the given pose is not far worse, the other cameras are refined again with this camera fixed. The
+comparison is then repeated with that rig.
 """
 
 from __future__ import annotations
@@ -225,6 +225,6 @@ def describe_direction(direction: np.ndarray, pose: np.ndarray, up: np.ndarray) 
     way = "aslant to its view"
     if along > 0.8:
         way = "along its view"
-    elif along < np.sqrt(1 - 0.8**2):
+    elif along < np.sqrt(1 - 0.8**2):  # within 37 degrees of perpendicular
         way = "across its view"
     return f"along the floor, {way}" if steep < 0.5 else f"aslant to the floor, {way}"

@@ -326,6 +326,7 @@ def _lowest_level(height: np.ndarray, need: int) -> float:
     ends = np.searchsorted(order, order + 2 * FOOT_TOLERANCE_M, side="right")
     first = int(np.argmax(ends - np.arange(len(order)) >= need))
     level = float(np.median(order[first : ends[first]]))
+    # number of heights within 2.5 cm of places every centimetre from the level up to the median
     between = np.arange(level, middle, 0.2 * FOOT_TOLERANCE_M)
     near = np.abs(height[:, None] - between) < 0.5 * FOOT_TOLERANCE_M
     count = near.sum(0)
@@ -341,7 +342,7 @@ def _levels(off: np.ndarray, height: np.ndarray, side: str) -> str:
 
 
 def _supporting(count: int) -> int:
-    """Least number of ``count`` sets in which feet form a level of their own."""
+    """Least number of sets that form a level of their own, of ``count`` sets: 15 %."""
     return max(MIN_FOOT_SETS, int(np.ceil(0.15 * count)))
 
 

@@ -254,7 +254,7 @@ def build_motion(
     scale = pixel_scale(rig)[:, None]
     if start is None:
         points, valid = _triangulated(pixels, seen, rig)
-        sigma = np.broadcast_to(4.0 * scale, seen.shape[1:])
+        sigma = np.broadcast_to(4.0 * scale, seen.shape[1:])  # initial value, px
         rounds = 3
     else:
         points, valid, rounds = start, seen, 2

@@ -7,8 +7,8 @@ In the InterCap release, two groups of files have the focal lengths and principa
   surfaces. An exchange is accepted if it brings the backgrounds of both cameras much closer to the
   backgrounds of the other cameras.
 - Cameras without depth are tested by the keypoints. An exchange shifts the expected pixels of both
-  cameras by a known pattern. Its gain is a log likelihood ratio in which points, pose errors (with
-  a prior) and a constant error of each keypoint in each view are marginalised. A wrong principal
+  cameras by a known pattern. Its gain is a log likelihood ratio. Points, pose errors (with a
+  prior) and a constant error of each keypoint in each view are marginalised. A wrong principal
   point resembles a rotation of the camera, so the test relies on accurate given poses.
 
 Cameras with depth on its own grid are not tested: their devices store both intrinsics themselves.
@@ -72,8 +72,8 @@ def lens_gains(
     For each ordered pair (a, b), the pattern is the displacement of camera a's pixels by the lens
     of b. One linear system holds the amplitudes of all patterns and the pose errors of all cameras.
     The exchange of a and b means amplitude 1 for (a, b) and (b, a). The pose errors are eliminated.
-    With the remaining squared norm e of the pattern and its product l with the residuals, the
-    amplitude is l / e, and the log likelihood ratio of amplitude 1 against 0 is l - e / 2.
+    Let e be the squared norm of the remaining pattern and l its product with the residuals. The
+    amplitude is l / e, the log likelihood ratio of amplitude 1 against 0 is l - e / 2.
 
     Args:
         keypoints: (T, C, 135, 3) x, y, confidence of the subject by moment.

@@ -244,8 +244,8 @@ def _robust_gain(gains: np.ndarray) -> float:
 class _Evidence:
     """Gains of all slips for one motion.
 
-    Intervals are searched within windows of at most 96 sets, and within windows shifted by half of
-    their length, so that an interval across a border is found as well.
+    Intervals are searched within windows of at most 96 sets. Windows shifted by half of their
+    length are searched too, for intervals that cross a border.
     """
 
     def __init__(self, motion: KeypointMotion, steps: list[int], fps: float) -> None:
@@ -310,8 +310,9 @@ def _best_of_window(cases: dict[int, _Slipped]) -> SlipInterval | None:
 def _own_series(motion: KeypointMotion, camera: int) -> tuple[np.ndarray, np.ndarray]:
     """One camera's residuals, given the keypoints of all other views.
 
-    The projector of the motion is N = (I - P) W^(1/2). The information matrix of the camera's pixel
-    is w (I - P)_cc w with w = 1 / sigma, where (I - P)_cc is its 2 x 2 diagonal block.
+    The projector of the motion is N = (I - P) W^(1/2). Let (I - P)_cc be its 2 x 2 diagonal block
+    of the camera, without the weights, and w = 1 / sigma. The information matrix of the camera's
+    pixel is w (I - P)_cc w.
 
     Returns:
         Matrices (T, K, 2, 2) that whiten the camera's pixels: root of (I - P)_cc times w.
@@ -324,6 +325,7 @@ def _own_series(motion: KeypointMotion, camera: int) -> tuple[np.ndarray, np.nda
     block = block + 1e-6 * np.eye(2)
     determinant = np.sqrt(np.maximum(np.linalg.det(block), 0))[..., None, None]
     trace = np.trace(block, axis1=2, axis2=3)[..., None, None]
+    # square root of a symmetric 2 x 2 matrix in closed form; ``determinant`` is already a root
     half = (block + determinant * np.eye(2)) / np.sqrt(trace + 2 * determinant)
     weighted = motion.projected(motion.residual)[..., both]
     return half * scale, np.linalg.solve(half, weighted[..., None])[..., 0]

@@ -1,8 +1,8 @@
 """Epipolar cost of a time lag between two cameras, from the motion of people whom both see.
 
 People are followed in each camera's images separately, so the cameras need not be synchronised.
-Only body points are used that do not depend on left and right (nose, neck, middle of the hips,
-middle between both knees, ...), because a detector may exchange the sides.
+A detector may exchange left and right. Only body points are used that do not depend on the sides:
+nose, neck, middle of the hips, middle between both knees, and others.
 
 Axes: T sets, C cameras, P places for people, K body points.
 """

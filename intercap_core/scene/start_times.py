@@ -1,10 +1,10 @@
 """Start times of cameras that were not started together: recordings late by up to seconds.
 
-The rays of two cameras to a moving person meet only if both images show the same moment, so the
-epipolar distance is low at the right lag. For each pair of cameras and each lag, robust costs of
-these distances are averaged (:mod:`.start_costs`). The median distance of each body point is
-subtracted first, since it stems from the calibration. The delay of each camera minimises the costs
-of all its pairs. If the person hardly moves, or the motion is periodic, no start is returned.
+The rays of two cameras to a moving person meet only if both images show the same moment. The
+epipolar distance is therefore low at the right lag. For each pair of cameras and each lag, robust
+costs of these distances are averaged (:mod:`.start_costs`). The median distance of each body point
+is subtracted first, since it stems from the calibration. The delay of each camera minimises the
+costs of all its pairs. If the person hardly moves, or the motion is periodic, no start is returned.
 
 The search begins at a stated start if there is one, else at the device times. The result differs
 from this initial value only if the cost is clearly lower elsewhere. If the difference exceeds the
@@ -81,7 +81,8 @@ def find_starts(
         if not known.known[c] and not result.apart:
             continue
         if not known.known[c]:
-            # a delay near 0 is only believed if the motion of some camera decided something
+            # If only a statement says that cameras started apart, nobody may move in the recording.
+            # A delay of FEWEST_SETS_APART or more is then not believed.
             moves = any(certain.values()) or abs(late[c]) < FEWEST_SETS_APART
             if not moves or not search.is_clear(late, c):
                 result.in_doubt[c] = True

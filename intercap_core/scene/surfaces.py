@@ -1,8 +1,8 @@
 """Depth images as thinned surfaces: points with normals, and for the foreground their speed.
 
-Moving surfaces (the person and the object) are in the middle of the ring of cameras and seen from
-all sides, so they connect cameras that share no background. They also determine *when* each camera
-exposed: a surface seen by two cameras is displaced by its speed along the normal times the
+Moving surfaces (the person and the object) are in the middle of the ring of cameras. They are seen
+from all sides, so they connect cameras that share no background. They also determine *when* each
+camera exposed: a surface seen by two cameras is displaced by its speed along the normal times the
 difference of their exposure times.
 """
 
@@ -181,6 +181,7 @@ def _moving(
     """Foreground surface of the second of three depth images, with the mean speed over both
     ``gaps`` (2,), seconds."""
     before, now, after = (_foreground(image, background) for image in images)
+    # cells of 2 cm, finer than those of the background
     surface = surface_from_depth(now, lens, cell_m=0.02, max_depth_m=MOVING_MAX_DEPTH_M)
     if not len(surface):
         return surface
@@ -204,7 +205,7 @@ def _points(image: np.ndarray, lens: Intrinsics) -> np.ndarray:
     """Points (N, 3), metres, of the valid pixels of a depth image (H, W), uint16 mm."""
     thin = np.s_[::2, ::2]  # every second pixel is enough
     z = image[thin].astype(np.float64) * 1e-3
-    keep = (z > 0) & (z < MOVING_MAX_DEPTH_M + 0.3)
+    keep = (z > 0) & (z < MOVING_MAX_DEPTH_M + 0.3)  # margin for motion, metres
     points = np.column_stack([lens.rays[thin][keep] * z[keep, None], z[keep]])
     return points[np.isfinite(points).all(1)]
 

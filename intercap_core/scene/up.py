@@ -108,8 +108,8 @@ def compare_with_stated(
 ) -> list[str]:
     """Return messages if a floor deviates from the stated one; all in the master's frame, metres.
 
-    The limits are 4 degrees and 6 cm: the stated floor is a board laid by hand, a few centimetres
-    thick, and a floor fitted to feet is tilted by up to about 3 degrees.
+    The limits are 4 degrees and 6 cm. The stated floor is a board laid by hand, a few centimetres
+    thick; a floor fitted to feet is tilted by up to about 3 degrees.
 
     Args:
         point: (3,) point of the floor.

@@ -49,9 +49,9 @@ def run(
 ) -> None:
     """Fit the subject's body in all frames and write body_fit.h5.
 
-    A frame fails if it has too few keypoints, if the fitted trunk is far from its keypoints, or if
-    only one view and no depth points show the person. Failed frames are marked ``failed`` and
-    ``bridged``: their bodies are interpolated from neighbouring frames.
+    A frame fails if it has too few keypoints, or if the fitted trunk is far from its keypoints. It
+    also fails if only one view and no depth points show the person. Failed frames are marked
+    ``failed`` and ``bridged``: their bodies are interpolated from neighbouring frames.
 
     Raises UserError if no frame can be fitted, the body file cannot be used, or the artefacts do
     not belong together.

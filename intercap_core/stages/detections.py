@@ -104,6 +104,7 @@ def _identity(path: Path) -> str:
 def _raise_nothing(
     sequence: SequenceEntry, cameras: list[str], found: list[CameraDetections]
 ) -> None:
+    """Raise UserError: no image of the sequence has keypoints or candidates."""
     reasons = "; ".join(
         f"{name}: {', '.join(d.notes)}" for name, d in zip(cameras, found, strict=True) if d.notes
     )

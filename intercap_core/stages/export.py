@@ -50,8 +50,9 @@ def run(
     The folder is filled under a temporary name and renamed once it is complete. README.txt lists
     the errors from the metrics, and the formats that are omitted because no object was found.
 
-    Raises UserError if an artefact or the object's mesh is missing or broken, if the metrics were
-    measured on another joint result, or if ``output`` contains anything but an earlier export.
+    Raises:
+        UserError: an artefact or the object's mesh is missing or broken; the metrics were measured
+            on another joint result; ``output`` contains anything but an earlier export.
     """
     output = Path(output)
     check_replaceable(output, marker=MARKER, what="export")

@@ -158,6 +158,7 @@ def _note_same_devices(views: list[ExtractedCamera]) -> None:
 
 
 def _require_usable(views: list[ExtractedCamera], sequence: SequenceEntry) -> None:
+    """Raise UserError if no camera is present."""
     reasons = "; ".join(f"{view.name}: {', '.join(view.notes)}" for view in views if view.notes)
     if not any(view.present for view in views):
         raise UserError(

@@ -124,6 +124,7 @@ _stated_cache: WeakKeyDictionary[SequenceMetrics, tuple[StatedError, ...]] = Wea
 
 
 def _stated(sequence: SequenceMetrics) -> tuple[StatedError, ...]:
+    """Stated errors of every part, without the cache."""
     values = sequence.values
     if "verdict/error" not in values:
         return ()

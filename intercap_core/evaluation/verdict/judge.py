@@ -1,7 +1,7 @@
 """The verdict on one sequence: an estimate of its errors without truth.
 
-It consists of the errors in cameras held out of the fit (:mod:`.hold_out`) and of one stated error
-for each of body, hands and object (:mod:`.stated`).
+It has the errors in cameras held out of the fit (:mod:`.hold_out`), and one stated error for each
+of body, hands and object (:mod:`.stated`).
 """
 
 from __future__ import annotations

@@ -192,6 +192,6 @@ def _compressed(counts: np.ndarray) -> np.ndarray:
             more = value != -1 if bits & 0x10 else value != 0
             if more:
                 bits |= 0x20
-            text[length] = bits + 48
+            text[length] = bits + 48  # printable characters, from "0" on
             length += 1
     return text[:length]

@@ -2,8 +2,8 @@
 
 Background subtraction: a pixel that differs in colour from the recording's median is foreground.
 Foreground around the projected keypoints is the person. Without depth, an object that occludes the
-person in the image counts as the person, and an object at rest for most of a recording is part of
-the background.
+person in the image counts as the person. An object at rest for most of a recording is part of the
+background.
 """
 
 from __future__ import annotations

@@ -5,8 +5,8 @@ uncertain by centimetres at the trunk (clothing, build) and by millimetres at th
 uncertainty is the *margin* of a bone. Distances are divided by it: a distance of 2 margins is 7 cm
 at the trunk and 2.4 cm at a finger.
 
-:class:`MovingPerson` evaluates the bones at the exposure of each camera, because a fast forearm
-moves by centimetres between the time of a set and the exposure.
+:class:`MovingPerson` evaluates the bones at the exposure of each camera: a fast forearm moves by
+centimetres between the time of a set and the exposure.
 """
 
 from __future__ import annotations

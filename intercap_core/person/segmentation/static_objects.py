@@ -147,11 +147,13 @@ def find_static_objects(
     points = np.concatenate(parts) if parts else np.zeros((0, 3), np.float32)
     pixel = np.concatenate(index) if index else np.zeros(0, np.int64)
     view_of = np.concatenate(owner) if owner else np.zeros(0, np.int32)
+    # the person's path, on a grid of 10 cm
     walked = np.unique(np.round(joints / 0.10), axis=0) * 0.10
     surface = OccupiedCells(points, SURFACE_CELL_M, SURFACE_POINTS)
     objects: list[StaticObject] = []
 
     def add(members: np.ndarray, on_top: bool, carries: bool) -> None:
+        """Append the component of points ``members`` to ``objects`` if size and distance fit."""
         own = points[members]
         size, away = box_diagonal(own), _away(own, walked)
         # largest size of an object that one person handles, and reach, metres; tuned on the studio
