@@ -39,8 +39,8 @@ from intercap_core.person.sides import (
 )
 
 # Gap between two rays at which the cost is truncated, metres, for arms, legs, head and hands. Rays
-# to one point miss each other by a few centimetres (detector bias, calibration), rays to a left and
-# a right point by up to the breadth of the body or face. Tuned on the studio.
+# to one point miss each other by a few centimetres (detector bias, calibration). Rays to a left and
+# a right point miss by up to the breadth of the body or face. Tuned on the studio.
 SIDE_GAPS_M = (0.12, 0.12, 0.05, 0.12)
 # Cost of each exchanged view; exceeds what noise alone gains by an exchange. Tuned on the studio.
 EXCHANGED_VIEW_COST = 0.5
@@ -84,6 +84,7 @@ def make_views_agree(keypoints: np.ndarray, rig: Rig, *, min_confidence: float) 
             )
             apart = ways[:, i] != ways[:, j]
             cost += np.where(apart, (other - same)[:, None], 0)
+        # numbers (T, W) of visible views that each assignment, and its mirror image, exchange
         seen = np.asarray((weight[:, order][:, :, limb] > 0).any(2))
         count = seen.sum(1)[:, None]
         plain = seen.astype(int) @ ways.T
@@ -96,6 +97,7 @@ def make_views_agree(keypoints: np.ndarray, rig: Rig, *, min_confidence: float) 
             opposite = np.minimum(opposite, count - unlike)
         best = (cost + EXCHANGED_VIEW_COST * np.minimum(unusual, opposite)).argmin(1)
         sets_at = (np.arange(sets), best)
+        # whether the mirror image of the best assignment exchanges fewer views
         other = (opposite[sets_at] < unusual[sets_at])[:, None]
         chosen = (ways[best] ^ other) & seen
         exchanged[:, order, number] = chosen

@@ -127,6 +127,7 @@ def steady_background(images: np.ndarray, person: np.ndarray) -> Background:
     for count in np.unique(needed[valid >= needed]):
         rows = np.flatnonzero((needed == count) & (valid >= needed))
         depth[rows], support[rows] = _farthest_cluster(ordered[rows], int(count))
+    # the cluster has over half of the valid samples, and over a quarter of those without a person
     static = (depth > 0) & (support > 0.5 * np.maximum(valid, usable / 2))
     return Background(depth.reshape(height, width), static.reshape(height, width))
 

@@ -117,6 +117,7 @@ class BodyConstraint:
         own = np.einsum("ncij,ncik->cjk", weighted, by_pose)
         matrix[np.arange(views), :, np.arange(views)] = own
         gradient = np.einsum("ncij,nci->cj", weighted, residual)
+        # Schur complement: eliminate the points
         cross = np.einsum("ncij,ncik->njck", by_point, weighted).reshape(count, 3, -1)
         solved = np.linalg.solve(normal, cross)
         matrix -= np.einsum("njk,njl->kl", cross, solved).reshape(matrix.shape)
@@ -266,6 +267,7 @@ class FloorConstraint:
             by_pose = np.column_stack(
                 [np.cross(arm, normal), np.broadcast_to(normal, points.shape)]
             )
+            # derivatives of the residual by two tilts about the centroid and the height
             plane = np.column_stack(
                 [(points - middle) @ axes[0], (points - middle) @ axes[1], -np.ones(len(points))]
             )

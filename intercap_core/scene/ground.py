@@ -77,6 +77,7 @@ def fit_ground(
     """
     cone = up.cone_deg
     facing = normals @ up.direction >= np.cos(np.radians(cone) + np.arccos(FLOOR_COSINE))
+    # the floor is below the median camera
     highest = np.median(rig.master_from_colour[:, :3, 3] @ up.direction)
     candidates = np.flatnonzero(facing & (points @ up.direction < highest))
     if not len(candidates):

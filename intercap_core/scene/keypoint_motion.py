@@ -125,6 +125,7 @@ def _smoothed(points: np.ndarray, known: np.ndarray, penalty: np.ndarray) -> np.
         factor = _factor(stiffness, known, penalty)
         path = cho_solve_banded((factor, False), right)
         energy = max(float((right * (points - path)).sum()), 1e-12)
+        # -2 log restricted likelihood of the three coordinates, up to a constant
         cost = 3 * (samples - ORDER) * np.log(energy)
         cost += 3 * (2 * np.log(factor[-1]).sum() - (sets - ORDER) * np.log(stiffness))
         costs.append(cost)

@@ -184,6 +184,7 @@ def estimate_offsets(motion: KeypointMotion, master: int) -> TimeOffsets:
     covariance = np.linalg.inv((matrix + np.diag(prior))[np.ix_(free, free)])
     solution = np.zeros(7 * views)
     solution[free] = covariance @ vector[free]
+    # places of the offsets, without the master's, among the free unknowns
     own = np.searchsorted(free, np.delete(np.arange(views), master))
     inflation = _inflation(matrices, vectors, solution, covariance, free, own)
     poses = (matrix + np.diag(prior))[views:, views:]

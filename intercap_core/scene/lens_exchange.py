@@ -94,6 +94,8 @@ def lens_gains(
     if not orders or len(times) < MIN_TIMING_SETS:
         return []
     motion = build_motion(keypoints, rig, times)
+    # the constant biases are kept in the residuals, because a wrong lens also causes constant
+    # shifts
     whole = np.where(motion.seen[..., None], motion.residual + motion.bias, 0.0)
     patterns = [motion.projected_of(a, _lens_shift(motion, a, b)) for a, b in orders]
     columns = np.concatenate([np.stack(patterns), pose_columns(motion)])
@@ -116,6 +118,7 @@ def lens_gains(
         linear = float(pattern @ vector)
         fitted = pattern * linear / energy
         fitted[number:] += poses @ vector[number:]
+        # variance of the keypoint groups' gradients at the fit over that of the noise model
         scores = (vectors - matrices @ fitted) @ pattern
         disagreement = float((np.bincount(CLUSTER, scores) ** 2).sum()) / energy
         gain = (linear - energy / 2) / max(1.0, disagreement)
@@ -135,7 +138,7 @@ def _lens_shift(motion: KeypointMotion, camera: int, other: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class LensExchange:
-    """Two cameras that were given each other's intrinsics."""
+    """Two cameras whose intrinsics are exchanged in the calibration."""
 
     cameras: tuple[int, int]
     """Camera indices."""

@@ -338,7 +338,7 @@ class _Slipped:
     series: np.ndarray
     """(K, W, 2) whitened residuals."""
     change: np.ndarray
-    """(K, W, 2) their change by the slip."""
+    """(K, W, 2) change of the whitened residuals by the slip."""
     linear: np.ndarray
     """(K, W) product of ``change`` with the residuals times ``precision``; its sum over an interval
     is the linear part of the gain."""

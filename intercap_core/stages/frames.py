@@ -52,8 +52,9 @@ def run(
     with ``present`` = False and a note. Poses are in the frame of the calibration's master, even if
     its recording is missing. Sets in ``frames_to_drop`` get no image.
 
-    Raises UserError if no camera can be used, if the calibration is unreadable, or if a set to drop
-    or a camera named in the settings does not exist.
+    Raises:
+        UserError: no camera can be used; the calibration is unreadable; a set to drop or a camera
+            named in the settings does not exist.
     """
     layout = open_layout(sequence)
     extrinsics = layout.extrinsics
@@ -271,6 +272,7 @@ def _frame_sets(
     for camera, view in enumerate(views):
         if not view.present:
             continue
+        # from numbers among the usable images to numbers among all images
         has = table.index[:, camera] >= 0
         table.index[has, camera] = np.flatnonzero(view.colour_usable)[table.index[has, camera]]
         undelayed = view.depth_times[view.depth_usable] - view.depth_delay_us

@@ -94,8 +94,8 @@ def run(
         starts: annotated time of the first image and its standard deviation, seconds, by camera.
 
     Raises:
-        UserError: the recording has no image, the two artefacts are of different recordings, the
-            annotated floor points span no plane, or the annotated starts leave no common time.
+        UserError: the recording has no image; the two artefacts are of different recordings; the
+            annotated floor points span no plane; the annotated starts leave no common time.
     """
     with Frames.open(frames) as source:
         if not source.available.any():

@@ -147,7 +147,7 @@ def hold_out(inputs: JointInputs, settings: JointSettings, result: JointResult) 
     # of velocities, and short enough that each has a turn in a recording of two seconds.
     block = np.arange(len(state)) // max(1, round(inputs.fps * 0.2))
     turn = block % len(cameras)
-    mixed = _select_states(without, turn)
+    mixed = _select_states(without, turn)  # each frame from the fit without its held-out camera
     camera_index = cameras[turn]
     judged = _errors_in_held_out(assembly, mixed, camera_index)
     points = _points(inputs, state)
