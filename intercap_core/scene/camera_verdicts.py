@@ -21,8 +21,7 @@ import numpy as np
 from intercap_core.scene.constraints import MIN_BODY_POINTS, BodyConstraint, BodyViews
 from intercap_core.scene.registration import MOVING, STATIC, Registration, RigEstimate
 
-# Largest ratio of held-out errors, refined over given, that counts as an improvement. Tuned on the
-# studio.
+# Largest ratio of errors, refined over given, that counts as an improvement. Tuned on the studio.
 MUST_IMPROVE = 0.98
 # Ratio of refined over given error above which the given pose is not far worse and the camera is
 # compared again. Tuned on the studio.

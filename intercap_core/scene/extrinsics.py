@@ -92,7 +92,9 @@ def refine(
     """Refine the poses of all cameras but the ``master``, depth biases and time offsets.
 
     1. Biases and offsets are estimated at the given poses, then together with all poses.
-    2. All given poses are kept unless one kind of held-out data improves and none gets worse.
+    2. All given poses are kept unless the residuals of one kind of data improve and those of no
+    kind
+       get worse: held-out background, held-out moving surfaces, keypoints.
     3. Otherwise each camera's refined and given pose are compared (:mod:`.camera_verdicts`). If
        some keep the given pose, the others are refined around them.
 
@@ -133,7 +135,7 @@ def refine(
 
         freed = solve(None, np.ones(len(rig), bool))
         ratios = _ratios(registration, body, unmoved.estimate, freed.estimate)
-        # no group of held-out data may worsen by more than 2 %; tuned on the studio
+        # no kind of data may get worse by more than 2 %; tuned on the studio
         finite = np.isfinite(freed.estimate.poses).all()
         if finite and ratios and min(ratios) <= MUST_IMPROVE and max(ratios) <= 1.02:
             judge = PoseJudge(
@@ -203,10 +205,10 @@ def _ratios(
     start: RigEstimate,
     refined: RigEstimate,
 ) -> list[float]:
-    """Ratios of held-out cost, refined over start, for background, moving surfaces and keypoints.
+    """Ratios of cost, refined over start: held-out background, held-out moving surfaces, keypoints.
 
-    A kind without data has no entry. The start has the depth biases and time offsets that fit it
-    best, so only poses are compared.
+    The keypoints are those of the fit, not held-out ones. A kind without data has no entry. The
+    start has the depth biases and time offsets that fit it best, so only poses are compared.
     """
     ratios = []
     for kind in (STATIC, MOVING):
