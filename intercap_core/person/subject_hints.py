@@ -104,6 +104,7 @@ def touch_test(
     """
 
     def touches(t: int, c: int, person: int) -> bool | None:
+        """See :data:`.subject.Touches`."""
         objects = [
             candidate
             for candidate in detections.candidates(t, c)

@@ -9,7 +9,7 @@ Point-to-plane ICP over all pairs of cameras at once, solved by robust Gauss-New
 - Further terms on the poses (:mod:`.constraints`) are passed in, because surfaces alone may not
   suffice: a bare floor leaves three degrees of freedom undetermined.
 
-A quarter of the points is held out of the fit and serves to compare poses.
+A quarter of the points is held out: the fit does not match them, and they serve to compare poses.
 """
 
 from __future__ import annotations
@@ -218,7 +218,7 @@ class Registration:
             constraints: further normal equations of the poses.
             timing: normal equations of the offsets from the keypoints: matrix (C, C), 1/s^2, and
                 vector (C,), 1/s.
-            free_poses: whether poses are estimated, for all cameras or by camera (C,).
+            free_poses: whether poses are estimated, one bool for all cameras or a mask (C,).
         """
         current = RigEstimate(start.poses.copy(), start.bias.copy(), start.offset.copy())
         count = len(self.rig)
@@ -227,7 +227,8 @@ class Registration:
         free[self._master] = False
         free[self._master, BIAS] = True
         rows = np.flatnonzero(free.ravel())
-        # gates on the distance to the plane, metres, one an iteration; tuned on the studio
+        # Largest distance of a match to the plane, metres, in each iteration; tuned on the studio.
+        # Three iterations suffice if all poses are fixed.
         gates = (0.08, 0.05, 0.03, 0.02, 0.015, 0.015, 0.015)
         for gate in gates if np.any(free_poses) else (0.08, 0.04, 0.04):
             matrix = np.zeros((count, FREEDOMS, count, FREEDOMS))
@@ -302,7 +303,7 @@ class Registration:
         rows = own.held_out if held_out else own.queries
         queries, surface = own.surface.subset(rows), other.surface
         points = apply(source, queries.points - at.bias[a] * queries.rays)
-        # the tree holds b's points with their depth bias, so the queries get the same bias
+        # the tree holds b's points with their depth bias, so the query points get the same bias
         in_target = apply(invert(target), points)
         depth = np.maximum(in_target[:, 2:], 0.1)
         sought = np.column_stack([in_target * (1 + at.bias[b] / depth), own.moment[rows]])

@@ -103,6 +103,7 @@ def _put_cameras(writer: artefacts.Writer, cameras: CameraFit) -> None:
 
 
 def _put_body(writer: artefacts.Writer, model: BodyModel, state: State) -> None:
+    """Write the SMPL-X parameters and the joints (T, 55, 3)."""
     parameters = state.parameters(model)
     with torch.no_grad():
         joints = model(parameters, vertex_ids=np.array([0])).joints

@@ -261,6 +261,7 @@ def _ground(
 
 
 def _write(output: Path, source: Frames, scene: _Scene, settings: SceneSettings) -> None:
+    """Write the scene artefact; column 0 of ``pairs`` is background, column 1 moving surfaces."""
     rig, refined, ground = scene.rig, scene.refined, scene.ground
     pairs = refined.pairs
     up = _up(source, rig)

@@ -106,7 +106,7 @@ class DepthSegmenter:
         zup = scene["zup_from_master"]
         upright = bool(np.isfinite(zup).all())
         grounded = bool(scene.attributes["ground_found"]) and upright
-        zup = zup if upright else np.eye(4)
+        zup = zup if upright else np.eye(4)  # without an up direction, the master's frame is used
         bias = np.nan_to_num(scene["depth_bias"])
         self.cameras = [
             c
