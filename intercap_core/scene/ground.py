@@ -93,7 +93,7 @@ def fit_ground(
     height = (sample @ normals[tried].T) - (points[tried] * normals[tried]).sum(1)
     inside = (np.abs(height) < FLOOR_HYPOTHESIS_TOLERANCE_M).sum(0)
     below = (height < -BELOW_FLOOR_M).sum(0)
-    # a point below the plane outweighs three inliers; tuned on the studio
+    # a point below the plane counts as much as three inliers; tuned on the studio
     best = tried[np.argmax(inside - 3.0 * below)]
     fitted = _refined(
         points[candidates], normals[candidates], points[best], normals[best], tolerance_m
