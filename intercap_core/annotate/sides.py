@@ -97,8 +97,8 @@ def doubts(opened: Opened) -> list[Doubt]:
     """Return runs of frames with doubtful sides.
 
     Sides are doubtful in a frame if one of these holds:
-    - Stage person contradicted the detector in half of the views or more, and the annotation does
-      not state the exchange.
+    - At least two views show a limb, and in half of them or more stage person contradicted the
+      sides of the detector, or those of the annotation where it states an exchange.
     - The body's build clearly suits exchanged sides better (``MIRRORED_BUILD``).
     - Limbs of the result jump to the other side and back.
     """

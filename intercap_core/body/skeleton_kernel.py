@@ -34,7 +34,7 @@ class RestJoints(NamedTuple):
 
     @classmethod
     def of(cls, model: BodyModel) -> RestJoints:
-        """Return the joints of a body: points 1 to 55 of a selection of one vertex and them."""
+        """Return a body's joints, by a selection: point 0 is a vertex, 1 to 55 are the joints."""
         selection = model.select(np.array([0]), joints=True)
         return cls(selection.template[1:].numpy(), selection.directions[1:].numpy())
 
@@ -42,8 +42,8 @@ class RestJoints(NamedTuple):
 class PosedPoints(NamedTuple):
     """B posed bodies and N of their points, as arrays for kernels.
 
-    ``rotations`` to ``moved`` are the fields of :class:`Skeleton`, the others those of
-    :class:`.selection.Selection`.
+    ``rotations`` to ``moved`` are the fields of :class:`Skeleton`; ``directions`` to ``below`` are
+    those of :class:`.selection.Selection`.
     """
 
     rest: np.ndarray

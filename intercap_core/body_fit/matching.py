@@ -4,8 +4,8 @@ There are three kinds of measurements, each a signed distance at a sample:
 - depth points of the person, matched to the surface here;
 - samples in front of a surface that a camera measured farther away (:mod:`.free_space`);
 - rims of the person's masks, whose rays touch the surface (:mod:`.outlines`).
-The distances at each sample and camera are averaged. :class:`.evidence.Evidence` averages them over
-the cameras to one residual of :mod:`.cloud_term`.
+The distances at each sample and camera are averaged. :class:`.evidence.Evidence` then averages over
+the cameras, which gives one residual of :mod:`.cloud_term` for each sample.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from intercap_core.geometry.camera.rig import Rig
 
 # Smallest cosine between the normals of a point and of its vertex. Tuned on the studio.
 MATCH_COSINE = 0.3
-# Distance of a point from the outside of the covering beyond which it loses weight, metres. Tuned
-# on the studio.
+# A covering is what lies over the skin, clothing or hair (:mod:`.cloud_term`). A point farther than
+# this from its outer surface loses weight, metres. Tuned on the studio.
 CLOUD_HUBER_M = 0.012
 
 
@@ -106,7 +106,7 @@ class PosedSkin(NamedTuple):
     vertices: Tensor
     """(R, 3) vertices of the surface."""
     normals: Tensor
-    """(R, 3) unit normals; those of samples and patches are correct."""
+    """(R, 3) unit normals of samples and patches; 0 at other vertices."""
     samples: Tensor
     """(S, 3) positions of the samples."""
     displacement: Tensor | None
@@ -121,7 +121,7 @@ class FrameMatches(NamedTuple):
     points: Tensor
     """(C, S) effective number of points, 0 = none."""
     residual: Tensor
-    """Median distance of the depth points, metres."""
+    """Median absolute distance of the matched depth points, metres; NaN = no match."""
     measured: Tensor
     """(S,) bool: the sample has depth points."""
 

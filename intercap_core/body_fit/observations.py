@@ -233,7 +233,7 @@ def _fuse(
             window,
             background=observations.background[c],
             before_m=0.04,  # of the background; tuned on the studio
-            every=2,  # neighbouring rows are redundant
+            every=2,  # neighbouring rows and columns are redundant
         )
         if len(index):
             seen_by.append((c, depth, index))

@@ -1,7 +1,8 @@
 """Groups of candidates of different views that may show one object, and their outlines.
 
-If depth measures a candidate, its points give the position. Otherwise the rays through the middles
-of two views' masks do, if they meet and both masks have the object's size there.
+In a view with depth, the measured points of a candidate give its position; a candidate with too few
+points is ignored. Without depth, the rays through the middles of two views' masks give it, if they
+meet and both masks have the object's size there.
 
 The outline of a mask is its support function h(d) = max over its pixels p of d . p: its extent in
 each direction of the image. The object's own support is reached at a vertex of its convex hull, so
@@ -281,9 +282,9 @@ def _ray_crossings(outlined: list[LocatedCandidate], diameter: float) -> list[np
 def _possible_candidates(view: View) -> list[MaskCandidate]:
     """Return the candidates of a view that are not the person.
 
-    A candidate is the person if most of it lies on the person and it is labelled or as large as a
-    person. Either alone is not enough: labels may be wrong, and an object that is held in front of
-    the body lies in the person's mask.
+    A candidate is the person if most of it lies on the person, and it is labelled as a person or
+    has more than 0.3 of the person's area. Either alone is not enough: labels may be wrong, and an
+    object that is held in front of the body lies in the person's mask.
     """
     possible = []
     for candidate in view.candidates:

@@ -1,11 +1,11 @@
 """Segments in which the object is at rest: a change-point test on the evidence of the images.
 
-A segment is at rest if one pose explains all its frames within their evidence. Errors of masks and
-calibration last for some time and make a resting object seem to creep. A frame in motion, which has
-a pose of its own, therefore costs more than such errors would gain by it. The cheapest partition of
-the recording into rests and motions is found exactly by dynamic programming (Jackson et al. 2005).
-It runs twice: the first result gives the variance of poses at rest, with which the second finds
-slow motions too.
+A segment is at rest if one pose explains all its frames within their evidence. A frame in motion
+has a pose of its own, and a fixed cost. Errors of masks and calibration last for some time and make
+a resting object seem to creep. The cost of motion is therefore higher than what a frame at rest
+would save by following such errors. The cheapest partition of the recording into rests and motions
+is found exactly by dynamic programming (Jackson et al. 2005). It runs twice: the first result gives
+the variance of poses at rest, with which the second finds slow motions too.
 """
 
 from __future__ import annotations
@@ -104,8 +104,9 @@ def _partition(
         until = min(a + MAX_REST_FRAMES, count)
         spread = _spread(poses[a:until], information[a:until], seen[a:until])
         ends = a + 1 + np.arange(len(spread))
-        # A rest at the start or the end of the recording may be cut off, and then costs less than a
-        # whole one: 5, and for each frame beyond the shortest rest a little less than motion.
+        # A rest at the start or the end of the recording may be cut off, so it may be half as long
+        # and cost less: 5, plus nine tenths of the cost of motion for each frame from the shortest
+        # whole rest on, but at most the cost of a whole rest.
         length = ends - a
         cut = (a == 0) | (ends == count)
         longer = np.maximum(length - shortest + 1, 0) * MOVING_COST * share * 0.9

@@ -151,8 +151,8 @@ def _make(
 def _return_freed_memory() -> None:
     """Make glibc return freed arrays of 4 MB and more to the system.
 
-    By default it keeps up to 32 MB per array for the process, a fifth of the joint stage's peak at
-    1,000 frames. Without effect for other C libraries.
+    By default it keeps freed arrays of up to 32 MB for the process, together a fifth of the joint
+    stage's peak at 1,000 frames. Without effect for other C libraries.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if os.name == "posix" else None
     if mallopt is not None:

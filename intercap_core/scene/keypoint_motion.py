@@ -32,8 +32,9 @@ MIN_CONFIDENCE = 0.3  # keypoints of lower confidence are ignored; tuned on the 
 OUTLIER_SIGMA = 4.0  # length of an outlier's residual, standard deviations; tuned on the studio
 # Weights of the squared third differences that are tried; the likelihood selects one.
 STIFFNESS = 10.0 ** np.arange(-3, 4)
-# Factor on the selected weight. The likelihood takes detector errors that last for several sets for
-# motion; the factor removes the resulting bias of the speeds. Tuned on the studio.
+# Factor on the selected weight. Detector errors that last for several sets look like motion to the
+# likelihood, so it selects paths that are too flexible, with speeds that are too high. The factor
+# removes this bias. Tuned on the studio.
 STIFFER = 4.0
 MIN_PATH_SAMPLES = 6  # third differences need four samples
 ORDER = 3  # order of the differences

@@ -48,8 +48,8 @@ from intercap_core.scene.up import (
 from intercap_core.schemas import SCENE
 
 FEET = slice(19, 25)  # toes and heels among the body's 25 keypoints
-# A camera is reported if its pose lets the rig's centre move by more than this (standard
-# deviation).
+# A camera is reported if it sees the rig's centre less accurately than this, because its pose is
+# uncertain (standard deviation).
 WEAK_CAMERA_M = 0.010
 Floor = Sequence[tuple[float, float, float]]  # annotated floor points, master frame, metres
 
@@ -95,7 +95,8 @@ def run(
 
     Raises:
         UserError: the recording has no image; the two artefacts are of different recordings; the
-            annotated floor points span no plane; the annotated starts leave no common time.
+            annotated floor points span no plane; the annotated starts leave no common time; cameras
+            and person contradict the stated up direction.
     """
     with Frames.open(frames) as source:
         if not source.available.any():
@@ -197,8 +198,8 @@ def _with_feet(
 ) -> tuple[GroundPlane, list[str]]:
     """The floor, and notes about it.
 
-    If no floor was measured (``ground``), it is the stated floor. If feet contradict the stated
-    floor, or none is stated, it is the floor under the feet.
+    A measured floor (``ground``) is kept. Otherwise it is the stated floor or, if the feet
+    contradict that or none is stated, the floor under the feet.
     """
     stated = source.stated_up, source.stated_floor
     middle = ring_centre(rig)

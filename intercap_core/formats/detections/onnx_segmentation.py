@@ -352,7 +352,11 @@ def _rcnn_outputs(model: OnnxModel) -> dict[str, int] | None:
 
 
 def _auto_values(model: OnnxModel, outputs: dict[str, int]) -> PixelValues:
-    """Pixel values by exporter: torchvision's masks cover the image, detectron2 adds its size."""
+    """Pixel values by exporter.
+
+    Detectron2 adds the image's size as a fifth output. Masks of torchvision cover the image, those
+    of maskrcnn-benchmark the box.
+    """
     if len(model.outputs) > 4:
         return "bgr255"
     lengths = model.outputs[outputs["masks"]][1][-2:]

@@ -102,7 +102,7 @@ def decode(rle: bytes, height: int, width: int) -> np.ndarray:
 def from_counts(counts: Sequence[int], height: int, width: int) -> bytes:
     """Compress an uncompressed RLE, a list of run lengths.
 
-    Raises ValueError if a length is no integer from 0 or the runs do not fill the image.
+    Raises ValueError if a length is negative or no integer, or the runs do not fill the image.
     """
     lengths = np.asarray(counts)
     if lengths.ndim != 1 or (lengths.size and lengths.dtype.kind not in "iu"):

@@ -174,7 +174,8 @@ def camera_table(summaries: Sequence[SequenceSummary]) -> pd.DataFrame:
 def camera_groups(cameras: pd.DataFrame) -> pd.DataFrame:
     """Return one row per camera over all its sequences.
 
-    Images are summed. The other numbers of :func:`camera_table` are means weighted by frames.
+    Frames and images are summed, and sequences with a note are counted. The other numbers of
+    :func:`camera_table` are means weighted by frames.
     """
     if cameras.empty:
         return pd.DataFrame(columns=["camera", "sequences", "frames", "images"])

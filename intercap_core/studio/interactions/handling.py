@@ -114,7 +114,14 @@ class HandlingScript(Interaction):
         top: float,
         heading: float = 0.0,
     ) -> None:
-        """Place a block: its ``middle`` and ``half`` sizes on the floor, its ``top``, metres."""
+        """Place a block that stands on the floor.
+
+        Args:
+            middle: its middle on the floor, metres.
+            half: half of its length and width, metres.
+            top: height of its top, metres.
+            heading: its rotation about the vertical, radians.
+        """
         low = (middle[0] - half[0], middle[1] - half[1], 0.0)
         high = (middle[0] + half[0], middle[1] + half[1], top)
         self.furniture.append(Box(low, high, heading, "wood"))
