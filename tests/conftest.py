@@ -22,8 +22,8 @@ PROJECT_ROOT = Path(__file__).resolve().parents[1]
 
 # Folders whose tests share a long run: all their tests stay on one worker.
 TOGETHER = ("workflow", "slurm")
-# Folders and files that start processes, render captures or fit sequences, and other files that take
-# more than some 3 s (`--durations`, warm kernels): not in `make test-fast`.
+# Not in `make test-fast`: folders and files that start processes, render captures or fit sequences,
+# and files that take more than some 3 s (`--durations`, warm kernels).
 SLOW = (
     "annotate/browser",
     "annotate/test_rerun.py",

@@ -183,7 +183,7 @@ def results_file(wildcards):
 
 
 def length_of(wildcards):
-    """Extent of the sequence, from its frames artefact or estimated from its recordings."""
+    """Extent of the sequence, from its frames artefact, the studio's settings, or a default."""
     if not hasattr(wildcards, "sequence"):
         return Extent(0, 0)
     frames = PROJECT.artefact(wildcards.sequence, "frames")
