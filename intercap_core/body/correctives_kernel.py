@@ -8,9 +8,9 @@ follows with dR / d theta_c = skew(J_l e_c) R, the left Jacobian J_l and the uni
 The gradient is exact, the Gauss-Newton matrices are approximate. Those of keypoints and cloud
 contain the derivatives of a point's blend shapes only by the joints of its own limb
 (:class:`.selection.Limbs`). That of self-penetration contains none. Exact matrices would couple
-every point with every joint, for millimetres per radian. Their assembly would take 2 times as long
-for the body alone, 3.5 times with hands and face. The minima do not change, since the gradient is
-exact.
+every point with every joint, although the additional derivatives are only millimetres per radian.
+Their assembly would take 2 times as long for the body alone, 3.5 times with hands and face. The
+minima do not change, since the gradient is exact.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class RestPoints(NamedTuple):
 
         Args:
             feature: (B, 486) vec(R - I).
-            at: places of the B bodies.
+            at: slice of ``points`` that holds the B bodies.
             used: (B, N) bool, points that are moved.
         """
         move(self.correctives, feature, used, self.points[at])

@@ -1,7 +1,8 @@
 """Schedule of the body's fit: five stages, each of which starts from the result of the last.
 
 1. The trunk is placed rigidly, then each frame is fitted to triangulated keypoints (:mod:`.start`).
-2. E_J of all frames. Sigmas are wide at first if the depth of a single view locates keypoints.
+2. E_J of all frames together. If only the depth of a single view locates some keypoints, they are
+   targets too, and the sigmas of E_J are wide at first (:meth:`Fitter._lift_by_depth`).
 3. E_J + E_D: keypoint offsets and the thickness of clothing become free; frames that jump are
    refitted (:mod:`.recover`).
 4. Hands and face, with the rest of the body fixed except the wrists.
@@ -40,8 +41,8 @@ from intercap_core.progress import Progress
 
 log = logging.getLogger(__name__)
 
-# Largest valid distance of correspondences, metres: twice in stage 3, then in stage 5. Tuned on the
-# studio.
+# Largest valid distance of correspondences, metres: in the first and second round of stage 3, then
+# in stage 5. Tuned on the studio.
 _CLOUD_REACH_M = (0.10, 0.06, 0.05)
 # Factors of the keypoints' sigma in successive minimisations, while limbs may be far off. Tuned on
 # the studio.
@@ -297,7 +298,8 @@ class Fitter:
         """Return the body keypoints that only the depth of one view locates; None = no keypoints.
 
         They constrain the body until its cloud does. The depth at an occluded keypoint is that of
-        the occluder. The pixels of E_J correct this error, for which their sigma is wide at first.
+        the occluder. E_J corrects this error by the keypoints' pixels; as the body may be far off
+        until then, the sigmas of E_J are wide at first.
         """
         observations = self.evidence.observations
         joints = observations.joints[self.frames][:, BODY]

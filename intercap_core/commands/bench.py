@@ -32,14 +32,15 @@ MEASURED = SEQUENCE_STAGES[: SEQUENCE_STAGES.index("metrics") + 1]
 def measure(settings: Path, output: Path, *, cores: int = 0) -> None:
     """Measure the project's first sequence and write flat JSON with the keys ``area.measure``.
 
-    Makes a virtual recording first, which is not measured. Then the workflow runs all stages up to
-    the metrics, so that the starts of processes are included. Keeps the figures of other commands
-    in the file. Raises UserError if a stage fails.
+    A recording of the studio is made first, which is not measured. Then the workflow runs all
+    stages up to the metrics, so that the starts of processes are included. Keeps the figures of
+    other commands in the file. Raises UserError if a stage fails.
 
     - ``STAGE.seconds_per_frame``, ``STAGE.peak_memory_mb``: job of one stage.
     - ``verdict.seconds_per_frame``: duration of the held-out evaluation, see :func:`time_hold_out`.
+    - ``end_to_end.seconds_per_frame``: duration of the whole run of the workflow.
     - ``end_to_end.peak_memory_mb``: largest sum of the resident memory of all processes.
-    - ``frames.fps``: speed of the frames stage, see :func:`time_extraction`.
+    - ``frames.fps``, ``frames.bytes_...``: speed and size, see :func:`time_extraction`.
     """
     project = load_project(settings)
     sequence = next(iter(project.sequences))
@@ -63,7 +64,9 @@ def measure(settings: Path, output: Path, *, cores: int = 0) -> None:
 
 
 def add_figures(output: Path, figures: Mapping[str, float]) -> None:
-    """Replace all figures of the given figures' areas in a JSON file; keep those of other areas.
+    """Write ``figures`` to a JSON file; its other figures of the same areas are removed.
+
+    The area is the part of a key before the dot. Figures of other areas are kept.
 
     Raises UserError if the file is no JSON object.
     """

@@ -1,4 +1,5 @@
-"""Windows of a view around the object with which a fit compares renderings: points and contours.
+"""Patches: windows of a view around the object, whose points and contours a fit compares with
+renderings.
 
 A patch is cut when a view chooses its candidate, with a margin within which the pose may move.
 """

@@ -3,8 +3,9 @@
 1. Poses that a search finds in a few frames, and annotated poses, are followed forwards and
    backwards through the frames.
 2. A hidden Markov model (:mod:`.decoder`) decides which hypothesis is true in every frame.
-3. Uncertain frames are searched, and the model decides again, until no hypothesis is new. Near
-   symmetries, new fits of moving objects and colours add to the decision in the same way.
+3. Uncertain frames are searched, and the model decides again, until no hypothesis is new. It also
+   decides again after poses that a near symmetry makes as likely are added, and after moving
+   objects are fitted again. The last decision includes the evidence of colours.
 4. :mod:`.whole` refines the decided poses: rest, smoothness and covariance.
 """
 
@@ -43,9 +44,8 @@ from intercap_core.object_track.whole import FrameResult, FrameStatus, WholeTrac
 # seconds.
 ABSENT_LOG_RATIO = 1.0  # nats; tuned
 AMBIGUOUS_PROBABILITY = 0.2  # of different poses together; above it a frame is ambiguous; tuned
-# Total log-likelihood ratio of the frames that are not lost, as independent observations, below
-# which the recording shows no object. False detections reach 8 nats; the least of real objects (a
-# cup behind a hand without depth) is about 25.
+# Threshold of ``Track.evidence``: below it, the recording shows no object. False detections reach 8
+# nats; the least of real objects (a cup behind a hand without depth) is about 25.
 NOTHING_LOG_RATIO = 12.0  # nats; tuned
 
 
@@ -60,7 +60,8 @@ class Track:
     annotated: bool
     """Whether poses were annotated."""
     evidence: float
-    """Log-likelihood ratio of all frames that are not lost, as independent observations, nats."""
+    """Sum of the log-likelihood ratios of the frames that are not lost, each times the share of an
+    independent observation that a frame is, nats."""
     agrees: bool = True
     """Whether the track agrees with at least one annotated pose; True if there is none."""
     doubts: tuple[str, ...] = ()
@@ -168,8 +169,9 @@ class Tracker:
     def _decode(self) -> Decoded:
         """Decide between the hypotheses of all frames, and update the prior of places accordingly.
 
-        The model decides up to three times: with the usual motions; with free motion at no cost
-        near annotated poses of a hidden object; and with the costs of places that are out of reach.
+        The model decides two or three times. First it uses the usual costs of motion. If the object
+        is hidden near an annotated pose, it then decides with free motion at no cost there. Last,
+        hypotheses that the object cannot reach from the nearest sure frames get an additional cost.
         """
         times, fits = self._observer.times, self._hypotheses.fits
         weights = [self._prior.weigh(t, own) for t, own in enumerate(fits)]
@@ -250,6 +252,7 @@ class Tracker:
             far = np.linalg.norm(steps[:, :3], axis=1) > np.radians(20)
             far |= np.linalg.norm(centres - centres[k], axis=1) > 0.05
             other = float(probability[:-1][far].sum())
+            # probability[-1]: no hypothesis is true
             overlap = own[k].mean_overlap
             lost = probability[-1] > 0.5 or 0 < overlap < self._observer.settings.lost_overlap
             rivals = np.where(far, probability[:-1], 0.0) * (other > AMBIGUOUS_PROBABILITY / 2)
@@ -265,7 +268,10 @@ class Tracker:
         return result
 
     def _guess(self, t: int) -> FittedPose:
-        """Return the likeliest pose of the nearest frame with hypotheses, compared with frame t."""
+        """Return a pose for frame t, where no hypothesis is true, compared with its images.
+
+        It is the likeliest hypothesis of the nearest frame that has any.
+        """
         fits = self._hypotheses.fits
         u = min((u for u, own in enumerate(fits) if own), key=lambda u: abs(u - t))
         weights = self._prior.weigh(u, fits[u])

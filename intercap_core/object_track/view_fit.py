@@ -34,7 +34,7 @@ from intercap_core.object_track.view_report import (
 )
 
 # The lambdas of equation 1. Pixels of a view err together, so each term of a view counts as this
-# many independent samples.
+# many independent samples (depth: at most, for many pixels).
 DEPTH_SAMPLES = 4.0  # tuned
 CONTOUR_SAMPLES = 3.0  # tuned
 # Standard deviation of one view's depth: systematic error and calibration, not pixel noise. Azure
@@ -60,7 +60,7 @@ class ViewFit:
     """One view during a fit: its chosen candidate and the measurements around it.
 
     All terms refer to the current pose and its renderings, set by the constructor and :meth:`see`.
-    Before :meth:`choose` there is no candidate. Views may run on different threads.
+    Before :meth:`choose` there is no candidate. Different views may be fitted in different threads.
     """
 
     def __init__(
@@ -150,6 +150,9 @@ class ViewFit:
             drawn.face, corner, patch.inside, patch.person, (patch.x0, patch.y0), patch.contour,
             patch.rim, patch.starts, background, GATE_SCALES * scale, MIN_RENDERED_PX,
         )  # fmt: skip
+        # The first ``missed`` matches are those of mask pixels that the rendering misses. The
+        # others are those of the rendering's rim outside of the mask. They are left out where
+        # measured depth shows an occluder, or the object itself.
         measured, lens = self._depth_patch, geometry.depth_lens
         if measured is not None and lens is not None and missed < len(at):
             clear = object_silhouette.sees_past(

@@ -5,8 +5,9 @@ several views at once. Points triangulated from inconsistent views are wrong. "L
 four groups arms, legs, head and hands (``LIMBS``), each with left and right points.
 
 :func:`make_views_agree` works on single sets. For each limb it tries all 2^(C-1) assignments of
-sides to views. Their cost is the sum of truncated squared gaps between the rays of all pairs of
-views, plus a constant for each exchanged view. The result may still be mirrored in all views.
+sides to views (the ten with most keypoints). Their cost is the sum of truncated squared gaps
+between the rays of all pairs of views, plus a constant for each exchanged view. The result may
+still be mirrored in all views.
 
 :func:`find_mirrored` then decides, for all sets together, which limbs are mirrored. It runs the
 Viterbi algorithm over the eight ways of exchanging arms, legs and head:
@@ -15,7 +16,7 @@ Viterbi algorithm over the eight ways of exchanging arms, legs and head:
   chest; shoulders and hips face the same way; detectors are mostly right.
 - Pairwise costs: motion from set to set, and a change of sides.
 
-Each hand is assigned to the arm whose wrist is nearer.
+The two hands are exchanged if they are at the wrists of the other side (:func:`_other_hands`).
 """
 
 from __future__ import annotations
@@ -172,8 +173,8 @@ def _build(points: np.ndarray) -> np.ndarray:
 
     Each test gives a cosine, positive for a possible body. The cost is minus the cosine where it is
     negative, times a factor tuned on the studio (a negative log likelihood). The factors are 8 for
-    knees and ankles, 6 for back and head, 3 for the nose above the chest: the head turns and the
-    back twists by up to some 80 degrees.
+    knees and ankles, 6 for back and head, 3 for a nose in front of the chest. The last is lowest:
+    the head can turn and the back can twist by up to some 80 degrees.
     """
 
     def between(start: str, end: str) -> np.ndarray:

@@ -191,7 +191,10 @@ def _object_heat(name: str, heat: Heatmaps, objects: Mapping[str, ObjectEntry]) 
 
 
 def _medians(pairs: Sequence[tuple[str, float, float]]) -> tuple[float, float]:
-    """Medians before and after over camera pairs (name, before, after) with both; NaN if none."""
+    """Median residuals before and after refinement, over camera pairs that have both; NaN if none.
+
+    ``pairs``: name, residual before and residual after the refinement of the cameras.
+    """
     known = np.array([pair[1:] for pair in pairs if np.isfinite(pair[1:]).all()])
     if not len(known):
         return float("nan"), float("nan")

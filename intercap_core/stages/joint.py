@@ -114,7 +114,7 @@ def _put_body(writer: artefacts.Writer, model: BodyModel, state: State) -> None:
 
 
 def _put_fit(writer: artefacts.Writer, fitted: JointFit) -> None:
-    """Write everything except the body and the cameras."""
+    """Write residuals, object, contact, time offsets, energies and flags."""
     before, after = fitted.energy_before, fitted.energy_after
     names = sorted(before.keys() | after.keys())
     writer.put("keypoint_residual", fitted.residuals.keypoint_px)

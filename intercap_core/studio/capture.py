@@ -56,7 +56,7 @@ def write_truth(
     body_visible, object_visible = visible(stage, moment)
     seen = np.stack([camera.object_pixels for camera in recorded], 1)
     whole = np.stack([camera.object_whole for camera in recorded], 1)
-    # a view sees the object if it shows 40 pixels and 5 % of it
+    # a view sees the object if it shows at least 40 pixels and 5 % of it
     views = (seen >= 40) & (seen >= 0.05 * np.maximum(whole, 1))
     normal = master[:3, 2]  # the stage's z axis
     with artefacts.write(

@@ -103,7 +103,8 @@ def _triangle(a, b, c, za, zb, zc, aligned):
 
 
 SOUND_RATE = 16_000  # samples a second
-SWAPPED = (3, 4)  # cameras 4 and 5 of InterCap's release
+# Cameras whose colour lenses the fault "swapped_lenses" exchanges: 4 and 5 of InterCap's release
+SWAPPED = (3, 4)
 
 
 @dataclass(frozen=True)
@@ -176,8 +177,10 @@ class CaptureFolder(ABC):
         """Write the calibration with its errors, ``claimed``."""
 
     def image_number(self, t: int, order: int, fps: int) -> int:
-        """Return the image number that files of detections use for set ``t``, the ``order``-th
-        image."""
+        """Return the number of an image in the files of detections.
+
+        The image is that of set ``t`` and the ``order``-th image of its camera.
+        """
         return order
 
     def add_keypoints(self, camera: str, t: int, fps: int, content: str) -> None:  # noqa: B027

@@ -7,6 +7,8 @@ Errors of a joint:
 - exchanges of left and right;
 - a plausible wrong place if the joint is occluded.
 
+Errors of a person: the subject is missed, or a person who does not exist is reported.
+
 The confidence depends on the error only partly. The 135 points are body (0 to 24; 8 = middle of the
 hips), left hand (25 to 45), right hand (46 to 66) and face (67 to 134).
 """
@@ -59,11 +61,11 @@ class Detector:
     # standard deviation, in x and in y, of the error of a hidden body joint, metres
     hidden_shift_m = 0.045
     hidden_hand_shift_m = 0.030  # the same of a hidden hand joint
-    swap_probability = 0.015  # of an exchange of left and right
+    swap_probability = 0.015  # that left and right are exchanged in a frame
     swap_s = 0.3  # duration of an exchange
-    miss_probability = 0.012  # of a person who is not detected
+    miss_probability = 0.012  # that a person is not detected in a frame
     miss_s = 0.25  # duration of a miss
-    bystander_probability = 0.08  # of a person who does not exist
+    bystander_probability = 0.08  # that a person who does not exist is detected in a frame
     bystander_s = 1.0  # duration of a false person
     fewest_visible = 8  # visible body joints of 25 below which a passer-by is not detected
     blind = 0.35  # share of the confidence that is independent of the true error
@@ -110,7 +112,7 @@ class Detector:
         )
         slow = noise.process(rng, self.frames, 270, self.jitter_s).reshape(-1, 135, 2)
         fast = noise.tails(rng.normal(size=slow.shape))
-        # of all points of the left and of the right hand together
+        # additional errors that all points of the left hand, and all of the right, have in common
         group = noise.process(rng, self.frames, 4, self.jitter_s).reshape(-1, 2, 2)
         wander = np.sqrt(1 - self.fast_jitter**2) * slow + self.fast_jitter * fast
         wander[:, LEFT_HAND] += 0.9 * group[:, :1]
@@ -144,7 +146,7 @@ class Detector:
     def _confidence(
         self, rng: np.random.Generator, error: np.ndarray, hidden: np.ndarray
     ) -> np.ndarray:
-        """Confidence (T, 135) in [0, 1], which decreases with the error and if a point is hidden.
+        """Confidence (T, 135) in [0, 1], lower for larger errors and for hidden points.
 
         ``guess`` depends on the true error (px); ``ignorant`` does not.
         """

@@ -2,8 +2,8 @@
 it.
 
 Rays are not normalised (z = 1 in the camera frame), so that the parameter of a hit is its depth z.
-Moving surfaces are drawn by a z-buffer over the same rays, which costs half of building a tree for
-a body that changes in every image.
+Moving surfaces are drawn with a z-buffer through the same rays. This takes half the time of
+building a ray casting tree, which a body that changes would need in every image.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from intercap_core.studio.room import Room
 BODY, OBJECT, PASSER_BY = 1, 2, 3  # values of an identity image; 0 is the room
 # Directions to two ceiling lamps, stage frame, and their strength as a share of full brightness
 LAMPS = (((0.45, 0.3, 0.85), 0.42), ((-0.6, -0.25, 0.75), 0.30))
-CAMERA_GAMMA = 2.2  # grey levels are linear light to the power 1 / 2.2, as nearly in sRGB
+CAMERA_GAMMA = 2.2  # grey levels are linear light to the power 1 / 2.2, nearly as in sRGB
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from intercap_core.project import Project
 
 SIDE_BY_SIDE = 2  # workflows at a time
 LOCK = Path(".snakemake") / "evaluation.lock"
-# CPU seconds per frame of six 720P views; CPU time of `make evaluate-quick` on an AMD EPYC.
+# CPU seconds per frame of six 720P views, measured with `make evaluate-quick` on an AMD EPYC.
 SECONDS_PER_FRAME = {
     STUDIO: 0.52, "frames": 0.02, "detections": 0.02, "scene": 0.25, "person": 0.15,
     "object_track": 0.22, "body_fit": 0.17, "joint": 0.37, "metrics": 0.30,
@@ -120,8 +120,9 @@ class ProjectRun:
 def bring_up_to_date(wanted: Mapping[str, Targets], *, cores: int = 0) -> int:
     """Run the workflows of all projects to the stages that the parts need.
 
-    Prints failed jobs and returns 1 if any job failed. A run that was killed continues:
-    Snakemake's lock is not used, and a system lock prevents two evaluations in one folder.
+    Prints failed jobs and returns 1 if any job failed. After a run that was killed, the
+    next one continues its work: Snakemake's lock, which would remain, is not used. A lock of the
+    system prevents two evaluations in one folder instead.
     Raises UserError if another evaluation is running.
 
     Args:

@@ -26,7 +26,9 @@ _NO_BACKGROUND = np.zeros((0, 0), np.uint16)
 
 
 def mask_window(depth: np.ndarray, camera: Camera, mask: Runs) -> Window | None:
-    """Return the rows and columns of the depth image (H, W) that can show the mask, or None.
+    """Return the rows and columns of the depth image (H, W) that can show the mask.
+
+    None if there are none: the mask is empty, outside of the depth image, or there is no depth.
 
     A grid of 5 x 5 points of the mask's box is placed at three depths and projected into the depth
     image.
@@ -89,7 +91,7 @@ def mask_pixels(
         mask.ends,
         mask.box,
         np.float32(CELL_SPACINGS * spacing),
-        # depth on the colour grid hides nothing
+        # depth that is aligned to the colour grid contains no pixel that the colour camera misses
         np.float32(np.inf if camera.aligned else HIDDEN_BEHIND_M),
     )
 

@@ -1,10 +1,11 @@
 """Drift (beyond the paper): corrections of the sequential fits change slowly.
 
-    E = sum over frames t, points i of |c_i(t+1) - c_i(t)|^2 / (2 sigma^2),  c = X - X_sequential
+    E = 1/2 sum over t, i of |c_i(t+1) - c_i(t)|^2 / (2 sigma^2),  c = X - X_sequential
 
 Errors of a sequential fit last: those of calibration, clothing and masks are the same in the next
-frame. sigma^2 is the variance of a random walk over one frame plus that of the sequential fit's
-jitter. X are joints of the body or points of the object. Without these terms contact that comes and
+frame. sigma^2 is the variance of a random walk over one frame plus twice that of the sequential
+fit's jitter. X are joints i of the body or points i of the object in frame t; neighbouring points
+err alike, which the factor 1/2 accounts for. Without these terms contact that comes and
 goes would shake a steady fit. While the object rests, its corrections are the same in all frames.
 Weighed by the setting ``drift_weight``, except for the object at rest.
 """

@@ -3,14 +3,16 @@
 The evidence of a frame is that of equation 1: silhouettes and depth of every view v. It is a
 quadratic form of a small step x of the object's pose and of corrections d_v of the cameras,
 
-    E(x, d, e) = sum_v |x + e - A_v d_v|^2 by I_v / 2 + g_v (x + e - A_v d_v),    e ~ N(0, F)
+    E(x, d, e) = sum_v (y_v^T I_v y_v / 2 + g_v^T y_v) + e^T F^-1 e / 2,    y_v = x + e - A_v d_v
 
-where |y|^2 by I_v stands for y^T I_v y, and I_v and g_v are the matrix and gradient of view v.
-A_v d_v is the apparent step of the object under a correction of camera v. e is the difference
-between mesh and object, with the variances F that the track adds to its covariance (``spread``).
-At the best e the matrix of x is I - I K I with K = (I + F^-1)^-1, I = sum I_v.
+y_v is the step that view v sees, I_v and g_v are the matrix and gradient of its evidence. A_v d_v
+is the apparent step of the object due to a correction of camera v. e is the pose error due to
+differences between mesh and object and to ambiguity. Its variances F (diagonal) are those that the
+track adds to its covariance (``spread``). Minimised over e, the matrix of x is I - I K I with
+K = (I + F^-1)^-1 and I = sum I_v.
 
-The scale of I_v follows from the disagreement of the views. A frame whose own minimum is far from
+The I_v and g_v of all frames are divided by one factor (``_noise``), which follows from the
+disagreement of the views. A frame whose own minimum is far from
 the compared pose has little weight (Geman-McClure). Frames in which the object is lost, or whose
 images contradict the pose, stay near the tracked pose, as in :mod:`.object_data`.
 """
@@ -61,7 +63,7 @@ class ObjectImages:
         views: cache of the frames' views.
         mesh: simplified mesh of the object.
         context: renderer and settings of the comparison.
-        threads: compare a frame each.
+        threads: pool; each thread compares one frame.
     """
 
     def __init__(
@@ -236,7 +238,7 @@ class ObjectImagesData(JointTerm):
         """Agreement of one view of each tracked frame with ``state``: frame, camera, report.
 
         ``camera`` (T,) is the index of the view's camera; a frame whose camera has no image or no
-        pose is left out. The result of the last :meth:`refresh` stays.
+        pose is left out. What the last :meth:`refresh` stored does not change.
         """
         images, poses = self._images, rigid(state.rotation, state.translation)
         twists = self._motion(poses)
@@ -333,8 +335,9 @@ class ObjectImagesData(JointTerm):
             cross[t][:, columns] = form.cross
         gradient = np.einsum("tij,tj->ti", self._matrix, offset) + self._gradient
         matrix = self._matrix + np.diag(UNKNOWN_SIGMA**-2)
-        # the noise cancels the scale of the matrices: errors that all views have in common do not
-        # show in their disagreement, so that the stated variance counts here
+        # ``_noise`` undoes the division of the matrices by it. It measures how much the views
+        # disagree. Errors that all views have in common affect the cameras' corrections, but not
+        # this disagreement, so that the variance as stated counts here
         share = self._share * self._noise
         return CameraEvidence(OBJECT, matrix, gradient, cross, hessian, pull, share)
 

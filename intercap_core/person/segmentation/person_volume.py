@@ -1,7 +1,7 @@
 """Signed distance of points from a person of average build around the triangulated keypoints.
 
 The person is a union of tapered capsules (two radii), one per bone. The position of its surface is
-uncertain by centimetres at the trunk (clothing, build) and by millimetres at the fingers. This
+uncertain by 3.5 cm at the trunk (clothing, build) and by 1.2 cm at the fingers. This
 uncertainty is the *margin* of a bone. Distances are divided by it: a distance of 2 margins is 7 cm
 at the trunk and 2.4 cm at a finger.
 
@@ -43,7 +43,7 @@ LIMB_RADII_M: dict[tuple[str, str], tuple[float, float, float]] = {
     ("heel", "small_toe"): (0.040, 0.035, 0.022),
     ("heel", "big_toe"): (0.040, 0.035, 0.022),
 }
-FINGER_RADII_M = (0.012, 0.010, 0.009)  # at the knuckle, middle, tip (anatomy)
+FINGER_RADII_M = (0.012, 0.010, 0.009)  # at the second joint, third joint and tip (anatomy)
 PALM_RADII_M = (0.024, 0.016)  # at the wrist, at the knuckles (anatomy)
 HAND_MARGIN_M = 0.012  # margin of fingers and palm; tuned on the studio
 BONES_PER_GROUP = 5  # bones with a common bounding ball, skipped together if a point is far from it
@@ -58,9 +58,8 @@ def build_bones(joints: np.ndarray, sigma: np.ndarray | None = None) -> np.ndarr
 
     Args:
         joints: (135, 3) metres; NaN = unknown.
-        sigma: (135,) standard deviations of the keypoints, metres. Their mean over both ends is
-        added
-            to the margin in quadrature.
+        sigma: (135,) standard deviations of the keypoints, metres. The mean over both ends
+            of a bone is added to its margin in quadrature.
     """
     off = np.zeros(len(joints)) if sigma is None else sigma
     points = np.column_stack([joints, off])  # (135, 4)
@@ -203,7 +202,7 @@ class MovingPerson:
         times = scene["times"]
         if frame_from_master is not None:
             joints = apply(frame_from_master, joints.reshape(-1, 3)).reshape(joints.shape)
-        # longer gaps than half a second are not interpolated; tuned on the studio
+        # sets more than half a second from the nearest known one stay unknown; tuned on the studio
         self.joints = fill_short_gaps(joints, times, max_gap_s=0.5)
         self._sigma = np.nan_to_num(sigma)
         self._velocity = np.nan_to_num(
@@ -215,7 +214,7 @@ class MovingPerson:
         self._late_sigma = np.nan_to_num(scene["time_offset_sigma"], nan=0.01)
 
     def bones(self, t: int, c: int) -> np.ndarray:
-        """Bones (B, 9) at the exposure of camera ``c`` at moment ``t``, see :func:`build_bones`."""
+        """Bones (B, 9) at the exposure of camera ``c`` in set ``t``, see :func:`build_bones`."""
         off = self._late_sigma[c] * np.linalg.norm(self._velocity[t], axis=-1)
         joints = self.joints[t] + self._late[c] * self._velocity[t]
         return build_bones(joints, np.hypot(self._sigma[t], off))
