@@ -89,7 +89,7 @@ class BodyDrift(_Drift):
     equation = Equation(
         symbol="drift of the body",
         source="beyond",
-        formula="\\|\\|c(t+1) - c(t)\\|\\|^2 / (2 sigma^2), c the correction of a joint of the "
+        formula="\\|\\|c(t+1) - c(t)\\|\\|^2 / (4 sigma^2), c the correction of a joint of the "
         "sequential fit, sigma its change in a frame",
         settings=("drift_weight",),
     )
