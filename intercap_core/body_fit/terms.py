@@ -8,11 +8,12 @@
 | priors | 2 | prior_term.py | PriorTerm | CompiledPriors |
 
 :class:`TorchTerms` is the readable form and the one that runs on a GPU. :class:`CompiledTerms` has
-the same cost, gradient and Gauss-Newton matrix on the CPU. The body of a licensed file has pose
-blend shapes. Costs and gradients contain their derivatives in full. The Gauss-Newton matrices of
-E_J and E_D contain only the derivatives by the joints of a point's own limb, that of E_P_self
-contains none. In full they would make every block of the normal equations dense: see
-:mod:`intercap_core.body.correctives_kernel`.
+the same cost, gradient and Gauss-Newton matrix on the CPU.
+
+The bodies of licensed files have pose blend shapes. Costs and gradients include these in full. The
+Gauss-Newton matrices include their derivatives only in part, since all of them would make every
+block of the normal equations dense: E_J and E_D have those by the joints of a point's own limb,
+E_P_self has none. See :mod:`intercap_core.body.correctives_kernel`.
 """
 
 from __future__ import annotations

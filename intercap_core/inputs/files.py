@@ -37,7 +37,8 @@ _REPR.maxstring = _REPR.maxother = 80
 class UnreadableFile(UserError):
     """A file that cannot be used.
 
-    ``reason`` fits after the file's name, for readers that continue without the file.
+    ``reason`` continues a sentence that starts with the file's name, for callers that write their
+    own message.
     """
 
     def __init__(self, path: Path, reason: str, advice: str = "check the path") -> None:

@@ -89,7 +89,7 @@ class CameraFit:
     def __init__(self, start: Cameras, covariance: np.ndarray) -> None:
         """``covariance`` (C, 7, C, 7) is 0 for fixed unknowns.
 
-        Raises LinAlgError if it is not positive definite.
+        Raises LinAlgError if that of the other unknowns is not positive definite.
         """
         self._given = start, covariance
         self.now, self.covariance, self.refused = start, covariance, False
@@ -117,7 +117,7 @@ class CameraFit:
 
         Each unknown must stay below 5 standard deviations of the scene, and so must the root mean
         square of all in units of the scene's covariance. A point at 2.5 m must move by less than
-        30 mm. Both limits are two to three times the largest correction on the studio.
+        30 mm. These limits are two to three times the largest correction on the studio.
         """
         free = total.ravel()[self._free]
         together = np.sqrt(free @ self._information @ free / max(len(free), 1))

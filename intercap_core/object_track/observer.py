@@ -162,7 +162,10 @@ class Observer:
         )  # fmt: skip
 
     def evidence(self, t: int, pose: np.ndarray, twist: np.ndarray) -> ImageEvidence:
-        """Evaluate the quadratic form of frame t at a pose (4, 4) that moves by ``twist`` (6,)."""
+        """Evaluate the images of frame t as a quadratic form of small motions of ``pose`` (4, 4).
+
+        ``twist`` (6,) is the object's motion per second.
+        """
         return evidence_at(self.context, self.views(t), pose, twist)
 
     def carried(self, t: int, u: int, pose: np.ndarray) -> np.ndarray:

@@ -146,7 +146,8 @@ class ObjectRecording:
 class ViewCache:
     """Least recently used cache of the views of frames.
 
-    ``max_bytes`` holds 90 frame sets of six unreduced depth images, 360 of a suitcase's.
+    The default ``max_bytes`` holds 90 frame sets of six cameras with depth at full resolution, or
+    360 with depth reduced as for a suitcase.
     """
 
     def __init__(self, load: Callable[[int], list[View]], max_bytes: int = 800_000_000) -> None:

@@ -1,5 +1,9 @@
 """Start times of cameras: stated by the user or by sound, and estimated from the keypoints.
 
+A start is expressed as ``late``: the time that the recording gives an image minus the time of the
+moment that it shows, on the master's clock. ``late`` > 0 means that the camera started earlier than
+its times say, so that the image with the time of a set shows an older moment.
+
 The search of :mod:`.start_times` begins at a stated start, which is also the prior of the time
 offset. A statement is rejected if the keypoints clearly contradict it.
 """
@@ -20,8 +24,8 @@ from intercap_core.formats.detections.read import PeopleOfImages
 PRIOR_OFFSET_S = 0.01
 FEWEST_SETS_APART = 2  # sets; a smaller shift is a slip or an offset, not a late start; tuned
 MIN_SHARED_S = 1.0  # least overlap of two recordings to determine a start; tuned on the studio
-# Combined standard deviations beyond which keypoints overrule a stated start. A smaller bound would
-# overrule about one correct statement in a thousand.
+# Combined standard deviations beyond which keypoints overrule a stated start. At three, about one
+# correct statement in 400 would be overruled by chance.
 REJECTED_SIGMAS = 4.0
 
 
@@ -106,7 +110,7 @@ class StatedStarts:
 
         If the cameras share one clock, the images' own times are the more accurate ones. Statements
         that agree with them within three standard deviations are therefore dropped. With five
-        synchronised cameras, chance exceeds this bound in one of 75 recordings.
+        synchronised cameras besides the master, chance exceeds this bound in one of 75 recordings.
         """
         apart = (np.abs(self.late) > 3.0 * self.sigma)[self.known].any()
         return self if apart else StatedStarts.nothing(len(self.late))

@@ -48,7 +48,7 @@ def run(
     failed: Mapping[str, str] | None = None,
     changed: Sequence[tuple[str, str, str]] = (),
 ) -> Path:
-    """Merge the sequences' summaries; returns the site's first page.
+    """Merge the sequences' summaries; returns the path of the site's first page.
 
     Summaries that are missing or broken are logged, left out and listed on the page. Raises
     UserError if no sequence is left.

@@ -49,14 +49,14 @@ def run(
 ) -> None:
     """Track the object through the recording and write the object_track artefact.
 
-    If ``object_`` is None (a person alone) or the object is found in no image, all frames are
-    written as lost, without a pose.
+    All frames are written as lost, without a pose, if ``object_`` is None (a person alone), if the
+    object is found in no frame, or if the images do not support the track as a whole.
 
     The track agrees with the annotated ``poses``, unless the images clearly contradict them.
     Without annotated poses, the object is searched for.
 
-    Raises UserError if the mesh or an input artefact is unusable, or if an annotated frame does not
-    exist.
+    Raises UserError if the mesh or an input artefact is unusable, if no camera has images and a
+    pose, or if an annotated frame does not exist.
     """
     if object_ is None:
         with Frames.open(frames) as recording:

@@ -212,7 +212,7 @@ class Detector:
         passer_by: np.ndarray,
         hidden: np.ndarray,
     ) -> list[list[np.ndarray]]:
-        """Add a second person (T, 135, 3) to each file where enough joints are visible."""
+        """Add a second person (T, 135, 3) to each file unless missed or mostly hidden."""
         noise = self.noise
         rng = noise.detector_rng("passer-by", camera.name)
         one, common = np.ones((self.frames, 1)), np.zeros(self.frames)

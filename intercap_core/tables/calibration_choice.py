@@ -107,5 +107,5 @@ def _residual(a: Camera, b: Camera, depth_a: np.ndarray, depth_b: np.ndarray) ->
     column, row = np.rint(lens.project(points)).astype(np.int64).T
     measured = depth_b[np.minimum(row, lens.height - 1), np.minimum(column, lens.width - 1)] * 1e-3
     distance = np.abs(measured - points[:, 2])[measured > 0]
-    near = distance[distance < 0.3]  # metres; a farther surface hides the point from b
+    near = distance[distance < 0.3]  # metres; beyond that, b sees another surface
     return float(np.median(near)) if len(near) >= 500 else np.nan

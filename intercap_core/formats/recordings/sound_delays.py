@@ -120,8 +120,8 @@ def _lag(window: np.ndarray, whole: np.ndarray, nfft: int, count: int) -> int | 
     best = int(power.argmax())
     near = round(0.03 * SOUND_RATE)  # first echoes of a room: a detour of 10 m
     others = np.concatenate([power[: max(0, best - near)], power[best + near + 1 :]])
-    # The mean over eight samples of unrelated noise (chi square) exceeds the average eight times
-    # by chance once in 1e10 delays. The factor to the next highest peak is tuned on the studio.
+    # In unrelated noise (chi square), a mean over eight samples exceeds eight times the average at
+    # one of 1e10 delays. The factor to the next highest peak is tuned on the studio.
     if not len(others) or power[best] < 8.0 * others.mean() or power[best] < 1.5 * others.max():
         return None
     return best - (len(window) - 1)

@@ -26,8 +26,8 @@ from intercap_core.geometry.solve.thread_pool import ThreadPool
 # Triangles with a corner nearer than this are skipped, metres: the range of the Azure Kinect begins
 # at 0.25 m (data sheet).
 NEAR_M = 0.05
-# Margin of the window around the projected vertices: distorted edges bend outward by less than this
-# in known lenses, pixels.
+# Margin of the window around the projected vertices, pixels: in known lenses, distorted edges reach
+# beyond the bounding box of their corners by less than this.
 BOX_MARGIN_PX = 2
 NO_FACE = -1
 
@@ -233,7 +233,7 @@ def _draw(corners, pixels, x0, y0, faces, rays, focal, cull_back, number, depth,
         n2x, n2y, n2z = cy * az - cz * ay, cz * ax - cx * az, cx * ay - cy * ax
         sx, sy, sz = n0x + n1x + n2x, n0y + n1y + n2y, n0z + n1z + n2z  # the plane's normal
         sign = 1.0 if volume > 0.0 else -1.0
-        narrow = extent > 6.0  # px; in larger triangles it is faster to bound each row by the edges
+        narrow = extent > 6.0  # px; bounding each row by the edges is faster in larger triangles
         if narrow:
             _bound(0, pixels[i], pixels[j], pixels[k], x0, y0, slack, bounds)
             _bound(1, pixels[j], pixels[k], pixels[i], x0, y0, slack, bounds)
@@ -275,7 +275,9 @@ def _bound(edge, p, q, opposite, x0, y0, slack, bounds):
     du, dv = q[0] - p[0], q[1] - p[1]
     inner = du * (opposite[1] - p[1]) - dv * (opposite[0] - p[0])
     side = 1.0 if inner > 0.0 else -1.0
-    across, along = -side * dv, side * du  # of the distance from the edge, times its length
+    # a pixel's distance inside the edge, times the edge's length, is
+    # across * (its column - p's) + along * (its row - p's)
+    across, along = -side * dv, side * du
     if inner == 0.0 or abs(across) < 1e-9:
         bounds[edge, 2] = 0.0
         return

@@ -184,7 +184,7 @@ class BodyData(JointTerm):
             evidence.observations = replace(evidence.observations, time_offset=time_offset)
 
     def camera_evidence(self, state: State, share: float) -> CameraEvidence:
-        """Form of E_B by body and cameras at ``state``; ``share`` is a frame's weight."""
+        """Gauss-Newton form of E_B by body and cameras; ``share`` is a frame's weight."""
         self._place(state)
         count = FREEDOMS * len(self._fitter.evidence.observations.rig)
         hessian, gradient, _ = self._equations(state)
@@ -235,7 +235,10 @@ class BodyData(JointTerm):
         return offsets
 
     def take_offsets(self, offset: np.ndarray) -> float:
-        """Use these time offsets (C,), seconds; returns the largest change."""
+        """Use these time offsets (C,), seconds, unless all changes are negligible.
+
+        Returns the largest change.
+        """
         evidence = self._fitter.evidence
         change = float(np.abs(offset - self.time_offset).max())
         if change > 0.0003:  # seconds: a hand at 3 m/s moves a millimetre

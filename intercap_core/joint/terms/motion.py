@@ -3,7 +3,7 @@
     E_A = 1 / (T - 2) sum over t of || W'_(t-1) + W'_(t+1) - 2 W'_t ||^2  over object vertices W'
     E_S = 1 / (Q (T - 2)) sum over t of || z_(t+1) - z_t ||^2  over latents z of LEMO's network
 
-with T frames, A.2's latent vectors z and Q, the number of LEMO's virtual markers (not Q_t). E_S is
+with T frames, the latent vectors z of A.2, and Q, the number of LEMO's virtual markers. E_S is
 :class:`LearnedMotion` if the user supplies LEMO's weights; otherwise :class:`BodyMotion`, which has
 E_A's form over the body's joints. For a rigid body E_A depends on the vertices only through their
 mean and covariance, so that six points with the same moments give the same energy.
@@ -137,16 +137,22 @@ class LearnedMotion(JointTerm):
 
         E_S = k / 2 sum over t of || z(t+1) - z(t) ||^2,  Z = F_S(steps of the markers)
 
-    F_S is :class:`intercap_core.body.lemo.MotionEncoder`. k stands for 1 / Q(T - 2): a body that
-    translates with random everyday accelerations costs as much as in :class:`BodyMotion` if that
-    were not robust.
+    F_S is :class:`intercap_core.body.lemo.MotionEncoder`. The factor k, which includes the setting,
+    replaces 1 / Q(T - 2). It is chosen on an "everyday motion", a body that translates with random
+    accelerations of ``BODY_ACCELERATION``: E_S costs as much there as plain squares of all joints'
+    accelerations over ``BODY_ACCELERATION`` (:class:`BodyMotion` without robustness).
 
     Energy and gradient are exact: automatic differentiation up to the markers, then the body's
-    Jacobian. The exact curvature couples 22 frames, of which three fit into the bands of the
-    equations; an upper bound replaces it. Except for the signs at its leaky ReLUs the encoder
-    commutes with a shift in time: with K its derivative, z(t+1) - z(t) changes by K times the
-    change da of the markers' acceleration, so that k |K|^2 |da|^2 / 2 (spectral norm) bounds the
-    curvature. K is taken at the everyday motion above. If ReLUs differ, the bound does not hold; a
+    Jacobian. The exact curvature couples 22 frames, but the bands of the equations hold only three,
+    so that an upper bound replaces it:
+
+    - Let K be the encoder's derivative by steps over their spread, and da a change of the markers'
+      accelerations (second differences over spread).
+    - If all leaky ReLUs keep their signs, the encoder commutes with a shift in time. Then
+      z(t+1) - z(t) changes by K da, and the energy's second-order part is at most
+      k |K|^2 |da|^2 / 2 with the spectral norm |K|.
+
+    |K| is computed at the everyday motion. Where ReLUs have other signs, the bound may not hold; a
     step that raises the energy is then refused and damped.
     """
 

@@ -63,7 +63,7 @@ INTERACTIONS: dict[str, type[Interaction]] = {
         stoop_bend=0.42,
     ),
     "cup_drink": _script(Drinking, "cup"),
-    "bottle_drink": _script(  # it leans over the horizontal: its bottom is higher than the lips
+    "bottle_drink": _script(  # tilted beyond the horizontal: its bottom is above the lips
         Drinking, "bottle", tilt_deg=(66.0, 80.0), head_back=0.42, grip_height_m=0.01,
         lips_at_edge=False,
     ),
