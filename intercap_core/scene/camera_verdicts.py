@@ -140,7 +140,7 @@ class PoseJudge:
         """Verdict of each of the ``cameras``.
 
         Doubtful cameras are compared a second time. All of them then have their given poses, and
-        the rest of the rig is refined anew around them.
+        the other cameras are refined again with these fixed.
         """
         verdicts = {}
         for c in cameras:

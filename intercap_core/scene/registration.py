@@ -32,7 +32,7 @@ from intercap_core.scene.surfaces import DepthSurface
 SURFACE_SIGMA_FLOOR_M = 0.003
 PRIOR_TRANSLATION_M = 0.01  # error of a careful calibration; tuned on the studio
 PRIOR_ROTATION_RAD = np.radians(0.5)  # error of a careful calibration; tuned on the studio
-HELD_OUT_EVERY = 4  # one of so many points is held out; untuned
+HELD_OUT_EVERY = 4  # every fourth point is held out; untuned
 # Largest distance of a point to the nearest point of the other surface; exceeds the widest gate.
 # Tuned on the studio.
 SURFACE_SEARCH_M = 0.12
