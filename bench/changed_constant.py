@@ -8,12 +8,14 @@ import importlib.util
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from intercap_core.errors import UserError
+from intercap_core.kernel_cache import kernel_modules
 
 PACKAGE = "intercap_core"
 ROOT = Path(__file__).resolve().parents[1] / PACKAGE
@@ -67,6 +69,32 @@ def find_constants(selector: str, *, root: Path = ROOT) -> list[Constant]:
 
 def _module(file: Path, root: Path) -> str:
     return ".".join((PACKAGE, *file.relative_to(root).with_suffix("").parts))
+
+
+def kernels_with(module: str) -> list[str]:
+    """Names ``folder.file`` of the modules whose kernels may contain a constant of ``module``.
+
+    These are the module and those that import it, directly or indirectly.
+    """
+    imported = _imports_of_kernels()
+    found = {module}
+    while more := {name for name, uses in imported.items() if uses & found} - found:
+        found |= more
+    return sorted(".".join(name.split(".")[-2:]) for name in found)
+
+
+@cache
+def _imports_of_kernels() -> dict[str, set[str]]:
+    """Names that each module which a kernel can reach imports from the package."""
+    imported: dict[str, set[str]] = {}
+    for name, text in kernel_modules().items():
+        imported[name] = names = set()
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+            elif isinstance(node, ast.Import):
+                names |= {alias.name for alias in node.names}
+    return imported
 
 
 def bound_constants(statement: ast.stmt) -> list[str]:

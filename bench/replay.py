@@ -1,16 +1,20 @@
-"""Replay a stage from stored artefacts, with another value of one constant, in this process.
+"""Replay a stage from stored artefacts, with another value of one constant.
 
-    python -m bench.replay TASK OUTPUT
+    python -m bench.replay
 
-``TASK`` is the JSON of a :class:`Task`; its :class:`Outcome` is written to ``OUTPUT``. Called by
-:mod:`bench.sensitivity` in a new process for each value, because a changed constant must be
-imported before the modules that use it.
+Started by :mod:`bench.sensitivity`. Reads the JSON of a :class:`Task` and the path of an output
+file from each line of the standard input, writes the task's :class:`Outcome` and prints the exit
+status. Each task runs in a fork of this process, because a changed constant must be imported before
+the modules that use it. The fork has the libraries already, whose import takes seconds, and no
+module of the package that has constants.
 """
 
 from __future__ import annotations
 
 import hashlib
+import importlib
 import json
+import os
 import sys
 import tempfile
 import time
@@ -21,7 +25,13 @@ from typing import Any
 
 from bench.changed_constant import Constant, import_changed, scaled
 from intercap_core.errors import UserError
+from intercap_core.kernel_cache import VARIABLE, use_kernel_cache
 
+# Libraries that most stages import
+LIBRARIES = (
+    *("numba", "torch", "cv2", "h5py", "pandas", "pydantic", "trimesh", "scipy.ndimage"),
+    *("scipy.optimize", "scipy.sparse.csgraph", "scipy.spatial.transform", "scipy.stats"),
+)
 # Of segmentation, the figures are those of the object's track without a detector's candidates
 IMAGES_ONLY = {"person": {"segmentation": "images"}}
 
@@ -127,13 +137,44 @@ def _text(value: Any) -> str:
     return f"{value:.4g}"
 
 
-def main(text: str, output: str) -> None:
-    """Replay one task and write its outcome."""
-    content = json.loads(text)
-    constant = content.pop("constant")
-    task = Task(**content, constant=Constant(**constant) if constant else None)
-    Path(output).write_text(json.dumps(asdict(replay(task))), encoding="utf-8")
+def main() -> None:
+    """Replay the tasks of the standard input."""
+    for name in LIBRARIES:
+        importlib.import_module(name)
+    for line in sys.stdin:
+        request = json.loads(line)
+        child = os.fork()
+        if child == 0:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            _write_outcome(**request)
+            os._exit(0)
+        _, status = os.waitpid(child, 0)
+        print(os.waitstatus_to_exitcode(status), flush=True)
+
+
+def _write_outcome(task: dict[str, Any], output: str, stale: list[str]) -> None:
+    constant = task.pop("constant")
+    _use_kernels_without(stale, Path(output).parent)
+    outcome = replay(Task(**task, constant=Constant(**constant) if constant else None))
+    Path(output).write_text(json.dumps(asdict(outcome)), encoding="utf-8")
+
+
+def _use_kernels_without(stale: list[str], folder: Path) -> None:
+    """Use links to the compiled kernels in ``folder``, except for those of ``stale`` modules.
+
+    Numba compares a kernel's own file only, not the constants of other modules that it contains.
+    """
+    compiled = Path(os.environ[VARIABLE])
+    os.environ[VARIABLE] = str(folder)
+    own = use_kernel_cache()
+    assert own is not None
+    for path in compiled.glob("*/*.nb[ic]"):
+        module = f"{path.parent.name.rpartition('_')[0]}.{path.name.partition('.')[0]}"
+        if module not in stale:
+            target = own / path.relative_to(compiled)
+            target.parent.mkdir(exist_ok=True)
+            target.symlink_to(path)
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main()

@@ -27,15 +27,15 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from pathlib import Path
+from queue import Queue
 from threading import Lock
 
 from bench.again import check_run, content_of
-from bench.changed_constant import Constant, find_constants
+from bench.changed_constant import Constant, find_constants, kernels_with
 from bench.command import exit_on_user_error
 from bench.replay import IMAGES_ONLY, Outcome, Task
 from bench.stage_figures import FLAGS, STAGES_WITH_FIGURES
 from intercap_core.errors import UserError
-from intercap_core.kernel_cache import kernel_modules
 from intercap_core.project import load_project
 
 SETTINGS = Path("config/demo/config.yaml")
@@ -68,7 +68,9 @@ class Replays:
     def __init__(self, path: Path, jobs: int) -> None:
         self._path, self._jobs, self._lock = path, jobs, Lock()
         self._known = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-        self._kernels = kernel_modules()
+        self._servers: Queue[subprocess.Popen[str]] = Queue()
+        for _ in range(jobs):
+            self._servers.put(_start_server())
         self._contents: dict[str, str] = {}
 
     def run(self, tasks: Sequence[Task]) -> list[Outcome]:
@@ -100,20 +102,28 @@ class Replays:
         return Outcome(**self._known[key])
 
     def _start(self, task: Task) -> Outcome:
-        environment = os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+        stale = kernels_with(task.constant.module) if task.constant is not None else []
         with tempfile.TemporaryDirectory() as folder:
-            # numba's cache does not notice that a value which was compiled into a kernel changed
-            if task.constant is not None and task.constant.module in self._kernels:
-                environment["NUMBA_CACHE_DIR"] = folder
             output = Path(folder) / "outcome.json"
-            process = subprocess.run(
-                [sys.executable, "-m", "bench.replay", json.dumps(asdict(task)), str(output)],
-                env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
-            )  # fmt: skip
-            if process.returncode:
-                last = (process.stderr.strip().splitlines() or ["no message"])[-1]
-                return Outcome("", "", "", {}, 0.0, last)
+            request = {"task": asdict(task), "output": str(output), "stale": stale}
+            server = self._servers.get()
+            assert server.stdin is not None and server.stdout is not None
+            server.stdin.write(json.dumps(request) + "\n")
+            server.stdin.flush()
+            status = server.stdout.readline().strip()
+            self._servers.put(server)
+            if status != "0":
+                return Outcome("", "", "", {}, 0.0, f"the process ended with status {status}")
             return Outcome(**json.loads(output.read_text(encoding="utf-8")))
+
+
+def _start_server() -> subprocess.Popen[str]:
+    """A process that replays the tasks that it is sent, one after another, on one thread."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "bench.replay"],
+        env=os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"},
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
+    )  # fmt: skip
 
 
 def changes(unchanged: Outcome, other: Outcome) -> dict[str, tuple[float, float, float]]:
