@@ -22,6 +22,9 @@ PROJECT_ROOT = Path(__file__).resolve().parents[1]
 
 # Folders whose tests share a long run: all their tests stay on one worker.
 TOGETHER = ("workflow", "slurm")
+# Folders in the order in which they start; the others follow. The first ones compile most kernels,
+# which the processes of the next would compile again.
+FIRST = ("body_fit", "joint", *TOGETHER)
 # Not in `make test-fast`: folders and files that start processes, render captures or fit sequences,
 # and files that take more than some 3 s (`--durations`, warm kernels).
 SLOW = (
@@ -113,7 +116,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark slow tests and tests of the second tier; put the folders of TOGETHER first."""
+    """Mark slow tests and tests of the second tier; put the folders of FIRST first."""
     places = {item: item.path.relative_to(PROJECT_ROOT / "tests") for item in items}
     for item, place in places.items():
         if any(place.is_relative_to(folder) for folder in SLOW):
@@ -121,7 +124,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         smoke = getattr(item, "originalname", item.name) in SMOKE
         if not smoke and any(place.is_relative_to(folder) for folder in FULL):
             item.add_marker(pytest.mark.full)
-    items.sort(key=lambda item: places[item].parts[0] not in TOGETHER)
+    order = {folder: rank for rank, folder in enumerate(FIRST)}
+    items.sort(key=lambda item: order.get(places[item].parts[0], len(FIRST)))
 
 
 @pytest.fixture(scope="session")
