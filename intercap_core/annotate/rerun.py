@@ -50,10 +50,7 @@ class EditedProject(Project):
 def stale_stages(project: Project, sequence: str) -> list[dict[str, Any]]:
     """Return the stages that a run would compute, in order, with the reasons."""
     with _PLANNING:
-        plan = Plan(project)
-        states = plan.states(sequence).items()
-        if not isinstance(project, EditedProject):
-            plan.save()
+        states = Plan(project).states(sequence).items()
     return [
         {"stage": stage, "reasons": list(state.reasons)}
         for stage, state in states

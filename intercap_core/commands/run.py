@@ -151,10 +151,7 @@ def _run(
 
     If some sequences fail, the outputs of all sequences are made from the others.
     """
-    plan = Plan(project)
-    done = not arguments and plan.all_done()
-    plan.save()
-    if done:
+    if not arguments and Plan(project).all_done():
         count = len(project.sequences)
         console.print(f"nothing to do: all {count} sequences are done", highlight=False)
         _print_report(project, console)

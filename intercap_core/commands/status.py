@@ -66,7 +66,6 @@ def status(project: Project) -> Status:
     plan = Plan(project)
     sequences = {name: _of_sequence(project, plan, name) for name in project.sequences}
     dataset = plan.dataset
-    plan.save()
     words = {OutputStatus.done: DONE, OutputStatus.missing: MISSING, OutputStatus.stale: STALE}[
         dataset.status
     ]

@@ -2,9 +2,9 @@
 
 A recording has gigabytes. The checksum of each input is stored with its size and date next to the
 results of the sequence. A start with nothing to do therefore reads no recording; a touched or
-copied file is read once and makes nothing stale. The checksum of each artefact is stored in the
-same way: another size or date shows that an artefact may be truncated or overwritten, and only then
-is its content compared. All stored values may be lost without harm.
+copied file is read once and makes nothing stale. The checksum and the manifest of each artefact are
+stored in the same way: another size or date shows that an artefact may be truncated or overwritten,
+and only then is it opened. All stored values may be lost without harm.
 """
 
 from __future__ import annotations
@@ -18,11 +18,13 @@ from typing import Any
 
 from intercap_core import artefacts, schemas
 from intercap_core.artefacts import part_of
+from intercap_core.errors import UserError
+from intercap_core.pipeline.provenance import FILE, Manifest, read_manifest
 from intercap_core.stages.folders import EXPORT_MARKER
 
 INPUTS_FILE = ".inputs.json"
 _SUFFIX = ".left"  # suffix of the file that stores the checksum of an output
-_MANIFEST = "record"  # key of the digest of the manifest in that file
+_MANIFEST = "manifest"  # key of the manifest in that file
 _MAX_LISTED = 200  # files of a folder up to which each file's size and date are compared
 _LARGE_BYTES = 100_000_000  # a larger file with another size counts as changed, unread
 _ROWS = 64  # rows read at a time, so that memory stays flat
@@ -113,7 +115,7 @@ def remember_output(output: Path) -> None:
     with contextlib.suppress(OSError, artefacts.Unreadable):
         values = {
             output.name: [_output_stamp(output), _file_digest(output)],
-            _MANIFEST: [_manifest_digest(output), ""],
+            _MANIFEST: [_manifest_text(output), ""],
         }
         write_pairs(_checksum_file(output), values)
 
@@ -141,7 +143,7 @@ def find_damage(output: Path) -> str:
         if output.name in stored:
             if _file_digest(output) == stored[output.name][1]:
                 return ""
-            if stored.get(_MANIFEST, ["", ""])[0] == _manifest_digest(output):
+            if stored.get(_MANIFEST, ["", ""])[0] == _manifest_text(output):
                 return f"{output}: is not as it was written; delete it and run again"
         if output.suffix != ".h5":
             return ""
@@ -175,11 +177,38 @@ def _find_damaged_file(folder: Path) -> str:
     )
 
 
-def _manifest_digest(output: Path) -> str:
-    """Digest of an artefact's manifest; "" for other files."""
-    if output.suffix != ".h5":
-        return ""
-    return hashlib.sha256(artefacts.made_from(output).encode()).hexdigest()
+def read_valid_manifest(output: Path) -> Manifest | None:
+    """The manifest of an output; None if it has none or if the output is a damaged artefact.
+
+    An artefact is opened, and then read completely, only if its size or date differs from the
+    stored one. Raises UserError if the output cannot be read.
+    """
+    is_artefact = output.suffix == ".h5"
+    file = output if is_artefact else output / FILE
+    try:
+        file.open("rb").close()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise UserError(
+            f"{file}: cannot be read ({error.strerror}); make it readable, or delete it, then run "
+            "again"
+        ) from None
+    if not is_artefact:
+        return read_manifest(output)
+    stored = read_pairs(_checksum_file(output))
+    if _MANIFEST in stored and is_unchanged(output):
+        return Manifest.from_text(stored[_MANIFEST][0])
+    manifest = read_manifest(output)
+    if manifest is None or find_damage(output):
+        return None
+    remember_output(output)
+    return manifest
+
+
+def _manifest_text(output: Path) -> str:
+    """Text of an artefact's manifest; "" for other files."""
+    return artefacts.made_from(output) if output.suffix == ".h5" else ""
 
 
 def _checksum_file(output: Path) -> Path:

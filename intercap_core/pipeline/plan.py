@@ -23,12 +23,10 @@ from intercap_core.pipeline.checksums import (
     InputChecksums,
     find_damage,
     is_unchanged,
-    read_pairs,
-    remember_output,
-    write_pairs,
+    read_valid_manifest,
 )
 from intercap_core.pipeline.job import last_failure
-from intercap_core.pipeline.provenance import FILE, Manifest, read_manifest
+from intercap_core.pipeline.provenance import Manifest, read_manifest
 from intercap_core.pipeline.stage_inputs import (
     STUDIO,
     dataset_manifest,
@@ -44,7 +42,6 @@ DATASET_OUTPUTS = (
     "croissant.json",
 )  # fmt: skip
 MARKS = Path(".snakemake") / "out_of_date"
-_CACHE_FILE = ".records.json"  # manifests by output, with its size and date
 _LATER_S = 1.0  # time by which a mark is newer than its output
 
 
@@ -77,7 +74,6 @@ class Plan:
         self.project = project
         self._sequences: dict[str, dict[str, OutputState]] = {}
         self._annotation_faults: dict[str, str] = {}
-        self._manifests = _ManifestCache(project.results)
 
     def states(self, sequence: str) -> dict[str, OutputState]:
         """States of a sequence by stage; "studio" comes first if it makes the recording."""
@@ -97,7 +93,7 @@ class Plan:
         if not all(file.exists() for file in files):
             return OutputState(OutputStatus.missing, (), current.fingerprint)
         damaged = any(find_damage(file) for file in checked_files(files) if not is_unchanged(file))
-        manifest = None if damaged else self._manifests.read(self.project.results)
+        manifest = None if damaged else read_manifest(self.project.results)
         return _compare(self.project.results, manifest, current)
 
     def output(self, sequence: str, stage: str) -> Path:
@@ -164,10 +160,6 @@ class Plan:
                 self.mark(name, stage)
         self.mark("", DATASET)
 
-    def save(self) -> None:
-        """Store the manifests that were read, so that the next start opens no artefact."""
-        self._manifests.save()
-
     def _state(self, sequence: str, stage: str) -> OutputState:
         return self.dataset if stage == DATASET else self.states(sequence)[stage]
 
@@ -192,7 +184,7 @@ class Plan:
         fingerprints: dict[str, str] = {}
         for stage, declared in STAGES.items():
             path = self.output(sequence, stage)
-            before = self._manifests.read(path)
+            before = read_valid_manifest(path)
             current = stage_manifest(
                 self.project,
                 sequence,
@@ -224,7 +216,7 @@ class Plan:
         path = self.output(sequence, STUDIO)
         if not all((path / name).is_file() for name in ("capture.json", "truth.h5")):
             return OutputState(OutputStatus.missing, (), current.fingerprint)
-        return _compare(path, self._manifests.read(path), current)
+        return _compare(path, read_valid_manifest(path), current)
 
     def _wait_for_annotation(
         self, sequence: str, error: UserError
@@ -277,47 +269,3 @@ def _dated_files(output: Path) -> list[Path]:
     """Files whose date Snakemake may take for that of an output."""
     names = (".snakemake_timestamp", "capture.json", "truth.h5")
     return [path for path in (output, *(output / name for name in names)) if path.exists()]
-
-
-class _ManifestCache:
-    """Manifests of outputs; each output is opened once as long as its size and date stay.
-
-    An artefact that has changed is read through, and has no manifest if it is damaged.
-    """
-
-    def __init__(self, results: Path) -> None:
-        self._path = results / _CACHE_FILE
-        self._known = read_pairs(self._path)
-        self._changed = False
-
-    def read(self, output: Path) -> Manifest | None:
-        """The manifest of an output; None if it has none."""
-        is_artefact = output.suffix == ".h5"
-        file = output if is_artefact else output / FILE
-        try:
-            with open(file, "rb") as opened:
-                stat = os.fstat(opened.fileno())
-        except FileNotFoundError:
-            return None
-        except OSError as error:
-            raise UserError(
-                f"{file}: cannot be read ({error.strerror}); make it readable, or delete it, then "
-                "run again"
-            ) from None
-        key, stamp = str(output), f"{stat.st_size} {stat.st_mtime_ns} {stat.st_ino}"
-        known = self._known.get(key)
-        if known is not None and known[0] == stamp:
-            return Manifest.from_text(known[1])
-        manifest = read_manifest(output)
-        if manifest is not None and is_artefact and not is_unchanged(output):
-            if find_damage(output):
-                return None
-            remember_output(output)
-        if manifest is not None:  # an unreadable one may be readable later
-            self._known[key] = [stamp, manifest.to_text()]
-            self._changed = True
-        return manifest
-
-    def save(self) -> None:
-        if self._changed and self._path.parent.is_dir():
-            write_pairs(self._path, self._known)

@@ -83,7 +83,6 @@ class ClusterRun:
         assert done.returncode == 0, done.stderr
 
 
-DATES = (".inputs.json", ".records.json")  # caches of file dates
 
 
 def contents(results: Path) -> dict[str, bytes]:
@@ -91,7 +90,7 @@ def contents(results: Path) -> dict[str, bytes]:
     return {
         path.relative_to(results).as_posix(): path.read_bytes()
         for path in sorted(results.rglob("*"))
-        if path.is_file() and path.name not in (".snakemake_timestamp", *DATES)
+        if path.is_file() and path.name not in (".snakemake_timestamp", ".inputs.json")
         if path.suffix != ".left"
     }
 

@@ -1,4 +1,3 @@
-import atexit
 import functools
 import re
 from pathlib import Path
@@ -42,7 +41,6 @@ if workflow.is_main_process:
         PLAN.mark_all()
     except (UserError, OSError) as error:
         raise WorkflowError(str(error)) from None
-    atexit.register(PLAN.save)
 VIRTUAL = [name for name in SEQUENCES if PROJECT.recordings_made(name) is not None]
 NOTHING = "(?!)"  # pattern without a match
 RESULTS = PROJECT.results.as_posix()
