@@ -110,19 +110,14 @@ def check(settings: Settings = DEFAULT_SETTINGS) -> None:
 
     Example: intercap check config/demo/config.yaml
     """
-    from intercap_core.commands.check import (
-        check_bodies,
-        check_detector,
-        check_sequences,
-        notes_of_sequences,
-    )
+    from intercap_core.commands.check import check_bodies, check_detector, check_sequences
     from intercap_core.pipeline.step import check_device
     from intercap_core.project import load_project
 
     project = load_project(settings)
     check_device(project)
     check_bodies(project)
-    notes = [*check_detector(project), *notes_of_sequences(project)]
+    notes = check_detector(project)
     start = time.monotonic()
     found = check_sequences(project)
     elapsed, faults = time.monotonic() - start, found.faults

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from intercap_core.annotation import Annotation
-from intercap_core.config import FramesSettings
-from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.project import Project, tidy
 
 if TYPE_CHECKING:
     from intercap_core.commands.check_recordings import RecordingFindings
-    from intercap_core.formats.recordings.source import RecordingLayout
 
 
 @dataclass(frozen=True)
@@ -67,6 +63,7 @@ def check_detector(project: Project) -> list[Fault]:
         PoseModel.load(settings)
     if settings.segmentation_model is None:
         return []
+    from intercap_core.commands.check_recordings import list_labels
     from intercap_core.formats.detections.onnx_segmentation import Segmenter
 
     classes = Segmenter.load(settings).classes
@@ -74,18 +71,13 @@ def check_detector(project: Project) -> list[Fault]:
         Fault(
             "",
             f"{settings.segmentation_model}: none of its {len(classes)} classes "
-            f"({_list_labels(classes)}) is a label of object {name!r} "
+            f"({list_labels(classes)}) is a label of object {name!r} "
             f"({', '.join(project.objects[name].labels)}); add the label to objects.yaml, or name "
             "the model's classes in detections.segmentation_labels",
         )
         for name in project.objects_named()
         if project.objects[name].labels and not {*project.objects[name].labels} & {*classes}
     ]
-
-
-def _list_labels(labels: list[str]) -> str:
-    more = f" and {len(labels) - 8} more" if len(labels) > 8 else ""
-    return ", ".join(labels[:8]) + more
 
 
 @dataclass
@@ -99,17 +91,21 @@ class Findings:
     summaries: list[Fault] = field(default_factory=list)
     """One line per usable recording."""
 
-
-def faults_of_sequences(project: Project) -> list[Fault]:
-    """The faults that :func:`check_sequences` finds, without its notes."""
-    return check_sequences(project).faults
+    def add(self, sequence: str, found: RecordingFindings) -> None:
+        """Add the findings on the recordings of a sequence."""
+        self.faults += [Fault(sequence, message) for message in found.faults]
+        self.notes += [Fault(sequence, message) for message in found.notes]
+        self.summaries += [Fault(sequence, found.summary)] if found.summary else []
 
 
 def check_sequences(project: Project) -> Findings:
     """Check annotation, files, mesh, camera poses and recordings of every sequence.
 
-    Reads a few images per recording. For virtual recordings, checks that the studio can make them.
+    Reads a few images and detections per recording. For virtual recordings, checks that the studio
+    can make them.
     """
+    from intercap_core.commands.check_recordings import check_row
+
     findings = Findings()
     meshes = {name: _check_mesh(project, name, findings) for name in project.objects_named()}
     faults = findings.faults
@@ -129,10 +125,7 @@ def check_sequences(project: Project) -> Findings:
         if project.recordings_made(name) is not None:
             faults += [Fault(name, message) for message in _faults_of_capture(project, name)]
             continue
-        recording = _check_files(row, project.config.frames)
-        faults += [Fault(name, message) for message in recording.faults]
-        findings.notes += [Fault(name, message) for message in recording.notes]
-        findings.summaries += [Fault(name, recording.summary)] if recording.summary else []
+        findings.add(name, check_row(project, row))
     return findings
 
 
@@ -151,114 +144,6 @@ def fault_of_cameras(project: Project, name: str, annotation: Annotation) -> str
     except (UserError, OSError):
         return None
     return annotation.check_cameras(list(extrinsics.master_from_colour), extrinsics.master)
-
-
-def notes_of_sequences(project: Project) -> list[Fault]:
-    """Notes on cameras without recording or detections, which do not end a run.
-
-    Skips virtual recordings and those that cannot be used at all.
-    """
-    return [
-        Fault(name, message)
-        for name, row in project.sequences.items()
-        if project.recordings_made(name) is None
-        and row.recordings.is_dir()
-        and row.calibration.exists()
-        for message in _notes_of_cameras(project, row)
-    ]
-
-
-def _notes_of_cameras(project: Project, row: SequenceEntry) -> list[str]:
-    """Notes on cameras without recordings, keypoints or candidates, and on the files' contents."""
-    from intercap_core.formats.detections.candidate_files import has_candidates
-    from intercap_core.formats.detections.keypoint_files import has_keypoints, preview_keypoints
-    from intercap_core.formats.recordings.layouts import open_layout
-
-    try:
-        layout = open_layout(row)
-    except UserError:
-        return []
-    known = list(layout.extrinsics.master_from_colour)
-    notes = []
-    absent = [name for name in known if name not in layout.names]
-    if absent and layout.names:
-        notes.append(
-            f"{row.recordings} records {', '.join(layout.names)}; {row.calibration} also has "
-            f"{', '.join(absent)}: add their recordings or correct the file names if they exist"
-        )
-    recorded = [name for name in known if name in layout.names]
-    in_recordings = row.layout == "behave"
-    settings = project.config.detections
-    segmented = settings.segmentation_model is not None
-    has_model = segmented or settings.keypoint_model is not None
-    has_files = row.keypoints is not None or row.candidates is not None or in_recordings
-    if recorded and not has_files and not has_model:
-        notes.append(
-            "its row names neither keypoints nor candidates, so only the frames can be computed; "
-            "run the detectors and add the columns"
-        )
-    if row.keypoints is not None and row.keypoints.is_dir():
-        folder = row.keypoints
-        without = [n for n in recorded if not has_keypoints(folder, n)]
-        if settings.keypoint_model is None:
-            notes += [
-                f"{folder} has no folder {name} and no {name}.json; add this camera's keypoints"
-                for name in without
-            ]
-        having = [name for name in recorded if name not in without]
-        full = settings.keypoint_full_confidence
-        for name in having:
-            size = _colour_size(layout, name)
-            if size is not None:
-                notes += preview_keypoints(folder, name, size=size, full_confidence=full)
-    if row.candidates is not None and row.candidates.is_dir():
-        folder = row.candidates
-        having = [name for name in recorded if has_candidates(folder, name, row.layout)]
-        without = [name for name in recorded if name not in having and not segmented]
-        notes += [f"{folder} has no {name}.json; add this camera's candidates" for name in without]
-        notes += _notes_of_candidates(project, row, layout, having)
-    return notes
-
-
-def _colour_size(layout: RecordingLayout, camera: str) -> tuple[int, int] | None:
-    """Width and height of a camera's images; None if its recording cannot be opened."""
-    try:
-        with layout.open(camera) as recording:
-            return recording.camera.colour.width, recording.camera.colour.height
-    except UserError:
-        return None
-
-
-def _notes_of_candidates(
-    project: Project, row: SequenceEntry, layout: RecordingLayout, cameras: list[str]
-) -> list[str]:
-    """Notes on format, size and labels of the first candidates of each camera."""
-    from intercap_core.formats.detections.candidate_files import preview_candidates
-    from intercap_core.formats.detections.class_names import class_names
-
-    assert row.candidates is not None
-    settings = project.config.detections
-    notes: list[str] = []
-    labels: set[str] = set()
-    for name in cameras:
-        size = _colour_size(layout, name)
-        if size is None:
-            continue
-        preview = preview_candidates(
-            row.candidates, name, size=size, names=class_names(settings.category_names)
-        )
-        notes += preview.notes
-        labels |= preview.labels
-    entry = project.object_of(row.sequence)
-    expected = () if entry is None else entry.labels
-    if labels and expected and not labels & {*expected}:
-        named = sorted(label or "no label" for label in labels)
-        notes.append(
-            f"{row.candidates}: the labels of the first results are {_list_labels(named)}; "
-            f"object {row.object!r} expects {', '.join(expected)}; add its labels to "
-            "objects.yaml, or set detections.category_names"
-        )
-    return notes
 
 
 def _annotations_without_sequence(project: Project) -> list[Fault]:
@@ -313,69 +198,3 @@ def _faults_of_capture(project: Project, name: str) -> list[str]:
     except UserError as error:
         return [f"{project.path}: {error}"]
     return []
-
-
-def _check_files(row: SequenceEntry, settings: FramesSettings) -> RecordingFindings:
-    """Check that the files of a row exist, then its recordings."""
-    from intercap_core.commands.check_recordings import RecordingFindings
-
-    faults = []
-    for column in ("calibration", "keypoints", "candidates", "results", "truth"):
-        path = getattr(row, column)
-        if path is not None and not path.exists():
-            faults.append(f"column {column} names {path}, which does not exist")
-    if row.truth is not None and row.truth.exists():
-        faults += faults_of_truth(row.truth)
-    if not row.recordings.is_dir():
-        return RecordingFindings(
-            faults=[f"column recordings names {row.recordings}, which is not a folder", *faults]
-        )
-    if not row.calibration.exists():
-        return RecordingFindings(faults=faults)
-    findings = _check_recordings(row, settings)
-    findings.faults[:0] = faults
-    return findings
-
-
-def faults_of_truth(path: Path) -> list[str]:
-    """Error message if a file in the column truth is no truth file; [] otherwise."""
-    from intercap_core import artefacts
-    from intercap_core.schemas import TRUTH
-
-    try:
-        with artefacts.read(path, TRUTH):
-            return []
-    except UserError as error:
-        return [f"column truth names a file without truth: {error}"]
-
-
-def _check_recordings(row: SequenceEntry, settings: FramesSettings) -> RecordingFindings:
-    """Check the names and poses of a row's cameras, then the recordings of those with a pose."""
-    from intercap_core.commands.check_recordings import RecordingFindings, check_recordings
-    from intercap_core.formats.recordings.layouts import open_layout
-
-    try:
-        layout = open_layout(row)
-    except UserError as error:
-        return RecordingFindings(faults=[str(error)])
-    if not layout.names:
-        return RecordingFindings(
-            faults=[f"{row.recordings} contains no recording in the layout {row.layout}"]
-        )
-    cameras = settings.cameras
-    known = list(layout.extrinsics.master_from_colour)
-    faults = [
-        f"the setting frames.cameras names {name!r}, {row.recordings} has {', '.join(layout.names)}"
-        for name in cameras
-        if name not in known and name not in layout.names
-    ]
-    used = [name for name in layout.names if not cameras or name in cameras]
-    faults += [
-        f"{row.calibration}: has no pose of {name}, which {row.recordings} records; add the camera"
-        for name in used
-        if name not in known
-    ]
-    posed = [name for name in used if name in known]
-    findings = check_recordings(row, layout, posed, without_depth=not settings.depth)
-    findings.faults[:0] = faults
-    return findings

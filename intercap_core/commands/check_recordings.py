@@ -1,4 +1,4 @@
-"""Check a sequence's recordings in a fraction of a second: sizes, lengths, numbers of images."""
+"""Check the files of a sequence's row in a fraction of a second: recordings and detections."""
 
 from __future__ import annotations
 
@@ -10,10 +10,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from intercap_core import artefacts
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.detections import candidate_files, keypoint_files
+from intercap_core.formats.detections.class_names import class_names
+from intercap_core.formats.recordings.layouts import open_layout
 from intercap_core.formats.recordings.source import RecordingLayout, RecordingPreview
+from intercap_core.project import Project
+from intercap_core.schemas import TRUTH
 
 # Length of a recording as a share of the other cameras' or of the length that its header states.
 MIN_LENGTH_SHARE = 0.5  # a shorter one is a fault
@@ -48,7 +53,131 @@ class RecordingFindings:
     faults: list[str] = field(default_factory=list)
     """Faults that cost a camera or most of its images."""
     notes: list[str] = field(default_factory=list)
-    """Smaller losses."""
+    """Smaller losses and probable mistakes."""
+    sizes: dict[str, tuple[int, int]] = field(default_factory=dict)
+    """Width and height that the calibration states, by camera whose recording could be opened."""
+
+
+def check_row(project: Project, row: SequenceEntry) -> RecordingFindings:
+    """Check that the files of a row exist, then its recordings, keypoints and candidates."""
+    faults = []
+    for column in ("calibration", "keypoints", "candidates", "results", "truth"):
+        path = getattr(row, column)
+        if path is not None and not path.exists():
+            faults.append(f"column {column} names {path}, which does not exist")
+    if row.truth is not None and row.truth.exists():
+        faults += faults_of_truth(row.truth)
+    if not row.recordings.is_dir():
+        faults.insert(0, f"column recordings names {row.recordings}, which is not a folder")
+    if not row.recordings.is_dir() or not row.calibration.exists():
+        return RecordingFindings(faults=faults)
+    try:
+        layout = open_layout(row)
+    except UserError as error:
+        return RecordingFindings(faults=[*faults, str(error)])
+    if not layout.names:
+        faults.append(f"{row.recordings} contains no recording in the layout {row.layout}")
+        return RecordingFindings(faults=faults)
+    settings = project.config.frames
+    known = list(layout.extrinsics.master_from_colour)
+    faults += [
+        f"the setting frames.cameras names {name!r}, {row.recordings} has {', '.join(layout.names)}"
+        for name in settings.cameras
+        if name not in known and name not in layout.names
+    ]
+    used = [name for name in layout.names if not settings.cameras or name in settings.cameras]
+    faults += [
+        f"{row.calibration}: has no pose of {name}, which {row.recordings} records; add the camera"
+        for name in used
+        if name not in known
+    ]
+    posed = [name for name in used if name in known]
+    findings = check_recordings(row, layout, posed, without_depth=not settings.depth)
+    findings.faults[:0] = faults
+    absent = [name for name in known if name not in layout.names]
+    if absent:
+        findings.notes.append(
+            f"{row.recordings} records {', '.join(layout.names)}; {row.calibration} also has "
+            f"{', '.join(absent)}: add their recordings or correct the file names if they exist"
+        )
+    findings.notes += _notes_on_keypoints(project, row, posed, findings.sizes)
+    findings.notes += _notes_on_candidates(project, row, posed, findings.sizes)
+    return findings
+
+
+def faults_of_truth(path: Path) -> list[str]:
+    """Error message if a file in the column truth is no truth file; [] otherwise."""
+    try:
+        with artefacts.read(path, TRUTH):
+            return []
+    except UserError as error:
+        return [f"column truth names a file without truth: {error}"]
+
+
+def _notes_on_keypoints(
+    project: Project, row: SequenceEntry, cameras: list[str], sizes: dict[str, tuple[int, int]]
+) -> list[str]:
+    """Notes on cameras without keypoints, and on the first keypoints of the others."""
+    settings = project.config.detections
+    has_model = settings.segmentation_model is not None or settings.keypoint_model is not None
+    has_files = row.keypoints is not None or row.candidates is not None or row.layout == "behave"
+    if cameras and not has_files and not has_model:
+        return [
+            "its row names neither keypoints nor candidates, so only the frames can be computed; "
+            "run the detectors and add the columns"
+        ]
+    folder, notes = row.keypoints, []
+    if folder is None or not folder.is_dir():
+        return []
+    full = settings.keypoint_full_confidence
+    for name in cameras:
+        if keypoint_files.has_keypoints(folder, name):
+            if name in sizes:
+                notes += keypoint_files.preview_keypoints(
+                    folder, name, size=sizes[name], full_confidence=full
+                )
+        elif settings.keypoint_model is None:
+            notes.append(
+                f"{folder} has no folder {name} and no {name}.json; add this camera's keypoints"
+            )
+    return notes
+
+
+def _notes_on_candidates(
+    project: Project, row: SequenceEntry, cameras: list[str], sizes: dict[str, tuple[int, int]]
+) -> list[str]:
+    """Notes on cameras without candidates, and on format, size and labels of the first ones."""
+    settings = project.config.detections
+    folder, notes = row.candidates, []
+    if folder is None or not folder.is_dir():
+        return []
+    labels: set[str] = set()
+    for name in cameras:
+        if candidate_files.has_candidates(folder, name, row.layout):
+            if name in sizes:
+                preview = candidate_files.preview_candidates(
+                    folder, name, size=sizes[name], names=class_names(settings.category_names)
+                )
+                notes += preview.notes
+                labels |= preview.labels
+        elif settings.segmentation_model is None:
+            notes.append(f"{folder} has no {name}.json; add this camera's candidates")
+    entry = project.object_of(row.sequence)
+    expected = () if entry is None else entry.labels
+    if labels and expected and not labels & {*expected}:
+        named = sorted(label or "no label" for label in labels)
+        notes.append(
+            f"{folder}: the labels of the first results are {list_labels(named)}; "
+            f"object {row.object!r} expects {', '.join(expected)}; add its labels to "
+            "objects.yaml, or set detections.category_names"
+        )
+    return notes
+
+
+def list_labels(labels: list[str]) -> str:
+    """The first labels of a detector as text."""
+    more = f" and {len(labels) - 8} more" if len(labels) > 8 else ""
+    return ", ".join(labels[:8]) + more
 
 
 def check_recordings(
@@ -84,6 +213,7 @@ def check_recordings(
         _check_recording(findings, row, name, recording, expected.get(name))
         findings.notes += _check_detections(row, name, recording.preview.images)
     findings.summary = _summary(row, recordings)
+    findings.sizes = {name: recording.size for name, recording in recordings.items()}
     return findings
 
 

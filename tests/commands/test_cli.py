@@ -23,8 +23,7 @@ from rich.console import Console
 from intercap_core import artefacts, cli
 from intercap_core.commands.check import (
     check_detector,
-    faults_of_sequences,
-    notes_of_sequences,
+    check_sequences,
 )
 from intercap_core.commands.run import Watcher
 from intercap_core.errors import UserError
@@ -209,27 +208,27 @@ def test_check_lists_all_faults_of_all_sequences(small_project: Path) -> None:
 )
 def test_check_opens_the_files(inside: Path, file: str, content: str | None, says: str) -> None:
     project = load_project(Path("config.yaml"), {"exclude": ["bad", "empty"]})
-    assert faults_of_sequences(project) == []
+    assert check_sequences(project).faults == []
     if content is None:
         write_recording(Path(file))
     else:
         Path(file).write_text(content)
-    (fault,) = faults_of_sequences(project)
+    (fault,) = check_sequences(project).faults
     assert says in f"problem: {fault}"
 
 
 def test_check_names_unknown_cameras(inside: Path) -> None:
     settings = {"exclude": ["bad", "empty"], "frames": {"cameras": ["k9"]}}
-    (fault,) = faults_of_sequences(load_project(Path("config.yaml"), settings))
+    (fault,) = check_sequences(load_project(Path("config.yaml"), settings)).faults
     assert "the setting frames.cameras names 'k9', rec has k1" in str(fault)
     settings = settings | {"frames": {"cameras": ["k1"]}}
-    assert faults_of_sequences(load_project(Path("config.yaml"), settings)) == []
+    assert check_sequences(load_project(Path("config.yaml"), settings)).faults == []
     assert "\n" not in str(fault)
 
 
 def test_check_notes_cameras_without_recording_or_detections(inside: Path) -> None:
     exclude = {"exclude": ["bad", "empty"]}
-    (note,) = notes_of_sequences(load_project(Path("config.yaml"), exclude))
+    (note,) = check_sequences(load_project(Path("config.yaml"), exclude)).notes
     assert str(note).startswith("sequence 'good': its row names neither keypoints nor candidates")
 
     beside = np.eye(4)
@@ -241,14 +240,16 @@ def test_check_notes_cameras_without_recording_or_detections(inside: Path) -> No
     table.write_text("\n".join([*lines, *(f"{line}\t\t" for line in others)]) + "\n")
     (inside / "points" / "camera1").mkdir(parents=True)
     (inside / "masks").mkdir()
-    missing = [str(note) for note in notes_of_sequences(load_project(Path("config.yaml"), exclude))]
+    missing = [
+        str(note) for note in check_sequences(load_project(Path("config.yaml"), exclude)).notes
+    ]
     assert [text.partition(": ")[2].partition(";")[0] for text in missing] == [
         "rec records k1", "points has no folder k1 and no k1.json", "masks has no k1.json",
     ]  # fmt: skip
     assert "rig.json also has k2" in missing[0]
     (inside / "points" / "k1").mkdir()
     (inside / "masks" / "k1.json").write_text("[]")
-    assert len(notes_of_sequences(load_project(Path("config.yaml"), exclude))) == 1
+    assert len(check_sequences(load_project(Path("config.yaml"), exclude)).notes) == 1
     done = intercap("check", "config.yaml", folder=inside)
     assert "note: sequence 'good': rec records k1" in done.stdout
 
@@ -258,7 +259,7 @@ def notes_with(column: str, folder: str) -> list[str]:
     table = Path("sequences.tsv")
     head, good, *_ = table.read_text().splitlines()
     table.write_text(f"{head}\t{column}\n{good}\t{folder}\n")
-    return [str(note) for note in notes_of_sequences(load_project(Path("config.yaml")))]
+    return [str(note) for note in check_sequences(load_project(Path("config.yaml"))).notes]
 
 
 LARGE = [

@@ -83,8 +83,6 @@ class ClusterRun:
         assert done.returncode == 0, done.stderr
 
 
-
-
 def contents(results: Path) -> dict[str, bytes]:
     """Bytes of all files of a run's results by path, without caches of file dates."""
     return {

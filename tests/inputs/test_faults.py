@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from intercap_core.annotation import Annotation
-from intercap_core.commands.check import faults_of_truth
+from intercap_core.commands.check_recordings import faults_of_truth
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.image_files import encoded_size
 from intercap_core.formats.recordings.k4a import KinectFile

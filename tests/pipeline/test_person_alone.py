@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pytest
 
-from intercap_core.commands.check import faults_of_sequences
+from intercap_core.commands.check import check_sequences
 from intercap_core.commands.closeups import draw_closeups
 from intercap_core.commands.evaluate import field
 from intercap_core.commands.evaluate.part import Measured
@@ -54,7 +54,7 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
         "sequence\tsubject\tobject\trecordings\tcalibration\tkeypoints\tcandidates\ttruth\n" + ROW
     )
     project = load_project(folder / "config.yaml")
-    assert not faults_of_sequences(project)
+    assert not check_sequences(project).faults
     run_studio(project, NAME)
     for stage in STAGES:
         inputs = {name: project.artefact(NAME, name) for name in STAGES[stage].reads}
@@ -210,7 +210,9 @@ def test_a_script_and_an_object_must_fit(project: Project, tmp_path: Path) -> No
     root = project.path.parent
     text = text.replace("s04\t\t", "s04\tcup\t").replace("results/trial", f"{root}/results/trial")
     (tmp_path / "sequences.tsv").write_text(text)
-    faults = [str(fault) for fault in faults_of_sequences(load_project(tmp_path / "config.yaml"))]
+    faults = [
+        str(fault) for fault in check_sequences(load_project(tmp_path / "config.yaml")).faults
+    ]
     assert any("needs no object, the sequence has 'cup'" in line for line in faults)
 
 

@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from intercap_core.cli import app
-from intercap_core.commands.check import faults_of_sequences
+from intercap_core.commands.check import check_sequences
 from intercap_core.errors import UserError
 from intercap_core.formats.released import PERSON_MESH
 from intercap_core.geometry.camera.rig import Rig
@@ -91,7 +91,7 @@ def test_the_project_written_is_ready_to_run(release):
     assert genders == {"Sub01": "male", "Sub02": "female"}
     assert project.objects["stool"].mesh.name == "stool_f1000.ply"
     assert project.objects["stool"].labels == ("stool",)
-    assert [str(fault) for fault in faults_of_sequences(project)] == []
+    assert [str(fault) for fault in check_sequences(project).faults] == []
     for name, entry in project.sequences.items():
         frames_stage.run(sequence=entry, output=Path(f"{name}.h5"), settings=project.config.frames)
 
@@ -112,7 +112,7 @@ def test_the_data_sets_results_are_named_on_request(release):
     assert write("--results", ".", "--replace").exit_code == 0
     project = load_project(Path("config/behave/config.yaml"))
     assert project.sequences[SEQUENCES[0]].results == Path(SEQUENCES[0])
-    assert [str(fault) for fault in faults_of_sequences(project)] == []
+    assert [str(fault) for fault in check_sequences(project).faults] == []
     done = write("--results", "nowhere", "--replace")
     assert isinstance(done.exception, UserError) and "no such folder" in str(done.exception)
 

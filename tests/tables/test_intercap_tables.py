@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from intercap_core.cli import app
-from intercap_core.commands.check import faults_of_sequences
+from intercap_core.commands.check import check_sequences
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.rig import Rig
@@ -118,7 +118,7 @@ def test_the_project_written_is_ready_to_run(release):
     }
     genders = {name: row.gender for name, row in project.subjects.items()}
     assert genders == {"s01": "male", "s03": "female", "s09": "female"}
-    assert [str(fault) for fault in faults_of_sequences(project)] == []
+    assert [str(fault) for fault in check_sequences(project).faults] == []
     assert "1 sequences of" in output and "have no images" in output
     for name, row in project.sequences.items():
         frames_stage.run(sequence=row, output=Path(f"{name}.h5"), settings=project.config.frames)
