@@ -36,6 +36,10 @@ class Unreadable(UserError):
     """An artefact that is missing, damaged or of another schema."""
 
 
+class _Contradiction(ValueError):
+    """A file or dataset contradicts its schema; the message lacks the file's name."""
+
+
 @dataclass(frozen=True)
 class Field:
     """Declaration of one dataset."""
@@ -116,26 +120,6 @@ class Writer:
         self._dims: dict[str, int] = {}
         self.attributes: dict[str, Any] = {}
 
-    def _check(self, key: str, shape: tuple[int, ...], free_first: bool = False) -> Field:
-        """Return the declaration of a dataset; raises ValueError if the shape contradicts it.
-
-        ``free_first``: the first axis may have any length, because rows are appended to it.
-        """
-        declared = self._schema.field_of(key)
-        if len(shape) != len(declared.dims):
-            raise ValueError(f"{key}: shape {shape} does not fit dims {declared.dims}")
-        camera = key if declared.dims and "{camera}" in _template(self._schema, declared) else ""
-        for axis, (dim, length) in enumerate(zip(declared.dims, shape, strict=True)):
-            if free_first and axis == 0:
-                continue
-            scope = (
-                dim if dim in _SHARED_DIMS or not camera else f"{camera.rsplit('/', 1)[0]}:{dim}"
-            )
-            expected = int(dim) if dim.isdigit() else self._dims.setdefault(scope, length)
-            if expected != length:
-                raise ValueError(f"{key}: axis {dim} has {length} entries, {expected} elsewhere")
-        return declared
-
     def put(self, key: str, values: Any) -> None:
         """Write a dataset; ``values`` are cast to the declared type.
 
@@ -153,21 +137,24 @@ class Writer:
             if target.kind in "iu" and array.dtype.kind == "f":
                 raise ValueError(f"{key}: float values for an integer dataset")
             array = np.ascontiguousarray(array, dtype=target)
-        declared = self._check(key, array.shape)
-        dataset = self._create(key, declared, array.shape, array.dtype)
+        dataset = self._create(key, array.shape, array.dtype)
         if array.size:
             dataset[...] = array
         self._raw.check()
 
     def stream(self, key: str, row_shape: tuple[int, ...] = ()) -> RowStream:
         """Open a dataset to which rows are appended along its first axis."""
-        declared = self._check(key, (0, *row_shape), free_first=True)
-        dataset = self._create(key, declared, (0, *row_shape), np.dtype(declared.dtype))
+        dtype = np.dtype(self._schema.field_of(key).dtype)
+        dataset = self._create(key, (0, *row_shape), dtype, grows=True)
         return RowStream(dataset, self._raw)
 
     def _create(
-        self, key: str, declared: Field, shape: tuple[int, ...], dtype: np.dtype
+        self, key: str, shape: tuple[int, ...], dtype: np.dtype, *, grows: bool = False
     ) -> h5py.Dataset:
+        """Create a dataset; ``grows``: rows will be appended along the first axis."""
+        declared = self._schema.field_of(key)
+        group = key.rpartition("/")[0] if key not in self._schema.fields else ""
+        _check_shape(key, declared, shape, self._dims, group=group, grows=grows)
         chunks = _chunks(shape, dtype.itemsize)
         if declared.codec == "depth":
             chunks = (1, *shape[1:])  # one image per chunk, because frames are read one by one
@@ -193,9 +180,33 @@ class Writer:
 _SHARED_DIMS = frozenset({"T", "T+1", "C"})
 
 
-def _template(schema: Schema, declared: Field) -> str:
-    """Key of a declaration in the schema, which may contain ``{camera}``."""
-    return next(key for key, value in schema.fields.items() if value is declared)
+def _check_shape(
+    key: str,
+    declared: Field,
+    shape: tuple[int, ...],
+    lengths: dict[str, int],
+    *,
+    group: str = "",
+    grows: bool = False,
+) -> None:
+    """Raise _Contradiction unless a dataset's shape is the declared one.
+
+    Args:
+        lengths: lengths found so far by the name of the axis; those of this dataset are added.
+        group: group of a camera's datasets, within which other axes have their own lengths.
+        grows: the first axis may have any length.
+    """
+    if len(shape) != len(declared.dims):
+        raise _Contradiction(f"dataset {key!r} has shape {shape}, expected {declared.dims}")
+    for axis, (dim, length) in enumerate(zip(declared.dims, shape, strict=True)):
+        if grows and axis == 0:
+            continue
+        name = dim if dim in _SHARED_DIMS or not group else f"{group}:{dim}"
+        expected = int(dim) if dim.isdigit() else lengths.setdefault(name, length)
+        if length != expected:
+            raise _Contradiction(
+                f"dataset {key!r} has {length} entries along {dim}, expected {expected}"
+            )
 
 
 class RowStream:
@@ -388,11 +399,7 @@ class Artefact:
 
 def schema_name(path: Path) -> str:
     """Name of an artefact's schema; raises Unreadable if the file is no artefact."""
-    path = Path(path)
-    if path.is_dir():
-        raise Unreadable(f"{path}: is a folder, expected an .h5 file; name one that a stage wrote")
-    if not path.is_file():
-        raise Unreadable(f"{path}: there is no such file; check the path")
+    _check_is_file(path, "name an .h5 file that a stage wrote")
     try:
         with h5py.File(path, "r", locking="best-effort") as file:
             name = _value(file.attrs["schema"])
@@ -402,6 +409,13 @@ def schema_name(path: Path) -> str:
             "stage wrote, or delete this one and re-run its stage"
         ) from None
     return str(name)
+
+
+def _check_is_file(path: Path, advice: str) -> None:
+    if path.is_dir():
+        raise Unreadable(f"{path}: is a folder, expected an .h5 file; {advice}")
+    if not path.is_file():
+        raise Unreadable(f"{path}: there is no such file; {advice}")
 
 
 @contextlib.contextmanager
@@ -414,10 +428,7 @@ def read(path: Path, schema: Schema) -> Iterator[Artefact]:
     """
     path = Path(path)
     again = f"re-run stage '{schema.stage}' for this sequence"
-    if path.is_dir():
-        raise Unreadable(f"{path}: is a folder, expected an .h5 file; delete it and {again}")
-    if not path.is_file():
-        raise Unreadable(f"{path}: there is no such file; {again}")
+    _check_is_file(path, again)
     try:
         file = h5py.File(path, "r", locking="best-effort")
     except OSError as error:
@@ -426,80 +437,60 @@ def read(path: Path, schema: Schema) -> Iterator[Artefact]:
         ) from error
     with file:
         try:
-            artefact = Artefact(file, path, schema, _validate(file, path, schema, again))
+            artefact = Artefact(file, path, schema, _validate(file, schema))
+        except _Contradiction as fault:
+            raise Unreadable(f"{path}: {fault}; {again}") from None
         except (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError) as error:
             raise Unreadable(f"{path}: its contents are damaged; delete it and {again}") from error
         yield artefact
 
 
-def _validate(file: h5py.File, path: Path, schema: Schema, again: str) -> dict[str, h5py.Dataset]:
-    """Check the file against the schema; returns its declared datasets by key."""
+def _validate(file: h5py.File, schema: Schema) -> dict[str, h5py.Dataset]:
+    """Check the file against the schema; returns its declared datasets by key.
+
+    Raises _Contradiction.
+    """
     found = str(_value(file.attrs.get("schema", "none")))
     if found != schema.name:
-        raise Unreadable(f"{path}: holds schema {found!r}, expected {schema.name!r}; {again}")
+        raise _Contradiction(f"holds schema {found!r}, expected {schema.name!r}")
     version = file.attrs.get("schema_version", 0)
     if not isinstance(version, int | np.integer):
-        raise Unreadable(
-            f"{path}: attribute 'schema_version' is {version!r}, expected a whole number; {again}"
-        )
+        raise _Contradiction(f"attribute 'schema_version' is {version!r}, expected a whole number")
     if version != schema.version:
-        raise Unreadable(
-            f"{path}: schema {schema.name!r} has version {version}, this program reads version "
-            f"{schema.version}; {again}"
+        raise _Contradiction(
+            f"schema {schema.name!r} has version {version}, this program reads version "
+            f"{schema.version}"
         )
     complete = file.attrs.get("complete", False)
     if not isinstance(complete, bool | np.bool_) or not complete:
-        raise Unreadable(f"{path}: was never finished (no 'complete' mark); delete it and {again}")
+        raise _Contradiction("was never finished (no 'complete' mark)")
     for name in schema.attributes:
         if name not in file.attrs:
-            raise Unreadable(f"{path}: attribute {name!r} is missing; {again}")
+            raise _Contradiction(f"attribute {name!r} is missing")
     lengths: dict[str, int] = {}
     datasets = {}
     for key, declared in schema.fields.items():
-        if "{camera}" in key:
-            continue
-        dataset = file.get(key)
-        if dataset is None:
-            if declared.optional:
-                continue
-            raise Unreadable(f"{path}: dataset {key!r} is missing; {again}")
-        _check_dataset(dataset, key, declared, lengths, path, again)
-        datasets[key] = dataset
+        dataset = None if "{camera}" in key else file.get(key)
+        if dataset is not None:
+            _check_dataset(dataset, key, declared, lengths)
+            datasets[key] = dataset
+        elif "{camera}" not in key and not declared.optional:
+            raise _Contradiction(f"dataset {key!r} is missing")
     return datasets
 
 
 def _check_dataset(
-    dataset: h5py.Dataset,
-    key: str,
-    declared: Field,
-    lengths: dict[str, int],
-    path: Path,
-    again: str,
+    dataset: h5py.Dataset, key: str, declared: Field, lengths: dict[str, int]
 ) -> None:
-    """Raise Unreadable unless a dataset has the declared type and number of axes.
-
-    Axes of one name must have the same length; ``lengths`` holds the lengths found so far.
-    """
+    """Raise _Contradiction unless a dataset has the declared type and shape."""
     if not isinstance(dataset, h5py.Dataset) or dataset.shape is None:
-        raise Unreadable(f"{path}: {key!r} holds no values, expected a dataset; {again}")
+        raise _Contradiction(f"{key!r} holds no values, expected a dataset")
     text = declared.dtype == "str"
     if (text and dataset.dtype.kind != "S") or (
         not text and dataset.dtype != np.dtype(declared.dtype)
     ):
-        raise Unreadable(
-            f"{path}: dataset {key!r} has type {dataset.dtype}, expected {declared.dtype}; {again}"
-        )
-    if len(dataset.shape) != len(declared.dims):
-        raise Unreadable(
-            f"{path}: dataset {key!r} has shape {dataset.shape}, expected {declared.dims}; {again}"
-        )
-    for dim, length in zip(declared.dims, dataset.shape, strict=True):
-        expected = int(dim) if dim.isdigit() else lengths.setdefault(dim, length)
-        if length != expected:
-            raise Unreadable(
-                f"{path}: dataset {key!r} has {length} entries along {dim}, expected {expected}; "
-                f"{again}"
-            )
+        raise _Contradiction(f"dataset {key!r} has type {dataset.dtype}, expected {declared.dtype}")
+    _check_shape(key, declared, dataset.shape, lengths)
 
 
 def pack_ragged(items: Sequence[bytes]) -> tuple[np.ndarray, np.ndarray]:

@@ -87,10 +87,10 @@ def test_every_dataset_has_checksum_and_units(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"points": np.zeros((4, 2))}, "does not fit dims"),
-        ({"points": np.zeros((4, 2, 4))}, "axis 3 has 4 entries"),
-        ({"good": np.zeros(5, bool)}, "axis T has 5 entries, 4 elsewhere"),
-        ({"cameras/k1/count": np.arange(5)}, "axis T has 5 entries"),
+        ({"points": np.zeros((4, 2))}, "has shape (4, 2), expected ('T', "),
+        ({"points": np.zeros((4, 2, 4))}, "has 4 entries along 3"),
+        ({"good": np.zeros(5, bool)}, "has 5 entries along T, expected 4"),
+        ({"cameras/k1/count": np.arange(5)}, "has 5 entries along T"),
         ({"cameras/k1/count": np.zeros(4)}, "float values for an integer"),
         ({"names": None}, "missing ['names']"),
     ],
