@@ -6,11 +6,7 @@ min_version("9.20")
 include: "workflow/rules/common.smk"
 include: "workflow/rules/studio.smk"
 include: "workflow/rules/dataset.smk"
-
-
-for _stage in STAGES:
-
-    include: f"workflow/rules/{_stage}.smk"
+include: "workflow/rules/stages.smk"
 
 
 rule all:

@@ -1,9 +1,8 @@
 """The stages of one sequence, in the order in which data flows through them.
 
 All facts about a stage are in this list. The command line, the plan of a run, the rules of the
-workflow, the resources of jobs and the report read them from here. A new stage
-needs an entry here, a module ``stages/<name>.py`` with a function ``run``, a schema, a section of
-settings and a rule.
+workflow, the resources of jobs and the report read them from here. A new stage needs an entry here,
+a module ``stages/<name>.py`` with a function ``run``, a schema and a section of settings.
 """
 
 from __future__ import annotations

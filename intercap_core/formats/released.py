@@ -37,17 +37,6 @@ def intercap_file(path: Path) -> Path:
     return next((path / name for name in INTERCAP if (path / name).is_file()), path)
 
 
-def files_of(path: Path) -> list[Path]:
-    """Paths of results that the workflow watches: a file, or BEHAVE's folder and the files in it.
-
-    Files in its folders of frames are not watched: there are thousands. The folder's time changes
-    if a frame is added or removed.
-    """
-    main = intercap_file(path)
-    inside = (path / name for name in (BEHAVE_PERSON, BEHAVE_OBJECT))
-    return [main, *(file for file in inside if main == path and file.is_file())]
-
-
 @dataclass(frozen=True, eq=False)
 class Recording:
     """The sequence whose results are read."""

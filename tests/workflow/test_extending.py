@@ -23,10 +23,10 @@ TOUCH_TIME = Schema(
 )
 
 
-def test_a_new_stage_takes_five_files(flow: Flow, tmp_path: Path) -> None:
+def test_a_new_stage_takes_four_files(flow: Flow, tmp_path: Path) -> None:
     other = Flow.copy(tmp_path)
     files = apply_chapter("A new stage", other.folder)
-    assert len([path for path in files if "tests" not in path.parts]) == 5
+    assert len([path for path in files if "tests" not in path.parts]) == 4
     for name in ("frames", "joint"):
         (other.results / ONE).mkdir(parents=True, exist_ok=True)
         shutil.copy2(flow.artefact(ONE, name), other.artefact(ONE, name))

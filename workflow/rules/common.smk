@@ -4,10 +4,9 @@ from pathlib import Path
 
 from snakemake.exceptions import WorkflowError
 
-from intercap_core.formats.recordings.layouts import input_files
 from intercap_core.errors import UserError
-from intercap_core.formats.released import files_of
-from intercap_core.pipeline.plan import DATASET, STUDIO, Plan
+from intercap_core.pipeline.code_digest import stage_code
+from intercap_core.pipeline.plan import DATASET, Plan
 from intercap_core.pipeline.resources import (
     extent_of,
     has_model,
@@ -47,65 +46,23 @@ RESULTS = PROJECT.results.as_posix()
 LOGS = PROJECT.logs.as_posix()
 BENCHMARKS = f"benchmarks/{SETTINGS.dataset}"
 ENVIRONMENT = "../../envs/intercap.yaml"
+MODEL_THREADS = 8
 
 
 wildcard_constraints:
     sequence="|".join(map(re.escape, SEQUENCES)),
 
 
-def existing(*paths):
-    """Existing paths among ``paths``; the job that reads a missing file then reports it."""
-    return [path for path in paths if path is not None and Path(path).exists()]
-
-
-def of_sequence(wildcards):
-    """The sequence's row, its object (None for a person without an object) and its subject."""
-    row = PROJECT.sequences[wildcards.sequence]
-    return row, PROJECT.object_of(wildcards.sequence), PROJECT.subjects[row.subject]
-
-
-def made_by_studio(wildcards, name):
-    """Output of the rule studio that represents a column's files; None for a real recording."""
-    if PROJECT.recordings_made(wildcards.sequence) is None:
-        return None
-    output = "truth" if name == "truth" else "manifest"
-    return expand(getattr(rules.studio.output, output), sequence=wildcards.sequence)
-
-
-def recorded(column):
-    """Input function: files of the sequence's row in ``column``, or the studio's output.
-
-    Their dates are ignored, except those of a recording that the studio makes again.
-    """
-
-    def files(wildcards):
-        made = made_by_studio(wildcards, column)
-        if made is not None:
-            is_stale = PLAN.is_stale(wildcards.sequence, STUDIO)
-            return made if is_stale else ancient(made)
-        row = PROJECT.sequences[wildcards.sequence]
-        if column == "recordings":
-            return ancient(input_files(row))
-        return ancient(existing(getattr(row, column)))
-
-    return files
-
-
-def annotation_broken(sequence):
-    """Whether the sequence's annotation is invalid; one that the studio writes is not checked."""
-    return bool(PLAN.annotation_fault(sequence)) and not PROJECT.annotation_made(
-        sequence
-    )
-
-
 def annotation_input(wildcards):
     """Input function: for an invalid annotation, the output of a job that fails with the reason.
 
-    The sequence's existing outputs stay. Changes of a valid annotation are found by the manifests.
+    The sequence's existing outputs stay. Changes of a valid annotation are found by the manifests;
+    an annotation that the studio writes is not checked.
     """
-    if not annotation_broken(wildcards.sequence):
+    sequence = wildcards.sequence
+    if PROJECT.annotation_made(sequence) or not PLAN.annotation_fault(sequence):
         return []
-    return [rules.broken_annotation.output.checked.format(sequence=wildcards.sequence)]
+    return [rules.broken_annotation.output.checked.format(sequence=sequence)]
 
 
 def out_of_date(stage):
@@ -122,62 +79,52 @@ def identity_of(stage):
     return lambda wildcards: PLAN.fingerprint(getattr(wildcards, "sequence", ""), stage)
 
 
-def artefacts_read(stage):
-    """Input function: the artefacts that a stage reads, by stage.
+def inputs_of(stage):
+    """Input function: the artefacts that a stage reads, by stage, and the studio's recording.
 
     Their dates count only if the stage's output is stale. If it is not, an artefact that is made
     again gets the same content, and the output stays up to date.
     """
+    made = []
+    if "recordings" in STAGES[stage].columns:
+        made.append("manifest")
+    if "truth" in stage_code(stage).parameters:
+        made.append("truth")
 
     def files(wildcards):
+        sequence = wildcards.sequence
         paths = {
-            name: f"{RESULTS}/{wildcards.sequence}/{name}.h5"
-            for name in STAGES[stage].reads
+            name: f"{RESULTS}/{sequence}/{name}.h5" for name in STAGES[stage].reads
         }
-        if PLAN.is_stale(wildcards.sequence, stage):
+        if sequence in VIRTUAL:
+            studio = {name: getattr(rules.studio.output, name) for name in made}
+            paths |= {
+                name: path.format(sequence=sequence) for name, path in studio.items()
+            }
+        if PLAN.is_stale(sequence, stage):
             return paths
         return {name: ancient(path) for name, path in paths.items()}
 
     return files
 
 
+def output_of(stage):
+    """Output of a stage: an artefact or a folder."""
+    path = PROJECT.artefact("{sequence}", stage).as_posix()
+    if stage == "page":
+        return report(
+            directory(path),
+            htmlindex="index.html",
+            category="Sequences",
+            labels={"sequence": "{sequence}"},
+        )
+    return directory(path) if STAGES[stage].writes_folder else path
+
+
 def summaries(wildcards):
-    """Input function: the summaries of all sequences; dates count as in ``artefacts_read``."""
+    """Input function: the summaries of all sequences; dates count as in ``inputs_of``."""
     paths = expand(f"{RESULTS}/{{sequence}}/summary.h5", sequence=SEQUENCES)
     return paths if PLAN.is_stale("", DATASET) else ancient(paths)
-
-
-def object_files(wildcards):
-    """Input function: the object's mesh and contact vertices."""
-    _, tracked, _ = of_sequence(wildcards)
-    return [] if tracked is None else existing(tracked.mesh, tracked.contact_vertices)
-
-
-def body_file(wildcards):
-    """Input function: the licensed body file of the subject's gender, if one is set."""
-    _, _, subject = of_sequence(wildcards)
-    return existing(SETTINGS.body_models.of(subject.gender))
-
-
-def pose_prior_file(wildcards):
-    """Input function: the pose prior's weights, if the settings name them."""
-    return existing(SETTINGS.body_models.vposer)
-
-
-def keypoint_definition_file(wildcards):
-    """Input function: the table of the detector's joint positions, if the settings name one."""
-    return existing(SETTINGS.body_fit.keypoint_definition)
-
-
-def motion_prior_files(wildcards):
-    """Input function: the motion prior's weights and statistics, if the settings name them."""
-    return existing(*(SETTINGS.joint.lemo_files or ()))
-
-
-def results_file(wildcards):
-    """Input function: files of another program's results, if the sequence's row names them."""
-    named = PROJECT.sequences[wildcards.sequence].results
-    return [] if named is None else existing(*files_of(named))
 
 
 def length_of(wildcards):
@@ -222,3 +169,8 @@ def gpu_of(stage):
         return {}
     partition = SETTINGS.cluster.gpu_partition
     return {"gpu": 1, **({"slurm_partition": partition} if partition else {})}
+
+
+def threads_of(stage):
+    """Threads: several if a detector runs, otherwise one."""
+    return MODEL_THREADS if stage == "detections" and has_model(PROJECT) else 1

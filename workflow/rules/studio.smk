@@ -7,7 +7,6 @@ rule studio:
     Its files depend on the layout: the manifest, written last, stands for all of them.
     """
     input:
-        object=ancient(object_files),
         mark=out_of_date("studio"),
     output:
         truth=f"{_recordings}/truth.h5",

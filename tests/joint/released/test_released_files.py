@@ -16,7 +16,7 @@ from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.errors import UserError
 from intercap_core.formats.released import (
     PERSON_MESH,
-    files_of,
+    intercap_file,
     object_fits,
     object_poses_at_30_fps,
     person_poses_at_30_fps,
@@ -97,16 +97,11 @@ def test_object_may_have_the_name_of_its_category(tmp_path):
     assert object_fits(tmp_path) == [fit]
 
 
-def test_workflow_watches_the_folder_not_files_of_frames(tmp_path):
-    frame = tmp_path / "t0003.000" / PERSON_MESH
-    frame.parent.mkdir(parents=True)
-    frame.touch()
-    assert files_of(tmp_path) == [tmp_path]
-    (tmp_path / "object_fit_all.npz").touch()
-    assert files_of(tmp_path) == [tmp_path, tmp_path / "object_fit_all.npz"]
-    (tmp_path / "res.pkl").touch()  # InterCap's results take precedence
-    assert files_of(tmp_path) == [tmp_path / "res.pkl"]
-    assert files_of(tmp_path / "res.pkl") == [tmp_path / "res.pkl"]
+def test_results_of_a_folder_are_those_of_intercap_or_the_folder(tmp_path):
+    assert intercap_file(tmp_path) == tmp_path
+    (tmp_path / "res.pkl").touch()
+    assert intercap_file(tmp_path) == tmp_path / "res.pkl"
+    assert intercap_file(tmp_path / "res.pkl") == tmp_path / "res.pkl"
 
 
 def _tube(count: int, length: float) -> tuple[np.ndarray, np.ndarray]:
