@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.errors import UserError
 from intercap_core.formats.released import (
-    PERSON_MESH,
     intercap_file,
     object_fits,
     object_poses_at_30_fps,
