@@ -1,12 +1,8 @@
-"""Arrays of .npz archives and of pickles, without executing what a file names.
-
-The stated size of an array is compared with the size of its content before memory is allocated.
-"""
+"""Arrays of .npz archives and of pickles, without executing what a file names."""
 
 from __future__ import annotations
 
 import io
-import math
 import pickle
 import tokenize
 import zipfile
@@ -25,14 +21,11 @@ from intercap_core.inputs.files import (
     read_bytes,
 )
 
-_HEADS = {
-    (1, 0): np.lib.format.read_array_header_1_0,
-    (2, 0): np.lib.format.read_array_header_2_0,
-}
 # Exceptions of zipfile, zlib and numpy's parser of headers for damaged archives.
 _ARCHIVE_ERRORS = (
     zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OSError,
     ValueError, OverflowError, TypeError, SyntaxError, tokenize.TokenError, KeyError,
+    MemoryError,  # a damaged header states any size
 )  # fmt: skip
 # Exceptions of the unpickler for damaged files.
 PICKLE_ERRORS = (
@@ -92,22 +85,10 @@ def read_arrays(
 
 def _array(content: bytes) -> np.ndarray:
     """Return the array of an .npy file's content."""
-    file = io.BytesIO(content)
-    version = np.lib.format.read_magic(file)
-    if version not in _HEADS:
-        raise ValueError(f"version {version} of the format")
-    shape, fortran, dtype = _HEADS[version](file)
-    if dtype.hasobject or dtype.kind not in "biufcSU":
-        raise ValueError(f"it holds {dtype}, expected numbers")
-    if not all(type(n) is int and n >= 0 for n in shape):
-        raise ValueError(f"its shape is {shape!r:.60}")
-    size, available = math.prod(shape) * dtype.itemsize, len(content) - file.tell()
-    if size != available:
-        raise ValueError(f"its shape {shape!r:.60} needs {size} bytes, it has {available}")
-    if not size:
-        return np.zeros(shape, dtype)
-    values = np.frombuffer(content, dtype, offset=file.tell())
-    return values.reshape(shape, order="F" if fortran else "C").copy(order="K")
+    array = np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
+    if array.dtype.kind not in "biufcSU":
+        raise ValueError(f"it holds {array.dtype}, expected numbers")
+    return array
 
 
 class _Unpickler(pickle.Unpickler):

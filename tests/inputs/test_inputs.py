@@ -154,10 +154,10 @@ def _head(shape: str, descr: str = "<f8") -> bytes:
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (_head("(1000000000000,)"), "needs 8000000000000 bytes"),
-        (_head("(2,)") + bytes(15), "needs 16 bytes, it has 15"),
-        (_head("(1,)", "|O") + bytes(8), "expected numbers"),
-        (_head("(-1,)"), "shape"),
+        (_head("(1000000000000,)"), "Unable to allocate"),
+        (_head("(2,)") + bytes(15), "expected 16 bytes got 15"),
+        (_head("(1,)", "|O") + bytes(8), "Object arrays cannot be loaded"),
+        (_head("(-1,)"), "negative dimensions"),
         (_head("(" * 60 + ")" * 60), "no readable array"),
         (b"text", "no readable array"),
     ],
