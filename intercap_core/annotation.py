@@ -272,27 +272,19 @@ class Annotation(Model):
 
     def check_frames(self, count: int) -> str | None:
         """Error message if an entry lies beyond the recording's ``count`` frame sets, or None."""
-        for index, interval in enumerate(self.contact or ()):
-            if interval.end > count:
-                return f"contact[{index}].end is {interval.end}, the recording has {count} frames"
-        if self.object_pose is not None and self.object_pose.frame >= count:
-            return (
-                f"object_pose.frame is {self.object_pose.frame}, the recording has {count} frames"
-            )
-        for index, pose in enumerate(self.object_poses):
-            if pose.frame >= count:
-                return (
-                    f"object_poses[{index}].frame is {pose.frame}, the recording has {count} frames"
-                )
-        for index, sides in enumerate(self.left_right):
-            if sides.end > count:
-                return f"left_right[{index}].end is {sides.end}, the recording has {count} frames"
-        for index, point in enumerate(self.subject):
-            if point.frame >= count:
-                return f"subject[{index}].frame is {point.frame}, the recording has {count} frames"
-        beyond = [frame for frame in self.drop_frames if frame >= count]
-        if beyond:
-            return f"drop_frames holds {beyond[0]}, the recording has {count} frames"
+        limits = [  # entry, its number, and the largest number that the recording allows
+            *((f"contact[{i}].end is", c.end, count) for i, c in enumerate(self.contact or ())),
+            *((f"object_poses[{i}].frame is", p.frame, count - 1)
+              for i, p in enumerate(self.object_poses)),
+            *((f"left_right[{i}].end is", s.end, count) for i, s in enumerate(self.left_right)),
+            *((f"subject[{i}].frame is", s.frame, count - 1) for i, s in enumerate(self.subject)),
+            *(("drop_frames holds", frame, count - 1) for frame in self.drop_frames),
+        ]  # fmt: skip
+        if self.object_pose is not None:
+            limits.append(("object_pose.frame is", self.object_pose.frame, count - 1))
+        for entry, number, largest in limits:
+            if number > largest:
+                return f"{entry} {number}, the recording has {count} frames"
         if count and len(set(self.drop_frames)) == count:
             return f"drop_frames drops all {count} frames of the recording"
         return None
