@@ -64,8 +64,7 @@ def compute_once(
     key, content = output.with_suffix(".key"), _content((stage,), project, sequence, paths)
     if not (output.exists() and key.exists() and key.read_text() == content):
         key.unlink(missing_ok=True)  # an interrupted run must not leave an old key
-        inputs = {name: paths[name] for name in STAGES[stage].reads}
-        run_step(stage, project, sequence, inputs=inputs, output=output)
+        run_step(stage, project, sequence, inputs=paths, output=output)
         key.write_text(content)
     return output
 

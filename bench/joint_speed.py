@@ -32,18 +32,16 @@ from bench.stage_resources import peak_memory_mb
 from intercap_core.joint.state import State
 from intercap_core.pipeline.step import run_step
 from intercap_core.project import Project, load_project
-from intercap_core.stage_list import STAGES
 
 LONG = (300, 1000)  # frames
 
 
 def run_stage(project: Project, sequence: str) -> tuple[float, State]:
     """Run the whole stage; returns its seconds and its result."""
-    inputs = {name: project.artefact(sequence, name) for name in STAGES["joint"].reads}
     with tempfile.TemporaryDirectory(dir=project.results) as folder:
         output = Path(folder) / "joint.h5"
         begin = time.perf_counter()
-        run_step("joint", project, sequence, inputs=inputs, output=output)
+        run_step("joint", project, sequence, output=output)
         return time.perf_counter() - begin, read_state(output)
 
 

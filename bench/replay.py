@@ -87,7 +87,7 @@ def replay(task: Task) -> Outcome:
     from bench.stage_figures import Written, figures_of
     from intercap_core.pipeline.step import run_step
     from intercap_core.project import load_project
-    from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
+    from intercap_core.stage_list import SEQUENCE_STAGES
 
     project = load_project(Path(task.settings), dict(task.overrides))
     seconds, state, written = 0.0, hashlib.sha256(), []
@@ -96,10 +96,9 @@ def replay(task: Task) -> Outcome:
             paths = {stage: project.artefact(sequence, stage) for stage in SEQUENCE_STAGES}
             for stage in task.stages:
                 output = Path(folder) / f"{sequence}-{stage}.h5"
-                inputs = {name: paths[name] for name in STAGES[stage].reads}
                 begin = time.perf_counter()
                 try:
-                    run_step(stage, project, sequence, inputs=inputs, output=output)
+                    run_step(stage, project, sequence, inputs=paths, output=output)
                 except Exception as error:  # an impossible value may fail in any way
                     reason = f"{stage} of {sequence}: {type(error).__name__}: {error}"
                     return Outcome(before, after, "", {}, seconds, reason)

@@ -18,7 +18,7 @@ import typer
 from intercap_core import disk
 from intercap_core.errors import UserError
 from intercap_core.signals import Terminated, raise_on_signals
-from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
+from intercap_core.stage_list import STAGES
 
 WHOLE, SINGLE, LOOK = "A whole dataset", "One step of one sequence", "Look and maintain"
 
@@ -499,12 +499,10 @@ def _stage_command(stage: str, purpose: str) -> Callable[..., None]:
 
         project = load_project(settings)
         name = _known(project.sequences, sequence)
-        written = output or project.artefact(name, stage)
         if not STAGES[stage].writes_folder:
+            written = output or project.artefact(name, stage)
             _check_output(written, replace_any=output is None)
-        inputs = {other: project.artefact(name, other) for other in SEQUENCE_STAGES}
-        run_step(stage, project, name, inputs=inputs, output=written)
-        typer.echo(written)
+        typer.echo(run_step(stage, project, name, output=output))
 
     command.__doc__ = (
         f"{purpose}\n\nReads the artefacts of earlier stages of this sequence. Its settings are "

@@ -22,7 +22,7 @@ from intercap_core.errors import UserError
 from intercap_core.pipeline.step import run_step
 from intercap_core.project import Project, load_project
 from intercap_core.schemas import FRAMES
-from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
+from intercap_core.stage_list import SEQUENCE_STAGES
 
 REPEATS = 3  # measured runs, after one that imports and compiles
 # Stages from the frames to the metrics
@@ -141,7 +141,7 @@ def time_extraction(project: Project, sequence: str, frames: int) -> dict[str, f
         for _ in range(1 + REPEATS):
             output.unlink(missing_ok=True)
             start = time.perf_counter()
-            run_step("frames", project, sequence, inputs={}, output=output)
+            run_step("frames", project, sequence, output=output)
             seconds.append(time.perf_counter() - start)
         written = output.stat().st_size
     row = project.sequences[sequence]
@@ -167,11 +167,10 @@ def time_hold_out(settings: Path, sequence: str, frames: int) -> dict[str, float
     }
     for _ in range(1 + REPEATS):
         for hold_out, project in projects.items():
-            inputs = {name: project.artefact(sequence, name) for name in STAGES["metrics"].reads}
             with tempfile.TemporaryDirectory(dir=project.results) as folder:
                 start = time.perf_counter()
                 output = Path(folder) / "metrics.h5"
-                run_step("metrics", project, sequence, inputs=inputs, output=output)
+                run_step("metrics", project, sequence, output=output)
                 seconds[hold_out].append(time.perf_counter() - start)
     with_it, without = (statistics.median(seconds[hold_out][1:]) for hold_out in (True, False))
     return {"verdict.seconds_per_frame": round((with_it - without) / frames, 4)}

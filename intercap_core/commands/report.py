@@ -8,7 +8,7 @@ from pathlib import Path
 from intercap_core.errors import UserError
 from intercap_core.pipeline.step import run_dataset, run_step
 from intercap_core.project import Project
-from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
+from intercap_core.stage_list import STAGES
 
 log = logging.getLogger(__name__)
 
@@ -19,13 +19,11 @@ def write_site(project: Project) -> Path:
     Sequences that cannot be reported are left out with a warning. Raises UserError if none is left.
     """
     for name in project.sequences:
-        inputs = {stage: project.artefact(name, stage) for stage in SEQUENCE_STAGES}
         for stage in ("summary", "page"):
-            if not all(inputs[source].is_file() for source in STAGES[stage].reads):
+            if not all(project.artefact(name, read).is_file() for read in STAGES[stage].reads):
                 continue
-            output = project.artefact(name, stage)
             try:
-                run_step(stage, project, name, inputs=inputs, output=output, keep=True)
+                run_step(stage, project, name, keep=True)
             except UserError as error:
                 log.warning("sequence %s has no %s: %s", name, stage, error)
     return run_dataset(project)

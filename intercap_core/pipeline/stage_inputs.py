@@ -70,11 +70,6 @@ def arguments(
     return {name: known[name] for name in stage_code(stage).parameters if name in known}
 
 
-def takes_paths(stage: str) -> bool:
-    """Whether the stage gets its artefacts as SequencePaths instead of single arguments."""
-    return "paths" in stage_code(stage).parameters
-
-
 def stage_manifest(
     project: Project,
     sequence: str,

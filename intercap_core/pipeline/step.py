@@ -8,7 +8,9 @@ import logging
 import os
 import shutil
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from intercap_core import artefacts, schemas
 from intercap_core.annotation import Annotation
@@ -20,6 +22,7 @@ from intercap_core.pipeline.checksums import (
     forget_output,
     remember_output,
 )
+from intercap_core.pipeline.code_digest import stage_code
 from intercap_core.pipeline.lease import Lease, acquire
 from intercap_core.pipeline.plan import DATASET, DATASET_OUTPUTS, checked_files, failures
 from intercap_core.pipeline.provenance import FILE, Manifest, read_manifest, write_manifest
@@ -40,66 +43,49 @@ def run_step(
     project: Project,
     sequence: str,
     *,
-    inputs: Mapping[str, Path],
-    output: Path,
+    inputs: Mapping[str, Path] | None = None,
+    output: Path | None = None,
     keep: bool = False,
-) -> None:
+) -> Path:
     """Run ``intercap_core.stages.<stage>.run`` and put its output in place with its manifest.
 
-    One process at a time writes an output; others wait for its lease. Raises UserError if an input
-    is missing, unreadable or of another sequence, or if the stage finds a fault in it.
+    Returns the output's path. One process at a time writes an output; others wait for its lease.
+    Raises UserError if an input is missing, unreadable or of another sequence, or if the stage
+    finds a fault in it.
 
     Args:
-        inputs: artefacts by the stage that wrote them.
-        output: an artefact, or a folder for the export and the page.
+        inputs: artefacts by the stage that wrote them; default: those of the project.
+        output: an artefact, or a folder for the export and the page; default: that of the project.
         keep: do not run the stage if the output is up to date once the lease is acquired.
     """
-    annotation = project.annotation(sequence, look_at_frames=stage != "frames")
+    reads = STAGES[stage].reads
+    step = _Step(
+        stage, project, sequence,
+        project.annotation(sequence, look_at_frames=stage != "frames"),
+        {name: (inputs or {}).get(name, project.artefact(sequence, name)) for name in reads},
+        output or project.artefact(sequence, stage),
+    )  # fmt: skip
     _return_freed_memory()
     done = False
     while not done:
-        with explain_disk_errors(project, output, stage), acquire(output) as lease:
-            manifest = _current_manifest(stage, project, sequence, annotation, inputs)
-            if keep and _is_up_to_date(output, manifest):
+        with explain_disk_errors(project, step.output, stage), acquire(step.output) as lease:
+            manifest = step.current_manifest()
+            if keep and _is_up_to_date(step.output, manifest):
                 log.info("sequence %s, %s: another process has written it", sequence, stage)
                 done = True
             else:
-                _check_inputs(stage, sequence, inputs)
-                done = _make(stage, project, sequence, annotation, inputs, output, manifest, lease)
+                step.check_inputs()
+                done = step.make(manifest, lease)
         if not done:  # this process was suspended until its lease expired
             log.info(
                 "sequence %s, %s: its lease was taken over by another process", sequence, stage
             )
             keep = True
     if not STAGES[stage].writes_folder:
-        for note in outcome.notes(stage, output):
+        for note in outcome.notes(stage, step.output):
             log.warning("sequence %s: %s", sequence, note)
-    log.info("sequence %s, %s: %s", sequence, stage, outcome.line(stage, output, inputs))
-
-
-def _current_manifest(
-    stage: str,
-    project: Project,
-    sequence: str,
-    annotation: Annotation,
-    inputs: Mapping[str, Path],
-) -> Manifest:
-    """Manifest of the output that the stage would write from these inputs."""
-    manifests = {name: read_manifest(inputs[name]) for name in STAGES[stage].reads}
-    checksums = InputChecksums(project.results / sequence / INPUTS_FILE)
-    current = stage_inputs.stage_manifest(
-        project,
-        sequence,
-        stage,
-        annotation,
-        artefacts={
-            name: "not recorded" if manifest is None else manifest.fingerprint
-            for name, manifest in manifests.items()
-        },
-        checksums=checksums,
-    )
-    checksums.save()
-    return current
+    log.info("sequence %s, %s: %s", sequence, stage, outcome.line(stage, step.output, step.inputs))
+    return step.output
 
 
 def _is_up_to_date(output: Path, current: Manifest) -> bool:
@@ -107,45 +93,81 @@ def _is_up_to_date(output: Path, current: Manifest) -> bool:
     return before is not None and before.fingerprint == current.fingerprint
 
 
-def _make(
-    stage: str,
-    project: Project,
-    sequence: str,
-    annotation: Annotation,
-    inputs: Mapping[str, Path],
-    output: Path,
-    manifest: Manifest,
-    lease: Lease,
-) -> bool:
-    """Run the stage and replace its output; False if the lease was lost meanwhile, in which case
-    the output is left alone."""
-    if STAGES[stage].on_device:
-        check_device(project)
-    module = importlib.import_module(f"intercap_core.stages.{stage}")
-    arguments = stage_inputs.arguments(project, sequence, stage, annotation)
-    read = {name: inputs[name] for name in STAGES[stage].reads}
-    arguments |= {"paths": SequencePaths(**read)} if stage_inputs.takes_paths(stage) else read
-    in_folder = STAGES[stage].writes_folder
-    if in_folder:
-        folders.check_replaceable(output, marker=module.MARKER, what=stage)
-    part = artefacts.part_of(output)
-    try:
-        module.run(output=part, **arguments)
-        write_manifest(part, manifest)
-        if not lease.is_held():
-            return False
+@dataclass(frozen=True)
+class _Step:
+    """One stage of one sequence."""
+
+    stage: str
+    project: Project
+    sequence: str
+    annotation: Annotation
+    inputs: Mapping[str, Path]
+    """Artefacts that the stage reads, by the stage that wrote them."""
+    output: Path
+
+    def current_manifest(self) -> Manifest:
+        """Manifest of the output that the stage would write from these inputs."""
+        manifests = {name: read_manifest(path) for name, path in self.inputs.items()}
+        checksums = InputChecksums(self.project.results / self.sequence / INPUTS_FILE)
+        current = stage_inputs.stage_manifest(
+            self.project,
+            self.sequence,
+            self.stage,
+            self.annotation,
+            artefacts={
+                name: "not recorded" if manifest is None else manifest.fingerprint
+                for name, manifest in manifests.items()
+            },
+            checksums=checksums,
+        )
+        checksums.save()
+        return current
+
+    def check_inputs(self) -> None:
+        """Raise UserError if an input is unreadable or belongs to another sequence."""
+        for name, path in self.inputs.items():
+            with artefacts.read(path, getattr(schemas, name.upper())) as source:
+                actual = source.attributes["sequence"]
+            if actual != self.sequence:
+                raise UserError(
+                    f"{path}: holds sequence {actual!r}, expected {self.sequence!r}; delete it and "
+                    f"re-run stage {name!r} for sequence {self.sequence!r}"
+                )
+
+    def make(self, manifest: Manifest, lease: Lease) -> bool:
+        """Run the stage and replace its output; False if the lease was lost meanwhile, in which
+        case the output is left alone."""
+        if STAGES[self.stage].on_device:
+            check_device(self.project)
+        module = importlib.import_module(f"intercap_core.stages.{self.stage}")
+        in_folder = STAGES[self.stage].writes_folder
         if in_folder:
-            folders.put(part, output)
-        else:
-            forget_output(output)
-            os.replace(part, output)
-            remember_output(output)
-        return True
-    finally:
-        if in_folder:
-            shutil.rmtree(part, ignore_errors=True)
-        else:
-            part.unlink(missing_ok=True)
+            folders.check_replaceable(self.output, marker=module.MARKER, what=self.stage)
+        part = artefacts.part_of(self.output)
+        try:
+            module.run(output=part, **self._arguments())
+            write_manifest(part, manifest)
+            if not lease.is_held():
+                return False
+            if in_folder:
+                folders.put(part, self.output)
+            else:
+                forget_output(self.output)
+                os.replace(part, self.output)
+                remember_output(self.output)
+            return True
+        finally:
+            if in_folder:
+                shutil.rmtree(part, ignore_errors=True)
+            else:
+                part.unlink(missing_ok=True)
+
+    def _arguments(self) -> dict[str, Any]:
+        """Arguments of the stage's ``run`` except the output."""
+        given = stage_inputs.arguments(self.project, self.sequence, self.stage, self.annotation)
+        if "paths" in stage_code(self.stage).parameters:
+            return given | {"paths": SequencePaths(**self.inputs)}
+        return given | dict(self.inputs)
 
 
 def _return_freed_memory() -> None:
@@ -171,18 +193,6 @@ def check_device(project: Project) -> None:
             f"{project.path}: device is {project.config.device}, but PyTorch finds no such device "
             "here; set device: cpu, or run on a machine that has one"
         )
-
-
-def _check_inputs(stage: str, sequence: str, inputs: Mapping[str, Path]) -> None:
-    """Raise UserError if an input is unreadable or belongs to another sequence."""
-    for name in STAGES[stage].reads:
-        with artefacts.read(inputs[name], getattr(schemas, name.upper())) as source:
-            actual = source.attributes["sequence"]
-        if actual != sequence:
-            raise UserError(
-                f"{inputs[name]}: holds sequence {actual!r}, expected {sequence!r}; delete it and "
-                f"re-run stage {name!r} for sequence {sequence!r}"
-            )
 
 
 def run_studio(project: Project, sequence: str) -> Path:

@@ -64,8 +64,7 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
     )
     for stage in ("joint", "scene"):
         made.artefact("s01", stage).write_bytes(capture.paths[stage].read_bytes())
-    inputs = {stage: made.artefact("s01", stage) for stage in STAGES["summary"].reads}
-    run_step("summary", made, "s01", inputs=inputs, output=made.artefact("s01", "summary"))
+    run_step("summary", made, "s01")
     return made
 
 
@@ -86,16 +85,15 @@ def _of_folder(folder: Path) -> tuple[int, float]:
 def test_page_export_and_dataset_are_summarised_in_one_line(
     project: Project, caplog: pytest.LogCaptureFixture
 ) -> None:
-    inputs = {stage: project.artefact("s01", stage) for stage in SEQUENCE_STAGES}
     folders = {stage: project.artefact("s01", stage) for stage in ("page", "export")}
     with caplog.at_level(logging.INFO, "intercap_core"):
-        run_step("export", project, "s01", inputs=inputs, output=folders["export"])
+        run_step("export", project, "s01")
         files, size = _of_folder(folders["export"])
         assert _logged(caplog) == (
             "sequence s01, export: amass, bop, coco, contact, glb, intercap: 5 frames in "
             f"{files} files, {size:.1f} MB"
         )
-        run_step("page", project, "s01", inputs=inputs, output=folders["page"])
+        run_step("page", project, "s01")
         html = (folders["page"] / "index.html").read_text()
         pictures, (_, size) = html.count('<img src="data:'), _of_folder(folders["page"])
         assert pictures > 3 and _logged(caplog) == (

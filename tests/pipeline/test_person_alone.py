@@ -57,8 +57,7 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
     assert not check_sequences(project).faults
     run_studio(project, NAME)
     for stage in STAGES:
-        inputs = {name: project.artefact(NAME, name) for name in STAGES[stage].reads}
-        run_step(stage, project, NAME, inputs=inputs, output=project.artefact(NAME, stage))
+        run_step(stage, project, NAME)
     run_dataset(project)
     return project
 

@@ -30,13 +30,11 @@ from intercap_core.pipeline.job import set_threads
 set_threads(1)
 from intercap_core.pipeline.step import run_step
 from intercap_core.project import load_project
-from intercap_core.stage_list import STAGES
 settings, results, sequence, *stages = sys.argv[1:]
 project = load_project(Path(settings), {"results": results})
 project.artefact(sequence, stages[0]).parent.mkdir(parents=True)
 for stage in stages:
-    inputs = {name: project.artefact(sequence, name) for name in STAGES[stage].reads}
-    run_step(stage, project, sequence, inputs=inputs, output=project.artefact(sequence, stage))
+    run_step(stage, project, sequence)
 """
 
 

@@ -1,7 +1,5 @@
 """One stage of one sequence; the rule's name says which."""
 
-from pathlib import Path
-
 from intercap_core.pipeline.job import job
 
 with job(
@@ -11,15 +9,6 @@ with job(
 ):
     from intercap_core.pipeline.step import run_step
     from intercap_core.project import load_project
-    from intercap_core.stage_list import SEQUENCE_STAGES
 
-    run_step(
-        snakemake.rule,
-        load_project(**snakemake.config["project"]),
-        snakemake.wildcards.sequence,
-        inputs={
-            name: Path(path) for name, path in snakemake.input.items() if name in SEQUENCE_STAGES
-        },
-        output=Path(snakemake.output[0]),
-        keep=True,
-    )
+    project = load_project(**snakemake.config["project"])
+    run_step(snakemake.rule, project, snakemake.wildcards.sequence, keep=True)
