@@ -11,7 +11,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -69,32 +69,6 @@ class Part(StrEnum):
 
 WIDEST_HOLE = 0.1  # default limit, as a share of the object's length
 DEFAULT_SETTINGS = Path("config/config.yaml")
-SEQUENCE_SETTINGS = [Path("config/evaluation/config.yaml"), Path("config/object/config.yaml")]
-CAPTURE_SETTINGS = [
-    Path(f"config/capture/{name}.yaml") for name in ("config", "family_b", "noise_2")
-]
-FIELD_SCENE_SETTINGS = [
-    Path(f"config/field/{name}.yaml") for name in ("starts_30", "rates", "floor", "beam")
-]
-FIELD_SETTINGS = [
-    Path("config/evaluation/config.yaml"),
-    *(
-        Path(f"config/field/{name}.yaml")
-        for name in ("no_depth", "builds", "shoes", "two_views", "alone", "beam", "passer_by")
-    ),
-]
-OBJECT_SETTINGS = [
-    Path(f"config/object/{name}.yaml") for name in ("config", "no_detector", "noise_2", "family_b")
-]
-BODY_SETTINGS = [
-    *(Path(f"config/object/{name}.yaml") for name in ("config", "noise_2", "family_b")),
-    *(
-        Path(f"config/body/{name}.yaml")
-        for name in (
-            "per_frame_shape", "rgb_only", "four_view", "two_view", "two_view_rgb_only", "one_view",
-        )
-    ),
-]  # fmt: skip
 Settings = Annotated[Path, typer.Argument(metavar="SETTINGS", help="The project's config.yaml.")]
 SequenceName = Annotated[str, typer.Argument(help="A sequence of the project's table.")]
 Cores = Annotated[int, typer.Option(min=0, help="Processor cores to use; 0 = all.")]
@@ -352,41 +326,32 @@ def release(
     typer.echo(write_release(load_project(settings), kinds))
 
 
+def _evaluated(stage: str, which: str = "Projects") -> Any:
+    """Option for the projects of a part of the evaluation."""
+    words = f"{which} evaluated up to {stage}; may repeat."
+    return typer.Option(metavar="SETTINGS", help=words)
+
+
 @app.command(rich_help_panel=WHOLE)
 def evaluate(
     settings: Annotated[
-        list[Path],
-        typer.Argument(metavar="SETTINGS", help="Projects evaluated up to the metrics."),
-    ] = SEQUENCE_SETTINGS,
-    captures: Annotated[
-        list[Path],
-        typer.Option(metavar="SETTINGS", help="Projects evaluated up to the scene; may repeat."),
-    ] = CAPTURE_SETTINGS,
-    objects: Annotated[
-        list[Path],
-        typer.Option(
-            metavar="SETTINGS", help="Projects evaluated up to the object track; may repeat."
+        list[Path] | None,
+        typer.Argument(
+            metavar="SETTINGS",
+            help="Projects evaluated up to the metrics. Default here and of the options below: the "
+            "recordings in config/.",
         ),
-    ] = OBJECT_SETTINGS,
-    bodies: Annotated[
-        list[Path],
-        typer.Option(metavar="SETTINGS", help="Projects evaluated up to the body fit; may repeat."),
-    ] = BODY_SETTINGS,
+    ] = None,
+    captures: Annotated[list[Path] | None, _evaluated("the scene")] = None,
+    objects: Annotated[list[Path] | None, _evaluated("the object track")] = None,
+    bodies: Annotated[list[Path] | None, _evaluated("the body fit")] = None,
     field_scenes: Annotated[
-        list[Path],
-        typer.Option(
-            metavar="SETTINGS",
-            help="Projects with field conditions, evaluated up to the scene; may repeat.",
-        ),
-    ] = FIELD_SCENE_SETTINGS,
+        list[Path] | None, _evaluated("the scene", "Projects with field conditions,")
+    ] = None,
     field: Annotated[
-        list[Path],
-        typer.Option(
-            metavar="SETTINGS",
-            help="Projects with and without field conditions, evaluated up to the metrics; may "
-            "repeat.",
-        ),
-    ] = FIELD_SETTINGS,
+        list[Path] | None,
+        _evaluated("the metrics", "Projects with and without field conditions,"),
+    ] = None,
     only: Annotated[
         Part | None,
         typer.Option(
@@ -446,7 +411,7 @@ def evaluate(
         Part.field_scenes: field_scenes,
         Part.field: field,
     }
-    chosen = {part.value: some for part, some in parts.items() if only in (None, part)}
+    chosen = {part.value: some or [] for part, some in parts.items() if only in (None, part)}
     raise typer.Exit(run_evaluation(chosen, output, cores=cores, seed=seed))
 
 

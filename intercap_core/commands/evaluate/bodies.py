@@ -17,6 +17,7 @@ from intercap_core.commands.evaluate.part import (
     Figures,
     Measured,
     add_rows,
+    config_files,
     console_of,
     keyed,
     number,
@@ -219,12 +220,20 @@ def _print_worst(console: Console, evaluations: Sequence[Bodies]) -> None:
 
 
 PART = EvaluationPart(
-    "bodies",
-    "body_fit",
-    ("frames", "scene", "person"),
-    measure,
-    flat,
-    print_bodies,
-    lambda project: rig_of(project.config),
+    name="bodies",
+    stage="body_fit",
+    reads=("frames", "scene", "person"),
+    settings=(
+        *config_files("object", "config", "noise_2", "family_b"),
+        *config_files(
+            "body", "per_frame_shape", "rgb_only", "four_view", "two_view", "two_view_rgb_only",
+            "one_view",
+        ),
+    ),
+    budget_minutes=6,
+    measure=measure,
+    flat=flat,
+    print_tables=print_bodies,
+    rig=lambda project: rig_of(project.config),
     kept=BodyErrors,
-)
+)  # fmt: skip

@@ -14,11 +14,6 @@ from intercap_core.commands.evaluate.part import Figures, Targets
 from intercap_core.project import Project
 from intercap_core.stage_list import STAGES
 
-# Minutes on two cores that a part may add to `make evaluate`, for its recordings and the stages
-# that no earlier part computes. The sum must not exceed 60.
-BUDGET_MINUTES = {
-    "sequences": 19, "captures": 5, "objects": 8, "bodies": 6, "field_scenes": 8, "field": 14,
-}  # fmt: skip
 STUDIO = "studio"
 
 
@@ -70,16 +65,15 @@ def jobs_by_part(parts: Mapping[str, Targets]) -> dict[str, list[Job]]:
 
 
 def minutes_of_parts(parts: Mapping[str, Targets]) -> Figures:
-    """Figures ``<part>_minutes_budget`` and ``<part>_minutes_taken``, on two fully used cores.
+    """Figures ``<part>_minutes_taken`` on two fully used cores.
 
-    ``_taken`` is the sum over all jobs of the last run's duration, halved; the last run may belong
-    to an earlier evaluation.
+    Each is the sum over all jobs of the last run's duration, halved; the last run may belong to an
+    earlier evaluation.
     """
-    minutes: Figures = {}
-    for part, jobs in jobs_by_part(parts).items():
-        minutes[f"{part}_minutes_budget"] = BUDGET_MINUTES[part]
-        minutes[f"{part}_minutes_taken"] = sum(job.seconds() for job in jobs) / (2 * 60)
-    return minutes
+    return {
+        f"{part}_minutes_taken": sum(job.seconds() for job in jobs) / (2 * 60)
+        for part, jobs in jobs_by_part(parts).items()
+    }
 
 
 def print_minutes(parts: Sequence[str], minutes: Figures, duration: float) -> None:

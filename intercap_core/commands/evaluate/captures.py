@@ -13,6 +13,7 @@ from intercap_core.commands.evaluate.part import (
     EvaluationPart,
     Figures,
     Measured,
+    config_files,
     console_of,
     keyed,
     number,
@@ -83,11 +84,13 @@ def _mean_mm(values: np.ndarray, digits: int = 1) -> str:
 
 
 PART = EvaluationPart(
-    "captures",
-    "scene",
-    ("frames",),
-    measure,
-    flat,
-    print_captures,
+    name="captures",
+    stage="scene",
+    reads=("frames",),
+    settings=config_files("capture", "config", "family_b", "noise_2"),
+    budget_minutes=5,
+    measure=measure,
+    flat=flat,
+    print_tables=print_captures,
     kept=CaptureErrors,
 )

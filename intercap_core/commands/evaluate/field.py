@@ -25,6 +25,7 @@ from intercap_core.commands.evaluate.part import (
     EvaluationPart,
     Figures,
     Measured,
+    config_files,
     console_of,
     keyed,
     number,
@@ -204,12 +205,18 @@ def print_field(evaluations: Sequence[FieldSequences]) -> None:
 
 
 PART = EvaluationPart(
-    "field",
-    "metrics",
-    ("joint",),
-    measure,
-    flat,
-    print_field,
+    name="field",
+    stage="metrics",
+    settings=(
+        *config_files("evaluation", "config"),
+        *config_files(
+            "field", "no_depth", "builds", "shoes", "two_views", "alone", "beam", "passer_by"
+        ),
+    ),
+    budget_minutes=14,
+    measure=measure,
+    flat=flat,
+    print_tables=print_field,
     last=last_stage,
     timed=seconds,
 )

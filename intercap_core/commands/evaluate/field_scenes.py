@@ -15,6 +15,7 @@ from intercap_core.commands.evaluate.part import (
     EvaluationPart,
     Figures,
     Measured,
+    config_files,
     console_of,
     keyed,
     number,
@@ -86,10 +87,11 @@ def _list(values: np.ndarray, digits: int) -> str:
 
 
 PART = EvaluationPart(
-    "field_scenes",
-    "scene",
-    ("frames",),
-    measure,
-    flat,
-    print_scenes,
+    name="field_scenes",
+    stage="scene",
+    settings=config_files("field", "starts_30", "rates", "floor", "beam"),
+    budget_minutes=8,
+    measure=measure,
+    flat=flat,
+    print_tables=print_scenes,
 )

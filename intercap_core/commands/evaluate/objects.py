@@ -13,6 +13,7 @@ from intercap_core.commands.evaluate.part import (
     Figures,
     Measured,
     add_rows,
+    config_files,
     console_of,
     keyed,
     number,
@@ -125,12 +126,14 @@ def has_object(project: Project, sequence: str) -> bool:
 
 
 PART = EvaluationPart(
-    "objects",
-    "object_track",
-    ("scene",),
-    measure,
-    flat,
-    print_objects,
+    name="objects",
+    stage="object_track",
+    reads=("scene",),
+    settings=config_files("object", "config", "no_detector", "noise_2", "family_b"),
+    budget_minutes=8,
+    measure=measure,
+    flat=flat,
+    print_tables=print_objects,
     kept=ObjectErrors,
     has=has_object,
 )

@@ -49,7 +49,7 @@ class Measured(Generic[Errors]):
     """Description of the cameras and data that the settings select."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class EvaluationPart(Generic[Errors]):
     """One part of the evaluation: how its recordings are computed, measured and reported."""
 
@@ -57,8 +57,13 @@ class EvaluationPart(Generic[Errors]):
     """Name of the module in this package, whose code digest is part of the key of cached errors."""
     stage: str
     """Stage whose artefact is compared with the truth."""
-    reads: tuple[str, ...]
+    reads: tuple[str, ...] = ()
     """Other stages whose artefacts are read."""
+    settings: Sequence[Path]
+    """Settings files that are evaluated by default."""
+    budget_minutes: int
+    """Minutes on two cores that the part may add to `make evaluate`, for its recordings and the
+    stages that no earlier part computes. The sum of all parts must not exceed 60."""
     measure: Callable[[Project, str], Errors]
     """Measures the errors of (project, sequence)."""
     flat: Callable[[Sequence[Measured[Errors]]], Figures]
@@ -184,6 +189,11 @@ def _dataclass_of(kind: Any, values: dict[str, Any]) -> Any:
         for name, value in values.items()
     }
     return kind(**made)
+
+
+def config_files(folder: str, *names: str) -> tuple[Path, ...]:
+    """Settings files ``config/<folder>/<name>.yaml``."""
+    return tuple(Path("config", folder, f"{name}.yaml") for name in names)
 
 
 def truth_of(project: Project, sequence: str) -> Path:

@@ -47,7 +47,7 @@ QUICK_PARTS = ("sequences", "objects")
 
 
 def evaluate(
-    settings: Mapping[str, Sequence[Path]],
+    chosen: Mapping[str, Sequence[Path]],
     output: Path,
     *,
     cores: int = 0,
@@ -59,17 +59,18 @@ def evaluate(
     Raises UserError if a project's settings are wrong or none of its sequences has a result.
 
     Args:
-        settings: settings files of the recordings of each part in ``PARTS``.
+        chosen: settings files of the recordings of each part in ``PARTS``; none = its default.
         output: flat JSON with keys ``area.measure``, and ``area.measure_spread`` for the standard
             error of a figure. docs/evaluation.md describes the areas; ``time`` holds minutes.
         cores: number of cores, 0 = all.
         seed: draw everything random in the recordings from new seeds (:mod:`.seeds`).
     """
     begin = time.monotonic()
+    settings = {name: list(paths or PARTS[name].settings) for name, paths in chosen.items()}
     if seed is not None:
         settings = redraw_settings(settings, seed)
     projects = {
-        name: [load_project(path) for path in paths] for name, paths in settings.items() if paths
+        name: [load_project(path) for path in paths] for name, paths in settings.items()
     }  # errors in settings are reported before any work
     wanted = {name: PARTS[name].targets(some) for name, some in projects.items()}
     for some in projects.values():
@@ -84,6 +85,7 @@ def evaluate(
         part.print_tables(measured)
         figures |= part.flat(measured) | part.time_one(some)
     minutes = budget.minutes_of_parts(wanted)
+    minutes |= {f"{name}_minutes_budget": PARTS[name].budget_minutes for name in wanted}
     duration = (time.monotonic() - begin) / 60
     budget.print_minutes(list(projects), minutes, duration)
     figures |= {f"time.{key}": value for key, value in {**minutes, "minutes": duration}.items()}

@@ -14,6 +14,7 @@ from intercap_core.commands.evaluate.part import (
     EvaluationPart,
     Figures,
     Measured,
+    config_files,
     number,
     with_spread,
 )
@@ -209,4 +210,12 @@ def _cell(column: Figures, name: str) -> str:
     return number(column.get(name), 3) + (f" +- {error}" if error else "")
 
 
-PART = EvaluationPart("sequences", "metrics", (), measure, flat, print_sequences)
+PART = EvaluationPart(
+    name="sequences",
+    stage="metrics",
+    settings=(*config_files("evaluation", "config"), *config_files("object", "config")),
+    budget_minutes=19,
+    measure=measure,
+    flat=flat,
+    print_tables=print_sequences,
+)

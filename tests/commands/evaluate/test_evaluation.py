@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from intercap_core.cli import BODY_SETTINGS, OBJECT_SETTINGS
 from intercap_core.commands.evaluate import bodies as body_evaluation
 from intercap_core.commands.evaluate import objects as object_evaluation
 from intercap_core.commands.evaluate.captures import flat as capture_figures
@@ -18,7 +17,7 @@ from intercap_core.commands.evaluate.captures import print_captures
 from intercap_core.commands.evaluate.field_scenes import print_scenes
 from intercap_core.commands.evaluate.objects import lost_by_draw, print_objects
 from intercap_core.commands.evaluate.part import Measured, require_truth
-from intercap_core.commands.evaluate.run import QUICK_SETTINGS
+from intercap_core.commands.evaluate.run import PARTS, QUICK_SETTINGS
 from intercap_core.errors import UserError
 from intercap_core.evaluation.body_errors import CLOUD_KEYS, BodyErrors
 from intercap_core.evaluation.field_errors import FieldScene
@@ -38,7 +37,7 @@ def test_no_two_recordings_share_a_seed() -> None:
         assert {"furnished", "bare"} == set(rooms)
         seeds += [entry.seed for entry in studio.captures.values()]
     of_config = ("no_detector", "redrawn_1", "redrawn_2")
-    objects = [path for path in OBJECT_SETTINGS if path.stem not in of_config]
+    objects = [path for path in PARTS["objects"].settings if path.stem not in of_config]
     others = [
         Path(f"config/{other}/config.yaml")
         for other in ("demo", "test", "bench", "evaluation", "annotate")
@@ -145,7 +144,7 @@ def test_every_object_and_number_of_views_is_printed(capsys: pytest.CaptureFixtu
 
 
 def test_reduced_bodies_share_recordings() -> None:
-    projects = [load_project(path) for path in BODY_SETTINGS]
+    projects = [load_project(path) for path in PARTS["bodies"].settings]
     first = projects[0]
     assert first.config.studio is not None
     made = {row.recordings for row in first.sequences.values()}
@@ -161,7 +160,7 @@ def test_reduced_bodies_share_recordings() -> None:
         "2 views, no depth",
         "1 view",
     ]
-    assert {path for path in Path("config/body").glob("*.yaml")} < set(BODY_SETTINGS)
+    assert {path for path in Path("config/body").glob("*.yaml")} < set(PARTS["bodies"].settings)
 
 
 def _body(name: str, pve_mm: float, *, interaction: str = "drink", flagged: bool = False):

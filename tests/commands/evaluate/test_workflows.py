@@ -6,15 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from intercap_core.cli import (
-    BODY_SETTINGS,
-    CAPTURE_SETTINGS,
-    FIELD_SCENE_SETTINGS,
-    FIELD_SETTINGS,
-    OBJECT_SETTINGS,
-    SEQUENCE_SETTINGS,
-)
-from intercap_core.commands.evaluate.budget import BUDGET_MINUTES, Job, jobs_by_part
+from intercap_core.commands.evaluate.budget import Job, jobs_by_part
 from intercap_core.commands.evaluate.part import Targets
 from intercap_core.commands.evaluate.run import PARTS
 from intercap_core.commands.evaluate.workflows import (
@@ -26,21 +18,12 @@ from intercap_core.commands.evaluate.workflows import (
 )
 from intercap_core.project import load_project
 
-SETTINGS = {
-    "sequences": SEQUENCE_SETTINGS,
-    "captures": CAPTURE_SETTINGS,
-    "objects": OBJECT_SETTINGS,
-    "bodies": BODY_SETTINGS,
-    "field_scenes": FIELD_SCENE_SETTINGS,
-    "field": FIELD_SETTINGS,
-}
-
 
 @pytest.fixture(scope="module")
 def wanted() -> dict[str, Targets]:
     return {
-        name: PARTS[name].targets([load_project(path) for path in paths])
-        for name, paths in SETTINGS.items()
+        name: part.targets([load_project(path) for path in part.settings])
+        for name, part in PARTS.items()
     }
 
 
@@ -94,8 +77,8 @@ def test_each_part_is_expected_to_keep_to_its_budget(wanted: dict[str, Targets])
             )
             for job in jobs
         ]
-        assert sum(seconds) / 120 <= BUDGET_MINUTES[part]
-    assert sum(BUDGET_MINUTES[part] for part in PARTS) <= 60
+        assert sum(seconds) / 120 <= PARTS[part].budget_minutes
+    assert sum(part.budget_minutes for part in PARTS.values()) <= 60
 
 
 def test_remaining_work_shrinks_as_jobs_end(tmp_path: Path) -> None:
