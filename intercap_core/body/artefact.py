@@ -10,7 +10,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 import torch
 
-from intercap_core.artefacts import Artefact
+from intercap_core.artefacts import Artefact, Writer
 from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
@@ -45,6 +45,22 @@ def read_parameters(artefact: Artefact) -> BodyParameters:
     arrays = (np.atleast_2d(artefact[name]) for name in names)
     tensors = (torch.as_tensor(array, dtype=torch.float32) for array in arrays)
     return BodyParameters(**dict(zip(names, tensors, strict=True)))
+
+
+def put_parameters(
+    writer: Writer, parameters: BodyParameters, joints: np.ndarray, *, betas: np.ndarray
+) -> None:
+    """Write the bodies of a body_fit or joint artefact.
+
+    Args:
+        parameters: T frames; their betas are not written.
+        joints: (T, 55, 3) posed joints.
+        betas: (T, S), or (S,) of a shared shape.
+    """
+    writer.put("betas", betas)
+    for name in (field.name for field in fields(BodyParameters) if field.name != "betas"):
+        writer.put(name, getattr(parameters, name).cpu().numpy())
+    writer.put("joints", joints)
 
 
 def load_model(

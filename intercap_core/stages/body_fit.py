@@ -6,7 +6,6 @@ shape, the thickness of the clothing and the offsets of the detector's keypoints
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,10 +13,9 @@ import numpy as np
 import torch
 
 from intercap_core import artefacts
-from intercap_core.body.artefact import file_digest, load_pose_prior
+from intercap_core.body.artefact import file_digest, load_pose_prior, put_parameters
 from intercap_core.body.loading import OPEN_BODY, ShapePrior, load_body_file
 from intercap_core.body.model import BodyModel, check_body
-from intercap_core.body.parameters import BodyParameters
 from intercap_core.body_fit import quality
 from intercap_core.body_fit.bridge import bridge, bridged_sigma, unwrap_turns
 from intercap_core.body_fit.definition import Definition
@@ -108,7 +106,7 @@ def run(
         gender=subject.gender,
         body_model=file_digest(path),
     ) as writer:
-        _put_bodies(writer, replace(params, betas=shapes.betas(params.betas)), joints)
+        put_parameters(writer, params, joints, betas=shapes.betas(params.betas).cpu().numpy())
         writer.put("keypoint_residual", keypoint_residual)
         writer.put("cloud_residual", cloud_residual)
         writer.put("joint_sigma", stated.sigma)
@@ -123,16 +121,6 @@ def run(
         writer.put("uncertain", stated.uncertain)
         writer.put("part_names", list(BODY_PARTS))
         writer.put("undetermined", stated.undetermined)
-
-
-def _put_bodies(writer: artefacts.Writer, params: BodyParameters, joints: np.ndarray) -> None:
-    """Write the SMPL-X parameters and the joints (T, 55, 3)."""
-    for name in (
-        "betas", "expression", "global_orient", "transl", "body_pose", "jaw_pose", "leye_pose",
-        "reye_pose", "left_hand_pose", "right_hand_pose",
-    ):  # fmt: skip
-        writer.put(name, getattr(params, name).cpu().numpy())
-    writer.put("joints", joints)
 
 
 class _Uncertainty(NamedTuple):

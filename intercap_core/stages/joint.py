@@ -15,24 +15,18 @@ import torch
 
 from intercap_core import artefacts
 from intercap_core.annotation import ContactInterval
+from intercap_core.body.artefact import put_parameters
 from intercap_core.body.keypoints import LEFT_HAND, RIGHT_HAND
-from intercap_core.body.model import BodyModel
 from intercap_core.config import digest
 from intercap_core.joint.cameras import CameraFit
 from intercap_core.joint.fit import fit
 from intercap_core.joint.inputs import open_inputs
 from intercap_core.joint.released.artefact import import_joint
 from intercap_core.joint.result import Convergence, JointFit
-from intercap_core.joint.state import State
 from intercap_core.schemas import CONTACT_REGIONS, JOINT, PERSON
 from intercap_core.sequence_inputs import FitSettings, SequenceModels, SequencePaths
 
 log = logging.getLogger(__name__)
-
-_BODY_PARAMETERS = (
-    "expression", "global_orient", "transl", "body_pose", "jaw_pose", "leye_pose", "reye_pose",
-    "left_hand_pose", "right_hand_pose",
-)  # fmt: skip
 
 
 def run(
@@ -77,7 +71,10 @@ def run(
         cameras_corrected=fitted.cameras_corrected,
         **inputs.attributes,
     ) as writer:
-        _put_body(writer, inputs.model, fitted.state)
+        parameters = fitted.state.parameters(inputs.model)
+        with torch.no_grad():
+            joints = inputs.model(parameters, vertex_ids=np.array([0])).joints.cpu().numpy()
+        put_parameters(writer, parameters, joints, betas=fitted.state.betas)
         _put_fit(writer, fitted)
         undetermined = inputs.sequential.flags.hands | _hands_of_few_views(paths.person)
         writer.put("hand_undetermined", undetermined)
@@ -100,17 +97,6 @@ def _put_cameras(writer: artefacts.Writer, cameras: CameraFit) -> None:
     writer.put("master_from_colour", cameras.now.rig.master_from_colour)
     writer.put("depth_bias", cameras.now.depth_bias)
     writer.put("camera_covariance", cameras.covariance)
-
-
-def _put_body(writer: artefacts.Writer, model: BodyModel, state: State) -> None:
-    """Write the SMPL-X parameters and the joints (T, 55, 3)."""
-    parameters = state.parameters(model)
-    with torch.no_grad():
-        joints = model(parameters, vertex_ids=np.array([0])).joints
-    writer.put("betas", state.betas)
-    for name in _BODY_PARAMETERS:
-        writer.put(name, getattr(parameters, name).cpu().numpy())
-    writer.put("joints", joints.cpu().numpy())
 
 
 def _put_fit(writer: artefacts.Writer, fitted: JointFit) -> None:

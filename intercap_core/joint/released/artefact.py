@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from intercap_core import artefacts
-from intercap_core.body.artefact import file_digest
+from intercap_core.body.artefact import file_digest, put_parameters
 from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import BodyParameters
@@ -26,7 +26,6 @@ from intercap_core.formats.released import (
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.joint.released import behave, intercap
-from intercap_core.joint.sequential import POSE_NAMES
 from intercap_core.schemas import CONTACT_REGIONS, JOINT, PERSON, SCENE
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 
@@ -131,10 +130,7 @@ def import_joint(
         cameras_corrected=False,
         made_by=f"another program: {released.source}",
     ) as writer:
-        writer.put("betas", shape.astype(np.float32))
-        for name in ("expression", *POSE_NAMES):
-            writer.put(name, getattr(params, name).numpy())
-        writer.put("joints", posed.joints.numpy())
+        put_parameters(writer, params, posed.joints.numpy(), betas=shape.astype(np.float32))
         writer.put("keypoint_residual", _keypoint_errors(paths.person, rig, keypoints))
         writer.put("cloud_residual", np.full(total, np.nan, np.float32))
         writer.put("rotation", rotation)
