@@ -188,7 +188,7 @@ def modules_reached(module: str, *, root: Path = ROOT) -> dict[str, frozenset[st
 def _used(module: str, names: frozenset[str], root: Path) -> list[_Statement]:
     """Top-level statements that are needed to define ``names``, in order."""
     path = _path(module, root)
-    statements = _statements(module, path, path.stat().st_mtime_ns, root)
+    statements = _statements(path, path.stat().st_mtime_ns, root)
     if WHOLE in names:
         return list(statements)
     chosen: set[int] = set()
@@ -207,7 +207,7 @@ def _used(module: str, names: frozenset[str], root: Path) -> list[_Statement]:
 
 
 @cache
-def _statements(module: str, path: Path, mtime_ns: int, root: Path) -> tuple[_Statement, ...]:
+def _statements(path: Path, mtime_ns: int, root: Path) -> tuple[_Statement, ...]:
     """Top-level statements of a module; ``mtime_ns`` invalidates the cache after an edit."""
     tree = ast.parse(path.read_bytes(), str(path))
     for node in ast.walk(tree):
@@ -219,7 +219,7 @@ def _statements(module: str, path: Path, mtime_ns: int, root: Path) -> tuple[_St
             ast.dump(node).encode(),
             frozenset(_defines(node)),
             frozenset(_uses(node)),
-            tuple(_imports(node, module, root)),
+            tuple(_imports(node, root)),
         )
         for node in tree.body
     )
@@ -256,9 +256,10 @@ def _uses(statement: ast.stmt) -> set[str]:
     return names
 
 
-def _imports(node: ast.stmt, module: str, root: Path) -> list[tuple[str, str]]:
+def _imports(node: ast.stmt, root: Path) -> list[tuple[str, str]]:
     """Pairs (module, name) that a statement imports from the package, with parent packages.
 
+    No import in the package is relative (ruff's rule TID252).
     ``from a import b`` counts both as the name b of module a and as a module a.b, if that exists.
     """
     found: list[tuple[str, str]] = []
@@ -266,9 +267,8 @@ def _imports(node: ast.stmt, module: str, root: Path) -> list[tuple[str, str]]:
         if isinstance(inner, ast.Import):
             targets = [(alias.name, WHOLE) for alias in inner.names]
         elif isinstance(inner, ast.ImportFrom):
-            base = _absolute(inner, module, root)
-            targets = [(base, alias.name) for alias in inner.names]
-            targets += [(f"{base}.{alias.name}", WHOLE) for alias in inner.names]
+            targets = [(str(inner.module), alias.name) for alias in inner.names]
+            targets += [(f"{inner.module}.{alias.name}", WHOLE) for alias in inner.names]
         elif isinstance(inner, ast.Call):
             targets = [(name, WHOLE) for name in _discovered(inner, root)]
         else:
@@ -290,17 +290,6 @@ def _discovered(call: ast.Call, root: Path) -> list[str]:
         return []
     files = sorted(_path(package, root).parent.glob("*.py"))
     return [f"{package}.{file.stem}" for file in files if file.stem != "__init__"]
-
-
-def _absolute(node: ast.ImportFrom, module: str, root: Path) -> str:
-    """Absolute name of the module from which ``module`` imports."""
-    if not node.level:
-        return node.module or ""
-    package = module.split(".")
-    if _path(module, root).name != "__init__.py":
-        package = package[:-1]
-    package = package[: len(package) - (node.level - 1)]
-    return ".".join([*package, *([node.module] if node.module else [])])
 
 
 def _path(module: str, root: Path) -> Path:

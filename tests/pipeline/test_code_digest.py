@@ -16,7 +16,7 @@ FILES = {
     "config.py": "from pydantic import BaseModel\nclass A(BaseModel):\n    x: int = 1\n"
     "class B(BaseModel):\n    a: A\nclass C(BaseModel):\n    y: int = 1\n",
     "schemas.py": "_SHARED = 1\nONE = {'a': _SHARED}\nTWO = 2\n",
-    "project.py": "from .config import C\ndef digest(x):\n    return x\n"
+    "project.py": "from intercap_core.config import C\ndef digest(x):\n    return x\n"
     "def load():\n    return C\n",
     "energy/__init__.py": "",
     "energy/contact.py": "WEIGHT = 1\n",
@@ -24,7 +24,7 @@ FILES = {
     "solve/__init__.py": "from intercap_core.solve import banded\n",
     "solve/banded.py": "import numpy as np\n",
     "body/__init__.py": "",
-    "body/model.py": "from . import maps\n",
+    "body/model.py": "from intercap_core.body import maps\n",
     "body/maps.py": "",
     "body/data/body.npz": "data",
     "stages/__init__.py": "",
@@ -34,7 +34,8 @@ FILES = {
         "def run():\n    from intercap_core.energy import contact\n"
         "    import intercap_core.body.model\n    return contact, digest\n"
     ),
-    "stages/scene.py": "from ..energy.ground import WEIGHT\nfrom intercap_core import solve\n",
+    "stages/scene.py": "from intercap_core.energy.ground import WEIGHT\n"
+    "from intercap_core import solve\n",
 }
 
 
