@@ -11,7 +11,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -19,6 +19,9 @@ from intercap_core import disk
 from intercap_core.errors import UserError
 from intercap_core.signals import Terminated, raise_on_signals
 from intercap_core.stage_list import STAGES
+
+if TYPE_CHECKING:
+    from intercap_core.project import Project
 
 WHOLE, SINGLE, LOOK = "A whole dataset", "One step of one sequence", "Look and maintain"
 
@@ -249,11 +252,10 @@ def verify(settings: Settings = DEFAULT_SETTINGS) -> None:
 
     Example: intercap verify config/demo/config.yaml
     """
-    _prepare()
+    project = _open(settings)
     from intercap_core.commands.status import print_verification
-    from intercap_core.project import load_project
 
-    raise typer.Exit(0 if print_verification(load_project(settings)) else 1)
+    raise typer.Exit(0 if print_verification(project) else 1)
 
 
 @app.command(rich_help_panel=WHOLE)
@@ -262,11 +264,10 @@ def report(settings: Settings = DEFAULT_SETTINGS) -> None:
 
     Example: intercap report config/demo/config.yaml
     """
-    _prepare()
+    project = _open(settings)
     from intercap_core.commands.report import write_site
-    from intercap_core.project import load_project
 
-    typer.echo(write_site(load_project(settings)))
+    typer.echo(write_site(project))
 
 
 @app.command(rich_help_panel=WHOLE)
@@ -439,12 +440,10 @@ def studio(settings: Settings, sequence: SequenceName) -> None:
 
     Example: intercap studio config/demo/config.yaml cup_drink_s02
     """
-    _prepare()
+    project = _open(settings, sequence)
     from intercap_core.pipeline.step import run_studio
-    from intercap_core.project import load_project
 
-    project = load_project(settings)
-    typer.echo(run_studio(project, _known(project.sequences, sequence)))
+    typer.echo(run_studio(project, sequence))
 
 
 def _stage_command(stage: str, purpose: str) -> Callable[..., None]:
@@ -458,16 +457,13 @@ def _stage_command(stage: str, purpose: str) -> Callable[..., None]:
         ] = None,
         threads: Annotated[int, typer.Option(min=1, help="Threads of numerical libraries.")] = 1,
     ) -> None:
-        _prepare(threads)
+        project = _open(settings, sequence, threads)
         from intercap_core.pipeline.step import run_step
-        from intercap_core.project import load_project
 
-        project = load_project(settings)
-        name = _known(project.sequences, sequence)
         if not STAGES[stage].writes_folder:
-            written = output or project.artefact(name, stage)
+            written = output or project.artefact(sequence, stage)
             _check_output(written, replace_any=output is None)
-        typer.echo(run_step(stage, project, name, output=output))
+        typer.echo(run_step(stage, project, sequence, output=output))
 
     command.__doc__ = (
         f"{purpose}\n\nReads the artefacts of earlier stages of this sequence. Its settings are "
@@ -610,13 +606,10 @@ def view(
 
     Example: intercap view config/demo/config.yaml cup_drink_s02
     """
-    _prepare()
+    project = _open(settings, sequence)
     from intercap_core.commands.view import view as write_view
-    from intercap_core.project import load_project
 
-    project = load_project(settings)
-    name = _known(project.sequences, sequence)
-    typer.echo(write_view(project, name, output, show=show))
+    typer.echo(write_view(project, sequence, output, show=show))
 
 
 @app.command(rich_help_panel=LOOK)
@@ -674,6 +667,17 @@ def _prepare(threads: int = 1) -> None:
     logging.getLogger("intercap_core").setLevel(logging.INFO)
 
 
+def _open(settings: Path, sequence: str | None = None, threads: int = 1) -> Project:
+    """Prepare as :func:`_prepare` and load a project; UserError if it lacks ``sequence``."""
+    _prepare(threads)
+    from intercap_core.project import load_project
+
+    project = load_project(settings)
+    if sequence is not None:
+        project.require_sequence(sequence)
+    return project
+
+
 def _check_output(path: Path, *, replace_any: bool) -> None:
     """Raise UserError if the output cannot be written, before any computation.
 
@@ -702,12 +706,6 @@ def _check_output(path: Path, *, replace_any: bool) -> None:
             f"{path}: cannot be written ({error.strerror}), expected a folder that takes files; "
             "name another output"
         ) from None
-
-
-def _known(sequences: dict, name: str) -> str:
-    if name not in sequences:
-        raise UserError(f"sequence {name!r} is not in the table; it lists {', '.join(sequences)}")
-    return name
 
 
 def main() -> None:

@@ -126,11 +126,7 @@ def open_sequence(
             z forward), or the name of another camera, with that stage's camera poses.
     """
     project = settings if isinstance(settings, Project) else load_project(Path(settings))
-    if sequence not in project.sequences:
-        raise UserError(
-            f"{project.path}: has no sequence {sequence!r}; it has "
-            f"{', '.join(sorted(project.sequences))}"
-        )
+    project.require_sequence(sequence)
     entry = project.object_of(sequence)
     mesh = None if entry is None else ObjectMesh.load(entry)
     gender = project.subjects[project.sequences[sequence].subject].gender

@@ -51,6 +51,14 @@ class Project:
         """Folder of this dataset's logs."""
         return Path("logs") / self.config.dataset
 
+    def require_sequence(self, name: str) -> None:
+        """Raise UserError if the table of sequences has no such row."""
+        if name not in self.sequences:
+            raise UserError(
+                f"{self.path}: sequence {name!r} is not in the table; it lists "
+                f"{_some(self.sequences)}"
+            )
+
     def paths(self, sequence: str) -> SequencePaths:
         """Paths of the sequence's artefacts, from frames to metrics."""
         return SequencePaths(

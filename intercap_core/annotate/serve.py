@@ -51,11 +51,8 @@ def serve(
             f"the page needs the package {error.name}: pip install 'intercap-core[annotate]'"
         ) from None
     annotator = Annotator(settings, by=by, cores=cores, profile=profile)
-    if sequence is not None and sequence not in annotator.project.sequences:
-        raise UserError(
-            f"there is no sequence {sequence!r} in the table; it lists "
-            f"{', '.join(annotator.project.sequences)}"
-        )
+    if sequence is not None:
+        annotator.project.require_sequence(sequence)
     token = secrets.token_urlsafe(24)
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as listening:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -27,12 +27,8 @@ def draw_closeups(
     folder = output or project.results / "closeups"
     if folder.exists() and not folder.is_dir():
         raise UserError(f"{folder}: is a file, expected a folder for pictures; name another output")
-    unknown = [name for name in sequences if name not in project.sequences]
-    if unknown:
-        raise UserError(
-            f"{project.path}: there is no sequence {unknown[0]!r}, expected one of "
-            f"{', '.join(project.sequences)}; correct the name"
-        )
+    for name in sequences:
+        project.require_sequence(name)
     written, empty = [], []
     for name in sequences or project.sequences:
         models = project.models(name)

@@ -150,7 +150,7 @@ def test_the_command_writes_a_picture_for_each_hold(project: Path, tmp_path: Pat
 
 
 def test_missing_inputs_are_reported(project: Path, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"no sequence 'nobody', expected one of s01_o03"):
+    with pytest.raises(UserError, match=r"sequence 'nobody' is not in the table; it lists s01_o03"):
         draw_closeups(project, ["nobody"])
     with pytest.raises(UserError, match=r"config.yaml: is a file, expected a folder"):
         draw_closeups(project, [NAME], project)
