@@ -41,6 +41,14 @@ _CAMERA_MODELS = {
     "colour_from_depth": Field(("C", "4", "4"), "float64", "depth camera to colour camera; NaN without depth", "m", "colour camera"),
 }  # fmt: skip
 
+_CAMERA_COVARIANCE = {
+    "camera_covariance": Field(("C", "7", "C", "7"), "float64", "covariance of each camera's rotation about its centre, translation and depth bias; 0 for the master's pose", "rad, m", "master"),
+}  # fmt: skip
+_OBJECT_POSE = {
+    "rotation": Field(("T", "3", "3"), "float64", "rotation of master_from_object; NaN in all frames = no object", "1", "master"),
+    "translation": Field(("T", "3"), "float64", "translation of master_from_object (position of the mesh's origin)", "m", "master"),
+}  # fmt: skip
+
 FRAMES = Schema(
     name="frames",
     version=1,
@@ -129,7 +137,7 @@ SCENE = Schema(
         "master_from_colour": Field(("C", "4", "4"), "float64", "refined extrinsics", "m", "master"),
         "master_from_colour_start": Field(("C", "4", "4"), "float64", "extrinsics as given", "m", "master"),
         "depth_bias": Field(("C",), "float64", "bias to subtract from each camera's depth", "m"),
-        "camera_covariance": Field(("C", "7", "C", "7"), "float64", "covariance of each camera's rotation about its centre, translation and depth bias; 0 for the master's pose", "rad, m", "master"),
+        **_CAMERA_COVARIANCE,
         "camera_refined": Field(("C",), "bool", "the camera's pose was refined from its own evidence; otherwise it is the given one", optional=True),
         "camera_verdict": Field(("C",), "str", "reason in words: held-out errors of the refined and the given pose, and the standard deviation of the pose", optional=True),
         "camera_slide": Field(("C", "3"), "float64", "least determined direction of the camera's pose: displacement of the rig's centre by one standard deviation", "m", "master", optional=True),
@@ -200,8 +208,7 @@ OBJECT_TRACK = Schema(
     },
     fields={
         "camera_names": Field(("C",), "str", "camera names"),
-        "rotation": Field(("T", "3", "3"), "float64", "rotation of master_from_object; NaN in all frames = no object", "1", "master"),
-        "translation": Field(("T", "3"), "float64", "translation of master_from_object (position of the mesh's origin)", "m", "master"),
+        **_OBJECT_POSE,
         "candidate": Field(("T", "C"), "int32", "index of the candidate used in each view (scene's image_of), -1 = none"),
         "overlap": Field(("T", "C"), "float32", "IoU of the used candidate and the visible part of the rendered object; NaN = none"),
         "depth_residual": Field(("T", "C"), "float32", "median absolute depth residual; NaN = none", "m"),
@@ -334,20 +341,7 @@ JOINT = Schema(
     },
     fields={
         **_body(one_shape=True),
-        "rotation": Field(
-            ("T", "3", "3"),
-            "float64",
-            "rotation of master_from_object; NaN in all frames = no object",
-            "1",
-            "master",
-        ),
-        "translation": Field(
-            ("T", "3"),
-            "float64",
-            "translation of master_from_object (position of the mesh's origin)",
-            "m",
-            "master",
-        ),
+        **_OBJECT_POSE,
         "region_names": Field(("R",), "str", "contact regions of the body"),
         "contact_probability": Field(
             ("T", "R"), "float32", "probability that the region touches the object; NaN = no object"
@@ -373,13 +367,7 @@ JOINT = Schema(
             "bias to subtract from each camera's depth, refined by body and object",
             "m",
         ),
-        "camera_covariance": Field(
-            ("C", "7", "C", "7"),
-            "float64",
-            "covariance of each camera's rotation about its centre, translation and depth bias; 0 for the master's pose",
-            "rad, m",
-            "master",
-        ),
+        **_CAMERA_COVARIANCE,
         "energy_names": Field(("E",), "str", "terms of the energy"),
         "energy_before": Field(("E",), "float64", "weighted energy of each term at the start"),
         "energy_after": Field(("E",), "float64", "weighted energy of each term at the end"),
