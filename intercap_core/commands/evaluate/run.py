@@ -12,7 +12,6 @@ from typing import Any
 
 from intercap_core.commands.evaluate import (
     bodies,
-    budget,
     captures,
     field,
     field_scenes,
@@ -27,7 +26,11 @@ from intercap_core.commands.evaluate.reference import (
     update_reference,
 )
 from intercap_core.commands.evaluate.seeds import redraw_settings
-from intercap_core.commands.evaluate.workflows import bring_up_to_date
+from intercap_core.commands.evaluate.workflows import (
+    bring_up_to_date,
+    minutes_of_parts,
+    print_minutes,
+)
 from intercap_core.errors import UserError
 from intercap_core.project import load_project
 
@@ -84,10 +87,10 @@ def evaluate(
         measured = part.measure_all(some, workers=workers)
         part.print_tables(measured)
         figures |= part.flat(measured) | part.time_one(some)
-    minutes = budget.minutes_of_parts(wanted)
+    minutes = minutes_of_parts(wanted)
     minutes |= {f"{name}_minutes_budget": PARTS[name].budget_minutes for name in wanted}
     duration = (time.monotonic() - begin) / 60
-    budget.print_minutes(list(projects), minutes, duration)
+    print_minutes(list(projects), minutes, duration)
     figures |= {f"time.{key}": value for key, value in {**minutes, "minutes": duration}.items()}
     flat = {k: float(f"{value:.6g}") for k, value in figures.items() if math.isfinite(value)}
     output.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Bring the workflows of many projects up to date, two at a time.
+"""Bring the workflows of many projects up to date, two at a time; their expected and taken time.
 
 One workflow leaves cores idle while its last long job runs; a second workflow uses them. A project
 that reads the recordings of another project starts after it. Among the projects that can start, the
@@ -7,28 +7,29 @@ one with the longest expected work, including the work that waits for it, is fir
 
 from __future__ import annotations
 
+import csv
 import fcntl
 import math
 import os
 import re
-import signal
 import subprocess
-import sys
 import time
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO
+from typing import IO, NamedTuple
 
 from rich.console import Console
+from rich.table import Table
 
 from intercap_core.commands.check import check_bodies
-from intercap_core.commands.evaluate.budget import STUDIO, Job, list_jobs
-from intercap_core.commands.evaluate.part import Targets
+from intercap_core.commands.evaluate.part import Figures, Targets
 from intercap_core.commands.run import POLL_SECONDS, Watcher, snakemake_command
 from intercap_core.errors import UserError
+from intercap_core.pipeline.stage_inputs import STUDIO
 from intercap_core.project import Project
+from intercap_core.stage_list import STAGES
 
 SIDE_BY_SIDE = 2  # workflows at a time
 LOCK = Path(".snakemake") / "evaluation.lock"
@@ -37,6 +38,53 @@ SECONDS_PER_FRAME = {
     STUDIO: 0.52, "frames": 0.02, "detections": 0.02, "scene": 0.25, "person": 0.15,
     "object_track": 0.22, "body_fit": 0.17, "joint": 0.37, "metrics": 0.30,
 }  # fmt: skip
+
+
+class Job(NamedTuple):
+    """A stage of one recording, or the rendering of a virtual recording (stage ``STUDIO``)."""
+
+    project: Project
+    sequence: str
+    stage: str
+
+    def seconds(self) -> float:
+        """Wall seconds of the last run, from the workflow's benchmark file; 0 if unknown."""
+        folder = Path("benchmarks") / self.project.config.dataset / self.sequence
+        try:
+            with open(folder / f"{self.stage}.tsv", encoding="utf-8") as file:
+                return float(next(csv.DictReader(file, delimiter="\t"))["s"])
+        except (OSError, StopIteration, KeyError, ValueError):
+            return 0.0
+
+
+def list_jobs(project: Project, stages: Sequence[str]) -> list[Job]:
+    """All jobs that a project's target ``stages`` need, including the recordings."""
+    wanted, pending = set(), list(stages)
+    while pending:
+        stage = pending.pop()
+        if stage not in wanted:
+            wanted.add(stage)
+            pending += [name for name in STAGES[stage].reads if name in STAGES]
+    ordered = [stage for stage in STAGES if stage in wanted]
+    return [
+        Job(project, name, stage)
+        for name in project.sequences
+        for stage in [*([STUDIO] if project.recordings_made(name) is not None else []), *ordered]
+    ]
+
+
+def jobs_by_part(parts: Mapping[str, Targets]) -> dict[str, list[Job]]:
+    """Jobs that each part adds; shared jobs belong to the first part that needs them."""
+    known: set[tuple[Path, str, str]] = set()
+    jobs: dict[str, list[Job]] = {}
+    for part, targets in parts.items():
+        jobs[part] = []
+        for job in (job for stage, project in targets for job in list_jobs(project, [stage])):
+            key = (job.project.results.resolve(), job.sequence, job.stage)
+            if key not in known:
+                known.add(key)
+                jobs[part].append(job)
+    return jobs
 
 
 def expected_seconds(job: Job, frames: int) -> float:
@@ -143,12 +191,8 @@ def bring_up_to_date(wanted: Mapping[str, Targets], *, cores: int = 0) -> int:
             raise UserError(
                 "another evaluation is running in this folder; wait for it or end it"
             ) from None
-        # exit statuses by the convention of shells: 128 + 15 (SIGTERM), 128 + 2 (SIGINT)
-        previous_handler = signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
         try:
             _run(runs, parallel, cores, lock.fileno(), console)
-        except KeyboardInterrupt:
-            raise SystemExit(130) from None
         finally:
             running = [run.process for run in runs if run.process is not None]
             for process in running:
@@ -156,7 +200,6 @@ def bring_up_to_date(wanted: Mapping[str, Targets], *, cores: int = 0) -> int:
                     process.terminate()
             for process in running:
                 process.wait()
-            signal.signal(signal.SIGTERM, previous_handler)
     return max((1 if run.status else 0 for run in runs), default=0)
 
 
@@ -264,3 +307,27 @@ def _end(run: ProjectRun) -> None:
     run.status = run.process.returncode
     if run.status:
         run.watcher.print_failures(failed=True, prefix=f"{run.project.config.dataset}: ")
+
+
+def minutes_of_parts(parts: Mapping[str, Targets]) -> Figures:
+    """Figures ``<part>_minutes_taken`` on two fully used cores.
+
+    Each is the sum over all jobs of the last run's duration, halved; the last run may belong to an
+    earlier evaluation.
+    """
+    return {
+        f"{part}_minutes_taken": sum(job.seconds() for job in jobs) / (2 * 60)
+        for part, jobs in jobs_by_part(parts).items()
+    }
+
+
+def print_minutes(parts: Sequence[str], minutes: Figures, duration: float) -> None:
+    """Print one row per part, and the ``duration`` of this run in minutes."""
+    console = Console()
+    table = Table("part", "budget", "taken", box=None, title="minutes on 2 cores")
+    for part in parts:
+        budget, taken = (minutes[f"{part}_minutes_{key}"] for key in ("budget", "taken"))
+        excess = "over its budget" if taken > budget else ""
+        table.add_row(part, f"{budget:.1f}", f"{taken:.1f}", excess)
+    console.print(table)
+    console.print(f"this run took {duration:.1f} minutes of wall time", highlight=False)

@@ -6,13 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from intercap_core.commands.evaluate.budget import Job, jobs_by_part
 from intercap_core.commands.evaluate.part import Targets
 from intercap_core.commands.evaluate.run import PARTS
 from intercap_core.commands.evaluate.workflows import (
+    Job,
     ProjectRun,
     expected_seconds,
     frames_of_recordings,
+    jobs_by_part,
     plan_runs,
     progress,
 )
