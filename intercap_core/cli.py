@@ -11,7 +11,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -59,17 +59,7 @@ class ReleasedKind(StrEnum):
     artefact = "artefact"
 
 
-class Part(StrEnum):
-    """Parts of the evaluation."""
-
-    sequences = "sequences"
-    captures = "captures"
-    objects = "objects"
-    bodies = "bodies"
-    field_scenes = "field_scenes"
-    field = "field"
-
-
+Part = Literal["sequences", "captures", "objects", "bodies", "field_scenes", "field"]
 WIDEST_HOLE = 0.1  # default limit, as a share of the object's length
 DEFAULT_SETTINGS = Path("config/config.yaml")
 Settings = Annotated[Path, typer.Argument(metavar="SETTINGS", help="The project's config.yaml.")]
@@ -116,7 +106,8 @@ def check(settings: Settings = DEFAULT_SETTINGS) -> None:
 @app.command(rich_help_panel=WHOLE)
 def tables(
     layout: Annotated[
-        str, typer.Argument(metavar="LAYOUT", help="Released dataset: intercap or behave.")
+        Literal["intercap", "behave"],
+        typer.Argument(metavar="LAYOUT", help="Released dataset: intercap or behave."),
     ],
     root: Annotated[Path, typer.Argument(help="Folder of the unpacked release.")],
     output: Annotated[
@@ -323,8 +314,7 @@ def release(
 
     if check is not None:
         raise typer.Exit(0 if check_release(check) else 1)
-    kinds = [kind.value for kind in only] if only else list(KINDS)
-    typer.echo(write_release(load_project(settings), kinds))
+    typer.echo(write_release(load_project(settings), [*only] if only else KINDS))
 
 
 def _evaluated(stage: str, which: str = "Projects") -> Any:
@@ -405,14 +395,10 @@ def evaluate(
         status = evaluate_quick(output, cores=cores, renew_reference=update_reference)
         raise typer.Exit(status)
     parts = {
-        Part.sequences: settings,
-        Part.captures: captures,
-        Part.objects: objects,
-        Part.bodies: bodies,
-        Part.field_scenes: field_scenes,
-        Part.field: field,
-    }
-    chosen = {part.value: some or [] for part, some in parts.items() if only in (None, part)}
+        "sequences": settings, "captures": captures, "objects": objects, "bodies": bodies,
+        "field_scenes": field_scenes, "field": field,
+    }  # fmt: skip
+    chosen = {part: some or [] for part, some in parts.items() if only in (None, part)}
     raise typer.Exit(run_evaluation(chosen, output, cores=cores, seed=seed))
 
 

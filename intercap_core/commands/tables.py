@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from dataclasses import replace as changed
 from pathlib import Path
+from typing import Literal
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -27,7 +28,7 @@ class WrittenTables:
 
 
 def write_tables(
-    layout: str,
+    layout: Literal["intercap", "behave"],
     root: Path,
     output: Path,
     *,
@@ -36,7 +37,7 @@ def write_tables(
     objects: Path,
     replace: bool,
 ) -> WrittenTables:
-    """Write the project of a release in the layout "intercap" or "behave" into ``output``.
+    """Write the project of a release into ``output``.
 
     The layouts are described in :mod:`intercap_core.tables`. Raises UserError if a folder of the
     release is missing or malformed, or if files exist in ``output`` and ``replace`` is False.
@@ -61,15 +62,13 @@ def write_tables(
             raise UserError(f"{path}: no such folder; correct the path")
     if layout == "intercap":
         draft = intercap.draft(root, sources, dataset=name, objects=objects)
-    elif layout == "behave":
+    else:
         if changed(sources, results=None) != intercap.Sources():
             raise UserError(
                 "layout 'behave' has fixed places for calibration, meshes and detections; "
                 "leave out --calibrations, --annotations, --meshes, --keypoints and --candidates"
             )
         draft = behave.draft(root, dataset=name, results=sources.results)
-    else:
-        raise UserError(f"layout {layout!r} is unknown, expected intercap or behave; correct it")
     written = write_project(draft, output, replace=replace)
     remarks = draft.remarks + [
         f"{row.columns['sequence']}: {remark}" for row in draft.rows for remark in row.remarks
