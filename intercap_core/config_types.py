@@ -16,9 +16,8 @@ from pydantic import (
 
 from intercap_core.inputs.files import path_fault
 
-MAX_POSITION_M = (
-    50.0  # larger values are probably millimetres: a capture volume is some metres wide
-)
+# Larger values are probably millimetres: a capture volume is some metres wide.
+MAX_POSITION_M = 50.0
 
 
 def _metres(value: float) -> float:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass, field
+from logging.handlers import BufferingHandler
 from typing import TYPE_CHECKING
 
 from intercap_core.annotation import Annotation
@@ -161,7 +161,7 @@ def _check_mesh(project: Project, name: str, findings: Findings) -> str | None:
     """Error message if an object's mesh cannot be used; warnings on a usable one become notes."""
     from intercap_core.geometry.rigid import mesh
 
-    warnings = _LogTexts()
+    warnings = BufferingHandler(capacity=1000)
     mesh.log.addHandler(warnings)
     mesh.log.propagate = False
     try:
@@ -171,20 +171,8 @@ def _check_mesh(project: Project, name: str, findings: Findings) -> str | None:
     finally:
         mesh.log.removeHandler(warnings)
         mesh.log.propagate = True
-    findings.notes += [Fault("", text) for text in warnings.texts]
+    findings.notes += [Fault("", record.getMessage()) for record in warnings.buffer]
     return None
-
-
-class _LogTexts(logging.Handler):
-    """Collects the texts of log records."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.texts: list[str] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Append the record's text."""
-        self.texts.append(record.getMessage())
 
 
 def _faults_of_capture(project: Project, name: str) -> list[str]:
