@@ -76,8 +76,13 @@ class Stage:
     """True if it runs on the device that the setting ``device`` names."""
     estimates: bool = False
     """True if it estimates poses, which the metrics compare with the truth."""
-    writes_folder: bool = False
-    """True if it writes a folder of other tools' files instead of an artefact."""
+    folder_marker: str = ""
+    """Name of a file in the folder that it writes instead of an artefact; "" = an artefact."""
+
+    @property
+    def writes_folder(self) -> bool:
+        """True if it writes a folder of other tools' files instead of an artefact."""
+        return bool(self.folder_marker)
 
 
 # Artefacts that the joint fit reads, and artefacts of all stages up to the metrics.
@@ -172,7 +177,7 @@ STAGES: dict[str, Stage] = {
             columns=("intent",),
             resources=JobResources(620, mb_per_image=0.3, seconds=20, seconds_per_image=0.03),
             output_bytes=15_000_000,
-            writes_folder=True,
+            folder_marker="index.html",
         ),
         Stage(
             name="export",
@@ -180,7 +185,7 @@ STAGES: dict[str, Stage] = {
             reads=("frames", "joint", "scene", "metrics", "body_fit", "object_track"),
             resources=JobResources(600, mb_per_image=0.05, seconds=20, seconds_per_image=0.02),
             output_bytes=60_000_000,
-            writes_folder=True,
+            folder_marker="export.json",  # names the files of an export and their checksums
         ),
     )
 }  # fmt: skip

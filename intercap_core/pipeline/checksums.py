@@ -20,7 +20,7 @@ from intercap_core import artefacts, schemas
 from intercap_core.artefacts import part_of
 from intercap_core.errors import UserError
 from intercap_core.pipeline.provenance import FILE, Manifest, read_manifest
-from intercap_core.stages.folders import EXPORT_MARKER
+from intercap_core.stage_list import STAGES
 
 INPUTS_FILE = ".inputs.json"
 _SUFFIX = ".left"  # suffix of the file that stores the checksum of an output
@@ -159,17 +159,18 @@ def find_damage(output: Path) -> str:
 
 def _find_damaged_file(folder: Path) -> str:
     """The first file of an export that differs from its checksum in the export's manifest."""
-    if not (folder / EXPORT_MARKER).is_file():
+    listing = folder / STAGES["export"].folder_marker
+    if not listing.is_file():
         return ""
     try:
-        listed = json.loads((folder / EXPORT_MARKER).read_text(encoding="utf-8"))["files"]
+        listed = json.loads(listing.read_text(encoding="utf-8"))["files"]
         damaged = [
             name
             for name, digest in listed.items()
             if not (folder / name).is_file() or _file_digest(folder / name) != digest
         ]
     except (ValueError, KeyError, AttributeError, TypeError):
-        damaged = [EXPORT_MARKER]
+        damaged = [listing.name]
     if not damaged:
         return ""
     return (

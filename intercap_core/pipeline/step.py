@@ -30,7 +30,6 @@ from intercap_core.pipeline.resources import explain_disk_errors
 from intercap_core.project import Project
 from intercap_core.sequence_inputs import SequencePaths
 from intercap_core.stage_list import STAGES
-from intercap_core.stages import folders
 
 log = logging.getLogger(__name__)
 
@@ -142,7 +141,7 @@ class _Step:
         module = importlib.import_module(f"intercap_core.stages.{self.stage}")
         in_folder = STAGES[self.stage].writes_folder
         if in_folder:
-            folders.check_replaceable(self.output, marker=module.MARKER, what=self.stage)
+            check_replaceable(self.output, self.stage)
         part = artefacts.part_of(self.output)
         try:
             module.run(output=part, **self._arguments())
@@ -150,7 +149,7 @@ class _Step:
             if not lease.is_held():
                 return False
             if in_folder:
-                folders.put(part, self.output)
+                replace_folder(self.output, part)
             else:
                 forget_output(self.output)
                 os.replace(part, self.output)
@@ -168,6 +167,33 @@ class _Step:
         if "paths" in stage_code(self.stage).parameters:
             return given | {"paths": SequencePaths(**self.inputs)}
         return given | dict(self.inputs)
+
+
+def check_replaceable(output: Path, stage: str) -> None:
+    """Raise UserError if ``output`` holds anything but an earlier output of ``stage``."""
+    marker = STAGES[stage].folder_marker
+    if output.is_dir():
+        if any(output.iterdir()) and not (output / marker).is_file():
+            raise UserError(
+                f"{output}: the folder is neither empty nor an earlier {stage} (it has no "
+                f"{marker}); name a new or empty folder, or clear this one yourself"
+            )
+    elif output.exists() or output.is_symlink():
+        raise UserError(f"{output}: is a file, expected a folder for the {stage}; name another")
+
+
+def replace_folder(output: Path, part: Path) -> None:
+    """Replace ``output`` by the complete folder ``part``; restores ``output`` if that fails."""
+    old = part.with_suffix(".old")
+    try:
+        if output.exists():
+            output.rename(old)
+        part.rename(output)
+    except BaseException:
+        if old.exists() and not output.exists():
+            old.rename(output)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
 
 
 def _return_freed_memory() -> None:

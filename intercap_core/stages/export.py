@@ -28,11 +28,11 @@ from intercap_core.output.export.readme import needs_object, readme
 from intercap_core.output.export.silhouettes import Scenes, body_vertices
 from intercap_core.schemas import JOINT, SCENE
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
-from intercap_core.stages.folders import EXPORT_MARKER, check_replaceable, replaced
+from intercap_core.stage_list import STAGES
 
 log = logging.getLogger(__name__)
 
-MARKER = EXPORT_MARKER
+MARKER = STAGES["export"].folder_marker
 _IMAGE_FORMATS = {"bop", "coco"}  # formats that annotate images
 _BODY_FORMATS = {"intercap", "amass"}  # formats of parameters, which need the body model
 _NO_FRAME = "none: numbers of vertices and regions, distances in metres"
@@ -45,17 +45,14 @@ def run(
     settings: ExportSettings,
     output: Path,
 ) -> None:
-    """Write the formats of the settings into the folder ``output``, replacing an earlier export.
+    """Write the formats of the settings into the new folder ``output``.
 
-    The folder is filled under a temporary name and renamed once it is complete. README.txt lists
-    the errors from the metrics, and the formats that are omitted because no object was found.
+    README.txt lists the errors from the metrics, and the formats that are omitted because no object
+    was found.
 
-    Raises:
-        UserError: an artefact or the object's mesh is missing or broken; the metrics were measured
-            on another joint result; ``output`` contains anything but an earlier export.
+    Raises UserError if an artefact or the object's mesh is missing or broken, or if the metrics
+    were measured on another joint result.
     """
-    output = Path(output)
-    check_replaceable(output, marker=MARKER, what="export")
     with artefacts.read(paths.scene, SCENE) as scene:
         rig = Rig.from_artefact(scene)
         zup_from_master, z_up_name = scene["zup_from_master"], z_up_frame(scene)
@@ -80,49 +77,49 @@ def run(
     posed = set(formats) & (_IMAGE_FORMATS | {"meshes"})
     bodies = body_vertices(motion) if posed else np.zeros((0, 0, 3))
     scenes = Scenes(motion, rig, mesh, image_of, times, time_offset, bodies)
-    with replaced(output) as folder:
-        for name in formats:
-            if name == "intercap":
-                (folder / "intercap").mkdir()
-                parameters.write_intercap(folder / "intercap" / "res.pkl", motion, about)
-            elif name == "amass":
-                parameters.write_amass(folder / "amass", viewed, about)
-            elif name == "bop" and models.object_ is not None:
-                number = bop.object_id(models.object_.mesh)
-                bop.write(folder / "bop", scenes, number, about, masks=settings.masks)
-            elif name == "coco":
-                coco.write(folder / "coco" / "annotations.json", scenes, about)
-            elif name == "contact" and about.contact is not None and about.touching is not None:
-                contact.write(folder / "contact", about.contact, about.touching)
-            elif name == "meshes":
-                viewed_from_master = zup_from_master if z_up else np.eye(4)
-                placed = (apply(viewed_from_master, b) for b in bodies[:: settings.mesh_every])
-                meshes.write(
-                    folder / "meshes", viewed, placed, mesh, about,
-                    kind=settings.mesh_format, every=settings.mesh_every,
-                )  # fmt: skip
-            elif name == "glb":
-                (folder / "glb").mkdir()
-                glb.write(folder / "glb" / f"{motion.sequence}.glb", viewed, mesh, about, z_up=z_up)
-        files: Sequence[WrittenBody] = ()
-        if set(formats) & _BODY_FORMATS:
-            files = body_files.write(folder / "body", about.body)
-        if settings.images and set(formats) & _IMAGE_FORMATS:
-            _copy_images(folder, paths.frames, scenes, formats)
-        if about.verdict.stated:
-            summary = {"sequence": motion.sequence, **about.verdict.summary()}
-            _dump(folder / "verdict.json", summary)
-        text = readme(motion, viewed, mesh, requested, about, files, kind=settings.mesh_format)
-        (folder / "README.txt").write_text(text, encoding="utf-8")
-        coordinates = {
-            **dict.fromkeys(("amass", "meshes"), Coordinates.of(viewed)),
-            "intercap": Coordinates.of(motion),
-            "bop": Coordinates.of(motion, bop.UNITS),
-            "coco": Coordinates.of(motion, coco.UNITS),
-            "glb": glb.coordinates(viewed, z_up=z_up),
-            "contact": Coordinates(_NO_FRAME, np.full(3, np.nan)),
-        }
-        _write_manifest(folder, motion, formats, about, coordinates, files)
+    output.mkdir(parents=True)
+    for name in formats:
+        if name == "intercap":
+            (output / "intercap").mkdir()
+            parameters.write_intercap(output / "intercap" / "res.pkl", motion, about)
+        elif name == "amass":
+            parameters.write_amass(output / "amass", viewed, about)
+        elif name == "bop" and models.object_ is not None:
+            number = bop.object_id(models.object_.mesh)
+            bop.write(output / "bop", scenes, number, about, masks=settings.masks)
+        elif name == "coco":
+            coco.write(output / "coco" / "annotations.json", scenes, about)
+        elif name == "contact" and about.contact is not None and about.touching is not None:
+            contact.write(output / "contact", about.contact, about.touching)
+        elif name == "meshes":
+            viewed_from_master = zup_from_master if z_up else np.eye(4)
+            placed = (apply(viewed_from_master, b) for b in bodies[:: settings.mesh_every])
+            meshes.write(
+                output / "meshes", viewed, placed, mesh, about,
+                kind=settings.mesh_format, every=settings.mesh_every,
+            )  # fmt: skip
+        elif name == "glb":
+            (output / "glb").mkdir()
+            glb.write(output / "glb" / f"{motion.sequence}.glb", viewed, mesh, about, z_up=z_up)
+    files: Sequence[WrittenBody] = ()
+    if set(formats) & _BODY_FORMATS:
+        files = body_files.write(output / "body", about.body)
+    if settings.images and set(formats) & _IMAGE_FORMATS:
+        _copy_images(output, paths.frames, scenes, formats)
+    if about.verdict.stated:
+        summary = {"sequence": motion.sequence, **about.verdict.summary()}
+        _dump(output / "verdict.json", summary)
+    text = readme(motion, viewed, mesh, requested, about, files, kind=settings.mesh_format)
+    (output / "README.txt").write_text(text, encoding="utf-8")
+    coordinates = {
+        **dict.fromkeys(("amass", "meshes"), Coordinates.of(viewed)),
+        "intercap": Coordinates.of(motion),
+        "bop": Coordinates.of(motion, bop.UNITS),
+        "coco": Coordinates.of(motion, coco.UNITS),
+        "glb": glb.coordinates(viewed, z_up=z_up),
+        "contact": Coordinates(_NO_FRAME, np.full(3, np.nan)),
+    }
+    _write_manifest(output, motion, formats, about, coordinates, files)
 
 
 def _about(paths: SequencePaths, motion: Motion, mesh: ObjectMesh | None) -> About:

@@ -39,11 +39,9 @@ from intercap_core.output.site.track_section import read_track
 from intercap_core.output.viewer import page as viewer
 from intercap_core.schemas import JOINT, OBJECT_TRACK, SCENE
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
-from intercap_core.stages.folders import check_replaceable, replaced
 
 log = logging.getLogger(__name__)
 
-MARKER = "index.html"
 _MAX_CLOSEUPS = 2  # longest contacts drawn; `intercap closeups` draws all
 
 
@@ -57,17 +55,14 @@ def run(
     output: Path,
     truth: Path | None,
 ) -> None:
-    """Write the page into the folder ``output``, replacing an earlier page.
+    """Write the page into the new folder ``output``.
 
-    Raises UserError if an artefact or the object's mesh is missing or broken, or if ``output``
-    contains anything but an earlier page.
+    Raises UserError if an artefact or the object's mesh is missing or broken.
 
     Args:
         contact: annotated intervals; None = not annotated.
         truth: truth file, drawn next to the fits in close-ups of hands; None = no truth.
     """
-    output = Path(output)
-    check_replaceable(output, marker=MARKER, what="page")
     measured = SequenceMetrics.read(paths.metrics)
     shown = models if measured.has_object else replace(models, object_=None)
     with artefacts.read(paths.joint, JOINT) as fit, artefacts.read(paths.scene, SCENE) as scene:
@@ -100,9 +95,9 @@ def run(
         body_file=model.path.name,
         viewer=ViewerParts(viewer.POLICY, viewer.style(), viewer.element(), viewer.load()),
     )
-    with replaced(output) as folder:
-        (folder / MARKER).write_text(page(content), encoding="utf-8")
-        viewer.write_script(folder / viewer.SCRIPT, paths, shown, truth=truth)
+    output.mkdir(parents=True)
+    (output / "index.html").write_text(page(content), encoding="utf-8")
+    viewer.write_script(output / viewer.SCRIPT, paths, shown, truth=truth)
 
 
 def _overlays(

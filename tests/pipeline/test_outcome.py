@@ -15,12 +15,13 @@ from rich.console import Console
 from intercap_core.commands.closing import print_remarks, remarks
 from intercap_core.commands.inspect import print_summary
 from intercap_core.config import MetricsSettings
+from intercap_core.errors import UserError
 from intercap_core.pipeline import outcome
 from intercap_core.pipeline.job import job
 from intercap_core.pipeline.step import run_dataset, run_step
 from intercap_core.project import Project, load_project
 from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
-from intercap_core.stages import metrics
+from intercap_core.stages import export, metrics
 from tests.helpers import fitted_capture as fitted
 
 SAYS = {
@@ -227,3 +228,38 @@ def test_texts_are_printed_as_they_are(
     assert "  1 to 2: object lost, filled in" in capsys.readouterr().out
     print_summary(Path(project.artefact("s01", "scene")))
     assert "  k2: its pose is as given" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("stage", ["page", "export"])
+def test_only_an_earlier_output_is_replaced(project: Project, tmp_path: Path, stage: str) -> None:
+    home, file = tmp_path / "home", tmp_path / "notes.txt"
+    home.mkdir()
+    for path in (file, home / "thesis.txt"):
+        path.write_text("years of work")
+    for path, words in ((home, f"neither empty nor an earlier {stage}"), (file, "is a file")):
+        with pytest.raises(UserError, match=words) as caught:
+            run_step(stage, project, "s01", output=path)
+        assert str(path) in str(caught.value)
+    assert file.read_text() == (home / "thesis.txt").read_text() == "years of work"
+
+
+def test_an_export_that_fails_leaves_the_earlier_one_and_a_new_one_replaces_it(
+    project: Project, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / export.MARKER).write_text("earlier")
+
+    def full(*_: object) -> None:
+        raise OSError("no space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(export.parameters, "write_intercap", full)
+        with pytest.raises(OSError, match="no space"):
+            run_step("export", project, "s01", output=out)
+    assert [p.name for p in tmp_path.rglob("*")] == ["out", export.MARKER]
+    assert (out / export.MARKER).read_text() == "earlier"
+    (out / "old.txt").write_text("of an earlier version")
+    run_step("export", project, "s01", output=out)
+    assert not (out / "old.txt").exists() and (out / "intercap" / "res.pkl").is_file()
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]

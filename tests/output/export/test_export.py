@@ -10,7 +10,6 @@ import pickletools
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import h5py
@@ -24,7 +23,6 @@ from scipy.spatial.transform import Rotation
 from intercap_core import artefacts
 from intercap_core.body.loading import OPEN_BODY
 from intercap_core.entries import Symmetry
-from intercap_core.errors import UserError
 from intercap_core.formats.recordings.synchronise import images_of_moments
 from intercap_core.geometry.camera.masks import decode
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
@@ -259,45 +257,9 @@ def test_without_a_floor_exports_name_the_source_of_up(
         assert words in bodies and "no floor is known" in bodies and "gravity-aligned" not in bodies
 
 
-def test_same_input_same_bytes_and_old_files_go(
-    capture: fitted.Capture, folder: Path, tmp_path: Path
-) -> None:
-    out = tmp_path / "again"
-    out.mkdir()
-    (out / "old.txt").write_text("left by an earlier version")
-    (out / export.MARKER).write_text("{}")
-    exported.run(capture, out)
-    assert [p.name for p in tmp_path.iterdir()] == ["again"]
+def test_same_input_same_bytes(capture: fitted.Capture, folder: Path, tmp_path: Path) -> None:
+    out = exported.run(capture, tmp_path / "again")
     names = sorted(p.relative_to(out) for p in out.rglob("*") if p.is_file())
     assert names == sorted(p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
     for name in names:
         assert (out / name).read_bytes() == (folder / name).read_bytes(), name
-
-
-def test_only_an_export_is_replaced(capture: fitted.Capture, tmp_path: Path) -> None:
-    home, file = tmp_path / "home", tmp_path / "notes.txt"
-    home.mkdir()
-    for path in (file, home / "thesis.txt"):
-        path.write_text("years of work")
-    for path, words in ((home, "neither empty nor an earlier export"), (file, "is a file")):
-        with pytest.raises(UserError, match=words) as caught:
-            exported.run(capture, path)
-        assert str(path) in str(caught.value)
-    assert file.read_text() == (home / "thesis.txt").read_text() == "years of work"
-
-
-def test_an_export_that_fails_leaves_the_earlier_one(
-    capture: fitted.Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / export.MARKER).write_text("earlier")
-
-    def full(*_: Any) -> None:
-        raise OSError("no space left on device")
-
-    monkeypatch.setattr(export.parameters, "write_intercap", full)
-    with pytest.raises(OSError, match="no space"):
-        exported.run(capture, out, formats=("intercap",))
-    assert [p.name for p in tmp_path.rglob("*")] == ["out", export.MARKER]
-    assert (out / export.MARKER).read_text() == "earlier"

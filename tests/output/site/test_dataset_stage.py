@@ -177,21 +177,6 @@ def test_annotated_contact_is_shown_with_stated_contact(
     assert text.count("camera k") and "left hand, annotated" not in text
 
 
-def test_a_page_replaces_a_page_and_nothing_else(
-    captures: dict[str, fitted.Capture], tmp_path: Path
-) -> None:
-    (tmp_path / "notes.txt").write_text("mine")
-    capture = captures["s01_o03"]
-    with pytest.raises(UserError, match="nor an earlier page"):
-        page.run(
-            paths=capture.inputs(*STAGES["page"].reads),
-            sequence=row("s01_o03"), models=capture.models,
-            settings=PageSettings(), contact=None,
-            output=tmp_path, truth=None,
-        )  # fmt: skip
-    assert (tmp_path / "notes.txt").read_text() == "mine"
-
-
 def test_markup_in_texts_is_escaped(captures: dict[str, fitted.Capture], tmp_path: Path) -> None:
     paths = write_summaries(captures, tmp_path)
     with h5py.File(paths["s01_o03"], "r+") as file:
