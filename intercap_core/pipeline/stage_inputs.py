@@ -86,8 +86,20 @@ def stage_manifest(
         artefacts: fingerprint of each artefact that the stage reads, by stage.
         before: an earlier manifest; saves reading large files whose size has changed.
     """
-    given = arguments(project, sequence, stage, annotation)
+    given = _given(project, sequence, stage, annotation)
     machine = {"device": given.pop("device", "cpu"), "cpu": processor()}
+    return _manifest(stage, sequence, given, artefacts, checksums, before, machine)
+
+
+def files_read(project: Project, sequence: str, stage: str) -> list[Path]:
+    """The user's files whose checksums the manifest of the stage's output holds."""
+    given = _given(project, sequence, stage, Annotation())
+    return [path for value in given.values() for path in _split_paths(value)[1].values()]
+
+
+def _given(project: Project, sequence: str, stage: str, annotation: Annotation) -> dict[str, Any]:
+    """Arguments as the manifest names them: groups of arguments one by one."""
+    given = arguments(project, sequence, stage, annotation)
     if given.get("results") is not None:
         given["results"] = intercap_file(given["results"])  # the newest file of a folder
     for name in ("models", "fit_settings"):
@@ -95,7 +107,7 @@ def stage_manifest(
         given |= vars(group) if group is not None else {}
     if "body_models" in given:
         given["body_models"] = _body_files(project.config, given["subject"].gender)
-    return _manifest(stage, sequence, given, artefacts, checksums, before, machine)
+    return given
 
 
 def studio_manifest(project: Project, sequence: str, checksums: InputChecksums) -> Manifest:

@@ -7,6 +7,7 @@ from snakemake.exceptions import WorkflowError
 from intercap_core.errors import UserError
 from intercap_core.pipeline.code_digest import stage_code
 from intercap_core.pipeline.plan import DATASET, Plan
+from intercap_core.pipeline.stage_inputs import files_read
 from intercap_core.pipeline.resources import (
     extent_of,
     has_model,
@@ -104,6 +105,24 @@ def inputs_of(stage):
         if PLAN.is_stale(sequence, stage):
             return paths
         return {name: ancient(path) for name, path in paths.items()}
+
+    return files
+
+
+def files_of(stage):
+    """Input function: the user's files that a stage reads, without those of the studio.
+
+    Missing ones are left out; the job that reads them reports them. Their dates are ignored, but
+    the executor for Slurm adopts no job whose files have changed.
+    """
+
+    def files(wildcards):
+        made = PROJECT.recordings_made(wildcards.sequence)
+        return [
+            path
+            for path in files_read(PROJECT, wildcards.sequence, stage)
+            if path.exists() and (made is None or not path.is_relative_to(made))
+        ]
 
     return files
 

@@ -6,6 +6,7 @@ for _stage in STAGES.values():
             _stage.name
         input:
             unpack(inputs_of(_stage.name)),
+            files=ancient(files_of(_stage.name)),
             annotation=ancient(annotation_input),
             mark=out_of_date(_stage.name),
         output:
