@@ -165,10 +165,7 @@ def _work(what: str, settings: Path, sequence: str, folder: Path) -> None:
             summaries={path.stem: path for path in sorted(folder.glob("*.h5"))},
             objects=project.objects,
             body_models=project.config.body_models,
-            site=folder / "site",
-            summary=folder / "summary.json",
-            heatmaps=folder / "heatmaps" / "heatmaps.h5",
-            tables_folder=folder / "tables",
+            results=folder / "merged",
             card=project.config.card,
             formats=project.config.export.formats,
         )

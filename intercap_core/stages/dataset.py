@@ -38,10 +38,7 @@ def run(
     summaries: Mapping[str, Path],
     objects: Mapping[str, ObjectEntry],
     body_models: BodyModels,
-    site: Path,
-    summary: Path,
-    heatmaps: Path,
-    tables_folder: Path,
+    results: Path,
     card: CardSettings,
     formats: Sequence[str],
     virtual: bool = False,
@@ -58,10 +55,7 @@ def run(
         summaries: summary artefacts by sequence, in the order of the table.
         objects: the list of objects, by name.
         body_models: body model files of the settings.
-        site: folder of the site.
-        summary: path of summary.json; the dataset card is written into the same folder.
-        heatmaps: path of the heatmaps artefact.
-        tables_folder: folder of the tables.
+        results: folder of the outputs, which ``pipeline.plan.DATASET_OUTPUTS`` lists.
         card: statements of the dataset card.
         formats: formats of the exports, for the card.
         virtual: True if the studio rendered all recordings.
@@ -96,22 +90,21 @@ def run(
         "rig": rig,
         **groups,
     }
-    tables.write(tables_folder, written)
+    tables.write(results / "tables", written)
     heat = collect_heatmaps(found)
     surfaces, doubts = _body_heat(found, heat, body_models)
     doubts |= _unlisted(found, objects)
     remarks = {name: "; ".join(reasons) for name, reasons in heat.left_out.items()} | doubts
     for name, why in remarks.items():
         log.warning("sequence %s: %s", name, why)
-    _write_heatmaps(heatmaps, dataset, heat)
-    _replace(summary, _json(figures.summary(dataset, measured)))
+    _write_heatmaps(results / "heatmaps.h5", dataset, heat)
+    _replace(results / "summary.json", _json(figures.summary(dataset, measured)))
     stated = facts(
         dataset, card, found, groups, formats=formats, failed=unreported, virtual=virtual
     )
-    folder = summary.parent
-    _replace(folder / "card.md", markdown(stated))
-    _replace(folder / "card.json", _json(stated))
-    _replace(folder / "croissant.json", _json(croissant(stated, tables_folder.parent, written)))
+    _replace(results / "card.md", markdown(stated))
+    _replace(results / "card.json", _json(stated))
+    _replace(results / "croissant.json", _json(croissant(stated, results, written)))
     content = DatasetContent(
         dataset=dataset,
         sequences=found,
@@ -125,7 +118,7 @@ def run(
         remarks=remarks,
         changed=changed,
     )
-    first = site / "index.html"
+    first = results / "site" / "index.html"
     _replace(first, overview.page(content))
     return first
 
