@@ -62,7 +62,7 @@ def measure(settings: Path, output: Path, count: int) -> None:
         merged = _timed("merge", settings, "", many)
         figures[f"aggregate_s_{count}"] = merged["seconds"]
         figures[f"aggregate_mb_{count}"] = merged["peak_mb"]
-        figures["overview_mb"] = (many / "site" / "index.html").stat().st_size / MEGABYTE
+        figures["overview_mb"] = (many / "merged" / "site" / "index.html").stat().st_size / MEGABYTE
         figures["one_more_s"] = figures["summary_s"] + merged["seconds"] + page["seconds"]
     for key, value in figures.items():
         print(f"dataset.{key} {value:.2f}")
