@@ -158,14 +158,14 @@ def tables(
     from intercap_core.tables.intercap import Sources
 
     sources = Sources(calibrations, annotations, meshes, keypoints, candidates, results)
-    done = write_tables(
+    draft, written = write_tables(
         layout, root, output, dataset=dataset, sources=sources, objects=objects, replace=replace
     )
-    for remark in done.remarks:
+    for remark in draft.all_remarks():
         typer.echo(f"note: {remark}", err=True)
-    for path in done.written:
+    for path in written:
         typer.echo(path)
-    typer.echo(f"{done.sequences} sequences; next: intercap check {output / 'config.yaml'}")
+    typer.echo(f"{len(draft.rows)} sequences; next: intercap check {output / 'config.yaml'}")
 
 
 @app.command(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from dataclasses import replace as changed
 from pathlib import Path
 from typing import Literal
@@ -12,19 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 from intercap_core.config_types import Name
 from intercap_core.errors import UserError
 from intercap_core.tables import behave, intercap
-from intercap_core.tables.project_files import write_project
-
-
-@dataclass(frozen=True)
-class WrittenTables:
-    """Result of :func:`write_tables`."""
-
-    written: list[Path]
-    """Files of the project."""
-    sequences: int
-    """Number of sequences in the table."""
-    remarks: list[str]
-    """Remarks for the user, by sequence."""
+from intercap_core.tables.project_files import Draft, write_project
 
 
 def write_tables(
@@ -36,8 +23,8 @@ def write_tables(
     sources: intercap.Sources,
     objects: Path,
     replace: bool,
-) -> WrittenTables:
-    """Write the project of a release into ``output``.
+) -> tuple[Draft, list[Path]]:
+    """Write the project of a release into ``output``; returns its content and its files.
 
     The layouts are described in :mod:`intercap_core.tables`. Raises UserError if a folder of the
     release is missing or malformed, or if files exist in ``output`` and ``replace`` is False.
@@ -69,8 +56,4 @@ def write_tables(
                 "leave out --calibrations, --annotations, --meshes, --keypoints and --candidates"
             )
         draft = behave.draft(root, dataset=name, results=sources.results)
-    written = write_project(draft, output, replace=replace)
-    remarks = draft.remarks + [
-        f"{row.columns['sequence']}: {remark}" for row in draft.rows for remark in row.remarks
-    ]
-    return WrittenTables(written, len(draft.rows), remarks)
+    return draft, write_project(draft, output, replace=replace)

@@ -46,6 +46,13 @@ class Draft:
     remarks: list[str] = field(default_factory=list)
     """Comments of config.yaml, which are also shown to the user."""
 
+    def all_remarks(self) -> list[str]:
+        """Remarks on the project, then those on each sequence with its name."""
+        of_rows = [
+            f"{row.columns['sequence']}: {text}" for row in self.rows for text in row.remarks
+        ]
+        return self.remarks + of_rows
+
 
 def write_project(draft: Draft, folder: Path, *, replace: bool) -> list[Path]:
     """Write config.yaml and the files that it names into ``folder``; returns their paths.
