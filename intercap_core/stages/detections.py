@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -214,17 +215,10 @@ def _segment(
     wanted = _unknown(images, [d.candidates_found for d in found])
     if not wanted:
         return
-    segmenter = Segmenter.load(settings)
-    damaged = [0] * len(images)
-    pictures = _pictures(frames, wanted, damaged)
-    progress = Progress(log, "segmented", len(wanted), "images")
-    for (t, c), instances in segmenter.segment(pictures):
+    pictures = _pictures(frames, wanted, found, "segmented")
+    for (t, c), instances in Segmenter.load(settings).segment(pictures):
         found[c].instances[t] = instances
         found[c].candidates_found[t] = True
-        progress.step()
-    for detections, count in zip(found, damaged, strict=True):
-        if count:
-            detections.notes.append(f"{count} damaged images not segmented")
 
 
 def _find_people(
@@ -240,19 +234,14 @@ def _find_people(
     if not wanted:
         return
     model = PoseModel.load(settings)
-    damaged = [0] * len(images)
     cleaners = [
         KeypointCleaner(camera.size, settings.keypoint_full_confidence) for camera in images
     ]
-    progress = Progress(log, "found people in", len(wanted), "images")
-    for (t, c), picture in _pictures(frames, wanted, damaged):
+    for (t, c), picture in _pictures(frames, wanted, found, "found people in"):
         found[c].people[t] = cleaners[c].clean(model.find(picture, found[c].instances[t]))
         found[c].keypoints_found[t] = True
-        progress.step()
-    for detections, count, cleaner in zip(found, damaged, cleaners, strict=True):
+    for detections, cleaner in zip(found, cleaners, strict=True):
         detections.notes += cleaner.notes()
-        if count:
-            detections.notes.append(f"{count} damaged images not looked at for keypoints")
 
 
 def _unknown(images: list[CameraImages], known: list[np.ndarray]) -> list[Image]:
@@ -269,12 +258,16 @@ def _unknown(images: list[CameraImages], known: list[np.ndarray]) -> list[Image]
 
 
 def _pictures(
-    frames: Path, wanted: list[Image], damaged: list[int]
+    frames: Path, wanted: list[Image], found: list[CameraDetections], doing: str
 ) -> Iterator[tuple[Image, np.ndarray]]:
-    """Yield the wanted images (H, W, 3); images that do not decode are counted in ``damaged``, a
-    list with one number for each camera."""
+    """Yield the wanted images (H, W, 3); a note counts those of a camera that do not decode.
+
+    ``doing``: word before "images", for the progress and the note.
+    """
     from intercap_core.formats.recordings.frames import Frames
 
+    damaged: Counter[int] = Counter()
+    progress = Progress(log, doing, len(wanted), "images")
     with Frames.open(frames) as recording:
         for t, c in wanted:
             try:
@@ -285,3 +278,6 @@ def _pictures(
                 damaged[c] += 1
             else:
                 yield (t, c), picture
+            progress.step()
+    for c, count in damaged.items():
+        found[c].notes.append(f"{count} damaged images left out ({doing} the others)")
