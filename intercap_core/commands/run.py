@@ -252,18 +252,33 @@ class Watcher:
     def __init__(self, project: Project, console: Console) -> None:
         self._project = project
         self._console = console
-        self._start = time.time() - 1.0  # some file systems store whole seconds
+        self._started = time.time() - 1.0  # some file systems store whole seconds
         self._printed: set[str] = set()
         self._printed_at = time.monotonic()
         self._logs = project.logs
         self.transcript = self._logs / "snakemake.log"
+
+    def start(
+        self, command: Sequence[str], *, pass_fds: Sequence[int] = ()
+    ) -> subprocess.Popen[bytes]:
+        """Start Snakemake with its output in the transcript."""
+        self.transcript.parent.mkdir(parents=True, exist_ok=True)
+        self.transcript.unlink(missing_ok=True)
+        with open(self.transcript, "w", encoding="utf-8") as output:
+            return subprocess.Popen(
+                command,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, "NO_COLOR": "1"},
+                pass_fds=pass_fds,
+            )
 
     def jobs(self) -> dict[str, JobState]:
         """State of every job that this run has started, by "sequence: stage"."""
         found = {}
         for path in sorted(self._logs.glob("**/*.log")):
             try:
-                if path == self.transcript or path.stat().st_mtime < self._start:
+                if path == self.transcript or path.stat().st_mtime < self._started:
                     continue
                 state = JobState(*read_state(path), path)
             except FileNotFoundError:  # Snakemake removes an old log before it starts a job
@@ -372,24 +387,19 @@ def run_watched(command: Sequence[str], watcher: Watcher, console: Console) -> i
 
     A signal to this process also ends Snakemake and its jobs before it is raised.
     """
-    watcher.transcript.parent.mkdir(parents=True, exist_ok=True)
-    environment = {**os.environ, "NO_COLOR": "1"}
-    with open(watcher.transcript, "w", encoding="utf-8") as transcript:
-        process = subprocess.Popen(
-            command, stdout=transcript, stderr=subprocess.STDOUT, env=environment
-        )
-        try:
-            with _display(watcher, console) as refresh:
-                while process.poll() is None:
-                    time.sleep(POLL_SECONDS)
-                    refresh()
+    process = watcher.start(command)
+    try:
+        with _display(watcher, console) as refresh:
+            while process.poll() is None:
+                time.sleep(POLL_SECONDS)
                 refresh()
-        except Terminated as end:
-            _terminate(process, interrupted=end.number == signal.SIGINT and _in_foreground())
-            raise
-        finally:
-            if process.poll() is None:
-                _terminate(process)
+            refresh()
+    except Terminated as end:
+        _terminate(process, interrupted=end.number == signal.SIGINT and _in_foreground())
+        raise
+    finally:
+        if process.poll() is None:
+            _terminate(process)
     return process.returncode
 
 

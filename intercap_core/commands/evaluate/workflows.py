@@ -18,7 +18,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import NamedTuple
 
 from rich.console import Console
 from rich.table import Table
@@ -121,8 +121,6 @@ class ProjectRun:
     """Follows the jobs; None until the workflow has started."""
     process: subprocess.Popen[bytes] | None = None
     """Snakemake's process; None until the workflow has started."""
-    transcript: IO[str] | None = None
-    """Open file of Snakemake's output."""
     status: int | None = None
     """Exit status; None until the workflow has ended."""
 
@@ -257,8 +255,10 @@ def _run(runs: list[ProjectRun], parallel: int, cores: int, lock: int, console: 
         for run in running:
             assert run.process is not None and run.watcher is not None
             run.watcher.print_changes()
-            if run.process.poll() is not None:
-                _end(run)
+            run.status = run.process.poll()
+            if run.status:
+                prefix = f"{run.project.config.dataset}: "
+                run.watcher.print_failures(failed=True, prefix=prefix)
         now = time.monotonic()
         if now - reported > 60.0:
             reported = now
@@ -287,26 +287,9 @@ def _start(run: ProjectRun, cores: int, lock: int, console: Console) -> None:
         str(project.artefact(name, stage)) for stage in run.stages for name in project.sequences
     ]
     run.watcher = Watcher(project, console)
-    path = run.watcher.transcript
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.unlink(missing_ok=True)
-    run.transcript = open(path, "w", encoding="utf-8")  # noqa: SIM115 (closed in _end)
     command = snakemake_command(project.path, cores=cores, arguments=[*targets, "--nolock"])
-    run.process = subprocess.Popen(
-        command,
-        stdout=run.transcript,
-        stderr=subprocess.STDOUT,
-        env={**os.environ, "NO_COLOR": "1"},
-        pass_fds=[lock],  # the lock lasts as long as any of the processes
-    )
-
-
-def _end(run: ProjectRun) -> None:
-    assert run.process is not None and run.watcher is not None and run.transcript is not None
-    run.transcript.close()
-    run.status = run.process.returncode
-    if run.status:
-        run.watcher.print_failures(failed=True, prefix=f"{run.project.config.dataset}: ")
+    # the lock lasts as long as any of the processes
+    run.process = run.watcher.start(command, pass_fds=[lock])
 
 
 def minutes_of_parts(parts: Mapping[str, Targets]) -> Figures:
