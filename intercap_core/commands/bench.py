@@ -185,16 +185,11 @@ def _print(figures: dict[str, float], title: str) -> None:
             f"{figures[f'{area}.seconds_per_frame']:.3f}",
             "" if memory is None else f"{memory:.0f}",
         )
-    console = Console()
-    console.print(table)
-    console.print(
+    Console().print(table)
+    print(
         f"extraction alone: {figures['frames.fps']:.1f} frame sets a second; "
         f"{figures['frames.bytes_per_set'] / 1e6:.2f} MB a set, the recordings' own "
         f"{figures['frames.recorded_bytes_per_set'] / 1e6:.2f} MB "
-        f"(ratio {figures['frames.bytes_ratio']:.3f})",
-        highlight=False,
+        f"(ratio {figures['frames.bytes_ratio']:.3f})"
     )
-    console.print(
-        f"of the metrics, the verdict: {figures['verdict.seconds_per_frame']:.3f} s a frame",
-        highlight=False,
-    )
+    print(f"of the metrics, the verdict: {figures['verdict.seconds_per_frame']:.3f} s a frame")

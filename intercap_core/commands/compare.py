@@ -39,10 +39,9 @@ def print_comparison(old: Path, new: Path, output: Path | None = None) -> list[P
     differs = len(comparison.sequences) - same
     left = max(0, differs - ROWS)
     more = f" ({left} of them are not printed)" if left else ""
-    console.print(
+    print(
         f"{differs} of {len(comparison.sequences)} sequences differ{more}, "
-        f"{len(comparison.frames)} frames; {same} are the same",
-        highlight=False,
+        f"{len(comparison.frames)} frames; {same} are the same"
     )
     if output is None:
         return []

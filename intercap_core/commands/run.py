@@ -94,7 +94,7 @@ def _exclusive(project: Project, settings: Path, console: Console) -> Iterator[N
                     f"running (their Snakemake is process {snakemake}); wait for them, or end them"
                 )
             console.print(f"the run by {killed} was killed: going on where it stopped")
-            subprocess.run(snakemake_command(settings, arguments=["--unlock"]), capture_output=True)
+            _unlock(settings)
         elif killed is not None:
             console.print(f"the lease of the run by {killed} has expired: it is taken over")
         yield

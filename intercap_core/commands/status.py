@@ -116,27 +116,25 @@ def print_status(project: Project, *, every: bool = False, as_json: bool = False
     states = {name: current.of(name) for name in current.sequences}
     counts = {state: list(states.values()).count(state) for state in _MARKS}
     words = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
-    console.print(f"{project.config.dataset}: {words} of {len(states)} sequences", highlight=False)
+    print(f"{project.config.dataset}: {words} of {len(states)} sequences")
     shown = [name for name in states if every or states[name] != DONE]
     if shown:
         console.print(_table(current, shown[:ROWS] if not every else shown))
     if len(shown) > ROWS and not every:
-        console.print(f"... and {len(shown) - ROWS} more; --all prints them", highlight=False)
+        print(f"... and {len(shown) - ROWS} more; --all prints them")
     if shown:
         marks = ", ".join(f"{mark} {state}" for state, mark in _MARKS.items())
         console.print(f"[dim]{marks}[/dim]", highlight=False)
     for line in _reasons(current):
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+        print(line)
     if current.dataset.state != DONE:
         why = f": {'; '.join(current.dataset.words)}" if current.dataset.words else ""
-        words = f"the site's first page, tables and card are {current.dataset.state}{why}"
-        console.print(words, highlight=False, markup=False, soft_wrap=True)
+        print(f"the site's first page, tables and card are {current.dataset.state}{why}")
     for machine, count in _other_machines(current).items():
-        console.print(
+        print(
             f"{count} results were computed on another machine or device ({machine}); they may "
-            "differ in the last digits and are not recomputed",
-            highlight=False, markup=False, soft_wrap=True,
-        )  # fmt: skip
+            "differ in the last digits and are not recomputed"
+        )
 
 
 def _table(current: Status, names: list[str]) -> Table:
@@ -200,7 +198,6 @@ def print_verification(project: Project) -> bool:
     """Read all data of every artefact and print the damaged ones; True if none is damaged."""
     outputs = (project.artefact(name, stage) for name in project.sequences for stage in STAGES)
     paths = [path for path in outputs if path.exists()]
-    console = Console()
     damaged: list[str] = []
     progress = Progress(log, "verified", len(paths), "files")
     for path in paths:
@@ -210,6 +207,6 @@ def print_verification(project: Project) -> bool:
         damaged += [damage] if damage else []
         progress.step()
     for words in damaged:
-        console.print(words, highlight=False, markup=False, soft_wrap=True)
-    console.print(f"{len(paths)} outputs read, {len(damaged)} damaged", highlight=False)
+        print(words)
+    print(f"{len(paths)} outputs read, {len(damaged)} damaged")
     return not damaged

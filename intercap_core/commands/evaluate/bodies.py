@@ -141,12 +141,11 @@ def print_bodies(evaluations: Sequence[Bodies]) -> None:
     _print_worst(console, evaluations)
     every = [e for found in evaluations for e in found.errors]
     flags = body_errors.flag_figures(every)
-    console.print(
+    print(
         f"bad frames in all: {sum(int(e.bad.sum()) for e in every)} of "
         f"{sum(len(e.bad) for e in every)}; flags' recall "
         f"{number(flags.get('bad_frames_recall'), 2) or '-'}, precision "
-        f"{number(flags.get('bad_frames_precision'), 2) or '-'}",
-        highlight=False,
+        f"{number(flags.get('bad_frames_precision'), 2) or '-'}"
     )
 
 

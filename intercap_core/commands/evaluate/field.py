@@ -201,7 +201,7 @@ def print_field(evaluations: Sequence[FieldSequences]) -> None:
             table.add_row(f"{found.dataset}: {name}", "no metrics")
     console.print(table)
     for key, value in flat(evaluations).items():
-        console.print(f"{key}: {value:.3g}", highlight=False)
+        print(f"{key}: {value:.3g}")
 
 
 PART = EvaluationPart(

@@ -79,7 +79,7 @@ def print_scenes(evaluations: Sequence[FieldScenes]) -> None:
             table.add_row(f"{found.dataset}: {name}", "no scene")
     console.print(table)
     for key, value in flat(evaluations).items():
-        console.print(f"{key}: {value:.3g}", highlight=False)
+        print(f"{key}: {value:.3g}")
 
 
 def _list(values: np.ndarray, digits: int) -> str:

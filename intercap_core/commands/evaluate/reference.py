@@ -112,14 +112,12 @@ def passes_gate(figures: Mapping[str, float], reference: Sequence[GatedFigure]) 
     console.width = max(console.width, 110)
     console.print(table)
     if failing:
-        console.print(
+        print(
             f"regression gate failed: {len(failing)} of {len(reference)} figures are worse than "
-            f"their reference by more than the spread, or missing: {', '.join(failing)}",
-            highlight=False,
-            soft_wrap=True,
+            f"their reference by more than the spread, or missing: {', '.join(failing)}"
         )
     else:
-        console.print(f"regression gate passed: {len(reference)} figures", highlight=False)
+        print(f"regression gate passed: {len(reference)} figures")
     return not failing
 
 

@@ -192,7 +192,7 @@ def print_sequences(evaluations: Sequence[Sequences]) -> None:
             table.add_row(name, *_row(areas(of_object)))
         Console(width=max(console.width, 190)).print(table)
     for name in (name for measured in evaluations for name in measured.missing):
-        console.print(f"{name}: no metrics", highlight=False, markup=False)
+        print(f"{name}: no metrics")
 
 
 def _row(found: Areas) -> list[str]:

@@ -306,11 +306,10 @@ def minutes_of_parts(parts: Mapping[str, Targets]) -> Figures:
 
 def print_minutes(parts: Sequence[str], minutes: Figures, duration: float) -> None:
     """Print one row per part, and the ``duration`` of this run in minutes."""
-    console = Console()
     table = Table("part", "budget", "taken", box=None, title="minutes on 2 cores")
     for part in parts:
         budget, taken = (minutes[f"{part}_minutes_{key}"] for key in ("budget", "taken"))
         excess = "over its budget" if taken > budget else ""
         table.add_row(part, f"{budget:.1f}", f"{taken:.1f}", excess)
-    console.print(table)
-    console.print(f"this run took {duration:.1f} minutes of wall time", highlight=False)
+    Console().print(table)
+    print(f"this run took {duration:.1f} minutes of wall time")
