@@ -99,19 +99,12 @@ class ContinuousSymmetry(Model):
 class Symmetry(Model):
     """Transforms that do not change the object's appearance."""
 
-    discrete: tuple[tuple[float, ...], ...] = ()
+    discrete: tuple[Annotated[tuple[float, ...], Field(min_length=16, max_length=16)], ...] = ()
     """4x4 transforms in row-major order, metres; the identity is implied."""
     continuous: tuple[ContinuousSymmetry, ...] = ()
     """Axes of rotational symmetry."""
     sphere: bool = False
     """Invariance to all rotations about the mesh's origin."""
-
-    @model_validator(mode="after")
-    def _sixteen(self) -> Symmetry:
-        for row, transform in enumerate(self.discrete):
-            if len(transform) != 16:
-                raise ValueError(f"discrete[{row}] has {len(transform)} numbers, expected 16")
-        return self
 
 
 class ObjectEntry(Model):
