@@ -213,13 +213,9 @@ def load_project(path: Path, overrides: Mapping[str, Any] | None = None) -> Proj
     }
     if not sequences:
         raise UserError(f"{table}: holds no sequence (or all are excluded); add at least one row")
+    sections = {name: value for name, value in config if isinstance(value, BaseModel)}
     config = config.model_copy(
-        update={
-            "body_models": _absolute(config.body_models, path.parent),
-            "detections": _absolute(config.detections, path.parent),
-            "body_fit": _absolute(config.body_fit, path.parent),
-            "joint": _absolute(config.joint, path.parent),
-        }
+        update={name: _absolute(value, path.parent) for name, value in sections.items()}
     )
     project = Project(config, path, sequences, subjects, objects)
     _check_files(project)
@@ -436,24 +432,17 @@ def _read_objects(path: Path) -> dict[str, ObjectEntry]:
         raise UserError(
             f"{path}: expected object names and entries, found {type(values).__name__}; correct it"
         )
+    objects = {}
     for name, entry in values.items():
+        where = f"{path}, object {quoted(name)}"
         if not isinstance(entry, dict | None):
             raise UserError(
-                f"{path}, object {quoted(name)}: expected fields such as 'mesh: cup.ply', found "
-                f"{quoted(entry)}; correct it"
+                f"{where}: expected fields such as 'mesh: cup.ply', found {quoted(entry)}; correct "
+                "it"
             )
-    return {
-        name: _absolute(
-            _parse(
-                ObjectEntry,
-                {"name": name, **(entry or {})},
-                f"{path}, object {quoted(name)}",
-                "field",
-            ),
-            path.parent,
-        )
-        for name, entry in values.items()
-    }
+        parsed = _parse(ObjectEntry, {"name": name, **(entry or {})}, where, "field")
+        objects[name] = _absolute(parsed, path.parent)
+    return objects
 
 
 def _absolute(entry: M, folder: Path) -> M:
