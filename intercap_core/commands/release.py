@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from intercap_core import schemas
-from intercap_core.errors import UserError
 from intercap_core.evaluation.summary import SequenceSummary
 from intercap_core.output.release import manifest
 from intercap_core.pipeline.code_digest import code_digest
@@ -20,6 +19,7 @@ from intercap_core.versions import versions
 
 log = logging.getLogger(__name__)
 
+TABLES = ("sequences", "subjects", "objects")  # settings that name them
 _PRINTED = 20  # paths of each kind of difference
 
 
@@ -120,19 +120,11 @@ def _without_folders(values: Any) -> Any:
 def _inputs(project: Project, names: Sequence[str]) -> dict[str, str]:
     """SHA-256 of the tables and of the sequences' annotations, by file name."""
     config, folder = project.config, project.path.parent
-    found = {}
-    for name in ("sequences", "subjects", "objects"):
-        path = tidy(folder / getattr(config, name))
-        found[f"{name}{path.suffix}"] = _sha256(path)
-    for name in names:
-        path = project.annotation_path(name)
-        if path.is_file():
-            found[f"annotations/{name}.yaml"] = _sha256(path)
-    return found
-
-
-def _sha256(path: Path) -> str:
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror})") from None
+    tables = {name: tidy(folder / getattr(config, name)) for name in TABLES}
+    files = {f"{name}{path.suffix}": path for name, path in tables.items()}
+    files |= {f"annotations/{name}.yaml": project.annotation_path(name) for name in names}
+    return {
+        name: hashlib.sha256(path.read_bytes()).hexdigest()
+        for name, path in files.items()
+        if path.is_file()
+    }
