@@ -16,7 +16,7 @@ from typing import Any
 
 from intercap_core.annotate.before import Backup
 from intercap_core.annotation import Annotation
-from intercap_core.commands.run import ENDS_WITHIN_S
+from intercap_core.commands.run import ENDS_WITHIN_S, kill_with_children
 from intercap_core.errors import UserError
 from intercap_core.pipeline.job import last_words, read_state
 from intercap_core.pipeline.plan import OutputStatus, Plan
@@ -139,7 +139,7 @@ class RunManager:
                 self._stop_time = time.monotonic()
                 self._process.terminate()
             elif time.monotonic() - self._stop_time > ENDS_WITHIN_S + _PATIENCE_S:
-                _kill(self._process)
+                kill_with_children(self._process)
 
     def wait(self) -> None:
         """Wait until a stopped run has ended, at most as long as it may take."""
@@ -186,14 +186,3 @@ class RunManager:
         except FileNotFoundError:
             pass
         return {"state": "waits", "message": ""}
-
-
-def _kill(process: subprocess.Popen[bytes]) -> None:
-    """Kill a process and its descendants."""
-    import psutil
-
-    with contextlib.suppress(psutil.NoSuchProcess):
-        parent = psutil.Process(process.pid)
-        for descendant in (*parent.children(recursive=True), parent):
-            with contextlib.suppress(psutil.NoSuchProcess):
-                descendant.kill()

@@ -425,10 +425,19 @@ def _terminate(process: subprocess.Popen[bytes], *, interrupted: bool = False) -
         try:
             process.wait(ENDS_WITHIN_S)
         except subprocess.TimeoutExpired:
-            for left in (snakemake, *snakemake.children(recursive=True)):
-                with contextlib.suppress(psutil.NoSuchProcess):
-                    left.kill()
+            kill_with_children(process)
     process.wait()
+
+
+def kill_with_children(process: subprocess.Popen[bytes]) -> None:
+    """Kill a process and its descendants."""
+    import psutil
+
+    with contextlib.suppress(psutil.NoSuchProcess):
+        parent = psutil.Process(process.pid)
+        for descendant in (*parent.children(recursive=True), parent):
+            with contextlib.suppress(psutil.NoSuchProcess):
+                descendant.kill()
 
 
 def _in_foreground() -> bool:
