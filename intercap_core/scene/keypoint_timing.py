@@ -48,12 +48,10 @@ class TimeNoise:
     """Share of the variance that is white noise, 0 to 1."""
     scale: float
     """Standard deviation, in units of the series."""
-    constant: float = CONSTANT_VARIANCE
-    """Variance of the constant part, relative to the rest."""
 
     def covariance(self, times: np.ndarray) -> np.ndarray:
         """Covariance (T, T) for ``scale`` 1, with the constant part."""
-        return _covariance(times, self.kind, self.length, self.fast) + self.constant
+        return _covariance(times, self.kind, self.length, self.fast) + CONSTANT_VARIANCE
 
     def precision(self, times: np.ndarray, variance: np.ndarray) -> np.ndarray:
         """Inverse covariances (N, T, T) of N series.
@@ -112,7 +110,7 @@ def _covariance(times: np.ndarray, kind: str, length: float, fast: float) -> np.
 
 # (K,) group of each of POINTS with correlated errors: each of the 25 body points on its own, the 8
 # points of each hand, and the 8 points of the face.
-CLUSTER = np.r_[np.arange(25), np.repeat([25, 26, 27], 8)]
+_CLUSTER = np.r_[np.arange(25), np.repeat([25, 26, 27], 8)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,8 +172,8 @@ def estimate_offsets(motion: KeypointMotion, master: int) -> TimeOffsets:
     views = len(motion.rig)
     # derivatives (7C, T, K, 2C) of the projected residuals by offsets, then by pose errors
     by_offset = [motion.projected_of(c, motion.speed_px[:, c]) for c in range(views)]
-    columns = np.concatenate([np.stack(by_offset), pose_columns(motion)])
-    matrices, vectors = keypoint_equations(motion, motion.residual, columns)
+    columns = np.concatenate([np.stack(by_offset), _pose_columns(motion)])
+    matrices, vectors = _keypoint_equations(motion, columns)
     # offsets are uncertain by 50 ms, given poses by a degree and 2 cm; tuned on the studio
     pose_sigma = np.repeat([np.radians(1.0), 0.02], 3)
     prior = np.r_[np.full(views, 0.05**-2.0), np.tile(pose_sigma**-2.0, views)]
@@ -217,7 +215,7 @@ def _inflation(
     """Factor, at least 1, by which the offsets' variance exceeds that of the noise model.
 
     Cluster-robust sandwich variance over model variance, mean over the cameras. A cluster is a
-    group of :data:`CLUSTER`; its score is the sum of its keypoints' gradients at the solution.
+    group of :data:`_CLUSTER`; its score is the sum of its keypoints' gradients at the solution.
 
     Args:
         matrices: (K, n, n) normal matrix of each keypoint, n = 7C.
@@ -228,8 +226,8 @@ def _inflation(
         own: indices of the offsets among the free unknowns.
     """
     scores = (vectors - matrices @ solution)[:, free]
-    groups = np.zeros((CLUSTER.max() + 1, len(free)))
-    np.add.at(groups, CLUSTER, scores)
+    groups = np.zeros((_CLUSTER.max() + 1, len(free)))
+    np.add.at(groups, _CLUSTER, scores)
     taking_part = (np.abs(groups).sum(1) > 0).sum()
     if taking_part < 3:
         return 1.0
@@ -276,29 +274,19 @@ def precisions(motion: KeypointMotion, noise: TimeNoise, part: slice) -> np.ndar
     return np.swapaxes(inverse.reshape(views, count, size, size), 0, 1)
 
 
-def keypoint_equations(
-    motion: KeypointMotion,
-    residual: np.ndarray,
-    columns: np.ndarray,
-    constant: float = CONSTANT_VARIANCE,
+def _keypoint_equations(
+    motion: KeypointMotion, columns: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Normal matrix (K, n, n) and vector (K, n) of each keypoint, for n unknowns.
 
-    Args:
-        residual: (T, C, K, 2) px, not projected.
-        columns: (n, T, K, 2C) derivatives of the projected residuals by the unknowns.
-        constant: variance of the series' constant part, see :class:`TimeNoise`.
+    ``columns``: (n, T, K, 2C) derivatives of the projected residuals by the unknowns.
     """
-    noise = replace(estimate_noise(motion), constant=constant)
-    series = as_series(motion.projected(residual))
+    noise = estimate_noise(motion)
+    series = as_series(motion.projected(motion.residual))
     size, _, count, _ = columns.shape
     matrices, vectors = np.zeros((count, size, size)), np.zeros((count, size))
-    parts = windows(len(motion.times))
-    # If the constant is not free, it is the same in all windows: their information about a constant
-    # pattern is then averaged, not added.
-    share = 1.0 if constant >= CONSTANT_VARIANCE else 1 / len(parts)
-    for part in parts:
-        precision = precisions(motion, noise, part) * share
+    for part in windows(len(motion.times)):
+        precision = precisions(motion, noise, part)
         for k in range(count):
             for c in np.flatnonzero(motion.valid[part, :, k].any(0)):
                 both = slice(2 * c, 2 * c + 2)
@@ -309,7 +297,7 @@ def keypoint_equations(
     return matrices, vectors
 
 
-def pose_columns(motion: KeypointMotion) -> np.ndarray:
+def _pose_columns(motion: KeypointMotion) -> np.ndarray:
     """Derivatives (6C, T, K, 2C) of the projected residuals by each camera's rotation about its
     centre, rad, and translation, m, in the master's axes."""
     poses = []

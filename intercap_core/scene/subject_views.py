@@ -15,8 +15,8 @@ from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.formats.detections.read import PeopleOfImages
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.triangulation import pixel_scale, reproject
-from intercap_core.person.groups import MIN_COMMON_POINTS, NOBODY
-from intercap_core.person.sides import BODY_POINTS, swap_sides
+from intercap_core.person.groups import NOBODY, distance_to
+from intercap_core.person.sides import BODY_POINTS
 from intercap_core.person.subject import find_subject, subject_keypoints
 from intercap_core.person.subject_joints import fill_middles, triangulate_people
 from intercap_core.scene.keypoint_motion import MIN_CONFIDENCE
@@ -48,27 +48,15 @@ def add_late_views(
         before = np.arange(np.searchsorted(times, times[t] - reach_s - 1e-3), t + 1)
         expected = reproject(np.nan_to_num(body[before].reshape(-1, 3), nan=1.0), rig)[:, c]
         expected = expected.reshape(len(before), -1, 2)
-        known = np.isfinite(body[before, :, 0])
-        errors = [_distance(person, expected, known) for person in people]
-        if min(errors, default=np.inf) < limit[c]:
+        places = list(zip(expected, np.isfinite(body[before, :, 0]), strict=True))
+        bodies = people[:, BODY_POINTS]
+        errors = [
+            min(distance_to(*place, body, body[:, 2] >= MIN_CONFIDENCE)[0] for place in places)
+            for body in bodies
+        ]
+        if min(errors) < limit[c]:
             result[t, c] = int(np.argmin(errors))
     return result
-
-
-def _distance(person: np.ndarray, expected: np.ndarray, known: np.ndarray) -> float:
-    """Least median distance, px, of a person (135, 3) from the ``expected`` bodies (N, 25, 2).
-
-    The person is tried as detected and with left and right exchanged; inf with too few points.
-    ``known``: (N, 25) bool.
-    """
-    best = np.inf
-    for body in (person[BODY_POINTS], swap_sides(person)[BODY_POINTS]):
-        common = known & (body[:, 2] >= MIN_CONFIDENCE)
-        away = np.linalg.norm(expected - body[:, :2], axis=-1)
-        for row, both in zip(away, common, strict=True):
-            if both.sum() >= MIN_COMMON_POINTS:
-                best = min(best, float(np.median(row[both])))
-    return best
 
 
 @dataclass(frozen=True, eq=False)

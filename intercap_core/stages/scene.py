@@ -17,7 +17,6 @@ from intercap_core.geometry.camera.rig import Rig, ring_centre
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.scene.background import Background, camera_background
 from intercap_core.scene.camera_verdicts import describe_direction, weakest_motion
-from intercap_core.scene.constraints import FloorConstraint
 from intercap_core.scene.extrinsics import Refinement, refine
 from intercap_core.scene.ground import (
     GroundPlane,
@@ -112,7 +111,7 @@ def run(
                 f"{', '.join(source.rig.names)} as in {frames}; re-run stage 'detections'"
             )
         rig, master = source.rig, source.rig.names.index(source.master)
-        stated, disagree = _stated_starts(source, starts or {}, master)
+        stated = _stated_starts(source, starts or {}, master)
         moments = find_moments(
             people, rig, source.time_s, source.fps, source.available, master=master, stated=stated
         )
@@ -121,7 +120,6 @@ def run(
         backgrounds = _backgrounds(source, subject, moments.slip)
         rig, exchanges = exchange_lenses(rig, backgrounds, subject, source.time_s, master)
         surfaces = background_surfaces(rig, backgrounds)
-        given_ground = _ground(source, rig, surfaces, np.zeros(len(rig)), settings, floor)
         refined = refine(
             rig,
             master,
@@ -129,7 +127,6 @@ def run(
             moving_surfaces(source, rig, image_of, backgrounds),
             moments,
             source.time_s,
-            floor=FloorConstraint.of(rig, surfaces, given_ground),
             free_poses=settings.refine_extrinsics,
         )
         rig = rig.moved(refined.poses)
@@ -137,8 +134,7 @@ def run(
         ground, more_notes = _with_feet(source, rig, ground, subject)
         slides, known_to = _slides(source, rig, refined, ground)
         notes = _notes(source, refined, moments, stated, exchanges)
-        for note, disagreement, slide, words in zip(notes, disagree, slides, known_to, strict=True):
-            note += [disagreement] if disagreement else []
+        for note, slide, words in zip(notes, slides, known_to, strict=True):
             note += [words] if np.linalg.norm(slide) > WEAK_CAMERA_M else []
         ground_notes += more_notes
         scene = _Scene(
@@ -149,11 +145,11 @@ def run(
 
 def _stated_starts(
     source: Frames, starts: Mapping[str, tuple[float, float]], master: int
-) -> tuple[StatedStarts, list[str]]:
-    """Starts by annotation and sound combined, and messages (C,) on disagreements; "" = none."""
+) -> StatedStarts:
+    """Starts by annotation, and by sound for cameras without an annotation."""
     names, heard = source.rig.names, source.sound_starts
     if not starts and not heard:
-        return StatedStarts.nothing(len(names)), [""] * len(names)
+        return StatedStarts.nothing(len(names))
     first = source.first_image_s
     annotated = StatedStarts.of(starts, names, master, first, "the annotation")
     try:
@@ -161,7 +157,7 @@ def _stated_starts(
     except UserError as error:
         raise UserError(f"sequence {source.sequence}: {error}") from None
     by_sound = StatedStarts.of(heard, names, master, first, "the sound").unless_in_step()
-    return annotated.combine(by_sound)
+    return annotated.or_else(by_sound)
 
 
 def _backgrounds(
@@ -330,9 +326,7 @@ def _notes(
     notes = [[note] if note else [] for note in refined.notes]
     for swap in exchanges:
         part = "its lens" if swap.with_distortion else "its focal length and principal point"
-        evidence = "by the keypoints"
-        if np.isfinite(swap.before):
-            evidence = f"background {1e3 * swap.before:.1f} to {1e3 * swap.after:.1f} mm"
+        evidence = f"background {1e3 * swap.before:.1f} to {1e3 * swap.after:.1f} mm"
         for own, other in (swap.cameras, swap.cameras[::-1]):
             notes[own].append(
                 f"{part} and those of {source.rig.names[other]} are exchanged in the calibration "
