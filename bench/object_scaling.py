@@ -137,8 +137,8 @@ def _view(mesh: ObjectMesh, geometry: ViewGeometry, pose: np.ndarray) -> View:
     silhouette, drawn = Renderer().draw(
         Surface.of(mesh),
         [
-            Shot(geometry.lens, geometry.colour_from_master @ pose),
-            Shot(lens, geometry.depth_from_master @ pose),
+            Shot(geometry.lens, geometry.camera.colour_from_master @ pose),
+            Shot(lens, geometry.camera.depth_from_master @ pose),
         ],
     )
     depth = np.zeros((lens.height, lens.width), np.float32)
@@ -154,7 +154,7 @@ def _shots(scene: Scene, count: int) -> list[Shot]:
     for number in range(count):
         geometry = scene.views[number % len(scene.views)].geometry
         turned = rigid(Rotation.random(rng=rng).as_matrix(), scene.pose[:3, 3])
-        shots.append(Shot(geometry.lens, geometry.colour_from_master @ turned))
+        shots.append(Shot(geometry.lens, geometry.camera.colour_from_master @ turned))
     return shots
 
 

@@ -158,7 +158,7 @@ class ColourDecision:
         views, pictures = observer.views(t), self._pictures[1]
         poses = seen_by(fit.pose, views, fit.twist)
         shots = [
-            Shot(view.geometry.lens, view.geometry.colour_from_master @ pose)
+            Shot(view.geometry.lens, view.geometry.camera.colour_from_master @ pose)
             for view, pose in zip(views, poses, strict=True)
         ]
         renderings = observer.context.renderer.draw(Surface.of(mesh), shots)

@@ -23,7 +23,7 @@ from intercap_core.formats.detections.instance import PERSON_LABEL
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.camera.triangulation import midpoints
 from intercap_core.geometry.rigid.mesh import ObjectMesh
-from intercap_core.object_track.object_silhouette import rim_mask
+from intercap_core.object_track.object_silhouette import rim_pixels
 from intercap_core.object_track.view import MaskCandidate, View
 
 OUTLINE_DIRECTIONS = 16  # image directions in which the support function is sampled; tuned
@@ -58,8 +58,8 @@ class MaskOutline:
     def of(cls, view: View, candidate: MaskCandidate) -> MaskOutline | None:
         """Compute the outline of a candidate's mask; None if it is cut off in all directions."""
         mask, lens = candidate.mask, view.geometry.lens
-        row, column = np.nonzero(rim_mask(np.pad(mask.mask, 1)))
-        x, y = column + mask.x0 - 1, row + mask.y0 - 1
+        pixels, _ = rim_pixels(np.pad(mask.mask, 1))
+        x, y = pixels[:, 0] + (mask.x0 - 1), pixels[:, 1] + (mask.y0 - 1)
         rays = lens.rays[y, x].astype(np.float64)
         fine = np.isfinite(rays[:, 0])
         x, y, rays = x[fine], y[fine], rays[fine]

@@ -88,7 +88,7 @@ def _depth(
     total, count = depth_log_ratio(
         drawn.depth, drawn.face, drawn.x0, drawn.y0, view.depth, view.background,
         geometry.depth_lens.rays, mesh.face_normals,
-        geometry.depth_from_master[:3, :3] @ pose[:3, :3],
+        geometry.camera.depth_from_master[:3, :3] @ pose[:3, :3],
         np.asarray(colour_from_depth), geometry.lens.parameters,
         person.mask, person.x0, person.y0, mask.mask, mask.x0, mask.y0,
         likely_sigma_m, background_m, clutter_m, log_past, log_hidden,

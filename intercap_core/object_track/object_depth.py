@@ -4,37 +4,18 @@ R_D is the rendered depth, D the measured depth, S the object's mask; lambda_dep
 :mod:`intercap_core.object_track.view_fit`. The paper compares depth along the ray. The residual
 here is point to plane: the same difference along the normal of the rendered triangle. It equals the
 depth difference times the cosine of incidence, so grazing surfaces do not dominate, and it is
-linear in small motions.
+linear in small motions:
 
-:func:`residuals` is the readable form. The compiled functions compute the same residual and
-Jacobian pixel by pixel, directly into the normal equations; tests compare the two.
+    r = n . (p - X)        dr/dw = n x (p - o)        dr/dd = -n
+
+with p the measured point, X the surface point of the object under the same pixel and n the normal
+there. The object moves by X' = exp(w) (X - o) + o + d, with o its translation.
 """
 
 from __future__ import annotations
 
 import numba
 import numpy as np
-
-
-def residuals(
-    observed: np.ndarray, hit: np.ndarray, normals: np.ndarray, origin: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Compute point-to-plane residuals n . (observed - hit) (N,) and their Jacobian (N, 6), metres.
-
-    A residual is positive if the measured point lies outside of the rendered surface. The Jacobian
-    is exact for the motion X' = exp(w) (X - origin) + origin + d; its columns are w (rad), then d
-    (m).
-
-    Args (master frame, metres):
-        observed: (N, 3) measured points, fixed.
-        hit: (N, 3) surface points of the object under the same pixels; they move with it.
-        normals: (N, 3) unit normals at ``hit``; they move with the object.
-        origin: (3,) translation of the object.
-    """
-    gap = np.einsum("ij,ij->i", normals, observed - hit)
-    # d/dw [exp(w) n . (p - X')] = n x (p - X) - (X - o) x n = n x (p - o)
-    turn = np.cross(normals, observed - origin)
-    return gap, np.concatenate([turn, -normals], axis=1)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -45,7 +26,7 @@ def normal_equations(
     """Sum the depth term over a rendering: J'WJ (6, 6), J'Wr (6,) and the number of pixels used.
 
     The loop runs over the pixels that the rendering and the patch of measurements share. A pixel
-    whose depths differ by ``gate`` or more is left out. Columns as in :func:`residuals`; all
+    whose depths differ by ``gate`` or more is left out. Columns are w (rad), then d (m); all
     lengths in metres.
 
     Args:

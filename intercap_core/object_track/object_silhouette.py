@@ -7,17 +7,16 @@ contour pulls the nearest rim pixel of the render. Beyond the paper, the optiona
 the reverse: rim pixels of the render over known background are pulled to the nearest contour pixel
 of the mask.
 
-:func:`residuals` and :func:`rim_mask` are the readable form. The compiled functions compute the
-same, directly into the normal equations; tests compare the two.
+The residual is the distance r = |u(X) - u'| of the projection of a rim point X from the pixel u'
+that it should reach, in pixels. Its derivative by motions of the object (:mod:`.object_depth`) is
+taken along the line between the two.
 """
 
 from __future__ import annotations
 
-import cv2
 import numba
 import numpy as np
 
-from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.projection_kernels import (
     project_point,
     project_point_with_jacobian,
@@ -25,49 +24,12 @@ from intercap_core.geometry.camera.projection_kernels import (
 from intercap_core.object_track.object_depth import add_row
 
 
-def rim_mask(mask: np.ndarray) -> np.ndarray:
-    """Return the pixels of a mask (h, w) that touch its outside, (h, w) bool.
+@numba.njit(cache=True, nogil=True)
+def rim_pixels(mask):
+    """List the pixels of a mask (h, w) that touch its outside, row by row.
 
     The mask is assumed to continue beyond the window: a silhouette that the image's edge cuts off
     has no contour there.
-    """
-    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
-    eroded = cv2.erode(mask.astype(np.uint8), cross, borderType=cv2.BORDER_REPLICATE)
-    return mask & (eroded == 0)
-
-
-def residuals(
-    points: np.ndarray,
-    targets: np.ndarray,
-    lens: Intrinsics,
-    camera_from_master: np.ndarray,
-    origin: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Compute contour distances |projection - target| (N,) in pixels and their Jacobian (N, 6).
-
-    The derivative is taken along the line between the two points, zero if they coincide. Motion
-    and columns as in :func:`.object_depth.residuals`.
-
-    Args:
-        points: (N, 3) rim points of the object, master frame, metres; they move with it.
-        targets: (N, 2) image points that they should project to.
-        lens: lens of the image.
-        camera_from_master: (4, 4).
-        origin: (3,) translation of the object, master frame.
-    """
-    rotation = camera_from_master[:3, :3]
-    in_camera = points @ rotation.T + camera_from_master[:3, 3]
-    projected, by_point = lens.project_with_jacobian(in_camera)
-    offset = projected - targets
-    distance = np.linalg.norm(offset, axis=1)
-    direction = offset / np.maximum(distance, 1e-9)[:, None]
-    along = np.einsum("ni,nij->nj", direction, by_point) @ rotation
-    return distance, np.concatenate([np.cross(points - origin, along), along], axis=1)
-
-
-@numba.njit(cache=True, nogil=True)
-def rim_pixels(mask):
-    """List the pixels of :func:`rim_mask` row by row.
 
     Returns:
         pixels: (R, 2) x, y.
@@ -208,7 +170,7 @@ def normal_equations(
 ):
     """Sum the silhouette term: J'WJ (6, 6), J'Wr (6,) and the residuals (N,) in pixels.
 
-    Columns as in :func:`residuals`.
+    Columns as in :func:`.object_depth.normal_equations`.
 
     Args:
         at, target: (N, 2) matches of :func:`correspondences`.

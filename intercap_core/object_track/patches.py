@@ -60,8 +60,8 @@ class DepthPatch:
         person = view.person
         depth, points, trust, on_person = _lift(
             view.depth, lens.rays, left, top, right, bottom, np.asarray(colour_from_depth),
-            geometry.master_from_depth, geometry.lens.parameters, mask.mask, mask.x0, mask.y0,
-            person.mask, person.x0, person.y0,
+            geometry.camera.master_from_depth, geometry.lens.parameters,
+            mask.mask, mask.x0, mask.y0, person.mask, person.x0, person.y0,
         )  # fmt: skip
         return cls(left, top, depth, points, trust, on_person)
 

@@ -7,7 +7,6 @@ frame is sure if it is not uncertain by the rule of :meth:`Proposals.search_unce
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
 
 import numpy as np
 
@@ -78,13 +77,8 @@ class Proposals:
         log.info("first frame %d, %.0f nats", first, best)
         return first
 
-    def add_annotated(self, given: GivenPose) -> GivenPose | None:
-        """Follow an annotated pose, unless the images clearly contradict it.
-
-        Returns:
-            The pose if the images support it or hide the object. If they contradict it, the pose
-            fitted to a neighbouring frame that shows it; None if no frame does.
-        """
+    def add_annotated(self, given: GivenPose) -> bool:
+        """Follow an annotated pose, unless the images clearly contradict it; returns whether."""
         t, pose = given.frame, given.pose
         wide = self._fit(t, pose)
         fits = [wide] if wide.log_ratio > SEEN_LOG_RATIO else []
@@ -94,38 +88,15 @@ class Proposals:
             if own.log_ratio > DENIED_LOG_RATIO:
                 fits.append(own)
         if not fits:
-            return self._find_in_neighbours(given)
-        self._accept(given, fits)
-        return given
-
-    def _find_in_neighbours(self, given: GivenPose) -> GivenPose | None:
-        """Follow the annotated pose in the neighbouring frame that shows it, if any."""
-        t, pose = given.frame, given.pose
-        # the frame number of an annotation may be off by five
-        near = range(max(t - 5, 0), min(t + 6, self._observer.count))
-        best: tuple[int, FittedPose] | None = None
-        for u in sorted(near, key=lambda u: abs(u - t)):
-            fit = self._fit(u, pose)
-            if best is None or fit.log_ratio > best[1].log_ratio + RIVAL_LOG_RATIO:
-                best = u, fit
-            if best[1].log_ratio > SEED_SURE_LOG_RATIO:
-                break
-        if best is None or best[1].log_ratio < SEEN_LOG_RATIO or best[0] in self._prior.given:
-            return None
-        shown = replace(given, frame=best[0], pose=best[1].pose)
-        self._accept(shown, [best[1]])
-        return shown
-
-    def _accept(self, given: GivenPose, fits: list[FittedPose]) -> None:
-        """Follow the fits of an annotated frame; the first one claims its place."""
-        t = given.frame
+            return False
         self._prior.given[t] = given
-        if fits[0].log_ratio > SEEN_LOG_RATIO:
+        if fits[0].log_ratio > SEEN_LOG_RATIO:  # the first fit claims its place
             self._searched.add(t)
             self._observer.places.claim(self._observer.mesh.centre_at(fits[0].pose))
         for fit in fits:
             if self._hypotheses.known(t, fit.pose) is None:
                 self._hypotheses.follow(t, fit)
+        return True
 
     def search_uncertain(self, decoded: Decoded) -> bool:
         """Search the uncertain frames; returns whether a hypothesis is new.

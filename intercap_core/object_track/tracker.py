@@ -100,8 +100,8 @@ class Tracker:
 
         Raises NotFound if no frame shows a possible object.
         """
-        used = [self._proposals.add_annotated(given) for given in annotated]
-        seed = self._start([given.frame for given in used if given is not None])
+        used = [given for given in annotated if self._proposals.add_annotated(given)]
+        seed = self._start([given.frame for given in used])
         decoded = self._search(self._decode())
         if self._proposals.add_near_symmetries(decoded):
             decoded = self._decode()
@@ -119,12 +119,10 @@ class Tracker:
         def agrees(given: GivenPose, frames: list[FrameResult]) -> bool:
             return given.holds(self._mesh, frames[given.frame].fit.pose)
 
-        pairs = list(zip(annotated, used, strict=True))
-        agreeing = [given for given, own in pairs if own is given and agrees(given, frames)]
+        agreeing = [given for given in used if agrees(given, frames)]
         final = flag_frames(self._mesh, WholeTrack(self._observer).refine(frames, agreeing))
         doubts = [
-            describe_contradiction(self._mesh, given, own, final[given.frame])
-            for given, own in pairs
+            describe_contradiction(self._mesh, given, final[given.frame]) for given in annotated
         ]
         doubts += mesh_doubts(self._observer, final)
         return Track(
@@ -132,7 +130,7 @@ class Tracker:
             seed,
             bool(annotated),
             self._evidence(final),
-            not annotated or any(agrees(own, final) for own in used if own is not None),
+            not annotated or any(agrees(given, final) for given in used),
             tuple(filter(None, doubts)),
         )
 
@@ -289,16 +287,10 @@ def _sure_frames(decoded: Decoded) -> np.ndarray:
     )
 
 
-def describe_contradiction(
-    mesh: ObjectMesh, given: GivenPose, used: GivenPose | None, frame: FrameResult
-) -> str:
+def describe_contradiction(mesh: ObjectMesh, given: GivenPose, frame: FrameResult) -> str:
     """Return a warning if the track contradicts an annotated pose, else an empty string.
 
-    Args:
-        mesh: the object.
-        given: the annotated pose.
-        used: the pose as it was used, in its own or in another frame; None = it was not used.
-        frame: final result of the annotated frame.
+    ``frame`` is the final result of the annotated frame.
     """
     turn, shift = given.distance(mesh, frame.fit.pose)
     subject = (
@@ -307,10 +299,6 @@ def describe_contradiction(
     )
     if not frame.lost and given.holds(mesh, frame.fit.pose):
         return ""
-    if used is not None and used.frame != given.frame:
-        return (
-            f"{subject}: the images show the object there in frame {used.frame}; correct its frame"
-        )
     if frame.lost:
         return f"{subject}: the images contradict it, and show the object nowhere; correct it"
     return (

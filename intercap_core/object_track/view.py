@@ -88,29 +88,9 @@ class ViewGeometry:
         return depth
 
     @cached_property
-    def colour_from_master(self) -> np.ndarray:
-        """(4, 4) of the camera; cached, as the next ones, because fits read it often."""
-        return np.ascontiguousarray(self.camera.colour_from_master)
-
-    @cached_property
-    def master_from_colour(self) -> np.ndarray:
-        """(4, 4) of the camera."""
-        return np.ascontiguousarray(self.camera.master_from_colour)
-
-    @cached_property
-    def master_from_depth(self) -> np.ndarray:
-        """(4, 4); the camera must have depth."""
-        return np.ascontiguousarray(self.camera.master_from_depth)
-
-    @cached_property
-    def depth_from_master(self) -> np.ndarray:
-        """(4, 4); the camera must have depth."""
-        return np.ascontiguousarray(self.camera.depth_from_master)
-
-    @cached_property
     def depth_from_colour(self) -> np.ndarray:
-        """(4, 4); the camera must have depth."""
-        return self.depth_from_master @ self.master_from_colour
+        """(4, 4); the camera must have depth. Cached, because fits read it often."""
+        return self.camera.depth_from_master @ self.camera.master_from_colour
 
 
 def camera_distances(cameras: Sequence[Camera], joints: np.ndarray) -> list[float]:

@@ -50,9 +50,9 @@ NormalEquations = tuple[np.ndarray, np.ndarray]
 def shots_of(view: View, pose: np.ndarray) -> list[Shot]:
     """Return the shots to render at a pose (4, 4): colour image, then depth image if present."""
     geometry = view.geometry
-    shots = [Shot(geometry.lens, geometry.colour_from_master @ pose)]
+    shots = [Shot(geometry.lens, geometry.camera.colour_from_master @ pose)]
     if view.depth is not None and geometry.depth_lens is not None:
-        shots.append(Shot(geometry.depth_lens, geometry.depth_from_master @ pose))
+        shots.append(Shot(geometry.depth_lens, geometry.camera.depth_from_master @ pose))
     return shots
 
 
@@ -124,7 +124,7 @@ class ViewFit:
             drawn.depth, drawn.face, (drawn.x0 - patch.x0, drawn.y0 - patch.y0),
             patch.depth, patch.points, patch.trust, self._context.mesh.face_normals,
             self._pose[:3, :3], self._pose[:3, 3],
-            self._view.geometry.master_from_depth[:3, 3], GATE_SCALES * scale_m, scale_m,
+            self._view.geometry.camera.master_from_depth[:3, 3], GATE_SCALES * scale_m, scale_m,
         )  # fmt: skip
         if count < MIN_RENDERED_PX:
             return np.zeros((6, 6)), np.zeros(6)
@@ -165,7 +165,7 @@ class ViewFit:
             return nothing
         hessian, gradient, residuals = object_silhouette.normal_equations(
             at, target, drawn.depth, corner, geometry.lens.rays, geometry.lens.parameters,
-            geometry.master_from_colour, self._pose[:3, 3], scale,
+            geometry.camera.master_from_colour, self._pose[:3, 3], scale,
         )  # fmt: skip
         # normalised by the whole rim: a few pixels that are off weigh less than a whole rim
         samples = CONTOUR_SAMPLES / max(len(patch.contour), rim_size)
@@ -187,7 +187,7 @@ class ViewFit:
             gap, across, where = object_depth.matches(
                 drawn.depth, drawn.face, (drawn.x0 - patch.x0, drawn.y0 - patch.y0),
                 patch.depth, patch.points, self._context.mesh.face_normals,
-                self._pose[:3, :3], view.geometry.master_from_depth[:3, 3],
+                self._pose[:3, :3], view.geometry.camera.master_from_depth[:3, 3],
             )  # fmt: skip
             column, row = where.T
             # in metres; pixels whose depth differs by more show something else

@@ -129,7 +129,8 @@ def quick_report(
         compared, free, total = object_depth.agreement(
             drawn_depth.depth, drawn_depth.face, drawn_depth.x0, drawn_depth.y0,
             view.depth, geometry.depth_lens.rays, context.mesh.face_normals,
-            geometry.depth_from_master[:3, :3] @ pose[:3, :3], FREE_SPACE_M, AGREEMENT_SCALE_M,
+            geometry.camera.depth_from_master[:3, :3] @ pose[:3, :3],
+            FREE_SPACE_M, AGREEMENT_SCALE_M,
         )  # fmt: skip
         if free >= MIN_RENDERED_PX:
             agreement = total / free

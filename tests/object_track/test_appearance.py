@@ -52,7 +52,7 @@ def paint_images(capture: ObjectCapture, views: list[View], t: int, paints: Pain
     pictures: list[Image] = []
     for c, view in enumerate(views):
         lens = view.geometry.lens
-        pose = view.geometry.colour_from_master @ capture.poses[t]
+        pose = view.geometry.camera.colour_from_master @ capture.poses[t]
         (drawn,) = Renderer().draw(Surface.of(mesh), [Shot(lens, pose)])
         light = np.full((lens.height, lens.width, 3), 0.1)
         rows, columns = np.nonzero(drawn.mask)

@@ -136,13 +136,11 @@ def test_single_views_next_to_unseen_frames_are_flagged():
 
 def test_contradictions_of_annotated_poses_are_described(suitcase):
     given, seen = annotate(0, at()), FrameStatus.SEEN
-    assert describe_contradiction(suitcase, given, given, frame(at(0.02), seen)) == ""
-    text = describe_contradiction(suitcase, given, given, frame(at(0.3), seen))
+    assert describe_contradiction(suitcase, given, frame(at(0.02), seen)) == ""
+    text = describe_contradiction(suitcase, given, frame(at(0.3), seen))
     assert "frame 0 (stated to 10 mm and 5 degrees)" in text and "300 mm and 0 degrees" in text
-    text = describe_contradiction(suitcase, given, None, frame(at(), FrameStatus.LOST))
+    text = describe_contradiction(suitcase, given, frame(at(), FrameStatus.LOST))
     assert "show the object nowhere" in text
-    text = describe_contradiction(suitcase, given, annotate(4, at(0.3)), frame(at(0.3), seen))
-    assert "in frame 4; correct its frame" in text
 
 
 class Swinging(ObjectCapture):
@@ -217,11 +215,3 @@ def test_annotated_poses_of_seen_frames_change_nothing(capture, images):
     assert not frames_with(found, "carried") and not found.doubts and found.seed_frame == 1
     poses = np.array([frame.fit.pose for frame in alone.frames])
     assert errors_of(capture.mesh, found, poses)[0].max() < 0.001
-
-
-def test_a_pose_of_another_frame_is_found_in_its_own(suitcase):
-    """Five frames off while the object moves by 7 cm a frame."""
-    capture = ObjectCapture.make(suitcase, 6, speed=0.07, turn_deg=4)
-    track = track_of(capture, annotate(5, capture.poses[0]))
-    assert track.annotated and track.agrees
-    assert errors_of(suitcase, track, capture.poses)[0].max() < 0.004

@@ -275,10 +275,10 @@ class ObjectImagesData(JointTerm):
             gradient: (6,) weighted gradient by the object's step.
         """
         place = self._compared[t, :3, 3]
-        arms = place - np.array([g.master_from_colour[:3, 3] for g in self._geometry])
+        arms = place - np.array([g.camera.master_from_colour[:3, 3] for g in self._geometry])
         depth_poses = np.array(
             [
-                g.master_from_depth if g.camera.depth else g.master_from_colour
+                g.camera.master_from_depth if g.camera.depth else g.camera.master_from_colour
                 for g in self._geometry
             ]
         )
