@@ -207,21 +207,12 @@ def test_distance_moves_an_end_within_the_uncertainty(interval, uncertainty, tou
     [
         ([("left_hand", 5, 15)], range(0, 60), []),
         ([("left_hand", 5, 5)], range(0, 60), [(range(5, 5), "no frame at 5", False)]),
-        (
-            [("left_hand", 5, 15), ("left_hand", 12, 20)], range(0, 60),
-            [(range(12, 15), "left_hand annotated twice", False)],
-        ),
-        (
-            [("left_hand", 5, 20), ("left_hand", 7, 9)], range(0, 60),
-            [(range(7, 9), "left_hand annotated twice", False)],
-        ),
-        ([("left_hand", 5, 15), ("seat", 12, 20), ("any", 0, 30)], range(0, 60), None),
-        ([("left_hand", 5, 28)], range(0, 60), [(range(27, 29), "left_hand ends unseen", False)]),
-        ([("left_hand", 31, 40)], range(0, 60), [(range(30, 32), "hand begins unseen", False)]),
+        ([("left_hand", 5, 15), ("left_hand", 12, 20)], range(0, 60), []),
+        ([("left_hand", 5, 15), ("seat", 12, 20), ("any", 0, 30)], range(0, 60), []),
         ([("left_hand", 20, 40)], range(20, 40), []),  # unseen in its interior
         ([("left_hand", 5, 20)], range(0, 12), [(range(12, 20), "left_hand annotated 2.00", True)]),
         ([("any", 33, 40)], range(0, 35), [(range(35, 40), "any annotated 2.00 m from", True)]),
-        ([("left_hand", 28, 31)], range(0, 0), None),  # far, but unseen
+        ([("left_hand", 28, 31)], range(0, 0), []),  # far, but unseen
     ],
 )  # fmt: skip
 def test_implausible_annotations_name_frames_and_part(intervals, near, expected):
@@ -230,9 +221,6 @@ def test_implausible_annotations_name_frames_and_part(intervals, near, expected)
     issues = find_issues(_intervals(intervals), REGIONS, distance, UNSEEN)
     evidence, labels = _evidence(*intervals)
     assert np.isfinite(evidence).all() and np.isin(labels, (-1, 0, 1)).all()
-    if expected is None:
-        assert not any(issue.distrusted or "twice" in issue.text for issue in issues)
-        return
     assert [(i.frames, i.distrusted) for i in issues] == [(f, d) for f, _, d in expected]
     for issue, (_, text, _) in zip(issues, expected, strict=True):
         assert text in issue.text

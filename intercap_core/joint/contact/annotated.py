@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import groupby, pairwise
+from itertools import pairwise
 
 import numpy as np
 
@@ -68,51 +68,14 @@ def find_issues(
         distance: (T, R) of each region to the object in the fit, metres.
         unseen: (T,) frames in which body or object was not seen.
     """
-    filled = [interval for interval in intervals if interval.end > interval.start]
-    return [
-        *(
-            AnnotationIssue(
-                range(i.start, i.end), f"contact of {i.part} annotated for no frame at {i.start}"
-            )
-            for i in intervals
-            if i.end <= i.start
-        ),
-        *_find_overlaps(filled),
-        *(
-            issue
-            for interval in filled
-            for issue in (
-                *_find_unseen_ends(interval, unseen),
-                *_find_far(interval, regions, distance, unseen),
-            )
-        ),
-    ]
-
-
-def _find_overlaps(intervals: Sequence[ContactInterval]) -> list[AnnotationIssue]:
-    """Find overlapping intervals of one part, which count once."""
-    by_part = sorted(intervals, key=lambda i: (i.part, i.start, i.end))
     issues = []
-    for part, group in groupby(by_part, key=lambda i: i.part):
-        reached = 0
-        for interval in group:
-            if interval.start < reached:
-                both = range(interval.start, min(reached, interval.end))
-                issues.append(AnnotationIssue(both, f"contact of {part} annotated twice"))
-            reached = max(reached, interval.end)
+    for interval in intervals:
+        if interval.end > interval.start:
+            issues += _find_far(interval, regions, distance, unseen)
+        else:
+            text = f"contact of {interval.part} annotated for no frame at {interval.start}"
+            issues.append(AnnotationIssue(range(interval.start, interval.end), text))
     return issues
-
-
-def _find_unseen_ends(interval: ContactInterval, unseen: np.ndarray) -> list[AnnotationIssue]:
-    """Find ends in unseen frames: the annotation alone determines when the contact changes."""
-    ends = {"begins": interval.start, "ends": interval.end}
-    return [
-        AnnotationIssue(
-            range(at - 1, at + 1), f"annotated contact of {interval.part} {what} unseen"
-        )
-        for what, at in ends.items()
-        if 0 < at < len(unseen) and unseen[at - 1 : at + 1].any()
-    ]
 
 
 def _find_far(
