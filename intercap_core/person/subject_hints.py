@@ -7,14 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from intercap_core.annotation import SubjectPoint
-from intercap_core.body.keypoints import BODY, LEFT_HAND, RIGHT_HAND, SKELETON, keypoint_pairs
+from intercap_core.body.keypoints import BODY, LEFT_HAND, RIGHT_HAND
 from intercap_core.errors import UserError
 from intercap_core.formats.detections.instance import PERSON_LABEL
 from intercap_core.formats.detections.read import Detections
+from intercap_core.person.masks import BONES
 from intercap_core.person.sides import BODY_POINTS
 from intercap_core.person.subject import NamedDetection, Touches
-
-_BONES = keypoint_pairs(SKELETON)
 
 
 def named_people(
@@ -77,7 +76,7 @@ def _distance(person: np.ndarray, point: np.ndarray, min_confidence: float) -> f
     The size is the longer side of the box around the visible keypoints. inf without a bone.
     """
     seen = person[:, 2] >= min_confidence
-    bones = _BONES[seen[_BONES].all(1)]
+    bones = BONES[seen[BONES].all(1)]
     if not len(bones):
         return np.inf
     start, end = person[bones[:, 0], :2], person[bones[:, 1], :2]

@@ -8,6 +8,7 @@ import cv2
 import numba
 import numpy as np
 
+from intercap_core.geometry.camera.masks import from_counts
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import apply
 
@@ -128,10 +129,10 @@ def encode_window(
     """
     columns = min(mask.shape[1] * scale, width - left * scale)
     rows = min(mask.shape[0] * scale, height - top * scale)
-    if columns <= 0 or rows <= 0:
-        return bytes(_compressed(np.array([width * height], np.int64)))
-    counts = _counts(mask, left, top, scale, width, height)
-    return bytes(_compressed(counts))
+    counts = [width * height]
+    if columns > 0 and rows > 0:
+        counts = _counts(mask, left, top, scale, width, height).tolist()
+    return from_counts(counts, height, width)
 
 
 @numba.njit(cache=True)
@@ -173,25 +174,3 @@ def _counts(
                 start, inside = at, here
     counts[number] = width * height - start
     return counts[: number + 1]
-
-
-@numba.njit(cache=True)
-def _compressed(counts: np.ndarray) -> np.ndarray:
-    """Compressed string of run lengths, as pycocotools writes it (maskApi.c, rleToString).
-
-    From the fourth run on, the difference to the run two before is stored, in groups of 5 bits.
-    """
-    text = np.empty(len(counts) * 8, np.uint8)
-    length = 0
-    for i in range(len(counts)):
-        value = counts[i] - counts[i - 2] if i > 2 else counts[i]
-        more = True
-        while more:
-            bits = value & 0x1F
-            value >>= 5
-            more = value != -1 if bits & 0x10 else value != 0
-            if more:
-                bits |= 0x20
-            text[length] = bits + 48  # printable characters, from "0" on
-            length += 1
-    return text[:length]

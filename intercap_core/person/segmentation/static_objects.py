@@ -25,35 +25,23 @@ MIN_STATIC_POINTS = 60
 _BITS = 21  # bits of each coordinate in a cell's integer key
 
 
-def label_components(points: np.ndarray, cell_m: float) -> tuple[np.ndarray, int]:
-    """Component of each point, (N,) int32, and the number of components.
-
-    Points (N, 3), metres, in the same or in adjacent cells (26-neighbourhood) belong to one
-    component. Components are numbered by decreasing number of cells.
-    """
-    if not len(points):
-        return np.zeros(0, np.int32), 0
-    occupied, inverse = np.unique(_keys(points, cell_m), return_inverse=True)
-    label = _label_cells(occupied)
-    order = np.argsort(-np.bincount(label), kind="stable")
-    rank = np.empty(len(order), np.int32)
-    rank[order] = np.arange(len(order), dtype=np.int32)
-    return rank[label][inverse], len(order)
-
-
 def components(points: np.ndarray, cell_m: float, min_points: int) -> list[np.ndarray]:
     """Connected components with at least ``min_points`` points, largest number of cells first.
 
-    Returns ascending indices into ``points`` (N, 3), metres, for each component.
+    Points in the same or in adjacent cells (26-neighbourhood) belong to one component. Returns
+    ascending indices into ``points`` (N, 3), metres, for each component.
     """
-    label, count = label_components(points, cell_m)
-    if not count:
+    if not len(points):
         return []
-    order = np.argsort(label, kind="stable")
-    sizes = np.bincount(label, minlength=count)
-    ends = np.cumsum(sizes)
-    large = np.flatnonzero(sizes >= min_points)
-    return [order[ends[k] - sizes[k] : ends[k]] for k in large]
+    occupied, inverse = np.unique(_keys(points, cell_m), return_inverse=True)
+    label = _label_cells(occupied)
+    order = np.argsort(-np.bincount(label), kind="stable")
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    component = rank[label][inverse]  # (N,)
+    ends = np.cumsum(np.bincount(component))
+    members = np.split(np.argsort(component, kind="stable"), ends[:-1])
+    return [own for own in members if len(own) >= min_points]
 
 
 class OccupiedCells:

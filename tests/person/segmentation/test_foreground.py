@@ -24,7 +24,6 @@ from intercap_core.person.segmentation.static_objects import (
     OccupiedCells,
     components,
     find_static_objects,
-    label_components,
 )
 from tests.helpers.synthetic_capture import FURNITURE, ring, room_depth, to_millimetres
 from tests.helpers.synthetic_people import stick_person
@@ -43,14 +42,14 @@ def test_components_are_those_of_a_dense_grid():
     at = tuple((cells - cells.min(0)).T)
     grid[at] = True
     dense, count = ndimage.label(grid, np.ones((3, 3, 3)))
-    label, number = label_components(points, 0.06)
-    pairs = np.unique(np.column_stack([dense[at], label]), axis=0)
-    assert len(pairs) == count == number  # one to one
-    sizes = [len(np.unique(cells[label == k], axis=0)) for k in range(number)]
+    groups = components(points, 0.06, 1)
+    assert len(groups) == count and sum(map(len, groups)) == len(points)
+    assert all(len(np.unique(dense[at][group])) == 1 for group in groups)
+    sizes = [len(np.unique(cells[group], axis=0)) for group in groups]
     assert sizes == sorted(sizes, reverse=True)
-    groups = components(points, 0.06, 5)
-    assert [len(g) for g in groups] == [n for n in np.bincount(label) if n >= 5]
-    assert all((np.diff(g) > 0).all() for g in groups)
+    assert all((np.diff(group) > 0).all() for group in groups)
+    large = components(points, 0.06, 5)
+    assert [len(group) for group in large] == [len(g) for g in groups if len(g) >= 5]
     assert components(points[:0], 0.06, 1) == []
 
 
