@@ -169,8 +169,3 @@ class ViewCache:
                 _, oldest = self._kept.popitem(last=False)
                 self._bytes -= sum(view.nbytes for view in oldest)
             return self._kept[t]
-
-    def kept(self, t: int) -> list[View] | None:
-        """Return the views of frame t if they are cached; nothing is loaded or evicted."""
-        with self._lock:
-            return self._kept.get(t)

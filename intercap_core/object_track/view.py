@@ -76,10 +76,6 @@ class ViewGeometry:
             time_offset_s,
         )
 
-    def corrected(self, camera: Camera, depth_bias_m: float, time_offset_s: float) -> ViewGeometry:
-        """Return the same lenses with another camera pose, depth bias and time offset."""
-        return replace(self, camera=camera, depth_bias_m=depth_bias_m, time_offset_s=time_offset_s)
-
     def reduced_depth(self, depth_mm: np.ndarray) -> np.ndarray:
         """Reduce depth (H, W) uint16 mm to float32 metres without bias, 0 where invalid."""
         raw = depth_mm[:: self.depth_step, :: self.depth_step]
@@ -143,7 +139,7 @@ class View:
     """(h, w) depth of the empty room in the form of ``depth``; (0, 0) if unknown."""
 
     def through(self, geometry: ViewGeometry) -> View:
-        """Return the same image with :meth:`ViewGeometry.corrected` geometry."""
+        """Return the same image with another camera pose, depth bias and time offset."""
 
         def nearer(depth: np.ndarray) -> np.ndarray:
             by = np.float32(geometry.depth_bias_m - self.geometry.depth_bias_m)

@@ -20,7 +20,7 @@ images contradict the pose, stay near the tracked pose, as in :mod:`.object_data
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -131,8 +131,10 @@ class ObjectImagesData(JointTerm):
     def take_cameras(self, cameras: Cameras) -> None:
         """Use these poses and depth biases from the next :meth:`refresh` on."""
         self._geometry = [
-            given.corrected(
-                cameras.rig[c], float(np.nan_to_num(cameras.depth_bias[c])), given.time_offset_s
+            replace(
+                given,
+                camera=cameras.rig[c],
+                depth_bias_m=float(np.nan_to_num(cameras.depth_bias[c])),
             )
             for c, given in zip(self._cameras, self._geometry, strict=True)
         ]
@@ -140,7 +142,7 @@ class ObjectImagesData(JointTerm):
     def take_offsets(self, time_offset: np.ndarray) -> None:
         """Use these time offsets (C,), seconds, from the next :meth:`refresh` on."""
         self._geometry = [
-            given.corrected(given.camera, given.depth_bias_m, float(time_offset[c]))
+            replace(given, time_offset_s=float(time_offset[c]))
             for c, given in zip(self._cameras, self._geometry, strict=True)
         ]
 
@@ -247,8 +249,7 @@ class ObjectImagesData(JointTerm):
 
         def report(t: int) -> ViewReport:
             number = place[int(camera[t])]
-            cached = images.views.kept(t)
-            view = images.recording.view(t, number) if cached is None else cached[number]
+            view = images.recording.view(t, number)
             return report_at(
                 images.context, view.through(self._geometry[number]), poses[t], twists[t]
             )
