@@ -105,78 +105,59 @@ class PoseVerdict:
         return f"{pose} (held-out errors, {', '.join(map(str, self.evidence))})"
 
 
-class PoseJudge:
-    """Judges single cameras of a rig that was refined as a whole."""
+def judge_poses(
+    registration: Registration,
+    refine: Callable[[BodyViews | None, np.ndarray], RigEstimate],
+    views: BodyViews | None,
+    given: RigEstimate,
+    refined: RigEstimate,
+    cameras: Sequence[int],
+) -> dict[int, PoseVerdict]:
+    """Judge the poses of single ``cameras`` of a rig that was refined as a whole.
 
-    def __init__(
-        self,
-        registration: Registration,
-        refine: Callable[[BodyViews | None, np.ndarray], RigEstimate],
-        views: BodyViews | None,
-        given: RigEstimate,
-        refined: RigEstimate,
-    ) -> None:
-        """
-        Args:
-            registration: gives the residuals of held-out surface points.
-            refine: estimates the rig. Its arguments are the keypoints to use (None = all) and a
-                mask (C,) of the cameras whose poses are estimated.
-            views: keypoints of the subject; None = too few.
-            given: given poses, with biases and offsets estimated for them.
-            refined: all poses refined.
-        """
-        self._registration, self._refine = registration, refine
-        self._given, self._refined = given, refined
-        # half of the keypoints, the rig refined with them, and the other half for evaluation
-        self._seen = self._halved = self._held_out = None
-        if views is not None:
-            seen, unseen = views.halves()
-            if min(len(seen.points), len(unseen.points)) >= MIN_BODY_POINTS:
-                self._seen = seen
-                self._halved = refine(seen, np.ones(len(given.poses), bool))
-                self._held_out = BodyConstraint(unseen, registration.rig)
+    Doubtful cameras are compared a second time. All of them then have their given poses, and the
+    other cameras are refined again with these fixed.
 
-    def verdicts(self, cameras: Sequence[int]) -> dict[int, PoseVerdict]:
-        """Verdict of each of the ``cameras``.
+    Args:
+        registration: gives the residuals of held-out surface points.
+        refine: estimates the rig. Its arguments are the keypoints to use (None = all) and a mask
+            (C,) of the cameras whose poses are estimated.
+        views: keypoints of the subject; None = too few.
+        given: given poses, with biases and offsets estimated for them.
+        refined: all poses refined.
+    """
+    free = np.ones(len(given.poses), bool)
+    # half of the keypoints, the rig refined with them, and the other half for evaluation
+    seen, unseen = views.halves() if views is not None else (None, None)
+    halved = held_out = None
+    if seen and unseen and min(len(seen.points), len(unseen.points)) >= MIN_BODY_POINTS:
+        halved, held_out = refine(seen, free), BodyConstraint(unseen, registration.rig)
 
-        Doubtful cameras are compared a second time. All of them then have their given poses, and
-        the other cameras are refined again with these fixed.
-        """
-        verdicts = {}
-        for c in cameras:
-            apart = _with_camera_of(self._refined, self._given, c)
-            halved = None if self._halved is None else _with_camera_of(self._halved, self._given, c)
-            verdicts[c] = self._compare(c, apart, halved)
-        doubtful = [c for c, verdict in verdicts.items() if verdict.doubtful]
-        if doubtful:
-            free = np.ones(len(self._given.poses), bool)
-            free[doubtful] = False
-            apart = self._refine(None, free)
-            halved = None if self._halved is None else self._refine(self._seen, free)
-            verdicts |= {c: self._compare(c, apart, halved) for c in doubtful}
-        return verdicts
+    def compare(c: int, apart: RigEstimate, apart_halved: RigEstimate | None) -> PoseVerdict:
+        """Compare camera c's poses with those of estimates in which it has its given pose.
 
-    def _compare(self, camera: int, apart: RigEstimate, halved: RigEstimate | None) -> PoseVerdict:
-        """Compare one camera's poses.
-
-        Args:
-            apart: estimate in which this camera has its given pose.
-            halved: the same without the held-out keypoints; None = too few keypoints.
+        ``apart_halved`` is estimated without the held-out keypoints; None = too few keypoints.
         """
         evidence = []
         for name, kind in _KINDS:
-            medians = (
-                self._registration.median_residuals(at, kind, camera)
-                for at in (apart, self._refined)
-            )
+            medians = (registration.median_residuals(at, kind, c) for at in (apart, refined))
             evidence.append(HeldOutComparison.of(name, *medians))
-        if halved is not None and self._halved is not None and self._held_out is not None:
-            held_out = self._held_out
-            errors = (
-                held_out.unit_errors(at.poses, at.offset, camera) for at in (halved, self._halved)
-            )
+        if apart_halved is not None and halved is not None and held_out is not None:
+            errors = (held_out.unit_errors(at.poses, at.offset, c) for at in (apart_halved, halved))
             evidence.append(HeldOutComparison.of("keypoints", *errors))
         return PoseVerdict.of([e for e in evidence if len(e.log_ratio)])
+
+    verdicts = {}
+    for c in cameras:
+        mixed = None if halved is None else _with_camera_of(halved, given, c)
+        verdicts[c] = compare(c, _with_camera_of(refined, given, c), mixed)
+    doubtful = [c for c, verdict in verdicts.items() if verdict.doubtful]
+    if doubtful:
+        free[doubtful] = False
+        apart = refine(None, free)
+        mixed = None if halved is None else refine(seen, free)
+        verdicts |= {c: compare(c, apart, mixed) for c in doubtful}
+    return verdicts
 
 
 def _with_camera_of(at: RigEstimate, other: RigEstimate, camera: int) -> RigEstimate:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.geometry.camera.rig import Rig
-from intercap_core.scene.camera_verdicts import MUST_IMPROVE, PoseJudge, PoseVerdict
+from intercap_core.scene.camera_verdicts import MUST_IMPROVE, PoseVerdict, judge_poses
 from intercap_core.scene.constraints import (
     MIN_BODY_POINTS,
     BodyConstraint,
@@ -125,14 +125,14 @@ def refine(
         # no kind of data may get worse by more than 2 %; tuned on the studio
         finite = np.isfinite(freed.estimate.poses).all()
         if finite and ratios and min(ratios) <= MUST_IMPROVE and max(ratios) <= 1.02:
-            judge = PoseJudge(
+            verdicts = judge_poses(
                 registration,
                 lambda some, free: solve(some, free).estimate,
                 views if body else None,
                 unmoved.estimate,
                 freed.estimate,
+                [c for c in range(len(rig)) if c != master],
             )
-            verdicts = judge.verdicts([c for c in range(len(rig)) if c != master])
             refined = np.array([c in verdicts and verdicts[c].refined for c in range(len(rig))])
             if refined.any():
                 result = freed if refined.sum() == len(verdicts) else solve(None, refined)
