@@ -188,13 +188,11 @@ class StartTimes:
         return self.sets * self.step_s - self.late
 
     @property
-    def offset_sigma(self) -> np.ndarray | None:
+    def offset_sigma(self) -> np.ndarray:
         """(C,) standard deviations of ``offset``, seconds: stated, else half a set if the cameras
-        started apart. None if nothing is stated and the cameras started together."""
-        stated = np.isfinite(self.sigma)
-        if not self.apart and not stated.any():
-            return None
-        return np.where(stated, self.sigma, self.step_s / 2 if self.apart else PRIOR_OFFSET_S)
+        started apart, else that of synchronised devices."""
+        usual = self.step_s / 2 if self.apart else PRIOR_OFFSET_S
+        return np.where(np.isfinite(self.sigma), self.sigma, usual)
 
     def with_slips(self, slip: np.ndarray) -> np.ndarray:
         """Delay (T, C) of each image, in sets, by start and slip together.
