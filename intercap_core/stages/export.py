@@ -24,7 +24,7 @@ from intercap_core.output.export.about import About, Deviations, ExportBody, Ver
 from intercap_core.output.export.body_files import WrittenBody
 from intercap_core.output.export.contact import ContactVertices, StatedContact
 from intercap_core.output.export.motion import Coordinates, Motion, read_motion, z_up_frame
-from intercap_core.output.export.readme import needs_object, readme
+from intercap_core.output.export.readme import NEED_OBJECT, readme
 from intercap_core.output.export.silhouettes import Scenes, body_vertices
 from intercap_core.schemas import JOINT, SCENE
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
@@ -70,7 +70,7 @@ def run(
     z_up = settings.frame == "z-up"
     viewed = motion.moved(zup_from_master, z_up_name) if z_up else motion
     requested = sorted(set(settings.formats))
-    formats = [name for name in requested if mesh is not None or not needs_object(name)]
+    formats = [name for name in requested if mesh is not None or name not in NEED_OBJECT]
     for name in set(requested) - set(formats):
         log.info("sequence %s: there is no object, so %s is not exported", motion.sequence, name)
     about = _about(paths, motion, mesh)

@@ -23,19 +23,8 @@ _POSE_DIRECTIONS = 9 * (len(JOINT_NAMES) - 1)  # a 3x3 matrix per joint except t
 _FRAME = "rest pose of the body: y up, facing z, x to its left; origin near the chest"
 
 
-@dataclass(frozen=True)
-class Layout:
-    """Number of shape columns, followed by the number of expression columns."""
-
-    shape: int
-    expression: int
-
-    @property
-    def name(self) -> str:
-        return f"{self.shape}_{self.expression}"
-
-
-SMALL, FULL = Layout(10, 10), Layout(300, 100)
+# Numbers of shape columns, and of the expression columns that follow them, by layout
+_LAYOUTS = ((10, 10), (300, 100))
 
 
 @dataclass(frozen=True)
@@ -52,17 +41,10 @@ class WrittenBody:
     """Columns of the expression, as start:stop."""
 
 
-def layouts(body: ExportBody) -> Sequence[Layout]:
-    """Return the layouts with enough columns for the parameters."""
-    return [
-        layout
-        for layout in (SMALL, FULL)
-        if body.num_betas <= layout.shape and body.num_expression <= layout.expression
-    ]
-
-
 def write(folder: Path, body: ExportBody) -> Sequence[WrittenBody]:
     """Write the body file, its maps of points and regions, and a file per layout into ``folder``.
+
+    Layouts with fewer columns than the parameters are left out.
 
     Columns beyond those of the parameters are zero, as are the pose blend shapes, which the open
     body does not have. All other numbers are copied bit by bit. Returns the written files, none
@@ -79,10 +61,13 @@ def write(folder: Path, body: ExportBody) -> Sequence[WrittenBody]:
     written = [
         WrittenBody(body.path.name, file_digest(body.path), f"0:{half}", f"{half}:{2 * half}")
     ]
-    for layout in layouts(body):
-        path = folder / f"{body.path.stem}_{layout.name}.npz"
-        np.savez_compressed(path, allow_pickle=True, **_laid_out(arrays, body, layout))
-        start = layout.shape
+    for start, expression in _LAYOUTS:
+        if body.num_betas > start or body.num_expression > expression:
+            continue
+        path = folder / f"{body.path.stem}_{start}_{expression}.npz"
+        np.savez_compressed(
+            path, allow_pickle=True, **_laid_out(arrays, body, start, start + expression)
+        )
         written.append(
             WrittenBody(
                 path.name,
@@ -95,15 +80,16 @@ def write(folder: Path, body: ExportBody) -> Sequence[WrittenBody]:
 
 
 def _laid_out(
-    arrays: dict[str, np.ndarray], body: ExportBody, layout: Layout
+    arrays: dict[str, np.ndarray], body: ExportBody, start: int, total: int
 ) -> dict[str, np.ndarray]:
-    """Return the arrays of the body file with shape and expression in the columns of a layout."""
+    """Return the arrays of the body file with the expression from column ``start`` of ``total``."""
     table = arrays["shapedirs"]
     vertices, half = len(table), table.shape[2] // 2
-    columns = np.zeros((vertices, 3, layout.shape + layout.expression), table.dtype)
+    columns = np.zeros((vertices, 3, total), table.dtype)
     columns[..., : body.num_betas] = table[..., : body.num_betas]
-    expression = slice(layout.shape, layout.shape + body.num_expression)
-    columns[..., expression] = table[..., half : half + body.num_expression]
+    columns[..., start : start + body.num_expression] = table[
+        ..., half : half + body.num_expression
+    ]
     return {
         **arrays,
         "shapedirs": columns,

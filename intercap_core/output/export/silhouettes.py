@@ -6,7 +6,8 @@ They are rendered through each camera's own lens and match the distorted images 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -94,21 +95,22 @@ class Scenes:
     """(C,) seconds by which each camera exposes later."""
     bodies: np.ndarray
     """(T, V, 3) vertices of the body, master frame; empty if no format needs them."""
-    poses: list[dict[int, np.ndarray]] = field(init=False)
-    """For each camera, master_from_object (4, 4) by image number at the time of exposure; NaN if
-    the object has no pose."""
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "poses", list(self._poses_at_exposure()))
+    @cached_property
+    def poses(self) -> list[dict[int, np.ndarray]]:
+        """For each camera, master_from_object (4, 4) by image number at the time of exposure.
 
-    def _poses_at_exposure(self) -> Iterator[dict[int, np.ndarray]]:
+        NaN if the object has no pose.
+        """
         poses = rigid(self.motion.rotation, self.motion.translation)
         known = np.isfinite(poses).all(axis=(1, 2))
         twist = np.zeros((len(self.motion), 6))
         twist[known] = rigid_velocity(poses[known], np.ones(known.sum(), bool), self.times[known])
+        result = []
         for number in range(len(self.rig)):
             exposed = apply_step(poses, self.time_offset[number] * twist)
-            yield {image: exposed[t] for image, t in sorted(self.frames_of(number).items())}
+            result.append({i: exposed[t] for i, t in sorted(self.frames_of(number).items())})
+        return result
 
     def frames_of(self, number: int) -> dict[int, int]:
         """Map the image numbers of a camera to the frames that they show."""
