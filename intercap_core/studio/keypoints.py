@@ -162,9 +162,10 @@ class Detector:
         self, rng: np.random.Generator, pixels: np.ndarray, confidence: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Exchange left and right of the whole body or of the legs for short periods."""
-        chance = np.full((self.frames, 2), self.swap_probability)
-        shared = self.noise.process(rng, self.frames, 1, self.swap_s)[:, 0]
-        swapped = self.noise.episodes(rng, self.frames, chance, shared, self.swap_s, 0.0)
+        self.noise.process(rng, self.frames, 1, self.swap_s)  # keeps the order of random numbers
+        swapped = self.noise.episodes(
+            rng, self.frames, self.swap_probability, self.swap_s, channels=2
+        )
         pixels, confidence = pixels.copy(), confidence.copy()
         for t in np.flatnonzero(swapped.any(1)):
             rows = np.arange(67) if swapped[t, 0] else _LEGS
@@ -180,15 +181,14 @@ class Detector:
         """
         noise = self.noise
         rng = noise.detector_rng("people", camera.name)
-        one = np.ones((self.frames, 1))
         shared = noise.detector_rng("people")
-        common = noise.process(shared, self.frames, 1, self.miss_s)[:, 0]
+        common = noise.process(shared, self.frames, 1, self.miss_s)
         missed = noise.episodes(
-            rng, self.frames, one * self.miss_probability, common, self.miss_s, 0.3
+            rng, self.frames, self.miss_probability, self.miss_s, common, agreement=0.3
         )[:, 0]
-        common = noise.process(shared, self.frames, 1, self.bystander_s)[:, 0]
+        common = noise.process(shared, self.frames, 1, self.bystander_s)
         bystander = noise.episodes(
-            rng, self.frames, one * self.bystander_probability, common, self.bystander_s, 0.4
+            rng, self.frames, self.bystander_probability, self.bystander_s, common, agreement=0.4
         )[:, 0]
         width, height = camera.colour.width, camera.colour.height
         place = np.array([rng.uniform(0.1, 0.9) * width, rng.uniform(0.3, 0.5) * height])
@@ -215,10 +215,7 @@ class Detector:
         """Add a second person (T, 135, 3) to each file unless missed or mostly hidden."""
         noise = self.noise
         rng = noise.detector_rng("passer-by", camera.name)
-        one, common = np.ones((self.frames, 1)), np.zeros(self.frames)
-        missed = noise.episodes(
-            rng, self.frames, one * self.miss_probability, common, self.miss_s, 0.0
-        )[:, 0]
+        missed = noise.episodes(rng, self.frames, self.miss_probability, self.miss_s)[:, 0]
         seen = (passer_by[:, BODY, 2] > 0) & ~hidden[:, BODY]
         detected = (seen.sum(1) >= self.fewest_visible) & ~missed
         result = []

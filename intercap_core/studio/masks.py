@@ -100,13 +100,10 @@ class CameraMasks:
         noise, frames = network.noise, network.frames
         self.network, self.noise, self.size = network, noise, size
         self._rng = rng = noise.detector_rng("masks", name)
-        one = np.ones((frames, 1))
 
         def episodes(kind: str, probability: float) -> np.ndarray:
-            seconds = rng.uniform(*EPISODE_S)
-            return noise.episodes(
-                rng, frames, one * probability, network.shared[kind], seconds, AGREEMENT
-            )[:, 0]
+            seconds, shared = rng.uniform(*EPISODE_S), network.shared[kind]
+            return noise.episodes(rng, frames, probability, seconds, shared, AGREEMENT)[:, 0]
 
         self._wrong_label = episodes("label", self.wrong_label)
         self._merged, self._split = episodes("merge", self.merged), episodes("split", self.split)
@@ -121,9 +118,7 @@ class CameraMasks:
         self._twin = clutter if clutter is not None and clutter.sum() > self.min_pixels else None
         self._clutter = self._false_instances()
         often = [self.twin] * (self._twin is not None) + [self.clutter] * len(self._clutter)
-        self._clutter_on = np.stack(
-            [noise.episodes(rng, frames, one * chance, miss, 0.7, 0.0)[:, 0] for chance in often], 1
-        )
+        self._clutter_on = np.concatenate([noise.episodes(rng, frames, p, 0.7) for p in often], 1)
         # columns: person, object, unused, fate of the object's own mask if merged, false instances
         self._score = noise.process(rng, frames, 4 + len(often), 0.3)
         if network.passer_by:
@@ -136,9 +131,8 @@ class CameraMasks:
         self._waves = np.concatenate([self._waves, waves], 1)
         self._directions = np.concatenate([self._directions, rng.normal(size=(1, 12, 2))])
         self._phases = np.concatenate([self._phases, rng.uniform(0, 2 * np.pi, (1, 12))])
-        chance, common = np.full((frames, 1), self.person_missed), np.zeros(frames)
         seconds = rng.uniform(*EPISODE_S)
-        self._other_missed = noise.episodes(rng, frames, chance, common, seconds, 0.0)[:, 0]
+        self._other_missed = noise.episodes(rng, frames, self.person_missed, seconds)[:, 0]
         self._other_score = noise.process(rng, frames, 1, 0.3)[:, 0]
 
     def _false_instances(self) -> list[tuple[str, dict[str, Any]]]:

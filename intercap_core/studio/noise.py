@@ -86,20 +86,20 @@ class NoiseSource:
         self,
         rng: np.random.Generator,
         frames: int,
-        probability: np.ndarray,
-        shared: np.ndarray,
+        probability: float,
         correlation_s: float,
-        agreement: float,
+        shared: np.ndarray | float = 0.0,
+        agreement: float = 0.0,
+        channels: int = 1,
     ) -> np.ndarray:
-        """(frames, n) on/off episodes of about ``correlation_s`` that views partly share.
+        """On/off episodes (frames, channels) of about ``correlation_s`` that views partly share.
 
         Args:
-            probability: (frames, n) of being on, multiplied by ``scale``.
-            shared: (frames,) process common to all views.
+            probability: of being on, multiplied by ``scale``.
             correlation_s: correlation time of the views' own processes, seconds.
+            shared: (frames,) process common to all views.
             agreement: share of the variance that ``shared`` explains.
         """
-        own = self.process(rng, frames, probability.shape[1], correlation_s)
-        mixed = np.sqrt(agreement) * shared[:, None] + np.sqrt(1 - agreement) * own
-        scaled = np.clip(probability * self.scale, 0, 0.95)
-        return ndtr(mixed) < scaled
+        own = self.process(rng, frames, channels, correlation_s)
+        mixed = np.sqrt(agreement) * np.reshape(shared, (-1, 1)) + np.sqrt(1 - agreement) * own
+        return ndtr(mixed) < np.clip(probability * self.scale, 0, 0.95)

@@ -232,8 +232,7 @@ def test_noise_has_unit_variance_and_correlation(family: str) -> None:
 def test_episodes_have_their_probability_and_are_correlated() -> None:
     noise = NoiseSource(3, 1.0, "a", 15.0)
     shared = noise.process(np.random.default_rng(1), 20000, 1, 0.5)[:, 0]
-    probability = np.full((20000, 2), 0.15)
-    views = noise.episodes(np.random.default_rng(2), 20000, probability, shared, 0.5, 0.5)
+    views = noise.episodes(np.random.default_rng(2), 20000, 0.15, 0.5, shared, 0.5, channels=2)
     assert views.mean() == pytest.approx(0.15, abs=0.02)
     both = (views[:, 0] & views[:, 1]).mean()
     assert 1.5 * 0.15**2 < both < 0.15
