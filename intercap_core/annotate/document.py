@@ -13,7 +13,7 @@ import hashlib
 import json
 import os
 import stat
-import tempfile
+import uuid
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -200,21 +200,17 @@ def replace(path: Path, text: str) -> None:
         raise UserError(reason)
     for part in _parts(path):  # of an interrupted save
         part.unlink(missing_ok=True)
-    mode = path.stat().st_mode & 0o777 if path.exists() else None
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=_PART, dir=path.parent)
+    part = path.with_name(f".{path.name}.{uuid.uuid4().hex}{_PART}")
     try:
-        with os.fdopen(handle, "wb") as file:
+        with part.open("wb") as file:
+            if path.exists():
+                part.chmod(path.stat().st_mode & 0o777)
             file.write(text.encode())
             file.flush()
             os.fsync(file.fileno())
-        if mode is None:
-            umask = os.umask(0)
-            os.umask(umask)
-            mode = 0o666 & ~umask
-        os.chmod(name, mode)
-        os.replace(name, path)
+        os.replace(part, path)
     except BaseException:
-        Path(name).unlink(missing_ok=True)
+        part.unlink(missing_ok=True)
         raise
     folder = os.open(path.parent, os.O_RDONLY)
     try:
