@@ -46,28 +46,7 @@ export const post = async (path, content) =>
 
 export const blob = async (path, signal) => (await request(path, { signal })).blob();
 
-/* Fetch data as `payload` in intercap_core/output/viewer/page.py serializes it.
- * Returns header, arrays by name, and the compressed bytes for the viewer. */
-export async function fetchArrays(path) {
-  const data = await blob(path);
-  const bytes = await new Response(data.stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer();
-  const length = new DataView(bytes).getUint32(0, true);
-  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(bytes, 4, length)));
-  const types = { float32: Float32Array, uint32: Uint32Array, uint16: Uint16Array, int16: Int16Array, uint8: Uint8Array };
-  const arrays = {};
-  for (const [name, { type, shape, offset }] of Object.entries(header.arrays)) {
-    arrays[name] = new types[type](bytes, 4 + length + offset, shape.reduce((a, b) => a * b, 1));
-  }
-  return { header, arrays, data };
-}
-
-export function toBase64(data) {
-  return new Promise((resolve, reject) => {
-    const reader = new FileReader();
-    reader.onload = () => resolve(reader.result.slice(reader.result.indexOf(",") + 1));
-    reader.onerror = () => reject(reader.error);
-    reader.readAsDataURL(data);
-  });
-}
+/* Fetch header and arrays by name, as `unpack` of the viewer returns them. */
+export const fetchArrays = async (path) => window.unpack(await blob(path));
 
 export const fromBase64 = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));

@@ -1,6 +1,6 @@
 /* The 4D viewer. The overlay takes the body's vertices and colours from it, and the parts in contact. The
  * result before the last run is loaded here as well. */
-import { toBase64, fetchArrays } from "./api.js";
+import { fetchArrays } from "./api.js";
 import { find, make } from "./dom.js";
 import { apply, compose, invert } from "./geometry.js";
 import { posedFrames } from "./pose.js";
@@ -20,9 +20,9 @@ export class Space {
     const { app } = this;
     find("space").replaceChildren(make("p", { class: "dim" }, "Loading the body and the 4D viewer (some MB)… Images and marks can already be used."));
     try {
-      const { header, arrays, data } = await fetchArrays(`sequences/${app.info.sequence}/viewer?v=${app.info.result}`);
+      const data = await fetchArrays(`sequences/${app.info.sequence}/viewer?v=${app.info.result}`), { header, arrays } = data;
       find("space").replaceChildren(viewerElement());
-      await window.showInterCap(await toBase64(data));
+      await window.showInterCap(data);
       this.viewer = window.intercapViewer;
       if (!this.viewer) throw new Error("this browser cannot draw in 3D");
       this.main = Object.keys(header.versions)[0];
@@ -196,11 +196,7 @@ function skinPaint(header, arrays) {
 }
 
 function viewerElement() {
-  const part = (tag, name, more = {}, ...children) => {
-    const element = make(tag, { ...more }, ...children);
-    element.dataset.part = name;
-    return element;
-  };
+  const part = (tag, name, more = {}, ...children) => make(tag, { ...more, data: { part: name } }, ...children);
   const root = make("div", { class: "viewer", tabIndex: 0, role: "group" },
     part("canvas", "canvas", { role: "img", "aria-label": "Body and object in 3D" }), part("div", "message", { role: "status" }),
     make("div", { class: "time", hidden: true }, part("button", "play", { type: "button" }),

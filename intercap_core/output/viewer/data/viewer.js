@@ -1,8 +1,11 @@
 "use strict";
 /* Show a sequence in 4D (body, object, point clouds, cameras, contact) in the element with class "viewer".
- * `payload` is the result of `payload` in intercap_core/output/viewer/page.py. A version is one result
- * (joint, sequential or truth); the first one is opaque and shows contact. Clouds and images exist only in
- * the frames `header.moments`; a moment is an index into that list. Coordinates are z up, metres. */
+ * `payload` is the base64 text that `payload` in intercap_core/output/viewer/page.py makes, or the result of
+ * `unpack`. A version is one result (joint, sequential or truth); the first one is opaque and shows contact.
+ * Clouds and images exist only in the frames `header.moments`; a moment is an index into that list.
+ * Coordinates are z up, metres. */
+const COLOURS = { joint: [0.42, 0.66, 0.92], sequential: [0.66, 0.6, 0.78], truth: [0.45, 0.74, 0.5] }; // by version
+
 async function showInterCap(payload) {
   const root = document.querySelector(".viewer");
   const find = (name) => root.querySelector(`[data-part="${name}"]`);
@@ -13,7 +16,8 @@ async function showInterCap(payload) {
   say("Loading");
   let data;
   try {
-    data = await unpack(payload);
+    data = typeof payload === "string"
+      ? await unpack(new Blob([Uint8Array.from(atob(payload), (letter) => letter.charCodeAt(0))])) : payload;
   } catch (error) {
     say(`This browser cannot read the data of the sequence: ${error.message}`);
     return;
@@ -45,7 +49,6 @@ async function showInterCap(payload) {
   controls.enableDamping = false;
 
   // ------------------------------------------------------------------ bodies and objects
-  const COLOURS = { joint: [0.42, 0.66, 0.92], sequential: [0.66, 0.6, 0.78], truth: [0.45, 0.74, 0.5] };
   const TOUCHING = [0.86, 0.2, 0.26];
   const STATED = [[0.97, 0.84, 0.62], [0.93, 0.5, 0.06]]; // colours of probabilities 0.5 and 1
   const names = Object.keys(header.versions);
@@ -392,10 +395,9 @@ async function showInterCap(payload) {
   window.intercapViewer = { header, show, look, play, pause, state, versions, cameras, eye, draw };
 }
 
-/* Header and arrays by name from the base64 text that `payload` in viewer/page.py makes. */
-async function unpack(payload) {
-  const packed = Uint8Array.from(atob(payload), (letter) => letter.charCodeAt(0));
-  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
+/* Header and arrays by name from the bytes of which `payload` in viewer/page.py makes a text. */
+async function unpack(blob) {
+  const stream = blob.stream().pipeThrough(new DecompressionStream("deflate"));
   const whole = await new Response(stream).arrayBuffer();
   const length = new DataView(whole).getUint32(0, true);
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(whole, 4, length)));
@@ -434,14 +436,13 @@ function centreOf(mesh) {
 /* Linear blend skinning with modes of the residual, see SkinnedBody in
  * intercap_core/output/viewer/skinning.py. `transforms` holds 12 numbers (3x4, row by row) per joint. */
 function skinnedBody(name, header, arrays) {
-  const COLOUR = { joint: [0.42, 0.66, 0.92], sequential: [0.66, 0.6, 0.78] }[name];
   const [rest, joints, weights, transforms, modes, amounts] = [
     "rest", "joints", "weights", "transforms", "modes", "amounts",
   ].map((key) => arrays[`${name}/${key}`]);
   const count = rest.length / 3;
   const kept = amounts.length / header.frames;
   const skeleton = transforms.length / header.frames;
-  const mesh = meshOf(count, arrays.faces, COLOUR);
+  const mesh = meshOf(count, arrays.faces, COLOURS[name]);
   const place = mesh.geometry.attributes.position;
   const shaped = new Float32Array(rest.length);
   let shown = -1;
@@ -491,7 +492,7 @@ function trueBody(header, arrays) {
   const size = moved.length / moments.length;
   const steps = new Uint16Array(moved);
   for (let i = size; i < steps.length; i += 1) steps[i] += steps[i - size]; // uint16 arithmetic wraps around
-  const mesh = meshOf(size / 3, arrays.faces, [0.45, 0.74, 0.5]);
+  const mesh = meshOf(size / 3, arrays.faces, COLOURS.truth);
   const place = mesh.geometry.attributes.position;
   const pose = (frame) => {
     let at = 0;
@@ -509,15 +510,11 @@ function objectOf(name, header, arrays) {
   const prefix = name === "truth" ? "truth/object_" : "object/";
   const vertices = arrays[`${prefix}vertices`];
   if (!poses || !vertices) return null;
-  const mesh = meshOf(vertices.length / 3, arrays[`${prefix}faces`], [0.45, 0.74, 0.5]);
+  const mesh = meshOf(vertices.length / 3, arrays[`${prefix}faces`], COLOURS[name]);
   mesh.geometry.attributes.position.array.set(vertices);
-  const painted = name === "truth" ? null : arrays["object/colours"];
-  if (painted && name === "joint") {
+  if (name === "joint") {
     const linear = (value) => Math.pow(value / 255, 2.2); // vertex colours are linear in three.js
-    mesh.geometry.attributes.color.array.set(Float32Array.from(painted, linear));
-  } else if (painted) {
-    const colours = mesh.geometry.attributes.color.array;
-    for (let i = 0; i < colours.length; i += 1) colours[i] = [0.66, 0.6, 0.78][i % 3];
+    mesh.geometry.attributes.color.array.set(Float32Array.from(arrays["object/colours"], linear));
   }
   mesh.geometry.computeVertexNormals();
   mesh.matrixAutoUpdate = false;
