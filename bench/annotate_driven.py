@@ -35,7 +35,7 @@ from intercap_core.errors import UserError
 from intercap_core.evaluation import figures
 from intercap_core.evaluation.contact_figures import stated_contact_figures
 from intercap_core.evaluation.figures import SequenceMetrics
-from intercap_core.evaluation.flags import ranges
+from intercap_core.evaluation.flags import runs
 from intercap_core.evaluation.object_errors import ObjectErrors
 from intercap_core.evaluation.truth import match_times
 from intercap_core.geometry.rigid.mesh import ObjectMesh
@@ -324,8 +324,7 @@ def contact_figures(project: Project, name: str) -> tuple[float, float, dict[str
     found = SequenceMetrics.read(project.artefact(name, "metrics"))
     true = found.values["truth/contact_region"]
     intervals = {
-        part: [(a, b + 1) for a, b, _ in ranges(["x" if one else "" for one in true[:, r]])]
-        for r, part in enumerate(METRIC_REGIONS)
+        part: [(a, b + 1) for a, b in runs(true[:, r])] for r, part in enumerate(METRIC_REGIONS)
     }
     stated = stated_contact_figures([found])["contact_detected_f1"]
     meshes = figures.truth_figures([found], "joint")["contact_region_f1"]

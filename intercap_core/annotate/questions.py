@@ -20,7 +20,7 @@ from intercap_core.annotate.opened import Opened
 from intercap_core.annotate.sides import doubts
 from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.errors import UserError
-from intercap_core.evaluation.flags import ranges
+from intercap_core.evaluation.flags import runs
 from intercap_core.schemas import JOINT, OBJECT_TRACK, PERSON
 
 _MAX_BYTES = 1 << 22
@@ -169,12 +169,12 @@ def _ask_object(opened: Opened, object_: str, times: np.ndarray) -> list[dict[st
         ("place", "I place it"),
         ("hidden", "It is not visible"),
     )
-    for first, last in _runs(lost):
+    for first, last in runs(lost):
         message = f"The {object_} is lost here. Where is it?"
         questions.append(_question("lost", "", first, last, (first + last) // 2, message,
                                    2.0 * (last - first + 1), choices))  # fmt: skip
     choices = (("yes", "Yes, as drawn"), ("no", "No: I rotate it"), ("unsure", "I cannot tell"))
-    for first, last in _runs(ambiguous):
+    for first, last in runs(ambiguous):
         message = f"Is the rotation of the {object_} as drawn?"
         questions.append(_question("turn", "", first, last, (first + last) // 2, message,
                                    3.0 + 1.5 * (last - first), choices))  # fmt: skip
@@ -191,7 +191,7 @@ def _ask_contact(opened: Opened, object_: str, times: np.ndarray) -> list[dict[s
     for r, region in enumerate(regions):
         p = probability[:, r]
         uncertain = (p > 0.25) & (p < 0.75) & (labels[:, r] < 0)
-        for first, last in _runs(uncertain):
+        for first, last in runs(uncertain):
             if (last - first + 1) * step < 0.1:  # seconds; too short to matter
                 continue
             # weight: each frame counts 4 p (1 - p), which is 1 at p = 0.5 and 0 if p is certain
@@ -202,8 +202,3 @@ def _ask_contact(opened: Opened, object_: str, times: np.ndarray) -> list[dict[s
             questions.append(_question("contact", region, first, last, frame, message,
                                        float((4 * run * (1 - run)).sum()), choices))  # fmt: skip
     return questions
-
-
-def _runs(mask: np.ndarray) -> list[tuple[int, int]]:
-    """Return first and last frame of each run of set frames (T,)."""
-    return [(first, last) for first, last, _ in ranges(["x" if on else "" for on in mask])]

@@ -17,7 +17,7 @@ from intercap_core import artefacts
 from intercap_core.annotate.opened import Opened
 from intercap_core.annotate.sides import doubts
 from intercap_core.errors import UserError
-from intercap_core.evaluation.flags import ranges
+from intercap_core.evaluation.flags import ranges, runs
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
@@ -293,7 +293,7 @@ def _doubtful(part: str, error: float, by_frame: np.ndarray) -> Iterator[dict[st
     if not np.isfinite(error):
         return
     high = np.nan_to_num(by_frame) > DOUBTFUL * error
-    for first, last, _ in ranges(["x" if value else "" for value in high]):
+    for first, last in runs(high):
         worst = first + int(np.nanargmax(by_frame[first : last + 1]))
         ratio = float(by_frame[worst] / error)
         message = f"the verdict states {1e3 * by_frame[worst]:.0f} mm for the {part} here"
@@ -302,8 +302,7 @@ def _doubtful(part: str, error: float, by_frame: np.ndarray) -> Iterator[dict[st
 
 def _runs(mask: np.ndarray, kind: str, message: str, weight: float) -> list[dict[str, Any]]:
     """Return a place for each run of set frames (T,)."""
-    runs = ranges([message if value else "" for value in mask])
-    return [_place(first, last, kind, message, weight) for first, last, _ in runs]
+    return [_place(first, last, kind, message, weight) for first, last in runs(mask)]
 
 
 def _place(

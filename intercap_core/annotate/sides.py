@@ -13,7 +13,7 @@ from intercap_core.annotate.opened import Opened
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.errors import UserError
-from intercap_core.evaluation.flags import exchanged, ranges
+from intercap_core.evaluation.flags import exchanged, runs
 from intercap_core.formats.detections.read import Detections
 from intercap_core.output.viewer.page import payload
 from intercap_core.person.left_right import excess_build_cost
@@ -174,8 +174,8 @@ def _runs(limbs: np.ndarray, sides: Sides) -> list[Doubt]:
     for before, after in pairwise(np.flatnonzero(doubtful).tolist()):
         if after - before <= 4:  # at most three frames between are part of the run
             doubtful[before:after] = True
-    runs = []
-    for first, last, _ in ranges(["x" if value else "" for value in doubtful]):
+    found = []
+    for first, last in runs(doubtful):
         run = slice(first, last + 1)
         why = []
         if contradicted[run].any():
@@ -188,5 +188,5 @@ def _runs(limbs: np.ndarray, sides: Sides) -> list[Doubt]:
         worst = first + int((against[run] + 3.0 * share[run].max(1)).argmax())
         most = int((limbs[run] > 0).sum((0, 2)).argmax())
         message = f"left and right: {'; '.join(why)}"
-        runs.append(Doubt(first, last, worst, sides.cameras[most], message))
-    return runs
+        found.append(Doubt(first, last, worst, sides.cameras[most], message))
+    return found

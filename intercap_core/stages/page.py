@@ -34,7 +34,7 @@ from intercap_core.output.site.overlays import (
     choose_frames,
     overlays,
 )
-from intercap_core.output.site.sequence_page import SequenceContent, ViewerParts, page
+from intercap_core.output.site.sequence_page import SequenceContent, page
 from intercap_core.output.site.track_section import read_track
 from intercap_core.output.viewer import page as viewer
 from intercap_core.schemas import JOINT, OBJECT_TRACK, SCENE
@@ -93,7 +93,6 @@ def run(
         annotated=contact,
         made_by=_made_by(paths),
         body_file=model.path.name,
-        viewer=ViewerParts(viewer.POLICY, viewer.style(), viewer.element(), viewer.load()),
     )
     output.mkdir(parents=True)
     (output / "index.html").write_text(page(content), encoding="utf-8")

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -21,7 +20,7 @@ from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.geometry.rigid.render import render
 from intercap_core.output.site import charts
-from intercap_core.output.site.drawing import EncodedImage, SquareCrop, make_sheet
+from intercap_core.output.site.drawing import SquareCrop, make_sheet
 from intercap_core.output.site.overlays import choose_frames
 from intercap_core.schemas import BODY_FIT, PERSON, SCENE
 from intercap_core.sequence_inputs import SequenceModels, SequencePaths
@@ -59,13 +58,16 @@ def read_fit(paths: SequencePaths, models: SequenceModels) -> dict[str, Any]:
     with torch.no_grad():
         posed = model.forward(parameters.frames(torch.tensor(shown)))
         points = model.keypoints(posed).double().numpy()
-    vertices = posed.vertices.double().numpy()
-    bodies = {t: PosedBody(vertices[i], points[i]) for i, t in enumerate(shown)}
+    vertices, faces = posed.vertices.double().numpy(), model.faces.numpy()
+
+    def draw(camera: Camera, t: int, c: int, rgb: np.ndarray) -> np.ndarray | None:
+        i = shown.index(t)
+        return _cell(camera, rgb, vertices[i], faces, points[i], detected[t, c])
+
     sheet, note = None, ""
     try:
         with Frames.open(paths.frames) as images:
-            faces = model.faces.numpy()
-            sheet = body_sheet(name, images.showing(image_of), rig, bodies, faces, detected)
+            sheet = make_sheet(name, images.showing(image_of), rig, shown, _CELL_PX, draw)
     except UserError as error:  # an unreadable image must not prevent the page
         note = str(error)
     return {
@@ -161,54 +163,34 @@ _CELL_PX = 220
 _BONES = keypoint_pairs([*SKELETON, *FEET]).tolist()
 
 
-@dataclass(frozen=True, eq=False)
-class PosedBody:
-    """The fit in one frame, master frame, metres."""
-
-    vertices: np.ndarray
-    """(V, 3)"""
-    keypoints: np.ndarray
-    """(135, 3)"""
-
-
-def body_sheet(
-    name: str,
-    images: Frames,
-    rig: Rig,
-    bodies: Mapping[int, PosedBody],
+def _cell(
+    camera: Camera,
+    rgb: np.ndarray,
+    vertices: np.ndarray,
     faces: np.ndarray,
+    keypoints: np.ndarray,
     detected: np.ndarray,
-) -> EncodedImage:
-    """Draw outline and bones of the fits, and the detected keypoints, over crops of the images.
+) -> np.ndarray | None:
+    """Draw outline and bones of the fit, and the detected keypoints, over a crop of one image.
 
     Args:
-        bodies: by frame, in the order of the rows.
-        detected: (T, C, 135, 3) x, y, confidence.
-    """
+        vertices: (V, 3) of the fit, master frame, metres.
+        keypoints: (135, 3) of the fit, master frame, metres.
+        detected: (135, 3) x, y, confidence.
 
-    def draw(camera: Camera, t: int, c: int, rgb: np.ndarray) -> np.ndarray | None:
-        return _cell(camera, rgb, bodies[t], faces, detected[t, c])
-
-    return make_sheet(name, images, rig, list(bodies), _CELL_PX, draw)
-
-
-def _cell(
-    camera: Camera, rgb: np.ndarray, body: PosedBody, faces: np.ndarray, detected: np.ndarray
-) -> np.ndarray | None:
-    """Draw the crop around the body in one image; None if the body is not in view.
-
-    ``detected``: (135, 3) x, y, confidence.
+    Returns:
+        The crop, None if the body is not in view.
     """
     lens = camera.colour
-    local = apply(camera.colour_from_master, body.vertices)
+    local = apply(camera.colour_from_master, vertices)
     # the square around the visible vertices
     crop = _crop(lens.project(local[seen])) if (seen := lens.sees(local)).any() else None
     if crop is None:
         return None
     cell = crop.extract(rgb)
-    drawn = render(body.vertices, faces, lens, camera.colour_from_master, cull_back=True)
+    drawn = render(vertices, faces, lens, camera.colour_from_master, cull_back=True)
     crop.outline(cell, drawn.mask, drawn.x0, drawn.y0, FIT_COLOUR)
-    points = apply(camera.colour_from_master, body.keypoints[BODY])
+    points = apply(camera.colour_from_master, keypoints[BODY])
     known = lens.sees(points)
     at = crop.to_cell(lens.project(np.where(known[:, None], points, [0.0, 0.0, 1.0])))
     for a, b in _BONES:

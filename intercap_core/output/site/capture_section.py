@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from intercap_core import artefacts
 from intercap_core.errors import UserError
 from intercap_core.evaluation import flags
 from intercap_core.formats.recordings.frames import Frames
-from intercap_core.output.site import charts
+from intercap_core.output.site import charts, embed
 from intercap_core.output.site.capture_pictures import (
     CAMERA_COLOURS,
     CapturePictures,
@@ -23,8 +22,7 @@ from intercap_core.output.site.capture_pictures import (
 from intercap_core.schemas import FRAMES, SCENE
 
 _MAX_PAIRS = 45  # drawn pairs of cameras
-STATES = ("recorded", "part", "slipped", "missing", "dropped")
-_WORDS = {
+STATES = {  # of a camera in a frame set
     "recorded": "recorded",
     "part": "only one of colour and depth",
     "slipped": "shows an earlier frame",
@@ -33,120 +31,45 @@ _WORDS = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class CameraFacts:
-    """One camera of a capture of T frame sets; seconds and metres; NaN = unknown."""
+def read_capture(frames: Path, scene: Path) -> dict[str, Any]:
+    """Read and draw one capture; return the variables of the template capture.html.j2.
 
-    name: str
-    state: Sequence[str]
-    """(T,) keys of STATES."""
-    slip: Sequence[int]
-    """(T,) whole frames by which the images are older than their device times."""
-    start: float
-    """Time of the first image."""
-    end: float
-    """Time of the last image."""
-    offset: float
-    """Exposure time minus the set's time."""
-    offset_sigma: float
-    """Standard deviation of ``offset``; NaN = not estimated."""
-    depth_bias: float
-    """Bias that is subtracted from the depth; NaN = no depth."""
-    depth_bias_sigma: float
-    """Standard deviation of ``depth_bias``; NaN = not stated."""
-    moved: float
-    """Distance by which refinement moved the camera."""
-    turned_deg: float
-    """Angle by which refinement rotated the camera."""
-    slide: float
-    """Distance by which the rig's centre is displaced if the camera's pose is off by one standard
-    deviation in its least certain direction."""
-    verdict: str
-    """Why the refined or the given pose is used, in words; "" = not judged."""
-    note: str
-    """Remarks of stages frames and scene."""
-
-    @property
-    def recorded(self) -> int:
-        """Number of sets with an image of this camera."""
-        return sum(state in ("recorded", "part", "slipped") for state in self.state)
-
-
-@dataclass(frozen=True)
-class Pair:
-    """Distances of the surfaces that two cameras measure, before and after refinement, metres.
-
-    Medians over held-out points; NaN without overlap.
-    """
-
-    name: str
-    """Names of both cameras."""
-    before: float
-    after: float
-    points: int
-    """Number of points on static surfaces."""
-    weak: bool
-    """Few points, or distances well above those of the other pairs."""
-    moving: tuple[float, float, int]
-    """Before, after and number of points, on moving surfaces."""
-
-
-@dataclass(frozen=True, eq=False)
-class CaptureFacts:
-    """One capture, from its frames and scene artefacts; metres and seconds."""
-
-    name: str
-    fps: float
-    times: np.ndarray
-    """(T,) time of each frame set."""
-    master: str
-    """Name of the master camera."""
-    cameras: Sequence[CameraFacts]
-    pairs: Sequence[Pair]
-    ground: str
-    """Source and accuracy of the floor, in words."""
-    verdict: str
-    """Result of the refinement of the extrinsics, in words."""
-    pictures: CapturePictures | None
-    """None if an image is unreadable."""
-    note: str = ""
-    """Why there are no pictures."""
-    gaps: Sequence[tuple[int, int]] = ()
-    """As :func:`gaps` returns them."""
-
-
-def read_capture(frames: Path, scene: Path) -> CaptureFacts:
-    """Read and draw one capture; raises UserError as :func:`artefacts.read` does.
-
-    If an image is unreadable, ``pictures`` is None and ``note`` has the reason.
+    If an image is unreadable, there are no pictures and ``note`` has the reason. Raises UserError
+    as :func:`artefacts.read` does.
     """
     with artefacts.read(frames, FRAMES) as recorded, artefacts.read(scene, SCENE) as refined:
-        pictures, note = None, ""
+        drawn, note = None, ""
         try:
-            pictures = draw_capture(Frames(recorded), refined)
+            drawn = draw_capture(Frames(recorded), refined)
         except UserError as error:  # an unreadable image must not prevent the page
             note = str(error)
-        names = recorded.text("camera_names")
-        times, fps = recorded["times"], float(recorded.attributes["fps"])
-        return CaptureFacts(
-            name=str(recorded.attributes["sequence"]),
-            fps=fps,
-            times=times,
-            master=str(recorded.attributes["master"]),
-            cameras=_cameras(recorded, refined),
-            pairs=_pairs(refined, names),
-            ground=_ground(refined),
-            verdict=str(refined.attributes["verdict"]),
-            pictures=pictures,
-            note=note,
-            gaps=gaps(times, fps),
-        )
+        names, times = recorded.text("camera_names"), recorded["times"]
+        rows, cameras = _cameras(recorded, refined)
+        missing = gaps(times, float(recorded.attributes["fps"]))
+        marks = [(t, f"{count} {_sets(count)} without any image") for t, count in missing]
+        return {
+            "name": str(recorded.attributes["sequence"]),
+            "note": note,
+            "verdict": str(refined.attributes["verdict"]),
+            "ground": _ground(refined),
+            "frame": drawn.frame if drawn else None,
+            "pictures": [row for row in (*drawn.views, drawn.slice_) if row] if drawn else [],
+            "profiles": _profile_charts(drawn) if drawn else [],
+            "pairs": _pair_charts(refined, names),
+            "pairs_left_out": max(0, len(refined["pairs"]) - _MAX_PAIRS),
+            "timeline": charts.timeline(rows, len(times), marks),
+            "states": list(STATES.items()),
+            "gaps": [f"after frame {t} ({count} {_sets(count)})" for t, count in missing],
+            "cameras": cameras,
+            "legend": [(name, _colour(c)) for c, name in enumerate(names)],
+            "sets": len(times),
+        }
 
 
 def camera_states(
     colour: np.ndarray, depth: np.ndarray, slip: np.ndarray, dropped: np.ndarray
 ) -> list[str]:
-    """Return the state of one camera in each set, one of STATES.
+    """Return the state of one camera in each set, a key of STATES.
 
     Args:
         colour, depth: (T,) bool, whether the set has such an image.
@@ -167,84 +90,61 @@ def gaps(times: np.ndarray, fps: float) -> list[tuple[int, int]]:
     return [(int(t), round(float(steps[t])) - 1) for t in np.flatnonzero(steps > 1.5)]
 
 
-def context(facts: CaptureFacts) -> dict[str, Any]:
-    """Return the variables of the template capture.html.j2."""
-    drawn = facts.pictures
-    pictures = [*drawn.views, drawn.slice_] if drawn else []
-    return {
-        "name": facts.name,
-        "note": facts.note,
-        "verdict": facts.verdict,
-        "ground": facts.ground,
-        "frame": drawn.frame if drawn else None,
-        "pictures": [row for row in pictures if row],
-        "profiles": _profile_charts(drawn) if drawn else [],
-        "pairs": _pair_charts(facts.pairs),
-        "pairs_left_out": max(0, len(facts.pairs) - _MAX_PAIRS),
-        "timeline": _timeline(facts),
-        "states": [(state, _WORDS[state]) for state in STATES],
-        "gaps": [f"after frame {t} ({count} {_sets(count)})" for t, count in facts.gaps],
-        "cameras": [_row(camera, facts.master) for camera in facts.cameras],
-        "legend": [(camera.name, _colour(c)) for c, camera in enumerate(facts.cameras)],
-        "sets": len(facts.times),
-    }
-
-
-def _cameras(recorded: artefacts.Artefact, refined: artefacts.Artefact) -> list[CameraFacts]:
-    """Collect the facts of each camera from the artefacts of frames and scene."""
+def _cameras(
+    recorded: artefacts.Artefact, refined: artefacts.Artefact
+) -> tuple[list[charts.TimelineRow], list[dict[str, Any]]]:
+    """Return the row of each camera in the timeline, and in the table."""
     start, end = refined["master_from_colour_start"], refined["master_from_colour"]
     turn = np.swapaxes(start[:, :3, :3], 1, 2) @ end[:, :3, :3]
     cosine = np.clip((np.trace(turn, axis1=1, axis2=2) - 1) / 2, -1, 1)
     colour, depth = recorded["colour_index"] >= 0, recorded["depth_index"] >= 0
     slip, dropped, times = refined["slip"], recorded["dropped"], recorded["times"]
-    offset, sigma, bias = (
-        refined[key] for key in ("time_offset", "time_offset_sigma", "depth_bias")
-    )
-    has_depth = refined["depth_size"][:, 0] > 0
+    offset, sigma = refined["time_offset"], refined["time_offset_sigma"]
+    bias = np.where(refined["depth_size"][:, 0] > 0, refined["depth_bias"], np.nan)
     variance = np.einsum("cici->ci", refined["camera_covariance"])[:, 6]  # of the depth bias
     bias_sigma = np.sqrt(np.maximum(variance, 0))  # 0 = not stated
     notes = zip(recorded.text("note"), refined.text("note"), strict=True)
-    judged = "camera_verdict" in refined  # absent in artefacts of earlier versions
-    slides = (
-        np.linalg.norm(refined["camera_slide"], axis=1) if judged else np.full(len(end), np.nan)
-    )
-    verdicts = refined.text("camera_verdict") if judged else [""] * len(end)
-    result = []
+    slides, verdicts = np.full(len(end), np.nan), [""] * len(end)
+    if "camera_verdict" in refined:  # absent in artefacts of earlier versions
+        slides = np.linalg.norm(refined["camera_slide"], axis=1)
+        verdicts = refined.text("camera_verdict")
+    rows, table = [], []
     for c, (name, words) in enumerate(zip(recorded.text("camera_names"), notes, strict=True)):
-        recorded_sets = np.flatnonzero(colour[:, c] | depth[:, c])
-        first, last = times[recorded_sets[[0, -1]]] if len(recorded_sets) else (np.nan, np.nan)
-        result.append(
-            CameraFacts(
-                name=name,
-                state=camera_states(colour[:, c], depth[:, c], slip[:, c], dropped),
-                slip=slip[:, c].tolist(),
-                start=float(first),
-                end=float(last),
-                offset=float(offset[c]),
-                offset_sigma=float(sigma[c]),
-                depth_bias=float(bias[c]) if has_depth[c] else float("nan"),
-                depth_bias_sigma=float(bias_sigma[c]) if bias_sigma[c] > 0 else float("nan"),
-                moved=float(np.linalg.norm(end[c, :3, 3] - start[c, :3, 3])),
-                turned_deg=float(np.degrees(np.arccos(cosine[c]))),
-                slide=float(slides[c]) if slides[c] > 0 else float("nan"),
-                verdict=verdicts[c],
-                note="; ".join(dict.fromkeys(word for word in words if word)),
+        states = camera_states(colour[:, c], depth[:, c], slip[:, c], dropped)
+        delay = bias_mm = ""
+        if np.isfinite(sigma[c]):
+            delay = f"{1e3 * float(offset[c]):+.1f} ± {1e3 * float(sigma[c]):.1f}"
+        if np.isfinite(bias[c]):
+            bias_mm = f"{1e3 * float(bias[c]):.1f}"
+            bias_mm += f" ± {1e3 * float(bias_sigma[c]):.1f}" if bias_sigma[c] > 0 else ""
+        span = times[np.flatnonzero(colour[:, c] | depth[:, c])]
+        rows.append(
+            charts.TimelineRow(
+                name, _runs(states, slip[:, c]), _row_label(states, slip[:, c], span, delay)
             )
         )
-    return result
-
-
-def _pairs(scene: artefacts.Artefact, names: Sequence[str]) -> list[Pair]:
-    columns = ("residual_before", "residual_after", "points", "weak",
-               "moving_before", "moving_after", "moving_points")  # fmt: skip
-    rows = zip(scene["pairs"], *(scene[f"pair_{column}"] for column in columns), strict=True)
-    return [
-        Pair(
-            f"{names[i]}–{names[j]}", float(before), float(after), int(points), bool(weak),
-            (float(moving_before), float(moving_after), int(moving_points)),
+        table.append(
+            {
+                "name": name,
+                "master": name == str(recorded.attributes["master"]),
+                "recorded": _count_images(states),
+                "counts": [states.count(state) for state in ("missing", "slipped")],
+                "offset": delay,
+                "bias": bias_mm,
+                "moved": 1e3 * float(np.linalg.norm(end[c, :3, 3] - start[c, :3, 3])),
+                "turned": float(np.degrees(np.arccos(cosine[c]))),
+                # displacement of the rig's centre by one standard deviation of the camera's pose
+                # in its least certain direction
+                "slide": 1e3 * float(slides[c]) if slides[c] > 0 else float("nan"),
+                "verdict": verdicts[c],
+                "note": "; ".join(dict.fromkeys(word for word in words if word)),
+            }
         )
-        for (i, j), before, after, points, weak, moving_before, moving_after, moving_points in rows
-    ]  # fmt: skip
+    return rows, table
+
+
+def _count_images(states: Sequence[str]) -> int:
+    return sum(state in ("recorded", "part", "slipped") for state in states)
 
 
 def _ground(scene: artefacts.Artefact) -> str:
@@ -261,101 +161,66 @@ def _ground(scene: artefacts.Artefact) -> str:
     return f"{text}; {stated['ground_note']}" if "ground_note" in stated else text
 
 
-def _pair_charts(pairs: Sequence[Pair]) -> list[tuple[str, str]]:
-    """Plot residuals of static and of moving surfaces: (caption, SVG)."""
-    worst = sorted(pairs, key=lambda pair: -np.nan_to_num(pair.after, nan=-1.0))[:_MAX_PAIRS]
-    shown = [pair for pair in pairs if pair in worst]
-    static = [(pair, pair.before, pair.after, pair.points) for pair in shown]
-    moving = [(pair, *pair.moving) for pair in shown]
-    return [
-        (
-            what,
-            charts.bar_pairs(
-                [
-                    charts.BarPair.change(
-                        pair.name, 1e3 * before, 1e3 * after, f"{points:,} points", pair.weak
-                    )
-                    for pair, before, after, points in rows
-                ],
-                "median distance, mm",
-            ),
-        )
-        for what, rows in (("static surfaces", static), ("person and moving surfaces", moving))
-        if any(points for *_, points in rows)
+def _pair_charts(scene: artefacts.Artefact, names: Sequence[str]) -> list[tuple[str, str]]:
+    """Plot residuals of static and of moving surfaces: (caption, SVG).
+
+    They are medians over held-out points, NaN without overlap. At most ``_MAX_PAIRS`` pairs with
+    the largest residuals are shown.
+    """
+    after = np.nan_to_num(scene["pair_residual_after"], nan=-1.0)
+    shown = np.sort(np.argsort(-after, kind="stable")[:_MAX_PAIRS])
+    labels, weak = [f"{names[i]}–{names[j]}" for i, j in scene["pairs"]], scene["pair_weak"]
+    plots = []
+    for what, residual, points in (
+        ("static surfaces", "pair_residual", scene["pair_points"]),
+        ("person and moving surfaces", "pair_moving", scene["pair_moving_points"]),
+    ):
+        before, after = scene[f"{residual}_before"], scene[f"{residual}_after"]
+        bars = [
+            charts.BarPair.change(
+                labels[p], 1e3 * float(before[p]), 1e3 * float(after[p]),
+                f"{int(points[p]):,} points", bool(weak[p]),
+            )
+            for p in shown
+        ]  # fmt: skip
+        if points[shown].any():
+            plots.append((what, charts.bar_pairs(bars, "median distance, mm")))
+    return plots
+
+
+def _runs(states: Sequence[str], slip: np.ndarray) -> list[tuple[int, int, str, str]]:
+    """Return the runs of a :class:`.charts.TimelineRow`; slips (T,) are part of the tooltips."""
+    slipped = [
+        f"slipped by {late}" if state == "slipped" else state
+        for state, late in zip(states, slip.tolist(), strict=True)
     ]
+    runs = []
+    for first, last, text in flags.ranges(slipped):
+        state, _, frames = text.partition(" by ")
+        late = f", {frames} {'frame' if frames == '1' else 'frames'} before" if frames else ""
+        title = f"{embed.span(first, last)}: {STATES[state]}{late}"
+        runs.append((first, last, f"state {state}", title))
+    return runs
 
 
-def _timeline(facts: CaptureFacts) -> str:
-    rows = []
-    for camera in facts.cameras:
-        states = [
-            f"slipped by {slip}" if state == "slipped" else state
-            for state, slip in zip(camera.state, camera.slip, strict=True)
-        ]
-        runs = []
-        for first, last, text in flags.ranges(states):
-            state, _, frames = text.partition(" by ")
-            at = f"{first}" if first == last else f"{first}–{last}"
-            late = f", {frames} {_frames(int(frames))} before" if frames else ""
-            runs.append((first, last, f"state {state}", f"{at}: {_WORDS[state]}{late}"))
-        rows.append(charts.TimelineRow(camera.name, runs, _row_label(camera)))
-    marks = [(t, f"{count} {_sets(count)} without any image") for t, count in facts.gaps]
-    return charts.timeline(rows, len(facts.times), marks)
+def _row_label(states: Sequence[str], slip: np.ndarray, times: np.ndarray, delay: str) -> str:
+    """Return the text at the end of a camera's row of the timeline.
 
-
-def _row_label(camera: CameraFacts) -> str:
-    """Return the text at the end of a camera's row of the timeline."""
-    if not camera.recorded:
+    Args:
+        times: times of its images.
+        delay: text on the delay of its exposures.
+    """
+    if not _count_images(states):
         return "no image"
-    parts = [f"{camera.start:.2f}–{camera.end:.2f} s"]
-    parts += [
-        f"{count} {word}"
-        for state, word in (("missing",) * 2, ("slipped", _slipped(camera)), ("part", "incomplete"))
-        if (count := list(camera.state).count(state))
-    ]
-    if np.isfinite(camera.offset_sigma):
-        parts.append(f"{_offset(camera)} ms")
-    return " · ".join(parts)
-
-
-def _slipped(camera: CameraFacts) -> str:
-    """Describe by how many frames the images slipped, such as "slipped by 2 or 3"."""
-    late = {
-        slip for state, slip in zip(camera.state, camera.slip, strict=True) if state == "slipped"
+    late = sorted({int(slip[t]) for t, state in enumerate(states) if state == "slipped"})
+    words = {
+        "missing": "missing",
+        "slipped": f"slipped by {' or '.join(map(str, late))}",
+        "part": "incomplete",
     }
-    return f"slipped by {' or '.join(map(str, sorted(late)))}"
-
-
-def _offset(camera: CameraFacts) -> str:
-    if not np.isfinite(camera.offset_sigma):
-        return ""
-    return f"{1e3 * camera.offset:+.1f} ± {1e3 * camera.offset_sigma:.1f}"
-
-
-def _bias(camera: CameraFacts) -> str:
-    """Format the bias in millimetres with its deviation; "" for a camera without depth."""
-    if not np.isfinite(camera.depth_bias):
-        return ""
-    text = f"{1e3 * camera.depth_bias:.1f}"
-    sigma = camera.depth_bias_sigma
-    return f"{text} ± {1e3 * sigma:.1f}" if np.isfinite(sigma) else text
-
-
-def _row(camera: CameraFacts, master: str) -> dict[str, Any]:
-    states = list(camera.state)
-    return {
-        "name": camera.name,
-        "master": camera.name == master,
-        "recorded": camera.recorded,
-        "counts": [states.count(state) for state in ("missing", "slipped")],
-        "offset": _offset(camera),
-        "bias": _bias(camera),
-        "moved": 1e3 * camera.moved,
-        "turned": camera.turned_deg,
-        "slide": 1e3 * camera.slide,
-        "verdict": camera.verdict,
-        "note": camera.note,
-    }
+    parts = [f"{times[0]:.2f}–{times[-1]:.2f} s"]
+    parts += [f"{n} {word}" for state, word in words.items() if (n := states.count(state))]
+    return " · ".join([*parts, f"{delay} ms"] if delay else parts)
 
 
 def _profile_charts(drawn: CapturePictures) -> list[tuple[str, str]]:
@@ -392,10 +257,6 @@ def _profile_chart(
 
 def _colour(c: int) -> str:
     return CAMERA_COLOURS[c % len(CAMERA_COLOURS)]
-
-
-def _frames(count: int) -> str:
-    return "frame" if count == 1 else "frames"
 
 
 def _sets(count: int) -> str:

@@ -183,12 +183,12 @@ def read_handling(
 
 def holds(probability: np.ndarray) -> list[Hold]:
     """Return the holds of both hands by their probability of contact (T, 2), longest first."""
-    runs = [
+    found = [
         Hold(side, first, last)
         for side, values in zip(SIDES, probability.T, strict=True)
-        for first, last, _ in flags.ranges(["x" if p > 0.5 else "" for p in values])
+        for first, last in flags.runs(values > 0.5)
     ]
-    return sorted(runs, key=lambda hold: (hold.first - hold.last, hold.first, hold.side))
+    return sorted(found, key=lambda hold: (hold.first - hold.last, hold.first, hold.side))
 
 
 def closeup(handling: Handling, hold: Hold) -> EncodedImage:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -180,30 +180,17 @@ def _tiles(measured: Sequence[SequenceMetrics]) -> list[dict[str, str]]:
     return [*tiles, tile("flagged", share, "%", f"{count:,} frames not trusted")]
 
 
-def _rows(content: DatasetContent) -> list[dict[str, Any]]:
-    columns = {
-        "penetration": "penetration.mean_mm",
-        "penetration_p98": "penetration.p98_mm",
-        "body_visible": "vertex_to_cloud.body_visible_mm",
-        "object_visible": "vertex_to_cloud.object_visible_mm",
-        "acceleration_body": "acceleration_body_mm",
-        "acceleration_object": "acceleration_object_mm",
-        "stated_body": "verdict.body_mm",
-        "stated_object": "verdict.object_mm",
-        "pve": "joint.body_pve_mm",
-        "object_mm": "joint.object_translation_mm",
-        "object_deg": "joint.object_rotation_deg",
-    }
-    rows = []
-    for record in content.table.to_dict("records"):
-        row = {name: record.get(column) for name, column in columns.items()}
-        for name in ("sequence", "subject", "object", "intent", "frames", "rank"):
-            row[name] = record[name]
-        row["flagged"] = 100 * record["flagged_frames"] / record["frames"]
-        row["contact"] = 100 * record["contact_frames"] / record["frames"]
-        row["page"] = content.page_of[record["sequence"]]
-        rows.append(row)
-    return rows
+def _rows(content: DatasetContent) -> list[dict[Hashable, Any]]:
+    """Return the records of the table of sequences with percentages and addresses of pages."""
+    return [
+        record
+        | {
+            "flagged": 100 * record["flagged_frames"] / record["frames"],
+            "contact": 100 * record["contact_frames"] / record["frames"],
+            "page": content.page_of[record["sequence"]],
+        }
+        for record in content.table.to_dict("records")
+    ]
 
 
 def _counts(measured: Sequence[SequenceMetrics]) -> dict[str, Any]:

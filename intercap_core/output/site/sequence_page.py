@@ -13,27 +13,13 @@ from intercap_core.annotation import ContactInterval
 from intercap_core.evaluation import figures, flags
 from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.evaluation.verdict.figures import stated_errors
-from intercap_core.output.site import capture_section, charts, measures
-from intercap_core.output.site.capture_section import CaptureFacts
+from intercap_core.output.site import charts, measures
 from intercap_core.output.site.drawing import EncodedImage
 from intercap_core.output.site.embed import css, embedded, render, span, tile
 from intercap_core.output.site.overlays import BODY_COLOUR, OBJECT_COLOUR, Overlay
+from intercap_core.output.viewer import page as viewer
 from intercap_core.schemas import METRIC_REGIONS
 from intercap_core.versions import versions
-
-
-@dataclass(frozen=True)
-class ViewerParts:
-    """Parts of the page for the viewer, inserted without escaping."""
-
-    policy: str
-    """Content security policy."""
-    style: str
-    """Style sheet."""
-    element: str
-    """HTML element of the viewer."""
-    load: str
-    """HTML element that loads the viewer's script and data."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +38,8 @@ class SequenceContent:
     energies: Sequence[tuple[str, float, float]]
     """Name of each energy term with its values before and after the joint fit."""
     closeups: Sequence[EncodedImage]
-    capture: CaptureFacts
+    capture: dict[str, Any]
+    """Variables of the section on the capture."""
     track: dict[str, Any] | None
     """Variables of the section on the track, None without an object."""
     body: dict[str, Any]
@@ -63,8 +50,6 @@ class SequenceContent:
     """Schema version and digest of settings by stage."""
     body_file: str
     """File name of the body file."""
-    viewer: ViewerParts | None = None
-    """Parts for the 4D viewer; None without one."""
 
 
 def page(content: SequenceContent) -> str:
@@ -99,19 +84,17 @@ def page(content: SequenceContent) -> str:
         "cameras": list(cameras.values()),
         "note": content.note,
         "closeups": [embedded(picture) for picture in content.closeups],
-        "capture": _capture(content.capture),
+        "capture": content.capture
+        | {"pictures": [[embedded(p) for p in row] for row in content.capture["pictures"]]},
         "track": None if content.track is None else _with_sheet(content.track),
         "body": _with_sheet(content.body),
         "colours": {"body": css(BODY_COLOUR), "object": css(OBJECT_COLOUR)},
         "made_by": list(content.made_by.items()),
         "versions": [*versions(), ("body file", content.body_file)],
-        "viewer": None,
+        "policy": viewer.POLICY,
+        "viewer_style": Markup(viewer.style()),
+        "viewer": {"element": Markup(viewer.element()), "load": Markup(viewer.load())},
     }
-    if content.viewer is not None:
-        parts = content.viewer
-        context["policy"] = parts.policy
-        context["viewer_style"] = Markup(parts.style)
-        context["viewer"] = {"element": Markup(parts.element), "load": Markup(parts.load)}
     return render("sequence.html.j2", context)
 
 
@@ -269,12 +252,6 @@ def _energies(terms: Sequence[tuple[str, float, float]]) -> str:
     )
 
 
-def _capture(facts: CaptureFacts) -> dict[str, Any]:
-    variables = capture_section.context(facts)
-    variables["pictures"] = [[embedded(p) for p in row] for row in variables["pictures"]]
-    return variables
-
-
 def _with_sheet(variables: dict[str, Any]) -> dict[str, Any]:
     """Embed the sheet of a section, if it has one."""
     sheet = variables["sheet"]
@@ -283,5 +260,4 @@ def _with_sheet(variables: dict[str, Any]) -> dict[str, Any]:
 
 def _runs(mask: np.ndarray) -> list[tuple[int, int, str, str]]:
     """Return the runs of set frames (T,) for a row of the timeline."""
-    runs = flags.ranges(["x" if value else "" for value in mask])
-    return [(first, last, "fill any", span(first, last)) for first, last, _ in runs]
+    return [(first, last, "fill any", span(first, last)) for first, last in flags.runs(mask)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -96,13 +96,24 @@ def _sheet(
     kept: Callable[[int, int], bytes],
     overlap: np.ndarray,
 ) -> tuple[EncodedImage | None, str]:
-    """Draw the sheet; if an image is unreadable, return None and the reason."""
+    """Draw the outlines of track and candidate over crops of the images.
+
+    If an image is unreadable, return None and the reason.
+
+    Args:
+        poses: (T, 4, 4) master_from_object.
+        kept: as in :func:`read_track`.
+        overlap: (T, C) of the track with the candidate.
+    """
+
+    def draw(camera: Camera, t: int, c: int, rgb: np.ndarray) -> np.ndarray | None:
+        return _cell(camera, rgb, mesh, poses[t], kept(t, c))
+
     try:
         with artefacts.read(paths.scene, SCENE) as scene, Frames.open(paths.frames) as images:
-            shown_images = images.showing(scene["image_of"])
-            rig = Rig.from_artefact(scene)
-            shown = choose_frames(1 - _mean(overlap, 1), 5)
-            return track_sheet(name, shown_images, rig, mesh, poses, kept, shown), ""
+            shown = images.showing(scene["image_of"])
+            frames, rig = choose_frames(1 - _mean(overlap, 1), 5), Rig.from_artefact(scene)
+            return make_sheet(name, shown, rig, frames, _CELL_PX, draw), ""
     except (UserError, ValueError) as error:  # ValueError: a candidate that does not decode
         return None, str(error)
 
@@ -186,29 +197,6 @@ def _largest(covariance: np.ndarray) -> np.ndarray:
 
 TRACK_COLOUR, CANDIDATE_COLOUR = (255, 158, 46), (64, 224, 255)  # RGB
 _CELL_PX = 148
-
-
-def track_sheet(
-    name: str,
-    images: Frames,
-    rig: Rig,
-    mesh: ObjectMesh,
-    poses: np.ndarray,
-    kept: Callable[[int, int], bytes],
-    frames: Sequence[int],
-) -> EncodedImage:
-    """Draw the outlines of track and candidate over crops of the images.
-
-    Args:
-        images: images indexed by the frame that they show.
-        poses: (T, 4, 4) master_from_object.
-        kept: as in :func:`read_track`.
-    """
-
-    def draw(camera: Camera, t: int, c: int, rgb: np.ndarray) -> np.ndarray | None:
-        return _cell(camera, rgb, mesh, poses[t], kept(t, c))
-
-    return make_sheet(name, images, rig, frames, _CELL_PX, draw)
 
 
 def _cell(
