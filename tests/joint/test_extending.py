@@ -28,30 +28,19 @@ class Copied(importlib.abc.MetaPathFinder):
 
 
 sys.meta_path.insert(0, Copied())
-import h5py, pytest
-from intercap_core.config import JointSettings
+import numpy as np, pytest
+from intercap_core.joint.state import ALL
 from intercap_core.joint.terms.steady_head import SteadyHead
-from intercap_core.sequence_inputs import FitSettings
-from intercap_core.stages import joint
-from tests.helpers import fitted_capture as fitted
 from tests.helpers.bodies import open_body
+from tests.joint.scenes import FRAMES, Scene, bodies
 from tests.joint.test_terms import test_gradient_of_each_term_matches_differences as check
 
 assert pytest.main(["-q", "-p", "no:cacheprovider", "--confcutdir", str(copy), test]) == 0
 check(open_body(), SteadyHead)
-capture = fitted.make_capture(copy, total=3)
-stages = ("frames", "detections", "scene", "person", "object_track", "body_fit")
-settings = JointSettings(look_again=False, refine_cameras=False)
-joint.run(
-    paths=capture.inputs(*stages), models=capture.models, output=copy / "fit.h5",
-    fit_settings=FitSettings(
-        settings, fitted.FIT_SETTINGS.body_fit, fitted.FIT_SETTINGS.object_track
-    ),
-)
-with h5py.File(copy / "fit.h5") as fit:
-    names = fit["energy_names"].asstr()[()].tolist()
-    assert fit["energy_after"][names.index(SteadyHead.name)] > 0
-    assert fit["energy_after"][()].sum() < fit["energy_before"][()].sum()
+shaken = np.random.default_rng(0).normal(scale=0.01, size=(FRAMES, ALL.stop))
+state = bodies(open_body(), 0.5).moved(shaken)
+fit = Scene(open_body(), state, hold=0.1, track=0.1).minimise(max_steps=3)
+assert 0 < fit.equations.energy[SteadyHead.name] < fit.energy_before[SteadyHead.name]
 """
 
 
