@@ -78,11 +78,9 @@ def check(settings: Settings = DEFAULT_SETTINGS) -> None:
     Example: intercap check config/demo/config.yaml
     """
     from intercap_core.commands.check import check_bodies, check_detector, check_sequences
-    from intercap_core.pipeline.step import check_device
     from intercap_core.project import load_project
 
     project = load_project(settings)
-    check_device(project)
     check_bodies(project)
     notes = check_detector(project)
     start = time.monotonic()

@@ -374,7 +374,7 @@ class ClusterSettings(Model):
     time_scale: dict[Name, Positive] = {}
     """Factor of the requested time by stage; "all" = all other stages."""
     gpu_partition: str = ""
-    """Partition for stages that run on a GPU; empty = the profile's partition."""
+    """Partition for detectors that run on a GPU; empty = the profile's partition."""
 
     @field_validator("memory_scale", "time_scale")
     @classmethod
@@ -404,7 +404,7 @@ class Config(Model):
     results: Path = Path("results")
     """Folder of all results, relative to the folder in which the workflow runs."""
     device: Literal["cpu", "cuda"] = "cpu"
-    """Device of the fits."""
+    """Device of the fits: the CPU; cuda is refused with an error."""
     body_models: BodyModels = BodyModels()
     """SMPL-X files; without one, the open body is used."""
     frames: FramesSettings = FramesSettings()

@@ -217,6 +217,10 @@ def load_project(path: Path, overrides: Mapping[str, Any] | None = None) -> Proj
     config = config.model_copy(
         update={name: _absolute(value, path.parent) for name, value in sections.items()}
     )
+    if config.device == "cuda":
+        raise UserError(
+            f"{path}: device is 'cuda', expected 'cpu': fits run on the CPU only; set device: cpu"
+        )
     project = Project(config, path, sequences, subjects, objects)
     _check_files(project)
     _check_studio(project, rows, table)

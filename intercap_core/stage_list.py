@@ -72,8 +72,6 @@ class Stage:
     """Columns of the sequence's row that it reads; others are hidden from it."""
     layout_columns: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Further columns by the layout of the recording."""
-    on_device: bool = False
-    """True if it runs on the device that the setting ``device`` names."""
     estimates: bool = False
     """True if it estimates poses, which the metrics compare with the truth."""
     folder_marker: str = ""
@@ -143,7 +141,6 @@ STAGES: dict[str, Stage] = {
             reads=("frames", "scene", "person"),
             resources=JobResources(560, mb_per_image=0.4, seconds=15, seconds_per_image=0.06),
             output_bytes=1_100_000,
-            on_device=True,
             estimates=True,
         ),
         Stage(
@@ -152,7 +149,6 @@ STAGES: dict[str, Stage] = {
             reads=_FITS,
             resources=JobResources(800, mb_per_frame=3.7, seconds=20, seconds_per_image=0.06),
             output_bytes=700_000,
-            on_device=True,
             estimates=True,
         ),
         Stage(

@@ -14,7 +14,7 @@ from rich.table import Table
 from intercap_core.errors import UserError
 from intercap_core.pipeline.lease import lease_holder
 from intercap_core.pipeline.provenance import library_versions, processor
-from intercap_core.pipeline.resources import disk_usage
+from intercap_core.pipeline.resources import disk_usage, on_gpu
 from intercap_core.project import Project
 from intercap_core.versions import versions
 
@@ -37,7 +37,7 @@ class Finding:
 
 
 def findings(project: Project | None) -> Iterator[Finding]:
-    """Check the machine; with a ``project`` also its device, body files, disk and locks."""
+    """Check the machine; with a ``project`` also its body files, disk and locks."""
     for name, version in versions():
         yield Finding(name, GOOD, version)
     deciding = ", ".join(f"{name} {version}" for name, version in library_versions().items())
@@ -65,18 +65,22 @@ def print_findings(project: Project | None) -> bool:
 
 
 def _gpu(project: Project | None) -> Finding:
-    import torch
+    """GPU for the models of the detectors; no other stage uses one."""
+    wanted = project is not None and on_gpu(project, "detections")
+    try:
+        import onnxruntime
 
-    wanted = project is not None and project.config.device == "cuda"
-    if torch.cuda.is_available():
-        name = torch.cuda.get_device_name(0)
-        words = "" if wanted or project is None else "; the settings ask for the CPU (device: cpu)"
-        return Finding("GPU", GOOD, f"{name}{words}")
+        found = "CUDAExecutionProvider" in onnxruntime.get_available_providers()
+    except ImportError:
+        found = False
+    if found:
+        words = "" if wanted or project is None else "; the settings run detectors on the CPU"
+        return Finding("GPU", GOOD, f"onnxruntime has CUDA{words}")
     if wanted:
         return Finding(
-            "GPU", BAD, "the settings ask for a GPU (device: cuda), but PyTorch finds none"
+            "GPU", BAD, "the settings run detectors on a GPU, but onnxruntime finds no CUDA"
         )
-    return Finding("GPU", GOOD, "none found, none needed (device: cpu)")
+    return Finding("GPU", GOOD, "none found, none needed")
 
 
 def _bodies(project: Project) -> Finding:

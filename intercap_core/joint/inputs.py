@@ -60,7 +60,7 @@ class JointInputs:
 
 @contextmanager
 def open_inputs(
-    paths: SequencePaths, models: SequenceModels, fit_settings: FitSettings, device: str = "cpu"
+    paths: SequencePaths, models: SequenceModels, fit_settings: FitSettings
 ) -> Iterator[JointInputs]:
     """Open the inputs of the joint fit for a ``with`` block, in which images are read.
 
@@ -79,7 +79,7 @@ def open_inputs(
         artefacts.read(paths.object_track, OBJECT_TRACK) as track,
         artefacts.read(paths.scene, SCENE) as scene,
     ):
-        model = load_model(body_models, str(body.attributes["gender"]), body, device=device)
+        model = load_model(body_models, str(body.attributes["gender"]), body)
         encoder = _motion_encoder(settings, scene, model)
         sequential = SequentialFits.read(body, track, scene)
         attributes = {name: body.attributes[name] for name in ("sequence", "gender", "body_model")}

@@ -90,11 +90,8 @@ def has_model(project: Project) -> bool:
 
 
 def on_gpu(project: Project, rule: str) -> bool:
-    """Whether the jobs of a rule run on a GPU with the project's settings."""
-    config = project.config
-    if rule in STAGES and STAGES[rule].on_device:
-        return config.device == "cuda"
-    detectors = config.detections
+    """Whether the jobs of a rule run on a GPU with the project's settings: only detectors can."""
+    detectors = project.config.detections
     models = (
         (detectors.segmentation_model, detectors.segmentation_device),
         (detectors.keypoint_model, detectors.keypoint_device),

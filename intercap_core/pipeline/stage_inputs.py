@@ -56,7 +56,6 @@ def arguments(
         "object_": project.object_of(sequence),
         "subject": project.subjects[row.subject],
         "body_models": config.body_models,
-        "device": config.device,
         "results": row.results,
         "truth": row.truth,
         "frames_to_drop": annotation.drop_frames,
@@ -87,7 +86,7 @@ def stage_manifest(
         before: an earlier manifest; saves reading large files whose size has changed.
     """
     given = _given(project, sequence, stage, annotation)
-    machine = {"device": given.pop("device", "cpu"), "cpu": processor()}
+    machine = {"cpu": processor()}
     return _manifest(stage, sequence, given, artefacts, checksums, before, machine)
 
 

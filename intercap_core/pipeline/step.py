@@ -136,8 +136,6 @@ class _Step:
     def make(self, manifest: Manifest, lease: Lease) -> bool:
         """Run the stage and replace its output; False if the lease was lost meanwhile, in which
         case the output is left alone."""
-        if STAGES[self.stage].on_device:
-            check_device(self.project)
         module = importlib.import_module(f"intercap_core.stages.{self.stage}")
         in_folder = STAGES[self.stage].writes_folder
         if in_folder:
@@ -206,19 +204,6 @@ def _return_freed_memory() -> None:
     if mallopt is not None:
         mallopt(_M_MMAP_THRESHOLD, _RETURNED_BYTES)
         mallopt(_M_TRIM_THRESHOLD, _RETURNED_BYTES)
-
-
-def check_device(project: Project) -> None:
-    """Raise UserError if the settings name a device that this machine does not have."""
-    if project.config.device == "cpu":
-        return
-    import torch
-
-    if not torch.cuda.is_available():
-        raise UserError(
-            f"{project.path}: device is {project.config.device}, but PyTorch finds no such device "
-            "here; set device: cpu, or run on a machine that has one"
-        )
 
 
 def run_studio(project: Project, sequence: str) -> Path:

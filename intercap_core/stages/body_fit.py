@@ -43,7 +43,6 @@ def run(
     subject: SubjectEntry,
     body_models: BodyModels,
     settings: BodyFitSettings,
-    device: str = "cpu",
 ) -> None:
     """Fit the subject's body in all frames and write body_fit.h5.
 
@@ -58,7 +57,7 @@ def run(
     file = load_body_file(path, settings.betas, num_expression=10)
     shapes = ShapePrior.of(file, subject.gender, subject.height)
     # the shapes of the fit are in units of the subject's prior
-    model = BodyModel(shapes.centred(file), torch.device(device), torch.float32)
+    model = BodyModel(shapes.centred(file), torch.device("cpu"), torch.float32)
     check_body(model)
     pose_prior = load_pose_prior(body_models, model)
     seen = read_observations(scene, person)

@@ -36,7 +36,6 @@ def run(
     fit_settings: FitSettings,
     output: Path,
     contact: Sequence[ContactInterval] | None = None,
-    device: str = "cpu",
     results: Path | None = None,
 ) -> None:
     """Write joint.h5: a fit that starts from the sequential fits, or imported results.
@@ -53,7 +52,7 @@ def run(
         betas, settings_digest = fit_settings.body_fit.betas, digest(settings)
         import_joint(results, paths, models, output, betas=betas, settings_digest=settings_digest)
         return
-    with open_inputs(paths, models, fit_settings, device) as inputs:
+    with open_inputs(paths, models, fit_settings) as inputs:
         fitted = fit(inputs, settings, contact)
     for issue in fitted.contact.issues:
         first, last = issue.frames.start, max(issue.frames.start, issue.frames.stop - 1)

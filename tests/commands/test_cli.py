@@ -30,7 +30,6 @@ from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import Extrinsics, write_rig_file
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera
-from intercap_core.pipeline.step import check_device
 from intercap_core.project import load_project
 from intercap_core.schemas import DETECTIONS
 from intercap_core.stage_list import STAGES
@@ -367,11 +366,10 @@ def test_an_invalid_body_file_stops_before_any_job(
     assert " file body.npz " in done.stderr
 
 
-def test_a_missing_device_is_an_error(inside: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    check_device(load_project(Path("config.yaml")))
-    with pytest.raises(UserError, match=r"config\.yaml: device is cuda, .* set device: cpu"):
-        check_device(load_project(Path("config.yaml"), {"device": "cuda"}))
+def test_fits_on_a_gpu_are_refused(inside: Path) -> None:
+    load_project(Path("config.yaml"), {"device": "cpu"})
+    with pytest.raises(UserError, match=r"config\.yaml: device is 'cuda', .* set device: cpu"):
+        load_project(Path("config.yaml"), {"device": "cuda"})
 
 
 @pytest.fixture

@@ -73,16 +73,18 @@ def test_scaled_memory_grows_with_attempts() -> None:
     assert minutes(raised, "metrics", LONG) == minutes(project(), "metrics", LONG)
 
 
-def test_gpu_stages_follow_the_settings() -> None:
-    def found(**settings: object) -> set[str]:
-        return {stage for stage in JOBS if on_gpu(project(**settings), stage)}
-
-    assert found() == set()
-    assert found(device="cuda") == {"body_fit", "joint"}
+def test_detectors_run_on_a_gpu_if_the_settings_say_so(tmp_path: Path) -> None:
+    model = tmp_path / "model.onnx"
+    model.touch()
+    on_cpu = project(detections={"keypoint_model": str(model)})
+    on_cuda = project(detections={"keypoint_model": str(model), "keypoint_device": "cuda"})
+    assert {stage for stage in JOBS if on_gpu(on_cuda, stage)} == {"detections"}
+    assert not any(on_gpu(on_cpu, stage) for stage in JOBS)
     # without a model nothing runs on it
-    assert found(detections={"keypoint_device": "cuda"}) == set()
-    more = memory_mb(project(device="cuda"), "joint", SHORT) - memory_mb(project(), "joint", SHORT)
-    assert more == CUDA_MB
+    assert not on_gpu(project(detections={"keypoint_device": "cuda"}), "detections")
+    for stage in JOBS:
+        more = memory_mb(on_cuda, stage, SHORT) - memory_mb(on_cpu, stage, SHORT)
+        assert more == (CUDA_MB if stage == "detections" else 0)
 
 
 def test_virtual_recordings_have_the_extent_of_their_settings() -> None:

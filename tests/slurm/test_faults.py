@@ -17,7 +17,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-import torch
 
 from intercap_core.stage_list import STAGES
 from tests.helpers.cluster_run import PROFILE, ClusterRun, contents, written
@@ -349,17 +348,23 @@ def test_submitter_killed_and_the_input_edited(
     assert run.slurm.jobs(ended=True)[number][0] == "CANCELLED"
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="here the stage would find a GPU")
-def test_a_gpu_stage_uses_the_gpu_partition(run: ClusterRun, local: dict[str, bytes]) -> None:
-    """Slurm's node claims a GPU; the error that PyTorch finds none is reported once."""
-    before = numbers(run, "rule_body_fit_", ONE)
-    with recomputed(run, local, "body_fit") as targets:
-        on_gpu = ("--config", "device=cuda", "cluster={gpu_partition: gpu}")
-        started = run.start(*targets, *on_gpu)
+def test_a_detector_on_a_gpu_uses_the_gpu_partition(
+    run: ClusterRun, local: dict[str, bytes], tmp_path: Path
+) -> None:
+    """Slurm's node claims a GPU; the error that onnxruntime finds none is reported once."""
+    onnxruntime = pytest.importorskip("onnxruntime")
+    if "CUDAExecutionProvider" in onnxruntime.get_available_providers():
+        pytest.skip("here the stage would find CUDA")
+    model = tmp_path / "model.onnx"
+    model.touch()
+    before = numbers(run, "rule_detections_", ONE)
+    with recomputed(run, local, "detections") as targets:
+        on_gpu = f"detections={{keypoint_model: {model}, keypoint_device: cuda}}"
+        started = run.start(*targets, "--config", on_gpu, "cluster={gpu_partition: gpu}")
         assert started.process.wait(300) == 1
-        assert f"{ONE}: body_fit: failed: " in started.output
-        assert "config/test/config.yaml: device is cuda, but PyTorch finds no" in started.output
-        (number,) = numbers(run, "rule_body_fit_", ONE) - before
+        assert f"{ONE}: detections: failed: " in started.output
+        assert "finds no cuda here" in started.output
+        (number,) = numbers(run, "rule_detections_", ONE) - before
         assert (
             run.slurm.command("squeue", "-h", "-t", "all", "-j", number, "-o", "%P").strip()
             == "gpu"
