@@ -116,22 +116,6 @@ def test_a_subset_equals_the_whole_image():
     assert np.array_equal(part.hidden, whole.hidden[at])
 
 
-def test_a_colour_mask_covers_the_depth_of_the_panel():
-    depth = wall_with_panel()
-    panel = depth == PANEL_M * 1000
-    rays = COLOUR.rays.astype(np.float64)
-    rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], -1)
-    inverse = invert(CAMERA.colour_from_depth)
-    direction = rays @ inverse[:3, :3].T
-    hit = inverse[:3, 3] + direction * ((PANEL_M - inverse[2, 3]) / direction[..., 2:])
-    mask = (np.abs(hit[..., :2]) <= PANEL_HALF_M).all(-1)
-    lookup = colour_lookup(depth, CAMERA)
-    warped = np.zeros(depth.shape, bool)
-    warped.ravel()[lookup.depth_index] = lookup.sample(mask)
-    assert (warped & panel).sum() / (warped | panel).sum() > 0.97
-    assert not (warped & ~panel).any()  # never the wall that the panel hides
-
-
 def test_an_image_of_another_size_is_refused():
     with pytest.raises(ValueError, match="does not fit camera k2"):
         depth_points(np.zeros((10, 10), np.uint16), CAMERA)

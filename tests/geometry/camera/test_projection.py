@@ -170,9 +170,6 @@ def test_impossible_lenses_are_refused(change):
         Intrinsics(**values)
 
 
-STEP_M = 1e-7
-
-
 def random_lens(seed: int) -> np.ndarray:
     """Parameters (13,) scattered about those of a wide depth or a colour lens."""
     rng = np.random.default_rng(seed)
@@ -189,33 +186,13 @@ def random_lens(seed: int) -> np.ndarray:
 def test_compiled_kernels_equal_numpy(seed):
     lens, points = random_lens(seed), random_points(300, seed)
     covered = inside_model(points, lens)
-    assert 20 < covered.sum() < len(points) - 20
+    assert 20 < covered.sum() < len(points) - 20 and (points[:, 2] < MIN_DEPTH_M).any()
     pixels, jacobian = project_with_jacobian(points, lens)
     compiled = np.array([project_point_with_jacobian(*point, lens) for point in points])
     np.testing.assert_allclose(compiled[:, :2], pixels, rtol=1e-12, atol=1e-9)
     np.testing.assert_allclose(compiled[:, 2:].reshape(-1, 2, 3), jacobian, rtol=1e-11, atol=1e-9)
     alone = np.array([project_point(*point, lens) for point in points])
     np.testing.assert_allclose(alone, pixels, rtol=1e-12, atol=1e-9)
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_the_compiled_jacobian_matches_finite_differences(seed):
-    lens, points = random_lens(seed), random_points(300, seed)
-    x, y, z = points.T
-    radius = np.hypot(x, y) / np.maximum(z, MIN_DEPTH_M)
-    # Not within a step of a kink: the metric radius, the nearest depth.
-    smooth = (np.abs(z - MIN_DEPTH_M) > 1e-2) & (np.abs(radius - lens[12]) > 1e-3)
-    points = points[smooth]
-    jacobian = np.array([project_point_with_jacobian(*p, lens)[2:] for p in points])
-    numeric = np.empty((len(points), 2, 3))
-    for axis, offset in enumerate(STEP_M * np.eye(3)):
-        after = np.array([project_point(*p, lens) for p in points + offset])
-        before = np.array([project_point(*p, lens) for p in points - offset])
-        numeric[..., axis] = (after - before) / (2 * STEP_M)
-    scale = np.abs(numeric).max(axis=(1, 2), keepdims=True) + 1.0
-    assert (np.abs(jacobian.reshape(-1, 2, 3) - numeric) / scale).max() < 1e-5
-    behind = points[:, 2] < MIN_DEPTH_M
-    assert behind.any() and not jacobian[behind][:, [2, 5]].any()
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -13,7 +13,6 @@ import trimesh
 from intercap_core.entries import ObjectEntry, Symmetry
 from intercap_core.errors import UserError
 from intercap_core.geometry.rigid.contact_vertices import contact_list
-from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 
 
@@ -26,33 +25,21 @@ def _write(mesh, path: Path) -> Path:
     return path
 
 
-def _ball(subdivisions=3):
-    return trimesh.creation.icosphere(subdivisions=subdivisions, radius=0.11)
+def _ball(subdivisions=3, scale=1.0):
+    return trimesh.creation.icosphere(subdivisions=subdivisions, radius=0.11 * scale)
 
 
-def _scaled(factor):
-    ball = _ball()
-    ball.apply_scale(factor)
-    return ball
+BALL = _ball()
+VERTICES, FACES = np.array(BALL.vertices), np.array(BALL.faces)
 
 
-def _changed(vertices=None, faces=None):
-    ball = _ball()
-    if vertices is not None:
-        ball.vertices = vertices(ball.vertices.copy())
-    faces = ball.faces if faces is None else faces(ball.faces.copy())
-    return trimesh.Trimesh(ball.vertices, faces, process=False)
+def _mesh(vertices=VERTICES, faces=FACES):
+    return trimesh.Trimesh(vertices, faces, process=False)
 
 
-def _half_open():
-    ball = _ball()
-    soup = ball.vertices[ball.faces[::2]].reshape(-1, 3)
-    return trimesh.Trimesh(soup, np.arange(len(soup)).reshape(-1, 3), process=False)
-
-
-def _not_a_number(vertices):
-    vertices[7, 1] = np.nan
-    return vertices
+def _soup(faces=FACES):
+    """Faces that share no vertices."""
+    return VERTICES[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3)
 
 
 NO_VERTICES = (
@@ -65,16 +52,16 @@ NO_VERTICES = (
     ("content", "words"),
     [
         (None, "no such mesh"),
-        (trimesh.PointCloud(_ball().vertices), "0 faces"),
-        (_changed(vertices=_not_a_number), "vertex 7 is not a number"),
-        (_scaled(1000), r"220 m long.*millimetres \(0\.001\)"),
-        (_scaled(100), r"22 m long.*centimetres \(0\.01\)"),
-        (_changed(faces=lambda faces: faces[:, [0, 1, 1]]), "encloses"),
+        (trimesh.PointCloud(VERTICES), "0 faces"),
+        (_mesh(np.where(np.arange(642)[:, None] == 7, np.nan, VERTICES)), "vertex 7 is not a"),
+        (_ball(scale=1000), r"220 m long.*millimetres \(0\.001\)"),
+        (_ball(scale=100), r"22 m long.*centimetres \(0\.01\)"),
+        (_mesh(faces=FACES[:, [0, 1, 1]]), "encloses"),
         (b"", "not a readable mesh|0 faces"),
         (NO_VERTICES, "0 faces|not a readable mesh"),
-        (_scaled(0.001), "unit is the metre"),
-        (_half_open(), "no inside"),
-        (_changed(vertices=lambda vertices: vertices * (1, 1, 1e-9)), "flat sheet"),
+        (_ball(scale=0.001), "unit is the metre"),
+        (_mesh(*_soup(FACES[::2])), "no inside"),
+        (_mesh(VERTICES * (1, 1, 1e-9)), "flat sheet"),
         (b"ply\nformat ascii 1.0\nelement vertex 9\nend_header\n1 2", "export"),
     ],
 )
@@ -91,43 +78,33 @@ def test_bad_meshes_are_refused(tmp_path, content, words):
 
 @pytest.mark.parametrize(("scale", "doubted"), [(0.05, True), (1, False), (20, True)])
 def test_unusual_sizes_are_reported_and_used(tmp_path, caplog, scale, doubted):
-    ball = _scaled(scale)
     with caplog.at_level(logging.WARNING):
-        mesh = ObjectMesh.load(_entry(_write(ball, tmp_path / "thing.ply")))
+        mesh = ObjectMesh.load(_entry(_write(_ball(scale=scale), tmp_path / "thing.ply")))
     assert mesh.diameter == pytest.approx(0.22 * scale, rel=1e-3)
     assert ("check its unit" in caplog.text) == doubted
 
 
 def test_an_open_mesh_is_reported_and_used(tmp_path, caplog):
-    """A box without its lid: what lies deep inside is inside, what lies outside is not."""
-    box = trimesh.creation.box((0.4, 0.4, 0.4)).subdivide().subdivide()
-    lid = box.triangles_center[:, 2] > 0.199
-    box = trimesh.Trimesh(box.vertices, box.faces[~lid], process=True)
+    bowl = _mesh(faces=FACES[BALL.triangles_center[:, 2] < 0.08])
     with caplog.at_level(logging.WARNING):
-        mesh = ObjectMesh.load(_entry(_write(box, tmp_path / "thing.ply")))
-    assert not mesh.watertight and "not watertight" in caplog.text
-    assert "thing.ply" in caplog.text
-    field = DistanceField(mesh.vertices, mesh.faces, watertight=mesh.watertight)
-    rng = np.random.default_rng(0)
-    inner = rng.uniform(-0.19, 0.19, (500, 3)) - (0, 0, 0.1) * rng.random((500, 1))
-    inner[:, 2] = inner[:, 2].clip(-0.19, -0.02)
-    outer = inner + np.array([0.5, 0.1, 0])
-    assert field.inside(inner).mean() > 0.95 and not field.inside(outer).any()
-    assert 0 < mesh.radius < 0.5 and np.isfinite(mesh.centre_of_mass).all()
+        mesh = ObjectMesh.load(_entry(_write(bowl, tmp_path / "thing.ply")))
+    assert not mesh.watertight
+    assert "not watertight" in caplog.text and "thing.ply" in caplog.text
+    assert 0.1 < mesh.radius < 0.2
+    np.testing.assert_allclose(mesh.centre_of_mass, [0, 0, -0.015], atol=0.005)
 
 
 @pytest.mark.parametrize("stray", [np.nan, 40.0])
 def test_vertices_without_a_face_do_not_count(tmp_path, caplog, stray):
-    ball = _ball()
-    vertices = np.concatenate([[[stray, 0, 0]], ball.vertices])
-    path = _write(trimesh.Trimesh(vertices, ball.faces + 1, process=False), tmp_path / "thing.ply")
+    ball = _mesh(np.concatenate([[[stray, 0, 0]], VERTICES]), FACES + 1)
+    path = _write(ball, tmp_path / "thing.ply")
     contact = tmp_path / "thing.json"
     contact.write_text("[0, 1, 6]")
     with caplog.at_level(logging.WARNING):
         mesh = ObjectMesh.load(_entry(path, contact_vertices=contact))
     assert "left out 1 vertices that no face uses" in caplog.text
     assert mesh.watertight and mesh.diameter == pytest.approx(0.22, rel=1e-3)
-    assert len(mesh.vertices) == len(ball.vertices) == len(mesh.colours)
+    assert len(mesh.vertices) == len(VERTICES) == len(mesh.colours)
     np.testing.assert_array_equal(mesh.contact_vertices, [0, 5])
     contact.write_text("[0]")
     with pytest.raises(UserError, match="no face of the mesh uses any"):
@@ -135,48 +112,33 @@ def test_vertices_without_a_face_do_not_count(tmp_path, caplog, stray):
 
 
 def test_faces_without_area_are_left_out(tmp_path, caplog):
-    ball = _changed(faces=lambda faces: np.concatenate([faces, [[0, 0, 1], [5, 7, 7]]]))
+    ball = _mesh(faces=np.concatenate([FACES, [[0, 0, 1], [5, 7, 7]]]))
     with caplog.at_level(logging.WARNING):
         mesh = ObjectMesh.load(_entry(_write(ball, tmp_path / "thing.ply")))
-    assert mesh.watertight and len(mesh.faces) == len(_ball().faces)
+    assert mesh.watertight and len(mesh.faces) == len(FACES)
     assert "left out 2 faces without area" in caplog.text
 
 
-def _inside_out(ball):
-    ball.invert()
+FAULTY = {
+    "inside out": (VERTICES, FACES[:, ::-1]),
+    "one face turned": (VERTICES, np.concatenate([FACES[:1, ::-1], FACES[1:]])),
+    "one face missing": (VERTICES, np.delete(FACES, 11, axis=0)),
+    "corners not joined": _soup(),
+}
 
 
-def _one_face_turned(ball):
-    ball.faces[3] = ball.faces[3][::-1]
-
-
-def _one_face_missing(ball):
-    ball.update_faces(np.arange(len(ball.faces)) != 11)
-
-
-def _corners_not_joined(ball):
-    soup = ball.vertices[ball.faces].reshape(-1, 3)
-    ball.vertices, ball.faces = soup, np.arange(len(soup)).reshape(-1, 3)
-
-
-@pytest.mark.parametrize(
-    "harm", [_inside_out, _one_face_turned, _one_face_missing, _corners_not_joined]
-)
-def test_small_faults_are_repaired(tmp_path, caplog, harm):
-    ball = _ball()
-    volume = ball.volume
-    ball = trimesh.Trimesh(ball.vertices.copy(), ball.faces.copy(), process=False)
-    harm(ball)
-    path = _write(ball, tmp_path / "thing.ply")
+@pytest.mark.parametrize("fault", FAULTY)
+def test_small_faults_are_repaired(tmp_path, fault):
+    vertices, faces = FAULTY[fault]
+    path = _write(_mesh(vertices, faces), tmp_path / "thing.ply")
     listed = [0, 1, 5]
-    positions = np.asarray(ball.vertices)[listed]
+    positions = vertices[listed]
     contact = tmp_path / "thing.json"
     contact.write_text(json.dumps(listed))
-    with caplog.at_level(logging.WARNING):
-        mesh = ObjectMesh.load(_entry(path, contact_vertices=contact))
+    mesh = ObjectMesh.load(_entry(path, contact_vertices=contact))
     repaired = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     assert mesh.watertight and repaired.is_winding_consistent
-    assert repaired.volume == pytest.approx(volume, rel=1e-3)
+    assert repaired.volume == pytest.approx(BALL.volume, rel=1e-3)
     distance = np.linalg.norm(
         positions[:, None] - mesh.vertices[mesh.contact_vertices][None], axis=-1
     )
@@ -186,18 +148,15 @@ def test_small_faults_are_repaired(tmp_path, caplog, harm):
 @pytest.mark.parametrize("suffix", ["json", "npz"])
 def test_a_list_of_another_mesh_is_refused(tmp_path, suffix):
     """A changed mesh is detected by its number of vertices and their coordinates."""
-    ball = _ball()
-    stored = contact_list([3, 9], ball.vertices)
+    stored = contact_list([3, 9], VERTICES)
     contact = tmp_path / f"thing.contact.{suffix}"
     if suffix == "json":
         contact.write_text(json.dumps(stored))
     else:
         np.savez(contact, **stored)
-    entry = _entry(_write(ball, tmp_path / "thing.ply"), contact_vertices=contact)
+    entry = _entry(_write(BALL, tmp_path / "thing.ply"), contact_vertices=contact)
     np.testing.assert_array_equal(ObjectMesh.load(entry).contact_vertices, [3, 9])
-    reordered = trimesh.Trimesh(
-        ball.vertices[::-1], len(ball.vertices) - 1 - ball.faces, process=False
-    )
+    reordered = _mesh(VERTICES[::-1], len(VERTICES) - 1 - FACES)
     for other, words in ((_ball(2), "mesh_vertices 642.*has 162"), (reordered, "mesh_digest")):
         again = _entry(_write(other, tmp_path / "again.ply"), contact_vertices=contact)
         with pytest.raises(UserError, match=f"{words}.*mesh was changed.*choose") as caught:
@@ -221,21 +180,17 @@ def _npz(**arrays):
         ("c.json", b"[0.5]", "not a list"),
         ("c.json", b"[[1], [2, 3]]", "not a list"),
         ("c.json", b"[1, 2", "not a JSON list"),
-        ("c.json", b"", "not a JSON list"),
         ("c.json", b"[1, Infinity]", "not a list"),
         ("c.json", b'["a"]', "not a list"),
         ("c.npz", b"no archive", "not a readable .npz"),
         ("c.npz", _npz(contact_vertices=np.arange(9))[:-30], "not a readable .npz"),
         ("c.npz", _npz(), "not a readable .npz"),
-        ("c.npz", _npz(contact_vertices=np.array(["a"])), "not a list"),
         ("c.npz", _npz(contact_vertices=np.array(3)), "not a list"),
-        ("c.pkl", pickle.dumps({"a": 1}), "not a list"),
         ("c.pkl", pickle.dumps({1, (1, 2)}), "not a list"),
-        ("c.pkl", pickle.dumps(3), "not a list"),
     ],
 )
 def test_bad_contact_lists_are_refused(tmp_path, name, data, words):
-    mesh = _write(_ball(), tmp_path / "thing.ply")
+    mesh = _write(BALL, tmp_path / "thing.ply")
     contact = tmp_path / name
     contact.write_bytes(data)
     with pytest.raises(UserError, match=words) as caught:
@@ -245,7 +200,7 @@ def test_bad_contact_lists_are_refused(tmp_path, name, data, words):
 
 @pytest.mark.parametrize("kind", ["list", "array", "npz", "none"])
 def test_contact_lists_of_every_kind(tmp_path, kind):
-    mesh = _write(_ball(), tmp_path / "thing.ply")
+    mesh = _write(BALL, tmp_path / "thing.ply")
     path: Path | None = tmp_path / ("03.npz" if kind == "npz" else "03.pkl")
     if kind == "npz":
         np.savez(path, contact_vertices=np.array([9, 3, 3]))
@@ -260,7 +215,7 @@ def test_contact_lists_of_every_kind(tmp_path, kind):
 
 
 def test_impossible_symmetry_names_the_object(tmp_path):
-    mesh = _write(_ball(), tmp_path / "thing.ply")
+    mesh = _write(BALL, tmp_path / "thing.ply")
     flat = tuple(np.diag([2.0, 1, 1, 1]).ravel())
     with pytest.raises(UserError, match="object 'thing': symmetry"):
         ObjectMesh.load(_entry(mesh, symmetry=Symmetry(discrete=(flat,))))

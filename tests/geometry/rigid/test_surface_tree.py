@@ -20,25 +20,13 @@ def _bumpy(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("reach", [0.02, 0.1, 10.0])
-def test_distances_equal_other_libraries_up_to_the_reach(reach: float) -> None:
+def test_distances_equal_embree_up_to_the_reach(reach: float) -> None:
     vertices, faces = _bumpy()
     points = np.random.default_rng(1).uniform(-0.6, 0.6, (3000, 3))
     found = SurfaceTree(vertices, faces).shaped(vertices).distance(points, reach)
-    peer = np.sqrt(igl.point_mesh_squared_distance(points, vertices, faces.astype(np.int64))[0])
+    peer = DistanceField(vertices, faces).distance(points)
     assert found == pytest.approx(np.minimum(peer, reach), abs=1e-6)
-    assert found == pytest.approx(
-        np.minimum(DistanceField(vertices, faces).distance(points), reach), abs=1e-6
-    )
     assert (found < reach).any() and (found == reach).any() == (reach < 1)
-
-
-def test_another_shape_of_the_mesh_is_as_exact() -> None:
-    tree = SurfaceTree(*_bumpy())
-    vertices, faces = _bumpy(seed=5)
-    bent = vertices @ np.diag([0.2, 3.0, 1.0]) + np.array([1.0, 2.0, 3.0])
-    points = np.random.default_rng(2).uniform(-1, 1, (2000, 3)) + np.array([1.0, 2.0, 3.0])
-    found = tree.shaped(bent).distance(points, 5.0)
-    assert found == pytest.approx(DistanceField(bent, faces).distance(points), abs=2e-6)
 
 
 @pytest.mark.parametrize("count", [1, 2, 4, 5, 9])
@@ -85,7 +73,7 @@ def _asked(kind: str) -> np.ndarray:
 
 @pytest.mark.parametrize("kind", ["scattered", "neighbours", "grid"])
 @pytest.mark.parametrize("mesh", [_bumpy, _pair, _box])
-@pytest.mark.parametrize(("reach", "deepest"), [(0.1, 0.25), (0.005, 0.25), (2.0, 2.0)])
+@pytest.mark.parametrize(("reach", "deepest"), [(0.005, 0.25), (2.0, 2.0)])
 def test_signed_distances_equal_embree(mesh, kind: str, reach: float, deepest: float):
     vertices, faces = mesh()
     points = _asked(kind)
@@ -99,26 +87,21 @@ def test_signed_distances_equal_embree(mesh, kind: str, reach: float, deepest: f
     assert (found < 0).any() and (found > 0).any()
 
 
-def test_the_inside_of_another_shape_of_the_mesh() -> None:
+def test_another_shape_of_the_mesh_is_as_exact() -> None:
     tree = SurfaceTree(*_bumpy())
     vertices, faces = _bumpy(seed=5)
-    points = _asked("scattered")
-    found = tree.shaped(vertices).signed_distance(points, 9.0, 9.0)
-    solid = trimesh.Trimesh(vertices, faces, process=False)
-    some = slice(0, 400)
-    peer = -trimesh.proximity.signed_distance(solid, points[some])
-    assert found[some] == pytest.approx(peer, abs=1e-6)
+    offset = np.array([1.0, 2.0, 3.0])
+    bent = vertices @ np.diag([0.2, 3.0, 1.0]) + offset
+    points = np.random.default_rng(2).uniform(-1, 1, (2000, 3)) + offset
+    found = tree.shaped(bent).signed_distance(points, 9.0, 9.0)
+    assert found == pytest.approx(DistanceField(bent, faces).signed_distance(points), abs=2e-6)
 
 
-def test_points_that_are_not_finite_are_out_of_reach() -> None:
+def test_points_that_are_not_finite_are_out_of_reach_and_holes_are_noticed() -> None:
     vertices, faces = _box()
     points = np.array([[0.0, 0, 0], [np.nan, 0, 0], [0, 0, 0.1], [0, np.inf, 0], [0, 0, 0.4]])
     found = SurfaceTree(vertices, faces).shaped(vertices).signed_distance(points, 0.2, 0.3)
     assert found == pytest.approx([-0.25, 0.2, -0.15, 0.2, 0.15], abs=1e-6)
-
-
-def test_a_mesh_with_a_hole_is_not_closed() -> None:
-    vertices, faces = _box()
     assert not SurfaceTree(vertices, faces[1:]).closed
 
 
