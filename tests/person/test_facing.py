@@ -33,31 +33,37 @@ def corrected(damaged: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return fixed, np.linalg.norm(points.points - true, axis=1)
 
 
+SIX = slice(4, 10)
+
+
 @pytest.mark.parametrize(
-    ("sets", "views"),
+    "exchanges",
     [
-        (slice(4, 10), [0, 2, 4]),  # three against three
-        (slice(4, 10), [0, 2, 3, 4]),
-        (slice(4, 10), range(6)),
-        (slice(0, 5), range(6)),  # from the beginning on
-        (slice(0, 11), range(6)),  # most of the time
+        [(SIX, (0, 2, 4), ALL)],  # three views against three
+        [(SIX, (0, 2, 3, 4), ALL)],
+        [(SIX, range(6), ALL)],
+        [(slice(0, 5), range(6), ALL)],  # from the beginning on
+        [(slice(0, 11), range(6), ALL)],  # most of the time
+        [(SIX, range(6), LEGS)],
+        [(SIX, range(6), HANDS)],
+        [(SIX, (2,), np.r_[ARMS, LEGS]), (slice(3, 9), (4,), LEGS), (slice(8, 12), (0,), HANDS)],
     ],
 )
-def test_mirrored_people_are_corrected(clean, sets, views):
+def test_exchanged_people_and_limbs_are_put_back(clean, exchanges):
     damaged = clean.copy()
-    for c in views:
-        damaged[sets, c] = swap_sides(damaged[sets, c])
+    for sets, views, limb in exchanges:
+        for c in views:
+            damaged[sets, c] = swap_sides(damaged[sets, c], limb)
     fixed, error = corrected(damaged)
     np.testing.assert_array_equal(fixed[:, :, ALL], clean[:, :, ALL])
     assert error.max() < 0.03
 
 
-@pytest.mark.parametrize("limb", [LEGS, HANDS], ids=["legs", "hands"])
-def test_limb_exchanged_in_all_views_is_corrected(clean, limb):
-    damaged = clean.copy()
-    damaged[4:10] = swap_sides(damaged[4:10], limb)
-    fixed, _ = corrected(damaged)
-    np.testing.assert_array_equal(fixed[:, :, ALL], clean[:, :, ALL])
+def test_partners_are_an_involution():
+    np.testing.assert_array_equal(PARTNER[PARTNER], np.arange(135))
+    for limb in LIMBS:
+        np.testing.assert_array_equal(np.sort(PARTNER[limb]), np.sort(limb))
+        assert (PARTNER[limb] != limb).all()
 
 
 def test_two_contradicting_views_are_corrected(clean):

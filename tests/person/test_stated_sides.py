@@ -15,22 +15,21 @@ from intercap_core.geometry.camera.triangulation import Triangulation
 from intercap_core.person.sides import (
     LEGS,
     exchange_points,
-    exchange_stated,
     hold_sides,
     images_with_stated_sides,
     swap_sides,
 )
 from intercap_core.schemas import PERSON
 from intercap_core.stages import person
-from tests.helpers.synthetic_capture import ring, write_frames
+from tests.helpers.synthetic_capture import ring, write_frames, write_scene
 from tests.helpers.synthetic_people import seen_by, walking, write_detections
-from tests.stages.test_person import write_scene
 
 RIG, UP = ring()
 T = 8
 BODY = walking(T, np.array([-0.2, 0.1]), np.array([0.01, 0]))
 TRUE = apply(invert(UP), BODY.reshape(-1, 3)).reshape(T, 135, 3)
 NAMES = ("k1", "k2", "k3")
+NO_DEPTH = np.zeros((RIG[0].depth.height, RIG[0].depth.width), np.uint16)
 
 
 def joints(tmp_path, keypoints, *stated: ExchangedSides) -> np.ndarray:
@@ -39,7 +38,7 @@ def joints(tmp_path, keypoints, *stated: ExchangedSides) -> np.ndarray:
     person.run(
         frames=write_frames(tmp_path / "frames.h5", RIG, num_sets=T),
         detections=write_detections(tmp_path / "detections.h5", RIG, people),
-        scene=write_scene(tmp_path / "scene.h5", RIG, T),
+        scene=write_scene(tmp_path / "scene.h5", RIG, np.arange(T) / 15, [NO_DEPTH] * len(RIG)),
         output=tmp_path / "person.h5",
         settings=PersonSettings(segmentation="detector"),
         left_right=stated,
@@ -57,14 +56,6 @@ def test_images_are_those_of_the_stated_frames_and_cameras():
     unknown = [ExchangedSides(start=0, end=1, camera="k9")]
     with pytest.raises(UserError, match=r"left_right\[0\] names camera 'k9'; .* k1, k2, k3"):
         images_with_stated_sides(unknown, NAMES, image_of, "one")
-
-
-def test_exchanging_back_undoes_the_exchange():
-    keypoints = np.random.default_rng(0).normal(size=(2, 3, 135, 3))
-    stated = np.array([[True, False, True], [False, False, True]])
-    wrong = exchange_stated(keypoints, stated)
-    np.testing.assert_array_equal(wrong[stated], swap_sides(keypoints)[stated])
-    np.testing.assert_array_equal(exchange_stated(wrong, stated), keypoints)
 
 
 def test_stated_sides_decide_their_set():
@@ -104,8 +95,8 @@ def test_statement_decides_without_other_evidence(tmp_path):
     assert np.linalg.norm(found[:, shown] - TRUE[:, shown], axis=-1).max() < 0.01
 
 
-@pytest.mark.parametrize("cameras", [(0,), (1, 2, 3, 4)])
-def test_some_cameras_are_exchanged_back(tmp_path, cameras):
+def test_most_cameras_are_exchanged_back(tmp_path):
+    cameras = (1, 2, 3, 4)
     keypoints = seen_by(BODY, RIG, UP)
     for c in cameras:
         keypoints[2:6, c] = swap_sides(keypoints[2:6, c])

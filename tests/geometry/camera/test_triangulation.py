@@ -8,10 +8,7 @@ import pytest
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.geometry.camera.triangulation import midpoints, reproject, triangulate
-from intercap_core.person.sides import ARMS, HANDS, LEGS, LIMBS, PARTNER, swap_sides
-from intercap_core.person.subject_joints import triangulate_people
 from tests.helpers.synthetic_capture import ring
-from tests.helpers.synthetic_people import seen_by, walking
 
 RIG, UP = ring()
 
@@ -96,25 +93,3 @@ def test_limits_scale_with_the_image_size():
     pixels[:, 0] += 15  # 30 px at 1080p
     found = triangulate(pixels, np.ones((50, 6)), half, max_error_px=20)
     assert not found.inlier[:, 0].any() and found.inlier[:, 1:].all()
-
-
-def test_partners_are_an_involution():
-    np.testing.assert_array_equal(PARTNER[PARTNER], np.arange(135))
-    for limb in LIMBS:
-        np.testing.assert_array_equal(np.sort(PARTNER[limb]), np.sort(limb))
-        assert (PARTNER[limb] != limb).all()
-
-
-def test_exchanged_limbs_are_found_and_put_back():
-    truth = walking(20, np.array([-0.2, 0.1]), np.array([0.01, 0.0]))
-    clean = seen_by(truth, RIG, UP)
-    clean[..., :2] += np.random.default_rng(0).normal(0, 2, clean[..., :2].shape)
-    damaged = clean.copy()
-    damaged[5:15, 2] = swap_sides(damaged[5:15, 2], np.r_[ARMS, LEGS])
-    damaged[3:9, 4] = swap_sides(damaged[3:9, 4], LEGS)
-    damaged[8:12, 0] = swap_sides(damaged[8:12, 0], HANDS)
-    fixed, found = triangulate_people(damaged, RIG, min_confidence=0.3, max_error_px=20)
-    limbs = np.r_[ARMS, LEGS, HANDS]
-    np.testing.assert_array_equal(fixed[:, :, limbs], clean[:, :, limbs])
-    expected = apply(invert(UP), truth.reshape(-1, 3))
-    assert np.linalg.norm(found.points - expected, axis=1).max() < 0.03

@@ -7,14 +7,17 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import open3d as o3d
 import trimesh
 
 from intercap_core.body.keypoints import KEYPOINT_NAMES
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.formats.recordings.synchronise import images_of_moments
+from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera, Rig
 from intercap_core.geometry.camera.transforms import apply, invert
+from intercap_core.geometry.rigid.render import render_scene
+from intercap_core.geometry.rigid.shots import Drawable
+from intercap_core.object_track.reduced_mask import reduced_lens
 from intercap_core.scene.background import camera_background
 from tests.helpers.synthetic_capture import (
     FURNITURE,
@@ -79,33 +82,26 @@ class Carrying:
         hand = self.people[t, KEYPOINT_NAMES.index("right_wrist")]
         return hand + np.array([0.10, -0.02, -0.20])
 
-    def _scene(self, t: int) -> o3d.t.geometry.RaycastingScene:
+    def _draw(
+        self, t: int, lens: Intrinsics, zup_from_camera: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Depth (H, W), metres, 0 = nothing, and what it shows (H, W): PERSON, BOX, SCENERY, 0."""
         at = dict(zip(KEYPOINT_NAMES, self.people[t], strict=False))
         rows = list(_BODY)
         for side in ("left", "right"):
             rows += [(f"{side}_{a}", f"{side}_{b}", r) for a, b, r in _LIMBS]
         body = trimesh.util.concatenate([_capsule(at[a], at[b], r) for a, b, r in rows])
-        box = trimesh.creation.box(BOX_M)
-        box.apply_translation(self.box(t))
+        box = trimesh.creation.box(BOX_M).apply_translation(self.box(t))
         stool = trimesh.creation.box(bounds=STOOL)
-        scene = o3d.t.geometry.RaycastingScene(nthreads=1)
         rest = trimesh.util.concatenate([trimesh.creation.box(bounds=b) for b in FURNITURE])
-        for mesh in (body, box, stool, rest):
-            vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-            scene.add_triangles(
-                o3d.core.Tensor(vertices.astype(np.float32)),
-                o3d.core.Tensor(faces.astype(np.uint32)),
-            )
-        return scene
-
-    def _cast(
-        self, t: int, origin: np.ndarray, directions: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Distance in units of ``directions`` (N, 3), z up, inf = nothing; what was hit (N,)."""
-        rays = np.concatenate([np.broadcast_to(origin, directions.shape), directions], 1)
-        hit = self._scene(t).cast_rays(o3d.core.Tensor(np.nan_to_num(rays).astype(np.float32)))
-        what = hit["geometry_ids"].numpy().astype(np.int64)
-        return hit["t_hit"].numpy(), np.where(what < 3, what + 1, 0)
+        scene = [
+            Drawable(np.asarray(mesh.vertices), np.asarray(mesh.faces), invert(zup_from_camera))
+            for mesh in (body, box, stool, rest)
+        ]
+        drawn = render_scene(scene, lens)
+        depth, what = np.zeros((2, lens.height, lens.width))
+        depth[drawn.window], what[drawn.window] = drawn.depth, (drawn.body + 1) % 4
+        return depth, what
 
     @cached_property
     def depths(self) -> list[np.ndarray]:
@@ -115,26 +111,18 @@ class Carrying:
         for camera in self.rig:
             assert camera.depth is not None
             room = room_depth(camera, self.zup_from_master, FURNITURE)
-            pose = self.zup_from_master @ camera.master_from_depth
-            rays = np.dstack([camera.depth.rays, np.ones(room.shape)]).reshape(-1, 3)
             images = []
             for t in range(self.sets):
-                z, _ = self._cast(t, pose[:3, 3], rays @ pose[:3, :3].T)
-                nearest = np.minimum(np.where(room > 0, room, np.inf), z.reshape(room.shape))
-                nearest[~np.isfinite(nearest)] = 0
-                images.append(to_millimetres(nearest, rng))
+                z, _ = self._draw(t, camera.depth, self.zup_from_master @ camera.master_from_depth)
+                nearer = (z > 0) & ((room == 0) | (z < room))
+                images.append(to_millimetres(np.where(nearer, z, room), rng))
             result.append(np.stack(images))
         return result
 
     def true_masks(self, t: int, camera: Camera, step: int) -> np.ndarray:
         """What every ``step``-th colour pixel shows (h, w): PERSON, BOX, SCENERY or 0."""
-        lens = camera.colour
-        pixels = np.stack(
-            np.meshgrid(np.arange(0, lens.width, step), np.arange(0, lens.height, step)), -1
-        )
-        pose = self.zup_from_master @ camera.master_from_colour
-        rays = lens.unproject(pixels.reshape(-1, 2)) @ pose[:3, :3].T
-        return self._cast(t, pose[:3, 3], rays)[1].reshape(pixels.shape[:2])
+        lens = reduced_lens(camera.colour, step)
+        return self._draw(t, lens, self.zup_from_master @ camera.master_from_colour)[1]
 
     def write(self, folder: Path, floor: bool = True) -> tuple[Path, Path]:
         """Frames and scene artefacts; without a ``floor`` neither it nor the vertical is known."""
