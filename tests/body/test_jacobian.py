@@ -76,18 +76,6 @@ def test_every_parameter_moves_skin_and_leaf_joints_no_joint(body: BodyModel) ->
     assert {int(i) for i in still} == ends
 
 
-def test_equals_finite_differences(body64: BodyModel) -> None:
-    vector = random_vector(1, body64.num_parameters, 8, torch.float64)
-    ids = torch.tensor([11, 4711, 8563])
-    analytic = _by_formula(body64, vector, ids)[0, :3]
-    step = 1e-6
-    moves = step * torch.eye(body64.num_parameters, dtype=torch.float64)
-    plus = body64.forward(body64.parameters(vector + moves), vertex_ids=ids).vertices
-    minus = body64.forward(body64.parameters(vector - moves), vertex_ids=ids).vertices
-    numeric = ((plus - minus) / (2 * step)).permute(1, 2, 0)
-    assert (analytic - numeric).abs().max() < 1e-8
-
-
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 0.0099, 0.0101, 1.0, 3.0, math.pi, 4.0])
 def test_left_jacobian_turns_small_changes_into_world_turns(angle: float) -> None:
     axis = torch.tensor([0.6, -0.48, 0.64], dtype=torch.float64)

@@ -12,13 +12,17 @@ import torch
 from intercap_core.body.lemo import FEWEST_FRAMES, LATENT, MotionEncoder
 from intercap_core.errors import UserError
 from tests.helpers.bodies import random_normal
-from tests.helpers.lemo_release import COORDINATES, random_state, write_release
+from tests.helpers.lemo_release import (
+    COORDINATES,
+    SPREAD,
+    random_encoder,
+    random_state,
+    write_release,
+)
 
 
-def _load(folder: Path, dtype: torch.dtype = torch.float64) -> MotionEncoder:
-    files = write_release(folder).lemo_files
-    assert files is not None
-    return MotionEncoder.load(*files, dtype=dtype)
+def _load(folder: Path) -> MotionEncoder:
+    return MotionEncoder.load(*write_release(folder), dtype=torch.float64)
 
 
 def _by_hand(state: dict[str, torch.Tensor], steps: np.ndarray) -> np.ndarray:
@@ -44,16 +48,15 @@ def test_latents_equal_convolutions_in_numpy(tmp_path: Path) -> None:
     steps = random_normal(FEWEST_FRAMES - 1, COORDINATES) * 0.02
     found = _load(tmp_path).latents(steps)
     assert found.shape == (FEWEST_FRAMES - 1, LATENT)
-    expected = _by_hand(random_state(), steps.numpy() / 0.6)
+    expected = _by_hand(random_state(), steps.numpy() / SPREAD)
     np.testing.assert_allclose(found.reshape(expected.shape), expected, atol=1e-9)
 
 
-def test_derivative_with_recomputed_activations_is_exact(tmp_path: Path) -> None:
-    encoder, steps = _load(tmp_path), random_normal(12, COORDINATES) * 0.02
-    along, weight = (
-        random_normal(*shape, seed=k) for k, shape in enumerate([(12, 243), (12, LATENT)])
-    )
+def test_derivative_with_recomputed_activations_is_exact() -> None:
+    encoder, steps = random_encoder(), random_normal(12, COORDINATES) * 0.02
+    along = random_normal(12, COORDINATES)
     _, forward = torch.func.jvp(encoder.latents, (steps,), (along,))
+    weight = random_normal(*forward.shape, seed=1)
     (backward,) = torch.autograd.grad(encoder.latents(steps.requires_grad_()), steps, weight)
     torch.testing.assert_close((forward * weight).sum(), (backward * along).sum())
 
@@ -101,8 +104,7 @@ MISTAKES: dict[str, tuple[Callable[[Path, Path], object], list[str]]] = {
 
 @pytest.mark.parametrize("name", MISTAKES)
 def test_wrong_files_are_reported(name: str, tmp_path: Path) -> None:
-    files = write_release(tmp_path).lemo_files
-    assert files is not None
+    files = write_release(tmp_path)
     spoil, expected = MISTAKES[name]
     spoil(*files)
     with pytest.raises(UserError) as caught:

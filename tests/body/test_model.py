@@ -73,17 +73,6 @@ def test_a_gpu_gives_the_values_and_derivatives_of_the_cpu(full_file: Path) -> N
         assert (found.cpu() - expected).abs().max() < 1e-10
 
 
-def test_shape_columns_of_a_full_file_are_those_of_the_open_body(full_file: Path) -> None:
-    arrays = open_arrays()
-    model = BodyModel.load(full_file, num_betas=300, num_expression=100)
-    params = model.zeros()
-    params.betas[0, 2], params.expression[0, 1] = 1.5, -0.7
-    table = arrays["shapedirs"].astype(np.float32)
-    smile = table[:, :, table.shape[2] // 2 + 1]
-    expected = arrays["v_template"] + 1.5 * table[:, :, 2] - 0.7 * smile
-    assert np.abs(model.forward(params).vertices[0].numpy() - expected).max() < 1e-6
-
-
 def test_parts_of_vertices_and_of_a_batch_equal_the_whole(body: BodyModel) -> None:
     """The shape has one row for all bodies."""
     vector = random_vector(3, body.num_parameters, 2, torch.float32)

@@ -183,7 +183,7 @@ def _vposer(name: str, form: str, file: str) -> Kind:
 
 
 def _make_lemo(folder: Path) -> None:
-    weights, statistics = write_release(folder / "release").lemo_files or (folder, folder)
+    weights, statistics = write_release(folder / "release")
     shutil.copy(weights, folder / "encoder.pkl")
     shutil.copy(statistics, folder / "statistics.npz")
     shutil.rmtree(folder / "release")

@@ -13,23 +13,21 @@ from intercap_core.config import JointSettings
 CHANNELS = (1, 32, 64, 64, 64, 64)
 THIN = (1, 4, 4, 4, 4, 4)
 COORDINATES = 243  # of 81 markers
+SPREAD = 0.6  # standard deviation of each, in the release's statistics
 
 
-def random_encoder(
-    *, bias: float = 0.1, channels: tuple[int, ...] = THIN, spread: float = 0.6
-) -> MotionEncoder:
+def random_encoder(*, bias: float = 0.1) -> MotionEncoder:
     """An encoder in double precision; with few channels it takes little time."""
-    state = random_state(bias=bias, channels=channels)
-    weights = [values.double() for values in state.values()]
+    weights = [values.double() for values in random_state(bias=bias, channels=THIN).values()]
     blocks = [tuple(weights[k : k + 4]) for k in range(0, len(weights), 4)]
-    return MotionEncoder(tuple(blocks), torch.full((COORDINATES,), spread, dtype=torch.float64))
+    return MotionEncoder(tuple(blocks), torch.full((COORDINATES,), SPREAD, dtype=torch.float64))
 
 
 def random_state(
-    seed: int = 0, *, bias: float = 0.1, channels: tuple[int, ...] = CHANNELS
+    *, bias: float = 0.1, channels: tuple[int, ...] = CHANNELS
 ) -> dict[str, torch.Tensor]:
     """An encoder's state: ten convolutions of 3 x 3, biases up to ``bias``."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     state = {}
     for block in range(5):
         sizes = channels[block], channels[block + 1]
@@ -41,16 +39,14 @@ def random_state(
     return state
 
 
-def write_release(
-    folder: Path, state: dict[str, torch.Tensor] | None = None, spread: float = 0.6
-) -> JointSettings:
-    """Write weights and statistics below ``folder``; settings that name it."""
-    settings = JointSettings(lemo=folder)
-    assert settings.lemo_files is not None
-    weights, statistics = settings.lemo_files
+def write_release(folder: Path) -> tuple[Path, Path]:
+    """Write weights and statistics below ``folder``; returns their paths."""
+    files = JointSettings(lemo=folder).lemo_files
+    assert files is not None
+    weights, statistics = files
     for path in (weights, statistics):
         path.parent.mkdir(parents=True, exist_ok=True)
-    torch.save(state or random_state(), weights)
+    torch.save(random_state(), weights)
     mean = np.zeros((1, 1, COORDINATES))
-    np.savez_compressed(statistics, Xmean=mean, Xstd=np.full(COORDINATES, spread))
-    return settings
+    np.savez_compressed(statistics, Xmean=mean, Xstd=np.full(COORDINATES, SPREAD))
+    return files
