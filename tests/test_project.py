@@ -82,7 +82,6 @@ def objects(text: str) -> Edit:
 MISTAKES: list[tuple[Edit, list[str]]] = [
     (remove("config.yaml"), ["config.yaml", "no such file"]),
     (settings("dataset: [\n"), ["config.yaml", "not valid YAML", "line"]),
-    (settings("- a\n"), ["config.yaml", "expected names and values"]),
     (settings("joint: {}\n"), ["config.yaml", "dataset", "required"]),
     (settings("dataset: a b\n"), ["config.yaml", "dataset", "'a b'"]),
     (settings("dataset: x\njiont: {}\n"), ["config.yaml", "jiont", "not permitted"]),
@@ -91,21 +90,12 @@ MISTAKES: list[tuple[Edit, list[str]]] = [
         ["config.yaml", "joint.contact_weight", "greater than or equal to 0", "-1"],
     ),
     (
-        settings("dataset: x\nbody_fit: {cloud_weight: 1.0e+30}\n"),
-        ["config.yaml", "body_fit.cloud_weight", "less than or equal to 1000"],
-    ),
-    (
         settings("dataset: x\nbody_fit: {points_per_frame: 0}\n"),
         ["config.yaml", "body_fit.points_per_frame", "greater than or equal to 200", "found 0"],
     ),
-    (settings("dataset: -x\n"), ["config.yaml", "dataset", "'-x'"]),
     (
         settings("dataset: x\njoint: {contact_weight: .inf}\n"),
         ["config.yaml", "joint.contact_weight", "finite", "inf"],
-    ),
-    (
-        settings("dataset: x\nmetrics: {contact_mm: .nan}\n"),
-        ["config.yaml", "metrics.contact_mm", "finite", "nan"],
     ),
     (
         objects("cup: {mesh: cup.ply, symmetry: {continuous: [{axis: [0, 0, .nan]}]}}\n"),
@@ -147,10 +137,8 @@ MISTAKES: list[tuple[Edit, list[str]]] = [
     (rows("one\ts09\tcup\tr\tc\n"), ["sequences.tsv", "'one'", "subject 's09'", "s01, s02"]),
     (rows("one\ts01\tmug\tr\tc\n"), ["sequences.tsv", "'one'", "object 'mug'", "cup"]),
     (rows("../x\ts01\tcup\tr\tc\n"), ["sequences.tsv", "line 2", "column sequence", "'../x'"]),
-    (rows("a/b\ts01\tcup\tr\tc\n"), ["sequences.tsv", "line 2", "column sequence", "'a/b'"]),
     (rows("..\ts01\tcup\tr\tc\n"), ["sequences.tsv", "line 2", "column sequence", "'..'"]),
     (rows("one\ts01\tcup\tr\n"), ["sequences.tsv", "line 2", "number of columns", "tabs"]),
-    (rows("one\ts01\tcup\tr\tc\td\n"), ["sequences.tsv", "line 2", "number of columns"]),
     (rows("one\ts01\tcup\t\tc\n"), ["sequences.tsv", "line 2", "column recordings", "required"]),
     (
         rows("one\ts01\tcup\tr\tc\n# x\none\ts01\tcup\tr\tc\n"),
@@ -173,30 +161,22 @@ MISTAKES: list[tuple[Edit, list[str]]] = [
         ["sequences.tsv", "line 1", "column 'people' is not known", "keypoints"],
     ),
     (rows("", header=""), ["sequences.tsv", "line 1", "'sequence' is missing"]),
-    (rows("tables\ts01\tcup\tr\tc\n"), ["sequences.tsv", "line 2", "'tables'", "choose"]),
     (rows("recordings\ts01\tcup\tr\tc\n"), ["line 2", "'recordings'", "choose another"]),
     (rows("a b\ts01\tcup\tr\tc\n"), ["line 2", "letters, digits, _ and - only", "'a b'"]),
-    (
-        settings("dataset: x\njoint: {}\njoint: {}\n"),
-        ["config.yaml", "line 3", "'joint' is given twice"],
-    ),
     (
         settings("dataset: x\njoint:\n  ground_weight: 1\n  ground_weight: 2\n"),
         ["config.yaml", "line 4", "'ground_weight' is given twice"],
     ),
-    (settings("[" * 5000), ["config.yaml", "nested too deeply"]),
-    (settings("dataset: 2001-99-99\n"), ["config.yaml", "not valid YAML", "month"]),
+    (settings(f"dataset: x\nobjects: {'x' * 300}\n"), ["config.yaml", "setting objects"]),
+    (rows(f"one\ts01\tcup\t{'x' * 300}\tc\n"), ["line 2", "recordings", "255 bytes a name"]),
+    (rows(f"one\ts01\tcup\t{'y' * (1 << 20)}\tc\n"), ["line 2", "255 bytes a name"]),
     (settings("false\n"), ["config.yaml", "expected names and values"]),
-    (objects("cup: 3\n"), ["objects.yaml", "object 'cup'", "mesh", "found 3"]),
     (objects("cup: false\n"), ["objects.yaml", "object 'cup'", "found False"]),
-    (objects("cup: [mesh]\n"), ["objects.yaml", "object 'cup'", "found ['mesh']"]),
     (objects("cup:\n"), ["objects.yaml", "object 'cup'", "mesh", "required"]),
-    (objects("cup: {mesh: a.ply}\ncup: {mesh: b.ply}\n"), ["line 2", "'cup' is given twice"]),
     (
         lambda folder: (folder / "subjects.tsv").write_text("subject\tgender\ns01\tF\n"),
         ["subjects.tsv", "line 2", "'s01'", "gender", "'F'"],
     ),
-    (objects("cup: {}\n"), ["objects.yaml", "object 'cup'", "mesh", "required"]),
     (objects("cup: {mesh: mug.ply}\n"), ["objects.yaml", "object 'cup'", "mug.ply", "no such"]),
     (
         objects("cup: {mesh: cup.ply, contact_vertices: no.json}\n"),
@@ -228,12 +208,10 @@ def test_mistakes_are_one_error_line(folder: Path, edit: Edit, says: list[str]) 
         ("contact:\n- {part: elbow, start: 1, end: 3}\n", ["contact.0.part", "'elbow'"]),
         ("contact:\n- {part: seat, start: -1, end: 3}\n", ["contact.0.start", "-1"]),
         ("contact:\n- {part: seat, start: true, end: 3}\n", ["contact.0.start", "True"]),
-        ("contact:\n- {part: seat, start: 0, end: '3'}\n", ["contact.0.end", "'3'"]),
         ("contact:\n- {part: seat, start: 0, end: 3.0}\n", ["contact.0.end", "3.0"]),
         ("drop_frames: [true]\n", ["drop_frames.0", "True"]),
         ("floor: [[0, 0, 1], [1, 0, 1]]\n", ["floor", "2 points"]),
         ("floor: [[0, 0, 1], [1, 0, 1], [2, 0, 1]]\n", ["on one line"]),
-        ("floor: [[0, 0, 1], [0, 0, 1], [0, 0, 1]]\n", ["on one line"]),
         ("floor: [[0, 0, 1], [900, 0, 1], [0, 1, 1]]\n", ["floor.1.0", "millimetres", "900"]),
         (
             "object_pose: {frame: 0, rotation_vector: [0, .nan, 0], translation: [0, 0, 1]}\n",
@@ -243,7 +221,6 @@ def test_mistakes_are_one_error_line(folder: Path, edit: Edit, says: list[str]) 
             "object_pose: {frame: 0, rotation_vector: [0, 0, 0], translation: [0, 0, 2400]}\n",
             ["object_pose.translation.2", "millimetres"],
         ),
-        ("object_pose: {frame: 0, translation: [0, 0, 1]}\n", ["rotation_vector", "required"]),
         (
             f"object_poses: [{POSE % 1}, {POSE % 4}, {POSE % 1}]\n",
             ["object_poses[0] and object_poses[2] both describe frame 1"],
@@ -266,28 +243,21 @@ def test_mistakes_are_one_error_line(folder: Path, edit: Edit, says: list[str]) 
         ("left_right: [{start: 3, end: 3}]\n", ["left_right.0", "no frame", "3"]),
         ("left_right: [{start: 0, end: 3, camera: k/1}]\n", ["left_right.0.camera", "letters"]),
         ("left_right: [{end: 3}]\n", ["left_right.0.start", "required"]),
-        ("drop_frames: [x]\n", ["drop_frames.0", "'x'"]),
         ("subject: [{camera: k1, frame: 0, x: 612}]\n", ["subject.0.y", "required"]),
-        ("subject: [{camera: k1, frame: 0, x: .nan, y: 1}]\n", ["subject.0.x", "finite"]),
         ("subject: [{camera: k1, frame: -2, x: 1, y: 1}]\n", ["subject.0.frame", "-2"]),
         ("starts: {k1: 0}\n", ["starts names fewer than two cameras"]),
         ("starts: [0, 1]\n", ["starts", "[0, 1]"]),
         ("starts: {k1: 0, k2: true}\n", ["starts.k2", "True"]),
         ("starts: {k1: 0, k2: '0.4'}\n", ["starts.k2", "'0.4'"]),
-        ("starts: {k1: 0, k2: .inf}\n", ["starts.k2", "finite"]),
         ("starts: {k1: 10:00:12:13, k2: 10:00:12:20}\n", ["starts.k1", "'10:00:12:13'"]),
         ("starts: {k1: 0, k/2: 1}\n", ["starts.k/2", "letters, digits"]),
         ("starts: {k1: 0, k2: {sigma: 1}}\n", ["starts.k2", "seconds", "required"]),
         ("starts: {k1: 0, k2: {seconds: 1, sigma: 0}}\n", ["starts.k2", "sigma", "greater", "0"]),
-        ("starts: {k1: 0, k2: 1}\nstarts_sigma: -1\n", ["starts_sigma", "greater", "-1"]),
         ("starts: {k1: 0, k2: 1}\nstarts_sigma: 20\n", ["starts_sigma", "10", "20"]),
         ("starts_sigma: 0.1\n", ["starts_sigma is set without starts"]),
         ("flor: []\n", ["flor", "not permitted"]),
         ("contact: [\n", ["not valid YAML"]),
-        ("- 1\n", ["expected names and values"]),
         ("false\n", ["expected names and values", "False"]),
-        ("0\n", ["expected names and values", "0"]),
-        ("[]\n", ["expected names and values", "[]"]),
     ],
 )
 def test_broken_annotation_fails_only_its_sequence(
@@ -367,6 +337,8 @@ def test_annotation_past_the_end(folder: Path) -> None:
     who = pose.model_copy(update={"object_pose": None})
     assert who.check_frames(11) is None
     assert "subject[0].frame is 10" in str(who.check_frames(10))
+    assert "all 3 frames" in str(Annotation(drop_frames=(0, 1, 2)).check_frames(3))
+    assert Annotation(drop_frames=(0, 1)).check_frames(3) is None
 
 
 def test_starts_of_cameras_that_are_not_there() -> None:

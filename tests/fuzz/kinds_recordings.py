@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from fractions import Fraction
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-import av
 import cv2
 import numpy as np
 import yaml
@@ -46,6 +43,7 @@ from tests.fuzz.plausible import IMAGE_SIZE, Kind, Notes, within
 from tests.helpers import tiny_onnx, tiny_pose
 from tests.helpers.kinect_files import MODES, make_camera, pose_of, record
 from tests.helpers.release_folders import write_behave, write_intercap
+from tests.helpers.videos import write_video
 
 SIZE = (64, 48)
 RIG = Rig((make_camera(0), make_camera(1)))
@@ -134,33 +132,17 @@ def _read_recording(recording: CameraRecording) -> Any:
         )
 
 
-def _make_video(folder: Path, name: str, codec: str, sound: str) -> None:
-    with av.open(str(folder / name), "w") as container:
-        stream = container.add_stream(codec, rate=10)
-        stream.width, stream.height = SIZE
-        stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
-        audio = container.add_stream(sound, rate=16_000, layout="stereo")
-        for number in range(6):
-            image = np.full((*SIZE[::-1], 3), 20 * number, np.uint8)
-            frame = av.VideoFrame.from_ndarray(image, format="bgr24")
-            frame.pts = number
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-        noise = np.random.default_rng(0).normal(0, 0.1, (2, 9_600)).astype(np.float32)
-        heard = av.AudioFrame.from_ndarray(noise, format="fltp", layout="stereo")
-        heard.sample_rate, heard.time_base, heard.pts = 16_000, Fraction(1, 16_000), 0
-        resampler = av.AudioResampler(format=audio.codec_context.format)
-        for part in [*resampler.resample(heard), None]:
-            container.mux(audio.encode(part))
-
-
 def _video(name: str, codec: str, sound: str) -> Kind:
     def read(folder: Path) -> Any:
         camera = Camera("left", Intrinsics(*SIZE, 50.0, 50.0, 32.0, 24.0), None, None, np.eye(4))
         path = folder / name
         return _read_recording(VideoRecording(path, camera, [], fps=None, offset_s=0.0, times=None))
 
-    make = partial(_make_video, name=name, codec=codec, sound=sound)
+    def make(folder: Path) -> None:
+        shades = [np.full((*SIZE[::-1], 3), 20 * number, np.uint8) for number in range(6)]
+        noise = np.random.default_rng(0).normal(0, 0.1, 9_600)
+        write_video(folder / name, shades, codec, sound=noise, sound_codec=sound)
+
     return Kind(f"video-{name[2:]}", "bytes", make, [name], read)
 
 

@@ -81,11 +81,21 @@ def record(
                 writer.write_depth(image_of(camera, tick), time_us + DEPTH_DELAY_US)
 
 
+def row(
+    recordings: Path, calibration: Path, *, layout: str = "k4a", **columns: object
+) -> SequenceEntry:
+    """Row of a sequence of subject "a" and object "b"."""
+    return SequenceEntry(
+        sequence="s1", subject="a", object="b", layout=layout, recordings=recordings,
+        calibration=calibration, **columns,
+    )  # fmt: skip
+
+
 def entry_of(folder: Path, cameras: int) -> SequenceEntry:
     """Row of the sequence recorded in ``folder``, with a rig file next to it."""
     rig = folder.parent / "rig.json"
     write_rig_file(rig, Extrinsics("k1", {f"k{i + 1}": pose_of(i) for i in range(cameras)}))
-    return SequenceEntry(sequence="s1", subject="a", object="b", recordings=folder, calibration=rig)
+    return row(folder, rig)
 
 
 def run(capture: SequenceEntry, drop=()) -> Path:

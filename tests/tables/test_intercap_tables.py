@@ -21,6 +21,7 @@ from intercap_core.project import load_project
 from intercap_core.stages import frames as frames_stage
 from intercap_core.tables.calibration_choice import choose_calibration
 from intercap_core.tables.intercap import find_stated_calibration
+from tests.helpers.kinect_files import row
 from tests.helpers.release_folders import write_intercap
 from tests.helpers.synthetic_capture import (
     COLOUR,
@@ -120,8 +121,8 @@ def test_the_project_written_is_ready_to_run(release):
     assert genders == {"s01": "male", "s03": "female", "s09": "female"}
     assert [str(fault) for fault in check_sequences(project).faults] == []
     assert "1 sequences of" in output and "have no images" in output
-    for name, row in project.sequences.items():
-        frames_stage.run(sequence=row, output=Path(f"{name}.h5"), settings=project.config.frames)
+    for name, entry in project.sequences.items():
+        frames_stage.run(sequence=entry, output=Path(f"{name}.h5"), settings=project.config.frames)
 
 
 def test_annotations_count_frame_sets(release):
@@ -278,16 +279,12 @@ def rooms(tmp_path: Path, moved: tuple[float, float]) -> tuple[SequenceEntry, di
         recordings, folders[name] = write_intercap(
             tmp_path / "InterCap", rig, calibration=f"calibration_{name}", **given
         )
-    row = SequenceEntry(
-        sequence="s", subject="a", object="b", layout="intercap", recordings=recordings,
-        calibration=folders["first"],
-    )  # fmt: skip
-    return row, folders
+    return row(recordings, folders["first"], layout="intercap"), folders
 
 
 def test_depth_images_decide_an_unstated_calibration(tmp_path, monkeypatch):
-    row, folders = rooms(tmp_path, (0.03, 1.0))
-    choice = choose_calibration(row, folders)
+    sequence, folders = rooms(tmp_path, (0.03, 1.0))
+    choice = choose_calibration(sequence, folders)
     assert choice.best == "third" and choice.residual_m["third"] < 0.7 * choice.residual_m["first"]
     monkeypatch.chdir(tmp_path)
     done = tables("InterCap", "--output", "out", "--objects", str(ROOT / "config/objects.yaml"))
@@ -298,7 +295,7 @@ def test_depth_images_decide_an_unstated_calibration(tmp_path, monkeypatch):
 
 
 def test_equal_calibrations_are_not_decided(tmp_path):
-    row, folders = rooms(tmp_path, (0.0, 0.0))
-    assert choose_calibration(row, folders).best is None
+    sequence, folders = rooms(tmp_path, (0.0, 0.0))
+    assert choose_calibration(sequence, folders).best is None
     (folders["second"] / "Color.json").write_text(json.dumps({}))
-    assert choose_calibration(row, folders).best is None
+    assert choose_calibration(sequence, folders).best is None

@@ -20,8 +20,10 @@ def _moved(x: float) -> list[list[float]]:
     return pose.tolist()
 
 
-def _rig(pose: object = EYE, name: str = "k2") -> str:
-    cameras = {"k1": {"master_from_camera": EYE}, name: {"master_from_camera": pose}}
+def _rig(pose: object = EYE, *names: str) -> str:
+    """The text of a rig file with k1 as master; the other cameras, usually k2, are at ``pose``."""
+    cameras = {"k1": {"master_from_camera": EYE}}
+    cameras |= {name: {"master_from_camera": pose} for name in names or ("k2",)}
     return json.dumps({"master": "k1", "cameras": cameras})
 
 
@@ -35,28 +37,25 @@ def test_a_byte_order_mark_is_skipped(tmp_path: Path) -> None:
     ("content", "words"),
     [
         ("", "not valid JSON"),
-        (b"\xff\xfe{}", "not valid JSON"),
-        ("[" * 100000, "not valid JSON"),
         ("[]", "found list"),
         ("{}", "expected 'master'"),
         ('{"master": "k9", "cameras": {"k1": {}}}', "'k9' is none of the cameras"),
         (_rig(None), "camera 'k2' has no rigid"),
         (_rig([[1, 2], [3]]), "camera 'k2' has no rigid"),
-        (_rig((2 * np.eye(4)).tolist()), "camera 'k2' has no rigid"),
         (_rig(np.diag([1.0, 1, -1, 1]).tolist()), "camera 'k2' has no rigid"),
         (_rig(_moved(np.nan)), "camera 'k2' has no rigid"),
-        (_rig(_moved(np.inf)), "camera 'k2' has no rigid"),
         (_rig([[10**400] * 4] * 4), "camera 'k2' has no rigid"),
         (_rig(_moved(1500.0)), "1500 m.*millimetres"),
-        (_rig(name="../k2"), "rename"),
-        (_rig(name="k 2"), "rename"),
-        (_rig(name=""), "rename"),
-        (_rig(name="k2\n"), "rename"),
+        (_rig(_moved(90.0)), "likely in centimetres"),
+        (_rig(_moved(1.0), "k2", "k3"), "'k2' and 'k3' are in one place"),
+        (_rig(_moved(1.0)).replace("k2", "k1"), "'k1' is given twice"),
+        (_rig(EYE, "../k2"), "rename"),
+        (_rig(EYE, "k2\n"), "rename"),
     ],
 )
-def test_wrong_rig_files_are_refused(tmp_path: Path, content: str | bytes, words: str) -> None:
+def test_wrong_rig_files_are_refused(tmp_path: Path, content: str, words: str) -> None:
     path = tmp_path / "rig.json"
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    path.write_text(content)
     with pytest.raises(UserError, match=words) as caught:
         read_extrinsics(path)
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
@@ -67,7 +66,6 @@ def test_wrong_rig_files_are_refused(tmp_path: Path, content: str | bytes, words
     [
         ({"R": [0, 0, 0]}, "rotation vector 'R'"),
         ({"R": [0, 0], "T": [0, 0, 0]}, "rotation vector 'R'"),
-        ({"R": [0, 0, 10**400], "T": [0, 0, 0]}, "rotation vector 'R'"),
         ({"R": [0, 0, float("nan")], "T": [0, 0, 0]}, "finite"),
         ({"R": [0, 0, 0], "T": [0, float("inf"), 0]}, "finite"),
         ({"R": [0, 0, 0], "T": [0, 1500, 0]}, "1500 m.*millimetres"),

@@ -19,8 +19,12 @@ from intercap_core.formats.calibration.k4a import (
 RADIAL = (0.01, 0.02, 0.03, 0.04, 0.05, 0.06)  # k1 to k6
 
 
-def make_calibration(**changes) -> bytes:
-    """A calibration with round numbers: centre in the middle, focal lengths 0.5 and 0.7."""
+def make_calibration(lens: dict | None = None, sensor: int = 1, **changes) -> bytes:
+    """A calibration with round numbers: centre in the middle, focal lengths 0.5 and 0.7.
+
+    ``lens`` has other parameters by number, ``changes`` other entries of the ``sensor``: 0 for
+    depth, 1 for colour.
+    """
 
     def camera(location, fx, fy, translation):
         return {
@@ -34,8 +38,14 @@ def make_calibration(**changes) -> bytes:
         }
 
     cameras = [camera("D0", 0.5, 0.5, [0, 0, 0]), camera("PV0", 0.6, 0.8, [-0.032, -0.002, 0.004])]
-    cameras[1].update(changes)
+    for number, value in (lens or {}).items():
+        cameras[sensor]["Intrinsics"]["ModelParameters"][number] = value
+    cameras[sensor].update(changes)
     return json.dumps({"CalibrationInformation": {"Cameras": cameras}}).encode()
+
+
+def moved(translation: object) -> bytes:
+    return make_calibration(Rt={"Rotation": np.eye(3).ravel().tolist(), "Translation": translation})
 
 
 def read(content: bytes, colour_mode="1080P", depth_mode="NFOV_UNBINNED"):
@@ -113,6 +123,18 @@ def test_lenses_of_a_real_device_are_32_mm_apart(real_calibration):
         (make_calibration(Location="elsewhere"), "PV0"),
         (make_calibration(Intrinsics={"ModelType": "Other", "ModelParameters": []}), "'Other'"),
         (make_calibration(Rt={"Rotation": [2] * 9, "Translation": [0] * 3}), "rigid"),
+        (b'{"CalibrationInformation": null}', "expected an object"),
+        (make_calibration({2: 10**400}), "finite numbers"),
+        (make_calibration({2: 1e308}), "fx|finite"),
+        (make_calibration({2: 1e-9}), "fx is 1.*e-06 px"),
+        (make_calibration({2: 1e9}, sensor=0), "fx is 1.024e.12 px"),
+        (make_calibration({0: 50}), "cx is"),
+        (make_calibration({4: 1e9}), "distortion"),
+        (make_calibration({12: 5}), "tangential distortion"),
+        (make_calibration(MetricRadius=10**400), "radius|finite"),
+        (moved([10**400, 0, 0]), "rigid"),
+        (moved([1e300, 0, 0]), "rigid|moves"),
+        (moved(0.1), "rigid"),
     ],
 )
 def test_broken_calibrations_are_refused(content, words):

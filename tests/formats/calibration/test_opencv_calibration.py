@@ -186,18 +186,15 @@ def change(path: str, value: object):
     [
         (change("cameras", ...), "expected 'cameras'"),
         (change("master", "front"), "master 'front' is none of the cameras"),
-        (change("master", []), "is none of the cameras"),
         (change("fps", -3), "fps is -3, expected 0.05 to 10000"),
         (change("cameras.left.camera_matrix", ...), "camera 'left': has no camera_matrix"),
         (change("cameras.left.distortion_coefficients", ...), "has no distortion_coefficients"),
         (change("cameras.left.camera_matrix", [[1, 2], [3, 4]]), "camera_matrix is no"),
-        (change("cameras.left.distortion_coefficients", [0] * 12), "has 12 numbers.*thin prism"),
         (change("cameras.left.distortion_coefficients", [0] * 14), "has 14 numbers.*thin prism"),
         (change("cameras.left.distortion_coefficients", [0] * 3), "has 3 numbers, expected 4, 5"),
         (change("cameras.left.distortion_coefficients", ["x"] * 4), "expected finite numbers"),
         (change("cameras.left.image_size", [640, 480]), "principal point 958, 542 is that of"),
         (change("cameras.left.image_size", [1920.5, 1080]), "expected width and height"),
-        (change("cameras.left.image_size", ...), "image_size is"),
         (change("cameras.right.T", ...), "camera 'right': has no pose"),
         (change("cameras.right.T", [2100.0, 0, 0]), "likely in millimetres"),
         (change("cameras.right.R", [[2, 0, 0], [0, 1, 0], [0, 0, 1]]), "R is no rotation"),
@@ -206,8 +203,13 @@ def change(path: str, value: object):
         (change("cameras.right.depth.colour_from_depth", MILLIMETRES), "moves by 32 m"),
         (change("cameras.right.time_offset", "late"), "time_offset is 'late'"),
         (change("cameras.right", 3), "camera 'right': expected a name of"),
+        (change("cameras.left.camera_matrix", [[1e-9, 0, 958], [0, 900, 542], [0, 0, 1]]),
+         "fx is 1e-09 px"),
+        (change("cameras.left.distortion_coefficients", [50, 0, 0, 0]), "camera 'left'.*scales"),
+        (change("cameras.left.distortion_coefficients", [-1e9, 0, 0, 0]), "turns back"),
+        (change("fps", 1e-9), "fps is 1e-09"),
     ],
-)
+)  # fmt: skip
 def test_broken_files_are_refused(tmp_path, content, fault, words):
     fault(content)
     with pytest.raises(UserError, match=words):
@@ -218,7 +220,6 @@ def test_broken_files_are_refused(tmp_path, content, fault, words):
     ("name", "text", "words"),
     [
         ("rig.yaml", "cameras: [", "not valid JSON or YAML"),
-        ("rig.json", "{", "not valid JSON or YAML"),
         ("rig.yaml", "a list", "found str"),
         ("rig.yaml", "cameras: !!python/object:os.system {}", "not valid JSON or YAML"),
     ],

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
 tiny_onnx = pytest.importorskip("tests.helpers.tiny_onnx", exc_type=ImportError)
 
@@ -158,6 +159,77 @@ def test_unusable_models_are_refused(tmp_path, make, words):
     with pytest.raises(UserError, match=words) as caught:
         Segmenter.load(DetectionsSettings(segmentation_model=path))
     assert str(path) in str(caught.value)
+
+
+def constant_rcnn(path, boxes=(10, 10, 90, 90), score=0.9, mask=(HEIGHT, WIDTH)):
+    """A Mask R-CNN that says the same of every image."""
+    graph = tiny_onnx.Graph()
+    outputs = []
+    for name, value, kind in (
+        ("boxes", np.reshape(boxes, (-1, 4)), np.float32),
+        ("labels", np.ones(1), np.int64),
+        ("scores", [score], np.float32),
+        ("masks", np.ones((1, 1, *mask)), np.float32),
+    ):
+        graph.add("Identity", graph.constant(value, kind), name=name)
+        element = onnx.TensorProto.INT64 if kind is np.int64 else onnx.TensorProto.FLOAT
+        outputs.append((name, element, [None] * np.ndim(value)))
+    return graph.save(path, [("image", onnx.TensorProto.FLOAT, [3, "height", "width"])], outputs)
+
+
+@pytest.mark.parametrize(
+    ("outputs", "words"),
+    [
+        ({}, None),
+        ({"score": 50.0}, "scores up to 50"),
+        ({"boxes": [10, np.nan, 90, 90]}, "no numbers"),
+        ({"mask": (0, 0)}, "outputs"),
+        ({"mask": (1, 40_000)}, "outputs"),
+    ],
+)
+def test_impossible_outputs_are_refused(tmp_path, outputs, words):
+    model = constant_rcnn(tmp_path / "model.onnx", **outputs)
+    settings = DetectionsSettings(segmentation_model=model)
+    if words is None:
+        assert len(found(settings, [picture()[0]])[0]) == 1
+        return
+    with pytest.raises(UserError, match=rf"model\.onnx: .*{words}"):
+        found(settings, [picture()[0]])
+
+
+def huge_input(*shape):
+    def change(model):
+        for axis, length in zip(
+            model.graph.input[0].type.tensor_type.shape.dim, shape, strict=True
+        ):
+            axis.dim_value = length
+
+    return change
+
+
+def external_data(model):
+    constant = model.graph.initializer[0]
+    constant.data_location = onnx.TensorProto.EXTERNAL
+    length = len(constant.raw_data)
+    constant.ClearField("raw_data")
+    for key, value in (("location", "/dev/zero"), ("offset", "0"), ("length", str(length))):
+        constant.external_data.add(key=key, value=value)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        huge_input(1, 3, 40_000, 40_000), huge_input(1, 3, 10**9, 10**9),
+        huge_input(10**9, 3, 64, 64), external_data,
+    ],
+)  # fmt: skip
+def test_models_that_would_fill_the_memory_are_refused(tmp_path, change):
+    path = tiny_onnx.yolo(tmp_path / "model.onnx", (160, 160), NAMES)
+    model = onnx.load(path)
+    change(model)
+    path.write_bytes(model.SerializeToString())
+    with pytest.raises(UserError, match=r"model\.onnx"):
+        found(DetectionsSettings(segmentation_model=path), [picture()[0]])
 
 
 def test_a_missing_device_is_refused(tmp_path):

@@ -64,22 +64,6 @@ def zero_depth(folder: Path) -> None:
     record(folder, 1, range(TICKS), image_of=lambda camera, tick: 0 * depth_at(camera, tick))
 
 
-def died(folder: Path) -> None:
-    record(folder, 1, range(TICKS // 2))
-
-
-def cut_short(folder: Path) -> None:
-    content = (folder / "k2.mkv").read_bytes()
-    (folder / "k2.mkv").write_bytes(content[: len(content) // 2])
-
-
-def overwritten_middle(folder: Path) -> None:
-    content = bytearray((folder / "k2.mkv").read_bytes())
-    middle = len(content) // 2
-    content[middle : middle + 300_000] = bytes(300_000)
-    (folder / "k2.mkv").write_bytes(content)
-
-
 def stays(missing=(), depth=True, count=TICKS):
     """Which of a camera's ticks the sets hold: all but ``missing``."""
     return {"ticks": [t for t in range(count) if t not in missing], "depth": depth}
@@ -88,16 +72,11 @@ def stays(missing=(), depth=True, count=TICKS):
 @pytest.mark.parametrize(
     ("fault", "camera", "words", "kept"),
     [
-        (same_serial, 1, "k2.mkv and k3.mkv have the same serial number 1", stays()),
         (same_serial, 2, "k2.mkv and k3.mkv have the same serial number 1", stays()),
-        (copied, 1, "k2.mkv and k3.mkv hold the same images", stays()),
         (copied, 2, "k2.mkv and k3.mkv hold the same images", stays(missing=range(TICKS))),
         (zero_depth, 1, "depth is zero in all 12 images", stays(depth=False)),
-        (died, 1, "ends 6 frame sets early", stays(missing=range(6, 12))),
-        (with_clock(1, 7, 500_000), 1, "jump back 1 times: 5 images", stays(range(7, 12))),
         (with_clock(1, 4, 500_000), 1, "jump back 1 times: 8 images", stays(range(4, 12))),
         (with_clock(1, 7, 3_150_000), 1, "jump back 1 times: 5 images", stays(range(7, 12))),
-        (with_clock(1, 5, 3_000_000), 1, "jump back 1 times: 7 images", stays(range(5, 12))),
         (with_clock(0, 7, 500_000), 0, "jump back 1 times: 5 images", stays(range(7, 12))),
         (one_wrong_time, 1, "1 images with device times out of order", stays(missing=[5])),
     ],
@@ -105,7 +84,9 @@ def stays(missing=(), depth=True, count=TICKS):
 def test_a_faulty_camera_does_not_affect_the_others(capture, fault, camera, words, kept):
     fault(capture.recordings)
     output = run(capture)
-    assert words in notes_of(output)[f"k{camera + 1}"]
+    notes = notes_of(output)
+    for name in ("k2", "k3") if fault in (same_serial, copied) else (f"k{camera + 1}",):
+        assert words in notes[name]
     with Frames.open(output) as frames:
         assert frames.num_sets == TICKS
         assert np.allclose(np.diff(frames.time_s), PERIOD_US * 1e-6, atol=5e-4)
@@ -138,9 +119,12 @@ def test_if_all_clocks_reset_the_longer_epoch_is_kept(capture):
         assert frames.colour_jpeg(0, 1) == jpeg_at(1, 4)
 
 
-@pytest.mark.parametrize("fault", [cut_short, overwritten_middle])
-def test_a_damaged_file_gives_its_readable_images(capture, fault):
-    fault(capture.recordings)
+def test_a_damaged_file_gives_its_readable_images(capture):
+    path = capture.recordings / "k2.mkv"
+    content = bytearray(path.read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 300_000] = bytes(300_000)
+    path.write_bytes(content)
     output = run(capture)
     assert notes_of(output)["k2"] != "" and notes_of(output)["k1"] == ""
     with Frames.open(output) as frames:
@@ -166,16 +150,6 @@ def test_hidden_files_are_ignored(capture):
         assert frames.rig.names == ("k1", "k2", "k3") and frames.available.all()
 
 
-def test_a_gap_of_all_cameras_is_noted(capture):
-    for camera in range(3):
-        record(capture.recordings, camera, [t for t in range(TICKS) if t not in (5, 6, 9)])
-    output = run(capture)
-    expected = "no camera has an image for 3 periods in 2 places, the first after frame set 4"
-    assert expected in notes_of(output)["k1"]
-    with Frames.open(output) as frames:
-        assert frames.num_sets == TICKS - 3 and frames.available.all()
-
-
 def test_a_drifting_clock_is_followed_and_noted(capture):
     def time(tick: int) -> int:
         return 3_000_000 + round(tick * PERIOD_US * 1.008)
@@ -194,25 +168,6 @@ def test_a_clock_off_by_more_than_the_window_is_noted(capture):
     assert expected in notes_of(output)["k3"]
     with Frames.open(output) as frames:
         assert frames.num_sets == TICKS and not frames.available[:, 2].any()
-
-
-def test_delays_that_jitter_and_unequal_counts_are_normal(capture):
-    rng = np.random.default_rng(3)
-    late = {c: rng.integers(-3000, 3000, TICKS) for c in range(3)}
-    lost = {0: {3}, 1: {0, 7}, 2: {11}}
-    for c in range(3):
-        ticks = [t for t in range(TICKS) if t not in lost[c]]
-        record(
-            capture.recordings, c, ticks,
-            times_us=lambda tick, c=c: 3_010_000 + tick * PERIOD_US + int(late[c][tick]),
-        )  # fmt: skip
-    with Frames.open(run(capture)) as frames:
-        assert frames.num_sets == TICKS
-        for c in range(3):
-            assert set(np.flatnonzero(~frames.available[:, c])) == lost[c]
-            for t in np.flatnonzero(frames.available[:, c]):
-                assert frames.colour_jpeg(t, c) == jpeg_at(c, t)
-                assert np.array_equal(frames.depth(t, c), depth_at(c, t))
 
 
 @pytest.mark.parametrize(

@@ -66,6 +66,9 @@ def test_noise_is_no_image():
         encoded_size(bytes(damaged))  # some size or none, never an exception
     assert encoded_size(b"") is None and encoded_size(b"\xff\xd8\xff\xd9") is None
     assert encoded_size(rng.bytes(100)) is None
+    scan = jpeg.index(b"\xff\xda")
+    assert encoded_size(jpeg[:scan] + b"\xff\xd9") is None
+    assert encoded_size(jpeg[: scan + 14] + b"\xff\xd9") is None
 
 
 def test_encoding_changes_little():

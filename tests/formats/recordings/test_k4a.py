@@ -14,8 +14,11 @@ import pytest
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.k4a import read_calibration
 from intercap_core.formats.recordings.k4a import KinectFile, parse_imu_samples
+from intercap_core.studio.calibration import write_calibration
 from intercap_core.studio.mkv import MkvWriter
+from tests.helpers.kinect_files import MODES, make_camera
 
+CALIBRATION = write_calibration(make_camera(0), serial="1", **MODES)
 MASTERS = {0x18538067, 0x1F43B675, 0xA0, 0x1941A469, 0x61A7}  # elements that hold elements
 
 
@@ -102,11 +105,12 @@ def write(path: Path, frames: int = 5, **changes) -> Path:
         serial="1", start_offset_ns=2_000_000_000,
     )  # fmt: skip
     jpeg = cv2.imencode(".jpg", np.full((720, 1280, 3), 99, np.uint8))[1].tobytes()
-    with MkvWriter(path, **(options | changes)) as writer:
+    options |= changes
+    with MkvWriter(path, **options) as writer:
         for index in range(frames):
-            time_us = 2_000_000 + index * 33_333
+            time_us = options["start_offset_ns"] // 1000 + index * 33_333
             writer.write_colour(jpeg, time_us)
-            if (options | changes)["depth_mode"]:
+            if options["depth_mode"]:
                 writer.write_depth(np.full((288, 320), index, np.uint16), time_us)
     return path
 
@@ -166,6 +170,10 @@ def another_video(path: Path, whole: bytes) -> None:
         container.mux(stream.encode())
 
 
+def tagged(**times_ns):
+    return lambda path, whole: write(path, calibration_json=CALIBRATION, **times_ns)
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [
@@ -177,8 +185,13 @@ def another_video(path: Path, whole: bytes) -> None:
         (lambda path, whole: write(path, calibration_json=None), "holds no calibration.json"),
         (lambda path, whole: path.write_bytes(whole.replace(b"COLOR", b"COL0R")), "no COLOR track"),
         (another_video, "no COLOR track"),
+        (tagged(start_offset_ns=10**398), "tag K4A_START_OFFSET_NS is .*expected nanoseconds"),
+        (tagged(start_offset_ns=(1 << 63) * 1000), "tag K4A_START_OFFSET_NS"),
+        (tagged(depth_delay_ns=10**29), "tag K4A_DEPTH_DELAY_NS"),
+        (tagged(subordinate_delay_ns=10**12, wired_sync_mode="SUBORDINATE"),
+         "tag K4A_SUBORDINATE_DELAY_NS"),
     ],
-)
+)  # fmt: skip
 def test_unusable_files_are_refused(tmp_path, make, words):
     whole = write(tmp_path / "whole.mkv").read_bytes()
     path = tmp_path / "k1.mkv"

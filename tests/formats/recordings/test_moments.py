@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -9,14 +11,28 @@ from intercap_core.errors import UserError
 from intercap_core.formats.detections.read import Detections
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.formats.recordings.synchronise import images_of_moments
-from tests.helpers.fitted_capture import Capture, make_capture
+from tests.helpers.synthetic_capture import ring, write_frames
+from tests.helpers.synthetic_people import stick_person, write_detections
 
 SETS, LATE = 5, 2
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory) -> Capture:
-    return make_capture(tmp_path_factory.mktemp("moments"), total=SETS)
+def capture(tmp_path_factory) -> dict[str, Path]:
+    """Frames and detections of three cameras; each set has another depth, person and mask."""
+    folder = tmp_path_factory.mktemp("moments")
+    rig = ring(3)[0]
+    paths = {stage: folder / f"{stage}.h5" for stage in ("frames", "detections")}
+    lens = rig[0].depth
+    depths = [np.full((lens.height, lens.width), 1000 + t, np.uint16) for t in range(SETS)]
+    jpegs = [b"image %d" % t for t in range(SETS)]
+    write_frames(
+        paths["frames"], rig, num_sets=SETS, depths=[np.stack(depths)] * 3, colours=[jpegs] * 3
+    )
+    people = [[[stick_person() + t]] * 3 for t in range(SETS)]
+    cups = {(t, c): [("cup", b"mask %d" % t)] for t in range(SETS) for c in range(3)}
+    write_detections(paths["detections"], rig, people, cups)
+    return paths
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +45,7 @@ def image_of() -> np.ndarray:
 
 def test_a_slipped_image_is_read_at_the_moment_it_shows(capture, image_of):
     assert image_of[:, 1].tolist() == [0, 1, 2, -1, -1]
-    with Frames.open(capture.paths["frames"]) as images:
+    with Frames.open(capture["frames"]) as images:
         shown = images.showing(np.roll(image_of, 1, axis=0))
         assert shown.depth_available[:, 1].tolist() == [False, True, True, True, False]
         assert shown.depth(4, 1) is None and shown.colour(0, 1) is None
@@ -39,7 +55,7 @@ def test_a_slipped_image_is_read_at_the_moment_it_shows(capture, image_of):
 
 
 def test_detections_go_with_their_image(capture, image_of):
-    found = Detections.load(capture.paths["detections"])
+    found = Detections.load(capture["detections"])
     shown = found.showing(np.roll(image_of, 1, axis=0))
     assert len(shown.people(4, 1)) == 0 and shown.candidates(0, 1) == []
     assert not shown.candidates_found[0, 1]
@@ -50,9 +66,9 @@ def test_detections_go_with_their_image(capture, image_of):
 
 def test_moments_of_another_recording_are_refused(capture):
     with (
-        Frames.open(capture.paths["frames"]) as images,
+        Frames.open(capture["frames"]) as images,
         pytest.raises(UserError, match="re-run stage 'scene'"),
     ):
         images.showing(np.zeros((SETS + 1, 3), np.int32))
     with pytest.raises(UserError, match="the scene artefact 5 of 2"):
-        Detections.load(capture.paths["detections"]).showing(np.zeros((SETS, 2), np.int32))
+        Detections.load(capture["detections"]).showing(np.zeros((SETS, 2), np.int32))

@@ -11,13 +11,11 @@ from intercap_core.config_types import LayoutName
 from intercap_core.entries import SequenceEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.layouts import INPUTS, input_files, open_layout
+from tests.helpers.kinect_files import row
 
 
 def entry(folder: Path, layout: str) -> SequenceEntry:
-    return SequenceEntry(
-        sequence="s", subject="a", object="b", recordings=folder, layout=layout,
-        calibration=folder / "calibration.json",
-    )  # fmt: skip
+    return row(folder, folder / "calibration.json", layout=layout)
 
 
 FILES = [

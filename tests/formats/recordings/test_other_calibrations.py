@@ -17,6 +17,7 @@ from intercap_core.formats.recordings.layouts import open_layout
 from intercap_core.geometry.camera.transforms import invert, rigid
 from intercap_core.stages import frames
 from tests.helpers import other_calibrations as written
+from tests.helpers.kinect_files import row
 
 SIZE = (64, 48)
 MATRIX = np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
@@ -41,14 +42,11 @@ def recording(tmp_path: Path) -> Path:
 
 
 def entry(folder: Path, calibration: Path, **columns: object) -> SequenceEntry:
-    return SequenceEntry(
-        sequence="s1", subject="a", object="b", layout=columns.pop("layout", "plain"),
-        recordings=folder / "recordings", calibration=calibration, **columns,
-    )  # fmt: skip
+    return row(folder / "recordings", calibration, **({"layout": "plain"} | columns))
 
 
-def read(folder: Path, row: SequenceEntry) -> Frames:
-    frames.run(sequence=row, output=folder / "frames.h5", settings=FramesSettings())
+def read(folder: Path, sequence: SequenceEntry) -> Frames:
+    frames.run(sequence=sequence, output=folder / "frames.h5", settings=FramesSettings())
     return Frames.open(folder / "frames.h5")
 
 
@@ -61,12 +59,14 @@ def test_easymocap_without_sizes_uses_those_of_the_images(recording):
         assert np.isnan(source.stated_up).all() and np.isnan(source.stated_floor).all()
 
 
-@pytest.mark.parametrize("axis", ["x", "-x", "y", "-y", "z", "-z"])
+@pytest.mark.parametrize("axis", ["-x", "y", "z"])
 def test_up_and_floor_are_in_the_frame_of_the_master(recording, axis):
     path = written.write_colmap(recording, VIEWS, metres=0.25, binary=True)
-    row = entry(recording, path, calibration_scale=0.25, calibration_up=axis, calibration_floor=0.3)
+    sequence = entry(
+        recording, path, calibration_scale=0.25, calibration_up=axis, calibration_floor=0.3
+    )
     up = np.eye(3)["xyz".index(axis[-1])] * (-1 if axis[0] == "-" else 1)
-    with read(recording, row) as source:
+    with read(recording, sequence) as source:
         np.testing.assert_allclose(source.stated_up, LEVEL @ up, atol=1e-9)
         world = invert(VIEWS["a"].camera_from_world) @ [*source.stated_floor, 1]
         np.testing.assert_allclose(world[:3], 0.3 * up, atol=1e-9)
@@ -89,9 +89,9 @@ def test_of_kinects_only_the_poses_are_read(tmp_path):
 def test_a_scale_for_a_form_in_metres_is_refused(tmp_path, layout):
     (tmp_path / "recordings").mkdir()
     (tmp_path / "rig.json").write_text("{}")
-    row = entry(tmp_path, tmp_path / "rig.json", layout=layout, calibration_scale=0.001)
+    sequence = entry(tmp_path, tmp_path / "rig.json", layout=layout, calibration_scale=0.001)
     with pytest.raises(UserError, match="is in metres, yet column calibration_scale"):
-        open_layout(row)
+        open_layout(sequence)
 
 
 def test_impossible_columns_are_refused(tmp_path):

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
-import av
 import numpy as np
 import pytest
 from scipy import signal
@@ -24,6 +23,7 @@ from intercap_core.formats.recordings.video import read_sound
 from intercap_core.schemas import FRAMES
 from intercap_core.stages import frames
 from tests.helpers.plain_capture import plain_entry, write_rig
+from tests.helpers.videos import SOUND_HZ, write_video
 
 FPS, SIZE = 10, (96, 64)
 
@@ -72,7 +72,7 @@ def test_a_track_that_is_shifted_by_whole_samples(late):
     assert back is not None and back.seconds == pytest.approx(-found.seconds, abs=0.0003)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("seconds", [3.0, 8.0])
 def test_steps_in_a_room_with_noise(seed, seconds):
     late = np.random.default_rng(seed).uniform(-1, 1)
@@ -135,31 +135,13 @@ def test_starts_of_several_cameras():
     assert np.isnan(sound_starts([tracks[0], tracks[4]])[0]).all()
 
 
-def write_video(
-    path: Path, samples: np.ndarray | None, *, codec: str = "aac", sound_from_s: float = 0.0
-) -> None:
-    """Two seconds and more of grey images, and sound that begins so long after the first one."""
-    seconds = 2.0 if samples is None else max(2.0, len(samples) / 16_000 + sound_from_s)
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("mpeg4", rate=FPS)
-        stream.width, stream.height = SIZE
-        stream.pix_fmt = "yuv420p"
-        if samples is not None:
-            audio = container.add_stream(codec, rate=16_000, layout="stereo")
-        for number in range(round(seconds * FPS)):
-            image = np.full((SIZE[1], SIZE[0], 3), number + 9 * len(path.stem), np.uint8)
-            frame = av.VideoFrame.from_ndarray(image, format="bgr24")
-            frame.pts = number
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-        if samples is not None:
-            both = np.stack([samples, samples]).astype(np.float32)
-            heard = av.AudioFrame.from_ndarray(both, format="fltp", layout="stereo")
-            heard.sample_rate, heard.time_base = 16_000, Fraction(1, 16_000)
-            heard.pts = round(sound_from_s * 16_000)
-            resampler = av.AudioResampler(format=audio.codec_context.format)
-            for part in [*resampler.resample(heard), None]:
-                container.mux(audio.encode(part))
+def write_grey(path: Path, samples: np.ndarray | None, **options: Any) -> None:
+    """Two seconds and more of grey images, with the sound ``samples`` if they are given."""
+    begins = options.get("sound_from_s", 0.0)
+    seconds = 2.0 if samples is None else max(2.0, len(samples) / SOUND_HZ + begins)
+    shades = range(9 * len(path.stem), 9 * len(path.stem) + round(seconds * FPS))
+    images = (np.full((SIZE[1], SIZE[0], 3), shade, np.uint8) for shade in shades)
+    write_video(path, images, fps=FPS, sound=samples, **options)
 
 
 @pytest.mark.parametrize(
@@ -170,7 +152,7 @@ def test_sound_and_images_share_a_clock(tmp_path, name, codec, begins):
     """A click 1 s into the sound."""
     samples = np.random.default_rng(1).normal(0, 1e-4, 48_000)
     samples[16_000:16_080] = 0.8 * np.sin(np.arange(80))
-    write_video(tmp_path / name, samples, codec=codec, sound_from_s=begins)
+    write_grey(tmp_path / name, samples, sound_codec=codec, sound_from_s=begins)
     sound = read_sound(tmp_path / name, 0.0)
     assert sound is not None and sound.samples.dtype == np.float32
     assert len(sound.samples) == pytest.approx(3 * SOUND_RATE, abs=1100)
@@ -181,25 +163,11 @@ def test_sound_and_images_share_a_clock(tmp_path, name, codec, begins):
 
 
 def test_files_without_sound(tmp_path):
-    write_video(tmp_path / "quiet.mp4", None)
+    write_grey(tmp_path / "quiet.mp4", None)
     assert read_sound(tmp_path / "quiet.mp4", 0.0) is None
     (tmp_path / "none.mp4").write_bytes(b"no video")
     assert read_sound(tmp_path / "none.mp4", 0.0) is None
     assert read_sound(tmp_path / "missing.mp4", 0.0) is None
-
-
-def test_damaged_sound_is_read_in_part(tmp_path):
-    path = tmp_path / "a.mkv"
-    write_video(path, np.random.default_rng(1).normal(0, 0.2, 48_000), codec="pcm_s16le")
-    content = bytearray(path.read_bytes())
-    for at in np.random.default_rng(2).integers(len(content) // 3, len(content), 400):
-        content[at] ^= 0xFF
-    path.write_bytes(bytes(content))
-    sound = read_sound(path, 0.0)
-    assert sound is None or np.isfinite(sound.samples).all()
-    path.write_bytes(bytes(content)[: len(content) // 2])
-    sound = read_sound(path, 0.0)
-    assert sound is None or len(sound.samples) < 3.2 * SOUND_RATE
 
 
 def test_frames_hold_the_starts_by_sound(tmp_path):
@@ -210,7 +178,7 @@ def test_frames_hold_the_starts_by_sound(tmp_path):
     for name, start in (("left", 0.0), ("right", 0.7)):
         (folder / name).rmdir()
         begin = round((0.4 + start) * 16_000)
-        write_video(folder / f"{name}.mp4", 0.3 * sound[begin : begin + 64_000])
+        write_grey(folder / f"{name}.mp4", 0.3 * sound[begin : begin + 64_000])
     row = plain_entry(tmp_path)
     frames.run(sequence=row, output=tmp_path / "frames.h5", settings=FramesSettings())
     with Frames.open(tmp_path / "frames.h5") as source:
@@ -229,7 +197,7 @@ def test_first_images_are_on_the_clock_of_the_sets(tmp_path):
     for name, first in (("left", 5.0), ("right", 5.3)):
         (tmp_path / "recordings" / name).rmdir()
         path = tmp_path / "recordings" / f"{name}.mp4"
-        write_video(path, None)
+        write_grey(path, None)
         times = [f"{first + n / FPS:.6f}\n" for n in range(20)]
         path.with_name(f"{name}_timestamps.csv").write_text("".join(times))
     frames.run(
