@@ -39,18 +39,6 @@ def _patched(path: Path, text: str, **changes: object) -> str:
     return document.patched(document.read(path), changes)
 
 
-def test_comments_and_order_stay_where_a_value_changes(path: Path) -> None:
-    contact = [
-        {"part": "seat", "start": 1, "end": 5},
-        {"part": "back", "start": 1, "end": 4},
-        {"part": "any", "start": 8, "end": 9},
-    ]
-    new = _patched(path, WRITTEN, contact=contact)
-    assert new == WRITTEN.replace("end: 4\n# between", "end: 5\n# between").replace(
-        "end: 4 # late\n", "end: 4 # late\n- {part: any, start: 8, end: 9}\n"
-    )
-
-
 def test_a_section_that_stays_is_not_touched(path: Path) -> None:
     text = EXAMPLE.read_text()
     new = _patched(path, text, drop_frames=[17, 18, 40])
@@ -196,17 +184,6 @@ def test_removing_an_aliased_value_is_refused(path: Path) -> None:
     with pytest.raises(UserError, match="change it in an editor"):
         _patched(path, text, floor=[[0, 0, 2], [1, 0, 2], [0, 1, 2]])
     assert path.read_text() == text
-
-
-def test_empty_contact_differs_from_missing_contact(path: Path) -> None:
-    new = _patched(path, WRITTEN, contact=[])
-    assert Annotation.model_validate(yaml.safe_load(new)).contact == ()
-    assert "# looked at twice" in new and "# the end" in new
-    path.write_text(new)
-    assert document.read(path).sections == {"contact": [], "drop_frames": [3, 4]}
-    again = _patched(path, new, contact=None)
-    assert Annotation.model_validate(yaml.safe_load(again)).contact is None
-    assert _patched(path, "# mine\n", contact=[]) == "# mine\n\ncontact: []\n"
 
 
 def test_only_an_empty_contact_section_is_a_statement(path: Path) -> None:

@@ -91,19 +91,6 @@ def test_a_run_that_fails_says_why(project: Project, monkeypatch: pytest.MonkeyP
     assert progress["state"] == "failed" and "another run is going on" in progress["message"]
 
 
-def test_one_run_at_a_time_and_it_can_be_stopped(
-    project: Project, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _pretend(monkeypatch, "import time; time.sleep(60)")
-    runs = rerun.RunManager()
-    runs.start(project, NAME)
-    with pytest.raises(UserError, match="in progress"):
-        runs.start(project, NAME)
-    runs.stop()
-    _wait_for_end(runs)
-    assert not runs.in_progress and runs.progress(project)["state"] == "stopped"
-
-
 def test_stopping_a_run_does_not_wait_and_signals_once(
     project: Project, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -31,96 +31,102 @@ def page(settings: Path) -> Iterator[Served]:
         yield server
 
 
-def test_the_list_and_a_sequence_are_served(page: Served) -> None:
-    rows = page.json("sequences")["sequences"]
+@pytest.fixture(scope="module")
+def still(made: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """The page of one copy of the project, for requests that change nothing."""
+    with served(copied(made, tmp_path_factory.mktemp("still") / "project")) as server:
+        yield server
+
+
+def test_the_list_and_a_sequence_are_served(still: Served) -> None:
+    rows = still.json("sequences")["sequences"]
     assert [row["name"] for row in rows] == [NAME] and not rows[0]["annotated"]
-    answer = page.json(OF)
+    answer = still.json(OF)
     assert answer["frames"] == 6 and answer["object"] == "football" and answer["viewer"]
     assert [entry["name"] for entry in answer["cameras"]] == ["k1", "k2", "k3"]
     assert answer["annotation"]["digest"] == "none"
 
 
-def test_images_come_as_large_as_they_are_shown(page: Served) -> None:
+def test_images_come_as_large_as_they_are_shown(still: Served) -> None:
     for asked, wide in ((200, 240), (300, 320), (4000, 480)):
-        status, data = page.get(f"/api/{OF}/image/k1/2?width={asked}")
+        status, data = still.get(f"/api/{OF}/image/k1/2?width={asked}")
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         assert status == 200 and image.shape[1] == wide
-    assert page.get(f"/api/{OF}/image/k1/99?width=240")[0] == 422
-    assert page.get(f"/api/{OF}/image/k9/0?width=240")[0] == 422
+    assert still.get(f"/api/{OF}/image/k1/99?width=240")[0] == 422
+    assert still.get(f"/api/{OF}/image/k9/0?width=240")[0] == 422
 
 
-def test_the_objects_poses_are_the_joint_fits(page: Served, settings: Path) -> None:
-    _, data = page.get(f"/api/{OF}/object")
+def test_the_objects_poses_are_the_joint_fits(still: Served, made: Path) -> None:
+    _, data = still.get(f"/api/{OF}/object")
     _, arrays = unpacked(base64.b64encode(data).decode())
-    with h5py.File(artefact(settings, "joint")) as joint:
+    with h5py.File(artefact(made, "joint")) as joint:
         assert np.allclose(arrays["poses/joint"][:, :, 3], joint["translation"][:], atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["..", "../../etc/passwd", "%2e%2e", "nobody", "a/b"])
-def test_only_sequences_of_the_table_are_known(page: Served, name: str) -> None:
-    assert page.get(f"/api/sequences/{name}")[0] in (404, 405)
-    assert page.get(f"/page/{name}/config.yaml")[0] == 404
+def test_only_sequences_of_the_table_are_known(still: Served, name: str) -> None:
+    assert still.get(f"/api/sequences/{name}")[0] in (404, 405)
+    assert still.get(f"/page/{name}/config.yaml")[0] == 404
 
 
-def test_the_server_refuses_requests_without_token(page: Served) -> None:
-    assert page.get("/api/sequences", **{"x-intercap-token": ""})[0] == 401
-    assert page.get("/", host="evil.example")[0] == 400
-    assert page.get("/")[0] == 200
+def test_the_server_refuses_requests_without_token(still: Served) -> None:
+    assert still.get("/api/sequences", **{"x-intercap-token": ""})[0] == 401
+    assert still.get("/", host="evil.example")[0] == 400
+    assert still.get("/")[0] == 200
 
 
-def test_an_edit_is_checked_as_it_is_typed(page: Served) -> None:
+def test_an_edit_is_checked_as_it_is_typed(still: Served) -> None:
     contact = [{"part": "right_hand", "start": 1, "end": 9}]
-    _, answer = page.post(f"{OF}/check", {"changes": {"contact": contact}})
+    _, answer = still.post(f"{OF}/check", {"changes": {"contact": contact}})
     assert answer["faults"] == [
         {"where": "contact", "message": "contact[0].end is 9, the recording has 6 frames"}
     ]
     contact[0]["end"] = 4
-    _, answer = page.post(f"{OF}/check", {"changes": {"contact": contact}})
+    _, answer = still.post(f"{OF}/check", {"changes": {"contact": contact}})
     assert (
         not answer["faults"] and "+  - {part: right_hand, start: 1, end: 4}" in answer["difference"]
     )
-    _, answer = page.post(f"{OF}/check", {"changes": {"contact": [{"part": "tail"}]}})
+    _, answer = still.post(f"{OF}/check", {"changes": {"contact": [{"part": "tail"}]}})
     assert answer["faults"][0]["where"].startswith("contact.0")
 
 
 _PLACE = {"rotation_vector": [0, 0, 0], "translation": [0, 0, 2]}
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"contact": [{"part": "seat", "start": 1, "end": 9}]}, "contact[0].end is 9"),
-        ({"object_poses": [{"frame": 6, **_PLACE}]}, "object_poses[0].frame is 6"),
-        ({"subject": [{"camera": "k9", "x": 1, "y": 1}]}, "subject[0] names camera 'k9'"),
-        ({"subject": [{"camera": "k1", "x": 1e9, "y": 1}]}, "camera k1 has 480 x 270 pixels"),
-        ({"subject": [{"camera": "k1", "x": 1, "y": -1}]}, "subject[0] is at x 1, y -1"),
-        ({"subject": [{"camera": "k1", "frame": 6, "x": 1, "y": 1}]}, "subject[0].frame is 6"),
-        ({"left_right": [{"start": 0, "end": 2, "camera": "k9"}]}, "names camera 'k9'"),
-        ({"left_right": [{"start": 0, "end": 7}]}, "left_right[0].end is 7"),
-        ({"drop_frames": [0, 1, 2, 3, 4, 5]}, "drops all 6 frames"),
-        ({"starts": {"k2": 0, "k3": 1}}, "lacks k1, the master"),
-        ({"floor": [[0, 0, 1], [1, 0, 1], [1e9, 1, 1]]}, "millimetres"),
-        ({"floor": [[0, 0, 1], [1, 0, 1], [0.5, 0.02, 1]]}, "on one line within 20 mm"),
-    ],
-)
-def test_the_page_reports_the_same_faults_as_a_run(
-    page: Served, settings: Path, changes: dict, message: str
-) -> None:
-    _, answer = page.post(f"{OF}/check", {"changes": changes})
-    [fault] = answer["faults"]
-    assert message in fault["message"]
+FAULTS: list[tuple[dict, str]] = [
+    ({"contact": [{"part": "seat", "start": 1, "end": 9}]}, "contact[0].end is 9"),
+    ({"object_poses": [{"frame": 6, **_PLACE}]}, "object_poses[0].frame is 6"),
+    ({"subject": [{"camera": "k9", "x": 1, "y": 1}]}, "subject[0] names camera 'k9'"),
+    ({"subject": [{"camera": "k1", "x": 1e9, "y": 1}]}, "camera k1 has 480 x 270 pixels"),
+    ({"subject": [{"camera": "k1", "x": 1, "y": -1}]}, "subject[0] is at x 1, y -1"),
+    ({"subject": [{"camera": "k1", "frame": 6, "x": 1, "y": 1}]}, "subject[0].frame is 6"),
+    ({"left_right": [{"start": 0, "end": 2, "camera": "k9"}]}, "names camera 'k9'"),
+    ({"left_right": [{"start": 0, "end": 7}]}, "left_right[0].end is 7"),
+    ({"drop_frames": [0, 1, 2, 3, 4, 5]}, "drops all 6 frames"),
+    ({"starts": {"k2": 0, "k3": 1}}, "lacks k1, the master"),
+    ({"floor": [[0, 0, 1], [1, 0, 1], [1e9, 1, 1]]}, "millimetres"),
+    ({"floor": [[0, 0, 1], [1, 0, 1], [0.5, 0.02, 1]]}, "on one line within 20 mm"),
+]
+
+
+def test_the_page_reports_the_same_faults_as_a_run(page: Served, settings: Path) -> None:
     path = annotation(settings)
-    path.write_text(yaml.safe_dump(changes))
-    with pytest.raises(UserError) as refused:
-        page.annotator.project.annotation(NAME)
-    assert fault["message"] in str(refused.value)
-    _, answer = page.post(f"{OF}/check", {"changes": {}})  # of the file as it is, too
-    assert answer["faults"] == [fault]
+    for changes, message in FAULTS:
+        _, answer = page.post(f"{OF}/check", {"changes": changes})
+        [fault] = answer["faults"]
+        assert message in fault["message"]
+        path.write_text(yaml.safe_dump(changes))
+        with pytest.raises(UserError) as refused:
+            page.annotator.project.annotation(NAME)
+        assert fault["message"] in str(refused.value)
+        _, answer = page.post(f"{OF}/check", {"changes": {}})  # of the file as it is, too
+        assert answer["faults"] == [fault]
+        path.unlink()
 
 
-def test_a_click_outside_the_image_is_refused(page: Served) -> None:
+def test_a_click_outside_the_image_is_refused(still: Served) -> None:
     for x, y in ((-1, 5), (5, 270.5), (1e8, 5)):
-        status, answer = page.post(f"{OF}/point", {"camera": "k1", "frame": 0, "x": x, "y": y})
+        status, answer = still.post(f"{OF}/point", {"camera": "k1", "frame": 0, "x": x, "y": y})
         assert status == 422 and "outside of the image" in answer["error"]
 
 
@@ -192,8 +198,8 @@ def test_a_save_succeeds_if_the_answer_log_fails(settings: Path) -> None:
         ("answer", {"kind": "turn", "part": "", "answer": "yes", "from_s": 0, "to_s": 1e300}),
     ],
 )
-def test_values_of_other_types_are_refused(page: Served, verb: str, content: dict) -> None:
-    status, answer = page.post(f"{OF}/{verb}", content)
+def test_values_of_other_types_are_refused(still: Served, verb: str, content: dict) -> None:
+    status, answer = still.post(f"{OF}/{verb}", content)
     assert status == 422 and "unexpected" not in str(answer)
 
 
@@ -237,8 +243,8 @@ def test_a_result_with_other_frames_is_not_drawn(page: Served, settings: Path) -
     assert "contact" not in answer and not answer["viewer"]
 
 
-def test_missing_recordings_are_reported(page: Served) -> None:
-    assert any("the recordings are missing" in note for note in page.json(OF)["notes"])
+def test_missing_recordings_are_reported(still: Served) -> None:
+    assert any("the recordings are missing" in note for note in still.json(OF)["notes"])
 
 
 def test_changed_results_change_the_state(page: Served, settings: Path) -> None:
@@ -286,11 +292,11 @@ def test_unreadable_images_are_reported(page: Served, settings: Path) -> None:
     assert page.json(f"{OF}/run")["command"]
 
 
-def test_the_viewer_receives_only_the_result_compressed(page: Served) -> None:
-    status, data = page.get(f"/api/{OF}/viewer")
+def test_the_viewer_receives_only_the_result_compressed(still: Served) -> None:
+    status, data = still.get(f"/api/{OF}/viewer")
     header, arrays = unpacked(base64.b64encode(data).decode())
     assert status == 200 and list(header["versions"]) == ["joint"]
     assert "joint/transforms" in arrays
     assert not [name for name in arrays if name.startswith(("sequential/", "truth/"))]
-    _, answer = page.get(f"/api/{OF}", **{"accept-encoding": "gzip"})
+    _, answer = still.get(f"/api/{OF}", **{"accept-encoding": "gzip"})
     assert json.loads(gzip.decompress(answer))["frames"] == 6
