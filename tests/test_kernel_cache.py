@@ -130,9 +130,9 @@ def test_several_processes_at_once(package: Path) -> None:
     env = {**os.environ, "PYTHONPATH": str(package.parent), "NUMBA_CACHE_DIR": cache}
     started = [
         subprocess.Popen(command, env=env, cwd=package.parent, stdout=subprocess.PIPE, text=True)
-        for _ in range(3)
+        for _ in range(2)
     ]
-    assert [process.communicate()[0].split()[0] for process in started] == ["11.0"] * 3
+    assert [process.communicate()[0].split()[0] for process in started] == ["11.0"] * 2
     assert len(list(Path(cache).iterdir())) == 1
 
 

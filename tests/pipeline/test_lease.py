@@ -95,7 +95,10 @@ def test_lost_lease_is_noticed_and_left_to_its_new_owner(tmp_path: Path) -> None
     assert lease_path(output).exists()
 
 
-def test_one_of_many_threads_holds_it_at_a_time(tmp_path: Path) -> None:
+def test_one_of_many_threads_holds_it_at_a_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(leases, "_POLL_S", 0.05)
     output, inside, counts = tmp_path / "x.h5", [], []
 
     def work() -> None:

@@ -18,7 +18,7 @@ from intercap_core.config import MetricsSettings
 from intercap_core.errors import UserError
 from intercap_core.pipeline import outcome
 from intercap_core.pipeline.job import job
-from intercap_core.pipeline.step import run_dataset, run_step
+from intercap_core.pipeline.step import run_step
 from intercap_core.project import Project, load_project
 from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
 from intercap_core.stages import export, metrics
@@ -69,47 +69,10 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
     return made
 
 
-def _logged(caplog: pytest.LogCaptureFixture) -> str:
-    """The last message of the pipeline."""
-    messages = [
-        r.getMessage() for r in caplog.records if r.name.startswith("intercap_core.pipeline")
-    ]
-    return messages[-1]
-
-
-def _of_folder(folder: Path) -> tuple[int, float]:
-    """Its files, and their size in MB."""
-    files = [path for path in folder.rglob("*") if path.is_file()]
-    return len(files), sum(path.stat().st_size for path in files) / 1e6
-
-
-def test_page_export_and_dataset_are_summarised_in_one_line(
-    project: Project, caplog: pytest.LogCaptureFixture
-) -> None:
-    folders = {stage: project.artefact("s01", stage) for stage in ("page", "export")}
-    with caplog.at_level(logging.INFO, "intercap_core"):
-        run_step("export", project, "s01")
-        files, size = _of_folder(folders["export"])
-        assert _logged(caplog) == (
-            "sequence s01, export: amass, bop, coco, contact, glb, intercap: 5 frames in "
-            f"{files} files, {size:.1f} MB"
-        )
-        run_step("page", project, "s01")
-        html = (folders["page"] / "index.html").read_text()
-        pictures, (_, size) = html.count('<img src="data:'), _of_folder(folders["page"])
-        assert pictures > 3 and _logged(caplog) == (
-            f"sequence s01, page: 3 of 3 cameras, {pictures} pictures, {size:.1f} MB with the "
-            "viewer"
-        )
-        run_dataset(project)
-        assert _logged(caplog) == "dataset trial: 1 of 1 sequences merged, 5 frames"
-        there = project.sequences["s01"]
-        lacking = {f"s{n:02d}": there for n in range(1, 9)}
-        run_dataset(replace(project, sequences=lacking))
-        assert _logged(caplog) == (
-            "dataset trial: 1 of 8 sequences merged, 5 frames; left out: s02, s03, s04, s05, s06 "
-            "and 2 more"
-        )
+@pytest.fixture
+def logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An empty working directory, in which the logs are written."""
+    monkeypatch.chdir(tmp_path)
 
 
 @pytest.mark.parametrize("stage", SEQUENCE_STAGES)
@@ -130,26 +93,24 @@ def test_flagged_frames_with_their_reasons(project: Project) -> None:
     assert reasons[0] == ("object lost, filled in", 2)
 
 
-def test_a_run_ends_with_remarks_worst_first(
-    project: Project, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)  # logs are where one works
+def _printed(project: Project, width: int = 80) -> list[str]:
+    stream = io.StringIO()
+    print_remarks(project, Console(file=stream, width=width))
+    return stream.getvalue().splitlines()
+
+
+def test_a_run_ends_with_remarks_worst_first(project: Project, logs: None) -> None:
     (found,) = remarks(project)
     assert found.share == pytest.approx(4 / 5)
     assert found.texts[0].startswith("4 of 5 frames flagged: object lost, filled in (2)")
     assert "scene: camera k2: its pose is as given" in found.texts
-    stream = io.StringIO()
-    print_remarks(project, Console(file=stream, width=200))
-    printed = stream.getvalue()
+    printed = "\n".join(_printed(project, width=200))
     assert "1 of 1 sequences have remarks, worst first" in printed
     assert "s01 (logs: " in printed and "k2: its pose is as given" in printed
 
 
-def test_logged_warnings_are_repeated_once(
-    project: Project, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What the artefact says already is not. Logs are where one works."""
-    monkeypatch.chdir(tmp_path)
+def test_logged_warnings_are_repeated_once(project: Project, logs: None) -> None:
+    """What the artefact says already is not."""
     folder = Path(project.logs) / "s01"
     folder.mkdir(parents=True)
     with job("s01: scene", folder / "scene.log"):
@@ -169,17 +130,8 @@ def _warn(log: Path, *texts: str) -> None:
             logging.getLogger("intercap_core").warning(text)
 
 
-def _printed(project: Project) -> list[str]:
-    stream = io.StringIO()
-    print_remarks(project, Console(file=stream, width=80))
-    return stream.getvalue().splitlines()
-
-
-def test_warnings_of_page_export_and_dataset_are_repeated(
-    project: Project, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_warnings_of_page_export_and_dataset_are_repeated(project: Project, logs: None) -> None:
     """A warning that several stages log for one mesh is repeated once."""
-    monkeypatch.chdir(tmp_path)
     for stage in ("page", "export"):
         folder = project.artefact("s01", stage)
         folder.mkdir(parents=True, exist_ok=True)
@@ -198,10 +150,7 @@ def test_warnings_of_page_export_and_dataset_are_repeated(
     assert (project.logs / "remarks.txt").read_text().splitlines() == printed[:-1]
 
 
-def test_remarks_beyond_twenty_sequences_are_in_a_file(
-    project: Project, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_remarks_beyond_twenty_sequences_are_in_a_file(project: Project, logs: None) -> None:
     names = [f"t{n:02d}" for n in range(23)]
     many = replace(project, sequences=dict.fromkeys(names, project.sequences["s01"]))
     for name in names:

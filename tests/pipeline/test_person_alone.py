@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 import json
+import logging
 import pickle
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -36,9 +38,32 @@ ROW = (
 )
 
 
+class Messages(logging.Handler):
+    """The texts that were logged."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.texts: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.texts.append(record.getMessage())
+
+
 @pytest.fixture(scope="module")
-def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
-    """Every stage has run."""
+def logged() -> Iterator[Messages]:
+    """What the pipeline logs while ``project`` is made."""
+    logger, messages = logging.getLogger("intercap_core.pipeline"), Messages()
+    level = logger.level
+    logger.addHandler(messages)
+    logger.setLevel(logging.INFO)
+    yield messages
+    logger.removeHandler(messages)
+    logger.setLevel(level)
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory, logged: Messages) -> Project:
+    """Every stage has run, and the dataset twice: first with seven sequences without results."""
     folder = tmp_path_factory.mktemp("alone")
     (folder / "config.yaml").write_text(
         "dataset: trial\n"
@@ -58,6 +83,9 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
     run_studio(project, NAME)
     for stage in STAGES:
         run_step(stage, project, NAME)
+    there = project.sequences[NAME]
+    lacking = {f"s{n:02d}": there for n in range(2, 9)}
+    run_dataset(replace(project, sequences={NAME: there, **lacking}))
     run_dataset(project)
     return project
 
@@ -100,6 +128,36 @@ def test_summaries_of_the_stages_omit_the_object(project: Project) -> None:
     assert lines["object_track"].startswith("no object: the sequence names no object")
     assert "the body alone, without an object" in lines["joint"] and "contact" not in lines["joint"]
     assert not notes("object_track", project.artefact(NAME, "object_track"))  # as was asked for
+
+
+def _of_folder(folder: Path) -> tuple[int, float]:
+    """Its files, and their size in MB."""
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return len(files), sum(path.stat().st_size for path in files) / 1e6
+
+
+def test_page_export_and_dataset_are_summarised_in_one_line(
+    project: Project, logged: Messages
+) -> None:
+    files, size = _of_folder(project.artefact(NAME, "export"))
+    assert (
+        f"sequence {NAME}, export: amass, coco, glb, intercap: 6 frames in {files} files, "
+        f"{size:.1f} MB"
+    ) in logged.texts
+    page = project.artefact(NAME, "page")
+    pictures, (_, size) = (
+        (page / "index.html").read_text().count('<img src="data:'),
+        _of_folder(page),
+    )
+    assert pictures > 0
+    assert (
+        f"sequence {NAME}, page: 2 of 2 cameras, {pictures} pictures, {size:.1f} MB with the viewer"
+    ) in logged.texts
+    assert logged.texts[-2:] == [
+        "dataset trial: 1 of 8 sequences merged, 6 frames; left out: s02, s03, s04, s05, s06 and 2 "
+        "more",
+        "dataset trial: 1 of 1 sequences merged, 6 frames",
+    ]
 
 
 def test_files_for_other_tools_hold_the_body(project: Project) -> None:
@@ -156,10 +214,6 @@ def test_the_report_leaves_objects_and_contact_out(project: Project) -> None:
     assert summary["vertex_to_cloud"]["object_mm"] is None
     assert summary["penetration"]["share_le_5mm"] is None
     assert "object_track" not in summary["truth"] or not summary["truth"]["object_track"]
-    with open(project.results / "tables" / "sequences.csv", newline="") as table:
-        (values,) = csv.DictReader(table)
-    assert values["contact_frames"] == values["vertex_to_cloud.object_mm"] == ""
-    assert float(values["joint.body_pve_mm"]) > 0
 
 
 def test_results_are_points_and_pictures_of_the_body(
@@ -223,16 +277,15 @@ def test_release_lists_and_verifies_its_files(
     assert "no licence is stated" in caplog.text and "several" not in caplog.text
     content = json.loads(path.read_text())
     assert content["sequences"] == [NAME] and content["dataset"] == "trial"
-    kinds = {entry["kind"] for entry in content["files"]}
-    assert kinds == {"card", "tables", "site", "export", "artefact"}
+    assert {entry["kind"] for entry in content["files"]} == set(KINDS)
     assert not any("truth" in entry["path"] or "mkv" in entry["path"] for entry in content["files"])
     assert str(project.path.parent) not in path.read_text()  # no folder of this machine
     assert set(content["inputs"]) >= {"sequences.tsv", "subjects.tsv", "objects.yaml"}
     assert check_release(project.results)
     card = project.results / "card.md"
     text = card.read_text()
+    assert "0 objects" in text and "The recordings are virtual" in text
     card.write_text(text + "more")
     assert not check_release(project.results)
     assert "changed: card.md" in capsys.readouterr().out
     card.write_text(text)
-    assert "0 objects" in text and "The recordings are virtual" in text
