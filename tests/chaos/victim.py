@@ -139,8 +139,15 @@ def damage(path: Path) -> str:
     return f"{kind} at byte {where}"
 
 
+def different(found: dict[str, bytes], wanted: dict[str, bytes]) -> list[str]:
+    """Files of the results that have other bytes, or that only one of the two has."""
+    names = sorted({*found, *wanted})
+    return [name for name in names if found.get(name) != wanted.get(name)]
+
+
 def identical(victim: Victim, other: Victim) -> dict[str, bool]:
     """Whether each file of the results is the other's, byte for byte; one that only one has is
     not."""
     found, wanted = contents(victim.flow.results), contents(other.flow.results)
-    return {name: found.get(name) == wanted.get(name) for name in {*found, *wanted}}
+    other_bytes = different(found, wanted)
+    return {name: name not in other_bytes for name in {*found, *wanted}}

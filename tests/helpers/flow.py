@@ -20,39 +20,6 @@ ROOT = Path(__file__).resolve().parents[2]
 EXECUTOR = "snakemake_executor_plugin_intercap_slurm"
 COPIED = ("Snakefile", "workflow", "profiles", "envs", "config", "intercap_core", EXECUTOR)
 KERNELS = shutil.ignore_patterns("*.nbi", "*.nbc")  # of a cache next to the source
-# Rewrites the manifest of every output to what the output would be made from now.
-REWRITE_MANIFESTS = """
-import sys
-from dataclasses import replace
-from pathlib import Path
-from intercap_core.pipeline.checksums import INPUTS_FILE, InputChecksums
-from intercap_core.pipeline.plan import DATASET, Plan
-from intercap_core.pipeline.provenance import read_manifest, write_manifest
-from intercap_core.pipeline.stage_inputs import (
-    dataset_manifest, stage_manifest, studio_manifest
-)
-from intercap_core.project import load_project
-from intercap_core.stage_list import STAGES
-project = load_project(Path(sys.argv[1]))
-summaries = {}
-for name in project.sequences:
-    checksums, fingerprints = InputChecksums(project.results / name / INPUTS_FILE), {}
-    recordings = project.recordings_made(name)
-    if recordings is not None:
-        write_manifest(recordings, studio_manifest(project, name, checksums))
-    annotation = project.annotation(name)
-    for stage, declared in STAGES.items():
-        reads = {other: fingerprints[other] for other in declared.reads}
-        manifest = stage_manifest(
-            project, name, stage, annotation, artefacts=reads, checksums=checksums
-        )
-        fingerprints[stage] = manifest.fingerprint
-        output = project.artefact(name, stage)
-        if output.exists() and read_manifest(output) != manifest:
-            write_manifest(output, manifest)
-    summaries[name] = fingerprints["summary"]
-write_manifest(project.results, dataset_manifest(project, summaries, {}))
-"""
 ONE, OTHER = "suitcase_carry_s03", "cup_drink_s04"
 # Appended to a stage of a copy, which then returns the result of a finished run. Its imports
 # and signature stay, so that its code digest and arguments are the real ones.
@@ -225,7 +192,7 @@ class Flow:
     def rewrite_manifests(self) -> None:
         """Make all existing outputs up to date."""
         subprocess.run(
-            [sys.executable, "-c", REWRITE_MANIFESTS, self.settings],
+            [sys.executable, str(ROOT / "tests" / "helpers" / "manifests.py"), self.settings],
             cwd=self.folder, env=self.environment, check=True,
         )  # fmt: skip
 

@@ -11,6 +11,7 @@ import pytest
 from intercap_core.pipeline.code_digest import ROOT, code_digest, modules_reached
 from intercap_core.stage_list import SEQUENCE_STAGES
 
+FITS = SEQUENCE_STAGES[: SEQUENCE_STAGES.index("metrics")]
 FILES = {
     "__init__.py": "",
     "config.py": "from pydantic import BaseModel\nclass A(BaseModel):\n    x: int = 1\n"
@@ -114,12 +115,26 @@ def test_an_unknown_module_is_refused(package: Path) -> None:
 
 def test_only_the_metrics_reach_the_truth() -> None:
     """No stage before the metrics may know the studio, its truth or its noise."""
-    for stage in SEQUENCE_STAGES[: SEQUENCE_STAGES.index("metrics")]:
+    for stage in FITS:
         modules = modules_reached(f"stages.{stage}")
         assert not [name for name in modules if ".studio" in name or ".evaluation" in name], stage
         assert "TRUTH" not in modules.get("intercap_core.schemas", ())
     assert "TRUTH" in modules_reached("stages.metrics")["intercap_core.schemas"]
     assert not [name for name in modules_reached("stages.metrics") if ".studio" in name]
+
+
+@pytest.mark.parametrize(
+    ("module", "stages"),
+    [
+        ("joint.terms.ground", {"joint"}),
+        ("object_track.smooth", {"object_track"}),
+        ("body_fit.problem", {"body_fit", "joint"}),
+    ],
+)
+def test_a_term_is_reached_by_its_own_stages(module: str, stages: set[str]) -> None:
+    name = f"intercap_core.{module}"
+    reaching = {stage for stage in FITS if name in modules_reached(f"stages.{stage}")}
+    assert reaching == stages
 
 
 def test_core_does_not_import_snakemake() -> None:

@@ -1,73 +1,247 @@
-"""What is decided without a run: what is missing, what an annotation says, what is looked at."""
+"""Which outputs an edit makes stale, of a project whose outputs are all there.
+
+The plan reads nothing of an output but its manifest, so empty files stand for the outputs.
+tests/workflow checks that Snakemake follows the plan.
+"""
 
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import pytest
+import yaml
 
-from intercap_core.pipeline import checksums, stage_inputs
-from intercap_core.pipeline.checksums import InputChecksums
-from intercap_core.pipeline.plan import OutputStatus, Plan
+from intercap_core.commands.status import print_status
+from intercap_core.pipeline import checksums
+from intercap_core.pipeline.checksums import remember_output
+from intercap_core.pipeline.plan import DATASET_OUTPUTS, OutputStatus, Plan
+from intercap_core.pipeline.provenance import read_manifest, write_manifest
 from intercap_core.project import Project, load_project
 from intercap_core.stage_list import STAGES
+from tests.helpers.flow import ONE, OTHER
+from tests.helpers.manifests import rewrite_manifests
 
 ROOT = Path(__file__).resolve().parents[2]
-CUP = "cup"
+SETTINGS = Path("config/test/config.yaml")
+AFTER_METRICS = {"summary", "page", "export"}
+AFTER_JOINT = {"metrics", *AFTER_METRICS}
+AFTER_SCENE = {"scene", "person", "object_track", "body_fit", "joint", *AFTER_JOINT}
+DATASET = {("", "dataset")}
+CONTACT = "contact:\n- {part: right_hand, start: 1, end: 4}\n"
+FLOOR = "floor: [[0.0, 1.0, 2.0], [1.0, 1.0, 2.0], [0.0, 1.0, 3.0]]\n"
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The project of config/test with two virtual recordings; all outputs are up to date."""
+    folder = tmp_path_factory.mktemp("made")
+    shutil.copytree(ROOT / "config", folder / "config")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        project = load_project(SETTINGS)
+        for name in project.sequences:
+            recordings = project.recordings_made(name)
+            assert recordings is not None
+            recordings.mkdir(parents=True)
+            for file in ("capture.json", "truth.h5", "calibration.json", "k1.mkv"):
+                (recordings / file).write_text("made")
+            for stage in STAGES:
+                _write(project.artefact(name, stage))
+        for file in DATASET_OUTPUTS:
+            _write(project.results / file)
+        _bring_up_to_date(project)
+    return folder
 
 
 @pytest.fixture
-def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Project:
-    """A real recording of one sequence, of which nothing is computed."""
-    monkeypatch.chdir(tmp_path)
-    shutil.copytree(ROOT / "config" / "objects", tmp_path / "objects")
-    shutil.copy(ROOT / "config" / "objects.yaml", tmp_path)
-    (tmp_path / "captures").mkdir()
-    (tmp_path / "captures" / "k1.mkv").write_bytes(b"images")
-    (tmp_path / "captures" / "calibration.json").write_text("{}")
-    (tmp_path / "config.yaml").write_text("dataset: lab\n")
-    (tmp_path / "subjects.tsv").write_text("subject\tgender\np01\tneutral\n")
-    (tmp_path / "sequences.tsv").write_text(
-        "sequence\tsubject\tobject\trecordings\tcalibration\n"
-        f"s01\tp01\t{CUP}\tcaptures\tcaptures/calibration.json\n"
-    )
-    return load_project(Path("config.yaml"))
+def folder(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy that a test may change; the working directory."""
+    shutil.copytree(made, tmp_path / "copy")
+    monkeypatch.chdir(tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+def _write(path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix == ".h5":
+        h5py.File(path, "w").close()
+    elif path.suffix:
+        path.touch()
+    else:
+        path.mkdir()
+
+
+def _bring_up_to_date(project: Project) -> None:
+    rewrite_manifests(project)
+    for path in [*project.results.rglob("*.h5"), *project.results.glob("*.*")]:
+        if path.is_file():
+            remember_output(path)
+
+
+def _pending() -> set[tuple[str, str]]:
+    """(sequence, stage) of every output that a run would make; sequence "" for the dataset's."""
+    plan = Plan(load_project(SETTINGS))
+    pending = {
+        (name, stage)
+        for name in plan.project.sequences
+        for stage, state in plan.states(name).items()
+        if state.status is not OutputStatus.done
+    }
+    assert plan.all_done() == (not pending and plan.dataset.status is OutputStatus.done)
+    return pending | (DATASET if plan.dataset.status is not OutputStatus.done else set())
+
+
+def _annotate(folder: Path, text: str) -> None:
+    path = folder / SETTINGS.parent / "annotations" / f"{OTHER}.yaml"
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(text)
+
+
+def _set(folder: Path, **settings: object) -> None:
+    path = folder / SETTINGS
+    path.write_text(yaml.safe_dump({**yaml.safe_load(path.read_text()), **settings}))
+
+
+def _of(name: str, *stages: str) -> set[tuple[str, str]]:
+    return {(name, stage) for stage in stages}
+
+
+@pytest.mark.parametrize(
+    ("text", "stages"),
+    [
+        (CONTACT, {"joint", *AFTER_JOINT}),
+        (FLOOR, AFTER_SCENE),
+        (
+            "object_pose: {rotation_vector: [0, 0, 0], translation: [0, 0, 2]}\n",
+            {"object_track", "joint", *AFTER_JOINT},
+        ),
+        ("drop_frames: [2]\n", {"frames", "detections", *AFTER_SCENE}),
+        ("subject: [{camera: k1, frame: 0, x: 612, y: 340}]\n", AFTER_SCENE - {"scene"}),
+        ("# nothing yet\ncontact:\n", set()),
+    ],
+)
+def test_an_annotation_reruns_from_the_stage_that_reads_it(
+    folder: Path, text: str, stages: set[str]
+) -> None:
+    assert _pending() == set()
+    _annotate(folder, text)
+    assert _pending() == _of(OTHER, *stages) | (DATASET if stages else set())
+
+
+def test_a_section_reruns_only_its_own_stages(folder: Path) -> None:
+    """Contact and floor are annotated; then one of them is edited, or both are reordered."""
+    _annotate(folder, CONTACT + FLOOR)
+    _bring_up_to_date(load_project(SETTINGS))
+    _annotate(folder, "# a comment, and the same content\n" + FLOOR + CONTACT)
+    assert _pending() == set()
+    _annotate(folder, FLOOR + CONTACT.replace("end: 4", "end: 5"))
+    assert _pending() == _of(OTHER, "joint", *AFTER_JOINT) | DATASET
+    _annotate(folder, CONTACT + FLOOR.replace("2.0", "2.1"))
+    assert _pending() == _of(OTHER, *AFTER_SCENE) | DATASET
+
+
+def test_a_setting_reruns_its_own_stage(folder: Path) -> None:
+    _set(folder, page={"frames": 2})
+    # the site's first page lists settings that differ from the defaults
+    assert _pending() == _of(ONE, "page") | _of(OTHER, "page") | DATASET
+    _set(folder, page={}, joint={"ground_weight": 2.0})
+    stages = {"joint", *AFTER_JOINT}
+    assert _pending() == _of(ONE, *stages) | _of(OTHER, *stages) | DATASET
+
+
+def test_another_model_reruns_the_detections(folder: Path) -> None:
+    """A model counts by its content, not by its path."""
+    model = folder / SETTINGS.parent / "model.onnx"
+    model.write_text("one")
+    _set(folder, detections={"segmentation_model": model.name})
+    stages = {"detections", *AFTER_SCENE}
+    expected = _of(ONE, *stages) | _of(OTHER, *stages) | DATASET
+    assert _pending() == expected
+    _bring_up_to_date(load_project(SETTINGS))
+    assert _pending() == set()
+    model.write_text("another")
+    assert _pending() == expected
+
+
+def test_another_seed_makes_another_recording(folder: Path) -> None:
+    text = (folder / SETTINGS).read_text()
+    (folder / SETTINGS).write_text(text.replace("seed: 22", "seed: 23"))
+    assert _pending() == _of(OTHER, "studio", *STAGES) | DATASET
+
+
+def test_a_restored_result_of_other_settings_is_stale(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    project = load_project(SETTINGS)
+    path = project.artefact(ONE, "scene")
+    manifest = read_manifest(path)
+    assert manifest is not None
+    settings = {**manifest.given["settings"], "voxel_mm": 0.5}
+    write_manifest(path, replace(manifest, given={**manifest.given, "settings": settings}))
+    remember_output(path)
+    assert _pending() == _of(ONE, "scene")  # what was made of the right one stays
+    print_status(project)
+    printed = capsys.readouterr().out
+    assert f"scene out of date in {ONE}: settings: voxel_mm 0.5 → none" in printed
+
+
+def test_a_damaged_artefact_is_stale(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    project = load_project(SETTINGS)
+    project.artefact(ONE, "person").write_bytes(b"damaged")
+    assert _pending() == _of(ONE, "person")
+    print_status(project)
+    reason = "what it was made from is not recorded, or the file is damaged"
+    assert f"person out of date in {ONE}: {reason}" in capsys.readouterr().out
+
+
+def test_another_processor_is_reported_and_reruns_nothing(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    project = load_project(SETTINGS)
+    path = project.artefact(ONE, "joint")
+    manifest = read_manifest(path)
+    assert manifest is not None
+    write_manifest(path, replace(manifest, machine={"device": "cuda", "cpu": "another"}))
+    remember_output(path)
+    assert _pending() == set()
+    print_status(project)
+    printed = capsys.readouterr().out
+    assert "2 done of 2 sequences" in printed
+    assert "1 results were computed on another machine or device (cuda, another)" in printed
 
 
 def test_of_a_sequence_without_results_no_recording_is_read(
-    project: Project, monkeypatch: pytest.MonkeyPatch
+    folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def never(path: Path) -> str:
-        raise AssertionError(f"{path} was read")
+        assert "recordings" not in path.parts, f"{path} was read"
+        return digest(path)
 
+    shutil.rmtree(folder / "results" / "test" / ONE)
+    shutil.rmtree(folder / "results" / "test" / "site")
+    digest = checksums._file_digest
     monkeypatch.setattr(checksums, "_file_digest", never)
-    states = Plan(project).states("s01")
-    assert set(states) == set(STAGES)
-    assert {state.status for state in states.values()} == {OutputStatus.missing}
-    assert not Plan(project).all_done() and Plan(project).mark("s01", "joint") == []
+    plan = Plan(load_project(SETTINGS))
+    states = {stage: state.status for stage, state in plan.states(ONE).items()}
+    assert states.pop("studio") is OutputStatus.done
+    assert states == dict.fromkeys(STAGES, OutputStatus.missing)
+    assert plan.mark(ONE, "joint") == []
 
 
-def test_broken_annotation_makes_all_stages_wait(project: Project) -> None:
-    path = project.annotation_path("s01")
-    path.parent.mkdir()
-    path.write_text("contact: [{part: seat, start: 4, end: 2}]\n")
-    plan = Plan(project)
-    assert "interval is reversed" in plan.annotation_fault("s01")
-    path.write_text("contact: [{part: seat, start: 2, end: 4}]\n")
-    assert Plan(project).annotation_fault("s01") == ""
+def test_broken_annotation_makes_all_stages_wait(folder: Path) -> None:
+    _annotate(folder, CONTACT.replace("end: 4", "end: 0"))
+    assert "interval is reversed" in Plan(load_project(SETTINGS)).annotation_fault(OTHER)
+    assert _pending() == _of(OTHER, *STAGES) | DATASET
+    _annotate(folder, CONTACT)
+    assert Plan(load_project(SETTINGS)).annotation_fault(OTHER) == ""
 
 
-def test_companion_files_of_a_mesh_are_in_the_manifest(project: Project) -> None:
-    def files() -> dict[str, str]:
-        made_from = stage_inputs.stage_manifest(
-            project, "s01", "object_track", project.annotation("s01"),
-            artefacts=dict.fromkeys(STAGES["object_track"].reads, "made"),
-            checksums=InputChecksums(Path("none")),
-        )  # fmt: skip
-        return dict(made_from.files["object_"])
-
-    before = files()
-    mesh = project.objects[CUP].mesh
+def test_companion_files_of_a_mesh_count(folder: Path) -> None:
+    mesh = load_project(SETTINGS).objects["cup"].mesh
     mesh.with_suffix(".mtl").write_text("newmtl cup\n")
-    assert set(files()) - set(before) == {f"mesh/{mesh.stem}.mtl"}
+    plan = Plan(load_project(SETTINGS))
+    (reason,) = plan.states(OTHER)["studio"].reasons
+    assert f"mesh/{mesh.stem}.mtl" in reason

@@ -6,10 +6,7 @@ import shutil
 
 import pytest
 
-from intercap_core.stage_list import STAGES
 from tests.helpers.flow import ONE, OTHER, Flow
-
-RUN_AGAIN = ("metrics", "summary", "page", "export")
 
 
 @pytest.fixture(scope="session")
@@ -37,8 +34,8 @@ def _run(flow: Flow, *targets: str) -> None:
 def recorded(flow: Flow, tmp_path_factory: pytest.TempPathFactory) -> Flow:
     """The same recordings without studio and truth in another folder, after `intercap run`.
 
-    The recordings of one of the two sequences are unreadable. The last stages of the other one have
-    been run by replay; its earlier results are those of ``flow``.
+    The recordings of one of the two sequences are unreadable. The summary of the other one has been
+    made by replay; its other results are those of ``flow``.
     """
     other = Flow.copy(
         tmp_path_factory.mktemp("recorded"), settings="config/lab/config.yaml", replay=flow.results
@@ -56,10 +53,9 @@ def recorded(flow: Flow, tmp_path_factory: pytest.TempPathFactory) -> Flow:
     without_truth = [row.rpartition("\t")[0] for row in rows]
     text = "\n".join(without_truth).replace("results/test/recordings", "captures") + "\n"
     (settings / "sequences.tsv").write_text(text)
-    (other.results / ONE).mkdir(parents=True)
-    for stage in STAGES:
-        if stage not in RUN_AGAIN:
-            shutil.copy2(flow.artefact(ONE, stage), other.artefact(ONE, stage))
+    for place in (ONE, f"site/sequences/{ONE}"):
+        shutil.copytree(flow.results / place, other.results / place)
+    other.artefact(ONE, "summary").unlink()
     other.rewrite_manifests()
     other.transcript.write_text(other.intercap("run", other.settings, "--cores", "2").stderr)
     return other

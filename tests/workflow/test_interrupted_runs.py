@@ -10,52 +10,39 @@ from pathlib import Path
 
 import pytest
 
-from tests.chaos.victim import Victim, damage, identical, kill_in
+from tests.chaos.victim import Victim, damage, different, kill_in
+from tests.helpers.cluster_run import contents
 from tests.helpers.flow import ONE, OTHER, Flow
 
 ENDS_WITHIN_S = 60.0
 STAGE_S = 0.5  # duration of a replayed stage, in which signals can reach it
 
 
-@pytest.fixture(scope="module")
-def peaceful(flow: Flow, tmp_path_factory: pytest.TempPathFactory) -> Victim:
-    """A copy of the finished project in which everything is up to date."""
-    return _copied(flow.results, tmp_path_factory.mktemp("peaceful"))
-
-
 @pytest.fixture
-def victim(flow: Flow, tmp_path_factory: pytest.TempPathFactory) -> Victim:
-    """Another copy, without Snakemake's folder."""
-    return _copied(flow.results, tmp_path_factory.mktemp("victim"))
-
-
-def _copied(results: Path, folder: Path) -> Victim:
-    other = Victim(Flow.copy(folder, replay=results, pause_s=STAGE_S))
-    shutil.copytree(results, other.flow.results)
+def victim(flow: Flow, tmp_path: Path) -> Victim:
+    """A copy of the finished project in which everything is up to date."""
+    other = Victim(Flow.copy(tmp_path, replay=flow.results, pause_s=STAGE_S))
+    shutil.copytree(flow.results, other.flow.results)
     other.flow.rewrite_manifests()
     return other
 
 
-def test_a_killed_run_continues_and_replaces_damaged_results(
-    victim: Victim, peaceful: Victim
-) -> None:
+def test_a_killed_run_continues_and_replaces_damaged_results(victim: Victim) -> None:
+    whole = contents(victim.flow.results)
     victim.flow.artefact(ONE, "metrics").unlink()
     assert kill_in(victim, {(ONE, "metrics")}, {(ONE, "metrics"): 2.0}) == (ONE, "metrics")
-    cut, flipped = victim.flow.artefact(OTHER, "metrics"), victim.flow.results / "heatmaps.h5"
-    cut.write_bytes(cut.read_bytes()[:-1000])
-    damage(flipped)
+    damage(victim.flow.results / "heatmaps.h5")
     status, output = victim.go_on()
     assert status == 0, output[-3000:]
     assert "was killed: going on where it stopped" in output
     assert victim.left_over() == []
-    assert [name for name, same in identical(victim, peaceful).items() if not same] == []
+    assert different(contents(victim.flow.results), whole) == []
 
 
 @pytest.mark.full
-def test_one_command_replaces_damage_downstream_of_unchanged_results(
-    victim: Victim, peaceful: Victim
-) -> None:
+def test_one_command_replaces_damage_downstream_of_unchanged_results(victim: Victim) -> None:
     """Snakemake plans only the first one: the outputs between them do not change."""
+    whole = contents(victim.flow.results)
     for damaged in (
         *(victim.flow.artefact(OTHER, stage) for stage in ("joint", "summary")),
         victim.flow.results / "heatmaps.h5",
@@ -63,7 +50,7 @@ def test_one_command_replaces_damage_downstream_of_unchanged_results(
         damaged.write_bytes(damaged.read_bytes()[:-1000])
     status, output = victim.go_on()
     assert status == 0, output[-3000:]
-    assert [name for name, same in identical(victim, peaceful).items() if not same] == []
+    assert different(contents(victim.flow.results), whole) == []
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import inspect
 import re
-import subprocess
 import sys
 from dataclasses import fields
 from pathlib import Path
@@ -18,6 +17,7 @@ from intercap_core.pipeline.checksums import InputChecksums
 from intercap_core.project import load_project
 from intercap_core.sequence_inputs import FitSettings, SequenceModels
 from intercap_core.stage_list import SEQUENCE_STAGES, STAGES
+from tests.helpers.flow import Flow
 
 ROOT = Path(__file__).resolve().parents[2]
 TEXT = "\n".join(path.read_text() for path in sorted((ROOT / "workflow/rules").glob("*.smk")))
@@ -72,18 +72,13 @@ def test_one_rule_has_the_inputs_of_all_stages() -> None:
     assert "unpack(inputs_of(_stage.name))" in RULES[""]
 
 
-def snakemake(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "snakemake", "--configfile", "config/demo/config.yaml"]
-    return subprocess.run([*command, *arguments], cwd=ROOT, capture_output=True, text=True)
-
-
-def test_lint_is_clean() -> None:
-    done = snakemake("--lint")
-    assert done.returncode == 0, done.stderr
-
-
-def test_the_slurm_profile_is_understood() -> None:
-    done = snakemake("--workflow-profile", "profiles/slurm", "-n")
+@pytest.mark.parametrize(
+    "arguments", [("--lint",), ("--workflow-profile", "profiles/slurm", "--dry-run")]
+)
+def test_snakemake_finds_no_fault_and_understands_the_profile(
+    flow: Flow, arguments: tuple[str, ...]
+) -> None:
+    done = flow.ask(*arguments)
     assert done.returncode == 0, done.stderr
 
 

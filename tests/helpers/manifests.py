@@ -1,0 +1,42 @@
+"""Give every output of a project the manifest of what it would be made from now.
+
+Flow runs this file as a script, with the package of its copy.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from intercap_core.pipeline.checksums import INPUTS_FILE, InputChecksums
+from intercap_core.pipeline.provenance import read_manifest, write_manifest
+from intercap_core.pipeline.stage_inputs import dataset_manifest, stage_manifest, studio_manifest
+from intercap_core.project import Project, load_project
+from intercap_core.stage_list import STAGES
+
+
+def rewrite_manifests(project: Project) -> None:
+    """Make all existing outputs up to date."""
+    summaries = {}
+    for name in project.sequences:
+        checksums = InputChecksums(project.results / name / INPUTS_FILE)
+        fingerprints: dict[str, str] = {}
+        recordings = project.recordings_made(name)
+        if recordings is not None:
+            write_manifest(recordings, studio_manifest(project, name, checksums))
+        annotation = project.annotation(name)
+        for stage, declared in STAGES.items():
+            reads = {other: fingerprints[other] for other in declared.reads}
+            manifest = stage_manifest(
+                project, name, stage, annotation, artefacts=reads, checksums=checksums
+            )
+            fingerprints[stage] = manifest.fingerprint
+            output = project.artefact(name, stage)
+            if output.exists() and read_manifest(output) != manifest:
+                write_manifest(output, manifest)
+        summaries[name] = fingerprints["summary"]
+    write_manifest(project.results, dataset_manifest(project, summaries, {}))
+
+
+if __name__ == "__main__":
+    rewrite_manifests(load_project(Path(sys.argv[1])))
