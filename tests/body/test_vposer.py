@@ -160,6 +160,9 @@ WRONG: dict[str, tuple[object, str]] = {
     "short bias": (_state(1) | {_BIAS: torch.zeros(5)}, r"expected \(512,\)"),
     "sparse": (_state(1) | {_WEIGHT: _state(1)[_WEIGHT].to_sparse()}, "no numbers"),
     "not finite": (_state(1) | {_BIAS: torch.full((512,), torch.nan)}, "not finite"),
+    "on no device": (_state(1) | {_WEIGHT: torch.zeros(126, 512, device="meta")}, "meta"),
+    "zeros": (_state(1) | {_WEIGHT: torch.zeros(126, 512)}, "is zero, so that every"),
+    "huge": (_state(1) | {_WEIGHT: torch.full((126, 512), 1e30)}, "expected at most 1000"),
 }
 
 
