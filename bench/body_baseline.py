@@ -254,8 +254,8 @@ class Energy:
         pose = pose + (priors.joint_limits(vector).residuals ** 2).sum()
         for side in (0, 1):
             own = (model.hand_mean, model.hand_components, deviation)
-            rows = priors.hand_pose(vector, *own, side=side, count=HAND_COMPONENTS)
-            pose = pose + (rows.residuals**2).sum()
+            rows = priors.hand_pose(vector, *own, side=side)
+            pose = pose + (rows.residuals[:, :HAND_COMPONENTS] ** 2).sum()
         jaw = vector[0, _JAW] * vector.new_tensor([1.0, JAW_SIDEWAYS, JAW_SIDEWAYS])
         return (
             stage.pose**2 * pose

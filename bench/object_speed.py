@@ -134,9 +134,10 @@ def run_single_pass(clip: ObjectClip, start: np.ndarray) -> Run:
         fit = observer.fit(0, start, MotionPrior(start), rounds=FIT_ROUNDS, scale=1.0)
         found = [fit.pose, fit.pose]  # before the first frame it rested
         for t in range(1, len(clip)):
-            guess = extrapolate(*found[-2:])
+            before, now = found[-2:]
+            guess = extrapolate(before, now)
             found.append(
-                observer.fit(t, guess, predict_prior(*found[-2:], guess, clip.step_s)).pose
+                observer.fit(t, guess, predict_prior(before, now, guess, clip.step_s)).pose
             )
         poses = np.array(found[1:])
         seconds.append(time.perf_counter() - begin)

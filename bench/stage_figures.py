@@ -153,7 +153,7 @@ def _joint(written: Sequence[Written]) -> Figures:
             one.artefacts["joint"], "joint", one.project.config.body_models, one.gender
         )
         true = one.true()
-        errors = truths.object_errors(true, track, mesh, 1.0)
+        errors = truths.object_errors(true.rotation, true.translation, track, mesh, 1.0)
         shift.append(errors["object_translation"])
         turn.append(errors["object_rotation"])
         surface = PosedObject(mesh.vertices, mesh.faces, watertight=mesh.watertight)
