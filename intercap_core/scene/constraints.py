@@ -1,10 +1,14 @@
-"""Further term of the registration of a rig: bundle adjustment of the subject's keypoints.
+"""Further terms of the registration of a rig: body keypoints and one common floor.
 
-The term returns the normal equations of its residuals with respect to the cameras' poses: the
-matrix J' W J (C, 6, C, 6) and the gradient J' W r (C, 6). A pose has 6 parameters: rotation vector
-about the camera's centre, applied on the left, rad, and translation of ``master_from_colour``,
-metres. The points of the body are eliminated by the Schur complement, so the camera system stays
-small.
+Each constraint returns the normal equations of its residuals with respect to the cameras' poses:
+the matrix J' W J (C, 6, C, 6) and the gradient J' W r (C, 6). A pose has 6 parameters: rotation
+vector about the camera's centre, applied on the left, rad, and translation of
+``master_from_colour``, metres. The constraint's own unknowns (points of the body, the plane) are
+eliminated by the Schur complement, so the camera system stays small.
+
+- :class:`BodyConstraint`: bundle adjustment of the subject's keypoints.
+- :class:`FloorConstraint`: all cameras see the same plane. It fixes height and tilt of cameras that
+  see no common part of the floor.
 """
 
 from __future__ import annotations
@@ -17,11 +21,16 @@ import numpy as np
 from intercap_core.body.keypoints import NUM_KEYPOINTS
 from intercap_core.geometry.camera import projection
 from intercap_core.geometry.camera.rig import Rig
-from intercap_core.geometry.camera.transforms import invert
+from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.geometry.solve.robust import geman_mcclure_weight
 from intercap_core.person.sides import BODY_POINTS
+from intercap_core.scene.ground import FLOOR_COSINE, GroundPlane
 from intercap_core.scene.subject_views import SubjectViews
+from intercap_core.scene.surfaces import DepthSurface
 
+# Standard deviation of floor points from the common plane: floors are not flat and depth is biased.
+# Tuned on the studio.
+FLOOR_SIGMA_M = 0.005
 ROBUST_SIGMA = 3.0  # scale of Geman and McClure's function, standard deviations; tuned
 KEYPOINT_ERROR_TIME_S = 0.5  # how long an error at one joint lasts; tuned on the studio
 MIN_BODY_POINTS = 50  # joints times sets; fewer do not constrain a rig; tuned on the studio
@@ -188,3 +197,88 @@ def _cross_matrix(vectors: np.ndarray) -> np.ndarray:
     zero = np.zeros_like(x)
     rows = [np.stack(r, -1) for r in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
     return np.stack(rows, -2)
+
+
+class FloorConstraint:
+    """Normal equations of one common floor: distances of floor points from the plane that fits
+    the points of all cameras best."""
+
+    def __init__(self, rig: Rig, points: dict[int, np.ndarray], up: np.ndarray) -> None:
+        """
+        Args:
+            points: (n, 3) floor points by camera, in its depth frame, metres.
+            up: (3,) approximate normal of the floor, master frame.
+        """
+        self._rig = rig
+        self._points = points
+        self._up = up
+
+    @property
+    def cameras(self) -> frozenset[int]:
+        """Cameras with floor points."""
+        return frozenset(self._points)
+
+    @classmethod
+    def of(
+        cls, rig: Rig, surfaces: dict[int, DepthSurface], ground: GroundPlane
+    ) -> FloorConstraint | None:
+        """Select the points of ``surfaces`` that lie on the plane ``ground`` at the given poses.
+
+        Returns None without a floor, or if fewer than two cameras have enough points on it.
+        """
+        if not ground.found:
+            return None
+        points = {}
+        for c, surface in surfaces.items():
+            pose = rig[c].master_from_depth
+            height = (apply(pose, surface.points) - ground.point) @ ground.normal
+            facing = surface.normals @ pose[:3, :3].T @ ground.normal
+            # within 6 cm, because poses are not refined yet; tuned on the studio
+            rows = np.flatnonzero((np.abs(height) < 0.06) & (facing > FLOOR_COSINE))
+            if len(rows) >= 200:  # cells of 3 cm: a fifth of a square metre
+                rows = np.random.default_rng(0).permutation(rows)[:1000]  # bounds the time
+                points[c] = surface.points[rows]
+        return cls(rig, points, ground.normal) if len(points) >= 2 else None
+
+    def __call__(self, poses: np.ndarray, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Matrix (C, 6, C, 6) and gradient (C, 6) at ``poses`` (C, 4, 4), plane eliminated.
+
+        The plane is fitted to all points by least squares. Its three unknowns are two tilts about
+        the centroid and the height. ``offset`` is unused.
+        """
+        count = len(self._rig)
+        moved = self._rig.moved(poses)
+        own = {c: apply(moved[c].master_from_depth, points) for c, points in self._points.items()}
+        everything = np.concatenate(list(own.values()))
+        middle = everything.mean(0)
+        axes = np.linalg.svd(everything - middle, full_matrices=False)[2]
+        normal = axes[2] * np.sign(axes[2] @ self._up)
+        matrix = np.zeros((count * 6, count * 6))
+        gradient = np.zeros(count * 6)
+        by_plane = np.zeros((3, 3))
+        cross = np.zeros((3, count * 6))
+        slope = np.zeros(3)
+        for c, points in own.items():
+            residual = (points - middle) @ normal
+            robust = geman_mcclure_weight(residual**2, ROBUST_SIGMA * FLOOR_SIGMA_M)
+            # ten independent points per camera: errors of lens and bias are shared
+            weight = robust * min(1.0, 10.0 / len(points)) / FLOOR_SIGMA_M**2
+            arm = points - poses[c, :3, 3]
+            by_pose = np.column_stack(
+                [np.cross(arm, normal), np.broadcast_to(normal, points.shape)]
+            )
+            # derivatives of the residual by two tilts about the centroid and the height
+            plane = np.column_stack(
+                [(points - middle) @ axes[0], (points - middle) @ axes[1], -np.ones(len(points))]
+            )
+            at = slice(6 * c, 6 * c + 6)
+            weighted = by_pose * weight[:, None]
+            matrix[at, at] += weighted.T @ by_pose
+            gradient[at] += weighted.T @ residual
+            cross[:, at] += plane.T @ weighted
+            by_plane += plane.T @ (plane * weight[:, None])
+            slope += plane.T @ (weight * residual)
+        solved = np.linalg.solve(by_plane, np.column_stack([cross, slope]))
+        matrix -= cross.T @ solved[:, :-1]
+        gradient -= cross.T @ solved[:, -1]
+        return matrix.reshape(count, 6, count, 6), gradient.reshape(count, 6)

@@ -13,6 +13,7 @@ from intercap_core.scene.constraints import (
     MIN_BODY_POINTS,
     BodyConstraint,
     BodyViews,
+    FloorConstraint,
     body_views,
 )
 from intercap_core.scene.keypoint_timing import TIMING_INFLATION
@@ -23,6 +24,7 @@ from intercap_core.scene.registration import (
     PRIOR_ROTATION_RAD,
     PRIOR_TRANSLATION_M,
     STATIC,
+    Constraint,
     Registration,
     RigEstimate,
     RigSolution,
@@ -84,13 +86,15 @@ def refine(
     moments: Moments,
     times: np.ndarray,
     *,
+    floor: FloorConstraint | None,
     free_poses: bool,
 ) -> Refinement:
     """Refine the poses of all cameras but the ``master``, depth biases and time offsets.
 
     1. Biases and offsets are estimated at the given poses, then together with all poses.
     2. All given poses are kept unless the residuals of one kind of data improve and those of no
-       kind get worse: held-out background, held-out moving surfaces, keypoints.
+    kind
+       get worse: held-out background, held-out moving surfaces, keypoints.
     3. Otherwise each camera's refined and given pose are compared (:mod:`.camera_verdicts`). If
        some keep the given pose, the others are refined around them.
 
@@ -101,6 +105,8 @@ def refine(
         moving: moving surfaces by camera, of several sets.
         moments: images by moment, time offsets of the keypoints, and the subject.
         times: (T,) seconds of the sets.
+        floor: constraint of a common floor; None = no floor. It is used only if some camera shares
+            no surface with the others.
         free_poses: False keeps all given poses.
     """
     starts, timing = moments.starts, moments.timing
@@ -110,14 +116,21 @@ def refine(
     views = body_views(moments.subject, times)
     body = BodyConstraint(views, rig) if len(views.points) >= MIN_BODY_POINTS else None
     known = timing.information / TIMING_INFLATION**2, timing.vector / TIMING_INFLATION**2
-    unmoved = registration.solve(given, None, known, free_poses=False)
+    overlapping = [pair for k in (STATIC, MOVING) for pair in registration.residuals(given, k)]
+    linked = _linked(overlapping, master)
+    constraints: list[Constraint] = [body] if body else []
+    if floor is not None and len(linked) < len(rig):
+        constraints.append(floor)  # unnecessary if all overlap, which constrains more
+    unmoved = registration.solve(given, (), known, free_poses=False)
     result, ratios, covariance = unmoved, [], unmoved.covariance
     verdicts: dict[int, PoseVerdict] = {}
     refined = np.zeros(len(rig), bool)
     if free_poses and len(rig) > 1:
 
         def solve(some: BodyViews | None, free: np.ndarray) -> RigSolution:
-            used = body if some is None else BodyConstraint(some, rig)
+            used = constraints
+            if some is not None:
+                used = [BodyConstraint(some, rig), *(c for c in constraints if c is not body)]
             return registration.solve(given, used, known, free_poses=free)
 
         freed = solve(None, np.ones(len(rig), bool))
@@ -147,6 +160,7 @@ def refine(
     sigma[master] = 0.0
     converged = result.last_step_m < 0.001
     verdict = _verdict(rig, pairs, ratios, refined, converged=converged, free=free_poses)
+    on_floor = floor.cameras if floor is not None and floor in constraints else ()
     return Refinement(
         poses=result.estimate.poses,
         bias=result.estimate.bias,
@@ -158,7 +172,7 @@ def refine(
         verdict=verdict,
         refined=refined,
         verdicts=_verdicts(rig, master, verdicts, verdict),
-        notes=_notes(rig, master, pairs, views.weights, refined),
+        notes=_notes(rig, master, pairs, views.weights, refined, on_floor),
     )
 
 
@@ -268,6 +282,7 @@ def _notes(
     pairs: PairTable,
     body_weights: np.ndarray,
     refined: np.ndarray,
+    on_floor: Collection[int],
 ) -> tuple[str, ...]:
     """Describe which data determine the pose of each camera that shares no surface with others.
 
@@ -276,6 +291,7 @@ def _notes(
     Args:
         body_weights: (N, C) weights of the keypoints, see :class:`BodyViews`.
         refined: (C,) bool, cameras with refined poses.
+        on_floor: cameras with points in the constraint of the common floor.
     """
     linked = _linked(pairs.pairs.tolist(), master)
     notes = []
@@ -286,7 +302,8 @@ def _notes(
             why = "shares no surface with the others" if rig[c].depth else "has no depth"
             seen = len(body_weights) and (body_weights[:, c] > 0).sum() >= MIN_BODY_POINTS
             if refined[c] and seen:
-                notes.append(f"{why}: its pose rests on the keypoints")
+                rests = "the keypoints and the floor" if c in on_floor else "the keypoints"
+                notes.append(f"{why}: its pose rests on {rests}")
             elif seen:
                 notes.append(f"{why}: its pose is as given")
             else:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -67,6 +67,8 @@ def fit_ground(
     1. Up to 400 upward-facing points with their normals are plane hypotheses. Each is scored on
        6000 sampled points: inliers minus three times the points clearly below.
     2. The best hypothesis is refined by iterated weighted least squares.
+    3. A platform may be larger than the visible floor around it. The search therefore continues to
+       the lowest parallel plane that is large enough.
 
     Args:
         up: approximate up direction. Normals of hypotheses lie within its cone.
@@ -96,7 +98,63 @@ def fit_ground(
     fitted = _refined(
         points[candidates], normals[candidates], points[best], normals[best], tolerance_m
     )
-    return fitted if fitted.inliers * cell_m**2 >= MIN_FLOOR_AREA_M2 else NO_GROUND
+    if fitted.inliers * cell_m**2 < MIN_FLOOR_AREA_M2:
+        return NO_GROUND
+    return _lowest(points[candidates], normals[candidates], fitted, tolerance_m, cell_m)
+
+
+def _lowest(
+    points: np.ndarray, normals: np.ndarray, ground: GroundPlane, tolerance_m: float, cell_m: float
+) -> GroundPlane:
+    """The lowest large plane below and parallel to ``ground``, or ``ground`` if there is none.
+
+    Points (N, 3) with normals (N, 3) that face up. Each round looks for the densest layer, 6 cm
+    thick, at least :data:`BELOW_FLOOR_M` below the current plane, and refines a plane there.
+    """
+    upper = ground
+    while True:
+        facing = normals @ ground.normal >= FLOOR_COSINE
+        height = (points - ground.point) @ ground.normal
+        under = np.flatnonzero(facing & (height < -BELOW_FLOOR_M))
+        if len(under) * cell_m**2 < MIN_FLOOR_AREA_M2:
+            break
+        order = under[np.argsort(height[under])]
+        reach = height[order] + 2 * FLOOR_HYPOTHESIS_TOLERANCE_M
+        count = np.searchsorted(height[order], reach, side="right") - np.arange(len(order))
+        first = int(np.argmax(count))
+        start = points[order[first : first + count[first]]].mean(0)
+        lower = _refined(points, normals, start, ground.normal, tolerance_m)
+        parallel = degrees_between(lower.normal, ground.normal) <= 3.0  # two level surfaces
+        deep = (lower.point - ground.point) @ ground.normal < -BELOW_FLOOR_M
+        if lower.inliers * cell_m**2 < MIN_FLOOR_AREA_M2 or not (parallel and deep):
+            break
+        if _covered(points, lower, ground, tolerance_m) > 0.5:
+            break  # the upper surface, seen by a misplaced camera
+        ground = lower
+    if ground is upper:
+        return ground
+    above = float((upper.point - ground.point) @ ground.normal)
+    note = f"a larger level surface lies {above:.2f} m above the floor (a platform, or a table)"
+    return replace(ground, note=note)
+
+
+def _covered(
+    points: np.ndarray, lower: GroundPlane, upper: GroundPlane, tolerance_m: float
+) -> float:
+    """Share of the lower plane's cells, 15 cm wide, above which the upper plane was measured too.
+
+    A camera cannot look through a platform, so the share is small there. If a misplaced camera
+    shows the one floor at two heights, the share is large.
+    """
+    across = np.linalg.svd(upper.normal[None])[2][1:]
+
+    def cells(plane: GroundPlane) -> set[tuple[int, ...]]:
+        on = np.abs((points - plane.point) @ plane.normal) < tolerance_m
+        flat = np.floor(points[on] @ across.T / 0.15).astype(int)
+        return set(map(tuple, flat.tolist()))
+
+    below = cells(lower)
+    return len(below & cells(upper)) / max(1, len(below))
 
 
 def _refined(

@@ -62,7 +62,7 @@ def exchange_lenses(
         """Held-out residual by pair, metres, with poses refined on the background."""
         surfaces = background_surfaces(rig, backgrounds)
         registration = Registration(rig, {STATIC: [surfaces]}, master)
-        body = BodyConstraint(views, rig) if enough else None
+        body = [BodyConstraint(views, rig)] if enough else []
         refined = registration.solve(RigEstimate.start(rig), body).estimate
         return registration.median_residuals(refined, STATIC)
 

@@ -6,15 +6,15 @@ Point-to-plane ICP over all pairs of cameras at once, solved by robust Gauss-New
 - Unknowns of each camera: rotation, translation, depth bias and time offset. Pose and time of the
   master are fixed. A weak prior keeps the others near the start.
 - Moving surfaces also determine the time offsets, through their speed.
-- The body's keypoints (:mod:`.constraints`) are a further term on the poses, because surfaces alone
-  may not suffice: a bare floor leaves three degrees of freedom undetermined.
+- Further terms on the poses (:mod:`.constraints`) are passed in, because surfaces alone may not
+  suffice: a bare floor leaves three degrees of freedom undetermined.
 
 A quarter of the points is held out: the fit does not match them, and they serve to compare poses.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -25,7 +25,6 @@ from scipy.spatial.transform import Rotation
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.geometry.solve.robust import SIGMA_PER_MAD
-from intercap_core.scene.constraints import BodyConstraint
 from intercap_core.scene.starts import PRIOR_OFFSET_S
 from intercap_core.scene.surfaces import DepthSurface
 
@@ -68,6 +67,10 @@ def balance_directions(weight: np.ndarray, normals: np.ndarray) -> np.ndarray:
 BIAS = 6
 OFFSET = 7
 FREEDOMS = 8
+
+# Returns the normal equations of further residuals at poses (C, 4, 4) and time offsets (C,): matrix
+# (C, 6, C, 6) and gradient (C, 6) of rotation and translation
+Constraint = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -203,7 +206,7 @@ class Registration:
     def solve(
         self,
         start: RigEstimate,
-        body: BodyConstraint | None = None,
+        constraints: Sequence[Constraint] = (),
         timing: tuple[np.ndarray, np.ndarray] | None = None,
         *,
         free_poses: bool | np.ndarray = True,
@@ -212,7 +215,7 @@ class Registration:
 
         Args:
             start: first estimate, and mean of the prior.
-            body: keypoints of the body; None = surfaces alone.
+            constraints: further normal equations of the poses.
             timing: normal equations of the offsets from the keypoints: matrix (C, C), 1/s^2, and
                 vector (C,), 1/s.
             free_poses: whether poses are estimated, one bool for all cameras or a mask (C,).
@@ -231,8 +234,8 @@ class Registration:
             matrix = np.zeros((count, FREEDOMS, count, FREEDOMS))
             gradient = np.zeros((count, FREEDOMS))
             self._add_surfaces(matrix, gradient, current, gate)
-            if body is not None:
-                block, slope = body(current.poses, current.offset)
+            for constraint in constraints:
+                block, slope = constraint(current.poses, current.offset)
                 matrix[:, :6, :, :6] += block
                 gradient[:, :6] += slope
             if timing is not None:

@@ -129,14 +129,28 @@ class StatedStarts:
                     "state the starts in seconds, of one clock"
                 )
 
-    def or_else(self, other: StatedStarts) -> StatedStarts:
-        """These starts, and those of ``other`` for cameras about which these state nothing."""
-        sources = zip(self.source, other.source, strict=True)
-        return StatedStarts(
-            np.where(self.known, self.late, other.late),
-            np.where(self.known, self.sigma, other.sigma),
-            tuple(own or theirs for own, theirs in sources),
-        )
+    def combine(self, other: StatedStarts) -> tuple[StatedStarts, list[str]]:
+        """Combine two sources of starts; if they disagree about a camera, this one has precedence.
+
+        Returns the combined starts, and a message (C,) for each disagreement, "" = none.
+        """
+        late, sigma, source = self.late.copy(), self.sigma.copy(), list(self.source)
+        odd = [""] * len(late)
+        for c in np.flatnonzero(other.known):
+            if not self.known[c]:
+                late[c], sigma[c], source[c] = other.late[c], other.sigma[c], other.source[c]
+                continue
+            if abs(late[c] - other.late[c]) > REJECTED_SIGMAS * np.hypot(sigma[c], other.sigma[c]):
+                odd[c] = (
+                    f"{source[c]} has it start {describe_start(late[c])}, {other.source[c]} "
+                    f"{describe_start(other.late[c])}: the first was taken"
+                )
+                continue
+            late[c], sigma[c] = combine_estimates(
+                (late[c], sigma[c]), (other.late[c], other.sigma[c])
+            )
+            source[c] = f"{source[c]} and {other.source[c]}"
+        return StatedStarts(late, sigma, tuple(source)), odd
 
 
 def combine_estimates(

@@ -17,6 +17,7 @@ from intercap_core.geometry.camera.rig import Rig, ring_centre
 from intercap_core.geometry.camera.transforms import apply
 from intercap_core.scene.background import Background, camera_background
 from intercap_core.scene.camera_verdicts import describe_direction, weakest_motion
+from intercap_core.scene.constraints import FloorConstraint
 from intercap_core.scene.extrinsics import Refinement, refine
 from intercap_core.scene.ground import (
     GroundPlane,
@@ -111,7 +112,7 @@ def run(
                 f"{', '.join(source.rig.names)} as in {frames}; re-run stage 'detections'"
             )
         rig, master = source.rig, source.rig.names.index(source.master)
-        stated = _stated_starts(source, starts or {}, master)
+        stated, disagree = _stated_starts(source, starts or {}, master)
         moments = find_moments(
             people, rig, source.time_s, source.fps, source.available, master=master, stated=stated
         )
@@ -120,6 +121,7 @@ def run(
         backgrounds = _backgrounds(source, subject, moments.slip)
         rig, exchanges = exchange_lenses(rig, backgrounds, subject, source.time_s, master)
         surfaces = background_surfaces(rig, backgrounds)
+        given_ground = _ground(source, rig, surfaces, np.zeros(len(rig)), settings, floor)
         refined = refine(
             rig,
             master,
@@ -127,6 +129,7 @@ def run(
             moving_surfaces(source, rig, image_of, backgrounds),
             moments,
             source.time_s,
+            floor=FloorConstraint.of(rig, surfaces, given_ground),
             free_poses=settings.refine_extrinsics,
         )
         rig = rig.moved(refined.poses)
@@ -134,7 +137,8 @@ def run(
         ground, more_notes = _with_feet(source, rig, ground, subject)
         slides, known_to = _slides(source, rig, refined, ground)
         notes = _notes(source, refined, moments, stated, exchanges)
-        for note, slide, words in zip(notes, slides, known_to, strict=True):
+        for note, disagreement, slide, words in zip(notes, disagree, slides, known_to, strict=True):
+            note += [disagreement] if disagreement else []
             note += [words] if np.linalg.norm(slide) > WEAK_CAMERA_M else []
         ground_notes += more_notes
         scene = _Scene(
@@ -145,11 +149,11 @@ def run(
 
 def _stated_starts(
     source: Frames, starts: Mapping[str, tuple[float, float]], master: int
-) -> StatedStarts:
-    """Starts by annotation, and by sound for cameras without an annotation."""
+) -> tuple[StatedStarts, list[str]]:
+    """Starts by annotation and sound combined, and messages (C,) on disagreements; "" = none."""
     names, heard = source.rig.names, source.sound_starts
     if not starts and not heard:
-        return StatedStarts.nothing(len(names))
+        return StatedStarts.nothing(len(names)), [""] * len(names)
     first = source.first_image_s
     annotated = StatedStarts.of(starts, names, master, first, "the annotation")
     try:
@@ -157,7 +161,7 @@ def _stated_starts(
     except UserError as error:
         raise UserError(f"sequence {source.sequence}: {error}") from None
     by_sound = StatedStarts.of(heard, names, master, first, "the sound").unless_in_step()
-    return annotated.or_else(by_sound)
+    return annotated.combine(by_sound)
 
 
 def _backgrounds(

@@ -83,6 +83,15 @@ def room(seed: int, table: bool = True, extra: np.ndarray | None = None) -> Clou
     return apply(to_master, points), normals @ to_master[:3, :3].T
 
 
+def platform(height_m: float, half_m: float) -> Cloud:
+    """A room whose level platform hides most of a floor of 3 by 3 m; master frame."""
+    rng = np.random.default_rng(1)
+    flat = rng.uniform(-1.5, 1.5, (10000, 2))
+    points = np.column_stack([flat, np.where((np.abs(flat) < half_m).all(1), height_m, 0.0)])
+    points += rng.normal(0, 0.003, points.shape)
+    return apply(invert(UP), points), np.tile(MASTER_UP, (len(points), 1))
+
+
 def fitted(cloud: Cloud, up=BY_GRAVITY) -> GroundPlane:
     return fit_ground(*cloud, RIG, up, tolerance_m=0.015, cell_m=0.03)
 
@@ -105,6 +114,19 @@ def test_room_without_a_visible_floor_has_none():
     assert not empty.found and np.isnan(empty.normal).all()
 
 
+@pytest.mark.parametrize("height_m", [0.15, 0.17, 0.5])
+def test_floor_is_below_a_larger_platform(height_m):
+    ground = fitted(platform(height_m, 1.35))  # 7.3 of 9 square metres
+    angle, height = errors(ground)
+    assert angle < 0.1 and abs(height) < 0.002
+    assert f"{height_m:.2f} m above the floor" in ground.note
+
+
+def test_small_surface_far_below_is_no_floor():
+    ground = fitted(platform(0.3, 1.49))  # a rim of 0.12 square metres
+    assert abs(errors(ground)[1] - 0.3) < 0.002 and ground.note == ""
+
+
 @pytest.mark.parametrize("height_m", [0.04, 0.1])
 def test_beam_does_not_tilt_the_floor(height_m):
     low, high = (-1.5, 0.6, height_m), (1.5, 0.75, height_m)
@@ -117,7 +139,7 @@ def test_misplaced_camera_adds_no_lower_floor():
     rng = np.random.default_rng(4)
     again = np.column_stack([rng.uniform(-1.2, 1.2, (1200, 2)), np.full(1200, -0.2)])
     ground = fitted(room(0, False, again))
-    assert abs(errors(ground)[1]) < 0.001
+    assert abs(errors(ground)[1]) < 0.001 and ground.note == ""
 
 
 # --- annotated and stated ------------------------------------------------------------------------

@@ -13,7 +13,8 @@ from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.geometry.camera.triangulation import triangulate
 from intercap_core.scene.background import camera_background
-from intercap_core.scene.constraints import BodyConstraint, BodyViews, body_views
+from intercap_core.scene.constraints import BodyConstraint, BodyViews, FloorConstraint, body_views
+from intercap_core.scene.ground import fit_ground
 from intercap_core.scene.registration import (
     MAX_DIRECTION_GAIN,
     MAX_DIRECTION_SHARE,
@@ -24,7 +25,8 @@ from intercap_core.scene.registration import (
     balance_directions,
 )
 from intercap_core.scene.subject_views import SubjectViews
-from intercap_core.scene.surfaces import moving_surfaces, surface_from_depth
+from intercap_core.scene.surfaces import DepthSurface, moving_surfaces, surface_from_depth
+from intercap_core.scene.up import rough_up
 from tests.helpers.synthetic_capture import (
     FURNITURE,
     extrinsics_error,
@@ -122,7 +124,7 @@ def test_body_constrains_rigs_above_a_bare_floor():
     registration = registration_of(start, surfaces(1, furnished=False)[0])
     alone = registration.solve(RigEstimate.start(start)).estimate
     body = BodyConstraint(views_of(0, 3.0), TRUTH)
-    together = registration.solve(RigEstimate.start(start), body).estimate
+    together = registration.solve(RigEstimate.start(start), [body]).estimate
     errors = [
         extrinsics_error(start.moved(e.poses), TRUTH, MIDDLE)[1:].mean() for e in (alone, together)
     ]
@@ -228,6 +230,76 @@ def test_floor_keeps_at_most_its_share_of_the_weight() -> None:
 def test_balanced_weights_are_unchanged(counts, scale) -> None:
     weight = scale * np.random.default_rng(3).uniform(0, 1, 300)
     np.testing.assert_array_equal(balance_directions(weight, normals(*counts)), weight)
+
+
+# --- a common floor ------------------------------------------------------------------------------
+
+BY_CAMERAS = rough_up(TRUTH, np.full((6, 3), np.nan))
+
+
+@pytest.fixture(scope="module")
+def patches() -> dict[int, DepthSurface]:
+    """Each camera's own sixth of a bare floor: no two cameras share any of it."""
+    result = {}
+    for c, surface in surfaces(0, furnished=False)[0].items():
+        world = apply(UP @ TRUTH[c].master_from_depth, surface.points)
+        sector = np.arctan2(world[:, 1], world[:, 0]) - 2 * np.pi * c / 6
+        off = np.abs((sector + np.pi) % (2 * np.pi) - np.pi)
+        own = (off < np.radians(22)) & (np.hypot(*world.T[:2]) > 0.4)
+        result[c] = surface.subset(np.flatnonzero(own))
+    return result
+
+
+def floor_of(rig, patches) -> FloorConstraint | None:
+    points = [apply(rig[c].master_from_depth, s.points) for c, s in patches.items()]
+    normals = [s.normals @ rig[c].master_from_depth[:3, :3].T for c, s in patches.items()]
+    cloud = np.concatenate(points), np.concatenate(normals)
+    ground = fit_ground(*cloud, rig, BY_CAMERAS, tolerance_m=0.03, cell_m=0.03)
+    return FloorConstraint.of(rig, patches, ground)
+
+
+def test_common_floor_corrects_height_and_tilt_without_overlap(patches):
+    start = perturbed(TRUTH, np.random.default_rng(2), 0.01, 0.3)
+    registration = registration_of(start, patches)
+    assert not registration.residuals(RigEstimate.start(start), STATIC)
+    refined = registration.solve(RigEstimate.start(start), [floor_of(start, patches)]).estimate
+
+    def errors(poses: np.ndarray) -> tuple[float, float]:
+        heights, tilts = [], []
+        for pose, true in zip(poses[1:], TRUTH.master_from_colour[1:], strict=True):
+            moved = UP @ pose @ np.linalg.inv(true) @ np.linalg.inv(UP)
+            middle = apply(UP @ true, np.array([[0.0, 0, 2.5]]))
+            heights.append(abs((apply(moved, middle) - middle)[0, 2]))
+            tilts.append(np.degrees(np.arccos(min(1.0, moved[2, 2]))))
+        return float(np.mean(heights)), float(np.mean(tilts))
+
+    before, after = errors(start.master_from_colour), errors(refined.poses)
+    assert after[0] < 0.5 * before[0] and after[1] < 0.6 * before[1]
+
+
+def test_floor_equations_are_those_of_the_best_plane(patches):
+    start = perturbed(TRUTH, np.random.default_rng(3), 0.003, 0.05)
+    floor, poses = floor_of(start, patches), start.master_from_colour
+    matrix, gradient = floor(poses, NONE)
+    flat = matrix.reshape(36, 36)
+    np.testing.assert_allclose(flat, flat.T, atol=1e-6 * np.abs(flat).max())
+    assert np.linalg.eigvalsh(flat).min() > -1e-6 * np.abs(flat).max()
+    # turning or moving all cameras together has no cost
+    together = np.zeros((6, 6, 6))
+    for axis in range(3):
+        together[:, axis, axis] = together[:, 3 + axis, 3 + axis] = 1
+        together[:, 3:, axis] = np.cross(np.eye(3)[axis], poses[:, :3, 3])
+    assert np.abs(flat @ together.reshape(36, 6)).max() < 2e-2 * np.abs(flat).max()
+    # a step against the gradient brings the floors together
+    step = -1e-3 * gradient / np.abs(gradient).max()
+    moved = poses.copy()
+    moved[:, :3, :3] = Rotation.from_rotvec(step[:, :3]).as_matrix() @ moved[:, :3, :3]
+    moved[:, :3, 3] += step[:, 3:]
+    assert np.linalg.norm(floor(moved, NONE)[1]) < np.linalg.norm(gradient)
+
+
+def test_floor_seen_by_one_camera_is_no_constraint(patches):
+    assert floor_of(TRUTH, {0: patches[0]}) is None
 
 
 # --- moving surfaces -----------------------------------------------------------------------------

@@ -266,7 +266,7 @@ def test_stated_starts_are_relative_to_the_times_of_the_files():
     stated.check_common(np.array([0, 3.0]), names)
 
 
-def test_first_source_has_precedence():
+def test_two_sources_are_combined_unless_they_disagree():
     nan = np.nan
     first = StatedStarts(
         np.array([nan, 0.5, 0.5, nan]), np.array([nan, 0.02, 0.02, nan]), ("", *"aa", "")
@@ -274,7 +274,8 @@ def test_first_source_has_precedence():
     other = StatedStarts(
         np.array([nan, 0.53, 0.9, 0.1]), np.array([nan, 0.01, 0.01, 0.01]), ("", *"bbb")
     )
-    both = first.or_else(other)
-    np.testing.assert_allclose(both.late, [nan, 0.5, 0.5, 0.1])
-    np.testing.assert_allclose(both.sigma, [nan, 0.02, 0.02, 0.01])
-    assert both.source == ("", "a", "a", "b")
+    both, disagreements = first.combine(other)
+    np.testing.assert_allclose(both.late, [nan, 0.524, 0.5, 0.1])
+    np.testing.assert_allclose(both.sigma, [nan, 0.02 / 5**0.5, 0.02, 0.01])
+    assert both.source == ("", "a and b", "a", "b")
+    assert [bool(text) for text in disagreements] == [False, False, True, False]
