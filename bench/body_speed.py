@@ -68,11 +68,10 @@ def fit_clip(clip: BodyClip) -> Run:
     """Fit all frames of the clip as the stage does."""
     begin = time.perf_counter()
     fit = Fitter(clip.model, clip.seen, clip.clouds, clip.settings).run()
-    vectors = fit.vectors.cpu()
     seconds = time.perf_counter() - begin
     if len(fit.frames) != len(clip):
         raise UserError(f"{clip.seen.sequence}: frames without a person cannot be compared")
-    return Run(seconds / len(clip), clip.errors(vectors.to(clip.model.device), fit.frames))
+    return Run(seconds / len(clip), clip.errors(fit.vectors, fit.frames))
 
 
 def fit_frames_separately(clip: BodyClip) -> Run:
@@ -178,10 +177,6 @@ def measure(settings: Path, output: Path, frames: int) -> None:
         "frames": len(clip),
         "threads": THREADS,
     }
-    if torch.cuda.is_available():
-        on_gpu = recording.on(torch.device("cuda"))
-        fit_clip(on_gpu)
-        figures["gpu_fps"] = 1 / fit_clip(on_gpu).seconds
     add_figures(output, "body", figures)
     rows = {
         f"ours, {len(recording)} frames at once": fit,

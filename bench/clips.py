@@ -27,8 +27,6 @@ from intercap_core.body_fit.observations import (
 )
 from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.body_fit.schedule import Fitter, Settled
-from intercap_core.body_fit.surface import choose_samples
-from intercap_core.body_fit.terms import TorchTerms
 from intercap_core.config import BodyFitSettings, JointSettings, ObjectTrackSettings
 from intercap_core.errors import UserError
 from intercap_core.evaluation import object_pose
@@ -165,7 +163,6 @@ class ObjectClip:
 _BY_FRAME = (
     "keypoints", "confidence", "joints", "joint_views", "mask_source", "image_of", "times",
 )  # fmt: skip
-_TENSORS = ("points", "normals", "trust", "view")  # of a cloud
 _CHUNK = 32  # bodies posed at once
 
 
@@ -218,22 +215,13 @@ class BodyClip:
                     for t in numbers
                     for c in range(cameras)
                 ]
-                for name in ("masks", "beside")
+                for name in ("masks", "other_masks")
             },
             **{name: getattr(self.seen, name)[frames] for name in _BY_FRAME},
         )
         return replace(
             self, seen=seen, clouds=self.clouds[frames], true_vertices=self.true_vertices[frames]
         )
-
-    def on(self, device: torch.device) -> BodyClip:
-        """The clip with model and clouds on another device."""
-        model = BodyModel.load(self.model.path, device=device)
-        clouds = [
-            cloud and replace(cloud, **{name: getattr(cloud, name).to(device) for name in _TENSORS})
-            for cloud in self.clouds
-        ]
-        return replace(self, model=model, clouds=clouds)
 
     def errors(self, vectors: Tensor, frames: np.ndarray, *, step: int = 1) -> np.ndarray:
         """PVE (N,) of bodies (N, P) in ``frames`` (N,) over every step-th vertex, millimetres."""
@@ -260,7 +248,7 @@ _POSE = (
 
 @dataclass(frozen=True, eq=False)
 class BodyEvidence:
-    """E_B in plain torch, with the noise constants that the body's fit has estimated."""
+    """The observations of E_B, with the noise constants that the body's fit has estimated."""
 
     fitter: Fitter  # computes the correspondences of ``problem``
     problem: BodyProblem
@@ -311,8 +299,7 @@ class JointClip:
             fps = float(scene.attributes["fps"])
         seen = read_observations(paths["scene"], paths["person"])
         clouds = person_clouds(paths["frames"], seen, settings.points_per_frame, model.device)
-        terms = TorchTerms(model, choose_samples(model))
-        fitter = Fitter(model, seen, clouds, settings, load_pose_prior(models, model), terms)
+        fitter = Fitter(model, seen, clouds, settings, load_pose_prior(models, model))
         start = sequential.state
         if failed.any() or len(fitter.frames) != len(start):
             raise UserError(f"{sequence}: frames without a person cannot be compared")

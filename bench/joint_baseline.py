@@ -29,11 +29,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bench.body_energy import BodyEnergy
 from bench.clips import JointClip
 from bench.object_baseline import Crops, ObjectImages
 from bench.object_baseline import Recipe as ObjectRecipe
 from intercap_core.body.joints import JOINT_INDEX, NUM_JOINTS
 from intercap_core.body.kinematics import rotation_from_axis_angle
+from intercap_core.body_fit.term_inputs import Bodies
 from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.solve.robust import geman_mcclure
 from intercap_core.joint.geometry import Geometry
@@ -84,11 +86,14 @@ class Energy:
         """The energy of each term, differentiable."""
         clip, posed, settings = self._clip, self.geometry.at(x), self._clip.settings
         problem = clip.body.problem
-        shared = problem.base.new_zeros(0)
+        bodies = Bodies(
+            problem.layout.vectors(problem.base, posed.body, None), problem.all_offsets(),
+            problem.thickness_of_group(), self._index,
+        )  # fmt: skip
         distance = posed.distance()
         at_patch = torch.as_tensor(clip.geometry.skin.patch)
         found = {
-            "body_data": problem.cost(posed.body, shared, self._index).sum(),
+            "body_data": BodyEnergy(problem).cost(bodies).sum(),
             "object_data": OBJECT_WEIGHT * self._images(posed.rotation, posed.translation),
             "contact": settings.contact_weight * contact(distance[:, at_patch], self._contact),
             "penetration": settings.penetration_weight * penetration(distance, clip.geometry),

@@ -13,7 +13,7 @@ A point x at rest is posed to sum_m w_m (R_m x + t_m) by the bones m with skinni
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -81,16 +81,6 @@ class Linearisation:
     def joints(self) -> Tensor:
         """(B,55,3); empty if the joints were not requested."""
         return self.points[:, self.selection.num_vertices :]
-
-    def with_correctives_of(self, joints: np.ndarray | None) -> Linearisation:
-        """Return a copy with the derivatives of the pose blend shapes by some joints only.
-
-        joints (N,55) bool: joints that count, for each point; None = none.
-        """
-        if self.correctives is None or joints is None:
-            return replace(self, correctives=None)
-        flags = torch.as_tensor(joints[:, 1:], device=self.points.device)
-        return replace(self, correctives=self.correctives * flags[:, None, :, None])
 
     def full(self) -> Tensor:
         """Return all derivatives (B,N,3,P), mostly zeros; for few points."""

@@ -139,16 +139,6 @@ class DiagonalRows:
     columns: Tensor
     """(R,) columns of the parameters."""
 
-    def add_to(self, hessian: Tensor, gradient: Tensor, weight: float) -> None:
-        """Add weight^2 J^T J to (B,P,P) and weight^2 J^T r to (B,P), in place."""
-        diagonal = torch.diagonal(hessian, dim1=1, dim2=2)
-        diagonal[:, self.columns] += weight**2 * self.slopes**2
-        gradient[:, self.columns] += weight**2 * self.slopes * self.residuals
-
-    def energy(self, weight: float) -> Tensor:
-        """Return half the weighted sum of squares (B,)."""
-        return 0.5 * weight**2 * (self.residuals**2).sum(1)
-
 
 @dataclass(frozen=True)
 class LinearRows:
@@ -160,16 +150,6 @@ class LinearRows:
     """(R, C)"""
     columns: Tensor
     """(C,) columns of the parameters."""
-
-    def add_to(self, hessian: Tensor, gradient: Tensor, weight: float) -> None:
-        """Add weight^2 J^T J to (B,P,P) and weight^2 J^T r to (B,P), in place."""
-        square = weight**2 * self.jacobian.T @ self.jacobian
-        hessian[:, self.columns[:, None], self.columns] += square
-        gradient[:, self.columns] += weight**2 * self.residuals @ self.jacobian
-
-    def energy(self, weight: float) -> Tensor:
-        """Return half the weighted sum of squares (B,)."""
-        return 0.5 * weight**2 * (self.residuals**2).sum(1)
 
 
 def joint_limits(vector: Tensor) -> DiagonalRows:

@@ -48,12 +48,6 @@ class Limbs(NamedTuple):
             np.stack([moved_by[points].any(0) for points in groups]),
         )
 
-    def moved_by_point(self) -> np.ndarray:
-        """Return (N, 55) bool, the joints that move the limb of each point."""
-        flags = np.zeros((len(self.order), NUM_JOINTS), bool)
-        flags[self.order] = self.moved_by.repeat(np.diff(self.starts), 0)
-        return flags
-
 
 @dataclass(frozen=True)
 class Selection:

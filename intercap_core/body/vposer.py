@@ -55,11 +55,6 @@ class PoseGaussian(NamedTuple):
         """Return the prior of the frames ``index``."""
         return PoseGaussian(self.mean[index], self.precision[index])
 
-    def cost(self, body_pose: Tensor) -> Tensor:
-        """Return the cost (B,) of poses (B,63)."""
-        away = body_pose - self.mean
-        return 0.5 * (away[:, None] @ self.precision @ away[..., None])[:, 0, 0]
-
 
 @dataclass(frozen=True)
 class VPoser:

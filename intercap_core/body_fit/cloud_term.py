@@ -17,12 +17,10 @@ one measurement however many points it has. :mod:`.matching` finds the points of
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numba
 import numpy as np
-import torch
 from torch import Tensor
 
 from intercap_core.body.correctives_kernel import PointSource, add_to_row
@@ -40,12 +38,10 @@ from intercap_core.body_fit.term_inputs import (
     Batch,
     Bodies,
     CloudRows,
-    Columns,
     CompiledTerm,
     TermInputs,
     contiguous,
 )
-from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
 
 _SHAPE, _TRANSL = TRANSL.stop, TRANSL.start
 
@@ -56,63 +52,10 @@ def residuals(points: Tensor, rows: CloudRows, thickness: Tensor, group: Tensor)
     Args:
         points: (B, N, 3) samples, metres.
         rows: rows of the B bodies.
-        thickness: (G,) of the coverings, metres.
+        thickness: (G,) or (B, G) of the coverings, metres.
         group: (N,) covering of each sample.
     """
-    return rows.target - (rows.normal * points).sum(2) - thickness[group]
-
-
-@dataclass(frozen=True)
-class CloudTerm:
-    """E_D in torch; see :class:`.term_inputs.TorchTerm`."""
-
-    model: BodyModel
-    sample_ids: Tensor
-    """(N,) vertex ids of the samples."""
-    group: Tensor
-    """(N,) covering of each sample."""
-
-    def cost(self, inputs: TermInputs, bodies: Bodies) -> Tensor:
-        if inputs.rows is None:
-            return bodies.vectors.new_zeros(len(bodies.frames))
-        params = self.model.parameters(bodies.vectors)
-        points = self.model.forward(params, vertex_ids=self.sample_ids).vertices
-        rows = inputs.rows.frames(bodies.frames)
-        e = residuals(points, rows, bodies.thickness, self.group)
-        return 0.5 * (rows.weight * e * e).sum(1)
-
-    def add(
-        self, inputs: TermInputs, bodies: Bodies, columns: Columns, equations: NormalEquations
-    ) -> None:
-        if inputs.rows is None:
-            return
-        params = self.model.parameters(bodies.vectors)
-        linear = self.model.linearise(params, vertex_ids=self.sample_ids)
-        own_limb = linear.with_correctives_of(linear.selection.limbs.moved_by_point())
-        rows = inputs.rows.frames(bodies.frames)
-        # n . d v / d parameters (b, N, n)
-        by, by_own_limb = (
-            each.along(rows.normal[:, :, None])[:, :, 0][..., columns.parameters]
-            for each in (linear, own_limb)
-        )
-        thickness, weight = bodies.thickness, rows.weight
-        e = residuals(linear.vertices, rows, thickness, self.group)
-        weighted = by_own_limb * weight[..., None]
-        n, at = len(columns.parameters), columns.coverings_at
-        cost, gradient, hessian = equations
-        cost += 0.5 * (weight * e * e).sum(1)
-        # de/d theta = -by
-        gradient[:, :n] += -(by * (weight * e)[..., None]).sum(1)
-        hessian[:, :n, :n] += weighted.transpose(1, 2) @ by_own_limb
-        if columns.coverings:
-            # de/du = -c of the sample's covering, since c = c0 exp(u)
-            pick = torch.zeros(len(self.group), len(thickness), dtype=by.dtype, device=by.device)
-            pick[torch.arange(len(self.group)), self.group] = thickness[self.group]
-            cross = weighted.transpose(1, 2) @ pick
-            gradient[:, at] += -(weight * e) @ pick
-            hessian[:, at, at] += torch.einsum("bn,ng,nh->bgh", weight, pick, pick)
-            hessian[:, :n, at] += cross
-            hessian[:, at, :n] += cross.transpose(1, 2)
+    return rows.target - (rows.normal * points).sum(2) - thickness[..., group]
 
 
 # --- compiled --------------------------------------------------------------------------------

@@ -8,7 +8,8 @@ keypoint:
 2. `_fill_rows` computes the derivatives (3, m) of the point by the m parameters of the limb;
 3. their product is added to the dense block (m, m) of the limb.
 The block is added to the normal equations at the end of the limb. The result equals that of the
-torch form to rounding, with pose blend shapes (:mod:`intercap_core.body.correctives_kernel`) too.
+PyTorch form in `bench/body_energy.py` to rounding, with pose blend shapes
+(:mod:`intercap_core.body.correctives_kernel`) too.
 """
 
 from __future__ import annotations

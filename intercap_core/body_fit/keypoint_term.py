@@ -16,7 +16,7 @@ by the body are applied.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -34,7 +34,6 @@ from intercap_core.body_fit.term_inputs import (
     Batch,
     BatchEquations,
     Bodies,
-    Columns,
     CompiledTerm,
     KeypointSet,
     Targets,
@@ -43,8 +42,6 @@ from intercap_core.body_fit.term_inputs import (
     contiguous,
 )
 from intercap_core.geometry.camera import projection
-from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
-from intercap_core.geometry.solve.robust import geman_mcclure
 
 # Scale of rho_J, standard deviations: a larger residual is an outlier. Tuned on the studio.
 KEYPOINT_SCALE = 4.0
@@ -57,22 +54,6 @@ class Keypoints(NamedTuple):
     """(B, K, 3) with offsets, metres."""
     derivatives: Tensor | None
     """(B, K, 3, n)"""
-    rotations: Tensor
-    """(B, K, 3, 3) of the bones that carry the offsets."""
-    own_limb: Tensor | None = None
-    """(B, K, 3, n) derivatives for Gauss-Newton matrices, which contain pose blend shapes only by
-    the joints of each keypoint's own limb."""
-
-
-class PointTerm(NamedTuple):
-    """A cost as a function of K points of B bodies."""
-
-    cost: Tensor
-    """(B,)"""
-    gradient: Tensor
-    """(B, K, 3) by the points."""
-    matrix: Tensor
-    """(B, K, 3, 3) Gauss-Newton matrix by the points."""
 
 
 def evaluate(
@@ -94,19 +75,15 @@ def evaluate(
         derivatives: compute the derivatives as well.
         columns: (n,) parameters to differentiate by; None = all.
     """
-    local = rotation_from_axis_angle(params.full_pose())
-    still = local.new_zeros(local.shape[0], NUM_JOINTS, 3)
-    world = pose_joints(still, local, still[:, 0]).rotations
-    rotations = world[:, chosen.carrier]
-    arms = (rotations @ offsets[..., None])[..., 0]
+    arms = (carrier_rotations(params, chosen) @ offsets[..., None])[..., 0]
     if not derivatives:
         output = model.forward(params, vertex_ids=chosen.vertices)
         points = chosen.matrix @ torch.cat([output.vertices, output.joints], 1)
-        return Keypoints(points + arms, None, rotations)
+        return Keypoints(points + arms, None)
     if columns is None:
         columns = torch.arange(model.num_parameters, device=model.device)
     linear = model.linearise(params, vertex_ids=chosen.vertices, joints=True)
-    full = linear.with_correctives_of(None).full()
+    full = replace(linear, correctives=None).full()
     batch, _, _, size = full.shape
     by = (chosen.matrix @ full.reshape(batch, full.shape[1], -1)).reshape(batch, -1, 3, size)
     # a rotation omega of joint l moves the rotated offset R o by omega x R o, if l is the carrier
@@ -117,36 +94,18 @@ def evaluate(
     by[:, moved, :, : 3 * NUM_JOINTS] += turned.transpose(2, 3).reshape(
         batch, len(moved), 3, 3 * NUM_JOINTS
     )
-    own_limb = by
     if linear.correctives is not None:
         extra = torch.einsum("kn,bnijd->bkijd", chosen.matrix, linear.correctives)
-        flags = torch.as_tensor(chosen.limbs.moved_by_point()[:, 1:], device=model.device)
-        own_limb = by.clone()
-        own_limb[..., 3:NUM_POSE] += (extra * flags[:, None, :, None]).flatten(3)
         by[..., 3:NUM_POSE] += extra.flatten(3)
     points = chosen.matrix @ linear.points + arms
-    return Keypoints(points, by[..., columns], rotations, own_limb[..., columns])
+    return Keypoints(points, by[..., columns])
 
 
-def reprojection(points: Tensor, views: Views) -> PointTerm:
-    """Return the cost sum w rho(|r / sigma|^2) / 2 over the views, with pixel residuals r.
-
-    points (B, K, 3): keypoints, master frame, metres.
-    """
-    pose, lenses = views.colour_from_master, views.lenses
-    pixels, by_point = projection.project_with_jacobian(
-        _in_cameras(points, pose, views.shift), lenses[:, None]
-    )
-    known = views.confidence > 0
-    sigma = views.sigma[..., None]
-    residual = torch.where(known[..., None], (pixels - views.observed) / sigma, 0)
-    robust = geman_mcclure((residual**2).sum(-1), KEYPOINT_SCALE)
-    by_point = by_point @ pose[:, None, :3, :3] / sigma[..., None]
-    weight = views.confidence * robust.weight
-    weighted = by_point.transpose(-1, -2) * weight[..., None, None]
-    gradient = (weighted @ residual[..., None])[..., 0].sum(1)
-    cost = 0.5 * (views.confidence * robust.rho).sum((1, 2))
-    return PointTerm(cost, gradient, (weighted @ by_point).sum(1))
+def carrier_rotations(params: BodyParameters, chosen: KeypointSet) -> Tensor:
+    """Return the rotations (B, K, 3, 3) of the bones that carry the offsets."""
+    local = rotation_from_axis_angle(params.full_pose())
+    still = local.new_zeros(local.shape[0], NUM_JOINTS, 3)
+    return pose_joints(still, local, still[:, 0]).rotations[:, chosen.carrier]
 
 
 def pixel_residuals(points: Tensor, views: Views) -> Tensor:
@@ -162,94 +121,6 @@ def _in_cameras(points: Tensor, pose: Tensor, shift: Tensor | None) -> Tensor:
     """
     moved = points[:, None] if shift is None else points[:, None] + shift
     return moved @ pose[:, :3, :3].transpose(1, 2) + pose[:, None, :3, 3]
-
-
-def triangulated(points: Tensor, targets: Targets) -> PointTerm:
-    """Return the cost sum w rho(|(X - target) / sigma|^2) / 2 of points X (B, K, 3), metres."""
-    known = targets.confidence > 0
-    residual = torch.where(known[..., None], (points - targets.points) / targets.sigma, 0)
-    robust = geman_mcclure((residual**2).sum(-1), KEYPOINT_SCALE)
-    weight = targets.confidence * robust.weight / targets.sigma
-    eye = torch.eye(3, dtype=points.dtype, device=points.device)
-    return PointTerm(
-        0.5 * (targets.confidence * robust.rho).sum(1),
-        weight[..., None] * residual,
-        (weight / targets.sigma)[..., None, None] * eye,
-    )
-
-
-@dataclass(frozen=True)
-class KeypointTerm:
-    """E_J in torch; see :class:`.term_inputs.TorchTerm`."""
-
-    model: BodyModel
-
-    def cost(self, inputs: TermInputs, bodies: Bodies) -> Tensor:
-        return _by_points(inputs, bodies.frames, self._evaluate(inputs, bodies).points).cost
-
-    def add(
-        self, inputs: TermInputs, bodies: Bodies, columns: Columns, equations: NormalEquations
-    ) -> None:
-        keypoints = self._evaluate(inputs, bodies, columns.parameters)
-        term = _by_points(inputs, bodies.frames, keypoints.points)
-        assert keypoints.derivatives is not None and keypoints.own_limb is not None
-        n, batch = len(columns.parameters), len(bodies.frames)
-        cost, gradient, hessian = equations
-        cost += term.cost
-        by = keypoints.derivatives.reshape(batch, -1, n)
-        gradient[:, :n] += (by.transpose(1, 2) @ term.gradient.reshape(batch, -1, 1))[..., 0]
-        weighted = (term.matrix @ keypoints.own_limb).reshape(batch, -1, n)
-        hessian[:, :n, :n] += keypoints.own_limb.reshape(batch, -1, n).transpose(1, 2) @ weighted
-        if columns.offsets:
-            _add_offsets(term, keypoints, columns, equations)
-
-    def _evaluate(
-        self, inputs: TermInputs, bodies: Bodies, columns: Tensor | None = None
-    ) -> Keypoints:
-        return evaluate(
-            self.model,
-            self.model.parameters(bodies.vectors),
-            inputs.keypoints,
-            bodies.offsets,
-            derivatives=columns is not None,
-            columns=columns,
-        )
-
-
-def _by_points(inputs: TermInputs, frames: Tensor, points: Tensor) -> PointTerm:
-    """Return E_J of the frames (B,) as a function of the points: views plus targets."""
-    terms = []
-    if inputs.views is not None:
-        terms.append(reprojection(points, inputs.views.frames(frames)))
-    if inputs.targets is not None:
-        terms.append(triangulated(points, inputs.targets.frames(frames)))
-    if not terms:
-        raise ValueError("the problem has neither views nor targets")
-    return PointTerm(*(sum(part[1:], start=part[0]) for part in zip(*terms, strict=True)))
-
-
-def _add_offsets(
-    term: PointTerm, keypoints: Keypoints, columns: Columns, equations: NormalEquations
-) -> None:
-    """Add the blocks of the offsets, and the blocks of offsets by parameters.
-
-    An offset moves its keypoint by the rotation of the carrier.
-    """
-    count, n, at = columns.offsets, len(columns.parameters), columns.offsets_at
-    assert keypoints.own_limb is not None
-    rotation = keypoints.rotations[:, :count]
-    batch = rotation.shape[0]
-    gradient = (rotation.transpose(2, 3) @ term.gradient[:, :count, :, None])[..., 0]
-    turned = term.matrix[:, :count] @ rotation
-    by = keypoints.own_limb[:, :count]
-    cross = (by.transpose(2, 3) @ turned).permute(0, 2, 1, 3).flatten(2)
-    own = rotation.new_zeros(batch, count, 3, count, 3)
-    each = torch.arange(count, device=rotation.device)
-    own[:, each, :, each, :] = (rotation.transpose(2, 3) @ turned).transpose(0, 1)
-    equations.gradient[:, at] += gradient.reshape(batch, -1)
-    equations.hessian[:, at, at] += own.reshape(batch, 3 * count, 3 * count)
-    equations.hessian[:, :n, at] += cross
-    equations.hessian[:, at, :n] += cross.transpose(1, 2)
 
 
 # --- compiled --------------------------------------------------------------------------------

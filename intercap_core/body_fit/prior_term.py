@@ -15,7 +15,6 @@ priors are therefore in units of their own standard deviation, with weight 1.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numba
@@ -31,86 +30,42 @@ from intercap_core.body_fit.term_inputs import (
     Batch,
     BatchEquations,
     Bodies,
-    Columns,
     CompiledTerm,
     TermInputs,
     contiguous,
 )
-from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
 
-_BODY_POSE = slice(3, 66)  # columns of the 21 body joints (SMPL-X)
-_BODY_START = _BODY_POSE.start
+_BODY_START = 3  # first column of the 21 body joints (SMPL-X)
 _HANDS = (75, 120)  # first column of each hand (SMPL-X)
 
 Rows = priors.DiagonalRows | priors.LinearRows
 
 
-@dataclass(frozen=True)
-class PriorTerm:
-    """All priors in torch; see :class:`.term_inputs.TorchTerm`."""
+def prior_rows(model: BodyModel, vectors: Tensor, *, body_pose: bool) -> list[tuple[Rows, float]]:
+    """Return the rows and weights of all priors but those of shape and expression.
 
-    model: BodyModel
+    They are in this order: rest pose, joint limits, bending, left hand, right hand.
 
-    def rows(
-        self, vectors: Tensor, *, body_pose: bool = True, hand_share: float = 1.0
-    ) -> list[tuple[Rows, float]]:
-        """Return the rows and weights of all priors but those of shape and expression.
-
-        Args:
-            vectors: (B, P) parameters.
-            body_pose: include the open prior of the 21 body joints.
-            hand_share: factor of E_theta_h in one frame.
-        """
-        model = self.model
-        # some hand components hardly vary among grasps; at least 0.03 rad, tuned on the studio
-        deviation = model.hand_deviation.clamp_min(0.03)
-        own = (model.hand_mean, model.hand_components, deviation)
-        hands = [(priors.hand_pose(vectors, *own, side=side), hand_share**0.5) for side in (0, 1)]
-        # The ranges of joints are those of most people, not of all, so their limits are soft: an
-        # excess of 4 degrees is one standard deviation (tuned on the studio).
-        limits = 1 / math.radians(4)
-        # The residual exp(sign theta) is 1 for a straight limb, which should cost little: the
-        # weight is small (tuned on the studio).
-        bending = 1 / 6
-        return [
-            (priors.rest_pose(vectors, first=1 if body_pose else JOINT_INDEX["jaw"]), 1.0),
-            (priors.joint_limits(vectors), limits),
-            (priors.bending(vectors), bending),
-            *hands,
-        ]
-
-    def cost(self, inputs: TermInputs, bodies: Bodies) -> Tensor:
-        vectors = bodies.vectors
-        total = 0.5 * (vectors[:, _standard_normal(self.model, not inputs.one_shape)] ** 2).sum(1)
-        if inputs.pose is not None:
-            total = total + inputs.pose.of_frames(bodies.frames).cost(vectors[:, _BODY_POSE])
-        for rows, weight in self._rows(inputs, vectors):
-            total = total + rows.energy(weight)
-        return total
-
-    def add(
-        self, inputs: TermInputs, bodies: Bodies, columns: Columns, equations: NormalEquations
-    ) -> None:
-        vectors = bodies.vectors
-        batch, size = vectors.shape
-        gradient, hessian = torch.zeros_like(vectors), vectors.new_zeros(batch, size, size)
-        if inputs.pose is not None:
-            pose = inputs.pose.of_frames(bodies.frames)
-            difference = vectors[:, _BODY_POSE] - pose.mean
-            gradient[:, _BODY_POSE] += (pose.precision @ difference[..., None])[..., 0]
-            hessian[:, _BODY_POSE, _BODY_POSE] += pose.precision
-        for rows, weight in self._rows(inputs, vectors):
-            rows.add_to(hessian, gradient, weight)
-        at = _standard_normal(self.model, not inputs.one_shape)
-        gradient[:, at] += vectors[:, at]
-        hessian.diagonal(dim1=1, dim2=2)[:, at] += 1
-        chosen, n = columns.parameters, len(columns.parameters)
-        equations.cost.add_(self.cost(inputs, bodies))
-        equations.gradient[:, :n] += gradient[:, chosen]
-        equations.hessian[:, :n, :n] += hessian[:, chosen][:, :, chosen]
-
-    def _rows(self, inputs: TermInputs, vectors: Tensor) -> list[tuple[Rows, float]]:
-        return self.rows(vectors, body_pose=inputs.pose is None, hand_share=inputs.hand_share)
+    Args:
+        model: the body.
+        vectors: (B, P) parameters.
+        body_pose: include the open prior of the 21 body joints.
+    """
+    # some hand components hardly vary among grasps; at least 0.03 rad, tuned on the studio
+    deviation = model.hand_deviation.clamp_min(0.03)
+    own = (model.hand_mean, model.hand_components, deviation)
+    # The ranges of joints are those of most people, not of all, so their limits are soft: an
+    # excess of 4 degrees is one standard deviation (tuned on the studio).
+    limits = 1 / math.radians(4)
+    # The residual exp(sign theta) is 1 for a straight limb, which should cost little: the weight
+    # is small (tuned on the studio).
+    bending = 1 / 6
+    return [
+        (priors.rest_pose(vectors, first=1 if body_pose else JOINT_INDEX["jaw"]), 1.0),
+        (priors.joint_limits(vectors), limits),
+        (priors.bending(vectors), bending),
+        *((priors.hand_pose(vectors, *own, side=side), 1.0) for side in (0, 1)),
+    ]
 
 
 def _standard_normal(model: BodyModel, shape: bool) -> slice:
@@ -155,7 +110,7 @@ class PriorArrays(NamedTuple):
             body_pose: include the open prior of the 21 body joints.
         """
         zero = torch.zeros(1, model.num_parameters, dtype=model.dtype)
-        terms = PriorTerm(model).rows(zero, body_pose=body_pose)
+        terms = prior_rows(model, zero, body_pose=body_pose)
         alone = [(r, weight) for r, weight in terms if isinstance(r, priors.DiagonalRows)]
         hands = [r.jacobian for r, _ in terms if isinstance(r, priors.LinearRows)]
         (rest, _), (_, outside), (_, bending) = alone

@@ -22,13 +22,8 @@ from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
 from intercap_core.body_fit.definition import Definition
 from intercap_core.body_fit.surface import COVERINGS, Samples
-from intercap_core.body_fit.term_inputs import (
-    Bodies,
-    Columns,
-    TermInputs,
-    TorchTerm,
-)
-from intercap_core.body_fit.terms import terms_on
+from intercap_core.body_fit.term_inputs import Bodies, Columns, TermInputs
+from intercap_core.body_fit.terms import CompiledTerms
 from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
 
 NUM_OFFSETS = 25  # OpenPose's body keypoints
@@ -193,14 +188,14 @@ class BodyProblem(TermInputs):
     """Fit offsets and coverings."""
     definition: Definition = field(default_factory=Definition.unknown)
     """Prior of the offsets."""
-    terms: TorchTerm | None = None
-    """The terms; None = the fastest form on the device of ``base``."""
+    terms: CompiledTerms | None = None
+    """The terms, which cache what they need of the model; None = new ones."""
 
     def __post_init__(self) -> None:
         device = self.base.device
         self._group = torch.as_tensor(self.samples.group, device=device)
         self._usual_thickness = torch.tensor([c.thickness for c in COVERINGS]).to(self.base)
-        self.terms = self._terms = self.terms or terms_on(device, self.model, self.samples)
+        self.terms = self._terms = self.terms or CompiledTerms(self.model, self.samples)
 
     @property
     def layout(self) -> ParameterLayout:

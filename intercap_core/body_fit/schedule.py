@@ -34,7 +34,7 @@ from intercap_core.body_fit.quality import PartEvidence, compare_parts
 from intercap_core.body_fit.recover import recover
 from intercap_core.body_fit.start import START_SIGMA_M, fit_start
 from intercap_core.body_fit.surface import COVERINGS
-from intercap_core.body_fit.term_inputs import Targets, TorchTerm
+from intercap_core.body_fit.term_inputs import Targets
 from intercap_core.config import BodyFitSettings
 from intercap_core.geometry.solve.levenberg_marquardt import Solution, minimise
 from intercap_core.progress import Progress
@@ -105,7 +105,6 @@ class Fitter:
         clouds: points of each frame.
         settings: settings of the stage.
         pose_prior: learned prior of the body pose; None = the open prior.
-        terms: terms of the energy; None = the fastest form on the model's device.
         definition: prior of the keypoint offsets; None = unknown.
     """
 
@@ -116,12 +115,10 @@ class Fitter:
         clouds: list[PersonCloud | None],
         settings: BodyFitSettings,
         pose_prior: VPoser | None = None,
-        terms: TorchTerm | None = None,
         definition: Definition | None = None,
     ) -> None:
         self.model, self.settings, self.pose_prior = model, settings, pose_prior
         self.definition = definition or Definition.unknown()
-        self._terms = terms
         self._progress = Progress(log, "body: minimised", None, "rounds")
         self.evidence = Evidence(model, observations, clouds, settings.cloud_weight)
         self.frames = self.evidence.frames
@@ -226,7 +223,6 @@ class Fitter:
             keypoints=self.evidence.keypoints(),
             samples=self.evidence.samples,
             self_weight=self.settings.self_penetration_weight,
-            terms=self._terms,
             **changes,
         )
 

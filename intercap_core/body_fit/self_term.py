@@ -13,15 +13,12 @@ neither. :mod:`.self_contact` finds the pairs.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numba
 import numpy as np
-from torch import Tensor
 
 from intercap_core.body.correctives_kernel import PointSource
-from intercap_core.body.jacobian import Linearisation
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import TRANSL
 from intercap_core.body.skeleton_kernel import (
@@ -35,84 +32,18 @@ from intercap_core.body_fit.surface import SAMPLE_SHARE
 from intercap_core.body_fit.term_inputs import (
     Batch,
     Bodies,
-    Columns,
     CompiledTerm,
     Pairs,
     TermInputs,
     contiguous,
 )
-from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
-from intercap_core.geometry.solve.robust import geman_mcclure
 
 SELF_TOLERANCE_M = 0.003  # skin yields by some millimetres under pressure; tuned on the studio
-_REACH_M = 0.015  # scale of rho, the depth at which it levels off; tuned on the studio
-_WEIGHT = SAMPLE_SHARE / 0.008**2  # w, 1/m^2; the skin is fitted to 8 mm (measured on the studio)
+SELF_REACH_M = 0.015  # scale of rho, the depth at which it levels off; tuned on the studio
+# w, 1/m^2; the skin is fitted to 8 mm (measured on the studio)
+SELF_WEIGHT = SAMPLE_SHARE / 0.008**2
 
 _SHAPE = TRANSL.stop
-
-
-@dataclass(frozen=True)
-class SelfPenetrationTerm:
-    """E_P_self in torch; see :class:`.term_inputs.TorchTerm`.
-
-    The gradient contains pose blend shapes, the Gauss-Newton matrix does not.
-    """
-
-    model: BodyModel
-
-    def cost(self, inputs: TermInputs, bodies: Bodies) -> Tensor:
-        total = bodies.vectors.new_zeros(len(bodies.frames))
-        here = None if inputs.pairs is None else inputs.pairs.of_frames(bodies.frames)
-        if here is None:
-            return total
-        pairs, present = here
-        params = self.model.parameters(bodies.vectors).frames(present)
-        points = self.model.forward(params, vertex_ids=pairs.vertices).vertices
-        robust = geman_mcclure(_residuals(points, pairs) ** 2, _REACH_M)
-        inside = total.index_add(0, present[pairs.frame], 0.5 * _WEIGHT * robust.rho)
-        return inputs.self_weight * inside
-
-    def add(
-        self, inputs: TermInputs, bodies: Bodies, columns: Columns, equations: NormalEquations
-    ) -> None:
-        here = None if inputs.pairs is None else inputs.pairs.of_frames(bodies.frames)
-        if here is None:
-            return
-        pairs, present = here
-        params = self.model.parameters(bodies.vectors).frames(present)
-        linear = self.model.linearise(params, vertex_ids=pairs.vertices)
-        residual = _residuals(linear.points, pairs)
-        active = residual > 0
-        if not bool(active.any()):
-            return
-        frame, residual = pairs.frame[active], residual[active]
-        inner, outer, normal = pairs.inner[active], pairs.outer[active], pairs.normal[active]
-
-        def rows_of(linear: Linearisation) -> Tensor:
-            """d residual / d parameters = -n . (dp - dq), (M, n)"""
-            by_point = linear.full()[..., columns.parameters]
-            return -(normal[:, None] @ (by_point[frame, inner] - by_point[frame, outer]))[:, 0]
-
-        rows, rigid_rows = rows_of(linear), rows_of(linear.with_correctives_of(None))
-        robust = geman_mcclure(residual**2, _REACH_M)
-        weight = _WEIGHT * robust.weight
-        count, n, factor = len(present), len(columns.parameters), inputs.self_weight
-        cost = rows.new_zeros(count).index_add(0, frame, 0.5 * _WEIGHT * robust.rho)
-        gradients = (weight * residual)[:, None] * rows
-        gradient = rows.new_zeros(count, n).index_add(0, frame, gradients)
-        hessian = rows.new_zeros(count, n, n)
-        for f in frame.unique().tolist():
-            own = frame == f
-            hessian[f] = rigid_rows[own].T @ (weight[own, None] * rigid_rows[own])
-        equations.cost.index_add_(0, present, factor * cost)
-        equations.gradient[present, :n] += factor * gradient
-        equations.hessian[present, :n, :n] += factor * hessian
-
-
-def _residuals(points: Tensor, pairs: Pairs) -> Tensor:
-    """Return the depth (M,) beyond the tolerance, metres, of points (F, U, 3); 0 = outside."""
-    gap = points[pairs.frame, pairs.inner] - points[pairs.frame, pairs.outer]
-    return (-(pairs.normal * gap).sum(1) - SELF_TOLERANCE_M).clamp_min(0)
 
 
 # --- compiled --------------------------------------------------------------------------------
@@ -154,7 +85,7 @@ class CompiledSelfPenetration:
             inner=contiguous(inputs.pairs.inner),
             outer=contiguous(inputs.pairs.outer),
             normal=contiguous(inputs.pairs.normal),
-            weight=float(inputs.self_weight * _WEIGHT),
+            weight=float(inputs.self_weight * SELF_WEIGHT),
         )
         rest = source.at_rest(contiguous(bodies.vectors[:, _SHAPE:]), derivatives)
 
@@ -189,7 +120,7 @@ def _depth(points, pairs, b, at):
 @numba.njit(cache=True, nogil=True)
 def add_cost(points, pairs, frames, cost):
     """Add E_P_self to cost (B,) of the frames (B,)."""
-    square = _REACH_M * _REACH_M
+    square = SELF_REACH_M * SELF_REACH_M
     for b in range(len(frames)):
         total = 0.0
         for at in range(pairs.starts[frames[b]], pairs.starts[frames[b] + 1]):
@@ -216,7 +147,7 @@ def add_equations(points, pairs, frames, equations, rest_gradient):
     columns = place[place >= 0]
     scratch = np.empty((points.chain.shape[1], 3), hessian.dtype)
     one = np.ones(1, hessian.dtype)[0]
-    square = _REACH_M * _REACH_M
+    square = SELF_REACH_M * SELF_REACH_M
     for b in range(len(frames)):
         first, end = pairs.starts[frames[b]], pairs.starts[frames[b] + 1]
         rows = np.zeros((end - first, gradient.shape[1]), hessian.dtype)

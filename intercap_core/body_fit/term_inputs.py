@@ -1,14 +1,10 @@
-"""The interface of the terms of the body's energy E_B (equation 2): inputs, columns, results.
-
-Every term exists in two forms. The torch form is the readable one and runs on any device. The
-compiled form is used on the CPU. Both have the same cost, gradient and Gauss-Newton matrix.
-"""
+"""The interface of the terms of the body's energy E_B (equation 2): inputs, columns, results."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -20,7 +16,6 @@ from intercap_core.body.model import BodyModel
 from intercap_core.body.selection import Limbs
 from intercap_core.body.skeleton_kernel import Skeleton
 from intercap_core.body.vposer import PoseGaussian
-from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
 
 # --- observations ----------------------------------------------------------------------------
 
@@ -99,23 +94,6 @@ class Pairs(NamedTuple):
     """(M, 3) outward normal at that vertex, master frame."""
     vertices: Tensor
     """(U,) vertex ids."""
-
-    def of_frames(self, index: Tensor) -> tuple[Pairs, Tensor] | None:
-        """Return the pairs of the frames ``index`` (b,), or None if there are none.
-
-        Returns:
-            The pairs; their ``frame`` is an index 0 to F - 1 of the F frames with pairs.
-            (F,) places of these frames in ``index``.
-        """
-        place = self.frame.new_full((int(max(self.frame.max(), index.max())) + 1,), -1)
-        place[index] = torch.arange(len(index), device=index.device)
-        at = place[self.frame]
-        kept = at >= 0
-        if not bool(kept.any()):
-            return None
-        present, frame = at[kept].unique(return_inverse=True)
-        inner, outer, normal = self.inner[kept], self.outer[kept], self.normal[kept]
-        return Pairs(frame, inner, outer, normal, self.vertices), present
 
 
 # --- keypoints -------------------------------------------------------------------------------
@@ -272,21 +250,7 @@ class Columns(NamedTuple):
         return np.arange(at.start, at.stop) if self.coverings else np.full(count, -1)
 
 
-class TorchTerm(Protocol):
-    """The torch form of a term, or of the sum of all terms."""
-
-    def cost(self, inputs: TermInputs, bodies: Bodies) -> Tensor:
-        """Return the cost (b,) of each body."""
-        ...
-
-    def add(
-        self, inputs: TermInputs, bodies: Bodies, columns: Columns, equations: NormalEquations
-    ) -> None:
-        """Add cost (b,), gradient (b, n) and Gauss-Newton matrix (b, n, n) in place."""
-        ...
-
-
-# --- compiled form ---------------------------------------------------------------------------
+# --- results ---------------------------------------------------------------------------------
 
 
 class Batch(NamedTuple):
@@ -325,7 +289,7 @@ class BatchEquations(NamedTuple):
 
 
 class CompiledTerm(NamedTuple):
-    """The compiled form of a term at the b bodies of one evaluation."""
+    """A term at the b bodies of one evaluation."""
 
     rest: RestPoints | None
     """Points of the term at rest, which pose blend shapes move; None = no points."""

@@ -1,14 +1,14 @@
 """The terms of the body's energy E_B (equation 2 with 3 to 5), summed.
 
-| term | equation | file | torch form | compiled form |
-| --- | --- | --- | --- | --- |
-| E_J | 3 | keypoint_term.py | KeypointTerm | CompiledKeypoints |
-| E_D | 4 | cloud_term.py | CloudTerm | CompiledCloud |
-| E_P_self | 5 | self_term.py | SelfPenetrationTerm | CompiledSelfPenetration |
-| priors | 2 | prior_term.py | PriorTerm | CompiledPriors |
+| term | equation | file | class |
+| --- | --- | --- | --- |
+| E_J | 3 | keypoint_term.py | CompiledKeypoints |
+| E_D | 4 | cloud_term.py | CompiledCloud |
+| E_P_self | 5 | self_term.py | CompiledSelfPenetration |
+| priors | 2 | prior_term.py | CompiledPriors |
 
-:class:`TorchTerms` is the readable form and the one that runs on a GPU. :class:`CompiledTerms` has
-the same cost, gradient and Gauss-Newton matrix on the CPU.
+The terms are compiled for the CPU. The readable form is `bench/body_energy.py`, with which tests
+compare them: it states the residuals of each term in PyTorch.
 
 The bodies of licensed files have pose blend shapes. Costs and gradients include these in full. The
 Gauss-Newton matrices include their derivatives only in part, since all of them would make every
@@ -34,10 +34,10 @@ from intercap_core.body.correctives_kernel import (
 )
 from intercap_core.body.model import BodyModel
 from intercap_core.body.skeleton_kernel import RestJoints, pose
-from intercap_core.body_fit.cloud_term import CloudTerm, CompiledCloud
-from intercap_core.body_fit.keypoint_term import CompiledKeypoints, KeypointTerm
-from intercap_core.body_fit.prior_term import CompiledPriors, PriorTerm
-from intercap_core.body_fit.self_term import CompiledSelfPenetration, SelfPenetrationTerm
+from intercap_core.body_fit.cloud_term import CompiledCloud
+from intercap_core.body_fit.keypoint_term import CompiledKeypoints
+from intercap_core.body_fit.prior_term import CompiledPriors
+from intercap_core.body_fit.self_term import CompiledSelfPenetration
 from intercap_core.body_fit.surface import Samples
 from intercap_core.body_fit.term_inputs import (
     Batch,
@@ -46,59 +46,13 @@ from intercap_core.body_fit.term_inputs import (
     Columns,
     CompiledTerm,
     TermInputs,
-    TorchTerm,
 )
 from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
 from intercap_core.geometry.solve.thread_pool import ThreadPool
 
 
-def terms_on(device: torch.device, model: BodyModel, samples: Samples) -> TorchTerm:
-    """Return the fastest form on a device: compiled on the CPU, else torch."""
-    form = CompiledTerms if device.type == "cpu" else TorchTerms
-    return form(model, samples)
-
-
-class TorchTerms:
-    """The sum of all terms in torch; see :class:`.term_inputs.TorchTerm`."""
-
-    def __init__(self, model: BodyModel, samples: Samples) -> None:
-        def tensor(values: object) -> Tensor:
-            return torch.as_tensor(values, device=model.device)
-
-        self.terms: tuple[TorchTerm, ...] = (
-            KeypointTerm(model),
-            CloudTerm(model, tensor(samples.vertex), tensor(samples.group)),
-            SelfPenetrationTerm(model),
-            PriorTerm(model),
-        )
-
-    def cost(self, inputs: TermInputs, bodies: Bodies) -> Tensor:
-        total = bodies.vectors.new_zeros(len(bodies.frames))
-        for at in _chunks(len(total)):
-            for term in self.terms:
-                total[at] += term.cost(inputs, _part(bodies, at))
-        return total
-
-    def add(
-        self, inputs: TermInputs, bodies: Bodies, columns: Columns, equations: NormalEquations
-    ) -> None:
-        for at in _chunks(len(bodies.frames)):
-            part = NormalEquations(*(whole[at] for whole in equations))
-            for term in self.terms:
-                term.add(inputs, _part(bodies, at), columns, part)
-
-
-def _part(bodies: Bodies, at: slice) -> Bodies:
-    return bodies._replace(vectors=bodies.vectors[at], frames=bodies.frames[at])
-
-
-def _chunks(count: int) -> list[slice]:
-    """Divide frames into chunks of 32, whose dense Jacobians fit into memory."""
-    return [slice(i, i + 32) for i in range(0, count, 32)]
-
-
 class CompiledTerms:
-    """The sum of all terms by compiled kernels, on the CPU; see :class:`.term_inputs.TorchTerm`.
+    """The sum of all terms by compiled kernels.
 
     The skeleton of a frame is posed once for all terms. Frames are divided among as many threads as
     torch uses. Each frame has its own normal equations, so the result does not depend on the number
@@ -115,6 +69,7 @@ class CompiledTerms:
         )
 
     def cost(self, inputs: TermInputs, bodies: Bodies) -> Tensor:
+        """Return the cost (b,) of each body."""
         terms = self._prepare(inputs, bodies, False)
         total = bodies.vectors.new_zeros(len(bodies.frames))
 
@@ -129,6 +84,7 @@ class CompiledTerms:
     def add(
         self, inputs: TermInputs, bodies: Bodies, columns: Columns, equations: NormalEquations
     ) -> None:
+        """Add cost (b,), gradient (b, n) and Gauss-Newton matrix (b, n, n) in place."""
         terms = self._prepare(inputs, bodies, True)
         moved = [term.rest for term in terms if term.rest and term.rest.correctives]
         place = columns.of_parameters(bodies.vectors.shape[1])

@@ -1,8 +1,8 @@
-"""The terms of the body's energy: torch against differences, compiled against torch."""
+"""The compiled terms of the body's energy against autograd, and the whole against differences."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -10,25 +10,29 @@ import pytest
 import torch
 from torch import Tensor
 
+from bench.body_energy import BodyEnergy, Rows
+from intercap_core.body.jacobian import shaped_points
+from intercap_core.body.kinematics import rotation_from_axis_angle
 from intercap_core.body.loading import load_body_file
 from intercap_core.body.model import BodyModel
+from intercap_core.body.selection import Limbs
 from intercap_core.body.vposer import PoseGaussian
-from intercap_core.body_fit import cloud_term, keypoint_term
-from intercap_core.body_fit.prior_term import PriorTerm
+from intercap_core.body_fit import keypoint_term
+from intercap_core.body_fit.prior_term import CompiledPriors, prior_rows
 from intercap_core.body_fit.problem import BodyProblem, columns_of
 from intercap_core.body_fit.surface import COVERINGS, choose_samples
 from intercap_core.body_fit.term_inputs import (
+    Batch,
     Bodies,
     CloudRows,
     Pairs,
     Targets,
     TermInputs,
-    TorchTerm,
     Views,
     keypoint_set,
 )
-from intercap_core.body_fit.terms import TorchTerms
 from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations
+from intercap_core.geometry.solve.robust import geman_mcclure_weight
 
 FRAMES, CAMERAS, KEYPOINTS = 3, 3, 118
 
@@ -102,7 +106,7 @@ def exact(request: pytest.FixtureRequest) -> Iterator[BodyProblem]:
     torch.set_default_dtype(torch.float32)
 
 
-# --- torch ----------------------------------------------------------------------------------------
+# --- against torch --------------------------------------------------------------------------------
 
 
 def _learned(problem: BodyProblem) -> BodyProblem:
@@ -113,87 +117,6 @@ def _learned(problem: BodyProblem) -> BodyProblem:
         problem, columns=columns, one_shape=False, fit_shared=False, hand_share=0.2,
         pose=PoseGaussian(0.1 * _random(FRAMES, 63, seed=12), spread @ spread.mT),
     )  # fmt: skip
-
-
-@pytest.mark.parametrize("learned", [False, True])
-@pytest.mark.parametrize("number", range(4), ids=["E_J", "E_D", "E_P_self", "priors"])
-def test_gradient_of_each_term_is_the_slope_of_its_cost(
-    number: int, learned: bool, exact: BodyProblem
-) -> None:
-    """By pose, shape, keypoint offsets and thickness of clothing."""
-    problem = _learned(exact) if learned else exact
-    term = TorchTerms(problem.model, problem.samples).terms[number]
-    cost, gradient, hessian, ahead, behind = _along(problem, term, step=1e-6)
-    torch.testing.assert_close(cost, term.cost(*_evaluation(problem)))
-    slope = (ahead - behind) / 2e-6
-    torch.testing.assert_close(gradient, slope, rtol=1e-5, atol=1e-3)
-    torch.testing.assert_close(hessian, hessian.mT)
-    assert torch.linalg.eigvalsh(hessian).min() > -1e-6 * hessian.abs().max()
-
-
-def _evaluation(problem: BodyProblem) -> tuple[TermInputs, Bodies]:
-    own, shared, index = problem.own_start(), problem.shared_start(), torch.arange(FRAMES)
-    return problem, problem._bodies(own, shared, index)
-
-
-def _moved(problem: BodyProblem, bodies: Bodies, way: Tensor, step: float) -> Bodies:
-    """The bodies moved along ``way`` (n,) by the columns of the normal equations."""
-    columns = problem.layout.equations()
-    vectors, offsets = bodies.vectors.clone(), bodies.offsets.clone()
-    vectors[:, columns.parameters] += step * way[: len(columns.parameters)]
-    thickness = bodies.thickness
-    if columns.offsets:
-        offsets[:25] += step * way[columns.offsets_at].reshape(25, 3)
-        thickness = thickness * (step * way[columns.coverings_at]).exp()
-    return bodies._replace(vectors=vectors, offsets=offsets, thickness=thickness)
-
-
-def _along(problem: BodyProblem, term: TorchTerm, step: float) -> tuple[Tensor, ...]:
-    """Cost, derivative along a random way, Hessian; costs ahead and behind."""
-    (inputs, bodies), columns = _evaluation(problem), problem.layout.equations()
-    size = columns.coverings_at.stop
-    sums = NormalEquations(*(torch.zeros(FRAMES, *[size] * axes) for axes in (0, 1, 2)))
-    term.add(inputs, bodies, columns, sums)
-    way = _random(size, seed=20)
-    ahead, behind = (
-        term.cost(inputs, _moved(problem, bodies, way, sign * step)) for sign in (1, -1)
-    )
-    return sums.cost, sums.gradient @ way, sums.hessian, ahead, behind
-
-
-@pytest.mark.parametrize("exact", [False], indirect=True)  # else they omit some derivatives
-def test_gauss_newton_matrices_are_products_of_residual_slopes(exact: BodyProblem) -> None:
-    """v^T H v = sum w (dr / dv)^2 along a way v, for E_D and for E_J without blend shapes."""
-    model = exact.model
-    problem = replace(exact, targets=None)
-    keypoints, cloud, *_ = TorchTerms(model, problem.samples).terms
-    (_, bodies), step = _evaluation(problem), 1e-6
-    way = _random(problem.layout.equations().coverings_at.stop, seed=20)
-    moved = [_moved(problem, bodies, way, sign * step) for sign in (1, -1)]
-    ids, group = torch.as_tensor(problem.samples.vertex), torch.as_tensor(problem.samples.group)
-
-    def distances(at: Bodies) -> Tensor:
-        points = model.forward(model.parameters(at.vectors), vertex_ids=ids).vertices
-        return cloud_term.residuals(points, problem.rows, at.thickness, group)
-
-    def pixels(at: Bodies) -> Tensor:
-        params = model.parameters(at.vectors)
-        points = keypoint_term.evaluate(
-            model, params, problem.keypoints, at.offsets, derivatives=False
-        ).points
-        return keypoint_term.pixel_residuals(points, problem.views) / 40.0
-
-    slope = (distances(moved[0]) - distances(moved[1])) / (2 * step)
-    expected = (problem.rows.weight * slope**2).sum(1)
-    _, _, hessian, *_ = _along(problem, cloud, step)
-    torch.testing.assert_close((hessian @ way) @ way, expected, rtol=1e-6, atol=0)
-
-    slope = (pixels(moved[0]) - pixels(moved[1])).nan_to_num() / (2 * step)
-    square = (pixels(bodies).nan_to_num() ** 2).sum(-1)
-    weight = problem.views.confidence * (16 / (square + 16)) ** 2
-    expected = (weight * (slope**2).sum(-1)).sum((1, 2))
-    _, _, hessian, *_ = _along(problem, keypoints, step)
-    torch.testing.assert_close((hessian @ way) @ way, expected, rtol=1e-5, atol=0)
 
 
 def test_keypoints_without_offsets_are_the_models(body64: BodyModel) -> None:
@@ -209,7 +132,10 @@ def test_keypoints_without_offsets_are_the_models(body64: BodyModel) -> None:
 def _prior_cost(model: BodyModel, x: Tensor, **changes: object) -> Tensor:
     given = {"keypoints": keypoint_set(model, [0]), "one_shape": False} | changes
     bodies = Bodies(x, torch.zeros(0, 3), torch.zeros(0), torch.arange(len(x)))
-    return PriorTerm(model).cost(TermInputs(**given), bodies)
+    cost = np.zeros(len(x))
+    term = CompiledPriors(model).prepare(TermInputs(**given), bodies, derivatives=False)
+    term.add_cost(Batch(slice(None), x.numpy(), np.arange(len(x)), skeleton=None), cost)
+    return torch.from_numpy(cost)
 
 
 def test_prior_of_shared_betas_is_left_to_the_layout(body64: BodyModel) -> None:
@@ -226,7 +152,10 @@ def test_five_frames_with_a_fifth_of_the_hand_prior_cost_one(body64: BodyModel) 
     x[1, 75:165] += 0.1 * _random(90, seed=1).double()
     whole, fifth = (_prior_cost(body64, x, hand_share=share) for share in (1.0, 0.2))
     torch.testing.assert_close(whole[0], fifth[0])
-    others = sum(rows.energy(weight) for rows, weight in PriorTerm(body64).rows(x)[:3])
+    others = sum(
+        0.5 * (weight * rows.residuals).square().sum(1)
+        for rows, weight in prior_rows(body64, x, body_pose=True)[:3]
+    )
     hands = (whole - others)[1] - (whole - others)[0]
     assert hands > 1
     torch.testing.assert_close(5 * ((fifth - others)[1] - (fifth - others)[0]), hands)
@@ -255,20 +184,101 @@ def _difference(found: Tensor, expected: Tensor) -> float:
     return float((found - expected).abs().max() / expected.abs().max())
 
 
+def _moved(problem: BodyProblem, bodies: Bodies, step: Tensor) -> Bodies:
+    """The bodies moved by ``step`` (b, n) along the columns of the normal equations."""
+    columns, count = problem.layout.equations(), len(step)
+    n = len(columns.parameters)
+    offsets = bodies.offsets.expand(count, -1, -1)
+    thickness = bodies.thickness.expand(count, -1)
+    if columns.offsets:
+        moved = step[:, columns.offsets_at].reshape(count, -1, 3)
+        offsets = torch.cat(
+            [offsets[:, : columns.offsets] + moved, offsets[:, columns.offsets :]], 1
+        )
+        thickness = thickness * step[:, columns.coverings_at].exp()
+    vectors = bodies.vectors.index_add(1, columns.parameters, step[:, :n])
+    return bodies._replace(vectors=vectors, offsets=offsets, thickness=thickness)
+
+
+class OwnLimbs(BodyEnergy):
+    """The energy with the derivatives of pose blend shapes that Gauss-Newton matrices contain.
+
+    E_J and E_D have those by the joints of a point's own limb, E_P_self has none.
+    """
+
+    def keypoints(self, vectors: Tensor) -> Tensor:
+        chosen = self.problem.keypoints
+        return self._by_limb(
+            chosen.limbs,
+            lambda own: chosen.matrix @ self._points(vectors, chosen.vertices, own, True),
+        )
+
+    def samples(self, vectors: Tensor) -> Tensor:
+        ids = self.problem.samples.vertex
+        limbs = self.problem.model.select(ids).limbs
+        return self._by_limb(limbs, lambda own: self._points(vectors, ids, own, False))
+
+    def paired(self, vectors: Tensor) -> Tensor:
+        assert self.problem.pairs is not None
+        return self._points(vectors, self.problem.pairs.vertices, np.zeros(55, bool), False)
+
+    def _by_limb(self, limbs: Limbs, points_of: Callable[[np.ndarray], Tensor]) -> Tensor:
+        """The points of each limb, evaluated with the joints (55,) bool that move it."""
+        each = zip(limbs.starts[:-1], limbs.starts[1:], limbs.moved_by, strict=True)
+        parts = [points_of(own)[:, limbs.order[first:last]] for first, last, own in each]
+        return torch.cat(parts, 1)[:, np.argsort(limbs.order)]
+
+    def _points(
+        self, vectors: Tensor, ids: Tensor | np.ndarray, own: np.ndarray, joints: bool
+    ) -> Tensor:
+        """Vertices, and joints if requested; blend shapes have derivatives by ``own`` joints."""
+        model = self.problem.model
+        selection, params = model.select(ids, joints=joints), model.parameters(vectors)
+        _, posed, axis_angle = model._rest(selection, params)
+        local = rotation_from_axis_angle(axis_angle)
+        local = torch.where(torch.as_tensor(own)[:, None, None], local, local.detach())
+        shape = torch.cat([params.betas, params.expression], 1)
+        rest = shaped_points(selection, shape, local)
+        rotation = torch.einsum("nj,bjcd->bncd", selection.weights, posed.rotations)
+        return (rotation @ rest[..., None])[..., 0] + selection.weights @ posed.offsets
+
+
+def _gauss_newton(rows: Rows, step: Tensor, way: Tensor) -> Tensor:
+    """J^T W J way (b, n) of residuals that depend on ``step`` (b, n)."""
+    outward = torch.zeros_like(rows.residual, requires_grad=True)
+    (pulled,) = torch.autograd.grad(rows.residual, step, outward, create_graph=True)
+    (slopes,) = torch.autograd.grad(pulled, outward, way.expand_as(step), retain_graph=True)
+    square = (rows.residual.detach() ** 2).sum(1)
+    weight = rows.weight
+    if rows.scale is not None:
+        weight = weight * geman_mcclure_weight(square, rows.scale)
+    weighted = weight[:, None] * slopes
+    return torch.autograd.grad(rows.residual, step, weighted, retain_graph=True)[0]
+
+
 @pytest.mark.parametrize("name", ["all", "own shape, learned pose", "targets alone",
                                   "fingers of a standing body"])  # fmt: skip
 def test_compiled_terms_equal_torch_in_some_frames(name: str, exact: BodyProblem) -> None:
-    """They agree far beyond float32, so that fits take the same steps."""
-    compiled, at = _variants(exact)[name], torch.tensor([2, 1])
-    in_torch = replace(compiled, terms=TorchTerms(exact.model, exact.samples))
-    own, shared = compiled.own_start()[at], compiled.shared_start()
-    found, expected = (each.linearise(own, shared, at) for each in (compiled, in_torch))
-    for ours, theirs in zip(found, expected, strict=True):
-        assert ours.dtype == torch.float64
-        assert _difference(ours, theirs) < 1e-12
-    for each in (compiled, in_torch):
-        cost = each.cost(own, shared, at)
-        torch.testing.assert_close(cost, expected.cost, rtol=1e-12, atol=0)
+    """Gradient and Gauss-Newton matrix are those of autograd, far beyond float32."""
+    problem, at = _variants(exact)[name], torch.tensor([2, 1])
+    own, shared = problem.own_start()[at], problem.shared_start()
+    found = problem.linearise(own, shared, at)
+    assert found.hessian.dtype == torch.float64
+    bodies = problem._bodies(own, shared, at)
+    step = torch.zeros_like(found.gradient, requires_grad=True)
+    cost = BodyEnergy(problem).cost(_moved(problem, bodies, step))
+    (gradient,) = torch.autograd.grad(cost.sum(), step)
+    expected = NormalEquations(cost.detach(), gradient, torch.zeros_like(found.hessian))
+    problem.layout.add_prior(shared, expected)
+    torch.testing.assert_close(found.cost, expected.cost, rtol=1e-12, atol=0)
+    torch.testing.assert_close(problem.cost(own, shared, at), expected.cost, rtol=1e-12, atol=0)
+    assert _difference(found.gradient, expected.gradient) < 1e-12
+    every = list(OwnLimbs(problem).rows(_moved(problem, bodies, step)))
+    for seed in range(20, 26):
+        way = _random(step.shape[1], seed=seed)
+        product = expected.hessian @ way + sum(_gauss_newton(rows, step, way) for rows in every)
+        assert _difference(found.hessian @ way, product) < 1e-12
+    torch.testing.assert_close(found.hessian, found.hessian.mT)
 
 
 def test_gradient_of_the_whole_energy_is_its_slope(exact: BodyProblem) -> None:

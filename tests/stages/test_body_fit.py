@@ -22,7 +22,6 @@ from intercap_core.body_fit.problem import BodyProblem, columns_of
 from intercap_core.body_fit.schedule import Fitter
 from intercap_core.body_fit.surface import COVERINGS, choose_samples
 from intercap_core.body_fit.term_inputs import keypoint_set
-from intercap_core.body_fit.terms import CompiledTerms, TorchTerms
 from intercap_core.config import BodyFitSettings, BodyModels
 from intercap_core.entries import SubjectEntry
 from intercap_core.errors import UserError
@@ -327,7 +326,7 @@ def test_artefacts_of_another_recording_are_refused(model, clothed, tmp_path: Pa
         other.fit(tmp_path / "out.h5", person=capture.inputs.person)
 
 
-def test_compiled_and_torch_fits_agree_with_blend_shapes(tmp_path):
+def test_a_body_with_strong_blend_shapes_is_fitted(tmp_path):
     """A bend moves the skin around its joint by a centimetre and more."""
     file = load_body_file(None, 10, 10)
     joints = (file.joint_regressor @ file.template)[1:]
@@ -340,11 +339,7 @@ def test_compiled_and_torch_fits_agree_with_blend_shapes(tmp_path):
     model = BodyModel(replace(file, posedirs=moves), torch.device("cpu"), torch.float32)
     capture = Capture(model, tmp_path, 2, cameras=4, pixel_noise=1.0, depth_noise_mm=3.0)
     seen = read_observations(capture.inputs.scene, capture.inputs.person)
-    found = []
-    samples = choose_samples(model)
-    for terms in (CompiledTerms(model, samples), TorchTerms(model, samples)):
-        clouds = person_clouds(capture.inputs.frames, seen, 800, model.device)
-        vectors = Fitter(model, seen, clouds, SETTINGS, terms=terms).run().vectors
-        found.append(model.forward(model.parameters(vectors)).joints.numpy())
-    assert 1000 * np.linalg.norm(found[0] - found[1], axis=2).max() < 0.3
-    assert 1000 * np.linalg.norm(found[0] - capture.joints, axis=2)[:, :22].mean() < 6
+    clouds = person_clouds(capture.inputs.frames, seen, 800, model.device)
+    vectors = Fitter(model, seen, clouds, SETTINGS).run().vectors
+    found = model.forward(model.parameters(vectors)).joints.numpy()
+    assert 1000 * np.linalg.norm(found - capture.joints, axis=2)[:, :22].mean() < 6
