@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.config import JointSettings
 from intercap_core.geometry.camera.transforms import rigid
-from intercap_core.geometry.rigid.distance import DistanceField
+from intercap_core.geometry.rigid.distance import DistanceField, SurfacePart
 from intercap_core.geometry.solve.thread_pool import ThreadPool
 from intercap_core.joint.floor import FloorPlane
-from intercap_core.joint.geometry import moment_points
+from intercap_core.joint.geometry import moment_points, points_by_object
 from intercap_core.joint.problem import TERMS, JointProblem
-from intercap_core.joint.proximity import proximity
+from intercap_core.joint.proximity import along_by_object, proximity
 from intercap_core.joint.sequential import TrackedPoses, TrackMarks
 from intercap_core.joint.state import ALL
 from intercap_core.joint.terms.contact import (
@@ -35,7 +35,12 @@ from intercap_core.joint.terms.penetration import (
     find_embedded,
 )
 from intercap_core.joint.terms.plant import standing_probability
-from intercap_core.joint.terms.stick import STICK_VERTICES, _representatives
+from intercap_core.joint.terms.stick import (
+    STICK_VERTICES,
+    _representatives,
+    local_by_object,
+    local_points,
+)
 from intercap_core.joint.terms.term import Data
 from tests.joint.scenes import (
     BOX,
@@ -116,6 +121,55 @@ def test_distance_far_from_an_object_is_that_to_its_box(sphere):
     assert (near.distance > 0.2).all()
     along = away / np.linalg.norm(away, axis=2, keepdims=True)
     assert ((near.normals * along).sum(axis=2) > 0.9).all()
+
+
+@pytest.mark.parametrize("annotated", [False, True])
+def test_derivatives_of_distances_match_differences(annotated):
+    """Distances to the whole surface, and to its upper side."""
+    box = trimesh.creation.box((0.2, 0.3, 0.1))
+    field = DistanceField(box.vertices, box.faces)
+    if annotated:
+        upper = np.flatnonzero(box.vertices[:, 2] > 0)
+        field = SurfacePart(field, box.vertices, box.faces, upper)
+    rotation, translation = _poses(3)
+    points = translation[:, None] + RNG.normal(scale=0.15, size=(3, 40, 3))
+    near = proximity(field, points, rotation, translation)
+    by_object = -along_by_object(points, near.normals, translation)
+    step = 2e-3
+
+    def distance(twist: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        turn = Rotation.from_rotvec(twist[:3]).as_matrix()
+        moved = turn @ rotation, translation + twist[3:]
+        return proximity(field, points + offset, *moved).distance
+
+    analytic = np.concatenate([by_object, near.normals], axis=2)
+    for axis, move in enumerate(step * np.eye(9)):
+        up, down = (distance(s * move[:6], s * move[6:]) for s in (1, -1))
+        # points that change their nearest face within the step have no derivative
+        agree = np.abs((up - down) / (2 * step) - analytic[..., axis]) < 2e-3
+        assert agree.mean() > 0.9
+
+
+def test_derivative_of_points_that_move_with_the_object():
+    points, along = RNG.normal(size=(2, 2, 5, 3))
+    rotation, translation = _poses(2)
+    rows = along_by_object(points, along, translation)
+    local = local_points(points, rotation, translation)
+    by_local = local_by_object(points, rotation, translation)
+    own = RNG.normal(size=(4, 3))
+    placed, by_placed = points_by_object(own, rotation, translation)
+    step = 1e-6
+    np.testing.assert_allclose(local @ rotation.transpose(0, 2, 1) + translation[:, None], points)
+    for axis, twist in enumerate(step * np.eye(6)):
+        turn = Rotation.from_rotvec(twist[:3]).as_matrix()
+        moved = (points - translation[:, None]) @ turn.T + translation[:, None] + twist[3:]
+        change = ((moved - points) * along).sum(axis=2) / step
+        np.testing.assert_allclose(change, rows[..., axis], atol=1e-5)
+        there = turn @ rotation, translation + twist[3:]
+        change = (local_points(points, *there) - local) / step
+        np.testing.assert_allclose(change, by_local[..., axis], atol=1e-5)
+        change = (points_by_object(own, *there)[0] - placed) / step
+        np.testing.assert_allclose(change, by_placed[..., axis], atol=1e-5)
 
 
 def test_depth_of_an_object_in_the_body(model):
