@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from intercap_core.body.keypoints import KEYPOINT_NAMES
+from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.object_track.bridges import Bridge, FilledTrack, Gap, fill_lost
 from intercap_core.object_track.observer import Observer
@@ -30,11 +31,8 @@ def hand_of(poses: np.ndarray, grasp: np.ndarray) -> np.ndarray:
 @pytest.fixture
 def arc() -> np.ndarray:
     """Poses (T, 4, 4) on half a circle of 30 cm that turn with it."""
-    poses = np.tile(np.eye(4), (FRAMES, 1, 1))
-    angle = np.linspace(0, np.pi, FRAMES)
-    poses[:, :3, :3] = Rotation.from_euler("z", angle[:, None]).as_matrix()
-    poses[:, 0, 3], poses[:, 1, 3] = 0.3 * np.cos(angle), 0.3 * np.sin(angle)
-    return poses
+    turns = Rotation.from_euler("z", np.linspace(0, np.pi, FRAMES)[:, None])
+    return rigid(turns.as_matrix(), turns.apply([0.3, 0, 0]))
 
 
 def bridges_of(mesh: ObjectMesh, poses: np.ndarray, joints: np.ndarray) -> list[Bridge]:

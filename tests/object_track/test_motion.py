@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from intercap_core.body.keypoints import KEYPOINT_NAMES
-from intercap_core.geometry.camera.transforms import apply_step, step_between
+from intercap_core.geometry.camera.transforms import apply_step, rigid, step_between
 from intercap_core.object_track.decoder import Decoded
 from intercap_core.object_track.fit import FittedPose, seen_by
 from intercap_core.object_track.hypotheses import MAX_HYPOTHESES, Hypotheses, Prior
@@ -43,12 +43,9 @@ def test_a_held_object_moves_with_wrist_and_forearm():
     elbow, wrist = np.array([0.0, 0.0, 0.0]), np.array([0.25, 0.0, 0.0])
     after = np.stack([elbow + shift, turn @ wrist + shift])
     joints = joints_of(np.stack([elbow, after[0]]), np.stack([wrist, after[1]]))
-    pose = np.eye(4)
-    pose[:3, 3] = [0.33, 0.02, 0.0]
+    pose = rigid(np.eye(3), np.array([0.33, 0.02, 0.0]))
     (found,) = carry_in_hands(joints, pose, pose[:3, 3], 0.05)
-    rigid = np.eye(4)
-    rigid[:3, :3], rigid[:3, 3] = turn, shift
-    np.testing.assert_allclose(found, rigid @ pose, atol=1e-12)
+    np.testing.assert_allclose(found, rigid(turn, shift) @ pose, atol=1e-12)
 
 
 def test_a_hand_turns_with_a_visible_palm():
@@ -92,8 +89,7 @@ def test_the_prior_widens_with_time():
 
 def test_a_twist_is_the_same_motion_at_any_point():
     rng = np.random.default_rng(1)
-    pose, other = np.eye(4), np.eye(4)
-    pose[:3, 3], other[:3, 3] = rng.normal(size=(2, 3))
+    pose, other = rigid(np.array([np.eye(3)] * 2), rng.normal(size=(2, 3)))
     twist = 0.001 * rng.normal(size=6)
     of_other = shift_twist(twist, pose[:3, 3], other[:3, 3])
     together = apply_step(pose, twist) @ np.linalg.inv(pose) @ other

@@ -35,6 +35,17 @@ def test_search_finds_the_pose_without_a_start(context, capture, views):
     assert search_pose(context, field_of(mesh), empty) == []
 
 
+@pytest.mark.parametrize("depth", [True, False])
+def test_search_in_two_views_compares_outlines(context, capture, views, depth):
+    two = [view if depth else replace(view, depth=None) for view in (views[0], views[2])]
+    found = search_pose(context, field_of(context.mesh), two, up=capture.master_from_room[:3, 2])
+    poses = np.array([fit.pose for fit in found])
+    shift = np.linalg.norm((poses - capture.poses[0])[:, :3, 3], axis=1)
+    turn = context.mesh.symmetry.rotation_error_deg(poses[:, :3, :3], capture.poses[0, :3, :3])
+    # outlines alone do not tell a half turn
+    assert ((shift < 0.02) & (turn < 5)).any() and (depth or len(found) > 1)
+
+
 def test_the_rotation_grid_has_no_gap():
     targets = Rotation.random(200, rng=np.random.default_rng(0)).as_matrix()
     for name, widest in (("cup", 50.0), ("stool", 50.0), ("bottle", 40.0), ("football", 0.1)):

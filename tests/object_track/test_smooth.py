@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from intercap_core.geometry.camera.transforms import apply_step
+from intercap_core.geometry.camera.transforms import apply_step, rigid
 from intercap_core.object_track.evidence import FrameEvidence
 from intercap_core.object_track.rest import find_rests
 from intercap_core.object_track.smooth import smooth
@@ -31,11 +31,8 @@ def lifted(count: int, starts: int, stops: int) -> np.ndarray:
     """Poses (T, 4, 4) at rest until a smooth lift of 40 cm and 60 degrees, then at rest again."""
     done = np.clip((np.arange(count) - starts) / (stops - starts), 0, 1)
     done = done**2 * (3 - 2 * done)
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    turn = np.radians(60) * done[:, None] * np.array([0, 0.6, 0.8])
-    poses[:, :3, :3] = Rotation.from_rotvec(turn).as_matrix()
-    poses[:, :3, 3] = np.array([0.3, 0.1, 2.0]) + done[:, None] * np.array([0.0, -0.4, 0.0])
-    return poses
+    turn = Rotation.from_rotvec(np.radians(60) * np.outer(done, [0, 0.6, 0.8]))
+    return rigid(turn.as_matrix(), np.array([0.3, 0.1, 2.0]) - np.outer(done, [0, 0.4, 0]))
 
 
 def shift(found: np.ndarray, true: np.ndarray) -> np.ndarray:

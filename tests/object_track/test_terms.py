@@ -16,16 +16,14 @@ from tests.helpers.synthetic_capture import COLOUR
 RNG = np.random.default_rng(5)
 HALF_LENS = COLOUR.scaled(0.5)
 STEPS = np.eye(6) * 1e-6
-MASTER = np.eye(4)
-MASTER[:3, :3] = Rotation.from_rotvec([0.2, -0.4, 0.1]).as_matrix()
-MASTER[:3, 3] = 0.3, 0.1, -0.2  # master_from_camera
+MASTER = rigid(  # master_from_camera
+    Rotation.from_rotvec([0.2, -0.4, 0.1]).as_matrix(), np.array([0.3, 0.1, -0.2])
+)
 
 
 def _pose(shift=(0, 0, 0), turn=(0, 0, 0)):
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_rotvec(np.add((0.4, 0.8, -0.3), turn)).as_matrix()
-    pose[:3, 3] = np.add((0.25, -0.1, 1.8), shift)
-    return pose
+    turned = Rotation.from_rotvec(np.add((0.4, 0.8, -0.3), turn))
+    return rigid(turned.as_matrix(), np.add((0.25, -0.1, 1.8), shift))
 
 
 def depth_residuals(observed, hit, normals, origin):

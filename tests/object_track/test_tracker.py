@@ -13,7 +13,6 @@ from intercap_core.annotation import ObjectPose
 from intercap_core.config import ObjectTrackSettings
 from intercap_core.errors import UserError
 from intercap_core.object_track.fit import FittedPose
-from intercap_core.object_track.proposals import NotFound
 from intercap_core.object_track.tracker import Track, Tracker
 from intercap_core.object_track.whole import FrameResult
 from intercap_core.schemas import OBJECT_TRACK
@@ -22,7 +21,6 @@ from tests.geometry.rigid.conftest import catalogue
 from tests.helpers.object_capture import ObjectCapture
 from tests.object_track.scenes import (
     annotate,
-    disturb,
     errors_of,
     frames_with,
     images_of,
@@ -46,12 +44,6 @@ def test_it_is_tracked_through_misses_and_an_absence(suitcase):
     assert place[7] > 10 * place[5]
 
 
-def test_a_track_starts_from_a_disturbed_annotation(suitcase, capture, images):
-    track = track_of(capture, annotate(2, disturb(capture.poses[2], 3)), images=images)
-    assert object_track._seed_source(track) == "annotated" and track.seed_frame == 2
-    assert errors_of(suitcase, track, capture.poses)[0].max() < 0.003
-
-
 def test_known_exposure_offsets_reduce_the_errors(suitcase):
     """At 1.5 m/s and 3 rad/s, eight milliseconds are 12 mm and 1.4 degrees."""
     capture = ObjectCapture.make(suitcase, 5, speed=0.1, turn_deg=11.5)
@@ -70,17 +62,17 @@ class TurnedUnseen(ObjectCapture):
 
     def pose_at(self, t: float) -> np.ndarray:
         pose = super().pose_at(0.0)
-        if t >= 5:
+        if t >= 4:
             pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("z", 110, degrees=True).as_matrix()
         return pose
 
 
 def test_an_object_that_reappears_turned_is_found(suitcase):
-    capture = TurnedUnseen.make(suitcase, 9)
-    capture.hidden = {3, 4}
+    capture = TurnedUnseen.make(suitcase, 7, cameras=3)
+    capture.hidden = {2, 3}
     track = track_of(capture, annotate(0, capture.poses[0]))
     assert set(frames_with(track, "lost")) == capture.hidden
-    shift, turn = (np.delete(e, [3, 4]) for e in errors_of(suitcase, track, capture.poses))
+    shift, turn = (np.delete(e, [2, 3]) for e in errors_of(suitcase, track, capture.poses))
     assert shift.max() < 0.005 and turn.max() < 1.5
 
 
@@ -118,13 +110,6 @@ def test_rests_and_unobserved_axes(name):
     # the unobserved spin does not jump
     steps = mesh.symmetry.none().rotation_error_deg(poses[1:, :3, :3], poses[:-1, :3, :3])
     assert steps.max() < 12
-
-
-def test_an_object_that_is_never_there_is_not_found(suitcase):
-    capture = ObjectCapture.make(suitcase, 3)
-    capture.hidden = {0, 1, 2}
-    with pytest.raises(NotFound):
-        track_of(capture)
 
 
 @pytest.fixture(scope="module")
