@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -19,10 +17,9 @@ from tests.helpers import fitted_capture as fitted
 OFFSET = fitted.BODY_OFFSET_M
 
 
-def _measure(capture: fitted.Capture, **instead: Path) -> BodyErrors:
-    truth = instead.pop("truth", capture.paths["truth"])
-    paths = replace(capture.inputs("frames", "scene", "person", "body_fit"), **instead)
-    return body_errors.measure(paths, truth, fitted.BODY_MODELS, "neutral")
+def _measure(capture: fitted.Capture) -> BodyErrors:
+    paths = capture.inputs("frames", "scene", "person", "body_fit")
+    return body_errors.measure(paths, capture.paths["truth"], fitted.BODY_MODELS, "neutral")
 
 
 @pytest.fixture(scope="module")
@@ -32,12 +29,11 @@ def shifted(capture: fitted.Capture) -> BodyErrors:
 
 @pytest.fixture(scope="module")
 def true(capture: fitted.Capture, tmp_path_factory: pytest.TempPathFactory) -> BodyErrors:
-    path = tmp_path_factory.mktemp("true") / "body_fit.h5"
-    shutil.copy(capture.paths["body_fit"], path)
-    with h5py.File(path, "r+") as file:
+    made = capture.copied(tmp_path_factory.mktemp("true"), "body_fit")
+    with made.edit("body_fit") as file:
         file["transl"][:, 1] -= OFFSET
         file["failed"][1] = file["bridged"][2] = True
-    return _measure(capture, body_fit=path)
+    return _measure(made)
 
 
 def test_errors_of_a_shifted_body(shifted: BodyErrors) -> None:
@@ -72,11 +68,10 @@ def test_cloud_distances_of_the_true_body_are_the_floor(
 def test_without_depth_there_are_no_points_to_compare_with(
     capture: fitted.Capture, tmp_path: Path
 ) -> None:
-    path = tmp_path / "frames.h5"
-    shutil.copy(capture.paths["frames"], path)
-    with h5py.File(path, "r+") as file:
+    without = capture.copied(tmp_path, "frames")
+    with without.edit("frames") as file:
         file["depth_index"][:] = -1
-    found = _measure(capture, frames=path)
+    found = _measure(without)
     assert all(np.isnan(found.clouds[key]).all() for key in CLOUD_KEYS)
     figures = body_errors.figures([found])
     assert "cloud_to_mesh_mm" not in figures
@@ -86,14 +81,13 @@ def test_without_depth_there_are_no_points_to_compare_with(
 def test_body_of_another_topology_has_only_joint_errors(
     capture: fitted.Capture, tmp_path: Path
 ) -> None:
-    path = tmp_path / "truth.h5"
-    shutil.copy(capture.paths["truth"], path)
-    with h5py.File(path, "r+") as file:
+    other = capture.copied(tmp_path, "truth")
+    with other.edit("truth") as file:
         for key in ("correspondence_face", "correspondence_weights"):
             values, attributes = file[key][:-1], dict(file[key].attrs)
             del file[key]
             file.create_dataset(key, data=values, fletcher32=True).attrs.update(attributes)
-    found = _measure(capture, truth=path)
+    found = _measure(other)
     assert np.isnan(found.pve).all() and np.isnan(found.face).all() and not found.bad.any()
     figures = body_errors.figures([found])
     assert "pve_mm" not in figures

@@ -17,6 +17,7 @@ from intercap_core.errors import UserError
 from intercap_core.evaluation.compare import compare
 from intercap_core.schemas import CONTACT_REGIONS
 from tests.helpers import fitted_capture as fitted
+from tests.helpers.reduced_capture import Reduction
 
 HAND = CONTACT_REGIONS.index("right_hand")
 
@@ -99,9 +100,10 @@ def test_unstated_contact_is_no_change(versions: tuple[Path, Path]) -> None:
 
 
 def test_recordings_of_different_lengths_are_reported(
-    versions: tuple[Path, Path], tmp_path: Path
+    capture: fitted.Capture, versions: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    shorter = fitted.make_capture(tmp_path / "shorter", total=4).paths["joint"]
+    whole = {stage: capture.paths[stage] for stage in ("frames", "joint")}
+    shorter = Reduction(sets=4).apply(whole, tmp_path / "shorter")["joint"]
     shutil.copyfile(shorter, versions[1] / "a" / "joint.h5")
     row = compare(*versions).sequences.set_index("sequence").loc["a"]
     assert row["state"] == "not comparable" and "5 frames before and 4 after" in row["note"]

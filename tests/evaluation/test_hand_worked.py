@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
 
 from intercap_core.entries import ContinuousSymmetry, Symmetry
 from intercap_core.evaluation import body, contact, flags, motion, object_pose
@@ -17,22 +19,26 @@ from intercap_core.evaluation.proximity import (
     visible_to_cloud,
 )
 from intercap_core.evaluation.scene_errors import displacement, rig_centre
+from intercap_core.geometry.camera.intrinsics import Intrinsics
+from intercap_core.geometry.camera.rig import Camera
+from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.surface_tree import SurfaceTree
 from intercap_core.geometry.rigid.surfaces import sample_surface
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+NONE = SymmetryGroup.none()
+ROUND = SymmetryGroup.from_settings(
+    Symmetry(continuous=(ContinuousSymmetry(axis=(0.0, 0.0, 1.0)),))
+)
 SQUARE_FACES = np.array([[0, 1, 2], [0, 2, 3]])
 
 
-def _turn_z(degrees: float) -> np.ndarray:
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+def _turn(axis: str, degrees: float) -> np.ndarray:
+    return Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
 
 
 def _box(side: float) -> tuple[np.ndarray, np.ndarray]:
-    import trimesh
-
     mesh = trimesh.creation.box((side, side, side))
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
@@ -88,17 +94,13 @@ def test_normalised_error_is_unknown_without_a_covariance() -> None:
 
 def test_object_error_at_the_centre_over_the_symmetry_group() -> None:
     centre = np.array([0.1, 0, 0])
-    quarter = _turn_z(90)
+    quarter = _turn("z", 90)
     at = object_pose.posed_point(quarter, np.zeros(3), centre)
     assert at == pytest.approx([0, 0.1, 0])
     true = object_pose.posed_point(np.eye(3), np.zeros(3), centre)
     assert object_pose.centre_error(at, true) == pytest.approx(0.1 * np.sqrt(2))
-    none = SymmetryGroup.none()
-    round_ = SymmetryGroup.from_settings(
-        Symmetry(continuous=(ContinuousSymmetry(axis=(0.0, 0.0, 1.0)),))
-    )
-    assert object_pose.rotation_error_deg(quarter, np.eye(3), none) == pytest.approx(90)
-    assert object_pose.rotation_error_deg(quarter, np.eye(3), round_) == pytest.approx(0, abs=1e-6)
+    assert object_pose.rotation_error_deg(quarter, np.eye(3), NONE) == pytest.approx(90)
+    assert object_pose.rotation_error_deg(quarter, np.eye(3), ROUND) == pytest.approx(0, abs=1e-6)
 
 
 def test_lost_and_first_frame() -> None:
@@ -121,10 +123,8 @@ def test_contact_counts_and_scores() -> None:
     assert contact.f1(counts.sum(0)) == pytest.approx(2 * 2 / (2 * 2 + 2 + 1))
     assert np.isnan(contact.f1(np.array([0, 0, 0, 9])))
     regions = {"a": np.array([0]), "b": np.array([2, 3])}
-    assert contact.region_contact(found, regions, ("b", "a")).tolist() == [
-        [False, True],
-        [True, True],
-    ]
+    by_region = contact.region_contact(found, regions, ("b", "a"))
+    assert by_region.tolist() == [[False, True], [True, True]]
     assert contact.recall(np.array([1, 0, 1], bool), np.array([1, 1, 0], bool)) == 0.5
     assert contact.precision(np.array([1, 0, 1], bool), np.array([1, 1, 0], bool)) == 0.5
     assert np.isnan(contact.recall(np.array([True]), np.array([False])))
@@ -176,15 +176,9 @@ def test_moving_jitter_and_onset() -> None:
     rotation = np.repeat(np.eye(3)[None], 30, 0)
     moves = motion.moving(rotation, centre, fps)
     assert moves.tolist() == [False] * 14 + [True] * 16
-    turning = np.stack([_turn_z(angle) for angle in [0, 0, 0, 3, 6]])
-    assert motion.moving(turning, np.zeros((5, 3)), fps).tolist() == [
-        False,
-        False,
-        True,
-        True,
-        True,
-    ]
-
+    turning = np.stack([_turn("z", angle) for angle in [0, 0, 0, 3, 6]])
+    turns = motion.moving(turning, np.zeros((5, 3)), fps)
+    assert turns.tolist() == [False, False, True, True, True]
     late = np.roll(centre, 3, axis=0)
     late[:3] = 0
     assert motion.motion_onset_lags(late, centre, moves, fps) == [3.0]
@@ -200,15 +194,11 @@ def test_moving_jitter_and_onset() -> None:
 
 
 def test_turn_errors_are_relative_and_over_the_symmetry_group() -> None:
-    none = SymmetryGroup.none()
-    round_ = SymmetryGroup.from_settings(
-        Symmetry(continuous=(ContinuousSymmetry(axis=(0.0, 0.0, 1.0)),))
-    )
-    found = np.stack([_turn_z(angle) for angle in (0, 2, 2)])
-    true = np.stack([_turn_z(angle) for angle in (40, 40, 43)])
-    assert motion.turns(found, true, none) == pytest.approx([2, 3], abs=1e-5)
+    found = np.stack([_turn("z", angle) for angle in (0, 2, 2)])
+    true = np.stack([_turn("z", angle) for angle in (40, 40, 43)])
+    assert motion.turns(found, true, NONE) == pytest.approx([2, 3], abs=1e-5)
     still = np.repeat(np.eye(3)[None], 3, 0)
-    assert motion.turns(found, still, round_) == pytest.approx([0, 0], abs=1e-5)
+    assert motion.turns(found, still, ROUND) == pytest.approx([0, 0], abs=1e-5)
 
 
 def test_cloud_distances_count_all_or_only_visible_points() -> None:
@@ -235,7 +225,7 @@ def test_samples_cover_area_not_vertices() -> None:
 def test_distance_to_a_posed_box_both_ways() -> None:
     vertices, faces = _box(0.2)
     surface = PosedObject(vertices, faces)
-    rotation, translation = _turn_z(90), np.array([1.0, 2, 3])
+    rotation, translation = _turn("z", 90), np.array([1.0, 2, 3])
     points = translation + np.array([[0.0, 0, 0], [0.13, 0, 0], [0.05, 0, 0], [3, 0, 0]])
     expected = [-0.1, 0.03, -0.05, 0.10]
     assert surface.signed_distance(points, rotation, translation) == pytest.approx(
@@ -255,9 +245,6 @@ def test_depths_have_a_larger_cap_than_distances() -> None:
 
 
 def test_sight_knows_occlusion_facing_and_image() -> None:
-    from intercap_core.geometry.camera.intrinsics import Intrinsics
-    from intercap_core.geometry.camera.rig import Camera
-
     lens = Intrinsics(100, 100, 100.0, 100.0, 49.5, 49.5)
     camera = Camera("k1", lens, None, None, np.eye(4))
     vertices, faces = _box(0.2)
@@ -281,32 +268,21 @@ def test_sight_knows_occlusion_facing_and_image() -> None:
 
 def test_extrinsics_displacement_of_a_shift_and_a_turn() -> None:
     true = np.repeat(np.eye(4)[None], 3, 0)
-    true[1, :3, :3], true[2, :3, :3] = _around_y(120), _around_y(240)
+    true[1, :3, :3], true[2, :3, :3] = _turn("y", 120), _turn("y", 240)
     for pose in true:
         pose[:3, 3] = -2.0 * pose[:3, 2]  # all look at the origin from 2 m
     assert rig_centre(true) == pytest.approx(np.zeros(3), abs=1e-4)
     estimated = true.copy()
     estimated[1, 0, 3] += 0.01
-    turn = _around_y(1.0)
+    turn = _turn("y", 1.0)
     estimated[2, :3] = turn @ true[2, :3]
     found = displacement(estimated, true, 0)
     # a turn by a about an axis through the cube's centre moves a point at distance r by 2 r sin a/2
     # and the mean of r^2 = x^2 + z^2 over the cube is 2 * side^2 / 12
     expected = 2 * np.sin(np.radians(0.5)) * np.sqrt(2 * 4 / 12)
     assert found == pytest.approx([0, 0.01, expected], abs=1e-5)
-    moved = _rigid(_around_y(30), [1, 2, 3])
+    moved = rigid(_turn("y", 30), np.array([1.0, 2, 3]))
     assert displacement(moved @ estimated, true, 0) == pytest.approx(found, abs=1e-9)
-
-
-def _around_y(degrees: float) -> np.ndarray:
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
-
-
-def _rigid(rotation: np.ndarray, translation: list[float]) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, translation
-    return pose
 
 
 def test_flags_join_reasons_and_runs() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 
@@ -115,25 +114,19 @@ def test_a_single_camera_has_no_poses_and_offsets_to_judge() -> None:
     assert found["ground_error_mm"] == pytest.approx(2)
 
 
-def test_artefacts_are_compared_by_camera_and_moment(tmp_path: Path) -> None:
-    made = fitted.make_capture(tmp_path)
-    with h5py.File(made.paths["truth"], "r+") as truth:
+def test_artefacts_are_compared_by_camera_and_moment(
+    capture: fitted.Capture, tmp_path: Path
+) -> None:
+    made = capture.copied(tmp_path, "scene", "truth")
+    with made.edit("scene") as scene, made.edit("truth") as truth:
         truth["time_offset"][...] = [0, 0.002, -0.004]
         truth["slip"][3:, 1] = 1
-        floor = fitted_floor(made)
-        truth.attrs["ground_offset"] = floor + 0.003
-    with h5py.File(made.paths["scene"], "r+") as scene:
         scene["slip"][4:, 1] = 1
-        scene["present"][...] = [True, True, True]
+        # n . x + d = 0 with n = (0, -1, 0): d is the floor's y
+        truth.attrs["ground_offset"] = scene["ground_point"][1] + 0.003
     found = scene_errors.measure(*(made.paths[name] for name in ("frames", "scene", "truth")))
     assert found.before == pytest.approx([0.012, 0], abs=1e-6)
     assert found.after == pytest.approx([0, 0], abs=1e-6)
     assert found.offset == pytest.approx([-0.002, 0.004])
     assert found.slips == SlipCounts(found=1, missed=0, false=0, images_wrong=1, images=15)
     assert (found.ground_m, found.ground_deg) == pytest.approx((0.003, 0), abs=1e-9)
-
-
-def fitted_floor(made: fitted.Capture) -> float:
-    """n . x + d = 0 with n = (0, -1, 0): d is the floor's y."""
-    with h5py.File(made.paths["scene"]) as scene:
-        return float(scene["ground_point"][1])

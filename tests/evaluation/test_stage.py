@@ -2,44 +2,20 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 
 from intercap_core import artefacts
-from intercap_core.config import MetricsSettings
 from intercap_core.errors import UserError
 from intercap_core.schemas import METRIC_REGIONS, METRICS
-from intercap_core.stages import metrics
 from tests.helpers import fitted_capture as fitted
-
-STAGES = ("frames", "scene", "detections", "person", "object_track", "body_fit", "joint")
-
-
-def _run(capture: fitted.Capture, output: Path, truth: Path | None, **settings: bool) -> Path:
-    metrics.run(
-        paths=capture.inputs(*STAGES), output=output, models=capture.models, truth=truth,
-        settings=MetricsSettings(**settings), fit_settings=fitted.FIT_SETTINGS,
-    )  # fmt: skip
-    return output
-
-
-def _changed_truth(capture: fitted.Capture, folder: Path, **offsets: float) -> Path:
-    """A copy of the truth with constants added to some datasets."""
-    path = folder / "truth.h5"
-    shutil.copy(capture.paths["truth"], path)
-    with h5py.File(path, "r+") as file:
-        for key, offset in offsets.items():
-            file[key][...] += offset
-    return path
 
 
 @pytest.fixture(scope="module")
 def measured(capture: fitted.Capture) -> dict[str, np.ndarray]:
-    output = _run(capture, capture.paths["metrics"], capture.paths["truth"])
+    output = capture.measure(truth=True)
     with artefacts.read(output, METRICS) as artefact:
         assert artefact.attributes["has_truth"]
         return {key: artefact[key] for key in artefact.keys()}  # noqa: SIM118
@@ -138,7 +114,7 @@ def test_flags_carry_every_reason(measured: dict[str, np.ndarray]) -> None:
 def test_without_truth_all_other_values_are_the_same(
     capture: fitted.Capture, measured: dict[str, np.ndarray], tmp_path: Path
 ) -> None:
-    output = _run(capture, tmp_path / "metrics.h5", None)  # the verdict reads no truth either
+    output = capture.measure(tmp_path / "metrics.h5")  # the verdict reads no truth either
     with artefacts.read(output, METRICS) as artefact:
         assert not artefact.keys("truth/")
         for key in artefact.keys():  # noqa: SIM118
@@ -151,19 +127,24 @@ def test_without_truth_all_other_values_are_the_same(
 
 
 def test_same_input_same_bytes(capture: fitted.Capture, tmp_path: Path) -> None:
-    again = _run(capture, tmp_path / "metrics.h5", capture.paths["truth"])
+    again = capture.measure(tmp_path / "metrics.h5", truth=True)
     assert again.read_bytes() == capture.paths["metrics"].read_bytes()
 
 
 def test_truth_at_other_times_is_rejected(capture: fitted.Capture, tmp_path: Path) -> None:
-    truth = _changed_truth(capture, tmp_path, times=0.05)
+    late = capture.copied(tmp_path, "truth")
+    with late.edit("truth") as file:
+        file["times"][...] += 0.05
     with pytest.raises(UserError, match=r"truth\.h5: holds 5 frames, the recording 5"):
-        _run(capture, tmp_path / "metrics.h5", truth)
+        late.measure(tmp_path / "metrics.h5", truth=True)
 
 
 def test_truth_of_another_recording_is_noticed(
     capture: fitted.Capture, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    truth = _changed_truth(capture, tmp_path, body_vertices=0.5, translation=0.5)
-    _run(capture, tmp_path / "metrics.h5", truth, hold_out=False)
+    other = capture.copied(tmp_path, "truth")
+    with other.edit("truth") as file:
+        for key in ("body_vertices", "translation"):
+            file[key][...] += 0.5
+    other.measure(tmp_path / "metrics.h5", truth=True, hold_out=False)
     assert "truth of another recording" in caplog.text

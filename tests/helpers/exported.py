@@ -2,41 +2,29 @@
 
 from __future__ import annotations
 
-import shutil
-from dataclasses import replace
+import json
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
+import pygltflib
 import torch
 from scipy.spatial.transform import Rotation
 
 from intercap_core import artefacts
 from intercap_core.body.artefact import read_parameters
 from intercap_core.body.model import BodyModel
-from intercap_core.config import ExportSettings, MetricsSettings
+from intercap_core.config import ExportSettings
+from intercap_core.inputs.arrays import read_pickle
 from intercap_core.output.export.about import About, ExportBody, Verdict
 from intercap_core.output.export.motion import Motion
 from intercap_core.schemas import JOINT
 from intercap_core.stage_list import STAGES
-from intercap_core.stages import export, metrics
+from intercap_core.stages import export
 from tests.helpers import fitted_capture as fitted
 
+NAME = "s01_o09"  # of the exported capture
 NUM_COMPONENTS = 12  # of a hand's pose, as the InterCap release has them
-
-
-def measured_capture(folder: Path, object_name: str = "cup") -> fitted.Capture:
-    """A capture of a person with an object, up to metrics."""
-    made = fitted.make_capture(folder, object_name=object_name)
-    metrics.run(
-        paths=made.inputs(*STAGES["metrics"].reads),
-        output=made.paths["metrics"],
-        models=made.models,
-        settings=MetricsSettings(),
-        fit_settings=fitted.FIT_SETTINGS,
-    )
-    return made
 
 
 def run(capture: fitted.Capture, output: Path, **settings: Any) -> Path:
@@ -50,27 +38,35 @@ def run(capture: fitted.Capture, output: Path, **settings: Any) -> Path:
     return output
 
 
+def stated(folder: Path) -> dict[str, dict[str, Any]]:
+    """What the files of all formats state about their numbers, by format and file."""
+    found: dict[str, dict[str, Any]] = {}
+    for name in ("amass/body", "amass/object", "intercap/res"):
+        with np.load(folder / f"{name}.npz") as file:
+            arrays = {key: file[key] for key in file.files}
+        found[name] = {key: value if value.ndim else value.item() for key, value in arrays.items()}
+    found["intercap"] = read_pickle(folder / "intercap" / "res.pkl")["about"]
+    for name in ("bop", "meshes"):
+        found[name] = json.loads((folder / name / "about.json").read_text())
+    found["coco"] = json.loads((folder / "coco" / "annotations.json").read_text())["info"]
+    found["glb"] = pygltflib.GLTF2().load(str(folder / "glb" / f"{NAME}.glb")).asset.extras
+    return found
+
+
 def plain_about(motion: Motion) -> About:
     """Return facts without flags, contact and verdict."""
     total = len(motion)
     verdict = Verdict((), np.zeros((0, total)), ())
-    return About("cap", ExportBody.of(motion.model, "neutral"), [""] * total, None, verdict)
-
-
-def changed(capture: fitted.Capture, stage: str, folder: Path) -> tuple[fitted.Capture, Path]:
-    """The capture with a copy of one artefact in ``folder``, to be changed."""
-    folder.mkdir(exist_ok=True)
-    path = Path(shutil.copy(capture.paths[stage], folder / f"{stage}.h5"))
-    return replace(capture, paths=capture.paths | {stage: path}), path
+    return About(NAME, ExportBody.of(motion.model, "neutral"), [""] * total, None, verdict)
 
 
 def lively(capture: fitted.Capture, folder: Path) -> fitted.Capture:
     """The capture with another joint result: every joint turned, a face that moves, hands within
     the first components of their pose space, and an object that turns."""
-    made, path = changed(capture, "joint", folder)
+    made = capture.copied(folder, "joint")
     rng = np.random.default_rng(4)
     model = capture.model
-    with h5py.File(path, "r+") as file:
+    with made.edit("joint") as file:
         total = len(file["transl"])
         file["betas"][...] = rng.normal(0, 1, file["betas"].shape)
         file["expression"][...] = rng.normal(0, 1.5, file["expression"].shape)
@@ -81,9 +77,9 @@ def lively(capture: fitted.Capture, folder: Path) -> fitted.Capture:
             basis = model.hand_components[side, :NUM_COMPONENTS].numpy()
             file[name][...] = model.hand_mean[side].numpy() + code @ basis
         file["rotation"][...] = Rotation.random(total, random_state=5).as_matrix()
-    with artefacts.read(path, JOINT) as joint:
+    with artefacts.read(made.paths["joint"], JOINT) as joint:
         joints = posed(model, joint)[1]
-    with h5py.File(path, "r+") as file:
+    with made.edit("joint") as file:
         file["joints"][...] = joints
     return made
 

@@ -7,7 +7,8 @@ moved by constants, so that every error against the truth can be worked out by h
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,13 @@ from intercap_core.body.loading import OPEN_BODY
 from intercap_core.body.model import BodyModel, with_hand_mean
 from intercap_core.body.parameters import BodyParameters
 from intercap_core.body_fit.surface import COVERINGS
-from intercap_core.config import BodyFitSettings, BodyModels, JointSettings, ObjectTrackSettings
+from intercap_core.config import (
+    BodyFitSettings,
+    BodyModels,
+    JointSettings,
+    MetricsSettings,
+    ObjectTrackSettings,
+)
 from intercap_core.entries import ObjectEntry, SubjectEntry
 from intercap_core.geometry.camera import masks
 from intercap_core.geometry.camera.intrinsics import Intrinsics
@@ -41,6 +48,8 @@ from intercap_core.schemas import (
     TRUTH,
 )
 from intercap_core.sequence_inputs import FitSettings, SequenceModels, SequencePaths
+from intercap_core.stage_list import STAGES
+from intercap_core.stages import metrics
 from tests.helpers.bodies import open_body
 from tests.helpers.synthetic_capture import fill, write_frames, write_person, write_scene
 from tests.helpers.synthetic_people import write_detections
@@ -58,7 +67,8 @@ class Capture:
     """Paths of the artefacts, by stage, and what they were made from."""
 
     paths: dict[str, Path]
-    object_: ObjectEntry
+    object_: ObjectEntry | None
+    """None for a person alone."""
     mesh: ObjectMesh
     model: BodyModel
     rig: Rig
@@ -66,7 +76,6 @@ class Capture:
     joints: np.ndarray  # (T, 55, 3), true
     rotation: np.ndarray
     translation: np.ndarray
-    extra: dict[str, Any] = field(default_factory=dict)
 
     @property
     def models(self) -> SequenceModels:
@@ -74,6 +83,37 @@ class Capture:
 
     def inputs(self, *stages: str) -> SequencePaths:
         return SequencePaths(**{stage: self.paths[stage] for stage in stages})
+
+    def copied(self, folder: Path, *stages: str, name: str = "") -> Capture:
+        """Return the capture with copies of some artefacts in ``folder``, to be changed.
+
+        Args:
+            name: another name of the sequence; needs a copy of every artefact.
+        """
+        folder.mkdir(parents=True, exist_ok=True)
+        copies = {stage: Path(shutil.copy(self.paths[stage], folder)) for stage in stages}
+        made = replace(self, paths=self.paths | copies)
+        for stage in stages if name else ():
+            with made.edit(stage) as file:
+                file.attrs["sequence"] = name
+        return made
+
+    def edit(self, stage: str) -> h5py.File:
+        """Open an artefact for changes that checksums do not notice."""
+        return h5py.File(self.paths[stage], "r+")
+
+    def measure(self, output: Path | None = None, *, truth: bool = False, **settings: bool) -> Path:
+        """Run stage metrics; returns its artefact, by default the capture's."""
+        output = output or self.paths["metrics"]
+        metrics.run(
+            paths=self.inputs(*STAGES["metrics"].reads),
+            output=output,
+            models=self.models,
+            settings=MetricsSettings(**settings),
+            fit_settings=FIT_SETTINGS,
+            truth=self.paths["truth"] if truth else None,
+        )
+        return output
 
 
 def object_entry(name: str) -> ObjectEntry:
@@ -162,25 +202,31 @@ def _pose_capture(
     return capture, params, keypoints
 
 
-def take_object_away(capture: Capture) -> None:
+def take_object_away(capture: Capture) -> Capture:
     """Make the capture one of a person alone: artefacts up to joint, and the truth."""
-    total, count = len(capture.vertices), len(capture.rig)
-    with h5py.File(capture.paths["object_track"], "r+") as file:
-        file.attrs["object"], file.attrs["seed_source"] = "", SOURCE_NONE
-        for key, values in absent_track(total, count).items():
-            file[key][...] = values
-    with h5py.File(capture.paths["joint"], "r+") as file:
-        file.attrs["object"] = ""
-        for key in ("rotation", "translation", "contact_probability"):
-            file[key][...] = np.nan
-    with h5py.File(capture.paths["truth"], "r+") as file:
-        file.attrs["object"] = ""
+    lose_object(capture)
+    for stage in ("object_track", "joint", "truth"):
+        with capture.edit(stage) as file:
+            file.attrs["object"] = ""
+    with capture.edit("truth") as file:
         file["region_contact"][...] = False
         for key in (
             "object_vertices", "object_faces", "object_views", "object_visible", "rotation",
             "translation",
         ):  # fmt: skip
             del file[key]
+    return replace(capture, object_=None)
+
+
+def lose_object(capture: Capture, doubts: str = "") -> None:
+    """Make the object's track lost in every frame, and the joint result one without the object."""
+    with capture.edit("object_track") as file:
+        file.attrs["seed_source"], file.attrs["doubts"] = SOURCE_NONE, doubts
+        for key, values in absent_track(len(capture.vertices), len(capture.rig)).items():
+            file[key][...] = values
+    with capture.edit("joint") as file:
+        for key in ("rotation", "translation", "contact_probability"):
+            file[key][...] = np.nan
 
 
 def write_project(folder: Path, capture: Capture, name: str) -> Path:
@@ -189,11 +235,13 @@ def write_project(folder: Path, capture: Capture, name: str) -> Path:
     results.mkdir(parents=True)
     for stage in ("frames", "scene", "detections", "person", "object_track", "body_fit", "joint"):
         shutil.copy(capture.paths[stage], results)
-    (folder / "objects.yaml").write_text(f"football: {{mesh: {capture.object_.mesh}}}\n")
+    object_ = capture.object_
+    assert object_ is not None
+    (folder / "objects.yaml").write_text(f"{object_.name}: {{mesh: {object_.mesh}}}\n")
     (folder / "subjects.tsv").write_text("subject\tgender\np01\tneutral\n")
     (folder / "sequences.tsv").write_text(
         "sequence\tsubject\tobject\trecordings\tcalibration\ttruth\n"
-        f"{name}\tp01\tfootball\trec\tcal\t{capture.paths['truth']}\n"
+        f"{name}\tp01\t{object_.name}\trec\tcal\t{capture.paths['truth']}\n"
     )
     path = folder / "config.yaml"
     path.write_text(f"dataset: trial\nresults: {folder / 'results'}\n")
@@ -310,72 +358,56 @@ def _write_person(capture: Capture, views: Any, joints: np.ndarray, name: str) -
 
 def _write_fits(capture: Capture, params: BodyParameters, name: str) -> None:
     rig, total = capture.rig, len(capture.vertices)
-    count = len(rig)
+    count, regions = len(rig), len(CONTACT_REGIONS)
     body = {key: getattr(params, key).numpy().copy() for key in vars(params)}
     body["transl"][:, 1] += BODY_OFFSET_M
     body["joints"] = capture.joints + np.array([0, BODY_OFFSET_M, 0])
     body["keypoint_residual"] = np.full((total, count), 5.0)
     body["cloud_residual"] = np.full(total, 0.01)
-    lost = np.zeros(total, bool)
-    lost[0] = True
+    below, object_name = np.array([0, OBJECT_OFFSET_M, 0]), _name(capture)
+    identity = {"sequence": name, "subject": SUBJECT.subject, "gender": "neutral",
+                "body_model": file_digest(OPEN_BODY)}  # fmt: skip
     with artefacts.write(
-        capture.paths["object_track"], OBJECT_TRACK, sequence=name,
-        object=capture.object_.name, seed_frame=0, seed_source="search", doubts="",
+        capture.paths["object_track"], OBJECT_TRACK, sequence=name, object=object_name,
+        seed_frame=0, seed_source="search", doubts="",
     ) as writer:  # fmt: skip
-        writer.put("camera_names", rig.names)
-        writer.put("rotation", capture.rotation)
-        writer.put("translation", capture.translation + np.array([0, OBJECT_OFFSET_M, 0]))
-        writer.put("candidate", np.zeros((total, count), int))
-        for key, value in {
-            "overlap": 0.9, "depth_residual": 0.003, "silhouette_residual": 1
-        }.items():  # fmt: skip
-            writer.put(key, np.full((total, count), value))
-        writer.put("views", np.full(total, count))
-        writer.put("covariance", np.repeat(np.eye(6)[None] * 0.004**2, total, 0))
-        writer.put("lost", lost)
-        writer.put("recovered", np.zeros(total, bool))
-        for key in ("ambiguous", "resting", "gone"):
-            writer.put(key, np.zeros(total, bool))
-        writer.put("probability", np.ones(total))
-        writer.put("spread", np.zeros((total, 6, 6)))
-        writer.put("free_axis", np.zeros((total, 3)))
+        _put(writer, {
+            "camera_names": rig.names, "rotation": capture.rotation,
+            "translation": capture.translation + below, "overlap": np.full((total, count), 0.9),
+            "depth_residual": np.full((total, count), 0.003),
+            "silhouette_residual": np.full((total, count), 1.0), "views": np.full(total, count),
+            "covariance": np.repeat(np.eye(6)[None] * 0.004**2, total, 0),
+            "lost": np.arange(total) == 0, "probability": np.ones(total),
+        })  # fmt: skip
         fill(writer, OBJECT_TRACK, T=total, C=count)
-    identity = {"sequence": name, "subject": SUBJECT.subject, "gender": "neutral"}
-    with artefacts.write(
-        capture.paths["body_fit"], BODY_FIT, body_model=file_digest(OPEN_BODY), **identity
-    ) as writer:
-        for key, value in body.items():
-            writer.put(key, value)
-        writer.put("joint_sigma", np.full((total, 55), 0.01))
-        writer.put("failed", np.zeros(total, bool))
-        writer.put("bridged", np.zeros(total, bool))
-        writer.put("part_names", ["left_hand", "right_hand"])
-        writer.put("keypoint_sigma", np.full(135, 0.01))
-        writer.put("covering_noise", np.full(len(COVERINGS), 0.01))
+    with artefacts.write(capture.paths["body_fit"], BODY_FIT, **identity) as writer:
+        _put(writer, body | {
+            "joint_sigma": np.full((total, 55), 0.01), "part_names": ["left_hand", "right_hand"],
+            "keypoint_sigma": np.full(135, 0.01), "covering_noise": np.full(len(COVERINGS), 0.01),
+        })  # fmt: skip
         fill(writer, BODY_FIT, T=total, C=count, P=2, G=len(COVERINGS), K=135)
     with artefacts.write(
-        capture.paths["joint"], JOINT, body_model=file_digest(OPEN_BODY),
-        object=capture.object_.name, iterations=3, refused=0, converged=True,
-        cameras_corrected=True, **identity,
+        capture.paths["joint"], JOINT, object=object_name, iterations=3, refused=0,
+        converged=True, cameras_corrected=True, **identity,
     ) as writer:  # fmt: skip
-        for key, value in body.items():
-            writer.put(key, value[0] if key == "betas" else value)
-        writer.put("rotation", capture.rotation)
-        writer.put("translation", capture.translation + np.array([0, OBJECT_OFFSET_M / 2, 0]))
-        writer.put("region_names", CONTACT_REGIONS)
-        writer.put("contact_probability", np.full((total, len(CONTACT_REGIONS)), 0.5))
-        writer.put("contact_annotated", np.full((total, len(CONTACT_REGIONS)), -1))
-        writer.put("camera_names", list(capture.rig.names))
-        writer.put("master_from_colour", capture.rig.master_from_colour)
-        writer.put("depth_bias", np.zeros(count))
-        writer.put("camera_covariance", np.zeros((count, 7, count, 7)))
-        writer.put("time_offset", np.zeros(count))
-        writer.put("energy_names", ["object", "body"])
-        writer.put("energy_before", [2.0, 1.0])
-        writer.put("energy_after", [1.0, 0.5])
-        writer.put("flagged", np.zeros(total, bool))
-        writer.put("flag_reason", [""] * total)
+        _put(writer, body | {
+            "betas": body["betas"][0], "rotation": capture.rotation,
+            "translation": capture.translation + below / 2, "region_names": CONTACT_REGIONS,
+            "contact_probability": np.full((total, regions), 0.5),
+            "contact_annotated": np.full((total, regions), -1), "camera_names": list(rig.names),
+            "master_from_colour": rig.master_from_colour, "energy_names": ["object", "body"],
+            "energy_before": [2.0, 1.0], "energy_after": [1.0, 0.5],
+        })  # fmt: skip
         fill(writer, JOINT, T=total, C=count)
+
+
+def _name(capture: Capture) -> str:
+    return "" if capture.object_ is None else capture.object_.name
+
+
+def _put(writer: artefacts.Writer, values: Mapping[str, Any]) -> None:
+    for key, value in values.items():
+        writer.put(key, value)
 
 
 def _write_truth(capture: Capture, tips: np.ndarray, name: str) -> None:
@@ -389,26 +421,18 @@ def _write_truth(capture: Capture, tips: np.ndarray, name: str) -> None:
     contact[:, CONTACT_REGIONS.index("right_hand")] = True
     with artefacts.write(
         capture.paths["truth"], TRUTH, sequence=name, interaction="hold", subject="p01",
-        object=capture.object_.name, ground_offset=0.0, fps=FPS,
+        object=_name(capture), ground_offset=0.0, fps=FPS,
     ) as writer:  # fmt: skip
-        writer.put("times", np.arange(total) / FPS)
-        writer.put("body_vertices", capture.vertices)
-        writer.put("body_faces", faces)
-        writer.put("correspondence_face", face)
-        writer.put("correspondence_weights", np.eye(3)[corner])
-        writer.put("joints", capture.joints)
-        writer.put("fingertips", tips)
-        writer.put("object_vertices", capture.mesh.vertices)
-        writer.put("object_faces", capture.mesh.faces)
-        writer.put("rotation", capture.rotation)
-        writer.put("translation", capture.translation)
-        writer.put("object_views", np.full(total, len(rig)))
-        writer.put("region_names", CONTACT_REGIONS)
-        writer.put("region_contact", contact)
-        writer.put("camera_names", rig.names)
-        writer.put("master_from_colour", rig.master_from_colour)
-        writer.put("time_offset", np.zeros(len(rig)))
-        writer.put("slip", np.zeros((total, len(rig)), int))
-        writer.put("ground_normal", [0.0, -1.0, 0.0])
-        writer.put("body_visible", np.ones((total, capture.model.num_vertices), bool))
-        writer.put("object_visible", np.ones((total, len(capture.mesh.vertices)), bool))
+        _put(writer, {
+            "times": np.arange(total) / FPS, "body_vertices": capture.vertices,
+            "body_faces": faces, "correspondence_face": face,
+            "correspondence_weights": np.eye(3)[corner], "joints": capture.joints,
+            "fingertips": tips, "object_vertices": capture.mesh.vertices,
+            "object_faces": capture.mesh.faces, "rotation": capture.rotation,
+            "translation": capture.translation, "object_views": np.full(total, len(rig)),
+            "region_names": CONTACT_REGIONS, "region_contact": contact, "camera_names": rig.names,
+            "master_from_colour": rig.master_from_colour, "time_offset": np.zeros(len(rig)),
+            "slip": np.zeros((total, len(rig)), int), "ground_normal": [0.0, -1.0, 0.0],
+            "body_visible": np.ones((total, capture.model.num_vertices), bool),
+            "object_visible": np.ones((total, len(capture.mesh.vertices)), bool),
+        })  # fmt: skip

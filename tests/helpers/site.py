@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 
-import h5py
-
-from intercap_core.config import CardSettings, ExportSettings, MetricsSettings, PageSettings
+from intercap_core.config import CardSettings, ExportSettings, PageSettings
 from intercap_core.entries import SequenceEntry
-from intercap_core.evaluation.figures import SequenceMetrics
 from intercap_core.schemas import CONTACT_REGIONS
 from intercap_core.stage_list import STAGES
-from intercap_core.stages import dataset, metrics, page, summary
+from intercap_core.stages import dataset, page, summary
 from tests.helpers import fitted_capture as fitted
 
-MEASURED = ("frames", "scene", "detections", "person", "object_track", "body_fit", "joint")
 TWO_CAPTURES = {"s01_o03": "football", "s01_o09": "cup"}  # sequence: object
+HELD = "s01_o03"
 INTENTS = {"s01_o03": "use", "s01_o09": "pass"}
 FAILED = {"s03_o01": "k2.mkv: is cut after 3 s <and> more; record it again"}
 
@@ -27,11 +23,11 @@ def make_two_captures(folder: Path) -> None:
     for name, object_name in TWO_CAPTURES.items():
         (folder / name).mkdir(parents=True)
         made = fitted.make_capture(folder / name, name=name, object_name=object_name, total=4)
-        with h5py.File(made.paths["joint"], "r+") as file:
+        with made.edit("joint") as file:
             hands = [CONTACT_REGIONS.index(f"{side}_hand") for side in ("left", "right")]
-            file["contact_probability"][:2, hands] = 0.9 if object_name == "football" else 0.1
-            file["contact_probability"][3, hands] = 0.9 if object_name == "football" else 0.1
-        measure(made, truth=object_name == "football")
+            for frames in (slice(2), 3):
+                file["contact_probability"][frames, hands] = 0.9 if name == HELD else 0.1
+        made.measure(truth=name == HELD)
 
 
 def open_two_captures(folder: Path) -> dict[str, fitted.Capture]:
@@ -40,18 +36,6 @@ def open_two_captures(folder: Path) -> dict[str, fitted.Capture]:
         name: fitted.open_capture(folder / name, object_name=object_name, total=4)
         for name, object_name in TWO_CAPTURES.items()
     }
-
-
-def measure(capture: fitted.Capture, *, truth: bool = False) -> None:
-    """The capture's metrics."""
-    metrics.run(
-        paths=capture.inputs(*MEASURED),
-        output=capture.paths["metrics"],
-        models=capture.models,
-        settings=MetricsSettings(),
-        fit_settings=fitted.FIT_SETTINGS,
-        truth=capture.paths["truth"] if truth else None,
-    )
 
 
 def write_summaries(
@@ -94,11 +78,10 @@ def write_page(
     settings: PageSettings | None = None,
 ) -> None:
     """A sequence's page, in the site of the folder ``out``."""
-    measured = SequenceMetrics.read(capture.paths["metrics"])
     page.run(
         paths=capture.inputs(*STAGES["page"].reads),
         sequence=row(sequence, intent),
-        models=replace(capture.models, object_=capture.object_ if measured.object_ else None),
+        models=capture.models,
         contact=None,
         settings=settings or PageSettings(),
         output=out / "site" / "sequences" / sequence,
@@ -118,7 +101,7 @@ def merge(
     return dataset.run(
         dataset=name,
         summaries=summaries,
-        objects={capture.object_.name: capture.object_ for capture in captures.values()},
+        objects={of.name: of for capture in captures.values() if (of := capture.object_)},
         body_models=fitted.BODY_MODELS,
         results=out,
         card=card or CardSettings(),

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 
@@ -22,7 +20,6 @@ from intercap_core.joint.minimise import limited
 from intercap_core.joint.result import JointResult
 from intercap_core.joint.state import BODY, OBJECT, State
 from intercap_core.schemas import SCENE
-from intercap_core.sequence_inputs import SequencePaths
 from tests.helpers import fitted_capture as fitted
 
 STAGES = ("frames", "scene", "detections", "person", "object_track", "body_fit")
@@ -35,21 +32,16 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
 
 @contextmanager
 def _opened(
-    capture: fitted.Capture, **instead: Path
+    capture: fitted.Capture,
 ) -> Iterator[tuple[JointInputs, JointSettings, JointResult]]:
-    paths = capture.paths | instead
-    with artefacts.read(paths["scene"], SCENE) as scene:
-        result = JointResult.read(paths["joint"], scene)
-    with open_inputs(
-        SequencePaths(**{stage: paths[stage] for stage in STAGES}),
-        capture.models,
-        fitted.FIT_SETTINGS,
-    ) as inputs:
+    with artefacts.read(capture.paths["scene"], SCENE) as scene:
+        result = JointResult.read(capture.paths["joint"], scene)
+    with open_inputs(capture.inputs(*STAGES), capture.models, fitted.FIT_SETTINGS) as inputs:
         yield inputs, fitted.FIT_SETTINGS.joint, result
 
 
-def _held(capture: fitted.Capture, **instead: Path) -> HeldOut:
-    with _opened(capture, **instead) as opened:
+def _held(capture: fitted.Capture) -> HeldOut:
+    with _opened(capture) as opened:
         held = hold_out(*opened)
     assert held is not None
     return held
@@ -85,21 +77,13 @@ def test_errors_of_the_result_in_all_cameras(held: HeldOut) -> None:
     assert np.isnan(held.all_cameras.overlap[0]).all()
 
 
-def _lying(capture: fitted.Capture, folder: Path, camera: int, pixels: float) -> Path:
-    """The person artefact with one camera's keypoints that far to the side."""
-    path = folder / "person.h5"
-    shutil.copy(capture.paths["person"], path)
-    with h5py.File(path, "r+") as file:
-        values = file["keypoints"][:]
-        values[:, camera, :, 0] += pixels
-        file["keypoints"][...] = values
-    return path
-
-
 def test_wrong_camera_has_a_large_held_out_error(
     capture: fitted.Capture, held: HeldOut, tmp_path: Path
 ) -> None:
-    lie = _held(capture, person=_lying(capture, tmp_path, camera=1, pixels=3.0))
+    lying = capture.copied(tmp_path, "person")
+    with lying.edit("person") as file:
+        file["keypoints"][:, 1, :, 0] += 3.0  # px, to the side
+    lie = _held(lying)
     before, after = (np.mean(h.shift[JudgedPart.BODY], axis=1) for h in (held, lie))
     # of what the lie is worth at the person's distance
     assert ((after - before) > 0.05 * 3.0 * 2.4 / 230).all()
@@ -145,14 +129,11 @@ def _joints(inputs: JointInputs, state: State) -> np.ndarray:
 
 
 def test_single_camera_has_no_verdict(capture: fitted.Capture, tmp_path: Path) -> None:
-    path = tmp_path / "person.h5"
-    shutil.copy(capture.paths["person"], path)
-    with h5py.File(path, "r+") as file:
-        values = file["keypoints"][:]
-        values[:, 1:, :, 2] = 0  # no other camera sees a keypoint
-        file["keypoints"][...] = values
-    paths = {stage: capture.paths[stage] for stage in (*STAGES, "joint")} | {"person": path}
-    verdict = SequenceVerdict.reach(SequencePaths(**paths), capture.models, fitted.FIT_SETTINGS)
+    single = capture.copied(tmp_path, "person")
+    with single.edit("person") as file:
+        file["keypoints"][:, 1:, :, 2] = 0  # no other camera sees a keypoint
+    paths = single.inputs(*STAGES, "joint")
+    verdict = SequenceVerdict.reach(paths, capture.models, fitted.FIT_SETTINGS)
     values = verdict.values()
     assert np.isnan(values["error"]).all()
     assert all("fewer than two cameras" in reason for reason in values["silent"])

@@ -14,6 +14,7 @@ import pytest
 import trimesh
 
 from tests.helpers import exported
+from tests.helpers import fitted_capture as fitted
 
 POINTS = 4000  # spread over the object's surface
 BORDER_PX = 3  # a mask's border and a point on the silhouette differ by rounding
@@ -70,8 +71,10 @@ def _images(folder: Path) -> Iterator[Image]:
 def turning(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A suitcase that turns from frame to frame: large enough for its outline to show how."""
     folder = tmp_path_factory.mktemp("suitcase")
-    capture = exported.lively(exported.measured_capture(folder, "suitcase"), folder / "joint")
-    return exported.run(capture, folder / "out", formats=("bop",)) / "bop"
+    capture = fitted.make_capture(folder, object_name="suitcase")
+    capture.measure(hold_out=False)
+    lively = exported.lively(capture, folder / "joint")
+    return exported.run(lively, folder / "out", formats=("bop",)) / "bop"
 
 
 @pytest.fixture(scope="module")
@@ -116,6 +119,18 @@ def test_visible_masks_agree_with_facing_points(occluded: list[Image]) -> None:
         assert within == pytest.approx(share, abs=0.2)
         shares.append(share)
     assert min(shares) < 0.8 and max(shares) > 0.9, "nothing hides the cup anywhere"
+
+
+def test_info_is_that_of_the_masks(everything: Path, occluded: list[Image]) -> None:
+    for image in occluded:
+        assert not (image.visible & ~image.mask).any()
+        counts = (image.info["px_count_all"], image.info["px_count_visib"])
+        assert counts == (image.mask.sum(), image.visible.sum())
+        assert image.info["visib_fract"] == pytest.approx(counts[1] / counts[0])
+        box = cv2.boundingRect(image.mask.astype(np.uint8))
+        assert box == tuple(image.info["bbox_obj"])
+    first = _load(everything / "bop" / "scenes" / "000000" / "scene_camera.json")["0"]
+    assert _load(everything / "bop" / "camera.json")["fx"] == first["cam_K"][0]
 
 
 def test_boxes_hold_the_projected_points(images: list[Image]) -> None:

@@ -8,18 +8,16 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
-import pygltflib
 import pytest
 import trimesh
 
 from intercap_core import artefacts
 from intercap_core.errors import UserError
-from intercap_core.inputs.arrays import read_pickle
 from intercap_core.schemas import BODY_FIT, JOINT, METRICS, OBJECT_TRACK
 from tests.helpers import exported
 from tests.helpers import fitted_capture as fitted
+from tests.helpers.reduced_capture import Reduction
 
 LIMIT_M = 0.0045
 WITHIN_M = 2e-4  # of the limit, the two ways to measure may disagree
@@ -63,20 +61,9 @@ def test_contact_vertices_agree_with_trimesh(
             assert distance[start + place] == pytest.approx(own[vertex], abs=WITHIN_M)
 
 
-def _per_frame(folder: Path) -> dict[str, Any]:
+def _per_frame(folder: Path) -> dict[str, dict[str, Any]]:
     """What each format says of every frame, by the name of its file."""
-    entries: dict[str, Any] = {}
-    for name in ("amass/body.npz", "amass/object.npz", "intercap/res.npz"):
-        with np.load(folder / name) as file:
-            entries[name] = {key: file[key] for key in file.files}
-    entries["res.pkl"] = read_pickle(folder / "intercap" / "res.pkl")["about"]["by_frame"]
-    for name in ("bop/about.json", "meshes/about.json"):
-        entries[name] = json.loads((folder / name).read_text())["by_frame"]
-    coco = json.loads((folder / "coco" / "annotations.json").read_text())
-    entries["coco"] = coco["info"]["by_frame"]
-    glb = pygltflib.GLTF2().load(str(folder / "glb" / "cap.glb"))
-    entries["glb"] = glb.asset.extras["by_frame"]
-    return entries
+    return {name: about.get("by_frame", about) for name, about in exported.stated(folder).items()}
 
 
 def _is_json(content: Any) -> bool:
@@ -118,7 +105,7 @@ def test_deviations_and_stated_errors_are_in_every_format(
         parts = measured.text("verdict/part_names")
         errors = dict(zip(parts, 1e3 * measured["verdict/error_frame"], strict=True))
         silent = dict(zip(parts, measured.text("verdict/silent"), strict=True))
-    assert lost.tolist() == [True, False, False, False, False]
+    assert lost.tolist() == [True, False, False, False]
     for name, entries in _per_frame(everything).items():
         if _is_json(entries):
             sigma = np.array(entries["joint_sigma_mm"]) / 1e3
@@ -204,8 +191,8 @@ def test_bop_images_name_their_frame(capture: fitted.Capture, everything: Path) 
 
 
 def test_imported_results_have_no_deviations(capture: fitted.Capture, tmp_path: Path) -> None:
-    made, path = exported.changed(capture, "joint", tmp_path)
-    with h5py.File(path, "r+") as file:
+    made = capture.copied(tmp_path, "joint")
+    with made.edit("joint") as file:
         file.attrs["made_by"] = "another program: res.pkl"
     out = exported.run(made, tmp_path / "out", formats=("amass", "intercap"))
     with np.load(out / "amass" / "body.npz") as content:
@@ -218,16 +205,20 @@ def test_imported_results_have_no_deviations(capture: fitted.Capture, tmp_path: 
 @pytest.mark.parametrize(
     ("key", "shape", "parts"),
     [
-        ("body_to_object", (5, 10475), ["5 frames of 10475", "open_body.npz", "13492 vertices"]),
-        ("object_to_body", (5, 12), ["5 frames of 12", "mesh of object 'cup'"]),
-        ("body_to_object", None, ["has no body_to_object, although sequence 'cap' has an object"]),
+        ("body_to_object", (4, 10475), ["4 frames of 10475", "open_body.npz", "13492 vertices"]),
+        ("object_to_body", (4, 12), ["4 frames of 12", "mesh of object 'cup'"]),
+        (
+            "body_to_object",
+            None,
+            ["has no body_to_object, although sequence 's01_o09' has"],
+        ),
     ],
 )
 def test_metrics_of_another_body_or_object_are_refused(
     key: str, shape: tuple | None, parts: list[str], capture: fitted.Capture, tmp_path: Path
 ) -> None:
-    made, path = exported.changed(capture, "metrics", tmp_path)
-    with h5py.File(path, "r+") as file:
+    made = capture.copied(tmp_path, "metrics")
+    with made.edit("metrics") as file:
         attributes = dict(file[key].attrs)
         del file[key]
         if shape is not None:
@@ -236,14 +227,21 @@ def test_metrics_of_another_body_or_object_are_refused(
             data.attrs.update(attributes)
     with pytest.raises(UserError) as caught:
         exported.run(made, tmp_path / "out")
-    for part in [str(path), "sequence 'cap'", "re-run stage 'metrics'", *parts]:
+    for part in [
+        str(made.paths["metrics"]),
+        f"sequence {exported.NAME!r}",
+        "re-run stage 'metrics'",
+        *parts,
+    ]:
         assert part in str(caught.value)
     assert not (tmp_path / "out").exists()
 
 
 def test_fits_with_other_frames_are_refused(capture: fitted.Capture, tmp_path: Path) -> None:
-    longer = fitted.make_capture(tmp_path, object_name="cup", total=6)
+    shorter = Reduction(sets=3).apply(
+        {stage: capture.paths[stage] for stage in ("frames", "body_fit", "object_track")}, tmp_path
+    )
     for stage in ("body_fit", "object_track"):
-        made = replace(capture, paths=capture.paths | {stage: longer.paths[stage]})
-        with pytest.raises(UserError, match=f"6 frames.*'cap' has 5; re-run stage '{stage}'"):
+        made = replace(capture, paths=capture.paths | {stage: shorter[stage]})
+        with pytest.raises(UserError, match=f"3 frames.* has 4; re-run stage '{stage}'"):
             exported.run(made, tmp_path / "out")

@@ -7,16 +7,13 @@ import datetime
 import json
 from pathlib import Path
 
-import h5py
 import pytest
 import yaml
 
-from intercap_core.config import CardSettings, MetricsSettings
-from intercap_core.stages import metrics
+from intercap_core.config import CardSettings
 from tests.helpers import fitted_capture as fitted
 from tests.helpers.site import merge, write_summaries
 
-STAGES = ("frames", "scene", "detections", "person", "object_track", "body_fit", "joint")
 CARD = CardSettings(
     title='Hands: "things" & more',
     description="Six people, <ten> things.",
@@ -30,26 +27,19 @@ CARD = CardSettings(
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(captures: dict[str, fitted.Capture], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The card and tables of three sequences with two objects and one subject; one fails."""
     made = {}
-    for name, object_name in (("s01_o03", "football"), ("s01_o09", "cup"), ("s01_o09_b", "cup")):
-        capture = fitted.make_capture(
-            tmp_path_factory.mktemp(name), name=name, object_name=object_name, total=4
-        )
-        with h5py.File(capture.paths["joint"], "r+") as file:
+    for name in ("s01_o03", "s01_o09", "s01_o09_b"):
+        source = captures[name.removesuffix("_b")]
+        capture = source.copied(tmp_path_factory.mktemp(name), *source.paths, name=name)
+        with capture.edit("joint") as file:
             file["flagged"][:2] = True
             reasons = file["flag_reason"][()].astype("S80")
             reasons[:2] = [b"lost 3 frames | ago", b"lost 12 frames | ago; unsure"]
             del file["flag_reason"]
             file["flag_reason"] = reasons
-        metrics.run(
-            paths=capture.inputs(*STAGES),
-            output=capture.paths["metrics"],
-            models=capture.models,
-            settings=MetricsSettings(hold_out=False),
-            fit_settings=fitted.FIT_SETTINGS,
-        )
+        capture.measure(hold_out=False)
         made[name] = capture
     out = tmp_path_factory.mktemp("dataset")
     summaries = write_summaries(made, out / "summaries")
@@ -103,11 +93,11 @@ def test_markdown_has_a_head_that_hubs_read(folder: Path) -> None:
     assert "s02_o01: k2.mkv: cut\n" in body and "nan" not in body.lower().split()
 
 
-def test_without_a_licence_the_card_says_so(folder: Path, tmp_path: Path) -> None:
+def test_without_a_licence_the_card_says_so(
+    folder: Path, captures: dict[str, fitted.Capture], tmp_path: Path
+) -> None:
     summaries = {path.stem: path for path in (folder / "summaries").iterdir()}
-    capture = fitted.Capture({}, fitted.object_entry("cup"), *[None] * 7)  # type: ignore[arg-type]
-    ball = fitted.Capture({}, fitted.object_entry("football"), *[None] * 7)  # type: ignore[arg-type]
-    merge(summaries, {"a": capture, "b": ball}, tmp_path, "things")
+    merge(summaries, captures, tmp_path, "things")
     text = (tmp_path / "card.md").read_text()
     assert "licence | **not stated" in text and "license: other" in text
     assert "license" not in json.loads((tmp_path / "croissant.json").read_text())

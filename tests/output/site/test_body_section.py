@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import h5py
 import numpy as np
 import pytest
 
@@ -17,16 +16,16 @@ from intercap_core.output.site.body_section import FIT_COLOUR, KEYPOINT_COLOUR
 from intercap_core.output.site.drawing import SquareCrop
 from tests.helpers import fitted_capture as fitted
 
-SETS = 6
-
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
-    found = fitted.make_capture(tmp_path_factory.mktemp("body"), total=SETS)
-    with h5py.File(found.paths["person"], "r+") as person:
+def made(
+    captures: dict[str, fitted.Capture], tmp_path_factory: pytest.TempPathFactory
+) -> fitted.Capture:
+    found = captures["s01_o03"].copied(tmp_path_factory.mktemp("body"), "person", "body_fit")
+    with found.edit("person") as person:
         person["keypoints"][...] = 0  # nobody sees any, but for
         person["keypoints"][:, 0, :25] = [240.0, 135.0, 0.9]  # the middle of the first camera
-    with h5py.File(found.paths["body_fit"], "r+") as fit:
+    with found.edit("body_fit") as fit:
         fit["failed"][1] = fit["bridged"][1] = True
         fit["joint_sigma"][1] = 0.04
         fit["joint_sigma"][:, 20] = 0.02  # the left wrist
@@ -56,12 +55,11 @@ def test_states_of_fit_and_views_and_deviations_by_joint(made: fitted.Capture) -
 
 
 def test_another_body_file_is_refused(made: fitted.Capture, tmp_path: Path) -> None:
-    other = tmp_path / "fitted.h5"
-    other.write_bytes(made.paths["body_fit"].read_bytes())
-    with h5py.File(other, "r+") as fit:
+    other = made.copied(tmp_path, "body_fit")
+    with other.edit("body_fit") as fit:
         fit.attrs["body_model"] = "0123456789abcdef"
-    with pytest.raises(UserError, match=r"fitted\.h5: the bodies of .* with another body file"):
-        _section(made, body_fit=other)
+    with pytest.raises(UserError, match=r"body_fit\.h5: the bodies of .* with another body file"):
+        _section(other)
 
 
 def test_the_sheet_shows_fit_and_keypoints(made: fitted.Capture) -> None:
@@ -86,11 +84,10 @@ def test_unreadable_images_only_omit_the_sheet(made: fitted.Capture, tmp_path: P
 
 
 def test_a_body_that_no_camera_sees_is_not_drawn(made: fitted.Capture, tmp_path: Path) -> None:
-    path = tmp_path / "body_fit.h5"
-    path.write_bytes(made.paths["body_fit"].read_bytes())
-    with h5py.File(path, "r+") as fit:
+    sunk = made.copied(tmp_path, "body_fit")
+    with sunk.edit("body_fit") as fit:
         fit["transl"][:, 1] += 50.0  # far under the floor
-    sheet = _section(made, body_fit=path)["sheet"]
+    sheet = _section(sunk)["sheet"]
     assert sheet is not None
     bgr = cv2.imdecode(np.frombuffer(sheet.data, np.uint8), cv2.IMREAD_COLOR)
     assert (np.abs(bgr[..., ::-1].astype(int) - FIT_COLOUR).max(-1) < 70).sum() < 50

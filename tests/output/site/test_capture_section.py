@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import re
-import shutil
 from pathlib import Path
 
 import cv2
-import h5py
 import numpy as np
 import pytest
 
@@ -24,12 +22,9 @@ STAGES = ("frames", "scene")
 WHEN = ("before", "after")
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
-    found = fitted.make_capture(tmp_path_factory.mktemp("capture"), total=6)
-    with h5py.File(found.paths["scene"], "r+") as scene:
-        scene["image_of"][...] = np.arange(6)[:, None]
-    return found
+@pytest.fixture
+def made(captures: dict[str, fitted.Capture]) -> fitted.Capture:
+    return captures["s01_o03"]
 
 
 def _decoded(picture: EncodedImage) -> np.ndarray:
@@ -60,18 +55,19 @@ def test_facts_of_cameras_and_pairs(made: fitted.Capture) -> None:
 
 
 def test_a_depth_bias_has_its_deviation(made: fitted.Capture, tmp_path: Path) -> None:
-    scene = Path(shutil.copy(made.paths["scene"], tmp_path / "scene.h5"))
-    with h5py.File(scene, "r+") as file:
+    changed = made.copied(tmp_path, "scene")
+    with changed.edit("scene") as file:
         file["depth_bias"][...] = [0.0021, -0.004, 0.001]
         covariance = np.zeros((3, 7, 3, 7))
         covariance[0, 6, 0, 6], covariance[1, 6, 1, 6] = 0.0003**2, 0.0012**2
         covariance[2, 3:6, 2, 3:6] = 1e-6 * np.eye(3)  # of the pose alone
         file["camera_covariance"][...] = covariance
-    rows = capture_section.read_capture(made.paths["frames"], scene)["cameras"]
+    paths = changed.paths["frames"], changed.paths["scene"]
+    rows = capture_section.read_capture(*paths)["cameras"]
     assert [row["bias"] for row in rows] == ["2.1 ± 0.3", "-4.0 ± 1.2", "1.0"]
-    with h5py.File(scene, "r+") as file:
+    with changed.edit("scene") as file:
         file["depth_size"][2] = 0
-    assert capture_section.read_capture(made.paths["frames"], scene)["cameras"][2]["bias"] == ""
+    assert capture_section.read_capture(*paths)["cameras"][2]["bias"] == ""
 
 
 REDUCTIONS = {
@@ -79,7 +75,7 @@ REDUCTIONS = {
     "no depth at all": Reduction(depth=()),
     "depth of one camera": Reduction(depth={"k2"}),
     "a camera without any image": Reduction(images_until={"k3": 0}),
-    "a camera that dies": Reduction(images_until={"k2": 3}),
+    "a camera that dies": Reduction(images_until={"k2": 2}),
     "one set": Reduction(sets=1),
     "one set of one camera": Reduction(cameras={"k1"}, sets=1),
 }
@@ -115,14 +111,14 @@ def test_states_of_a_cameras_frames() -> None:
 def test_the_timeline_states_how_late_slipped_images_are(
     made: fitted.Capture, tmp_path: Path
 ) -> None:
-    frames, scene = (Path(shutil.copy(made.paths[stage], tmp_path)) for stage in STAGES)
-    with h5py.File(scene, "r+") as file:
-        file["slip"][:, 1] = [0, 2, 2, 1, 0, 0]
-    with h5py.File(frames, "r+") as file:
-        file["colour_index"][4, 1] = file["depth_index"][4, 1] = -1
-    drawn = capture_section.read_capture(frames, scene)["timeline"]
-    assert "1–2: shows an earlier frame, 2 frames before" in drawn
-    assert "3: shows an earlier frame, 1 frame before" in drawn
+    late = made.copied(tmp_path, *STAGES)
+    with late.edit("scene") as file:
+        file["slip"][:, 1] = [2, 2, 1, 0]
+    with late.edit("frames") as file:
+        file["colour_index"][3, 1] = file["depth_index"][3, 1] = -1
+    drawn = capture_section.read_capture(late.paths["frames"], late.paths["scene"])["timeline"]
+    assert "0–1: shows an earlier frame, 2 frames before" in drawn
+    assert "2: shows an earlier frame, 1 frame before" in drawn
     assert "3 slipped by 1 or 2" in drawn and "1 missing" in drawn
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,10 +23,12 @@ PAGE_BYTES = 60_000  # of a picture: the report stays light
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
+def capture(
+    captures: dict[str, fitted.Capture], tmp_path_factory: pytest.TempPathFactory
+) -> fitted.Capture:
     """The right hand touches a football in frames 1 to 3."""
-    made = fitted.make_capture(tmp_path_factory.mktemp("capture"), name=NAME, total=4)
-    with h5py.File(made.paths["joint"], "r+") as file:
+    made = captures[NAME].copied(tmp_path_factory.mktemp("capture"), "joint")
+    with made.edit("joint") as file:
         file["contact_probability"][...] = 0.1
         file["contact_probability"][1:, RIGHT] = 0.9
     return made
@@ -122,20 +123,7 @@ def test_both_viewpoints_look_at_the_hand_from_different_sides(handling: Handlin
 @pytest.fixture
 def project(capture: fitted.Capture, tmp_path: Path) -> Path:
     """A project of which this sequence was taken to the joint fit."""
-    results = tmp_path / "results" / "trial" / NAME
-    results.mkdir(parents=True)
-    for stage in ("scene", "object_track", "body_fit", "joint"):
-        shutil.copy(capture.paths[stage], results)
-    entry = capture.object_
-    (tmp_path / "objects.yaml").write_text(f"football: {{mesh: {entry.mesh}}}\n")
-    (tmp_path / "subjects.tsv").write_text("subject\tgender\np01\tneutral\n")
-    (tmp_path / "sequences.tsv").write_text(
-        "sequence\tsubject\tobject\trecordings\tcalibration\ttruth\n"
-        f"{NAME}\tp01\tfootball\trec\tcal\t{capture.paths['truth']}\n"
-    )
-    settings = tmp_path / "config.yaml"
-    settings.write_text(f"dataset: trial\nresults: {tmp_path / 'results'}\n")
-    return settings
+    return fitted.write_project(tmp_path, capture, NAME)
 
 
 def test_the_command_writes_a_picture_for_each_hold(project: Path, tmp_path: Path) -> None:

@@ -16,18 +16,15 @@ from intercap_core.errors import UserError
 from intercap_core.project import Project, load_project
 from intercap_core.schemas import METRICS
 from tests.helpers import fitted_capture as fitted
-from tests.helpers.site import MEASURED, measure
 
-GOOD = "good"
+GOOD = "s01_o09"
 MARKUP = '<b onclick="x">p&01</b>'
 Damage = Callable[[Path], object]  # of a sequence's folder
 
 
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
-    made = fitted.make_capture(tmp_path_factory.mktemp("capture"), name=GOOD, total=3)
-    measure(made)
-    return made
+@pytest.fixture
+def capture(captures: dict[str, fitted.Capture]) -> fitted.Capture:
+    return captures[GOOD]
 
 
 def _project(folder: Path, capture: fitted.Capture, copies: Iterable[str] = ()) -> Project:
@@ -108,25 +105,19 @@ def test_an_empty_dataset_names_its_sequences(capture: fitted.Capture, tmp_path:
 def test_a_sequence_without_contact_has_no_figures_of_it(
     capture: fitted.Capture, tmp_path: Path
 ) -> None:
-    """The ball hangs a metre away: no contact frame, no close-up, no figure of penetration."""
-    paths = {}
-    for stage in MEASURED:
-        paths[stage] = Path(shutil.copy(capture.paths[stage], tmp_path / f"{stage}.h5"))
+    """The cup hangs a metre away: no contact frame, no close-up, no figure of penetration."""
+    apart = capture.copied(tmp_path, "object_track", "joint", "metrics")
     for stage in ("object_track", "joint"):
-        with h5py.File(paths[stage], "r+") as file:
+        with apart.edit(stage) as file:
             file["translation"][..., 0] += 1.0
-    with h5py.File(paths["joint"], "r+") as file:
+    with apart.edit("joint") as file:
         file["contact_probability"][...] = 0.01
-    apart = fitted.Capture(
-        **{**capture.__dict__, "paths": {**paths, "metrics": tmp_path / "metrics.h5"}}
-    )
-    measure(apart)
+    apart.measure(hold_out=False)
     (tmp_path / "project").mkdir()
-    apart.paths["truth"] = capture.paths["truth"]
     overview = write_site(_project(tmp_path / "project", apart))
     text = overview.read_text()
     page = (overview.parent / "sequences" / GOOD / "index.html").read_text()
-    assert "maximum 0.0 % of 3 frames" in text and ">nan" not in text
+    assert "maximum 0.0 % of 4 frames" in text and ">nan" not in text
     assert "<b>0 %</b><small>of the frames" in page and " hand, frames " not in page
     assert "<span>penetration</span><b>–</b>" in page
     with h5py.File(overview.parents[1] / GOOD / "summary.h5") as file:

@@ -3,72 +3,51 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pandas as pd
 import pytest
 
 from intercap_core.commands.evaluate.sequences import areas
-from intercap_core.config import MetricsSettings, PageSettings
+from intercap_core.config import PageSettings
 from intercap_core.evaluation.figures import SequenceMetrics, flag_figures, truth_figures
 from intercap_core.evaluation.summary import SequenceSummary, collect_heatmaps
-from intercap_core.object_track.artefact import SOURCE_NONE, absent_track
 from intercap_core.schemas import CONTACT_REGIONS
-from intercap_core.stages import metrics
 from tests.helpers import fitted_capture as fitted
-from tests.helpers.site import write_site
+from tests.helpers.site import HELD, write_site
 
-STAGES = ("frames", "scene", "detections", "person", "object_track", "body_fit", "joint")
 TOTAL = 4
-HELD, ALONE, MISSED = "held", "alone", "missed"
+ALONE, MISSED = "alone", "missed"
 WHY = "the track is of nothing"
 
 
-def _miss(capture: fitted.Capture) -> None:
-    """The object is there, and its track is lost in every frame."""
-    with h5py.File(capture.paths["object_track"], "r+") as file:
-        file.attrs["seed_source"], file.attrs["doubts"] = SOURCE_NONE, WHY
-        for key, values in absent_track(TOTAL, len(capture.rig)).items():
-            file[key][...] = values
-    with h5py.File(capture.paths["joint"], "r+") as file:
-        for key in ("rotation", "translation", "contact_probability"):
-            file[key][...] = np.nan
+@pytest.fixture(scope="module")
+def mixed(
+    captures: dict[str, fitted.Capture], tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, fitted.Capture]:
+    """One of a person with an object, and two copies: one without it, one whose track is lost."""
+    held = captures[HELD]
+    alone, missed = (
+        held.copied(tmp_path_factory.mktemp(name), *held.paths, name=name)
+        for name in (ALONE, MISSED)
+    )
+    alone = fitted.take_object_away(alone)
+    fitted.lose_object(missed, WHY)
+    for made in (alone, missed):
+        made.measure(truth=True)
+    return {HELD: held, ALONE: alone, MISSED: missed}
 
 
 @pytest.fixture(scope="module")
-def captures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, fitted.Capture]:
-    made = {}
-    for name in (HELD, ALONE, MISSED):
-        made[name] = capture = fitted.make_capture(
-            tmp_path_factory.mktemp(name), name=name, total=TOTAL
-        )
-        if name == ALONE:
-            fitted.take_object_away(capture)
-        if name == MISSED:
-            _miss(capture)
-        metrics.run(
-            paths=capture.inputs(*STAGES),
-            output=capture.paths["metrics"],
-            models=replace(capture.models, object_=None) if name == ALONE else capture.models,
-            settings=MetricsSettings(),
-            fit_settings=fitted.FIT_SETTINGS,
-            truth=capture.paths["truth"],
-        )
-    return made
+def measured(mixed: dict[str, fitted.Capture]) -> dict[str, SequenceMetrics]:
+    return {name: SequenceMetrics.read(made.paths["metrics"]) for name, made in mixed.items()}
 
 
 @pytest.fixture(scope="module")
-def measured(captures: dict[str, fitted.Capture]) -> dict[str, SequenceMetrics]:
-    return {name: SequenceMetrics.read(made.paths["metrics"]) for name, made in captures.items()}
-
-
-@pytest.fixture(scope="module")
-def out(captures: dict[str, fitted.Capture], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def out(mixed: dict[str, fitted.Capture], tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("dataset")
-    return write_site(captures, folder, name="mixed", settings=PageSettings(cameras=1, frames=1))
+    return write_site(mixed, folder, name="mixed", settings=PageSettings(cameras=1, frames=1))
 
 
 def test_the_body_is_measured_as_with_an_object(measured: dict[str, SequenceMetrics]) -> None:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import pytest
 
@@ -20,13 +18,13 @@ from intercap_core.sequence_inputs import SequencePaths
 from tests.helpers import fitted_capture as fitted
 from tests.helpers.browser import PHONE, Visit, needs_chromium, visit
 
-FRAMES, SIZE = 6, (900, 1000)
+FRAMES, SIZE = 4, (900, 1000)
 NAME = "s01_o03"
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> fitted.Capture:
-    return fitted.make_capture(tmp_path_factory.mktemp("capture"), name=NAME, total=FRAMES)
+def capture(captures: dict[str, fitted.Capture]) -> fitted.Capture:
+    return captures[NAME]
 
 
 def _write(capture: fitted.Capture, folder: Path, name: str = NAME, **without: bool) -> Path:
@@ -223,16 +221,13 @@ def test_fingers_turn_come_nearer_play_seek_and_switch(shown: Path) -> None:
 
 @needs_chromium
 def test_text_from_files_is_escaped(capture: fitted.Capture, tmp_path: Path) -> None:
-    shutil.copy(capture.paths["joint"], tmp_path / "joint.h5")
-    with h5py.File(tmp_path / "joint.h5", "r+") as file:
+    changed = capture.copied(tmp_path, "joint")
+    del changed.paths["metrics"]
+    with changed.edit("joint") as file:
         reasons = file["flag_reason"][()].astype("S60")
         reasons[0] = b"<img src=x onerror=alert(1)> </script>"
         del file["flag_reason"]
         file["flag_reason"] = reasons
-    changed = fitted.Capture(**{**capture.__dict__, "paths": {
-        **{k: v for k, v in capture.paths.items() if k != "metrics"},
-        "joint": tmp_path / "joint.h5",
-    }})  # fmt: skip
     shown = _write(changed, tmp_path / "page", name='<b onclick="x">"name"</b>')
     found = _browse(shown, "result.flag = root.querySelector('[data-part=flag]').innerHTML;")
     assert found["console"] == [] and "<b onclick" not in found["dom"]

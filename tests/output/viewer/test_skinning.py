@@ -12,14 +12,8 @@ from intercap_core.body.model import BodyModel
 from intercap_core.output.viewer import skinning
 from intercap_core.output.viewer.content import quantised
 from intercap_core.output.viewer.page import payload, unpacked
-from tests.helpers.bodies import open_body
 
 FRAMES = 7
-
-
-@pytest.fixture(scope="module")
-def model() -> BodyModel:
-    return open_body()
 
 
 def _moving(model: BodyModel):
