@@ -250,7 +250,7 @@ def write_scene(
     path: Path,
     rig: Rig,
     times: np.ndarray,
-    backgrounds: Sequence[np.ndarray],
+    backgrounds: Sequence[np.ndarray] = (),
     *,
     zup_from_master: np.ndarray | None = None,
     attributes: Mapping[str, object] | None = None,
@@ -259,7 +259,7 @@ def write_scene(
     """Write a scene artefact whose extrinsics were not refined.
 
     Args:
-        backgrounds: depth (H, W) of the empty room for each camera.
+        backgrounds: depth (H, W) of the empty room for each camera, or none at all.
         zup_from_master: (4, 4), None if no floor was found.
         attributes: attributes that differ from their neutral values.
         values: datasets that differ from their neutral values.
@@ -289,7 +289,7 @@ def write_scene(
         for key, value in written.items():
             writer.put(key, value)
         fill(writer, SCENE, T=sets, C=count, P=len(values.get("pairs", ())))
-        for name, background in zip(rig.names, backgrounds, strict=True):
+        for name, background in zip(rig.names if backgrounds else (), backgrounds, strict=True):
             writer.put(f"cameras/{name}/background", background)
     return path
 

@@ -311,14 +311,6 @@ def test_a_recording_without_a_person_is_reported(model: BodyModel, tmp_path: Pa
         capture.fit(tmp_path / "body_fit.h5")
 
 
-def test_a_missing_body_file_is_reported(clothed, tmp_path: Path) -> None:
-    capture, _, _ = clothed
-    male = SubjectEntry(subject="s01", gender="male")
-    models = BodyModels(male=tmp_path / "SMPLX_MALE.npz")
-    with pytest.raises(UserError, match=r"SMPLX_MALE\.npz"):
-        capture.fit(tmp_path / "out.h5", subject=male, body_models=models)
-
-
 def test_artefacts_of_another_recording_are_refused(model, clothed, tmp_path: Path) -> None:
     capture, _, _ = clothed
     other = Capture(model, tmp_path, 2, cameras=2, depth=False)

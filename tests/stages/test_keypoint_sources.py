@@ -78,27 +78,6 @@ def test_files_count_and_the_model_fills_the_rest(capture, tmp_path, caplog):
     assert first.read_bytes() == second.read_bytes()
 
 
-def test_one_file_per_camera(capture, tmp_path):
-    people = [
-        {"file_name": f"left/shot_{n:04d}.jpg", "keypoints": whole_body(10 * n)} for n in (1, 3, 3)
-    ]
-    (tmp_path / "keypoints").mkdir()
-    (tmp_path / "keypoints" / "left.json").write_text(json.dumps(people))
-    read = detect(capture.model_copy(update={"keypoints": tmp_path / "keypoints"}))
-    assert [read.people(t, 0)[:, 0, 0].tolist() for t in range(COUNT)] == [[10], [], [30, 30]]
-    assert read.keypoints_found.all(0).tolist() == [True, False]
-    assert read.notes[1] == "no keypoints keypoints/right/ or keypoints/right.json"
-
-
-def test_keypoints_of_another_length_name_file_and_camera(capture, tmp_path):
-    (tmp_path / "keypoints").mkdir()
-    people = [{"image_id": 0, "keypoints": [1.0] * 54}]
-    (tmp_path / "keypoints" / "right.json").write_text(json.dumps(people))
-    words = r"none of camera right's keypoints can be used: keypoints/right.json, entry 0"
-    with pytest.raises(UserError, match=words):
-        detect(capture.model_copy(update={"keypoints": tmp_path / "keypoints"}))
-
-
 def test_a_model_of_another_kind_stops_the_stage(capture, tmp_path):
     from tests.helpers import tiny_onnx
 

@@ -16,46 +16,14 @@ from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply, invert
 from intercap_core.person.sides import LEGS, swap_sides
 from intercap_core.person.subject_joints import steady_sides
-from intercap_core.schemas import PERSON, SCENE
+from intercap_core.schemas import PERSON
 from intercap_core.stages import person
-from tests.helpers.synthetic_capture import ring, write_frames
+from tests.helpers.synthetic_capture import ring, write_frames, write_scene
 from tests.helpers.synthetic_people import seen_by, walking, write_detections
 
 RIG, UP = ring()
 T = 8
 BODY = walking(T, np.array([-0.2, 0.1]), np.array([0.01, 0]))
-
-
-def write_scene(path: Path, rig: Rig, sets: int, slip: np.ndarray | None = None) -> Path:
-    attributes = {
-        "sequence": "test", "master": "k1", "fps": 15.0, "extrinsics_refined": False,
-        "extrinsics_converged": False, "verdict": "",
-        "ground_found": False, "ground_source": "none", "ground_rms": 0.0, "ground_inliers": 0,
-    }  # fmt: skip
-    count = len(rig)
-    with artefacts.write(path, SCENE, **attributes) as writer:
-        for key, values in rig.datasets().items():
-            writer.put(key, values)
-        writer.put("present", np.ones(count, bool))
-        writer.put("times", np.arange(sets) / 15)
-        for key in ("master_from_colour", "master_from_colour_start"):
-            writer.put(key, rig.master_from_colour)
-        for key in ("depth_bias", "time_offset"):
-            writer.put(key, np.zeros(count))
-        writer.put("camera_covariance", np.zeros((count, 7, count, 7)))
-        writer.put("time_offset_sigma", np.full(count, np.nan))
-        slip = np.zeros((sets, count), int) if slip is None else slip
-        writer.put("slip", slip)
-        writer.put("image_of", images_of_moments(slip, np.ones(slip.shape, bool)))
-        writer.put("pairs", np.zeros((0, 2), int))
-        writer.put("note", [""] * count)
-        for key in SCENE.fields:
-            if key.startswith("pair_"):
-                writer.put(key, np.zeros(0, int))
-        writer.put("ground_point", np.full(3, np.nan))
-        writer.put("ground_normal", np.full(3, np.nan))
-        writer.put("zup_from_master", np.eye(4))
-    return path
 
 
 def silhouette(keypoints: np.ndarray, grow: int = 25) -> np.ndarray:
@@ -80,10 +48,14 @@ def alone(keypoints: np.ndarray) -> list:
 
 
 def run(tmp_path, people, candidates=None, slip=None, note="") -> Path:
+    slip = np.zeros((T, len(RIG)), int) if slip is None else slip
+    image_of = images_of_moments(slip, np.ones(slip.shape, bool))
     person.run(
         frames=write_frames(tmp_path / "frames.h5", RIG, num_sets=T),
         detections=write_detections(tmp_path / "detections.h5", RIG, people, candidates, note),
-        scene=write_scene(tmp_path / "scene.h5", RIG, T, slip),
+        scene=write_scene(
+            tmp_path / "scene.h5", RIG, np.arange(T) / 15, slip=slip, image_of=image_of
+        ),
         output=tmp_path / "person.h5",
         settings=PersonSettings(segmentation="detector"),
     )

@@ -49,17 +49,6 @@ def found(capture: SequenceEntry) -> dict[str, list[float]]:
     }
 
 
-def test_files_named_after_the_images_follow_them(capture):
-    for name in ("left", "right"):
-        for number in range(1, 7):
-            path = capture.keypoints / name / f"shot_{number:04d}_keypoints.json"
-            if name == "left" or number != ABSENT:
-                keypoints(path, number)
-    people = found(capture)
-    assert people["left"] == [1, 2, 3, 4, 5, 6]
-    assert people["right"] == [1, 0, 3, 0, 5, 6]
-
-
 def candidates(capture: SequenceEntry, content: list) -> tuple[list[list[float]], str]:
     """The right camera's boxes by frame set where it has candidates, and its note."""
     folder = capture.recordings.parent / "candidates"

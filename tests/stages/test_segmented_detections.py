@@ -47,13 +47,8 @@ def capture(tmp_path) -> SequenceEntry:
     return plain_entry(tmp_path, candidates=candidates)
 
 
-@pytest.mark.parametrize("make", ["yolo", "mask_rcnn"])
-def test_images_without_candidates_are_segmented(capture, tmp_path, caplog, make):
-    path = tmp_path / "model.onnx"
-    if make == "yolo":
-        tiny_onnx.yolo(path, (160, 160), NAMES)
-    else:
-        tiny_onnx.mask_rcnn(path, "detectron2")
+def test_images_without_candidates_are_segmented(capture, tmp_path, caplog):
+    path = tiny_onnx.yolo(tmp_path / "model.onnx", (160, 160), NAMES)
     with caplog.at_level(logging.INFO, "intercap_core"):
         read = detect(capture, "detections.h5", segmentation_model=path)
     assert read.candidates_found.all() and read.notes == ("no candidates candidates/left.json", "")
