@@ -22,6 +22,7 @@ from intercap_core.studio.render import scene_of
 from intercap_core.studio.skeleton import local_rotations
 from intercap_core.studio.stage import StudioStage
 from tests.helpers.fitted_capture import object_entry
+from tests.helpers.synthetic_people import DelayedPeople
 
 COVER_EVERY_S = 0.2  # interval at which occlusion is computed
 
@@ -124,19 +125,7 @@ def _hidden(stage: StudioStage, points: list[np.ndarray]) -> np.ndarray:
     return hidden
 
 
-class _People:
-    """What the search for the subject asks of detections."""
-
-    def __init__(self, capture: KeypointCapture) -> None:
-        self._people = capture.people
-        self.num_sets = len(capture.people)
-
-    def people(self, t: int, c: int) -> np.ndarray:
-        found = self._people[t][c]
-        return np.array(found).reshape(-1, 135, 3) if found else np.zeros((0, 135, 3))
-
-
 def subject_keypoints(capture: KeypointCapture) -> np.ndarray:
     """The subject's keypoints (T, C, 135, 3) as the scene stage finds them; 0 = not seen."""
-    people = _People(capture)
+    people = DelayedPeople(capture.people, np.zeros(len(capture.rig), int))
     return find_subject_views(people, capture.rig, capture.times).keypoints

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import av
@@ -18,7 +17,6 @@ from intercap_core import artefacts
 from intercap_core.annotation import Annotation
 from intercap_core.body.keypoints import BODY
 from intercap_core.config import StudioCapture, StudioSettings
-from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.evaluation.motion import support
 from intercap_core.evaluation.truth import Truth
@@ -31,8 +29,8 @@ from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.schemas import TRUTH
 from intercap_core.studio.capture import MARK, make_capture
 from intercap_core.studio.subjects import Subject
+from tests.helpers.fitted_capture import object_entry
 
-Entry = Callable[[str], ObjectEntry]
 FRAMES, CAMERAS = 3, 2
 CAPTURE = StudioCapture(
     interaction="stool_sit", subject="s02", seed=77, frames=FRAMES, annotate=True, shoes="heavy"
@@ -40,14 +38,15 @@ CAPTURE = StudioCapture(
 SETTINGS = StudioSettings(captures={}, cameras=CAMERAS, colour_mode="720P")
 
 
-def make(folder: Path, entry: ObjectEntry) -> Path:
-    make_capture(CAPTURE, SETTINGS, sequence="tiny", objects=entry, output=folder)
+def make(folder: Path) -> Path:
+    stool = object_entry("stool")
+    make_capture(CAPTURE, SETTINGS, sequence="tiny", objects=stool, output=folder)
     return folder
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory, object_entry: Entry) -> Path:
-    return make(tmp_path_factory.mktemp("studio") / "tiny", object_entry("stool"))
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make(tmp_path_factory.mktemp("studio") / "tiny")
 
 
 def claimed_camera(capture: Path, name: str) -> Camera:
@@ -74,13 +73,13 @@ def images(path: Path) -> tuple[list[np.ndarray], list[np.ndarray]]:
     return colour, depth
 
 
-def test_same_arguments_same_bytes(capture: Path, tmp_path: Path, object_entry: Entry) -> None:
+def test_same_arguments_same_bytes(capture: Path, tmp_path: Path) -> None:
     """Also in a folder that lost its manifest: a workflow deletes what a job declares."""
     left = tmp_path / "again"
     left.mkdir()
     (left / MARK).touch()
     (left / "k9.mkv").write_bytes(b"half a recording")
-    again = make(left, object_entry("stool"))
+    again = make(left)
     first, second = ((p / "capture.json").read_bytes() for p in (capture, again))
     assert first == second
     listed = json.loads(first)["files"]
@@ -200,10 +199,10 @@ def test_annotation_errs_within_its_bounds(capture: Path) -> None:
     assert np.abs(distance + offset).max() <= 0.0101
 
 
-def test_foreign_folders_are_not_overwritten(tmp_path: Path, object_entry: Entry) -> None:
+def test_foreign_folders_are_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(UserError, match="was not made by the studio"):
-        make(tmp_path, object_entry("stool"))
+        make(tmp_path)
     assert (tmp_path / "notes.txt").read_text() == "mine"
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,6 @@ import pytest
 
 from intercap_core import artefacts
 from intercap_core.config import StudioCapture, StudioSettings
-from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.k4a import DEPTH_MODES
 from intercap_core.formats.recordings.k4a import KinectFile
@@ -23,6 +21,7 @@ from intercap_core.studio.recording import Kinect
 from intercap_core.studio.rig import Failures, StudioRig, build_rig, started_apart
 from intercap_core.studio.room import build_room
 from intercap_core.studio.stage import check_capture
+from tests.helpers.fitted_capture import object_entry
 
 FRAMES, FPS = 8, 5
 
@@ -107,9 +106,7 @@ def test_without_overlap_only_the_master_sees_the_middle() -> None:
 
 
 @pytest.fixture(scope="module")
-def broken_capture(
-    tmp_path_factory: pytest.TempPathFactory, object_entry: Callable[[str], ObjectEntry]
-) -> Path:
+def broken_capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Five frames a second, three cameras: one stops, one clock jumps back; a second person."""
     folder = tmp_path_factory.mktemp("studio") / "broken"
     make_capture(

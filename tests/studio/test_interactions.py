@@ -21,7 +21,7 @@ from intercap_core.studio.interactions.slipping import (
     along_and_about,
 )
 from intercap_core.studio.stage import StageState, StudioStage
-from tests.studio.conftest import MakeStage
+from tests.studio.studio_stage import make_stage
 
 FPS = 15
 CARRIED = ((0.0, 1.05), (2.5, 3.0))
@@ -58,12 +58,8 @@ CASES = {
     "bottle_check": Case("s01", 8, PALMS, (16, 37), CHECKED, on_floor=False),
     "football_pass": Case("s08", 24, PALMS, (16, 37), PASSED, on_floor=False),
     "racquet_glide": Case("s03", 6, {"right_hand"}, (16, 37), SWUNG, **RACQUET),
-    "umbrella_turn": Case("s09", 26, {"right_hand"}, (16, 37), SWUNG, **UMBRELLA),
     "stool_sit": Case(
         "s05", 13, {"seat", "right_hand"}, (22, 30), ((0.0, 2.9),), pressed_m=0.018
-    ),
-    "chair_sit": Case(
-        "s10", 193616834, {"seat", "back", "right_hand"}, (22, 33), ((0.0, 3.0),), pressed_m=0.02
     ),
     "football_kick": Case("s08", 5, {"right_foot"}, (13, 15), ((0.0, 1.55),)),
     "skateboard_ride": Case(
@@ -79,6 +75,10 @@ MORE_CASES = {
     "umbrella_swing": Case("s09", 25, {"right_hand"}, (16, 37), SWUNG, **UMBRELLA),
     "bottle_regrasp": Case(
         "s08", 27, {"right_hand"}, (21, 37), ((0.0, 1.36), (2.53, 3.0)), on_floor=False
+    ),
+    "umbrella_turn": Case("s09", 26, {"right_hand"}, (16, 37), SWUNG, **UMBRELLA),
+    "chair_sit": Case(
+        "s10", 193616834, {"seat", "back", "right_hand"}, (22, 33), ((0.0, 3.0),), pressed_m=0.02
     ),
     "toolbox_carry": Case("s02", 2, {"right_hand"}, (17, 36), CARRIED),
 }
@@ -112,7 +112,7 @@ def near_object(stage: StudioStage, points: np.ndarray, pose: np.ndarray) -> np.
     scope="module",
     params=[*CASES, *(pytest.param(name, marks=pytest.mark.full) for name in MORE_CASES)],
 )
-def played(request: pytest.FixtureRequest, make_stage: MakeStage) -> Played:
+def played(request: pytest.FixtureRequest) -> Played:
     case = (CASES | MORE_CASES)[request.param]
     stage = make_stage(request.param, case.subject, case.seed)
     sets = np.arange(1, stage.frames, 2)
@@ -211,7 +211,7 @@ def test_object_and_joints_move_without_a_jump(played: Played) -> None:
     assert np.linalg.norm(np.diff(joints, 2, axis=0), axis=-1).max() / step**2 < case.joint_m_s2
 
 
-def test_a_kicked_ball_slides_then_rolls_then_stops(make_stage: MakeStage) -> None:
+def test_a_kicked_ball_slides_then_rolls_then_stops() -> None:
     case = CASES["football_kick"]
     stage = make_stage("football_kick", case.subject, case.seed)
     pose = stage.interaction.perform(np.arange(2.0, 3.0, 0.02)).script_from_object
@@ -224,7 +224,7 @@ def test_a_kicked_ball_slides_then_rolls_then_stops(make_stage: MakeStage) -> No
     np.testing.assert_allclose(spin[rolls] * 0.11, speed[rolls], rtol=0.02)
 
 
-def test_script_times_depend_on_the_recordings_length(make_stage: MakeStage) -> None:
+def test_script_times_depend_on_the_recordings_length() -> None:
     script = make_stage("beam_walk", "s03", 9001).interaction
     speeds = [np.diff(script.script_times(np.array([0, 0.1]), s))[0] / 0.1 for s in (3.0, 6.0)]
     assert speeds == pytest.approx([1.0, 0.5])
@@ -236,9 +236,7 @@ def test_script_times_depend_on_the_recordings_length(make_stage: MakeStage) -> 
 
 
 @pytest.mark.parametrize(("subject", "seed"), [("s03", 9001), ("s12", 9003)])
-def test_feet_stand_on_the_beam_and_pass_each_other(
-    make_stage: MakeStage, subject: str, seed: int
-) -> None:
+def test_feet_stand_on_the_beam_and_pass_each_other(subject: str, seed: int) -> None:
     stage = make_stage("beam_walk", subject, seed)
     state, script = stage.at(stage.set_times), stage.interaction
     assert isinstance(script, BeamWalk)
@@ -298,7 +296,7 @@ class Held:
 
 
 @pytest.fixture(scope="module", params=["racquet_glide", "umbrella_turn", "bottle_regrasp"])
-def held(request: pytest.FixtureRequest, make_stage: MakeStage) -> Held:
+def held(request: pytest.FixtureRequest) -> Held:
     case = (CASES | MORE_CASES)[request.param]
     stage = make_stage(request.param, case.subject, case.seed)
     state = stage.at(stage.set_times)

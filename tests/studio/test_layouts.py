@@ -23,7 +23,6 @@ from intercap_core.studio.capture_folder import Aligner, Device, DeviceFrame
 from intercap_core.studio.layouts import FOLDERS, camera_names
 from intercap_core.studio.rig import StudioRig, build_rig
 from intercap_core.studio.stage import check_faults
-from tests.helpers.aligned_depth import depth_on_colour as mean_of_samples
 from tests.helpers.synthetic_capture import FURNITURE, ring, room_depth
 
 FPS, SETS = 15, (0, 1, 4)
@@ -179,17 +178,12 @@ def test_captures_without_depth_have_no_depth_files(tmp_path: Path) -> None:
     assert camera.depth is None and {image.kind for image in images} == {"colour"}
 
 
-def by_the_studio(depth: np.ndarray, camera: Camera) -> np.ndarray:
-    return Aligner(camera).align(depth)
-
-
-@pytest.mark.parametrize("align", [mean_of_samples, by_the_studio])
-def test_aligned_depth_is_that_of_the_colour_camera(align):
+def test_aligned_depth_is_that_of_the_colour_camera():
     rig, zup_from_master = ring(count=2)
     for camera in rig:
         camera = replace(camera, colour=camera.colour.scaled(0.3))
         depth = np.rint(room_depth(camera, zup_from_master, FURNITURE) * 1000).astype(np.uint16)
-        found = align(depth, camera)
+        found = Aligner(camera).align(depth)
         colour_as_depth = replace(camera, depth=camera.colour, colour_from_depth=np.eye(4))
         truth = room_depth(colour_as_depth, zup_from_master, FURNITURE) * 1000
         both = (found > 0) & (truth > 0)
@@ -200,14 +194,13 @@ def test_aligned_depth_is_that_of_the_colour_camera(align):
         assert (error > 100).mean() < 0.02
 
 
-@pytest.mark.parametrize("align", [mean_of_samples, by_the_studio])
-def test_aligned_surfaces_are_whole_and_near_ones_win(align):
+def test_aligned_surfaces_are_whole_and_near_ones_win():
     rig, _ = ring(count=1)
     camera = replace(rig[0], colour=rig[0].colour.scaled(0.5))
     far = np.full((camera.depth.height, camera.depth.width), 3000, np.uint16)
-    middle = align(far, camera)[200:340, 350:610]
+    middle = Aligner(camera).align(far)[200:340, 350:610]
     assert (middle > 0).all()
     near = far.copy()
     near[70:110, 80:120] = 1000
-    found = align(near, camera)
+    found = Aligner(camera).align(near)
     assert ((found > 900) & (found < 1100)).sum() > 40 * 40

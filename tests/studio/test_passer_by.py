@@ -2,33 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
-import open3d as o3d
 import pytest
 
 from intercap_core.config import StudioCapture, StudioSettings
-from intercap_core.entries import ObjectEntry
-from intercap_core.geometry.camera.transforms import invert
 from intercap_core.studio.keypoints import Detector
 from intercap_core.studio.noise import NoiseSource
 from intercap_core.studio.passer_by import PasserBy
-from intercap_core.studio.recording import surfaces_at
-from intercap_core.studio.render import BODY, OBJECT, PASSER_BY, RoomView, scene_of
 from intercap_core.studio.stage import StudioStage
-from intercap_core.studio.subjects import body_colours
+from tests.helpers.fitted_capture import object_entry
 
-Entry = Callable[[str], ObjectEntry]
-CAPTURE = StudioCapture(
-    interaction="stool_sit", subject="s06", seed=5, frames=10, layout="plain", passer_by="walks"
-)
+CAPTURE = StudioCapture(interaction="stool_sit", subject="s06", seed=5, frames=10, layout="plain")
 SETTINGS = StudioSettings(captures={}, cameras=3, colour_mode="720P", fps=5)
 
 
+def stage_with(passer_by: str) -> StudioStage:
+    capture = CAPTURE.model_copy(update={"passer_by": passer_by})
+    return StudioStage(capture, SETTINGS, object_entry("stool"))
+
+
 @pytest.fixture(scope="module")
-def stage(object_entry: Entry) -> StudioStage:
-    return StudioStage(CAPTURE, SETTINGS, object_entry("stool"))
+def stage() -> StudioStage:
+    return stage_with("walks")
 
 
 @pytest.fixture(scope="module")
@@ -54,10 +49,8 @@ def test_a_second_person_walks_past_without_contact(stage: StudioStage, walker: 
     assert pace.min() > 0.8 and pace.max() < 2.2
 
 
-def test_a_second_person_stands_and_watches(object_entry: Entry) -> None:
-    stage = StudioStage(
-        CAPTURE.model_copy(update={"passer_by": "stands"}), SETTINGS, object_entry("stool")
-    )
+def test_a_second_person_stands_and_watches() -> None:
+    stage = stage_with("stands")
     times = np.arange(0, stage.duration, 1 / 15)
     moment, passing = stage.at(times), stage.passer_by.at(times)
     assert passing.present.all()
@@ -77,46 +70,13 @@ def test_a_walker_is_present_only_near_the_passage(walker: PasserBy) -> None:
     assert present.tolist() == [False, True, True, True, False]
 
 
-def test_a_passer_by_leaves_the_recording_unchanged(
-    stage: StudioStage, object_entry: Entry
-) -> None:
-    alone = StudioStage(
-        CAPTURE.model_copy(update={"passer_by": "nobody"}), SETTINGS, object_entry("stool")
-    )
+def test_a_passer_by_leaves_the_recording_unchanged(stage: StudioStage) -> None:
+    alone = stage_with("nobody")
     ours, theirs = (s.at(s.set_times[::4]) for s in (stage, alone))
     np.testing.assert_array_equal(ours.body, theirs.body)
     np.testing.assert_array_equal(ours.stage_from_object, theirs.stage_from_object)
     np.testing.assert_array_equal(stage.room.vertices, alone.room.vertices)
     np.testing.assert_array_equal(stage.rig.offset_s, alone.rig.offset_s)
-
-
-def test_surfaces_occlude_those_behind_them(stage: StudioStage, walker: PasserBy) -> None:
-    """Against rays that are cast through all surfaces at once."""
-    times = np.array([0.0, walker.way.when])
-    moment, passing = stage.at(times), walker.at(times)
-    colours = body_colours(stage.subject, stage.noise.rng("looks"))
-    stage_from_master = invert(stage.rig.master_from_stage)
-    drawn_of_walker = 0
-    for camera in stage.rig.true[:2]:
-        pose = stage_from_master @ camera.master_from_colour
-        view = RoomView(camera.colour.scaled(0.2), pose, stage.room, coloured=True)
-        for t in range(len(times)):
-            surfaces = surfaces_at(stage, moment, t, colours, passing)
-            cast = view.cast(surfaces)
-            drawn = np.zeros(view.depth.shape, int)
-            drawn[cast.window] = cast.identity
-            meshes = [
-                (s.vertices @ s.stage_from_mesh[:3, :3].T + s.stage_from_mesh[:3, 3], s.faces)
-                for s in surfaces
-            ]
-            scene = scene_of(*meshes, (stage.room.vertices, stage.room.faces))
-            rays = np.empty((*view.depth.shape, 6), np.float32)
-            rays[..., :3], rays[..., 3:] = view.eye, view.directions()
-            hit = scene.cast_rays(o3d.core.Tensor.from_numpy(rays))["geometry_ids"].numpy()
-            for number, kind in enumerate((BODY, OBJECT, PASSER_BY)):
-                assert ((hit == number) != (drawn == kind)).mean() < 1e-4
-            drawn_of_walker += int((drawn == PASSER_BY).sum())
-    assert drawn_of_walker > 1000
 
 
 def test_a_walker_is_detected_only_while_visible(stage: StudioStage) -> None:

@@ -13,7 +13,7 @@ from intercap_core.studio.interactions.handling import HandlingScript
 from intercap_core.studio.motion import RIGHT
 from intercap_core.studio.skeleton import REACH_FREE, PuppetSkeleton
 from intercap_core.studio.subjects import Subject
-from tests.studio.conftest import MakeStage
+from tests.studio.studio_stage import make_stage
 
 
 def test_limb_reaches_its_target_and_bends_to_the_pole() -> None:
@@ -54,7 +54,7 @@ def test_walls_block_half_of_all_directions_shells_all() -> None:
 
 
 @pytest.mark.parametrize("subject", ["s03", pytest.param("s06", marks=pytest.mark.full)])
-def test_no_finger_is_inside_the_cup(subject: str, make_stage: MakeStage) -> None:
+def test_no_finger_is_inside_the_cup(subject: str) -> None:
     stage = make_stage("cup_drink", subject, 911, 3)
     script = stage.interaction
     assert isinstance(script, HandlingScript)
