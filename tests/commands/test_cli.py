@@ -12,7 +12,6 @@ import sys
 from pathlib import Path
 from unittest import mock
 
-import cv2
 import h5py
 import numpy as np
 import pytest
@@ -28,14 +27,11 @@ from intercap_core.commands.check import (
 from intercap_core.commands.run import Watcher
 from intercap_core.errors import UserError
 from intercap_core.formats.calibration.extrinsics import Extrinsics, write_rig_file
-from intercap_core.geometry.camera.intrinsics import Intrinsics
-from intercap_core.geometry.camera.rig import Camera
 from intercap_core.project import load_project
 from intercap_core.schemas import DETECTIONS
 from intercap_core.stage_list import STAGES
-from intercap_core.studio.calibration import write_calibration
-from intercap_core.studio.mkv import MkvWriter
-from tests.helpers.synthetic_capture import ring, write_frames
+from tests.helpers.kinect_files import record
+from tests.helpers.synthetic_capture import fill, ring, write_frames
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -134,19 +130,6 @@ def test_threads_are_one_or_more(threads: str) -> None:
     assert "--threads" in done.stderr
 
 
-def write_recording(path: Path) -> None:
-    """A recording of one camera whose head is right, with one image."""
-    modes = {"colour_mode": "720P", "depth_mode": "NFOV_2X2BINNED"}
-    colour = Intrinsics(1280, 720, 612.0, 612.0, 640.0, 360.0, np.zeros(8))
-    depth = Intrinsics(320, 288, 252.0, 252.0, 160.0, 144.0, np.zeros(8), 1.5)
-    camera = Camera(path.stem, colour, depth, np.eye(4), np.eye(4))
-    content = write_calibration(camera, serial="1", **modes)
-    jpeg = cv2.imencode(".jpg", np.zeros((720, 1280, 3), np.uint8))[1].tobytes()
-    with MkvWriter(path, calibration_json=content, fps=30, serial="1", **modes) as writer:
-        writer.write_colour(jpeg, 1000)
-        writer.write_depth(np.ones((288, 320), np.uint16), 1000)
-
-
 @pytest.fixture
 def small_project(tmp_path: Path) -> Path:
     """A folder with a project of one good sequence and two that lack files."""
@@ -161,7 +144,7 @@ def small_project(tmp_path: Path) -> Path:
         "empty\ts01\tcup\t.\trig.json\n"
     )
     (tmp_path / "rec").mkdir()
-    write_recording(tmp_path / "rec" / "k1.mkv")
+    record(tmp_path / "rec", 0, range(1))
     (tmp_path / "annotations").mkdir()
     (tmp_path / "annotations" / "bad.yaml").write_text("floor: 3\n")
     return tmp_path
@@ -209,7 +192,7 @@ def test_check_opens_the_files(inside: Path, file: str, content: str | None, say
     project = load_project(Path("config.yaml"), {"exclude": ["bad", "empty"]})
     assert check_sequences(project).faults == []
     if content is None:
-        write_recording(Path(file))
+        record(Path("rec"), 1, range(1))
     else:
         Path(file).write_text(content)
     (fault,) = check_sequences(project).faults
@@ -271,11 +254,8 @@ LARGE = [
     ("content", "says"),
     [
         ("{", "k1.json is not valid JSON"),
-        ("{}", "k1.json holds an empty object, expected a list of results"),
         ([LARGE[0] | {"segmentation": {"size": [7, 7], "counts": "?"}}],
          "1 of its first 1 results cannot be used (first: entry 0 (image 0): the mask has 7x7"),
-        ([LARGE[0] | {"segmentation": [[1, 2]]}, LARGE[1] | {"category_name": "mug"}, *LARGE],
-         "(first: entry 0 (image 0): a polygon"),
         (LARGE, "the labels of the first results are apple; object 'cup' expects mug"),
         ([LARGE[0] | {"category_name": "mug"}, *LARGE[1:]], ""),
         ([], ""),
@@ -300,11 +280,9 @@ FAR_OUT = [v for i in range(133) for v in (1300.0 + i, 20.0, 0.5)]
     ("name", "content", "says"),
     [
         ("k1.json", "{", "k1.json is not valid JSON"),
-        ("k1.json", {"bodies": []}, "k1.json holds an object with bodies, expected a list"),
         ("k1.json", [{"image_id": 0, "keypoints": [1.0] * 54}],
          "1 of its first 1 people cannot be used (first: entry 0 (image 0): has 18 keypoints"),
         ("k1.json", [{"image_id": 0, "keypoints": FAR_OUT}], "another size"),
-        ("k1/0_keypoints.json", {"people": [{"pose_keypoints_2d": [1.0] * 54}]}, "54 numbers"),
         ("k1/0.json", [{"keypoints": [*WHOLE_BODY[:-1], 7.0]}], "1 of 133 confidences are beyond"),
         ("k1.json", [{"image_id": 0, "keypoints": WHOLE_BODY}] * 300, ""),
         ("k1/0_keypoints.json", {"people": []}, ""),
@@ -376,13 +354,9 @@ def test_fits_on_a_gpu_are_refused(inside: Path) -> None:
 def detections(tmp_path: Path) -> Path:
     """A detections artefact of one camera and two frame sets."""
     path = tmp_path / "detections.h5"
-    lengths = {"T": 2, "C": 1}
     with artefacts.write(path, DETECTIONS, sequence="one") as writer:
-        for key, field in DETECTIONS.fields.items():
-            if "{camera}" not in key:
-                shape = [lengths.get(dim) or int(dim) for dim in field.dims]
-                text = field.dtype == "str"
-                writer.put(key, ["k1"] * shape[0] if text else np.ones(shape, field.dtype))
+        writer.put("camera_names", ["k1"])
+        fill(writer, DETECTIONS, T=2, C=1)
     return path
 
 

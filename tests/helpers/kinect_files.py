@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -41,6 +42,7 @@ def depth_at(camera: int, tick: int) -> np.ndarray:
     return np.full((288, 320), 1000 + 100 * camera + tick, np.uint16)
 
 
+@cache
 def jpeg_at(camera: int, tick: int) -> bytes:
     image = np.full((720, 1280, 3), (10 * camera, tick, 128), np.uint8)
     return cv2.imencode(".jpg", image)[1].tobytes()
