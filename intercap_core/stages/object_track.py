@@ -55,8 +55,8 @@ def run(
     The track agrees with the annotated ``poses``, unless the images clearly contradict them.
     Without annotated poses, the object is searched for.
 
-    Raises UserError if the mesh or an input artefact is unusable, or if no camera has images and a
-    pose.
+    Raises UserError if the mesh or an input artefact is unusable, if no camera has images and a
+    pose, or if an annotated frame does not exist.
     """
     if object_ is None:
         with Frames.open(frames) as recording:
@@ -94,7 +94,7 @@ def run(
             warn(doubt)
         track: Track | None = None
         try:
-            track = Tracker(observer).run(_given(poses))
+            track = Tracker(observer).run(_given(poses, recording.num_sets, sequence))
             reason = _absence(track)
         except NotFound:
             reason = (
@@ -163,8 +163,14 @@ def _write(
         writer.put("camera_names", names)
 
 
-def _given(poses: Sequence[ObjectPose]) -> list[GivenPose]:
-    """Convert the annotated poses, whose frames the recording has (``Project.annotation``)."""
+def _given(poses: Sequence[ObjectPose], count: int, sequence: str) -> list[GivenPose]:
+    """Convert the annotated poses for a recording of ``count`` frame sets."""
+    beyond = [pose.frame for pose in poses if pose.frame >= count]
+    if beyond:
+        raise UserError(
+            f"sequence {sequence}: an annotated pose of the object is in frame {beyond[0]}, the "
+            f"recording has {count} frame sets; correct 'frame' in the annotation"
+        )
     return [
         GivenPose(
             pose.frame,
