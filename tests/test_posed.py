@@ -75,7 +75,7 @@ def test_times_and_cameras_match_the_artefacts(capture, settings):
 
 
 def test_missing_results_are_reported(settings):
-    with pytest.raises(UserError, match="no sequence 'cup'; it has cap"):
+    with pytest.raises(UserError, match="sequence 'cup' is not in the table; it lists cap"):
         open_sequence(settings, "cup")
     with pytest.raises(UserError, match=r"no frame 'k7'; expected z-up, .* k1, k2"):
         open_sequence(settings, "cap", frame="k7")
