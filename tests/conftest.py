@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import cache
 from pathlib import Path
 
 from intercap_core.pipeline.job import THREAD_VARIABLES
@@ -32,6 +33,8 @@ SLOW = (
     "annotate/test_rerun.py",
     "annotate/test_server.py",
     "body/test_jacobian.py",
+    "body/test_lemo.py",
+    "body/test_model.py",
     "body_fit/test_terms.py",
     "commands/test_cli.py",
     "commands/test_extending.py",
@@ -117,13 +120,18 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark slow tests and tests of the second tier; put the folders of FIRST first."""
     places = {item: item.path.relative_to(PROJECT_ROOT / "tests") for item in items}
     for item, place in places.items():
-        if any(place.is_relative_to(folder) for folder in SLOW):
+        if _is_in(place, SLOW):
             item.add_marker(pytest.mark.slow)
         smoke = getattr(item, "originalname", item.name) in SMOKE
-        if not smoke and any(place.is_relative_to(folder) for folder in FULL):
+        if not smoke and _is_in(place, FULL):
             item.add_marker(pytest.mark.full)
     order = {folder: rank for rank, folder in enumerate(FIRST)}
     items.sort(key=lambda item: order.get(places[item].parts[0], len(FIRST)))
+
+
+@cache
+def _is_in(place: Path, folders: tuple[str, ...]) -> bool:
+    return any(place.is_relative_to(folder) for folder in folders)
 
 
 @pytest.fixture(scope="session")
