@@ -117,19 +117,17 @@ class Evidence:
         self._self_contact = SelfContact.of(model, self.samples)._replace(
             vertex=self.surface.sample, patch=self.surface.patch
         )
-        self._matcher = Matcher.of(self.samples, self.surface, model.device)
-        self.sample_ids = torch.as_tensor(self.samples.vertex, device=model.device)
-        self.group = torch.as_tensor(self.samples.group, device=model.device)
-        carrier = model.skinning_weights.argmax(1).cpu().numpy()
+        self._matcher = Matcher.of(self.samples, self.surface)
+        self.sample_ids = torch.as_tensor(self.samples.vertex)
+        self.group = torch.as_tensor(self.samples.group)
+        carrier = model.skinning_weights.argmax(1).numpy()
         self.sample_joints = carrier[self.samples.vertex]
         self._posed: tuple[Tensor, list[tuple[int, Tensor, Tensor]]] | None = None
         # compiled code runs frame by frame, which threads can share
-        self._threads = ThreadPool(torch.get_num_threads() if model.device.type == "cpu" else 1)
+        self._threads = ThreadPool(torch.get_num_threads())
         self.cloud_noise = self._tensor(np.array([c.noise for c in COVERINGS]))
-        self.cloud_residual = torch.full((len(self.frames),), torch.nan, device=model.device)
-        self.measured = torch.zeros(
-            len(self.frames), len(self.samples.vertex), dtype=torch.bool, device=model.device
-        )
+        self.cloud_residual = torch.full((len(self.frames),), torch.nan)
+        self.measured = torch.zeros(len(self.frames), len(self.samples.vertex), dtype=torch.bool)
         self.by_view: ViewDistances | None = None
         self.keypoint_sigma = self._tensor(np.zeros(NUM_KEYPOINTS))
         self.keypoint_doubt = torch.zeros_like(self.keypoint_sigma)
@@ -141,7 +139,7 @@ class Evidence:
             self.median_confidence[part] = float(np.median(detected)) if len(detected) else 1.0
 
     def _tensor(self, values: np.ndarray) -> Tensor:
-        return torch.as_tensor(values, dtype=self.model.dtype, device=self.model.device)
+        return torch.as_tensor(values, dtype=self.model.dtype)
 
     def take_cameras(self, rig: Rig, depth_bias: np.ndarray) -> None:
         """Replace camera poses and depth biases (C,), metres, and move the clouds accordingly."""
@@ -177,7 +175,7 @@ class Evidence:
         observations, frames = self.observations, self.frames
         problem.keypoints = self.keypoints(hands=hands, face=face)
         chosen = problem.keypoints.index
-        at = np.ix_(frames, np.arange(len(observations.rig)), chosen.cpu().numpy())
+        at = np.ix_(frames, np.arange(len(observations.rig)), chosen.numpy())
         points = self.points(problem)
         pose = self._tensor(observations.rig.colour_from_master)
         lenses = self._tensor(observations.rig.colour_parameters)
@@ -237,7 +235,7 @@ class Evidence:
     def velocity(self, points: Tensor) -> Tensor:
         """Return the velocity (N, ..., 3), m/s, of points (N, ..., 3) of the usable frames."""
         velocity = limited_velocity(
-            points.double().cpu().numpy(),
+            points.double().numpy(),
             self.observations.times[self.frames],
             max_speed=6.0,  # m/s; hands reach about 5 in everyday tasks; tuned on the studio
         )
@@ -323,7 +321,7 @@ class Evidence:
         """
         if not problem.self_weight:
             return None
-        ids = torch.as_tensor(self.surface.ids, device=self.model.device)
+        ids = torch.as_tensor(self.surface.ids)
         contacts = []
         for _, vertices, normals in self._bodies(problem.base):
             contacts += self._threads.map(

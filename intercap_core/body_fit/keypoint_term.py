@@ -81,7 +81,7 @@ def evaluate(
         points = chosen.matrix @ torch.cat([output.vertices, output.joints], 1)
         return Keypoints(points + arms, None)
     if columns is None:
-        columns = torch.arange(model.num_parameters, device=model.device)
+        columns = torch.arange(model.num_parameters)
     linear = model.linearise(params, vertex_ids=chosen.vertices, joints=True)
     full = replace(linear, correctives=None).full()
     batch, _, _, size = full.shape

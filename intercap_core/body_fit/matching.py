@@ -66,13 +66,13 @@ def match_points(
     """
 
     def array(values: Tensor) -> np.ndarray:
-        return values.to("cpu", vertices.dtype).numpy()
+        return values.to(vertices.dtype).numpy()
 
     arrays = _match(
         array(points), array(normals), array(vertices), array(vertex_normals), surface.sample,
         surface.patch, surface.order, surface.groups, reach,
     )  # fmt: skip
-    return Matches(*(torch.as_tensor(values, device=vertices.device) for values in arrays))
+    return Matches(*(torch.as_tensor(values) for values in arrays))
 
 
 def average(
@@ -91,7 +91,7 @@ def average(
     """
     excess = (matches.distance - expected[matches.sample]).abs()
     weight = trust * matches.valid * (huber / excess.clamp_min(huber))
-    total = torch.zeros(len(expected), dtype=trust.dtype, device=trust.device)
+    total = torch.zeros(len(expected), dtype=trust.dtype)
     total = total.index_add(0, matches.sample, weight)
     summed = torch.zeros_like(total).index_add(0, matches.sample, weight * matches.distance)
     return summed / total.clamp_min(1e-6), total
@@ -137,8 +137,8 @@ class Matcher:
     """Samples that rims of masks can touch."""
 
     @classmethod
-    def of(cls, samples: Samples, surface: SkinSurface, device: torch.device) -> Matcher:
-        sample = torch.as_tensor(surface.sample, device=device)
+    def of(cls, samples: Samples, surface: SkinSurface) -> Matcher:
+        sample = torch.as_tensor(surface.sample)
         return cls(surface, sample, RimSamples.of(samples, surface))
 
     def match(
@@ -198,14 +198,14 @@ class Matcher:
         self, cloud: PersonCloud, rig: Rig, depth_bias: np.ndarray, skin: PosedSkin
     ) -> tuple[Matches, Tensor]:
         """Match samples in front of a surface measured farther away, and return their trust."""
-        outward = skin.normals[self.sample].cpu().numpy()
+        outward = skin.normals[self.sample].numpy()
         parts = []
         for window in cloud.windows:
             view, samples = window.view, skin.samples
             if skin.displacement is not None:
                 samples = samples + skin.displacement[view]
             index, inside = find_protruding(
-                window, rig[view], float(depth_bias[view]), samples.cpu().numpy(), outward
+                window, rig[view], float(depth_bias[view]), samples.numpy(), outward
             )
             parts.append((view, index, -inside))
         return self._join(parts, skin)
@@ -214,10 +214,10 @@ class Matcher:
         self, cloud: PersonCloud, rig: Rig, skin: PosedSkin, reach: float
     ) -> tuple[Matches, Tensor]:
         """Match samples that the rims of masks touch, and return their trust."""
-        vertices, normals = skin.vertices.cpu().numpy(), skin.normals.cpu().numpy()
+        vertices, normals = skin.vertices.numpy(), skin.normals.numpy()
         parts = []
         for rim in cloud.outlines:
-            moved = None if skin.displacement is None else skin.displacement[rim.view].cpu().numpy()
+            moved = None if skin.displacement is None else skin.displacement[rim.view].numpy()
             pose = rig[rim.view].master_from_colour
             index, distance = find_touched(rim, pose, vertices, normals, self.rims, reach, moved)
             parts.append((rim.view, index, distance))
@@ -230,8 +230,8 @@ class Matcher:
         like = skin.samples
         sample, distance = [self.sample[:0]], [like[:0, 0]]
         for view, index, away in parts:
-            sample.append(self._row(view, torch.as_tensor(index, device=like.device)))
-            distance.append(torch.as_tensor(away, dtype=like.dtype, device=like.device))
+            sample.append(self._row(view, torch.as_tensor(index)))
+            distance.append(torch.as_tensor(away, dtype=like.dtype))
         every = torch.cat(sample)
         matches = Matches(every, torch.cat(distance), torch.ones_like(every, dtype=torch.bool))
         return matches, like.new_ones(len(every))

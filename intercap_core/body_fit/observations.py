@@ -179,10 +179,10 @@ class PersonCloud:
             bias_before: (C,) depth biases of this cloud, metres.
         """
         points, normals = self.points.clone(), self.normals.clone()
-        for view in np.unique(self.view.cpu().numpy()):
+        for view in np.unique(self.view.numpy()):
             mine = self.view == int(view)
             old, new = before[view].depth_from_master, rig[view].master_from_depth
-            measured = apply(old, points[mine].double().cpu().numpy())
+            measured = apply(old, points[mine].double().numpy())
             measured -= (bias[view] - bias_before[view]) * measured / measured[:, 2:]
             turn = new[:3, :3] @ old[:3, :3]
             points[mine] = torch.as_tensor(apply(new, measured)).to(points)
@@ -190,20 +190,16 @@ class PersonCloud:
         return replace(self, points=points, normals=normals)
 
 
-def person_clouds(
-    frames: Path, observations: Observations, count: int, device: torch.device
-) -> list[PersonCloud | None]:
+def person_clouds(frames: Path, observations: Observations, count: int) -> list[PersonCloud | None]:
     """Return the cloud of each frame, of about ``count`` points; None = no usable mask."""
     with Frames.open(frames) as reader:
         reader = reader.showing(observations.image_of)
         return ThreadPool(torch.get_num_threads()).map(
-            lambda t: _fuse(reader, observations, t, count, device), range(observations.num_frames)
+            lambda t: _fuse(reader, observations, t, count), range(observations.num_frames)
         )
 
 
-def _fuse(
-    reader: Frames, observations: Observations, t: int, count: int, device: torch.device
-) -> PersonCloud | None:
+def _fuse(reader: Frames, observations: Observations, t: int, count: int) -> PersonCloud | None:
     """Return the depth points of frame t within the person's masks, and the rims of the masks."""
     seen_by: list[tuple[int, np.ndarray, np.ndarray]] = []  # camera, depth image, pixels
     windows, outlines = [], []
@@ -253,10 +249,10 @@ def _fuse(
         parts.append((*in_master, np.full(len(chosen), c)))
     points, normals, trust, view = (np.concatenate(p) for p in zip(*parts, strict=True))
     return PersonCloud(
-        torch.as_tensor(points, dtype=torch.float32, device=device),
-        torch.as_tensor(normals, dtype=torch.float32, device=device),
-        torch.as_tensor(trust, dtype=torch.float32, device=device),
-        torch.as_tensor(view, dtype=torch.int64, device=device),
+        torch.as_tensor(points, dtype=torch.float32),
+        torch.as_tensor(normals, dtype=torch.float32),
+        torch.as_tensor(trust, dtype=torch.float32),
+        torch.as_tensor(view, dtype=torch.int64),
         tuple(windows),
         tuple(outlines),
     )

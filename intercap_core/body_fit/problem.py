@@ -46,7 +46,7 @@ def columns_of(model: BodyModel, *, hands: bool, face: bool, betas: bool) -> Ten
         pose += list(range(TRANSL.stop, TRANSL.stop + model.num_betas))
     if face:
         pose += list(range(TRANSL.stop + model.num_betas, model.num_parameters))
-    return torch.tensor(pose, device=model.device)
+    return torch.tensor(pose)
 
 
 # --- parameters ------------------------------------------------------------------------------
@@ -87,7 +87,7 @@ class ParameterLayout:
         """Return the columns of the normal equations: own, then shared."""
         parameters = self.columns
         if self.one_shape:
-            betas = torch.arange(self.shape.start, self.shape.stop, device=parameters.device)
+            betas = torch.arange(self.shape.start, self.shape.stop)
             parameters = torch.cat([parameters, betas])
         if not self.fit_shared:
             return Columns(parameters, 0, 0)
@@ -192,8 +192,7 @@ class BodyProblem(TermInputs):
     """The terms, which cache what they need of the model; None = new ones."""
 
     def __post_init__(self) -> None:
-        device = self.base.device
-        self._group = torch.as_tensor(self.samples.group, device=device)
+        self._group = torch.as_tensor(self.samples.group)
         self._usual_thickness = torch.tensor([c.thickness for c in COVERINGS]).to(self.base)
         self.terms = self._terms = self.terms or CompiledTerms(self.model, self.samples)
 

@@ -123,7 +123,7 @@ def compare_parts(
     result = PartEvidence(unknown, unknown.clone(), none, none.clone(), none.clone())
     metres = torch.where(confidence > 0, whitened * sigma, torch.nan)
     for column, part in enumerate(BODY_PARTS):
-        at = torch.isin(index, torch.as_tensor(_PARTS[part].keypoints, device=index.device))
+        at = torch.isin(index, torch.as_tensor(_PARTS[part].keypoints))
         if not bool(at.any()):
             continue
         weight, good = confidence[:, :, at], whitened[:, :, at] <= KEYPOINT_SCALE
@@ -150,7 +150,7 @@ def _worst(share: Tensor) -> Tensor:
 
 def trunk_distance(evidence: PartEvidence) -> np.ndarray:
     """Return the median distance (N,) of the trunk's keypoints, metres; NaN = none visible."""
-    return evidence.distance[:, BODY_PARTS.index("trunk")].cpu().numpy()
+    return evidence.distance[:, BODY_PARTS.index("trunk")].numpy()
 
 
 def flag_unmeasured(evidence: PartEvidence) -> np.ndarray:
@@ -160,7 +160,7 @@ def flag_unmeasured(evidence: PartEvidence) -> np.ndarray:
         & (evidence.measured_share < _MEASURED_SHARE)
         & (evidence.visible_share > 0)
     )
-    result = np.asarray(flags.cpu().numpy())
+    result = np.asarray(flags.numpy())
     result[:, [BODY_PARTS.index(part) for part in ("trunk", "face")]] = False
     return result
 
@@ -180,12 +180,12 @@ def _leaning(evidence: PartEvidence) -> np.ndarray:
     In one view, the pose mirrored in depth is as likely: `MIRRORED_SIGMA_M`, reduced by depth
     points. In no view it is `UNSEEN_SIGMA_M`. For other parts it is 0.
     """
-    known = np.clip(evidence.measured_share.cpu().numpy() / _MEASURED_SHARE, 0, 1)
+    known = np.clip(evidence.measured_share.numpy() / _MEASURED_SHARE, 0, 1)
     limbs = [part.partition("_")[2] for part in BODY_PARTS]
     mirrored = np.array([MIRRORED_SIGMA_M.get(limb, 0.0) for limb in limbs])
     unseen = np.array([UNSEEN_SIGMA_M.get(limb, 0.0) for limb in limbs])
     leaning = np.where(flag_unmeasured(evidence), mirrored * (1 - known) ** 2, 0.0)
-    return np.where(evidence.visible_share.cpu().numpy() == 0, unseen, leaning)
+    return np.where(evidence.visible_share.numpy() == 0, unseen, leaning)
 
 
 def widen_sigma(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
@@ -197,8 +197,8 @@ def widen_sigma(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
     A hand has at least the added deviation of its arm.
     """
     # the median length of a normal error in two dimensions is 1.1774 standard deviations
-    disputed = evidence.outlier_share.cpu().numpy() > _DISAGREEING_SHARE
-    distance = np.where(disputed, np.nan_to_num(evidence.distance.cpu().numpy()), 0) / 1.1774
+    disputed = evidence.outlier_share.numpy() > _DISAGREEING_SHARE
+    distance = np.where(disputed, np.nan_to_num(evidence.distance.numpy()), 0) / 1.1774
     distance = np.hypot(distance, _leaning(evidence))
     for side in ("left", "right"):
         arm, hand = BODY_PARTS.index(f"{side}_arm"), BODY_PARTS.index(f"{side}_hand")
@@ -215,15 +215,15 @@ def flag_undetermined(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
 
     sigma (N, 55): standard deviation of the joints, metres.
     """
-    flags = evidence.outlier_share.cpu().numpy() > _DISAGREEING_SHARE
+    flags = evidence.outlier_share.numpy() > _DISAGREEING_SHARE
     for column, part in enumerate(BODY_PARTS):
         limit = LARGEST_SIGMA_M
         if part.endswith("hand"):
             limit = LARGEST_HAND_SIGMA_M
-            flags[:, column] |= evidence.visible_share[:, column].cpu().numpy() == 0
+            flags[:, column] |= evidence.visible_share[:, column].numpy() == 0
         flags[:, column] |= _rms(sigma[:, _PARTS[part].joints]) > limit
     face = BODY_PARTS.index("face")
-    flags[:, face] |= evidence.visible_share[:, face].cpu().numpy() < 0.5  # tuned on the studio
+    flags[:, face] |= evidence.visible_share[:, face].numpy() < 0.5  # tuned on the studio
     return flags
 
 

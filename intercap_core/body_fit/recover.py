@@ -64,14 +64,14 @@ def recover(problem: BodyProblem, times: np.ndarray) -> np.ndarray:
     changed = np.zeros(len(times), bool)
     params = model.parameters(problem.base)
     joints = model.forward(params, vertex_ids=np.array([0])).joints[:, _BODY_JOINTS]
-    jumped = np.asarray((measure_jumps(joints.double().cpu().numpy(), times) > 0).any(1))
+    jumped = np.asarray((measure_jumps(joints.double().numpy(), times) > 0).any(1))
     if not jumped.any() or jumped.all():
         return changed
-    between = bridge(problem.base.double().cpu().numpy(), ~jumped, times)
-    at = torch.as_tensor(np.flatnonzero(jumped), device=problem.base.device)
+    between = bridge(problem.base.double().numpy(), ~jumped, times)
+    at = torch.as_tensor(np.flatnonzero(jumped))
     base = torch.as_tensor(between[jumped]).to(problem.base)
     again = _of_frames(problem, at, base)
-    everyone = torch.arange(len(at), device=base.device)
+    everyone = torch.arange(len(at))
     nothing = base.new_zeros(0)
     before = again.cost(problem.base[at][:, again.columns], nothing, everyone)
     solution = minimise(again, again.own_start(), max_trials=10, cost_tolerance=1e-3)
@@ -82,7 +82,7 @@ def recover(problem: BodyProblem, times: np.ndarray) -> np.ndarray:
     rows[kept] = again.base[kept]
     problem.base = problem.base.clone()
     problem.base[at] = rows
-    changed[np.flatnonzero(jumped)[kept.cpu().numpy()]] = True
+    changed[np.flatnonzero(jumped)[kept.numpy()]] = True
     return changed
 
 
@@ -91,7 +91,7 @@ def _of_frames(problem: BodyProblem, at: torch.Tensor, base: torch.Tensor) -> Bo
 
     base (n, P): bodies, whose shape is fixed.
     """
-    shape = torch.arange(base.shape[1], device=base.device)[problem.layout.shape]
+    shape = torch.arange(base.shape[1])[problem.layout.shape]
     return replace(
         problem,
         base=base,

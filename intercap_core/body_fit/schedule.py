@@ -303,7 +303,7 @@ class Fitter:
         if not lifted.any():
             return None
         points, confidence = (
-            torch.as_tensor(values, dtype=self.model.dtype, device=self.model.device)
+            torch.as_tensor(values, dtype=self.model.dtype)
             for values in (np.nan_to_num(joints), lifted)
         )
         return Targets(points, confidence, START_SIGMA_M)
@@ -318,7 +318,7 @@ class Fitter:
         columns = columns_of(self.model, hands=hands, face=face, betas=False)
         fixed = columns_of(self.model, hands=False, face=False, betas=False)
         wrists = [3 * JOINT_INDEX[joint] + axis for joint in _WRISTS for axis in range(3)]
-        fixed = fixed[~torch.isin(fixed, torch.tensor(wrists, device=fixed.device))]
+        fixed = fixed[~torch.isin(fixed, torch.tensor(wrists))]
         kept = (problem.columns, problem.rows, problem.one_shape, problem.fit_shared)
         problem.columns = columns[~torch.isin(columns, fixed)]
         problem.rows, problem.one_shape, problem.fit_shared = None, False, False

@@ -91,9 +91,9 @@ class SelfContact(NamedTuple):
     @classmethod
     def of(cls, model: BodyModel, samples: Samples) -> SelfContact:
         """Compute from the template, once for a body file."""
-        template = model.template.double().cpu().numpy()
-        faces = model.faces.cpu().numpy()
-        part = _PART_OF_JOINT[model.skinning_weights.argmax(1).cpu().numpy()]
+        template = model.template.double().numpy()
+        faces = model.faces.numpy()
+        part = _PART_OF_JOINT[model.skinning_weights.argmax(1).numpy()]
         thickness = _thickness(template, faces, samples.vertex)
         own = part[samples.vertex]
         # Smallest geodesic distance of samples that are compared, over the mean thickness of their
@@ -106,7 +106,7 @@ class SelfContact(NamedTuple):
         around = np.linalg.norm(template[samples.patch] - template[samples.vertex, None], axis=2)
         # distance of the sixth neighbour; a vertex has six on average (Euler's formula)
         spacing = np.sort(around, 1)[:, 6]
-        dtype = model.template.cpu().numpy().dtype
+        dtype = model.template.numpy().dtype
         return cls(
             vertex=samples.vertex,
             patch=samples.patch,
@@ -180,7 +180,7 @@ def join_frames(contacts: list[Contacts]) -> Pairs | None:
         return None
     inner, outer, normal = (torch.cat(parts) for parts in zip(*contacts, strict=True))
     vertices, place = torch.cat([inner, outer]).unique(return_inverse=True)
-    frame = torch.arange(len(contacts)).repeat_interleave(counts).to(inner.device)
+    frame = torch.arange(len(contacts)).repeat_interleave(counts)
     return Pairs(frame, place[: len(inner)], place[len(inner) :], normal, vertices)
 
 
@@ -199,8 +199,8 @@ def find_contacts(contact: SelfContact, vertices: Tensor, normals: Tensor) -> Co
         Indices of the vertices p and q, and normals at q.
     """
     parts = len(_PART_NAMES)
-    indices = _find(parts, vertices.cpu().numpy(), normals.cpu().numpy(), contact)
-    inner, outer = (torch.as_tensor(index, device=vertices.device) for index in indices)
+    indices = _find(parts, vertices.numpy(), normals.numpy(), contact)
+    inner, outer = (torch.as_tensor(index) for index in indices)
     return inner, outer, normals[outer]
 
 

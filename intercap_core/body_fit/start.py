@@ -76,18 +76,18 @@ def fit_start(evidence: Evidence, problem: BodyProblem) -> torch.Tensor:
     """
     model = evidence.model
     rest = model.zeros()
-    keypoints = model.keypoints_of(rest)[0].double().cpu().numpy()
-    pelvis = model.forward(rest, vertex_ids=np.array([0])).joints[0, 0].double().cpu().numpy()
+    keypoints = model.keypoints_of(rest)[0].double().numpy()
+    pelvis = model.forward(rest, vertex_ids=np.array([0])).joints[0, 0].double().numpy()
     joints = evidence.observations.joints[evidence.frames]
     placed = interpolate_unknown(
         place_trunk(keypoints, joints, pelvis), evidence.observations.times[evidence.frames]
     )
     straight = _fit_triangulated(problem, placed, joints)
-    poor = np.flatnonzero((straight.cost > 1.5 * straight.cost.median()).cpu().numpy())
+    poor = np.flatnonzero((straight.cost > 1.5 * straight.cost.median()).numpy())
     if len(poor):
         turned = _fit_triangulated(problem, turn_around(placed[poor]), joints[poor])
         better = turned.cost < straight.cost[poor]
-        straight.own[poor[better.cpu().numpy()]] = turned.own[better]
+        straight.own[poor[better.numpy()]] = turned.own[better]
     return straight.own
 
 
@@ -105,7 +105,7 @@ def _fit_triangulated(problem: BodyProblem, placed: np.ndarray, joints: np.ndarr
     model = problem.model
 
     def tensor(values: np.ndarray) -> torch.Tensor:
-        return torch.as_tensor(values, dtype=model.dtype, device=model.device)
+        return torch.as_tensor(values, dtype=model.dtype)
 
     base = model.zeros(len(placed)).vector().clone()
     base[:, 75:120], base[:, 120:165] = model.hand_mean[0], model.hand_mean[1]  # left, right

@@ -93,9 +93,9 @@ def choose_samples(model: BodyModel) -> Samples:
     """Spread samples over the outer skin, denser on the hands. The choice is deterministic."""
     import scipy.spatial
 
-    template = model.template.double().cpu().numpy()
-    faces = model.faces.cpu().numpy()
-    joint = model.skinning_weights.argmax(1).cpu().numpy()
+    template = model.template.double().numpy()
+    faces = model.faces.numpy()
+    joint = model.skinning_weights.argmax(1).numpy()
     # wrists and the 30 finger joints, 25 to 54
     hand_joints = [i for i, name in enumerate(JOINT_NAMES) if i >= 25 or name.endswith("wrist")]
     hand = np.isin(joint, hand_joints)
@@ -198,7 +198,7 @@ class SkinSurface:
     @classmethod
     def around_samples(cls, model: BodyModel, samples: Samples) -> SkinSurface:
         """Return the surface around the samples of a body."""
-        every = model.faces.cpu().numpy()
+        every = model.faces.numpy()
         used = np.zeros(model.num_vertices, bool)
         used[samples.vertex] = used[samples.patch] = True
         faces = every[used[every].any(1)]
@@ -228,10 +228,9 @@ class SkinSurface:
         Normals of vertices outside of all patches are zero.
         """
         vertices = self.model.forward(params, vertex_ids=self.ids).vertices
-        posed = vertices.cpu()
-        normals = torch.empty_like(posed)
-        _vertex_normals(posed.numpy(), self.faces, self.starts, self.around, normals.numpy())
-        return vertices, normals.to(vertices.device)
+        normals = torch.empty_like(vertices)
+        _vertex_normals(vertices.numpy(), self.faces, self.starts, self.around, normals.numpy())
+        return vertices, normals
 
 
 def _group_samples(model: BodyModel, samples: Samples) -> tuple[np.ndarray, np.ndarray]:
@@ -245,7 +244,7 @@ def _group_samples(model: BodyModel, samples: Samples) -> tuple[np.ndarray, np.n
     """
     template = model.template[None]
     rest = torch.cat([template, NORMAL_LENGTH_M * vertex_normals(template, model.faces)], 2)[0]
-    at = rest.double().cpu().numpy()[samples.vertex]
+    at = rest.double().numpy()[samples.vertex]
     whole, parts = [np.arange(len(at))], []
     while whole:
         part = whole.pop()

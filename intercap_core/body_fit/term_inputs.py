@@ -124,7 +124,7 @@ def keypoint_set(model: BodyModel, index: Sequence[int] | range) -> KeypointSet:
     the joint with the largest skinning weight.
     """
     keypoints, rows = model.keypoint_map, np.asarray(index)
-    heaviest = model.skinning_weights.argmax(1).cpu().numpy()
+    heaviest = model.skinning_weights.argmax(1).numpy()
     carrier = [
         max(PARENTS[joint], 0) if joint >= 0 else int(heaviest[ids[weights.argmax()]])
         for joint, ids, weights in zip(
@@ -138,19 +138,18 @@ def keypoint_set(model: BodyModel, index: Sequence[int] | range) -> KeypointSet:
     count = len(keypoints.vertex_ids)
     used = np.flatnonzero(matrix[:, :count].any(0))
     matrix = np.concatenate([matrix[:, used], matrix[:, count:]], 1)
-    device = model.device
     vertices = keypoints.vertex_ids[used]
     # a joint follows only its parent
     follows = np.zeros((len(vertices) + NUM_JOINTS, NUM_JOINTS), bool)
-    follows[: len(vertices)] = model.skinning_weights[torch.as_tensor(vertices)].cpu().numpy() != 0
+    follows[: len(vertices)] = model.skinning_weights[torch.as_tensor(vertices)].numpy() != 0
     follows[len(vertices) + np.arange(NUM_JOINTS), [max(parent, 0) for parent in PARENTS]] = True
     chains = [_chain(np.flatnonzero(bones)) for bones in (matrix != 0) @ follows]
     return KeypointSet(
-        torch.as_tensor(rows, device=device),
-        torch.as_tensor(vertices, device=device),
-        torch.as_tensor(matrix, dtype=model.dtype, device=device),
-        torch.as_tensor(carrier, device=device),
-        torch.as_tensor(turned, dtype=model.dtype, device=device),
+        torch.as_tensor(rows),
+        torch.as_tensor(vertices),
+        torch.as_tensor(matrix, dtype=model.dtype),
+        torch.as_tensor(carrier),
+        torch.as_tensor(turned, dtype=model.dtype),
         _limbs(chains),
     )
 
@@ -241,7 +240,7 @@ class Columns(NamedTuple):
     def of_parameters(self, count: int) -> np.ndarray:
         """Return the column of each of ``count`` body parameters, -1 = fixed."""
         columns = np.full(count, -1)
-        columns[self.parameters.cpu().numpy()] = np.arange(len(self.parameters))
+        columns[self.parameters.numpy()] = np.arange(len(self.parameters))
         return columns
 
     def of_coverings(self, count: int) -> np.ndarray:

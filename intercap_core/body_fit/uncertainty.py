@@ -32,7 +32,7 @@ def joint_covariance(model: BodyModel, fit: BodyFit) -> Tensor:
     as its number of frames. sigma_m is the error of the body model.
     """
     own = len(fit.columns)
-    betas = torch.arange(TRANSL.stop, TRANSL.stop + model.num_betas, device=fit.vectors.device)
+    betas = torch.arange(TRANSL.stop, TRANSL.stop + model.num_betas)
     at_rest = [_eliminated(fit.hessian[at], own) for at in _chunks(len(fit.vectors))]
     information = torch.cat([schur for _, _, schur in at_rest]).mean(0)
     counts = fit.shared_counts.double()

@@ -98,7 +98,7 @@ class PosedGeometry:
         """Positions (T, K, 3) of the body's vertices with these ids (K,)."""
         with torch.no_grad():
             body = self._geometry.model(self._parameters, vertex_ids=vertices)
-        return body.vertices.double().cpu().numpy()
+        return body.vertices.double().numpy()
 
     def object_depth(self, threads: ThreadPool) -> np.ndarray:
         """Largest depth (T,) of the object's surface inside the body, metres; 0 without overlap.
@@ -106,13 +106,13 @@ class PosedGeometry:
         400 points of the object are compared with the whole posed body.
         """
         g, state = self._geometry, self.state
-        mesh, faces = g.mesh, g.model.faces.cpu().numpy()
+        mesh, faces = g.mesh, g.model.faces.numpy()
         points = sample_surface(mesh.vertices, mesh.faces, 400).of(mesh.vertices, mesh.faces)
         vector, depth = self._parameters.vector(), np.zeros(len(state))
         for start in range(0, len(state), _CHUNK):
             with torch.no_grad():
                 bodies = g.model(g.model.parameters(vector[start : start + _CHUNK]))
-            posed = bodies.vertices.cpu().numpy()
+            posed = bodies.vertices.numpy()
 
             def deepest(frame: tuple[int, np.ndarray]) -> float:
                 t, vertices = frame
@@ -154,10 +154,8 @@ class PosedGeometry:
         model = self._geometry.model
         parameters = model.parameters(self._parameters.vector()[frames])
         lin = model.linearise(parameters, vertex_ids=ids)
-        along = torch.as_tensor(
-            np.ascontiguousarray(axes), dtype=lin.points.dtype, device=lin.points.device
-        )
-        return lin.along(along)[..., BODY].double().cpu().numpy()
+        along = torch.as_tensor(np.ascontiguousarray(axes), dtype=lin.points.dtype)
+        return lin.along(along)[..., BODY].double().numpy()
 
     @cached_property
     def joints(self) -> tuple[np.ndarray, np.ndarray]:
@@ -171,8 +169,8 @@ class PosedGeometry:
             lin = g.model.linearise(
                 g.model.parameters(vector[at]), vertex_ids=np.zeros(0, np.int64), joints=True
             )
-            points[at] = lin.joints.double().cpu().numpy()
-            jacobian[at] = lin.full()[..., BODY].cpu().numpy()
+            points[at] = lin.joints.double().numpy()
+            jacobian[at] = lin.full()[..., BODY].numpy()
         return points, jacobian
 
     @cached_property

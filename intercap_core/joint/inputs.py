@@ -102,7 +102,7 @@ def open_inputs(
     if sequential.tracked is None:
         mesh = None
     geometry = _geometry(model, mesh, settings)
-    threads = ThreadPool(torch.get_num_threads() if model.device.type == "cpu" else 1)
+    threads = ThreadPool(torch.get_num_threads())
     # one BLAS thread: small matrix products gain nothing from more, and would block ``threads``
     with Frames.open(paths.frames) as recording, threadpool_limits(1, user_api="blas"):
         images = None
@@ -170,7 +170,7 @@ def _motion_encoder(
     weights, statistics = settings.lemo_files
     # double precision: E_S is a small difference of large latents, and GPU convolutions in single
     # precision may round to ten bits
-    return MotionEncoder.load(weights, statistics, device=model.device, dtype=torch.float64)
+    return MotionEncoder.load(weights, statistics, dtype=torch.float64)
 
 
 def read_cameras(scene: Artefact) -> CameraFit:

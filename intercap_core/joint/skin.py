@@ -38,8 +38,8 @@ def contact_patches(model: BodyModel) -> Patches:
     A region keeps at most 240 vertices, evenly spread (tuned on the studio). Fewer would miss thin
     fingers around an object, or the few vertices of a large region that touch an edge.
     """
-    template = model.template.cpu().numpy()
-    joint_of = model.skinning_weights.cpu().numpy().argmax(axis=1)
+    template = model.template.numpy()
+    joint_of = model.skinning_weights.numpy().argmax(axis=1)
     region_of_patch: list[int] = []
     vertices, region, patch, share = [], [], [], []
     for r, name in enumerate(CONTACT_REGIONS):
@@ -94,7 +94,7 @@ class SkinSamples:
     def select(cls, model: BodyModel, patches: Patches) -> SkinSamples:
         """Choose the samples."""
         vertices = np.union1d(patches.vertices, choose_samples(model).vertex)
-        template = model.template.double().cpu().numpy()
+        template = model.template.double().numpy()
         _, nearest = cKDTree(template[vertices]).query(template)
         share = np.bincount(nearest, minlength=len(vertices)).astype(float)
         return cls(vertices, share, np.searchsorted(vertices, patches.vertices))

@@ -39,11 +39,11 @@ class State:
         return State(self.body, self.betas, self.expression, *nowhere)
 
     def parameters(self, model: BodyModel) -> BodyParameters:
-        """The body's parameters on the device and in the precision of ``model``."""
+        """The body's parameters in the precision of ``model``."""
         vector = np.concatenate(
             [self.body, np.tile(self.betas, (len(self), 1)), self.expression], axis=1
         )
-        return model.parameters(torch.as_tensor(vector, dtype=model.dtype, device=model.device))
+        return model.parameters(torch.as_tensor(vector, dtype=model.dtype))
 
     def moved(self, step: np.ndarray) -> State:
         """The state after ``step`` (T, 174)."""

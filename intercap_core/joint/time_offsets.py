@@ -236,7 +236,7 @@ def observe_keypoints(evidence: Evidence, problem: BodyProblem) -> PointObservat
         _array(velocity[..., 0]),
         _array(by_point),
         _array(views.confidence),
-        _part_of_keypoint(problem.keypoints.index.cpu().numpy()),
+        _part_of_keypoint(problem.keypoints.index.numpy()),
     )
 
 
@@ -258,7 +258,7 @@ def observe_clouds(evidence: Evidence, problem: BodyProblem) -> PointObservation
         np.broadcast_to(_array(along)[:, None, :, None], shape),
         np.ones((*shape, 1)),
         _array(clouds.points / (clouds.points + 2.0)),
-        joint.cpu().numpy(),
+        joint.numpy(),
     )
 
 
@@ -271,4 +271,4 @@ def _part_of_keypoint(index: np.ndarray) -> np.ndarray:
 
 def _array(values: Tensor) -> np.ndarray:
     with torch.no_grad():
-        return values.double().cpu().numpy()
+        return values.double().numpy()

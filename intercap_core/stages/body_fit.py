@@ -67,7 +67,7 @@ def run(
             "views, or one and its depth, place three keypoints of the subject's trunk; check the "
             "keypoints and the camera poses of this sequence"
         )
-    clouds = person_clouds(frames, seen, settings.points_per_frame, model.device)
+    clouds = person_clouds(frames, seen, settings.points_per_frame)
     definition = Definition.read(settings.keypoint_definition)
     fit = Fitter(model, seen, clouds, settings, pose_prior, definition=definition).run()
 
@@ -76,7 +76,7 @@ def run(
     on_trunk = quality.trunk_distance(fit.parts) < WRONG_TRUNK_M
     # two views, or one view and depth points: keypoints of one view do not determine the distance
     determined = (~fit.pixel_residual.isnan()).sum(1) + (~fit.cloud_residual.isnan()) >= 2
-    fitted[fit.frames[on_trunk & determined.cpu().numpy()]] = True
+    fitted[fit.frames[on_trunk & determined.numpy()]] = True
     if not fitted.any():
         raise UserError(
             f"{person}: sequence {seen.sequence}: in every frame the fitted trunk is more than "
@@ -85,17 +85,17 @@ def run(
             "this recording"
         )
     vectors = np.zeros((seen.num_frames, model.num_parameters))
-    vectors[fit.frames] = fit.vectors.double().cpu().numpy()
+    vectors[fit.frames] = fit.vectors.double().numpy()
     vectors = bridge(vectors, fitted, seen.times)
     vectors[:, :3] = unwrap_turns(vectors[:, :3])
 
-    params = model.parameters(torch.as_tensor(vectors, dtype=model.dtype, device=model.device))
-    joints = model.forward(params, vertex_ids=np.array([0])).joints.cpu().numpy()
+    params = model.parameters(torch.as_tensor(vectors, dtype=model.dtype))
+    joints = model.forward(params, vertex_ids=np.array([0])).joints.numpy()
     stated = _state_uncertainty(model, fit, seen.times, fitted, joints)
     keypoint_residual = np.full((seen.num_frames, len(seen.rig)), np.nan)
-    keypoint_residual[fit.frames] = fit.pixel_residual.cpu().numpy()
+    keypoint_residual[fit.frames] = fit.pixel_residual.numpy()
     cloud_residual = np.full(seen.num_frames, np.nan)
-    cloud_residual[fit.frames] = fit.cloud_residual.cpu().numpy()
+    cloud_residual[fit.frames] = fit.cloud_residual.numpy()
     with artefacts.write(
         output,
         BODY_FIT,
@@ -105,16 +105,16 @@ def run(
         gender=subject.gender,
         body_model=file_digest(path),
     ) as writer:
-        put_parameters(writer, params, joints, betas=shapes.betas(params.betas).cpu().numpy())
+        put_parameters(writer, params, joints, betas=shapes.betas(params.betas).numpy())
         writer.put("keypoint_residual", keypoint_residual)
         writer.put("cloud_residual", cloud_residual)
         writer.put("joint_sigma", stated.sigma)
         writer.put("joint_covariance", stated.covariance)
-        writer.put("keypoint_offsets", fit.settled.offsets.cpu().numpy())
-        writer.put("keypoint_sigma", fit.settled.keypoint_sigma.cpu().numpy())
-        writer.put("keypoint_doubt", fit.settled.keypoint_doubt.cpu().numpy())
-        writer.put("covering", fit.settled.covering.cpu().numpy())
-        writer.put("covering_noise", fit.settled.cloud_noise.cpu().numpy())
+        writer.put("keypoint_offsets", fit.settled.offsets.numpy())
+        writer.put("keypoint_sigma", fit.settled.keypoint_sigma.numpy())
+        writer.put("keypoint_doubt", fit.settled.keypoint_doubt.numpy())
+        writer.put("covering", fit.settled.covering.numpy())
+        writer.put("covering_noise", fit.settled.cloud_noise.numpy())
         writer.put("failed", ~fitted)
         writer.put("bridged", ~fitted)
         writer.put("uncertain", stated.uncertain)
@@ -150,7 +150,7 @@ def _state_uncertainty(
     """
     count = len(times)
     sigma = np.zeros((count, 55))
-    stated = joint_covariance(model, fit).cpu().numpy()
+    stated = joint_covariance(model, fit).numpy()
     # A jump of a joint may be a wrong minimum, so it widens sigma. Jumps count from JUMP_M on; for
     # joints that only keypoints of one view constrain, from 0 on.
     least = np.full_like(sigma, JUMP_M)
@@ -168,6 +168,6 @@ def _state_uncertainty(
     covariance = np.zeros((*sigma.shape, 3, 3))
     covariance[fit.frames] = stated
     covariance[~fitted] = 0
-    share = model.skinning_weights.double().mean(0).cpu().numpy()
+    share = model.skinning_weights.double().mean(0).numpy()
     uncertain = fitted & (quality.expected_error(sigma, share) > BAD_BODY_M)
     return _Uncertainty(sigma, widen(covariance, sigma), undetermined, uncertain)

@@ -72,7 +72,7 @@ def run(
     ) as writer:
         parameters = fitted.state.parameters(inputs.model)
         with torch.no_grad():
-            joints = inputs.model(parameters, vertex_ids=np.array([0])).joints.cpu().numpy()
+            joints = inputs.model(parameters, vertex_ids=np.array([0])).joints.numpy()
         put_parameters(writer, parameters, joints, betas=fitted.state.betas)
         _put_fit(writer, fitted)
         undetermined = inputs.sequential.flags.hands | _hands_of_few_views(paths.person)

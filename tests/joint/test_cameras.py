@@ -71,7 +71,7 @@ def _make_fitter(folder: Path, frames: int, late: np.ndarray) -> Fitter:
         np.stack([model.keypoints(body).double().numpy() for body in bodies], 1),
     )
     observed = read_observations(inputs.scene, inputs.person)
-    clouds = person_clouds(inputs.frames, observed, 3000, model.device)
+    clouds = person_clouds(inputs.frames, observed, 3000)
     return Fitter(model, observed, clouds, BodyFitSettings(points_per_frame=3000))
 
 

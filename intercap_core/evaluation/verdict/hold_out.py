@@ -235,7 +235,7 @@ def _points(inputs: JointInputs, state: State) -> dict[JudgedPart, np.ndarray]:
     """Points (T, K, 3) by which each part is compared: joints, or the object's centre of mass."""
     with torch.no_grad():
         posed = inputs.model(state.parameters(inputs.model), vertex_ids=np.array([0]))
-    joints = posed.joints.double().cpu().numpy()
+    joints = posed.joints.double().numpy()
     found = {part: joints[:, at] for part, at in JOINTS.items()}
     if inputs.geometry.has_object:
         centre = state.rotation @ inputs.geometry.mesh.centre_of_mass + state.translation

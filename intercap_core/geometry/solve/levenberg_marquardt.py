@@ -101,14 +101,14 @@ def minimise(
         cost_tolerance: relative decrease of the cost.
         keep_normal: return the normal equations at the solution.
     """
-    count, device = own.shape[0], own.device
+    count = own.shape[0]
     own = own.clone()
     y = own.new_zeros(0) if shared is None else shared.clone()
-    everyone = torch.arange(count, device=device)
+    everyone = torch.arange(count)
     normal = problem.linearise(own, y, everyone)
     cost = normal.cost.clone()
-    lam = torch.full((count,), damping, dtype=torch.float64, device=device)
-    stale = torch.zeros(count, dtype=torch.bool, device=device)
+    lam = torch.full((count,), damping, dtype=torch.float64)
+    stale = torch.zeros(count, dtype=torch.bool)
     done = torch.zeros_like(stale)
     converged = torch.zeros_like(stale)
     trials = 0
@@ -210,7 +210,7 @@ def _damped_step(
     right = torch.cat([gradient[:, :n, None], normal.hessian[:, :n, n:]], 2).double()
     solved = info == 0
     if not bool(solved.all()):  # such a frame keeps its parameters while its damping grows
-        eye = torch.eye(n, dtype=a.dtype, device=a.device)
+        eye = torch.eye(n, dtype=a.dtype)
         factor = torch.where(solved[:, None, None], factor, eye)
         right = torch.where(solved[:, None, None], right, torch.zeros_like(right))
     # H = L L^T; ``half`` = L^-1 [g B] eliminates the frames from the equations of y

@@ -48,6 +48,6 @@ def geman_mcclure(squared: Tensor, scale: float | Tensor) -> Robust:
     """
     import torch
 
-    c2 = torch.as_tensor(scale, dtype=squared.dtype, device=squared.device) ** 2
+    c2 = torch.as_tensor(scale, dtype=squared.dtype) ** 2
     share = c2 / (squared + c2)
     return Robust(share * squared, share * share)

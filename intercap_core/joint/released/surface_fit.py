@@ -77,7 +77,7 @@ class _SurfaceFit:
         self.hand = torch.as_tensor(samples.hand)
         self.ids = self.skin.ids[self.skin.sample]
         self.outer = np.unique(self.skin.ids[self.skin.patch])
-        self.faces = model.faces.cpu().numpy()
+        self.faces = model.faces.numpy()
         free = np.setdiff1d(np.arange(TRANSL.stop), np.arange(TRANSL.stop)[_JAW_AND_EYES])
         self.columns = torch.from_numpy(free)
 

@@ -72,7 +72,7 @@ class BodyData(JointTerm):
     def __init__(self, fitter: Fitter, problem: BodyProblem, trusted: np.ndarray) -> None:
         self._fitter, self._problem = fitter, problem
         self._trusted = trusted[fitter.frames]
-        self._index = torch.arange(len(fitter.frames), device=fitter.model.device)
+        self._index = torch.arange(len(fitter.frames))
         self._interpolated: np.ndarray | None = None  # bodies at the first refresh
 
     @classmethod
@@ -89,7 +89,7 @@ class BodyData(JointTerm):
     ) -> BodyData:
         """Read the observations, and the constants of the body fit."""
         observations = read_observations(paths.scene, paths.person)
-        clouds = person_clouds(paths.frames, observations, settings.points_per_frame, model.device)
+        clouds = person_clouds(paths.frames, observations, settings.points_per_frame)
         fitter = Fitter(model, observations, clouds, settings, pose_prior)
         names = [
             "keypoint_offsets",
@@ -100,7 +100,7 @@ class BodyData(JointTerm):
         ]
         settled = Settled(*(torch.from_numpy(body_fit[name]) for name in names))
         problem = fitter.resume(state.parameters(model).vector()[fitter.frames], settled)
-        problem.columns = torch.arange(BODY.stop, device=model.device)
+        problem.columns = torch.arange(BODY.stop)
         # a hand's pose lasts 0.5 s (tuned on the studio: 0.3 to 1 are alike)
         lasting = min(fps * 0.5, len(fitter.frames))
         problem.hand_share = 1 / max(lasting, 1.0)
@@ -135,7 +135,7 @@ class BodyData(JointTerm):
         :meth:`refresh`.
         """
         problem, evidence = self._problem, self._fitter.evidence
-        counted = torch.as_tensor(used[self._fitter.frames], device=problem.base.device)[..., None]
+        counted = torch.as_tensor(used[self._fitter.frames])[..., None]
         views, rows = problem.views, problem.rows
         assert views is not None, "refresh comes first"
         problem.views = replace(views, confidence=views.confidence * counted)
@@ -156,12 +156,12 @@ class BodyData(JointTerm):
         energy = np.zeros(len(state))
         for chunk in self._index.split(_CHUNK):
             normal = self._problem.linearise(pose[chunk], shared, chunk)
-            places = chunk.cpu().numpy()  # a tensor with one element would index like a scalar
+            places = chunk.numpy()  # a tensor with one element would index like a scalar
             trusted = self._trusted[places]
             at = self._fitter.frames[places][trusted]
-            hessian[at] = normal.hessian.cpu().numpy()[trusted]
-            gradient[at] = normal.gradient.cpu().numpy()[trusted]
-            energy[at] = normal.cost.double().cpu().numpy()[trusted]
+            hessian[at] = normal.hessian.numpy()[trusted]
+            gradient[at] = normal.gradient.numpy()[trusted]
+            energy[at] = normal.cost.double().numpy()[trusted]
         frames = self._fitter.frames[self._trusted]
         # a frame without a fit stays near its interpolated pose: 0.3 rad, 0.1 m (tuned)
         filled = np.setdiff1d(np.arange(len(state)), frames)
@@ -201,8 +201,8 @@ class BodyData(JointTerm):
         total = len(self._fitter.evidence.observations.times)
         keypoint = np.full((total, pixels.shape[1]), np.nan)
         cloud = np.full(total, np.nan)
-        keypoint[self._fitter.frames] = pixels.cpu().numpy()
-        cloud[self._fitter.frames] = metres.cpu().numpy()
+        keypoint[self._fitter.frames] = pixels.numpy()
+        cloud[self._fitter.frames] = metres.numpy()
         return BodyResiduals(keypoint, cloud)
 
     def person_by_view(self) -> np.ndarray:
@@ -213,7 +213,7 @@ class BodyData(JointTerm):
         if clouds is not None:
             distance = (clouds.distance - self._problem.thickness()).abs()
             distance = torch.where(clouds.points > 0, distance, torch.nan)
-            person[self._fitter.frames] = distance.nanmedian(2).values.cpu().numpy()
+            person[self._fitter.frames] = distance.nanmedian(2).values.numpy()
         return person
 
     @property
@@ -279,7 +279,7 @@ def _add_keypoints(
         problem.keypoints,
         problem.all_offsets(),
         derivatives=True,
-        columns=torch.arange(BODY.stop, device=problem.base.device),
+        columns=torch.arange(BODY.stop),
     )
     assert model_points.derivatives is not None
     points = model_points.points[:, None]
@@ -348,4 +348,4 @@ def _poses(evidence: Evidence) -> torch.Tensor:
 
 
 def _array(values: torch.Tensor) -> np.ndarray:
-    return values.double().cpu().numpy()
+    return values.double().numpy()

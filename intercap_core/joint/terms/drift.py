@@ -99,7 +99,7 @@ class BodyDrift(_Drift):
         model, trusted = self.geometry.model, context.trust.body
         with torch.no_grad():
             body = model(context.start.parameters(model), vertex_ids=np.array([0]))
-        self._sequential = body.joints.double().cpu().numpy()
+        self._sequential = body.joints.double().numpy()
         sigma = self._sigma(self._sequential, trusted, BODY_DRIFT, context.fps)
         self._weights = context.settings.drift_weight * (trusted[1:] & trusted[:-1]) / sigma**2
 

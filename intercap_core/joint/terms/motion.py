@@ -197,7 +197,7 @@ class LearnedMotion(JointTerm):
         (force,) = torch.autograd.grad(energy.sum(), markers)
         posed, ids = self.geometry.at(state), self.geometry.model.markers
         every = slice(0, len(state))
-        along = posed.vertices_by_body(every, ids, force.double().cpu().numpy()[:, :, None])
+        along = posed.vertices_by_body(every, ids, force.double().numpy()[:, :, None])
         # exact energy and gradient without curvature; then the bound of the curvature, as rows
         # without residuals
         columns = BODY.stop - BODY.start
@@ -210,7 +210,7 @@ class LearnedMotion(JointTerm):
             axes = np.broadcast_to(np.eye(3), (count, len(index), 3, 3))
             return posed.vertices_by_body(frames, ids[index], axes)
 
-        spread = self._encoder.spread.double().cpu().numpy().reshape(-1, 3)
+        spread = self._encoder.spread.double().numpy().reshape(-1, 3)
         steepness = self._curvature / np.square(spread).min(axis=1)
         equations.add_rows(
             self.name,
@@ -218,7 +218,7 @@ class LearnedMotion(JointTerm):
             rows,
             np.tile(steepness, (len(state) - 2, 1)),
             np.zeros((len(state) - 2, len(ids), 3)),
-            energy.detach().cpu().numpy(),
+            energy.detach().numpy(),
             stencil=ACCELERATION,
         )
 

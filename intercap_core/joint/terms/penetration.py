@@ -155,9 +155,9 @@ class ObjectInBody(JointTerm):
         # 10 cm^2 are one measurement (tuned on the studio): a hand's breadth of a handle
         self._scale = weight / PENETRATION_SIGMA**2 * area / count / 1e-3
         model = geometry.model
-        self._faces = model.faces.cpu().numpy().astype(np.int64)
-        template = model.template.double().cpu().numpy()
-        carrier = model.skinning_weights.argmax(1).cpu().numpy()
+        self._faces = model.faces.numpy().astype(np.int64)
+        template = model.template.double().numpy()
+        carrier = model.skinning_weights.argmax(1).numpy()
         self._hands = np.isin(carrier, _HANDS)[geometry.skin.vertices]
         self._sample_of = cKDTree(template[geometry.skin.vertices]).query(template)[1]
         self._deepest = _DeepestPoints.none(0)

@@ -229,8 +229,8 @@ def _forearm_faces(model: BodyModel) -> np.ndarray:
         for name, index in JOINT_INDEX.items()
         if name.endswith(("_elbow", "_wrist")) or index >= JOINT_INDEX["left_index1"]
     ]
-    shown = np.isin(model.skinning_weights.cpu().numpy().argmax(1), parts)
-    faces = model.faces.cpu().numpy()
+    shown = np.isin(model.skinning_weights.numpy().argmax(1), parts)
+    faces = model.faces.numpy()
     return faces[shown[faces].all(1)]
 
 

@@ -96,7 +96,7 @@ def gather(paths: SequencePaths, models: SequenceModels, *, truth: Path | None =
         content.arrays["object/vertices"] = vertices.astype(np.float32)
         content.arrays["object/faces"] = faces.astype(np.uint32)
         content.arrays["object/colours"] = colours
-    content.arrays["faces"] = shown.model.faces.cpu().numpy().astype(np.uint32)
+    content.arrays["faces"] = shown.model.faces.numpy().astype(np.uint32)
     for name, body in bodies.items():
         _add_body(content, name, body, zup)
         if mesh is not None:

@@ -50,14 +50,14 @@ class SkinnedBody:
 def skinned(model: BodyModel, parameters: BodyParameters) -> SkinnedBody:
     """Compress T posed bodies in the frame of the parameters."""
     rest, rest_joints = rest_pose(model, parameters)
-    all_weights = model.skinning_weights.cpu().numpy().astype(np.float64)
+    all_weights = model.skinning_weights.numpy().astype(np.float64)
     strongest = np.argsort(-all_weights, axis=1, kind="stable")[:, :4]
     weights = np.take_along_axis(all_weights, strongest, 1)
     weights /= weights.sum(1, keepdims=True)
     batches = list(posed_batches(model, parameters))
     vertices = np.concatenate([posed.vertices.double().numpy() for posed in batches])
     joints = np.concatenate([posed.joints.double().numpy() for posed in batches])
-    turns = _global_rotations(parameters.full_pose().cpu().numpy())
+    turns = _global_rotations(parameters.full_pose().numpy())
     shifts = joints - np.einsum("tjab,jb->tja", turns, rest_joints)
     transforms = np.concatenate([turns, shifts[..., None]], 3)
     residual = np.stack(
