@@ -147,12 +147,10 @@ class ObjectClip:
         """Errors (...) of poses (..., 4, 4) in the given frames, millimetres and degrees."""
         centre = self.whole.centre_of_mass
         rotation = np.broadcast_to(self.true_rotation[frames], (*poses.shape[:-2], 3, 3))
-        apart = object_pose.centre_error(
-            object_pose.posed_point(poses[..., :3, :3], poses[..., :3, 3], centre),
-            object_pose.posed_point(rotation, self.true_translation[frames], centre),
-        )
-        turned = object_pose.rotation_error_deg(poses[..., :3, :3], rotation, self.mesh.symmetry)
-        return 1e3 * apart, turned
+        fitted = object_pose.posed_point(poses[..., :3, :3], poses[..., :3, 3], centre)
+        true = object_pose.posed_point(rotation, self.true_translation[frames], centre)
+        turned = self.mesh.symmetry.rotation_error_deg(poses[..., :3, :3], rotation)
+        return 1e3 * np.linalg.norm(fitted - true, axis=-1), turned
 
     @cached_property
     def seen(self) -> np.ndarray:
@@ -335,10 +333,9 @@ class JointClip:
         with torch.no_grad():
             vertices = model(state.parameters(model)).vertices.numpy()
         centre = self.geometry.mesh.centre_of_mass
-        apart = object_pose.centre_error(
-            object_pose.posed_point(state.rotation, state.translation, centre),
-            object_pose.posed_point(true.rotation, true.translation, centre),
-        )
+        fitted = object_pose.posed_point(state.rotation, state.translation, centre)
+        truly = object_pose.posed_point(true.rotation, true.translation, centre)
+        apart = np.linalg.norm(fitted - truly, axis=-1)
         return JointErrors(
             1e3 * float(vertex_error(vertices, true.vertices).mean()),
             1e3 * float(apart[true.object_views >= SEEN_VIEWS].mean()),

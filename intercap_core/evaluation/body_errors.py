@@ -23,7 +23,6 @@ from intercap_core.evaluation.proximity import (
     DEEPEST_M,
     MeasuredCloud,
     Sight,
-    face_normals,
     visible_to_cloud,
 )
 from intercap_core.evaluation.segmented import SegmentedClouds, read_person_masks
@@ -32,7 +31,7 @@ from intercap_core.evaluation.truth import Truth, body_errors
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.rigid.surface_tree import SurfaceTree
-from intercap_core.geometry.rigid.surfaces import sample_surface
+from intercap_core.geometry.rigid.surfaces import face_normals, sample_surface
 from intercap_core.schemas import SCENE, TRUTH
 from intercap_core.sequence_inputs import SequencePaths
 

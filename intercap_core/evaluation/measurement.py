@@ -18,7 +18,6 @@ from intercap_core.evaluation.proximity import (
     MeasuredCloud,
     PosedObject,
     Sight,
-    face_normals,
     vertex_to_cloud,
     visible_to_cloud,
 )
@@ -28,7 +27,7 @@ from intercap_core.evaluation.truth import Truth
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.rigid.mesh import ObjectMesh
 from intercap_core.geometry.rigid.surface_tree import SurfaceTree
-from intercap_core.geometry.rigid.surfaces import sample_surface
+from intercap_core.geometry.rigid.surfaces import face_normals, sample_surface
 from intercap_core.progress import Progress
 from intercap_core.schemas import CONTACT_REGIONS
 

@@ -18,23 +18,6 @@ def posed_point(rotation: np.ndarray, translation: np.ndarray, point: np.ndarray
     return rotation @ point + translation
 
 
-def centre_error(centre: np.ndarray, true_centre: np.ndarray) -> np.ndarray:
-    """Distance (...) of the object's centre of mass (..., 3) from the true one, metres.
-
-    Symmetries of the object leave its centre of mass in place, so they need not be considered.
-    """
-    return np.linalg.norm(centre - true_centre, axis=-1)
-
-
-def rotation_error_deg(
-    rotation: np.ndarray,
-    true_rotation: np.ndarray,
-    symmetry: SymmetryGroup,
-) -> np.ndarray:
-    """Geodesic angle (...), the smallest over the symmetry group, degrees."""
-    return symmetry.rotation_error_deg(rotation, true_rotation)
-
-
 def lost(translation_error_m: np.ndarray, rotation_error_degrees: np.ndarray) -> np.ndarray:
     """Mask (...) of lost poses: errors above 50 mm or 20 degrees.
 

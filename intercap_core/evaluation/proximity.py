@@ -162,10 +162,3 @@ class Sight:
                 surface.blocks(start, np.broadcast_to(eye, start.shape), hidden)
             seen[ids[~hidden]] = True
         return seen
-
-
-def face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Outward unit normals (F, 3) of the faces."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    normals = np.cross(b - a, c - a)
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-18)

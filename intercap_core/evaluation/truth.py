@@ -224,8 +224,8 @@ def object_errors(
     true = object_pose.posed_point(rotation, translation, centre)
     turns = motion.turns(track.rotation, rotation, mesh.symmetry)
     result = {
-        "object_translation": object_pose.centre_error(fitted, true),
-        "object_rotation": object_pose.rotation_error_deg(track.rotation, rotation, mesh.symmetry),
+        "object_translation": np.linalg.norm(fitted - true, axis=-1),
+        "object_rotation": mesh.symmetry.rotation_error_deg(track.rotation, rotation),
         "object_centre": fitted,
         "object_turn": np.append(np.nan, turns),
         "object_flagged": track.flagged,

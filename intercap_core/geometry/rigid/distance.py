@@ -1,4 +1,4 @@
-"""Queries of a triangle mesh by Embree: distances, inside or outside, and visibility.
+"""Queries of a triangle mesh by Embree: distances, and inside or outside.
 
 Queries use Open3D's RaycastingScene (Embree). The search tree is built once in the mesh's own
 frame, so callers transform query points of a moving object into that frame.
@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.machinery import EXTENSION_SUFFIXES
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
@@ -24,9 +23,6 @@ from typing import Any
 import igl
 import numpy as np
 import trimesh
-
-from intercap_core.geometry.camera.intrinsics import Intrinsics
-from intercap_core.geometry.rigid.surfaces import vertex_normals
 
 # Directions of rays whose crossings are counted. A point is outside if the first ray says so (no
 # error on 10,000 points). Else all five vote, since a ray may pass along an edge. The directions
@@ -269,48 +265,6 @@ class _OpenSurface:
         place, normals = closest.points.copy(), closest.normals.copy()
         place[at[closer]], normals[at[closer]] = hull.points[closer], hull.normals[closer]
         return Closest(place, closest.faces, closest.barycentric, normals)
-
-
-class OcclusionScene:
-    """Visibility of a mesh's vertices from cameras, occluded by the mesh itself and by others.
-
-    All meshes are in one coordinate frame. Build one scene for each frame of the capture and query
-    it for every camera.
-    """
-
-    def __init__(
-        self,
-        vertices: np.ndarray,
-        faces: np.ndarray,
-        occluders: Sequence[tuple[np.ndarray, np.ndarray]] = (),
-        *,
-        threads: int = 0,
-    ) -> None:
-        self._scene = o3d.t.geometry.RaycastingScene(nthreads=threads)
-        for points, triangles in [(vertices, faces), *occluders]:
-            self._scene.add_triangles(
-                o3d.core.Tensor.from_numpy(np.ascontiguousarray(points, np.float32)),
-                o3d.core.Tensor.from_numpy(np.ascontiguousarray(triangles, np.uint32)),
-            )
-        self._vertices = np.asarray(vertices, np.float64)
-        self._normals = vertex_normals(self._vertices, faces)
-
-    def visible(self, intrinsics: Intrinsics, camera_from_mesh: np.ndarray) -> np.ndarray:
-        """Return whether each vertex (V,) is in the image, faces the camera and is not occluded."""
-        rotation, translation = camera_from_mesh[:3, :3], camera_from_mesh[:3, 3]
-        eye = -rotation.T @ translation
-        to_eye = eye - self._vertices
-        seen = np.einsum("ij,ij->i", to_eye, self._normals) > 0
-        seen &= intrinsics.sees(self._vertices @ rotation.T + translation)
-        ids = np.flatnonzero(seen)
-        if len(ids):
-            start = self._vertices[ids] + 0.001 * self._normals[ids]  # 1 mm off its own surface
-            rays = np.concatenate([start, eye - start], 1).astype(np.float32)
-            hidden = self._scene.test_occlusions(
-                o3d.core.Tensor.from_numpy(rays), tnear=0.0, tfar=1.0
-            )
-            seen[ids[hidden.numpy()]] = False
-        return seen
 
 
 def _scene(vertices: np.ndarray, faces: np.ndarray, threads: int) -> Any:

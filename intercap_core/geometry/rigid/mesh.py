@@ -20,6 +20,7 @@ from intercap_core.geometry.rigid.mesh_files import (
     load_mesh,
     read_mesh,
 )
+from intercap_core.geometry.rigid.surfaces import face_normals
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 
 log = logging.getLogger(__name__)
@@ -85,9 +86,7 @@ class ObjectMesh:
     @cached_property
     def face_normals(self) -> np.ndarray:
         """Outward unit normals (F, 3)."""
-        a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
-        normals = np.cross(b - a, c - a)
-        return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-18)
+        return face_normals(self.vertices, self.faces)
 
     @cached_property
     def centre_of_mass(self) -> np.ndarray:
@@ -205,18 +204,13 @@ def _colours(mesh: Any, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
 def _check_size(path: Path, mesh: trimesh.Trimesh) -> None:
     """Raise UserError if the size of a mesh is impossible for an object, warn if unusual."""
     extent = float(np.ptp(mesh.vertices[np.unique(mesh.faces)], axis=0).max())
-    if extent > 5.0:
+    if not 0.01 <= extent <= 5.0:
         fitting = [f"{unit} ({scale:g})" for unit, scale in UNITS.items()
                    if HANDLED_MIN_M <= extent * scale <= HANDLED_MAX_M]  # fmt: skip
         unit = f"; it looks like {' or '.join(fitting)}" if fitting else ""
         raise UserError(
             f"{path}: is {extent:.4g} m long, expected {HANDLED_MIN_M} to {HANDLED_MAX_M:g} m"
             f"{unit}: scale it so that its unit is the metre"
-        )
-    if extent < 0.01:
-        raise UserError(
-            f"{path}: is only {extent:.3g} m long, expected {HANDLED_MIN_M} to {HANDLED_MAX_M:g} m"
-            "; scale it so that its unit is the metre"
         )
     away = float(np.abs(mesh.vertices[np.unique(mesh.faces)]).max())
     # scans may be a room's width away from the origin; at 50 m single precision rounds to 4 um

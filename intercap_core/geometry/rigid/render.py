@@ -59,16 +59,6 @@ class Renderer:
 
         return self.pool.map(draw_shot, shots)
 
-    def visible(self, surface: Surface, shots: Sequence[Shot]) -> np.ndarray:
-        """Return whether each shot (N) sees each vertex: (N, V) bool.
-
-        A vertex is visible if it is in the image, faces the camera and is not hidden by the mesh.
-        """
-        from intercap_core.geometry.rigid.distance import OcclusionScene
-
-        scene = OcclusionScene(surface.vertices, surface.faces, threads=self.pool.threads)
-        return np.array([scene.visible(shot.lens, shot.camera_from_mesh) for shot in shots])
-
 
 def open_renderer(
     device: Literal["auto", "cpu", "cuda"] = "auto", *, threads: int | None = None

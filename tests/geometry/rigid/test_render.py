@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 from intercap_core.errors import UserError
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.transforms import rigid
-from intercap_core.geometry.rigid.distance import OcclusionScene
 from intercap_core.geometry.rigid.render import (
     Renderer,
     default_renderer,
@@ -93,24 +92,6 @@ def test_nearer_mesh_hides_the_farther():
     assert (image.body == order.index(far)).sum() > 0
 
 
-def test_visible_vertices_of_a_sphere_and_behind_a_screen():
-    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.1)
-    vertices = np.asarray(ball.vertices)
-    pose = _pose((0, 0, 2.0))
-    seen = OcclusionScene(vertices, ball.faces).visible(PINHOLE, pose)
-    horizon = -0.1 * 0.1 / 2.0  # z of the tangent circle in the ball's frame
-    clear = np.abs(vertices[:, 2] - horizon) > 0.003
-    np.testing.assert_array_equal(seen[clear], (vertices[:, 2] < horizon)[clear])
-
-    screen = trimesh.creation.box((0.2, 0.4, 0.01))
-    screen.apply_translation((-0.1, 0, -0.5))  # hides the left half
-    occluder = (np.asarray(screen.vertices), np.asarray(screen.faces))
-    behind = OcclusionScene(vertices, ball.faces, [occluder]).visible(PINHOLE, pose)
-    assert not behind[vertices[:, 0] < -0.003].any()
-    right = clear & (vertices[:, 0] > 0.003)
-    np.testing.assert_array_equal(behind[right], seen[right])
-
-
 def _shots(count: int, seed: int = 0) -> list[Shot]:
     """Two lenses, poses all around; the last three partly, and wholly, out of view."""
     rng = np.random.default_rng(seed)
@@ -135,16 +116,6 @@ def test_batches_equal_single_images(objects, threads):
         for name in ("depth", "face", "body"):
             np.testing.assert_array_equal(getattr(image, name), getattr(one, name))
     assert images[-3].area > 0 and images[-2].area == 0 and images[-1].area == 0
-
-
-def test_visible_vertices_of_a_batch(objects):
-    mesh, shots = objects["stool"], _shots(6, seed=5)
-    seen = Renderer().visible(Surface.of(mesh), shots)
-    rays = OcclusionScene(mesh.vertices, mesh.faces)
-    np.testing.assert_array_equal(
-        seen, [rays.visible(shot.lens, shot.camera_from_mesh) for shot in shots]
-    )
-    assert 0.1 < seen[0].mean() < 0.6 and not seen[-1].any()
 
 
 def test_a_gpu_is_refused():
