@@ -26,7 +26,7 @@ from intercap_core.body.kinematics import vertex_normals
 from intercap_core.body.model import BodyModel
 from intercap_core.body.parameters import NUM_POSE, TRANSL
 from intercap_core.body_fit.observations import Observations, PersonCloud
-from intercap_core.evaluation.proximity import Sight
+from intercap_core.evaluation.proximity import seen_by_cameras
 from intercap_core.geometry.camera import projection
 from intercap_core.geometry.rigid.surface_tree import SurfaceTree
 from intercap_core.geometry.solve.robust import geman_mcclure
@@ -208,9 +208,11 @@ class Energy:
             vertices = self._model.forward(self._model.parameters(vector)).vertices
             normals = vertex_normals(vertices, self._model.faces)[0].double().cpu().numpy()
         points, faces = vertices[0].double().cpu().numpy(), self._model.faces.cpu().numpy()
-        sight = Sight([SurfaceTree(points, faces).shaped(points)])
+        surface = SurfaceTree(points, faces).shaped(points)
         self._visible = [
-            torch.as_tensor(np.flatnonzero(sight.seen(points, normals, [camera]))).to(vector.device)
+            torch.as_tensor(
+                np.flatnonzero(seen_by_cameras(points, normals, [camera], [surface]))
+            ).to(vector.device)
             for camera in self._rig
         ]
 

@@ -6,8 +6,7 @@ because of clothing and depth noise.
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -22,7 +21,7 @@ from intercap_core.evaluation.figures import BAD_BODY_M, Figures
 from intercap_core.evaluation.proximity import (
     DEEPEST_M,
     MeasuredCloud,
-    Sight,
+    seen_by_cameras,
     visible_to_cloud,
 )
 from intercap_core.evaluation.segmented import SegmentedClouds, read_person_masks
@@ -62,21 +61,6 @@ class BodyClouds:
         self._tree = SurfaceTree(template, self._faces)
         self._samples = sample_surface(template, self._faces, 4000)
 
-    @classmethod
-    @contextlib.contextmanager
-    def open(
-        cls,
-        frames: Path,
-        scene: Path,
-        person: Path,
-        model: BodyModel,
-    ) -> Iterator[BodyClouds]:
-        """Context manager; raises UserError if an artefact cannot be read."""
-        with Frames.open(frames) as images, artefacts.read(scene, SCENE) as found:
-            rig = Rig.from_artefact(found)
-            images = images.showing(found["image_of"])
-            yield cls(images, rig, read_person_masks(person), found["depth_bias"], model)
-
     def measure(self, t: int, vertices: np.ndarray, truth: Truth) -> dict[str, float]:
         """Mean distances of frame ``t`` by CLOUD_KEYS, metres; NaN if no point was measured.
 
@@ -113,12 +97,11 @@ class BodyClouds:
         occluders = [self._tree.shaped(true)]
         if truth.has_object:
             occluders.append(SurfaceTree(object_, truth.object_faces).shaped(object_))
-        sight = Sight(occluders)
         points = self._samples.of(true, self._faces)
         normals = face_normals(true, self._faces)[self._samples.faces]
         # visibility in any camera by the truth, which includes occlusion by furniture
         anyhow = self._samples.of(truth.visible[t].astype(np.float32), self._faces) > 0.5
-        return anyhow & sight.seen(points, normals, cameras)
+        return anyhow & seen_by_cameras(points, normals, cameras, occluders)
 
 
 BODY_JOINT_NAMES = JOINT_NAMES[body.BODY_JOINTS]
@@ -194,7 +177,10 @@ def measure(
         interaction = str(true.attributes["interaction"])
     found_errors = body_errors(known, track, fps)
     assert track.sigma is not None
-    with BodyClouds.open(paths.frames, paths.scene, paths.person, track.model) as points:
+    masks = read_person_masks(paths.person)
+    with Frames.open(paths.frames) as images, artefacts.read(paths.scene, SCENE) as found:
+        images, rig = images.showing(found["image_of"]), Rig.from_artefact(found)
+        points = BodyClouds(images, rig, masks, found["depth_bias"], track.model)
         surface, clouds = _surface(track, known, points)
     return BodyErrors(
         sequence=sequence,

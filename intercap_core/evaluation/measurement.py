@@ -17,7 +17,7 @@ from intercap_core.evaluation.proximity import (
     BodySurface,
     MeasuredCloud,
     PosedObject,
-    Sight,
+    seen_by_cameras,
     vertex_to_cloud,
     visible_to_cloud,
 )
@@ -201,17 +201,13 @@ class Measurement:
             MeasuredCloud(points) for points in self.clouds.at(t, np.concatenate(near))
         )
         body_points = self.body_samples.of(vertices, self.faces)
-        sight = None
-        if seen_body is None or (handled is not None and seen_object is None):
-            occluders = [surface.surface]
-            if handled is not None:
-                track = handled.track
-                occluders.append(handled.surface.placed(track.rotation[t], track.translation[t]))
-            sight = Sight(occluders)
+        occluders = [surface.surface]
+        if handled is not None and (seen_body is None or seen_object is None):
+            track = handled.track
+            occluders.append(handled.surface.placed(track.rotation[t], track.translation[t]))
         if seen_body is None:
-            assert sight is not None
             normals = face_normals(vertices, self.faces)[self.body_samples.faces]
-            seen_body = sight.seen(body_points, normals, self.rig.cameras)
+            seen_body = seen_by_cameras(body_points, normals, self.rig.cameras, occluders)
         step = max(1, len(person.points) // 3000)
         chosen = person.points[::step].astype(np.float64)
         back = surface.distance(chosen)
@@ -223,9 +219,8 @@ class Measurement:
         if handled is not None:
             object_points = handled.posed(t, handled.sample_points)
             if seen_object is None:
-                assert sight is not None
                 normals = handled.sample_normals @ handled.track.rotation[t].T
-                seen_object = sight.seen(object_points, normals, self.rig.cameras)
+                seen_object = seen_by_cameras(object_points, normals, self.rig.cameras, occluders)
             row["object_to_cloud"] = vertex_to_cloud(object_vertices, object_)
             row["object_visible_to_cloud"] = visible_to_cloud(object_points, seen_object, object_)
         return row, (person, object_)

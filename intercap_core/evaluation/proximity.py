@@ -124,41 +124,37 @@ class _Solid:
         return found
 
 
-class Sight:
-    """Visibility of surface points to the cameras in one frame, with surfaces as occluders."""
+def seen_by_cameras(
+    points: np.ndarray,
+    normals: np.ndarray,
+    cameras: Sequence[Camera],
+    occluders: Sequence[ShapedSurface],
+) -> np.ndarray:
+    """Mask (N,) of the surface points that at least one camera sees.
 
-    def __init__(self, surfaces: Sequence[ShapedSurface]) -> None:
-        self._surfaces = surfaces
+    Visibility is that of the depth camera, or of the colour camera if there is no depth.
 
-    def seen(
-        self,
-        points: np.ndarray,
-        normals: np.ndarray,
-        cameras: Sequence[Camera],
-    ) -> np.ndarray:
-        """Mask (N,) of the surface points that at least one camera sees.
-
-        Visibility is that of the depth camera, or of the colour camera if there is no depth.
-
-        Args:
-            points, normals: (N, 3) surface points and outward normals, master frame.
-        """
-        seen = np.zeros(len(points), bool)
-        for camera in cameras:
-            lens, camera_from_master = (
-                (camera.depth, camera.depth_from_master)
-                if camera.depth
-                else (camera.colour, camera.colour_from_master)
-            )
-            eye = -camera_from_master[:3, :3].T @ camera_from_master[:3, 3]
-            facing = ((eye - points) * normals).sum(1) > 0
-            ids = np.flatnonzero(facing & ~seen)
-            ids = ids[lens.sees(apply(camera_from_master, points[ids]))]
-            if len(ids) == 0:
-                continue
-            start = points[ids] + 0.002 * normals[ids]  # off the surface, which must not block
-            hidden = np.zeros(len(ids), bool)
-            for surface in self._surfaces:
-                surface.blocks(start, np.broadcast_to(eye, start.shape), hidden)
-            seen[ids[~hidden]] = True
-        return seen
+    Args:
+        points, normals: (N, 3) surface points and outward normals, master frame.
+        cameras: the cameras.
+        occluders: all surfaces of the frame, the points' own surface included.
+    """
+    seen = np.zeros(len(points), bool)
+    for camera in cameras:
+        lens, camera_from_master = (
+            (camera.depth, camera.depth_from_master)
+            if camera.depth
+            else (camera.colour, camera.colour_from_master)
+        )
+        eye = -camera_from_master[:3, :3].T @ camera_from_master[:3, 3]
+        facing = ((eye - points) * normals).sum(1) > 0
+        ids = np.flatnonzero(facing & ~seen)
+        ids = ids[lens.sees(apply(camera_from_master, points[ids]))]
+        if len(ids) == 0:
+            continue
+        start = points[ids] + 0.002 * normals[ids]  # off the surface, which must not block
+        hidden = np.zeros(len(ids), bool)
+        for surface in occluders:
+            surface.blocks(start, np.broadcast_to(eye, start.shape), hidden)
+        seen[ids[~hidden]] = True
+    return seen

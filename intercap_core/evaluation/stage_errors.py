@@ -35,10 +35,6 @@ class _ObjectSurfaces:
     true_surface: DistanceField
     """Surface of the true object, which may have another mesh."""
 
-    def true_normals(self, points: np.ndarray) -> np.ndarray:
-        """Normals (N, 3) of the true surface nearest to points (N, 3), both in its frame."""
-        return self.true_surface.closest(points).normals
-
 
 class StageErrors:
     """Errors of each stage by dataset name; quantities that a stage does not estimate are omitted.
@@ -151,6 +147,7 @@ class StageErrors:
         if not track.known:
             return {"slip": np.full(len(skin), np.nan)}
         pose, true = (rigid(of.rotation, of.translation) for of in (track, self._truth))
+        true_surface = self._object.true_surface
         symmetry = self._object.mesh.symmetry  # a rotation about a symmetry axis is no slip
         pose = np.array(
             [symmetry.nearest_equivalent_pose(a, b) for a, b in zip(pose, true, strict=True)]
@@ -160,7 +157,7 @@ class StageErrors:
             _local(skin, pose[:, :3, :3], pose[:, :3, 3]),
             self._true_local,
             touching,
-            self._object.true_normals,
+            lambda points: true_surface.closest(points).normals,
             self._fps,
         )
         return {"slip": speed}

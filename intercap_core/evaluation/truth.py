@@ -117,7 +117,11 @@ class Truth:
                 **_object_datasets(file, at),
                 contact_region=file["region_contact"][at][:, columns],
                 floor=Floor(file["ground_normal"], offset),
-                support_height=_support_height(file, at),
+                support_height=(
+                    file["support_height"][at]
+                    if "support_height" in file
+                    else np.zeros((len(at), 2))
+                ),
                 camera_names=tuple(file.text("camera_names")),
                 master_from_colour=file["master_from_colour"],
             )
@@ -136,11 +140,6 @@ class Truth:
         points = samples.of(mesh.vertices, mesh.faces)
         nearest = cKDTree(self.object_vertices).query(points)[1]
         return self.object_vertices[nearest], self.object_visible[:, nearest]
-
-
-def _support_height(file: artefacts.Artefact, at: np.ndarray) -> np.ndarray:
-    """Height (T, 2) of the surface under the soles above the floor; 0 if the file lacks it."""
-    return file["support_height"][at] if "support_height" in file else np.zeros((len(at), 2))
 
 
 def _object_datasets(file: artefacts.Artefact, at: np.ndarray) -> dict[str, np.ndarray]:

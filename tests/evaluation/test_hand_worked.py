@@ -13,8 +13,7 @@ from intercap_core.evaluation.proximity import (
     BodySurface,
     MeasuredCloud,
     PosedObject,
-    Sight,
-    face_normals,
+    seen_by_cameras,
     vertex_to_cloud,
     visible_to_cloud,
 )
@@ -23,7 +22,7 @@ from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.rig import Camera
 from intercap_core.geometry.camera.transforms import rigid
 from intercap_core.geometry.rigid.surface_tree import SurfaceTree
-from intercap_core.geometry.rigid.surfaces import sample_surface
+from intercap_core.geometry.rigid.surfaces import face_normals, sample_surface
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
@@ -255,15 +254,13 @@ def test_sight_knows_occlusion_facing_and_image() -> None:
     middles = far[faces].mean(1)
     tree = SurfaceTree(vertices, faces)
 
-    def sight(*placed: np.ndarray) -> Sight:
-        return Sight([tree.shaped(one) for one in placed])
+    def seen(points: np.ndarray, *placed: np.ndarray) -> np.ndarray:
+        return seen_by_cameras(points, normals, [camera], [tree.shaped(one) for one in placed])
 
-    seen = sight(far).seen(middles, normals, [camera])
-    assert np.array_equal(seen, normals[:, 2] < -0.5)
-    assert not sight(far, vertices * 0.6 + ahead).seen(middles, normals, [camera]).any()
-    assert sight(far, near + right).seen(middles, normals, [camera]).any()
-    aside = middles + 5 * right
-    assert not sight(far).seen(aside, normals, [camera]).any()
+    assert np.array_equal(seen(middles, far), normals[:, 2] < -0.5)
+    assert not seen(middles, far, vertices * 0.6 + ahead).any()
+    assert seen(middles, far, near + right).any()
+    assert not seen(middles + 5 * right, far).any()
 
 
 def test_extrinsics_displacement_of_a_shift_and_a_turn() -> None:
