@@ -18,7 +18,7 @@ from intercap_core.evaluation.scene_errors import displacement
 from intercap_core.evaluation.segmented import read_clouds
 from intercap_core.evaluation.stage_errors import StageErrors
 from intercap_core.evaluation.tracks import BodyTrack, read_body, read_object
-from intercap_core.evaluation.verdict.judge import SequenceVerdict
+from intercap_core.evaluation.verdict.judge import reach_verdict
 from intercap_core.formats.recordings.frames import Frames
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.rigid.mesh import ObjectMesh
@@ -109,7 +109,7 @@ def run(
     # The error model of the verdict was fitted to results of this program, so imported results have
     # none. Rig and body are still referenced here, so that their cached ray tables are used again.
     if settings.hold_out and not made_by:
-        verdict = SequenceVerdict.reach(paths, models, fit_settings).values()
+        verdict = reach_verdict(paths, models, fit_settings)
     with artefacts.write(output, METRICS, settings_digest=digest(settings), **attributes) as writer:
         for key in sorted(values):
             writer.put(key, values[key])

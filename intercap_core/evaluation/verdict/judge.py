@@ -7,14 +7,13 @@ of body, hands and object (:mod:`.stated`).
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from intercap_core import artefacts
-from intercap_core.evaluation.verdict.hold_out import JOINTS, HeldOut, JudgedPart, hold_out
-from intercap_core.evaluation.verdict.stated import FEATURES, ErrorEstimate, estimate_error
+from intercap_core.evaluation.verdict.hold_out import JOINTS, JudgedPart, hold_out
+from intercap_core.evaluation.verdict.stated import FEATURES, estimate_error
 from intercap_core.joint.inputs import JointInputs, open_inputs
 from intercap_core.joint.result import JointResult
 from intercap_core.joint.sequential import SequentialFits
@@ -26,87 +25,61 @@ log = logging.getLogger(__name__)
 Values = dict[str, np.ndarray | list[str]]
 
 
-@dataclass(frozen=True, eq=False)
-class SequenceVerdict:
-    """Held-out evaluation and stated errors of a sequence."""
+def reach_verdict(
+    paths: SequencePaths, models: SequenceModels, fit_settings: FitSettings
+) -> Values:
+    """Evaluate the joint artefact with the inputs of the joint stage; no truth is read.
 
-    cameras: tuple[str, ...]
-    """Names of the C cameras."""
-    frames: int
-    """Number of frames T."""
-    held: HeldOut | None
-    """Held-out evaluation; None if fewer than two cameras show the person."""
-    stated: dict[JudgedPart, ErrorEstimate]
-    """Error of each part; without the object if the recording has none."""
-
-    @classmethod
-    def reach(
-        cls,
-        paths: SequencePaths,
-        models: SequenceModels,
-        fit_settings: FitSettings,
-    ) -> SequenceVerdict:
-        """Evaluate the joint artefact with the inputs of the joint stage; no truth is read.
-
-        Raises UserError if an artefact or the mesh cannot be used.
-        """
-        with artefacts.read(paths.scene, SCENE) as source:
-            result = JointResult.read(paths.joint, source)
-            names = tuple(source.text("camera_names"))
-        with open_inputs(paths, models, fit_settings) as inputs:
-            held = hold_out(inputs, fit_settings.joint, result)
-            sequential = inputs.sequential
-            parts = [
-                part
-                for part in JudgedPart
-                if part != JudgedPart.OBJECT or inputs.geometry.has_object
-            ]
-            moved = _moved(inputs, result, paths.body_fit, paths.joint)
-        stated = {
-            part: estimate_error(
-                held, part, _sigma(sequential, part), moved[part], _known(sequential, result, part)
-            )
-            for part in parts
-        }
-        for part, estimate in stated.items():
-            if estimate.silent:
-                log.warning("%s: no stated error: %s", part, estimate.silent)
-                continue
-            error, factor = 1e3 * estimate.error, estimate.factor
-            low, high = error / factor, error * factor
-            log.info("%s: stated error %.1f mm (%.1f to %.1f)", part, error, low, high)
-        return cls(names, len(result.state), held, stated)
-
-    def values(self) -> Values:
-        """Datasets of the metrics artefact by name, without the prefix ``verdict/``."""
-        parts = list(self.stated)
-        estimates = [self.stated[part] for part in parts]
-        values: Values = {
-            "part_names": [str(part) for part in parts],
-            "feature_names": list(FEATURES),
-            "features": np.array([[s.features[name] for name in FEATURES] for s in estimates]),
-            "error": np.array([s.error for s in estimates]),
-            "error_factor": np.array([s.factor for s in estimates]),
-            "error_frame": np.stack([s.by_frame for s in estimates]),
-            "silent": [s.silent for s in estimates],
-            "camera_names": list(self.cameras),
-        }
-        if self.held is None:
-            return values
-        held = self.held
-        shape = (len(parts), len(self.cameras), self.frames)
-        shift = np.full(shape, np.nan)
-        for place, part in enumerate(parts):
-            shift[place, held.cameras] = held.shift[part]
-        values |= {
-            "held_camera": held.camera_index,
-            "shift": shift,
-            "repeated": np.stack([held.repeated[part] for part in parts]),
-        }
-        for name, within in vars(held.all_cameras).items():
-            values[name] = within
-            values[f"{name}_held_out"] = getattr(held.held_out, name)
+    Returns the datasets ``verdict/...`` of the metrics artefact by name, without the prefix. Those
+    of single cameras are omitted if fewer than two cameras show the person. Raises UserError if an
+    artefact or the mesh cannot be used.
+    """
+    with artefacts.read(paths.scene, SCENE) as source:
+        result = JointResult.read(paths.joint, source)
+        cameras = source.text("camera_names")
+    with open_inputs(paths, models, fit_settings) as inputs:
+        held = hold_out(inputs, fit_settings.joint, result)
+        sequential = inputs.sequential
+        has_object = inputs.geometry.has_object
+        parts = [part for part in JudgedPart if part != JudgedPart.OBJECT or has_object]
+        moved = _moved(inputs, result, paths.body_fit, paths.joint)
+    estimates = [
+        estimate_error(
+            held, part, _sigma(sequential, part), moved[part], _known(sequential, result, part)
+        )
+        for part in parts
+    ]
+    for part, estimate in zip(parts, estimates, strict=True):
+        if estimate.silent:
+            log.warning("%s: no stated error: %s", part, estimate.silent)
+            continue
+        error, factor = 1e3 * estimate.error, estimate.factor
+        low, high = error / factor, error * factor
+        log.info("%s: stated error %.1f mm (%.1f to %.1f)", part, error, low, high)
+    values: Values = {
+        "part_names": [str(part) for part in parts],
+        "feature_names": list(FEATURES),
+        "features": np.array([[s.features[name] for name in FEATURES] for s in estimates]),
+        "error": np.array([s.error for s in estimates]),
+        "error_factor": np.array([s.factor for s in estimates]),
+        "error_frame": np.stack([s.by_frame for s in estimates]),
+        "silent": [s.silent for s in estimates],
+        "camera_names": cameras,
+    }
+    if held is None:
         return values
+    shift = np.full((len(parts), len(cameras), len(result.state)), np.nan)
+    for place, part in enumerate(parts):
+        shift[place, held.cameras] = held.shift[part]
+    values |= {
+        "held_camera": held.camera_index,
+        "shift": shift,
+        "repeated": np.stack([held.repeated[part] for part in parts]),
+    }
+    for name, within in vars(held.all_cameras).items():
+        values[name] = within
+        values[f"{name}_held_out"] = getattr(held.held_out, name)
+    return values
 
 
 def _sigma(fits: SequentialFits, part: JudgedPart) -> np.ndarray:

@@ -12,7 +12,7 @@ import pytest
 from intercap_core import artefacts
 from intercap_core.config import JointSettings
 from intercap_core.evaluation.verdict.hold_out import JOINTS, HeldOut, JudgedPart, hold_out
-from intercap_core.evaluation.verdict.judge import SequenceVerdict
+from intercap_core.evaluation.verdict.judge import reach_verdict
 from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.fit import assemble
 from intercap_core.joint.inputs import JointInputs, open_inputs
@@ -133,8 +133,7 @@ def test_single_camera_has_no_verdict(capture: fitted.Capture, tmp_path: Path) -
     with single.edit("person") as file:
         file["keypoints"][:, 1:, :, 2] = 0  # no other camera sees a keypoint
     paths = single.inputs(*STAGES, "joint")
-    verdict = SequenceVerdict.reach(paths, capture.models, fitted.FIT_SETTINGS)
-    values = verdict.values()
+    values = reach_verdict(paths, capture.models, fitted.FIT_SETTINGS)
     assert np.isnan(values["error"]).all()
     assert all("fewer than two cameras" in reason for reason in values["silent"])
     assert "shift" not in values
