@@ -39,10 +39,9 @@ def boxes_of(instances: list[Instance]) -> np.ndarray:
     return np.array([i.box for i in instances], np.float32).reshape(-1, 4)
 
 
-def make_instance(label: str, score: float, mask: np.ndarray) -> Instance | None:
-    """The instance of a mask (H, W) of the colour image's size; None if the mask is empty."""
-    rle = masks.encode(mask)
-    x, y, width, height = masks.Runs(rle, *mask.shape).box
+def make_instance(label: str, score: float, rle: bytes, size: tuple[int, int]) -> Instance | None:
+    """The instance of a mask of an image of ``size`` (width, height); None if it is empty."""
+    x, y, width, height = masks.Runs(rle, size[1], size[0]).box
     if not width:
         return None
     return Instance(label, score, (float(x), float(y), float(width), float(height)), rle)

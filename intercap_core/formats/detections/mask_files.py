@@ -22,6 +22,7 @@ from intercap_core.formats.detections.instance import (
 )
 from intercap_core.formats.recordings.behave import frame_folders
 from intercap_core.formats.recordings.image_files import DamagedImage, encoded_size, read_content
+from intercap_core.geometry.camera import masks
 from intercap_core.inputs.files import printable
 
 BEHAVE_PERSON = ("person_mask",)
@@ -69,7 +70,7 @@ def read_masks(file: MaskFile, size: tuple[int, int]) -> list[Instance]:
     instances = []
     for mask in _split(image, file):
         fitting = mask if mask.shape == size[::-1] else resize_mask(mask, size)
-        instance = make_instance(file.label, 1.0, fitting)
+        instance = make_instance(file.label, 1.0, masks.encode(fitting), size)
         if instance is not None:
             instances.append(instance)
     return instances

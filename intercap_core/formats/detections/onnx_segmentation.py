@@ -31,7 +31,7 @@ from intercap_core.formats.detections.class_names import (
     read_label_map,
 )
 from intercap_core.formats.detections.coco import MAX_SCORE
-from intercap_core.formats.detections.instance import Instance
+from intercap_core.formats.detections.instance import Instance, make_instance
 from intercap_core.formats.detections.onnx_model import (
     FLOATS,
     Fit,
@@ -63,7 +63,7 @@ class _Region(NamedTuple):
     """The same of y."""
 
 
-def _make_instance(
+def _sample_instance(
     region: _Region, label: str, size: tuple[int, int], threshold: float
 ) -> Instance | None:
     """The instance of the pixels in the region's box whose grid exceeds the threshold.
@@ -93,10 +93,7 @@ def _make_instance(
         borderMode=cv2.BORDER_REPLICATE,
     )
     rle = masks.encode_window(sampled > threshold, x0, y0, size[1], size[0])
-    x, y, width, height = masks.Runs(rle, size[1], size[0]).box
-    if not width:
-        return None
-    return Instance(label, score, (float(x), float(y), float(width), float(height)), rle)
+    return make_instance(label, score, rle, size)
 
 
 def suppress_overlaps(corners: np.ndarray, scores: np.ndarray, classes: np.ndarray) -> np.ndarray:
@@ -226,7 +223,7 @@ class Segmenter:
                     )
                 label = self._kind.names.get(region.number, f"category {region.number}")
                 threshold = 0.0 if self._kind.yolo else 0.5  # logits or probabilities
-                instances.append(_make_instance(region, label, fit.size, threshold))
+                instances.append(_sample_instance(region, label, fit.size, threshold))
             yield key, [instance for instance in instances if instance is not None]
 
     def _decode_yolo(
