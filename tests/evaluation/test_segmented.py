@@ -55,7 +55,7 @@ def test_points_are_those_of_the_plain_lookup_around_the_meshes(bias: float):
         depth < 1e3 * (local[:, 2].max() + MARGIN_M)
     )
     lookup = colour_lookup(depth, camera)
-    shown = (lookup.colour_index >= 0) & ~lookup.hidden & around.ravel()[lookup.depth_index]
+    shown = lookup.shown & around.ravel()[lookup.depth_index]
     expected = depth_points(depth, camera, lookup.depth_index[shown]).points.astype(float)
     expected -= bias * expected / expected[:, 2:]
     expected = apply(camera.master_from_depth, expected)

@@ -219,8 +219,8 @@ def _camera_points(
         index = np.flatnonzero(kept)
         colours = np.tile(np.array([0.55, 0.55, 0.58], np.float32), (len(index), 1))
     else:
-        lookup = colour_lookup(depth, thin, np.flatnonzero(kept))
-        shown = (lookup.colour_index >= 0) & ~lookup.hidden
+        lookup = colour_lookup(depth, thin)
+        shown = lookup.shown & kept.ravel()[lookup.depth_index]
         index = lookup.depth_index[shown]
         bgr = image.reshape(-1, 3)[lookup.colour_index[shown]]
         colours = bgr[:, ::-1] / np.float32(255)

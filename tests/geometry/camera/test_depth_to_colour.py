@@ -75,8 +75,8 @@ def test_edges_of_depth_fall_on_edges_of_the_image(real_frame):
     z = depth.astype(np.float32)
     far = cv2.dilate(z, np.ones((7, 7)))
     edge = (z > 0) & (far - z > 150)  # the nearer side of a step
-    lookup = colour_lookup(depth, camera, np.flatnonzero(edge))
-    shown = (lookup.colour_index >= 0) & ~lookup.hidden
+    lookup = colour_lookup(depth, camera)
+    shown = lookup.shown & edge.ravel()[lookup.depth_index]
     rows, columns = np.divmod(lookup.colour_index[shown], camera.colour.width)
     image = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 1.5)
     strength = np.hypot(cv2.Sobel(image, cv2.CV_32F, 1, 0), cv2.Sobel(image, cv2.CV_32F, 0, 1))

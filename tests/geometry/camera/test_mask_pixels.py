@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from intercap_core.geometry.camera.clouds import colour_lookup
+from intercap_core.geometry.camera.clouds import ColourLookup, colour_lookup
 from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.geometry.camera.mask_pixels import mask_pixels, mask_window
 from intercap_core.geometry.camera.masks import Runs, encode
@@ -43,6 +43,13 @@ def _mask(camera: Camera) -> Runs:
     return Runs(encode(drawn), height, width)
 
 
+def _within(mask: Runs, lookup: ColourLookup) -> np.ndarray:
+    """Flat depth pixels that the colour image shows within the mask."""
+    shown = lookup.shown
+    inside = mask.decode().ravel()[lookup.colour_index[shown]]
+    return lookup.depth_index[shown][inside]
+
+
 @pytest.mark.parametrize("camera", [BESIDE, ALIGNED], ids=["beside", "aligned"])
 @pytest.mark.parametrize(("with_background", "every"), [(True, 2), (False, 2), (False, 1)])
 def test_pixels_are_those_of_the_plain_lookup(
@@ -60,9 +67,9 @@ def test_pixels_are_those_of_the_plain_lookup(
         before[~nearer & (background > 0)] = 0
     chosen = np.zeros(depth.shape, bool)
     chosen[20:271:every, 30:301:every] = True
-    lookup = colour_lookup(before, camera, np.flatnonzero(chosen & (before > 0)))
-    shown = lookup.sample(mask.decode())
-    np.testing.assert_array_equal(found, lookup.depth_index[shown])
+    lookup = colour_lookup(before, camera)
+    expected = _within(mask, lookup)
+    np.testing.assert_array_equal(found, expected[chosen.ravel()[expected]])
     assert len(found) > 3000
     if camera is BESIDE:
         assert (lookup.hidden & (depth.ravel()[lookup.depth_index] < 2200)).any()
@@ -75,9 +82,7 @@ def test_the_window_holds_all_pixels_of_the_mask(camera: Camera) -> None:
     window = mask_window(depth, camera, mask)
     assert window is not None
     found = mask_pixels(depth, camera, mask, window)
-    lookup = colour_lookup(depth, camera)
-    shown = lookup.sample(mask.decode())
-    np.testing.assert_array_equal(found, lookup.depth_index[shown])
+    np.testing.assert_array_equal(found, _within(mask, colour_lookup(depth, camera)))
     height, width = camera.colour.height, camera.colour.width
     nothing = Runs(encode(np.zeros((height, width), bool)), height, width)
     assert mask_window(depth, camera, nothing) is None
