@@ -185,15 +185,9 @@ def extrinsics_figures(sequences: Sequence[SequenceMetrics]) -> Figures:
     """
     figures: Figures = {}
     for when in ("before", "after", "joint"):
-        found = [
-            s.values[f"truth/extrinsics_{when}"]
-            for s in sequences
-            if f"truth/extrinsics_{when}" in s.values
-        ]
-        if found:
-            moved = 1e3 * np.concatenate([v[np.isfinite(v)] for v in found]).astype(np.float64)
-            if len(moved) == 0:
-                continue
+        found = pooled(sequences, f"truth/extrinsics_{when}")
+        if found is not None and np.isfinite(found).any():
+            moved = 1e3 * found[np.isfinite(found)].astype(np.float64)
             figures[f"{when}_mean_mm"] = float(moved.mean())
             figures[f"{when}_worst_mm"] = float(moved.max())
     return figures
