@@ -93,6 +93,8 @@ class Replays:
     def _outcome(self, task: Task, key: str) -> Outcome:
         if key not in self._known:
             outcome = self._start(task)
+            if outcome.failure and task.constant is None:
+                return outcome  # not stored: the fault is not that of a value
             with self._lock:
                 self._known[key] = asdict(outcome)
                 self._path.parent.mkdir(parents=True, exist_ok=True)
