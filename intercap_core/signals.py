@@ -77,6 +77,10 @@ def raise_on_signals() -> Iterator[None]:
         signal.signal(number, end)
     try:
         yield
+    except Exception as error:
+        if _pending:  # the interrupted code raised this error instead, as some hooks of C code do
+            raise Terminated(_pending[0]) from error
+        raise
     finally:
         _pending.clear()
         for number, handler in before.items():
