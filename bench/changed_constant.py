@@ -59,7 +59,8 @@ def find_constants(selector: str, *, root: Path = ROOT) -> list[Constant]:
         for statement in ast.parse(file.read_text(encoding="utf-8")).body
         for own in bound_constants(statement)
     ]
-    found = [one for one in known if not name or one.name.lstrip("_") == name.lstrip("_")]
+    matches = (one for one in known if not name or one.name.lstrip("_") == name.lstrip("_"))
+    found = list(dict.fromkeys(matches))  # a name may be bound by several statements
     if not found:
         near = difflib.get_close_matches(name, [one.name for one in known], n=4, cutoff=0.5)
         hint = f"; similar names are {', '.join(near)}" if near else ""

@@ -147,13 +147,14 @@ def report(
     unchanged: Sequence[Outcome],
     changed: Sequence[Sequence[Outcome]],
 ) -> str:
-    """Table of the constants, most sensitive first, and the list of those without effect."""
-    rows, without_effect = [], []
+    """Table of the constants, most sensitive first, their counts, and those without effect."""
+    rows, without_effect, decisive = [], [], 0
     for constant, usual, pair in zip(constants, unchanged, changed, strict=True):
         if all(outcome.checksum == usual.checksum for outcome in pair):
             without_effect.append(f"{constant.label} = {pair[0].before}")
             continue
         cells, most = [], 0.0
+        decisive += any(outcome.failure or changes(usual, outcome) for outcome in pair)
         for outcome in pair:
             found = changes(usual, outcome)
             most = max([most, *(abs(s) for key, (*_, s) in found.items() if key != FLAGS)])
@@ -168,7 +169,9 @@ def report(
         rows.append((most, f"| `{constant.label}` | {value} | {' | '.join(cells)} |"))
     lines = ["| constant | value | half | double |", "|---|---|---|---|"]
     lines += [line for _, line in sorted(rows, key=lambda row: -row[0])]
-    return "\n".join([*lines, "", f"without effect: {len(without_effect)}", *without_effect])
+    counts = f"change a figure or let the stage fail: {decisive}; change arrays only: "
+    lines += ["", f"{counts}{len(rows) - decisive}", ""]
+    return "\n".join([*lines, f"without effect: {len(without_effect)}", *without_effect])
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
