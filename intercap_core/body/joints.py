@@ -11,7 +11,7 @@ JOINT_NAMES: tuple[str, ...] = (
       for finger in ("index", "middle", "pinky", "ring", "thumb") for i in (1, 2, 3)),
 )  # fmt: skip
 
-# Parent of each joint, -1 = root.
+# Parent of each joint (SMPL-X), -1 = root.
 PARENTS: tuple[int, ...] = (
     -1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 15, 15, 15,
     20, 25, 26, 20, 28, 29, 20, 31, 32, 20, 34, 35, 20, 37, 38,

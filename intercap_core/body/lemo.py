@@ -30,11 +30,10 @@ from intercap_core.errors import UserError
 from intercap_core.inputs.arrays import read_arrays
 from intercap_core.inputs.files import UnreadableFile
 
-# Sizes of the released network and its input (Zhang et al. 2021)
-FRAMES_PER_SECOND = 30.0
+FRAMES_PER_SECOND = 30.0  # of the network's input (Zhang et al. 2021)
 COORDINATES = 3 * len(MARKER_NAMES)
-_ROWS, _COLUMNS = 1, 8  # of reflection, at each side
-_CHANNELS = (1, 32, 64, 64, 64, 64)
+_ROWS, _COLUMNS = 1, 8  # of reflection, at each side (Zhang et al. 2021)
+_CHANNELS = (1, 32, 64, 64, 64, 64)  # before and after each block (Zhang et al. 2021)
 LATENT = _CHANNELS[-1] * (COORDINATES + 2 * _ROWS)
 # F frames have F - 1 steps, and a reflection by _COLUMNS needs one column more than that
 FEWEST_FRAMES = _COLUMNS + 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from itertools import accumulate
 
 import torch
 from torch import Tensor
@@ -16,6 +17,12 @@ POSE_BLOCKS: tuple[tuple[str, int], ...] = (
     ("left_hand_pose", 45),
     ("right_hand_pose", 45),
 )
+_ENDS = tuple(accumulate(size for _, size in POSE_BLOCKS))
+POSE_COLUMNS = {
+    name: slice(end - size, end) for (name, size), end in zip(POSE_BLOCKS, _ENDS, strict=True)
+}
+"""Columns of each block in the parameter vector."""
+HAND_COLUMNS = (POSE_COLUMNS["left_hand_pose"], POSE_COLUMNS["right_hand_pose"])
 NUM_POSE = 165  # axis-angles of the 55 joints (SMPL-X)
 TRANSL = slice(NUM_POSE, NUM_POSE + 3)
 
@@ -53,10 +60,7 @@ class BodyParameters:
     @classmethod
     def from_vector(cls, vector: Tensor, *, num_betas: int = 10) -> BodyParameters:
         """Split vectors (B,P); the columns after the betas are the expression."""
-        parts, start = {}, 0
-        for name, size in POSE_BLOCKS:
-            parts[name] = vector[:, start : start + size]
-            start += size
+        parts = {name: vector[:, columns] for name, columns in POSE_COLUMNS.items()}
         shape = vector[:, TRANSL.stop :]
         return cls(
             **parts,
@@ -68,15 +72,14 @@ class BodyParameters:
     def vector(self) -> Tensor:
         """Return vectors (B,P); fields of one row are expanded to the batch."""
         batch = self.batch
-        names = [*(name for name, _ in POSE_BLOCKS), "transl", "betas", "expression"]
+        names = [*POSE_COLUMNS, "transl", "betas", "expression"]
         return torch.cat([getattr(self, n).expand(batch, -1) for n in names], 1)
 
     def full_pose(self) -> Tensor:
         """Return the axis-angles (B,55,3) in joint order."""
         batch = self.batch
-        return torch.cat(
-            [getattr(self, name).expand(batch, -1) for name, _ in POSE_BLOCKS], 1
-        ).reshape(batch, 55, 3)
+        pose = [getattr(self, name).expand(batch, -1) for name in POSE_COLUMNS]
+        return torch.cat(pose, 1).reshape(batch, 55, 3)
 
     @property
     def batch(self) -> int:

@@ -34,12 +34,11 @@ import torch
 from torch import Tensor
 
 from intercap_core.body.joints import JOINT_NAMES
-from intercap_core.body.parameters import NUM_POSE
+from intercap_core.body.parameters import HAND_COLUMNS, NUM_POSE
 
 # Elbows (y) and knees (x), left and right: column in the parameter vector, sign of the unnatural
 # direction (Bogo et al. 2016, SMPLify).
 BENDING: tuple[tuple[int, int], ...] = ((55, 1), (58, -1), (12, -1), (15, -1))
-_HAND_COLUMNS = (slice(75, 120), slice(120, 165))  # left and right, of SMPL-X's pose
 
 _Range = tuple[float, float]
 _FREE: _Range = (-180.0, 180.0)
@@ -200,7 +199,7 @@ def hand_pose(
     mean (2,45), components (2,45,45) orthonormal rows, deviation (2,45) of the model; side 0 is the
     left hand.
     """
-    at = _HAND_COLUMNS[side]
+    at = HAND_COLUMNS[side]
     jacobian = components[side] / deviation[side, :, None]
     residuals = (vector[:, at] - mean[side]) @ jacobian.T
     return LinearRows(residuals, jacobian, torch.arange(at.start, at.stop, device=vector.device))

@@ -25,7 +25,7 @@ from torch import Tensor
 from intercap_core.body import priors
 from intercap_core.body.joints import JOINT_INDEX
 from intercap_core.body.model import BodyModel
-from intercap_core.body.parameters import NUM_POSE, TRANSL
+from intercap_core.body.parameters import HAND_COLUMNS, NUM_POSE, POSE_COLUMNS, TRANSL
 from intercap_core.body_fit.term_inputs import (
     Batch,
     BatchEquations,
@@ -35,8 +35,9 @@ from intercap_core.body_fit.term_inputs import (
     contiguous,
 )
 
-_BODY_START = 3  # first column of the 21 body joints (SMPL-X)
-_HANDS = (75, 120)  # first column of each hand (SMPL-X)
+# First columns of the 21 body joints and of each hand.
+_BODY_START = POSE_COLUMNS["body_pose"].start
+_HANDS = tuple(columns.start for columns in HAND_COLUMNS)
 
 Rows = priors.DiagonalRows | priors.LinearRows
 
@@ -120,8 +121,8 @@ class PriorArrays(NamedTuple):
         mean[at] = (-rest.residuals / rest.slopes)[0].numpy()
         own[at] = rest.slopes[0].numpy() ** 2
         own[_standard_normal(model, shape)] = 1
-        for first, hand_mean in zip(_HANDS, model.hand_mean.numpy(), strict=True):
-            mean[first : first + 45] = hand_mean
+        for columns, hand_mean in zip(HAND_COLUMNS, model.hand_mean.numpy(), strict=True):
+            mean[columns] = hand_mean
         ranges = np.deg2rad(np.array(priors.LIMITS_DEG)).reshape(NUM_POSE, 2).astype(dtype)
         ranges[:3] = -np.inf, np.inf  # the global orientation has no prior
         return cls(

@@ -26,7 +26,6 @@ LARGEST_SIGMA_M = 0.026
 # The same for hands: half of the joints have errors above 20 mm, the distance between fingers
 # (anatomy).
 LARGEST_HAND_SIGMA_M = 0.013
-_DISAGREEING_SHARE = 0.5  # share of outliers among a part's keypoints beyond which it is disputed
 # Smallest share of a part's skin samples with depth points at which depth determines the part. One
 # view sees a third of a limb; this is about half of it. Tuned on the studio.
 _MEASURED_SHARE = 0.15
@@ -197,7 +196,7 @@ def widen_sigma(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
     A hand has at least the added deviation of its arm.
     """
     # the median length of a normal error in two dimensions is 1.1774 standard deviations
-    disputed = evidence.outlier_share.numpy() > _DISAGREEING_SHARE
+    disputed = evidence.outlier_share.numpy() > 0.5
     distance = np.where(disputed, np.nan_to_num(evidence.distance.numpy()), 0) / 1.1774
     distance = np.hypot(distance, _leaning(evidence))
     for side in ("left", "right"):
@@ -215,7 +214,7 @@ def flag_undetermined(sigma: np.ndarray, evidence: PartEvidence) -> np.ndarray:
 
     sigma (N, 55): standard deviation of the joints, metres.
     """
-    flags = evidence.outlier_share.numpy() > _DISAGREEING_SHARE
+    flags = evidence.outlier_share.numpy() > 0.5
     for column, part in enumerate(BODY_PARTS):
         limit = LARGEST_SIGMA_M
         if part.endswith("hand"):
