@@ -48,7 +48,6 @@ from intercap_core.joint.terms.motion import (
     ACCELERATION_OUTLIER,
     BODY_ACCELERATION,
     FINGER_ACCELERATION,
-    OBJECT_ACCELERATION,
 )
 from intercap_core.joint.terms.penetration import PENETRATION_SIGMA, PENETRATION_TOLERANCE
 
@@ -244,7 +243,7 @@ def body_motion(joints: Tensor, fps: float) -> Tensor:
 
 def object_motion(moments: Tensor, fps: float) -> Tensor:
     """E_A of points with the object's moments (T, 6, 3)."""
-    return _accelerations(moments, torch.tensor(OBJECT_ACCELERATION), fps)
+    return _accelerations(moments, torch.tensor(BODY_ACCELERATION), fps)
 
 
 def _accelerations(points: Tensor, sigma: Tensor, fps: float) -> Tensor:

@@ -14,7 +14,6 @@ from intercap_core.joint.geometry import Geometry
 from intercap_core.joint.sequential import SequentialFits
 from intercap_core.schemas import CONTACT_REGIONS
 
-CONTRADICTION_M = 0.10  # three times the largest error of sequential fits on the studio
 _FEET = tuple(CONTACT_REGIONS.index(f"{side}_foot") for side in ("left", "right"))
 
 
@@ -40,10 +39,11 @@ class FloorPlane:
 def contradiction(geometry: Geometry, sequential: SequentialFits, floor: FloorPlane) -> str:
     """Describe how the sequential fits contradict ``floor``; "" if they do not.
 
-    The floor is too high if it is ``CONTRADICTION_M`` or more above the lower foot in most frames.
-    It is too low if it is as far below both feet and object in 90 % of the frames, more than a jump
-    lasts. Frames with an interpolated body do not count, nor does the object while it is lost.
+    The floor is too high if it is 0.1 m or more above the lower foot in most frames. It is too low
+    if it is as far below both feet and object in 90 % of the frames, more than a jump lasts. Frames
+    with an interpolated body do not count, nor does the object while it is lost.
     """
+    tolerance = 0.10  # metres, three times the largest error of sequential fits on the studio
     posed = geometry.at(sequential.state)
     feet = geometry.skin.patch[np.isin(geometry.patches.region, _FEET)]
     lowest = floor.heights(posed.skin[:, feet]).min(axis=1)
@@ -51,13 +51,13 @@ def contradiction(geometry: Geometry, sequential: SequentialFits, floor: FloorPl
     if not known.any():
         return ""
     sunk = float(np.median(lowest[known]))
-    if sunk < -CONTRADICTION_M:
+    if sunk < -tolerance:
         return f"floor {-sunk:.2f} m above the feet, not used"
     reach = lowest
     if geometry.has_object:
         objects = floor.heights(posed.object_vertices).min(axis=1)
         reach = np.where(sequential.flags.lost, lowest, np.minimum(lowest, objects))
     nearest = float(np.quantile(reach[known], 0.1))
-    if nearest > CONTRADICTION_M:
+    if nearest > tolerance:
         return f"floor {nearest:.2f} m below feet and object, not used"
     return ""

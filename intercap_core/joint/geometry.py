@@ -16,9 +16,7 @@ from intercap_core.geometry.rigid.surfaces import sample_surface
 from intercap_core.geometry.solve.thread_pool import ThreadPool
 from intercap_core.joint.proximity import Proximity, SearchableSurface, proximity
 from intercap_core.joint.skin import Patches, SkinSamples
-from intercap_core.joint.state import BODY, State
-
-_CHUNK = 32  # frames that are computed at a time, to bound the memory
+from intercap_core.joint.state import BODY, State, frame_chunks
 
 
 class Geometry:
@@ -109,9 +107,9 @@ class PosedGeometry:
         mesh, faces = g.mesh, g.model.faces.numpy()
         points = sample_surface(mesh.vertices, mesh.faces, 400).of(mesh.vertices, mesh.faces)
         vector, depth = self._parameters.vector(), np.zeros(len(state))
-        for start in range(0, len(state), _CHUNK):
+        for at in frame_chunks(len(state)):
             with torch.no_grad():
-                bodies = g.model(g.model.parameters(vector[start : start + _CHUNK]))
+                bodies = g.model(g.model.parameters(vector[at]))
             posed = bodies.vertices.numpy()
 
             def deepest(frame: tuple[int, np.ndarray]) -> float:
@@ -124,7 +122,7 @@ class PosedGeometry:
                 body = DistanceField(vertices, faces, threads=1)
                 return max(0.0, -float(body.signed_distance(near).min()))
 
-            depth[start : start + len(posed)] = threads.map(deepest, list(enumerate(posed, start)))
+            depth[at] = threads.map(deepest, list(enumerate(posed, at.start)))
         return depth
 
     @cached_property
@@ -164,8 +162,7 @@ class PosedGeometry:
         vector = self._parameters.vector()
         points = np.empty((len(vector), NUM_JOINTS, 3))
         jacobian = np.empty((*points.shape, BODY.stop), np.float32)
-        for start in range(0, len(vector), _CHUNK):
-            at = slice(start, start + _CHUNK)
+        for at in frame_chunks(len(vector)):
             lin = g.model.linearise(
                 g.model.parameters(vector[at]), vertex_ids=np.zeros(0, np.int64), joints=True
             )

@@ -11,9 +11,6 @@ import numpy as np
 from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.state import BODY_SHIFT, BODY_TURNS, OBJECT_SHIFT, OBJECT_TURN, State
 
-MIN_DAMPING = 1e-6  # share of the diagonal; tuned on the studio
-STALLED_DAMPING = 0.5  # share of the diagonal with which a frame hardly moves; tuned on the studio
-
 log = logging.getLogger(__name__)
 
 
@@ -38,9 +35,10 @@ def minimise(
     Each frame has its own damping, which grows if the energy rose there in a refused step: a badly
     linearised frame slows down its neighbourhood alone. The round has converged if a step lowers
     the energy by less than 3 % of what all its steps have gained, since most of the energy is
-    noise; or if a refused step would have gained less than 0.1 % of the energy. Factors and
-    tolerances are tuned on the studio.
+    noise; or if a refused step would have gained less than 0.1 % of the energy. Dampings, factors
+    and tolerances are tuned on the studio.
     """
+    stalling = 0.5  # damping with which a frame hardly moves, share of the diagonal
     accepted, refused, gained, converged = 0, 0, 0.0, False
     damping, moved = np.full(len(state), 1e-3), np.zeros(len(state), bool)
     here = linearise(state)
@@ -60,7 +58,7 @@ def minimise(
             damping, refused = np.where(rose, damping * 100.0, damping), refused + 1
             # a quadratic energy falls by half of what its slope promises, by less if damped
             promised = -0.5 * float((here.gradient * step).sum())
-            if promised < 1e-3 * here.total and tried.max() < STALLED_DAMPING:
+            if promised < 1e-3 * here.total and tried.max() < stalling:
                 converged = True
                 break
             del there  # the equations of two states are never kept at once
@@ -69,12 +67,12 @@ def minimise(
         gain = here.total - there.total
         gained += gain
         state, here, accepted = trial, there, accepted + 1
-        moved |= damping < STALLED_DAMPING
-        damping = np.maximum(damping / 5.0, MIN_DAMPING)
+        moved |= damping < stalling
+        damping = np.maximum(damping / 5.0, 1e-6)
         if gain < 0.03 * gained:
             converged = True
             break
-    stalled = (damping >= STALLED_DAMPING) & ~moved
+    stalled = (damping >= stalling) & ~moved
     return Minimum(state, here, before, accepted, refused, converged, stalled)
 
 

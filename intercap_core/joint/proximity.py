@@ -13,13 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from intercap_core.geometry.rigid.distance import DistanceField, SurfacePart
+from intercap_core.joint.state import frame_chunks
 
-ON_SURFACE = (
-    1e-4  # metres; below it the face's normal replaces the direction, which is noise; tuned
-)
-
-_CHUNK = 32  # frames that are computed at a time, to bound the memory
-
+# Distances in metres below which the face's normal replaces the direction: the surface's points err
+# by 1e-6 (single precision), and the direction by more than 1 %.
+ON_SURFACE = 1e-4
 
 SearchableSurface = DistanceField | SurfacePart
 """An object's surface, or a part of it."""
@@ -61,8 +59,7 @@ def proximity(
     ``rotation`` (T, 3, 3) and ``translation`` (T, 3) are master_from_object.
     """
     result = Proximity(np.empty(points.shape[:2]), np.empty(points.shape))
-    for start in range(0, len(points), _CHUNK):
-        at = slice(start, start + _CHUNK)
+    for at in frame_chunks(len(points)):
         local = (points[at] - translation[at, None]) @ rotation[at]
         flat = local.reshape(-1, 3)
         offset = flat - np.clip(flat, *surface.box)

@@ -8,14 +8,12 @@ from math import radians
 import numpy as np
 
 from intercap_core.artefacts import Artefact
-from intercap_core.body.parameters import POSE_BLOCKS, TRANSL
+from intercap_core.body.parameters import POSE_COLUMNS, TRANSL
 from intercap_core.geometry.camera.transforms import apply_step, rigid
 from intercap_core.geometry.solve.time_series import rigid_velocity
 from intercap_core.joint.state import State
 
-UNTRACKED_SIGMA = 0.5  # stated for the position of a lost object, metres; tuned on the studio
-
-POSE_NAMES = (*(name for name, _ in POSE_BLOCKS), "transl")
+POSE_NAMES = (*POSE_COLUMNS, "transl")
 """Datasets with a frame's pose and translation, in the order of the parameter vector."""
 
 
@@ -171,13 +169,15 @@ class SequentialFits:
                 time_offset=scene["time_offset"],
             )
         sigma = np.sqrt(np.trace(track["covariance"][:, 3:, 3:], axis1=1, axis2=2) / 3)
+        unknown = lost | ~np.isfinite(sigma)
         return cls(
             state=state,
             tracked=tracked,
             trust=Trust(~failed, ~lost, marks.resting[1:] & marks.resting[:-1]),
             flags=flags,
             joint_sigma=body["joint_sigma"].astype(float),
-            object_sigma=np.where(lost | ~np.isfinite(sigma), UNTRACKED_SIGMA, sigma),
+            # metres; so wide that distances say nothing about contact
+            object_sigma=np.where(unknown, 0.5, sigma),
         )
 
 

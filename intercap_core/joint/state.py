@@ -20,6 +20,11 @@ OBJECT_SHIFT = slice(OBJECT.start + 3, OBJECT.stop)
 ALL = slice(0, OBJECT.stop)
 
 
+def frame_chunks(count: int) -> list[slice]:
+    """Divide frames into chunks of 32, to bound the memory."""
+    return [slice(start, start + 32) for start in range(0, count, 32)]
+
+
 @dataclass(frozen=True)
 class State:
     """Body and object in T frames. A state is never changed in place."""

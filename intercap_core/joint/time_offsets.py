@@ -27,7 +27,9 @@ from intercap_core.body_fit.problem import BodyProblem
 from intercap_core.geometry.camera import projection
 from intercap_core.geometry.solve.robust import SIGMA_PER_MAD, geman_mcclure_weight
 
-LOOSE_OFFSET_SIGMA_S = 0.010  # without a prior: a third of the time between frames; tuned
+# Without a prior, seconds. Beyond 0.017 s, half the time between frames of a Kinect, an image
+# belongs to another frame set.
+LOOSE_OFFSET_SIGMA_S = 0.010
 POINT_SIGMA_M = 0.03  # prior of e, wide, so that only disagreement of views counts; tuned
 INNOVATION_OUTLIER = 3.0  # standard deviations at which an innovation counts a quarter; tuned
 

@@ -13,7 +13,6 @@ from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.state import ALL, BODY, BODY_SHIFT, State
 from intercap_core.joint.terms.motion import (
     BODY_ACCELERATION,
-    PROBE_STEPS,
     BodyMotion,
     LearnedMotion,
 )
@@ -109,7 +108,7 @@ def test_energy_does_not_depend_on_place_and_heading(context, term):
 
 def test_everyday_motion_costs_as_much_as_in_the_joints_term(context, unbiased):
     """A translating body with small accelerations, for which the joints' term is quadratic."""
-    rng, frames = np.random.default_rng(2), PROBE_STEPS + 1
+    rng, frames = np.random.default_rng(2), 17
     shift = np.cumsum(np.cumsum(rng.normal(size=(frames, 3)), 0), 0) / lemo.FRAMES_PER_SECOND**2
     state = _moving(frames=frames)
     body = np.tile(state.body[:1], (frames, 1))

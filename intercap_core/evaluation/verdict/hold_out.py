@@ -25,7 +25,7 @@ from intercap_core.evaluation.body import BODY_JOINTS, BOTH_HANDS
 from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.fit import Assembly, assemble
 from intercap_core.joint.inputs import JointInputs
-from intercap_core.joint.minimise import MIN_DAMPING, limited
+from intercap_core.joint.minimise import limited
 from intercap_core.joint.result import JointResult
 from intercap_core.joint.state import BODY, OBJECT, State
 from intercap_core.joint.terms.body_data import BodyData
@@ -72,7 +72,7 @@ class Refits:
         equations = self._rest.copy(self._bands)
         for columns, term in self._seen:
             equations.add_blocks(term.name, columns, *term.linearise_views(used, self.state))
-        step = equations.step(np.full(len(self.state), MIN_DAMPING))
+        step = equations.step(np.full(len(self.state), 1e-6))  # the least damping of the fit
         if step is None:  # some parameter is not determined
             return np.full(self._rest.gradient.shape, np.nan)
         return step

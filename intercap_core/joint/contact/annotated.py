@@ -10,9 +10,6 @@ import numpy as np
 
 from intercap_core.annotation import ANY_REGION, ContactInterval
 
-ANNOTATED_LOGIT = 12.0  # log odds above those that distance and slip can reach; tuned
-FAR_CONTACT = 0.15  # metres, above the errors of frames that are not flagged; tuned on the studio
-
 
 @dataclass(frozen=True)
 class AnnotationIssue:
@@ -33,7 +30,9 @@ def annotation_evidence(
     part (``any``) regions that are not named have no label and no evidence.
 
     The evidence is 0 within ``uncertainty`` frames of an end of an interval, where annotators err
-    and the geometry decides. The middle between two ends always has evidence.
+    and the geometry decides. The middle between two ends always has evidence. Elsewhere it is plus
+    or minus 12, beyond the evidence of distance and slip in one frame, which is between -9 and 7
+    (:mod:`.detect`).
     """
     labels = np.zeros((frames, len(regions)), np.int8)
     # intervals of an unnamed part come first: those of a named part overwrite their labels
@@ -53,7 +52,7 @@ def annotation_evidence(
             away = np.minimum(begins, finishes)
             certain[start:end, r] = away > min(uncertainty, (end - start) / 2 - 1)
     sign = np.choose(labels + 1, (0.0, -1.0, 1.0))  # of the labels -1, 0, 1
-    return sign * certain * ANNOTATED_LOGIT, labels
+    return sign * certain * 12.0, labels
 
 
 def find_issues(
@@ -81,14 +80,17 @@ def find_issues(
 def _find_far(
     interval: ContactInterval, regions: Sequence[str], distance: np.ndarray, unseen: np.ndarray
 ) -> list[AnnotationIssue]:
-    """Find runs of frames in which the annotated part is far from the object."""
+    """Find runs of frames in which the annotated part is more than 0.15 m from the object.
+
+    Unflagged frames of the studio have smaller errors (tuned).
+    """
     of_part = (
         distance.min(axis=1)
         if interval.part == ANY_REGION
         else distance[:, regions.index(interval.part)]
     )
     during = slice(interval.start, interval.end)
-    far = np.flatnonzero((of_part[during] > FAR_CONTACT) & ~unseen[during]) + interval.start
+    far = np.flatnonzero((of_part[during] > 0.15) & ~unseen[during]) + interval.start
     issues = []
     for run in np.split(far, np.flatnonzero(np.diff(far) > 1) + 1):
         if len(run):

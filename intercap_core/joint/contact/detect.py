@@ -19,9 +19,6 @@ from intercap_core.joint.skin import Patches
 # Standard deviations of a region's distance beyond those of the fits.
 LASTING_SIGMA = 0.006  # m, the same in all frames: shape, clothing, two meshes; tuned on the studio
 FRAME_SIGMA = 0.004  # m, different in each frame; tuned on the studio
-MOVING_SPEED = (
-    0.12  # of an object's surface, m/s: the track's jitter is slower; tuned on the studio
-)
 
 # Contacts per second of a free region. Four in five are brief (a sip, a kick: 0.3 s), the others
 # are holds (3 s). Tuned on the studio.
@@ -150,14 +147,14 @@ def _distance_evidence(distance: np.ndarray, sigma: np.ndarray) -> np.ndarray:
 
 
 def _motion_evidence(motion: RegionMotion) -> np.ndarray:
-    """Log odds (T, R) of the slip while the object moves.
+    """Log odds (T, R) of the slip while the object moves faster than its jitter.
 
     The slip is half-normal: with the jitter's standard deviation if the region holds the object,
     with the object's speed if it is free. Jitter and limit are tuned on the studio.
     """
     jitter, limit = 0.12, 4.0  # m/s; log odds of one frame
-    moving = motion.object_speed > MOVING_SPEED
-    spread = np.maximum(motion.object_speed, MOVING_SPEED)
+    moving = motion.object_speed > jitter
+    spread = np.maximum(motion.object_speed, jitter)
     holding = -0.5 * np.square(motion.slip / jitter) - np.log(jitter)
     free = -0.5 * np.square(motion.slip / spread) - np.log(spread)
     return np.where(moving, np.clip(holding - free, -limit, limit), 0.0)

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from intercap_core.body.model import BodyModel
-from intercap_core.body.parameters import POSE_BLOCKS, TRANSL
+from intercap_core.body.parameters import POSE_COLUMNS, TRANSL
 from intercap_core.entries import ObjectEntry
 from intercap_core.errors import UserError
 from intercap_core.formats.recordings.behave import frame_folders
@@ -41,9 +41,6 @@ from intercap_core.joint.released.surface_fit import fit_surfaces
 # Distances between the fitted and the released body above which a frame is flagged.
 FLAGGED_MEAN_M = 0.010  # mean; four times that of good fits, measured on the studio
 FLAGGED_P95_M = 0.030  # 95th percentile; likewise measured on the studio
-# 95th percentile of the distance between the released placement and ours above which the poses
-# belong to another mesh, metres; tuned: closed and simplified copies of a template are nearer.
-OTHER_MESH_M = 0.010
 
 log = logging.getLogger(__name__)
 
@@ -93,11 +90,7 @@ def read_results(folder: Path, recording: Recording) -> Results:
         recording.sequence, len(person.frames), folder, mean, p95, int(far.sum()),
         1e3 * FLAGGED_MEAN_M, 1e3 * FLAGGED_P95_M,
     )  # fmt: skip
-    ends = np.cumsum([size for _, size in POSE_BLOCKS])
-    pose = {
-        name: vectors[:, end - size : end]
-        for (name, size), end in zip(POSE_BLOCKS, ends, strict=True)
-    }
+    pose = {name: vectors[:, columns] for name, columns in POSE_COLUMNS.items()}
     shape = slice(TRANSL.stop, TRANSL.stop + model.num_betas)
     return Results(
         path=folder,
@@ -244,7 +237,11 @@ def _template_centre(folder: Path, entry: ObjectEntry) -> np.ndarray:
 def _check_placement(
     entry: ObjectEntry, files: Mapping[int, Path], rotation: np.ndarray, translation: np.ndarray
 ) -> None:
-    """Raise UserError if the entry's mesh does not lie on the released ``<object>_fit.ply``."""
+    """Raise UserError if the entry's mesh does not lie on the released ``<object>_fit.ply``.
+
+    Closed and simplified copies of a template are less than 10 mm (95th percentile) from it
+    (tuned).
+    """
     meshes = {t: path.with_suffix(".ply") for t, path in files.items()}
     frames = [t for t, path in sorted(meshes.items()) if path.is_file()]
     if not frames:
@@ -256,10 +253,10 @@ def _check_placement(
         placed = np.asarray(read_mesh(meshes[t]).vertices, np.float64)
         distance = surface.distance((placed - translation[t]) @ rotation[t])
         p95 = float(np.percentile(distance, 95))
-        if not p95 <= OTHER_MESH_M:
+        if not p95 <= 0.010:
             raise UserError(
                 f"{entry.mesh}: does not lie on {meshes[t]}, whose vertices are {1e3 * p95:.0f} "
-                f"mm from it, expected at most {1e3 * OTHER_MESH_M:.0f}; the poses "
+                "mm from it, expected at most 10; the poses "
                 f"belong to BEHAVE's template: name objects/{entry.name}/{entry.name}_f1000.ply "
                 "(or its like) as 'mesh' in objects.yaml"
             )

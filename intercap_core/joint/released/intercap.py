@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from intercap_core.body.parameters import POSE_BLOCKS
 from intercap_core.errors import UserError
 from intercap_core.formats.released import INTERCAP, Results, check_range, intercap_file
 from intercap_core.inputs.arrays import read_arrays, read_pickle
 
-FULL_HAND = 45  # numbers of a hand's full pose, 3 by joint (SMPL-X); fewer are components
-_TURNS = {"global_orient": 3, "body_pose": 63, "jaw_pose": 3, "leye_pose": 3, "reye_pose": 3}
+FULL_HAND = dict(POSE_BLOCKS)["left_hand_pose"]  # numbers of a full pose; fewer are components
 
 
 def read_results(path: Path) -> Results:
@@ -30,7 +30,11 @@ def read_results(path: Path) -> Results:
     values = _stack_frames(read_arrays(path) if path.suffix == ".npz" else read_pickle(path), path)
     transl = _array(values, "transl", path, 3)
     total = len(transl)
-    turns = {name: _array(values, name, path, size, total) for name, size in _TURNS.items()}
+    turns = {
+        name: _array(values, name, path, size, total)
+        for name, size in POSE_BLOCKS
+        if not name.endswith("_hand_pose")
+    }
     rotation = np.full((total, 3, 3), np.nan)
     translation = np.full((total, 3), np.nan)
     hands = _hand(values, "left", path, total), _hand(values, "right", path, total)

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from intercap_core.body.model import BodyModel
-from intercap_core.body.parameters import NUM_POSE, TRANSL
+from intercap_core.body.parameters import NUM_POSE, POSE_COLUMNS, TRANSL
 from intercap_core.body_fit.matching import MATCH_COSINE, average, match_points
 from intercap_core.body_fit.surface import SkinSurface, choose_samples
 from intercap_core.formats.released import Skin
@@ -26,17 +26,14 @@ from intercap_core.geometry.rigid.distance import DistanceField
 from intercap_core.geometry.rigid.surfaces import vertex_normals
 from intercap_core.geometry.solve.levenberg_marquardt import NormalEquations, minimise
 from intercap_core.geometry.solve.robust import geman_mcclure_weight
+from intercap_core.joint.state import frame_chunks
 
 SHAPE_FRAMES = 16  # evenly spread; the skin is within 0.1 mm of that of 48, measured on the studio
 # Difference between two body models at equal pose and shape, metres. Measured on the studio: after
 # the fit, the open body is 1.4 to 2.7 mm (mean) and 4 to 8 mm (95th percentile) from the skin of
 # people on another mesh.
 SURFACE_SIGMA_M = 0.004
-REACH_M = 0.20  # distance of the farthest correspondence: arms start that far away; tuned
 FAR_M = 0.03  # distance at which a correspondence counts a quarter (Geman-McClure); tuned
-
-_CHUNK = 32  # frames that are computed at a time, to bound the memory
-_JAW_AND_EYES, _FINGERS = slice(66, 75), slice(75, 165)  # columns of the parameter vector
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +57,7 @@ def fit_surfaces(model: BodyModel, skins: Sequence[Skin], rotations: np.ndarray)
     vectors[:, fit.shape] = posed[0, fit.shape]
     vectors[chosen] = posed
     distance = np.zeros((count, 2))
-    for at in _chunks(count):
+    for at in frame_chunks(count):
         vectors[at] = fit.minimise(skins[at], vectors[at], expected[at], with_shape=False)
         distance[at] = fit.measure_distance(skins[at], vectors[at])
     return FittedBodies(vectors, distance)
@@ -78,14 +75,15 @@ class _SurfaceFit:
         self.ids = self.skin.ids[self.skin.sample]
         self.outer = np.unique(self.skin.ids[self.skin.patch])
         self.faces = model.faces.numpy()
-        free = np.setdiff1d(np.arange(TRANSL.stop), np.arange(TRANSL.stop)[_JAW_AND_EYES])
+        jaw_and_eyes = np.arange(POSE_COLUMNS["jaw_pose"].start, POSE_COLUMNS["reye_pose"].stop)
+        free = np.setdiff1d(np.arange(TRANSL.stop), jaw_and_eyes)
         self.columns = torch.from_numpy(free)
 
     def initialise(self, skins: Sequence[Skin], rotations: Tensor) -> Tensor:
         """Parameters (N, P) with ``rotations``, the mean shape, and coinciding centroids."""
         vectors = self.model.zeros(len(skins)).vector()
         vectors[:, :NUM_POSE] = rotations.reshape(len(skins), NUM_POSE)
-        for at in _chunks(len(skins)):
+        for at in frame_chunks(len(skins)):
             with torch.no_grad():
                 posed = self.model.forward(self.model.parameters(vectors[at])).vertices.numpy()
             offset = [
@@ -139,9 +137,8 @@ class _SurfaceFit:
         """
         stiffness = torch.full((len(self.columns),), 0.25**-2)  # standard deviation 0.25 rad
         stiffness[:3] = 0.0  # turn of the pelvis
-        stiffness[(self.columns >= _FINGERS.start) & (self.columns < _FINGERS.stop)] = (
-            0.08 if fingers else 0.01
-        ) ** -2
+        hands = POSE_COLUMNS["left_hand_pose"].start
+        stiffness[self.columns >= hands] = (0.08 if fingers else 0.01) ** -2
         stiffness[self.columns >= TRANSL.start] = 0.0  # translation
         return stiffness
 
@@ -152,7 +149,7 @@ class _SurfaceFit:
             far[self.hand] = 0.008  # a point farther away may be on the next finger
         parts = []
         with torch.no_grad():
-            for at in _chunks(len(targets)):
+            for at in frame_chunks(len(targets)):
                 vertices, normals = self.skin.posed(self.model.parameters(vectors[at]))
                 parts += [
                     self._match_frame(*frame, far)
@@ -169,6 +166,7 @@ class _SurfaceFit:
         is perpendicular to the sample's own normal, at the mean height of the other surface's
         vertices that have matched the sample. At the distance ``far`` (S, 1) a plane counts 1/4.
         """
+        reach = 0.20  # metres, of the farthest correspondence: arms start that far away; tuned
         samples, along = vertices[self.skin.sample], normals[self.skin.sample]
         closest = target.field.closest(samples.numpy())
         nearest, facing = (
@@ -176,8 +174,8 @@ class _SurfaceFit:
             for values in (closest.points, closest.normals)
         )
         distance = (samples - nearest).norm(dim=1)
-        agrees = ((facing * along).sum(1) > MATCH_COSINE) & (distance < REACH_M)
-        matches = match_points(target.points, target.normals, vertices, normals, self.skin, REACH_M)
+        agrees = ((facing * along).sum(1) > MATCH_COSINE) & (distance < reach)
+        matches = match_points(target.points, target.normals, vertices, normals, self.skin, reach)
         ones = torch.ones(len(target.points), dtype=samples.dtype)
         zeros = torch.zeros(len(samples), dtype=samples.dtype)
         mean, count = average(matches, ones, zeros, huber=FAR_M)
@@ -236,7 +234,7 @@ class _Problem:
         """Cost (b,) of the frames ``index``."""
         vectors, off = self.vectors(own, shared, index), own - self.expected[index]
         result = 0.5 * (off * off * self.stiffness).sum(1)
-        for at in _chunks(len(own)):
+        for at in frame_chunks(len(own)):
             with torch.no_grad():
                 params = self.model.parameters(vectors[at])
                 points = self.model.forward(params, vertex_ids=self.ids).vertices
@@ -254,7 +252,7 @@ class _Problem:
         cost = self.cost(own, shared, index)
         gradient = own.new_zeros(len(own), n + m)
         hessian = own.new_zeros(len(own), n + m, n + m)
-        for at in _chunks(len(own)):
+        for at in frame_chunks(len(own)):
             planes = _Planes(*(part[index[at]] for part in self.planes))
             linear = self.model.linearise(self.model.parameters(vectors[at]), vertex_ids=self.ids)
             height = (planes.normal * linear.vertices[:, :, None]).sum(3) - planes.offset
@@ -273,7 +271,3 @@ def _centroid(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     a, b, c = (vertices[faces[:, i]].astype(np.float64) for i in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     return (area[:, None] * (a + b + c)).sum(0) / (3 * area.sum())
-
-
-def _chunks(count: int) -> list[slice]:
-    return [slice(start, start + _CHUNK) for start in range(0, count, _CHUNK)]

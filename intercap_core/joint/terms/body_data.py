@@ -46,7 +46,6 @@ from intercap_core.joint.time_offsets import (
 from intercap_core.sequence_inputs import SequencePaths
 
 log = logging.getLogger(__name__)
-_CHUNK = 64  # frames whose equations are computed at a time, to bound the memory
 
 
 @dataclass(frozen=True)
@@ -154,7 +153,7 @@ class BodyData(JointTerm):
         hessian = np.zeros((len(state), BODY.stop, BODY.stop))
         gradient = np.zeros((len(state), BODY.stop))
         energy = np.zeros(len(state))
-        for chunk in self._index.split(_CHUNK):
+        for chunk in self._index.split(64):  # to bound the memory
             normal = self._problem.linearise(pose[chunk], shared, chunk)
             places = chunk.numpy()  # a tensor with one element would index like a scalar
             trusted = self._trusted[places]

@@ -27,11 +27,9 @@ from intercap_core.joint.state import BODY, OBJECT, State
 from intercap_core.joint.terms.term import Data, Equation, JointTerm, TermContext
 
 # Standard deviations of accelerations in everyday motion.
-BODY_ACCELERATION = 6.0  # m/s^2, of trunk and limbs; tuned on the studio
+BODY_ACCELERATION = 6.0  # m/s^2, of trunk, limbs and carried objects; tuned on the studio
 FINGER_ACCELERATION = 10.0  # m/s^2; tuned on the studio
-OBJECT_ACCELERATION = 6.0  # m/s^2, of carried objects; tuned on the studio
 ACCELERATION_OUTLIER = 2.0  # standard deviations: a start, a stop, an impact; tuned on the studio
-PROBE_STEPS = 16  # of the motion that calibrates the learned E_S; tuned
 
 _FIRST_FINGER = JOINT_INDEX["left_index1"]  # joints from here on are the fingers'
 _HIPS = [JOINT_INDEX["left_hip"], JOINT_INDEX["right_hip"]]
@@ -127,7 +125,7 @@ class ObjectMotion(_Smoothness):
 
     def add(self, state: State, equations: BandedEquations) -> None:
         points, jacobian = self.geometry.at(state).moments
-        sigma = np.full(points.shape[1], OBJECT_ACCELERATION)
+        sigma = np.full(points.shape[1], BODY_ACCELERATION)
         factor = self._settings.object_smoothness
         self._add_accelerations(OBJECT, points, jacobian, sigma, factor, equations)
 
@@ -236,9 +234,9 @@ class LearnedMotion(JointTerm):
 
 
 def _everyday(encoder: MotionEncoder) -> Tensor:
-    """Steps (N, 243), metres, of a body that translates with random accelerations (seeded)."""
+    """Steps (16, 243), metres, of a body that translates with random accelerations (seeded)."""
     generator = torch.Generator().manual_seed(0)
-    change = torch.randn(PROBE_STEPS, 3, dtype=torch.float64, generator=generator)
+    change = torch.randn(16, 3, dtype=torch.float64, generator=generator)
     steps = torch.cumsum(change * BODY_ACCELERATION / lemo.FRAMES_PER_SECOND**2, dim=0)
     return steps.to(encoder.spread).repeat(1, lemo.COORDINATES // 3)
 

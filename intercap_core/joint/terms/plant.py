@@ -16,11 +16,8 @@ from intercap_core.joint.contact.chain import DwellChain
 from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.skin import Patches
 from intercap_core.joint.state import BODY, State
-from intercap_core.joint.terms.term import Equation, JointTerm, TermContext
+from intercap_core.joint.terms.term import CREEP, SLIP_OUTLIER, Equation, JointTerm, TermContext
 from intercap_core.schemas import CONTACT_REGIONS
-
-PLANT_WALK = 0.003  # creep of a sole: a random walk, metres in one second; tuned on the studio
-PLANT_OUTLIER = 0.15  # slip that counts a quarter, m/s, above the fits' jitter; tuned on the studio
 
 _SOLES = tuple(
     JOINT_INDEX[f"{side}_{name}"] for side in ("left", "right") for name in ("ankle", "foot")
@@ -86,7 +83,7 @@ class Plant(JointTerm):
     def __init__(self, context: TermContext) -> None:
         super().__init__(context)
         self._floor, self._fps = context.floor, context.fps
-        self._scale = context.settings.plant_weight * context.fps / PLANT_WALK**2
+        self._scale = context.settings.plant_weight * context.fps / CREEP**2
         parts = sole_parts(self.geometry.patches, 6)  # vertices that move nearly as one
         self._parts = [self.geometry.skin.patch[part] for part in parts]
         self._index = np.concatenate([np.zeros(0, int), *self._parts])  # (K,) of the skin samples
@@ -114,4 +111,4 @@ class Plant(JointTerm):
             axes = np.broadcast_to(np.eye(3), (*points[at, index].shape, 3))
             return posed.skin_by_body(at, self._index[index], axes)
 
-        self.add_steps(BODY, points, rows, self._weight, PLANT_OUTLIER / self._fps, equations)
+        self.add_steps(BODY, points, rows, self._weight, SLIP_OUTLIER / self._fps, equations)

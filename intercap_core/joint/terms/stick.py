@@ -19,13 +19,16 @@ from intercap_core.geometry.solve.robust import geman_mcclure_weight
 from intercap_core.joint.equations import BandedEquations
 from intercap_core.joint.state import ALL, State
 from intercap_core.joint.terms.contact import Contact
-from intercap_core.joint.terms.term import Data, Equation, JointTerm, TermContext
+from intercap_core.joint.terms.term import (
+    CREEP,
+    SLIP_OUTLIER,
+    Data,
+    Equation,
+    JointTerm,
+    TermContext,
+)
 from intercap_core.schemas import CONTACT_REGIONS
 
-STICK_WALK = 0.003  # creep of a grip: a random walk, metres in one second; tuned on the studio
-STICK_OUTLIER = 0.15  # slip that counts a quarter, m/s, above the fits' jitter; tuned on the studio
-# Vertices that represent a patch have at least this share of its largest probability; tuned.
-NEAR_LARGEST = 0.1
 STICK_VERTICES = 24  # at most for a patch, whose vertices move nearly as one; tuned on the studio
 
 # Hands grip and soles stand; what sits or leans glides as it settles.
@@ -70,7 +73,7 @@ class Stick(JointTerm):
     def __init__(self, context: TermContext) -> None:
         super().__init__(context)
         self._contact, self._fps = context.find(Contact), context.fps
-        self._scale = context.settings.stick_weight * context.fps / STICK_WALK**2
+        self._scale = context.settings.stick_weight * context.fps / CREEP**2
         self._grips = np.isin(self.geometry.patches.region, _GRIPPING)
         self._steady: np.ndarray | None = None  # (T - 1, M)
         self._index = np.zeros(0, int)  # (K,) of the skin samples
@@ -128,11 +131,13 @@ class Stick(JointTerm):
             by_object = local_by_object(some, rotation, state.translation[at])
             return np.concatenate([by_body, by_object], axis=3)
 
-        self.add_steps(ALL, local, rows, self._weight, STICK_OUTLIER / self._fps, equations)
+        self.add_steps(ALL, local, rows, self._weight, SLIP_OUTLIER / self._fps, equations)
 
 
 def _representatives(holds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Choose vertices of a patch that represent all of it.
+
+    They have at least a tenth of its largest probability (tuned).
 
     Args:
         holds: (T - 1, M) probability that each vertex holds the object, times its share.
@@ -141,9 +146,9 @@ def _representatives(holds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         Vertices (K,) and their weights (T - 1, K), whose sum is that of the whole patch.
     """
     most = holds.max(axis=0)
-    near = np.flatnonzero(most > NEAR_LARGEST * most.max())
+    near = np.flatnonzero(most > 0.1 * most.max())
     some = near[np.linspace(0, len(near) - 1, min(len(near), STICK_VERTICES)).round().astype(int)]
     weight = holds[:, some]
-    part = np.maximum(weight.sum(axis=1), NEAR_LARGEST * holds.sum(axis=1))
+    part = np.maximum(weight.sum(axis=1), 0.1 * holds.sum(axis=1))
     share = np.divide(holds.sum(axis=1), part, out=np.zeros(len(holds)), where=part > 0)
     return some, weight * share[:, None]

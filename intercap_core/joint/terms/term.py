@@ -22,6 +22,9 @@ from intercap_core.joint.proximity import Proximity, along_by_object
 from intercap_core.joint.sequential import Trust
 from intercap_core.joint.state import ALL, State
 
+CREEP = 0.003  # m in one second, of grips and soles: a random walk; tuned on the studio
+SLIP_OUTLIER = 0.15  # slip that counts a quarter, m/s, above the fits' jitter; tuned on the studio
+
 T = TypeVar("T", bound="JointTerm")
 
 
