@@ -18,11 +18,9 @@ from typing import TypeVar
 
 import numpy as np
 
-from intercap_core.scene.constraints import MIN_BODY_POINTS, BodyConstraint, BodyViews
+from intercap_core.scene.constraints import BodyConstraint, BodyViews
 from intercap_core.scene.registration import MOVING, STATIC, Registration, RigEstimate
 
-# Largest ratio of errors, refined over given, that counts as an improvement. Tuned on the studio.
-MUST_IMPROVE = 0.98
 # Ratio of refined over given error above which the given pose is not far worse and the camera is
 # compared again. Tuned on the studio.
 DOUBTFUL_RATIO = 0.5
@@ -95,8 +93,7 @@ class PoseVerdict:
         mean = np.mean([e.mean for e in evidence])
         sigma = np.sqrt(sum(e.sigma**2 for e in evidence)) / len(evidence)
         # by two standard deviations; tuned on the studio
-        better = mean <= np.log(MUST_IMPROVE) and mean <= -2.0 * sigma
-        return cls(bool(better), tuple(evidence))
+        return cls(bool(mean <= -2.0 * sigma), tuple(evidence))
 
     def __str__(self) -> str:
         if not self.evidence:
@@ -130,7 +127,7 @@ def judge_poses(
     # half of the keypoints, the rig refined with them, and the other half for evaluation
     seen, unseen = views.halves() if views is not None else (None, None)
     halved = held_out = None
-    if seen and unseen and min(len(seen.points), len(unseen.points)) >= MIN_BODY_POINTS:
+    if seen and unseen and seen.suffice and unseen.suffice:
         halved, held_out = refine(seen, free), BodyConstraint(unseen, registration.rig)
 
     def compare(c: int, apart: RigEstimate, apart_halved: RigEstimate | None) -> PoseVerdict:

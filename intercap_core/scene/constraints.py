@@ -28,12 +28,8 @@ from intercap_core.scene.ground import FLOOR_COSINE, GroundPlane
 from intercap_core.scene.subject_views import SubjectViews
 from intercap_core.scene.surfaces import DepthSurface
 
-# Standard deviation of floor points from the common plane: floors are not flat and depth is biased.
-# Tuned on the studio.
-FLOOR_SIGMA_M = 0.005
 ROBUST_SIGMA = 3.0  # scale of Geman and McClure's function, standard deviations; tuned
 KEYPOINT_ERROR_TIME_S = 0.5  # how long an error at one joint lasts; tuned on the studio
-MIN_BODY_POINTS = 50  # joints times sets; fewer do not constrain a rig; tuned on the studio
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,11 +50,20 @@ class BodyViews:
     """(N,) number of joint and time span: ``NUM_KEYPOINTS`` * span + keypoint index. Spans last
     :data:`KEYPOINT_ERROR_TIME_S`, so the points of one unit share one detector error."""
 
+    @property
+    def suffice(self) -> bool:
+        """Whether the points constrain a rig: 50 or more, as two sets of the body have."""
+        return len(self.points) >= 50
+
+    def subset(self, rows: np.ndarray) -> BodyViews:
+        """The points of a mask (N,)."""
+        fields = (self.pixels, self.weights, self.points, self.velocity, self.unit)
+        return BodyViews(*(field[rows] for field in fields))
+
     def halves(self) -> tuple[BodyViews, BodyViews]:
         """The points of the even time spans, and those of the odd ones."""
         odd = self.unit // NUM_KEYPOINTS % 2 == 1
-        fields = (self.pixels, self.weights, self.points, self.velocity, self.unit)
-        return BodyViews(*(f[~odd] for f in fields)), BodyViews(*(f[odd] for f in fields))
+        return self.subset(~odd), self.subset(odd)
 
 
 def body_views(subject: SubjectViews, times: np.ndarray) -> BodyViews:
@@ -249,6 +254,9 @@ class FloorConstraint:
         count = len(self._rig)
         moved = self._rig.moved(poses)
         own = {c: apply(moved[c].master_from_depth, points) for c, points in self._points.items()}
+        # standard deviation of floor points from the plane, metres: floors are not flat, depth is
+        # biased
+        sigma = 0.005
         everything = np.concatenate(list(own.values()))
         middle = everything.mean(0)
         axes = np.linalg.svd(everything - middle, full_matrices=False)[2]
@@ -260,9 +268,9 @@ class FloorConstraint:
         slope = np.zeros(3)
         for c, points in own.items():
             residual = (points - middle) @ normal
-            robust = geman_mcclure_weight(residual**2, ROBUST_SIGMA * FLOOR_SIGMA_M)
+            robust = geman_mcclure_weight(residual**2, ROBUST_SIGMA * sigma)
             # ten independent points per camera: errors of lens and bias are shared
-            weight = robust * min(1.0, 10.0 / len(points)) / FLOOR_SIGMA_M**2
+            weight = robust * min(1.0, 10.0 / len(points)) / sigma**2
             arm = points - poses[c, :3, 3]
             by_pose = np.column_stack(
                 [np.cross(arm, normal), np.broadcast_to(normal, points.shape)]

@@ -14,14 +14,21 @@ from intercap_core.scene.up import UpDirection, degrees_between
 # Height above the floor of the lowest foot keypoint (heel or toe) of a standing person, measured on
 # the open body.
 FOOT_HEIGHT_M = 0.014
-# Thresholds, all tuned on the studio:
-FOOT_TOLERANCE_M = 0.05  # feet whose heights differ by more do not stand on one floor
-MIN_FOOT_SPREAD_M = 0.15  # least standard deviation of foot positions that determine a tilt
-FLOOR_COSINE = 0.94  # largest angle of a floor point's normal to the plane's, 20 degrees
-FLOOR_HYPOTHESIS_TOLERANCE_M = 0.03  # distance of inliers from a hypothesis of the floor
-BELOW_FLOOR_M = 0.10  # depth under a plane from which a point is evidence against it as the floor
-MIN_FLOOR_AREA_M2 = 0.5  # least visible area of a floor
-MIN_FOOT_SETS = 5  # least number of sets with visible feet, for a floor
+# Feet whose heights differ by more do not stand on one floor. Tuned on the studio: at 0.1 m, beams
+# of 12 cm and stairs are taken for the floor.
+FOOT_TOLERANCE_M = 0.05
+# Least number of sets with visible feet that form a level: the median of five tolerates two wrong
+# detections.
+MIN_FOOT_SETS = 5
+# Cosine of the largest angle of a floor point's normal to the plane's, 20 degrees. Tuned on the
+# studio.
+FLOOR_COSINE = 0.94
+# Largest distance of a point from a plane before the plane is refined. Tuned on the studio.
+UNREFINED_TOLERANCE_M = 0.03
+# Depth under a plane from which a point is evidence against it as the floor. Tuned on the studio:
+# at 0.2 m, platforms of 15 cm are taken for the floor.
+BELOW_FLOOR_M = 0.10
+MIN_FLOOR_AREA_M2 = 0.5  # least visible area of a floor: a square of 0.7 m; tuned on the studio
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +98,7 @@ def fit_ground(
     if not len(tried):
         return NO_GROUND
     height = (sample @ normals[tried].T) - (points[tried] * normals[tried]).sum(1)
-    inside = (np.abs(height) < FLOOR_HYPOTHESIS_TOLERANCE_M).sum(0)
+    inside = (np.abs(height) < UNREFINED_TOLERANCE_M).sum(0)
     below = (height < -BELOW_FLOOR_M).sum(0)
     # a point below the plane counts as much as three inliers; tuned on the studio
     best = tried[np.argmax(inside - 3.0 * below)]
@@ -119,7 +126,7 @@ def _lowest(
         if len(under) * cell_m**2 < MIN_FLOOR_AREA_M2:
             break
         order = under[np.argsort(height[under])]
-        reach = height[order] + 2 * FLOOR_HYPOTHESIS_TOLERANCE_M
+        reach = height[order] + 2 * UNREFINED_TOLERANCE_M
         count = np.searchsorted(height[order], reach, side="right") - np.arange(len(order))
         first = int(np.argmax(count))
         start = points[order[first : first + count[first]]].mean(0)
@@ -169,7 +176,7 @@ def _refined(
     Eight iterations; the largest distance of points that take part (gate) narrows from 6 cm to the
     tolerance. Weights are Tukey's biweight of the distance.
     """
-    for gate in np.geomspace(max(0.06, tolerance_m), tolerance_m, 8):
+    for gate in np.geomspace(max(2 * UNREFINED_TOLERANCE_M, tolerance_m), tolerance_m, 8):
         distance = (points - point) @ normal
         weight = np.maximum(0, 1 - (distance / gate) ** 2) ** 2
         weight *= normals @ normal >= FLOOR_COSINE
@@ -372,10 +379,11 @@ def _normal_of(standing: np.ndarray, up: np.ndarray) -> np.ndarray | None:
     line.
     """
     _, spread, axes = np.linalg.svd(standing - standing.mean(0), full_matrices=False)
-    along, across = spread[:2] / np.sqrt(len(standing))
-    if along < MIN_FOOT_SPREAD_M:
+    # standard deviations of at least 15 cm determine a tilt; tuned on the studio
+    along, across = spread[:2] / np.sqrt(len(standing)) >= 0.15
+    if not along:
         return None
-    if across < MIN_FOOT_SPREAD_M:
+    if not across:
         normal = up - (up @ axes[0]) * axes[0]
         return normal / np.linalg.norm(normal)
     return axes[2] * np.sign(axes[2] @ up)

@@ -19,7 +19,7 @@ import numpy as np
 
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.scene.background import Background
-from intercap_core.scene.constraints import MIN_BODY_POINTS, BodyConstraint, body_views
+from intercap_core.scene.constraints import BodyConstraint, body_views
 from intercap_core.scene.registration import STATIC, Registration, RigEstimate
 from intercap_core.scene.subject_views import SubjectViews
 from intercap_core.scene.surfaces import background_surfaces
@@ -56,13 +56,12 @@ def exchange_lenses(
         master: camera whose pose is fixed.
     """
     views = body_views(subject, times)  # keypoints also constrain the poses
-    enough = len(views.points) >= MIN_BODY_POINTS
 
     def residuals(rig: Rig) -> dict[tuple[int, int], float]:
         """Held-out residual by pair, metres, with poses refined on the background."""
         surfaces = background_surfaces(rig, backgrounds)
         registration = Registration(rig, {STATIC: [surfaces]}, master)
-        body = [BodyConstraint(views, rig)] if enough else []
+        body = [BodyConstraint(views, rig)] if views.suffice else []
         refined = registration.solve(RigEstimate.start(rig), body).estimate
         return registration.median_residuals(refined, STATIC)
 

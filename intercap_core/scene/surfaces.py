@@ -22,8 +22,6 @@ from intercap_core.scene.background import Background
 
 # Largest depth of moving surfaces: farther, the depth error exceeds the motion between two sets.
 MOVING_MAX_DEPTH_M = 4.0
-# Largest displacement from one set to the next: 2 m/s at 15 sets per second.
-MOVING_SEARCH_M = 0.15
 BACKGROUND_CELL_M = 0.03  # side of the cells of thinned backgrounds; tuned on the studio
 
 
@@ -216,15 +214,16 @@ def _along_normals(surface: DepthSurface, points: np.ndarray) -> np.ndarray:
     The nearest of the other ``points`` lies beside the normal. The displacement is its distance
     along the normal, and the search is repeated twice from the displaced point.
     """
+    reach = 0.15  # metres from one set to the next: 2 m/s at 15 sets per second
     away, lost = np.zeros(len(surface)), np.zeros(len(surface), bool)
     if not len(points):
         return np.full(len(surface), np.nan)
     tree = cKDTree(points, balanced_tree=False)
     for _ in range(3):
         sought = surface.points + away[:, None] * surface.normals
-        distance, nearest = tree.query(sought, distance_upper_bound=MOVING_SEARCH_M)
+        distance, nearest = tree.query(sought, distance_upper_bound=reach)
         lost |= ~np.isfinite(distance)
         offset = points[np.where(lost, 0, nearest)] - surface.points
         away = np.where(lost, 0.0, (offset * surface.normals).sum(1))
-        lost |= np.abs(away) > MOVING_SEARCH_M
+        lost |= np.abs(away) > reach
     return np.where(lost, np.nan, away)

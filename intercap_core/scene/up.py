@@ -13,10 +13,9 @@ from intercap_core.geometry.camera.rig import Rig
 
 # Largest error of an accelerometer on a tripod, or of a calibration board laid on the floor.
 GRAVITY_CONE_DEG = 10.0
-CAMERA_UP_CONE_DEG = 40.0  # largest error of the cameras' mean up direction; tuned on the studio
-# Deviation from which a stated up is taken for a wrong axis. A wrong axis is 90 degrees off; the
-# cameras' mean up and the trunk of a bending person deviate by less than 60.
-WRONG_UP_DEG = 60.0
+# Largest error of the cameras' mean up direction: that of cameras on one side of the scene, all of
+# which look down by this angle.
+CAMERA_UP_CONE_DEG = 40.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,17 +87,19 @@ def check_stated_up(
         note = f"the stated up (calibration_up) is {off:.0f} degrees from the gravity sensors'"
         return [f"{note}, which were believed"] * (off > GRAVITY_CONE_DEG)
     leans = degrees_between(stated, trunk)
-    if off > WRONG_UP_DEG and leans > WRONG_UP_DEG:
+    # a wrong axis is 90 degrees off; the cameras' mean up and the trunk of a bending person less
+    wrong = 60.0
+    if off > wrong and leans > wrong:
         raise UserError(
             f"calibration_up is {off:.0f} degrees from the cameras' mean up and {leans:.0f} from "
             "the person's trunk, expected less than "
-            f"{WRONG_UP_DEG:.0f} from one of them; state another axis of the calibration's world, "
+            f"{wrong:.0f} from one of them; state another axis of the calibration's world, "
             "or leave the column empty"
         )
     notes = []
     if off > CAMERA_UP_CONE_DEG:
         notes.append(f"the stated up is {off:.0f} degrees from the cameras' mean up")
-    if leans > WRONG_UP_DEG:
+    if leans > wrong:
         notes.append(f"the stated up is {leans:.0f} degrees from the person's trunk")
     return notes
 
