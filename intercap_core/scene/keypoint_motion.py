@@ -30,14 +30,6 @@ from intercap_core.geometry.camera.triangulation import pixel_scale, triangulate
 MAX_PATH_GAP_S = 0.35  # a path bridges at most this time without samples; tuned on the studio
 MIN_CONFIDENCE = 0.3  # keypoints of lower confidence are ignored; tuned on the studio
 OUTLIER_SIGMA = 4.0  # length of an outlier's residual, standard deviations; tuned on the studio
-# Weights of the squared third differences that are tried; the likelihood selects one.
-STIFFNESS = 10.0 ** np.arange(-3, 4)
-# Factor on the selected weight. Detector errors that last for several sets look like motion to the
-# likelihood, so it selects paths that are too flexible, with speeds that are too high. The factor
-# removes this bias. Tuned on the studio.
-STIFFER = 4.0
-MIN_PATH_SAMPLES = 6  # third differences need four samples
-ORDER = 3  # order of the differences
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +65,7 @@ def smooth_paths(times: np.ndarray, points: np.ndarray) -> SmoothPaths:
     """Smooth the paths of K points.
 
     Gaps up to :data:`MAX_PATH_GAP_S` are bridged. A path is NaN in longer gaps, and everywhere with
-    fewer than :data:`MIN_PATH_SAMPLES` known points.
+    fewer than six known points: third differences need four.
 
     Args:
         times: (T,) seconds, increasing.
@@ -83,9 +75,9 @@ def smooth_paths(times: np.ndarray, points: np.ndarray) -> SmoothPaths:
     known = np.isfinite(points[..., 0])
     smooth = np.full(points.shape, np.nan)
     velocity = np.full(points.shape, np.nan)
-    if sets >= MIN_PATH_SAMPLES:
+    if sets >= 6:
         penalty = _penalty(times)
-        usable = np.flatnonzero(known.sum(0) >= MIN_PATH_SAMPLES)
+        usable = np.flatnonzero(known.sum(0) >= 6)
         for k in usable:
             smooth[:, k] = _smoothed(np.nan_to_num(points[:, k]), known[:, k], penalty)
         velocity[:, usable] = CubicSpline(times, smooth[:, usable])(times, 1)
@@ -100,38 +92,41 @@ def _penalty(times: np.ndarray) -> np.ndarray:
     differences, with time in units of the median interval."""
     gap = float(np.median(np.diff(times)))
     scaled = (times - times[0]) / gap
-    rows = len(times) - ORDER
-    weights = np.ones((rows, ORDER + 1))
-    for i in range(ORDER + 1):
-        for j in range(ORDER + 1):
+    rows = len(times) - 3
+    weights = np.ones((rows, 4))
+    for i in range(4):
+        for j in range(4):
             if i != j:
                 weights[:, i] /= scaled[i : i + rows] - scaled[j : j + rows]
     weights *= 6.0  # third derivative = 3! times the divided difference
-    banded = np.zeros((ORDER + 1, len(times)))
-    for i in range(ORDER + 1):
-        for j in range(i, ORDER + 1):
-            banded[ORDER - (j - i), j : j + rows] += weights[:, i] * weights[:, j]
+    banded = np.zeros((4, len(times)))
+    for i in range(4):
+        for j in range(i, 4):
+            banded[3 - (j - i), j : j + rows] += weights[:, i] * weights[:, j]
     return banded
 
 
 def _smoothed(points: np.ndarray, known: np.ndarray, penalty: np.ndarray) -> np.ndarray:
     """Smooth one path (T, 3).
 
-    The stiffness of greatest restricted likelihood is multiplied by :data:`STIFFER`.
+    The stiffness is the weight of the squared third differences, 0.001 to 1000. Detector errors
+    that last for several sets look like motion to the likelihood. It therefore selects paths that
+    are too flexible, with speeds that are too high, and the selected stiffness is multiplied by
+    four; tuned on the studio.
     """
     right = points * known[:, None]
     samples, sets = int(known.sum()), len(points)
-    costs = []
-    for stiffness in STIFFNESS:
+    tried, costs = 10.0 ** np.arange(-3, 4), []
+    for stiffness in tried:
         factor = _factor(stiffness, known, penalty)
         path = cho_solve_banded((factor, False), right)
         energy = max(float((right * (points - path)).sum()), 1e-12)
         # -2 log restricted likelihood of the three coordinates, up to a constant
-        cost = 3 * (samples - ORDER) * np.log(energy)
-        cost += 3 * (2 * np.log(factor[-1]).sum() - (sets - ORDER) * np.log(stiffness))
+        cost = 3 * (samples - 3) * np.log(energy)
+        cost += 3 * (2 * np.log(factor[-1]).sum() - (sets - 3) * np.log(stiffness))
         costs.append(cost)
-    likely = STIFFNESS[int(np.argmin(costs))]
-    return cho_solve_banded((_factor(STIFFER * likely, known, penalty), False), right)
+    likely = tried[int(np.argmin(costs))]
+    return cho_solve_banded((_factor(4.0 * likely, known, penalty), False), right)
 
 
 def _factor(stiffness: float, known: np.ndarray, penalty: np.ndarray) -> np.ndarray:
@@ -153,11 +148,15 @@ def _near_known(times: np.ndarray, known: np.ndarray) -> np.ndarray:
     return after - before <= MAX_PATH_GAP_S
 
 
-_HAND = np.array([0, 4, 5, 8, 9, 13, 17, 20])  # wrist, knuckles and finger tips
-_FACE = np.array([0, 9, 10, 13, 19, 28, 31, 37])  # corners of brows, eyes, nose, mouth
 # Indices of the K compared keypoints. The other keypoints move with these, so they would add little
 # information and double the run time.
-POINTS = np.r_[BODY, LEFT_HAND.start + _HAND, RIGHT_HAND.start + _HAND, FACE.start + _FACE]
+POINTS = np.r_[
+    BODY,
+    # of each hand: wrist, knuckles and finger tips
+    np.add.outer([LEFT_HAND.start, RIGHT_HAND.start], [0, 4, 5, 8, 9, 13, 17, 20]).ravel(),
+    # of the face: corners of brows, eyes, nose and mouth
+    np.add(FACE.start, [0, 9, 10, 13, 19, 28, 31, 37]),
+]
 
 
 @dataclass(frozen=True, eq=False)

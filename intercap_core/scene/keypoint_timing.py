@@ -24,14 +24,9 @@ from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.solve.time_series import filled_linearly
 from intercap_core.scene.keypoint_motion import KeypointMotion, build_motion
 
-# Variance of the constant part of a series, relative to the rest: large enough to be nearly free.
-CONSTANT_VARIANCE = 100.0
 # Factor that users of TimeOffsets apply to ``sigma``: errors of one person's keypoints are
 # correlated. Tuned on the studio.
 TIMING_INFLATION = 2.0
-# Largest length of a window, sets. Covariances over time are dense within a window and 0 between
-# windows, which bounds memory and time.
-WINDOW_SETS = 96
 MIN_TIMING_SETS = 8  # least number of sets for an estimate; tuned on the studio
 
 
@@ -49,10 +44,6 @@ class TimeNoise:
     scale: float
     """Standard deviation, in units of the series."""
 
-    def covariance(self, times: np.ndarray) -> np.ndarray:
-        """Covariance (T, T) for ``scale`` 1, with the constant part."""
-        return _covariance(times, self.kind, self.length, self.fast) + CONSTANT_VARIANCE
-
     def precision(self, times: np.ndarray, variance: np.ndarray) -> np.ndarray:
         """Inverse covariances (N, T, T) of N series.
 
@@ -60,7 +51,8 @@ class TimeNoise:
         very large for a missing sample.
         """
         unique, of_series = np.unique(variance, axis=0, return_inverse=True)
-        whole = np.broadcast_to(self.covariance(times), (*unique.shape, len(times))).copy()
+        one = _covariance(times, self.kind, self.length, self.fast)
+        whole = np.broadcast_to(one, (*unique.shape, len(times))).copy()
         rows = np.arange(len(times))
         whole[:, rows, rows] += unique
         return (np.linalg.inv(whole) / self.scale**2)[of_series.ravel()]
@@ -88,7 +80,7 @@ def fit_noise(times: np.ndarray, series: np.ndarray, valid: np.ndarray) -> TimeN
     for kind, lengths in {"rough": (0.2, 0.5, 1.0), "smooth": (0.15, 0.3, 0.6)}.items():
         for length in lengths:
             for fast in (0.03, 0.1, 0.25, 0.6):
-                covariance = _covariance(times, kind, length, fast) + CONSTANT_VARIANCE
+                covariance = _covariance(times, kind, length, fast)
                 low = np.linalg.cholesky(covariance)
                 energy = (np.linalg.solve(low, rows.T) ** 2).sum(0)
                 # The median over series is robust to occluded joints and unsynchronised cameras.
@@ -102,15 +94,11 @@ def fit_noise(times: np.ndarray, series: np.ndarray, valid: np.ndarray) -> TimeN
 
 
 def _covariance(times: np.ndarray, kind: str, length: float, fast: float) -> np.ndarray:
-    """Covariance (T, T) of unit variance: correlated part and white noise, without constant."""
+    """Covariance (T, T) of correlated part and white noise, together of unit variance, and of a
+    constant whose variance of 100 leaves it nearly free."""
     apart = np.abs(times[:, None] - times) / length
     lasting = np.exp(-apart) if kind == "rough" else np.exp(-(apart**2) / 2)
-    return (1 - fast) * lasting + fast * np.eye(len(times))
-
-
-# (K,) group of each of POINTS with correlated errors: each of the 25 body points on its own, the 8
-# points of each hand, and the 8 points of the face.
-_CLUSTER = np.r_[np.arange(25), np.repeat([25, 26, 27], 8)]
+    return (1 - fast) * lasting + fast * np.eye(len(times)) + 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,7 +203,9 @@ def _inflation(
     """Factor, at least 1, by which the offsets' variance exceeds that of the noise model.
 
     Cluster-robust sandwich variance over model variance, mean over the cameras. A cluster is a
-    group of :data:`_CLUSTER`; its score is the sum of its keypoints' gradients at the solution.
+    group of keypoints with correlated errors: each of the 25 body points on its own, the 8 points
+    of each hand, and the 8 points of the face. Its score is the sum of its keypoints' gradients at
+    the solution.
 
     Args:
         matrices: (K, n, n) normal matrix of each keypoint, n = 7C.
@@ -226,8 +216,8 @@ def _inflation(
         own: indices of the offsets among the free unknowns.
     """
     scores = (vectors - matrices @ solution)[:, free]
-    groups = np.zeros((_CLUSTER.max() + 1, len(free)))
-    np.add.at(groups, _CLUSTER, scores)
+    groups = np.zeros((28, len(free)))
+    np.add.at(groups, np.r_[np.arange(25), np.repeat([25, 26, 27], 8)], scores)
     taking_part = (np.abs(groups).sum(1) > 0).sum()
     if taking_part < 3:
         return 1.0
@@ -245,9 +235,12 @@ def keypoints_by_moment(keypoints: np.ndarray, slip: np.ndarray) -> np.ndarray:
 
 
 def windows(sets: int) -> list[slice]:
-    """Divide the indices of ``sets`` sets into slices of about equal length, at most
-    :data:`WINDOW_SETS`."""
-    edges = np.linspace(0, sets, -(-sets // WINDOW_SETS) + 1).round().astype(int)
+    """Divide the indices of ``sets`` sets into slices of about equal length, at most 96 sets.
+
+    Covariances over time are dense within a slice and 0 between slices, which bounds memory and
+    time.
+    """
+    edges = np.linspace(0, sets, -(-sets // 96) + 1).round().astype(int)
     return [slice(a, b) for a, b in pairwise(edges.tolist())]
 
 

@@ -37,16 +37,6 @@ from intercap_core.scene.keypoint_timing import (
     windows,
 )
 
-# All tuned on the studio. False detections are short, so the required gain of an interval is
-# MIN_SLIP_GAIN + MIN_SLIP_GAIN_OF_SET / (number of sets).
-MIN_SLIP_GAIN = 15.0
-MIN_SLIP_GAIN_OF_SET = 60.0
-# Gain by which a temporary slip must exceed a constant delay of the camera to be preferred.
-CLEAR_SLIP_GAIN = 10.0
-# Distance in time up to which a slip distorts the triangulated motion, and so the gains of other
-# cameras.
-SLIPS_APART_S = 1.0
-
 
 @dataclass(frozen=True)
 class SlipInterval:
@@ -67,10 +57,9 @@ class SlipInterval:
 
     @property
     def significant(self) -> bool:
-        """Whether ``robust_gain`` reaches the threshold for the number of sets."""
-        return self.robust_gain >= MIN_SLIP_GAIN + MIN_SLIP_GAIN_OF_SET / (
-            self.last - self.first + 1
-        )
+        """Whether ``robust_gain`` reaches 15 + 60 / (number of sets), because false detections are
+        short; tuned on the studio."""
+        return self.robust_gain >= 15.0 + 60.0 / (self.last - self.first + 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,13 +157,14 @@ def _apart(intervals: list[SlipInterval], times: np.ndarray) -> list[SlipInterva
     """The intervals that are accepted in one round: the best, and others unrelated to it.
 
     A late camera distorts the triangulated motion, which makes other cameras look late. Intervals
-    that are much weaker than the best or close to an accepted one in time wait for the next round.
+    that are much weaker than the best or within a second of an accepted one wait for the next
+    round.
     """
     ordered = sorted(intervals, key=lambda i: -i.gain)
     chosen: list[SlipInterval] = []
     for interval in ordered:
-        early, late = times[interval.first] - SLIPS_APART_S, times[interval.last] + SLIPS_APART_S
-        # a fifth of the best gain is needed in the same round; tuned on the studio
+        early, late = times[interval.first] - 1.0, times[interval.last] + 1.0
+        # at least a fifth of the best gain; it and the second are tuned on the studio
         if interval.gain >= 0.2 * ordered[0].gain and all(
             times[other.last] < early or times[other.first] > late for other in chosen
         ):
@@ -266,7 +256,7 @@ class _Evidence:
         """The significant interval of one camera with the greatest gain; None = there is none.
 
         An interval of all sets stands for a constant delay, which is preferred to a temporary slip
-        of slightly greater gain.
+        whose gain is greater by less than 10; tuned on the studio.
         """
         sets, own_step = len(self._motion.times), self._own_steps[camera]
         root, series = _own_series(self._motion, camera)
@@ -291,7 +281,7 @@ class _Evidence:
         whole = SlipInterval(
             camera, 0, sets - 1, step, float(always[step].sum()), _robust_gain(always[step])
         )
-        if whole.significant and (top is None or whole.gain > top.gain - CLEAR_SLIP_GAIN):
+        if whole.significant and (top is None or whole.gain > top.gain - 10.0):
             return whole
         return top
 

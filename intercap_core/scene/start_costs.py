@@ -25,8 +25,6 @@ from intercap_core.person.subject_joints import MAX_IMAGE_SPEED_RAD_S
 from intercap_core.person.tracks import MAX_LINK_GAP_S
 from intercap_core.scene.keypoint_motion import MIN_CONFIDENCE, known_median
 
-MAX_PEOPLE = 3  # used people of an image, those of greatest confidence; untuned
-
 _LEFT, _RIGHT = (
     [
         KEYPOINT_INDEX[f"{side}_{name}"]
@@ -53,19 +51,19 @@ def follow_rays(
     """Follow people in each camera's images; returns the rays of their :func:`body_middles`.
 
     Rays (T, C, P, K, 2) are x and y at z = 1 in the colour camera's frame; NaN = not seen. Each of
-    the P = :data:`MAX_PEOPLE` places holds one person for as long as they can be followed. Places
-    of different cameras are unrelated.
+    the P = 3 places holds one person for as long as they can be followed. Places of different
+    cameras are unrelated. Of more people in an image, those of greatest confidence are used.
 
     Args:
         times: (T,) seconds of the sets.
         available: (T, C) bool, the set has an image of the camera.
     """
-    rays = np.full((*available.shape, MAX_PEOPLE, len(_ALONE) + len(_LEFT), 2), np.nan)
+    rays = np.full((*available.shape, 3, len(_ALONE) + len(_LEFT), 2), np.nan)
     for c, usual in enumerate(usual_steps(available)):
         images = np.flatnonzero(available[:, c])
         for t in images.tolist():
             people = detections.people(t, c)
-            surest = np.argsort(-people[..., 2].sum(1), kind="stable")[:MAX_PEOPLE]
+            surest = np.argsort(-people[..., 2].sum(1), kind="stable")[:3]
             if not len(surest):
                 continue
             pixels = np.stack([body_middles(people[i]) for i in surest])
