@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, product
+from itertools import combinations
 
 import numpy as np
 
@@ -31,8 +31,6 @@ class LensExchange:
 
     cameras: tuple[int, int]
     """Camera indices."""
-    with_distortion: bool
-    """The distortion is exchanged as well."""
     before: float
     """Distance of both backgrounds to those of the other cameras with the given lenses, metres:
     mean over pairs of cameras of the median held-out residual."""
@@ -70,20 +68,19 @@ def exchange_lenses(
     while len(free) >= 2 and (best := _best_exchange(rig, free, residuals)) is not None:
         exchanges.append(best)
         free = [c for c in free if c not in best.cameras]
-        rig = swap_lenses(rig, *best.cameras, with_distortion=best.with_distortion)
+        rig = swap_lenses(rig, *best.cameras)
     return rig, exchanges
 
 
-def swap_lenses(rig: Rig, first: int, second: int, *, with_distortion: bool) -> Rig:
-    """Exchange focal lengths and principal points of two cameras, and optionally the distortion.
+def swap_lenses(rig: Rig, first: int, second: int) -> Rig:
+    """Exchange focal lengths and principal points of two cameras, but not the distortion.
 
     The intrinsics of depth on the colour image's pixel grid change with them.
     """
     cameras = list(rig.cameras)
     for own, other in ((first, second), (second, first)):
-        camera, lens = rig[own], rig[other].colour
-        if not with_distortion:
-            lens = replace(camera.colour, fx=lens.fx, fy=lens.fy, cx=lens.cx, cy=lens.cy)
+        camera, theirs = rig[own], rig[other].colour
+        lens = replace(camera.colour, fx=theirs.fx, fy=theirs.fy, cx=theirs.cx, cy=theirs.cy)
         depth = lens if camera.aligned else camera.depth
         cameras[own] = replace(camera, colour=lens, depth=depth)
     return Rig(tuple(cameras))
@@ -105,15 +102,15 @@ def _best_exchange(
     suspects = [c for c in cameras if _mean_of(given, c) > 1.3 * usual]  # tuned on the studio
     suspects = sorted(sorted(suspects, key=lambda c: -_mean_of(given, c))[:4])  # bounds the time
     better = []
-    for (a, b), distorted in product(combinations(suspects, 2), (True, False)):
+    for a, b in combinations(suspects, 2):
         own, other = rig[a].colour, rig[b].colour
         same_size = (own.width, own.height) == (other.width, other.height)
         if not same_size or np.array_equal(own.parameters, other.parameters):
             continue
         before = _mean_of(given, a, b)
-        after = _mean_of(residuals(swap_lenses(rig, a, b, with_distortion=distorted)), a, b)
+        after = _mean_of(residuals(swap_lenses(rig, a, b)), a, b)
         if after < 0.8 * before:  # tuned on the studio
-            better.append(LensExchange((a, b), distorted, before, after))
+            better.append(LensExchange((a, b), before, after))
     return min(better, key=lambda exchange: exchange.after, default=None)
 
 

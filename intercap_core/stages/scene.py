@@ -329,12 +329,11 @@ def _notes(
     """Notes (C,) on the lens, pose, time and slips of each camera."""
     notes = [[note] if note else [] for note in refined.notes]
     for swap in exchanges:
-        part = "its lens" if swap.with_distortion else "its focal length and principal point"
         evidence = f"background {1e3 * swap.before:.1f} to {1e3 * swap.after:.1f} mm"
         for own, other in (swap.cameras, swap.cameras[::-1]):
             notes[own].append(
-                f"{part} and those of {source.rig.names[other]} are exchanged in the calibration "
-                f"and were put right ({evidence})"
+                f"its focal length and principal point and those of {source.rig.names[other]} are "
+                f"exchanged in the calibration and were put right ({evidence})"
             )
     starts = moments.starts
     for c in np.flatnonzero(source.present & ~stated.known & (starts.sets != 0)).tolist():

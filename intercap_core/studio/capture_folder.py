@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -103,7 +103,8 @@ def _triangle(a, b, c, za, zb, zc, aligned):
 
 
 SOUND_RATE = 16_000  # samples a second
-# Cameras whose colour lenses the fault "swapped_lenses" exchanges: 4 and 5 of InterCap's release
+# Cameras whose focal lengths and principal points the fault "swapped_lenses" exchanges: 4 and 5 of
+# InterCap's release
 SWAPPED = (3, 4)
 
 
@@ -195,8 +196,11 @@ class CaptureFolder(ABC):
         """Return the colour lenses of the calibration, with the faults of the capture."""
         lenses = [camera.colour for camera in claimed]
         if "swapped_lenses" in self.capture.faults:
-            a, b = SWAPPED
-            lenses[a], lenses[b] = lenses[b], lenses[a]
+            for own, other in (SWAPPED, SWAPPED[::-1]):
+                theirs = claimed[other].colour
+                lenses[own] = replace(
+                    lenses[own], fx=theirs.fx, fy=theirs.fy, cx=theirs.cx, cy=theirs.cy
+                )
         if "wrong_resolution" in self.broken:
             at = self.broken["wrong_resolution"]
             lenses[at] = lenses[at].scaled(1.5)
