@@ -35,10 +35,10 @@ PRIOR_ROTATION_RAD = np.radians(0.5)  # error of a careful calibration; tuned on
 # Largest distance of a point to the nearest point of the other surface: 1.5 times the widest gate.
 # Tuned on the studio.
 SURFACE_SEARCH_M = 0.12
-# Largest share of the weight that one direction keeps, and largest factor on the other weights.
-# Tuned on the studio: cameras of config/field/floor.yaml are 4.1 mm off with both, 4.4 mm without.
+# Largest share of a pair's weight that one direction keeps. Tuned on the studio: the cameras of
+# config/field/floor.yaml are 4.1 mm off, without this limit 4.4 mm.
 MAX_DIRECTION_SHARE = 0.8
-MAX_DIRECTION_GAIN = 3.0
+MAX_DIRECTION_GAIN = 3.0  # largest factor on the weights of other directions; tuned on the studio
 
 
 def balance_directions(weight: np.ndarray, normals: np.ndarray) -> np.ndarray:
