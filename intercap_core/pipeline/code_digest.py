@@ -47,7 +47,6 @@ MODULES = {
     "dataset": "stages.dataset",
     "studio": "studio.capture",
 }
-_MAX_CACHED = 16  # cache files kept, one per version of the code, the newest
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,8 @@ def _all_stage_code() -> dict[str, StageCode]:
         part = path.with_name(f".{path.name}.{os.getpid()}.part")
         part.write_text(json.dumps({n: [dict(c.digests), c.parameters] for n, c in code.items()}))
         os.replace(part, path)
-        for old in sorted(folder.glob("*.json"), key=_date)[:-_MAX_CACHED]:
+        # keep the 16 newest files, one per version of the code
+        for old in sorted(folder.glob("*.json"), key=_date)[:-16]:
             old.unlink(missing_ok=True)
     return code
 

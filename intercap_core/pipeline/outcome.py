@@ -18,7 +18,6 @@ _CHOSEN_BY = {
     "handling": ", the subject handles the object",
     "middle": ", the subject is seen most",
 }
-_CONTACT_PROBABILITY = 0.5  # a region with a larger probability counts as touching
 _MAX_NAMED = 5  # left-out sequences named in a line
 
 
@@ -164,7 +163,7 @@ def _joint(a: Artefact) -> str:
     if "made_by" in a.attributes:
         return f"made by {a.attributes['made_by']}; {_share(~a['flagged'])} frames are not flagged"
     end = "converged" if a.attributes["converged"] else "iteration limit reached"
-    touching = int((a["contact_probability"] > _CONTACT_PROBABILITY).any(axis=1).sum())
+    touching = int((a["contact_probability"] > 0.5).any(axis=1).sum())
     contact = f"contact in {touching} of {len(a['flagged'])} frames"
     if np.isnan(a["contact_probability"]).all():
         contact = "the body alone, without an object"

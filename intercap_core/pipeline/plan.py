@@ -42,7 +42,6 @@ DATASET_OUTPUTS = (
     "croissant.json",
 )  # fmt: skip
 MARKS = Path(".snakemake") / "out_of_date"
-_LATER_S = 1.0  # time by which a mark is newer than its output
 
 
 class OutputStatus(StrEnum):
@@ -146,7 +145,7 @@ class Plan:
             # a unique content, in case Snakemake compares checksums of inputs
             lines = [*self._state(sequence, stage).reasons, uuid.uuid4().hex]
             path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-            later = max(newest, time.time()) + _LATER_S
+            later = max(newest, time.time()) + 1.0  # seconds
             os.utime(path, (later, later))
         return [path]
 

@@ -42,8 +42,6 @@ from intercap_core.sequence_inputs import SequenceModels, SequencePaths
 
 log = logging.getLogger(__name__)
 
-_MAX_CLOSEUPS = 2  # longest contacts drawn; `intercap closeups` draws all
-
 
 def run(
     *,
@@ -176,7 +174,8 @@ def _closeups(
         return []
     known = truth if truth is not None and truth.is_file() else None
     handling = read_handling(paths, models, truth=known)
-    return [closeup(handling, hold) for hold in holds(handling.probability)[:_MAX_CLOSEUPS]]
+    # the two longest contacts; `intercap closeups` draws all
+    return [closeup(handling, hold) for hold in holds(handling.probability)[:2]]
 
 
 def _track(paths: SequencePaths, entry: ObjectEntry) -> dict[str, Any]:

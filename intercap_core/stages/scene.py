@@ -47,7 +47,6 @@ from intercap_core.scene.up import (
 )
 from intercap_core.schemas import SCENE
 
-FEET = slice(19, 25)  # toes and heels among the body's 25 keypoints
 # A camera is reported if it sees the rig's centre less accurately than this, because its pose is
 # uncertain (standard deviation).
 WEAK_CAMERA_M = 0.010
@@ -203,8 +202,9 @@ def _with_feet(
     """
     stated = source.stated_up, source.stated_floor
     middle = ring_centre(rig)
+    toes_and_heels = slice(19, 25)
     if not ground.found:
-        feet = triangulate_views(subject.keypoints, rig).joints[:, FEET]
+        feet = triangulate_views(subject.keypoints, rig).joints[:, toes_and_heels]
         ground = fit_ground_to_feet(feet, _up(source, rig))
         if np.isfinite(stated[1]).all():
             denied = ground.found and compare_with_stated(
@@ -213,7 +213,7 @@ def _with_feet(
             ground = ground if denied else stated_ground(*stated)
     notes = [ground.note] if ground.note else []
     if ground.found and ground.source != "feet":
-        above = describe_raised_feet(subject.joints[:, FEET], ground)
+        above = describe_raised_feet(subject.joints[:, toes_and_heels], ground)
         notes += [above] if above else []
     if ground.found:
         notes += compare_with_stated(ground.point, ground.normal, *stated, middle)
