@@ -20,6 +20,8 @@ PARENTS: tuple[int, ...] = (
 
 NUM_JOINTS = len(JOINT_NAMES)
 JOINT_INDEX: dict[str, int] = {name: i for i, name in enumerate(JOINT_NAMES)}
+FIRST_FINGER = JOINT_INDEX["left_index1"]
+"""The joints from here on are those of the fingers, three of each."""
 
 
 def ancestors(joint: int) -> tuple[int, ...]:

@@ -21,8 +21,6 @@ Rows = Callable[[slice, np.ndarray], np.ndarray]
 points). Each value has R components, and m is the number of unknowns on which it depends.
 """
 
-_CHUNK = 8  # frames whose rows are computed at a time: few enough to stay in the cache
-
 
 class BandedEquations:
     """Sums of weighted J^T J and J^T r of all terms, by the n = 174 unknowns of T frames.
@@ -149,8 +147,10 @@ class BandedEquations:
         # leave out negligible weights, as of most vertices of a contact patch, to save their rows
         counts = couplings[0] > 1e-7 * couplings[0].max(initial=0.0)
 
+        chunk = 8  # frames whose rows are computed at a time: few enough to stay in the cache
+
         def add_chunk(start: int) -> None:
-            stop = min(start + _CHUNK, frames)
+            stop = min(start + chunk, frames)
             last = min(stop + ahead, frames)
             used = np.flatnonzero(counts[start:last].any(axis=0))
             if not len(used):
@@ -175,7 +175,7 @@ class BandedEquations:
                 if not stiff:
                     self.damped[here, columns] += block.diagonal(axis1=1, axis2=2)
 
-        self._threads.map(add_chunk, range(0, frames, _CHUNK))
+        self._threads.map(add_chunk, range(0, frames, chunk))
 
 
 def _over_stencil(factors: Sequence[float] | np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -15,8 +15,8 @@ import numpy as np
 from intercap_core.geometry.rigid.distance import DistanceField, SurfacePart
 from intercap_core.joint.state import frame_chunks
 
-# Distances in metres below which the face's normal replaces the direction: the surface's points err
-# by 1e-6 (single precision), and the direction by more than 1 %.
+# Distance in metres below which the face's normal replaces the direction to the closest point. The
+# direction errs by 1 % or more there: points of the surface err by up to 1e-6 (single precision).
 ON_SURFACE = 1e-4
 
 SearchableSurface = DistanceField | SurfacePart

@@ -10,14 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from intercap_core.body.joints import JOINT_INDEX
+from intercap_core.body.joints import FIRST_FINGER
 from intercap_core.body.model import BodyModel
 from intercap_core.body_fit.surface import choose_samples
 from intercap_core.schemas import CONTACT_REGIONS
 
 VERTICES_PER_MEASUREMENT = 10.0  # neighbours have the same error and count as one; tuned
-
-_FIRST_FINGER_JOINT = JOINT_INDEX["left_index1"]  # three joints per finger from here on
 
 
 @dataclass(frozen=True)
@@ -47,8 +45,8 @@ def contact_patches(model: BodyModel) -> Patches:
         kept = ids[farthest_points(template[ids], 240)]
         part = np.full(len(kept), -1)  # the palm, or the only patch
         if name.endswith("_hand"):
-            finger = joint_of[kept] >= _FIRST_FINGER_JOINT
-            part[finger] = (joint_of[kept][finger] - _FIRST_FINGER_JOINT) // 3  # number of finger
+            finger = joint_of[kept] >= FIRST_FINGER
+            part[finger] = (joint_of[kept][finger] - FIRST_FINGER) // 3  # number of finger
         for value in np.unique(part):
             members = kept[part == value]
             vertices.append(members)
