@@ -12,10 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from intercap_core.body.parameters import NUM_POSE
 
-# Smallest number of trial bridges over known frames to estimate the error of a bridge. Tuned on the
-# studio.
-_FEWEST_BRIDGES = 5
-
 
 def bridge(vectors: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Return parameter vectors with the unknown rows interpolated.
@@ -129,8 +125,8 @@ def bridged_sigma(
     """Return the standard deviation (T, J) of joints after bridging, metres.
 
     The error of a bridged frame is measured on the known frames: all trial bridges with the same
-    knots relative to the frame are compared with the fits. If less than five are possible, the
-    error is the usual speed of the joint times the time to the nearest known frame. The larger
+    knots relative to the frame are compared with the fits. If less than five are possible (tuned),
+    the error is the usual speed of the joint times the time to the nearest known frame. The larger
     deviation of the two ends is added in quadrature.
 
     Args:
@@ -154,7 +150,7 @@ def bridged_sigma(
         steps = knots - t
         tried = np.arange(max(0, -steps.min()), len(known) - max(0, steps.max()))
         tried = tried[known[tried] & np.all([known[tried + step] for step in steps], axis=0)]
-        if len(tried) < _FEWEST_BRIDGES:
+        if len(tried) < 5:
             off = np.minimum(speed * seconds[t], 0.5)  # an arm's length
         else:
             built = np.tensordot(weights[0], [joints[tried + step] for step in steps], 1)
@@ -166,7 +162,7 @@ def bridged_sigma(
 def _speed(joints: np.ndarray, known: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Return the usual speed (J,) along one coordinate, m/s, between adjacent known frames."""
     pairs = np.flatnonzero(known[1:] & known[:-1])
-    if len(pairs) < _FEWEST_BRIDGES:
+    if len(pairs) < 5:  # as few as for trial bridges
         return np.full(joints.shape[1], 1.0)  # speed of a walk
     moved = (joints[pairs + 1] - joints[pairs]) / np.diff(times)[pairs, None, None]
     # at least 0.1 m/s: a standing person sways

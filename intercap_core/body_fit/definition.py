@@ -21,7 +21,9 @@ from intercap_core.schemas import BODY_FIT
 
 POINTS = tuple(KEYPOINT_NAMES[BODY])
 _COLUMNS = ("point", "x_mm", "y_mm", "z_mm", "sigma_mm")
-UNKNOWN_SIGMA_M = 0.010  # of an offset without a definition; tuned on the studio
+# Of an offset without a definition, tuned on the studio: a detector's hip is 10 to 25 mm away from
+# the model's (docs/decisions.md).
+UNKNOWN_SIGMA_M = 0.010
 FITTED_SIGMA_M = 0.003  # least value of a definition: offsets are fitted to 3 mm, measured
 
 
