@@ -17,11 +17,9 @@ from intercap_core.body.keypoints import CONTOUR, FACE, KEYPOINT_NAMES, LEFT_HAN
 from intercap_core.body_fit.keypoint_term import KEYPOINT_SCALE
 from intercap_core.schemas import BODY_PARTS
 
-# Median length of a normal error in three dimensions, in standard deviations along one coordinate.
-MEDIAN_CHI_3 = 1.5382
-
 # Standard deviation along one coordinate beyond which a part is undetermined, metres. At this
-# value half of its joints have errors above 40 mm (MEDIAN_CHI_3).
+# value half of its joints have errors above 40 mm: the median length of a normal error in three
+# dimensions is 1.54 standard deviations.
 LARGEST_SIGMA_M = 0.026
 # The same for hands: half of the joints have errors above 20 mm, the distance between fingers
 # (anatomy).

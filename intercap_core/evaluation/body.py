@@ -16,6 +16,9 @@ BOTH_HANDS = slice(25, 55)
 # Median length of a 3D normal error, in standard deviations of one coordinate: the median of the
 # chi distribution with three degrees of freedom.
 MEDIAN_CHI_3 = 1.5382
+# A body with a larger mean vertex error is bad, metres: its frame should be flagged
+# (docs/evaluation.md).
+BAD_BODY_M = 0.040
 
 
 def vertex_error(vertices: np.ndarray, true_vertices: np.ndarray) -> np.ndarray:

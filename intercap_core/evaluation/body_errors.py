@@ -17,7 +17,7 @@ from intercap_core.body.joints import JOINT_NAMES
 from intercap_core.body.model import BodyModel
 from intercap_core.config import BodyModels
 from intercap_core.evaluation import body, contact
-from intercap_core.evaluation.figures import BAD_BODY_M, Figures
+from intercap_core.evaluation.figures import Figures
 from intercap_core.evaluation.proximity import (
     DEEPEST_M,
     MeasuredCloud,
@@ -34,7 +34,6 @@ from intercap_core.geometry.rigid.surfaces import face_normals, sample_surface
 from intercap_core.schemas import SCENE, TRUTH
 from intercap_core.sequence_inputs import SequencePaths
 
-EVERY = 5  # every fifth frame is compared with its points: neighbouring frames are redundant
 CLOUD_KEYS = (
     "cloud_to_mesh", "mesh_to_cloud_visible", "cloud_to_mesh_floor", "mesh_to_cloud_visible_floor",
 )  # fmt: skip
@@ -144,12 +143,12 @@ class BodyErrors:
     flagged: np.ndarray
     """(T,) bool: the stage marked the frame as unreliable."""
     clouds: dict[str, np.ndarray] = field(default_factory=dict)
-    """Distances (N,) in every EVERY-th frame, by CLOUD_KEYS."""
+    """Distances (N,) in every fifth frame, by CLOUD_KEYS."""
 
     @property
     def bad(self) -> np.ndarray:
         """Mask (T,) of frames with a vertex error above 40 mm."""
-        return self.pve > BAD_BODY_M
+        return self.pve > body.BAD_BODY_M
 
     @property
     def worst(self) -> int:
@@ -221,7 +220,7 @@ def _surface(
         face, true_face = (body.landmarks(v, keypoints) for v in (vertices, true))
         found["face"][t] = body.landmark_error(face, true_face)
         found["face_aligned"][t] = body.landmark_error(face, true_face, align=True)
-        if t % EVERY == 0:
+        if t % 5 == 0:  # neighbouring frames are redundant
             measured.append(clouds.measure(t, vertices, truth))
     return found, {
         key: np.array([values[key] for values in measured]) for key in CLOUD_KEYS if measured

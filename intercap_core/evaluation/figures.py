@@ -17,6 +17,7 @@ import numpy as np
 from intercap_core import artefacts
 from intercap_core.artefacts import Artefact
 from intercap_core.evaluation import contact, object_errors
+from intercap_core.evaluation.body import BAD_BODY_M
 from intercap_core.evaluation.object_errors import ObjectErrors
 from intercap_core.schemas import METRICS, PER_VERTEX_METRICS
 from intercap_core.stage_list import ESTIMATES
@@ -29,7 +30,6 @@ SUMMARY_TRUTH = (
 SUMMARY_PENETRATION = (
     "mean_mm", "median_mm", "p98_mm", "share_le_5mm", "share_le_7mm", "share_le_20mm",
 )  # fmt: skip
-BAD_BODY_M = 0.040  # a frame with a larger mean vertex error is bad and should have been flagged
 _PER_VERTEX = PER_VERTEX_METRICS | {"object_sample_points", "object_sample_contact"}
 
 Figures = dict[str, float]

@@ -8,7 +8,7 @@ from intercap_core.evaluation.body import MEDIAN_CHI_3
 from intercap_core.geometry.camera.transforms import rotation_log
 from intercap_core.geometry.rigid.symmetry import SymmetryGroup
 
-# A pose with a larger error of either kind is lost.
+# A pose with a larger error of either kind is lost (docs/evaluation.md).
 LOST_TRANSLATION_M = 0.050
 LOST_ROTATION_DEG = 20.0
 

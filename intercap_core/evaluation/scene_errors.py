@@ -14,7 +14,8 @@ from intercap_core.evaluation.truth import match_times
 from intercap_core.geometry.camera.transforms import invert
 from intercap_core.schemas import FRAMES, SCENE, TRUTH
 
-CUBE_SIDE_M = 2.0  # side of the cube over which displacements are averaged
+# Side of the cube over which displacements are averaged (docs/evaluation.md).
+CUBE_SIDE_M = 2.0
 
 
 def rig_centre(master_from_camera: np.ndarray) -> np.ndarray:
@@ -51,7 +52,8 @@ def displacement(
     return np.sqrt((at_centre**2).sum(1) + spread)
 
 
-CAPTURE_RADIUS_M = 1.5  # radius of the capture area on the floor around the rig's centre
+# Radius of the capture area on the floor around the rig's centre (docs/evaluation.md).
+CAPTURE_RADIUS_M = 1.5
 MEDIAN_CHI_1 = 0.6745  # median of |x| for a standard normal x
 
 

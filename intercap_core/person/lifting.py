@@ -26,7 +26,6 @@ from intercap_core.geometry.camera.triangulation import Triangulation
 from intercap_core.person.groups import NOBODY
 from intercap_core.person.sides import ARMS, BODY_POINTS, LEGS
 
-MIN_DEPTH_SAMPLES = 4  # least number of depth pixels around a keypoint; tuned on the studio
 # Depth of a keypoint below the skin, metres: measured on the open body, standing, as the median
 # over all horizontal directions. Keypoints without an entry lie on the skin.
 INSET_M = {
@@ -89,9 +88,10 @@ class DepthRelief:
         """Points (K, 3), master frame, metres, of keypoints at ``pixels`` (K, 2); NaN = unknown.
 
         The surface at a keypoint is the median depth of the nearest layer, 5 cm thick, within 3 cm
-        of its pixel. Background pixels are only used if too few others are near. Such a point is
-        kept if its distance is within 25 cm of the median of the other points, or if there are
-        fewer than six others: a person who stands still for long is part of the background.
+        of its pixel, of at least four pixels. Background pixels are only used if fewer than four
+        others are near. Such a point is kept if its distance is within 25 cm of the median of the
+        other points, or if there are fewer than six others: a person who stands still for long is
+        part of the background.
 
         Args:
             seen: (K,) bool, keypoints to lift.
@@ -109,14 +109,14 @@ class DepthRelief:
             away = np.abs(self.pixels[near] - pixels[k]).max(1)
             around_it = np.asarray(near, int)[away < reach[near]]
             before = around_it[~self.room[around_it]]
-            of_room[k] = len(before) < MIN_DEPTH_SAMPLES
+            enough = 4  # pixels; at 3 m, a Kinect has about 25 of these within 3 cm of a point
+            of_room[k] = len(before) < enough
             distances = self.distance[around_it if of_room[k] else before]
-            if len(distances) < MIN_DEPTH_SAMPLES:
+            if len(distances) < enough:
                 continue
             nearest = np.quantile(distances, 0.2)  # the closest samples may be flying pixels
-            surface = np.median(
-                distances[distances < nearest + 0.05]
-            )  # metres; tuned on the studio
+            layer = distances < nearest + 0.05  # metres; tuned on the studio
+            surface = np.median(distances[layer])
             result[k] = rays[k] * (surface + inset_m[k])
         away = np.linalg.norm(result, axis=1)
         body = np.isfinite(away) & ~of_room

@@ -39,9 +39,8 @@ from intercap_core.person.tracks import (
 # The score of the person who touches the object most is multiplied by 1 + HANDLING_WEIGHT, that of
 # others in proportion to their contact. Untuned.
 HANDLING_WEIGHT = 4.0
-RIVAL_SHARE = (
-    0.5  # another person of at least this share of the subject's score is reported; untuned
-)
+# Another person of at least this share of the subject's score is reported; untuned.
+RIVAL_SHARE = 0.5
 
 Touches = Callable[[int, int, int], bool | None]
 """Function of set t, camera c and person i of that image: whether the person touches the object.

@@ -87,11 +87,6 @@ def _distance(person: np.ndarray, point: np.ndarray, min_confidence: float) -> f
     return float(away / max(np.ptp(person[seen, :2], axis=0).max(), 1.0))
 
 
-# Tested keypoints, and offsets (9, 2) of the pixels tested around each: itself and a circle.
-_POINTS = np.r_[BODY, LEFT_HAND, RIGHT_HAND]
-_AROUND = np.array([(0, 0), *((np.cos(a), np.sin(a)) for a in np.arange(8) * np.pi / 4)])
-
-
 def touch_test(
     detections: Detections, labels: tuple[str, ...], *, min_confidence: float
 ) -> Touches:
@@ -101,6 +96,9 @@ def touch_test(
     not a person. A person touches it if a keypoint, or a pixel a hand's breadth from it, lies in
     the candidate's mask. Occlusion also causes such overlaps, but in few views only.
     """
+    parts = np.r_[BODY, LEFT_HAND, RIGHT_HAND]
+    # offsets (9, 2) of the tested pixels: the keypoint itself, and eight on a circle around it
+    around = np.array([(0, 0), *((np.cos(a), np.sin(a)) for a in np.arange(8) * np.pi / 4)])
 
     def touches(t: int, c: int, person: int) -> bool | None:
         """See :data:`.subject.Touches`."""
@@ -109,12 +107,12 @@ def touch_test(
             for candidate in detections.candidates(t, c)
             if candidate.label != PERSON_LABEL and (candidate.label in labels or not labels)
         ]
-        points = detections.people(t, c)[person][_POINTS]
+        points = detections.people(t, c)[person][parts]
         points = points[points[:, 2] >= min_confidence, :2]
         if not objects or not len(points):
             return None
         reach = 0.03 * float(np.ptp(points, axis=0).max())  # a hand's breadth (anatomy)
-        x, y = np.rint(points[:, None] + reach * _AROUND).astype(np.int64).reshape(-1, 2).T
+        x, y = np.rint(points[:, None] + reach * around).astype(np.int64).reshape(-1, 2).T
         return any(bool(candidate.runs.sample(x, y).any()) for candidate in objects)
 
     return touches

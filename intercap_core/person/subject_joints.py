@@ -28,8 +28,6 @@ from intercap_core.person.sides import LIMBS, PARTNER, exchange_everywhere, exch
 # Largest angular speed of a keypoint, rad/s: hands reach 5 m/s in everyday tasks, at two metres
 # from the cameras of a ring. Faster jumps in an image are wrong detections.
 MAX_IMAGE_SPEED_RAD_S = 2.5
-# A limb is exchanged if its cost falls at least to this share; tuned on the studio.
-MUCH_BETTER = 0.5
 
 
 def at_set_times(
@@ -189,8 +187,9 @@ def _exchange(
             )
             for side in (limb, PARTNER[limb])
         )
-        # 0.25: the root mean square error is half of the limit; tuned on the studio
-        t, c = np.nonzero((detected > 0.25) & (other < MUCH_BETTER * detected))
+        # detected > 0.25: the root mean square error is more than half of the limit. The exchange
+        # must halve the cost at least. Both are tuned on the studio.
+        t, c = np.nonzero((detected > 0.25) & (other < 0.5 * detected))
         exchange_limb(keypoints, t, c, limb)
         exchanged |= len(t) > 0
     return exchanged

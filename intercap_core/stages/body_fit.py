@@ -26,12 +26,11 @@ from intercap_core.body_fit.uncertainty import deviation, joint_covariance, wide
 from intercap_core.config import BodyFitSettings, BodyModels, digest
 from intercap_core.entries import SubjectEntry
 from intercap_core.errors import UserError
+from intercap_core.evaluation.body import BAD_BODY_M, MEDIAN_CHI_3
 from intercap_core.schemas import BODY_FIT, BODY_PARTS
 
 # Median trunk keypoint error from which the fit is not of the subject's body; tuned on the studio.
 WRONG_TRUNK_M = 0.06
-# Mean vertex error of a bad body, metres, as in the metrics (evaluation.figures).
-BAD_BODY_M = 0.040
 
 
 def run(
@@ -159,7 +158,7 @@ def _state_uncertainty(
     jumped[fitted] = measure_jumps(joints[fitted].astype(float), times[fitted], least[fitted])
     sigma[fit.frames] = np.hypot(
         quality.widen_sigma(deviation(stated), fit.parts),
-        jumped[fit.frames] / quality.MEDIAN_CHI_3,
+        jumped[fit.frames] / MEDIAN_CHI_3,
     )
     undetermined = np.ones((count, len(BODY_PARTS)), bool)
     undetermined[fit.frames] = quality.flag_undetermined(sigma[fit.frames], fit.parts)

@@ -22,7 +22,6 @@ Window = tuple[slice, slice]
 
 _MIN_DEPTH, _MILLIMETRE = np.float32(MIN_DEPTH_M), np.float32(1e-3)
 _ONE, _HALF = np.float32(1), np.float32(0.5)
-_NO_BACKGROUND = np.zeros((0, 0), np.uint16)
 
 
 def mask_window(depth: np.ndarray, camera: Camera, mask: Runs) -> Window | None:
@@ -79,7 +78,7 @@ def mask_pixels(
     spacing = max(colour.fx / camera.depth.fx, colour.fy / camera.depth.fy, 1.0)
     return _mask_pixels(
         depth,
-        _NO_BACKGROUND if background is None else background,
+        np.zeros((0, 0), np.uint16) if background is None else background,
         int(1000 * before_m),
         (rows.start, rows.stop),
         (columns.start, columns.stop),

@@ -16,7 +16,9 @@ from intercap_core.geometry.camera import projection
 from intercap_core.geometry.camera.rig import Rig
 from intercap_core.geometry.camera.transforms import apply
 
-MIN_PARALLAX_DEG = 4.0  # two rays with a smaller angle between them give no depth
+# Two rays with a smaller angle between them give no depth: its error would be more than 14 times
+# (1 / sin 4 degrees) that across the rays.
+MIN_PARALLAX_DEG = 4.0
 
 
 @dataclass(frozen=True)

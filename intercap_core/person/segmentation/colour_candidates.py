@@ -24,12 +24,7 @@ from intercap_core.person.segmentation.candidate_masks import (
 )
 from intercap_core.person.segmentation.person_volume import MovingPerson
 
-# Length of the background's colour vector, grey levels, below which its direction is unreliable;
-# tuned on the studio.
-DARK = 40.0
 COLOUR_SCALE = 2  # images are decoded at half size, which takes a quarter of the time for JPEG
-# Least number of images that show a pixel without the person, for a known background; untuned.
-MIN_COLOUR_SAMPLES = 3
 
 
 class ColourSegmenter:
@@ -99,9 +94,10 @@ class ColourSegmenter:
             if image is not None:
                 images.append(image)
                 people.append(draw_volume(bones, self._rig[c], image.shape[:2], 5.0))
-        if len(images) < MIN_COLOUR_SAMPLES:
+        if not images:
             return None
-        return median_background(np.stack(images), np.stack(people))
+        median, known = median_background(np.stack(images), np.stack(people))
+        return (median, known) if known.any() else None
 
     def _rle(self, mask: np.ndarray, camera: Camera) -> bytes:
         """RLE at full size of a mask (H, W) at half size that is not empty."""
@@ -115,7 +111,8 @@ class ColourSegmenter:
 def median_background(images: np.ndarray, people: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Median colour (H, W, 3) float32 without the person, and mask (H, W) of known pixels.
 
-    The images are first multiplied to match the exposure of the first one.
+    A pixel is known if at least three images show it without the person: of fewer, the median does
+    not reject an outlier. The images are first multiplied to match the exposure of the first one.
 
     Args:
         images: (S, H, W, 3) uint8.
@@ -128,7 +125,7 @@ def median_background(images: np.ndarray, people: np.ndarray) -> tuple[np.ndarra
     middle = np.maximum(seen - 1, 0) // 2
     median = np.take_along_axis(np.sort(values, 0), middle[None, ..., None], 0)[0]
     median[seen == 0] = 0
-    return median, seen >= MIN_COLOUR_SAMPLES
+    return median, seen >= 3
 
 
 def find_foreground(image: np.ndarray, background: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -151,7 +148,8 @@ def _changed(image: np.ndarray, background: np.ndarray, gain: np.ndarray) -> np.
 
     A pixel's colour is split into a multiple of the background's colour (brightness) and the rest
     (colour deviation). A pixel has changed if the deviation exceeds 14 grey levels or the
-    brightness leaves 0.5 to 1.4: a shadow only darkens to half. Where the background is dark, a
+    brightness leaves 0.5 to 1.4: a shadow only darkens to half. Where the background is dark, its
+    colour vector shorter than 40 grey levels, the direction of the vector is unreliable; there, a
     difference of 30 grey levels in any channel counts. Thresholds are tuned on the studio.
     """
     height, width, channels = image.shape
@@ -166,7 +164,7 @@ def _changed(image: np.ndarray, background: np.ndarray, gain: np.ndarray) -> np.
                 along += seen * known
                 length += seen * seen
                 largest = max(largest, abs(seen - known))
-            if power < DARK * DARK:
+            if power < 40.0 * 40.0:
                 changed[y, x] = largest > 30.0
                 continue
             brightness = along / power
@@ -182,7 +180,7 @@ def _gain(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """
     few = np.s_[::16, ::16]
     a, b = image[few].astype(np.float32), reference[few].astype(np.float32)
-    good = (a > DARK / 2) & (a < 250) & (b > DARK / 2) & (b < 250)  # neither dark nor saturated
+    good = (a > 20) & (a < 250) & (b > 20) & (b < 250)  # neither dark nor saturated
     gains = np.ones(3, np.float32)
     for channel in range(3):
         use = good[..., channel]

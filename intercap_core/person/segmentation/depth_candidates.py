@@ -38,22 +38,19 @@ from intercap_core.person.segmentation.foreground import (
 )
 from intercap_core.person.segmentation.person_volume import FAR, MovingPerson, distance_outside
 from intercap_core.person.segmentation.static_objects import (
+    CELL_M,
     box_diagonal,
     components,
     find_static_objects,
 )
 
-# Distances from the person are in margins, the uncertainty of the volume's surface, see
-# :mod:`.person_volume`. All values are tuned on the studio.
-PERSON_MARGINS = 1.5  # foreground up to this distance is the person
-NEAR_CUT = 1.0  # smaller of the two distances from which an object's points are collected
-FAR_CUT = 2.5  # larger of the two distances
-CLOTHING_MARGINS = 2.2  # a component that stays within this distance is clothing
-AROUND_PATH_M = 1.5  # largest distance of objects from the person's path, metres
-MAX_COMPONENTS = 6  # largest number of components of one kind in one frame set
-CELL_M = 0.02  # side of a cluster's cells; points of one surface 4 m away are 8 mm apart
-FLOOR_M = 0.025  # points lower than this above the floor are left out
-MIN_POINTS = 40  # least number of points of a component, over all views
+# The two distances from the person beyond which an object's points are collected, in margins: the
+# uncertainty of the volume's surface, see :mod:`.person_volume`. Tuned on the studio.
+NEAR_CUT, FAR_CUT = 1.0, 2.5
+CLOTHING_MARGINS = 2.2  # a component that stays within this distance is clothing; tuned likewise
+AROUND_PATH_M = 1.5  # largest distance of objects from the person's path; tuned on the studio
+MAX_COMPONENTS = 6  # of one kind in one frame set; tuned on the studio
+MIN_POINTS = 40  # least number of points of a component, over all views; tuned on the studio
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +121,9 @@ class DepthSegmenter:
         above = 0.7 if upright else AROUND_PATH_M  # metres above the highest keypoint; tuned
         self._high = everywhere.max(0) + np.array([AROUND_PATH_M, AROUND_PATH_M, above])
         if grounded:
-            self._low[2] = FLOOR_M
+            # points lower than 25 mm may be floor: the systematic error of depth is up to 11 mm +
+            # 0.1 % of depth (Azure Kinect DK data sheet)
+            self._low[2] = 0.025
         views = [self._views[c] for c in self.cameras]
         backgrounds = [
             DepthBackground.of(
@@ -330,7 +329,8 @@ def _masks(seen: _ViewPoints, number: int, proposed: list[_Component]) -> ViewSe
     points in the view have no mask.
     """
     visible = seen.cells.visible()
-    person = seen.moving & (seen.outside < PERSON_MARGINS)
+    # foreground up to 1.5 margins from the volume is the person; tuned on the studio
+    person = seen.moving & (seen.outside < 1.5)
     candidates = []
     for index, component in enumerate(proposed):
         members = component.members[number]

@@ -29,9 +29,6 @@ from intercap_core.person.segmentation.person_volume import distance_outside
 # (Toelgyessy et al., Sensors 21(2):413, 2021).
 BEFORE_MM = 15.0
 BEFORE_PER_DEPTH = 0.005
-# A pixel has no background if this share of the images measures something farther, or nothing.
-# Tuned on the studio.
-GONE_SHARE = 0.08
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +50,7 @@ class DepthBackground:
 
         Args:
             background: (H, W) uint16 mm.
-            images: samples of the recording, (H, W) uint16 mm.
+            images: at most 25 samples of the recording, (H, W) uint16 mm.
             reach_mm: (H, W) see :attr:`reach`.
         """
         tolerance = (BEFORE_MM + BEFORE_PER_DEPTH * background).astype(np.uint16)
@@ -62,7 +59,8 @@ class DepthBackground:
         for image in images:
             absent = ((image == 0) | (image > behind)).view(np.uint8)
             gone += cv2.medianBlur(absent, 5)  # removes single pixels without a measurement
-        often = (gone >= max(2, GONE_SHARE * len(images))).view(np.uint8)
+        # in one image, a pixel may also lack a measurement by chance
+        often = (gone >= 2).view(np.uint8)
         # narrow strips are edges of furniture, where measurements often fail: they stay background
         not_static = cv2.morphologyEx(often, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
         depth = np.where(not_static > 0, 0, background).astype(np.uint16)

@@ -45,9 +45,9 @@ LIMB_RADII_M: dict[tuple[str, str], tuple[float, float, float]] = {
 }
 FINGER_RADII_M = (0.012, 0.010, 0.009)  # at the second joint, third joint and tip (anatomy)
 PALM_RADII_M = (0.024, 0.016)  # at the wrist, at the knuckles (anatomy)
-HAND_MARGIN_M = 0.012  # margin of fingers and palm; tuned on the studio
-BONES_PER_GROUP = 5  # bones with a common bounding ball, skipped together if a point is far from it
-FAR = 20.0  # distances are truncated here, margins
+# Distances are truncated here, margins: 24 cm from a finger, 70 cm from the trunk. A component that
+# far away is certainly not clothing.
+FAR = 20.0
 
 
 def build_bones(joints: np.ndarray, sigma: np.ndarray | None = None) -> np.ndarray:
@@ -98,12 +98,13 @@ def _hand(
         wrist = at[f"{side}_hand_wrist"]
     rows = []
     known = 0
+    margin = 0.012  # of fingers and palm, metres; tuned on the studio
     for finger in ("thumb", "index", "middle", "ring", "pinky"):
         chain = [at[f"{side}_{finger}{i}"] for i in (1, 2, 3)] + [at[f"{side}_{finger}_tip"]]
         known += int(np.isfinite(chain[0]).all())
-        rows.append((wrist, chain[0], *PALM_RADII_M, HAND_MARGIN_M))
+        rows.append((wrist, chain[0], *PALM_RADII_M, margin))
         radii = (PALM_RADII_M[1], *FINGER_RADII_M)
-        rows += [(chain[i], chain[i + 1], radii[i], radii[i + 1], HAND_MARGIN_M) for i in range(3)]
+        rows += [(chain[i], chain[i + 1], radii[i], radii[i + 1], margin) for i in range(3)]
     if known >= 3:
         return rows
     along = wrist - at[f"{side}_elbow"]
@@ -125,19 +126,20 @@ def distance_outside(points: np.ndarray, bones: np.ndarray) -> np.ndarray:
 
     Negative inside, at most ``FAR``. ``bones``: (B, 9), see :func:`build_bones`.
     """
-    groups = range(0, len(bones), BONES_PER_GROUP)
+    size = 5  # bones in a group; affects the speed only
+    groups = range(0, len(bones), size)
     balls = np.zeros((len(groups), 5), np.float32)  # bounding balls of groups, largest margin
     for row, first in zip(balls, groups, strict=True):
-        some = bones[first : first + BONES_PER_GROUP]
+        some = bones[first : first + size]
         ends = some[:, :6].reshape(-1, 3)
         row[:3] = (ends.min(0) + ends.max(0)) / 2
         row[3] = np.linalg.norm(ends - row[:3], axis=1).max() + some[:, 6:8].max()
         row[4] = some[:, 8].max()
-    return _outside(points, bones, balls)
+    return _outside(points, bones, balls, size)
 
 
 @numba.njit(cache=True, fastmath=True)
-def _outside(points: np.ndarray, bones: np.ndarray, balls: np.ndarray) -> np.ndarray:
+def _outside(points: np.ndarray, bones: np.ndarray, balls: np.ndarray, size: int) -> np.ndarray:
     """Kernel of :func:`distance_outside`: for each point, the minimum over all bones.
 
     The distance from a bone is (distance from its axis - radius at the foot point) / margin. The
@@ -146,35 +148,37 @@ def _outside(points: np.ndarray, bones: np.ndarray, balls: np.ndarray) -> np.nda
     ball, widened by the current minimum times the group's largest margin, does not contain the
     point; this is exact. Square roots are only taken for bones that lower the minimum.
 
-    ``balls``: (G, 5) centre, radius and largest margin of each group.
+    Args:
+        points: (N, 3) float32.
+        bones: (B, 9), see :func:`build_bones`.
+        balls: (G, 5) centre, radius and largest margin of each group.
+        size: number of successive bones in a group.
     """
     result = np.empty(len(points), np.float32)
     for i in range(len(points)):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         nearest = np.float32(FAR)
-        near = True
-        for b in range(len(bones)):
-            if b % BONES_PER_GROUP == 0:
-                g = b // BONES_PER_GROUP
-                ux, uy, uz = px - balls[g, 0], py - balls[g, 1], pz - balls[g, 2]
-                reach = balls[g, 3] + max(nearest, np.float32(0)) * balls[g, 4]
-                near = ux * ux + uy * uy + uz * uz < reach * reach
+        for g in range(len(balls)):
+            ux, uy, uz = px - balls[g, 0], py - balls[g, 1], pz - balls[g, 2]
+            reach = balls[g, 3] + max(nearest, np.float32(0)) * balls[g, 4]
+            near = ux * ux + uy * uy + uz * uz < reach * reach
             if not near:
                 continue
-            ax, ay, az = bones[b, 0], bones[b, 1], bones[b, 2]
-            dx, dy, dz = bones[b, 3] - ax, bones[b, 4] - ay, bones[b, 5] - az
-            ux, uy, uz = px - ax, py - ay, pz - az
-            length = dx * dx + dy * dy + dz * dz
-            share = np.float32(0)
-            if length > 1e-10:
-                share = (ux * dx + uy * dy + uz * dz) / length
-                share = min(max(share, np.float32(0)), np.float32(1))
-            ux, uy, uz = ux - share * dx, uy - share * dy, uz - share * dz
-            radius = bones[b, 6] + share * (bones[b, 7] - bones[b, 6])
-            reach = radius + nearest * bones[b, 8]
-            away = ux * ux + uy * uy + uz * uz
-            if reach > 0 and away < reach * reach:
-                nearest = (np.sqrt(away) - radius) / bones[b, 8]
+            for b in range(g * size, min((g + 1) * size, len(bones))):
+                ax, ay, az = bones[b, 0], bones[b, 1], bones[b, 2]
+                dx, dy, dz = bones[b, 3] - ax, bones[b, 4] - ay, bones[b, 5] - az
+                ux, uy, uz = px - ax, py - ay, pz - az
+                length = dx * dx + dy * dy + dz * dz
+                share = np.float32(0)
+                if length > 1e-10:
+                    share = (ux * dx + uy * dy + uz * dz) / length
+                    share = min(max(share, np.float32(0)), np.float32(1))
+                ux, uy, uz = ux - share * dx, uy - share * dy, uz - share * dz
+                radius = bones[b, 6] + share * (bones[b, 7] - bones[b, 6])
+                reach = radius + nearest * bones[b, 8]
+                away = ux * ux + uy * uy + uz * uz
+                if reach > 0 and away < reach * reach:
+                    nearest = (np.sqrt(away) - radius) / bones[b, 8]
         result[i] = nearest
     return result
 

@@ -17,11 +17,7 @@ from scipy.spatial import cKDTree
 
 from intercap_core.person.segmentation.foreground import DepthBackground, DepthView
 
-STATIC_CELL_M = 0.025  # side of the cells of components; tuned on the studio
-SURFACE_CELL_M = 0.02  # side of the cells of a surface; tuned on the studio
-SURFACE_POINTS = 2  # least number of points in an occupied cell of a surface; tuned on the studio
-# Least number of points of a static component, over all views; tuned on the studio.
-MIN_STATIC_POINTS = 60
+CELL_M = 0.02  # side of the cells of a surface; a Kinect's points 4 m away are 8 mm apart
 _BITS = 21  # bits of each coordinate in a cell's integer key
 
 
@@ -137,8 +133,18 @@ def find_static_objects(
     view_of = np.concatenate(owner) if owner else np.zeros(0, np.int32)
     # the person's path, on a grid of 10 cm
     walked = np.unique(np.round(joints / 0.10), axis=0) * 0.10
-    surface = OccupiedCells(points, SURFACE_CELL_M, SURFACE_POINTS)
     objects: list[StaticObject] = []
+
+    def occupied(own: np.ndarray) -> OccupiedCells:
+        """Cells of the points ``own`` (N, 3); a single point may be a wrong measurement."""
+        return OccupiedCells(own, CELL_M, 2)
+
+    def connected(chosen: np.ndarray) -> list[np.ndarray]:
+        """Components of the points with indices ``chosen``: their indices into ``points``.
+
+        Cells are 2.5 cm wide, and a component has at least 60 points; tuned on the studio.
+        """
+        return [chosen[own] for own in components(points[chosen], 0.025, 60)]
 
     def add(members: np.ndarray, on_top: bool, carries: bool) -> None:
         """Append the component of points ``members`` to ``objects`` if size and distance fit."""
@@ -147,17 +153,15 @@ def find_static_objects(
         # largest size of an object that one person handles, and reach, metres; tuned on the studio
         if size < 2.2 and away < 0.35:
             pixels = [pixel[members[view_of[members] == v]] for v in range(len(views))]
-            cells = OccupiedCells(own, SURFACE_CELL_M, SURFACE_POINTS)
-            objects.append(StaticObject(size, away, on_top, carries, pixels, cells))
+            objects.append(StaticObject(size, away, on_top, carries, pixels, occupied(own)))
 
-    for members in components(points, STATIC_CELL_M, MIN_STATIC_POINTS):
-        top = _above_level(points, members)
-        above = [top[own] for own in components(points[top], STATIC_CELL_M, MIN_STATIC_POINTS)]
+    for members in connected(np.arange(len(points))):
+        above = connected(_above_level(points, members))
         add(members, False, bool(above))
         for standing in above:
             add(standing, True, False)
     objects.sort(key=lambda item: item.away_m)
-    return objects[:8], surface
+    return objects[:8], occupied(points)
 
 
 def _away(points: np.ndarray, places: np.ndarray) -> float:
