@@ -107,7 +107,7 @@ _VERTICES = 6890  # of SMPL and SMPL-H
 _JOINTS = {156: 52, 72: 24}  # of SMPL-H and SMPL, by the numbers of a pose
 _BODY_JOINTS = 22  # pelvis to wrists, in one order in SMPL, SMPL-H and SMPL-X
 _HAND_JOINTS = slice(22, 52)  # of SMPL-H, in SMPL-X's order
-_SMPLX_HANDS = slice(25, 55)
+_SMPLX_HANDS = slice(25, 55)  # of the 55 joints of SMPL-X: after the jaw and the two eyes
 
 
 class Skin(NamedTuple):

@@ -26,9 +26,9 @@ from intercap_core.errors import UserError
 
 log = logging.getLogger(__name__)
 
-BEAT_S = 5.0
+BEAT_S = 5.0  # between two heartbeats
 EXPIRES_S = 30.0  # above the 3 to 10 s for which NFS clients cache a date that changes every 5 s
-_POLL_S = 1.0
+_POLL_S = 1.0  # between two attempts to acquire a lease that is held
 
 
 @dataclass(frozen=True)

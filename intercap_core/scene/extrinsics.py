@@ -92,8 +92,7 @@ def refine(
 
     1. Biases and offsets are estimated at the given poses, then together with all poses.
     2. All given poses are kept unless the residuals of one kind of data improve and those of no
-    kind
-       get worse: held-out background, held-out moving surfaces, keypoints.
+       kind get worse: held-out background, held-out moving surfaces, keypoints.
     3. Otherwise each camera's refined and given pose are compared (:mod:`.camera_verdicts`). If
        some keep the given pose, the others are refined around them.
 

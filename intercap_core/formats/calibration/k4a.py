@@ -57,8 +57,8 @@ DEPTH_MODES = {
     "WFOV_2X2BINNED": Mode((512, 512), (0, 0), (512, 512)),
     "WFOV_UNBINNED": Mode((1024, 1024), (0, 0), (1024, 1024)),
 }
-# Positions of k1, k2, p1, p2, k3, k4, k5, k6 among the JSON's ModelParameters. Their order is cx,
-# cy, fx, fy, k1, k2, k3, k4, k5, k6, codx, cody, p2, p1.
+# Positions of k1, k2, p1, p2, k3, k4, k5, k6 among the ModelParameters of the JSON that an Azure
+# Kinect stores. Their order is cx, cy, fx, fy, k1, k2, k3, k4, k5, k6, codx, cody, p2, p1.
 DISTORTION_POSITIONS = (4, 5, 13, 12, 6, 7, 8, 9)
 
 

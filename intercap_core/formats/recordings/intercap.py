@@ -24,7 +24,7 @@ from intercap_core.geometry.camera.intrinsics import Intrinsics
 from intercap_core.inputs.documents import read_json
 from intercap_core.inputs.files import UnreadableFile
 
-FPS = 30.0  # of the release
+FPS = 30.0  # of the release, whose Azure Kinects record at their highest rate
 CAMERA_FOLDER = re.compile(r"frames_cam(\d{1,2})", re.IGNORECASE)
 COLOUR_FOLDER = re.compile(r"colou?r", re.IGNORECASE)
 DEPTH_FOLDER = re.compile(r"depth.*", re.IGNORECASE)
