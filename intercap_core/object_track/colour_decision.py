@@ -26,11 +26,7 @@ from intercap_core.object_track.fit import FittedPose, seen_by
 from intercap_core.object_track.hypotheses import RIVAL_PROBABILITY, Hypotheses
 from intercap_core.object_track.observer import Observer
 from intercap_core.object_track.proposals import KEY_FRAME_S
-from intercap_core.object_track.view_report import ASSESS_MIN_OVERLAP, choose_candidate
-
-PATCHES_ACROSS = (
-    12  # per diameter: patches of a cup are 1 cm, two pixels at 3 m; tuned on the studio
-)
+from intercap_core.object_track.view_report import choose_candidate
 
 
 class ColourDecision:
@@ -41,7 +37,8 @@ class ColourDecision:
         self._observer = observer
         self._hypotheses = hypotheses
         self._absent = absent
-        self._size = observer.mesh.diameter / PATCHES_ACROSS
+        # metres: patches of a cup are 1 cm, two pixels at 3 m; tuned on the studio
+        self._patch_size = observer.mesh.diameter / 12
         self._seen: dict[tuple[int, int], SurfaceColours | None] = {}
         self._pictures: tuple[int, list[np.ndarray | None]] | None = None
 
@@ -114,7 +111,7 @@ class ColourDecision:
         if len(kept) < 3:
             return None
         views = len(self._observer.views(kept[0].frame))
-        return Appearance(kept, views, self._observer.paint, self._size)
+        return Appearance(kept, views, self._observer.paint, self._patch_size)
 
     def _paint_log_ratio(self, learnt: Appearance) -> float:
         """Return the evidence of the mesh's own colours for the poses of the learnt frames, nats.
@@ -166,14 +163,14 @@ class ColourDecision:
         parts = []
         for number, (view, shot, drawn) in enumerate(zip(views, shots, renderings, strict=True)):
             picture = pictures[number]
-            candidate = choose_candidate(view, drawn, ASSESS_MIN_OVERLAP, observer.labels)
+            candidate = choose_candidate(view, drawn, observer.labels)
             if picture is None or candidate is None:
                 continue
             patch, face, colour = seen_patches(
                 drawn.depth, drawn.face, drawn.x0, drawn.y0,
                 candidate.mask.mask, candidate.mask.x0, candidate.mask.y0,
                 shot.lens.rays, picture, LIGHT, np.linalg.inv(shot.camera_from_mesh),
-                mesh.face_normals, self._size, steep_cosine,
+                mesh.face_normals, self._patch_size, steep_cosine,
             )  # fmt: skip
             if len(patch):
                 normals = mesh.face_normals[face] @ poses[number][:3, :3].T

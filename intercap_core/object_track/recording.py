@@ -74,7 +74,7 @@ class ObjectRecording:
         away = camera_distances([rig[c] for c in self.cameras], self.joints)
         self.geometry = [
             ViewGeometry.for_object(
-                rig[c], diameter_m, float(np.nan_to_num(bias[c])), float(late[c]), distance
+                rig[c], diameter_m, distance, float(np.nan_to_num(bias[c])), float(late[c])
             )
             for c, distance in zip(self.cameras, away, strict=True)
         ]

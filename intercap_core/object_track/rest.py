@@ -16,8 +16,9 @@ from intercap_core.geometry.camera.transforms import rotation_exp, step_between
 from intercap_core.object_track.evidence import ERROR_LASTING_S, FrameEvidence
 
 MIN_REST_S = 0.25  # shortest rest; tuned on the studio, as all values below
-BLIP_FRAMES = 2  # nothing moves away and back in so few frames, 0.1 s at 30 Hz; tuned
-MAX_REST_FRAMES = 900  # longest rest of the partition, half a minute at 30 Hz; limits the run time
+# Longest rest of the partition, half a minute at 30 Hz. It limits the run time, which grows with
+# the square of a rest's length: measured, a minute at rest takes 1.5 times as long without it.
+MAX_REST_FRAMES = 900
 # Costs are minus log-likelihoods, nats.
 MOVING_COST = 9.0  # of each independent observation in motion, for the six numbers of a pose; tuned
 REST_COST = 8.0  # of one more rest: its pose, its begin and its end; tuned
@@ -42,7 +43,7 @@ def find_rests(evidence: FrameEvidence, times: np.ndarray, centre: np.ndarray) -
     poses = evidence.poses.copy()
     poses[:, :3, :3] = rotation_exp(own[:, :3]) @ poses[:, :3, :3]
     poses[:, :3, 3] += own[:, 3:]
-    information = _remove_blips(poses, evidence.information)
+    information = evidence.information
     seen = np.trace(information, axis1=1, axis2=2) > 0
     step = float(np.median(np.diff(times))) if count > 1 else ERROR_LASTING_S
     share = min(1.0, step / ERROR_LASTING_S)
@@ -184,15 +185,16 @@ def _trim(segments: np.ndarray, poses: np.ndarray, information: np.ndarray) -> n
 def _merge(
     segments: np.ndarray, poses: np.ndarray, information: np.ndarray, seen: np.ndarray
 ) -> np.ndarray:
-    """Merge neighbouring segments (T,) if one pose for both costs less than another rest.
+    """Merge segments (T,) at most two frames apart if one pose costs less than another rest.
 
-    A single outlier or ``MAX_REST_FRAMES`` may have split a rest.
+    ``MAX_REST_FRAMES`` or one or two outliers may have split a rest: nothing moves away and back in
+    two frames, 0.1 s at 30 Hz.
     """
     result = np.full_like(segments, -1)
     number, last = -1, np.zeros(0, int)
     for old in range(segments.max(initial=-1) + 1):
         rest = np.flatnonzero(segments == old)
-        if len(last) and rest[0] - last[-1] <= BLIP_FRAMES + 1:
+        if len(last) and rest[0] - last[-1] <= 3:
             both = np.concatenate([last, rest])
             spreads = [_spread(poses[i], information[i], seen[i]) for i in (both, last, rest)]
             apart = 0.5 * (spreads[0][-1] - spreads[1][-1] - spreads[2][-1])
@@ -203,34 +205,3 @@ def _merge(
         number, last = number + 1, rest
         result[rest] = number
     return result
-
-
-def _remove_blips(poses: np.ndarray, information: np.ndarray) -> np.ndarray:
-    """Return the information (T, 6, 6), zero for outliers.
-
-    An outlier is one or two frames at another pose between two frames at equal poses. Poses are
-    equal below a squared distance of 10, and different above 25. For equal poses it is a chi square
-    with 6 degrees of freedom, of mean 6.
-    """
-    result = information.copy()
-    for width in range(1, BLIP_FRAMES + 1):
-        inner = np.arange(1, len(poses) - width)
-        if not len(inner):
-            break
-        before, after = inner - 1, inner + width
-        same = _squared_distance(poses, information, before, after) < 10.0
-        for k in range(width):
-            same &= _squared_distance(poses, information, before, inner + k) > 25.0
-        for k in range(width):
-            result[inner[same] + k] = 0
-    return result
-
-
-def _squared_distance(poses: np.ndarray, information: np.ndarray, a: np.ndarray, b: np.ndarray):
-    """Return squared distances (N,) of frames a and b (N,), in standard deviations.
-
-    They are measured in the information of the frame that gives the smaller distance.
-    """
-    offset = step_between(poses[a], poses[b])
-    both = [np.einsum("ni,nij,nj->n", offset, information[i], offset) for i in (a, b)]
-    return np.minimum(*both)

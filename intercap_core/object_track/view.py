@@ -20,8 +20,6 @@ from intercap_core.object_track.reduced_mask import (
     remove_person,
 )
 
-TYPICAL_DISTANCE_M = 2.5  # of the object from a camera of a capture ring, if unknown; studio
-
 
 @dataclass(frozen=True, eq=False)
 class ViewGeometry:
@@ -47,9 +45,9 @@ class ViewGeometry:
         cls,
         camera: Camera,
         diameter_m: float,
+        distance_m: float,
         depth_bias_m: float = 0.0,
         time_offset_s: float = 0.0,
-        distance_m: float = TYPICAL_DISTANCE_M,
     ) -> ViewGeometry:
         """Choose the reduction by the apparent size of the object.
 
@@ -59,9 +57,9 @@ class ViewGeometry:
         Args:
             camera: the camera.
             diameter_m: diameter of the object, metres.
+            distance_m: usual distance of the object from the camera, metres.
             depth_bias_m: as the field.
             time_offset_s: as the field.
-            distance_m: usual distance of the object from the camera, metres.
         """
         angle = diameter_m / distance_m
         step = _step(camera.colour.fx, angle, 80)
@@ -95,11 +93,11 @@ def camera_distances(cameras: Sequence[Camera], joints: np.ndarray) -> list[floa
     Args:
         cameras: C cameras.
         joints: (T, K, 3) of the person, master frame, NaN where unknown. If no joint is known, all
-            distances are ``TYPICAL_DISTANCE_M``.
+            distances are 2.5 m, as usual in a capture ring.
     """
     places = joints[np.isfinite(joints).all(-1)]
     if not len(places):
-        return [TYPICAL_DISTANCE_M] * len(cameras)
+        return [2.5] * len(cameras)
     eyes = [camera.master_from_colour[:3, 3] for camera in cameras]
     return [float(np.median(np.linalg.norm(places - eye, axis=1))) for eye in eyes]
 

@@ -4,7 +4,7 @@ The paper sets its lambdas empirically. Here they follow from the noise and from
 independent pixels of a view. Squared residuals are divided by their variance, and the pixels of a
 term together count as a number of independent samples:
 
-    lambda_depth = DEPTH_SAMPLES n / (n + DEPTH_HALF_SAMPLES_PX) / n / DEPTH_SIGMA_M^2
+    lambda_depth = VIEW_SAMPLES n / (n + DEPTH_HALF_SAMPLES_PX) / n / DEPTH_SIGMA_M^2
     lambda_segm = trust CONTOUR_SAMPLES / m / CONTOUR_SIGMA_PX^2
 
 for each of n depth pixels and m contour pixels (of the mask's contour or of the render's rim,
@@ -18,7 +18,12 @@ import numpy as np
 
 from intercap_core.geometry.rigid.shots import Rendering, Shot
 from intercap_core.object_track import object_depth, object_silhouette
-from intercap_core.object_track.likelihood import CONTOUR_SIGMA_PX, DEPTH_HALF_SAMPLES_PX, log_ratio
+from intercap_core.object_track.likelihood import (
+    CONTOUR_SIGMA_PX,
+    DEPTH_HALF_SAMPLES_PX,
+    VIEW_SAMPLES,
+    log_ratio,
+)
 from intercap_core.object_track.patches import ContourPatch, DepthPatch
 from intercap_core.object_track.reduced_mask import EMPTY
 from intercap_core.object_track.view import FitContext, MaskCandidate, View
@@ -33,10 +38,7 @@ from intercap_core.object_track.view_report import (
     visible_pixels,
 )
 
-# The lambdas of equation 1. Pixels of a view err together, so each term of a view counts as this
-# many independent samples (depth: at most, for many pixels).
-DEPTH_SAMPLES = 4.0  # tuned
-CONTOUR_SAMPLES = 3.0  # tuned
+CONTOUR_SAMPLES = 3.0  # independent samples of a view's silhouette term; tuned
 # Standard deviation of one view's depth: systematic error and calibration, not pixel noise. Azure
 # Kinect's data sheet states a systematic error below 11 mm + 0.1 % of the distance; half of that
 # bound is a guess of its standard deviation.
@@ -93,7 +95,7 @@ class ViewFit:
 
     def _best_candidate(self) -> MaskCandidate | None:
         context = self._context
-        return choose_candidate(self._view, self._silhouette, context.min_overlap, context.labels)
+        return choose_candidate(self._view, self._silhouette, context.labels, context.min_overlap)
 
     def _cut(self) -> None:
         """Cut the patches around the candidate, and set the trust in its mask."""
@@ -128,7 +130,7 @@ class ViewFit:
         )  # fmt: skip
         if count < MIN_RENDERED_PX:
             return np.zeros((6, 6)), np.zeros(6)
-        samples = DEPTH_SAMPLES * count / (count + DEPTH_HALF_SAMPLES_PX)
+        samples = VIEW_SAMPLES * count / (count + DEPTH_HALF_SAMPLES_PX)
         weight = samples / count / DEPTH_SIGMA_M**2
         return weight * hessian, weight * gradient
 

@@ -22,16 +22,15 @@ MIN_RENDERED_PX = 12  # renderings with fewer pixels are not compared; tuned
 # (nearer). The value is above the systematic errors of sensor and pose.
 FREE_SPACE_M = 0.03  # metres; tuned
 AGREEMENT_SCALE_M = 0.010  # a pixel this far off agrees by half (Azure Kinect's data sheet)
-ASSESS_MIN_OVERLAP = 0.1  # smallest IoU of a candidate to compare an unfitted pose with; tuned
 
 
 def choose_candidate(
-    view: View, predicted: Rendering, min_overlap: float, labels: tuple[str, ...]
+    view: View, predicted: Rendering, labels: tuple[str, ...], min_overlap: float = 0.1
 ) -> MaskCandidate | None:
     """Choose the candidate with the largest overlap with the visible render.
 
     0.05 is added to the overlap of candidates with one of the object's labels, which breaks ties.
-    Returns None if no overlap reaches ``min_overlap``.
+    Returns None if no overlap reaches ``min_overlap``, whose default is for poses without a fit.
     """
     best, best_rank = None, 0.0
     if predicted.area < MIN_RENDERED_PX:
@@ -120,7 +119,7 @@ def quick_report(
 
     ``drawn_depth`` is None without depth.
     """
-    candidate = choose_candidate(view, silhouette, ASSESS_MIN_OVERLAP, context.labels)
+    candidate = choose_candidate(view, silhouette, context.labels)
     overlap = mask_overlap(silhouette, candidate.mask, view.person) if candidate else float("nan")
     visible = visible_pixels(silhouette, view.person)
     agreement = float("nan")

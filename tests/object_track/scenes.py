@@ -32,7 +32,7 @@ def views_of(
     for c, camera in enumerate(capture.rig):
         depth, person, candidates = capture.image(t, c)
         late = float(capture.time_offset[c]) if timed else 0.0
-        geometry = ViewGeometry.for_object(camera, capture.mesh.diameter, time_offset_s=late)
+        geometry = ViewGeometry.for_object(camera, capture.mesh.diameter, 2.5, time_offset_s=late)
         if t in blank:
             depth, candidates = np.zeros_like(depth), []
         masks = [(index, label, rle) for index, label, _, rle in candidates]

@@ -12,7 +12,7 @@ from intercap_core.geometry.rigid.mesh import Paint
 from intercap_core.geometry.rigid.render import Renderer
 from intercap_core.geometry.rigid.shots import Shot, Surface
 from intercap_core.object_track.appearance import patches_of
-from intercap_core.object_track.colour_decision import PATCHES_ACROSS, ColourDecision
+from intercap_core.object_track.colour_decision import ColourDecision
 from intercap_core.object_track.decoder import Decoded, decode, decode_given, mix_decisions
 from intercap_core.object_track.hypotheses import Hypotheses, Prior
 from intercap_core.object_track.observer import Observer
@@ -149,7 +149,7 @@ def test_only_the_right_colours_of_the_mesh_decide_all_frames(toolbox, observe, 
 
 
 def test_patches_are_cells_of_one_side_of_the_surface(toolbox):
-    size = toolbox.mesh.diameter / PATCHES_ACROSS
+    size = toolbox.mesh.diameter / 12
     point = np.array([[0.01, 0.02, 0.03]])
     normal = np.array([[0.1, 0.9, 0.2]])
     own = patches_of(point, normal, size)
